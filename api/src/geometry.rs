@@ -1,0 +1,295 @@
+//! Points, poses and polygons in a site's frame.
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+/// Farthest coordinate from a site's origin, in metres; `f64` keeps 0.1 µm out here.
+pub const COORDINATE_MAX_M: f64 = 1.0e6;
+/// Fewest corners of a polygon.
+pub const CORNERS_MIN: usize = 3;
+/// Most corners of a polygon; the check for crossings is quadratic.
+pub const CORNERS_MAX: usize = 1_000;
+/// Smallest area of a polygon, in square metres.
+pub const AREA_MIN_M2: f64 = 1.0e-2;
+
+/// A point in the site's frame.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Point {
+    /// East-like coordinate, metres.
+    pub x_m: f64,
+    /// North-like coordinate, metres.
+    pub y_m: f64,
+}
+
+impl Point {
+    /// Whether both coordinates are finite and within [`COORDINATE_MAX_M`].
+    pub fn is_on_the_map(&self) -> bool {
+        self.x_m.abs() <= COORDINATE_MAX_M && self.y_m.abs() <= COORDINATE_MAX_M
+    }
+
+    /// Distance to another point, metres.
+    pub fn distance_m(&self, other: Point) -> f64 {
+        (other.x_m - self.x_m).hypot(other.y_m - self.y_m)
+    }
+}
+
+/// A position with a heading in the site's frame.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Pose {
+    /// East-like coordinate, metres.
+    pub x_m: f64,
+    /// North-like coordinate, metres.
+    pub y_m: f64,
+    /// Heading, radians counter-clockwise from x, −π to π.
+    pub heading_rad: f64,
+}
+
+impl Pose {
+    /// Where the pose stands.
+    pub fn position(&self) -> Point {
+        Point {
+            x_m: self.x_m,
+            y_m: self.y_m,
+        }
+    }
+}
+
+/// Velocities in the robot's own frame.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
+pub struct Twist {
+    /// Forward velocity, metres per second.
+    pub linear_m_s: f64,
+    /// Yaw rate, radians per second, counter-clockwise.
+    pub angular_rad_s: f64,
+}
+
+/// Why corners do not make a polygon.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum InvalidPolygon {
+    /// Fewer than [`CORNERS_MIN`] or more than [`CORNERS_MAX`] corners.
+    #[error("a polygon has {CORNERS_MIN} to {CORNERS_MAX} corners, this one has {0}")]
+    CornerCount(usize),
+    /// A coordinate is not finite or farther out than [`COORDINATE_MAX_M`].
+    #[error("corner {0} is not within {COORDINATE_MAX_M} m of the origin")]
+    OffTheMap(usize),
+    /// Two neighbouring corners are the same point.
+    #[error("corners {0} and {1} are the same point; leave out the closing corner")]
+    DuplicateCorner(usize, usize),
+    /// Two sides touch or cross.
+    #[error("the side from corner {0} crosses or touches the side from corner {1}")]
+    SelfCrossing(usize, usize),
+    /// The area is below [`AREA_MIN_M2`].
+    #[error("the polygon's area is below {AREA_MIN_M2} m²")]
+    TooSmall,
+}
+
+/// A simple polygon: corners in order, either way round, the last side closes it by itself.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(try_from = "Vec<Point>", into = "Vec<Point>")]
+#[schema(value_type = Vec<Point>, min_items = 3, max_items = 1000)]
+pub struct Polygon(Vec<Point>);
+
+impl Polygon {
+    /// Checks the corners.
+    ///
+    /// # Errors
+    /// [`InvalidPolygon`] names the corner: too few or many, off the map, doubled, sides that
+    /// cross or touch, or hardly any area.
+    pub fn new(corners: Vec<Point>) -> Result<Self, InvalidPolygon> {
+        let count = corners.len();
+        if !(CORNERS_MIN..=CORNERS_MAX).contains(&count) {
+            return Err(InvalidPolygon::CornerCount(count));
+        }
+        if let Some(index) = corners.iter().position(|corner| !corner.is_on_the_map()) {
+            return Err(InvalidPolygon::OffTheMap(index));
+        }
+        let side = |index: usize| (corners[index], corners[(index + 1) % count]);
+        let has_no_length = |&index: &usize| side(index).0 == side(index).1;
+        if let Some(index) = (0..count).find(has_no_length) {
+            return Err(InvalidPolygon::DuplicateCorner(index, (index + 1) % count));
+        }
+        for first in 0..count {
+            for second in first + 1..count {
+                let neighbours = second == first + 1 || (first == 0 && second == count - 1);
+                let crossing = if neighbours {
+                    folds_back(side(first), side(second))
+                } else {
+                    touches(side(first), side(second))
+                };
+                if crossing {
+                    return Err(InvalidPolygon::SelfCrossing(first, second));
+                }
+            }
+        }
+        let polygon = Self(corners);
+        if polygon.area_m2() < AREA_MIN_M2 {
+            Err(InvalidPolygon::TooSmall)
+        } else {
+            Ok(polygon)
+        }
+    }
+
+    /// The corners in order.
+    pub fn corners(&self) -> &[Point] {
+        &self.0
+    }
+
+    /// Enclosed area, square metres.
+    pub fn area_m2(&self) -> f64 {
+        let origin = self.0[0];
+        let doubled: f64 = self
+            .0
+            .windows(2)
+            .map(|pair| cross(origin, pair[0], pair[1]))
+            .sum();
+        doubled.abs() / 2.0
+    }
+
+    /// Whether a point lies inside; a point on the border may count either way.
+    pub fn contains(&self, point: Point) -> bool {
+        let mut inside = false;
+        let mut from = self.0[self.0.len() - 1];
+        for &to in &self.0 {
+            if (from.y_m > point.y_m) != (to.y_m > point.y_m) {
+                let ratio = (point.y_m - from.y_m) / (to.y_m - from.y_m);
+                if point.x_m < from.x_m + ratio * (to.x_m - from.x_m) {
+                    inside = !inside;
+                }
+            }
+            from = to;
+        }
+        inside
+    }
+}
+
+impl TryFrom<Vec<Point>> for Polygon {
+    type Error = InvalidPolygon;
+
+    fn try_from(corners: Vec<Point>) -> Result<Self, InvalidPolygon> {
+        Self::new(corners)
+    }
+}
+
+impl From<Polygon> for Vec<Point> {
+    fn from(polygon: Polygon) -> Self {
+        polygon.0
+    }
+}
+
+/// Twice the signed area of the triangle; positive when `c` lies left of `a` → `b`.
+fn cross(a: Point, b: Point, c: Point) -> f64 {
+    (b.x_m - a.x_m) * (c.y_m - a.y_m) - (b.y_m - a.y_m) * (c.x_m - a.x_m)
+}
+
+/// Whether two sides that share no corner have a point in common.
+fn touches(first: (Point, Point), second: (Point, Point)) -> bool {
+    let (a, b) = first;
+    let (c, d) = second;
+    let (abc, abd) = (cross(a, b, c), cross(a, b, d));
+    let (cda, cdb) = (cross(c, d, a), cross(c, d, b));
+    let opposite = |left: f64, right: f64| (left > 0.0) != (right > 0.0);
+    if abc != 0.0 && abd != 0.0 && cda != 0.0 && cdb != 0.0 {
+        return opposite(abc, abd) && opposite(cda, cdb);
+    }
+    (abc == 0.0 && within_box(a, b, c))
+        || (abd == 0.0 && within_box(a, b, d))
+        || (cda == 0.0 && within_box(c, d, a))
+        || (cdb == 0.0 && within_box(c, d, b))
+}
+
+/// Whether two neighbouring sides lie on each other instead of meeting only in their corner.
+fn folds_back(first: (Point, Point), second: (Point, Point)) -> bool {
+    let (start, shared, end) = if first.1 == second.0 {
+        (first.0, first.1, second.1)
+    } else {
+        (first.1, first.0, second.0)
+    };
+    let along = (start.x_m - shared.x_m) * (end.x_m - shared.x_m)
+        + (start.y_m - shared.y_m) * (end.y_m - shared.y_m);
+    cross(start, shared, end) == 0.0 && along > 0.0
+}
+
+fn within_box(a: Point, b: Point, point: Point) -> bool {
+    let between =
+        |low: f64, high: f64, value: f64| value >= low.min(high) && value <= low.max(high);
+    between(a.x_m, b.x_m, point.x_m) && between(a.y_m, b.y_m, point.y_m)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn polygon(corners: &[(f64, f64)]) -> Result<Polygon, InvalidPolygon> {
+        Polygon::new(
+            corners
+                .iter()
+                .map(|&(x_m, y_m)| Point { x_m, y_m })
+                .collect(),
+        )
+    }
+
+    #[test]
+    fn a_bow_tie_is_refused_with_the_sides_that_cross() {
+        let bow_tie = polygon(&[(0.0, 0.0), (2.0, 2.0), (2.0, 0.0), (0.0, 2.0)]);
+        assert_eq!(bow_tie, Err(InvalidPolygon::SelfCrossing(0, 2)));
+    }
+
+    #[test]
+    fn sides_that_touch_or_fold_back_are_refused() {
+        let touching = polygon(&[(0.0, 0.0), (4.0, 0.0), (4.0, 2.0), (2.0, 0.0), (0.0, 2.0)]);
+        assert!(
+            matches!(touching, Err(InvalidPolygon::SelfCrossing(..))),
+            "{touching:?}"
+        );
+        let folded = polygon(&[(0.0, 0.0), (4.0, 0.0), (2.0, 0.0), (2.0, 2.0)]);
+        assert!(
+            matches!(folded, Err(InvalidPolygon::SelfCrossing(..))),
+            "{folded:?}"
+        );
+    }
+
+    #[test]
+    fn corners_that_make_no_polygon_are_refused() {
+        assert_eq!(
+            polygon(&[(0.0, 0.0), (1.0, 0.0)]),
+            Err(InvalidPolygon::CornerCount(2))
+        );
+        let closed = polygon(&[(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 0.0)]);
+        assert_eq!(closed, Err(InvalidPolygon::DuplicateCorner(3, 0)));
+        let nan = polygon(&[(0.0, 0.0), (f64::NAN, 0.0), (1.0, 1.0)]);
+        assert_eq!(nan, Err(InvalidPolygon::OffTheMap(1)));
+        let tiny = polygon(&[(0.0, 0.0), (0.01, 0.0), (0.0, 0.01)]);
+        assert_eq!(tiny, Err(InvalidPolygon::TooSmall));
+    }
+
+    proptest! {
+        #[test]
+        fn a_star_shaped_polygon_is_simple_and_contains_its_centre(
+            radii in prop::collection::vec(0.5_f64..20.0, 3..24),
+            x_m in -1000.0_f64..1000.0,
+            y_m in -1000.0_f64..1000.0,
+            clockwise: bool,
+        ) {
+            let count = radii.len();
+            let mut corners: Vec<Point> = radii
+                .iter()
+                .enumerate()
+                .map(|(index, radius)| {
+                    #[expect(clippy::cast_precision_loss, reason = "two dozen corners")]
+                    let angle = std::f64::consts::TAU * index as f64 / count as f64;
+                    Point { x_m: x_m + radius * angle.cos(), y_m: y_m + radius * angle.sin() }
+                })
+                .collect();
+            if clockwise {
+                corners.reverse();
+            }
+            let polygon = Polygon::new(corners).unwrap();
+            let centre = Point { x_m, y_m };
+            prop_assert!(polygon.contains(centre));
+            let outside = Point { x_m: x_m + 21.0, y_m };
+            prop_assert!(!polygon.contains(outside));
+        }
+    }
+}

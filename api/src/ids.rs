@@ -1,0 +1,190 @@
+//! Identifiers: short readable names for what people name, UUIDs for what programs make.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+use uuid::Uuid;
+
+/// Longest readable identifier, in bytes; it is one chunk of a key expression.
+pub const SLUG_LENGTH_MAX: usize = 63;
+
+/// Why a text is not an identifier.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "`{text}` is not an identifier: use 1 to {SLUG_LENGTH_MAX} characters out of a-z, 0-9 and `-`"
+)]
+pub struct InvalidSlug {
+    text: String,
+}
+
+fn check_slug(text: &str) -> Result<(), InvalidSlug> {
+    let allowed = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'-';
+    if !text.is_empty() && text.len() <= SLUG_LENGTH_MAX && text.bytes().all(allowed) {
+        Ok(())
+    } else {
+        // What is echoed is bounded: it may have come from the network.
+        let text = text.chars().take(SLUG_LENGTH_MAX + 1).collect();
+        Err(InvalidSlug { text })
+    }
+}
+
+macro_rules! slug {
+    ($(#[$doc:meta])* $name:ident) => {
+        $(#[$doc])*
+        #[derive(
+            Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
+        )]
+        #[serde(try_from = "String", into = "String")]
+        #[schema(value_type = String, pattern = "^[a-z0-9-]{1,63}$", example = "north-yard")]
+        pub struct $name(String);
+
+        impl $name {
+            /// The identifier as text.
+            pub fn as_str(&self) -> &str {
+                &self.0
+            }
+        }
+
+        impl FromStr for $name {
+            type Err = InvalidSlug;
+
+            fn from_str(text: &str) -> Result<Self, InvalidSlug> {
+                check_slug(text)?;
+                Ok(Self(text.to_owned()))
+            }
+        }
+
+        impl TryFrom<String> for $name {
+            type Error = InvalidSlug;
+
+            fn try_from(text: String) -> Result<Self, InvalidSlug> {
+                check_slug(&text)?;
+                Ok(Self(text))
+            }
+        }
+
+        impl From<$name> for String {
+            fn from(id: $name) -> Self {
+                id.0
+            }
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+                formatter.write_str(&self.0)
+            }
+        }
+    };
+}
+
+slug! {
+    /// A site: one metric frame with its robots, terrains, cells and missions.
+    SiteId
+}
+slug! {
+    /// A robot, unique within its site.
+    RobotId
+}
+slug! {
+    /// A terrain, unique within its site.
+    TerrainId
+}
+
+macro_rules! uuid_id {
+    ($(#[$doc:meta])* $name:ident) => {
+        $(#[$doc])*
+        #[derive(
+            Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize,
+            ToSchema,
+        )]
+        #[serde(transparent)]
+        #[schema(value_type = Uuid)]
+        pub struct $name(Uuid);
+
+        impl $name {
+            /// Takes a UUID that was made elsewhere.
+            pub const fn from_uuid(uuid: Uuid) -> Self {
+                Self(uuid)
+            }
+
+            /// The UUID below.
+            pub const fn as_uuid(&self) -> Uuid {
+                self.0
+            }
+        }
+
+        impl FromStr for $name {
+            type Err = uuid::Error;
+
+            fn from_str(text: &str) -> Result<Self, uuid::Error> {
+                Uuid::parse_str(text).map(Self)
+            }
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+                self.0.fmt(formatter)
+            }
+        }
+    };
+}
+
+uuid_id! {
+    /// A mission: a version 7 UUID, so that ids sort by creation.
+    MissionId
+}
+uuid_id! {
+    /// One run of an agent's process: a new version 4 UUID at each start.
+    BootId
+}
+uuid_id! {
+    /// A robot's model and tyres: the version 5 UUID of their description.
+    ///
+    /// Equal descriptions give equal ids on every machine, so friction measured before and after
+    /// a change of tyres is never mixed. See [`crate::robot::RobotModel::configuration`].
+    ConfigurationId
+}
+uuid_id! {
+    /// What exactly a robot was asked to drive: the version 5 UUID of request and revision.
+    ///
+    /// See [`crate::wire::command::Offer::plan_hash_of`].
+    PlanHash
+}
+
+/// The name space of all version 5 UUIDs made here; changing it changes every derived id.
+pub(crate) const DERIVED_NAMESPACE: Uuid =
+    Uuid::from_u128(0x8f1d_5d53_6a0e_4f0b_9d3c_2f7a_51c4_e6b0);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_identifier_is_one_chunk_of_a_key_expression() {
+        assert!("rover-1".parse::<RobotId>().is_ok());
+        let too_long = "a".repeat(SLUG_LENGTH_MAX + 1);
+        for bad in [
+            "",
+            "Rover",
+            "a/b",
+            "a*",
+            "a b",
+            "$x",
+            "ü",
+            too_long.as_str(),
+        ] {
+            assert!(bad.parse::<RobotId>().is_err(), "`{bad}` was taken");
+        }
+    }
+
+    #[test]
+    fn a_bad_identifier_is_refused_while_parsing_json() {
+        let error = serde_json::from_str::<SiteId>("\"A B\"").unwrap_err();
+        assert!(
+            error.to_string().contains("`A B` is not an identifier"),
+            "{error}"
+        );
+    }
+}

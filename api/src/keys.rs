@@ -1,0 +1,177 @@
+//! Key expressions on zenoh, all below `tread/{site}/`.
+//!
+//! | key | kind | from → to |
+//! |---|---|---|
+//! | `robots/{robot}/alive/{boot}` | liveliness token | robot → all |
+//! | `robots/{robot}/state` | published | robot → all |
+//! | `robots/{robot}/friction` | published | robot → all |
+//! | `robots/{robot}/cmd/{verb}` | query | server → robot |
+//! | `server/hello/{robot}` | query | robot → server |
+//! | `server/ingest/{robot}` | query | robot → server |
+
+use crate::ids::{BootId, RobotId, SiteId};
+
+/// The first chunk of every key.
+pub const ROOT: &str = "tread";
+
+/// The verbs of commands to a robot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Verb {
+    /// Offer a mission.
+    Offer,
+    /// Cancel a mission.
+    Cancel,
+    /// Take a new definition of the site.
+    Site,
+}
+
+impl Verb {
+    /// Every verb.
+    pub const ALL: [Self; 3] = [Self::Offer, Self::Cancel, Self::Site];
+
+    /// The verb as a chunk of a key.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Offer => "offer",
+            Self::Cancel => "cancel",
+            Self::Site => "site",
+        }
+    }
+
+    /// The verb of that name.
+    pub fn from_chunk(chunk: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|verb| verb.as_str() == chunk)
+    }
+}
+
+fn robot_key(site: &SiteId, robot: &RobotId, rest: &str) -> String {
+    format!("{ROOT}/{site}/robots/{robot}/{rest}")
+}
+
+/// The liveliness token of one run of an agent.
+pub fn alive(site: &SiteId, robot: &RobotId, boot: BootId) -> String {
+    robot_key(site, robot, &format!("alive/{boot}"))
+}
+
+/// Where a robot publishes its state.
+pub fn state(site: &SiteId, robot: &RobotId) -> String {
+    robot_key(site, robot, "state")
+}
+
+/// Where a robot publishes both of its friction estimates.
+pub fn friction(site: &SiteId, robot: &RobotId) -> String {
+    robot_key(site, robot, "friction")
+}
+
+/// Where a robot answers one verb.
+pub fn command(site: &SiteId, robot: &RobotId, verb: Verb) -> String {
+    robot_key(site, robot, &format!("cmd/{}", verb.as_str()))
+}
+
+/// Every command to one robot.
+pub fn commands(site: &SiteId, robot: &RobotId) -> String {
+    robot_key(site, robot, "cmd/*")
+}
+
+/// Where a robot introduces itself.
+pub fn hello(site: &SiteId, robot: &RobotId) -> String {
+    format!("{ROOT}/{site}/server/hello/{robot}")
+}
+
+/// Where a robot uploads what must not be lost.
+pub fn ingest(site: &SiteId, robot: &RobotId) -> String {
+    format!("{ROOT}/{site}/server/ingest/{robot}")
+}
+
+/// The liveliness tokens of all robots of all sites.
+pub const ALL_ALIVE: &str = "tread/*/robots/*/alive/*";
+/// The states of all robots of all sites.
+pub const ALL_STATES: &str = "tread/*/robots/*/state";
+/// The friction of all robots of all sites.
+pub const ALL_FRICTION: &str = "tread/*/robots/*/friction";
+/// The introductions of all robots of all sites.
+pub const ALL_HELLOS: &str = "tread/*/server/hello/*";
+/// The uploads of all robots of all sites.
+pub const ALL_INGEST: &str = "tread/*/server/ingest/*";
+
+/// What a key means, read back.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Key {
+    /// A liveliness token.
+    Alive(SiteId, RobotId, BootId),
+    /// A robot's state.
+    State(SiteId, RobotId),
+    /// A robot's friction estimates.
+    Friction(SiteId, RobotId),
+    /// A command to a robot.
+    Command(SiteId, RobotId, Verb),
+    /// An introduction.
+    Hello(SiteId, RobotId),
+    /// An upload.
+    Ingest(SiteId, RobotId),
+}
+
+impl Key {
+    /// Reads a key; `None` if it is not one of ours.
+    pub fn parse(key: &str) -> Option<Self> {
+        let mut chunks = key.split('/');
+        if chunks.next()? != ROOT {
+            return None;
+        }
+        let site: SiteId = chunks.next()?.parse().ok()?;
+        let rest: Vec<&str> = chunks.collect();
+        Some(match rest.as_slice() {
+            ["robots", robot, "alive", boot] => {
+                Self::Alive(site, robot.parse().ok()?, boot.parse().ok()?)
+            }
+            ["robots", robot, "state"] => Self::State(site, robot.parse().ok()?),
+            ["robots", robot, "friction"] => Self::Friction(site, robot.parse().ok()?),
+            ["robots", robot, "cmd", verb] => {
+                Self::Command(site, robot.parse().ok()?, Verb::from_chunk(verb)?)
+            }
+            ["server", "hello", robot] => Self::Hello(site, robot.parse().ok()?),
+            ["server", "ingest", robot] => Self::Ingest(site, robot.parse().ok()?),
+            _ => return None,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use uuid::Uuid;
+
+    use super::*;
+
+    #[test]
+    fn every_key_reads_back_as_what_it_was_made_from() {
+        let site: SiteId = "yard".parse().unwrap();
+        let robot: RobotId = "rover-1".parse().unwrap();
+        let boot = BootId::from_uuid(Uuid::from_u128(7));
+        let pair = || (site.clone(), robot.clone());
+        let cases = [
+            (
+                alive(&site, &robot, boot),
+                Key::Alive(pair().0, pair().1, boot),
+            ),
+            (state(&site, &robot), Key::State(pair().0, pair().1)),
+            (friction(&site, &robot), Key::Friction(pair().0, pair().1)),
+            (
+                command(&site, &robot, Verb::Offer),
+                Key::Command(pair().0, pair().1, Verb::Offer),
+            ),
+            (hello(&site, &robot), Key::Hello(pair().0, pair().1)),
+            (ingest(&site, &robot), Key::Ingest(pair().0, pair().1)),
+        ];
+        for (text, key) in cases {
+            assert_eq!(Key::parse(&text), Some(key), "{text}");
+        }
+        for other in [
+            "",
+            "tread",
+            "tread/yard/robots/r",
+            "other/yard/robots/r/state",
+        ] {
+            assert_eq!(Key::parse(other), None, "{other}");
+        }
+    }
+}

@@ -1,0 +1,25 @@
+//! Every word that crosses the network: REST bodies, zenoh payloads, key expressions, identifiers.
+//!
+//! This crate does no I/O and knows no other part of Tread. Both sides of every wire build on it,
+//! so a change here is a change of the protocol.
+//!
+//! * REST shapes: [`site`], [`terrain`], [`robot`], [`trajectory`], [`mission`], [`friction`],
+//!   [`page`], [`problem`].
+//! * zenoh shapes: [`wire`], with the key expressions in [`keys`].
+//!
+//! Units are SI and stand last in a name (`_m`, `_m_s`, `_rad`). A site's frame is metric and
+//! right-handed, x east-like, y north-like; headings are counter-clockwise from x. A value that is
+//! not known is `null`, never a default. Integers stay below 2⁵³.
+
+pub mod friction;
+pub mod geometry;
+pub mod ids;
+pub mod keys;
+pub mod mission;
+pub mod page;
+pub mod problem;
+pub mod robot;
+pub mod site;
+pub mod terrain;
+pub mod trajectory;
+pub mod wire;

@@ -1,0 +1,18 @@
+//! The envelope of every list.
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+/// Entries of a page when the request does not say.
+pub const PAGE_LIMIT_DEFAULT: u32 = 100;
+/// Most entries of a page.
+pub const PAGE_LIMIT_MAX: u32 = 1_000;
+
+/// One page of a list.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Page<T> {
+    /// The entries.
+    pub items: Vec<T>,
+    /// Give this as `cursor` for the next page; `null` on the last one.
+    pub next_cursor: Option<String>,
+}

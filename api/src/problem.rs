@@ -1,0 +1,123 @@
+//! Errors over REST: RFC 9457 problems with a closed list of types.
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+/// The media type of a problem.
+pub const PROBLEM_MEDIA_TYPE: &str = "application/problem+json";
+
+/// Every kind of problem that the API answers with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
+#[expect(missing_docs, reason = "titles say it")]
+pub enum ProblemType {
+    #[serde(rename = "/problems/malformed-body")]
+    MalformedBody,
+    #[serde(rename = "/problems/invalid-body")]
+    InvalidBody,
+    #[serde(rename = "/problems/unknown-field")]
+    UnknownField,
+    #[serde(rename = "/problems/body-too-large")]
+    BodyTooLarge,
+    #[serde(rename = "/problems/unsupported-media-type")]
+    UnsupportedMediaType,
+    #[serde(rename = "/problems/invalid-path")]
+    InvalidPath,
+    #[serde(rename = "/problems/invalid-query")]
+    InvalidQuery,
+    #[serde(rename = "/problems/not-found")]
+    NotFound,
+    #[serde(rename = "/problems/method-not-allowed")]
+    MethodNotAllowed,
+    #[serde(rename = "/problems/unknown-site")]
+    UnknownSite,
+    #[serde(rename = "/problems/unknown-robot")]
+    UnknownRobot,
+    #[serde(rename = "/problems/unknown-terrain")]
+    UnknownTerrain,
+    #[serde(rename = "/problems/unknown-mission")]
+    UnknownMission,
+    #[serde(rename = "/problems/already-exists")]
+    AlreadyExists,
+    #[serde(rename = "/problems/beyond-limits")]
+    BeyondLimits,
+    #[serde(rename = "/problems/mission-ended")]
+    MissionEnded,
+    #[serde(rename = "/problems/too-many")]
+    TooMany,
+    #[serde(rename = "/problems/timeout")]
+    Timeout,
+    #[serde(rename = "/problems/unavailable")]
+    Unavailable,
+    #[serde(rename = "/problems/internal")]
+    Internal,
+}
+
+impl ProblemType {
+    /// Every kind.
+    pub const ALL: [Self; 20] = [
+        Self::MalformedBody,
+        Self::InvalidBody,
+        Self::UnknownField,
+        Self::BodyTooLarge,
+        Self::UnsupportedMediaType,
+        Self::InvalidPath,
+        Self::InvalidQuery,
+        Self::NotFound,
+        Self::MethodNotAllowed,
+        Self::UnknownSite,
+        Self::UnknownRobot,
+        Self::UnknownTerrain,
+        Self::UnknownMission,
+        Self::AlreadyExists,
+        Self::BeyondLimits,
+        Self::MissionEnded,
+        Self::TooMany,
+        Self::Timeout,
+        Self::Unavailable,
+        Self::Internal,
+    ];
+
+    /// The title for people, the same for every problem of this kind.
+    pub const fn title(self) -> &'static str {
+        match self {
+            Self::MalformedBody => "The body is not JSON",
+            Self::InvalidBody => "The body does not say something possible",
+            Self::UnknownField => "The body has a field that is not known",
+            Self::BodyTooLarge => "The body is too large",
+            Self::UnsupportedMediaType => "The body must be application/json",
+            Self::InvalidPath => "The path has a part that is not an identifier",
+            Self::InvalidQuery => "The query does not say something possible",
+            Self::NotFound => "There is nothing here",
+            Self::MethodNotAllowed => "This method is not for this path",
+            Self::UnknownSite => "The site is not known",
+            Self::UnknownRobot => "The robot is not known",
+            Self::UnknownTerrain => "The terrain is not known",
+            Self::UnknownMission => "The mission is not known",
+            Self::AlreadyExists => "The identifier is in use",
+            Self::BeyondLimits => "The robot cannot do this",
+            Self::MissionEnded => "The mission has ended",
+            Self::TooMany => "There are too many of these",
+            Self::Timeout => "The answer took too long",
+            Self::Unavailable => "The server cannot answer now",
+            Self::Internal => "Something broke in the server",
+        }
+    }
+}
+
+/// An error answer.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ProblemBody {
+    /// The kind, stable, for programs.
+    #[serde(rename = "type")]
+    pub kind: ProblemType,
+    /// What the kind means, for people.
+    pub title: String,
+    /// The HTTP status.
+    pub status: u16,
+    /// What is wrong here, and what to do, for people.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub detail: Option<String>,
+    /// Where in the body, as a path such as `trajectory.circle.radius_m`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub field: Option<String>,
+}

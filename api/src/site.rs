@@ -1,0 +1,129 @@
+//! Sites and their grids.
+
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use crate::geometry::Point;
+use crate::ids::SiteId;
+
+/// Smallest side of a cell, metres.
+pub const CELL_MIN_M: f64 = 0.1;
+/// Largest side of a cell, metres.
+pub const CELL_MAX_M: f64 = 100.0;
+/// Longest name of anything, in characters.
+pub const NAME_LENGTH_MAX: usize = 200;
+
+/// The squares in which friction is kept.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Grid {
+    /// Counts changes of the grid; a segment names the one it was cut by.
+    pub revision: u32,
+    /// Side of a cell, metres.
+    #[schema(minimum = 0.1, maximum = 100.0, example = 1.0)]
+    pub cell_m: f64,
+}
+
+impl Grid {
+    /// The cell that contains a point; `None` if the point is off the map.
+    pub fn cell_at(&self, point: Point) -> Option<Cell> {
+        point.is_on_the_map().then(|| {
+            #[expect(
+                clippy::cast_possible_truncation,
+                reason = "within 10^7 cells of the origin"
+            )]
+            let index = |coordinate_m: f64| (coordinate_m / self.cell_m).floor() as i32;
+            Cell {
+                ix: index(point.x_m),
+                iy: index(point.y_m),
+            }
+        })
+    }
+
+    /// The middle of a cell.
+    pub fn center_of(&self, cell: Cell) -> Point {
+        let middle = |index: i32| (f64::from(index) + 0.5) * self.cell_m;
+        Point {
+            x_m: middle(cell.ix),
+            y_m: middle(cell.iy),
+        }
+    }
+}
+
+/// One square of a site's grid, counted from the origin.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
+)]
+pub struct Cell {
+    /// Column: the cell spans `ix · cell_m` to `(ix + 1) · cell_m` in x.
+    pub ix: i32,
+    /// Row, likewise in y.
+    pub iy: i32,
+}
+
+/// A site as the server keeps it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Site {
+    /// The site's identifier, a chunk of every zenoh key.
+    pub id: SiteId,
+    /// Name for people.
+    pub name: String,
+    /// The grid of the site's friction map.
+    pub grid: Grid,
+    /// Counts changes of the site's terrains.
+    pub terrain_revision: u64,
+    /// When the site was made.
+    pub created_at: Timestamp,
+}
+
+/// The body of `POST /v1/sites`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct CreateSite {
+    /// The identifier to use.
+    pub id: SiteId,
+    /// Name for people; the identifier when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+    /// Side of a cell, metres; 1 m when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0.1, maximum = 100.0)]
+    pub cell_m: Option<f64>,
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn a_cell_contains_its_centre(ix in -10_000..10_000, iy in -10_000..10_000, cell_m in 0.1..100.0) {
+            let grid = Grid { revision: 1, cell_m };
+            let cell = Cell { ix, iy };
+            prop_assert_eq!(grid.cell_at(grid.center_of(cell)), Some(cell));
+        }
+    }
+
+    #[test]
+    fn a_point_that_is_no_place_has_no_cell() {
+        let grid = Grid {
+            revision: 1,
+            cell_m: 1.0,
+        };
+        assert_eq!(
+            grid.cell_at(Point {
+                x_m: f64::NAN,
+                y_m: 0.0
+            }),
+            None
+        );
+        assert_eq!(
+            grid.cell_at(Point {
+                x_m: 0.0,
+                y_m: 1.0e9
+            }),
+            None
+        );
+    }
+}

@@ -1,0 +1,356 @@
+//! What a user asks a robot to drive: a circle or waypoints.
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use crate::geometry::{COORDINATE_MAX_M, Point};
+
+/// Fewest waypoints of a path.
+pub const WAYPOINTS_MIN: usize = 2;
+/// Most waypoints of a path.
+pub const WAYPOINTS_MAX: usize = 100_000;
+/// Smallest distance between neighbouring waypoints, metres; closer ones are the same point.
+pub const WAYPOINT_SPACING_MIN_M: f64 = 1.0e-3;
+/// Smallest radius of a circle, metres.
+pub const RADIUS_MIN_M: f64 = 0.05;
+/// Largest radius of a circle, metres.
+pub const RADIUS_MAX_M: f64 = 10_000.0;
+/// Slowest speed that can be asked for, metres per second.
+pub const SPEED_MIN_M_S: f64 = 0.01;
+/// Fastest speed that can be asked for, metres per second; each robot's own limit is lower.
+pub const SPEED_MAX_M_S: f64 = 50.0;
+/// Fewest turns of a circle.
+pub const TURNS_MIN: f64 = 0.05;
+/// Most turns of a circle.
+pub const TURNS_MAX: f64 = 1_000.0;
+
+/// A path to drive, as a user asks for it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Trajectory {
+    /// Turns on a circle.
+    Circle(Circle),
+    /// A smooth path through points, driven without stopping at them.
+    Waypoints(Waypoints),
+}
+
+/// Which way round a circle is driven, seen from above.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Direction {
+    /// The heading grows.
+    #[default]
+    CounterClockwise,
+    /// The heading falls.
+    Clockwise,
+}
+
+/// Turns on a circle.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(try_from = "CircleFields")]
+pub struct Circle {
+    /// The circle's centre.
+    pub center: Point,
+    /// Radius, metres.
+    #[schema(minimum = 0.05, maximum = 10_000.0, example = 3.0)]
+    pub radius_m: f64,
+    /// Speed along the circle, metres per second; give this or `period_s`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0.01, maximum = 50.0, example = 0.6)]
+    pub speed_m_s: Option<f64>,
+    /// Time for one turn, seconds; give this or `speed_m_s`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub period_s: Option<f64>,
+    /// Which way round; counter-clockwise when absent.
+    #[serde(default)]
+    pub direction: Direction,
+    /// How many turns; one when absent.
+    #[serde(default = "one_turn")]
+    #[schema(minimum = 0.05, maximum = 1000.0, default = 1.0)]
+    pub turns: f64,
+}
+
+impl Circle {
+    /// The speed along the circle, metres per second, from the speed or the period.
+    pub fn speed_m_s(&self) -> f64 {
+        let from_period =
+            || std::f64::consts::TAU * self.radius_m / self.period_s.unwrap_or(f64::INFINITY);
+        self.speed_m_s.unwrap_or_else(from_period)
+    }
+}
+
+fn one_turn() -> f64 {
+    1.0
+}
+
+/// A smooth path through points.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(try_from = "WaypointsFields")]
+pub struct Waypoints {
+    /// The points in driving order, 2 to 100 000.
+    #[schema(min_items = 2, max_items = 100_000)]
+    pub points: Vec<Waypoint>,
+    /// Speed wherever a point does not say otherwise, metres per second.
+    #[schema(minimum = 0.01, maximum = 50.0, example = 0.6)]
+    pub speed_m_s: f64,
+}
+
+/// One point of a path.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Waypoint {
+    /// East-like coordinate, metres.
+    pub x_m: f64,
+    /// North-like coordinate, metres.
+    pub y_m: f64,
+    /// Speed from here to the next point, metres per second.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub speed_m_s: Option<f64>,
+    /// Direction of the path at this point, radians; free when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub heading_rad: Option<f64>,
+}
+
+impl Waypoint {
+    /// Where the point lies.
+    pub fn position(&self) -> Point {
+        Point {
+            x_m: self.x_m,
+            y_m: self.y_m,
+        }
+    }
+}
+
+/// Why a trajectory cannot be driven by any robot.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum InvalidTrajectory {
+    /// The radius is not within [`RADIUS_MIN_M`] to [`RADIUS_MAX_M`].
+    #[error("radius_m must be {RADIUS_MIN_M} to {RADIUS_MAX_M}, not {0}")]
+    Radius(f64),
+    /// The turns are not within [`TURNS_MIN`] to [`TURNS_MAX`].
+    #[error("turns must be {TURNS_MIN} to {TURNS_MAX}, not {0}")]
+    Turns(f64),
+    /// Neither or both of speed and period were given.
+    #[error("give either speed_m_s or period_s")]
+    SpeedOrPeriod,
+    /// The speed is not within [`SPEED_MIN_M_S`] to [`SPEED_MAX_M_S`].
+    #[error("the speed must be {SPEED_MIN_M_S} to {SPEED_MAX_M_S} m/s, not {0}")]
+    Speed(f64),
+    /// A point's own speed is out of range.
+    #[error(
+        "points[{index}].speed_m_s must be {SPEED_MIN_M_S} to {SPEED_MAX_M_S}, not {speed_m_s}"
+    )]
+    PointSpeed {
+        /// Which point, from 0.
+        index: usize,
+        /// The speed that was given.
+        speed_m_s: f64,
+    },
+    /// The centre is not finite or too far out.
+    #[error("the centre must be within {COORDINATE_MAX_M} m of the origin")]
+    Center,
+    /// Too few or too many points.
+    #[error("a path has {WAYPOINTS_MIN} to {WAYPOINTS_MAX} points, this one has {0}")]
+    PointCount(usize),
+    /// A point is not finite or too far out.
+    #[error("points[{0}] must be within {COORDINATE_MAX_M} m of the origin")]
+    PointOffTheMap(usize),
+    /// A point's heading is not finite.
+    #[error("points[{0}].heading_rad must be a finite number")]
+    PointHeading(usize),
+    /// A point repeats the one before it.
+    #[error(
+        "points[{0}] repeats the point before it; keep neighbours {WAYPOINT_SPACING_MIN_M} m apart"
+    )]
+    DuplicatePoint(usize),
+}
+
+fn is_speed(speed_m_s: f64) -> bool {
+    (SPEED_MIN_M_S..=SPEED_MAX_M_S).contains(&speed_m_s)
+}
+
+impl Circle {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`InvalidTrajectory`] names the field that is out of range.
+    pub fn validate(&self) -> Result<(), InvalidTrajectory> {
+        if !self.center.is_on_the_map() {
+            return Err(InvalidTrajectory::Center);
+        }
+        if !(RADIUS_MIN_M..=RADIUS_MAX_M).contains(&self.radius_m) {
+            return Err(InvalidTrajectory::Radius(self.radius_m));
+        }
+        if !(TURNS_MIN..=TURNS_MAX).contains(&self.turns) {
+            return Err(InvalidTrajectory::Turns(self.turns));
+        }
+        if self.speed_m_s.is_some() == self.period_s.is_some() {
+            return Err(InvalidTrajectory::SpeedOrPeriod);
+        }
+        let speed_m_s = self.speed_m_s();
+        if is_speed(speed_m_s) {
+            Ok(())
+        } else {
+            Err(InvalidTrajectory::Speed(speed_m_s))
+        }
+    }
+}
+
+impl Waypoints {
+    /// Checks every point.
+    ///
+    /// # Errors
+    /// [`InvalidTrajectory`] names the first point that is out of range or doubled.
+    pub fn validate(&self) -> Result<(), InvalidTrajectory> {
+        let count = self.points.len();
+        if !(WAYPOINTS_MIN..=WAYPOINTS_MAX).contains(&count) {
+            return Err(InvalidTrajectory::PointCount(count));
+        }
+        if !is_speed(self.speed_m_s) {
+            return Err(InvalidTrajectory::Speed(self.speed_m_s));
+        }
+        let mut previous: Option<Point> = None;
+        for (index, point) in self.points.iter().enumerate() {
+            let position = point.position();
+            if !position.is_on_the_map() {
+                return Err(InvalidTrajectory::PointOffTheMap(index));
+            }
+            if point
+                .heading_rad
+                .is_some_and(|heading_rad| !heading_rad.is_finite())
+            {
+                return Err(InvalidTrajectory::PointHeading(index));
+            }
+            if let Some(speed_m_s) = point.speed_m_s.filter(|&speed_m_s| !is_speed(speed_m_s)) {
+                return Err(InvalidTrajectory::PointSpeed { index, speed_m_s });
+            }
+            let near = |before: Point| before.distance_m(position) < WAYPOINT_SPACING_MIN_M;
+            if previous.is_some_and(near) {
+                return Err(InvalidTrajectory::DuplicatePoint(index));
+            }
+            previous = Some(position);
+        }
+        Ok(())
+    }
+}
+
+impl Trajectory {
+    /// The fastest speed that is asked for anywhere, metres per second.
+    pub fn speed_max_m_s(&self) -> f64 {
+        match self {
+            Self::Circle(circle) => circle.speed_m_s(),
+            Self::Waypoints(waypoints) => waypoints
+                .points
+                .iter()
+                .filter_map(|point| point.speed_m_s)
+                .fold(waypoints.speed_m_s, f64::max),
+        }
+    }
+}
+
+#[derive(Deserialize)]
+struct CircleFields {
+    center: Point,
+    radius_m: f64,
+    #[serde(default)]
+    speed_m_s: Option<f64>,
+    #[serde(default)]
+    period_s: Option<f64>,
+    #[serde(default)]
+    direction: Direction,
+    #[serde(default = "one_turn")]
+    turns: f64,
+}
+
+impl TryFrom<CircleFields> for Circle {
+    type Error = InvalidTrajectory;
+
+    fn try_from(fields: CircleFields) -> Result<Self, InvalidTrajectory> {
+        let CircleFields {
+            center,
+            radius_m,
+            speed_m_s,
+            period_s,
+            direction,
+            turns,
+        } = fields;
+        let circle = Self {
+            center,
+            radius_m,
+            speed_m_s,
+            period_s,
+            direction,
+            turns,
+        };
+        circle.validate()?;
+        Ok(circle)
+    }
+}
+
+#[derive(Deserialize)]
+struct WaypointsFields {
+    points: Vec<Waypoint>,
+    speed_m_s: f64,
+}
+
+impl TryFrom<WaypointsFields> for Waypoints {
+    type Error = InvalidTrajectory;
+
+    fn try_from(fields: WaypointsFields) -> Result<Self, InvalidTrajectory> {
+        let WaypointsFields { points, speed_m_s } = fields;
+        let waypoints = Self { points, speed_m_s };
+        waypoints.validate()?;
+        Ok(waypoints)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn refusal(body: &serde_json::Value) -> String {
+        serde_json::from_value::<Trajectory>(body.clone())
+            .unwrap_err()
+            .to_string()
+    }
+
+    #[test]
+    fn a_circle_takes_its_speed_from_the_period() {
+        let circle: Trajectory = serde_json::from_value(json!({
+            "circle": {"center": {"x_m": 0.0, "y_m": 0.0}, "radius_m": 6.0, "period_s": 62.83},
+        }))
+        .unwrap();
+        assert!((circle.speed_max_m_s() - 0.6).abs() < 1e-3);
+    }
+
+    #[test]
+    fn a_bad_circle_is_refused_by_the_name_of_its_field() {
+        let circle = |radius_m: f64, turns: f64, speed_m_s: f64| {
+            json!({"circle": {"center": {"x_m": 0.0, "y_m": 0.0}, "radius_m": radius_m,
+                              "turns": turns, "speed_m_s": speed_m_s}})
+        };
+        assert!(refusal(&circle(0.0, 1.0, 0.5)).contains("radius_m"));
+        assert!(refusal(&circle(1.0, 0.0, 0.5)).contains("turns"));
+        assert!(refusal(&circle(1.0, 1.0, -0.5)).contains("speed"));
+        let mut both = circle(1.0, 1.0, 0.5);
+        both["circle"]["period_s"] = json!(3.0);
+        assert!(refusal(&both).contains("either speed_m_s or period_s"));
+        assert!(refusal(&json!({"square": {}})).contains("square"));
+    }
+
+    #[test]
+    fn a_bad_path_is_refused_by_the_number_of_its_point() {
+        let path =
+            |points: serde_json::Value| json!({"waypoints": {"points": points, "speed_m_s": 0.5}});
+        let point = |x_m: f64| json!({"x_m": x_m, "y_m": 0.0});
+        assert!(refusal(&path(json!([point(0.0)]))).contains("2 to 100000 points"));
+        assert!(refusal(&path(json!([point(0.0), point(0.0)]))).contains("points[1] repeats"));
+        assert!(refusal(&path(json!([point(0.0), point(2.0e6)]))).contains("points[1]"));
+        #[expect(clippy::cast_precision_loss, reason = "far below 2^53")]
+        let many: Vec<_> = (0..=WAYPOINTS_MAX)
+            .map(|index| point(index as f64))
+            .collect();
+        assert!(refusal(&path(json!(many))).contains("has 100001"));
+    }
+}

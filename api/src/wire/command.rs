@@ -1,0 +1,114 @@
+//! Commands from the server to a robot, and the robot's answers.
+//!
+//! Each is a zenoh query. No reply means not delivered: the server sends the same again, and the
+//! robot takes the same twice without harm.
+
+use serde::{Deserialize, Serialize};
+use uuid::Uuid;
+
+use crate::ids::{BootId, DERIVED_NAMESPACE, MissionId, PlanHash};
+use crate::mission::PlanSummary;
+use crate::trajectory::Trajectory;
+
+/// `cmd/offer`: drive this mission.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Offer {
+    /// The mission.
+    pub mission: MissionId,
+    /// Its revision.
+    pub revision: u32,
+    /// What exactly is to be driven; see [`Offer::plan_hash_of`].
+    pub plan_hash: PlanHash,
+    /// What is to be driven.
+    pub trajectory: Trajectory,
+    /// How long from now the mission may still start, milliseconds; `None` for ever.
+    pub start_within_ms: Option<u64>,
+}
+
+impl Offer {
+    /// The hash of a request: of its trajectory and revision, never of samples.
+    pub fn plan_hash_of(mission: MissionId, revision: u32, trajectory: &Trajectory) -> PlanHash {
+        let request = serde_json::to_vec(&(mission, revision, trajectory)).unwrap_or_default();
+        PlanHash::from_uuid(Uuid::new_v5(&DERIVED_NAMESPACE, &request))
+    }
+}
+
+/// `cmd/cancel`: end this mission, braking along its path.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Cancel {
+    /// The mission.
+    pub mission: MissionId,
+    /// Why, for people.
+    pub reason: String,
+}
+
+/// A robot's answer to `cmd/offer`, `cmd/cancel` or `cmd/site`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Answer {
+    /// The run of the agent that answers.
+    pub boot: BootId,
+    /// What it answers.
+    pub outcome: Outcome,
+}
+
+/// What a robot says to a command.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// The mission is taken, now or already before.
+    Accepted {
+        /// What the robot planned; absent when it was answered before and is over.
+        plan: Option<PlanSummary>,
+    },
+    /// The command has taken effect, now or already before.
+    Done,
+    /// The robot will not.
+    Refused {
+        /// For programs.
+        code: OfferRefusal,
+        /// For people.
+        detail: String,
+    },
+}
+
+/// Why a robot refuses a command.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum OfferRefusal {
+    /// Another mission is being driven.
+    Busy,
+    /// The same mission and revision were offered with other content.
+    Conflict,
+    /// The mission has ended here before.
+    Ended,
+    /// The trajectory cannot be driven by this robot.
+    Impossible,
+    /// The robot is in no state to drive.
+    NotReady,
+    /// The latest start has passed.
+    TooLate,
+    /// The mission is not known here.
+    Unknown,
+    /// Any code of a newer peer.
+    #[serde(other)]
+    Other,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_plan_hash_tells_requests_apart_and_survives_the_wire() {
+        let mission = MissionId::from_uuid(Uuid::from_u128(1));
+        let text = r#"{"circle":{"center":{"x_m":0.1,"y_m":0.2},"radius_m":3.3,"speed_m_s":0.7}}"#;
+        let trajectory: Trajectory = serde_json::from_str(text).unwrap();
+        let hash = Offer::plan_hash_of(mission, 1, &trajectory);
+        let again: Trajectory =
+            serde_json::from_str(&serde_json::to_string(&trajectory).unwrap()).unwrap();
+        assert_eq!(Offer::plan_hash_of(mission, 1, &again), hash);
+        assert_ne!(Offer::plan_hash_of(mission, 2, &trajectory), hash);
+        let other: Trajectory = serde_json::from_str(&text.replace("3.3", "3.4")).unwrap();
+        assert_ne!(Offer::plan_hash_of(mission, 1, &other), hash);
+    }
+}

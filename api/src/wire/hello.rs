@@ -1,0 +1,44 @@
+//! A robot introduces itself; the server answers with the site.
+
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+
+use crate::ids::{BootId, RobotId};
+use crate::robot::RobotModel;
+use crate::site::Grid;
+use crate::terrain::TerrainShape;
+
+/// What a robot says on every new connection.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Hello {
+    /// Who speaks; the same as in the key.
+    pub robot: RobotId,
+    /// This run of the agent.
+    pub boot: BootId,
+    /// Version of the agent.
+    pub agent_version: String,
+    /// Model and tyres.
+    pub model: RobotModel,
+    /// The robot's wall clock.
+    pub robot_time: Timestamp,
+}
+
+/// The server's answer.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Welcome {
+    /// The site as the robot must know it.
+    pub site: SiteDefinition,
+    /// The server's wall clock.
+    pub server_time: Timestamp,
+}
+
+/// What a robot must know of its site to name cells and terrains.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SiteDefinition {
+    /// The grid.
+    pub grid: Grid,
+    /// Counts changes of the terrains; a robot reports the one it holds.
+    pub terrain_revision: u64,
+    /// All terrains.
+    pub terrains: Vec<TerrainShape>,
+}

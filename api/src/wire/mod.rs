@@ -1,0 +1,168 @@
+//! zenoh payloads: JSON, versioned, readable by any zenoh client.
+//!
+//! Every payload is `{"v": 1, "body": {…}}`. `v` is the major version: another one is refused.
+//! Fields that are not known are ignored, so that a newer peer may add some.
+
+pub mod command;
+pub mod hello;
+pub mod ingest;
+pub mod state;
+
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use serde_json::value::RawValue;
+
+/// The major version of all payloads.
+pub const VERSION: u32 = 1;
+/// Largest payload that is read, in bytes: a path of the most waypoints with room to spare.
+pub const PAYLOAD_BYTES_MAX: usize = 16 * 1024 * 1024;
+
+/// Why a payload is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum WireError {
+    /// It is larger than [`PAYLOAD_BYTES_MAX`].
+    #[error("a payload of {0} bytes is over the limit of {PAYLOAD_BYTES_MAX}")]
+    TooLarge(usize),
+    /// It is of another major version.
+    #[error("major version {0} is not known here, this side speaks {VERSION}")]
+    Version(u32),
+    /// It does not parse.
+    #[error("the payload does not parse")]
+    Malformed(#[source] serde_json::Error),
+}
+
+#[derive(Serialize)]
+struct Outgoing<'body, T> {
+    v: u32,
+    body: &'body T,
+}
+
+#[derive(Deserialize)]
+struct Incoming<'payload> {
+    v: u32,
+    #[serde(borrow)]
+    body: &'payload RawValue,
+}
+
+/// Writes a payload.
+///
+/// # Errors
+/// A value that JSON cannot say, such as a map with keys that are no strings; a number that is
+/// not finite becomes `null`, which the reader refuses.
+pub fn encode<T: Serialize>(body: &T) -> Result<Vec<u8>, serde_json::Error> {
+    serde_json::to_vec(&Outgoing { v: VERSION, body })
+}
+
+/// Reads a payload.
+///
+/// # Errors
+/// [`WireError`]: too large, another major version, or not what was expected.
+pub fn decode<T: DeserializeOwned>(payload: &[u8]) -> Result<T, WireError> {
+    if payload.len() > PAYLOAD_BYTES_MAX {
+        return Err(WireError::TooLarge(payload.len()));
+    }
+    let incoming: Incoming<'_> = serde_json::from_slice(payload).map_err(WireError::Malformed)?;
+    if incoming.v != VERSION {
+        return Err(WireError::Version(incoming.v));
+    }
+    serde_json::from_str(incoming.body.get()).map_err(WireError::Malformed)
+}
+
+/// Why the other side refused a query; the body of every error reply.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Refusal {
+    /// For programs.
+    pub code: RefusalCode,
+    /// For people.
+    pub detail: String,
+}
+
+/// Why a query was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RefusalCode {
+    /// The payload does not parse or is too large.
+    Malformed,
+    /// The payload is of another major version.
+    Version,
+    /// The payload names another robot than the key.
+    Impersonation,
+    /// The site is not known.
+    UnknownSite,
+    /// Try again later.
+    Busy,
+    /// Any code of a newer peer.
+    #[serde(other)]
+    Other,
+}
+
+impl From<&WireError> for Refusal {
+    fn from(error: &WireError) -> Self {
+        let code = match error {
+            WireError::TooLarge(_) | WireError::Malformed(_) => RefusalCode::Malformed,
+            WireError::Version(_) => RefusalCode::Version,
+        };
+        // The cause is for the peer's developer: where in the payload the parser stopped.
+        let cause = std::error::Error::source(error).map(|cause| format!(": {cause}"));
+        Self {
+            code,
+            detail: format!("{error}{}", cause.unwrap_or_default()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Debug, PartialEq, Serialize, Deserialize)]
+    struct Body {
+        x: f64,
+    }
+
+    #[test]
+    fn a_payload_comes_back_as_it_was_written() {
+        let payload = encode(&Body { x: 0.1 }).unwrap();
+        assert_eq!(payload, br#"{"v":1,"body":{"x":0.1}}"#);
+        assert_eq!(decode::<Body>(&payload).unwrap(), Body { x: 0.1 });
+    }
+
+    #[test]
+    fn fields_of_a_newer_minor_version_are_ignored() {
+        let payload = br#"{"v":1,"trace":"t","body":{"x":0.5,"y":[1,{}]}}"#;
+        assert_eq!(decode::<Body>(payload).unwrap(), Body { x: 0.5 });
+    }
+
+    #[test]
+    fn another_major_version_is_refused_by_its_number() {
+        let refused = decode::<Body>(br#"{"v":2,"body":{"z":1}}"#).unwrap_err();
+        assert!(matches!(refused, WireError::Version(2)));
+        assert_eq!(Refusal::from(&refused).code, RefusalCode::Version);
+    }
+
+    #[test]
+    fn numbers_that_are_not_finite_do_not_pass() {
+        let payload = encode(&Body { x: f64::NAN }).unwrap();
+        assert!(matches!(
+            decode::<Body>(&payload),
+            Err(WireError::Malformed(_))
+        ));
+        for text in ["NaN", "1e999", "-Infinity"] {
+            let payload = format!(r#"{{"v":1,"body":{{"x":{text}}}}}"#);
+            assert!(decode::<Body>(payload.as_bytes()).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn garbage_is_refused() {
+        for payload in [
+            &b""[..],
+            b"\xff\xfe",
+            b"[]",
+            b"{\"v\":1}",
+            b"{\"v\":-1,\"body\":{}}",
+        ] {
+            assert!(decode::<Body>(payload).is_err());
+        }
+    }
+}

@@ -1,0 +1,2 @@
+//! `tread`.
+fn main() {}

@@ -1,0 +1,164 @@
+//! The ground's grip: friction coefficient over slip, equations (7) to (9) of the paper.
+//!
+//! `μ(λ) = K (σ₁(λ) + σ₂(λ) λ)` for λ ≥ 0: rises with slope K up to the peak at `λ_m`, then falls
+//! in a straight line to the share α of the peak at λ = 1. θ = 1/K is the slip compliance.
+
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// The three figures of a friction curve, not yet checked.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct FrictionSpec {
+    /// Slope K of the rising part, above zero.
+    pub stiffness: f64,
+    /// Slip `λ_m` at the peak, above 0 and below 1.
+    pub peak_slip: f64,
+    /// Share α of the peak that is left at full sliding, 0 to 1.
+    pub sliding_ratio: f64,
+}
+
+/// Why a friction curve was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+pub enum FrictionError {
+    /// K is not a finite number above zero.
+    #[error("`stiffness` must be finite and above zero, not {0}")]
+    Stiffness(f64),
+    /// `λ_m` is not strictly between 0 and 1.
+    #[error("`peak_slip` must be above 0 and below 1, not {0}")]
+    PeakSlip(f64),
+    /// α is not between 0 and 1.
+    #[error("`sliding_ratio` must be between 0 and 1, not {0}")]
+    SlidingRatio(f64),
+}
+
+/// A checked friction curve (7).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "FrictionSpec", into = "FrictionSpec")]
+pub struct FrictionCurve {
+    spec: FrictionSpec,
+}
+
+impl TryFrom<FrictionSpec> for FrictionCurve {
+    type Error = FrictionError;
+
+    fn try_from(spec: FrictionSpec) -> Result<Self, Self::Error> {
+        if !spec.stiffness.is_finite() || spec.stiffness <= 0.0 {
+            return Err(FrictionError::Stiffness(spec.stiffness));
+        }
+        if !(spec.peak_slip > 0.0 && spec.peak_slip < 1.0) {
+            return Err(FrictionError::PeakSlip(spec.peak_slip));
+        }
+        if !(0.0..=1.0).contains(&spec.sliding_ratio) {
+            return Err(FrictionError::SlidingRatio(spec.sliding_ratio));
+        }
+        Ok(Self { spec })
+    }
+}
+
+impl From<FrictionCurve> for FrictionSpec {
+    fn from(curve: FrictionCurve) -> Self {
+        curve.spec
+    }
+}
+
+impl FrictionCurve {
+    /// A curve of stiffness K with the paper's `λ_m` = 0.2 and α = 0.8.
+    pub fn with_stiffness(stiffness: f64) -> Result<Self, FrictionError> {
+        FrictionSpec { stiffness, peak_slip: 0.2, sliding_ratio: 0.8 }.try_into()
+    }
+
+    /// K, the slope of the rising part.
+    pub fn stiffness(&self) -> f64 {
+        self.spec.stiffness
+    }
+
+    /// θ = 1/K, the slip compliance.
+    pub fn theta(&self) -> f64 {
+        self.spec.stiffness.recip()
+    }
+
+    /// `λ_m`, the slip at the peak.
+    pub fn peak_slip(&self) -> f64 {
+        self.spec.peak_slip
+    }
+
+    /// α, the share of the peak left at full sliding.
+    pub fn sliding_ratio(&self) -> f64 {
+        self.spec.sliding_ratio
+    }
+
+    /// `μ_p = K λ_m`, the largest friction coefficient.
+    pub fn mu_peak(&self) -> f64 {
+        self.spec.stiffness * self.spec.peak_slip
+    }
+
+    /// Friction coefficient at a slip, odd in it; slips beyond 1 slide as at 1.
+    pub fn mu(&self, slip: f64) -> f64 {
+        (self.mu_over_slip(slip.abs()) * slip).clamp(-self.mu_peak(), self.mu_peak())
+    }
+
+    /// `μ(|σ|)/|σ|` for a slip magnitude ≥ 0, regular at zero where it is K.
+    pub fn mu_over_slip(&self, slip_magnitude: f64) -> f64 {
+        let FrictionSpec { stiffness, peak_slip, sliding_ratio } = self.spec;
+        if slip_magnitude < peak_slip {
+            return stiffness;
+        }
+        let beyond = (slip_magnitude.min(1.0) - peak_slip) / (1.0 - peak_slip);
+        stiffness * peak_slip * (1.0 - (1.0 - sliding_ratio) * beyond) / slip_magnitude
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn friction_is_odd_bounded_and_opposes_slip(
+            stiffness in 0.1..50.0_f64, peak_slip in 0.01..0.99_f64,
+            sliding_ratio in 0.0..=1.0_f64, slip in -3.0..3.0_f64,
+        ) {
+            let curve =
+                FrictionCurve::try_from(FrictionSpec { stiffness, peak_slip, sliding_ratio }).unwrap();
+            let mu = curve.mu(slip);
+            prop_assert!((mu + curve.mu(-slip)).abs() < 1.0e-12);
+            prop_assert!(mu.abs() <= curve.mu_peak() + 1.0e-12);
+            prop_assert!(mu * slip >= 0.0);
+        }
+
+        #[test]
+        fn the_curve_is_the_papers_closed_form(
+            stiffness in 0.1..50.0_f64, peak_slip in 0.01..0.99_f64,
+            sliding_ratio in 0.0..=1.0_f64, slip in 0.0..1.0_f64,
+        ) {
+            let curve =
+                FrictionCurve::try_from(FrictionSpec { stiffness, peak_slip, sliding_ratio }).unwrap();
+            // Equations (8) and (9).
+            let (sigma_1, sigma_2) = if slip < peak_slip {
+                (0.0, 1.0)
+            } else {
+                let fall = (1.0 - peak_slip).recip() * peak_slip;
+                ((1.0 - sliding_ratio * peak_slip) * fall, -(1.0 - sliding_ratio) * fall)
+            };
+            let paper = stiffness * (sigma_1 + sigma_2 * slip);
+            prop_assert!((curve.mu(slip) - paper).abs() < 1.0e-9 * stiffness);
+        }
+    }
+
+    #[test]
+    fn figures_outside_their_range_are_refused() {
+        let good = FrictionSpec { stiffness: 5.0, peak_slip: 0.2, sliding_ratio: 0.8 };
+        for bad in [
+            FrictionSpec { stiffness: 0.0, ..good },
+            FrictionSpec { stiffness: f64::NAN, ..good },
+            FrictionSpec { peak_slip: 1.0, ..good },
+            FrictionSpec { peak_slip: f64::NAN, ..good },
+            FrictionSpec { sliding_ratio: 1.1, ..good },
+            FrictionSpec { sliding_ratio: f64::NAN, ..good },
+        ] {
+            assert!(FrictionCurve::try_from(bad).is_err(), "{bad:?}");
+        }
+    }
+}

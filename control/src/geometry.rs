@@ -1,0 +1,110 @@
+//! Points, poses and velocities in the plane.
+
+use std::f64::consts::{PI, TAU};
+
+use serde::{Deserialize, Serialize};
+
+/// A point of the site's frame.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Point {
+    /// East-like coordinate, metres.
+    pub x_m: f64,
+    /// North-like coordinate, metres.
+    pub y_m: f64,
+}
+
+impl Point {
+    /// Distance to another point, metres.
+    pub fn distance_m(self, other: Self) -> f64 {
+        (other.x_m - self.x_m).hypot(other.y_m - self.y_m)
+    }
+
+    /// Direction from here to another point, radians; 0 when both are the same.
+    pub fn bearing_rad(self, other: Self) -> f64 {
+        (other.y_m - self.y_m).atan2(other.x_m - self.x_m)
+    }
+
+    /// Whether both coordinates are finite.
+    pub fn is_finite(self) -> bool {
+        self.x_m.is_finite() && self.y_m.is_finite()
+    }
+}
+
+/// Position and heading in the site's frame.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Pose {
+    /// East-like coordinate, metres.
+    pub x_m: f64,
+    /// North-like coordinate, metres.
+    pub y_m: f64,
+    /// Heading counter-clockwise from x, radians; any real number, see [`wrap_angle_rad`].
+    pub heading_rad: f64,
+}
+
+impl Pose {
+    /// The position alone.
+    pub fn point(self) -> Point {
+        Point { x_m: self.x_m, y_m: self.y_m }
+    }
+
+    /// Whether all three numbers are finite.
+    pub fn is_finite(self) -> bool {
+        self.point().is_finite() && self.heading_rad.is_finite()
+    }
+
+    /// The other point as seen from this pose: x ahead, y to the left.
+    pub fn body_from_site(self, point: Point) -> Point {
+        let (sin, cos) = self.heading_rad.sin_cos();
+        let (dx_m, dy_m) = (point.x_m - self.x_m, point.y_m - self.y_m);
+        Point { x_m: cos * dx_m + sin * dy_m, y_m: cos * dy_m - sin * dx_m }
+    }
+}
+
+/// Velocity of a body that moves ahead and turns.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Twist {
+    /// Speed ahead, metres per second.
+    pub linear_m_s: f64,
+    /// Turn rate, radians per second, counter-clockwise positive.
+    pub angular_rad_s: f64,
+}
+
+impl Twist {
+    /// Whether both numbers are finite.
+    pub fn is_finite(self) -> bool {
+        self.linear_m_s.is_finite() && self.angular_rad_s.is_finite()
+    }
+}
+
+/// The same angle in (−π, π].
+pub fn wrap_angle_rad(angle_rad: f64) -> f64 {
+    let wrapped = angle_rad.rem_euclid(TAU);
+    if wrapped > PI { wrapped - TAU } else { wrapped }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn a_wrapped_angle_points_the_same_way(angle_rad in -1.0e4..1.0e4_f64) {
+            let wrapped = wrap_angle_rad(angle_rad);
+            prop_assert!(wrapped > -PI - 1.0e-12 && wrapped <= PI);
+            prop_assert!((wrapped.sin() - angle_rad.sin()).abs() < 1.0e-9);
+            prop_assert!((wrapped.cos() - angle_rad.cos()).abs() < 1.0e-9);
+        }
+
+        #[test]
+        fn a_point_ahead_is_seen_ahead(
+            x_m in -10.0..10.0_f64, y_m in -10.0..10.0_f64, heading_rad in -4.0..4.0_f64
+        ) {
+            let pose = Pose { x_m, y_m, heading_rad };
+            let (sin, cos) = heading_rad.sin_cos();
+            let seen = pose.body_from_site(Point { x_m: x_m + 2.0 * cos, y_m: y_m + 2.0 * sin });
+            prop_assert!((seen.x_m - 2.0).abs() < 1.0e-9 && seen.y_m.abs() < 1.0e-9);
+        }
+    }
+}

@@ -1,0 +1,30 @@
+//! Tread's control part: everything a robot computes between its sensors and its wheels.
+//!
+//! Pure: no I/O, no clock, no randomness, no `async`, and no allocation in a control tick. Units
+//! are SI and stand last in a name. Frames are right-handed: the site's frame is metric with
+//! headings counter-clockwise from x; the body frame has x ahead and y to the left.
+//!
+//! * Words: [`geometry`], [`robot`], [`friction`], [`measured`].
+//! * Planning (may allocate): [`trajectory`] is what is asked for, [`path`] its geometry,
+//!   [`profile`] its timing, [`plan`] both, from where the robot stands.
+//! * Driving (one call per tick): [`reference`] walks along the plan, [`tracking`] turns errors
+//!   into wheel speeds, [`follower`] runs one mission, [`gate`] has the last word.
+//! * Knowing: [`localisation`] says where the robot is, [`estimation`] how the ground grips.
+//! * [`plant`] is the simulated base; [`bench`] holds laws written only for comparison.
+
+pub mod bench;
+pub mod estimation;
+pub mod follower;
+pub mod friction;
+pub mod gate;
+pub mod geometry;
+pub mod localisation;
+pub mod measured;
+pub mod path;
+pub mod plan;
+pub mod plant;
+pub mod profile;
+pub mod reference;
+pub mod robot;
+pub mod tracking;
+pub mod trajectory;

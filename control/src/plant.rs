@@ -1,0 +1,355 @@
+//! The simulated base: a free four-wheel skid-steered body.
+//!
+//! Every contact i obeys one vector law, `F = −N μ(|σ|) σ/|σ|`: isotropic combined slip, with μ of
+//! (7) and σ the slip velocity over the reference speed `u`. The body has Coriolis terms,
+//! `m(ẍ − ẏφ̇) = ΣF`, `m(ÿ + ẋφ̇) = ΣP`, `I_G φ̈ = Σ(x_i P_i − y_i F_i)`; no constraint is imposed
+//! (the paper's (4) would be one that no force enforces).
+//!
+//! The reference speed is `u = (|rω|⁴ + u₀⁴)^¼` with `u₀` = 0.05 m/s, so that the law is regular at
+//! standstill and equals the paper's |rω| within 1.2·10⁻⁵ at 0.6 m/s. Slip poles, `gK/u` and its
+//! yaw counterpart, reach thousands per second at standstill: steps are split so that pole times
+//! step stays within the fourth-order Runge-Kutta method's stable and accurate range.
+
+use thiserror::Error;
+
+use crate::friction::FrictionCurve;
+use crate::geometry::{Pose, Twist};
+use crate::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
+use crate::robot::{GRAVITY_M_S2, RobotModel};
+
+/// Reference speed below which slip is regularised, metres per second.
+pub const SLIP_SPEED_FLOOR_M_S: f64 = 0.05;
+/// Largest product of slip pole and step.
+const POLE_STEP_MAX: f64 = 0.7;
+/// Longest internal step, seconds.
+const STEP_MAX_S: f64 = 2.5e-3;
+/// Most internal steps in one call; beyond it the step is cut, which needs `gK/u₀` above 10⁵.
+const STEPS_MAX: usize = 10_000;
+/// Shortest servo lag that is integrated; a shorter one acts as this one, seconds.
+const SERVO_LAG_FLOOR_S: f64 = 1.0e-3;
+
+/// What the simulated base is like beyond the robot's model.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PlantSpec {
+    /// First-order lag of the wheel servo, seconds, ≥ 0.
+    pub servo_lag_s: f64,
+    /// Rolling resistance over load, ≥ 0. It is a moment on the wheels: it shows in their torque.
+    pub rolling_resistance_ratio: f64,
+    /// True rolling radius of the left wheels over the model's, about 1.
+    pub left_radius_ratio: f64,
+    /// True rolling radius of the right wheels over the model's, about 1.
+    pub right_radius_ratio: f64,
+}
+
+impl Default for PlantSpec {
+    fn default() -> Self {
+        Self {
+            servo_lag_s: 0.05,
+            rolling_resistance_ratio: 0.01,
+            left_radius_ratio: 1.0,
+            right_radius_ratio: 1.0,
+        }
+    }
+}
+
+/// Why a plant was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+pub enum PlantError {
+    /// A figure is NaN, infinite or out of its range.
+    #[error("`{field}` is out of its range: {value}")]
+    OutOfRange {
+        /// The field's name.
+        field: &'static str,
+        /// What it held.
+        value: f64,
+    },
+}
+
+/// The ground under the two sides of a robot.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ground {
+    /// Under the left wheels.
+    pub left: FrictionCurve,
+    /// Under the right wheels.
+    pub right: FrictionCurve,
+}
+
+impl Ground {
+    /// The same ground under both sides.
+    pub fn uniform(curve: FrictionCurve) -> Self {
+        Self { left: curve, right: curve }
+    }
+}
+
+/// The true state of the simulated base.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct PlantState {
+    /// Pose in the site's frame.
+    pub pose: Pose,
+    /// Speed ahead, ẋ, metres per second.
+    pub ahead_m_s: f64,
+    /// Speed to the left, ẏ, metres per second.
+    pub left_m_s: f64,
+    /// Turn rate φ̇, radians per second.
+    pub yaw_rate_rad_s: f64,
+    /// Wheel speeds.
+    pub wheel_speeds: WheelSpeeds,
+}
+
+impl PlantState {
+    /// Speed ahead and turn rate.
+    pub fn twist(&self) -> Twist {
+        Twist { linear_m_s: self.ahead_m_s, angular_rad_s: self.yaw_rate_rad_s }
+    }
+}
+
+/// The simulated base.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Plant {
+    model: RobotModel,
+    spec: PlantSpec,
+    state: PlantState,
+    contact: Contact,
+}
+
+/// Forces of all contacts on the body.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Contact {
+    ahead_n: f64,
+    left_n: f64,
+    moment_n_m: f64,
+    left_side_ahead_n: f64,
+    right_side_ahead_n: f64,
+    slip_max: f64,
+}
+
+/// Derivative of the state; wheel accelerations last.
+type Rates = [f64; 8];
+
+impl Plant {
+    /// A base at rest at a pose.
+    ///
+    /// # Errors
+    /// [`PlantError`] when a figure of `spec` is out of its range.
+    pub fn new(model: RobotModel, spec: PlantSpec, pose: Pose) -> Result<Self, PlantError> {
+        let check = |field, value: f64, range: std::ops::RangeInclusive<f64>| {
+            if range.contains(&value) {
+                Ok(())
+            } else {
+                Err(PlantError::OutOfRange { field, value })
+            }
+        };
+        check("servo_lag_s", spec.servo_lag_s, 0.0..=5.0)?;
+        check("rolling_resistance_ratio", spec.rolling_resistance_ratio, 0.0..=1.0)?;
+        check("left_radius_ratio", spec.left_radius_ratio, 0.5..=2.0)?;
+        check("right_radius_ratio", spec.right_radius_ratio, 0.5..=2.0)?;
+        if !pose.is_finite() {
+            return Err(PlantError::OutOfRange { field: "pose", value: f64::NAN });
+        }
+        let state = PlantState { pose, ..PlantState::default() };
+        Ok(Self { model, spec, state, contact: Contact::default() })
+    }
+
+    /// The true state.
+    pub fn state(&self) -> &PlantState {
+        &self.state
+    }
+
+    /// Puts the base into a state, for instance a pose after a push.
+    pub fn set_state(&mut self, state: PlantState) {
+        self.state = state;
+    }
+
+    /// What an accelerometer at the centre of mass feels, without noise.
+    pub fn body_acceleration(&self) -> BodyAcceleration {
+        BodyAcceleration {
+            ahead_m_s2: self.contact.ahead_n / self.model.mass_kg(),
+            left_m_s2: self.contact.left_n / self.model.mass_kg(),
+        }
+    }
+
+    /// True drive torques per side: ground force times rolling radius plus rolling resistance.
+    pub fn wheel_torques(&self) -> WheelTorques {
+        let radius_m = self.model.wheel_radius_m();
+        let side = |force_n: f64, wheel_rad_s: f64, radius_ratio: f64| {
+            let rolling = (wheel_rad_s * radius_m / SLIP_SPEED_FLOOR_M_S).tanh();
+            let resistance_n =
+                self.spec.rolling_resistance_ratio * self.model.side_load_n() * rolling;
+            (force_n + resistance_n) * radius_m * radius_ratio
+        };
+        let wheels = self.state.wheel_speeds;
+        WheelTorques {
+            left_n_m: side(
+                self.contact.left_side_ahead_n,
+                wheels.left_rad_s,
+                self.spec.left_radius_ratio,
+            ),
+            right_n_m: side(
+                self.contact.right_side_ahead_n,
+                wheels.right_rad_s,
+                self.spec.right_radius_ratio,
+            ),
+        }
+    }
+
+    /// Largest combined slip of the four wheels after the last step.
+    pub fn slip_max(&self) -> f64 {
+        self.contact.slip_max
+    }
+
+    /// Moves the base on by `dt_s` under a constant wheel command.
+    ///
+    /// A command that is not finite acts as zero; one above the wheel limit acts as the limit.
+    pub fn step(&mut self, command: WheelSpeeds, ground: &Ground, dt_s: f64) {
+        if !(dt_s.is_finite() && dt_s > 0.0) {
+            return;
+        }
+        let limit_rad_s = self.model.limits().wheel_speed_max_rad_s;
+        let bounded = |speed_rad_s: f64| {
+            if speed_rad_s.is_finite() { speed_rad_s.clamp(-limit_rad_s, limit_rad_s) } else { 0.0 }
+        };
+        let command = WheelSpeeds {
+            left_rad_s: bounded(command.left_rad_s),
+            right_rad_s: bounded(command.right_rad_s),
+        };
+        let mut left_s = dt_s;
+        for _ in 0..STEPS_MAX {
+            let step_s = self.stable_step_s(ground).min(left_s);
+            self.runge_kutta(command, ground, step_s);
+            left_s -= step_s;
+            if left_s <= 1.0e-12 {
+                break;
+            }
+        }
+        self.contact = self.contact_forces(&self.state, ground);
+    }
+
+    /// The longest step that keeps the fastest slip pole well inside the stable range.
+    fn stable_step_s(&self, ground: &Ground) -> f64 {
+        let model = &self.model;
+        let wheels = self.state.wheel_speeds;
+        let slowest_m_s =
+            wheels.left_rad_s.abs().min(wheels.right_rad_s.abs()) * model.wheel_radius_m();
+        let stiffness = ground.left.stiffness().max(ground.right.stiffness());
+        let reference_m_s = slip_reference_m_s(slowest_m_s);
+        let shape = model.mass_kg()
+            * (model.track_width_m().powi(2) + model.wheelbase_m().powi(2))
+            / (4.0 * model.yaw_inertia_kg_m2());
+        let pole_s1 = GRAVITY_M_S2 * stiffness / reference_m_s * shape.max(1.0);
+        let servo_s = 0.5 * self.spec.servo_lag_s.max(SERVO_LAG_FLOOR_S);
+        (POLE_STEP_MAX / pole_s1).min(servo_s).min(STEP_MAX_S)
+    }
+
+    fn runge_kutta(&mut self, command: WheelSpeeds, ground: &Ground, step_s: f64) {
+        let start = pack(&self.state);
+        let rates_1 = self.rates(&start, command, ground);
+        let rates_2 = self.rates(&advance(&start, &rates_1, 0.5 * step_s), command, ground);
+        let rates_3 = self.rates(&advance(&start, &rates_2, 0.5 * step_s), command, ground);
+        let rates_4 = self.rates(&advance(&start, &rates_3, step_s), command, ground);
+        let mut end = start;
+        for index in 0..end.len() {
+            end[index] += step_s / 6.0
+                * (rates_1[index] + 2.0 * (rates_2[index] + rates_3[index]) + rates_4[index]);
+        }
+        self.state = unpack(&end);
+    }
+
+    fn rates(&self, packed: &Rates, command: WheelSpeeds, ground: &Ground) -> Rates {
+        let state = unpack(packed);
+        let contact = self.contact_forces(&state, ground);
+        let (sin, cos) = state.pose.heading_rad.sin_cos();
+        let (ahead_m_s, left_m_s, yaw) = (state.ahead_m_s, state.left_m_s, state.yaw_rate_rad_s);
+        let acceleration_max = self.model.limits().wheel_acceleration_max_rad_s2;
+        let lag_s = self.spec.servo_lag_s.max(SERVO_LAG_FLOOR_S);
+        let servo = |target: f64, speed: f64| {
+            ((target - speed) / lag_s).clamp(-acceleration_max, acceleration_max)
+        };
+        [
+            ahead_m_s * cos - left_m_s * sin,
+            ahead_m_s * sin + left_m_s * cos,
+            yaw,
+            contact.ahead_n / self.model.mass_kg() + left_m_s * yaw,
+            contact.left_n / self.model.mass_kg() - ahead_m_s * yaw,
+            contact.moment_n_m / self.model.yaw_inertia_kg_m2(),
+            servo(command.left_rad_s, state.wheel_speeds.left_rad_s),
+            servo(command.right_rad_s, state.wheel_speeds.right_rad_s),
+        ]
+    }
+
+    fn contact_forces(&self, state: &PlantState, ground: &Ground) -> Contact {
+        let half_track_m = 0.5 * self.model.track_width_m();
+        let half_base_m = 0.5 * self.model.wheelbase_m();
+        let load_n = 0.5 * self.model.side_load_n();
+        let radius_m = self.model.wheel_radius_m();
+        let sides = [
+            (
+                half_track_m,
+                state.wheel_speeds.left_rad_s * radius_m * self.spec.left_radius_ratio,
+                &ground.left,
+            ),
+            (
+                -half_track_m,
+                state.wheel_speeds.right_rad_s * radius_m * self.spec.right_radius_ratio,
+                &ground.right,
+            ),
+        ];
+        let mut sum = Contact::default();
+        let mut side_n = [0.0; 2];
+        for (side, (y_m, rim_m_s, curve)) in sides.into_iter().enumerate() {
+            let reference_m_s = slip_reference_m_s(rim_m_s);
+            let slip_ahead = (state.ahead_m_s - state.yaw_rate_rad_s * y_m - rim_m_s) / reference_m_s;
+            for x_m in [half_base_m, -half_base_m] {
+                let slip_left = (state.left_m_s + state.yaw_rate_rad_s * x_m) / reference_m_s;
+                let slip = slip_ahead.hypot(slip_left);
+                let gain_n = -load_n * curve.mu_over_slip(slip);
+                let (force_ahead_n, force_left_n) = (gain_n * slip_ahead, gain_n * slip_left);
+                side_n[side] += force_ahead_n;
+                sum.left_n += force_left_n;
+                sum.moment_n_m += x_m * force_left_n - y_m * force_ahead_n;
+                sum.slip_max = sum.slip_max.max(slip);
+            }
+        }
+        sum.left_side_ahead_n = side_n[0];
+        sum.right_side_ahead_n = side_n[1];
+        sum.ahead_n = side_n[0] + side_n[1];
+        sum
+    }
+}
+
+/// Reference speed of the slip ratio for a rim speed, regular at zero, metres per second.
+pub fn slip_reference_m_s(rim_m_s: f64) -> f64 {
+    (rim_m_s.powi(4) + SLIP_SPEED_FLOOR_M_S.powi(4)).sqrt().sqrt()
+}
+
+fn pack(state: &PlantState) -> Rates {
+    [
+        state.pose.x_m,
+        state.pose.y_m,
+        state.pose.heading_rad,
+        state.ahead_m_s,
+        state.left_m_s,
+        state.yaw_rate_rad_s,
+        state.wheel_speeds.left_rad_s,
+        state.wheel_speeds.right_rad_s,
+    ]
+}
+
+fn unpack(packed: &Rates) -> PlantState {
+    let &[x_m, y_m, heading_rad, ahead_m_s, left_m_s, yaw_rate_rad_s, left_rad_s, right_rad_s] =
+        packed;
+    PlantState {
+        pose: Pose { x_m, y_m, heading_rad },
+        ahead_m_s,
+        left_m_s,
+        yaw_rate_rad_s,
+        wheel_speeds: WheelSpeeds { left_rad_s, right_rad_s },
+    }
+}
+
+fn advance(start: &Rates, rates: &Rates, step_s: f64) -> Rates {
+    let mut end = *start;
+    for (value, rate) in end.iter_mut().zip(rates) {
+        *value += step_s * rate;
+    }
+    end
+}
