@@ -64,7 +64,12 @@ impl From<FrictionCurve> for FrictionSpec {
 impl FrictionCurve {
     /// A curve of stiffness K with the paper's `λ_m` = 0.2 and α = 0.8.
     pub fn with_stiffness(stiffness: f64) -> Result<Self, FrictionError> {
-        FrictionSpec { stiffness, peak_slip: 0.2, sliding_ratio: 0.8 }.try_into()
+        FrictionSpec {
+            stiffness,
+            peak_slip: 0.2,
+            sliding_ratio: 0.8,
+        }
+        .try_into()
     }
 
     /// K, the slope of the rising part.
@@ -99,7 +104,11 @@ impl FrictionCurve {
 
     /// `μ(|σ|)/|σ|` for a slip magnitude ≥ 0, regular at zero where it is K.
     pub fn mu_over_slip(&self, slip_magnitude: f64) -> f64 {
-        let FrictionSpec { stiffness, peak_slip, sliding_ratio } = self.spec;
+        let FrictionSpec {
+            stiffness,
+            peak_slip,
+            sliding_ratio,
+        } = self.spec;
         if slip_magnitude < peak_slip {
             return stiffness;
         }
@@ -149,14 +158,36 @@ mod tests {
 
     #[test]
     fn figures_outside_their_range_are_refused() {
-        let good = FrictionSpec { stiffness: 5.0, peak_slip: 0.2, sliding_ratio: 0.8 };
+        let good = FrictionSpec {
+            stiffness: 5.0,
+            peak_slip: 0.2,
+            sliding_ratio: 0.8,
+        };
         for bad in [
-            FrictionSpec { stiffness: 0.0, ..good },
-            FrictionSpec { stiffness: f64::NAN, ..good },
-            FrictionSpec { peak_slip: 1.0, ..good },
-            FrictionSpec { peak_slip: f64::NAN, ..good },
-            FrictionSpec { sliding_ratio: 1.1, ..good },
-            FrictionSpec { sliding_ratio: f64::NAN, ..good },
+            FrictionSpec {
+                stiffness: 0.0,
+                ..good
+            },
+            FrictionSpec {
+                stiffness: f64::NAN,
+                ..good
+            },
+            FrictionSpec {
+                peak_slip: 1.0,
+                ..good
+            },
+            FrictionSpec {
+                peak_slip: f64::NAN,
+                ..good
+            },
+            FrictionSpec {
+                sliding_ratio: 1.1,
+                ..good
+            },
+            FrictionSpec {
+                sliding_ratio: f64::NAN,
+                ..good
+            },
         ] {
             assert!(FrictionCurve::try_from(bad).is_err(), "{bad:?}");
         }

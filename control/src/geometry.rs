@@ -44,7 +44,10 @@ pub struct Pose {
 impl Pose {
     /// The position alone.
     pub fn point(self) -> Point {
-        Point { x_m: self.x_m, y_m: self.y_m }
+        Point {
+            x_m: self.x_m,
+            y_m: self.y_m,
+        }
     }
 
     /// Whether all three numbers are finite.
@@ -55,8 +58,11 @@ impl Pose {
     /// The other point as seen from this pose: x ahead, y to the left.
     pub fn body_from_site(self, point: Point) -> Point {
         let (sin, cos) = self.heading_rad.sin_cos();
-        let (dx_m, dy_m) = (point.x_m - self.x_m, point.y_m - self.y_m);
-        Point { x_m: cos * dx_m + sin * dy_m, y_m: cos * dy_m - sin * dx_m }
+        let (east_m, north_m) = (point.x_m - self.x_m, point.y_m - self.y_m);
+        Point {
+            x_m: cos * east_m + sin * north_m,
+            y_m: cos * north_m - sin * east_m,
+        }
     }
 }
 

@@ -7,10 +7,10 @@
 //! * Words: [`geometry`], [`robot`], [`friction`], [`measured`].
 //! * Planning (may allocate): [`trajectory`] is what is asked for, [`path`] its geometry,
 //!   [`profile`] its timing, [`plan`] both, from where the robot stands.
-//! * Driving (one call per tick): [`reference`] walks along the plan, [`tracking`] turns errors
+//! * Driving (one call per tick): [`mod@reference`] walks along the plan, [`tracking`] turns errors
 //!   into wheel speeds, [`follower`] runs one mission, [`gate`] has the last word.
 //! * Knowing: [`localisation`] says where the robot is, [`estimation`] how the ground grips.
-//! * [`plant`] is the simulated base; [`bench`] holds laws written only for comparison.
+//! * [`plant`] is the simulated base; [`mod@bench`] holds laws written only for comparison.
 
 pub mod bench;
 pub mod estimation;

@@ -77,7 +77,10 @@ pub struct Ground {
 impl Ground {
     /// The same ground under both sides.
     pub fn uniform(curve: FrictionCurve) -> Self {
-        Self { left: curve, right: curve }
+        Self {
+            left: curve,
+            right: curve,
+        }
     }
 }
 
@@ -99,7 +102,10 @@ pub struct PlantState {
 impl PlantState {
     /// Speed ahead and turn rate.
     pub fn twist(&self) -> Twist {
-        Twist { linear_m_s: self.ahead_m_s, angular_rad_s: self.yaw_rate_rad_s }
+        Twist {
+            linear_m_s: self.ahead_m_s,
+            angular_rad_s: self.yaw_rate_rad_s,
+        }
     }
 }
 
@@ -140,14 +146,29 @@ impl Plant {
             }
         };
         check("servo_lag_s", spec.servo_lag_s, 0.0..=5.0)?;
-        check("rolling_resistance_ratio", spec.rolling_resistance_ratio, 0.0..=1.0)?;
+        check(
+            "rolling_resistance_ratio",
+            spec.rolling_resistance_ratio,
+            0.0..=1.0,
+        )?;
         check("left_radius_ratio", spec.left_radius_ratio, 0.5..=2.0)?;
         check("right_radius_ratio", spec.right_radius_ratio, 0.5..=2.0)?;
         if !pose.is_finite() {
-            return Err(PlantError::OutOfRange { field: "pose", value: f64::NAN });
+            return Err(PlantError::OutOfRange {
+                field: "pose",
+                value: f64::NAN,
+            });
         }
-        let state = PlantState { pose, ..PlantState::default() };
-        Ok(Self { model, spec, state, contact: Contact::default() })
+        let state = PlantState {
+            pose,
+            ..PlantState::default()
+        };
+        Ok(Self {
+            model,
+            spec,
+            state,
+            contact: Contact::default(),
+        })
     }
 
     /// The true state.
@@ -206,7 +227,11 @@ impl Plant {
         }
         let limit_rad_s = self.model.limits().wheel_speed_max_rad_s;
         let bounded = |speed_rad_s: f64| {
-            if speed_rad_s.is_finite() { speed_rad_s.clamp(-limit_rad_s, limit_rad_s) } else { 0.0 }
+            if speed_rad_s.is_finite() {
+                speed_rad_s.clamp(-limit_rad_s, limit_rad_s)
+            } else {
+                0.0
+            }
         };
         let command = WheelSpeeds {
             left_rad_s: bounded(command.left_rad_s),
@@ -232,8 +257,7 @@ impl Plant {
             wheels.left_rad_s.abs().min(wheels.right_rad_s.abs()) * model.wheel_radius_m();
         let stiffness = ground.left.stiffness().max(ground.right.stiffness());
         let reference_m_s = slip_reference_m_s(slowest_m_s);
-        let shape = model.mass_kg()
-            * (model.track_width_m().powi(2) + model.wheelbase_m().powi(2))
+        let shape = model.mass_kg() * (model.track_width_m().powi(2) + model.wheelbase_m().powi(2))
             / (4.0 * model.yaw_inertia_kg_m2());
         let pole_s1 = GRAVITY_M_S2 * stiffness / reference_m_s * shape.max(1.0);
         let servo_s = 0.5 * self.spec.servo_lag_s.max(SERVO_LAG_FLOOR_S);
@@ -297,7 +321,8 @@ impl Plant {
         let mut side_n = [0.0; 2];
         for (side, (y_m, rim_m_s, curve)) in sides.into_iter().enumerate() {
             let reference_m_s = slip_reference_m_s(rim_m_s);
-            let slip_ahead = (state.ahead_m_s - state.yaw_rate_rad_s * y_m - rim_m_s) / reference_m_s;
+            let slip_ahead =
+                (state.ahead_m_s - state.yaw_rate_rad_s * y_m - rim_m_s) / reference_m_s;
             for x_m in [half_base_m, -half_base_m] {
                 let slip_left = (state.left_m_s + state.yaw_rate_rad_s * x_m) / reference_m_s;
                 let slip = slip_ahead.hypot(slip_left);
@@ -318,7 +343,9 @@ impl Plant {
 
 /// Reference speed of the slip ratio for a rim speed, regular at zero, metres per second.
 pub fn slip_reference_m_s(rim_m_s: f64) -> f64 {
-    (rim_m_s.powi(4) + SLIP_SPEED_FLOOR_M_S.powi(4)).sqrt().sqrt()
+    (rim_m_s.powi(4) + SLIP_SPEED_FLOOR_M_S.powi(4))
+        .sqrt()
+        .sqrt()
 }
 
 fn pack(state: &PlantState) -> Rates {
@@ -335,14 +362,29 @@ fn pack(state: &PlantState) -> Rates {
 }
 
 fn unpack(packed: &Rates) -> PlantState {
-    let &[x_m, y_m, heading_rad, ahead_m_s, left_m_s, yaw_rate_rad_s, left_rad_s, right_rad_s] =
-        packed;
-    PlantState {
-        pose: Pose { x_m, y_m, heading_rad },
+    let &[
+        x_m,
+        y_m,
+        heading_rad,
         ahead_m_s,
         left_m_s,
         yaw_rate_rad_s,
-        wheel_speeds: WheelSpeeds { left_rad_s, right_rad_s },
+        left_rad_s,
+        right_rad_s,
+    ] = packed;
+    PlantState {
+        pose: Pose {
+            x_m,
+            y_m,
+            heading_rad,
+        },
+        ahead_m_s,
+        left_m_s,
+        yaw_rate_rad_s,
+        wheel_speeds: WheelSpeeds {
+            left_rad_s,
+            right_rad_s,
+        },
     }
 }
 

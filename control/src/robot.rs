@@ -77,12 +77,21 @@ impl TryFrom<RobotModelSpec> for RobotModel {
             ("wheel_radius_m", spec.wheel_radius_m),
             ("yaw_inertia_kg_m2", spec.yaw_inertia_kg_m2),
             ("wheel_speed_max_rad_s", limits.wheel_speed_max_rad_s),
-            ("wheel_acceleration_max_rad_s2", limits.wheel_acceleration_max_rad_s2),
+            (
+                "wheel_acceleration_max_rad_s2",
+                limits.wheel_acceleration_max_rad_s2,
+            ),
             ("linear_max_m_s", limits.linear_max_m_s),
             ("angular_max_rad_s", limits.angular_max_rad_s),
-            ("linear_acceleration_max_m_s2", limits.linear_acceleration_max_m_s2),
+            (
+                "linear_acceleration_max_m_s2",
+                limits.linear_acceleration_max_m_s2,
+            ),
             ("linear_jerk_max_m_s3", limits.linear_jerk_max_m_s3),
-            ("lateral_acceleration_max_m_s2", limits.lateral_acceleration_max_m_s2),
+            (
+                "lateral_acceleration_max_m_s2",
+                limits.lateral_acceleration_max_m_s2,
+            ),
         ];
         for (field, value) in fields {
             if !value.is_finite() || value <= 0.0 {
@@ -198,7 +207,10 @@ mod tests {
             let mut spec = RobotModelSpec::from(RobotModel::yi2007());
             spec.limits.linear_jerk_max_m_s3 = bad;
             let error = RobotModel::try_from(spec).unwrap_err();
-            assert!(error.to_string().contains("linear_jerk_max_m_s3"), "{error}");
+            assert!(
+                error.to_string().contains("linear_jerk_max_m_s3"),
+                "{error}"
+            );
         }
     }
 
@@ -214,7 +226,10 @@ mod tests {
     #[test]
     fn wheel_speeds_and_twist_are_inverse() {
         let model = RobotModel::yi2007();
-        let twist = Twist { linear_m_s: 0.7, angular_rad_s: -0.4 };
+        let twist = Twist {
+            linear_m_s: 0.7,
+            angular_rad_s: -0.4,
+        };
         let back = model.twist_from_wheel_speeds(model.wheel_speeds_from_twist(twist));
         assert!((back.linear_m_s - twist.linear_m_s).abs() < 1.0e-12);
         assert!((back.angular_rad_s - twist.angular_rad_s).abs() < 1.0e-12);

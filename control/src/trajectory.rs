@@ -53,7 +53,11 @@ pub struct Waypoint {
 
 impl From<Point> for Waypoint {
     fn from(point: Point) -> Self {
-        Self { point, speed_m_s: None, heading_rad: None }
+        Self {
+            point,
+            speed_m_s: None,
+            heading_rad: None,
+        }
     }
 }
 

@@ -1,0 +1,433 @@
+//! One mission on one robot: plan, governor and tracking law together.
+//!
+//! ```text
+//! Approach ─► Tracking ─► Settling ─► Done
+//!     └──────────┴─ stop ─► Stopping ─► Stopped
+//! any of the moving ones ─► Failed(reason)
+//! ```
+//! `Approach` first turns on the spot where the path leaves in another direction, then drives the
+//! leg to the trajectory. The last four states are final and command rest.
+
+use crate::geometry::{Twist, wrap_angle_rad};
+use crate::measured::{Measured, WheelSpeeds};
+use crate::plan::Plan;
+use crate::reference::{Governor, GovernorInput, ReferenceSample};
+use crate::robot::RobotModel;
+use crate::tracking::{
+    ThetaKnowledge, Tracker, TrackerConfig, TrackerError, TrackingErrors, desaturated,
+};
+
+/// Turn on the spot when the path leaves by more than this from the robot's heading, radians.
+const ALIGN_FROM_RAD: f64 = 0.12;
+/// A turn on the spot ends within this angle, radians.
+const ALIGNED_RAD: f64 = 0.04;
+/// A turn on the spot ends below this turn rate, radians per second.
+const ALIGNED_RATE_RAD_S: f64 = 0.08;
+/// Gain from heading error to turn rate on the spot, per second.
+const ALIGN_GAIN_1_S: f64 = 2.0;
+/// Share of the turn-rate limit used on the spot.
+const ALIGN_SHARE: f64 = 0.4;
+/// Fastest change of the turn rate on the spot, radians per second squared.
+const ALIGN_ACCELERATION_RAD_S2: f64 = 2.0;
+/// Longest turn on the spot, seconds.
+const ALIGN_MAX_S: f64 = 30.0;
+
+/// Tolerances and bounds of one mission.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FollowerConfig {
+    /// Gains of the law.
+    pub tracker: TrackerConfig,
+    /// Distance from the path's end that counts as there, metres.
+    pub end_tolerance_m: f64,
+    /// Speed that counts as standing, metres per second.
+    pub rest_speed_m_s: f64,
+    /// How long the robot must be there and stand, seconds.
+    pub settle_hold_s: f64,
+    /// Longest time to settle, seconds.
+    pub settle_max_s: f64,
+    /// Cross-track error that fails the mission when it lasts, metres.
+    pub cross_track_max_m: f64,
+    /// How long it must last, seconds.
+    pub cross_track_max_for_s: f64,
+    /// How long the robot may be held up without progress, seconds.
+    pub stuck_max_s: f64,
+    /// Age of the pose at which the robot waits, seconds.
+    pub pose_age_hold_s: f64,
+    /// Age of the pose that fails the mission, seconds.
+    pub pose_age_max_s: f64,
+}
+
+impl Default for FollowerConfig {
+    fn default() -> Self {
+        Self {
+            tracker: TrackerConfig::default(),
+            end_tolerance_m: 0.10,
+            rest_speed_m_s: 0.05,
+            settle_hold_s: 0.3,
+            settle_max_s: 5.0,
+            cross_track_max_m: 0.5,
+            cross_track_max_for_s: 2.0,
+            stuck_max_s: 20.0,
+            pose_age_hold_s: 0.3,
+            pose_age_max_s: 3.0,
+        }
+    }
+}
+
+/// Why a mission failed on the robot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FailureReason {
+    /// The cross-track error was too large for too long.
+    LeftPath,
+    /// The robot did not come to rest at the path's end in time.
+    NotSettled,
+    /// The robot could not turn to the path's direction in time.
+    NotAligned,
+    /// The robot made no progress although it should.
+    Stuck,
+    /// No usable pose for too long.
+    PoseLost,
+}
+
+impl FailureReason {
+    /// A sentence part for people.
+    pub fn text(self) -> &'static str {
+        match self {
+            Self::LeftPath => "the robot left its path",
+            Self::NotSettled => "the robot did not come to rest at the end of its path",
+            Self::NotAligned => "the robot could not turn to the direction of its path",
+            Self::Stuck => "the robot made no progress",
+            Self::PoseLost => "the robot lost its position",
+        }
+    }
+}
+
+/// Where a mission is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum FollowerStatus {
+    /// On the way to the trajectory.
+    Approach,
+    /// On the trajectory.
+    Tracking,
+    /// At its end, coming to rest.
+    Settling,
+    /// At its end, at rest. Final.
+    Done,
+    /// Braking along the path after a stop.
+    Stopping,
+    /// At rest after a stop. Final.
+    Stopped,
+    /// Given up. Final.
+    Failed(FailureReason),
+}
+
+impl FollowerStatus {
+    /// Whether nothing will change any more.
+    pub fn is_final(self) -> bool {
+        matches!(self, Self::Done | Self::Stopped | Self::Failed(_))
+    }
+}
+
+/// What one tick gives.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FollowerOutput {
+    /// Wheel speeds to command; still to pass the gate.
+    pub wheel_speeds: WheelSpeeds,
+    /// The twist behind them.
+    pub twist: Twist,
+    /// Where the mission is.
+    pub status: FollowerStatus,
+    /// Arc length of the reference, metres; never falls.
+    pub progress_m: f64,
+    /// Length of the whole path, metres.
+    pub length_m: f64,
+    /// The plan's time that is left, seconds.
+    pub remaining_s: f64,
+    /// Errors in the frame of the reference.
+    pub errors: TrackingErrors,
+    /// Where the robot should be.
+    pub reference: ReferenceSample,
+    /// θ̂ in the loop; never a measurement.
+    pub theta_loop: f64,
+    /// Weight of friction feed-forward, 0 to 1.
+    pub confidence: f64,
+    /// Whether the wheel limits cut the command.
+    pub saturated: bool,
+}
+
+/// One mission.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Follower {
+    plan: Plan,
+    model: RobotModel,
+    config: FollowerConfig,
+    governor: Governor,
+    tracker: Tracker,
+    status: FollowerStatus,
+    aligning: bool,
+    align_rate_rad_s: f64,
+    phase_s: f64,
+    hold_s: f64,
+    off_path_s: f64,
+    stuck_s: f64,
+    best_arc_m: f64,
+    /// Paused, or slowed to nothing, by the operator.
+    rate_cap: f64,
+    invalid_s: f64,
+    last_errors: TrackingErrors,
+    saturated: bool,
+}
+
+impl Follower {
+    /// A mission that has not moved yet.
+    ///
+    /// # Errors
+    /// [`TrackerError`] names a gain that is out of its range.
+    pub fn new(
+        plan: Plan,
+        model: RobotModel,
+        config: FollowerConfig,
+    ) -> Result<Self, TrackerError> {
+        let tracker = Tracker::new(model, config.tracker)?;
+        let status = if plan.approach_length_m() > 0.0 {
+            FollowerStatus::Approach
+        } else {
+            FollowerStatus::Tracking
+        };
+        Ok(Self {
+            governor: Governor::new(&model),
+            plan,
+            model,
+            config,
+            tracker,
+            status,
+            aligning: true,
+            align_rate_rad_s: 0.0,
+            phase_s: 0.0,
+            hold_s: 0.0,
+            off_path_s: 0.0,
+            stuck_s: 0.0,
+            best_arc_m: 0.0,
+            rate_cap: 1.0,
+            invalid_s: 0.0,
+            last_errors: TrackingErrors::default(),
+            saturated: false,
+        })
+    }
+
+    /// The plan that is driven.
+    pub fn plan(&self) -> &Plan {
+        &self.plan
+    }
+
+    /// Where the mission is.
+    pub fn status(&self) -> FollowerStatus {
+        self.status
+    }
+
+    /// Starts with what a map or an earlier run knows about θ, at full weight.
+    pub fn warm_start(&mut self, knowledge: ThetaKnowledge) {
+        self.tracker.warm_start(knowledge);
+    }
+
+    /// Brakes to rest along the path, for good.
+    pub fn stop(&mut self) {
+        if !self.status.is_final() {
+            self.governor.stop();
+            self.enter(FollowerStatus::Stopping);
+        }
+    }
+
+    /// Limits the pace to a share of the plan's, 0 to 1; 0 pauses, 1 resumes fully.
+    pub fn set_pace(&mut self, share: f64) {
+        self.rate_cap = if share.is_finite() {
+            share.clamp(0.0, 1.0)
+        } else {
+            0.0
+        };
+    }
+
+    /// One tick.
+    pub fn step(
+        &mut self,
+        measured: &Measured,
+        knowledge: Option<ThetaKnowledge>,
+        dt_s: f64,
+    ) -> FollowerOutput {
+        if self.status.is_final() || !(dt_s.is_finite() && dt_s > 0.0) {
+            return self.at_rest();
+        }
+        self.phase_s += dt_s;
+        let usable = measured.is_finite() && measured.pose_age_s <= self.config.pose_age_hold_s;
+        self.invalid_s = if usable { 0.0 } else { self.invalid_s + dt_s };
+        if !measured.is_finite() || measured.pose_age_s > self.config.pose_age_max_s {
+            if self.invalid_s > self.config.pose_age_max_s || measured.is_finite() {
+                self.enter(FollowerStatus::Failed(FailureReason::PoseLost));
+            }
+            return self.at_rest();
+        }
+        if self.aligning
+            && let Some(output) = self.align(measured, dt_s)
+        {
+            return output;
+        }
+        self.drive(measured, knowledge, usable, dt_s)
+    }
+
+    fn drive(
+        &mut self,
+        measured: &Measured,
+        knowledge: Option<ThetaKnowledge>,
+        usable: bool,
+        dt_s: f64,
+    ) -> FollowerOutput {
+        self.governor
+            .set_rate_cap(if usable { self.rate_cap } else { 0.0 });
+        let errors = TrackingErrors::between(&self.governor.sample(&self.plan), measured);
+        let input = GovernorInput {
+            lag_m: errors.distance_m(),
+            saturated: self.saturated,
+        };
+        let reference = self.governor.step(&self.plan, &input, dt_s);
+        let tracked = self.tracker.step(&reference, measured, knowledge, dt_s);
+        self.saturated = tracked.saturated;
+        self.last_errors = tracked.errors;
+        self.advance(&reference, measured, dt_s);
+        if self.status.is_final() {
+            return self.at_rest();
+        }
+        FollowerOutput {
+            wheel_speeds: tracked.wheel_speeds,
+            twist: tracked.twist,
+            saturated: tracked.saturated,
+            confidence: tracked.confidence,
+            ..self.at_rest()
+        }
+    }
+
+    /// Turns on the spot; none once the robot points along the path.
+    fn align(&mut self, measured: &Measured, dt_s: f64) -> Option<FollowerOutput> {
+        let error_rad = wrap_angle_rad(self.plan.start_heading_rad() - measured.pose.heading_rad);
+        let started = self.align_rate_rad_s.abs() > 0.0;
+        let bound_rad = if started { ALIGNED_RAD } else { ALIGN_FROM_RAD };
+        let slow = measured.twist.angular_rad_s.abs() < ALIGNED_RATE_RAD_S;
+        if error_rad.abs() < bound_rad && (slow || !started) {
+            self.aligning = false;
+            self.phase_s = 0.0;
+            return None;
+        }
+        let stopping = self.status == FollowerStatus::Stopping;
+        let held = stopping || self.rate_cap <= 0.0;
+        if self.phase_s > ALIGN_MAX_S && !held {
+            self.enter(FollowerStatus::Failed(FailureReason::NotAligned));
+            return Some(self.at_rest());
+        }
+        let most_rad_s = ALIGN_SHARE * self.model.limits().angular_max_rad_s;
+        let wanted_rad_s = if held {
+            0.0
+        } else {
+            (ALIGN_GAIN_1_S * error_rad).clamp(-most_rad_s, most_rad_s) * self.rate_cap
+        };
+        let step = ALIGN_ACCELERATION_RAD_S2 * dt_s;
+        self.align_rate_rad_s += (wanted_rad_s - self.align_rate_rad_s).clamp(-step, step);
+        if held {
+            self.phase_s -= dt_s;
+            if stopping && self.align_rate_rad_s.abs() < ALIGNED_RATE_RAD_S {
+                self.enter(FollowerStatus::Stopped);
+                return Some(self.at_rest());
+            }
+        }
+        let twist = Twist {
+            linear_m_s: 0.0,
+            angular_rad_s: self.align_rate_rad_s,
+        };
+        let (wheel_speeds, saturated) = desaturated(&self.model, twist);
+        self.last_errors = TrackingErrors::between(&self.governor.sample(&self.plan), measured);
+        Some(FollowerOutput {
+            wheel_speeds,
+            twist,
+            saturated,
+            ..self.at_rest()
+        })
+    }
+
+    /// Moves the state on after a tick of driving.
+    fn advance(&mut self, reference: &ReferenceSample, measured: &Measured, dt_s: f64) {
+        let config = self.config;
+        let far = self.last_errors.cross_m.abs() > config.cross_track_max_m;
+        self.off_path_s = if far { self.off_path_s + dt_s } else { 0.0 };
+        let waiting = self.rate_cap <= 0.0 || reference.arc_m > self.best_arc_m + 1.0e-4;
+        self.stuck_s = if waiting { 0.0 } else { self.stuck_s + dt_s };
+        self.best_arc_m = self.best_arc_m.max(reference.arc_m);
+        let standing = measured.twist.linear_m_s.abs() < config.rest_speed_m_s;
+        match self.status {
+            FollowerStatus::Approach | FollowerStatus::Tracking
+                if self.off_path_s > config.cross_track_max_for_s =>
+            {
+                self.enter(FollowerStatus::Failed(FailureReason::LeftPath));
+            }
+            FollowerStatus::Approach | FollowerStatus::Tracking
+                if self.governor.is_at_end(&self.plan) =>
+            {
+                self.enter(FollowerStatus::Settling);
+            }
+            FollowerStatus::Approach | FollowerStatus::Tracking
+                if self.stuck_s > config.stuck_max_s =>
+            {
+                self.enter(FollowerStatus::Failed(FailureReason::Stuck));
+            }
+            FollowerStatus::Approach if reference.arc_m >= self.plan.approach_length_m() => {
+                self.enter(FollowerStatus::Tracking);
+            }
+            FollowerStatus::Settling => {
+                let there = self.last_errors.distance_m() < config.end_tolerance_m && standing;
+                self.hold_s = if there { self.hold_s + dt_s } else { 0.0 };
+                if self.hold_s >= config.settle_hold_s {
+                    self.enter(FollowerStatus::Done);
+                } else if self.phase_s > config.settle_max_s {
+                    self.enter(FollowerStatus::Failed(FailureReason::NotSettled));
+                }
+            }
+            FollowerStatus::Stopping => {
+                let rests = self.governor.is_stopped(&self.plan);
+                self.hold_s = if rests { self.hold_s + dt_s } else { 0.0 };
+                // A robot that does not stand in time is brought to rest by the gate's ramp.
+                if (self.hold_s > 0.0 && standing) || self.hold_s > config.settle_max_s {
+                    self.enter(FollowerStatus::Stopped);
+                }
+            }
+            FollowerStatus::Approach
+            | FollowerStatus::Tracking
+            | FollowerStatus::Done
+            | FollowerStatus::Stopped
+            | FollowerStatus::Failed(_) => {}
+        }
+    }
+
+    fn enter(&mut self, status: FollowerStatus) {
+        if self.status != status {
+            self.status = status;
+            self.phase_s = 0.0;
+            self.hold_s = 0.0;
+        }
+    }
+
+    /// The present state with a command of rest.
+    fn at_rest(&self) -> FollowerOutput {
+        let reference = self.governor.sample(&self.plan);
+        FollowerOutput {
+            wheel_speeds: WheelSpeeds::default(),
+            twist: Twist::default(),
+            status: self.status,
+            progress_m: reference.arc_m,
+            length_m: self.plan.length_m(),
+            remaining_s: (self.plan.duration_s() - self.governor.clock_s()).max(0.0),
+            errors: self.last_errors,
+            reference,
+            theta_loop: self.tracker.theta_loop(),
+            confidence: 0.0,
+            saturated: false,
+        }
+    }
+}

@@ -1,0 +1,367 @@
+//! Where the robot is: position fixes fused with gyro and wheel speeds.
+//!
+//! A Kalman filter over six states: pose, the difference between true and wheel-reckoned speed
+//! ahead, the speed to the left (a skid-steered base slides sideways in turns), and the gyro's
+//! offset. The two speeds are first-order Markov, the offset wanders. Fixes that cannot be true are
+//! refused and counted; after [`REFUSED_MAX`] in a row the robot was moved, and the filter starts
+//! afresh from the fix.
+
+use nalgebra::{Matrix3, Matrix3x6, Matrix6, Vector3, Vector6};
+
+use crate::geometry::{Pose, Twist, wrap_angle_rad};
+use crate::measured::WheelSpeeds;
+use crate::robot::RobotModel;
+
+/// Refused fixes in a row after which the filter starts afresh.
+pub const REFUSED_MAX: u32 = 20;
+/// Squared Mahalanobis distance beyond which a fix is refused (three degrees of freedom, one in
+/// 10⁶ true ones).
+const GATE: f64 = 30.7;
+/// Longest prediction in one call, seconds.
+const STEP_MAX_S: f64 = 0.5;
+/// Oldest fix that is used, seconds.
+const FIX_AGE_MAX_S: f64 = 1.0;
+/// Largest speed or turn rate that is believed, metres or radians per second.
+const RATE_MAX: f64 = 100.0;
+
+/// A measured pose.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PositionFix {
+    /// Pose in the site's frame.
+    pub pose: Pose,
+    /// How long ago it was measured, seconds.
+    pub age_s: f64,
+}
+
+/// Noise of the sensors that localisation uses; one standard deviation each.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct LocalisationNoise {
+    /// Position of a fix, per axis, metres.
+    pub position_m: f64,
+    /// Heading of a fix, radians.
+    pub heading_rad: f64,
+    /// Gyro, white, at the loop's rate, radians per second.
+    pub gyro_rad_s: f64,
+    /// Wandering of the gyro's offset, radians per second and root second.
+    pub gyro_offset_walk: f64,
+    /// Difference between true and wheel-reckoned speed ahead, metres per second.
+    pub speed_m_s: f64,
+    /// Speed to the left, metres per second.
+    pub sideways_m_s: f64,
+    /// Time over which both speeds forget, seconds.
+    pub speed_memory_s: f64,
+}
+
+impl Default for LocalisationNoise {
+    fn default() -> Self {
+        Self {
+            position_m: 0.01,
+            heading_rad: 0.005,
+            gyro_rad_s: 0.003,
+            gyro_offset_walk: 2.0e-4,
+            speed_m_s: 0.02,
+            sideways_m_s: 0.03,
+            speed_memory_s: 1.0,
+        }
+    }
+}
+
+/// What became of a fix.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FixOutcome {
+    /// It was the first, and is the pose now.
+    Started,
+    /// It was fused.
+    Fused,
+    /// It is not finite, or too old.
+    Invalid,
+    /// It cannot be true, given what was known.
+    Outlier,
+    /// Too many in a row could not be true: the filter started afresh from this one.
+    Restarted,
+}
+
+/// The filter.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Localisation {
+    model: RobotModel,
+    noise: LocalisationNoise,
+    state: Vector6<f64>,
+    covariance: Matrix6<f64>,
+    turn_rad_s: f64,
+    ahead_m_s: f64,
+    started: bool,
+    fix_age_s: f64,
+    refused_in_a_row: u32,
+    outliers: u64,
+    invalid: u64,
+    restarts: u64,
+}
+
+impl Localisation {
+    /// A filter that knows nothing yet.
+    pub fn new(model: RobotModel, noise: LocalisationNoise) -> Self {
+        Self {
+            model,
+            noise,
+            state: Vector6::zeros(),
+            covariance: Matrix6::zeros(),
+            turn_rad_s: 0.0,
+            ahead_m_s: 0.0,
+            started: false,
+            fix_age_s: f64::INFINITY,
+            refused_in_a_row: 0,
+            outliers: 0,
+            invalid: 0,
+            restarts: 0,
+        }
+    }
+
+    /// The pose; none before the first fix.
+    pub fn pose(&self) -> Option<Pose> {
+        self.started.then(|| Pose {
+            x_m: self.state[0],
+            y_m: self.state[1],
+            heading_rad: wrap_angle_rad(self.state[2]),
+        })
+    }
+
+    /// How the robot moves, body frame.
+    pub fn twist(&self) -> Twist {
+        Twist {
+            linear_m_s: self.ahead_m_s + self.state[3],
+            angular_rad_s: self.turn_rad_s,
+        }
+    }
+
+    /// Standard deviation of the position, the larger axis, metres; infinite before the first fix.
+    pub fn position_std_dev_m(&self) -> f64 {
+        if self.started {
+            self.covariance[(0, 0)]
+                .max(self.covariance[(1, 1)])
+                .max(0.0)
+                .sqrt()
+        } else {
+            f64::INFINITY
+        }
+    }
+
+    /// Age of the last fix that was used, seconds; infinite before the first.
+    pub fn fix_age_s(&self) -> f64 {
+        self.fix_age_s
+    }
+
+    /// Fixes refused because they could not be true.
+    pub fn outliers(&self) -> u64 {
+        self.outliers
+    }
+
+    /// Samples and fixes refused because they were not finite, too large or too old.
+    pub fn invalid(&self) -> u64 {
+        self.invalid
+    }
+
+    /// How often the filter started afresh.
+    pub fn restarts(&self) -> u64 {
+        self.restarts
+    }
+
+    /// Moves on by one tick with the gyro's and the wheels' measured rates.
+    pub fn predict(&mut self, gyro_rad_s: f64, wheels: WheelSpeeds, dt_s: f64) {
+        if !(dt_s.is_finite() && dt_s > 0.0) {
+            self.invalid += 1;
+            return;
+        }
+        self.fix_age_s += dt_s;
+        let wheel_m_s =
+            0.5 * self.model.wheel_radius_m() * (wheels.left_rad_s + wheels.right_rad_s);
+        // A sample that cannot be used leaves the last rates standing; the covariance grows.
+        if gyro_rad_s.is_finite() && gyro_rad_s.abs() < RATE_MAX {
+            self.turn_rad_s = gyro_rad_s - self.state[5];
+        } else {
+            self.invalid += 1;
+        }
+        if wheel_m_s.is_finite() && wheel_m_s.abs() < RATE_MAX {
+            self.ahead_m_s = wheel_m_s;
+        } else {
+            self.invalid += 1;
+        }
+        if !self.started {
+            return;
+        }
+        let dt_s = dt_s.min(STEP_MAX_S);
+        let middle_rad = self.state[2] + 0.5 * dt_s * self.turn_rad_s;
+        let (sin, cos) = middle_rad.sin_cos();
+        let (ahead_m_s, left_m_s) = (self.ahead_m_s + self.state[3], self.state[4]);
+        self.state[0] += dt_s * (ahead_m_s * cos - left_m_s * sin);
+        self.state[1] += dt_s * (ahead_m_s * sin + left_m_s * cos);
+        self.state[2] += dt_s * self.turn_rad_s;
+        let fade = (-dt_s / self.noise.speed_memory_s.max(dt_s)).exp();
+        self.state[3] *= fade;
+        self.state[4] *= fade;
+        let mut motion = Matrix6::identity();
+        motion[(0, 2)] = -dt_s * (ahead_m_s * sin + left_m_s * cos);
+        motion[(1, 2)] = dt_s * (ahead_m_s * cos - left_m_s * sin);
+        motion[(0, 3)] = dt_s * cos;
+        motion[(0, 4)] = -dt_s * sin;
+        motion[(1, 3)] = dt_s * sin;
+        motion[(1, 4)] = dt_s * cos;
+        motion[(2, 5)] = -dt_s;
+        motion[(3, 3)] = fade;
+        motion[(4, 4)] = fade;
+        // Standing wheels do not slide: the Markov speeds are let loose with the speed.
+        let moving = (self.ahead_m_s.abs() + 0.2 * self.turn_rad_s.abs()).min(0.5) / 0.5;
+        let renewed = (1.0 - fade * fade) * (0.05 + 0.95 * moving).powi(2);
+        self.covariance = motion * self.covariance * motion.transpose();
+        self.covariance[(2, 2)] += (self.noise.gyro_rad_s * dt_s).powi(2);
+        self.covariance[(3, 3)] += renewed * self.noise.speed_m_s.powi(2);
+        self.covariance[(4, 4)] += renewed * self.noise.sideways_m_s.powi(2);
+        self.covariance[(5, 5)] += dt_s * self.noise.gyro_offset_walk.powi(2);
+    }
+
+    /// Takes a position fix.
+    pub fn correct(&mut self, fix: &PositionFix) -> FixOutcome {
+        if !(fix.pose.is_finite() && (0.0..=FIX_AGE_MAX_S).contains(&fix.age_s)) {
+            self.invalid += 1;
+            return FixOutcome::Invalid;
+        }
+        let moved = self.carried(fix);
+        if !self.started {
+            self.start(moved, fix.age_s);
+            return FixOutcome::Started;
+        }
+        let innovation = Vector3::new(
+            moved.x_m - self.state[0],
+            moved.y_m - self.state[1],
+            wrap_angle_rad(moved.heading_rad - self.state[2]),
+        );
+        let observe = Matrix3x6::identity();
+        let position = self.noise.position_m.powi(2);
+        let noise = Matrix3::from_diagonal(&Vector3::new(
+            position,
+            position,
+            self.noise.heading_rad.powi(2),
+        ));
+        let spread: Matrix3<f64> = observe * self.covariance * observe.transpose() + noise;
+        let Some(inverse) = spread.try_inverse() else {
+            self.invalid += 1;
+            return FixOutcome::Invalid;
+        };
+        if (innovation.transpose() * inverse * innovation)[(0, 0)] > GATE {
+            self.outliers += 1;
+            self.refused_in_a_row += 1;
+            if self.refused_in_a_row < REFUSED_MAX {
+                return FixOutcome::Outlier;
+            }
+            self.restarts += 1;
+            self.start(moved, fix.age_s);
+            return FixOutcome::Restarted;
+        }
+        let gain = self.covariance * observe.transpose() * inverse;
+        self.state += gain * innovation;
+        // Joseph's form keeps the covariance symmetric and positive.
+        let keep = Matrix6::identity() - gain * observe;
+        self.covariance =
+            keep * self.covariance * keep.transpose() + gain * noise * gain.transpose();
+        self.refused_in_a_row = 0;
+        self.fix_age_s = fix.age_s;
+        FixOutcome::Fused
+    }
+
+    /// The fix carried on over its age with the present motion.
+    fn carried(&self, fix: &PositionFix) -> Pose {
+        let turn_rad = self.turn_rad_s * fix.age_s;
+        let (sin, cos) = (fix.pose.heading_rad + 0.5 * turn_rad).sin_cos();
+        let ahead_m = (self.ahead_m_s + self.state[3]) * fix.age_s;
+        let left_m = self.state[4] * fix.age_s;
+        Pose {
+            x_m: fix.pose.x_m + ahead_m * cos - left_m * sin,
+            y_m: fix.pose.y_m + ahead_m * sin + left_m * cos,
+            heading_rad: fix.pose.heading_rad + turn_rad,
+        }
+    }
+
+    fn start(&mut self, pose: Pose, age_s: f64) {
+        self.state = Vector6::new(
+            pose.x_m,
+            pose.y_m,
+            pose.heading_rad,
+            0.0,
+            0.0,
+            self.state[5],
+        );
+        let noise = &self.noise;
+        self.covariance = Matrix6::from_diagonal(&Vector6::new(
+            noise.position_m.powi(2),
+            noise.position_m.powi(2),
+            noise.heading_rad.powi(2),
+            noise.speed_m_s.powi(2),
+            noise.sideways_m_s.powi(2),
+            0.01_f64.powi(2),
+        ));
+        self.started = true;
+        self.refused_in_a_row = 0;
+        self.fix_age_s = age_s;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn filter() -> Localisation {
+        Localisation::new(RobotModel::yi2007(), LocalisationNoise::default())
+    }
+
+    fn fix(x_m: f64, y_m: f64) -> PositionFix {
+        PositionFix {
+            pose: Pose {
+                x_m,
+                y_m,
+                heading_rad: 0.0,
+            },
+            age_s: 0.0,
+        }
+    }
+
+    #[test]
+    fn nothing_is_known_before_the_first_fix() {
+        let mut filter = filter();
+        filter.predict(0.0, WheelSpeeds::default(), 0.01);
+        assert!(filter.pose().is_none() && filter.fix_age_s().is_infinite());
+        assert_eq!(filter.correct(&fix(1.0, 2.0)), FixOutcome::Started);
+        assert!((filter.pose().unwrap().x_m - 1.0).abs() < 1.0e-12);
+    }
+
+    #[test]
+    fn a_fix_that_cannot_be_true_is_refused_until_it_insists() {
+        let mut filter = filter();
+        filter.correct(&fix(0.0, 0.0));
+        for _ in 1..REFUSED_MAX {
+            filter.predict(0.0, WheelSpeeds::default(), 0.05);
+            assert_eq!(filter.correct(&fix(50.0, 0.0)), FixOutcome::Outlier);
+            assert!(filter.pose().unwrap().x_m.abs() < 0.01);
+        }
+        filter.predict(0.0, WheelSpeeds::default(), 0.05);
+        assert_eq!(filter.correct(&fix(50.0, 0.0)), FixOutcome::Restarted);
+        assert!((filter.pose().unwrap().x_m - 50.0).abs() < 1.0e-9);
+    }
+
+    #[test]
+    fn samples_that_are_no_numbers_are_counted_and_do_no_harm() {
+        let mut filter = filter();
+        filter.correct(&fix(0.0, 0.0));
+        filter.predict(
+            f64::NAN,
+            WheelSpeeds {
+                left_rad_s: f64::INFINITY,
+                right_rad_s: 0.0,
+            },
+            0.01,
+        );
+        assert_eq!(filter.correct(&fix(f64::NAN, 0.0)), FixOutcome::Invalid);
+        assert_eq!(filter.invalid(), 3);
+        assert!(filter.pose().unwrap().is_finite());
+        assert!((filter.fix_age_s() - 0.01).abs() < 1.0e-12);
+    }
+}

@@ -1,0 +1,267 @@
+//! How a robot joins a circle or a waypoint path: the quickest of many smooth legs.
+
+use std::f64::consts::{FRAC_PI_2, TAU};
+
+use super::polynomial::Derivatives;
+use super::{Path, Piece, Polynomial, RADIUS_MIN_M};
+use crate::geometry::{Point, Pose, wrap_angle_rad};
+use crate::robot::RobotModel;
+
+/// A robot nearer to the circle than this starts on it, metres.
+const ON_CIRCLE_M: f64 = 0.05;
+/// A robot that points along the path within this angle need not turn on the spot, radians.
+const ALIGNED_RAD: f64 = 0.1;
+/// Places on the circle that are tried.
+const PLACES: u32 = 36;
+/// Shortest leg that is tried, metres.
+const LEG_MIN_M: f64 = 0.2;
+/// Lengths of the leg's parameter that are tried, over its chord.
+const STRETCHES: [f64; 5] = [1.0, 1.15, 1.35, 1.7, 2.4];
+/// Distances straight behind the path's start that a leg may lead through, metres.
+const RUN_INS_M: [f64; 3] = [0.5, 1.0, 2.0];
+/// Start directions that are tried, radians from the direction of the place.
+const TURNS_RAD: [f64; 5] = [-1.0, -0.5, 0.0, 0.5, 1.0];
+/// Points at which a leg's time is summed.
+const TIME_STEPS: u32 = 48;
+/// Points at which the time of a spline's piece is summed.
+const PIECE_TIME_STEPS: u32 = 10;
+/// Slowest advance of a curve over that at its end; a slower one is about to come to a point.
+const ADVANCE_SHARE_MIN: f64 = 0.05;
+/// Tightest turn of a leg, metres.
+const LEG_RADIUS_MIN_M: f64 = 2.0 * RADIUS_MIN_M;
+/// Turn rate reckoned for turning on the spot, share of the limit.
+const SPOT_TURN_SHARE: f64 = 0.4;
+
+/// The circle that is joined.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct CircleTarget {
+    /// Centre.
+    pub(crate) center: Point,
+    /// Radius, metres.
+    pub(crate) radius_m: f64,
+    /// +1 counter-clockwise, −1 clockwise.
+    pub(crate) sign: f64,
+    /// Speed along the circle, metres per second.
+    pub(crate) speed_m_s: f64,
+}
+
+impl CircleTarget {
+    fn heading_rad(&self, place_rad: f64) -> f64 {
+        place_rad + self.sign * FRAC_PI_2
+    }
+
+    fn derivatives(&self, place_rad: f64) -> Derivatives {
+        let (sin, cos) = place_rad.sin_cos();
+        let ahead = Point {
+            x_m: -self.sign * sin,
+            y_m: self.sign * cos,
+        };
+        let inward = Point {
+            x_m: -cos,
+            y_m: -sin,
+        };
+        let bend = self.radius_m.recip();
+        let scaled = |point: Point, factor: f64| Point {
+            x_m: point.x_m * factor,
+            y_m: point.y_m * factor,
+        };
+        [
+            Point {
+                x_m: self.center.x_m + self.radius_m * cos,
+                y_m: self.center.y_m + self.radius_m * sin,
+            },
+            ahead,
+            scaled(inward, bend),
+            scaled(ahead, -bend * bend),
+            scaled(inward, -bend * bend * bend),
+        ]
+    }
+}
+
+/// The leg to the circle, empty when the robot stands on it, and the polar angle where it joins;
+/// nothing when no leg can be driven.
+pub(crate) fn join_circle(
+    target: &CircleTarget,
+    start: Pose,
+    model: &RobotModel,
+) -> Option<(Vec<Polynomial>, f64)> {
+    let nearest_rad = if target.center.distance_m(start.point()) > 1.0e-9 {
+        target.center.bearing_rad(start.point())
+    } else {
+        start.heading_rad - target.sign * FRAC_PI_2
+    };
+    let off_m = (target.center.distance_m(start.point()) - target.radius_m).abs();
+    let mut best: Option<(f64, Vec<Polynomial>, f64)> = None;
+    if off_m < ON_CIRCLE_M {
+        let time_s = spot_turn_s(start, target.heading_rad(nearest_rad), model);
+        best = Some((time_s, Vec::new(), nearest_rad));
+    }
+    // From the nearest place on, the way the circle is driven, so that a good bound comes early.
+    for place in 0..PLACES {
+        let place_rad = nearest_rad + target.sign * TAU * f64::from(place) / f64::from(PLACES);
+        let end = target.derivatives(place_rad);
+        let bound_s = best.as_ref().map_or(f64::INFINITY, |(best_s, ..)| *best_s);
+        // What is left of the circle counts nothing: turns are counted from the join.
+        if let Some((time_s, legs)) = join(start, &end, bound_s, target.speed_m_s, model) {
+            best = Some((time_s, legs, place_rad));
+        }
+    }
+    best.map(|(_, legs, place_rad)| (legs, place_rad))
+}
+
+/// The quickest leg from a pose to where a path starts, and about its time, seconds; none when the
+/// start is too near, or every leg too tight or slower than a bound.
+///
+/// A leg is one curve, or one to a point straight behind the start and one from there: a long curve
+/// into a tight bend would swing far out.
+pub(crate) fn join(
+    start: Pose,
+    end: &Derivatives,
+    bound_s: f64,
+    speed_m_s: f64,
+    model: &RobotModel,
+) -> Option<(f64, Vec<Polynomial>)> {
+    let mut best: Option<(f64, Vec<Polynomial>)> = None;
+    if let Some((time_s, leg)) = curve(start, end, bound_s, speed_m_s, model) {
+        best = Some((time_s, vec![leg]));
+    }
+    let pace = end[1].x_m.hypot(end[1].y_m);
+    let ahead = Point {
+        x_m: end[1].x_m / pace,
+        y_m: end[1].y_m / pace,
+    };
+    for run_in_m in RUN_INS_M {
+        let behind = Point {
+            x_m: end[0].x_m - run_in_m * ahead.x_m,
+            y_m: end[0].y_m - run_in_m * ahead.y_m,
+        };
+        let still = Point::default();
+        let bound_s = best.as_ref().map_or(bound_s, |(best_s, _)| *best_s);
+        let Some(last) = leg(behind, ahead.y_m.atan2(ahead.x_m), end, run_in_m) else {
+            continue;
+        };
+        let Some(last_s) = leg_time_s(&last, bound_s, speed_m_s, model) else {
+            continue;
+        };
+        let entry = [behind, ahead, still, still, still];
+        let Some((first_s, first)) = curve(start, &entry, bound_s - last_s, speed_m_s, model)
+        else {
+            continue;
+        };
+        let pieces = vec![first, last];
+        if Path::new(pieces.iter().copied().map(Piece::Polynomial).collect()).is_ok() {
+            best = Some((first_s + last_s, pieces));
+        }
+    }
+    best
+}
+
+/// The quickest single curve to a state, and about its time, seconds, if it is below a bound.
+fn curve(
+    start: Pose,
+    end: &Derivatives,
+    mut bound_s: f64,
+    speed_m_s: f64,
+    model: &RobotModel,
+) -> Option<(f64, Polynomial)> {
+    let chord_m = start.point().distance_m(end[0]);
+    if chord_m < LEG_MIN_M {
+        return None;
+    }
+    let bearing_rad = start.point().bearing_rad(end[0]);
+    let aimed = TURNS_RAD.map(|turn_rad| bearing_rad + turn_rad);
+    let mut best: Option<(f64, Polynomial)> = None;
+    for heading_rad in std::iter::once(start.heading_rad).chain(aimed) {
+        let turn_s = spot_turn_s(start, heading_rad, model);
+        if turn_s + chord_m / speed_m_s > bound_s {
+            continue;
+        }
+        for stretch in STRETCHES {
+            let timed = leg(start.point(), heading_rad, end, stretch * chord_m).and_then(|leg| {
+                leg_time_s(&leg, bound_s - turn_s, speed_m_s, model)
+                    .map(|time_s| (time_s + turn_s, leg))
+            });
+            if let Some((time_s, leg)) = timed
+                && Path::new(vec![Piece::Polynomial(leg)]).is_ok()
+            {
+                bound_s = time_s;
+                best = Some((time_s, leg));
+            }
+        }
+    }
+    best
+}
+
+/// About how long it takes to turn on the spot, seconds; nothing when hardly any turn is needed.
+fn spot_turn_s(start: Pose, heading_rad: f64, model: &RobotModel) -> f64 {
+    let turn_rad = wrap_angle_rad(heading_rad - start.heading_rad).abs();
+    if turn_rad > ALIGNED_RAD {
+        0.5 + turn_rad / (SPOT_TURN_SHARE * model.limits().angular_max_rad_s)
+    } else {
+        0.0
+    }
+}
+
+/// A leg of about a length, that joins at the path's own pace of its parameter.
+fn leg(start: Point, heading_rad: f64, end: &Derivatives, length_m: f64) -> Option<Polynomial> {
+    let (sin, cos) = heading_rad.sin_cos();
+    let pace = end[1].x_m.hypot(end[1].y_m);
+    let still = Point::default();
+    let ahead = Point {
+        x_m: pace * cos,
+        y_m: pace * sin,
+    };
+    Polynomial::nonic(&[start, ahead, still, still, still], end, length_m / pace)
+}
+
+/// About how long a leg takes, seconds; none when it is too tight to drive, or slower than a bound.
+fn leg_time_s(leg: &Polynomial, bound_s: f64, speed_m_s: f64, model: &RobotModel) -> Option<f64> {
+    time_s(
+        leg,
+        (TIME_STEPS, LEG_RADIUS_MIN_M),
+        bound_s,
+        speed_m_s,
+        model,
+    )
+}
+
+/// About how long a piece of a spline takes, seconds; none when it is too tight to drive.
+pub(crate) fn piece_time_s(piece: &Polynomial, speed_m_s: f64, model: &RobotModel) -> Option<f64> {
+    time_s(
+        piece,
+        (PIECE_TIME_STEPS, RADIUS_MIN_M),
+        f64::INFINITY,
+        speed_m_s,
+        model,
+    )
+}
+
+fn time_s(
+    curve: &Polynomial,
+    (steps, radius_min_m): (u32, f64),
+    bound_s: f64,
+    speed_m_s: f64,
+    model: &RobotModel,
+) -> Option<f64> {
+    let limits = model.limits();
+    let mut time_s = 0.0;
+    let pace = curve.advance(curve.span());
+    let width = curve.span() / f64::from(steps);
+    for step in 0..steps {
+        let parameter = (f64::from(step) + 0.5) * width;
+        let bend = curve.sample(parameter).curvature_1_m.abs().max(1.0e-6);
+        let advance = curve.advance(parameter);
+        if bend > radius_min_m.recip() || advance < ADVANCE_SHARE_MIN * pace {
+            return None;
+        }
+        // Half the limits: a curve that needs them all is no good one.
+        let fastest_m_s = speed_m_s
+            .min((0.5 * limits.lateral_acceleration_max_m_s2 / bend).sqrt())
+            .min(0.5 * limits.angular_max_rad_s / bend);
+        time_s += advance * width / fastest_m_s;
+        if time_s > bound_s {
+            return None;
+        }
+    }
+    Some(time_s)
+}

@@ -1,0 +1,235 @@
+//! Geometry of a path, by arc length, without any timing.
+//!
+//! A path is a row of pieces: arcs (exact) and polynomials. Joins are C⁴ in the parameter, which
+//! never stands still, so position, heading, curvature and the curvature's slope are continuous
+//! along the path. (Where a waypoint's heading is given the join is C³, which suffices for that.)
+//! Sampling allocates nothing.
+
+#![expect(clippy::cast_precision_loss, reason = "counts stay far below 2^52")]
+
+mod join;
+mod polynomial;
+mod route;
+mod spline;
+
+use thiserror::Error;
+
+use crate::geometry::{Point, Pose};
+
+pub(crate) use join::{CircleTarget, join_circle};
+pub(crate) use polynomial::Polynomial;
+pub(crate) use route::{from_here, joined_from_afar};
+pub(crate) use spline::Knot;
+
+/// Tightest turn that a path may have, metres.
+pub const RADIUS_MIN_M: f64 = 0.05;
+/// Fewest parameter intervals per polynomial piece in the table of arc lengths.
+const INTERVALS_MIN: usize = 8;
+/// Most parameter intervals per polynomial piece.
+const INTERVALS_MAX: usize = 256;
+/// Parameter interval aimed at, about metres.
+const INTERVAL_M: f64 = 0.1;
+/// Newton steps from arc length to parameter.
+const NEWTON_STEPS: usize = 4;
+/// Slowest advance along a polynomial, metres per parameter unit; below it the path has a cusp.
+const ADVANCE_MIN: f64 = 1.0e-3;
+
+/// One piece of a path.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Piece {
+    /// Part of a circle.
+    Arc {
+        /// Centre.
+        center: Point,
+        /// Radius, metres.
+        radius_m: f64,
+        /// Polar angle of the start as seen from the centre, radians.
+        start_rad: f64,
+        /// +1 counter-clockwise, −1 clockwise.
+        sign: f64,
+        /// Arc length, metres.
+        length_m: f64,
+    },
+    /// A polynomial curve.
+    Polynomial(Polynomial),
+}
+
+/// Start of a parameter interval in the table of arc lengths.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Node {
+    arc_m: f64,
+    piece: usize,
+    parameter: f64,
+    parameter_end: f64,
+}
+
+/// A path at one arc length.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct PathSample {
+    /// Position, and heading along the path.
+    pub pose: Pose,
+    /// Curvature, per metre, positive to the left.
+    pub curvature_1_m: f64,
+    /// Change of curvature along the path, per metre squared.
+    pub curvature_slope_1_m2: f64,
+}
+
+/// Why a geometry was refused; `piece` counts from zero along the path.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+pub(crate) enum PathError {
+    /// The path turns tighter than [`RADIUS_MIN_M`], or turns back on the spot.
+    #[error("the path turns too sharply in its piece {piece}")]
+    TooTight {
+        /// Which piece.
+        piece: usize,
+    },
+}
+
+/// A path by arc length.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Path {
+    pieces: Vec<Piece>,
+    nodes: Vec<Node>,
+    /// Arc length at the start of each piece, and the whole length last.
+    starts_m: Vec<f64>,
+}
+
+impl Path {
+    /// Joins pieces and measures them.
+    pub(crate) fn new(pieces: Vec<Piece>) -> Result<Self, PathError> {
+        let mut nodes = Vec::with_capacity(pieces.len() * INTERVALS_MIN);
+        let mut starts_m = Vec::with_capacity(pieces.len() + 1);
+        let mut arc_m = 0.0;
+        for (piece, shape) in pieces.iter().enumerate() {
+            starts_m.push(arc_m);
+            match shape {
+                Piece::Arc { length_m, .. } => {
+                    nodes.push(Node {
+                        arc_m,
+                        piece,
+                        parameter: 0.0,
+                        parameter_end: *length_m,
+                    });
+                    arc_m += length_m;
+                }
+                Piece::Polynomial(polynomial) => {
+                    let span = polynomial.span();
+                    let count = interval_count(span);
+                    for interval in 0..count {
+                        let parameter = span * interval as f64 / count as f64;
+                        let parameter_end = span * (interval + 1) as f64 / count as f64;
+                        check_turn(polynomial, parameter, parameter_end, piece)?;
+                        nodes.push(Node {
+                            arc_m,
+                            piece,
+                            parameter,
+                            parameter_end,
+                        });
+                        arc_m += polynomial.length_m(parameter, parameter_end);
+                    }
+                }
+            }
+        }
+        starts_m.push(arc_m);
+        Ok(Self {
+            pieces,
+            nodes,
+            starts_m,
+        })
+    }
+
+    /// Length of the whole path, metres.
+    pub fn length_m(&self) -> f64 {
+        self.starts_m.last().copied().unwrap_or_default()
+    }
+
+    /// Number of pieces.
+    pub(crate) fn piece_count(&self) -> usize {
+        self.pieces.len()
+    }
+
+    /// Arc length at which a piece starts; the whole length beyond the last.
+    pub(crate) fn piece_start_m(&self, piece: usize) -> f64 {
+        self.starts_m
+            .get(piece)
+            .copied()
+            .unwrap_or_else(|| self.length_m())
+    }
+
+    /// The path at an arc length, metres; clamped to the path's ends.
+    pub fn sample(&self, arc_m: f64) -> PathSample {
+        let arc_m = arc_m.clamp(0.0, self.length_m());
+        let after = self.nodes.partition_point(|node| node.arc_m <= arc_m);
+        let Some(node) = self.nodes.get(after.saturating_sub(1)) else {
+            return PathSample::default();
+        };
+        let beyond_m = arc_m - node.arc_m;
+        match &self.pieces[node.piece] {
+            Piece::Arc {
+                center,
+                radius_m,
+                start_rad,
+                sign,
+                ..
+            } => {
+                let angle_rad = start_rad + sign * beyond_m / radius_m;
+                let (sin, cos) = angle_rad.sin_cos();
+                PathSample {
+                    pose: Pose {
+                        x_m: center.x_m + radius_m * cos,
+                        y_m: center.y_m + radius_m * sin,
+                        heading_rad: crate::geometry::wrap_angle_rad(
+                            angle_rad + sign * std::f64::consts::FRAC_PI_2,
+                        ),
+                    },
+                    curvature_1_m: sign / radius_m,
+                    curvature_slope_1_m2: 0.0,
+                }
+            }
+            Piece::Polynomial(polynomial) => {
+                let next_m = self
+                    .nodes
+                    .get(after)
+                    .map_or(self.length_m(), |next| next.arc_m);
+                let width = node.parameter_end - node.parameter;
+                let whole_m = (next_m - node.arc_m).max(f64::MIN_POSITIVE);
+                let mut parameter = node.parameter + width * (beyond_m / whole_m).min(1.0);
+                for _ in 0..NEWTON_STEPS {
+                    let excess_m = polynomial.length_m(node.parameter, parameter) - beyond_m;
+                    parameter -= excess_m / polynomial.advance(parameter).max(ADVANCE_MIN);
+                    parameter = parameter.clamp(node.parameter, node.parameter_end);
+                    if excess_m.abs() < 1.0e-12 {
+                        break;
+                    }
+                }
+                polynomial.sample(parameter)
+            }
+        }
+    }
+}
+
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "a ceiling of a length, clamped to a small range"
+)]
+fn interval_count(span: f64) -> usize {
+    ((span / INTERVAL_M).ceil() as usize).clamp(INTERVALS_MIN, INTERVALS_MAX)
+}
+
+fn check_turn(
+    polynomial: &Polynomial,
+    start: f64,
+    end: f64,
+    piece: usize,
+) -> Result<(), PathError> {
+    for share in [0.0, 0.25, 0.5, 0.75, 1.0] {
+        let parameter = start + share * (end - start);
+        let curvature_1_m = polynomial.sample(parameter).curvature_1_m;
+        let cusp = polynomial.advance(parameter) < ADVANCE_MIN;
+        if cusp || !curvature_1_m.is_finite() || curvature_1_m.abs() > RADIUS_MIN_M.recip() {
+            return Err(PathError::TooTight { piece });
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,169 @@
+//! A planar polynomial curve of degree nine or less.
+
+use nalgebra::{SMatrix, SVector};
+
+use super::PathSample;
+use crate::geometry::{Point, Pose};
+
+/// Coefficients of one coordinate, lowest first.
+const COEFFICIENTS: usize = 10;
+/// Nodes and weights of the five-point Gauss-Legendre rule on [−1, 1].
+const GAUSS: [(f64, f64); 5] = [
+    (0.0, 0.568_888_888_888_888_9),
+    (0.538_469_310_105_683_1, 0.478_628_670_499_366_47),
+    (-0.538_469_310_105_683_1, 0.478_628_670_499_366_47),
+    (0.906_179_845_938_664, 0.236_926_885_056_189_08),
+    (-0.906_179_845_938_664, 0.236_926_885_056_189_08),
+];
+
+/// Position and its first four derivatives by parameter.
+pub(crate) type Derivatives = [Point; 5];
+
+/// A curve over the parameter 0 to `span`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Polynomial {
+    x: [f64; COEFFICIENTS],
+    y: [f64; COEFFICIENTS],
+    degree: usize,
+    span: f64,
+}
+
+impl Polynomial {
+    /// The quintic with given position, first and second derivative at both ends.
+    pub(crate) fn quintic(start: [Point; 3], end: [Point; 3], span: f64) -> Self {
+        let axis = |of: fn(&Point) -> f64| {
+            let [p_0, v_0, a_0] = [
+                of(&start[0]),
+                of(&start[1]) * span,
+                of(&start[2]) * span * span,
+            ];
+            let [p_1, v_1, a_1] = [of(&end[0]), of(&end[1]) * span, of(&end[2]) * span * span];
+            let gap = p_1 - p_0;
+            let mut unit = [0.0; COEFFICIENTS];
+            unit[0] = p_0;
+            unit[1] = v_0;
+            unit[2] = 0.5 * a_0;
+            unit[3] = 10.0 * gap - 6.0 * v_0 - 4.0 * v_1 - 1.5 * a_0 + 0.5 * a_1;
+            unit[4] = -15.0 * gap + 8.0 * v_0 + 7.0 * v_1 + 1.5 * a_0 - a_1;
+            unit[5] = 6.0 * gap - 3.0 * (v_0 + v_1) + 0.5 * (a_1 - a_0);
+            unscaled(unit, span)
+        };
+        Self {
+            x: axis(|point| point.x_m),
+            y: axis(|point| point.y_m),
+            degree: 5,
+            span,
+        }
+    }
+
+    /// The curve of degree nine with given derivatives up to the fourth at both ends.
+    pub(crate) fn nonic(start: &Derivatives, end: &Derivatives, span: f64) -> Option<Self> {
+        const FACTORIALS: [f64; 5] = [1.0, 1.0, 2.0, 6.0, 24.0];
+        let falling = |power: usize, order: usize| {
+            (0..order)
+                .map(|step| (power - step) as f64)
+                .product::<f64>()
+        };
+        let matrix = SMatrix::<f64, 5, 5>::from_fn(|order, column| falling(column + 5, order));
+        let solver = matrix.lu();
+        let axis = |of: fn(&Point) -> f64| -> Option<[f64; COEFFICIENTS]> {
+            let mut unit = [0.0; COEFFICIENTS];
+            let mut scale = 1.0;
+            for order in 0..5 {
+                unit[order] = of(&start[order]) * scale / FACTORIALS[order];
+                scale *= span;
+            }
+            let mut scale = 1.0;
+            let mut right = SVector::<f64, 5>::zeros();
+            for order in 0..5 {
+                let low: f64 = (order..5)
+                    .map(|power| unit[power] * falling(power, order))
+                    .sum();
+                right[order] = of(&end[order]) * scale - low;
+                scale *= span;
+            }
+            let high = solver.solve(&right)?;
+            unit[5..].copy_from_slice(high.as_slice());
+            Some(unscaled(unit, span))
+        };
+        Some(Self {
+            x: axis(|point| point.x_m)?,
+            y: axis(|point| point.y_m)?,
+            degree: 9,
+            span,
+        })
+    }
+
+    /// Largest parameter.
+    pub(crate) fn span(&self) -> f64 {
+        self.span
+    }
+
+    /// The derivative of an order at a parameter.
+    pub(crate) fn derivative(&self, order: usize, parameter: f64) -> Point {
+        let axis = |coefficients: &[f64; COEFFICIENTS]| {
+            let mut value = 0.0;
+            for power in (order..=self.degree).rev() {
+                let mut factor = coefficients[power];
+                for step in 0..order {
+                    factor *= (power - step) as f64;
+                }
+                value = value * parameter + factor;
+            }
+            value
+        };
+        Point {
+            x_m: axis(&self.x),
+            y_m: axis(&self.y),
+        }
+    }
+
+    /// Metres per parameter unit at a parameter.
+    pub(crate) fn advance(&self, parameter: f64) -> f64 {
+        let velocity = self.derivative(1, parameter);
+        velocity.x_m.hypot(velocity.y_m)
+    }
+
+    /// Arc length between two parameters, metres.
+    pub(crate) fn length_m(&self, start: f64, end: f64) -> f64 {
+        let (middle, half) = (0.5 * (start + end), 0.5 * (end - start));
+        GAUSS
+            .iter()
+            .map(|(node, weight)| weight * self.advance(middle + half * node))
+            .sum::<f64>()
+            * half
+    }
+
+    /// Pose, curvature and its slope at a parameter.
+    pub(crate) fn sample(&self, parameter: f64) -> PathSample {
+        let position = self.derivative(0, parameter);
+        let first = self.derivative(1, parameter);
+        let second = self.derivative(2, parameter);
+        let third = self.derivative(3, parameter);
+        let advance_2 = (first.x_m * first.x_m + first.y_m * first.y_m).max(f64::MIN_POSITIVE);
+        let advance = advance_2.sqrt();
+        let cross_2 = first.x_m * second.y_m - first.y_m * second.x_m;
+        let cross_3 = first.x_m * third.y_m - first.y_m * third.x_m;
+        let along_2 = first.x_m * second.x_m + first.y_m * second.y_m;
+        PathSample {
+            pose: Pose {
+                x_m: position.x_m,
+                y_m: position.y_m,
+                heading_rad: first.y_m.atan2(first.x_m),
+            },
+            curvature_1_m: cross_2 / (advance_2 * advance),
+            curvature_slope_1_m2: (cross_3 * advance_2 - 3.0 * cross_2 * along_2)
+                / (advance_2 * advance_2 * advance_2),
+        }
+    }
+}
+
+/// Coefficients over 0 to `span` from those over 0 to 1.
+fn unscaled(mut unit: [f64; COEFFICIENTS], span: f64) -> [f64; COEFFICIENTS] {
+    let mut scale = 1.0;
+    for coefficient in &mut unit {
+        *coefficient /= scale;
+        scale *= span;
+    }
+    unit
+}

@@ -1,0 +1,126 @@
+//! A path through waypoints from where the robot stands: the quickest of several splines.
+
+use super::join::{join, piece_time_s};
+use super::spline::{Knot, min_jerk_spline};
+use super::{Path, PathError, Piece, Polynomial};
+use crate::geometry::{Pose, wrap_angle_rad};
+use crate::robot::RobotModel;
+
+/// A robot this near to the first waypoint may start beside it when no smooth way leads through it,
+/// metres.
+const BESIDE_START_M: f64 = 0.25;
+/// The path follows the robot's heading when it would leave within this angle of it, radians.
+const HEADING_KEPT_RAD: f64 = 0.6;
+/// Turns at a waypoint beyond which its heading is set half-way through the turn, radians; tried in
+/// this order. Where it is set the path is C³, else C⁴.
+const CROSSWISE_FROM_RAD: [f64; 4] = [2.6, 1.7, 0.8, 0.0];
+/// Most knots of a path for which all of them are tried.
+const ALL_SPLINES_MAX: usize = 500;
+/// Paces of the spline's parameter that are tried, as exponents of the chord.
+const SPLINE_EXPONENTS: [f64; 3] = [1.0, 0.75, 0.5];
+
+/// A smooth leg to the first knot and a spline from there; also of how many pieces the leg is.
+pub(crate) fn joined_from_afar(
+    knots: &[Knot],
+    start: Pose,
+    speed_m_s: f64,
+    model: &RobotModel,
+) -> Option<(Path, usize)> {
+    let (spline, _) = best_spline(knots, speed_m_s, model).ok()?;
+    let begin = spline.first()?;
+    let derivatives = [0, 1, 2, 3, 4].map(|order| begin.derivative(order, 0.0));
+    let (_, legs) = join(start, &derivatives, f64::INFINITY, speed_m_s, model)?;
+    let count = legs.len();
+    let pieces = legs
+        .into_iter()
+        .chain(spline)
+        .map(Piece::Polynomial)
+        .collect();
+    Path::new(pieces).ok().map(|path| (path, count))
+}
+
+/// A spline from where the robot stands; it leaves along the robot's heading when that is near.
+pub(crate) fn from_here(
+    knots: &mut [Knot],
+    start: Pose,
+    speed_m_s: f64,
+    model: &RobotModel,
+) -> Result<Path, PathError> {
+    let path_of = |(pieces, time_s): (Vec<Polynomial>, f64)| {
+        Path::new(pieces.into_iter().map(Piece::Polynomial).collect()).map(|path| (path, time_s))
+    };
+    let free = best_spline(knots, speed_m_s, model).and_then(path_of);
+    if knots[0].heading_rad.is_some() {
+        return free.map(|(path, _)| path);
+    }
+    knots[0].heading_rad = Some(start.heading_rad);
+    let kept = best_spline(knots, speed_m_s, model).and_then(path_of);
+    match (free, kept) {
+        (Ok((free, free_s)), Ok((kept, kept_s))) => {
+            let leaves_rad = free.sample(0.0).pose.heading_rad;
+            let turn_rad = wrap_angle_rad(leaves_rad - start.heading_rad).abs();
+            let near = turn_rad < HEADING_KEPT_RAD && kept_s < free_s + 1.0 + turn_rad;
+            Ok(if near { kept } else { free })
+        }
+        (Ok((path, _)), Err(_)) | (Err(_), Ok((path, _))) => Ok(path),
+        (Err(error), Err(_)) => {
+            // Beside the first waypoint, where no smooth way leads through it: it counts as met.
+            if knots.len() < 3 || knots[0].point.distance_m(knots[1].point) > BESIDE_START_M {
+                return Err(error);
+            }
+            let mut onward = knots.to_vec();
+            onward.remove(1);
+            onward[0].heading_rad = None;
+            best_spline(&onward, speed_m_s, model)
+                .and_then(path_of)
+                .map(|(path, _)| path)
+        }
+    }
+}
+
+/// The quickest spline through the knots over several paces of its parameter, and about its time.
+fn best_spline(
+    knots: &[Knot],
+    speed_m_s: f64,
+    model: &RobotModel,
+) -> Result<(Vec<Polynomial>, f64), PathError> {
+    let mut best: Option<(Vec<Polynomial>, f64)> = None;
+    let mut refused = None;
+    for turn_rad in CROSSWISE_FROM_RAD {
+        // Long paths take the first that can be driven, short ones the quickest of all.
+        if best.is_some() && knots.len() > ALL_SPLINES_MAX {
+            break;
+        }
+        let knots = turned_crosswise(knots, turn_rad);
+        for exponent in SPLINE_EXPONENTS {
+            let pieces = min_jerk_spline(&knots, exponent);
+            let mut time_s = 0.0;
+            let tight = pieces.iter().position(|piece| {
+                let needed_s = piece_time_s(piece, speed_m_s, model);
+                time_s += needed_s.unwrap_or_default();
+                needed_s.is_none()
+            });
+            if let Some(piece) = tight {
+                refused = refused.or(Some(PathError::TooTight { piece }));
+            } else if best.as_ref().is_none_or(|(_, best_s)| time_s < *best_s) {
+                best = Some((pieces, time_s));
+            }
+        }
+    }
+    best.ok_or(refused.unwrap_or(PathError::TooTight { piece: 0 }))
+}
+
+/// Knots at which the path turns by more than an angle get the heading half-way through the turn,
+/// so that the path swings through them instead of coming to a point.
+fn turned_crosswise(knots: &[Knot], from_rad: f64) -> Vec<Knot> {
+    let mut turned = knots.to_vec();
+    for index in 1..knots.len().saturating_sub(1) {
+        let come_rad = knots[index - 1].point.bearing_rad(knots[index].point);
+        let leave_rad = knots[index].point.bearing_rad(knots[index + 1].point);
+        let turn_rad = wrap_angle_rad(leave_rad - come_rad);
+        if knots[index].heading_rad.is_none() && turn_rad.abs() > from_rad {
+            turned[index].heading_rad = Some(come_rad + 0.5 * turn_rad);
+        }
+    }
+    turned
+}

@@ -1,0 +1,189 @@
+//! Timing along a path: how fast, when. Jerk-bounded, and never above a limit.
+//!
+//! Two steps. First the quickest timing `s₀(t)` with piecewise constant acceleration under the
+//! limits, by a forward and a backward pass over `E = v²/2`. Then its mean over a window T,
+//! `s₁(t) = (1/T) ∫ s₀(u) du` for u from t − T to t. The mean's acceleration is a mean of
+//! accelerations, so within the bound; its jerk is at most `2a/T`, which chooses T. Its speed at a
+//! place is a mean of speeds at places at most `D = T·v_max` away; so the passes use limits that
+//! were lowered to their minimum within D, and the bound holds exactly. Both ends are at rest.
+
+#![expect(
+    clippy::cast_precision_loss,
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "counts of grid cells stay far below 2^52"
+)]
+
+use std::collections::VecDeque;
+
+/// Limits at one node of an even grid along the path.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct NodeLimits {
+    /// Fastest speed here, metres per second, above zero.
+    pub(crate) speed_m_s: f64,
+    /// Hardest acceleration here, metres per second squared, above zero.
+    pub(crate) acceleration_m_s2: f64,
+}
+
+/// Where one is along the path, and how fast, at a time.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct ProfileSample {
+    /// Arc length, metres.
+    pub arc_m: f64,
+    /// Speed, metres per second, ≥ 0.
+    pub speed_m_s: f64,
+    /// Acceleration, metres per second squared.
+    pub acceleration_m_s2: f64,
+}
+
+/// A node of the timing before the mean: constant acceleration until the next one.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Node {
+    time_s: f64,
+    arc_m: f64,
+    speed_m_s: f64,
+    acceleration_m_s2: f64,
+    /// `∫ s₀` up to here.
+    arc_integral_m_s: f64,
+}
+
+/// Timing along a path.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SpeedProfile {
+    nodes: Vec<Node>,
+    window_s: f64,
+    length_m: f64,
+}
+
+impl SpeedProfile {
+    /// Timing over an even grid of at least two nodes, from rest to rest.
+    pub(crate) fn new(length_m: f64, limits: &[NodeLimits], jerk_max_m_s3: f64) -> Self {
+        let cells = limits.len().saturating_sub(1).max(1);
+        let cell_m = length_m / cells as f64;
+        let hardest_m_s2 = limits
+            .iter()
+            .map(|node| node.acceleration_m_s2)
+            .fold(f64::MIN_POSITIVE, f64::max);
+        let fastest_m_s = limits.iter().map(|node| node.speed_m_s).fold(0.0, f64::max);
+        let window_s = 2.0 * hardest_m_s2 / jerk_max_m_s3;
+        // One cell more than the distance, so that limits between nodes are covered too.
+        let reach = ((window_s * fastest_m_s / cell_m).ceil() + 1.0).min(cells as f64) as usize;
+        let speeds = lowest_within(limits, reach, |node| node.speed_m_s);
+        let accelerations = lowest_within(limits, reach, |node| node.acceleration_m_s2);
+        let mut energies: Vec<f64> = speeds.iter().map(|speed| 0.5 * speed * speed).collect();
+        energies[0] = 0.0;
+        let last = energies.len() - 1;
+        energies[last] = 0.0;
+        let gain = |cell: usize| accelerations[cell].min(accelerations[cell + 1]) * cell_m;
+        for cell in 0..last {
+            energies[cell + 1] = energies[cell + 1].min(energies[cell] + gain(cell));
+        }
+        for cell in (0..last).rev() {
+            energies[cell] = energies[cell].min(energies[cell + 1] + gain(cell));
+        }
+        Self {
+            nodes: time_nodes(&energies, cell_m),
+            window_s,
+            length_m,
+        }
+    }
+
+    /// Time from rest to rest, seconds.
+    pub fn duration_s(&self) -> f64 {
+        self.nodes.last().map_or(0.0, |node| node.time_s) + self.window_s
+    }
+
+    /// Where one is at a time; at rest at the ends before and after.
+    pub fn sample(&self, time_s: f64) -> ProfileSample {
+        let (late, early) = (self.raw(time_s), self.raw(time_s - self.window_s));
+        ProfileSample {
+            arc_m: ((late.arc_integral_m_s - early.arc_integral_m_s) / self.window_s)
+                .clamp(0.0, self.length_m),
+            speed_m_s: ((late.arc_m - early.arc_m) / self.window_s).max(0.0),
+            acceleration_m_s2: (late.speed_m_s - early.speed_m_s) / self.window_s,
+        }
+    }
+
+    /// The timing before the mean.
+    fn raw(&self, time_s: f64) -> Node {
+        let after = self.nodes.partition_point(|node| node.time_s <= time_s);
+        let rest = Node {
+            time_s,
+            arc_m: 0.0,
+            speed_m_s: 0.0,
+            acceleration_m_s2: 0.0,
+            arc_integral_m_s: 0.0,
+        };
+        let Some(node) = after.checked_sub(1).and_then(|index| self.nodes.get(index)) else {
+            return rest;
+        };
+        let dt_s = time_s - node.time_s;
+        let a_m_s2 = node.acceleration_m_s2;
+        Node {
+            time_s,
+            arc_m: node.arc_m + dt_s * (node.speed_m_s + 0.5 * dt_s * a_m_s2),
+            speed_m_s: node.speed_m_s + dt_s * a_m_s2,
+            acceleration_m_s2: a_m_s2,
+            arc_integral_m_s: node.arc_integral_m_s
+                + dt_s * (node.arc_m + dt_s * (0.5 * node.speed_m_s + dt_s * a_m_s2 / 6.0)),
+        }
+    }
+}
+
+fn time_nodes(energies: &[f64], cell_m: f64) -> Vec<Node> {
+    let mut nodes = Vec::with_capacity(energies.len());
+    let mut node = Node {
+        time_s: 0.0,
+        arc_m: 0.0,
+        speed_m_s: 0.0,
+        acceleration_m_s2: 0.0,
+        arc_integral_m_s: 0.0,
+    };
+    for (cell, pair) in energies.windows(2).enumerate() {
+        let end_m_s = (2.0 * pair[1]).sqrt();
+        let dt_s = 2.0 * cell_m / (node.speed_m_s + end_m_s).max(1.0e-9);
+        node.acceleration_m_s2 = (end_m_s - node.speed_m_s) / dt_s;
+        nodes.push(node);
+        node.arc_integral_m_s += dt_s
+            * (node.arc_m + dt_s * (0.5 * node.speed_m_s + dt_s * node.acceleration_m_s2 / 6.0));
+        node.time_s += dt_s;
+        node.arc_m = cell_m * (cell + 1) as f64;
+        node.speed_m_s = end_m_s;
+    }
+    node.acceleration_m_s2 = 0.0;
+    node.speed_m_s = 0.0;
+    nodes.push(node);
+    nodes
+}
+
+/// Minimum over all nodes at most `reach` away, in linear time.
+fn lowest_within(
+    limits: &[NodeLimits],
+    reach: usize,
+    value: impl Fn(&NodeLimits) -> f64,
+) -> Vec<f64> {
+    let mut lowest = Vec::with_capacity(limits.len());
+    let mut window: VecDeque<usize> = VecDeque::new();
+    let mut next = 0;
+    for index in 0..limits.len() {
+        while next < limits.len() && next <= index + reach {
+            while window
+                .back()
+                .is_some_and(|&back| value(&limits[back]) >= value(&limits[next]))
+            {
+                window.pop_back();
+            }
+            window.push_back(next);
+            next += 1;
+        }
+        while window.front().is_some_and(|&front| front + reach < index) {
+            window.pop_front();
+        }
+        lowest.push(
+            window
+                .front()
+                .map_or(f64::MIN_POSITIVE, |&front| value(&limits[front])),
+        );
+    }
+    lowest
+}

@@ -1,0 +1,194 @@
+//! The governor: walks along a plan by its own clock.
+//!
+//! The plan's time τ advances by `dτ = σ dt`, σ from 0 to 1. σ falls when the robot lags or its
+//! wheels saturate, is capped from outside (pause, speed limit), and goes to rest along the path on
+//! a stop. The speed `v = σ v₁(τ)` never jumps: it is braked and raised within the robot's limits,
+//! with a bounded jerk. τ never goes back. States: walking → (stop) braking → at rest.
+
+use crate::geometry::Pose;
+use crate::plan::{Plan, PlanSample};
+use crate::robot::RobotModel;
+
+/// Plan speed below which rates of σ are reckoned as at this one, metres per second.
+const SPEED_FLOOR_M_S: f64 = 0.05;
+/// A reference slower than this is brought to rest on a stop, metres per second.
+const REST_M_S: f64 = 2.0e-3;
+/// Gain from a gap in σ to its rate, per second.
+const RATE_GAIN_1_S: f64 = 3.0;
+/// Fastest rise of σ, per second.
+const RISE_MAX_1_S: f64 = 1.0;
+/// Lag behind the reference that does not slow it, metres.
+const LAG_FREE_M: f64 = 0.10;
+/// Lag at which the reference waits, metres.
+const LAG_FULL_M: f64 = 0.40;
+/// σ that is aimed at while the wheels are saturated.
+const SATURATED_RATE: f64 = 0.5;
+
+/// Where the robot should be, and how it should move.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct ReferenceSample {
+    /// Position, and heading along the path.
+    pub pose: Pose,
+    /// Speed along the path v, metres per second, ≥ 0.
+    pub speed_m_s: f64,
+    /// Acceleration along the path a, metres per second squared.
+    pub acceleration_m_s2: f64,
+    /// Turn rate of the path's heading ω, radians per second.
+    pub turn_rad_s: f64,
+    /// Its change ω̇, radians per second squared.
+    pub turn_acceleration_rad_s2: f64,
+    /// Curvature, per metre.
+    pub curvature_1_m: f64,
+    /// Arc length, metres; never falls.
+    pub arc_m: f64,
+}
+
+/// What the governor looks at in one tick.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct GovernorInput {
+    /// Distance between the robot and its reference, metres.
+    pub lag_m: f64,
+    /// Whether the wheels cannot follow their commands.
+    pub saturated: bool,
+}
+
+/// Walks along a plan.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Governor {
+    clock_s: f64,
+    rate: f64,
+    rate_slope_1_s: f64,
+    rate_cap: f64,
+    stopping: bool,
+    brake_m_s2: f64,
+    jerk_m_s3: f64,
+}
+
+impl Governor {
+    /// A governor at the start of a plan, at rest, that may run at full speed.
+    pub fn new(model: &RobotModel) -> Self {
+        Self {
+            clock_s: 0.0,
+            rate: 1.0,
+            rate_slope_1_s: 0.0,
+            rate_cap: 1.0,
+            stopping: false,
+            brake_m_s2: model.limits().linear_acceleration_max_m_s2,
+            jerk_m_s3: model.limits().linear_jerk_max_m_s3,
+        }
+    }
+
+    /// Caps σ from outside: 0 pauses, 1 is full speed. Not finite counts as 0.
+    pub fn set_rate_cap(&mut self, rate_cap: f64) {
+        self.rate_cap = if rate_cap.is_finite() {
+            rate_cap.clamp(0.0, 1.0)
+        } else {
+            0.0
+        };
+    }
+
+    /// Starts to brake along the path, for good.
+    pub fn stop(&mut self) {
+        self.stopping = true;
+    }
+
+    /// Whether a stop was asked for.
+    pub fn is_stopping(&self) -> bool {
+        self.stopping
+    }
+
+    /// σ, the plan's seconds per second.
+    pub fn rate(&self) -> f64 {
+        self.rate
+    }
+
+    /// τ, the plan's time, seconds.
+    pub fn clock_s(&self) -> f64 {
+        self.clock_s
+    }
+
+    /// Whether the reference has reached the plan's end.
+    pub fn is_at_end(&self, plan: &Plan) -> bool {
+        self.clock_s >= plan.duration_s()
+    }
+
+    /// Whether the reference has come to rest after a stop.
+    pub fn is_stopped(&self, plan: &Plan) -> bool {
+        self.stopping
+            && (self.rate <= 0.0 || plan.sample(self.clock_s).speed_m_s * self.rate < REST_M_S)
+    }
+
+    /// Moves on by one tick and gives the new reference.
+    pub fn step(&mut self, plan: &Plan, input: &GovernorInput, dt_s: f64) -> ReferenceSample {
+        let planned = plan.sample(self.clock_s);
+        let floor_m_s = planned.speed_m_s.max(SPEED_FLOOR_M_S);
+        let wait = if input.lag_m.is_finite() {
+            ((LAG_FULL_M - input.lag_m) / (LAG_FULL_M - LAG_FREE_M)).clamp(0.0, 1.0)
+        } else {
+            0.0
+        };
+        let target = if self.stopping {
+            0.0
+        } else {
+            let followed = if input.saturated { SATURATED_RATE } else { 1.0 };
+            wait.min(followed).min(self.rate_cap)
+        };
+        // A change of σ asks for σ̇v₁ on top of σ²a₁; braking gets what the limit leaves. The brake
+        // is let go as the speed falls, a = √(jv), so that rest is met without a knock.
+        let speed_m_s = self.rate * planned.speed_m_s;
+        let own_m_s2 = self.rate * self.rate * planned.acceleration_m_s2;
+        let brake_m_s2 = self
+            .brake_m_s2
+            .min((self.jerk_m_s3 * speed_m_s).sqrt().max(0.05));
+        let fall_1_s = -((brake_m_s2 + own_m_s2) / floor_m_s).max(0.0);
+        let rise_1_s = ((0.5 * self.brake_m_s2 - own_m_s2) / floor_m_s).clamp(0.0, RISE_MAX_1_S);
+        let gap = target - self.rate;
+        let wanted_1_s = if self.stopping {
+            fall_1_s
+        } else {
+            (RATE_GAIN_1_S * gap).clamp(fall_1_s, rise_1_s)
+        };
+        let slew = self.jerk_m_s3 / floor_m_s * dt_s;
+        self.rate_slope_1_s +=
+            (wanted_1_s - self.rate_slope_1_s).clamp(-slew.max(0.0), slew.max(0.0));
+        let before = self.rate;
+        self.rate = (self.rate + self.rate_slope_1_s * dt_s).clamp(0.0, 1.0);
+        let at_bound = self.rate <= 0.0 || self.rate >= 1.0;
+        if at_bound && (self.rate - before) * self.rate_slope_1_s <= 0.0 {
+            self.rate_slope_1_s = 0.0;
+        }
+        if self.stopping && speed_m_s < REST_M_S {
+            self.rate = 0.0;
+            self.rate_slope_1_s = 0.0;
+        }
+        self.clock_s = (self.clock_s + 0.5 * (before + self.rate) * dt_s).min(plan.duration_s());
+        self.reference(&plan.sample(self.clock_s))
+    }
+
+    /// The present reference.
+    pub fn sample(&self, plan: &Plan) -> ReferenceSample {
+        self.reference(&plan.sample(self.clock_s))
+    }
+
+    /// The reference some time ahead, if σ stays as it is, seconds.
+    pub fn sample_ahead(&self, plan: &Plan, ahead_s: f64) -> ReferenceSample {
+        self.reference(&plan.sample(self.clock_s + self.rate * ahead_s))
+    }
+
+    fn reference(&self, planned: &PlanSample) -> ReferenceSample {
+        let speed_m_s = self.rate * planned.speed_m_s;
+        let acceleration_m_s2 = self.rate * self.rate * planned.acceleration_m_s2
+            + self.rate_slope_1_s * planned.speed_m_s;
+        let path = &planned.path;
+        ReferenceSample {
+            pose: path.pose,
+            speed_m_s,
+            acceleration_m_s2,
+            turn_rad_s: path.curvature_1_m * speed_m_s,
+            turn_acceleration_rad_s2: path.curvature_1_m * acceleration_m_s2
+                + path.curvature_slope_1_m2 * speed_m_s * speed_m_s,
+            curvature_1_m: path.curvature_1_m,
+            arc_m: planned.arc_m,
+        }
+    }
+}

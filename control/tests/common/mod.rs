@@ -1,0 +1,215 @@
+//! A simulated robot with noisy sensors around the plant, for closed-loop tests.
+
+#![allow(
+    dead_code,
+    clippy::allow_attributes,
+    reason = "each test binary uses its own part"
+)]
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use tread_control::estimation::{Estimator, SensorNoise, SensorSample};
+use tread_control::follower::{Follower, FollowerOutput};
+use tread_control::friction::FrictionCurve;
+use tread_control::gate::{GateInput, GateLimits, gate};
+use tread_control::geometry::Pose;
+use tread_control::localisation::{Localisation, LocalisationNoise, PositionFix};
+use tread_control::measured::{BodyAcceleration, Measured, WheelSpeeds, WheelTorques};
+use tread_control::plant::{Ground, Plant, PlantSpec};
+use tread_control::robot::RobotModel;
+use tread_control::tracking::ThetaKnowledge;
+
+/// Control loop, seconds.
+pub(crate) const LOOP_S: f64 = 0.01;
+/// Sensor samples per loop tick.
+pub(crate) const SAMPLES: u32 = 2;
+
+pub(crate) fn curve(stiffness: f64) -> FrictionCurve {
+    FrictionCurve::with_stiffness(stiffness).expect("a positive stiffness")
+}
+
+/// A seeded robot.
+pub(crate) struct SimRobot {
+    pub(crate) model: RobotModel,
+    pub(crate) plant: Plant,
+    pub(crate) ground: Ground,
+    pub(crate) localisation: Localisation,
+    pub(crate) estimator: Estimator,
+    pub(crate) noise: SensorNoise,
+    pub(crate) noisy: bool,
+    pub(crate) torque: bool,
+    pub(crate) ground_changes: u32,
+    /// Errors of the left and right torque constants.
+    pub(crate) torque_gain: [f64; 2],
+    pub(crate) accelerometer_offset: f64,
+    command: WheelSpeeds,
+    rng: ChaCha8Rng,
+    tick: u32,
+}
+
+impl SimRobot {
+    pub(crate) fn new(start: Pose, stiffness: f64, seed: u64, noisy: bool) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let sensors = SensorNoise::default();
+        let mut spec = PlantSpec::default();
+        let (mut torque_gain, mut accelerometer_offset) = ([1.0; 2], 0.0);
+        if noisy {
+            spec.left_radius_ratio = rng.random_range(0.98..1.02);
+            spec.right_radius_ratio = rng.random_range(0.98..1.02);
+            torque_gain = [0, 1].map(|_| 1.0 + sensors.torque_gain_ratio * normal(&mut rng));
+            accelerometer_offset = sensors.accelerometer_offset_m_s2 * normal(&mut rng);
+        }
+        let model = RobotModel::yi2007();
+        let mut robot = Self {
+            model,
+            plant: Plant::new(model, spec, start).expect("a valid plant"),
+            ground: Ground::uniform(curve(stiffness)),
+            localisation: Localisation::new(model, LocalisationNoise::default()),
+            estimator: Estimator::new(model, sensors),
+            noise: sensors,
+            noisy,
+            torque: true,
+            ground_changes: 0,
+            torque_gain,
+            accelerometer_offset,
+            command: WheelSpeeds::default(),
+            rng,
+            tick: 0,
+        };
+        robot.fix();
+        robot
+    }
+
+    fn gauss(&mut self, std_dev: f64) -> f64 {
+        if self.noisy {
+            std_dev * normal(&mut self.rng)
+        } else {
+            0.0
+        }
+    }
+
+    fn fix(&mut self) {
+        let pose = self.plant.state().pose;
+        let pose = Pose {
+            x_m: pose.x_m + self.gauss(0.01),
+            y_m: pose.y_m + self.gauss(0.01),
+            heading_rad: pose.heading_rad + self.gauss(0.005),
+        };
+        self.localisation.correct(&PositionFix { pose, age_s: 0.0 });
+    }
+
+    /// What the loop sees now.
+    pub(crate) fn measured(&self) -> Measured {
+        let true_motion = self.true_motion();
+        if !self.noisy {
+            return true_motion;
+        }
+        Measured {
+            pose: self.localisation.pose().expect("a first fix was taken"),
+            twist: self.localisation.twist(),
+            wheel_speeds: true_motion.wheel_speeds,
+            pose_age_s: self.localisation.fix_age_s(),
+        }
+    }
+
+    /// What a loop with perfect sensors would see.
+    pub(crate) fn true_motion(&self) -> Measured {
+        let state = self.plant.state();
+        Measured {
+            pose: state.pose,
+            twist: state.twist(),
+            wheel_speeds: state.wheel_speeds,
+            pose_age_s: 0.0,
+        }
+    }
+
+    pub(crate) fn knowledge(&self) -> Option<ThetaKnowledge> {
+        self.estimator.estimate().theta.map(|found| ThetaKnowledge {
+            theta: found.theta,
+            std_dev: found.std_dev,
+        })
+    }
+
+    /// Commands wheel speeds for one loop tick, through the gate.
+    pub(crate) fn act(&mut self, wanted: WheelSpeeds) {
+        let limits = GateLimits::of(&self.model);
+        let input = GateInput {
+            command: Some(wanted),
+            previous: self.command,
+            stop: false,
+            feedback_age_s: 0.0,
+            dt_s: LOOP_S,
+        };
+        self.command = gate(&input, &limits).wheel_speeds;
+        for _ in 0..SAMPLES {
+            self.sample(LOOP_S / f64::from(SAMPLES));
+        }
+        self.tick += 1;
+        if self.tick.is_multiple_of(5) {
+            self.fix();
+        }
+    }
+
+    fn sample(&mut self, dt_s: f64) {
+        self.plant.step(self.command, &self.ground, dt_s);
+        let state = *self.plant.state();
+        let noise = self.noise;
+        let wheel_speeds = WheelSpeeds {
+            left_rad_s: state.wheel_speeds.left_rad_s + self.gauss(noise.wheel_speed_rad_s),
+            right_rad_s: state.wheel_speeds.right_rad_s + self.gauss(noise.wheel_speed_rad_s),
+        };
+        let gyro_rad_s = state.yaw_rate_rad_s + self.gauss(noise.gyro_rad_s);
+        let felt = self.plant.body_acceleration();
+        let torques = self.plant.wheel_torques();
+        let torque_noise = noise.torque_mu * self.model.wheel_radius_m() * self.model.side_load_n();
+        let body_speed = self.tick.is_multiple_of(10);
+        let sample = SensorSample {
+            wheel_speeds,
+            gyro_rad_s,
+            acceleration: Some(BodyAcceleration {
+                ahead_m_s2: felt.ahead_m_s2
+                    + self.accelerometer_offset
+                    + self.gauss(noise.accelerometer_m_s2),
+                left_m_s2: felt.left_m_s2 + self.gauss(noise.accelerometer_m_s2),
+            }),
+            body_speed_m_s: (body_speed && self.rng.random::<bool>())
+                .then(|| state.ahead_m_s + self.gauss(noise.body_speed_m_s)),
+            wheel_torques: self.torque.then(|| WheelTorques {
+                left_n_m: self.torque_gain[0] * torques.left_n_m + self.gauss(torque_noise),
+                right_n_m: self.torque_gain[1] * torques.right_n_m + self.gauss(torque_noise),
+            }),
+        };
+        self.localisation.predict(gyro_rad_s, wheel_speeds, dt_s);
+        if self.estimator.update(&sample, dt_s).ground_changed {
+            self.ground_changes += 1;
+            self.estimator.close_segment();
+            self.estimator.begin_ground();
+        }
+    }
+
+    /// Drives a mission to its end, or for `bound_s` at most.
+    pub(crate) fn drive(
+        &mut self,
+        follower: &mut Follower,
+        bound_s: f64,
+        mut each: impl FnMut(&mut Follower, &FollowerOutput, &Self),
+    ) -> FollowerOutput {
+        let mut time_s = 0.0;
+        loop {
+            let output = follower.step(&self.measured(), self.knowledge(), LOOP_S);
+            each(follower, &output, self);
+            self.act(output.wheel_speeds);
+            time_s += LOOP_S;
+            if output.status.is_final() || time_s > bound_s {
+                return output;
+            }
+        }
+    }
+}
+
+/// A standard normal number.
+pub(crate) fn normal(rng: &mut ChaCha8Rng) -> f64 {
+    let first: f64 = rng.random_range(f64::MIN_POSITIVE..1.0);
+    let second: f64 = rng.random();
+    (-2.0 * first.ln()).sqrt() * (std::f64::consts::TAU * second).cos()
+}
