@@ -1,1 +1,38 @@
-//! Placeholder.
+//! Tread's agent: the program on every robot.
+//!
+//! A loop thread drives trajectories with `tread-control` and measures how the ground grips;
+//! everything around it takes missions from the server, and brings measurements to it without
+//! losing or doubling any.
+//!
+//! * [`agent`] puts it all together; [`program`] makes a process of it; [`config`] is `robot.toml`.
+//! * The loop: `control_loop`, the base behind [`drive`], the simulated one in [`sim`].
+//! * Around it: [`missions`] (what is held), `dispatcher` (answers), `recorder` and [`outbox`]
+//!   (what must not be lost), `reporter` (what may), [`fleet`] (the only one that knows zenoh).
+//! * [`mod@bench`] steps the loop by hand, for tests and figures.
+//! * Below all: [`clock`], `supervisor`, [`geometry`] (between wire and controller).
+//!
+//! No module keeps anything global: several agents may run in one process.
+
+pub mod agent;
+pub mod bench;
+pub mod clock;
+pub mod config;
+pub mod drive;
+pub mod fleet;
+pub mod geometry;
+pub mod missions;
+pub mod outbox;
+pub mod program;
+pub mod sim;
+
+mod control_loop;
+mod dispatcher;
+mod recorder;
+mod reporter;
+mod supervisor;
+
+pub use agent::{Agent, RunningAgent};
+pub use config::AgentConfig;
+pub use control_loop::seam::Fault;
+pub use program::run_from_args;
+pub use supervisor::PartEnded;

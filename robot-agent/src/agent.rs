@@ -1,0 +1,414 @@
+//! One running agent: everything put together, and taken apart again in order.
+//!
+//! ```text
+//! loop thread ──events──► recorder ──► outbox ──► uploader ─┐
+//!      ▲ └──snapshot──► reporter ───────────────────────────┼─► fleet (zenoh) ◄─► server
+//!      └──commands── dispatcher ◄───────────────────────────┘
+//! ```
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+use tracing::{error, info, warn};
+use tread_api::ids::BootId;
+use tread_api::robot::OutboxStatus;
+use tread_api::wire::hello::Hello;
+use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
+use tread_api::wire::state::{FrictionReport, RobotState};
+use tread_control::robot::RobotModelError;
+use uuid::Uuid;
+
+use crate::clock::{SharedClock, SystemClock};
+use crate::config::AgentConfig;
+use crate::control_loop::seam::{AgentEnds, Shared, seam};
+use crate::control_loop::tick::LoopCore;
+use crate::control_loop::{self, BRAKING_MAX};
+use crate::dispatcher::{Dispatcher, Missions, SiteCell};
+use crate::drive::simulated::{SimMode, SimulatedDrive, SimulatedDriveError};
+use crate::fleet::uploader::{self, Backoff};
+use crate::fleet::{self, FleetLink, Identity, LinkError};
+use crate::geometry::control_model;
+use crate::missions::memory::{Memory, MemoryError};
+use crate::outbox::{Outbox, OutboxError};
+use crate::recorder::Recorder;
+use crate::reporter::{Reporter, every, log_losses};
+use crate::supervisor::{PartEnded, Supervisor};
+
+/// Longest time that a stopping agent waits for the server to take its last records.
+const LAST_UPLOAD_MAX: Duration = Duration::from_secs(1);
+/// Pause between two looks at what still waits.
+const LAST_UPLOAD_POLL: Duration = Duration::from_millis(10);
+
+/// Why an agent could not start.
+#[derive(Debug, thiserror::Error)]
+pub enum StartError {
+    /// The robot's model is impossible.
+    #[error("the robot's model is impossible")]
+    Model(#[from] RobotModelError),
+    /// The server's endpoint is none.
+    #[error(transparent)]
+    Link(#[from] LinkError),
+    /// The simulated base could not be made.
+    #[error(transparent)]
+    Drive(#[from] SimulatedDriveError),
+    /// The outbox could not be opened.
+    #[error(transparent)]
+    Outbox(#[from] OutboxError),
+    /// The mission memory could not be read.
+    #[error(transparent)]
+    Memory(#[from] MemoryError),
+    /// The operating system refused a thread.
+    #[error("no thread for the {part}")]
+    Thread {
+        /// Which part.
+        part: &'static str,
+        /// What the operating system said.
+        #[source]
+        source: std::io::Error,
+    },
+}
+
+/// Starts agents.
+#[derive(Debug)]
+pub struct Agent;
+
+/// An agent that runs; several may run in one process.
+#[derive(Debug)]
+pub struct RunningAgent {
+    identity: Identity,
+    supervisor: Arc<Supervisor>,
+    shared: Arc<Shared>,
+    outbox: Outbox,
+    reporter: Arc<Reporter>,
+    is_connected: watch::Receiver<bool>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+impl Agent {
+    /// Starts an agent on the present multi-threaded runtime. It drives and measures at once, and
+    /// connects for as long as it takes.
+    ///
+    /// # Errors
+    /// [`StartError`]: nothing is left running then.
+    pub fn start(config: AgentConfig) -> Result<RunningAgent, StartError> {
+        Self::start_with_clock(config, SystemClock::shared())
+    }
+
+    /// The same with a clock of the caller's.
+    ///
+    /// # Errors
+    /// As [`Agent::start`].
+    pub fn start_with_clock(
+        config: AgentConfig,
+        clock: SharedClock,
+    ) -> Result<RunningAgent, StartError> {
+        let model = control_model(&config.model)?;
+        fleet::check_endpoint(&config.server)?;
+        let simulated = &config.drive;
+        let drive = SimulatedDrive::new(
+            &simulated.scenario,
+            model,
+            simulated.start,
+            simulated.seed,
+            SimMode::Auto,
+        )?;
+        let boot = BootId::from_uuid(Uuid::new_v4());
+        let outbox_folder = config.data_dir.join("outbox");
+        let outbox = Outbox::open(&outbox_folder, config.outbox, config.robot.clone(), boot)?;
+        let missions = recall_missions(&config, &outbox, &clock)?;
+        let identity = Identity {
+            site: config.site.clone(),
+            robot: config.robot.clone(),
+            boot,
+        };
+
+        let (
+            loop_ends,
+            AgentEnds {
+                commands,
+                events,
+                shared,
+            },
+        ) = seam();
+        let site = Arc::new(SiteCell::default());
+        let supervisor = Arc::new(Supervisor::new());
+        let recorder = Recorder {
+            configuration: config.model.configuration(),
+            missions: Arc::clone(&missions),
+            outbox: outbox.clone(),
+        };
+        let core = LoopCore::new(model, loop_ends);
+        let (loop_clock, period) = (Arc::clone(&clock), config.period());
+        let no_thread = |part| move |source| StartError::Thread { part, source };
+        let recording = supervisor
+            .spawn_thread("recorder", move || recorder.run(&events))
+            .map_err(no_thread("recorder"))?;
+        let looping = supervisor
+            .spawn_thread("control loop", move || {
+                control_loop::run(core, Box::new(drive), &loop_clock, period);
+            })
+            .map_err(no_thread("control loop"))?;
+        supervisor.spawn(
+            "outbox",
+            outbox.clone().keep_synced(supervisor.stop_token()),
+        );
+
+        supervisor.spawn(
+            "losses",
+            log_losses(Arc::clone(&shared), supervisor.stop_token()),
+        );
+
+        let reporter = Arc::new(Reporter {
+            identity: identity.clone(),
+            clock: Arc::clone(&clock),
+            shared: Arc::clone(&shared),
+            site: Arc::clone(&site),
+            outbox: outbox.clone(),
+            rate_hz: config.rate_hz,
+            states: AtomicU64::new(0),
+            frictions: AtomicU64::new(0),
+        });
+        let dispatcher = Arc::new(Dispatcher {
+            boot,
+            model,
+            clock,
+            missions,
+            site,
+            shared: Arc::clone(&shared),
+            to_loop: commands,
+        });
+        let (connected, is_connected) = watch::channel(false);
+        let online = Online {
+            config,
+            identity: identity.clone(),
+            reporter: Arc::clone(&reporter),
+            dispatcher,
+            outbox: outbox.clone(),
+            stop: supervisor.stop_token(),
+            connected,
+        };
+        supervisor.spawn("fleet link", online.run());
+        info!(robot.id = %identity.robot, %boot, "agent of `{}` runs", identity.robot);
+        Ok(RunningAgent {
+            identity,
+            supervisor,
+            shared,
+            outbox,
+            reporter,
+            is_connected,
+            threads: vec![looping, recording],
+        })
+    }
+}
+
+/// Reads the mission memory; what was in hand when the agent died is reported as failed.
+fn recall_missions(
+    config: &AgentConfig,
+    outbox: &Outbox,
+    clock: &SharedClock,
+) -> Result<Arc<Missions>, StartError> {
+    let memory = Memory::new(&config.data_dir);
+    let mut holder = memory.load()?;
+    let interrupted = holder.held().cloned();
+    if let Some(held) = &interrupted {
+        let report = MissionReport {
+            mission: held.mission,
+            revision: held.revision,
+            plan_hash: held.plan_hash,
+            at: clock.wall(),
+            phase: MissionPhase::Failed,
+            reason: Some("the agent restarted during the mission".to_owned()),
+            progress: None,
+        };
+        outbox.append(&RecordContent::Mission(report))?;
+        holder.end(held.mission, MissionPhase::Failed);
+    }
+    let missions = Missions::new(holder, memory);
+    if interrupted.is_some() {
+        missions.save();
+    }
+    Ok(missions)
+}
+
+/// Everything that needs the network.
+struct Online {
+    config: AgentConfig,
+    identity: Identity,
+    reporter: Arc<Reporter>,
+    dispatcher: Arc<Dispatcher>,
+    outbox: Outbox,
+    stop: CancellationToken,
+    connected: watch::Sender<bool>,
+}
+
+impl Online {
+    async fn run(self) {
+        let connecting = FleetLink::connect(&self.config.server, self.identity.clone(), &self.stop);
+        let (link, commands) = match connecting.await {
+            Ok(Some((link, commands))) => (Arc::new(link), commands),
+            Ok(None) => return,
+            Err(cause) => {
+                error!(
+                    error = &cause as &dyn std::error::Error,
+                    "the fleet link failed"
+                );
+                return;
+            }
+        };
+        let (welcomed, is_welcome) = watch::channel(false);
+        let _ = self.connected.send(true);
+        let reporter = &self.reporter;
+        let uploading = uploader::run(
+            Arc::clone(&link),
+            self.outbox.clone(),
+            is_welcome,
+            self.stop.clone(),
+        );
+        let answering = Arc::clone(&self.dispatcher).run(commands, self.stop.clone());
+        let working = async {
+            tokio::join!(
+                self.introduce(Arc::clone(&link), welcomed),
+                uploading,
+                answering,
+                every(self.config.state_rate_hz, Arc::clone(&link), |link| {
+                    link.publish_state(&reporter.state());
+                }),
+                every(self.config.friction_rate_hz, Arc::clone(&link), |link| {
+                    link.publish_friction(&reporter.friction());
+                }),
+            );
+        };
+        tokio::select! {
+            () = working => {}
+            () = self.stop.cancelled() => {}
+        }
+        link.close().await;
+    }
+
+    /// Says hello on every new connection until it is answered.
+    async fn introduce(&self, link: Arc<FleetLink>, welcomed: watch::Sender<bool>) {
+        let mut server_seen = link.server_seen();
+        loop {
+            server_seen.mark_unchanged();
+            let mut backoff = Backoff::new();
+            while !self.introduce_once(&link).await {
+                tokio::time::sleep(backoff.grow()).await;
+            }
+            let _ = welcomed.send(true);
+            if server_seen.changed().await.is_err() {
+                return;
+            }
+        }
+    }
+
+    async fn introduce_once(&self, link: &Arc<FleetLink>) -> bool {
+        let hello = Hello {
+            robot: self.identity.robot.clone(),
+            boot: self.identity.boot,
+            agent_version: env!("CARGO_PKG_VERSION").to_owned(),
+            model: self.config.model.clone(),
+            robot_time: self.dispatcher.clock.wall(),
+        };
+        match link.hello(&hello).await {
+            Ok(welcome) => {
+                info!("the server welcomes `{}`", self.identity.robot);
+                self.dispatcher.take_site(welcome.site)
+            }
+            Err(fleet::AskError::NoAnswer) => false,
+            Err(cause) => {
+                warn!(
+                    error = &cause as &dyn std::error::Error,
+                    "the server does not welcome us"
+                );
+                false
+            }
+        }
+    }
+}
+
+impl RunningAgent {
+    /// This run of the agent.
+    pub fn boot(&self) -> BootId {
+        self.identity.boot
+    }
+
+    /// The robot and its site.
+    pub fn identity(&self) -> &Identity {
+        &self.identity
+    }
+
+    /// The state as it would be published now.
+    pub fn state(&self) -> RobotState {
+        self.reporter.state()
+    }
+
+    /// Both friction estimates as they would be published now.
+    pub fn friction(&self) -> FrictionReport {
+        self.reporter.friction()
+    }
+
+    /// What waits for the server, and what was lost.
+    pub fn outbox_status(&self) -> OutboxStatus {
+        self.outbox.status()
+    }
+
+    /// Whether a server has been reached since the start.
+    pub fn has_connected(&self) -> bool {
+        *self.is_connected.borrow()
+    }
+
+    /// Waits for the first part of the agent that ends by itself: the agent is no use any more.
+    pub async fn failed(&self) -> PartEnded {
+        self.supervisor.failed().await
+    }
+
+    /// Brakes to standstill, saves and sends what is left, leaves the network, and ends.
+    pub async fn stop(mut self) {
+        info!("stopping");
+        self.supervisor.begin_stop();
+        self.shared.stop.store(true, Ordering::Relaxed);
+        let threads = std::mem::take(&mut self.threads);
+        let joining = tokio::task::spawn_blocking(move || {
+            for thread in threads {
+                // A panic was reported when it happened.
+                let _ = thread.join();
+            }
+        });
+        if tokio::time::timeout(2 * BRAKING_MAX, joining)
+            .await
+            .is_err()
+        {
+            error!("the control loop did not end in time");
+        }
+        if *self.is_connected.borrow() {
+            let sent_all = async {
+                while self.outbox.status().pending > 0 {
+                    tokio::time::sleep(LAST_UPLOAD_POLL).await;
+                }
+            };
+            if tokio::time::timeout(LAST_UPLOAD_MAX, sent_all)
+                .await
+                .is_err()
+            {
+                let pending = self.outbox.status().pending;
+                info!(pending, "{pending} records wait for the next start");
+            }
+        }
+        self.supervisor.end_tasks().await;
+        let outbox = self.outbox.clone();
+        match tokio::task::spawn_blocking(move || outbox.sync()).await {
+            Ok(Ok(())) => info!("stopped"),
+            Ok(Err(cause)) => {
+                error!(
+                    error = &cause as &dyn std::error::Error,
+                    "the outbox is not synced"
+                );
+            }
+            Err(_) => error!("the outbox is not synced"),
+        }
+    }
+}

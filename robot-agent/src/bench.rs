@@ -1,0 +1,240 @@
+//! The loop on a bench: the agent's own tick with a simulated base, stepped by hand.
+//!
+//! No thread, no clock, no network, so runs repeat to the bit and go as fast as the machine does.
+//! For tests, figures and benchmarks.
+
+use std::sync::Arc;
+use std::sync::mpsc::SendError;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use tread_api::ids::{MissionId, PlanHash};
+use tread_api::site::Grid;
+use tread_api::terrain::{TerrainRef, TerrainShape};
+use tread_api::trajectory::Trajectory;
+use tread_api::wire::hello::SiteDefinition;
+use tread_api::wire::ingest::MissionPhase;
+use tread_control::follower::{Follower, FollowerConfig};
+use tread_control::geometry::Pose;
+use tread_control::plan::Plan;
+use tread_control::robot::RobotModel;
+use uuid::Uuid;
+
+use crate::control_loop::seam::{
+    AgentEnds, ClosedSegment, EndReason, Job, LoopCommand, LoopEvent, seam,
+};
+use crate::control_loop::segments::Moment;
+use crate::control_loop::site_view::SiteView;
+use crate::control_loop::tick::LoopCore;
+use crate::drive::simulated::{SimMode, SimulatedDrive, SimulatedDriveError};
+use crate::drive::{Drive, Feedback};
+use crate::geometry::control_trajectory;
+use crate::sim::scenario::Scenario;
+
+/// Time between two ticks on the bench.
+pub const PERIOD: Duration = Duration::from_millis(10);
+
+/// Why the bench could not do what it was asked.
+#[derive(Debug, thiserror::Error)]
+pub enum BenchError {
+    /// The robot has not had a position fix yet.
+    #[error("the robot does not know yet where it is")]
+    NoPose,
+    /// The trajectory cannot be driven.
+    #[error("the trajectory cannot be driven: {0}")]
+    Impossible(String),
+    /// The loop is gone.
+    #[error("the loop takes no commands any more")]
+    Gone,
+}
+
+impl<T> From<SendError<T>> for BenchError {
+    fn from(_: SendError<T>) -> Self {
+        Self::Gone
+    }
+}
+
+/// A robot on the bench.
+#[derive(Debug)]
+pub struct Bench {
+    pub(crate) core: LoopCore,
+    pub(crate) drive: SimulatedDrive,
+    pub(crate) ends: AgentEnds,
+    pub(crate) now: Duration,
+    pub(crate) segments: Vec<ClosedSegment>,
+    pub(crate) starts: Vec<MissionId>,
+    pub(crate) ended: Vec<(MissionId, EndReason)>,
+    /// Distance from the path when the last mission ended.
+    pub(crate) cross_track_m: f64,
+}
+
+/// The site of a scenario as a server would define it.
+///
+/// # Errors
+/// A sentence on a polygon that is none; a parsed scenario has no such.
+pub fn site_of(scenario: &Scenario) -> Result<SiteDefinition, String> {
+    let mut terrains = Vec::with_capacity(scenario.terrains.len());
+    for terrain in &scenario.terrains {
+        terrains.push(TerrainShape {
+            terrain: TerrainRef {
+                id: terrain.id.clone(),
+                revision: 1,
+            },
+            polygon: terrain.outline()?,
+            layer: terrain.layer,
+        });
+    }
+    let grid = Grid {
+        revision: 1,
+        cell_m: scenario.cell_m,
+    };
+    Ok(SiteDefinition {
+        grid,
+        terrain_revision: 1,
+        terrains,
+    })
+}
+
+/// A base that says nothing.
+struct Silence;
+
+impl Drive for Silence {
+    fn read(&mut self, _: Duration) -> Feedback {
+        Feedback::default()
+    }
+
+    fn write(&mut self, _: tread_control::measured::WheelSpeeds) {}
+}
+
+impl Bench {
+    /// The paper's robot at rest on a scenario's ground.
+    ///
+    /// # Errors
+    /// [`SimulatedDriveError`] when the start is no pose.
+    pub fn new(scenario: &Scenario, start: Pose, seed: u64) -> Result<Self, SimulatedDriveError> {
+        let model = RobotModel::yi2007();
+        let (loop_ends, ends) = seam();
+        let drive = SimulatedDrive::new(scenario, model, start, seed, SimMode::Explicit)?;
+        Ok(Self {
+            core: LoopCore::new(model, loop_ends),
+            drive,
+            ends,
+            now: Duration::from_secs(1),
+            segments: Vec::new(),
+            starts: Vec::new(),
+            ended: Vec::new(),
+            cross_track_m: f64::NAN,
+        })
+    }
+
+    /// Tells the loop of its site.
+    ///
+    /// # Errors
+    /// [`BenchError::Gone`].
+    pub fn know_site(&mut self, definition: SiteDefinition) -> Result<(), BenchError> {
+        let view = Arc::new(SiteView::new(definition));
+        Ok(self.ends.commands.send(LoopCommand::Site(view))?)
+    }
+
+    /// Plans a trajectory from where the robot stands and hands it to the loop.
+    ///
+    /// # Errors
+    /// [`BenchError`] when the robot does not know where it is or the trajectory is impossible.
+    pub fn begin(
+        &mut self,
+        number: u128,
+        trajectory: &Trajectory,
+        start_by: Option<Duration>,
+    ) -> Result<MissionId, BenchError> {
+        let impossible = |problem: String| BenchError::Impossible(problem);
+        let (pose, _) = self.ends.shared.snapshot().pose.ok_or(BenchError::NoPose)?;
+        let model = RobotModel::yi2007();
+        let plan = Plan::new(&control_trajectory(trajectory), pose, &model)
+            .map_err(|refused| impossible(refused.to_string()))?;
+        let follower = Follower::new(plan, model, FollowerConfig::default())
+            .map_err(|refused| impossible(refused.to_string()))?;
+        let mission = MissionId::from_uuid(Uuid::from_u128(number));
+        let job = Job {
+            mission,
+            revision: 1,
+            plan_hash: PlanHash::from_uuid(Uuid::from_u128(number)),
+            follower,
+            start_by,
+        };
+        self.ends.commands.send(LoopCommand::Start(Box::new(job)))?;
+        Ok(mission)
+    }
+
+    /// Moves the base on by one period.
+    pub fn simulate(&mut self) {
+        self.now += PERIOD;
+        self.drive.advance(self.now);
+    }
+
+    fn moment(&self) -> Moment {
+        Moment {
+            monotonic: self.now,
+            wall: Timestamp::UNIX_EPOCH + self.now,
+        }
+    }
+
+    /// One tick of the loop alone; with `stop`, the robot brakes and its mission ends.
+    pub fn tick_loop(&mut self, stop: bool) {
+        let now = self.moment();
+        self.core.tick(now, stop, &mut self.drive);
+    }
+
+    /// One period in which the base says nothing and does nothing.
+    pub fn tick_without_base(&mut self) {
+        self.now += PERIOD;
+        let now = self.moment();
+        self.core.tick(now, false, &mut Silence);
+        self.collect();
+    }
+
+    /// Takes what the loop has reported.
+    pub fn collect(&mut self) {
+        for event in self.ends.events.try_iter() {
+            match event {
+                LoopEvent::Started { progress, .. } => self.starts.push(progress.id),
+                LoopEvent::Ended {
+                    reason,
+                    job,
+                    progress,
+                    ..
+                } => {
+                    self.ended.push((job.mission, reason));
+                    self.cross_track_m = progress.cross_track_m;
+                }
+                LoopEvent::Segment(segment) => self.segments.push(segment),
+                LoopEvent::Retired(_) => {}
+            }
+        }
+    }
+
+    /// One whole period: base, loop, reports.
+    pub fn tick(&mut self) {
+        self.simulate();
+        self.tick_loop(false);
+        self.collect();
+    }
+
+    /// So many whole periods as fit.
+    pub fn run_for(&mut self, time: Duration) {
+        let until = self.now + time;
+        while self.now < until {
+            self.tick();
+        }
+    }
+
+    /// How a mission ended, if it has.
+    pub fn end_of(&self, mission: MissionId) -> Option<MissionPhase> {
+        let ended = self.ended.iter().find(|(ended, _)| *ended == mission);
+        ended.map(|(_, reason)| reason.phase())
+    }
+
+    /// How many segments were closed so far.
+    pub fn segment_count(&self) -> usize {
+        self.segments.len()
+    }
+}

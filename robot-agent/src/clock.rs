@@ -1,0 +1,99 @@
+//! Time, injected: monotonic for ages and deadlines, wall for records.
+//!
+//! Nothing else in the agent reads the machine's clocks, so that a test can hand in its own.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant, SystemTime};
+
+use jiff::Timestamp;
+
+/// A source of both times. Monotonic time counts from the clock's own origin.
+pub trait Clock: std::fmt::Debug + Send + Sync {
+    /// Time since the clock's origin; never falls.
+    fn monotonic(&self) -> Duration;
+    /// The wall clock; it may jump.
+    fn wall(&self) -> Timestamp;
+}
+
+/// A clock as it is handed around.
+pub type SharedClock = Arc<dyn Clock>;
+
+/// The machine's clocks; the origin is when this was made.
+#[derive(Debug)]
+pub struct SystemClock {
+    origin: Instant,
+}
+
+impl SystemClock {
+    /// A clock whose origin is now.
+    pub fn new() -> Self {
+        #[expect(
+            clippy::disallowed_methods,
+            reason = "this is the clock that others inject"
+        )]
+        let origin = Instant::now();
+        Self { origin }
+    }
+
+    /// The same, ready to be handed around.
+    pub fn shared() -> SharedClock {
+        Arc::new(Self::new())
+    }
+}
+
+impl Default for SystemClock {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Clock for SystemClock {
+    fn monotonic(&self) -> Duration {
+        self.origin.elapsed()
+    }
+
+    fn wall(&self) -> Timestamp {
+        #[expect(
+            clippy::disallowed_methods,
+            reason = "this is the clock that others inject"
+        )]
+        let now = SystemTime::now();
+        // A machine whose clock stands outside the years that RFC 3339 knows reads as 1970.
+        Timestamp::try_from(now).unwrap_or(Timestamp::UNIX_EPOCH)
+    }
+}
+
+/// A clock that moves only when told.
+#[derive(Debug)]
+pub struct ManualClock {
+    elapsed: Mutex<Duration>,
+    wall_origin: Timestamp,
+}
+
+impl ManualClock {
+    /// A clock that stands at zero, and at `wall_origin`.
+    pub fn new(wall_origin: Timestamp) -> Self {
+        Self {
+            elapsed: Mutex::new(Duration::ZERO),
+            wall_origin,
+        }
+    }
+
+    /// Moves both times on.
+    pub fn advance(&self, step: Duration) {
+        *self.elapsed.lock().unwrap_or_else(PoisonError::into_inner) += step;
+    }
+}
+
+impl Clock for ManualClock {
+    fn monotonic(&self) -> Duration {
+        *self.elapsed.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn wall(&self) -> Timestamp {
+        // Saturates at the last year that RFC 3339 knows.
+        self.wall_origin
+            .checked_add(self.monotonic())
+            .unwrap_or(Timestamp::MAX)
+    }
+}

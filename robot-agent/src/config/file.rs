@@ -1,0 +1,102 @@
+//! `robot.toml` as it is written: every key, none of them checked yet but by its type.
+
+use std::path::PathBuf;
+
+use serde::Deserialize;
+use tread_api::ids::{RobotId, SiteId};
+use tread_api::robot::RobotModel;
+
+use super::ConfigError;
+
+/// `robot.toml`.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct FileConfig {
+    pub(super) site: Option<SiteId>,
+    pub(super) robot: Option<RobotId>,
+    pub(super) server: Option<String>,
+    pub(super) data_dir: Option<PathBuf>,
+    pub(super) rate_hz: Option<f64>,
+    pub(super) state_rate_hz: Option<f64>,
+    pub(super) friction_rate_hz: Option<f64>,
+    pub(super) model: Option<ModelFile>,
+    pub(super) drive: Option<DriveFile>,
+}
+
+/// `[model]` in `robot.toml`; the same words as on the wire, but strict.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ModelFile {
+    pub(super) name: String,
+    pub(super) tyres: String,
+    pub(super) mass_kg: f64,
+    pub(super) track_width_m: f64,
+    pub(super) wheelbase_m: f64,
+    pub(super) wheel_radius_m: f64,
+    pub(super) yaw_inertia_kg_m2: f64,
+    pub(super) limits: LimitsFile,
+}
+
+#[derive(Debug, Clone, Copy, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct LimitsFile {
+    pub(super) linear_max_m_s: f64,
+    pub(super) angular_max_rad_s: f64,
+    pub(super) linear_acceleration_max_m_s2: f64,
+    pub(super) lateral_acceleration_max_m_s2: f64,
+    pub(super) linear_jerk_max_m_s3: f64,
+    pub(super) wheel_speed_max_rad_s: f64,
+    pub(super) wheel_acceleration_max_rad_s2: f64,
+}
+
+impl From<ModelFile> for RobotModel {
+    fn from(file: ModelFile) -> Self {
+        let limits = file.limits;
+        Self {
+            name: file.name,
+            tyres: file.tyres,
+            mass_kg: file.mass_kg,
+            track_width_m: file.track_width_m,
+            wheelbase_m: file.wheelbase_m,
+            wheel_radius_m: file.wheel_radius_m,
+            yaw_inertia_kg_m2: file.yaw_inertia_kg_m2,
+            limits: tread_api::robot::RobotLimits {
+                linear_max_m_s: limits.linear_max_m_s,
+                angular_max_rad_s: limits.angular_max_rad_s,
+                linear_acceleration_max_m_s2: limits.linear_acceleration_max_m_s2,
+                lateral_acceleration_max_m_s2: limits.lateral_acceleration_max_m_s2,
+                linear_jerk_max_m_s3: limits.linear_jerk_max_m_s3,
+                wheel_speed_max_rad_s: limits.wheel_speed_max_rad_s,
+                wheel_acceleration_max_rad_s2: limits.wheel_acceleration_max_rad_s2,
+            },
+        }
+    }
+}
+
+/// What kind of base there is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum DriveKind {
+    Simulated,
+}
+
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct DriveFile {
+    /// There is one kind so far; it is asked for all the same, so that files stay valid.
+    #[serde(rename = "kind")]
+    _kind: DriveKind,
+    pub(super) scenario: Option<PathBuf>,
+    pub(super) x_m: Option<f64>,
+    pub(super) y_m: Option<f64>,
+    pub(super) heading_rad: Option<f64>,
+    pub(super) seed: Option<u64>,
+}
+
+/// Reads the text of a configuration; `file` is its name in errors.
+pub(super) fn parse(file: &str, text: &str) -> Result<FileConfig, ConfigError> {
+    toml::from_str(text).map_err(|refused| ConfigError::Malformed {
+        file: file.to_owned(),
+        problem: refused.to_string(),
+    })
+}

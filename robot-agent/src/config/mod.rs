@@ -1,0 +1,436 @@
+//! What an agent must know before it starts: `robot.toml`, and flags that go before it.
+//!
+//! Everything is read and checked before anything is opened. A mistake names file, line and key.
+
+mod file;
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::Parser;
+use tread_api::ids::{RobotId, SiteId};
+use tread_api::robot::RobotModel;
+use tread_control::geometry::Pose;
+
+use file::{DriveFile, FileConfig};
+
+use crate::geometry::{control_model, paper_robot};
+use crate::outbox;
+use crate::sim::scenario::{BUILT_IN_NAME, Scenario, ScenarioError};
+
+/// Where the server listens unless said otherwise.
+pub const SERVER_DEFAULT: &str = "tcp/127.0.0.1:7447";
+/// Slowest and fastest loop, Hz.
+pub const RATE_HZ_RANGE: std::ops::RangeInclusive<f64> = 20.0..=200.0;
+/// Slowest and fastest publication, Hz.
+pub const PUBLISH_HZ_RANGE: std::ops::RangeInclusive<f64> = 0.1..=50.0;
+
+/// Why a configuration was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file could not be read.
+    #[error("the configuration `{file}` cannot be read")]
+    Unreadable {
+        /// The file.
+        file: String,
+        /// What the operating system said.
+        #[source]
+        source: std::io::Error,
+    },
+    /// The text does not parse, or a key is not known.
+    #[error("in the configuration `{file}`: {problem}")]
+    Malformed {
+        /// The file.
+        file: String,
+        /// Line, column, key and what is wrong with it.
+        problem: String,
+    },
+    /// Something that has no default was not given.
+    #[error("`{key}` is missing: give it in the configuration or as `--{flag}`")]
+    Missing {
+        /// The key in the file.
+        key: &'static str,
+        /// The flag.
+        flag: &'static str,
+    },
+    /// A value is out of its range.
+    #[error("`{key}`: {problem}")]
+    OutOfRange {
+        /// The key.
+        key: &'static str,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// The scenario was refused.
+    #[error("the simulated drive has no ground")]
+    Scenario(#[from] ScenarioError),
+}
+
+/// Flags of the agent.
+#[derive(Debug, Clone, Default, Parser)]
+#[command(
+    name = "tread-agent",
+    version,
+    about = "Drives one robot and measures its ground"
+)]
+pub struct Flags {
+    /// The configuration file
+    #[arg(long, env = "TREAD_AGENT_CONFIG")]
+    pub config: Option<PathBuf>,
+    /// The site that the robot belongs to
+    #[arg(long)]
+    pub site: Option<SiteId>,
+    /// The robot's identifier within its site
+    #[arg(long)]
+    pub robot: Option<RobotId>,
+    /// The server's zenoh endpoint [default: tcp/127.0.0.1:7447]
+    #[arg(long)]
+    pub server: Option<String>,
+    /// Where measurements wait for the server
+    #[arg(long)]
+    pub data_dir: Option<PathBuf>,
+    /// Rate of the control loop, 20 to 200 Hz [default: 100]
+    #[arg(long)]
+    pub rate_hz: Option<f64>,
+    /// The scenario of the simulated base: a file, or `yard` for the built-in one
+    #[arg(long)]
+    pub scenario: Option<PathBuf>,
+    /// Start of the simulated base: x, y in metres and heading in radians, with commas
+    #[arg(long, value_parser = parse_start, allow_hyphen_values = true)]
+    pub start: Option<Pose>,
+    /// Seed of the simulated base
+    #[arg(long)]
+    pub seed: Option<u64>,
+    /// What to log, as in `info,tread_agent=debug`
+    #[arg(long, env = "RUST_LOG", default_value = "info,zenoh=warn")]
+    pub log: String,
+    /// How to log
+    #[arg(long, value_enum, default_value_t)]
+    pub log_format: LogFormat,
+}
+
+/// How to log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
+pub enum LogFormat {
+    /// Lines for people.
+    #[default]
+    Human,
+    /// One JSON object a line.
+    Json,
+}
+
+/// The simulated base.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SimulatedConfig {
+    /// The true ground.
+    pub scenario: Scenario,
+    /// Where the robot stands at first.
+    pub start: Pose,
+    /// What makes its sensors and wheels its own.
+    pub seed: u64,
+}
+
+/// A checked configuration.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AgentConfig {
+    /// The site.
+    pub site: SiteId,
+    /// The robot.
+    pub robot: RobotId,
+    /// The server's zenoh endpoint.
+    pub server: String,
+    /// Where measurements and missions outlive the process.
+    pub data_dir: PathBuf,
+    /// Rate of the control loop, Hz, within [`RATE_HZ_RANGE`].
+    pub rate_hz: f64,
+    /// Rate at which the state is published, Hz.
+    pub state_rate_hz: f64,
+    /// Rate at which friction is published, Hz.
+    pub friction_rate_hz: f64,
+    /// Model and tyres, as declared to the server.
+    pub model: RobotModel,
+    /// The base.
+    pub drive: SimulatedConfig,
+    /// Bounds of the outbox.
+    pub outbox: outbox::Limits,
+}
+
+impl AgentConfig {
+    /// A robot of a scenario, everything else as by default.
+    ///
+    /// # Errors
+    /// [`ConfigError`] when the scenario has no such robot.
+    pub fn simulated(
+        scenario: Scenario,
+        robot: RobotId,
+        server: String,
+        data_dir: PathBuf,
+    ) -> Result<Self, ConfigError> {
+        let flags = Flags {
+            site: Some(scenario.site.clone()),
+            robot: Some(robot),
+            server: Some(server),
+            data_dir: Some(data_dir),
+            ..Flags::default()
+        };
+        assemble(&flags, FileConfig::default(), scenario)
+    }
+
+    /// Reads the file that the flags name, if any, and lets the flags go before it.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names file, line and key.
+    pub fn load(flags: &Flags) -> Result<Self, ConfigError> {
+        let file = match &flags.config {
+            None => FileConfig::default(),
+            Some(path) => {
+                let file = path.display().to_string();
+                let text =
+                    std::fs::read_to_string(path).map_err(|source| ConfigError::Unreadable {
+                        file: file.clone(),
+                        source,
+                    })?;
+                file::parse(&file, &text)?
+            }
+        };
+        let from_file = file
+            .drive
+            .as_ref()
+            .and_then(|drive| drive.scenario.as_ref());
+        let scenario = match flags.scenario.as_ref().or(from_file) {
+            None => Scenario::built_in()?,
+            Some(name) if name == Path::new(BUILT_IN_NAME) => Scenario::built_in()?,
+            Some(path) => {
+                // Paths in a configuration are meant from where the file is.
+                let folder = flags.config.as_deref().and_then(Path::parent);
+                let is_from_flag = flags.scenario.is_some();
+                let folder = folder.filter(|_| !is_from_flag).unwrap_or(Path::new(""));
+                Scenario::load(&folder.join(path))?
+            }
+        };
+        assemble(flags, file, scenario)
+    }
+
+    /// Time between two ticks of the loop.
+    pub fn period(&self) -> Duration {
+        Duration::from_secs_f64(self.rate_hz.recip())
+    }
+}
+
+/// `x,y,heading` of the simulated base.
+fn parse_start(text: &str) -> Result<Pose, String> {
+    let numbers: Result<Vec<f64>, _> = text.split(',').map(|part| part.trim().parse()).collect();
+    match numbers.map_err(|refused| refused.to_string())?.as_slice() {
+        &[x_m, y_m, heading_rad] => Ok(Pose {
+            x_m,
+            y_m,
+            heading_rad,
+        }),
+        others => Err(format!(
+            "three numbers are needed, these are {}",
+            others.len()
+        )),
+    }
+}
+
+fn assemble(
+    flags: &Flags,
+    file: FileConfig,
+    scenario: Scenario,
+) -> Result<AgentConfig, ConfigError> {
+    let site = flags
+        .site
+        .clone()
+        .or(file.site)
+        .ok_or(ConfigError::Missing {
+            key: "site",
+            flag: "site",
+        })?;
+    let robot = flags
+        .robot
+        .clone()
+        .or(file.robot)
+        .ok_or(ConfigError::Missing {
+            key: "robot",
+            flag: "robot",
+        })?;
+    let data_dir = flags
+        .data_dir
+        .clone()
+        .or(file.data_dir)
+        .ok_or(ConfigError::Missing {
+            key: "data_dir",
+            flag: "data-dir",
+        })?;
+    let rate_hz = flags.rate_hz.or(file.rate_hz).unwrap_or(100.0);
+    within("rate_hz", rate_hz, &RATE_HZ_RANGE)?;
+    let state_rate_hz = file.state_rate_hz.unwrap_or(5.0);
+    within("state_rate_hz", state_rate_hz, &PUBLISH_HZ_RANGE)?;
+    let friction_rate_hz = file.friction_rate_hz.unwrap_or(2.0);
+    within("friction_rate_hz", friction_rate_hz, &PUBLISH_HZ_RANGE)?;
+    let model = file.model.map_or_else(paper_robot, RobotModel::from);
+    control_model(&model).map_err(|refused| ConfigError::OutOfRange {
+        key: "model",
+        problem: refused.to_string(),
+    })?;
+    let server = flags.server.clone().or(file.server);
+    Ok(AgentConfig {
+        drive: simulated(flags, file.drive, scenario, &robot)?,
+        site,
+        robot,
+        server: server.unwrap_or_else(|| SERVER_DEFAULT.to_owned()),
+        data_dir,
+        rate_hz,
+        state_rate_hz,
+        friction_rate_hz,
+        model,
+        outbox: outbox::Limits::default(),
+    })
+}
+
+fn simulated(
+    flags: &Flags,
+    file: Option<DriveFile>,
+    scenario: Scenario,
+    robot: &RobotId,
+) -> Result<SimulatedConfig, ConfigError> {
+    let listed = scenario.robot(robot);
+    let from_scenario = listed.map(|listed| Pose {
+        x_m: listed.x_m,
+        y_m: listed.y_m,
+        heading_rad: listed.heading_rad,
+    });
+    let from_file = file.as_ref().and_then(|drive| {
+        Some(Pose {
+            x_m: drive.x_m?,
+            y_m: drive.y_m?,
+            heading_rad: drive.heading_rad.unwrap_or(0.0),
+        })
+    });
+    let start = flags
+        .start
+        .or(from_file)
+        .or(from_scenario)
+        .ok_or(ConfigError::Missing {
+            key: "drive.x_m",
+            flag: "start",
+        })?;
+    if !start.is_finite() {
+        let problem = "the start must be finite numbers".to_owned();
+        return Err(ConfigError::OutOfRange {
+            key: "drive",
+            problem,
+        });
+    }
+    let seed = flags
+        .seed
+        .or(file.and_then(|drive| drive.seed))
+        .or(listed.map(|listed| listed.seed))
+        .unwrap_or(1);
+    Ok(SimulatedConfig {
+        scenario,
+        start,
+        seed,
+    })
+}
+
+fn within(
+    key: &'static str,
+    value: f64,
+    range: &std::ops::RangeInclusive<f64>,
+) -> Result<(), ConfigError> {
+    if range.contains(&value) {
+        return Ok(());
+    }
+    let problem = format!("{value} is not within {} to {}", range.start(), range.end());
+    Err(ConfigError::OutOfRange { key, problem })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn load(text: &str, arguments: &[&str]) -> Result<AgentConfig, String> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("robot.toml");
+        std::fs::write(&path, text).unwrap();
+        let mut words = vec!["tread-agent", "--config", path.to_str().unwrap()];
+        words.extend_from_slice(arguments);
+        let flags = Flags::try_parse_from(words).unwrap();
+        AgentConfig::load(&flags).map_err(|refused| refused.to_string())
+    }
+
+    const GOOD: &str = "site = \"yard\"\nrobot = \"rover-1\"\ndata_dir = \"/tmp/rover\"\n";
+
+    #[test]
+    fn defaults_fill_what_a_short_file_leaves_open() {
+        let config = load(GOOD, &[]).unwrap();
+        assert_eq!(config.server, SERVER_DEFAULT);
+        assert_eq!(config.period(), Duration::from_millis(10));
+        assert_eq!(config.model, paper_robot());
+        assert_eq!(config.drive.seed, 11, "the scenario's robot of that name");
+    }
+
+    #[test]
+    fn the_example_says_what_the_defaults_are() {
+        let example = load(include_str!("../../robot.example.toml"), &[]).unwrap();
+        let short = GOOD.replace("/tmp/rover", "/var/lib/tread-agent");
+        assert_eq!(example, load(&short, &[]).unwrap());
+    }
+
+    #[test]
+    fn flags_go_before_the_file() {
+        let start = [
+            "--robot",
+            "other",
+            "--rate-hz",
+            "50",
+            "--start",
+            "-1,2.5,0.1",
+        ];
+        let config = load(GOOD, &start).unwrap();
+        assert_eq!(config.robot.as_str(), "other");
+        assert_eq!(config.period(), Duration::from_millis(20));
+        assert_eq!(
+            config.drive.start,
+            Pose {
+                x_m: -1.0,
+                y_m: 2.5,
+                heading_rad: 0.1
+            }
+        );
+    }
+
+    #[test]
+    fn a_mistake_is_named_with_file_line_and_key() {
+        let cases = [
+            ("rate = 100", "line 4", "rate"),
+            ("rate_hz = \"fast\"", "line 4", "rate_hz"),
+            ("[drive]\nkind = \"simulated\"\nsede = 1", "line 6", "sede"),
+            ("[drive]\nkind = \"horse\"", "line 5", "horse"),
+            ("[model]\nname = \"m\"\nmass = 3", "line 6", "mass"),
+        ];
+        for (line, place, key) in cases {
+            let refused = load(&format!("{GOOD}{line}\n"), &[]).unwrap_err();
+            for part in ["robot.toml", place, key] {
+                assert!(refused.contains(part), "`{part}` is missing in: {refused}");
+            }
+        }
+        for (line, key) in [
+            ("rate_hz = 10.0", "rate_hz"),
+            ("rate_hz = nan", "rate_hz"),
+            ("state_rate_hz = 0.0", "state_rate_hz"),
+        ] {
+            let refused = load(&format!("{GOOD}{line}\n"), &[]).unwrap_err();
+            assert!(refused.contains(key), "{refused}");
+        }
+        let refused = load("site = \"yard\"\n", &[]).unwrap_err();
+        assert!(refused.contains("--robot"), "{refused}");
+    }
+
+    #[test]
+    fn a_robot_without_a_start_is_refused() {
+        let refused = load(GOOD, &["--robot", "stranger"]).unwrap_err();
+        assert!(refused.contains("--start"), "{refused}");
+    }
+}

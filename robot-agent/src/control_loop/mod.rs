@@ -1,0 +1,81 @@
+//! The loop thread: a fixed rate, absolute deadlines, and nothing that could hold it up.
+//!
+//! It owns the drive and all control state ([`tick`]). Comms live elsewhere and talk to it
+//! through [`seam`]: a dead network never stalls it. It does no I/O but the drive's.
+
+pub(crate) mod seam;
+pub(crate) mod segments;
+pub(crate) mod site_view;
+pub(crate) mod tick;
+
+use std::time::Duration;
+
+use tracing::{info, warn};
+
+use crate::clock::SharedClock;
+use crate::drive::Drive;
+use segments::Moment;
+use tick::LoopCore;
+
+/// Longest time from the word to stop until the loop ends, standing or not.
+pub(crate) const BRAKING_MAX: Duration = Duration::from_secs(5);
+/// Periods by which the loop may lag before it gives up the ticks that it missed.
+const LAG_PERIODS_MAX: u32 = 10;
+/// Standing ticks in a row that count as having stopped.
+const STANDING_TICKS: u32 = 5;
+
+/// Runs the loop until it is told to stop and the robot stands.
+pub(crate) fn run(
+    mut core: LoopCore,
+    mut drive: Box<dyn Drive>,
+    clock: &SharedClock,
+    period: Duration,
+) {
+    info!(
+        period_us = u64::try_from(period.as_micros()).unwrap_or(0),
+        "control loop runs"
+    );
+    let mut deadline = clock.monotonic();
+    let mut told_to_stop_at = None;
+    let mut standing_ticks = 0;
+    loop {
+        let began = clock.monotonic();
+        if began > deadline + period {
+            core.note_overrun();
+        }
+        let stop = core.is_told_to_stop();
+        core.tick(
+            Moment {
+                monotonic: began,
+                wall: clock.wall(),
+            },
+            stop,
+            drive.as_mut(),
+        );
+        let ended = clock.monotonic();
+        core.note_tick_time(ended.saturating_sub(began));
+        if stop {
+            let since = *told_to_stop_at.get_or_insert(began);
+            standing_ticks = if core.stands() { standing_ticks + 1 } else { 0 };
+            let has_stopped = standing_ticks >= STANDING_TICKS && core.flush();
+            let is_overdue = began.saturating_sub(since) > BRAKING_MAX;
+            if has_stopped {
+                info!("the robot stands, the control loop ends");
+                return;
+            }
+            if is_overdue {
+                warn!("the robot did not stand in time, the control loop ends");
+                return;
+            }
+        }
+        deadline += period;
+        if ended > deadline + LAG_PERIODS_MAX * period {
+            // The process slept or starved: what was missed is not made up for.
+            deadline = ended;
+        }
+        std::thread::sleep(deadline.saturating_sub(clock.monotonic()));
+    }
+}
+
+#[cfg(test)]
+mod tests;

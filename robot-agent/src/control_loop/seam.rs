@@ -1,0 +1,258 @@
+//! What passes between the loop thread and the rest of the agent.
+//!
+//! Commands come in and events go out through bounded channels, never waited for by the loop; the
+//! latest snapshot lies in a cell that the loop leaves alone while somebody reads it.
+
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use jiff::Timestamp;
+use tread_api::friction::ThetaEstimate;
+use tread_api::ids::{MissionId, PlanHash};
+use tread_api::robot::{MissionProgress, RobotMode};
+use tread_api::site::Cell;
+use tread_api::wire::ingest::MissionPhase;
+use tread_control::estimation::SegmentStatistics;
+use tread_control::follower::{FailureReason, Follower};
+use tread_control::geometry::{Pose, Twist};
+
+use super::site_view::SiteView;
+
+/// Commands that may wait for the next tick.
+pub(crate) const COMMANDS_MAX: usize = 16;
+/// Events that may wait for whoever records them; more segments than that are lost and counted.
+pub(crate) const EVENTS_MAX: usize = 1_024;
+
+/// A planned mission, ready to drive.
+#[derive(Debug)]
+pub(crate) struct Job {
+    pub(crate) mission: MissionId,
+    pub(crate) revision: u32,
+    pub(crate) plan_hash: PlanHash,
+    pub(crate) follower: Follower,
+    /// Past this monotonic time it must not start.
+    pub(crate) start_by: Option<Duration>,
+}
+
+/// To the loop.
+#[derive(Debug)]
+pub(crate) enum LoopCommand {
+    /// Drive this.
+    Start(Box<Job>),
+    /// Brake along the path and end the mission, if it is this one.
+    Cancel(MissionId),
+    /// The site is like this now.
+    Site(Arc<SiteView>),
+}
+
+/// Why a mission ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum EndReason {
+    Reached,
+    Cancelled,
+    Failed(FailureReason),
+    TooLate,
+    AnotherInHand,
+    AgentStopped,
+}
+
+impl EndReason {
+    pub(crate) fn phase(self) -> MissionPhase {
+        match self {
+            Self::Reached => MissionPhase::Succeeded,
+            Self::Cancelled => MissionPhase::Cancelled,
+            Self::TooLate => MissionPhase::Expired,
+            Self::Failed(_) | Self::AnotherInHand | Self::AgentStopped => MissionPhase::Failed,
+        }
+    }
+
+    /// For people; a success needs no words.
+    pub(crate) fn text(self) -> Option<&'static str> {
+        match self {
+            Self::Reached => None,
+            Self::Cancelled => Some("cancelled on request"),
+            Self::Failed(reason) => Some(reason.text()),
+            Self::TooLate => Some("its latest start passed before it began"),
+            Self::AnotherInHand => Some("another mission was being driven"),
+            Self::AgentStopped => Some("the agent was stopped"),
+        }
+    }
+}
+
+/// A segment as the loop closed it.
+#[derive(Debug, Clone)]
+pub(crate) struct ClosedSegment {
+    pub(crate) site: Arc<SiteView>,
+    pub(crate) mission: Option<MissionId>,
+    pub(crate) started_at: Timestamp,
+    pub(crate) ended_at: Timestamp,
+    pub(crate) cell: Cell,
+    pub(crate) terrain: Option<usize>,
+    pub(crate) distance_m: f64,
+    /// Share of the blocks on this ground with a wheel beyond the linear range.
+    pub(crate) saturation_ratio: f64,
+    pub(crate) statistics: SegmentStatistics,
+}
+
+/// From the loop.
+#[derive(Debug)]
+pub(crate) enum LoopEvent {
+    /// The first wheel command of a mission was given.
+    Started {
+        at: Timestamp,
+        progress: MissionProgress,
+    },
+    /// A mission ended; what was driven is handed back to be freed elsewhere.
+    Ended {
+        at: Timestamp,
+        reason: EndReason,
+        progress: MissionProgress,
+        job: Box<Job>,
+    },
+    /// A segment closed with information.
+    Segment(ClosedSegment),
+    /// A site that is no longer used, handed back to be freed elsewhere.
+    Retired(Arc<SiteView>),
+}
+
+/// What is broken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fault {
+    /// The base has not been heard for too long.
+    BaseSilent,
+    /// No position fix for too long.
+    PositionLost,
+}
+
+impl Fault {
+    /// For people.
+    pub fn text(self) -> &'static str {
+        match self {
+            Self::BaseSilent => "the base has not been heard for too long",
+            Self::PositionLost => "there has been no position fix for too long",
+        }
+    }
+}
+
+/// What the loop last said of itself.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Snapshot {
+    /// When, by the agent's monotonic clock.
+    pub at: Duration,
+    /// What the agent is doing.
+    pub mode: RobotMode,
+    /// What is broken, if anything.
+    pub fault: Option<Fault>,
+    /// Where the robot is, and when the last fix behind it was measured.
+    pub pose: Option<(Pose, Duration)>,
+    /// How it moves, and when the base was last heard.
+    pub twist: Option<(Twist, Duration)>,
+    /// The mission that is driven.
+    pub mission: Option<MissionProgress>,
+    /// θ̂ of the loop; kept from the last mission, none before the first.
+    pub theta_loop: Option<f64>,
+    /// θ measured on the present ground.
+    pub theta_measured: Option<ThetaEstimate>,
+    /// Whether the motion of late carried information on θ.
+    pub excited: bool,
+    /// The cell that the robot is in.
+    pub cell: Option<Cell>,
+    /// The terrain that it is on, by its place in the site's definition.
+    pub(crate) terrain: Option<usize>,
+    /// The revision of the definition that the loop uses.
+    pub terrain_revision: Option<u64>,
+    /// Ticks since the start.
+    pub ticks: u64,
+}
+
+impl Default for Snapshot {
+    fn default() -> Self {
+        Self {
+            at: Duration::ZERO,
+            mode: RobotMode::Idle,
+            fault: None,
+            pose: None,
+            twist: None,
+            mission: None,
+            theta_loop: None,
+            theta_measured: None,
+            excited: false,
+            cell: None,
+            terrain: None,
+            terrain_revision: None,
+            ticks: 0,
+        }
+    }
+}
+
+/// What both sides may look at.
+#[derive(Debug, Default)]
+pub(crate) struct Shared {
+    snapshot: Mutex<Snapshot>,
+    /// Tells the loop to brake and end.
+    pub(crate) stop: AtomicBool,
+    /// Ticks that began more than one period late.
+    pub(crate) overruns: AtomicU64,
+    /// Longest computation of a tick since it was last taken, microseconds.
+    pub(crate) tick_max_us: AtomicU32,
+    /// Segments that nobody took in time.
+    pub(crate) lost_segments: AtomicU64,
+    /// Blocks of measurement that belong to no cell, for want of a site or a position.
+    pub(crate) unplaced_blocks: AtomicU64,
+}
+
+impl Shared {
+    /// The newest snapshot.
+    pub(crate) fn snapshot(&self) -> Snapshot {
+        *self.snapshot.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Leaves a newer one, unless somebody is reading right now: the next tick brings another.
+    pub(super) fn publish(&self, snapshot: Snapshot) {
+        if let Ok(mut cell) = self.snapshot.try_lock() {
+            *cell = snapshot;
+        }
+    }
+
+    pub(super) fn count(counter: &AtomicU64) {
+        counter.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+/// The loop's ends of everything.
+#[derive(Debug)]
+pub(crate) struct LoopEnds {
+    pub(crate) commands: Receiver<LoopCommand>,
+    pub(crate) events: SyncSender<LoopEvent>,
+    pub(crate) shared: Arc<Shared>,
+}
+
+/// The other ends.
+#[derive(Debug)]
+pub(crate) struct AgentEnds {
+    pub(crate) commands: SyncSender<LoopCommand>,
+    pub(crate) events: Receiver<LoopEvent>,
+    pub(crate) shared: Arc<Shared>,
+}
+
+/// Everything that passes between the loop and the rest.
+pub(crate) fn seam() -> (LoopEnds, AgentEnds) {
+    let (command_sender, command_receiver) = sync_channel(COMMANDS_MAX);
+    let (event_sender, event_receiver) = sync_channel(EVENTS_MAX);
+    let shared = Arc::new(Shared::default());
+    let loop_ends = LoopEnds {
+        commands: command_receiver,
+        events: event_sender,
+        shared: Arc::clone(&shared),
+    };
+    (
+        loop_ends,
+        AgentEnds {
+            commands: command_sender,
+            events: event_receiver,
+            shared,
+        },
+    )
+}

@@ -1,0 +1,169 @@
+//! Cuts what is measured into segments: one cell, one ground, one pass.
+//!
+//! ```text
+//!              moved to a cell on one ground                 wheels on two grounds, no cell
+//! unplaced ────────────────────────────────► measuring(cell, terrain) ───────► unplaced
+//!                                              └ next cell, other terrain, changed ground,
+//!                                                SEGMENT_MAX over: close, measure on
+//! ```
+//! A segment is measured since the estimator's last close; what it measured while unplaced is
+//! thrown away. Only what carries information on θ is handed on.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use tread_api::ids::MissionId;
+use tread_api::site::Cell;
+use tread_control::estimation::Estimator;
+
+use super::seam::ClosedSegment;
+use super::site_view::SiteView;
+
+/// Longest segment.
+pub(crate) const SEGMENT_MAX: Duration = Duration::from_secs(30);
+
+/// Where a robot is, for the map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Place {
+    pub(crate) cell: Cell,
+    /// Its place in the site's definition; `None` where none is drawn.
+    pub(crate) terrain: Option<usize>,
+}
+
+/// The moment of a tick, by both clocks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Moment {
+    pub(crate) monotonic: Duration,
+    pub(crate) wall: Timestamp,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Open {
+    place: Place,
+    since: Moment,
+    distance_m: f64,
+}
+
+/// What a tick means for the segments.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct CutInput<'tick> {
+    pub(crate) now: Moment,
+    /// Where the robot is; none without a site or with wheels on two grounds.
+    pub(crate) place: Option<Place>,
+    pub(crate) site: Option<&'tick Arc<SiteView>>,
+    pub(crate) mission: Option<MissionId>,
+    /// Way driven in this tick, metres.
+    pub(crate) driven_m: f64,
+    /// The estimator says that the ground is another one now.
+    pub(crate) ground_changed: bool,
+}
+
+/// What became of it.
+#[derive(Debug, Default)]
+pub(crate) struct Cut {
+    /// A segment for the map; none if nothing was closed, or what was closed says nothing on θ.
+    pub(crate) segment: Option<ClosedSegment>,
+    /// The estimator has begun anew on other ground.
+    pub(crate) is_new_ground: bool,
+}
+
+/// Cuts segments.
+#[derive(Debug, Default)]
+pub(crate) struct SegmentCutter {
+    open: Option<Open>,
+    mission: Option<MissionId>,
+}
+
+impl SegmentCutter {
+    /// The cell of the open segment.
+    pub(crate) fn cell(&self) -> Option<Cell> {
+        self.open.map(|open| open.place.cell)
+    }
+
+    /// One tick, after the estimator has taken its samples.
+    pub(crate) fn step(&mut self, input: CutInput<'_>, estimator: &mut Estimator) -> Cut {
+        let Some(open) = &mut self.open else {
+            return self.start_at(input, estimator);
+        };
+        open.distance_m += input.driven_m;
+        let is_same_place = input.place == Some(open.place);
+        let is_same_mission = input.mission == self.mission;
+        let is_full = input.now.monotonic.saturating_sub(open.since.monotonic) >= SEGMENT_MAX;
+        if is_same_place && is_same_mission && !input.ground_changed && !is_full {
+            return Cut::default();
+        }
+        let closed = *open;
+        let mission = self.mission;
+        let segment = close(closed, mission, input, estimator);
+        let is_new_ground = input.ground_changed
+            || input
+                .place
+                .is_none_or(|place| place.terrain != closed.place.terrain);
+        if is_new_ground {
+            estimator.begin_ground();
+        }
+        self.open = input.place.map(|place| Open {
+            place,
+            since: input.now,
+            distance_m: 0.0,
+        });
+        self.mission = input.mission;
+        Cut {
+            segment,
+            is_new_ground,
+        }
+    }
+
+    fn start_at(&mut self, input: CutInput<'_>, estimator: &mut Estimator) -> Cut {
+        if let Some(place) = input.place {
+            // What was measured on the way here belongs to no place.
+            estimator.begin_ground();
+            self.open = Some(Open {
+                place,
+                since: input.now,
+                distance_m: 0.0,
+            });
+            self.mission = input.mission;
+        }
+        Cut {
+            segment: None,
+            is_new_ground: input.place.is_some(),
+        }
+    }
+
+    /// Closes what is open without using it, where the site itself has changed.
+    pub(crate) fn abandon(&mut self, estimator: &mut Estimator) {
+        self.open = None;
+        estimator.begin_ground();
+    }
+}
+
+fn close(
+    open: Open,
+    mission: Option<MissionId>,
+    input: CutInput<'_>,
+    estimator: &mut Estimator,
+) -> Option<ClosedSegment> {
+    let saturation_ratio = estimator.estimate().saturation_share;
+    let statistics = estimator.close_segment();
+    let site = input.site?;
+    let is_informative = statistics.theta_information > 0.0
+        && statistics.theta_weighted.is_finite()
+        && statistics.samples > 0;
+    if !is_informative {
+        return None;
+    }
+    Some(ClosedSegment {
+        site: Arc::clone(site),
+        mission,
+        started_at: open.since.wall,
+        // A wall clock that was set back must not make a segment end before it began.
+        ended_at: input.now.wall.max(open.since.wall),
+        cell: open.place.cell,
+        terrain: open.place.terrain,
+        distance_m: open.distance_m,
+        saturation_ratio,
+        statistics,
+    })
+}

@@ -1,0 +1,255 @@
+//! The site as the loop sees it: which cell and which terrain is under the robot, without
+//! allocating.
+
+use tread_api::geometry::Point;
+use tread_api::site::{Cell, Grid};
+use tread_api::terrain::TerrainRef;
+use tread_api::wire::hello::SiteDefinition;
+use tread_control::geometry::Pose;
+use tread_control::robot::RobotModel;
+
+/// How far a robot must be outside a cell before it counts as having left it, metres: more than
+/// the noise of its position, so that a path along a border does not chop its segments.
+const CELL_MARGIN_M: f64 = 0.05;
+
+#[derive(Debug, Clone, Copy)]
+struct Bounds {
+    low: Point,
+    high: Point,
+}
+
+impl Bounds {
+    fn of(corners: &[Point]) -> Self {
+        let start = Self {
+            low: Point {
+                x_m: f64::INFINITY,
+                y_m: f64::INFINITY,
+            },
+            high: Point {
+                x_m: f64::NEG_INFINITY,
+                y_m: f64::NEG_INFINITY,
+            },
+        };
+        corners.iter().fold(start, |bounds, corner| Self {
+            low: Point {
+                x_m: bounds.low.x_m.min(corner.x_m),
+                y_m: bounds.low.y_m.min(corner.y_m),
+            },
+            high: Point {
+                x_m: bounds.high.x_m.max(corner.x_m),
+                y_m: bounds.high.y_m.max(corner.y_m),
+            },
+        })
+    }
+
+    fn contains(&self, point: Point) -> bool {
+        (self.low.x_m..=self.high.x_m).contains(&point.x_m)
+            && (self.low.y_m..=self.high.y_m).contains(&point.y_m)
+    }
+}
+
+/// What a robot stands on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Footing {
+    /// All wheels on the same terrain, by its place in the definition; `None` where none is drawn.
+    Whole(Option<usize>),
+    /// Wheels on different ground.
+    Mixed,
+}
+
+/// A site's definition, prepared for looking up.
+#[derive(Debug)]
+pub(crate) struct SiteView {
+    definition: SiteDefinition,
+    bounds: Vec<Bounds>,
+    /// Places in the definition, the one that counts first.
+    order: Vec<usize>,
+}
+
+impl SiteView {
+    pub(crate) fn new(definition: SiteDefinition) -> Self {
+        let terrains = &definition.terrains;
+        let bounds = terrains
+            .iter()
+            .map(|shape| Bounds::of(shape.polygon.corners()))
+            .collect();
+        let mut order: Vec<usize> = (0..terrains.len()).collect();
+        order.sort_by(|&left, &right| {
+            let (left, right) = (&terrains[left], &terrains[right]);
+            right
+                .layer
+                .cmp(&left.layer)
+                .then_with(|| left.terrain.id.cmp(&right.terrain.id))
+        });
+        Self {
+            definition,
+            bounds,
+            order,
+        }
+    }
+
+    pub(crate) fn grid(&self) -> Grid {
+        self.definition.grid
+    }
+
+    pub(crate) fn terrain_revision(&self) -> u64 {
+        self.definition.terrain_revision
+    }
+
+    /// The terrain at a place in the definition.
+    pub(crate) fn terrain(&self, place: usize) -> Option<&TerrainRef> {
+        self.definition
+            .terrains
+            .get(place)
+            .map(|shape| &shape.terrain)
+    }
+
+    fn terrain_at(&self, point: Point) -> Option<usize> {
+        self.order.iter().copied().find(|&place| {
+            self.bounds[place].contains(point)
+                && self.definition.terrains[place].polygon.contains(point)
+        })
+    }
+
+    /// What the four wheels of a robot stand on.
+    pub(crate) fn footing(&self, pose: Pose, model: &RobotModel) -> Footing {
+        let (sin, cos) = pose.heading_rad.sin_cos();
+        let (ahead_m, left_m) = (0.5 * model.wheelbase_m(), 0.5 * model.track_width_m());
+        let under = |ahead_m: f64, left_m: f64| {
+            self.terrain_at(Point {
+                x_m: pose.x_m + ahead_m * cos - left_m * sin,
+                y_m: pose.y_m + ahead_m * sin + left_m * cos,
+            })
+        };
+        let first = under(ahead_m, left_m);
+        let others = [(ahead_m, -left_m), (-ahead_m, left_m), (-ahead_m, -left_m)];
+        if others
+            .into_iter()
+            .all(|(ahead_m, left_m)| under(ahead_m, left_m) == first)
+        {
+            Footing::Whole(first)
+        } else {
+            Footing::Mixed
+        }
+    }
+
+    /// The cell of a position; the former one while the robot is hardly outside it.
+    pub(crate) fn cell(&self, position: Point, former: Option<Cell>) -> Option<Cell> {
+        let grid = self.grid();
+        let is_near = |cell: &Cell| {
+            let center = grid.center_of(*cell);
+            let reach_m = 0.5 * grid.cell_m + CELL_MARGIN_M;
+            (position.x_m - center.x_m).abs() <= reach_m
+                && (position.y_m - center.y_m).abs() <= reach_m
+        };
+        former.filter(is_near).or_else(|| grid.cell_at(position))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use tread_api::geometry::Polygon;
+    use tread_api::terrain::{TerrainShape, terrain_at};
+
+    use super::*;
+
+    fn square(id: &str, x_m: f64, half_m: f64, layer: i32) -> TerrainShape {
+        let corner = |dx: f64, dy: f64| Point {
+            x_m: x_m + half_m * dx,
+            y_m: half_m * dy,
+        };
+        let corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
+        let corners = corners.into_iter().map(|(dx, dy)| corner(dx, dy)).collect();
+        TerrainShape {
+            terrain: TerrainRef {
+                id: id.parse().unwrap(),
+                revision: 1,
+            },
+            polygon: Polygon::new(corners).unwrap(),
+            layer,
+        }
+    }
+
+    fn site(terrains: Vec<TerrainShape>) -> SiteDefinition {
+        let grid = Grid {
+            revision: 1,
+            cell_m: 1.0,
+        };
+        SiteDefinition {
+            grid,
+            terrain_revision: 3,
+            terrains,
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn the_loop_and_the_wire_agree_on_the_terrain(
+            squares in prop::collection::vec((-5.0..5.0_f64, 0.5..6.0_f64, 0..3), 0..6),
+            x_m in -8.0..8.0_f64,
+            y_m in -8.0..8.0_f64,
+        ) {
+            let shapes: Vec<TerrainShape> = squares
+                .into_iter()
+                .enumerate()
+                .map(|(index, (x_m, half_m, layer))| square(&format!("t{index}"), x_m, half_m, layer))
+                .collect();
+            let point = Point { x_m, y_m };
+            let expected = terrain_at(&shapes, point).map(|shape| shape.terrain.clone());
+            let view = SiteView::new(site(shapes));
+            let found = view.terrain_at(point).and_then(|place| view.terrain(place)).cloned();
+            prop_assert_eq!(found, expected);
+        }
+    }
+
+    #[test]
+    fn wheels_on_two_terrains_have_no_single_footing() {
+        let view = SiteView::new(site(vec![square("a", 0.0, 2.0, 0)]));
+        let model = RobotModel::yi2007();
+        let at = |x_m: f64| {
+            view.footing(
+                Pose {
+                    x_m,
+                    y_m: 0.0,
+                    heading_rad: 0.3,
+                },
+                &model,
+            )
+        };
+        assert_eq!(at(0.0), Footing::Whole(Some(0)));
+        assert_eq!(at(2.0), Footing::Mixed);
+        assert_eq!(at(3.0), Footing::Whole(None));
+    }
+
+    #[test]
+    fn a_robot_on_the_border_of_a_cell_stays_in_it() {
+        let view = SiteView::new(site(Vec::new()));
+        let first = view.cell(
+            Point {
+                x_m: 0.99,
+                y_m: 0.5,
+            },
+            None,
+        );
+        assert_eq!(first, Some(Cell { ix: 0, iy: 0 }));
+        assert_eq!(
+            view.cell(
+                Point {
+                    x_m: 1.03,
+                    y_m: 0.5
+                },
+                first
+            ),
+            first
+        );
+        let next = view.cell(
+            Point {
+                x_m: 1.06,
+                y_m: 0.5,
+            },
+            first,
+        );
+        assert_eq!(next, Some(Cell { ix: 1, iy: 0 }));
+    }
+}

@@ -1,0 +1,93 @@
+//! The seam to a base: what is read from it and written to it once per tick.
+//!
+//! A drive hands over every sensor sample since the last tick (up to [`SAMPLES_MAX`]), so that the
+//! estimator sees all of a 200 Hz sensor in a 100 Hz loop. Neither call may block or allocate.
+
+pub mod simulated;
+
+use std::time::Duration;
+
+use tread_control::geometry::Pose;
+use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
+
+/// Most samples of one tick: a 20 Hz loop with 200 Hz sensors, with room for jitter.
+pub const SAMPLES_MAX: usize = 16;
+
+/// What the base's sensors said at one moment; absent where a sensor said nothing then.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct SensorSample {
+    /// When it was measured, by the agent's monotonic clock.
+    pub at: Duration,
+    /// Turn rate from the gyro, radians per second.
+    pub yaw_rate_rad_s: Option<f64>,
+    /// Acceleration without gravity.
+    pub acceleration: Option<BodyAcceleration>,
+    /// Wheel speeds as measured, never as commanded.
+    pub wheel_speeds: Option<WheelSpeeds>,
+    /// Drive torques.
+    pub wheel_torques: Option<WheelTorques>,
+    /// Speed of the body over ground, ahead, metres per second.
+    pub body_speed_m_s: Option<f64>,
+    /// A position fix in the site's frame.
+    pub position: Option<Pose>,
+}
+
+/// Everything that the base said since the last tick, oldest first.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Feedback {
+    samples: [SensorSample; SAMPLES_MAX],
+    count: usize,
+    lost: u32,
+}
+
+impl Feedback {
+    /// Adds a sample; the oldest gives way when there are too many.
+    pub fn push(&mut self, sample: SensorSample) {
+        if self.count == SAMPLES_MAX {
+            self.samples.rotate_left(1);
+            self.count -= 1;
+            self.lost = self.lost.saturating_add(1);
+        }
+        self.samples[self.count] = sample;
+        self.count += 1;
+    }
+
+    /// The samples, oldest first.
+    pub fn samples(&self) -> &[SensorSample] {
+        &self.samples[..self.count]
+    }
+
+    /// Samples that gave way.
+    pub fn lost(&self) -> u32 {
+        self.lost
+    }
+}
+
+/// A base.
+pub trait Drive: Send {
+    /// Everything that the sensors said since the last call.
+    fn read(&mut self, now: Duration) -> Feedback;
+
+    /// Commands the wheels; the base keeps this until the next call.
+    fn write(&mut self, command: WheelSpeeds);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn feedback_keeps_the_newest_samples() {
+        let mut feedback = Feedback::default();
+        for index in 0..SAMPLES_MAX as u64 + 3 {
+            let at = Duration::from_millis(index);
+            feedback.push(SensorSample {
+                at,
+                ..SensorSample::default()
+            });
+        }
+        assert_eq!(feedback.samples().len(), SAMPLES_MAX);
+        assert_eq!(feedback.lost(), 3);
+        assert_eq!(feedback.samples()[0].at, Duration::from_millis(3));
+    }
+}

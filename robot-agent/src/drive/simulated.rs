@@ -1,0 +1,133 @@
+//! A simulated base behind the drive's seam.
+//!
+//! It has no thread of its own: reading moves it on to the present time in steps of its sensors'
+//! period, under the last command, so that a loop that comes late finds the robot farther on.
+
+use std::time::Duration;
+
+use tread_control::geometry::Pose;
+use tread_control::measured::WheelSpeeds;
+use tread_control::plant::{Plant, PlantError, PlantSpec, PlantState};
+use tread_control::robot::RobotModel;
+
+use super::{Drive, Feedback};
+use crate::sim::ground::GroundMap;
+use crate::sim::scenario::{GroundSpec, Scenario, ScenarioError};
+use crate::sim::sensors::{SAMPLE_PERIOD, SensorSpec, Sensors};
+
+/// Most simulated time of one call; a process that slept longer finds its robot paused.
+const CATCH_UP_MAX: Duration = Duration::from_secs(1);
+
+/// What moves the simulated time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum SimMode {
+    /// Reading moves it on to the time of the call.
+    #[default]
+    Auto,
+    /// Only [`SimulatedDrive::advance`] moves it; for tests.
+    Explicit,
+}
+
+/// Why a simulated base could not be made.
+#[derive(Debug, thiserror::Error)]
+pub enum SimulatedDriveError {
+    /// The plant refused a figure.
+    #[error("the simulated base cannot be made")]
+    Plant(#[from] PlantError),
+    /// The scenario's ground was refused.
+    #[error("the simulated ground cannot be made")]
+    Ground(#[from] ScenarioError),
+}
+
+/// A simulated base.
+#[derive(Debug, Clone)]
+pub struct SimulatedDrive {
+    mode: SimMode,
+    plant: Plant,
+    ground: GroundMap,
+    sensors: Sensors,
+    track_width_m: f64,
+    command: WheelSpeeds,
+    waiting: Feedback,
+    /// Up to when it has been simulated; none before the first call.
+    simulated_to: Option<Duration>,
+}
+
+impl SimulatedDrive {
+    /// A base at rest at a pose on a scenario's ground.
+    ///
+    /// # Errors
+    /// [`SimulatedDriveError`] when a figure is out of its range.
+    pub fn new(
+        scenario: &Scenario,
+        model: RobotModel,
+        start: Pose,
+        seed: u64,
+        mode: SimMode,
+    ) -> Result<Self, SimulatedDriveError> {
+        let sensors = Sensors::new(SensorSpec::default(), &model, seed);
+        let (left_radius_ratio, right_radius_ratio) = sensors.radius_ratios();
+        let spec = PlantSpec {
+            left_radius_ratio,
+            right_radius_ratio,
+            ..PlantSpec::default()
+        };
+        Ok(Self {
+            mode,
+            plant: Plant::new(model, spec, start)?,
+            ground: GroundMap::new(scenario)?,
+            sensors,
+            track_width_m: model.track_width_m(),
+            command: WheelSpeeds::default(),
+            waiting: Feedback::default(),
+            simulated_to: None,
+        })
+    }
+
+    /// The true state, for tests and figures.
+    pub fn truth(&self) -> &PlantState {
+        self.plant.state()
+    }
+
+    /// The true ground under the robot's left side.
+    pub fn ground_truth(&self) -> GroundSpec {
+        let curve = self.ground.under(self.plant.state().pose, 0.0).left;
+        GroundSpec {
+            stiffness: curve.stiffness(),
+            peak_slip: curve.peak_slip(),
+            sliding_ratio: curve.sliding_ratio(),
+        }
+    }
+
+    /// Moves the simulated time on to `now`.
+    pub fn advance(&mut self, now: Duration) {
+        let from = self
+            .simulated_to
+            .unwrap_or_else(|| now.saturating_sub(SAMPLE_PERIOD));
+        let mut at = from.max(now.saturating_sub(CATCH_UP_MAX));
+        while at + SAMPLE_PERIOD <= now {
+            at += SAMPLE_PERIOD;
+            let ground = self
+                .ground
+                .under(self.plant.state().pose, self.track_width_m);
+            self.plant
+                .step(self.command, &ground, SAMPLE_PERIOD.as_secs_f64());
+            let sample = self.sensors.sample(&self.plant, at);
+            self.waiting.push(sample);
+        }
+        self.simulated_to = Some(at);
+    }
+}
+
+impl Drive for SimulatedDrive {
+    fn read(&mut self, now: Duration) -> Feedback {
+        if self.mode == SimMode::Auto {
+            self.advance(now);
+        }
+        std::mem::take(&mut self.waiting)
+    }
+
+    fn write(&mut self, command: WheelSpeeds) {
+        self.command = command;
+    }
+}

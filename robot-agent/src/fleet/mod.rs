@@ -1,0 +1,444 @@
+//! The link to the fleet's server: the only module that calls zenoh.
+//!
+//! The session is a client that connects for ever. Calls of zenoh block the thread that makes
+//! them, so all but the cheapest are made on the blocking pool; what comes in is handed over by
+//! callbacks that never wait. Nothing here knows of loops, missions or disks: [`uploader`] alone
+//! knows the outbox.
+
+pub mod uploader;
+
+use std::str::FromStr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::{mpsc, oneshot, watch};
+use tokio_util::sync::CancellationToken;
+use tracing::{debug, info, warn};
+use tread_api::ids::{BootId, RobotId, SiteId};
+use tread_api::keys::{self, Key, Verb};
+use tread_api::wire::command::Answer;
+use tread_api::wire::hello::{Hello, Welcome};
+use tread_api::wire::ingest::{Batch, Receipt};
+use tread_api::wire::state::{FrictionReport, RobotState};
+use tread_api::wire::{self, PAYLOAD_BYTES_MAX, Refusal, RefusalCode, WireError};
+use zenoh::Wait;
+use zenoh::handlers::FifoChannel;
+use zenoh::liveliness::LivelinessToken;
+use zenoh::pubsub::Publisher;
+use zenoh::qos::CongestionControl;
+use zenoh::query::{ConsolidationMode, Querier, Query};
+
+/// Commands that may wait to be answered; more are dropped, and the server asks again.
+pub const COMMANDS_MAX: usize = 64;
+/// Longest wait for the server's answer to an introduction.
+pub const HELLO_TIMEOUT: Duration = Duration::from_secs(2);
+/// Longest wait for the server's receipt.
+pub const UPLOAD_TIMEOUT: Duration = Duration::from_secs(10);
+/// Longest wait for a session to close.
+pub const CLOSE_MAX: Duration = Duration::from_secs(3);
+/// Replies to one query that may wait; there is one server.
+const REPLIES_MAX: usize = 4;
+/// First pause before a lost connection is tried again, milliseconds.
+const RETRY_FIRST_MS: u32 = 100;
+/// Longest pause between tries, milliseconds.
+const RETRY_MAX_MS: u32 = 2_000;
+/// After this silence the router takes a robot for gone, milliseconds.
+const LEASE_MS: u32 = 3_000;
+
+/// Who speaks.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct Identity {
+    /// The site.
+    pub site: SiteId,
+    /// The robot.
+    pub robot: RobotId,
+    /// This run of the agent.
+    pub boot: BootId,
+}
+
+/// Why the link could not be made.
+#[derive(Debug, thiserror::Error)]
+pub enum LinkError {
+    /// The server's endpoint is none.
+    #[error("`{endpoint}` is no zenoh endpoint: {problem}")]
+    Endpoint {
+        /// What was given.
+        endpoint: String,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// zenoh refused.
+    #[error("zenoh could not {action}: {problem}")]
+    Zenoh {
+        /// What was tried.
+        action: &'static str,
+        /// What zenoh said.
+        problem: String,
+    },
+}
+
+fn zenoh_failed(action: &'static str) -> impl FnOnce(zenoh::Error) -> LinkError {
+    move |problem| LinkError::Zenoh {
+        action,
+        problem: problem.to_string(),
+    }
+}
+
+/// Why a question to the server went without an answer.
+#[derive(Debug, thiserror::Error)]
+pub enum AskError {
+    /// Nobody answered: the server is not there, or too slow.
+    #[error("the server did not answer")]
+    NoAnswer,
+    /// The server refused the whole message.
+    #[error("the server refused: {0:?}")]
+    Refused(Refusal),
+    /// The answer cannot be read.
+    #[error("the server's answer cannot be read")]
+    Unreadable(#[source] WireError),
+    /// The question cannot be written.
+    #[error("the message cannot be written as JSON")]
+    Unwritable(#[source] serde_json::Error),
+    /// zenoh refused.
+    #[error(transparent)]
+    Link(#[from] LinkError),
+}
+
+/// A command that waits for its answer.
+#[derive(Debug)]
+pub struct IncomingCommand {
+    /// What is asked.
+    pub verb: Verb,
+    /// The payload as it came.
+    pub payload: Vec<u8>,
+    query: Query,
+}
+
+impl IncomingCommand {
+    /// Answers; a failure is logged, for the server asks again.
+    pub async fn answer(self, answer: &Answer) {
+        match wire::encode(answer) {
+            Ok(payload) => self.reply(payload, false).await,
+            Err(cause) => warn!(
+                error = &cause as &dyn std::error::Error,
+                "cannot write an answer"
+            ),
+        }
+    }
+
+    /// Refuses the message as a whole.
+    pub async fn refuse(self, refusal: &Refusal) {
+        if let Ok(payload) = wire::encode(refusal) {
+            self.reply(payload, true).await;
+        }
+    }
+
+    async fn reply(self, payload: Vec<u8>, is_error: bool) {
+        let replying = tokio::task::spawn_blocking(move || {
+            if is_error {
+                self.query.reply_err(payload).wait()
+            } else {
+                self.query
+                    .reply(self.query.key_expr().clone(), payload)
+                    .wait()
+            }
+        });
+        if let Ok(Err(cause)) = replying.await {
+            warn!("an answer could not be sent: {cause}");
+        }
+    }
+}
+
+/// A connected session with everything declared.
+#[derive(Debug)]
+pub struct FleetLink {
+    identity: Identity,
+    session: zenoh::Session,
+    state: Publisher<'static>,
+    friction: Publisher<'static>,
+    hello: Querier<'static>,
+    ingest: Querier<'static>,
+    _alive: LivelinessToken,
+    server_seen: watch::Receiver<u64>,
+}
+
+/// What comes in over a link.
+pub type Commands = mpsc::Receiver<IncomingCommand>;
+
+fn session_config(server: &str) -> Result<zenoh::Config, LinkError> {
+    let endpoint_failed = |problem: String| LinkError::Endpoint {
+        endpoint: server.to_owned(),
+        problem,
+    };
+    zenoh::config::EndPoint::from_str(server)
+        .map_err(|problem| endpoint_failed(problem.to_string()))?;
+    let endpoints = serde_json::json!([server]).to_string();
+    let retry = serde_json::json!({
+        "period_init_ms": RETRY_FIRST_MS,
+        "period_max_ms": RETRY_MAX_MS,
+        "period_increase_factor": 2.0,
+    });
+    let settings = [
+        ("mode", "\"client\"".to_owned()),
+        ("connect/endpoints", endpoints),
+        ("connect/timeout_ms", "-1".to_owned()),
+        ("connect/retry", retry.to_string()),
+        ("listen/endpoints", "[]".to_owned()),
+        ("scouting/multicast/enabled", "false".to_owned()),
+        ("scouting/gossip/enabled", "false".to_owned()),
+        ("transport/link/tx/lease", LEASE_MS.to_string()),
+    ];
+    let mut config = zenoh::Config::default();
+    for (key, value) in settings {
+        config
+            .insert_json5(key, &value)
+            .map_err(zenoh_failed("take its configuration"))?;
+    }
+    Ok(config)
+}
+
+/// Checks that a text is an endpoint that zenoh can connect to.
+///
+/// # Errors
+/// [`LinkError::Endpoint`].
+pub fn check_endpoint(server: &str) -> Result<(), LinkError> {
+    session_config(server).map(|_| ())
+}
+
+impl FleetLink {
+    /// Connects, however long that takes, and declares everything; `None` once told to stop.
+    ///
+    /// # Errors
+    /// [`LinkError`] for an endpoint that is none, or when zenoh refuses a declaration.
+    pub async fn connect(
+        server: &str,
+        identity: Identity,
+        stop: &CancellationToken,
+    ) -> Result<Option<(Self, Commands)>, LinkError> {
+        let config = session_config(server)?;
+        let (opened, opening) = oneshot::channel();
+        // Opening blocks until the server is there. A thread of its own can be left behind.
+        let cancelled = stop.clone();
+        std::thread::Builder::new()
+            .name("fleet-connect".to_owned())
+            .spawn(move || {
+                let session = zenoh::open(config).wait();
+                if let (Ok(session), true) = (&session, cancelled.is_cancelled()) {
+                    let _ = session.close().wait();
+                }
+                // Nobody waits any more: the session closes by being dropped.
+                let _ = opened.send(session);
+            })
+            .map_err(|cause| LinkError::Zenoh {
+                action: "start a thread",
+                problem: cause.to_string(),
+            })?;
+        let session = tokio::select! {
+            () = stop.cancelled() => return Ok(None),
+            session = opening => session,
+        };
+        let session = session
+            .map_err(|_| LinkError::Zenoh {
+                action: "open a session",
+                problem: "its thread died".to_owned(),
+            })?
+            .map_err(zenoh_failed("open a session"))?;
+        info!(server, "connected to `{server}`");
+        let declaring = tokio::task::spawn_blocking(move || Self::declare(session, identity));
+        declaring
+            .await
+            .map_or(Ok(None), |declared| declared.map(Some))
+    }
+
+    fn declare(session: zenoh::Session, identity: Identity) -> Result<(Self, Commands), LinkError> {
+        let (site, robot) = (&identity.site, &identity.robot);
+        let (command_sender, commands) = mpsc::channel(COMMANDS_MAX);
+        let take_query = move |query: Query| {
+            let Some(Key::Command(_, _, verb)) = Key::parse(query.key_expr().as_str()) else {
+                // A wildcard or an unknown verb: no reply means not delivered.
+                return;
+            };
+            let payload = query.payload().map_or(0, zenoh::bytes::ZBytes::len);
+            if payload > PAYLOAD_BYTES_MAX {
+                debug!(payload, "a command is larger than any can be");
+                return;
+            }
+            let payload = query.payload().map(|bytes| bytes.to_bytes().into_owned());
+            let command = IncomingCommand {
+                verb,
+                payload: payload.unwrap_or_default(),
+                query,
+            };
+            // Full: the query is dropped, the server sees no reply and asks again.
+            let _ = command_sender.try_send(command);
+        };
+        session
+            .declare_queryable(keys::commands(site, robot))
+            .complete(true)
+            .callback(take_query)
+            .background()
+            .wait()
+            .map_err(zenoh_failed("declare the commands"))?;
+        let publisher = |key: String| {
+            let publisher = session.declare_publisher(key);
+            publisher.congestion_control(CongestionControl::Drop).wait()
+        };
+        let querier = |key: String, timeout: Duration| {
+            let querier = session.declare_querier(key);
+            querier
+                .consolidation(ConsolidationMode::None)
+                .timeout(timeout)
+                .wait()
+        };
+        let state = publisher(keys::state(site, robot)).map_err(zenoh_failed("declare `state`"))?;
+        let friction =
+            publisher(keys::friction(site, robot)).map_err(zenoh_failed("declare `friction`"))?;
+        let ingest = querier(keys::ingest(site, robot), UPLOAD_TIMEOUT)
+            .map_err(zenoh_failed("declare `ingest`"))?;
+        let hello = querier(keys::hello(site, robot), HELLO_TIMEOUT)
+            .map_err(zenoh_failed("declare `hello`"))?;
+        let (seen_sender, server_seen) = watch::channel(0_u64);
+        hello
+            .matching_listener()
+            .callback(move |status| {
+                if status.matching() {
+                    seen_sender.send_modify(|count| *count += 1);
+                }
+            })
+            .background()
+            .wait()
+            .map_err(zenoh_failed("listen for the server"))?;
+        let alive = session
+            .liveliness()
+            .declare_token(keys::alive(site, robot, identity.boot))
+            .wait()
+            .map_err(zenoh_failed("declare the liveliness token"))?;
+        let link = Self {
+            identity,
+            session,
+            state,
+            friction,
+            hello,
+            ingest,
+            _alive: alive,
+            server_seen,
+        };
+        Ok((link, commands))
+    }
+
+    /// Counts how often the server has come into reach; changes with each (re)connection.
+    pub fn server_seen(&self) -> watch::Receiver<u64> {
+        self.server_seen.clone()
+    }
+
+    /// Who this is.
+    pub fn identity(&self) -> &Identity {
+        &self.identity
+    }
+
+    /// Publishes the state, or loses it where the network is slow.
+    pub fn publish_state(&self, state: &RobotState) {
+        match wire::encode(state) {
+            Ok(payload) => log_failed(self.state.put(payload).wait(), "state"),
+            Err(cause) => debug!("the state cannot be written: {cause}"),
+        }
+    }
+
+    /// Publishes both friction estimates, or loses them where the network is slow.
+    pub fn publish_friction(&self, report: &FrictionReport) {
+        match wire::encode(report) {
+            Ok(payload) => log_failed(self.friction.put(payload).wait(), "friction"),
+            Err(cause) => debug!("friction cannot be written: {cause}"),
+        }
+    }
+
+    /// Introduces the robot to the server.
+    ///
+    /// # Errors
+    /// [`AskError`] when there is no welcome.
+    pub async fn hello(self: &Arc<Self>, hello: &Hello) -> Result<Welcome, AskError> {
+        let payload = wire::encode(hello).map_err(AskError::Unwritable)?;
+        let answer = self.ask(Question::Hello, payload).await?;
+        wire::decode(&answer).map_err(AskError::Unreadable)
+    }
+
+    /// Uploads a batch; a receipt comes after the server's commit.
+    ///
+    /// # Errors
+    /// [`AskError`] when there is no receipt: the batch may or may not have been taken.
+    pub async fn upload(self: &Arc<Self>, batch: &Batch) -> Result<Receipt, AskError> {
+        let payload = wire::encode(batch).map_err(AskError::Unwritable)?;
+        let answer = self.ask(Question::Ingest, payload).await?;
+        wire::decode(&answer).map_err(AskError::Unreadable)
+    }
+
+    async fn ask(
+        self: &Arc<Self>,
+        question: Question,
+        payload: Vec<u8>,
+    ) -> Result<Vec<u8>, AskError> {
+        let link = Arc::clone(self);
+        // Sending blocks where the network is slow.
+        let sending = tokio::task::spawn_blocking(move || {
+            let querier = match question {
+                Question::Hello => &link.hello,
+                Question::Ingest => &link.ingest,
+            };
+            querier
+                .get()
+                .payload(payload)
+                .with(FifoChannel::new(REPLIES_MAX))
+                .wait()
+        });
+        let replies = sending
+            .await
+            .map_err(|_| AskError::NoAnswer)?
+            .map_err(zenoh_failed("send a query"))?;
+        // The channel closes by itself at the query's timeout.
+        let Ok(reply) = replies.recv_async().await else {
+            return Err(AskError::NoAnswer);
+        };
+        match reply.into_result() {
+            Ok(sample) => Ok(sample.payload().to_bytes().into_owned()),
+            Err(error) => match wire::decode::<Refusal>(&error.payload().to_bytes()) {
+                Ok(refusal) => Err(AskError::Refused(refusal)),
+                // zenoh itself reports a timeout as an error reply of its own.
+                Err(_) => Err(AskError::NoAnswer),
+            },
+        }
+    }
+
+    /// Closes the session: the token goes, the server sees the robot leave.
+    pub async fn close(&self) {
+        let session = self.session.clone();
+        let closing = tokio::task::spawn_blocking(move || session.close().wait());
+        match tokio::time::timeout(CLOSE_MAX, closing).await {
+            Ok(Ok(Ok(()))) => {}
+            Ok(Ok(Err(cause))) => warn!("the session did not close cleanly: {cause}"),
+            Ok(Err(_)) | Err(_) => warn!("the session did not close in time"),
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Question {
+    Hello,
+    Ingest,
+}
+
+fn log_failed(sent: zenoh::Result<()>, what: &str) {
+    if let Err(cause) = sent {
+        debug!("`{what}` was not published: {cause}");
+    }
+}
+
+/// Whether sending the same again to the same server may help.
+pub fn may_pass_later(error: &AskError) -> bool {
+    match error {
+        AskError::Refused(refusal) => refusal.code != RefusalCode::Malformed,
+        AskError::NoAnswer
+        | AskError::Unreadable(_)
+        | AskError::Unwritable(_)
+        | AskError::Link(_) => true,
+    }
+}

@@ -1,0 +1,119 @@
+//! Between the words of the wire (`tread-api`) and those of the controller (`tread-control`).
+//!
+//! Both crates know nobody, so each has its own points and poses; this is the only place that
+//! turns one into the other.
+
+use tread_api::{geometry as wire, robot, trajectory};
+use tread_control::geometry as control;
+use tread_control::robot::{Limits, RobotModel, RobotModelError, RobotModelSpec};
+use tread_control::trajectory as planned;
+
+/// A pose for the wire, its heading within −π to π.
+pub(crate) fn wire_pose(pose: control::Pose) -> wire::Pose {
+    wire::Pose {
+        x_m: pose.x_m,
+        y_m: pose.y_m,
+        heading_rad: control::wrap_angle_rad(pose.heading_rad),
+    }
+}
+
+/// A twist for the wire.
+pub(crate) fn wire_twist(twist: control::Twist) -> wire::Twist {
+    wire::Twist {
+        linear_m_s: twist.linear_m_s,
+        angular_rad_s: twist.angular_rad_s,
+    }
+}
+
+/// A point of the wire for the controller.
+pub(crate) fn control_point(point: wire::Point) -> control::Point {
+    control::Point {
+        x_m: point.x_m,
+        y_m: point.y_m,
+    }
+}
+
+/// The position of a pose for the wire.
+pub(crate) fn wire_point(pose: control::Pose) -> wire::Point {
+    wire::Point {
+        x_m: pose.x_m,
+        y_m: pose.y_m,
+    }
+}
+
+/// A robot's declared model, checked, for the controller.
+///
+/// # Errors
+/// [`RobotModelError`] names the figure that is out of its range.
+pub fn control_model(model: &robot::RobotModel) -> Result<RobotModel, RobotModelError> {
+    let limits = model.limits;
+    RobotModel::try_from(RobotModelSpec {
+        mass_kg: model.mass_kg,
+        track_width_m: model.track_width_m,
+        wheelbase_m: model.wheelbase_m,
+        wheel_radius_m: model.wheel_radius_m,
+        yaw_inertia_kg_m2: model.yaw_inertia_kg_m2,
+        limits: Limits {
+            wheel_speed_max_rad_s: limits.wheel_speed_max_rad_s,
+            wheel_acceleration_max_rad_s2: limits.wheel_acceleration_max_rad_s2,
+            linear_max_m_s: limits.linear_max_m_s,
+            angular_max_rad_s: limits.angular_max_rad_s,
+            linear_acceleration_max_m_s2: limits.linear_acceleration_max_m_s2,
+            linear_jerk_max_m_s3: limits.linear_jerk_max_m_s3,
+            lateral_acceleration_max_m_s2: limits.lateral_acceleration_max_m_s2,
+        },
+    })
+}
+
+/// The paper's robot as it is declared on the wire.
+pub fn paper_robot() -> robot::RobotModel {
+    let model = RobotModel::yi2007();
+    let limits = model.limits();
+    robot::RobotModel {
+        name: "yi2007".to_owned(),
+        tyres: "standard".to_owned(),
+        mass_kg: model.mass_kg(),
+        track_width_m: model.track_width_m(),
+        wheelbase_m: model.wheelbase_m(),
+        wheel_radius_m: model.wheel_radius_m(),
+        yaw_inertia_kg_m2: model.yaw_inertia_kg_m2(),
+        limits: robot::RobotLimits {
+            linear_max_m_s: limits.linear_max_m_s,
+            angular_max_rad_s: limits.angular_max_rad_s,
+            linear_acceleration_max_m_s2: limits.linear_acceleration_max_m_s2,
+            lateral_acceleration_max_m_s2: limits.lateral_acceleration_max_m_s2,
+            linear_jerk_max_m_s3: limits.linear_jerk_max_m_s3,
+            wheel_speed_max_rad_s: limits.wheel_speed_max_rad_s,
+            wheel_acceleration_max_rad_s2: limits.wheel_acceleration_max_rad_s2,
+        },
+    }
+}
+
+/// What a user asked for, in the controller's words.
+pub fn control_trajectory(asked: &trajectory::Trajectory) -> planned::Trajectory {
+    match asked {
+        trajectory::Trajectory::Circle(circle) => {
+            planned::Trajectory::Circle(planned::CircleSpec {
+                center: control_point(circle.center),
+                radius_m: circle.radius_m,
+                speed_m_s: circle.speed_m_s(),
+                direction: match circle.direction {
+                    trajectory::Direction::CounterClockwise => planned::Direction::CounterClockwise,
+                    trajectory::Direction::Clockwise => planned::Direction::Clockwise,
+                },
+                turns: circle.turns,
+            })
+        }
+        trajectory::Trajectory::Waypoints(waypoints) => {
+            let point = |point: &trajectory::Waypoint| planned::Waypoint {
+                point: control_point(point.position()),
+                speed_m_s: point.speed_m_s,
+                heading_rad: point.heading_rad,
+            };
+            planned::Trajectory::Waypoints(planned::WaypointsSpec {
+                points: waypoints.points.iter().map(point).collect(),
+                speed_m_s: waypoints.speed_m_s,
+            })
+        }
+    }
+}

@@ -1,0 +1,119 @@
+//! What the robot knows of missions, on its disk: one JSON file, replaced as a whole.
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use super::Holder;
+
+const FILE_NAME: &str = "missions.json";
+const NEW_FILE_NAME: &str = "missions.json.new";
+
+/// Why the memory could not be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum MemoryError {
+    /// The file failed.
+    #[error("the mission memory `{}` cannot be {action}", path.display())]
+    File {
+        /// What was tried.
+        action: &'static str,
+        /// On which file.
+        path: PathBuf,
+        /// What the operating system said.
+        #[source]
+        source: io::Error,
+    },
+    /// The file does not hold what it should.
+    #[error("the mission memory `{}` does not parse; move it away to start afresh", path.display())]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// Where the parser stopped.
+        #[source]
+        source: serde_json::Error,
+    },
+}
+
+/// The file in which a [`Holder`] outlives the process.
+#[derive(Debug, Clone)]
+pub struct Memory {
+    folder: PathBuf,
+}
+
+impl Memory {
+    /// The memory in a folder, which must exist.
+    pub fn new(folder: &Path) -> Self {
+        Self {
+            folder: folder.to_owned(),
+        }
+    }
+
+    /// Reads it; a robot's first start finds nothing.
+    ///
+    /// # Errors
+    /// [`MemoryError`] when the file cannot be read or does not parse.
+    pub fn load(&self) -> Result<Holder, MemoryError> {
+        let path = self.folder.join(FILE_NAME);
+        match fs::read(&path) {
+            Ok(text) => serde_json::from_slice(&text)
+                .map_err(|source| MemoryError::Malformed { path, source }),
+            Err(source) if source.kind() == io::ErrorKind::NotFound => Ok(Holder::default()),
+            Err(source) => Err(MemoryError::File {
+                action: "read",
+                path,
+                source,
+            }),
+        }
+    }
+
+    /// Writes it and waits until the disk has it. Blocks.
+    ///
+    /// # Errors
+    /// [`MemoryError`] when the disk refuses; the former content stays then.
+    pub fn save(&self, holder: &Holder) -> Result<(), MemoryError> {
+        let path = self.folder.join(NEW_FILE_NAME);
+        let failed = |source| MemoryError::File {
+            action: "written",
+            path: path.clone(),
+            source,
+        };
+        let text = serde_json::to_vec(holder)
+            .map_err(io::Error::from)
+            .map_err(failed)?;
+        let mut file = File::create(&path).map_err(failed)?;
+        file.write_all(&text).map_err(failed)?;
+        file.sync_data().map_err(failed)?;
+        fs::rename(&path, self.folder.join(FILE_NAME)).map_err(failed)?;
+        File::open(&self.folder)
+            .and_then(|folder| folder.sync_all())
+            .map_err(failed)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tread_api::ids::MissionId;
+    use uuid::Uuid;
+
+    use super::*;
+
+    #[test]
+    fn a_holder_comes_back_as_it_was_saved() {
+        let folder = tempfile::tempdir().unwrap();
+        let memory = Memory::new(folder.path());
+        assert_eq!(memory.load().unwrap(), Holder::default());
+        let mut holder = Holder::default();
+        holder.cancel(MissionId::from_uuid(Uuid::from_u128(7)));
+        memory.save(&holder).unwrap();
+        memory.save(&holder).unwrap();
+        assert_eq!(memory.load().unwrap(), holder);
+    }
+
+    #[test]
+    fn a_memory_that_does_not_parse_is_no_empty_memory() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join(FILE_NAME), b"{").unwrap();
+        let refused = Memory::new(folder.path()).load().unwrap_err();
+        assert!(refused.to_string().contains(FILE_NAME), "{refused}");
+    }
+}

@@ -1,0 +1,304 @@
+//! The outbox: what must not be lost, on the robot's disk until the server has answered for it.
+//!
+//! ```text
+//! append → pending → (server's receipt) → settled
+//!             │             └─ refused → dead-letter file, settled
+//!             └─ store full → dropped, counted
+//! ```
+//!
+//! Records are named `(robot, boot, seq)`; the server counts none twice, so a record may be sent
+//! again whenever an answer was lost. Syncing is batched: a crash loses at most what was appended
+//! within [`SYNC_DELAY`]. The outbox knows nothing of zenoh.
+
+mod dead_letters;
+mod frame;
+mod store;
+
+use std::fs::{self, File, TryLockError};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use tokio::sync::Notify;
+use tokio_util::sync::CancellationToken;
+use tracing::{error, warn};
+use tread_api::ids::{BootId, RobotId};
+use tread_api::robot::OutboxStatus;
+use tread_api::wire::ingest::{BATCH_RECORDS_MAX, Batch, Receipt, Record, RecordContent};
+
+use dead_letters::DeadLetters;
+pub use frame::CONTENT_BYTES_MAX;
+use store::Store;
+pub use store::{Limits, StoreError};
+
+/// Longest time that an appended record waits for the disk to have it.
+pub const SYNC_DELAY: Duration = Duration::from_millis(100);
+/// Most bytes of contents in one batch.
+pub const BATCH_BYTES_MAX: u64 = 1024 * 1024;
+
+/// Why the outbox could not do what it was asked.
+#[derive(Debug, thiserror::Error)]
+pub enum OutboxError {
+    /// The files failed.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// Another agent uses the same folder.
+    #[error("`{}` is in use by another agent", .0.display())]
+    InUse(PathBuf),
+    /// The lock file cannot be made or locked.
+    #[error("`{}` cannot be locked", path.display())]
+    Lock {
+        /// The lock file.
+        path: PathBuf,
+        /// What the operating system said.
+        #[source]
+        source: std::io::Error,
+    },
+    /// A record could not be written as JSON.
+    #[error("a record cannot be written as JSON")]
+    Content(#[source] serde_json::Error),
+}
+
+impl OutboxError {
+    /// Whether the same record will never be taken, however often it is tried.
+    pub fn is_for_ever(&self) -> bool {
+        match self {
+            Self::Store(StoreError::TooLarge(_)) | Self::Content(_) => true,
+            Self::Store(StoreError::File { .. }) | Self::InUse(_) | Self::Lock { .. } => false,
+        }
+    }
+}
+
+/// The oldest records that wait, ready to be sent.
+#[derive(Debug, Clone)]
+pub struct PendingBatch {
+    /// What goes on the wire.
+    pub batch: Batch,
+    through_ordinal: u64,
+}
+
+/// A handle to one robot's outbox; clones share it.
+#[derive(Debug, Clone)]
+pub struct Outbox {
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    robot: RobotId,
+    folder: PathBuf,
+    store: Mutex<Store>,
+    dead_letters: Mutex<DeadLetters>,
+    /// Something new waits for the server.
+    arrived: Notify,
+    /// Something waits for the disk.
+    unsynced: Notify,
+    /// Held for as long as the outbox lives, so that no second agent writes here.
+    _lock: File,
+}
+
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // The stores leave no half-done state behind between two of their steps.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Outbox {
+    /// Opens the outbox in a folder, which is made if needed; repairs what a crash left torn.
+    ///
+    /// # Errors
+    /// [`OutboxError`] when the folder cannot be used or another agent uses it.
+    pub fn open(
+        folder: &Path,
+        limits: Limits,
+        robot: RobotId,
+        boot: BootId,
+    ) -> Result<Self, OutboxError> {
+        let lock_path = folder.join("lock");
+        let lock_failed = |source| OutboxError::Lock {
+            path: lock_path.clone(),
+            source,
+        };
+        fs::create_dir_all(folder).map_err(lock_failed)?;
+        let lock = File::create(&lock_path).map_err(lock_failed)?;
+        match lock.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => return Err(OutboxError::InUse(folder.to_owned())),
+            Err(TryLockError::Error(source)) => return Err(lock_failed(source)),
+        }
+        let (store, recovery) = Store::open(folder, limits, boot)?;
+        if recovery.torn_bytes > 0 || recovery.lost_records > 0 {
+            warn!(
+                torn_bytes = recovery.torn_bytes,
+                lost_records = recovery.lost_records,
+                "repaired the outbox after a crash",
+            );
+        }
+        let dead_letters = DeadLetters::new(folder);
+        Ok(Self {
+            shared: Arc::new(Shared {
+                robot,
+                folder: folder.to_owned(),
+                store: Mutex::new(store),
+                dead_letters: Mutex::new(dead_letters),
+                arrived: Notify::new(),
+                unsynced: Notify::new(),
+                _lock: lock,
+            }),
+        })
+    }
+
+    /// Appends a record and returns its number within this run.
+    ///
+    /// # Errors
+    /// [`OutboxError`] when the disk refuses it; the record is not kept then.
+    pub fn append(&self, content: &RecordContent) -> Result<u64, OutboxError> {
+        let content = serde_json::to_vec(content).map_err(OutboxError::Content)?;
+        let name = locked(&self.shared.store).append(&content)?;
+        self.shared.arrived.notify_one();
+        self.shared.unsynced.notify_one();
+        Ok(name.seq)
+    }
+
+    /// The oldest records of one run that wait, at most `records_max` of them.
+    ///
+    /// # Errors
+    /// [`OutboxError`] when the files cannot be read.
+    pub fn pending(&self, records_max: usize) -> Result<Option<PendingBatch>, OutboxError> {
+        let records_max = records_max.clamp(1, BATCH_RECORDS_MAX);
+        loop {
+            let raw = locked(&self.shared.store).oldest(records_max, BATCH_BYTES_MAX)?;
+            let Some(&(first, _)) = raw.first() else {
+                return Ok(None);
+            };
+            let mut records = Vec::with_capacity(raw.len());
+            let mut through_ordinal = first.ordinal;
+            let mut unreadable = None;
+            for (name, content) in raw {
+                match serde_json::from_slice(&content) {
+                    Ok(content) => records.push(Record {
+                        seq: name.seq,
+                        content,
+                    }),
+                    Err(cause) => {
+                        unreadable = Some((name, content, cause.to_string()));
+                        break;
+                    }
+                }
+                through_ordinal = name.ordinal;
+            }
+            if let Some((name, content, cause)) = unreadable.filter(|_| records.is_empty()) {
+                // Written by another version of the agent: set aside, so that the head moves on.
+                let text = String::from_utf8_lossy(&content);
+                self.set_aside(name.boot, name.seq, &cause, &text)?;
+                locked(&self.shared.store).settle(name.ordinal, 1);
+                continue;
+            }
+            let batch = Batch {
+                robot: self.shared.robot.clone(),
+                boot: first.boot,
+                records,
+            };
+            return Ok(Some(PendingBatch {
+                batch,
+                through_ordinal,
+            }));
+        }
+    }
+
+    /// Settles a batch by the server's receipt; what it refused goes to the dead-letter file.
+    ///
+    /// # Errors
+    /// [`OutboxError`] when the dead-letter file cannot be written; nothing is settled then.
+    pub fn settle(&self, sent: &PendingBatch, receipt: &Receipt) -> Result<(), OutboxError> {
+        let mut refused = 0;
+        for refusal in &receipt.refused {
+            let Some(record) = sent
+                .batch
+                .records
+                .iter()
+                .find(|record| record.seq == refusal.seq)
+            else {
+                continue;
+            };
+            let content = serde_json::to_string(&record.content).map_err(OutboxError::Content)?;
+            self.set_aside(sent.batch.boot, record.seq, &refusal.reason, &content)?;
+            refused += 1;
+        }
+        locked(&self.shared.store).settle(sent.through_ordinal, refused);
+        self.shared.unsynced.notify_one();
+        Ok(())
+    }
+
+    fn set_aside(
+        &self,
+        boot: BootId,
+        seq: u64,
+        reason: &str,
+        content: &str,
+    ) -> Result<(), OutboxError> {
+        warn!(%boot, seq, reason, "record {seq} was refused and set aside");
+        locked(&self.shared.dead_letters).write(boot, seq, reason, content)?;
+        Ok(())
+    }
+
+    /// What waits, and what was lost.
+    pub fn status(&self) -> OutboxStatus {
+        let store = locked(&self.shared.store);
+        let head = store.head();
+        OutboxStatus {
+            pending: store.pending_records().try_into().unwrap_or(u64::MAX),
+            dropped: head.dropped,
+            refused: head.refused,
+        }
+    }
+
+    /// Waits until something has been appended since the last call.
+    pub async fn arrived(&self) {
+        self.shared.arrived.notified().await;
+    }
+
+    /// Makes everything that was appended and settled so far safe from a crash. Blocks.
+    ///
+    /// # Errors
+    /// [`OutboxError`] when the disk refuses.
+    pub fn sync(&self) -> Result<(), OutboxError> {
+        let ticket = locked(&self.shared.store).begin_sync()?;
+        // The slow part, while others may append.
+        ticket.run()?;
+        Ok(locked(&self.shared.store).finish_sync(&ticket)?)
+    }
+
+    /// Syncs soon after each change, until told to stop; then once more.
+    pub async fn keep_synced(self, stop: CancellationToken) {
+        while !stop.is_cancelled() {
+            tokio::select! {
+                () = self.shared.unsynced.notified() => {}
+                () = stop.cancelled() => {}
+            }
+            // Changes gather meanwhile; the wait and the sync itself bound what a crash can take.
+            tokio::select! {
+                () = tokio::time::sleep(SYNC_DELAY / 2) => {}
+                () = stop.cancelled() => {}
+            }
+            let outbox = self.clone();
+            match tokio::task::spawn_blocking(move || outbox.sync()).await {
+                Ok(Ok(())) => {}
+                Ok(Err(cause)) => {
+                    let folder = self.shared.folder.display();
+                    error!(
+                        error = &cause as &dyn std::error::Error,
+                        "cannot sync `{folder}`"
+                    );
+                    self.shared.unsynced.notify_one();
+                    // A sick disk is asked again, but not in a busy loop.
+                    tokio::time::sleep(SYNC_DELAY).await;
+                }
+                // Only when the runtime goes down.
+                Err(_) => return,
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

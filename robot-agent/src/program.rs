@@ -1,0 +1,79 @@
+//! The agent as a program: logging → configuration → start → wait → stop.
+
+use std::ffi::OsString;
+use std::process::ExitCode;
+
+use anyhow::Context;
+use clap::Parser;
+use tracing::{error, info};
+use tracing_subscriber::EnvFilter;
+
+use crate::agent::{Agent, RunningAgent};
+use crate::config::{AgentConfig, Flags, LogFormat};
+
+/// Runs an agent until it is told to stop by SIGTERM or ctrl-c; the first argument is the
+/// program's name. Sets up logging, so it is for whole processes.
+///
+/// The code is 0 after an orderly stop, 1 when the agent could not start or a part of it died,
+/// and 2 for wrong flags.
+pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
+    let flags = match Flags::try_parse_from(arguments) {
+        Ok(flags) => flags,
+        Err(message) => {
+            // Help and version come this way too; nobody is left to tell if this fails.
+            let _ = message.print();
+            return ExitCode::from(u8::try_from(message.exit_code()).unwrap_or(2));
+        }
+    };
+    init_logging(&flags);
+    match run(&flags) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(cause) => {
+            error!("{cause:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn init_logging(flags: &Flags) {
+    let filter = EnvFilter::try_new(&flags.log).unwrap_or_else(|_| EnvFilter::new("info"));
+    let subscriber = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr);
+    // A process that has a subscriber already keeps it.
+    let _ = match flags.log_format {
+        LogFormat::Human => subscriber.try_init(),
+        LogFormat::Json => subscriber.json().try_init(),
+    };
+}
+
+fn run(flags: &Flags) -> anyhow::Result<()> {
+    let config = AgentConfig::load(flags)?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .enable_all()
+        .build()
+        .context("no runtime")?;
+    let ended = runtime.block_on(async {
+        let agent = Agent::start(config)?;
+        let ended = wait(&agent).await;
+        agent.stop().await;
+        ended
+    });
+    // A thread that still waits for an absent server must not hold the process up.
+    runtime.shutdown_background();
+    ended
+}
+
+/// Waits for a signal, or for a part that dies.
+async fn wait(agent: &RunningAgent) -> anyhow::Result<()> {
+    use tokio::signal::unix::{SignalKind, signal};
+    let mut terminate = signal(SignalKind::terminate()).context("no signal handler")?;
+    let mut interrupt = signal(SignalKind::interrupt()).context("no signal handler")?;
+    tokio::select! {
+        _ = terminate.recv() => info!("told to stop by SIGTERM"),
+        _ = interrupt.recv() => info!("told to stop by ctrl-c"),
+        ended = agent.failed() => return Err(ended.into()),
+    }
+    Ok(())
+}

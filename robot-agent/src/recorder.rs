@@ -1,0 +1,161 @@
+//! Turns what the loop reports into records of the outbox.
+//!
+//! A thread of its own: it may wait for the disk, and frees what the loop hands back.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::time::Duration;
+
+use tracing::{error, info, warn};
+use tread_api::friction::{Information, SAMPLES_MAX, Segment};
+use tread_api::ids::ConfigurationId;
+use tread_api::robot::MissionProgress;
+use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
+
+use crate::control_loop::seam::{ClosedSegment, LoopEvent};
+use crate::dispatcher::Missions;
+use crate::outbox::Outbox;
+
+/// Pause between two tries on a disk that refuses.
+const RETRY_EVERY: Duration = Duration::from_secs(1);
+/// Records that wait in memory for a disk that refuses.
+const UNSAVED_MAX: usize = 10_000;
+
+/// Who records.
+#[derive(Debug)]
+pub(crate) struct Recorder {
+    pub(crate) configuration: ConfigurationId,
+    pub(crate) missions: Arc<Missions>,
+    pub(crate) outbox: Outbox,
+}
+
+impl Recorder {
+    /// Records until the loop has ended and everything it reported is in the outbox.
+    pub(crate) fn run(&self, events: &Receiver<LoopEvent>) {
+        let mut unsaved = VecDeque::new();
+        loop {
+            let event = match events.recv_timeout(RETRY_EVERY) {
+                Ok(event) => Some(event),
+                Err(RecvTimeoutError::Timeout) if unsaved.is_empty() => continue,
+                Err(RecvTimeoutError::Timeout) => None,
+                Err(RecvTimeoutError::Disconnected) => break,
+            };
+            if let Some(event) = event {
+                self.take(event, &mut unsaved);
+            }
+            self.save(&mut unsaved);
+        }
+        self.save(&mut unsaved);
+        if !unsaved.is_empty() {
+            error!(
+                "{} records are lost: the disk does not take them",
+                unsaved.len()
+            );
+        }
+    }
+
+    fn take(&self, event: LoopEvent, unsaved: &mut VecDeque<RecordContent>) {
+        match event {
+            LoopEvent::Started { at, progress } => {
+                let report = report_of(&progress, at, MissionPhase::Started);
+                unsaved.push_back(RecordContent::Mission(report));
+            }
+            LoopEvent::Ended {
+                at,
+                reason,
+                progress,
+                job,
+            } => {
+                let (mission, phase) = (job.mission, reason.phase());
+                info!(
+                    mission.id = %mission,
+                    driven_m = progress.driven_m,
+                    "mission {mission} ended: {phase:?} {}",
+                    reason.text().unwrap_or_default(),
+                );
+                let mut report = report_of(&progress, at, phase);
+                report.reason = reason.text().map(str::to_owned);
+                // First the record, then the memory: a crash between the two reports twice.
+                unsaved.push_back(RecordContent::Mission(report));
+                self.save(unsaved);
+                self.missions.holder().end(mission, phase);
+                self.missions.save();
+            }
+            LoopEvent::Segment(closed) => {
+                let segment = segment_of(&closed, self.configuration);
+                match segment.validate() {
+                    Ok(()) => unsaved.push_back(RecordContent::Segment(segment)),
+                    Err(cause) => warn!("a measured segment is impossible: {cause}"),
+                }
+            }
+            LoopEvent::Retired(site) => drop(site),
+        }
+    }
+
+    /// Appends in order; what a sick disk refuses stays for later, the oldest gives way.
+    fn save(&self, unsaved: &mut VecDeque<RecordContent>) {
+        while let Some(content) = unsaved.front() {
+            if let Err(cause) = self.outbox.append(content) {
+                error!(
+                    error = &cause as &dyn std::error::Error,
+                    "a record is not saved"
+                );
+                while unsaved.len() > UNSAVED_MAX {
+                    unsaved.pop_front();
+                }
+                return;
+            }
+            unsaved.pop_front();
+        }
+    }
+}
+
+fn report_of(
+    progress: &MissionProgress,
+    at: jiff::Timestamp,
+    phase: MissionPhase,
+) -> MissionReport {
+    MissionReport {
+        mission: progress.id,
+        revision: progress.revision,
+        plan_hash: progress.plan_hash,
+        at,
+        phase,
+        reason: None,
+        progress: Some(*progress),
+    }
+}
+
+fn segment_of(closed: &ClosedSegment, configuration: ConfigurationId) -> Segment {
+    let statistics = &closed.statistics;
+    let track = Information {
+        information: statistics.effective_track_information,
+        weighted: statistics.effective_track_weighted,
+    };
+    Segment {
+        configuration,
+        mission: closed.mission,
+        started_at: closed.started_at,
+        ended_at: closed.ended_at,
+        grid_revision: closed.site.grid().revision,
+        cell: closed.cell,
+        terrain: closed
+            .terrain
+            .and_then(|place| closed.site.terrain(place))
+            .cloned(),
+        theta: Information {
+            information: statistics.theta_information,
+            weighted: statistics.theta_weighted,
+        },
+        effective_track_ratio: (track.information > 0.0).then_some(track),
+        // The estimator knows no deviation of it, so there is nothing that could be summed.
+        rolling_resistance: None,
+        mu_peak_lower_bound: statistics.mu_peak_lower_bound,
+        samples: u32::try_from(statistics.samples)
+            .unwrap_or(SAMPLES_MAX)
+            .min(SAMPLES_MAX),
+        distance_m: closed.distance_m,
+        saturation_ratio: closed.saturation_ratio.clamp(0.0, 1.0),
+    }
+}

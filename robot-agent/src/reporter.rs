@@ -1,0 +1,135 @@
+//! Builds what the robot publishes about itself from the loop's latest snapshot.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use tokio::time::MissedTickBehavior;
+use tokio_util::sync::CancellationToken;
+use tracing::{info, warn};
+use tread_api::friction::LiveFriction;
+use tread_api::robot::{Aged, LoopStatus};
+use tread_api::wire::state::{FrictionReport, RobotState};
+
+use crate::clock::SharedClock;
+use crate::control_loop::seam::Shared;
+use crate::dispatcher::SiteCell;
+use crate::fleet::{FleetLink, Identity};
+use crate::geometry::{wire_pose, wire_twist};
+use crate::outbox::Outbox;
+
+/// Who tells others how the robot is.
+#[derive(Debug)]
+pub(crate) struct Reporter {
+    pub(crate) identity: Identity,
+    pub(crate) clock: SharedClock,
+    pub(crate) shared: Arc<Shared>,
+    pub(crate) site: Arc<SiteCell>,
+    pub(crate) outbox: Outbox,
+    pub(crate) rate_hz: f64,
+    pub(crate) states: AtomicU64,
+    pub(crate) frictions: AtomicU64,
+}
+
+fn aged<T>(value: T, at: Duration, now: Duration) -> Aged<T> {
+    let age = now.saturating_sub(at).as_millis();
+    Aged {
+        value,
+        age_ms: u64::try_from(age).unwrap_or(u64::MAX),
+    }
+}
+
+impl Reporter {
+    /// The state now.
+    pub(crate) fn state(&self) -> RobotState {
+        let snapshot = self.shared.snapshot();
+        let now = self.clock.monotonic();
+        RobotState {
+            robot: self.identity.robot.clone(),
+            boot: self.identity.boot,
+            seq: self.states.fetch_add(1, Ordering::Relaxed),
+            robot_time: self.clock.wall(),
+            mode: snapshot.mode,
+            fault: snapshot.fault.map(|fault| fault.text().to_owned()),
+            pose: snapshot
+                .pose
+                .map(|(pose, at)| aged(wire_pose(pose), at, now)),
+            twist: snapshot
+                .twist
+                .map(|(twist, at)| aged(wire_twist(twist), at, now)),
+            mission: snapshot.mission,
+            terrain_revision: snapshot.terrain_revision,
+            outbox: self.outbox.status(),
+            control_loop: LoopStatus {
+                rate_hz: self.rate_hz,
+                ticks: snapshot.ticks,
+                overruns: self.shared.overruns.load(Ordering::Relaxed),
+                tick_max_us: self.shared.tick_max_us.swap(0, Ordering::Relaxed),
+            },
+        }
+    }
+
+    /// Both friction estimates now.
+    pub(crate) fn friction(&self) -> FrictionReport {
+        let snapshot = self.shared.snapshot();
+        let view = self.site.view();
+        // The loop may not have taken the newest definition yet; then the place means nothing.
+        let view = view.filter(|view| Some(view.terrain_revision()) == snapshot.terrain_revision);
+        let terrain = view.as_ref().zip(snapshot.terrain);
+        FrictionReport {
+            robot: self.identity.robot.clone(),
+            boot: self.identity.boot,
+            seq: self.frictions.fetch_add(1, Ordering::Relaxed),
+            robot_time: self.clock.wall(),
+            cell: snapshot.cell,
+            terrain: terrain
+                .and_then(|(view, place)| view.terrain(place))
+                .cloned(),
+            friction: LiveFriction {
+                theta_loop: snapshot.theta_loop,
+                theta_measured: snapshot.theta_measured,
+                excited: snapshot.excited,
+            },
+        }
+    }
+}
+
+/// Time between two looks at the counters of what was lost.
+const LOSSES_EVERY: Duration = Duration::from_secs(10);
+
+/// Logs what the loop had to give up, when there is more of it, until told to stop.
+pub(crate) async fn log_losses(shared: Arc<Shared>, stop: CancellationToken) {
+    let (mut segments, mut blocks) = (0, 0);
+    loop {
+        tokio::select! {
+            () = tokio::time::sleep(LOSSES_EVERY) => {}
+            () = stop.cancelled() => return,
+        }
+        let lost = shared.lost_segments.load(Ordering::Relaxed);
+        if lost > segments {
+            warn!(
+                lost,
+                "{lost} segments were lost since the start: nobody took them in time"
+            );
+            segments = lost;
+        }
+        let unplaced = shared.unplaced_blocks.load(Ordering::Relaxed);
+        if unplaced > blocks {
+            info!(
+                unplaced,
+                "{unplaced} measurements belong to no cell: the site is not known"
+            );
+            blocks = unplaced;
+        }
+    }
+}
+
+/// Publishes at a fixed rate until the task is dropped.
+pub(crate) async fn every(rate_hz: f64, link: Arc<FleetLink>, publish: impl Fn(&FleetLink)) {
+    let mut ticks = tokio::time::interval(Duration::from_secs_f64(rate_hz.recip()));
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        ticks.tick().await;
+        publish(&link);
+    }
+}

@@ -1,0 +1,397 @@
+//! Scenario files: the true ground of a simulated site, its robots, and missions to show.
+//!
+//! TOML. The simulated base takes the true friction from here; no other part of the agent may
+//! look, it has to measure. `tread demo` also takes terrains' shapes and missions from it.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use tread_api::geometry::{Point, Polygon};
+use tread_api::ids::{RobotId, SiteId, TerrainId};
+use tread_api::terrain::{TERRAINS_MAX, TerrainClass};
+use tread_api::trajectory::Trajectory;
+use tread_control::friction::{FrictionCurve, FrictionSpec};
+
+/// The scenario that comes with the agent.
+pub const BUILT_IN: &str = include_str!("../../scenarios/yard.toml");
+/// What [`BUILT_IN`] is called in error messages and on the command line.
+pub const BUILT_IN_NAME: &str = "yard";
+/// Largest scenario file, bytes.
+pub const SCENARIO_BYTES_MAX: u64 = 4 * 1024 * 1024;
+
+/// Why a scenario was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ScenarioError {
+    /// The file could not be read.
+    #[error("the scenario `{file}` cannot be read")]
+    Unreadable {
+        /// The file.
+        file: String,
+        /// What the operating system said.
+        #[source]
+        source: std::io::Error,
+    },
+    /// The file is larger than [`SCENARIO_BYTES_MAX`].
+    #[error("the scenario `{file}` is larger than {SCENARIO_BYTES_MAX} bytes")]
+    TooLarge {
+        /// The file.
+        file: String,
+    },
+    /// The text does not parse, or a key is not known.
+    #[error("in the scenario `{file}`: {problem}")]
+    Malformed {
+        /// The file.
+        file: String,
+        /// Line, column, key and what is wrong with it.
+        problem: String,
+    },
+}
+
+/// A site as it truly is.
+#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct Scenario {
+    /// The site.
+    pub site: SiteId,
+    /// Side of the site's cells, metres.
+    pub cell_m: f64,
+    /// The ground outside all terrains.
+    #[serde(default)]
+    pub ground: GroundSpec,
+    /// The ground within polygons.
+    pub terrains: Vec<ScenarioTerrain>,
+    /// The robots, where they start and how they differ.
+    pub robots: Vec<ScenarioRobot>,
+    /// Missions to show, in the order in which each robot drives its own.
+    #[serde(default)]
+    pub missions: Vec<ScenarioMission>,
+}
+
+/// True friction of some ground.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct GroundSpec {
+    /// Friction stiffness K = 1/θ.
+    pub stiffness: f64,
+    /// Slip at the peak of friction, `λ_m`, within 0 to 1.
+    #[serde(default = "default_peak_slip")]
+    pub peak_slip: f64,
+    /// Share of the peak friction that is left at full sliding, α, within 0 to 1.
+    #[serde(default = "default_sliding_ratio")]
+    pub sliding_ratio: f64,
+}
+
+fn default_peak_slip() -> f64 {
+    0.2
+}
+
+fn default_sliding_ratio() -> f64 {
+    0.8
+}
+
+impl Default for GroundSpec {
+    fn default() -> Self {
+        Self {
+            stiffness: 5.0,
+            peak_slip: default_peak_slip(),
+            sliding_ratio: default_sliding_ratio(),
+        }
+    }
+}
+
+impl GroundSpec {
+    /// The friction curve, checked.
+    ///
+    /// # Errors
+    /// A sentence that names the figure.
+    pub fn curve(&self) -> Result<FrictionCurve, String> {
+        let spec = FrictionSpec {
+            stiffness: self.stiffness,
+            peak_slip: self.peak_slip,
+            sliding_ratio: self.sliding_ratio,
+        };
+        FrictionCurve::try_from(spec).map_err(|refused| refused.to_string())
+    }
+}
+
+/// Ground within a polygon.
+#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct ScenarioTerrain {
+    /// The terrain.
+    pub id: TerrainId,
+    /// Name for people; the identifier when absent.
+    pub name: Option<String>,
+    /// Kind of ground.
+    pub class: TerrainClass,
+    /// Corners `[x, y]` in metres.
+    pub polygon: Vec<[f64; 2]>,
+    /// Where terrains overlap the higher layer counts.
+    #[serde(default)]
+    pub layer: i32,
+    /// Friction stiffness K = 1/θ.
+    pub stiffness: f64,
+    /// Slip at the peak of friction, `λ_m`.
+    #[serde(default = "default_peak_slip")]
+    pub peak_slip: f64,
+    /// Share of the peak friction that is left at full sliding, α.
+    #[serde(default = "default_sliding_ratio")]
+    pub sliding_ratio: f64,
+}
+
+impl ScenarioTerrain {
+    /// The terrain's outline, checked.
+    ///
+    /// # Errors
+    /// A sentence that names the corner.
+    pub fn outline(&self) -> Result<Polygon, String> {
+        let corners = self
+            .polygon
+            .iter()
+            .map(|&[x_m, y_m]| Point { x_m, y_m })
+            .collect();
+        Polygon::new(corners).map_err(|refused| refused.to_string())
+    }
+
+    /// The terrain's friction, not yet checked.
+    pub fn ground(&self) -> GroundSpec {
+        GroundSpec {
+            stiffness: self.stiffness,
+            peak_slip: self.peak_slip,
+            sliding_ratio: self.sliding_ratio,
+        }
+    }
+}
+
+/// A robot of the scenario.
+#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct ScenarioRobot {
+    /// The robot.
+    pub id: RobotId,
+    /// Where it starts, metres.
+    pub x_m: f64,
+    /// Where it starts, metres.
+    pub y_m: f64,
+    /// How it stands, radians.
+    pub heading_rad: f64,
+    /// What makes its noise, offsets and rolling radii its own.
+    pub seed: u64,
+}
+
+/// A mission of the scenario.
+#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct ScenarioMission {
+    /// Who drives it.
+    pub robot: RobotId,
+    /// What to drive.
+    pub trajectory: Trajectory,
+}
+
+impl Scenario {
+    /// The scenario that comes with the agent.
+    ///
+    /// # Errors
+    /// Never for the file in this repository; a test holds it to that.
+    pub fn built_in() -> Result<Self, ScenarioError> {
+        Self::parse(BUILT_IN_NAME, BUILT_IN)
+    }
+
+    /// Reads a scenario file.
+    ///
+    /// # Errors
+    /// [`ScenarioError`] names file, line and key.
+    pub fn load(path: &Path) -> Result<Self, ScenarioError> {
+        let file = path.display().to_string();
+        let unreadable = |source| ScenarioError::Unreadable {
+            file: file.clone(),
+            source,
+        };
+        if std::fs::metadata(path).map_err(unreadable)?.len() > SCENARIO_BYTES_MAX {
+            return Err(ScenarioError::TooLarge { file });
+        }
+        let text = std::fs::read_to_string(path).map_err(unreadable)?;
+        Self::parse(&file, &text)
+    }
+
+    /// Reads a scenario; `file` is its name in errors.
+    ///
+    /// # Errors
+    /// [`ScenarioError::Malformed`] names line and key.
+    pub fn parse(file: &str, text: &str) -> Result<Self, ScenarioError> {
+        let malformed = |problem: String| ScenarioError::Malformed {
+            file: file.to_owned(),
+            problem,
+        };
+        let scenario: Self =
+            toml::from_str(text).map_err(|refused| malformed(refused.to_string()))?;
+        scenario.check(text).map_err(malformed)?;
+        Ok(scenario)
+    }
+
+    /// The robot of that name.
+    pub fn robot(&self, id: &RobotId) -> Option<&ScenarioRobot> {
+        self.robots.iter().find(|robot| robot.id == *id)
+    }
+
+    /// What types alone cannot say. `text` is only searched for line numbers.
+    fn check(&self, text: &str) -> Result<(), String> {
+        let at = |table: &str, index: usize, problem: String| {
+            format!(
+                "line {}: {table}[{index}]: {problem}",
+                line_of(text, table, index)
+            )
+        };
+        if !(tread_api::site::CELL_MIN_M..=tread_api::site::CELL_MAX_M).contains(&self.cell_m) {
+            return Err(format!(
+                "cell_m: {} is no possible side of a cell",
+                self.cell_m
+            ));
+        }
+        self.ground
+            .curve()
+            .map_err(|problem| format!("ground: {problem}"))?;
+        if self.terrains.len() > TERRAINS_MAX {
+            return Err(format!("terrains: there are more than {TERRAINS_MAX}"));
+        }
+        let mut terrains = BTreeSet::new();
+        for (index, terrain) in self.terrains.iter().enumerate() {
+            let refused = |problem| at("terrains", index, problem);
+            terrain
+                .outline()
+                .map_err(|problem| refused(format!("polygon: {problem}")))?;
+            terrain.ground().curve().map_err(refused)?;
+            if !terrains.insert(&terrain.id) {
+                return Err(refused(format!("id: `{}` is there twice", terrain.id)));
+            }
+        }
+        let mut robots = BTreeSet::new();
+        for (index, robot) in self.robots.iter().enumerate() {
+            let refused = |problem| at("robots", index, problem);
+            let start = Point {
+                x_m: robot.x_m,
+                y_m: robot.y_m,
+            };
+            if !(start.is_on_the_map() && robot.heading_rad.is_finite()) {
+                return Err(refused("x_m, y_m or heading_rad is no place".to_owned()));
+            }
+            if !robots.insert(&robot.id) {
+                return Err(refused(format!("id: `{}` is there twice", robot.id)));
+            }
+        }
+        for (index, mission) in self.missions.iter().enumerate() {
+            if !robots.contains(&mission.robot) {
+                let problem = format!("robot: `{}` is not among the robots", mission.robot);
+                return Err(at("missions", index, problem));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The line of the `index`-th `[[table]]`; the first line of the file for inline tables.
+fn line_of(text: &str, table: &str, index: usize) -> usize {
+    let header = format!("[[{table}]]");
+    let mut headers = text
+        .lines()
+        .enumerate()
+        .filter(|(_, line)| line.trim_start().starts_with(&header));
+    headers.nth(index).map_or(1, |(line, _)| line + 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const GOOD: &str = r#"
+site = "yard"
+cell_m = 1.0
+
+[[terrains]]
+id = "slab"
+class = "concrete"
+polygon = [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0]]
+stiffness = 8.0
+
+[[robots]]
+id = "rover-1"
+x_m = 1.0
+y_m = 0.5
+heading_rad = 0.0
+seed = 1
+
+[[missions]]
+robot = "rover-1"
+[missions.trajectory.circle]
+center = { x_m = 0.0, y_m = 0.0 }
+radius_m = 2.0
+speed_m_s = 0.5
+"#;
+
+    fn refusal(from: &str, to: &str) -> String {
+        assert!(GOOD.contains(from), "{from}");
+        Scenario::parse("test.toml", &GOOD.replace(from, to))
+            .unwrap_err()
+            .to_string()
+    }
+
+    #[test]
+    fn the_built_in_scenario_is_whole() {
+        let scenario = Scenario::built_in().unwrap();
+        assert!(scenario.terrains.len() >= 3);
+        assert!(scenario.robots.len() >= 3);
+        for robot in &scenario.robots {
+            let missions = scenario
+                .missions
+                .iter()
+                .filter(|mission| mission.robot == robot.id);
+            assert!(
+                missions.count() >= 2,
+                "{} has hardly anything to do",
+                robot.id
+            );
+        }
+    }
+
+    #[test]
+    fn a_mistake_is_named_with_file_line_and_key() {
+        let cases = [
+            ("stiffness = 8.0", "stifness = 8.0", "line 9", "stifness"),
+            ("stiffness = 8.0", "stiffness = -8.0", "line 5", "stiffness"),
+            ("stiffness = 8.0", "stiffness = nan", "line 5", "stiffness"),
+            ("[4.0, 0.0], [4.0, 4.0]", "[4.0, 0.0]", "line 5", "polygon"),
+            (
+                "heading_rad = 0.0",
+                "heading_rad = inf",
+                "line 11",
+                "heading_rad",
+            ),
+            (
+                "robot = \"rover-1\"",
+                "robot = \"rover-9\"",
+                "line 18",
+                "rover-9",
+            ),
+            ("radius_m = 2.0", "radius_m = 0.0", "line 20", "radius_m"),
+            ("site = \"yard\"", "site = \"Yard!\"", "line 2", "Yard!"),
+            ("cell_m = 1.0", "cell_m = 0.0", "cell_m", "0"),
+        ];
+        for (from, to, place, key) in cases {
+            let refused = refusal(from, to);
+            for part in ["test.toml", place, key] {
+                assert!(refused.contains(part), "`{part}` is missing in: {refused}");
+            }
+        }
+        assert!(Scenario::parse("test.toml", GOOD).is_ok());
+    }
+
+    #[test]
+    fn doubled_names_are_refused() {
+        let second =
+            "\n[[robots]]\nid = \"rover-1\"\nx_m = 0\ny_m = 0\nheading_rad = 0\nseed = 2\n";
+        let refused = Scenario::parse("test.toml", &format!("{GOOD}{second}")).unwrap_err();
+        assert!(refused.to_string().contains("twice"), "{refused}");
+    }
+}

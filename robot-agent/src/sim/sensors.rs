@@ -1,0 +1,191 @@
+//! Sensors of the simulated robot: noise, offsets and rates, all from one seed.
+
+use std::time::Duration;
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use tread_control::geometry::Pose;
+use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
+use tread_control::plant::Plant;
+use tread_control::robot::RobotModel;
+
+use crate::drive::SensorSample;
+
+/// Time between two samples of the fast sensors: 200 Hz.
+pub const SAMPLE_PERIOD: Duration = Duration::from_millis(5);
+/// A body speed with each so many samples: 10 Hz.
+const SAMPLES_PER_BODY_SPEED: u64 = 20;
+/// A position fix with each so many samples: 20 Hz.
+const SAMPLES_PER_POSITION: u64 = 10;
+
+/// How good the sensors are; deviations of white noise unless said otherwise.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SensorSpec {
+    /// Gyro, rad/s.
+    pub gyro_rad_s: f64,
+    /// Accelerometer, m/s².
+    pub acceleration_m_s2: f64,
+    /// Largest constant offset of the accelerometer, m/s².
+    pub acceleration_bias_m_s2: f64,
+    /// Wheel speed, rad/s.
+    pub wheel_speed_rad_s: f64,
+    /// Body speed, m/s.
+    pub body_speed_m_s: f64,
+    /// Position, each coordinate, metres.
+    pub position_m: f64,
+    /// Heading of a position fix, radians.
+    pub heading_rad: f64,
+    /// Largest constant error of the torque's scale, as a share.
+    pub torque_scale_ratio: f64,
+    /// Torque, as a friction coefficient of one side.
+    pub torque_mu: f64,
+    /// Largest difference of a side's rolling radius from the model's, as a share.
+    pub radius_ratio: f64,
+}
+
+impl Default for SensorSpec {
+    fn default() -> Self {
+        Self {
+            gyro_rad_s: 0.003,
+            acceleration_m_s2: 0.05,
+            acceleration_bias_m_s2: 0.02,
+            wheel_speed_rad_s: 0.02,
+            body_speed_m_s: 0.02,
+            position_m: 0.01,
+            heading_rad: 0.005,
+            torque_scale_ratio: 0.02,
+            torque_mu: 0.01,
+            radius_ratio: 0.01,
+        }
+    }
+}
+
+/// What a robot's seed makes of it: constant errors, and the source of its noise.
+#[derive(Debug, Clone)]
+pub struct Sensors {
+    spec: SensorSpec,
+    random: ChaCha8Rng,
+    samples: u64,
+    bias: BodyAcceleration,
+    torque_scale: f64,
+    torque_noise_n_m: f64,
+    radius_ratios: (f64, f64),
+}
+
+impl Sensors {
+    /// The sensors of one robot; equal seeds give equal sensors.
+    pub fn new(spec: SensorSpec, model: &RobotModel, seed: u64) -> Self {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let mut within = |most: f64| most * (2.0 * random.random::<f64>() - 1.0);
+        let bias = BodyAcceleration {
+            ahead_m_s2: within(spec.acceleration_bias_m_s2),
+            left_m_s2: within(spec.acceleration_bias_m_s2),
+        };
+        let torque_scale = 1.0 + within(spec.torque_scale_ratio);
+        let radius_ratios = (
+            1.0 + within(spec.radius_ratio),
+            1.0 + within(spec.radius_ratio),
+        );
+        let torque_noise_n_m = spec.torque_mu * model.side_load_n() * model.wheel_radius_m();
+        Self {
+            spec,
+            random,
+            samples: 0,
+            bias,
+            torque_scale,
+            torque_noise_n_m,
+            radius_ratios,
+        }
+    }
+
+    /// True rolling radii over the model's, left and right.
+    pub fn radius_ratios(&self) -> (f64, f64) {
+        self.radius_ratios
+    }
+
+    /// A sample of the standard normal distribution (Box and Muller).
+    fn normal(&mut self) -> f64 {
+        // The first is in (0, 1], so that its logarithm is finite.
+        let radius = (-2.0 * (1.0 - self.random.random::<f64>()).ln()).sqrt();
+        radius * (std::f64::consts::TAU * self.random.random::<f64>()).cos()
+    }
+
+    fn noisy(&mut self, value: f64, deviation: f64) -> f64 {
+        value + deviation * self.normal()
+    }
+
+    /// What the sensors say of the base now.
+    pub fn sample(&mut self, plant: &Plant, at: Duration) -> SensorSample {
+        let spec = self.spec;
+        let state = *plant.state();
+        let (acceleration, torques) = (plant.body_acceleration(), plant.wheel_torques());
+        let index = self.samples;
+        self.samples += 1;
+        let wheel_noise = spec.wheel_speed_rad_s;
+        let body_speed_m_s = index
+            .is_multiple_of(SAMPLES_PER_BODY_SPEED)
+            .then(|| self.noisy(state.ahead_m_s, spec.body_speed_m_s));
+        let position = index.is_multiple_of(SAMPLES_PER_POSITION).then(|| Pose {
+            x_m: self.noisy(state.pose.x_m, spec.position_m),
+            y_m: self.noisy(state.pose.y_m, spec.position_m),
+            heading_rad: self.noisy(state.pose.heading_rad, spec.heading_rad),
+        });
+        let torque_noise_n_m = self.torque_noise_n_m;
+        SensorSample {
+            at,
+            yaw_rate_rad_s: Some(self.noisy(state.yaw_rate_rad_s, spec.gyro_rad_s)),
+            acceleration: Some(BodyAcceleration {
+                ahead_m_s2: self.noisy(
+                    acceleration.ahead_m_s2 + self.bias.ahead_m_s2,
+                    spec.acceleration_m_s2,
+                ),
+                left_m_s2: self.noisy(
+                    acceleration.left_m_s2 + self.bias.left_m_s2,
+                    spec.acceleration_m_s2,
+                ),
+            }),
+            wheel_speeds: Some(WheelSpeeds {
+                left_rad_s: self.noisy(state.wheel_speeds.left_rad_s, wheel_noise),
+                right_rad_s: self.noisy(state.wheel_speeds.right_rad_s, wheel_noise),
+            }),
+            wheel_torques: Some(WheelTorques {
+                left_n_m: self.noisy(torques.left_n_m * self.torque_scale, torque_noise_n_m),
+                right_n_m: self.noisy(torques.right_n_m * self.torque_scale, torque_noise_n_m),
+            }),
+            body_speed_m_s,
+            position,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn noise_has_the_deviation_that_was_asked_for() {
+        let mut sensors = Sensors::new(SensorSpec::default(), &RobotModel::yi2007(), 5);
+        let count = 20_000;
+        let values: Vec<f64> = (0..count).map(|_| sensors.noisy(3.0, 0.5)).collect();
+        let mean = values.iter().sum::<f64>() / f64::from(count);
+        let variance = values
+            .iter()
+            .map(|value| (value - mean).powi(2))
+            .sum::<f64>()
+            / f64::from(count);
+        assert!((mean - 3.0).abs() < 0.02, "mean {mean}");
+        assert!(
+            (variance.sqrt() - 0.5).abs() < 0.02,
+            "deviation {}",
+            variance.sqrt()
+        );
+    }
+
+    #[test]
+    fn equal_seeds_give_equal_robots_and_others_do_not() {
+        let model = RobotModel::yi2007();
+        let ratios = |seed| Sensors::new(SensorSpec::default(), &model, seed).radius_ratios();
+        assert_eq!(ratios(1), ratios(1));
+        assert_ne!(ratios(1), ratios(2));
+    }
+}
