@@ -1,1 +1,186 @@
-//! Placeholder.
+//! Tread's server: takes missions over REST, hands them to robots over zenoh, keeps what the
+//! robots measure, and gives it back.
+//!
+//! * [`http`] knows HTTP and no SQL; [`app`] holds the use cases; [`db`] knows SQL and decides
+//!   nothing; [`fleet`] is the only module that calls zenoh; [`friction`] is pure.
+//! * [`Server::start`] runs everything inside a program of one's own; [`run_from_args`] is
+//!   the whole program, until a signal.
+
+pub mod app;
+pub mod clock;
+pub mod config;
+pub mod counters;
+pub mod db;
+pub mod fleet;
+pub mod friction;
+pub mod http;
+mod logging;
+pub mod supervisor;
+
+use std::ffi::OsString;
+use std::net::SocketAddr;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use anyhow::Context as _;
+use clap::Parser as _;
+use tokio::net::TcpListener;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::mpsc;
+use tracing::info;
+
+use self::app::{App, ingest, reconciler};
+use self::clock::Clock;
+pub use self::config::{Config, ServerArgs};
+use self::db::Db;
+use self::fleet::Fleet;
+use self::supervisor::Supervisor;
+
+/// How long threads that block may take after everything else has stopped.
+const RUNTIME_STOP_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// Builds servers.
+#[derive(Debug, Clone, Copy)]
+pub struct Server;
+
+/// A server at work.
+#[derive(Debug)]
+pub struct RunningServer {
+    http_address: SocketAddr,
+    app: App,
+    fleet: Fleet,
+    supervisor: Supervisor,
+}
+
+impl Server {
+    /// Starts a server on the machine's clock. Needs a multi-threaded tokio runtime.
+    ///
+    /// # Errors
+    /// The database cannot be opened, or an address is in use.
+    pub async fn start(config: Config) -> anyhow::Result<RunningServer> {
+        Self::start_with_clock(config, Clock::system()).await
+    }
+
+    /// Starts a server on a clock of one's own.
+    ///
+    /// # Errors
+    /// As [`Server::start`].
+    pub async fn start_with_clock(config: Config, clock: Clock) -> anyhow::Result<RunningServer> {
+        let db = Db::open(&config.database).await?;
+        let app = App::new(db, clock, config.friction);
+        app.ensure_site(&config.site).await?;
+        let listener = TcpListener::bind(config.http)
+            .await
+            .with_context(|| format!("cannot listen for HTTP on {}", config.http))?;
+        let http_address = listener.local_addr()?;
+
+        let supervisor = Supervisor::new();
+        let stop = || supervisor.stop_token();
+        let fleet = Fleet::open(config.zenoh, supervisor.clone()).await?;
+        let (uploads, uploads_in) = mpsc::channel(ingest::UPLOADS_WAITING_MAX);
+        supervisor.spawn_vital("ingest", ingest::run(app.clone(), uploads_in, stop()));
+        fleet.listen(&app, uploads).await?;
+        let reconciling =
+            reconciler::run(app.clone(), fleet.commands(), supervisor.clone(), stop());
+        supervisor.spawn_vital("reconciler", reconciling);
+        let router = http::router(app.clone());
+        let serving = http::serve::run(listener, router, app.clone(), supervisor.clone(), stop());
+        supervisor.spawn_vital("http", serving);
+        info!("REST API on http://{http_address}, described at http://{http_address}/docs");
+        Ok(RunningServer {
+            http_address,
+            app,
+            fleet,
+            supervisor,
+        })
+    }
+}
+
+impl RunningServer {
+    /// Where the REST API listens.
+    pub fn http_address(&self) -> SocketAddr {
+        self.http_address
+    }
+
+    /// The endpoint that robots connect to, as zenoh writes it.
+    pub fn zenoh_endpoint(&self) -> String {
+        format!("tcp/{}", self.fleet.address())
+    }
+
+    /// The use cases, for tests that look behind the API.
+    pub fn app(&self) -> &App {
+        &self.app
+    }
+
+    /// Waits until a vital task fails.
+    pub async fn failed(&self) {
+        self.supervisor.stopping().await;
+    }
+
+    /// Stops: finishes open requests, stores what was uploaded, closes network and database.
+    ///
+    /// # Errors
+    /// A vital task had failed, or tasks did not end in time.
+    pub async fn stop(self) -> anyhow::Result<()> {
+        let stopped = self.supervisor.stop().await;
+        self.fleet.close().await;
+        self.app.db().close().await;
+        Ok(stopped?)
+    }
+}
+
+/// Tread's server: missions to robots, friction from robots, one REST API.
+#[derive(Debug, clap::Parser)]
+#[command(name = "tread-server", version)]
+struct Command {
+    #[command(flatten)]
+    server: ServerArgs,
+}
+
+/// The whole program with these arguments, the first of which is its name.
+///
+/// Says on standard error what went wrong, and gives the code to end with: 0 after a stop that
+/// was asked for, 1 after a failure, 2 for arguments that make no sense.
+pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
+    let command = match Command::try_parse_from(arguments) {
+        Ok(command) => command,
+        Err(error) => {
+            // Help and version come this way too; without a terminal there is nobody to tell.
+            let _ = error.print();
+            return ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(2));
+        }
+    };
+    match run(&command.server) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// The whole program: configuration, logging, server, until a signal or a failure.
+///
+/// # Errors
+/// What keeps the server from starting, or what stopped it.
+pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
+    logging::start(args)?;
+    let config = Config::load(args)?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()?;
+    let ended = runtime.block_on(async {
+        let mut terminate = signal(SignalKind::terminate())?;
+        let mut interrupt = signal(SignalKind::interrupt())?;
+        let server = Server::start(config).await?;
+        tokio::select! {
+            _ = terminate.recv() => info!("asked to stop"),
+            _ = interrupt.recv() => info!("asked to stop"),
+            () = server.failed() => {}
+        }
+        server.stop().await
+    });
+    // A thread that is stuck in the network must not keep the process from ending.
+    runtime.shutdown_timeout(RUNTIME_STOP_TIMEOUT);
+    ended
+}

@@ -1,1 +1,15 @@
-//! Placeholder.
+//! A whole fleet under test: real server, real zenoh, real SQLite, simulated robots that run the
+//! real agent, each in a process of its own, so that any of them can be killed or cut off.
+//!
+//! * [`fleet`]: starts and stops the processes.
+//! * [`rest`]: speaks to the server as any client would.
+//! * [`relay`]: a network between robot and server that can be cut.
+//! * [`wait`]: waits for a state with a bound, and says what was seen last.
+//! * [`light_robot`]: robots without physics, for load.
+
+pub mod fleet;
+pub mod light_robot;
+pub mod process;
+pub mod relay;
+pub mod rest;
+pub mod wait;

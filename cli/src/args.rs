@@ -1,0 +1,345 @@
+//! The words of the command line.
+
+use std::ffi::OsString;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::{Args, Parser, Subcommand};
+use tread_api::geometry::Point;
+use tread_api::ids::{MissionId, RobotId, SiteId, TerrainId};
+use tread_api::trajectory::Waypoint;
+
+/// Where a server answers, unless told otherwise.
+pub(crate) const SERVER_DEFAULT: &str = "http://127.0.0.1:8420";
+/// The site that a server makes for itself, unless told otherwise.
+pub(crate) const SITE_DEFAULT: &str = "yard";
+/// Most robots of a demo; each is a process of its own.
+const DEMO_ROBOTS_MAX: i64 = 50;
+
+const EXIT_CODES: &str = "\
+Exit codes: 0 done; 1 done, and it went wrong (a mission failed); 2 wrong words on the command
+line; 3 no server answers; 4 the server refused.";
+
+/// Runs fleets of skid-steered robots and maps how the ground grips while they drive.
+#[derive(Debug, Parser)]
+#[command(name = "tread", version, after_help = EXIT_CODES)]
+pub(crate) struct Arguments {
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Start a whole fleet here: server, database, router and simulated robots on missions
+    Demo(DemoArguments),
+    #[command(flatten)]
+    Remote(RemoteCommand),
+    /// The server, as `tread demo` starts it
+    #[command(hide = true, disable_help_flag = true)]
+    Server(PassedOn),
+    /// An agent, as `tread demo` starts it
+    #[command(hide = true, disable_help_flag = true)]
+    Agent(PassedOn),
+}
+
+/// Arguments of another program.
+#[derive(Debug, Args)]
+pub(crate) struct PassedOn {
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+    rest: Vec<OsString>,
+}
+
+impl PassedOn {
+    /// The arguments as `program` would see them.
+    pub(crate) fn for_program(self, program: &str) -> Vec<OsString> {
+        std::iter::once(program.into()).chain(self.rest).collect()
+    }
+}
+
+/// Commands that talk to a running server.
+#[derive(Debug, Subcommand)]
+pub(crate) enum RemoteCommand {
+    /// List the robots of a site, or show one
+    Robots(RobotsArguments),
+    /// Send a robot on a circle or through waypoints
+    Send(SendArguments),
+    /// List missions, show one with its history, or cancel one
+    Missions(MissionsArguments),
+    /// List the terrains of a site
+    Terrains(TerrainsArguments),
+    /// Show what is known of the friction of a site's ground
+    Friction(FrictionArguments),
+    /// Show robots and missions as they change, until interrupted
+    Watch(WatchArguments),
+}
+
+impl RemoteCommand {
+    pub(crate) fn connection(&self) -> &Connection {
+        match self {
+            Self::Robots(arguments) => &arguments.connection,
+            Self::Send(arguments) => match &arguments.trajectory {
+                SendTrajectory::Circle(circle) => &circle.order.connection,
+                SendTrajectory::Waypoints(waypoints) => &waypoints.order.connection,
+            },
+            Self::Missions(arguments) => &arguments.connection,
+            Self::Terrains(arguments) => &arguments.connection,
+            Self::Friction(arguments) => &arguments.connection,
+            Self::Watch(arguments) => &arguments.connection,
+        }
+    }
+}
+
+/// Which server and site, and how to print.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct Connection {
+    /// Address of the server
+    #[arg(long, env = "TREAD_SERVER", default_value = SERVER_DEFAULT, value_name = "URL")]
+    pub(crate) server: String,
+    /// Site to look at
+    #[arg(long, env = "TREAD_SITE", default_value = SITE_DEFAULT)]
+    pub(crate) site: SiteId,
+    /// Print JSON as the server sent it instead of a table
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct RobotsArguments {
+    /// Show only this one, with the age of every value
+    pub(crate) robot: Option<RobotId>,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct SendArguments {
+    #[command(subcommand)]
+    pub(crate) trajectory: SendTrajectory,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum SendTrajectory {
+    /// Turns on a circle
+    Circle(SendCircle),
+    /// A smooth path through points
+    Waypoints(SendWaypoints),
+}
+
+/// What circles and waypoints have in common.
+#[derive(Debug, Args)]
+pub(crate) struct Order {
+    /// Robot that is to drive
+    #[arg(long)]
+    pub(crate) robot: RobotId,
+    /// Never start later than this from now
+    #[arg(long, value_name = "TIME", value_parser = duration)]
+    pub(crate) start_within: Option<Duration>,
+    /// Wait until the mission has ended, showing its progress
+    #[arg(long)]
+    pub(crate) wait: bool,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct SendCircle {
+    /// Centre in the site's frame, metres
+    #[arg(long, value_name = "X,Y", value_parser = point, allow_hyphen_values = true)]
+    pub(crate) center: Point,
+    /// Radius, metres
+    #[arg(long, value_name = "M")]
+    pub(crate) radius: f64,
+    /// Speed along the circle, metres per second
+    #[arg(long, value_name = "M/S", default_value_t = 0.5)]
+    pub(crate) speed: f64,
+    /// How many turns
+    #[arg(long, default_value_t = 1.0)]
+    pub(crate) turns: f64,
+    /// Drive clockwise
+    #[arg(long)]
+    pub(crate) clockwise: bool,
+    #[command(flatten)]
+    pub(crate) order: Order,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct SendWaypoints {
+    /// Points in the site's frame, metres, in driving order
+    #[arg(
+        value_name = "X,Y",
+        value_parser = waypoint,
+        allow_hyphen_values = true,
+        required_unless_present = "file"
+    )]
+    pub(crate) points: Vec<Waypoint>,
+    /// Read the points from a file: a line `x,y` each, or a JSON list of `{"x_m": …, "y_m": …}`
+    #[arg(long, value_name = "FILE", conflicts_with = "points")]
+    pub(crate) file: Option<PathBuf>,
+    /// Speed, metres per second
+    #[arg(long, value_name = "M/S", default_value_t = 0.5)]
+    pub(crate) speed: f64,
+    #[command(flatten)]
+    pub(crate) order: Order,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct MissionsArguments {
+    #[command(subcommand)]
+    pub(crate) action: Option<MissionsAction>,
+    /// Only those of this robot
+    #[arg(long)]
+    pub(crate) robot: Option<RobotId>,
+    /// At most so many, newest first
+    #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub(crate) limit: u32,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum MissionsAction {
+    /// Show a mission with its history
+    Show {
+        /// The mission
+        mission: MissionId,
+    },
+    /// Cancel a mission: its robot brakes along the path
+    Cancel {
+        /// The mission
+        mission: MissionId,
+    },
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct TerrainsArguments {
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct FrictionArguments {
+    /// Show only this terrain
+    #[arg(conflicts_with = "cells")]
+    pub(crate) terrain: Option<TerrainId>,
+    /// List cells instead of terrains
+    #[arg(long)]
+    pub(crate) cells: bool,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct WatchArguments {
+    /// Time between two looks
+    #[arg(long, value_name = "TIME", default_value = "500ms", value_parser = duration)]
+    pub(crate) every: Duration,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct DemoArguments {
+    /// How many robots, out of the scenario
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=DEMO_ROBOTS_MAX))]
+    pub(crate) robots: u32,
+    /// Scenario file instead of the one built in
+    #[arg(long, value_name = "FILE")]
+    pub(crate) scenario: Option<PathBuf>,
+    /// End when all missions have ended, or after this time at the latest; else at Ctrl-C
+    #[arg(long, value_name = "TIME", value_parser = duration)]
+    pub(crate) exit_after: Option<Duration>,
+    /// Print one JSON object at the end instead of progress and tables
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Port of the REST API on loopback; the next free one if it is taken
+    #[arg(long, default_value_t = 8420)]
+    pub(crate) port: u16,
+    /// Folder for the database, the agents' stores and the logs; a temporary one when absent
+    #[arg(long, value_name = "DIR")]
+    pub(crate) data_dir: Option<PathBuf>,
+}
+
+/// Reads a time such as `500ms`, `90s`, `5m` or `2h`.
+fn duration(text: &str) -> Result<Duration, String> {
+    let unit_at = text
+        .find(|letter: char| letter.is_ascii_alphabetic())
+        .unwrap_or(text.len());
+    let (number, unit) = text.split_at(unit_at);
+    let seconds_per_unit = match unit {
+        "ms" => 1e-3,
+        "s" => 1.0,
+        "m" | "min" => 60.0,
+        "h" => 3600.0,
+        _ => return Err("give a number and a unit: 500ms, 90s, 5m or 2h".to_owned()),
+    };
+    let number: f64 = number
+        .parse()
+        .map_err(|_| format!("`{number}` is not a number"))?;
+    Duration::try_from_secs_f64(number * seconds_per_unit).map_err(|error| error.to_string())
+}
+
+fn coordinates(text: &str) -> Result<(f64, f64), String> {
+    let (x, y) = text
+        .split_once(',')
+        .ok_or("give two numbers with a comma: 1.5,-2")?;
+    let number = |part: &str| {
+        let part = part.trim();
+        part.parse::<f64>()
+            .map_err(|_| format!("`{part}` is not a number"))
+    };
+    Ok((number(x)?, number(y)?))
+}
+
+fn point(text: &str) -> Result<Point, String> {
+    coordinates(text).map(|(x_m, y_m)| Point { x_m, y_m })
+}
+
+/// Reads one waypoint, `x,y` in metres.
+pub(crate) fn waypoint(text: &str) -> Result<Waypoint, String> {
+    let (x_m, y_m) = coordinates(text)?;
+    Ok(Waypoint {
+        x_m,
+        y_m,
+        speed_m_s: None,
+        heading_rad: None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_has_no_contradictions() {
+        Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn times_are_read_with_their_units() {
+        assert_eq!(duration("500ms"), Ok(Duration::from_millis(500)));
+        assert_eq!(duration("1.5m"), Ok(Duration::from_secs(90)));
+        for wrong in ["", "5", "s", "-5s", "5 days", "nans", "infs"] {
+            assert!(duration(wrong).is_err(), "`{wrong}` was taken");
+        }
+    }
+
+    #[test]
+    fn negative_coordinates_are_values_and_no_options() {
+        let line = [
+            "tread", "send", "circle", "--robot", "r", "--center", "-1.5,-2", "--radius", "3",
+        ];
+        assert!(Arguments::try_parse_from(line).is_ok());
+        let line = [
+            "tread",
+            "send",
+            "waypoints",
+            "--robot",
+            "r",
+            "0,0",
+            "-4,2.5",
+        ];
+        assert!(Arguments::try_parse_from(line).is_ok());
+    }
+}

@@ -1,0 +1,228 @@
+//! A client of the REST API.
+
+use std::time::Duration;
+
+use reqwest::{Method, RequestBuilder, StatusCode};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use tread_api::friction::{CellFriction, TerrainFriction};
+use tread_api::ids::{MissionId, RobotId, SiteId, TerrainId};
+use tread_api::mission::{CreateMission, Mission, MissionDetail};
+use tread_api::page::{PAGE_LIMIT_MAX, Page};
+use tread_api::problem::ProblemBody;
+use tread_api::robot::Robot;
+use tread_api::terrain::{CreateTerrain, Terrain};
+
+/// Longest wait for an answer; planning the longest path takes a while.
+const ANSWER_WAIT_MAX: Duration = Duration::from_secs(30);
+/// Longest wait for a connection.
+const CONNECT_WAIT_MAX: Duration = Duration::from_secs(3);
+/// Most pages of one list that are followed.
+const PAGES_MAX: usize = 100;
+
+/// Why a request got no answer that can be used.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum ClientError {
+    /// The address is not one.
+    #[error("`{address}` is not the address of a server: use one like http://127.0.0.1:8420")]
+    Address { address: String },
+    /// Nothing answers there.
+    #[error(
+        "no server answers at {address}: start one with `tread demo` or `tread-server`, or name \
+         another with --server"
+    )]
+    Unreachable {
+        address: String,
+        #[source]
+        cause: reqwest::Error,
+    },
+    /// The server refused.
+    #[error("{}", refusal(.problem))]
+    Refused { problem: Box<ProblemBody> },
+    /// What answers does not speak this API.
+    #[error("what answers at {address} is no Tread server of this version ({status})")]
+    NotUnderstood {
+        address: String,
+        status: StatusCode,
+        #[source]
+        cause: serde_json::Error,
+    },
+}
+
+fn refusal(problem: &ProblemBody) -> String {
+    let mut text = problem.title.clone();
+    if let Some(field) = &problem.field {
+        text = format!("{text}, at `{field}`");
+    }
+    match &problem.detail {
+        Some(detail) => format!("{text}: {detail}"),
+        None => text,
+    }
+}
+
+/// A connection to one server.
+#[derive(Debug, Clone)]
+pub(crate) struct Client {
+    address: String,
+    http: reqwest::Client,
+}
+
+impl Client {
+    pub(crate) fn new(address: &str) -> Result<Self, ClientError> {
+        let invalid = || ClientError::Address {
+            address: address.to_owned(),
+        };
+        let url = reqwest::Url::parse(address).map_err(|_| invalid())?;
+        if url.scheme() != "http" || url.host().is_none() {
+            return Err(invalid());
+        }
+        let address = address.trim_end_matches('/').to_owned();
+        let http = reqwest::Client::builder()
+            .timeout(ANSWER_WAIT_MAX)
+            .connect_timeout(CONNECT_WAIT_MAX)
+            .user_agent(concat!("tread/", env!("CARGO_PKG_VERSION")))
+            .build()
+            .map_err(|cause| ClientError::Unreachable {
+                address: address.clone(),
+                cause,
+            })?;
+        Ok(Self { address, http })
+    }
+
+    pub(crate) fn address(&self) -> &str {
+        &self.address
+    }
+
+    fn request(&self, method: Method, path: &str) -> RequestBuilder {
+        self.http.request(method, format!("{}{path}", self.address))
+    }
+
+    async fn send<T: DeserializeOwned>(&self, request: RequestBuilder) -> Result<T, ClientError> {
+        let unreachable = |cause| ClientError::Unreachable {
+            address: self.address.clone(),
+            cause,
+        };
+        let response = request.send().await.map_err(unreachable)?;
+        let status = response.status();
+        let body = response.bytes().await.map_err(unreachable)?;
+        let not_understood = |cause| ClientError::NotUnderstood {
+            address: self.address.clone(),
+            status,
+            cause,
+        };
+        if status.is_success() {
+            serde_json::from_slice(&body).map_err(not_understood)
+        } else {
+            let problem = serde_json::from_slice(&body).map_err(not_understood)?;
+            Err(ClientError::Refused {
+                problem: Box::new(problem),
+            })
+        }
+    }
+
+    async fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
+        self.send(self.request(Method::GET, path)).await
+    }
+
+    async fn post<B: Serialize + Sync, T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: &B,
+    ) -> Result<T, ClientError> {
+        self.send(self.request(Method::POST, path).json(body)).await
+    }
+
+    /// Follows a list to its end, at most [`PAGES_MAX`] pages.
+    async fn all<T: DeserializeOwned>(&self, path: &str) -> Result<Vec<T>, ClientError> {
+        let mut items = Vec::new();
+        let mut cursor: Option<String> = None;
+        for _ in 0..PAGES_MAX {
+            let mut query = vec![("limit", PAGE_LIMIT_MAX.to_string())];
+            query.extend(cursor.map(|cursor| ("cursor", cursor)));
+            let page: Page<T> = self
+                .send(self.request(Method::GET, path).query(&query))
+                .await?;
+            items.extend(page.items);
+            cursor = page.next_cursor;
+            if cursor.is_none() {
+                break;
+            }
+        }
+        Ok(items)
+    }
+
+    /// Whether the server is ready to work.
+    pub(crate) async fn is_ready(&self) -> bool {
+        let answer = self.request(Method::GET, "/readyz").send().await;
+        answer.is_ok_and(|response| response.status().is_success())
+    }
+
+    pub(crate) async fn robots(&self, site: &SiteId) -> Result<Vec<Robot>, ClientError> {
+        self.all(&format!("/v1/sites/{site}/robots")).await
+    }
+
+    pub(crate) async fn robot(&self, site: &SiteId, robot: &RobotId) -> Result<Robot, ClientError> {
+        self.get(&format!("/v1/sites/{site}/robots/{robot}")).await
+    }
+
+    pub(crate) async fn terrains(&self, site: &SiteId) -> Result<Vec<Terrain>, ClientError> {
+        self.all(&format!("/v1/sites/{site}/terrains")).await
+    }
+
+    pub(crate) async fn create_terrain(
+        &self,
+        site: &SiteId,
+        terrain: &CreateTerrain,
+    ) -> Result<Terrain, ClientError> {
+        self.post(&format!("/v1/sites/{site}/terrains"), terrain)
+            .await
+    }
+
+    pub(crate) async fn create_mission(
+        &self,
+        mission: &CreateMission,
+    ) -> Result<Mission, ClientError> {
+        self.post("/v1/missions", mission).await
+    }
+
+    /// The newest missions of a site, at most `limit`.
+    pub(crate) async fn missions(
+        &self,
+        site: &SiteId,
+        robot: Option<&RobotId>,
+        limit: u32,
+    ) -> Result<Page<Mission>, ClientError> {
+        let mut query = vec![("site", site.to_string()), ("limit", limit.to_string())];
+        query.extend(robot.map(|robot| ("robot", robot.to_string())));
+        self.send(self.request(Method::GET, "/v1/missions").query(&query))
+            .await
+    }
+
+    pub(crate) async fn mission(&self, mission: MissionId) -> Result<MissionDetail, ClientError> {
+        self.get(&format!("/v1/missions/{mission}")).await
+    }
+
+    pub(crate) async fn cancel_mission(&self, mission: MissionId) -> Result<Mission, ClientError> {
+        self.send(self.request(Method::POST, &format!("/v1/missions/{mission}/cancel")))
+            .await
+    }
+
+    pub(crate) async fn terrain_friction(
+        &self,
+        site: &SiteId,
+        terrain: Option<&TerrainId>,
+    ) -> Result<Vec<TerrainFriction>, ClientError> {
+        let path = format!("/v1/sites/{site}/friction/terrains");
+        match terrain {
+            Some(terrain) => Ok(vec![self.get(&format!("{path}/{terrain}")).await?]),
+            None => self.all(&path).await,
+        }
+    }
+
+    pub(crate) async fn cell_friction(
+        &self,
+        site: &SiteId,
+    ) -> Result<Vec<CellFriction>, ClientError> {
+        self.all(&format!("/v1/sites/{site}/friction/cells")).await
+    }
+}

@@ -1,0 +1,126 @@
+//! `tread missions`: what robots were asked to do, and what came of it.
+
+use std::process::ExitCode;
+
+use tread_api::mission::{Mission, MissionDetail, MissionState};
+use tread_api::trajectory::{Direction, Trajectory};
+
+use super::robots::percent;
+use crate::args::{MissionsAction, MissionsArguments};
+use crate::client::Client;
+use crate::output::{Output, or_dash, render, table};
+
+pub(super) async fn run(
+    arguments: &MissionsArguments,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    match &arguments.action {
+        None => {
+            let site = &arguments.connection.site;
+            let page = client
+                .missions(site, arguments.robot.as_ref(), arguments.limit)
+                .await?;
+            output.show(&page.items, |missions| list(missions))?;
+        }
+        Some(MissionsAction::Show { mission }) => {
+            let detail = client.mission(*mission).await?;
+            output.show(&detail, history)?;
+        }
+        Some(MissionsAction::Cancel { mission }) => {
+            let mission = client.cancel_mission(*mission).await?;
+            output.show(&mission, summary)?;
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// A table of missions.
+pub(super) fn list(missions: &[Mission]) -> String {
+    if missions.is_empty() {
+        return "no missions here yet: send one with `tread send`".to_owned();
+    }
+    let mut table = table([
+        "MISSION",
+        "ROBOT",
+        "STATE",
+        "DONE",
+        "TRAJECTORY",
+        "CREATED",
+        "REASON",
+    ]);
+    for mission in missions {
+        table.add_row([
+            mission.id.to_string(),
+            mission.robot.to_string(),
+            mission.state.as_str().to_owned(),
+            or_dash(
+                mission
+                    .progress
+                    .map(|progress| percent(progress.driven_m, progress.length_m)),
+            ),
+            trajectory(&mission.trajectory),
+            mission.created_at.to_string(),
+            mission.reason.clone().unwrap_or_default(),
+        ]);
+    }
+    render(&table)
+}
+
+/// One line on a mission.
+pub(crate) fn summary(mission: &Mission) -> String {
+    let reason = mission
+        .reason
+        .as_ref()
+        .map(|reason| format!(": {reason}"))
+        .unwrap_or_default();
+    format!(
+        "mission {} on {}: {}, {}{reason}",
+        mission.id,
+        mission.robot,
+        trajectory(&mission.trajectory),
+        mission.state.as_str()
+    )
+}
+
+fn history(detail: &MissionDetail) -> String {
+    let mut table = table(["AT", "WHO", "FROM", "TO", "WHY"]);
+    for event in &detail.events {
+        table.add_row([
+            event.at.to_string(),
+            event.actor.as_str().to_owned(),
+            or_dash(event.from.map(MissionState::as_str)),
+            event.to.as_str().to_owned(),
+            event.reason.clone().unwrap_or_default(),
+        ]);
+    }
+    let plan = detail.mission.plan.map(|plan| {
+        format!(
+            "planned {:.1} m in {:.0} s\n",
+            plan.length_m, plan.duration_s
+        )
+    });
+    format!(
+        "{}\n{}{}",
+        summary(&detail.mission),
+        plan.unwrap_or_default(),
+        render(&table)
+    )
+}
+
+/// A trajectory in a few words.
+fn trajectory(trajectory: &Trajectory) -> String {
+    match trajectory {
+        Trajectory::Circle(circle) => {
+            let way = match circle.direction {
+                Direction::CounterClockwise => "ccw",
+                Direction::Clockwise => "cw",
+            };
+            format!(
+                "circle R {} m, {} turns {way}",
+                circle.radius_m, circle.turns
+            )
+        }
+        Trajectory::Waypoints(waypoints) => format!("{} waypoints", waypoints.points.len()),
+    }
+}

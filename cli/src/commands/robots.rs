@@ -1,0 +1,173 @@
+//! `tread robots`: who is there, and what they said last.
+
+use std::process::ExitCode;
+
+use tread_api::robot::{LinkState, Robot, RobotLive, RobotMode};
+
+use crate::args::RobotsArguments;
+use crate::client::Client;
+use crate::output::{Output, age, or_dash, render, table};
+
+pub(super) async fn run(
+    arguments: &RobotsArguments,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    let site = &arguments.connection.site;
+    if let Some(robot) = &arguments.robot {
+        let robot = client.robot(site, robot).await?;
+        output.show(&robot, details)?;
+    } else {
+        let robots = client.robots(site).await?;
+        output.show(&robots, |robots| list(robots))?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// A table of robots.
+pub(super) fn list(robots: &[Robot]) -> String {
+    if robots.is_empty() {
+        return "no robot has said hello on this site yet".to_owned();
+    }
+    let mut table = table([
+        "ROBOT",
+        "LINK",
+        "MODE",
+        "X M",
+        "Y M",
+        "SPEED M/S",
+        "MISSION",
+        "DONE",
+        "THETA",
+        "HEARD",
+    ]);
+    for robot in robots {
+        let live = robot.live.as_ref();
+        let pose = live.and_then(|live| live.pose);
+        let twist = live.and_then(|live| live.twist);
+        let mission = live.and_then(|live| live.mission);
+        table.add_row([
+            robot.id.to_string(),
+            link_name(robot.link).to_owned(),
+            or_dash(live.map(|live| mode_name(live.mode))),
+            or_dash(pose.map(|pose| format!("{:.2}", pose.value.x_m))),
+            or_dash(pose.map(|pose| format!("{:.2}", pose.value.y_m))),
+            or_dash(twist.map(|twist| format!("{:.2}", twist.value.linear_m_s))),
+            or_dash(mission.map(|mission| mission.id)),
+            or_dash(mission.map(|mission| percent(mission.driven_m, mission.length_m))),
+            or_dash(live.and_then(theta)),
+            or_dash(live.map(|live| format!("{} ago", age(live.heard_age_ms)))),
+        ]);
+    }
+    render(&table)
+}
+
+fn details(robot: &Robot) -> String {
+    let mut lines = vec![
+        format!("robot          {} of site {}", robot.id, robot.site),
+        format!(
+            "model          {}, tyres {}",
+            robot.model.name, robot.model.tyres
+        ),
+        format!("configuration  {}", robot.configuration),
+        format!("agent          {}", robot.agent_version),
+        format!("link           {}", link_name(robot.link)),
+        format!("first seen     {}", robot.first_seen_at),
+        format!("last hello     {}", robot.last_hello_at),
+    ];
+    match &robot.live {
+        Some(live) => lines.extend(live_lines(live)),
+        None => lines.push("it has said nothing since the server started".to_owned()),
+    }
+    lines.join("\n")
+}
+
+fn live_lines(live: &RobotLive) -> Vec<String> {
+    let mut lines = vec![
+        format!("boot           {}", live.boot),
+        format!("heard          {} ago", age(live.heard_age_ms)),
+        format!("mode           {}", mode_name(live.mode)),
+    ];
+    lines.extend(
+        live.fault
+            .as_ref()
+            .map(|fault| format!("fault          {fault}")),
+    );
+    lines.extend(live.pose.map(|pose| {
+        let (value, age) = (pose.value, age(pose.age_ms));
+        format!(
+            "pose           x {:.3} m, y {:.3} m, heading {:.3} rad, {age} old",
+            value.x_m, value.y_m, value.heading_rad
+        )
+    }));
+    lines.extend(live.twist.map(|twist| {
+        let (value, age) = (twist.value, age(twist.age_ms));
+        format!(
+            "speed          {:.3} m/s, {:.3} rad/s, {age} old",
+            value.linear_m_s, value.angular_rad_s
+        )
+    }));
+    lines.extend(live.mission.map(|mission| {
+        format!(
+            "mission        {}, {:.1} of {:.1} m, {:.3} m off the path",
+            mission.id, mission.driven_m, mission.length_m, mission.cross_track_m
+        )
+    }));
+    lines.extend(live.friction.map(|friction| {
+        let excited = if friction.value.excited {
+            "excited"
+        } else {
+            "no new information"
+        };
+        format!(
+            "friction       theta measured {}, in the loop {}, {excited}, {} old",
+            or_dash(theta(live)),
+            or_dash(friction.value.theta_loop.map(|theta| format!("{theta:.4}"))),
+            age(friction.age_ms)
+        )
+    }));
+    lines.push(format!(
+        "outbox         {} waiting, {} dropped, {} refused",
+        live.outbox.pending, live.outbox.dropped, live.outbox.refused
+    ));
+    lines.push(format!(
+        "control loop   {} Hz, {} ticks, {} late, longest {} us",
+        live.control_loop.rate_hz,
+        live.control_loop.ticks,
+        live.control_loop.overruns,
+        live.control_loop.tick_max_us
+    ));
+    lines
+}
+
+/// The measured θ with its deviation.
+pub(super) fn theta(live: &RobotLive) -> Option<String> {
+    let measured = live.friction?.value.theta_measured?;
+    Some(format!("{:.4} ± {:.4}", measured.theta, measured.std_dev))
+}
+
+pub(super) fn percent(part: f64, whole: f64) -> String {
+    if whole > 0.0 {
+        format!("{:.0} %", 100.0 * (part / whole).min(1.0))
+    } else {
+        "-".to_owned()
+    }
+}
+
+pub(super) fn link_name(link: LinkState) -> &'static str {
+    match link {
+        LinkState::Online => "online",
+        LinkState::Stale => "stale",
+        LinkState::Offline => "offline",
+    }
+}
+
+pub(super) fn mode_name(mode: RobotMode) -> &'static str {
+    match mode {
+        RobotMode::Idle => "idle",
+        RobotMode::Tracking => "tracking",
+        RobotMode::Teleoperated => "teleoperated",
+        RobotMode::Stopped => "stopped",
+        RobotMode::Fault => "fault",
+    }
+}

@@ -1,0 +1,343 @@
+//! `tread demo`: a whole fleet on this machine, each part a process of its own.
+//!
+//! This executable starts itself again as the server and as one agent for each robot of a
+//! scenario, draws the scenario's terrains and sends its missions over REST, and shows how they
+//! come along. What the robots then know of the ground they have measured: only their simulated
+//! bases are told the truth.
+
+mod processes;
+mod progress;
+mod report;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Duration;
+
+use anyhow::{Context, bail, ensure};
+use tokio::time::{Instant, MissedTickBehavior};
+use tread_agent::sim::scenario::{Scenario, ScenarioRobot};
+use tread_api::ids::{MissionId, TerrainId};
+use tread_api::mission::{CreateMission, Mission};
+use tread_api::problem::ProblemType;
+use tread_api::robot::{LinkState, Robot};
+use tread_api::terrain::{CreateTerrain, Terrain, TerrainRef, TerrainShape, terrain_at};
+
+use self::processes::Processes;
+use self::progress::Progress;
+use self::report::Report;
+use crate::args::DemoArguments;
+use crate::client::{Client, ClientError};
+use crate::output::{json_line, line, note};
+
+/// Longest wait for the server or the robots to be there.
+const START_WAIT_MAX: Duration = Duration::from_secs(30);
+/// Longest wait for the last measurements after the last mission has ended.
+const UPLOAD_WAIT_MAX: Duration = Duration::from_secs(10);
+/// Time between two looks at the fleet.
+const LOOK_EVERY: Duration = Duration::from_millis(200);
+/// A mission shown is one of the newest so many.
+const MISSIONS_MAX: u32 = 1_000;
+
+/// Runs a fleet until its missions have ended, its time is over or somebody presses Ctrl-C.
+pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
+    let scenario = match &arguments.scenario {
+        Some(file) => Scenario::load(file)?,
+        None => Scenario::built_in()?,
+    };
+    let robots = choose_robots(&scenario, arguments.robots)?;
+    let folder = DataFolder::new(arguments.data_dir.clone())?;
+    let tell = |text: &str| {
+        if !arguments.json {
+            note(text);
+        }
+    };
+
+    tell("starting server, database and router …");
+    let mut processes = Processes::start_server(folder.path(), arguments.port, &scenario.site)?;
+    let client = Client::new(&processes.api_address())?;
+    let outcome = async {
+        let demo = Demo {
+            scenario: &scenario,
+            robots: &robots,
+            client: &client,
+        };
+        demo.wait_for_server(&mut processes).await?;
+        let terrains = demo.draw_terrains().await?;
+        for robot in &robots {
+            let file = arguments.scenario.as_deref();
+            processes.start_agent(folder.path(), &scenario.site, robot, file)?;
+        }
+        demo.wait_for_robots(&mut processes).await?;
+        let missions = demo.send_missions().await?;
+        tell(&welcome(&client, &processes, folder.path(), missions.len()));
+        let mut watch = Watch::new(&demo, &terrains, missions, &arguments);
+        watch.until_done(&mut processes).await?;
+        watch.report().await
+    };
+    let interrupted = async {
+        tokio::signal::ctrl_c()
+            .await
+            .context("cannot wait for Ctrl-C")?;
+        anyhow::Ok(())
+    };
+    let report = tokio::select! {
+        report = outcome => Some(report),
+        interrupted = interrupted => { interrupted?; None }
+    };
+    tell("stopping …");
+    processes.stop().await;
+    let Some(report) = report.transpose()? else {
+        return Ok(ExitCode::SUCCESS);
+    };
+    if arguments.json {
+        json_line(&report)?;
+    } else {
+        line(&report.for_people())?;
+    }
+    Ok(if report.holds() {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    })
+}
+
+fn choose_robots(scenario: &Scenario, count: u32) -> anyhow::Result<Vec<ScenarioRobot>> {
+    let count = usize::try_from(count)?;
+    let there = scenario.robots.len();
+    ensure!(
+        count <= there,
+        "the scenario has {there} robots, not {count}: ask for fewer with --robots, or write \
+         more into a scenario of your own and give it with --scenario"
+    );
+    Ok(scenario.robots.iter().take(count).cloned().collect())
+}
+
+fn welcome(client: &Client, processes: &Processes, folder: &Path, missions: usize) -> String {
+    format!(
+        "\n  REST API       {api}/v1\n  documentation  {api}/docs\n  zenoh router   {}\n  \
+         data and logs  {}\n\n{missions} missions sent; try `tread watch --server {api}` in \
+         another terminal.\n",
+        processes.zenoh_endpoint(),
+        folder.display(),
+        api = client.address(),
+    )
+}
+
+/// Where the demo keeps its files.
+enum DataFolder {
+    Temporary(tempfile::TempDir),
+    Kept(PathBuf),
+}
+
+impl DataFolder {
+    fn new(kept: Option<PathBuf>) -> anyhow::Result<Self> {
+        let Some(path) = kept else {
+            let folder = tempfile::Builder::new().prefix("tread-demo-").tempdir();
+            return Ok(Self::Temporary(
+                folder.context("cannot make a temporary folder")?,
+            ));
+        };
+        std::fs::create_dir_all(&path)
+            .with_context(|| format!("cannot make the folder {}", path.display()))?;
+        Ok(Self::Kept(path))
+    }
+
+    fn path(&self) -> &Path {
+        match self {
+            Self::Temporary(folder) => folder.path(),
+            Self::Kept(path) => path,
+        }
+    }
+}
+
+/// The scenario's part of a fleet.
+#[derive(Clone, Copy)]
+struct Demo<'demo> {
+    scenario: &'demo Scenario,
+    robots: &'demo [ScenarioRobot],
+    client: &'demo Client,
+}
+
+impl Demo<'_> {
+    async fn wait_for_server(&self, processes: &mut Processes) -> anyhow::Result<()> {
+        let deadline = Instant::now() + START_WAIT_MAX;
+        while !self.client.is_ready().await {
+            processes.all_alive()?;
+            ensure!(
+                Instant::now() < deadline,
+                "the server is not ready after {START_WAIT_MAX:?}"
+            );
+            tokio::time::sleep(LOOK_EVERY).await;
+        }
+        Ok(())
+    }
+
+    async fn draw_terrains(&self) -> anyhow::Result<Vec<Terrain>> {
+        for terrain in &self.scenario.terrains {
+            let request = CreateTerrain {
+                id: terrain.id.clone(),
+                name: terrain.name.clone(),
+                class: terrain.class,
+                polygon: terrain.outline().map_err(anyhow::Error::msg)?,
+                layer: terrain.layer,
+            };
+            match self
+                .client
+                .create_terrain(&self.scenario.site, &request)
+                .await
+            {
+                // A folder that was kept has them from the last time.
+                Err(ClientError::Refused { problem })
+                    if problem.kind == ProblemType::AlreadyExists => {}
+                other => _ = other?,
+            }
+        }
+        Ok(self.client.terrains(&self.scenario.site).await?)
+    }
+
+    async fn present_robots(&self) -> Result<Vec<Robot>, ClientError> {
+        self.client.robots(&self.scenario.site).await
+    }
+
+    async fn wait_for_robots(&self, processes: &mut Processes) -> anyhow::Result<()> {
+        let deadline = Instant::now() + START_WAIT_MAX;
+        loop {
+            let present = self.present_robots().await?;
+            let is_online = |robot: &&ScenarioRobot| {
+                present.iter().any(|seen| {
+                    seen.id == robot.id && seen.link == LinkState::Online && seen.live.is_some()
+                })
+            };
+            let Some(missing) = self.robots.iter().find(|robot| !is_online(robot)) else {
+                return Ok(());
+            };
+            processes.all_alive()?;
+            if Instant::now() >= deadline {
+                bail!(
+                    "robot `{}` is not online after {START_WAIT_MAX:?}",
+                    missing.id
+                );
+            }
+            tokio::time::sleep(LOOK_EVERY).await;
+        }
+    }
+
+    async fn send_missions(&self) -> anyhow::Result<Vec<MissionId>> {
+        let mut missions = Vec::new();
+        for mission in &self.scenario.missions {
+            if self.robots.iter().any(|robot| robot.id == mission.robot) {
+                let request = CreateMission {
+                    site: self.scenario.site.clone(),
+                    robot: mission.robot.clone(),
+                    trajectory: mission.trajectory.clone(),
+                    latest_start: None,
+                };
+                missions.push(self.client.create_mission(&request).await?.id);
+            }
+        }
+        Ok(missions)
+    }
+}
+
+/// Looks at the fleet until it is done.
+struct Watch<'demo> {
+    demo: Demo<'demo>,
+    shapes: Vec<TerrainShape>,
+    missions: Vec<MissionId>,
+    begin: Instant,
+    exit_after: Option<Duration>,
+    progress: Progress,
+    seen: Vec<Mission>,
+    driven: BTreeMap<TerrainId, Duration>,
+}
+
+impl<'demo> Watch<'demo> {
+    fn new(
+        demo: &Demo<'demo>,
+        terrains: &[Terrain],
+        missions: Vec<MissionId>,
+        arguments: &DemoArguments,
+    ) -> Self {
+        let shape = |terrain: &Terrain| TerrainShape {
+            terrain: TerrainRef {
+                id: terrain.id.clone(),
+                revision: terrain.revision,
+            },
+            polygon: terrain.polygon.clone(),
+            layer: terrain.layer,
+        };
+        Self {
+            demo: *demo,
+            shapes: terrains.iter().map(shape).collect(),
+            missions,
+            begin: Instant::now(),
+            exit_after: arguments.exit_after,
+            progress: Progress::new(demo.robots, !arguments.json),
+            seen: Vec::new(),
+            driven: BTreeMap::new(),
+        }
+    }
+
+    /// Returns when all missions have ended and everything measured is uploaded, or when the time
+    /// is over; without a time it goes on showing the fleet for ever.
+    async fn until_done(&mut self, processes: &mut Processes) -> anyhow::Result<()> {
+        let mut ticks = tokio::time::interval(LOOK_EVERY);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut uploads_until: Option<Instant> = None;
+        loop {
+            ticks.tick().await;
+            processes.all_alive()?;
+            let robots = self.look().await?;
+            let Some(exit_after) = self.exit_after else {
+                continue;
+            };
+            if self.begin.elapsed() >= exit_after {
+                break;
+            }
+            if self.seen.iter().all(|mission| mission.state.is_terminal()) {
+                let until = *uploads_until.get_or_insert(Instant::now() + UPLOAD_WAIT_MAX);
+                let uploaded = |robot: &Robot| {
+                    robot
+                        .live
+                        .as_ref()
+                        .is_some_and(|live| live.outbox.pending == 0)
+                };
+                if robots.iter().all(uploaded) || Instant::now() >= until {
+                    break;
+                }
+            }
+        }
+        self.progress.finish();
+        Ok(())
+    }
+
+    async fn look(&mut self) -> anyhow::Result<Vec<Robot>> {
+        let robots = self.demo.present_robots().await?;
+        let site = &self.demo.scenario.site;
+        let page = self.demo.client.missions(site, None, MISSIONS_MAX).await?;
+        let is_ours = |mission: &Mission| self.missions.contains(&mission.id);
+        self.seen = page.items.into_iter().filter(is_ours).collect();
+        for live in robots.iter().filter_map(|robot| robot.live.as_ref()) {
+            let place = live.pose.filter(|_| live.mission.is_some());
+            let under = place.and_then(|pose| terrain_at(&self.shapes, pose.value.position()));
+            if let Some(shape) = under {
+                *self.driven.entry(shape.terrain.id.clone()).or_default() += LOOK_EVERY;
+            }
+        }
+        self.progress.show(&robots, &self.seen);
+        Ok(robots)
+    }
+
+    async fn report(&self) -> anyhow::Result<Report> {
+        let site = &self.demo.scenario.site;
+        let measured = self.demo.client.terrain_friction(site, None).await?;
+        Ok(Report::new(
+            self.demo.scenario,
+            &self.seen,
+            &self.driven,
+            &measured,
+            self.begin.elapsed(),
+        ))
+    }
+}

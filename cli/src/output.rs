@@ -1,0 +1,110 @@
+//! Printing: tables for people, JSON for programs, and what went wrong.
+
+use std::io::{self, Write};
+use std::process::ExitCode;
+
+use anyhow::Context;
+use comfy_table::{ContentArrangement, Table, presets};
+use serde::Serialize;
+
+use crate::client::ClientError;
+
+/// The server could not be reached.
+const EXIT_UNREACHABLE: u8 = 3;
+/// The server refused.
+const EXIT_REFUSED: u8 = 4;
+
+/// Where answers go: standard output, as tables or as JSON.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Output {
+    json: bool,
+}
+
+impl Output {
+    pub(crate) fn new(json: bool) -> Self {
+        Self { json }
+    }
+
+    pub(crate) fn is_json(self) -> bool {
+        self.json
+    }
+
+    /// Prints a value as JSON, or what `human` makes of it.
+    pub(crate) fn show<T: Serialize>(
+        self,
+        value: &T,
+        human: impl FnOnce(&T) -> String,
+    ) -> anyhow::Result<()> {
+        if self.json {
+            json_line(value)
+        } else {
+            line(&human(value))
+        }
+    }
+}
+
+/// Prints a value as one line of JSON.
+pub(crate) fn json_line<T: Serialize>(value: &T) -> anyhow::Result<()> {
+    line(&serde_json::to_string(value).context("cannot write the answer as JSON")?)
+}
+
+/// Prints a line to standard output.
+pub(crate) fn line(text: &str) -> anyhow::Result<()> {
+    writeln!(io::stdout().lock(), "{text}").context("cannot print")
+}
+
+/// Prints a line to standard error, for people only.
+pub(crate) fn note(text: &str) {
+    // Nobody is left to be told when standard error is closed.
+    _ = writeln!(io::stderr().lock(), "{text}");
+}
+
+/// Prints what went wrong with its causes, and chooses the exit code.
+pub(crate) fn report(error: &anyhow::Error) -> ExitCode {
+    let closed_pipe = |cause: &(dyn std::error::Error + 'static)| {
+        let io_error = cause.downcast_ref::<io::Error>();
+        io_error.is_some_and(|error| error.kind() == io::ErrorKind::BrokenPipe)
+    };
+    if error.chain().any(closed_pipe) {
+        return ExitCode::SUCCESS;
+    }
+    note(&format!("tread: {error:#}"));
+    match error.downcast_ref::<ClientError>() {
+        Some(ClientError::Unreachable { .. }) => ExitCode::from(EXIT_UNREACHABLE),
+        Some(ClientError::Refused { .. }) => ExitCode::from(EXIT_REFUSED),
+        _ => ExitCode::FAILURE,
+    }
+}
+
+/// A table without lines, as command lines print them.
+pub(crate) fn table<const N: usize>(header: [&str; N]) -> Table {
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
+    table.set_content_arrangement(ContentArrangement::Disabled);
+    table.set_header(header);
+    table
+}
+
+/// A table as text, without the spaces at the ends of its lines.
+pub(crate) fn render(table: &Table) -> String {
+    let lines: Vec<String> = table
+        .lines()
+        .map(|line| line.trim_end().to_owned())
+        .collect();
+    lines.join("\n")
+}
+
+/// A value, or a dash where nothing is known.
+pub(crate) fn or_dash<T: ToString>(value: Option<T>) -> String {
+    value.map_or_else(|| "-".to_owned(), |value| value.to_string())
+}
+
+/// An age for people.
+pub(crate) fn age(age_ms: u64) -> String {
+    match age_ms {
+        0..1_000 => format!("{age_ms} ms"),
+        1_000..120_000 => format!("{}.{} s", age_ms / 1_000, age_ms % 1_000 / 100),
+        120_000..7_200_000 => format!("{} min", age_ms / 60_000),
+        _ => format!("{} h", age_ms / 3_600_000),
+    }
+}

@@ -1,0 +1,163 @@
+//! Robots: who they are, who is here, and what happens when one introduces itself.
+
+use tracing::info;
+use tread_api::ids::{RobotId, SiteId};
+use tread_api::page::Page;
+use tread_api::robot::{Robot, RobotModel};
+use tread_api::site::NAME_LENGTH_MAX;
+use tread_api::wire::hello::{Hello, Welcome};
+use tread_api::wire::{Refusal, RefusalCode};
+
+use super::terrains::site_definition;
+use super::{App, AppError, page, site_row};
+use crate::db;
+use crate::db::robots::{Introduction, RobotRow};
+
+impl App {
+    /// Robots of a site after a cursor.
+    pub async fn robots(
+        &self,
+        site: &SiteId,
+        cursor: Option<&str>,
+        limit: u32,
+    ) -> Result<Page<Robot>, AppError> {
+        let mut tx = self.db().read().await?;
+        let site_pk = site_row(&mut tx, site).await?.pk;
+        let after = cursor.unwrap_or_default();
+        let rows = db::robots::list(&mut tx, site_pk, after, limit + 1).await?;
+        let robots = rows.into_iter().map(|row| self.with_live(row)).collect();
+        Ok(page(robots, limit, |robot: &Robot| robot.id.to_string()))
+    }
+
+    /// One robot with its live state.
+    pub async fn robot(&self, site: &SiteId, id: &RobotId) -> Result<Robot, AppError> {
+        let mut tx = self.db().read().await?;
+        let site_pk = site_row(&mut tx, site).await?.pk;
+        let row = db::robots::find(&mut tx, site_pk, id).await?;
+        let unknown = || AppError::UnknownRobot(site.clone(), id.clone());
+        Ok(self.with_live(row.ok_or_else(unknown)?))
+    }
+
+    fn with_live(&self, row: RobotRow) -> Robot {
+        let now = self.clock().elapsed();
+        let presence = self.presences().get(&(row.site.clone(), row.id.clone()));
+        Robot {
+            id: row.id,
+            site: row.site,
+            model: row.model,
+            configuration: row.configuration,
+            agent_version: row.agent_version,
+            first_seen_at: row.first_seen_at,
+            last_hello_at: row.last_hello_at,
+            link: presence.link(now),
+            live: presence.live(now),
+        }
+    }
+
+    /// Takes a robot's introduction and answers with its site.
+    ///
+    /// # Errors
+    /// What the robot is told: its site is not known, its model is not possible, or the server
+    /// cannot write now.
+    pub async fn hello(&self, site: &SiteId, hello: &Hello) -> Result<Welcome, Refusal> {
+        check_model(hello).map_err(|detail| refusal(RefusalCode::Malformed, detail))?;
+        let welcome = self.introduce(site, hello).await.map_err(|error| {
+            tracing::error!("cannot write down robot `{}`: {error:?}", hello.robot);
+            refusal(RefusalCode::Busy, "the server cannot write now".to_owned())
+        })?;
+        let unknown = || {
+            self.counters().refused_unknown_site.one();
+            refusal(
+                RefusalCode::UnknownSite,
+                format!("site `{site}` is not known"),
+            )
+        };
+        let welcome = welcome.ok_or_else(unknown)?;
+        info!(robot.id = %hello.robot, "robot `{}` of site `{site}` said hello", hello.robot);
+        let key = (site.clone(), hello.robot.clone());
+        self.presences()
+            .hello(key, hello.boot, self.clock().elapsed());
+        self.wake();
+        Ok(welcome)
+    }
+
+    async fn introduce(&self, site: &SiteId, hello: &Hello) -> Result<Option<Welcome>, AppError> {
+        let now = self.clock().now();
+        let mut tx = self.db().write().await?;
+        let Some(row) = db::sites::find(&mut tx, site).await? else {
+            return Ok(None);
+        };
+        let introduction = Introduction {
+            id: &hello.robot,
+            boot: hello.boot,
+            agent_version: &hello.agent_version,
+            model: &hello.model,
+            at: now,
+        };
+        db::robots::introduce(&mut tx, row.pk, introduction).await?;
+        let definition = site_definition(&mut tx, site).await?;
+        tx.commit().await?;
+        Ok(definition.map(|site| Welcome {
+            site,
+            server_time: now,
+        }))
+    }
+}
+
+fn refusal(code: RefusalCode, detail: String) -> Refusal {
+    Refusal { code, detail }
+}
+
+fn check_model(hello: &Hello) -> Result<(), String> {
+    let RobotModel {
+        name,
+        tyres,
+        mass_kg,
+        track_width_m,
+        wheelbase_m,
+        wheel_radius_m,
+        yaw_inertia_kg_m2,
+        limits,
+    } = &hello.model;
+    for (field, text) in [
+        ("name", name),
+        ("tyres", tyres),
+        ("agent_version", &hello.agent_version),
+    ] {
+        if text.chars().count() > NAME_LENGTH_MAX {
+            return Err(format!(
+                "{field} is longer than {NAME_LENGTH_MAX} characters"
+            ));
+        }
+    }
+    let figures = [
+        ("mass_kg", *mass_kg),
+        ("track_width_m", *track_width_m),
+        ("wheelbase_m", *wheelbase_m),
+        ("wheel_radius_m", *wheel_radius_m),
+        ("yaw_inertia_kg_m2", *yaw_inertia_kg_m2),
+        ("limits.linear_max_m_s", limits.linear_max_m_s),
+        ("limits.angular_max_rad_s", limits.angular_max_rad_s),
+        (
+            "limits.linear_acceleration_max_m_s2",
+            limits.linear_acceleration_max_m_s2,
+        ),
+        (
+            "limits.lateral_acceleration_max_m_s2",
+            limits.lateral_acceleration_max_m_s2,
+        ),
+        ("limits.linear_jerk_max_m_s3", limits.linear_jerk_max_m_s3),
+        ("limits.wheel_speed_max_rad_s", limits.wheel_speed_max_rad_s),
+        (
+            "limits.wheel_acceleration_max_rad_s2",
+            limits.wheel_acceleration_max_rad_s2,
+        ),
+    ];
+    match figures
+        .into_iter()
+        .find(|(_field, value)| !(value.is_finite() && *value > 0.0))
+    {
+        Some((field, value)) => Err(format!("model.{field} must be positive, not {value}")),
+        None => Ok(()),
+    }
+}

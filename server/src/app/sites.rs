@@ -1,0 +1,81 @@
+//! Sites: list, read, create.
+
+use tread_api::ids::SiteId;
+use tread_api::page::Page;
+use tread_api::site::{CELL_MAX_M, CELL_MIN_M, CreateSite, Grid, Site};
+
+use super::{App, AppError, name_or, page, site_row};
+use crate::db;
+
+/// Most sites of one server.
+const SITES_MAX: u32 = 1_000;
+/// Side of a cell when nothing is said, metres.
+const CELL_DEFAULT_M: f64 = 1.0;
+
+impl App {
+    /// Sites after a cursor.
+    pub async fn sites(&self, cursor: Option<&str>, limit: u32) -> Result<Page<Site>, AppError> {
+        let mut tx = self.db().read().await?;
+        let rows = db::sites::list(&mut tx, cursor.unwrap_or_default(), limit + 1).await?;
+        let sites = rows.into_iter().map(|row| row.site).collect();
+        Ok(page(sites, limit, |site: &Site| site.id.to_string()))
+    }
+
+    /// One site.
+    pub async fn site(&self, id: &SiteId) -> Result<Site, AppError> {
+        let mut tx = self.db().read().await?;
+        Ok(site_row(&mut tx, id).await?.site)
+    }
+
+    /// Makes a site.
+    pub async fn create_site(&self, request: CreateSite) -> Result<Site, AppError> {
+        let CreateSite { id, name, cell_m } = request;
+        let cell_m = cell_m.unwrap_or(CELL_DEFAULT_M);
+        if !(CELL_MIN_M..=CELL_MAX_M).contains(&cell_m) {
+            let detail = format!("cell_m must be {CELL_MIN_M} to {CELL_MAX_M}, not {cell_m}");
+            return Err(AppError::Invalid {
+                field: "cell_m",
+                detail,
+            });
+        }
+        let site = Site {
+            name: name_or(name, id.as_str())?,
+            id,
+            grid: Grid {
+                revision: 1,
+                cell_m,
+            },
+            terrain_revision: 0,
+            created_at: self.clock().now(),
+        };
+        let mut tx = self.db().write().await?;
+        let present = db::sites::list(&mut tx, "", SITES_MAX).await?.len();
+        if u32::try_from(present).is_ok_and(|present| present >= SITES_MAX) {
+            return Err(AppError::TooMany {
+                what: "sites",
+                count: present,
+            });
+        }
+        if !db::sites::insert(&mut tx, &site).await? {
+            return Err(AppError::AlreadyExists {
+                what: "site",
+                id: site.id.to_string(),
+            });
+        }
+        tx.commit().await?;
+        Ok(site)
+    }
+
+    /// Makes a site unless it exists.
+    pub async fn ensure_site(&self, id: &SiteId) -> Result<(), AppError> {
+        let request = CreateSite {
+            id: id.clone(),
+            name: None,
+            cell_m: None,
+        };
+        match self.create_site(request).await {
+            Ok(_) | Err(AppError::AlreadyExists { .. }) => Ok(()),
+            Err(error) => Err(error),
+        }
+    }
+}

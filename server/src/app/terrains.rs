@@ -1,0 +1,160 @@
+//! Terrains: draw, list, replace, delete. Every change reaches the robots by the reconciler.
+
+use tread_api::ids::{SiteId, TerrainId};
+use tread_api::page::Page;
+use tread_api::terrain::{
+    CreateTerrain, ReplaceTerrain, TERRAINS_MAX, Terrain, TerrainRef, TerrainShape,
+};
+use tread_api::wire::hello::SiteDefinition;
+
+use super::{App, AppError, name_or, page, site_row};
+use crate::db::{self, DbError, Tx};
+
+impl App {
+    /// Terrains of a site after a cursor.
+    pub async fn terrains(
+        &self,
+        site: &SiteId,
+        cursor: Option<&str>,
+        limit: u32,
+    ) -> Result<Page<Terrain>, AppError> {
+        let mut tx = self.db().read().await?;
+        let site_pk = site_row(&mut tx, site).await?.pk;
+        let mut terrains = db::terrains::list(&mut tx, site_pk).await?;
+        terrains.retain(|terrain| cursor.is_none_or(|cursor| terrain.id.as_str() > cursor));
+        Ok(page(terrains, limit, |terrain| terrain.id.to_string()))
+    }
+
+    /// One terrain.
+    pub async fn terrain(&self, site: &SiteId, id: &TerrainId) -> Result<Terrain, AppError> {
+        let mut tx = self.db().read().await?;
+        let site_pk = site_row(&mut tx, site).await?.pk;
+        let terrain = db::terrains::find(&mut tx, site_pk, id).await?;
+        terrain.ok_or_else(|| AppError::UnknownTerrain(site.clone(), id.clone()))
+    }
+
+    /// Draws a terrain.
+    pub async fn create_terrain(
+        &self,
+        site: &SiteId,
+        request: CreateTerrain,
+    ) -> Result<Terrain, AppError> {
+        let CreateTerrain {
+            id,
+            name,
+            class,
+            polygon,
+            layer,
+        } = request;
+        let name = name_or(name, id.as_str())?;
+        let mut tx = self.db().write().await?;
+        let site_pk = site_row(&mut tx, site).await?.pk;
+        if db::terrains::find(&mut tx, site_pk, &id).await?.is_some() {
+            return Err(AppError::AlreadyExists {
+                what: "terrain",
+                id: id.to_string(),
+            });
+        }
+        if db::terrains::count(&mut tx, site_pk).await? >= TERRAINS_MAX {
+            return Err(AppError::TooMany {
+                what: "terrains in this site",
+                count: TERRAINS_MAX,
+            });
+        }
+        let revision = db::terrains::last_revision(&mut tx, site_pk, &id).await? + 1;
+        let updated_at = self.clock().now();
+        let terrain = Terrain {
+            id,
+            revision,
+            name,
+            class,
+            polygon,
+            layer,
+            updated_at,
+        };
+        self.put_terrain(tx, site_pk, terrain).await
+    }
+
+    /// Replaces everything of a terrain but its identifier.
+    pub async fn replace_terrain(
+        &self,
+        site: &SiteId,
+        id: &TerrainId,
+        request: ReplaceTerrain,
+    ) -> Result<Terrain, AppError> {
+        let ReplaceTerrain {
+            name,
+            class,
+            polygon,
+            layer,
+        } = request;
+        let name = name_or(name, id.as_str())?;
+        let mut tx = self.db().write().await?;
+        let site_pk = site_row(&mut tx, site).await?.pk;
+        if db::terrains::find(&mut tx, site_pk, id).await?.is_none() {
+            return Err(AppError::UnknownTerrain(site.clone(), id.clone()));
+        }
+        let revision = db::terrains::last_revision(&mut tx, site_pk, id).await? + 1;
+        let (id, updated_at) = (id.clone(), self.clock().now());
+        let terrain = Terrain {
+            id,
+            revision,
+            name,
+            class,
+            polygon,
+            layer,
+            updated_at,
+        };
+        self.put_terrain(tx, site_pk, terrain).await
+    }
+
+    async fn put_terrain(
+        &self,
+        mut tx: Tx,
+        site_pk: i64,
+        terrain: Terrain,
+    ) -> Result<Terrain, AppError> {
+        db::terrains::put(&mut tx, site_pk, &terrain).await?;
+        db::sites::count_terrain_change(&mut tx, site_pk).await?;
+        tx.commit().await?;
+        self.wake();
+        Ok(terrain)
+    }
+
+    /// Removes a terrain; what was measured on it stays.
+    pub async fn delete_terrain(&self, site: &SiteId, id: &TerrainId) -> Result<(), AppError> {
+        let mut tx = self.db().write().await?;
+        let site_pk = site_row(&mut tx, site).await?.pk;
+        if !db::terrains::delete(&mut tx, site_pk, id).await? {
+            return Err(AppError::UnknownTerrain(site.clone(), id.clone()));
+        }
+        db::sites::count_terrain_change(&mut tx, site_pk).await?;
+        tx.commit().await?;
+        self.wake();
+        Ok(())
+    }
+}
+
+/// A site as robots must know it; `None` if there is no such site.
+pub(super) async fn site_definition(
+    tx: &mut Tx,
+    site: &SiteId,
+) -> Result<Option<SiteDefinition>, DbError> {
+    let Some(row) = db::sites::find(tx, site).await? else {
+        return Ok(None);
+    };
+    let terrains = db::terrains::list(tx, row.pk).await?;
+    let shape = |terrain: Terrain| TerrainShape {
+        terrain: TerrainRef {
+            id: terrain.id,
+            revision: terrain.revision,
+        },
+        polygon: terrain.polygon,
+        layer: terrain.layer,
+    };
+    Ok(Some(SiteDefinition {
+        grid: row.site.grid,
+        terrain_revision: row.site.terrain_revision,
+        terrains: terrains.into_iter().map(shape).collect(),
+    }))
+}

@@ -1,0 +1,306 @@
+//! Configuration: built-in values, then a TOML file, then flags; the later one counts.
+//!
+//! An unknown key, an impossible value or an address beyond this machine stops the start, with a
+//! sentence that names file, line and key.
+
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use serde::Deserialize;
+use tread_api::ids::SiteId;
+
+/// Address of the REST API when nothing else is said.
+pub const HTTP_DEFAULT: &str = "127.0.0.1:8420";
+/// Address of the zenoh router when nothing else is said.
+pub const ZENOH_DEFAULT: &str = "127.0.0.1:7447";
+/// The database file when nothing else is said.
+pub const DATABASE_DEFAULT: &str = "tread.db";
+/// The site that exists from the start when nothing else is said.
+pub const SITE_DEFAULT: &str = "yard";
+
+/// Flags of the server; each wins over the configuration file.
+#[derive(Debug, Clone, Default, Args)]
+pub struct ServerArgs {
+    /// Configuration file, TOML
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Address of the REST API; port 0 takes a free one
+    #[arg(long, value_name = "ADDRESS")]
+    pub http: Option<SocketAddr>,
+    /// Address of the zenoh router that robots connect to; port 0 takes a free one
+    #[arg(long, value_name = "ADDRESS")]
+    pub zenoh: Option<SocketAddr>,
+    /// Database file, created when missing
+    #[arg(long, value_name = "FILE")]
+    pub database: Option<PathBuf>,
+    /// Site that is created when missing
+    #[arg(long)]
+    pub site: Option<SiteId>,
+    /// What is logged, such as `info` or `tread_server=debug`; `RUST_LOG` when absent
+    #[arg(long, value_name = "FILTER")]
+    pub log: Option<String>,
+    /// How it is logged
+    #[arg(long, value_enum, default_value_t)]
+    pub log_format: LogFormat,
+}
+
+/// How log lines look.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+pub enum LogFormat {
+    /// For people
+    #[default]
+    Human,
+    /// One JSON object per line
+    Json,
+}
+
+/// Everything that the server needs to know to start.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Config {
+    /// Address of the REST API, on this machine.
+    pub http: SocketAddr,
+    /// Address of the zenoh router, on this machine.
+    pub zenoh: SocketAddr,
+    /// The database file.
+    pub database: PathBuf,
+    /// The site that exists from the start.
+    pub site: SiteId,
+    /// How measurements of several robots and times are weighed.
+    pub friction: FrictionConfig,
+}
+
+/// How measurements of several robots and times are weighed.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct FrictionConfig {
+    /// Standard deviation of one robot's own bias as a share of θ, `s_b`; 0 to 1.
+    pub robot_bias_ratio: f64,
+    /// Growth of a measurement's variance with its age, `q`, θ² per second; not negative.
+    pub drift_variance_per_s: f64,
+}
+
+impl Default for FrictionConfig {
+    fn default() -> Self {
+        Self {
+            robot_bias_ratio: 0.08,
+            // A deviation of 0.02 after a day: a tenth of θ on ordinary ground.
+            drift_variance_per_s: 4.6e-9,
+        }
+    }
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    http: Option<SocketAddr>,
+    zenoh: Option<SocketAddr>,
+    database: Option<PathBuf>,
+    site: Option<SiteId>,
+    #[serde(default)]
+    friction: FrictionConfig,
+}
+
+/// Why the server cannot start with this configuration.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("cannot read the configuration file `{}`", path.display())]
+    Unreadable {
+        /// Which file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        cause: std::io::Error,
+    },
+    /// The file does not say something possible; the text names line and key.
+    #[error("configuration file `{}`, line {line}: {message}", path.display())]
+    Invalid {
+        /// Which file.
+        path: PathBuf,
+        /// Which line, from 1.
+        line: usize,
+        /// Which key, and what is wrong with it.
+        message: String,
+    },
+    /// A number is out of its range.
+    #[error("`{key}` must be {range}, not {value}")]
+    OutOfRange {
+        /// Which key.
+        key: &'static str,
+        /// What is allowed.
+        range: &'static str,
+        /// What was given.
+        value: f64,
+    },
+    /// An address that others can reach.
+    #[error(
+        "`{key}` is {address}, which other machines can reach; as long as people and robots do \
+         not have to prove who they are, use an address of this machine such as 127.0.0.1"
+    )]
+    NotLoopback {
+        /// Which key.
+        key: &'static str,
+        /// What was given.
+        address: SocketAddr,
+    },
+}
+
+impl Config {
+    /// Reads the file that the flags name, if any, and lets the flags win.
+    ///
+    /// # Errors
+    /// [`ConfigError`]: unreadable, an unknown key, an impossible value, or an address beyond
+    /// this machine.
+    pub fn load(args: &ServerArgs) -> Result<Self, ConfigError> {
+        let file = args
+            .config
+            .as_deref()
+            .map(read)
+            .transpose()?
+            .unwrap_or_default();
+        let builtin = "the built-in value parses";
+        let config = Self {
+            http: args
+                .http
+                .or(file.http)
+                .unwrap_or_else(|| HTTP_DEFAULT.parse().expect(builtin)),
+            zenoh: args
+                .zenoh
+                .or(file.zenoh)
+                .unwrap_or_else(|| ZENOH_DEFAULT.parse().expect(builtin)),
+            database: args
+                .database
+                .clone()
+                .or(file.database)
+                .unwrap_or_else(|| DATABASE_DEFAULT.into()),
+            site: args
+                .site
+                .clone()
+                .or(file.site)
+                .unwrap_or_else(|| SITE_DEFAULT.parse().expect(builtin)),
+            friction: file.friction,
+        };
+        config.check()?;
+        Ok(config)
+    }
+
+    fn check(&self) -> Result<(), ConfigError> {
+        for (key, address) in [("http", self.http), ("zenoh", self.zenoh)] {
+            if !address.ip().is_loopback() {
+                return Err(ConfigError::NotLoopback { key, address });
+            }
+        }
+        let FrictionConfig {
+            robot_bias_ratio,
+            drift_variance_per_s,
+        } = self.friction;
+        // TOML can say `nan`, which no range contains.
+        if !(0.0..=1.0).contains(&robot_bias_ratio) {
+            return Err(ConfigError::OutOfRange {
+                key: "friction.robot_bias_ratio",
+                range: "0 to 1",
+                value: robot_bias_ratio,
+            });
+        }
+        if !(0.0..=1.0).contains(&drift_variance_per_s) {
+            return Err(ConfigError::OutOfRange {
+                key: "friction.drift_variance_per_s",
+                range: "0 to 1",
+                value: drift_variance_per_s,
+            });
+        }
+        Ok(())
+    }
+}
+
+fn read(path: &Path) -> Result<File, ConfigError> {
+    let text = std::fs::read_to_string(path).map_err(|cause| ConfigError::Unreadable {
+        path: path.to_owned(),
+        cause,
+    })?;
+    toml::from_str(&text).map_err(|error| {
+        let start = error.span().map_or(0, |span| span.start);
+        let line = text
+            .bytes()
+            .take(start)
+            .filter(|&byte| byte == b'\n')
+            .count()
+            + 1;
+        let line_text = text.lines().nth(line - 1).unwrap_or_default().trim();
+        let message = format!("{} in `{line_text}`", error.message());
+        ConfigError::Invalid {
+            path: path.to_owned(),
+            line,
+            message,
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn load(text: &str) -> Result<Config, ConfigError> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tread.toml");
+        std::fs::write(&path, text).unwrap();
+        Config::load(&ServerArgs {
+            config: Some(path),
+            ..ServerArgs::default()
+        })
+    }
+
+    #[test]
+    fn an_unknown_key_is_named_with_its_file_and_line() {
+        let error = load("site = \"yard\"\nhtpp = \"127.0.0.1:1\"\n")
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains("tread.toml"), "{error}");
+        assert!(error.contains("line 2"), "{error}");
+        assert!(error.contains("htpp"), "{error}");
+        let nested = load("[friction]\nbias = 1.0\n").unwrap_err().to_string();
+        assert!(
+            nested.contains("line 2") && nested.contains("bias"),
+            "{nested}"
+        );
+    }
+
+    #[test]
+    fn a_value_that_is_not_possible_is_named() {
+        let error = load("site = \"A B\"\n").unwrap_err().to_string();
+        assert!(error.contains("line 1") && error.contains("A B"), "{error}");
+        let nan = load("[friction]\nrobot_bias_ratio = nan\n")
+            .unwrap_err()
+            .to_string();
+        assert!(nan.contains("friction.robot_bias_ratio"), "{nan}");
+    }
+
+    #[test]
+    fn an_address_beyond_this_machine_is_refused_with_a_sentence() {
+        for text in [
+            "http = \"0.0.0.0:8080\"",
+            "zenoh = \"192.0.2.7:7447\"",
+            "http = \"[::]:1\"",
+        ] {
+            let error = load(text).unwrap_err().to_string();
+            assert!(error.contains("other machines can reach"), "{error}");
+        }
+        assert!(load("http = \"[::1]:8080\"").is_ok());
+    }
+
+    #[test]
+    fn a_flag_wins_over_the_file_and_the_file_over_the_built_in_value() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tread.toml");
+        std::fs::write(&path, "http = \"127.0.0.1:1\"\nzenoh = \"127.0.0.1:2\"").unwrap();
+        let args = ServerArgs {
+            config: Some(path),
+            http: Some("127.0.0.1:3".parse().unwrap()),
+            ..ServerArgs::default()
+        };
+        let config = Config::load(&args).unwrap();
+        assert_eq!((config.http.port(), config.zenoh.port()), (3, 2));
+        assert_eq!(config.site.as_str(), SITE_DEFAULT);
+    }
+}

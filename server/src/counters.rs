@@ -1,0 +1,97 @@
+//! What the server counts about itself, shown at `GET /v1/server`.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+macro_rules! counters {
+    ($($(#[$doc:meta])* $name:ident,)*) => {
+        /// Counters since the start of the process; each only grows.
+        #[derive(Debug, Default)]
+        pub struct Counters {
+            $($(#[$doc])* pub $name: Counter,)*
+        }
+
+        /// The counters at one moment.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+        pub struct CounterValues {
+            $($(#[$doc])* pub $name: u64,)*
+        }
+
+        impl Counters {
+            /// Reads all counters.
+            pub fn values(&self) -> CounterValues {
+                CounterValues { $($name: self.$name.get(),)* }
+            }
+        }
+    };
+}
+
+counters! {
+    /// Segments stored.
+    segments_committed,
+    /// Segments and mission reports that were stored before and came again.
+    records_duplicate,
+    /// Records that can never be taken: impossible numbers, or not this robot's mission.
+    records_refused,
+    /// Mission reports taken.
+    mission_reports_committed,
+    /// Batches answered.
+    batches_answered,
+    /// Transactions of the ingest writer.
+    ingest_transactions,
+    /// Uploads that found the queue full; the robot sends them again.
+    ingest_dropped_busy,
+    /// States and friction reports taken.
+    states_received,
+    /// States and friction reports that found the queue full.
+    states_dropped,
+    /// Introductions answered.
+    hellos_answered,
+    /// Introductions that found the queue full; the robot sends them again.
+    hellos_dropped,
+    /// Messages that do not parse, or are too large.
+    refused_malformed,
+    /// Messages of another major version.
+    refused_version,
+    /// Messages that name another robot than their key.
+    refused_impersonation,
+    /// Messages to a site that is not known.
+    refused_unknown_site,
+    /// Messages on a key that is none of ours.
+    refused_key,
+    /// Changes of presence that found the queue full; the robot shows wrongly until its next one.
+    presence_dropped,
+    /// Replies that could not be sent because too many were waiting.
+    replies_dropped,
+    /// Missions offered to robots, with repetitions.
+    offers_sent,
+    /// Commands that no robot answered.
+    commands_unanswered,
+    /// HTTP connections refused because too many were open.
+    http_connections_refused,
+    /// Requests whose handler panicked.
+    http_panics,
+}
+
+/// One counter.
+#[derive(Debug, Default)]
+pub struct Counter(AtomicU64);
+
+impl Counter {
+    /// Counts one.
+    pub fn one(&self) {
+        self.add(1);
+    }
+
+    /// Counts several.
+    pub fn add(&self, count: u64) {
+        self.0.fetch_add(count, Ordering::Relaxed);
+    }
+
+    /// The count so far.
+    pub fn get(&self) -> u64 {
+        self.0.load(Ordering::Relaxed)
+    }
+}

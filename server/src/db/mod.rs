@@ -1,0 +1,280 @@
+//! The database: SQLite in one file. Knows SQL, decides nothing.
+//!
+//! There is one writer connection ([`Db::write`], `BEGIN IMMEDIATE`) and a pool of readers
+//! ([`Db::read`], each transaction a snapshot). `synchronous=FULL`: a commit that returned
+//! survives a power cut.
+
+pub mod missions;
+pub mod robots;
+pub mod segments;
+pub mod sites;
+pub mod sums;
+pub mod terrains;
+
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use serde::de::DeserializeOwned;
+use serde::{Serialize, Serializer as _};
+use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
+use sqlx::{Sqlite, SqlitePool, Transaction};
+
+/// Oldest SQLite that is free of the bug that can lose a WAL.
+pub const SQLITE_VERSION_MIN: (u32, u32, u32) = (3, 51, 3);
+/// Connections that read at the same time.
+const READERS_MAX: u32 = 4;
+/// How long a request waits for a connection.
+const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long SQLite waits for a lock that another process holds.
+const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// A transaction on the database.
+pub type Tx = Transaction<'static, Sqlite>;
+
+/// Why the database did not do it.
+#[derive(Debug, thiserror::Error)]
+pub enum DbError {
+    /// SQLite or its pool failed.
+    #[error("the database failed")]
+    Sqlite(#[from] sqlx::Error),
+    /// A stored value does not read back.
+    #[error("the database holds a {what} that does not read back: `{value}`")]
+    Corrupt {
+        /// What it should be.
+        what: &'static str,
+        /// What it is.
+        value: String,
+    },
+    /// A value does not fit into the database.
+    #[error("a {0} does not fit into the database")]
+    DoesNotFit(&'static str),
+}
+
+impl DbError {
+    /// Whether a rule of uniqueness refused the write.
+    pub fn is_unique_violation(&self) -> bool {
+        match self {
+            Self::Sqlite(sqlx::Error::Database(error)) => error.is_unique_violation(),
+            Self::Sqlite(_) | Self::Corrupt { .. } | Self::DoesNotFit(_) => false,
+        }
+    }
+}
+
+/// Why the database cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum OpenError {
+    /// The folder of the file is missing.
+    #[error("the folder `{}` of the database does not exist; create it first", .0.display())]
+    NoFolder(PathBuf),
+    /// The file cannot be opened.
+    #[error("cannot open the database `{}`", path.display())]
+    Open {
+        /// Which file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        cause: sqlx::Error,
+    },
+    /// A migration failed, or the file is of a newer version.
+    #[error("cannot bring the database `{}` up to date", path.display())]
+    Migrate {
+        /// Which file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        cause: sqlx::migrate::MigrateError,
+    },
+    /// SQLite is too old to be trusted.
+    #[error("SQLite {0} may lose data; 3.51.3 or newer is needed")]
+    TooOld(String),
+}
+
+/// The open database; clones are handles to the same.
+#[derive(Debug, Clone)]
+pub struct Db {
+    writer: SqlitePool,
+    readers: SqlitePool,
+    version: String,
+}
+
+impl Db {
+    /// Opens the file, creates it if it is missing, and brings it up to date.
+    ///
+    /// # Errors
+    /// [`OpenError`] names file or folder.
+    pub async fn open(path: &Path) -> Result<Self, OpenError> {
+        let folder = path
+            .parent()
+            .filter(|folder| !folder.as_os_str().is_empty());
+        if let Some(folder) = folder.filter(|folder| !folder.is_dir()) {
+            return Err(OpenError::NoFolder(folder.to_owned()));
+        }
+        let failed = |cause| OpenError::Open {
+            path: path.to_owned(),
+            cause,
+        };
+        let options = SqliteConnectOptions::new()
+            .filename(path)
+            .create_if_missing(true)
+            .journal_mode(SqliteJournalMode::Wal)
+            .synchronous(SqliteSynchronous::Full)
+            .foreign_keys(true)
+            .busy_timeout(BUSY_TIMEOUT);
+        let pool = |connections_max| {
+            SqlitePoolOptions::new()
+                .max_connections(connections_max)
+                .acquire_timeout(ACQUIRE_TIMEOUT)
+                .idle_timeout(None)
+                .max_lifetime(None)
+        };
+        let writer = pool(1)
+            .connect_with(options.clone())
+            .await
+            .map_err(failed)?;
+        let version = sqlx::query_scalar!(r#"SELECT sqlite_version() AS "version!: String""#)
+            .fetch_one(&writer)
+            .await
+            .map_err(failed)?;
+        if !is_new_enough(&version) {
+            return Err(OpenError::TooOld(version));
+        }
+        sqlx::migrate!("../migrations")
+            .run(&writer)
+            .await
+            .map_err(|cause| OpenError::Migrate {
+                path: path.to_owned(),
+                cause,
+            })?;
+        let readers = pool(READERS_MAX)
+            .connect_with(options.read_only(true))
+            .await
+            .map_err(failed)?;
+        Ok(Self {
+            writer,
+            readers,
+            version,
+        })
+    }
+
+    /// Version of the SQLite library.
+    pub fn sqlite_version(&self) -> &str {
+        &self.version
+    }
+
+    /// Begins to write; waits for its turn. Await nothing but the database before the commit.
+    ///
+    /// # Errors
+    /// The turn did not come in time, or SQLite failed.
+    pub async fn write(&self) -> Result<Tx, DbError> {
+        Ok(self.writer.begin_with("BEGIN IMMEDIATE").await?)
+    }
+
+    /// Begins to read one snapshot.
+    ///
+    /// # Errors
+    /// No connection became free in time, or SQLite failed.
+    pub async fn read(&self) -> Result<Tx, DbError> {
+        Ok(self.readers.begin().await?)
+    }
+
+    /// Closes all connections after what they are doing; the file is whole then.
+    pub async fn close(&self) {
+        self.readers.close().await;
+        self.writer.close().await;
+    }
+}
+
+fn is_new_enough(version: &str) -> bool {
+    let mut parts = version.split('.').map(|part| part.parse().unwrap_or(0_u32));
+    let mut next = || parts.next().unwrap_or(0);
+    (next(), next(), next()) >= SQLITE_VERSION_MIN
+}
+
+/// A time as the database keeps it.
+fn to_us(time: Timestamp) -> i64 {
+    time.as_microsecond()
+}
+
+fn from_us(time_us: i64) -> Result<Timestamp, DbError> {
+    Timestamp::from_microsecond(time_us).map_err(|_range| corrupt("time", time_us))
+}
+
+fn corrupt(what: &'static str, value: impl Display) -> DbError {
+    DbError::Corrupt {
+        what,
+        value: value.to_string(),
+    }
+}
+
+fn parse<T: FromStr>(what: &'static str, text: &str) -> Result<T, DbError> {
+    text.parse().map_err(|_error| corrupt(what, text))
+}
+
+fn to_json<T: Serialize>(what: &'static str, value: &T) -> Result<String, DbError> {
+    serde_json::to_string(value).map_err(|_error| DbError::DoesNotFit(what))
+}
+
+/// One JSON object of pairs, in their order; a key may repeat.
+fn object_json<V: Serialize>(
+    what: &'static str,
+    pairs: Vec<(String, V)>,
+) -> Result<String, DbError> {
+    let mut text = Vec::new();
+    let written = serde_json::Serializer::new(&mut text).collect_map(pairs);
+    written.map_err(|_error| DbError::DoesNotFit(what))?;
+    String::from_utf8(text).map_err(|_error| DbError::DoesNotFit(what))
+}
+
+fn from_json<T: DeserializeOwned>(what: &'static str, text: &str) -> Result<T, DbError> {
+    serde_json::from_str(text).map_err(|_error| corrupt(what, text))
+}
+
+fn unsigned<T: TryFrom<i64>>(what: &'static str, value: i64) -> Result<T, DbError> {
+    T::try_from(value).map_err(|_range| corrupt(what, value))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn versions_compare_as_numbers() {
+        assert!(is_new_enough("3.51.3") && is_new_enough("3.100.0") && is_new_enough("4.0.0"));
+        assert!(!is_new_enough("3.51.2") && !is_new_enough("3.9.9") && !is_new_enough("?"));
+    }
+
+    #[tokio::test]
+    async fn a_missing_folder_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let error = Db::open(&folder.path().join("nowhere/tread.db"))
+            .await
+            .unwrap_err();
+        assert!(error.to_string().contains("nowhere"), "{error}");
+    }
+
+    #[tokio::test]
+    async fn the_file_is_made_with_the_settings_that_keep_commits() {
+        let folder = tempfile::tempdir().unwrap();
+        let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
+        let mut tx = db.write().await.unwrap();
+        let setting = async |tx: &mut Tx, name: &'static str| -> String {
+            let row: (String,) = sqlx::query_as(name).fetch_one(&mut **tx).await.unwrap();
+            row.0
+        };
+        let journal = setting(&mut tx, "SELECT journal_mode FROM pragma_journal_mode").await;
+        assert_eq!(journal, "wal");
+        let durable = "SELECT CAST(synchronous AS TEXT) FROM pragma_synchronous";
+        assert_eq!(setting(&mut tx, durable).await, "2");
+        let keys = "SELECT CAST(foreign_keys AS TEXT) FROM pragma_foreign_keys";
+        assert_eq!(setting(&mut tx, keys).await, "1");
+        drop(tx);
+        let mut reading = db.read().await.unwrap();
+        let refused = sqlx::query("DELETE FROM sites")
+            .execute(&mut *reading)
+            .await;
+        assert!(refused.is_err(), "a reader wrote");
+    }
+}

@@ -1,0 +1,205 @@
+//! Robots, their configurations, and the runs of their agents.
+
+use jiff::Timestamp;
+use sqlx::SqliteConnection;
+use tread_api::ids::{BootId, ConfigurationId, RobotId, SiteId};
+use tread_api::robot::RobotModel;
+
+use super::{DbError, from_json, from_us, parse, to_json, to_us};
+
+/// A robot as the database keeps it.
+#[derive(Debug, Clone)]
+pub struct RobotRow {
+    /// The key of other tables.
+    pub pk: i64,
+    /// Its site.
+    pub site: SiteId,
+    /// The robot.
+    pub id: RobotId,
+    /// Model and tyres as last declared.
+    pub model: RobotModel,
+    /// The identifier of that model and those tyres.
+    pub configuration: ConfigurationId,
+    /// Version of the agent.
+    pub agent_version: String,
+    /// The run of the agent that said hello last.
+    pub boot: BootId,
+    /// First hello.
+    pub first_seen_at: Timestamp,
+    /// Last hello.
+    pub last_hello_at: Timestamp,
+}
+
+struct Raw {
+    pk: i64,
+    site: String,
+    id: String,
+    model: String,
+    configuration: String,
+    agent_version: String,
+    boot: String,
+    first_seen_at_us: i64,
+    last_hello_at_us: i64,
+}
+
+impl TryFrom<Raw> for RobotRow {
+    type Error = DbError;
+
+    fn try_from(raw: Raw) -> Result<Self, DbError> {
+        Ok(Self {
+            pk: raw.pk,
+            site: parse("site", &raw.site)?,
+            id: parse("robot", &raw.id)?,
+            model: from_json("robot model", &raw.model)?,
+            configuration: parse("configuration", &raw.configuration)?,
+            agent_version: raw.agent_version,
+            boot: parse("boot", &raw.boot)?,
+            first_seen_at: from_us(raw.first_seen_at_us)?,
+            last_hello_at: from_us(raw.last_hello_at_us)?,
+        })
+    }
+}
+
+macro_rules! robots {
+    ($condition:tt, $($argument:expr),* $(,)?) => {
+        sqlx::query_as!(
+            Raw,
+            r#"SELECT robots.pk AS "pk!", sites.id AS site, robots.id,
+                   configurations.model AS "model!", configurations.id AS configuration,
+                   robots.agent_version, robots.boot, robots.first_seen_at_us,
+                   robots.last_hello_at_us
+               FROM robots
+               JOIN sites ON sites.pk = robots.site_pk
+               JOIN configurations ON configurations.pk = robots.configuration_pk "# + $condition,
+            $($argument),*
+        )
+    };
+}
+
+/// The robot of that name.
+pub async fn find(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+    id: &RobotId,
+) -> Result<Option<RobotRow>, DbError> {
+    let id = id.as_str();
+    let raw = robots!("WHERE robots.site_pk = ? AND robots.id = ?", site_pk, id)
+        .fetch_optional(db)
+        .await?;
+    raw.map(RobotRow::try_from).transpose()
+}
+
+/// Robots of a site after an identifier, in alphabetical order.
+pub async fn list(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+    after: &str,
+    limit: u32,
+) -> Result<Vec<RobotRow>, DbError> {
+    let rows = robots!(
+        "WHERE robots.site_pk = ? AND robots.id > ? ORDER BY robots.id LIMIT ?",
+        site_pk,
+        after,
+        limit,
+    )
+    .fetch_all(db)
+    .await?;
+    rows.into_iter().map(RobotRow::try_from).collect()
+}
+
+/// What a robot says of itself.
+#[derive(Debug, Clone, Copy)]
+pub struct Introduction<'hello> {
+    /// The robot.
+    pub id: &'hello RobotId,
+    /// This run of the agent.
+    pub boot: BootId,
+    /// Version of the agent.
+    pub agent_version: &'hello str,
+    /// Model and tyres.
+    pub model: &'hello RobotModel,
+    /// When it said so.
+    pub at: Timestamp,
+}
+
+/// Writes down what a robot says of itself, and the run of its agent.
+pub async fn introduce(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+    introduction: Introduction<'_>,
+) -> Result<(), DbError> {
+    let Introduction {
+        id,
+        boot,
+        agent_version,
+        model,
+        at,
+    } = introduction;
+    let configuration = model.configuration().to_string();
+    let model = to_json("robot model", model)?;
+    sqlx::query!(
+        "INSERT INTO configurations (id, model) VALUES (?1, ?2)
+         ON CONFLICT (id) DO UPDATE SET model = ?2 WHERE model IS NULL",
+        configuration,
+        model,
+    )
+    .execute(&mut *db)
+    .await?;
+    let (id, boot_text, at_us) = (id.as_str(), boot.to_string(), to_us(at));
+    let robot_pk = sqlx::query_scalar!(
+        r#"INSERT INTO robots (site_pk, id, configuration_pk, agent_version, boot,
+               first_seen_at_us, last_hello_at_us)
+           VALUES (?1, ?2, (SELECT pk FROM configurations WHERE id = ?3), ?4, ?5, ?6, ?6)
+           ON CONFLICT (site_pk, id) DO UPDATE SET configuration_pk = excluded.configuration_pk,
+               agent_version = ?4, boot = ?5, last_hello_at_us = ?6
+           RETURNING pk AS "pk!""#,
+        site_pk,
+        id,
+        configuration,
+        agent_version,
+        boot_text,
+        at_us,
+    )
+    .fetch_one(&mut *db)
+    .await?;
+    boot_key(db, robot_pk, boot).await?;
+    Ok(())
+}
+
+/// The key of one run of an agent, written down if it is new.
+pub async fn boot_key(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+    boot: BootId,
+) -> Result<i64, DbError> {
+    let boot = boot.to_string();
+    sqlx::query!(
+        "INSERT INTO boots (robot_pk, id) VALUES (?, ?) ON CONFLICT DO NOTHING",
+        robot_pk,
+        boot,
+    )
+    .execute(&mut *db)
+    .await?;
+    let found = sqlx::query_scalar!(
+        r#"SELECT pk AS "pk!" FROM boots WHERE robot_pk = ? AND id = ?"#,
+        robot_pk,
+        boot,
+    );
+    Ok(found.fetch_one(db).await?)
+}
+
+/// The key of a configuration, written down without its model if it is new.
+pub async fn configuration_key(
+    db: &mut SqliteConnection,
+    id: ConfigurationId,
+) -> Result<i64, DbError> {
+    let id = id.to_string();
+    sqlx::query!(
+        "INSERT INTO configurations (id) VALUES (?) ON CONFLICT DO NOTHING",
+        id
+    )
+    .execute(&mut *db)
+    .await?;
+    let found = sqlx::query_scalar!(r#"SELECT pk AS "pk!" FROM configurations WHERE id = ?"#, id);
+    Ok(found.fetch_one(db).await?)
+}

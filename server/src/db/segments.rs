@@ -1,0 +1,192 @@
+//! Raw measurements, in the order of their commits.
+
+use jiff::Timestamp;
+use serde_json::value::RawValue;
+use sqlx::SqliteConnection;
+use tread_api::friction::StoredSegment;
+use tread_api::ids::{RobotId, TerrainId};
+
+use super::{DbError, from_json, from_us, object_json, parse, to_json, to_us, unsigned};
+
+/// A measurement on its way into the database, in the order of the statement that reads it.
+#[derive(Debug)]
+pub struct NewSegment<'segment>(
+    /// Key of the run of the agent.
+    pub i64,
+    /// Its number within that run.
+    pub i64,
+    /// Key of the robot.
+    pub i64,
+    /// Key of the site.
+    pub i64,
+    /// The terrain, `""` where none is drawn.
+    pub &'segment str,
+    /// The measurement as JSON.
+    pub &'segment RawValue,
+);
+
+/// One JSON object with what identifies a measurement as its key, the measurement as its value.
+///
+/// SQLite writes `value` anew for every mention of it, so the long part is mentioned only once.
+fn keyed(segments: &[NewSegment<'_>]) -> Result<String, DbError> {
+    let mut pairs = Vec::with_capacity(segments.len());
+    for NewSegment(boot_pk, seq, robot_pk, site_pk, terrain, measurement) in segments {
+        let key = to_json("segment", &(boot_pk, seq, robot_pk, site_pk, terrain))?;
+        pairs.push((key, *measurement));
+    }
+    object_json("segment", pairs)
+}
+
+/// Which of the offered measurements were new.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Inserted {
+    /// All of them.
+    All,
+    /// Those with these keys of boot and number, in the order in which they were offered.
+    Only(Vec<(i64, i64)>),
+}
+
+/// Stores those measurements that are not there yet, in one statement.
+pub async fn insert_new(
+    db: &mut SqliteConnection,
+    segments: &[NewSegment<'_>],
+    received_at: Timestamp,
+) -> Result<Inserted, DbError> {
+    if segments.is_empty() {
+        return Ok(Inserted::All);
+    }
+    let last = sqlx::query_scalar!(r#"SELECT COALESCE(MAX(pk), 0) AS "last!: i64" FROM segments"#)
+        .fetch_one(&mut *db)
+        .await?;
+    let (rows, received_at_us) = (keyed(segments)?, to_us(received_at));
+    // `WHERE true` tells the parser that ON belongs to the conflict.
+    let result = sqlx::query!(
+        "INSERT INTO segments
+             (boot_pk, seq, robot_pk, site_pk, terrain, received_at_us, measurement)
+         SELECT key ->> 0, key ->> 1, key ->> 2, key ->> 3, key ->> 4, ?2, value
+         FROM json_each(?1) WHERE true
+         ON CONFLICT (boot_pk, seq) DO NOTHING",
+        rows,
+        received_at_us,
+    )
+    .execute(&mut *db)
+    .await?;
+    if usize::try_from(result.rows_affected()) == Ok(segments.len()) {
+        return Ok(Inserted::All);
+    }
+    // The one writer gives rising keys, so what was added now lies behind what was there.
+    let added = sqlx::query!(
+        "SELECT boot_pk, seq FROM segments WHERE pk > ? ORDER BY pk",
+        last
+    )
+    .fetch_all(db)
+    .await?;
+    Ok(Inserted::Only(
+        added
+            .into_iter()
+            .map(|row| (row.boot_pk, row.seq))
+            .collect(),
+    ))
+}
+
+/// Which measurements to list.
+#[derive(Debug, Clone, Default)]
+pub struct SegmentFilter {
+    /// Only those of this robot.
+    pub robot: Option<RobotId>,
+    /// Only those on this terrain.
+    pub terrain: Option<TerrainId>,
+    /// Only those after this one.
+    pub after: i64,
+}
+
+struct Raw {
+    pk: i64,
+    robot: String,
+    boot: String,
+    seq: i64,
+    received_at_us: i64,
+    measurement: String,
+}
+
+impl TryFrom<Raw> for StoredSegment {
+    type Error = DbError;
+
+    fn try_from(raw: Raw) -> Result<Self, DbError> {
+        Ok(Self {
+            id: raw.pk,
+            robot: parse("robot", &raw.robot)?,
+            boot: parse("boot", &raw.boot)?,
+            seq: unsigned("number", raw.seq)?,
+            received_at: from_us(raw.received_at_us)?,
+            segment: from_json("measurement", &raw.measurement)?,
+        })
+    }
+}
+
+macro_rules! segments {
+    ($condition:tt, $($argument:expr),* $(,)?) => {
+        sqlx::query_as!(
+            Raw,
+            r#"SELECT segments.pk AS "pk!", robots.id AS robot, boots.id AS boot, segments.seq,
+                   segments.received_at_us, segments.measurement
+               FROM segments
+               JOIN robots ON robots.pk = segments.robot_pk
+               JOIN boots ON boots.pk = segments.boot_pk "# + $condition,
+            $($argument),*
+        )
+    };
+}
+
+/// Measurements of a site in the order of their commits.
+pub async fn list(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+    filter: &SegmentFilter,
+    limit: u32,
+) -> Result<Vec<StoredSegment>, DbError> {
+    let robot = filter.robot.as_ref().map(RobotId::as_str);
+    let terrain = filter.terrain.as_ref().map(TerrainId::as_str);
+    // One statement per kind of filter, so that each uses its own index. A plus sign keeps a
+    // column out of the choice of index.
+    let raw = match (robot, terrain) {
+        (Some(robot), _) => {
+            segments!(
+                "WHERE segments.robot_pk = (SELECT pk FROM robots WHERE site_pk = ?1 AND id = ?2)
+                   AND segments.pk > ?3 AND (?4 IS NULL OR segments.terrain = ?4)
+                 ORDER BY segments.pk LIMIT ?5",
+                site_pk,
+                robot,
+                filter.after,
+                terrain,
+                limit,
+            )
+            .fetch_all(db)
+            .await?
+        }
+        (None, Some(terrain)) => {
+            segments!(
+                "WHERE segments.site_pk = ?1 AND segments.terrain = ?2 AND segments.pk > ?3
+                 ORDER BY segments.pk LIMIT ?4",
+                site_pk,
+                terrain,
+                filter.after,
+                limit,
+            )
+            .fetch_all(db)
+            .await?
+        }
+        (None, None) => {
+            segments!(
+                "WHERE +segments.site_pk = ?1 AND segments.pk > ?2
+                 ORDER BY segments.pk LIMIT ?3",
+                site_pk,
+                filter.after,
+                limit,
+            )
+            .fetch_all(db)
+            .await?
+        }
+    };
+    raw.into_iter().map(StoredSegment::try_from).collect()
+}

@@ -1,0 +1,106 @@
+//! Sites.
+
+use sqlx::SqliteConnection;
+use tread_api::ids::SiteId;
+use tread_api::site::{Grid, Site};
+
+use super::{DbError, from_us, parse, to_us, unsigned};
+
+/// A site with its key in the database.
+#[derive(Debug, Clone)]
+pub struct SiteRow {
+    /// The key of other tables.
+    pub pk: i64,
+    /// The site.
+    pub site: Site,
+}
+
+struct Raw {
+    pk: i64,
+    id: String,
+    name: String,
+    grid_revision: i64,
+    cell_m: f64,
+    terrain_revision: i64,
+    created_at_us: i64,
+}
+
+impl TryFrom<Raw> for SiteRow {
+    type Error = DbError;
+
+    fn try_from(raw: Raw) -> Result<Self, DbError> {
+        let grid = Grid {
+            revision: unsigned("grid revision", raw.grid_revision)?,
+            cell_m: raw.cell_m,
+        };
+        let site = Site {
+            id: parse("site", &raw.id)?,
+            name: raw.name,
+            grid,
+            terrain_revision: unsigned("terrain revision", raw.terrain_revision)?,
+            created_at: from_us(raw.created_at_us)?,
+        };
+        Ok(Self { pk: raw.pk, site })
+    }
+}
+
+/// Adds a site; `false` if the identifier is in use.
+pub async fn insert(db: &mut SqliteConnection, site: &Site) -> Result<bool, DbError> {
+    let (id, created_at_us) = (site.id.as_str(), to_us(site.created_at));
+    let grid_revision = i64::from(site.grid.revision);
+    let result = sqlx::query!(
+        "INSERT INTO sites (id, name, grid_revision, cell_m, created_at_us)
+         VALUES (?, ?, ?, ?, ?) ON CONFLICT (id) DO NOTHING",
+        id,
+        site.name,
+        grid_revision,
+        site.grid.cell_m,
+        created_at_us,
+    )
+    .execute(db)
+    .await?;
+    Ok(result.rows_affected() == 1)
+}
+
+/// The site of that name.
+pub async fn find(db: &mut SqliteConnection, id: &SiteId) -> Result<Option<SiteRow>, DbError> {
+    let id = id.as_str();
+    let raw = sqlx::query_as!(
+        Raw,
+        r#"SELECT pk AS "pk!", id, name, grid_revision, cell_m, terrain_revision, created_at_us
+           FROM sites WHERE id = ?"#,
+        id,
+    )
+    .fetch_optional(db)
+    .await?;
+    raw.map(SiteRow::try_from).transpose()
+}
+
+/// Sites after an identifier, in alphabetical order.
+pub async fn list(
+    db: &mut SqliteConnection,
+    after: &str,
+    limit: u32,
+) -> Result<Vec<SiteRow>, DbError> {
+    let rows = sqlx::query_as!(
+        Raw,
+        r#"SELECT pk AS "pk!", id, name, grid_revision, cell_m, terrain_revision, created_at_us
+           FROM sites WHERE id > ? ORDER BY id LIMIT ?"#,
+        after,
+        limit,
+    )
+    .fetch_all(db)
+    .await?;
+    rows.into_iter().map(SiteRow::try_from).collect()
+}
+
+/// Counts a change of the site's terrains.
+pub async fn count_terrain_change(db: &mut SqliteConnection, pk: i64) -> Result<(), DbError> {
+    sqlx::query!(
+        "UPDATE sites SET terrain_revision = terrain_revision + 1 WHERE pk = ?",
+        pk
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}

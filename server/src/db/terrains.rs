@@ -1,0 +1,159 @@
+//! Terrains as they are drawn now, and every revision that ever was.
+
+use sqlx::SqliteConnection;
+use tread_api::ids::TerrainId;
+use tread_api::terrain::{Terrain, TerrainClass};
+
+use super::{DbError, corrupt, from_json, from_us, parse, to_json, to_us, unsigned};
+
+struct Raw {
+    id: String,
+    revision: i64,
+    name: String,
+    class: String,
+    polygon: String,
+    layer: i64,
+    updated_at_us: i64,
+}
+
+impl TryFrom<Raw> for Terrain {
+    type Error = DbError;
+
+    fn try_from(raw: Raw) -> Result<Self, DbError> {
+        Ok(Self {
+            id: parse("terrain", &raw.id)?,
+            revision: unsigned("terrain revision", raw.revision)?,
+            name: raw.name,
+            class: from_json("terrain class", &raw.class)?,
+            polygon: from_json("polygon", &raw.polygon)?,
+            layer: i32::try_from(raw.layer).map_err(|_range| corrupt("layer", raw.layer))?,
+            updated_at: from_us(raw.updated_at_us)?,
+        })
+    }
+}
+
+/// All terrains of a site, in alphabetical order; there are at most
+/// [`tread_api::terrain::TERRAINS_MAX`].
+pub async fn list(db: &mut SqliteConnection, site_pk: i64) -> Result<Vec<Terrain>, DbError> {
+    let rows = sqlx::query_as!(
+        Raw,
+        "SELECT id, revision, name, class, polygon, layer, updated_at_us
+         FROM terrains WHERE site_pk = ? ORDER BY id",
+        site_pk,
+    )
+    .fetch_all(db)
+    .await?;
+    rows.into_iter().map(Terrain::try_from).collect()
+}
+
+/// The terrain of that name.
+pub async fn find(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+    id: &TerrainId,
+) -> Result<Option<Terrain>, DbError> {
+    let id = id.as_str();
+    let raw = sqlx::query_as!(
+        Raw,
+        "SELECT id, revision, name, class, polygon, layer, updated_at_us
+         FROM terrains WHERE site_pk = ? AND id = ?",
+        site_pk,
+        id,
+    )
+    .fetch_optional(db)
+    .await?;
+    raw.map(Terrain::try_from).transpose()
+}
+
+/// How many terrains a site has.
+pub async fn count(db: &mut SqliteConnection, site_pk: i64) -> Result<usize, DbError> {
+    let count = sqlx::query_scalar!(
+        r#"SELECT COUNT(*) AS "count!: i64" FROM terrains WHERE site_pk = ?"#,
+        site_pk
+    )
+    .fetch_one(db)
+    .await?;
+    unsigned("count", count)
+}
+
+/// The newest revision that a name ever had, also of a terrain that is gone; 0 for none.
+pub async fn last_revision(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+    id: &TerrainId,
+) -> Result<u32, DbError> {
+    let id = id.as_str();
+    let revision = sqlx::query_scalar!(
+        r#"SELECT COALESCE(MAX(revision), 0) AS "revision!: i64"
+           FROM terrain_revisions WHERE site_pk = ? AND id = ?"#,
+        site_pk,
+        id,
+    )
+    .fetch_one(db)
+    .await?;
+    unsigned("terrain revision", revision)
+}
+
+/// Writes a terrain's present revision and keeps it in the history.
+pub async fn put(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+    terrain: &Terrain,
+) -> Result<(), DbError> {
+    let (id, revision) = (terrain.id.as_str(), i64::from(terrain.revision));
+    let class = class_text(terrain.class)?;
+    let polygon = to_json("polygon", &terrain.polygon)?;
+    let (layer, at_us) = (i64::from(terrain.layer), to_us(terrain.updated_at));
+    sqlx::query!(
+        "INSERT INTO terrains (site_pk, id, revision, name, class, polygon, layer, updated_at_us)
+         VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8)
+         ON CONFLICT (site_pk, id) DO UPDATE SET revision = ?3, name = ?4, class = ?5,
+             polygon = ?6, layer = ?7, updated_at_us = ?8",
+        site_pk,
+        id,
+        revision,
+        terrain.name,
+        class,
+        polygon,
+        layer,
+        at_us,
+    )
+    .execute(&mut *db)
+    .await?;
+    sqlx::query!(
+        "INSERT INTO terrain_revisions
+             (site_pk, id, revision, class, polygon, layer, written_at_us)
+         VALUES (?, ?, ?, ?, ?, ?, ?)",
+        site_pk,
+        id,
+        revision,
+        class,
+        polygon,
+        layer,
+        at_us,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Removes a terrain; its history stays. `false` if there was none.
+pub async fn delete(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+    id: &TerrainId,
+) -> Result<bool, DbError> {
+    let id = id.as_str();
+    let result = sqlx::query!(
+        "DELETE FROM terrains WHERE site_pk = ? AND id = ?",
+        site_pk,
+        id
+    )
+    .execute(db)
+    .await?;
+    Ok(result.rows_affected() == 1)
+}
+
+fn class_text(class: TerrainClass) -> Result<String, DbError> {
+    to_json("terrain class", &class)
+}

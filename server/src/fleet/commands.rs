@@ -1,0 +1,99 @@
+//! Commands to robots: zenoh queries with an application answer.
+
+use std::time::Duration;
+
+use serde::Serialize;
+use tokio::sync::oneshot;
+use tracing::{debug, warn};
+use tread_api::keys::{self, Verb};
+use tread_api::wire::command::Answer;
+use tread_api::wire::{self, Refusal};
+use zenoh::Session;
+use zenoh::Wait as _;
+use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
+
+use super::presence::RobotKey;
+use crate::supervisor::Supervisor;
+
+/// How long a robot may take to answer.
+pub const COMMAND_TIMEOUT: Duration = Duration::from_millis(800);
+/// How long the query itself may take beyond that before it counts as not delivered.
+const MARGIN: Duration = Duration::from_millis(200);
+
+/// Sends commands to robots; clones send through the same session.
+#[derive(Debug, Clone)]
+pub struct Commands {
+    session: Session,
+    supervisor: Supervisor,
+}
+
+impl Commands {
+    pub(super) fn new(session: Session, supervisor: Supervisor) -> Self {
+        Self {
+            session,
+            supervisor,
+        }
+    }
+
+    /// Sends one command and waits for its answer.
+    ///
+    /// `None` means not delivered, as far as anyone knows: no robot answered in time, or its
+    /// answer does not read. The same may be sent again without harm.
+    pub async fn send<T: Serialize>(
+        &self,
+        (site, robot): &RobotKey,
+        verb: Verb,
+        command: &T,
+    ) -> Option<Answer> {
+        let key = keys::command(site, robot, verb);
+        let payload = wire::encode(command)
+            .inspect_err(|error| warn!("cannot write a command for `{key}`: {error}"))
+            .ok()?;
+        let (answer, answered) = oneshot::channel();
+        let session = self.session.clone();
+        let query_key = key.clone();
+        // Sending blocks its thread when the robot's link is full.
+        let sent = self.supervisor.blocking(move || {
+            let mut answer = Some(answer);
+            session
+                .get(query_key)
+                .payload(payload)
+                .target(QueryTarget::BestMatching)
+                .consolidation(ConsolidationMode::None)
+                .timeout(COMMAND_TIMEOUT)
+                .callback_mut(move |reply| {
+                    // Only the first reply counts: the robot's key belongs to one robot.
+                    if let Some(answer) = answer.take() {
+                        let _ = answer.send(reply);
+                    }
+                })
+                .wait()
+        });
+        let exchange = async {
+            sent.await?
+                .inspect_err(|error| warn!("cannot query `{key}`: {error}"))
+                .ok()?;
+            answered.await.ok()
+        };
+        let reply = tokio::time::timeout(COMMAND_TIMEOUT + MARGIN, exchange)
+            .await
+            .ok()??;
+        read_answer(&key, &reply)
+    }
+}
+
+fn read_answer(key: &str, reply: &Reply) -> Option<Answer> {
+    match reply.result() {
+        Ok(sample) => wire::decode(&sample.payload().to_bytes())
+            .inspect_err(|error| warn!("the answer on `{key}` was refused: {error}"))
+            .ok(),
+        Err(error) => {
+            // A robot's refusal to read, or the plain text with which zenoh says "timeout".
+            match wire::decode::<Refusal>(&error.payload().to_bytes()) {
+                Ok(refusal) => warn!("`{key}` could not be read there: {}", refusal.detail),
+                Err(_not_a_refusal) => debug!("`{key}` was not answered"),
+            }
+            None
+        }
+    }
+}

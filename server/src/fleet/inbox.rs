@@ -1,0 +1,246 @@
+//! What robots send: zenoh's callbacks on one side, our tasks on the other.
+
+use tokio::sync::mpsc;
+use tokio::sync::mpsc::error::TrySendError;
+use tokio_util::sync::CancellationToken;
+use tracing::{info, warn};
+use tread_api::keys::{self, Key};
+use tread_api::wire::state::{FrictionReport, RobotState};
+use tread_api::wire::{self, WireError};
+use zenoh::query::Query;
+use zenoh::sample::SampleKind;
+use zenoh::{Session, Wait as _};
+
+use super::presence::RobotKey;
+use super::requests;
+use crate::app::App;
+use crate::app::ingest::Upload;
+use crate::counters::Counter;
+use crate::supervisor::Supervisor;
+
+/// Changes of presence that wait; all robots of a full server may come at once.
+const PRESENCE_WAITING_MAX: usize = 32_768;
+/// States and friction reports that wait: a second of a thousand robots at 10 Hz.
+const STATES_WAITING_MAX: usize = 10_000;
+/// Introductions that wait.
+const HELLOS_WAITING_MAX: usize = 8_192;
+/// Uploads that wait to be read.
+const UPLOADS_WAITING_MAX: usize = 512;
+
+/// The sending ends of the channels, for zenoh's callbacks.
+#[derive(Debug, Clone)]
+pub(super) struct Channels {
+    app: App,
+    presence: mpsc::Sender<TokenChange>,
+    states: mpsc::Sender<Published>,
+    hellos: mpsc::Sender<Query>,
+    uploads: mpsc::Sender<Query>,
+}
+
+#[derive(Debug)]
+struct TokenChange {
+    key: String,
+    appeared: bool,
+}
+
+#[derive(Debug)]
+struct Published {
+    key: String,
+    payload: Vec<u8>,
+}
+
+impl Channels {
+    /// Makes the channels and starts the tasks at their other ends.
+    pub(super) fn new(
+        supervisor: &Supervisor,
+        app: &App,
+        uploads_out: mpsc::Sender<Upload>,
+    ) -> Self {
+        let (presence, presence_in) = mpsc::channel(PRESENCE_WAITING_MAX);
+        let (states, states_in) = mpsc::channel(STATES_WAITING_MAX);
+        let (hellos, hellos_in) = mpsc::channel(HELLOS_WAITING_MAX);
+        let (uploads, uploads_in) = mpsc::channel(UPLOADS_WAITING_MAX);
+        let stop = || supervisor.stop_token();
+        supervisor.spawn_vital("presence", watch_presence(app.clone(), presence_in, stop()));
+        supervisor.spawn_vital("states", read_states(app.clone(), states_in, stop()));
+        let replies = requests::Replies::new(app.clone(), supervisor.clone());
+        supervisor.spawn_vital(
+            "hellos",
+            requests::serve_hellos(replies.clone(), hellos_in, stop()),
+        );
+        let serving = requests::serve_uploads(replies, uploads_in, uploads_out, stop());
+        supervisor.spawn_vital("uploads", serving);
+        Self {
+            app: app.clone(),
+            presence,
+            states,
+            hellos,
+            uploads,
+        }
+    }
+}
+
+fn hand_over<T>(channel: &mpsc::Sender<T>, message: T, dropped: &Counter) {
+    // A closed channel means that the server stops; nothing is lost that matters then.
+    if let Err(TrySendError::Full(_)) = channel.try_send(message) {
+        dropped.one();
+    }
+}
+
+/// Declares everything that the server listens to. Blocks its thread.
+pub(super) fn declare(session: &Session, channels: &Channels) -> zenoh::Result<()> {
+    let to = channels.clone();
+    session
+        .declare_queryable(keys::ALL_HELLOS)
+        .complete(true)
+        .callback(move |query| hand_over(&to.hellos, query, &to.app.counters().hellos_dropped))
+        .background()
+        .wait()?;
+    let to = channels.clone();
+    session
+        .declare_queryable(keys::ALL_INGEST)
+        .complete(true)
+        .callback(move |query| {
+            hand_over(&to.uploads, query, &to.app.counters().ingest_dropped_busy);
+        })
+        .background()
+        .wait()?;
+    for key in [keys::ALL_STATES, keys::ALL_FRICTION] {
+        let to = channels.clone();
+        session
+            .declare_subscriber(key)
+            .callback(move |sample| {
+                let published = Published {
+                    key: sample.key_expr().as_str().to_owned(),
+                    payload: sample.payload().to_bytes().into_owned(),
+                };
+                hand_over(&to.states, published, &to.app.counters().states_dropped);
+            })
+            .background()
+            .wait()?;
+    }
+    let to = channels.clone();
+    session
+        .liveliness()
+        .declare_subscriber(keys::ALL_ALIVE)
+        .history(true)
+        .callback(move |sample| {
+            let change = TokenChange {
+                key: sample.key_expr().as_str().to_owned(),
+                appeared: sample.kind() == SampleKind::Put,
+            };
+            hand_over(&to.presence, change, &to.app.counters().presence_dropped);
+        })
+        .background()
+        .wait()
+}
+
+async fn watch_presence(
+    app: App,
+    mut changes: mpsc::Receiver<TokenChange>,
+    stop: CancellationToken,
+) {
+    while let Some(change) = next(&mut changes, &stop).await {
+        let Some(Key::Alive(site, robot, boot)) = Key::parse(&change.key) else {
+            refuse_key(&app, &change.key);
+            continue;
+        };
+        let now = app.clock().elapsed();
+        if change.appeared {
+            info!(robot.id = %robot, "robot `{robot}` of site `{site}` is on the network");
+            app.presences().token_appeared((site, robot), boot, now);
+        } else {
+            info!(robot.id = %robot, "robot `{robot}` of site `{site}` is off the network");
+            app.presences().token_gone(&(site, robot), boot);
+        }
+        app.wake();
+    }
+}
+
+async fn read_states(app: App, mut published: mpsc::Receiver<Published>, stop: CancellationToken) {
+    while let Some(message) = next(&mut published, &stop).await {
+        let now = app.clock().elapsed();
+        match Key::parse(&message.key) {
+            Some(Key::State(site, robot)) => {
+                let named = |state: &RobotState| state.robot == robot;
+                let key = (site, robot.clone());
+                if let Some(state) = read(&app, &message, named)
+                    && app.presences().state(key, state, now)
+                {
+                    app.wake();
+                }
+            }
+            Some(Key::Friction(site, robot)) => {
+                let named = |report: &FrictionReport| report.robot == robot;
+                let key: RobotKey = (site, robot.clone());
+                if let Some(report) = read(&app, &message, named) {
+                    app.presences().friction(key, &report, now);
+                }
+            }
+            Some(_) | None => refuse_key(&app, &message.key),
+        }
+    }
+}
+
+/// The next message, until the stop.
+pub(super) async fn next<T>(
+    channel: &mut mpsc::Receiver<T>,
+    stop: &CancellationToken,
+) -> Option<T> {
+    tokio::select! {
+        biased;
+        () = stop.cancelled() => None,
+        message = channel.recv() => message,
+    }
+}
+
+fn read<T: serde::de::DeserializeOwned>(
+    app: &App,
+    message: &Published,
+    is_named: impl Fn(&T) -> bool,
+) -> Option<T> {
+    let counters = app.counters();
+    match wire::decode::<T>(&message.payload) {
+        Ok(body) if is_named(&body) => {
+            counters.states_received.one();
+            Some(body)
+        }
+        Ok(_other_robot) => {
+            counters.refused_impersonation.one();
+            warn!(
+                "a message on `{}` was refused: it names another robot",
+                message.key
+            );
+            None
+        }
+        Err(error) => {
+            count_refusal(app, &error);
+            warn!(
+                "a message on `{}` was refused: {}",
+                message.key,
+                explained(&error)
+            );
+            None
+        }
+    }
+}
+
+/// Counts what does not read.
+pub(super) fn count_refusal(app: &App, error: &WireError) {
+    match error {
+        WireError::TooLarge(_) | WireError::Malformed(_) => app.counters().refused_malformed.one(),
+        WireError::Version(_) => app.counters().refused_version.one(),
+    }
+}
+
+/// An error with its cause, on one line.
+pub(super) fn explained(error: &WireError) -> String {
+    wire::Refusal::from(error).detail
+}
+
+/// Counts and logs a key that is none of ours.
+pub(super) fn refuse_key(app: &App, key: &str) {
+    app.counters().refused_key.one();
+    let key: String = key.chars().take(200).collect();
+    warn!("a message on `{key}` was refused: the key is none of Tread's");
+}

@@ -1,0 +1,161 @@
+//! The fleet's network. The only module that calls zenoh.
+//!
+//! The server's session is itself the router that robots connect to. Callbacks run on zenoh's own
+//! threads, where anything slow would stop the whole network: they only `try_send` into bounded
+//! channels, and what does not fit is counted and dropped. Robots send again what matters.
+
+pub mod commands;
+mod inbox;
+pub mod presence;
+mod requests;
+
+use std::net::{SocketAddr, TcpListener};
+use std::time::Duration;
+
+use tokio::sync::mpsc;
+use tracing::{info, warn};
+use zenoh::{Config, Session, Wait as _};
+
+use self::commands::Commands;
+use crate::app::App;
+use crate::app::ingest::Upload;
+use crate::supervisor::Supervisor;
+
+/// Most robots that may be connected; zenoh's own default is 1000.
+const SESSIONS_MAX: u32 = 10_000;
+/// Most connections that may be in the middle of their opening.
+const ACCEPT_PENDING_MAX: u32 = 1_000;
+/// How long the session may take to open, and to close.
+const SESSION_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Why the network cannot be opened.
+#[derive(Debug, thiserror::Error)]
+pub enum FleetError {
+    /// Zenoh refused.
+    #[error("cannot open the zenoh router on {address}: {reason}")]
+    Open {
+        /// Where.
+        address: SocketAddr,
+        /// What zenoh says.
+        reason: String,
+    },
+    /// No port is free.
+    #[error("no port is free on {address}")]
+    NoPort {
+        /// Where.
+        address: SocketAddr,
+        /// Why.
+        #[source]
+        cause: std::io::Error,
+    },
+}
+
+/// The open network.
+#[derive(Debug)]
+pub struct Fleet {
+    session: Session,
+    supervisor: Supervisor,
+    address: SocketAddr,
+}
+
+impl Fleet {
+    /// Opens the router. Port 0 takes a free one.
+    ///
+    /// # Errors
+    /// [`FleetError`]: the address is in use, or zenoh refuses it.
+    pub async fn open(address: SocketAddr, supervisor: Supervisor) -> Result<Self, FleetError> {
+        let address = with_free_port(address)?;
+        let failed = |reason: String| FleetError::Open { address, reason };
+        let config = config(address).map_err(|error| failed(error.to_string()))?;
+        let opening = supervisor.blocking(move || zenoh::open(config).wait());
+        let session = tokio::time::timeout(SESSION_TIMEOUT, opening)
+            .await
+            .map_err(|_elapsed| failed("it took too long".to_owned()))?
+            .ok_or_else(|| failed("it panicked".to_owned()))?
+            .map_err(|error| failed(error.to_string()))?;
+        info!("zenoh router listens on tcp/{address}");
+        Ok(Self {
+            session,
+            supervisor,
+            address,
+        })
+    }
+
+    /// Where robots connect.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// The way to command robots.
+    pub fn commands(&self) -> Commands {
+        Commands::new(self.session.clone(), self.supervisor.clone())
+    }
+
+    /// Begins to listen to robots.
+    ///
+    /// # Errors
+    /// [`FleetError::Open`] if zenoh refuses a declaration.
+    pub async fn listen(&self, app: &App, uploads: mpsc::Sender<Upload>) -> Result<(), FleetError> {
+        let channels = inbox::Channels::new(&self.supervisor, app, uploads);
+        let session = self.session.clone();
+        let declared = self
+            .supervisor
+            .blocking(move || inbox::declare(&session, &channels))
+            .await;
+        let reason = match declared {
+            Some(Ok(())) => return Ok(()),
+            Some(Err(error)) => error.to_string(),
+            None => "it panicked".to_owned(),
+        };
+        Err(FleetError::Open {
+            address: self.address,
+            reason,
+        })
+    }
+
+    /// Closes the network; robots keep trying to come back.
+    pub async fn close(self) {
+        let session = self.session;
+        let closing = tokio::task::spawn_blocking(move || session.close().wait());
+        match tokio::time::timeout(SESSION_TIMEOUT, closing).await {
+            Ok(Ok(Ok(()))) => {}
+            Ok(Ok(Err(error))) => warn!("zenoh did not close cleanly: {error}"),
+            Ok(Err(_panic)) => warn!("zenoh panicked while closing"),
+            Err(_elapsed) => warn!("zenoh did not close in time"),
+        }
+    }
+}
+
+/// Zenoh does not say which port it took for 0, so a free one is looked for first.
+fn with_free_port(address: SocketAddr) -> Result<SocketAddr, FleetError> {
+    if address.port() != 0 {
+        return Ok(address);
+    }
+    TcpListener::bind(address)
+        .and_then(|listener| listener.local_addr())
+        .map_err(|cause| FleetError::NoPort { address, cause })
+}
+
+fn config(address: SocketAddr) -> zenoh::Result<Config> {
+    let mut config = Config::default();
+    let settings = [
+        ("mode", "\"router\"".to_owned()),
+        ("listen/endpoints", format!("[\"tcp/{address}\"]")),
+        // Nothing is discovered and nothing is advertised.
+        ("scouting/multicast/enabled", "false".to_owned()),
+        ("scouting/gossip/enabled", "false".to_owned()),
+        (
+            "timestamping/enabled",
+            "{ router: true, peer: true, client: true }".to_owned(),
+        ),
+        ("transport/unicast/max_sessions", SESSIONS_MAX.to_string()),
+        (
+            "transport/unicast/accept_pending",
+            ACCEPT_PENDING_MAX.to_string(),
+        ),
+    ];
+    for (key, value) in settings {
+        config.insert_json5(key, &value)?;
+    }
+    Ok(config)
+}

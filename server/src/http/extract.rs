@@ -1,0 +1,259 @@
+//! What is taken from a request, with problems for what is wrong with it.
+//!
+//! `Json` refuses unknown fields: a client that misspells one wants to know. (Payloads of robots
+//! ignore them, so that old and new versions work together; the types are the same.)
+
+use axum::body::Body;
+use axum::extract::{FromRequest, FromRequestParts, Request};
+use axum::http::request::Parts;
+use axum::http::{HeaderMap, header};
+use axum::response::{IntoResponse, Response};
+use futures_util::StreamExt as _;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use tread_api::page::{PAGE_LIMIT_DEFAULT, PAGE_LIMIT_MAX};
+use tread_api::problem::ProblemType;
+
+use super::problem::Problem;
+
+/// Fields that are not known and are named in the answer.
+const UNKNOWN_FIELDS_NAMED_MAX: usize = 5;
+
+/// Bytes of a body over the limit that are read and thrown away, so that a client that is still
+/// sending gets the answer instead of a broken connection.
+const DISCARDED_BYTES_MAX: usize = 64 * 1024 * 1024;
+
+/// The largest body that a route takes, in bytes; a request extension, set by a layer.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct BodyLimit(pub(super) usize);
+
+/// A JSON body, in and out.
+#[derive(Debug, Clone)]
+pub struct Json<T>(pub T);
+
+impl<S: Send + Sync, T: DeserializeOwned> FromRequest<S> for Json<T> {
+    type Rejection = Problem;
+
+    async fn from_request(request: Request, _state: &S) -> Result<Self, Problem> {
+        if !is_json(request.headers()) {
+            return Err(Problem::new(ProblemType::UnsupportedMediaType)
+                .detail("send the body with `content-type: application/json`"));
+        }
+        let limit = request.extensions().get::<BodyLimit>().copied();
+        let limit = limit.unwrap_or(BodyLimit(super::BODY_MAX));
+        parse(&read(request.into_body(), limit).await?).map(Self)
+    }
+}
+
+impl<T: Serialize> IntoResponse for Json<T> {
+    fn into_response(self) -> Response {
+        match serde_json::to_vec(&self.0) {
+            Ok(text) => ([(header::CONTENT_TYPE, "application/json")], text).into_response(),
+            Err(error) => {
+                tracing::error!("cannot write an answer: {error}");
+                Problem::new(ProblemType::Internal).into_response()
+            }
+        }
+    }
+}
+
+fn is_json(headers: &HeaderMap) -> bool {
+    let value = headers
+        .get(header::CONTENT_TYPE)
+        .and_then(|value| value.to_str().ok());
+    let essence = value
+        .and_then(|value| value.split(';').next())
+        .map(str::trim);
+    essence.is_some_and(|essence| essence.eq_ignore_ascii_case("application/json"))
+}
+
+/// Reads a whole body, or what there is to discard of one that is too large.
+async fn read(body: Body, BodyLimit(limit): BodyLimit) -> Result<Vec<u8>, Problem> {
+    let mut chunks = body.into_data_stream();
+    let mut text = Vec::new();
+    let mut discarded = 0;
+    while let Some(chunk) = chunks.next().await {
+        let chunk = chunk.map_err(|_broken| {
+            Problem::new(ProblemType::MalformedBody).detail("the body broke off")
+        })?;
+        if discarded == 0 && text.len() + chunk.len() <= limit {
+            text.extend_from_slice(&chunk);
+        } else {
+            text = Vec::new();
+            discarded += chunk.len();
+        }
+        if discarded > DISCARDED_BYTES_MAX {
+            break;
+        }
+    }
+    if discarded == 0 {
+        return Ok(text);
+    }
+    let detail = format!("a body may have at most {limit} bytes here");
+    Err(Problem::new(ProblemType::BodyTooLarge).detail(detail))
+}
+
+fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Problem> {
+    let mut unknown = Vec::new();
+    let mut reader = serde_json::Deserializer::from_slice(body);
+    let mut note = |path: serde_ignored::Path<'_>| {
+        if unknown.len() < UNKNOWN_FIELDS_NAMED_MAX {
+            unknown.push(path.to_string());
+        }
+    };
+    let watched = serde_ignored::Deserializer::new(&mut reader, &mut note);
+    let parsed: T = serde_path_to_error::deserialize(watched).map_err(|error| {
+        let path = error.path().to_string();
+        let cause = error.inner();
+        let kind = if cause.is_data() {
+            ProblemType::InvalidBody
+        } else {
+            ProblemType::MalformedBody
+        };
+        let problem = Problem::new(kind).detail(cause.to_string());
+        if path == "." {
+            problem
+        } else {
+            problem.field(path)
+        }
+    })?;
+    let trailing = |error: serde_json::Error| {
+        Problem::new(ProblemType::MalformedBody).detail(error.to_string())
+    };
+    reader.end().map_err(trailing)?;
+    if unknown.is_empty() {
+        return Ok(parsed);
+    }
+    let unknown: Vec<String> = unknown.iter().map(|path| spelt_out(path, body)).collect();
+    let detail = format!("not known: `{}`", unknown.join("`, `"));
+    let problem = Problem::new(ProblemType::UnknownField).detail(detail);
+    Err(match unknown.into_iter().next() {
+        Some(first) => problem.field(first),
+        None => problem,
+    })
+}
+
+/// The path of an unknown field with the names of enum variants, for which `serde_ignored` only
+/// has a `?`.
+fn spelt_out(path: &str, body: &[u8]) -> String {
+    let whole: serde_json::Value = serde_json::from_slice(body).unwrap_or_default();
+    let mut place = &whole;
+    let mut names: Vec<&str> = Vec::new();
+    let steps: Vec<&str> = path.split('.').collect();
+    for (index, &step) in steps.iter().enumerate() {
+        let step = if step == "?" {
+            let following = steps.get(index + 1).copied().unwrap_or_default();
+            let variant = place
+                .as_object()
+                .filter(|object| !object.contains_key(following));
+            match variant.and_then(|object| object.keys().next()) {
+                Some(name) => name.as_str(),
+                // An optional value, which is no step in JSON.
+                None => continue,
+            }
+        } else {
+            step
+        };
+        names.push(step);
+        let inner = step
+            .parse::<usize>()
+            .ok()
+            .and_then(|index| place.get(index));
+        place = inner
+            .or_else(|| place.get(step))
+            .unwrap_or(&serde_json::Value::Null);
+    }
+    names.join(".")
+}
+
+/// The parts of a path.
+#[derive(Debug, Clone)]
+pub struct Path<T>(pub T);
+
+impl<S: Send + Sync, T: DeserializeOwned + Send> FromRequestParts<S> for Path<T> {
+    type Rejection = Problem;
+
+    #[expect(clippy::disallowed_types, reason = "this is what wraps it")]
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Problem> {
+        let path = axum::extract::Path::from_request_parts(parts, state).await;
+        path.map(|axum::extract::Path(value)| Self(value))
+            .map_err(|rejection| {
+                Problem::new(ProblemType::InvalidPath).detail(rejection.body_text())
+            })
+    }
+}
+
+/// The parameters of a query. Their types refuse unknown ones with `deny_unknown_fields`.
+#[derive(Debug, Clone)]
+pub struct Query<T>(pub T);
+
+impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for Query<T> {
+    type Rejection = Problem;
+
+    #[expect(clippy::disallowed_types, reason = "this is what wraps it")]
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Problem> {
+        let query = axum::extract::Query::from_request_parts(parts, state).await;
+        query
+            .map(|axum::extract::Query(value)| Self(value))
+            .map_err(|rejection| {
+                Problem::new(ProblemType::InvalidQuery).detail(rejection.body_text())
+            })
+    }
+}
+
+/// How many entries a page has.
+pub(super) fn page_limit(limit: Option<u32>) -> Result<u32, Problem> {
+    let limit = limit.unwrap_or(PAGE_LIMIT_DEFAULT);
+    if (1..=PAGE_LIMIT_MAX).contains(&limit) {
+        Ok(limit)
+    } else {
+        let detail = format!("limit must be 1 to {PAGE_LIMIT_MAX}, not {limit}");
+        Err(Problem::new(ProblemType::InvalidQuery)
+            .detail(detail)
+            .field("limit"))
+    }
+}
+
+/// A cursor that is an identifier of that type.
+pub(super) fn cursor<T: std::str::FromStr>(cursor: Option<&str>) -> Result<Option<T>, Problem> {
+    let bad = |_error| {
+        Problem::new(ProblemType::InvalidQuery)
+            .detail("this is no cursor; take `next_cursor` of the page before")
+            .field("cursor")
+    };
+    cursor.map(|cursor| cursor.parse().map_err(bad)).transpose()
+}
+
+#[cfg(test)]
+mod tests {
+    use tread_api::mission::CreateMission;
+
+    use super::*;
+
+    fn problem(body: &str) -> serde_json::Value {
+        let problem = parse::<CreateMission>(body.as_bytes()).unwrap_err();
+        serde_json::to_value(format!("{problem:?}")).unwrap()
+    }
+
+    #[test]
+    fn an_unknown_field_is_named_with_its_path_however_deep() {
+        let text = r#"{"site":"a","robot":"b","trajectory":{"circle":
+            {"center":{"x_m":0.0,"y_m":0.0},"radius_m":1.0,"speed_m_s":0.5,"colour":1}}}"#;
+        let said = problem(text).to_string();
+        assert!(
+            said.contains("UnknownField") && said.contains("trajectory.circle.colour"),
+            "{said}"
+        );
+    }
+
+    #[test]
+    fn what_is_impossible_is_named_with_its_path() {
+        let said = problem(r#"{"site":"A B","robot":"b","trajectory":{}}"#).to_string();
+        assert!(
+            said.contains("InvalidBody") && said.contains("site"),
+            "{said}"
+        );
+        let said = problem("{\"site\": NaN}").to_string();
+        assert!(said.contains("MalformedBody"), "{said}");
+    }
+}

@@ -1,0 +1,70 @@
+//! Whether the server lives, is ready, and what it counts.
+
+use axum::extract::State;
+use serde::{Deserialize, Serialize};
+use tread_api::problem::{ProblemBody, ProblemType};
+use utoipa::ToSchema;
+
+use super::extract::Json;
+use super::problem::Problem;
+use crate::app::App;
+use crate::counters::CounterValues;
+
+/// The server is there.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct Health {
+    /// Always `ok`.
+    pub status: String,
+}
+
+/// The server about itself.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct ServerStatus {
+    /// Version of the server.
+    pub version: String,
+    /// Time since the start, milliseconds.
+    pub uptime_ms: u64,
+    /// Version of the SQLite library.
+    pub sqlite_version: String,
+    /// Robots that are on the network now.
+    pub robots_present: usize,
+    /// What it has counted since the start.
+    pub counters: CounterValues,
+}
+
+fn ok() -> Json<Health> {
+    Json(Health {
+        status: "ok".to_owned(),
+    })
+}
+
+/// Whether the process answers.
+#[utoipa::path(get, path = "/healthz", tag = "server", responses((status = 200, body = Health)))]
+pub(super) async fn healthz() -> Json<Health> {
+    ok()
+}
+
+/// Whether the server can work: the database answers.
+#[utoipa::path(get, path = "/readyz", tag = "server",
+    responses((status = 200, body = Health), (status = 503, body = ProblemBody)))]
+pub(super) async fn readyz(State(app): State<App>) -> Result<Json<Health>, Problem> {
+    let unready = |error| {
+        tracing::warn!("not ready: {error:?}");
+        Problem::new(ProblemType::Unavailable).detail("the database does not answer")
+    };
+    app.ready().await.map_err(unready)?;
+    Ok(ok())
+}
+
+/// Version, uptime and counters.
+#[utoipa::path(get, path = "/v1/server", tag = "server", operation_id = "get_server",
+    responses((status = 200, body = ServerStatus)))]
+pub(super) async fn status(State(app): State<App>) -> Json<ServerStatus> {
+    Json(ServerStatus {
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        uptime_ms: u64::try_from(app.uptime().as_millis()).unwrap_or(u64::MAX),
+        sqlite_version: app.db().sqlite_version().to_owned(),
+        robots_present: app.presences().present_count(),
+        counters: app.counters().values(),
+    })
+}

@@ -1,0 +1,153 @@
+//! The REST API. Knows HTTP and no SQL.
+//!
+//! Every route and its description in `/openapi.json` come from one `routes!`. All errors are
+//! problems ([`problem`]); bodies, paths and queries are read by [`extract`] alone.
+
+pub mod extract;
+mod friction;
+pub mod health;
+mod missions;
+pub mod problem;
+mod robots;
+pub mod serve;
+mod sites;
+mod terrains;
+
+use std::any::Any;
+use std::time::Duration;
+
+use axum::extract::{Request, State};
+use axum::http::HeaderName;
+use axum::middleware::{Next, from_fn, from_fn_with_state};
+use axum::response::{IntoResponse, Response};
+use axum::{Extension, Router, middleware};
+use tower_http::catch_panic::CatchPanicLayer;
+use tower_http::request_id::{
+    MakeRequestUuid, PropagateRequestIdLayer, RequestId, SetRequestIdLayer,
+};
+use tower_http::trace::TraceLayer;
+use tread_api::problem::ProblemType;
+use utoipa::OpenApi as _;
+use utoipa::openapi::OpenApi;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+use utoipa_swagger_ui::SwaggerUi;
+
+use self::extract::BodyLimit;
+use self::problem::Problem;
+use crate::app::App;
+
+/// Largest body of `POST /v1/missions`: a path of the most waypoints.
+pub const MISSION_BODY_MAX: usize = 16 * 1024 * 1024;
+/// Largest body of all other requests.
+pub const BODY_MAX: usize = 1024 * 1024;
+/// How long a request may take.
+pub const REQUEST_TIMEOUT: Duration = Duration::from_secs(15);
+/// The header that names a request, in the answer and in the log.
+const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
+
+#[derive(utoipa::OpenApi)]
+#[openapi(info(
+    title = "Tread",
+    description = "Missions for skid-steered robots, and the friction that they measure.",
+))]
+struct Description;
+
+fn routes() -> OpenApiRouter<App> {
+    let missions = OpenApiRouter::new()
+        .routes(routes!(missions::list, missions::create))
+        .layer(Extension(BodyLimit(MISSION_BODY_MAX)));
+    OpenApiRouter::with_openapi(Description::openapi())
+        .routes(routes!(health::healthz))
+        .routes(routes!(health::readyz))
+        .routes(routes!(health::status))
+        .routes(routes!(sites::list, sites::create))
+        .routes(routes!(sites::get))
+        .routes(routes!(terrains::list, terrains::create))
+        .routes(routes!(terrains::get, terrains::replace, terrains::delete))
+        .routes(routes!(robots::list))
+        .routes(routes!(robots::get))
+        .routes(routes!(missions::get))
+        .routes(routes!(missions::cancel))
+        .routes(routes!(friction::terrains))
+        .routes(routes!(friction::terrain))
+        .routes(routes!(friction::cells))
+        .routes(routes!(friction::segments))
+        .layer(Extension(BodyLimit(BODY_MAX)))
+        .merge(missions)
+}
+
+/// The description of the API.
+pub fn openapi() -> OpenApi {
+    routes().to_openapi()
+}
+
+/// The whole API on these use cases.
+pub fn router(app: App) -> Router {
+    let (router, openapi) = routes().split_for_parts();
+    router
+        .merge(SwaggerUi::new("/docs").url("/openapi.json", openapi))
+        .fallback(not_found)
+        .method_not_allowed_fallback(method_not_allowed)
+        .layer(from_fn(bound_time))
+        .layer(CatchPanicLayer::custom(broken))
+        .layer(from_fn_with_state(app.clone(), count_panics))
+        .layer(TraceLayer::new_for_http().make_span_with(span))
+        .layer(PropagateRequestIdLayer::new(REQUEST_ID))
+        .layer(SetRequestIdLayer::new(REQUEST_ID, MakeRequestUuid))
+        .with_state(app)
+}
+
+async fn not_found() -> Problem {
+    Problem::new(ProblemType::NotFound).detail("the API is described at /docs")
+}
+
+async fn method_not_allowed() -> Problem {
+    Problem::new(ProblemType::MethodNotAllowed).detail("the API is described at /docs")
+}
+
+async fn bound_time(request: Request, next: Next) -> Response {
+    match tokio::time::timeout(REQUEST_TIMEOUT, next.run(request)).await {
+        Ok(response) => response,
+        Err(_elapsed) => Problem::new(ProblemType::Timeout).into_response(),
+    }
+}
+
+/// Marks the answer to a request whose handler panicked.
+#[derive(Debug, Clone, Copy)]
+struct Panicked;
+
+#[expect(clippy::needless_pass_by_value, reason = "the layer's signature")]
+fn broken(panic: Box<dyn Any + Send + 'static>) -> Response {
+    let said = panic.downcast_ref::<&str>().copied();
+    let said = said.or_else(|| panic.downcast_ref::<String>().map(String::as_str));
+    tracing::error!(
+        "a request's handler panicked: {}",
+        said.unwrap_or("it did not say why")
+    );
+    let mut response = Problem::new(ProblemType::Internal).into_response();
+    response.extensions_mut().insert(Panicked);
+    response
+}
+
+async fn count_panics(
+    State(app): State<App>,
+    request: Request,
+    next: middleware::Next,
+) -> Response {
+    let response = next.run(request).await;
+    if response.extensions().get::<Panicked>().is_some() {
+        app.counters().http_panics.one();
+    }
+    response
+}
+
+fn span(request: &Request) -> tracing::Span {
+    let id = request.extensions().get::<RequestId>();
+    let id = id
+        .and_then(|id| id.header_value().to_str().ok())
+        .unwrap_or_default();
+    tracing::info_span!(
+        "request", http.method = %request.method(), http.path = request.uri().path(), id,
+    )
+}

@@ -1,0 +1,110 @@
+//! Errors as RFC 9457 problems. The only place that knows status codes.
+
+use axum::body::Body;
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use tracing::error;
+use tread_api::problem::{PROBLEM_MEDIA_TYPE, ProblemBody, ProblemType};
+
+use crate::app::AppError;
+
+/// An error answer on its way out.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Problem {
+    body: ProblemBody,
+}
+
+impl Problem {
+    /// A problem of that kind.
+    pub fn new(kind: ProblemType) -> Self {
+        let body = ProblemBody {
+            kind,
+            title: kind.title().to_owned(),
+            status: status(kind).as_u16(),
+            detail: None,
+            field: None,
+        };
+        Self { body }
+    }
+
+    /// Says what is wrong here, for people.
+    #[must_use]
+    pub fn detail(mut self, detail: impl Into<String>) -> Self {
+        self.body.detail = Some(detail.into());
+        self
+    }
+
+    /// Says where in the body or query.
+    #[must_use]
+    pub fn field(mut self, field: impl Into<String>) -> Self {
+        self.body.field = Some(field.into());
+        self
+    }
+}
+
+const fn status(kind: ProblemType) -> StatusCode {
+    match kind {
+        ProblemType::MalformedBody | ProblemType::InvalidPath | ProblemType::InvalidQuery => {
+            StatusCode::BAD_REQUEST
+        }
+        ProblemType::InvalidBody | ProblemType::UnknownField | ProblemType::BeyondLimits => {
+            StatusCode::UNPROCESSABLE_ENTITY
+        }
+        ProblemType::BodyTooLarge => StatusCode::PAYLOAD_TOO_LARGE,
+        ProblemType::UnsupportedMediaType => StatusCode::UNSUPPORTED_MEDIA_TYPE,
+        ProblemType::NotFound
+        | ProblemType::UnknownSite
+        | ProblemType::UnknownRobot
+        | ProblemType::UnknownTerrain
+        | ProblemType::UnknownMission => StatusCode::NOT_FOUND,
+        ProblemType::MethodNotAllowed => StatusCode::METHOD_NOT_ALLOWED,
+        ProblemType::AlreadyExists | ProblemType::MissionEnded | ProblemType::TooMany => {
+            StatusCode::CONFLICT
+        }
+        ProblemType::Timeout => StatusCode::GATEWAY_TIMEOUT,
+        ProblemType::Unavailable => StatusCode::SERVICE_UNAVAILABLE,
+        ProblemType::Internal => StatusCode::INTERNAL_SERVER_ERROR,
+    }
+}
+
+impl From<AppError> for Problem {
+    fn from(app_error: AppError) -> Self {
+        let kind = match &app_error {
+            AppError::UnknownSite(_) => ProblemType::UnknownSite,
+            AppError::UnknownRobot(..) => ProblemType::UnknownRobot,
+            AppError::UnknownTerrain(..) => ProblemType::UnknownTerrain,
+            AppError::UnknownMission(_) => ProblemType::UnknownMission,
+            AppError::AlreadyExists { .. } => ProblemType::AlreadyExists,
+            AppError::BeyondLimits { .. } => ProblemType::BeyondLimits,
+            AppError::MissionEnded { .. } => ProblemType::MissionEnded,
+            AppError::TooMany { .. } => ProblemType::TooMany,
+            AppError::Invalid { .. } => ProblemType::InvalidBody,
+            AppError::InvalidQuery { .. } => ProblemType::InvalidQuery,
+            AppError::Storage(cause) => {
+                // The cause is for the log alone, and is logged here once.
+                error!("a request failed: {cause:?}");
+                return Self::new(ProblemType::Internal)
+                    .detail("the cause is in the server's log, under the id of this request");
+            }
+        };
+        let problem = Self::new(kind).detail(app_error.to_string());
+        match app_error.field() {
+            Some(field) => problem.field(field),
+            None => problem,
+        }
+    }
+}
+
+impl IntoResponse for Problem {
+    fn into_response(self) -> Response {
+        let status = StatusCode::from_u16(self.body.status).unwrap_or_default();
+        let text = serde_json::to_vec(&self.body).unwrap_or_default();
+        let mut response = Response::new(Body::from(text));
+        *response.status_mut() = status;
+        let media_type = HeaderValue::from_static(PROBLEM_MEDIA_TYPE);
+        response
+            .headers_mut()
+            .insert(header::CONTENT_TYPE, media_type);
+        response
+    }
+}

@@ -1,0 +1,60 @@
+//! `/v1/sites`.
+
+use axum::extract::State;
+use axum::http::StatusCode;
+use serde::Deserialize;
+use tread_api::ids::SiteId;
+use tread_api::page::Page;
+use tread_api::problem::ProblemBody;
+use tread_api::site::{CreateSite, Site};
+use utoipa::IntoParams;
+
+use super::extract::{Json, Path, Query, page_limit};
+use super::problem::Problem;
+use crate::app::App;
+
+/// Which page of a list.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct PageQuery {
+    /// `next_cursor` of the page before.
+    pub(super) cursor: Option<String>,
+    /// Most entries of the page, 1 to 1000; 100 when absent.
+    pub(super) limit: Option<u32>,
+}
+
+/// All sites.
+#[utoipa::path(get, path = "/v1/sites", tag = "sites", operation_id = "list_sites",
+    params(PageQuery),
+    responses((status = 200, body = Page<Site>), (status = 400, body = ProblemBody)))]
+pub(super) async fn list(
+    State(app): State<App>,
+    Query(query): Query<PageQuery>,
+) -> Result<Json<Page<Site>>, Problem> {
+    let limit = page_limit(query.limit)?;
+    Ok(Json(app.sites(query.cursor.as_deref(), limit).await?))
+}
+
+/// One site.
+#[utoipa::path(get, path = "/v1/sites/{site}", tag = "sites", operation_id = "get_site",
+    params(("site" = SiteId, Path)),
+    responses((status = 200, body = Site), (status = 404, body = ProblemBody)))]
+pub(super) async fn get(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+) -> Result<Json<Site>, Problem> {
+    Ok(Json(app.site(&site).await?))
+}
+
+/// Makes a site.
+#[utoipa::path(post, path = "/v1/sites", tag = "sites", operation_id = "create_site",
+    request_body = CreateSite,
+    responses((status = 201, body = Site), (status = 409, body = ProblemBody),
+        (status = 422, body = ProblemBody)))]
+pub(super) async fn create(
+    State(app): State<App>,
+    Json(request): Json<CreateSite>,
+) -> Result<(StatusCode, Json<Site>), Problem> {
+    Ok((StatusCode::CREATED, Json(app.create_site(request).await?)))
+}

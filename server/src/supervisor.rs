@@ -1,0 +1,143 @@
+//! The only place that starts tasks, and sees them end.
+//!
+//! A *vital* task runs for as long as the process: one that ends early, or panics, stops
+//! everything, and the process ends with a failure code so that its service manager starts it
+//! again. A *passing* task (a connection, a command to a robot) ends by itself; its panic is
+//! logged and harms nobody else.
+
+use std::future::Future;
+use std::panic::AssertUnwindSafe;
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+
+use futures_util::FutureExt as _;
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+use tracing::{debug, error};
+
+/// How long tasks may take to end after they were asked to.
+pub const STOP_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Why the server stopped without being asked to.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum Stopped {
+    /// A vital task returned before the stop.
+    #[error("task `{0}` ended early")]
+    EndedEarly(&'static str),
+    /// A vital task panicked.
+    #[error("task `{0}` panicked")]
+    Panicked(&'static str),
+    /// Tasks did not end in time after the stop.
+    #[error("tasks did not end within {} s", STOP_TIMEOUT.as_secs())]
+    StopTimeout,
+}
+
+/// Starts tasks and watches them; clones are handles to the same supervisor.
+#[derive(Debug, Clone, Default)]
+pub struct Supervisor {
+    tracker: TaskTracker,
+    stop: CancellationToken,
+    failure: Arc<OnceLock<Stopped>>,
+}
+
+impl Supervisor {
+    /// A supervisor of nothing yet.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// The token that is cancelled when everything is to stop.
+    pub fn stop_token(&self) -> CancellationToken {
+        self.stop.clone()
+    }
+
+    /// Starts a task that must run until the stop.
+    pub fn spawn_vital(&self, name: &'static str, task: impl Future<Output = ()> + Send + 'static) {
+        let (stop, failure) = (self.stop.clone(), Arc::clone(&self.failure));
+        self.tracker.spawn(async move {
+            let ended = AssertUnwindSafe(task).catch_unwind().await;
+            let stopped = match ended {
+                Ok(()) if stop.is_cancelled() => return debug!("task `{name}` ended"),
+                Ok(()) => Stopped::EndedEarly(name),
+                Err(_panic) => Stopped::Panicked(name),
+            };
+            error!("{stopped}: the server stops");
+            // Only the first failure counts; what follows is a consequence.
+            let _ = failure.set(stopped);
+            stop.cancel();
+        });
+    }
+
+    /// Starts a task that ends by itself.
+    pub fn spawn_passing(
+        &self,
+        name: &'static str,
+        task: impl Future<Output = ()> + Send + 'static,
+    ) {
+        self.tracker.spawn(async move {
+            if AssertUnwindSafe(task).catch_unwind().await.is_err() {
+                error!("task `{name}` panicked");
+            }
+        });
+    }
+
+    /// Runs what blocks its thread on a thread of its own kind.
+    ///
+    /// `None` if it panicked.
+    pub async fn blocking<T: Send + 'static>(
+        &self,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> Option<T> {
+        self.tracker.spawn_blocking(work).await.ok()
+    }
+
+    /// Waits until a vital task fails or a stop is asked for.
+    pub async fn stopping(&self) {
+        self.stop.cancelled().await;
+    }
+
+    /// Asks all tasks to stop, waits for them, and says why they stopped if nobody asked.
+    ///
+    /// # Errors
+    /// The first failure of a vital task, or [`Stopped::StopTimeout`].
+    pub async fn stop(&self) -> Result<(), Stopped> {
+        self.stop.cancel();
+        self.tracker.close();
+        let in_time = tokio::time::timeout(STOP_TIMEOUT, self.tracker.wait()).await;
+        match (self.failure.get(), in_time) {
+            (Some(failure), _) => Err(failure.clone()),
+            (None, Err(_elapsed)) => Err(Stopped::StopTimeout),
+            (None, Ok(())) => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_vital_task_that_panics_or_ends_stops_the_rest_and_is_named() {
+        let supervisor = Supervisor::new();
+        let stop = supervisor.stop_token();
+        supervisor.spawn_vital("patient", async move { stop.cancelled().await });
+        supervisor.spawn_vital("broken", async { panic!("on purpose") });
+        supervisor.stopping().await;
+        assert_eq!(supervisor.stop().await, Err(Stopped::Panicked("broken")));
+
+        let supervisor = Supervisor::new();
+        supervisor.spawn_vital("hasty", async {});
+        supervisor.stopping().await;
+        assert_eq!(supervisor.stop().await, Err(Stopped::EndedEarly("hasty")));
+    }
+
+    #[tokio::test]
+    async fn a_passing_task_may_end_or_panic_without_harm() {
+        let supervisor = Supervisor::new();
+        supervisor.spawn_passing("short", async {});
+        supervisor.spawn_passing("broken", async { panic!("on purpose") });
+        let answer = supervisor.blocking(|| 7).await;
+        assert_eq!(answer, Some(7));
+        assert_eq!(supervisor.stop().await, Ok(()));
+    }
+}

@@ -1,0 +1,261 @@
+//! A server in a temporary folder, a client, and what is sent between them.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use reqwest::StatusCode;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use serde_json::{Value, json};
+use tempfile::TempDir;
+use tread_api::friction::{Information, Segment};
+use tread_api::ids::{MissionId, RobotId, SiteId};
+use tread_api::mission::{Mission, MissionDetail, MissionState};
+use tread_api::robot::{RobotLimits, RobotModel};
+use tread_api::site::Cell;
+use tread_api::terrain::TerrainRef;
+use tread_api::wire::ingest::{MissionPhase, MissionReport, Record, RecordContent};
+use tread_api::wire::{self, Refusal};
+use tread_server::config::FrictionConfig;
+use tread_server::counters::CounterValues;
+use tread_server::{Config, RunningServer, Server};
+use zenoh::Wait as _;
+
+/// How long anything may take to come about.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(15);
+const LOOK_AGAIN: Duration = Duration::from_millis(10);
+
+pub(crate) fn site() -> SiteId {
+    "yard".parse().unwrap()
+}
+
+pub(crate) fn time(text: &str) -> Timestamp {
+    text.parse().unwrap()
+}
+
+/// Waits until a look gives something, and says what was seen last if it never does.
+pub(crate) async fn eventually<T, S: std::fmt::Debug>(
+    what: &str,
+    mut look: impl AsyncFnMut() -> Result<T, S>,
+) -> T {
+    let mut last = None;
+    let waiting = async {
+        loop {
+            match look().await {
+                Ok(found) => return found,
+                Err(seen) => last = Some(seen),
+            }
+            tokio::time::sleep(LOOK_AGAIN).await;
+        }
+    };
+    let found = tokio::time::timeout(PATIENCE, waiting).await;
+    found.unwrap_or_else(|_elapsed| panic!("not within {PATIENCE:?}: {what}; last seen: {last:?}"))
+}
+
+/// A server with its folder.
+pub(crate) struct Yard {
+    pub(crate) folder: Arc<TempDir>,
+    pub(crate) server: RunningServer,
+    client: reqwest::Client,
+}
+
+impl Yard {
+    pub(crate) async fn start() -> Self {
+        Self::start_in(Arc::new(tempfile::tempdir().unwrap()), "127.0.0.1:0").await
+    }
+
+    async fn start_in(folder: Arc<TempDir>, zenoh: &str) -> Self {
+        let config = Config {
+            http: "127.0.0.1:0".parse().unwrap(),
+            zenoh: zenoh.parse().unwrap(),
+            database: database(folder.path()),
+            site: site(),
+            friction: FrictionConfig::default(),
+        };
+        let server = Server::start(config).await.unwrap();
+        Self {
+            folder,
+            server,
+            client: reqwest::Client::new(),
+        }
+    }
+
+    /// Stops the server and starts another on the same database and network address.
+    pub(crate) async fn restart(self) -> Self {
+        let zenoh = self.server.zenoh_endpoint();
+        self.server.stop().await.unwrap();
+        Self::start_in(self.folder, zenoh.trim_start_matches("tcp/")).await
+    }
+
+    pub(crate) fn url(&self, path: &str) -> String {
+        format!("http://{}{path}", self.server.http_address())
+    }
+
+    pub(crate) fn client(&self) -> &reqwest::Client {
+        &self.client
+    }
+
+    pub(crate) async fn send(&self, request: reqwest::RequestBuilder) -> (StatusCode, Value) {
+        let response = request.send().await.unwrap();
+        let (status, text) = (response.status(), response.text().await.unwrap());
+        (
+            status,
+            serde_json::from_str(&text).unwrap_or(Value::String(text)),
+        )
+    }
+
+    pub(crate) async fn get_value(&self, path: &str) -> (StatusCode, Value) {
+        self.send(self.client.get(self.url(path))).await
+    }
+
+    pub(crate) async fn get<T: DeserializeOwned>(&self, path: &str) -> T {
+        let (status, body) = self.get_value(path).await;
+        assert_eq!(status, StatusCode::OK, "{path}: {body}");
+        serde_json::from_value(body).unwrap()
+    }
+
+    pub(crate) async fn post(&self, path: &str, body: &impl Serialize) -> (StatusCode, Value) {
+        self.send(self.client.post(self.url(path)).json(body)).await
+    }
+
+    pub(crate) async fn counters(&self) -> CounterValues {
+        let (_status, body) = self.get_value("/v1/server").await;
+        serde_json::from_value(body["counters"].clone()).unwrap()
+    }
+
+    /// Sends a circle mission.
+    pub(crate) async fn create_mission(&self, robot: &RobotId) -> Mission {
+        let (status, body) = self.post("/v1/missions", &circle(robot)).await;
+        assert_eq!(status, StatusCode::CREATED, "{body}");
+        serde_json::from_value(body).unwrap()
+    }
+
+    pub(crate) async fn mission(&self, id: MissionId) -> MissionDetail {
+        self.get(&format!("/v1/missions/{id}")).await
+    }
+
+    pub(crate) async fn mission_becomes(
+        &self,
+        id: MissionId,
+        state: MissionState,
+    ) -> MissionDetail {
+        let what = format!("mission is {}", state.as_str());
+        eventually(&what, async || {
+            let detail = self.mission(id).await;
+            if detail.mission.state == state {
+                Ok(detail)
+            } else {
+                Err(detail)
+            }
+        })
+        .await
+    }
+}
+
+pub(crate) fn database(folder: &Path) -> std::path::PathBuf {
+    folder.join("tread.db")
+}
+
+pub(crate) fn circle(robot: &RobotId) -> Value {
+    json!({
+        "site": "yard",
+        "robot": robot,
+        "trajectory": {"circle": {"center": {"x_m": 1.0, "y_m": 2.0}, "radius_m": 3.0,
+                                  "speed_m_s": 0.6}},
+    })
+}
+
+pub(crate) fn model() -> RobotModel {
+    RobotModel {
+        name: "test rover".to_owned(),
+        tyres: "lugged".to_owned(),
+        mass_kg: 50.0,
+        track_width_m: 0.6,
+        wheelbase_m: 0.5,
+        wheel_radius_m: 0.15,
+        yaw_inertia_kg_m2: 3.0,
+        limits: RobotLimits {
+            linear_max_m_s: 2.0,
+            angular_max_rad_s: 1.5,
+            linear_acceleration_max_m_s2: 1.0,
+            lateral_acceleration_max_m_s2: 1.0,
+            linear_jerk_max_m_s3: 5.0,
+            wheel_speed_max_rad_s: 20.0,
+            wheel_acceleration_max_rad_s2: 50.0,
+        },
+    }
+}
+
+/// A measurement of θ 0.2 with a deviation of 0.01, an hour apart for each 3600 of `second`.
+pub(crate) fn segment(cell: (i32, i32), theta: f64, second: i64) -> Segment {
+    let at = Timestamp::from_second(1_793_000_000 + second).unwrap();
+    Segment {
+        configuration: model().configuration(),
+        mission: None,
+        started_at: at,
+        ended_at: at,
+        grid_revision: 1,
+        cell: Cell {
+            ix: cell.0,
+            iy: cell.1,
+        },
+        terrain: Some(TerrainRef {
+            id: "lawn".parse().unwrap(),
+            revision: 1,
+        }),
+        theta: Information {
+            information: 1e4,
+            weighted: 1e4 * theta,
+        },
+        effective_track_ratio: None,
+        rolling_resistance: None,
+        mu_peak_lower_bound: Some(0.4),
+        samples: 100,
+        distance_m: 0.9,
+        saturation_ratio: 0.0,
+    }
+}
+
+pub(crate) fn report(mission: &Mission, phase: MissionPhase) -> RecordContent {
+    RecordContent::Mission(MissionReport {
+        mission: mission.id,
+        revision: mission.revision,
+        plan_hash: mission.plan_hash,
+        at: time("2026-11-01T00:00:01Z"),
+        phase,
+        reason: None,
+        progress: None,
+    })
+}
+
+pub(crate) fn measured(seq: u64, segment: Segment) -> Record {
+    Record {
+        seq,
+        content: RecordContent::Segment(segment),
+    }
+}
+
+/// Sends a query and reads its reply; `Err(None)` is no reply.
+pub(crate) async fn ask<T: DeserializeOwned + Send + 'static>(
+    session: &zenoh::Session,
+    key: String,
+    payload: Vec<u8>,
+) -> Result<T, Option<Refusal>> {
+    let session = session.clone();
+    let asking = tokio::task::spawn_blocking(move || {
+        let replies = session
+            .get(key)
+            .payload(payload)
+            .timeout(PATIENCE)
+            .wait()
+            .unwrap();
+        let reply = replies.recv().map_err(|_closed| None)?;
+        match reply.result() {
+            Ok(sample) => Ok(wire::decode(&sample.payload().to_bytes()).unwrap()),
+            Err(error) => Err(wire::decode(&error.payload().to_bytes()).ok()),
+        }
+    });
+    asking.await.unwrap()
+}

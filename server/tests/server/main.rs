@@ -1,0 +1,21 @@
+//! The server as its neighbours see it: real HTTP, real SQLite, real zenoh, and robots that are
+//! played by the test.
+
+#[cfg(test)]
+mod bad_input;
+#[cfg(test)]
+mod harness;
+#[cfg(test)]
+mod ingest;
+#[cfg(test)]
+mod missions;
+#[cfg(test)]
+mod network;
+#[cfg(test)]
+mod openapi;
+#[cfg(test)]
+mod program;
+#[cfg(test)]
+mod resources;
+#[cfg(test)]
+mod robot;

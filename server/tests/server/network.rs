@@ -1,0 +1,121 @@
+//! Messages that are not what they should be are refused with a reason and a counter.
+
+use tread_api::ids::RobotId;
+use tread_api::keys;
+use tread_api::wire;
+use tread_api::wire::ingest::{BATCH_RECORDS_MAX, Batch, Receipt};
+use tread_api::wire::{RefusalCode, hello::Welcome};
+use zenoh::Wait as _;
+
+use crate::harness::{Yard, ask, eventually, measured, segment, site};
+use crate::robot::{Robot, session};
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn lies_and_garbage_are_refused_with_a_reason_and_counted() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let key = || keys::ingest(&site(), &robot.id);
+    let refused = async |key: String, payload: Vec<u8>| {
+        let refusal = robot
+            .ask::<Receipt>(key, payload)
+            .await
+            .unwrap_err()
+            .unwrap();
+        (refusal.code, refusal.detail)
+    };
+    let (code, _) = refused(key(), b"\xff{".to_vec()).await;
+    assert_eq!(code, RefusalCode::Malformed);
+    let (code, detail) = refused(key(), br#"{"v":7,"body":{}}"#.to_vec()).await;
+    assert_eq!(code, RefusalCode::Version, "{detail}");
+    let other: RobotId = "rover-2".parse().unwrap();
+    let batch = Batch {
+        robot: other.clone(),
+        boot: robot.boot,
+        records: Vec::new(),
+    };
+    let (code, detail) = refused(key(), wire::encode(&batch).unwrap()).await;
+    assert_eq!(code, RefusalCode::Impersonation);
+    assert!(
+        detail.contains("rover-1") && detail.contains("rover-2"),
+        "{detail}"
+    );
+    let (code, _) = refused(keys::ingest(&site(), &other), wire::encode(&batch).unwrap()).await;
+    assert_eq!(code, RefusalCode::Busy, "a robot says hello first");
+    let long = Batch {
+        robot: robot.id.clone(),
+        boot: robot.boot,
+        records: (0..=BATCH_RECORDS_MAX as u64)
+            .map(|seq| measured(seq, segment((0, 0), 0.2, 0)))
+            .collect(),
+    };
+    let (code, _) = refused(key(), wire::encode(&long).unwrap()).await;
+    assert_eq!(code, RefusalCode::Malformed);
+    let counters = yard.counters().await;
+    assert_eq!(counters.refused_malformed, 1);
+    assert_eq!(counters.refused_version, 1);
+    assert_eq!(counters.refused_impersonation, 1);
+    assert_eq!(counters.segments_committed, 0);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_state_that_lies_does_not_show_and_the_server_goes_on() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let stranger = session(&yard).await;
+    let publish = async |key: String, payload: &'static [u8]| {
+        let stranger = stranger.clone();
+        tokio::task::spawn_blocking(move || stranger.put(key, payload).wait().unwrap())
+            .await
+            .unwrap();
+    };
+    publish(keys::state(&site(), &robot.id), b"[1,2").await;
+    publish(keys::state(&site(), &robot.id), br#"{"v":9,"body":{}}"#).await;
+    publish("tread/yard/robots/Not-One/state".to_owned(), b"{}").await;
+    eventually("all three are counted", async || {
+        let counters = yard.counters().await;
+        let refused = (
+            counters.refused_malformed,
+            counters.refused_version,
+            counters.refused_key,
+        );
+        if refused == (1, 1, 1) {
+            Ok(())
+        } else {
+            Err(refused)
+        }
+    })
+    .await;
+    robot
+        .upload(vec![measured(0, segment((0, 0), 0.2, 0))])
+        .await
+        .unwrap();
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_hello_to_an_unknown_site_or_of_an_impossible_robot_is_refused() {
+    let yard = Yard::start().await;
+    let stranger = session(&yard).await;
+    let robot: RobotId = "rover-1".parse().unwrap();
+    let mut hello = tread_api::wire::hello::Hello {
+        robot: robot.clone(),
+        boot: tread_api::ids::BootId::from_uuid(uuid::Uuid::from_u128(1)),
+        agent_version: "0".to_owned(),
+        model: crate::harness::model(),
+        robot_time: crate::harness::time("2026-11-01T00:00:00Z"),
+    };
+    let nowhere = "nowhere".parse().unwrap();
+    let key = keys::hello(&nowhere, &robot);
+    let answer = ask::<Welcome>(&stranger, key, wire::encode(&hello).unwrap()).await;
+    assert_eq!(answer.unwrap_err().unwrap().code, RefusalCode::UnknownSite);
+    hello.model.mass_kg = -1.0;
+    let key = keys::hello(&site(), &robot);
+    let answer = ask::<Welcome>(&stranger, key, wire::encode(&hello).unwrap()).await;
+    let refusal = answer.unwrap_err().unwrap();
+    assert_eq!(refusal.code, RefusalCode::Malformed);
+    assert!(refusal.detail.contains("mass_kg"), "{refusal:?}");
+    let (status, _) = yard.get_value("/v1/sites/yard/robots/rover-1").await;
+    assert_eq!(status, 404);
+    yard.server.stop().await.unwrap();
+}

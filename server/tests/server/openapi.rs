@@ -1,0 +1,60 @@
+//! The description of the API is part of the API.
+
+use std::path::Path;
+
+use crate::harness::Yard;
+
+#[test]
+fn the_description_is_the_committed_one() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("openapi.json");
+    let mut now = serde_json::to_string_pretty(&tread_server::http::openapi()).unwrap();
+    now.push('\n');
+    if std::env::var_os("UPDATE_OPENAPI").is_some() {
+        std::fs::write(&path, &now).unwrap();
+    }
+    let committed = std::fs::read_to_string(&path).unwrap_or_default();
+    assert!(
+        committed == now,
+        "run the tests with UPDATE_OPENAPI=1 and commit openapi.json"
+    );
+}
+
+#[test]
+fn every_operation_has_a_name_of_its_own() {
+    let description = serde_json::to_value(tread_server::http::openapi()).unwrap();
+    let mut names = Vec::new();
+    for (path, operations) in description["paths"].as_object().unwrap() {
+        for (method, operation) in operations.as_object().unwrap() {
+            let name = operation["operationId"].as_str();
+            names.push(
+                name.unwrap_or_else(|| panic!("{method} {path} has none"))
+                    .to_owned(),
+            );
+        }
+    }
+    let count = names.len();
+    names.sort();
+    names.dedup();
+    assert_eq!(names.len(), count, "{names:?}");
+    assert!(count >= 20, "{names:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_page_that_shows_it_needs_nothing_from_elsewhere() {
+    let yard = Yard::start().await;
+    let (status, page) = yard.get_value("/docs/").await;
+    assert_eq!(status, 200);
+    let page = page.as_str().unwrap().to_owned();
+    assert!(page.contains("swagger"), "{page}");
+    assert!(
+        !page.contains("https://") && !page.contains("http://"),
+        "{page}"
+    );
+    let (status, script) = yard.get_value("/docs/swagger-ui-bundle.js").await;
+    assert_eq!(status, 200);
+    assert!(script.as_str().unwrap().len() > 100_000);
+    let (status, description) = yard.get_value("/openapi.json").await;
+    assert_eq!(status, 200);
+    assert_eq!(description["info"]["title"], "Tread");
+    yard.server.stop().await.unwrap();
+}

@@ -1,0 +1,96 @@
+//! The program as a service manager sees it.
+
+use std::process::{Command, Output, Stdio};
+use std::time::Duration;
+
+use crate::harness::{PATIENCE, eventually};
+
+fn program(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tread-server"));
+    command
+        .args(arguments)
+        .env_remove("RUST_LOG")
+        .stdin(Stdio::null());
+    command
+}
+
+fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+#[test]
+fn a_wrong_key_in_the_configuration_stops_the_start_with_file_line_and_key() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("tread.toml");
+    std::fs::write(&file, "# mine\ndatabse = \"x.db\"\n").unwrap();
+    let output = program(&["--config", file.to_str().unwrap()])
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let said = said(&output);
+    for part in ["tread.toml", "line 2", "databse"] {
+        assert!(said.contains(part), "`{part}` in: {said}");
+    }
+    assert_eq!(
+        std::fs::read_dir(folder.path()).unwrap().count(),
+        1,
+        "no database was made"
+    );
+}
+
+#[test]
+fn an_address_that_others_can_reach_stops_the_start_with_a_sentence() {
+    let output = program(&["--http", "0.0.0.0:0"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    assert!(
+        said(&output).contains("other machines can reach"),
+        "{}",
+        said(&output)
+    );
+    let output = program(&["--no-such-flag"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(2));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_program_starts_makes_its_database_and_stops_when_asked() {
+    let folder = tempfile::tempdir().unwrap();
+    let database = folder.path().join("tread.db");
+    let log = std::fs::File::create(folder.path().join("log")).unwrap();
+    let arguments = [
+        "--http=127.0.0.1:0",
+        "--zenoh=127.0.0.1:0",
+        "--site=field",
+        "--log-format=json",
+    ];
+    let mut child = program(&arguments)
+        .arg(format!("--database={}", database.display()))
+        .stderr(log)
+        .spawn()
+        .unwrap();
+    let address = eventually("the API is up", async || {
+        let log = std::fs::read_to_string(folder.path().join("log")).unwrap();
+        let line = log
+            .lines()
+            .find(|line| line.contains("REST API on "))
+            .map(str::to_owned);
+        let address = line.and_then(|line| {
+            let rest = line.split("REST API on ").nth(1)?;
+            Some(rest.split(',').next()?.to_owned())
+        });
+        address.ok_or(log)
+    })
+    .await;
+    let site = reqwest::get(format!("{address}/v1/sites/field"))
+        .await
+        .unwrap();
+    assert_eq!(site.status(), 200);
+    assert!(database.is_file());
+    let asked = Command::new("kill")
+        .arg(child.id().to_string())
+        .status()
+        .unwrap();
+    assert!(asked.success());
+    let ended = tokio::task::spawn_blocking(move || child.wait().unwrap());
+    let ended = tokio::time::timeout(PATIENCE + Duration::from_secs(10), ended).await;
+    assert_eq!(ended.unwrap().unwrap().code(), Some(0));
+}

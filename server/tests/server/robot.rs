@@ -1,0 +1,297 @@
+//! A robot whose every word the test chooses.
+
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use serde::de::DeserializeOwned;
+use tread_api::ids::{BootId, RobotId};
+use tread_api::keys::{self, Key, Verb};
+use tread_api::mission::Mission;
+use tread_api::robot::{LoopStatus, MissionProgress, OutboxStatus, RobotMode};
+use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome};
+use tread_api::wire::hello::{Hello, SiteDefinition, Welcome};
+use tread_api::wire::ingest::{Batch, MissionPhase, Receipt, Record};
+use tread_api::wire::state::RobotState;
+use tread_api::wire::{self, Refusal};
+use tread_server::supervisor::Supervisor;
+use uuid::Uuid;
+use zenoh::Wait as _;
+
+use crate::harness::{PATIENCE, Yard, ask, eventually, model, report, site, time};
+
+/// What a played robot answers to an offer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Mood {
+    Willing,
+    Refusing(OfferRefusal),
+    Silent,
+}
+
+#[derive(Debug)]
+struct Heard {
+    mood: Mood,
+    offers: Vec<Offer>,
+    cancels: Vec<Cancel>,
+    sites: Vec<SiteDefinition>,
+}
+
+/// A robot on the network that says what the test tells it to.
+pub(crate) struct Robot {
+    pub(crate) id: RobotId,
+    pub(crate) boot: BootId,
+    session: zenoh::Session,
+    state: Arc<Mutex<RobotState>>,
+    heard: Arc<Mutex<Heard>>,
+    _token: zenoh::liveliness::LivelinessToken,
+    supervisor: Supervisor,
+}
+
+impl Drop for Robot {
+    fn drop(&mut self) {
+        self.supervisor.stop_token().cancel();
+        let _ = self.session.close().wait();
+    }
+}
+
+/// A session of a client of the server's router.
+pub(crate) async fn session(yard: &Yard) -> zenoh::Session {
+    let mut config = zenoh::Config::default();
+    let endpoint = format!("[\"{}\"]", yard.server.zenoh_endpoint());
+    for (key, value) in [
+        ("mode", "\"client\""),
+        ("connect/endpoints", endpoint.as_str()),
+        (
+            "connect/retry",
+            "{ period_init_ms: 50, period_max_ms: 200, period_increase_factor: 1.5 }",
+        ),
+        ("scouting/multicast/enabled", "false"),
+        ("scouting/gossip/enabled", "false"),
+    ] {
+        config.insert_json5(key, value).unwrap();
+    }
+    let opening = tokio::task::spawn_blocking(move || zenoh::open(config).wait());
+    tokio::time::timeout(PATIENCE, opening)
+        .await
+        .unwrap()
+        .unwrap()
+        .unwrap()
+}
+
+impl Robot {
+    pub(crate) async fn join(yard: &Yard, id: &str) -> Self {
+        Self::join_with_pending(yard, id, 0).await
+    }
+
+    /// Joins with that many records in its store.
+    pub(crate) async fn join_with_pending(yard: &Yard, id: &str, pending: u64) -> Self {
+        let id: RobotId = id.parse().unwrap();
+        let boot = BootId::from_uuid(Uuid::new_v4());
+        let session = session(yard).await;
+        let heard = Arc::new(Mutex::new(Heard {
+            mood: Mood::Willing,
+            offers: Vec::new(),
+            cancels: Vec::new(),
+            sites: Vec::new(),
+        }));
+        let state = Arc::new(Mutex::new(RobotState {
+            robot: id.clone(),
+            boot,
+            seq: 0,
+            robot_time: time("2026-11-01T00:00:00Z"),
+            mode: RobotMode::Idle,
+            fault: None,
+            pose: None,
+            twist: None,
+            mission: None,
+            terrain_revision: None,
+            outbox: OutboxStatus {
+                pending,
+                ..OutboxStatus::default()
+            },
+            control_loop: LoopStatus::default(),
+        }));
+        let (listener, holding) = (Arc::clone(&heard), Arc::clone(&state));
+        session
+            .declare_queryable(keys::commands(&site(), &id))
+            .complete(true)
+            .callback(move |query| answer(&query, boot, &listener, &holding))
+            .background()
+            .wait()
+            .unwrap();
+        let token = session
+            .liveliness()
+            .declare_token(keys::alive(&site(), &id, boot))
+            .wait()
+            .unwrap();
+        let publisher = session
+            .declare_publisher(keys::state(&site(), &id))
+            .wait()
+            .unwrap();
+        let said = Arc::clone(&state);
+        let supervisor = Supervisor::new();
+        let stop = supervisor.stop_token();
+        supervisor.spawn_vital("speaking", async move {
+            while !stop.is_cancelled() {
+                let payload = {
+                    let mut state = said.lock().unwrap();
+                    state.seq += 1;
+                    wire::encode(&*state).unwrap()
+                };
+                let _ = publisher.put(payload).wait();
+                tokio::time::sleep(Duration::from_millis(50)).await;
+            }
+        });
+        let robot = Self {
+            id,
+            boot,
+            session,
+            state,
+            heard,
+            _token: token,
+            supervisor,
+        };
+        robot.hello().await;
+        robot
+    }
+
+    /// Ends this run of the agent and begins another, which remembers nothing.
+    pub(crate) async fn reboot(self, yard: &Yard) -> Self {
+        let id = self.id.clone();
+        drop(self);
+        Self::join(yard, id.as_str()).await
+    }
+
+    async fn hello(&self) -> Welcome {
+        let hello = Hello {
+            robot: self.id.clone(),
+            boot: self.boot,
+            agent_version: "0.0.1".to_owned(),
+            model: model(),
+            robot_time: time("2026-11-01T00:00:00Z"),
+        };
+        let welcome: Welcome = eventually("the server answers a hello", async || {
+            self.ask(
+                keys::hello(&site(), &self.id),
+                wire::encode(&hello).unwrap(),
+            )
+            .await
+        })
+        .await;
+        self.state.lock().unwrap().terrain_revision = Some(welcome.site.terrain_revision);
+        welcome
+    }
+
+    /// Sends a query and reads its reply; `Err(None)` is no reply.
+    pub(crate) async fn ask<T: DeserializeOwned + Send + 'static>(
+        &self,
+        key: String,
+        payload: Vec<u8>,
+    ) -> Result<T, Option<Refusal>> {
+        ask(&self.session, key, payload).await
+    }
+
+    pub(crate) fn say(&self, change: impl FnOnce(&mut RobotState)) {
+        change(&mut self.state.lock().unwrap());
+    }
+
+    pub(crate) fn set_mood(&self, mood: Mood) {
+        self.heard.lock().unwrap().mood = mood;
+    }
+
+    pub(crate) fn offers(&self) -> Vec<Offer> {
+        self.heard.lock().unwrap().offers.clone()
+    }
+
+    pub(crate) fn sites(&self) -> Vec<SiteDefinition> {
+        self.heard.lock().unwrap().sites.clone()
+    }
+
+    pub(crate) fn cancels(&self) -> Vec<Cancel> {
+        self.heard.lock().unwrap().cancels.clone()
+    }
+
+    pub(crate) async fn upload_as(
+        &self,
+        boot: BootId,
+        records: Vec<Record>,
+    ) -> Result<Receipt, Option<Refusal>> {
+        let batch = Batch {
+            robot: self.id.clone(),
+            boot,
+            records,
+        };
+        let key = keys::ingest(&site(), &self.id);
+        self.ask(key, wire::encode(&batch).unwrap()).await
+    }
+
+    pub(crate) async fn upload(&self, records: Vec<Record>) -> Result<Receipt, Option<Refusal>> {
+        self.upload_as(self.boot, records).await
+    }
+
+    /// Reports on a mission by the acknowledged way.
+    pub(crate) async fn report(&self, seq: u64, mission: &Mission, phase: MissionPhase) -> Receipt {
+        self.upload(vec![Record {
+            seq,
+            content: report(mission, phase),
+        }])
+        .await
+        .unwrap()
+    }
+
+    /// Shows in its state that it drives a mission.
+    pub(crate) fn drive(&self, mission: &Mission, driven_m: f64) {
+        let progress = MissionProgress {
+            id: mission.id,
+            revision: mission.revision,
+            plan_hash: mission.plan_hash,
+            driven_m,
+            length_m: 18.85,
+            cross_track_m: 0.0,
+        };
+        self.say(|state| {
+            state.mode = RobotMode::Tracking;
+            state.mission = Some(progress);
+        });
+    }
+}
+
+fn answer(
+    query: &zenoh::query::Query,
+    boot: BootId,
+    heard: &Mutex<Heard>,
+    state: &Mutex<RobotState>,
+) {
+    let Some(Key::Command(_, _, verb)) = Key::parse(query.key_expr().as_str()) else {
+        return;
+    };
+    let payload = query.payload().unwrap().to_bytes();
+    let mut heard = heard.lock().unwrap();
+    let outcome = match verb {
+        Verb::Offer => {
+            heard.offers.push(wire::decode(&payload).unwrap());
+            match heard.mood {
+                Mood::Silent => return,
+                Mood::Refusing(code) => Outcome::Refused {
+                    code,
+                    detail: "as told".to_owned(),
+                },
+                Mood::Willing => Outcome::Accepted { plan: None },
+            }
+        }
+        Verb::Cancel => {
+            heard.cancels.push(wire::decode(&payload).unwrap());
+            Outcome::Done
+        }
+        Verb::Site => {
+            let definition: SiteDefinition = wire::decode(&payload).unwrap();
+            state.lock().unwrap().terrain_revision = Some(definition.terrain_revision);
+            heard.sites.push(definition);
+            Outcome::Done
+        }
+    };
+    let payload = wire::encode(&Answer { boot, outcome }).unwrap();
+    query
+        .reply(query.key_expr().clone(), payload)
+        .wait()
+        .unwrap();
+}

@@ -1,0 +1,203 @@
+//! Segments per second, with receipts, and whether each acknowledged one is stored exactly once.
+
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+use hdrhistogram::Histogram;
+use serde::Serialize;
+use sqlx::sqlite::SqliteConnectOptions;
+use sqlx::{ConnectOptions, Row};
+use tokio::task::JoinSet;
+use tokio::time::{Instant, MissedTickBehavior};
+use tread_tests::fleet::Fleet;
+use tread_tests::light_robot::LightRobot;
+use tread_tests::process::{Usage, usage_of};
+
+use crate::{Arguments, period_of};
+
+/// What the ingest measurement found.
+#[derive(Debug, Serialize)]
+pub(crate) struct Ingest {
+    pub(crate) seconds: f64,
+    pub(crate) segments_offered: u64,
+    pub(crate) segments_committed: u64,
+    pub(crate) segments_per_second: f64,
+    pub(crate) ack_p50_ms: f64,
+    pub(crate) ack_p99_ms: f64,
+    pub(crate) ack_max_ms: f64,
+    pub(crate) uploads_failed: u64,
+    pub(crate) states_published_per_second: f64,
+    pub(crate) server_cpu_us_per_segment: f64,
+    pub(crate) acknowledged_but_lost: i64,
+    pub(crate) counted_twice: i64,
+    pub(crate) server: Usage,
+    pub(crate) generator: Usage,
+}
+
+/// What one light robot did.
+struct Tally {
+    acks_us: Histogram<u64>,
+    offered: u64,
+    committed: u64,
+    failed: u64,
+    states: u64,
+}
+
+impl Tally {
+    fn new() -> anyhow::Result<Self> {
+        Ok(Self {
+            acks_us: Histogram::new(3)?,
+            offered: 0,
+            committed: 0,
+            failed: 0,
+            states: 0,
+        })
+    }
+}
+
+pub(crate) async fn measure(
+    arguments: &Arguments,
+    fleet: &mut Fleet,
+    robots: Vec<LightRobot>,
+) -> anyhow::Result<Ingest> {
+    let server_before = fleet.server_usage().context("the server is gone")?;
+    let begin = Instant::now();
+    let end = begin + Duration::from_secs(arguments.seconds);
+    let mut working = JoinSet::new();
+    let count = robots.len();
+    for (index, robot) in robots.into_iter().enumerate() {
+        let plan = UploadPlan::new(arguments, index, count)?;
+        working.spawn(async move { work(robot, plan, end).await });
+    }
+    let mut all = Tally::new()?;
+    while let Some(tally) = working.join_next().await {
+        let tally = tally??;
+        all.acks_us.add(&tally.acks_us)?;
+        all.offered += tally.offered;
+        all.committed += tally.committed;
+        all.failed += tally.failed;
+        all.states += tally.states;
+    }
+    let seconds = begin.elapsed().as_secs_f64();
+    let server = fleet.server_usage().context("the server is gone")?;
+    let generator = usage_of(std::process::id()).context("/proc is not readable")?;
+    let stored = count_stored(fleet).await?;
+    let committed = i64::try_from(all.committed)?;
+    #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
+    let (committed_f64, states_f64) = (all.committed as f64, all.states as f64);
+    #[expect(clippy::cast_precision_loss, reason = "microseconds far below 2^53")]
+    let quantile_ms = |quantile: f64| all.acks_us.value_at_quantile(quantile) as f64 / 1e3;
+    Ok(Ingest {
+        seconds,
+        segments_offered: all.offered,
+        segments_committed: all.committed,
+        segments_per_second: committed_f64 / seconds,
+        ack_p50_ms: quantile_ms(0.5),
+        ack_p99_ms: quantile_ms(0.99),
+        ack_max_ms: quantile_ms(1.0),
+        uploads_failed: all.failed,
+        states_published_per_second: states_f64 / seconds,
+        server_cpu_us_per_segment: 1e6 * (server.cpu_s - server_before.cpu_s)
+            / committed_f64.max(1.0),
+        // An upload without receipt may or may not be stored, so more may be there than was
+        // acknowledged, never less; the sums must hold each stored one once.
+        acknowledged_but_lost: (committed - stored.segments).max(0),
+        counted_twice: (stored.in_sums - stored.segments).abs() + stored.doubles,
+        server,
+        generator,
+    })
+}
+
+#[derive(Clone, Copy)]
+struct UploadPlan {
+    records: usize,
+    every: Duration,
+    first: Duration,
+    state_every: Duration,
+}
+
+impl UploadPlan {
+    fn new(arguments: &Arguments, index: usize, count: usize) -> anyhow::Result<Self> {
+        let every = Duration::from_millis(arguments.upload_every_ms);
+        let all_per_upload = f64::from(arguments.segments_per_second) * every.as_secs_f64();
+        let records = all_per_upload / f64::from(u32::try_from(count)?);
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "small"
+        )]
+        let records = records.round() as usize;
+        let most = tread_api::wire::ingest::BATCH_RECORDS_MAX;
+        ensure!(
+            (1..=most).contains(&records),
+            "{records} segments for each upload: choose --segments-per-second and \
+             --upload-every-ms so that it is 1 to {most}"
+        );
+        // The robots are spread over the period: they do not upload in step.
+        let first =
+            every.mul_f64(f64::from(u32::try_from(index)?) / f64::from(u32::try_from(count)?));
+        Ok(Self {
+            records,
+            every,
+            first,
+            state_every: period_of(arguments.state_rate_hz),
+        })
+    }
+}
+
+async fn work(mut robot: LightRobot, plan: UploadPlan, end: Instant) -> anyhow::Result<Tally> {
+    let mut tally = Tally::new()?;
+    let start = Instant::now() + plan.first;
+    let mut uploads = tokio::time::interval_at(start, plan.every);
+    // A late receipt does not lower the offered rate: what was missed is caught up.
+    uploads.set_missed_tick_behavior(MissedTickBehavior::Burst);
+    let mut states = tokio::time::interval_at(start, plan.state_every);
+    states.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    loop {
+        tokio::select! {
+            due = uploads.tick() => {
+                if due >= end {
+                    return Ok(tally);
+                }
+                let batch = robot.next_batch(plan.records);
+                tally.offered += batch.records.len() as u64;
+                match robot.upload(&batch).await {
+                    Ok((receipt, took)) => {
+                        tally.committed += receipt.committed;
+                        tally.acks_us.record(u64::try_from(took.as_micros())?)?;
+                    }
+                    Err(_) => tally.failed += 1,
+                }
+            }
+            _ = states.tick() => {
+                robot.publish_state().await?;
+                tally.states += 1;
+            }
+        }
+    }
+}
+
+/// What the database holds.
+struct Stored {
+    segments: i64,
+    doubles: i64,
+    in_sums: i64,
+}
+
+async fn count_stored(fleet: &Fleet) -> anyhow::Result<Stored> {
+    let options = SqliteConnectOptions::new()
+        .filename(fleet.database())
+        .read_only(true);
+    let mut connection = options.connect().await?;
+    let row = sqlx::query(
+        "SELECT count(*), count(*) - count(DISTINCT boot_pk || ':' || seq), \
+         (SELECT coalesce(sum(segments), 0) FROM cell_sums) FROM segments",
+    )
+    .fetch_one(&mut connection)
+    .await?;
+    Ok(Stored {
+        segments: row.try_get(0)?,
+        doubles: row.try_get(1)?,
+        in_sums: row.try_get(2)?,
+    })
+}

@@ -1,0 +1,105 @@
+//! `load`: what one server carries, with the generator on the same machine.
+//!
+//! Starts a server and a few real agents as processes of their own and any number of light robots
+//! in this one, then measures, one after the other:
+//!
+//! 1. **ingest**: every light robot uploads batches of segments at a fixed rate and waits for each
+//!    receipt; counted are segments committed, times to the receipt, and the server's processor
+//!    time; afterwards the database must hold each acknowledged segment exactly once.
+//! 2. **dispatch**: circles are sent over REST to real agents, one at a time, while the light
+//!    robots publish their states; counted is the time from the request to the first wheel command.
+
+mod dispatch;
+mod ingest;
+mod report;
+
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::Parser;
+use tread_tests::fleet::Fleet;
+use tread_tests::light_robot::LightRobot;
+
+use crate::report::Report;
+
+/// Measures what one server carries.
+#[derive(Debug, Parser)]
+#[command(name = "load")]
+pub(crate) struct Arguments {
+    /// Light robots
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=5_000))]
+    robots: u32,
+    /// Length of each measurement, seconds
+    #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u64).range(2..=3_600))]
+    seconds: u64,
+    /// Segments offered per second, of all robots together
+    #[arg(long, default_value_t = 24_000)]
+    segments_per_second: u32,
+    /// Time between two uploads of a robot, milliseconds
+    #[arg(long, default_value_t = 250, value_parser = clap::value_parser!(u64).range(10..=10_000))]
+    upload_every_ms: u64,
+    /// States published per second by each light robot
+    #[arg(long, default_value_t = 2.0)]
+    state_rate_hz: f64,
+    /// Real agents that missions are sent to
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=20))]
+    agents: u32,
+    /// Missions sent to each of them
+    #[arg(long, default_value_t = 25, value_parser = clap::value_parser!(u32).range(1..=1_000))]
+    missions: u32,
+    /// Print one JSON object instead of a table
+    #[arg(long)]
+    json: bool,
+}
+
+#[tokio::main]
+async fn main() -> anyhow::Result<ExitCode> {
+    let arguments = Arguments::parse();
+    // The executables of this package stand beside each other.
+    let node = std::env::current_exe()?.with_file_name("node");
+    anyhow::ensure!(
+        node.exists(),
+        "{} is missing: build it with `cargo build --release -p tread-tests --bins`",
+        node.display()
+    );
+    let mut fleet = Fleet::start_with(&node).await;
+    let robots = start_light_robots(&fleet, arguments.robots).await?;
+    let ingest = ingest::measure(&arguments, &mut fleet, robots).await?;
+    let dispatch = dispatch::measure(&arguments, &mut fleet).await?;
+    let report = Report::new(&arguments, ingest, dispatch);
+    report.print(arguments.json)?;
+    Ok(if report.holds() {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    })
+}
+
+/// Connects the light robots, a few at a time as a fleet does after a power cut with jitter.
+pub(crate) async fn start_light_robots(
+    fleet: &Fleet,
+    count: u32,
+) -> anyhow::Result<Vec<LightRobot>> {
+    const AT_ONCE: u32 = 20;
+    let endpoint = fleet.zenoh_endpoint();
+    let mut robots = Vec::new();
+    for first in (0..count).step_by(AT_ONCE as usize) {
+        let mut starting = tokio::task::JoinSet::new();
+        for number in first..count.min(first + AT_ONCE) {
+            let endpoint = endpoint.clone();
+            let site = fleet.site();
+            let id = format!("light-{number}").parse()?;
+            starting.spawn(async move { LightRobot::start(&endpoint, &site, id).await });
+        }
+        while let Some(started) = starting.join_next().await {
+            robots.push(started??);
+        }
+    }
+    Ok(robots)
+}
+
+/// A period as a duration; longer than any measurement when the rate is not above zero.
+pub(crate) fn period_of(rate_hz: f64) -> Duration {
+    const FOR_EVER: Duration = Duration::from_hours(24);
+    Duration::try_from_secs_f64(rate_hz.recip()).map_or(FOR_EVER, |period| period.min(FOR_EVER))
+}

@@ -1,0 +1,14 @@
+//! The server or an agent as a process of its own, for tests: `node server …`, `node agent …`.
+
+use std::ffi::OsString;
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    // What is left starts with the role, where a program expects its name.
+    let arguments: Vec<OsString> = std::env::args_os().skip(1).collect();
+    match arguments.first().and_then(|role| role.to_str()) {
+        Some("server") => tread_server::run_from_args(arguments),
+        Some("agent") => tread_agent::run_from_args(arguments),
+        _ => ExitCode::from(2),
+    }
+}

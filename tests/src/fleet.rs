@@ -1,0 +1,224 @@
+//! A server and its robots, each a process, in a folder of their own.
+
+use std::collections::HashMap;
+use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::path::{Path, PathBuf};
+use std::process::ExitStatus;
+
+use anyhow::Context;
+use serde_json::json;
+use tempfile::TempDir;
+use tread_api::ids::{RobotId, SiteId};
+use tread_api::robot::LinkState;
+
+use crate::process::{Process, Usage};
+use crate::relay::Relay;
+use crate::rest::Rest;
+use crate::wait::{SHORT, eventually};
+
+/// The site of every fleet.
+pub const SITE: &str = "yard";
+/// The terrain under every robot.
+pub const GROUND: &str = "slab";
+/// The true θ of that terrain.
+pub const GROUND_THETA: f64 = 0.4;
+/// Half of its side, metres.
+const GROUND_HALF_M: f64 = 500.0;
+
+/// A running fleet; everything ends when it is dropped.
+#[derive(Debug)]
+pub struct Fleet {
+    /// A client of the server.
+    pub rest: Rest,
+    node: PathBuf,
+    folder: TempDir,
+    http: SocketAddr,
+    zenoh: SocketAddr,
+    server: Option<Process>,
+    agents: HashMap<RobotId, Process>,
+}
+
+impl Fleet {
+    /// Starts a server with `node`, the executable that is a server or an agent, and draws the
+    /// terrain of the simulated ground.
+    ///
+    /// # Panics
+    /// If the server does not get ready.
+    pub async fn start_with(node: &Path) -> Self {
+        let (http, zenoh) = (free_address(), free_address());
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let mut fleet = Self {
+            rest: Rest::new(format!("http://{http}")),
+            node: node.to_owned(),
+            folder,
+            http,
+            zenoh,
+            server: None,
+            agents: HashMap::new(),
+        };
+        fleet.start_server().await;
+        let corner = |x: f64, y: f64| json!({"x_m": GROUND_HALF_M * x, "y_m": GROUND_HALF_M * y});
+        let polygon = [
+            corner(-1.0, -1.0),
+            corner(1.0, -1.0),
+            corner(1.0, 1.0),
+            corner(-1.0, 1.0),
+        ];
+        let terrain = json!({"id": GROUND, "class": "concrete", "polygon": polygon});
+        fleet
+            .rest
+            .post(&format!("/v1/sites/{SITE}/terrains"), &terrain)
+            .await;
+        fleet
+    }
+
+    /// The fleet's site.
+    pub fn site(&self) -> SiteId {
+        SITE.parse().expect("it is an identifier")
+    }
+
+    /// Where the server's router listens.
+    pub fn zenoh_endpoint(&self) -> String {
+        format!("tcp/{}", self.zenoh)
+    }
+
+    /// The database file.
+    pub fn database(&self) -> PathBuf {
+        self.folder.path().join("tread.db")
+    }
+
+    /// What the server process has used; `None` when it does not run.
+    pub fn server_usage(&self) -> Option<Usage> {
+        self.server.as_ref()?.usage()
+    }
+
+    /// Starts the server on the same ports and database as before, and waits until it is ready.
+    ///
+    /// # Panics
+    /// If it does not get ready.
+    pub async fn start_server(&mut self) {
+        let arguments = [
+            "server".to_owned(),
+            format!("--http={}", self.http),
+            format!("--zenoh={}", self.zenoh),
+            format!("--database={}", self.database().display()),
+            format!("--site={SITE}"),
+        ];
+        self.server = Some(self.start_process("server", &arguments));
+        let log = self.folder.path().join("server.log");
+        let look = || async {
+            let ready = self.rest.call(reqwest::Method::GET, "/readyz", None).await;
+            match ready {
+                Some((status, _)) if status.is_success() => Ok(()),
+                _ => Err(std::fs::read_to_string(&log)),
+            }
+        };
+        _ = eventually("the server is ready", SHORT, look, Result::is_ok).await;
+    }
+
+    /// Ends the server as a power cut would.
+    pub fn kill_server(&mut self) {
+        self.server = None;
+    }
+
+    /// Asks the server to stop.
+    ///
+    /// # Errors
+    /// It does not run, or did not stop in time.
+    pub async fn stop_server(&mut self) -> anyhow::Result<ExitStatus> {
+        self.server.take().context("no server runs")?.stop().await
+    }
+
+    /// Starts an agent whose robot stands at `(x_m, 0)` heading along x, and waits until the
+    /// server hears it.
+    ///
+    /// # Panics
+    /// If it is not heard.
+    pub async fn start_agent(&mut self, robot: &RobotId, x_m: f64) {
+        self.spawn_agent(robot, x_m);
+        self.robot_is_online(robot).await;
+    }
+
+    /// Starts an agent without waiting.
+    pub fn spawn_agent(&mut self, robot: &RobotId, x_m: f64) {
+        let endpoint = self.zenoh_endpoint();
+        self.spawn_agent_to(robot, x_m, &endpoint);
+    }
+
+    /// Starts an agent that reaches the server only through a relay.
+    ///
+    /// # Panics
+    /// If it is not heard.
+    pub async fn start_agent_behind_relay(&mut self, robot: &RobotId, x_m: f64) -> Relay {
+        let relay = Relay::start(self.zenoh).await.expect("a free port");
+        self.spawn_agent_to(robot, x_m, &format!("tcp/{}", relay.address()));
+        self.robot_is_online(robot).await;
+        relay
+    }
+
+    /// Waits until the server hears a robot and knows where it is.
+    ///
+    /// # Panics
+    /// If it is not heard.
+    pub async fn robot_is_online(&self, robot: &RobotId) {
+        let look = || self.rest.robot(robot);
+        eventually(&format!("{robot} is online"), SHORT, look, |seen| {
+            seen.as_ref().is_some_and(|seen| {
+                let placed = seen.live.as_ref().is_some_and(|live| live.pose.is_some());
+                seen.link == LinkState::Online && placed
+            })
+        })
+        .await;
+    }
+
+    fn spawn_agent_to(&mut self, robot: &RobotId, x_m: f64, endpoint: &str) {
+        let scenario = self.folder.path().join(format!("{robot}.scenario.toml"));
+        let stiffness = GROUND_THETA.recip();
+        let text = format!(
+            "site = \"{SITE}\"\ncell_m = 1.0\nterrains = []\n[ground]\nstiffness = {stiffness}\n\
+             [[robots]]\nid = \"{robot}\"\nx_m = {x_m:?}\ny_m = 0.0\nheading_rad = 0.0\nseed = 7\n"
+        );
+        std::fs::write(&scenario, text).expect("the temporary folder can be written");
+        let arguments = [
+            "agent".to_owned(),
+            format!("--site={SITE}"),
+            format!("--robot={robot}"),
+            format!("--server={endpoint}"),
+            format!(
+                "--data-dir={}",
+                self.folder.path().join(robot.as_str()).display()
+            ),
+            format!("--scenario={}", scenario.display()),
+        ];
+        let process = self.start_process(robot.as_str(), &arguments);
+        self.agents.insert(robot.clone(), process);
+    }
+
+    /// Ends an agent as a power cut would.
+    pub fn kill_agent(&mut self, robot: &RobotId) {
+        self.agents.remove(robot);
+    }
+
+    /// Asks an agent to stop.
+    ///
+    /// # Errors
+    /// It does not run, or did not stop in time.
+    pub async fn stop_agent(&mut self, robot: &RobotId) -> anyhow::Result<ExitStatus> {
+        self.agents
+            .remove(robot)
+            .context("no such agent runs")?
+            .stop()
+            .await
+    }
+
+    fn start_process(&self, name: &str, arguments: &[String]) -> Process {
+        let log = self.folder.path().join(format!("{name}.log"));
+        Process::start(name, &self.node, arguments, &log).expect("the node can be started")
+    }
+}
+
+/// A port of the loopback that is free now.
+fn free_address() -> SocketAddr {
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
+    listener.local_addr().expect("a bound port has an address")
+}

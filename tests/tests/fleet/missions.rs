@@ -1,0 +1,120 @@
+//! Robots drive what was asked for, and measure the ground while they do.
+
+use tread_api::friction::{StoredSegment, TerrainFriction};
+use tread_api::ids::RobotId;
+use tread_api::mission::{Actor, MissionDetail, MissionState};
+use tread_tests::fleet::{GROUND, GROUND_THETA, SITE};
+use tread_tests::wait::{DRIVE, SHORT, eventually};
+
+use crate::{arc, bend, fleet};
+
+fn states_of(detail: &MissionDetail) -> Vec<MissionState> {
+    let mut states: Vec<_> = detail.events.iter().map(|event| event.to).collect();
+    states.dedup();
+    states
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_circle_and_waypoints_reach_their_ends_and_the_ground_is_measured() {
+    let mut fleet = fleet().await;
+    let robot: RobotId = "rover-1".parse().unwrap();
+    fleet.start_agent(&robot, 0.0).await;
+    // Both at once: the second waits in the robot's queue.
+    let circle = fleet.rest.send(&robot, arc(0.0, 1.0)).await;
+    let path = fleet.rest.send(&robot, bend(0.0)).await;
+    for mission in [circle, path] {
+        let ended = fleet
+            .rest
+            .mission_reaches(mission, &[MissionState::Succeeded], DRIVE)
+            .await;
+        let expected = [
+            MissionState::Queued,
+            MissionState::Offered,
+            MissionState::Active,
+            MissionState::Succeeded,
+        ];
+        assert_eq!(states_of(&ended), expected, "{ended:#?}");
+        let plan = ended.mission.plan.expect("the robot told its plan");
+        let progress = ended.mission.progress.expect("the robot told its progress");
+        assert!(plan.length_m > 2.0, "{plan:?}");
+        assert!(progress.driven_m > 0.95 * progress.length_m, "{progress:?}");
+        assert_eq!(
+            ended.events.last().map(|event| event.actor),
+            Some(Actor::Robot)
+        );
+    }
+
+    let friction = format!("/v1/sites/{SITE}/friction/terrains/{GROUND}");
+    let measured = eventually(
+        "the ground is measured",
+        SHORT,
+        || fleet.rest.get::<TerrainFriction>(&friction),
+        |terrain| terrain.models.iter().any(|model| model.friction.is_some()),
+    )
+    .await;
+    let fused = measured.models[0].friction.expect("it was just seen");
+    assert!(
+        (fused.theta - GROUND_THETA).abs() < 0.25 * GROUND_THETA,
+        "θ {} measured on ground of θ {GROUND_THETA}",
+        fused.theta
+    );
+    let segments: Vec<StoredSegment> = fleet.rest.all(&format!("/v1/sites/{SITE}/segments")).await;
+    assert_eq!(segments.len() as u64, fused.segments);
+    assert!(segments.iter().all(|segment| segment.robot == robot));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn two_robots_drive_at_once() {
+    let mut fleet = fleet().await;
+    let robots: [RobotId; 2] = ["rover-1".parse().unwrap(), "rover-2".parse().unwrap()];
+    for (robot, x_m) in robots.iter().zip([0.0, 10.0]) {
+        fleet.start_agent(robot, x_m).await;
+    }
+    let first = fleet.rest.send(&robots[0], arc(0.0, 0.7)).await;
+    let second = fleet.rest.send(&robots[1], arc(10.0, 0.7)).await;
+    let both_active = eventually(
+        "both missions are active at once",
+        SHORT,
+        || async {
+            let (first, second) = (
+                fleet.rest.mission(first).await,
+                fleet.rest.mission(second).await,
+            );
+            (first.mission.state, second.mission.state)
+        },
+        |states| *states == (MissionState::Active, MissionState::Active),
+    );
+    both_active.await;
+    for mission in [first, second] {
+        fleet
+            .rest
+            .mission_reaches(mission, &[MissionState::Succeeded], DRIVE)
+            .await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_cancelled_mission_ends_and_the_next_one_starts() {
+    let mut fleet = fleet().await;
+    let robot: RobotId = "rover-1".parse().unwrap();
+    fleet.start_agent(&robot, 0.0).await;
+    let long = fleet.rest.send(&robot, arc(0.0, 20.0)).await;
+    let waiting = fleet.rest.send(&robot, arc(0.0, 20.0)).await;
+    let next = fleet.rest.send(&robot, bend(0.0)).await;
+    fleet
+        .rest
+        .mission_reaches(long, &[MissionState::Active], SHORT)
+        .await;
+    for mission in [waiting, long] {
+        let cancel = format!("/v1/missions/{mission}/cancel");
+        fleet.rest.post(&cancel, &serde_json::Value::Null).await;
+        fleet
+            .rest
+            .mission_reaches(mission, &[MissionState::Cancelled], SHORT)
+            .await;
+    }
+    fleet
+        .rest
+        .mission_reaches(next, &[MissionState::Succeeded], DRIVE)
+        .await;
+}
