@@ -16,6 +16,7 @@ pub const NAME_LENGTH_MAX: usize = 200;
 
 /// The squares in which friction is kept.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(try_from = "GridFields")]
 pub struct Grid {
     /// Counts changes of the grid; a segment names the one it was cut by.
     pub revision: u32,
@@ -46,6 +47,29 @@ impl Grid {
         Point {
             x_m: middle(cell.ix),
             y_m: middle(cell.iy),
+        }
+    }
+}
+
+#[derive(Deserialize)]
+struct GridFields {
+    revision: u32,
+    cell_m: f64,
+}
+
+/// Why something is not a grid.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[error("cell_m must be {CELL_MIN_M} to {CELL_MAX_M}, not {0}")]
+pub struct InvalidGrid(f64);
+
+impl TryFrom<GridFields> for Grid {
+    type Error = InvalidGrid;
+
+    fn try_from(GridFields { revision, cell_m }: GridFields) -> Result<Self, InvalidGrid> {
+        if (CELL_MIN_M..=CELL_MAX_M).contains(&cell_m) {
+            Ok(Self { revision, cell_m })
+        } else {
+            Err(InvalidGrid(cell_m))
         }
     }
 }
@@ -102,6 +126,15 @@ mod tests {
             let grid = Grid { revision: 1, cell_m };
             let cell = Cell { ix, iy };
             prop_assert_eq!(grid.cell_at(grid.center_of(cell)), Some(cell));
+        }
+    }
+
+    #[test]
+    fn a_grid_that_has_no_cells_is_refused_while_parsing() {
+        for cell_m in ["0", "-1", "1e-300", "1e9"] {
+            let text = format!(r#"{{"revision":1,"cell_m":{cell_m}}}"#);
+            let error = serde_json::from_str::<Grid>(&text).unwrap_err();
+            assert!(error.to_string().contains("cell_m"), "{error}");
         }
     }
 

@@ -13,6 +13,9 @@ use tread_api::trajectory::Waypoint;
 pub(crate) const SERVER_DEFAULT: &str = "http://127.0.0.1:8420";
 /// The site that a server makes for itself, unless told otherwise.
 pub(crate) const SITE_DEFAULT: &str = "yard";
+/// Least and most time between two looks of `tread watch`.
+const LOOK_EVERY_MIN: Duration = Duration::from_millis(100);
+const LOOK_EVERY_MAX: Duration = Duration::from_hours(1);
 /// Most robots of a demo; each is a process of its own.
 const DEMO_ROBOTS_MAX: i64 = 50;
 
@@ -93,13 +96,13 @@ impl RemoteCommand {
 #[derive(Debug, Clone, Args)]
 pub(crate) struct Connection {
     /// Address of the server
-    #[arg(long, env = "TREAD_SERVER", default_value = SERVER_DEFAULT, value_name = "URL")]
+    #[arg(long, global = true, env = "TREAD_SERVER", default_value = SERVER_DEFAULT, value_name = "URL")]
     pub(crate) server: String,
     /// Site to look at
-    #[arg(long, env = "TREAD_SITE", default_value = SITE_DEFAULT)]
+    #[arg(long, global = true, env = "TREAD_SITE", default_value = SITE_DEFAULT)]
     pub(crate) site: SiteId,
-    /// Print JSON as the server sent it instead of a table
-    #[arg(long)]
+    /// Print JSON instead of a table
+    #[arg(long, global = true)]
     pub(crate) json: bool,
 }
 
@@ -144,16 +147,16 @@ pub(crate) struct Order {
 #[derive(Debug, Args)]
 pub(crate) struct SendCircle {
     /// Centre in the site's frame, metres
-    #[arg(long, value_name = "X,Y", value_parser = point, allow_hyphen_values = true)]
+    #[arg(long, value_name = "X,Y", value_parser = point)]
     pub(crate) center: Point,
     /// Radius, metres
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = finite, allow_negative_numbers = true)]
     pub(crate) radius: f64,
     /// Speed along the circle, metres per second
-    #[arg(long, value_name = "M/S", default_value_t = 0.5)]
+    #[arg(long, value_name = "M/S", default_value_t = 0.5, value_parser = finite, allow_negative_numbers = true)]
     pub(crate) speed: f64,
     /// How many turns
-    #[arg(long, default_value_t = 1.0)]
+    #[arg(long, default_value_t = 1.0, value_parser = finite, allow_negative_numbers = true)]
     pub(crate) turns: f64,
     /// Drive clockwise
     #[arg(long)]
@@ -168,7 +171,6 @@ pub(crate) struct SendWaypoints {
     #[arg(
         value_name = "X,Y",
         value_parser = waypoint,
-        allow_hyphen_values = true,
         required_unless_present = "file"
     )]
     pub(crate) points: Vec<Waypoint>,
@@ -176,7 +178,7 @@ pub(crate) struct SendWaypoints {
     #[arg(long, value_name = "FILE", conflicts_with = "points")]
     pub(crate) file: Option<PathBuf>,
     /// Speed, metres per second
-    #[arg(long, value_name = "M/S", default_value_t = 0.5)]
+    #[arg(long, value_name = "M/S", default_value_t = 0.5, value_parser = finite, allow_negative_numbers = true)]
     pub(crate) speed: f64,
     #[command(flatten)]
     pub(crate) order: Order,
@@ -231,7 +233,7 @@ pub(crate) struct FrictionArguments {
 #[derive(Debug, Args)]
 pub(crate) struct WatchArguments {
     /// Time between two looks
-    #[arg(long, value_name = "TIME", default_value = "500ms", value_parser = duration)]
+    #[arg(long, value_name = "TIME", default_value = "500ms", value_parser = look_interval)]
     pub(crate) every: Duration,
     #[command(flatten)]
     pub(crate) connection: Connection,
@@ -276,6 +278,35 @@ fn duration(text: &str) -> Result<Duration, String> {
         .parse()
         .map_err(|_| format!("`{number}` is not a number"))?;
     Duration::try_from_secs_f64(number * seconds_per_unit).map_err(|error| error.to_string())
+}
+
+/// Reads the time between two looks: often enough to be of use, not so often that it is a load.
+fn look_interval(text: &str) -> Result<Duration, String> {
+    let every = duration(text)?;
+    if (LOOK_EVERY_MIN..=LOOK_EVERY_MAX).contains(&every) {
+        Ok(every)
+    } else {
+        Err(format!(
+            "give a time from {LOOK_EVERY_MIN:?} to {LOOK_EVERY_MAX:?}"
+        ))
+    }
+}
+
+/// Reads a number; what is no finite one could not be said in JSON.
+fn finite(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(number) if number.is_finite() => Ok(number),
+        _ => Err("give a number".to_owned()),
+    }
+}
+
+/// Marks arguments like `-4,2.5` as values: with a space in front they are no options.
+pub(crate) fn shield_negative_points(argument: OsString) -> OsString {
+    let is_point = |text: &&str| text.starts_with('-') && coordinates(text).is_ok();
+    match argument.to_str().filter(is_point) {
+        Some(point) => format!(" {point}").into(),
+        None => argument,
+    }
 }
 
 fn coordinates(text: &str) -> Result<(f64, f64), String> {
@@ -326,20 +357,21 @@ mod tests {
     }
 
     #[test]
-    fn negative_coordinates_are_values_and_no_options() {
-        let line = [
-            "tread", "send", "circle", "--robot", "r", "--center", "-1.5,-2", "--radius", "3",
-        ];
-        assert!(Arguments::try_parse_from(line).is_ok());
-        let line = [
-            "tread",
-            "send",
-            "waypoints",
-            "--robot",
-            "r",
-            "0,0",
-            "-4,2.5",
-        ];
-        assert!(Arguments::try_parse_from(line).is_ok());
+    fn negative_coordinates_are_values_wherever_options_stand() {
+        for line in [
+            "tread send circle --center -1.5,-2 --radius 3 --robot r",
+            "tread send waypoints --robot r 0,0 -4,2.5",
+            "tread send waypoints -4,2.5 0,0 --robot r --start-within 5s",
+            "tread send circle --robot r --center 0,0 --radius 3 --speed -1",
+            "tread missions show 0192f0c1-2b3c-7d4e-8f50-617283940a1b --json",
+        ] {
+            let words = line
+                .split(' ')
+                .map(OsString::from)
+                .map(shield_negative_points);
+            if let Err(refused) = Arguments::try_parse_from(words) {
+                panic!("`{line}` was refused: {refused}");
+            }
+        }
     }
 }

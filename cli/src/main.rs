@@ -17,16 +17,26 @@ use clap::Parser;
 use crate::args::{Arguments, Command};
 
 fn main() -> ExitCode {
-    match Arguments::parse().command {
+    let words = std::env::args_os().map(args::shield_negative_points);
+    match Arguments::parse_from(words).command {
         Command::Server(arguments) => {
+            die_with_the_demo();
             tread_server::run_from_args(arguments.for_program("tread-server"))
         }
         Command::Agent(arguments) => {
+            die_with_the_demo();
             tread_agent::run_from_args(arguments.for_program("tread-agent"))
         }
         Command::Demo(arguments) => finish(demo::run(arguments)),
         Command::Remote(command) => finish(commands::run(command)),
     }
+}
+
+/// Asks the kernel to end this process when the demo that started it is gone, however it ended.
+fn die_with_the_demo() {
+    // Where the kernel cannot, a demo that is killed leaves its parts behind.
+    #[cfg(target_os = "linux")]
+    let _unsupported = nix::sys::prctl::set_pdeathsig(nix::sys::signal::Signal::SIGTERM);
 }
 
 /// Runs a command to its end and turns what went wrong into a sentence and an exit code.

@@ -1,6 +1,7 @@
 //! The agent as a program: logging → configuration → start → wait → stop.
 
 use std::ffi::OsString;
+use std::io::IsTerminal as _;
 use std::process::ExitCode;
 
 use anyhow::Context;
@@ -39,7 +40,8 @@ fn init_logging(flags: &Flags) {
     let filter = EnvFilter::try_new(&flags.log).unwrap_or_else(|_| EnvFilter::new("info"));
     let subscriber = tracing_subscriber::fmt()
         .with_env_filter(filter)
-        .with_writer(std::io::stderr);
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal());
     // A process that has a subscriber already keeps it.
     let _ = match flags.log_format {
         LogFormat::Human => subscriber.try_init(),

@@ -57,6 +57,8 @@ counters! {
     refused_version,
     /// Messages that name another robot than their key.
     refused_impersonation,
+    /// States and friction reports of robots that have not said hello.
+    refused_unknown_robot,
     /// Messages to a site that is not known.
     refused_unknown_site,
     /// Messages on a key that is none of ours.

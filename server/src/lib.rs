@@ -69,6 +69,7 @@ impl Server {
         let db = Db::open(&config.database).await?;
         let app = App::new(db, clock, config.friction);
         app.ensure_site(&config.site).await?;
+        app.know_robots().await?;
         let listener = TcpListener::bind(config.http)
             .await
             .with_context(|| format!("cannot listen for HTTP on {}", config.http))?;

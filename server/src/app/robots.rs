@@ -54,6 +54,19 @@ impl App {
         }
     }
 
+    /// Learns from the database which robots have said hello before, so that they need not say it
+    /// again to be heard.
+    ///
+    /// # Errors
+    /// The database failed.
+    pub async fn know_robots(&self) -> Result<(), AppError> {
+        let mut tx = self.db().read().await?;
+        for key in db::robots::names(&mut tx).await? {
+            self.presences().know(key);
+        }
+        Ok(())
+    }
+
     /// Takes a robot's introduction and answers with its site.
     ///
     /// # Errors

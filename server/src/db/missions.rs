@@ -1,5 +1,6 @@
 //! Missions and their histories.
 
+use futures_util::StreamExt as _;
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
@@ -98,10 +99,6 @@ macro_rules! missions {
     };
 }
 
-fn rows(raw: Vec<Raw>) -> Result<Vec<MissionRow>, DbError> {
-    raw.into_iter().map(MissionRow::try_from).collect()
-}
-
 /// Adds a mission.
 pub async fn insert(db: &mut SqliteConnection, row: &MissionRow) -> Result<(), DbError> {
     let mission = &row.mission;
@@ -150,17 +147,20 @@ pub struct MissionFilter {
     pub before: Option<MissionId>,
 }
 
-/// Missions, newest first.
+/// Missions, newest first, until there are `limit` or their trajectories pass `bytes_max`; and
+/// whether there are more.
 pub async fn list(
     db: &mut SqliteConnection,
     filter: &MissionFilter,
     limit: u32,
-) -> Result<Vec<MissionRow>, DbError> {
+    bytes_max: usize,
+) -> Result<(Vec<MissionRow>, bool), DbError> {
     let site = filter.site.as_ref().map(SiteId::as_str);
     let robot = filter.robot.as_ref().map(RobotId::as_str);
     let state = filter.state.map(MissionState::as_str);
     let before = filter.before.map(|id| id.to_string());
-    let raw = missions!(
+    let limit_and_one = i64::from(limit) + 1;
+    let query = missions!(
         "WHERE (?1 IS NULL OR sites.id = ?1) AND (?2 IS NULL OR robots.id = ?2)
            AND (?3 IS NULL OR missions.state = ?3) AND (?4 IS NULL OR missions.id < ?4)
          ORDER BY missions.id DESC LIMIT ?5",
@@ -168,11 +168,19 @@ pub async fn list(
         robot,
         state,
         before,
-        limit,
-    )
-    .fetch_all(db)
-    .await?;
-    rows(raw)
+        limit_and_one,
+    );
+    let mut found = query.fetch(db);
+    let (mut rows, mut bytes) = (Vec::new(), 0);
+    while let Some(raw) = found.next().await {
+        let raw = raw?;
+        if rows.len() >= limit as usize || bytes > bytes_max {
+            return Ok((rows, true));
+        }
+        bytes += raw.trajectory.len();
+        rows.push(MissionRow::try_from(raw)?);
+    }
+    Ok((rows, false))
 }
 
 /// Where an open mission stands, without what is to be driven, which may be long.

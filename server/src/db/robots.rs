@@ -203,3 +203,16 @@ pub async fn configuration_key(
     let found = sqlx::query_scalar!(r#"SELECT pk AS "pk!" FROM configurations WHERE id = ?"#, id);
     Ok(found.fetch_one(db).await?)
 }
+
+/// The names of all robots of all sites.
+pub async fn names(db: &mut SqliteConnection) -> Result<Vec<(SiteId, RobotId)>, DbError> {
+    let raw = sqlx::query!(
+        "SELECT sites.id AS site, robots.id AS robot
+         FROM robots JOIN sites ON sites.pk = robots.site_pk"
+    )
+    .fetch_all(db)
+    .await?;
+    raw.into_iter()
+        .map(|row| Ok((parse("site", &row.site)?, parse("robot", &row.robot)?)))
+        .collect()
+}

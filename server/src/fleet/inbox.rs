@@ -3,7 +3,7 @@
 use tokio::sync::mpsc;
 use tokio::sync::mpsc::error::TrySendError;
 use tokio_util::sync::CancellationToken;
-use tracing::{info, warn};
+use tracing::{debug, info, warn};
 use tread_api::keys::{self, Key};
 use tread_api::wire::state::{FrictionReport, RobotState};
 use tread_api::wire::{self, WireError};
@@ -11,7 +11,7 @@ use zenoh::query::Query;
 use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait as _};
 
-use super::presence::RobotKey;
+use super::presence::{Heard, RobotKey};
 use super::requests;
 use crate::app::App;
 use crate::app::ingest::Upload;
@@ -163,18 +163,22 @@ async fn read_states(app: App, mut published: mpsc::Receiver<Published>, stop: C
         match Key::parse(&message.key) {
             Some(Key::State(site, robot)) => {
                 let named = |state: &RobotState| state.robot == robot;
-                let key = (site, robot.clone());
-                if let Some(state) = read(&app, &message, named)
-                    && app.presences().state(key, state, now)
-                {
-                    app.wake();
+                let key: RobotKey = (site, robot.clone());
+                if let Some(state) = read(&app, &message, named) {
+                    match app.presences().state(&key, state, now) {
+                        Heard::News => app.wake(),
+                        Heard::Nothing => {}
+                        Heard::Stranger => refuse_stranger(&app, &key),
+                    }
                 }
             }
             Some(Key::Friction(site, robot)) => {
                 let named = |report: &FrictionReport| report.robot == robot;
                 let key: RobotKey = (site, robot.clone());
-                if let Some(report) = read(&app, &message, named) {
-                    app.presences().friction(key, &report, now);
+                if let Some(report) = read(&app, &message, named)
+                    && app.presences().friction(&key, &report, now) == Heard::Stranger
+                {
+                    refuse_stranger(&app, &key);
                 }
             }
             Some(_) | None => refuse_key(&app, &message.key),
@@ -236,6 +240,12 @@ pub(super) fn count_refusal(app: &App, error: &WireError) {
 /// An error with its cause, on one line.
 pub(super) fn explained(error: &WireError) -> String {
     wire::Refusal::from(error).detail
+}
+
+/// Counts and logs a message of a robot that is not known.
+fn refuse_stranger(app: &App, (site, robot): &RobotKey) {
+    app.counters().refused_unknown_robot.one();
+    debug!("a message of robot `{robot}` of site `{site}` was refused: it has not said hello");
 }
 
 /// Counts and logs a key that is none of ours.

@@ -39,6 +39,15 @@ pub enum FleetError {
         /// What zenoh says.
         reason: String,
     },
+    /// Another program listens there.
+    #[error("cannot listen for robots on {address}")]
+    InUse {
+        /// Where.
+        address: SocketAddr,
+        /// Why.
+        #[source]
+        cause: std::io::Error,
+    },
     /// No port is free.
     #[error("no port is free on {address}")]
     NoPort {
@@ -65,6 +74,8 @@ impl Fleet {
     /// [`FleetError`]: the address is in use, or zenoh refuses it.
     pub async fn open(address: SocketAddr, supervisor: Supervisor) -> Result<Self, FleetError> {
         let address = with_free_port(address)?;
+        // Asked here because the operating system's own words are clearer than zenoh's.
+        drop(TcpListener::bind(address).map_err(|cause| FleetError::InUse { address, cause })?);
         let failed = |reason: String| FleetError::Open { address, reason };
         let config = config(address).map_err(|error| failed(error.to_string()))?;
         let opening = supervisor.blocking(move || zenoh::open(config).wait());

@@ -12,12 +12,28 @@ use tread_api::wire::state::{FrictionReport, RobotState};
 /// How long after its last word a robot counts as heard.
 pub const ONLINE_TIMEOUT: Duration = Duration::from_millis(1_500);
 
+/// Most robots that are kept track of before they have said hello.
+const STRANGERS_MAX: usize = 20_000;
+
+/// What became of a robot's message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Heard {
+    /// It tells nothing that lets a mission go on.
+    Nothing,
+    /// It may let a mission go on: another mode or mission, another revision of the terrains, a
+    /// store that became empty, or a robot heard again.
+    News,
+    /// The robot has not said hello; nothing of it is kept.
+    Stranger,
+}
+
 /// A robot's name with its site.
 pub type RobotKey = (SiteId, RobotId);
 
 /// What is known of one robot now.
 #[derive(Debug, Clone, Default)]
 pub struct Presence {
+    welcomed: bool,
     tokens: BTreeSet<BootId>,
     boot: Option<(BootId, Duration)>,
     heard_at: Option<Duration>,
@@ -128,13 +144,17 @@ impl Presences {
     pub fn present_count(&self) -> usize {
         self.lock()
             .values()
-            .filter(|presence| !presence.tokens.is_empty())
+            .filter(|presence| presence.welcomed && !presence.tokens.is_empty())
             .count()
     }
 
     /// A robot's token appeared.
     pub fn token_appeared(&self, key: RobotKey, boot: BootId, now: Duration) {
         let mut robots = self.lock();
+        // A token may come before its robot's hello; only so many of them are remembered.
+        if !robots.contains_key(&key) && robots.len() >= STRANGERS_MAX {
+            return;
+        }
         let presence = robots.entry(key).or_default();
         presence.tokens.insert(boot);
         presence.enter_boot(boot, now);
@@ -142,27 +162,38 @@ impl Presences {
 
     /// A robot's token is gone.
     pub fn token_gone(&self, key: &RobotKey, boot: BootId) {
-        if let Some(presence) = self.lock().get_mut(key) {
+        let mut robots = self.lock();
+        if let Some(presence) = robots.get_mut(key) {
             presence.tokens.remove(&boot);
+            if !presence.welcomed && presence.tokens.is_empty() {
+                robots.remove(key);
+            }
         }
+    }
+
+    /// A robot that said hello to an earlier run of this server.
+    pub fn know(&self, key: RobotKey) {
+        self.lock().entry(key).or_default().welcomed = true;
     }
 
     /// A robot introduced itself.
     pub fn hello(&self, key: RobotKey, boot: BootId, now: Duration) {
         let mut robots = self.lock();
         let presence = robots.entry(key).or_default();
+        presence.welcomed = true;
         presence.enter_boot(boot, now);
         presence.heard_at = Some(now);
     }
 
-    /// A robot sent its state. `true` if that may let a mission go on: another mode or mission,
-    /// another revision of the terrains, a store that became empty, or a robot heard again.
-    pub fn state(&self, key: RobotKey, state: RobotState, now: Duration) -> bool {
+    /// A robot sent its state.
+    pub fn state(&self, key: &RobotKey, state: RobotState, now: Duration) -> Heard {
         let mut robots = self.lock();
-        let presence = robots.entry(key).or_default();
+        let Some(presence) = robots.get_mut(key).filter(|presence| presence.welcomed) else {
+            return Heard::Stranger;
+        };
         let was_online = presence.link(now) == LinkState::Online;
         if !presence.takes(state.boot, now) {
-            return false;
+            return Heard::Nothing;
         }
         let news = presence.state().is_none_or(|before| {
             before.mode != state.mode
@@ -172,16 +203,23 @@ impl Presences {
         });
         presence.heard_at = Some(now);
         presence.state = Some((state, now));
-        news || !was_online
+        if news || !was_online {
+            Heard::News
+        } else {
+            Heard::Nothing
+        }
     }
 
     /// A robot sent both of its friction estimates.
-    pub fn friction(&self, key: RobotKey, report: &FrictionReport, now: Duration) {
+    pub fn friction(&self, key: &RobotKey, report: &FrictionReport, now: Duration) -> Heard {
         let mut robots = self.lock();
-        let presence = robots.entry(key).or_default();
+        let Some(presence) = robots.get_mut(key).filter(|presence| presence.welcomed) else {
+            return Heard::Stranger;
+        };
         if presence.takes(report.boot, now) {
             presence.friction = Some((report.friction, now));
         }
+        Heard::Nothing
     }
 }
 
@@ -224,9 +262,10 @@ mod tests {
         let presences = Presences::default();
         let link = |now| presences.get(&key()).link(now);
         assert_eq!(link(SECOND), LinkState::Offline);
+        presences.hello(key(), boot(1), SECOND);
+        assert_eq!(link(SECOND), LinkState::Offline);
         presences.token_appeared(key(), boot(1), SECOND);
-        assert_eq!(link(SECOND), LinkState::Stale, "present, but not heard yet");
-        presences.state(key(), state(boot(1), 0), SECOND);
+        presences.state(&key(), state(boot(1), 0), SECOND);
         assert_eq!(link(2 * SECOND), LinkState::Online);
         assert_eq!(link(3 * SECOND), LinkState::Stale);
         presences.token_gone(&key(), boot(1));
@@ -237,21 +276,41 @@ mod tests {
     fn a_blip_of_the_token_is_no_restart_and_a_straggler_of_the_old_run_changes_nothing() {
         let presences = Presences::default();
         presences.token_appeared(key(), boot(1), SECOND);
-        presences.state(key(), state(boot(1), 7), SECOND);
+        presences.hello(key(), boot(1), SECOND);
+        presences.state(&key(), state(boot(1), 7), SECOND);
         presences.token_gone(&key(), boot(1));
         presences.token_appeared(key(), boot(1), 2 * SECOND);
         assert_eq!(presences.get(&key()).state().unwrap().seq, 7);
         presences.token_appeared(key(), boot(2), 3 * SECOND);
         assert!(presences.get(&key()).state().is_none());
-        assert!(!presences.state(key(), state(boot(1), 8), 3 * SECOND));
+        assert_eq!(
+            presences.state(&key(), state(boot(1), 8), 3 * SECOND),
+            Heard::Nothing
+        );
         assert_eq!(presences.get(&key()).boot(), Some((boot(2), 3 * SECOND)));
     }
 
     #[test]
     fn ages_grow_until_the_robot_speaks_again() {
         let presences = Presences::default();
-        presences.state(key(), state(boot(1), 0), SECOND);
+        presences.hello(key(), boot(1), SECOND);
+        presences.state(&key(), state(boot(1), 0), SECOND);
         let live = presences.get(&key()).live(4 * SECOND).unwrap();
         assert_eq!(live.heard_age_ms, 3_000);
+    }
+
+    #[test]
+    fn of_a_robot_that_said_no_hello_nothing_is_kept() {
+        let presences = Presences::default();
+        let heard = presences.state(&key(), state(boot(1), 0), SECOND);
+        assert_eq!(heard, Heard::Stranger);
+        presences.token_appeared(key(), boot(1), SECOND);
+        assert_eq!(presences.present_count(), 0);
+        assert_eq!(
+            presences.state(&key(), state(boot(1), 0), SECOND),
+            Heard::Stranger
+        );
+        presences.token_gone(&key(), boot(1));
+        assert!(presences.lock().is_empty());
     }
 }

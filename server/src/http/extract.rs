@@ -31,7 +31,7 @@ pub(super) struct BodyLimit(pub(super) usize);
 #[derive(Debug, Clone)]
 pub struct Json<T>(pub T);
 
-impl<S: Send + Sync, T: DeserializeOwned> FromRequest<S> for Json<T> {
+impl<S: Send + Sync, T: DeserializeOwned + Serialize> FromRequest<S> for Json<T> {
     type Rejection = Problem;
 
     async fn from_request(request: Request, _state: &S) -> Result<Self, Problem> {
@@ -93,7 +93,7 @@ async fn read(body: Body, BodyLimit(limit): BodyLimit) -> Result<Vec<u8>, Proble
     Err(Problem::new(ProblemType::BodyTooLarge).detail(detail))
 }
 
-fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Problem> {
+fn parse<T: DeserializeOwned + Serialize>(body: &[u8]) -> Result<T, Problem> {
     let mut unknown = Vec::new();
     let mut reader = serde_json::Deserializer::from_slice(body);
     let mut note = |path: serde_ignored::Path<'_>| {
@@ -105,13 +105,19 @@ fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Problem> {
     let parsed: T = serde_path_to_error::deserialize(watched).map_err(|error| {
         let path = error.path().to_string();
         let cause = error.inner();
-        let kind = if cause.is_data() {
-            ProblemType::InvalidBody
+        // An enum of no known variant is a syntax error to the parser, though the text is JSON.
+        let is_json = serde_json::from_slice::<serde::de::IgnoredAny>(body).is_ok();
+        let (kind, detail) = if cause.is_data() || is_json {
+            (
+                ProblemType::InvalidBody,
+                without_place(&cause.to_string()).to_owned(),
+            )
         } else {
-            ProblemType::MalformedBody
+            (ProblemType::MalformedBody, cause.to_string())
         };
-        let problem = Problem::new(kind).detail(cause.to_string());
-        if path == "." {
+        let problem = Problem::new(kind).detail(detail);
+        // A question mark is what the path has for a place without a name.
+        if path == "." || path.contains('?') {
             problem
         } else {
             problem.field(path)
@@ -121,6 +127,7 @@ fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Problem> {
         Problem::new(ProblemType::MalformedBody).detail(error.to_string())
     };
     reader.end().map_err(trailing)?;
+    refuse_lists_for_objects(&parsed, body)?;
     if unknown.is_empty() {
         return Ok(parsed);
     }
@@ -131,6 +138,54 @@ fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Problem> {
         Some(first) => problem.field(first),
         None => problem,
     })
+}
+
+/// A message of the parser without its line and column, which say nothing in a one-line body.
+fn without_place(message: &str) -> &str {
+    message.split(" at line ").next().unwrap_or(message)
+}
+
+/// Refuses a list where an object belongs: the parser would take its entries for the fields in
+/// their order, past the check for unknown ones.
+fn refuse_lists_for_objects<T: Serialize>(parsed: &T, body: &[u8]) -> Result<(), Problem> {
+    let sent: serde_json::Value = serde_json::from_slice(body).unwrap_or_default();
+    let meant = serde_json::to_value(parsed).unwrap_or_default();
+    match list_for_object(&sent, &meant) {
+        None => Ok(()),
+        Some(place) => {
+            let problem = Problem::new(ProblemType::InvalidBody)
+                .detail("a list stands where an object belongs");
+            Err(if place.is_empty() {
+                problem
+            } else {
+                problem.field(place)
+            })
+        }
+    }
+}
+
+/// The path of the first list that was read as an object.
+fn list_for_object(sent: &serde_json::Value, meant: &serde_json::Value) -> Option<String> {
+    use serde_json::Value;
+    let within = |name: &str, place: String| match place.as_str() {
+        "" => name.to_owned(),
+        _ => format!("{name}.{place}"),
+    };
+    match (sent, meant) {
+        (Value::Array(_), Value::Object(_)) => Some(String::new()),
+        (Value::Array(sent), Value::Array(meant)) => {
+            sent.iter()
+                .zip(meant)
+                .enumerate()
+                .find_map(|(index, (sent, meant))| {
+                    list_for_object(sent, meant).map(|place| within(&index.to_string(), place))
+                })
+        }
+        (Value::Object(sent), Value::Object(meant)) => sent.iter().find_map(|(name, sent)| {
+            list_for_object(sent, meant.get(name)?).map(|place| within(name, place))
+        }),
+        _ => None,
+    }
 }
 
 /// The path of an unknown field with the names of enum variants, for which `serde_ignored` only
@@ -233,6 +288,29 @@ mod tests {
     fn problem(body: &str) -> serde_json::Value {
         let problem = parse::<CreateMission>(body.as_bytes()).unwrap_err();
         serde_json::to_value(format!("{problem:?}")).unwrap()
+    }
+
+    #[test]
+    fn a_list_is_no_object_however_deep() {
+        let said = problem(r#"["a","b",{"circle":[{"x_m":0,"y_m":0},3,0.5]},null]"#).to_string();
+        assert!(
+            said.contains("InvalidBody") && said.contains("a list stands"),
+            "{said}"
+        );
+        let text = r#"{"site":"a","robot":"b","trajectory":{"circle":
+            {"center":[0.0,0.0],"radius_m":1.0,"speed_m_s":0.5}}}"#;
+        let said = problem(text).to_string();
+        assert!(said.contains("trajectory.circle.center"), "{said}");
+    }
+
+    #[test]
+    fn json_that_says_nothing_known_is_json_all_the_same() {
+        let said = problem(r#"{"site":"a","robot":"b","trajectory":{}}"#).to_string();
+        assert!(
+            said.contains("InvalidBody") && !said.contains("at line"),
+            "{said}"
+        );
+        assert!(problem("{").to_string().contains("MalformedBody"));
     }
 
     #[test]

@@ -26,9 +26,9 @@ use tower_http::request_id::{
     MakeRequestUuid, PropagateRequestIdLayer, RequestId, SetRequestIdLayer,
 };
 use tower_http::trace::TraceLayer;
-use tread_api::problem::ProblemType;
+use tread_api::problem::{PROBLEM_MEDIA_TYPE, ProblemType};
 use utoipa::OpenApi as _;
-use utoipa::openapi::OpenApi;
+use utoipa::openapi::{Content, OpenApi, Ref, RefOr, ResponseBuilder};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 use utoipa_swagger_ui::SwaggerUi;
@@ -79,14 +79,51 @@ fn routes() -> OpenApiRouter<App> {
 
 /// The description of the API.
 pub fn openapi() -> OpenApi {
-    routes().to_openapi()
+    with_problems(routes().to_openapi())
+}
+
+/// Says of every operation that its errors are problems.
+fn with_problems(mut openapi: OpenApi) -> OpenApi {
+    for item in openapi.paths.paths.values_mut() {
+        let operations = [
+            &mut item.get,
+            &mut item.put,
+            &mut item.post,
+            &mut item.delete,
+        ];
+        for operation in operations.into_iter().flatten() {
+            let problem = ResponseBuilder::new()
+                .description("What is wrong; `type` is one of the closed list")
+                .content(
+                    PROBLEM_MEDIA_TYPE,
+                    Content::new(Some(Ref::from_schema_name("ProblemBody"))),
+                );
+            let responses = &mut operation.responses.responses;
+            responses.insert("default".to_owned(), problem.into());
+            for (status, response) in responses {
+                if let (true, RefOr::T(response)) = (status.starts_with(['4', '5']), response)
+                    && let Some(content) = response.content.swap_remove("application/json")
+                {
+                    response
+                        .content
+                        .insert(PROBLEM_MEDIA_TYPE.to_owned(), content);
+                }
+            }
+        }
+    }
+    openapi
 }
 
 /// The whole API on these use cases.
 pub fn router(app: App) -> Router {
     let (router, openapi) = routes().split_for_parts();
     router
-        .merge(SwaggerUi::new("/docs").url("/openapi.json", openapi))
+        .merge(
+            SwaggerUi::new("/docs")
+                .url("/openapi.json", with_problems(openapi))
+                // Without this the page shows the description to a validator on another host.
+                .config(utoipa_swagger_ui::Config::default().validator_url("none")),
+        )
         .fallback(not_found)
         .method_not_allowed_fallback(method_not_allowed)
         .layer(from_fn(bound_time))

@@ -16,10 +16,12 @@ use tread_api::wire::command::Offer;
 use tread_api::wire::ingest::{MissionPhase, MissionReport};
 
 use self::transitions::{Change, next};
-use super::{App, AppError, page, site_row};
+use super::{App, AppError, site_row};
 use crate::db::missions::{Facts, MissionFilter, MissionRow, Standing};
 use crate::db::{self, DbError, Tx};
 
+/// Bytes of trajectories after which a page of missions ends, however many it has.
+const PAGE_BYTES_MAX: usize = 4 * 1024 * 1024;
 /// Most missions that wait for one robot.
 pub const QUEUE_MAX: usize = 1_000;
 /// Most steps of one mission's history; what only notes something is left out beyond half of it.
@@ -89,14 +91,15 @@ impl App {
         limit: u32,
     ) -> Result<Page<Mission>, AppError> {
         let mut tx = self.db().read().await?;
-        let rows = db::missions::list(&mut tx, filter, limit + 1).await?;
-        let missions = rows
-            .into_iter()
-            .map(|row| self.with_progress(row.mission))
-            .collect();
-        Ok(page(missions, limit, |mission: &Mission| {
-            mission.id.to_string()
-        }))
+        if let Some(site) = &filter.site {
+            site_row(&mut tx, site).await?;
+        }
+        let (rows, more) = db::missions::list(&mut tx, filter, limit, PAGE_BYTES_MAX).await?;
+        let last = rows.last().filter(|_| more);
+        let next_cursor = last.map(|row| row.mission.id.to_string());
+        let with_progress = |row: MissionRow| self.with_progress(row.mission);
+        let items = rows.into_iter().map(with_progress).collect();
+        Ok(Page { items, next_cursor })
     }
 
     /// One mission with its history.

@@ -65,7 +65,8 @@ fn presence(said: &Said) -> Presence {
     };
     let presences = Presences::default();
     presences.token_appeared(key.clone(), boot(said.boot), said.since);
-    presences.state(key.clone(), state, JUST);
+    presences.hello(key.clone(), state.boot, JUST);
+    presences.state(&key, state, JUST);
     presences.get(&key)
 }
 
