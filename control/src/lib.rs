@@ -10,6 +10,7 @@
 //! * Driving (one call per tick): [`mod@reference`] walks along the plan, [`tracking`] turns errors
 //!   into wheel speeds, [`follower`] runs one mission, [`gate`] has the last word.
 //! * Knowing: [`localisation`] says where the robot is, [`estimation`] how the ground grips.
+//! * [`mod@paper`] is the paper this began with, exactly; its law is a bench, not what ships.
 //! * [`plant`] is the simulated base; [`mod@bench`] holds laws written only for comparison.
 
 pub mod bench;
@@ -20,6 +21,7 @@ pub mod gate;
 pub mod geometry;
 pub mod localisation;
 pub mod measured;
+pub mod paper;
 pub mod path;
 pub mod plan;
 pub mod plant;
