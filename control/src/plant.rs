@@ -39,6 +39,54 @@ pub struct PlantSpec {
     pub left_radius_ratio: f64,
     /// True rolling radius of the right wheels over the model's, about 1.
     pub right_radius_ratio: f64,
+    /// How the tyres grip beyond the ground's curve.
+    pub tyres: Tyres,
+}
+
+/// How tyres differ from the isotropic piecewise line of (7).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tyres {
+    /// Stiffness across over that along, above 0.
+    pub side_grip_ratio: f64,
+    /// Shape of the rise to the peak.
+    pub rise: TyreRise,
+}
+
+impl Default for Tyres {
+    fn default() -> Self {
+        Self {
+            side_grip_ratio: 1.0,
+            rise: TyreRise::Straight,
+        }
+    }
+}
+
+/// Shape of a tyre's friction over slip up to its peak.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum TyreRise {
+    /// The paper's: straight to the peak, then falling.
+    #[default]
+    Straight,
+    /// A brush's: `μ = K λ (1 − z + z²/3)`, `z = λ/(3λ_m)`, with the same initial slope K and the
+    /// same peak `K λ_m`, reached at `z = 1` and kept beyond it.
+    Brush,
+}
+
+impl TyreRise {
+    /// `μ(|σ|)/|σ|` for a slip magnitude ≥ 0.
+    fn mu_over_slip(self, curve: &FrictionCurve, slip: f64) -> f64 {
+        match self {
+            Self::Straight => curve.mu_over_slip(slip),
+            Self::Brush => {
+                let share = slip / (3.0 * curve.peak_slip());
+                if share < 1.0 {
+                    curve.stiffness() * (1.0 - share + share * share / 3.0)
+                } else {
+                    curve.mu_peak() / slip
+                }
+            }
+        }
+    }
 }
 
 impl Default for PlantSpec {
@@ -48,6 +96,7 @@ impl Default for PlantSpec {
             rolling_resistance_ratio: 0.01,
             left_radius_ratio: 1.0,
             right_radius_ratio: 1.0,
+            tyres: Tyres::default(),
         }
     }
 }
@@ -153,6 +202,7 @@ impl Plant {
         )?;
         check("left_radius_ratio", spec.left_radius_ratio, 0.5..=2.0)?;
         check("right_radius_ratio", spec.right_radius_ratio, 0.5..=2.0)?;
+        check("side_grip_ratio", spec.tyres.side_grip_ratio, 0.1..=10.0)?;
         if !pose.is_finite() {
             return Err(PlantError::OutOfRange {
                 field: "pose",
@@ -259,7 +309,8 @@ impl Plant {
         let reference_m_s = slip_reference_m_s(slowest_m_s);
         let shape = model.mass_kg() * (model.track_width_m().powi(2) + model.wheelbase_m().powi(2))
             / (4.0 * model.yaw_inertia_kg_m2());
-        let pole_s1 = GRAVITY_M_S2 * stiffness / reference_m_s * shape.max(1.0);
+        let side_grip = self.spec.tyres.side_grip_ratio.max(1.0);
+        let pole_s1 = GRAVITY_M_S2 * stiffness * side_grip / reference_m_s * shape.max(1.0);
         let servo_s = 0.5 * self.spec.servo_lag_s.max(SERVO_LAG_FLOOR_S);
         (POLE_STEP_MAX / pole_s1).min(servo_s).min(STEP_MAX_S)
     }
@@ -305,6 +356,7 @@ impl Plant {
         let half_base_m = 0.5 * self.model.wheelbase_m();
         let load_n = 0.5 * self.model.side_load_n();
         let radius_m = self.model.wheel_radius_m();
+        let tyres = &self.spec.tyres;
         let sides = [
             (
                 half_track_m,
@@ -324,9 +376,12 @@ impl Plant {
             let slip_ahead =
                 (state.ahead_m_s - state.yaw_rate_rad_s * y_m - rim_m_s) / reference_m_s;
             for x_m in [half_base_m, -half_base_m] {
-                let slip_left = (state.left_m_s + state.yaw_rate_rad_s * x_m) / reference_m_s;
+                // The slip across that would give its force on an isotropic tyre.
+                let slip_left = tyres.side_grip_ratio
+                    * (state.left_m_s + state.yaw_rate_rad_s * x_m)
+                    / reference_m_s;
                 let slip = slip_ahead.hypot(slip_left);
-                let gain_n = -load_n * curve.mu_over_slip(slip);
+                let gain_n = -load_n * tyres.rise.mu_over_slip(curve, slip);
                 let (force_ahead_n, force_left_n) = (gain_n * slip_ahead, gain_n * slip_left);
                 side_n[side] += force_ahead_n;
                 sum.left_n += force_left_n;

@@ -9,7 +9,9 @@
 #![expect(clippy::print_stdout, reason = "a program that prints a report")]
 
 mod change;
+mod drives;
 mod report;
+mod robot;
 mod theta;
 mod tracking;
 

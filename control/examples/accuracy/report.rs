@@ -43,7 +43,10 @@ impl Options {
             }
         }
         let known = ["tracking", "theta", "change"];
-        if options.only.iter().any(|name| !known.contains(&name.as_str()))
+        if options
+            .only
+            .iter()
+            .any(|name| !known.contains(&name.as_str()))
             || !(1..=RUNS_MAX).contains(&options.runs)
             || options.threads == 0
         {
@@ -82,7 +85,6 @@ impl Check {
     }
 
     /// A figure that must lie between two bounds; NaN does not hold.
-    #[expect(dead_code, reason = "for the parts that measure coverage")]
     pub(crate) fn between(
         name: impl Into<String>,
         value: f64,
