@@ -165,6 +165,57 @@ pub struct Plant {
     spec: PlantSpec,
     state: PlantState,
     contact: Contact,
+    means: PlantMeans,
+}
+
+/// Means over the time of one call of [`Plant::step`]: what encoders that count, and inertial
+/// sensors that do not alias, give for it.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct PlantMeans {
+    /// Wheel speeds.
+    pub wheel_speeds: WheelSpeeds,
+    /// Turn rate φ̇, radians per second.
+    pub yaw_rate_rad_s: f64,
+    /// What an accelerometer at the centre of mass feels.
+    pub acceleration: BodyAcceleration,
+}
+
+/// Sums from which [`PlantMeans`] are made.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct MeanSums {
+    left_rad: f64,
+    right_rad: f64,
+    yaw_rad: f64,
+    /// `∫ẏφ̇ dt` and `∫ẋφ̇ dt`, metres per second.
+    left_turned_m_s: f64,
+    ahead_turned_m_s: f64,
+}
+
+impl MeanSums {
+    fn add(&mut self, before: &PlantState, after: &PlantState, step_s: f64) {
+        let half_s = 0.5 * step_s;
+        for state in [before, after] {
+            self.left_rad += half_s * state.wheel_speeds.left_rad_s;
+            self.right_rad += half_s * state.wheel_speeds.right_rad_s;
+            self.yaw_rad += half_s * state.yaw_rate_rad_s;
+            self.left_turned_m_s += half_s * state.left_m_s * state.yaw_rate_rad_s;
+            self.ahead_turned_m_s += half_s * state.ahead_m_s * state.yaw_rate_rad_s;
+        }
+    }
+
+    fn means(&self, start: &PlantState, end: &PlantState, span_s: f64) -> PlantMeans {
+        PlantMeans {
+            wheel_speeds: WheelSpeeds {
+                left_rad_s: self.left_rad / span_s,
+                right_rad_s: self.right_rad / span_s,
+            },
+            yaw_rate_rad_s: self.yaw_rad / span_s,
+            acceleration: BodyAcceleration {
+                ahead_m_s2: (end.ahead_m_s - start.ahead_m_s - self.left_turned_m_s) / span_s,
+                left_m_s2: (end.left_m_s - start.left_m_s + self.ahead_turned_m_s) / span_s,
+            },
+        }
+    }
 }
 
 /// Forces of all contacts on the body.
@@ -218,6 +269,7 @@ impl Plant {
             spec,
             state,
             contact: Contact::default(),
+            means: PlantMeans::default(),
         })
     }
 
@@ -231,7 +283,12 @@ impl Plant {
         self.state = state;
     }
 
-    /// What an accelerometer at the centre of mass feels, without noise.
+    /// Means over the last step.
+    pub fn means(&self) -> &PlantMeans {
+        &self.means
+    }
+
+    /// What an accelerometer at the centre of mass feels now, without noise.
     pub fn body_acceleration(&self) -> BodyAcceleration {
         BodyAcceleration {
             ahead_m_s2: self.contact.ahead_n / self.model.mass_kg(),
@@ -287,15 +344,20 @@ impl Plant {
             left_rad_s: bounded(command.left_rad_s),
             right_rad_s: bounded(command.right_rad_s),
         };
+        let start = self.state;
+        let mut sums = MeanSums::default();
         let mut left_s = dt_s;
         for _ in 0..STEPS_MAX {
             let step_s = self.stable_step_s(ground).min(left_s);
+            let before = self.state;
             self.runge_kutta(command, ground, step_s);
+            sums.add(&before, &self.state, step_s);
             left_s -= step_s;
             if left_s <= 1.0e-12 {
                 break;
             }
         }
+        self.means = sums.means(&start, &self.state, dt_s - left_s);
         self.contact = self.contact_forces(&self.state, ground);
     }
 

@@ -7,7 +7,7 @@ use tread_control::friction::FrictionCurve;
 use tread_control::geometry::Pose;
 use tread_control::localisation::{Localisation, LocalisationNoise, PositionFix};
 use tread_control::measured::{BodyAcceleration, Measured, WheelSpeeds, WheelTorques};
-use tread_control::plant::{Ground, Plant, PlantSpec, Tyres};
+use tread_control::plant::{Ground, Plant, PlantMeans, PlantSpec, Tyres};
 use tread_control::robot::RobotModel;
 
 /// Sensor samples, seconds.
@@ -28,6 +28,9 @@ pub(crate) struct RobotSpec {
     /// Largest error of a side's rolling radius; drawn evenly up to it.
     pub(crate) radius_error_max: f64,
     pub(crate) has_torque: bool,
+    /// Wheel speed, gyro and accelerometer give the value of the moment, not the mean since the
+    /// last sample: what happens between two samples aliases.
+    pub(crate) aliases: bool,
     pub(crate) servo_lag_s: f64,
     pub(crate) tyres: Tyres,
     pub(crate) told_tyres: TyrePrior,
@@ -41,6 +44,7 @@ impl RobotSpec {
             noise: SensorNoise::default(),
             radius_error_max: 0.02,
             has_torque: false,
+            aliases: false,
             servo_lag_s: 0.05,
             tyres: Tyres::default(),
             told_tyres: TyrePrior::default(),
@@ -149,13 +153,23 @@ impl SeededRobot {
         self.plant.step(command, &self.ground, SAMPLE_S);
         let state = *self.plant.state();
         let noise = self.spec.noise;
+        let moment = PlantMeans {
+            wheel_speeds: state.wheel_speeds,
+            yaw_rate_rad_s: state.yaw_rate_rad_s,
+            acceleration: self.plant.body_acceleration(),
+        };
+        let seen = if self.spec.aliases {
+            moment
+        } else {
+            *self.plant.means()
+        };
         let wheel_speeds = WheelSpeeds {
-            left_rad_s: state.wheel_speeds.left_rad_s + self.gauss(noise.wheel_speed_rad_s),
-            right_rad_s: state.wheel_speeds.right_rad_s + self.gauss(noise.wheel_speed_rad_s),
+            left_rad_s: seen.wheel_speeds.left_rad_s + self.gauss(noise.wheel_speed_rad_s),
+            right_rad_s: seen.wheel_speeds.right_rad_s + self.gauss(noise.wheel_speed_rad_s),
         };
         let gyro_rad_s =
-            state.yaw_rate_rad_s + self.gyro_offset_rad_s + self.gauss(noise.gyro_rad_s);
-        let felt = self.plant.body_acceleration();
+            seen.yaw_rate_rad_s + self.gyro_offset_rad_s + self.gauss(noise.gyro_rad_s);
+        let felt = seen.acceleration;
         let torques = self.plant.wheel_torques();
         let torque_noise = noise.torque_mu * self.model.wheel_radius_m() * self.model.side_load_n();
         let has_body_speed = self.samples.is_multiple_of(SAMPLES_PER_BODY_SPEED);

@@ -106,7 +106,8 @@ pub(crate) fn run(options: &Options) -> Section {
     let mut lines = Vec::new();
     let mut checks = Vec::new();
     let mut coverages = Vec::new();
-    for scenario in scenarios() {
+    let chosen = std::env::var("ONLY_SCENARIO").unwrap_or_default();
+    for scenario in scenarios().into_iter().filter(|one| one.name.contains(&chosen)) {
         let runs = run_seeded(options.runs, options.threads, |seed| {
             run_one(&scenario, seed)
         });
@@ -295,6 +296,7 @@ fn sweeps(all: &mut Vec<Scenario>) {
             &move |robot| robot.noise.accelerometer_offset_m_s2 = offset_m_s2,
         );
     }
+    push("samples that alias".to_owned(), &|robot| robot.aliases = true);
     for ratio in [0.7, 1.4] {
         push(format!("side grip × {ratio}"), &move |robot| {
             robot.tyres.side_grip_ratio = ratio;

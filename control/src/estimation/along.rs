@@ -40,6 +40,8 @@ struct Step {
     force_m_s: f64,
     rim_difference_m_s: f64,
     ahead_m_s2: f64,
+    /// Acceleration times the time since the step's start.
+    ahead_late_m_s: f64,
     gyro_rad_s: f64,
     /// Speed of the slower side, summed.
     slower_m_s: f64,
@@ -69,7 +71,8 @@ pub(super) struct AlongFilter {
     speed_m_s: f64,
     variance: f64,
     sensitivity: Parameters,
-    last_ahead_m_s2: f64,
+    /// Change of speed that the last step leaves to its successor.
+    last_share_m_s: f64,
     last_duration_s: f64,
     standing: u32,
     started: bool,
@@ -85,7 +88,7 @@ impl AlongFilter {
             speed_m_s: 0.0,
             variance: UNKNOWN_M2_S2,
             sensitivity: Parameters::zeros(),
-            last_ahead_m_s2: 0.0,
+            last_share_m_s: 0.0,
             last_duration_s: 0.0,
             standing: 0,
             started: false,
@@ -121,6 +124,7 @@ impl AlongFilter {
             step.slower_m_s += rims.left_m_s.min(rims.right_m_s);
         }
         step.ahead_m_s2 += acceleration.ahead_m_s2;
+        step.ahead_late_m_s += acceleration.ahead_m_s2 * (step.duration_s + 0.5 * dt_s);
         step.gyro_rad_s += sample.gyro_rad_s;
         step.duration_s += dt_s;
         if let Some(body_m_s) = sample.body_speed_m_s {
@@ -172,26 +176,28 @@ impl AlongFilter {
         rows
     }
 
-    /// From the middle of the last step to that of this one.
+    /// From the mean of the last step to that of this one: the acceleration between, weighed by a
+    /// triangle that rises over the last step and falls over this one.
     fn predict(&mut self, step: &Step, ahead_m_s2: f64, gyro_rad_s: f64, noise: &SensorNoise) {
+        let late_m_s = step.ahead_late_m_s / step.samples;
+        let early_m_s = ahead_m_s2 * step.duration_s - late_m_s;
+        let span_s = 0.5 * (self.last_duration_s + step.duration_s);
+        let gained_m_s = self.last_share_m_s + early_m_s;
+        self.last_share_m_s = late_m_s;
+        self.last_duration_s = step.duration_s;
         if !self.started {
             self.started = true;
-            self.last_ahead_m_s2 = ahead_m_s2;
-            self.last_duration_s = step.duration_s;
             self.speed_m_s = step.rim_m_s / step.samples;
             return;
         }
-        let span_s = 0.5 * (self.last_duration_s + step.duration_s);
-        self.speed_m_s += 0.5
-            * (self.last_duration_s * self.last_ahead_m_s2 + step.duration_s * ahead_m_s2);
+        self.speed_m_s += gained_m_s;
         self.sensitivity[index::AHEAD_OFFSET] -= span_s;
+        self.sensitivity[index::AHEAD_SCALE] += gained_m_s;
         self.sensitivity[index::THETA] -=
             span_s * (self.speed_m_s * gyro_rad_s).powi(2) / GRAVITY_M_S2;
-        self.variance =
-            (self.variance + (span_s * noise.accelerometer_m_s2).powi(2) / step.samples)
-                .min(UNKNOWN_M2_S2);
-        self.last_ahead_m_s2 = ahead_m_s2;
-        self.last_duration_s = step.duration_s;
+        self.variance = (self.variance
+            + (span_s * noise.accelerometer_m_s2).powi(2) / step.samples)
+            .min(UNKNOWN_M2_S2);
     }
 
     fn wheels(

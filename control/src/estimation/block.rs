@@ -104,6 +104,7 @@ impl Block {
         regressors[index::RADIUS_DIFFERENCE] = self.rim_mean_m_s;
         regressors[index::GYRO_OFFSET] = -self.track_width_m;
         regressors[index::CURVATURE] = self.bent(force.difference_m_s);
+        regressors[index::RESISTANCE] = -self.rim_difference_m_s;
         Some(Row {
             regressors,
             response: self.difference_m_s,
@@ -121,6 +122,7 @@ impl Block {
         regressors[index::RADIUS_OFFSET] = self.rim_mean_m_s;
         regressors[index::RADIUS_DIFFERENCE] = 0.25 * self.rim_difference_m_s;
         regressors[index::CURVATURE] = self.bent(force.mean_m_s);
+        regressors[index::RESISTANCE] = -self.rim_mean_m_s;
         Some(Row {
             regressors,
             response: slip_m_s,
@@ -174,6 +176,10 @@ pub(super) struct BlockContext<'robot> {
     pub(super) model: &'robot RobotModel,
     pub(super) noise: &'robot SensorNoise,
     pub(super) tyres: &'robot TyrePrior,
+    /// `δ_d` as it is known.
+    pub(super) radius_difference: f64,
+    /// θ as it is known.
+    pub(super) theta: f64,
 }
 
 impl BlockBuilder {
@@ -233,6 +239,7 @@ impl BlockBuilder {
             model,
             noise,
             tyres,
+            ..
         } = context;
         if self.samples == 0 || self.usable < self.samples {
             return None;
@@ -315,12 +322,16 @@ fn turning_row(means: &TurnMeans, slip: f64, context: BlockContext<'_>) -> Row {
         model,
         noise,
         tyres,
+        radius_difference,
+        theta,
     } = context;
     let track_m = model.track_width_m();
     // 4 I_G/(m g W), seconds squared.
     let inertia = 4.0 * model.yaw_inertia_kg_m2() / (model.mass_kg() * GRAVITY_M_S2 * track_m);
-    let force_m_s =
-        inertia * means.harmonic_m_s * means.turn_acceleration_rad_s2 + means.ahead_force_m_s;
+    // What is known of the radii belongs into the rim speeds' difference here, where it multiplies θ.
+    let force_m_s = inertia * means.harmonic_m_s * means.turn_acceleration_rad_s2
+        + means.ahead_force_m_s
+        - radius_difference * means.rim_mean_m_s * means.ahead_mu;
     let mut regressors = Parameters::zeros();
     regressors[index::THETA] = force_m_s;
     regressors[index::RADIUS_OFFSET] = means.rim_difference_m_s;
@@ -328,6 +339,7 @@ fn turning_row(means: &TurnMeans, slip: f64, context: BlockContext<'_>) -> Row {
     regressors[index::TRACK] =
         track_m * (model.effective_track_ratio() - 1.0) * means.turn_rad_s;
     regressors[index::GYRO_OFFSET] = -model.effective_track_m();
+    regressors[index::AHEAD_OFFSET] = -theta * means.rim_difference_m_s / GRAVITY_M_S2;
     regressors[index::CURVATURE] =
         force_m_s * slip * (1.0 + 2.0 / 3.0 * tyres.curvature * slip);
     let rim_noise_m_s = noise.wheel_speed_rad_s * model.wheel_radius_m();

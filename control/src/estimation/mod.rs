@@ -81,6 +81,9 @@ pub struct SensorNoise {
     pub accelerometer_m_s2: f64,
     /// Offset of the accelerometer, unknown, metres per second squared.
     pub accelerometer_offset_m_s2: f64,
+    /// Error of the accelerometer's scale, unknown, share. Sampling a rough drive has the same
+    /// effect: what lies between two samples is not seen.
+    pub accelerometer_scale_ratio: f64,
     /// Wheel speed, radians per second.
     pub wheel_speed_rad_s: f64,
     /// Body speed, metres per second.
@@ -101,6 +104,7 @@ impl Default for SensorNoise {
             gyro_rad_s: 0.003,
             accelerometer_m_s2: 0.05,
             accelerometer_offset_m_s2: 0.02,
+            accelerometer_scale_ratio: 0.03,
             wheel_speed_rad_s: 0.02,
             body_speed_m_s: 0.02,
             torque_mu: 0.01,
@@ -294,6 +298,8 @@ impl Estimator {
             model: &self.model,
             noise: &self.noise,
             tyres: &self.tyres,
+            radius_difference: self.estimate.radius_difference.value,
+            theta: self.bound.theta.unwrap_or(THETA_FIRST),
         };
         let block = builder.finish(context);
         let ground_changed = block.is_some_and(|block| self.take(block));

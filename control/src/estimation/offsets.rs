@@ -32,6 +32,7 @@ impl OffsetKnowledge {
         put(index::TRACK, weight(tyres.side_grip_spread));
         put(index::GYRO_OFFSET, weight(noise.gyro_offset_rad_s));
         put(index::AHEAD_OFFSET, weight(noise.accelerometer_offset_m_s2));
+        put(index::AHEAD_SCALE, weight(noise.accelerometer_scale_ratio));
         Self {
             information,
             weighted: SVector::zeros(),
@@ -93,14 +94,14 @@ impl OffsetKnowledge {
     }
 }
 
-/// The Schur complement that takes θ and θκ out of normal equations.
+/// The Schur complement that takes what is the ground's out of normal equations.
 fn without_ground(
     matrix: &ParameterMatrix,
     right: &Parameters,
 ) -> (SMatrix<f64, OFFSETS, OFFSETS>, SVector<f64, OFFSETS>) {
     let mut matrix = *matrix;
     let mut right = *right;
-    for parameter in [index::CURVATURE, index::THETA] {
+    for parameter in [index::RESISTANCE, index::CURVATURE, index::THETA] {
         let own = matrix[(parameter, parameter)].max(f64::MIN_POSITIVE);
         let column = matrix.column(parameter).into_owned();
         let share = right[parameter] / own;

@@ -13,9 +13,9 @@ use super::{BLOCKS_MIN, RELATIVE_STD_DEV_MAX, THETA_FIRST, THETA_RANGE, TyrePrio
 use crate::estimation::block::Block;
 
 /// Number of parameters.
-pub(super) const PARAMETERS: usize = 7;
+pub(super) const PARAMETERS: usize = 9;
 /// Number of the robot's own parameters, which follow θ.
-pub(super) const OFFSETS: usize = 5;
+pub(super) const OFFSETS: usize = 6;
 /// A value for each parameter.
 pub(super) type Parameters = SVector<f64, PARAMETERS>;
 /// A value for each pair of parameters.
@@ -35,8 +35,12 @@ pub(super) mod index {
     pub(in crate::estimation) const GYRO_OFFSET: usize = 4;
     /// `b_a`, the accelerometer's offset ahead, metres per second squared.
     pub(in crate::estimation) const AHEAD_OFFSET: usize = 5;
+    /// Share by which the accelerometer reads too little.
+    pub(in crate::estimation) const AHEAD_SCALE: usize = 6;
     /// θκ, θ times the tyre's curvature per slip.
-    pub(in crate::estimation) const CURVATURE: usize = 6;
+    pub(in crate::estimation) const CURVATURE: usize = 7;
+    /// `θf`, θ times the rolling resistance over load that measured torques hold.
+    pub(in crate::estimation) const RESISTANCE: usize = 8;
 }
 
 /// Rounds of the iteration on the weights.
@@ -49,6 +53,8 @@ const MODEL_SHARE: f64 = 0.05;
 const SIGNIFICANCE_MIN: f64 = 6.0;
 /// Rows from which on the residuals tell whether the assumed noise is too small.
 const INFLATION_ROWS: f64 = 15.0;
+/// How large rolling resistance over load may be, one standard deviation.
+const ROLLING_SPREAD: f64 = 0.02;
 /// Least spread of a tyre's curvature, so that the matrix stays regular.
 const CURVATURE_SPREAD_MIN: f64 = 1.0e-3;
 
@@ -181,6 +187,8 @@ impl Normal {
         bend[index::THETA] = -tyres.curvature / curvature_std_dev;
         bend[index::CURVATURE] = 1.0 / curvature_std_dev;
         normal.matrix += bend * bend.transpose();
+        let resistance = (index::RESISTANCE, index::RESISTANCE);
+        normal.matrix[resistance] += (theta * ROLLING_SPREAD).powi(-2);
         normal
     }
 
@@ -246,11 +254,22 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
         if input.theta_given.is_some() || round == ROUNDS || is_settled {
             let inflation = inflation(&channels, &parameters, theta_weights);
             let base = covariance[(index::THETA, index::THETA)];
+            let (theta, scale) = if sums.has_torque() {
+                (theta, 0.0)
+            } else {
+                // Force over load is then an acceleration, and the slip that stands for it is
+                // reckoned with a radius too large by δ_c: what is estimated is θ(1 − δ_c). Torque
+                // reads too high by just that share.
+                (theta * (1.0 + parameters[index::RADIUS_OFFSET]), theta)
+            };
+            let across = covariance[(index::THETA, index::RADIUS_OFFSET)];
+            let own = covariance[(index::RADIUS_OFFSET, index::RADIUS_OFFSET)];
+            let scaled = (2.0 * scale * across + scale * scale * own).max(-0.5 * base);
             return Some(Solution {
                 theta,
                 parameters,
                 covariance: covariance * inflation,
-                variance: base * inflation + base * base * normal.excess,
+                variance: (base + scaled) * inflation + base * base * normal.excess,
                 significance: 1.0 / (base * normal.noise_std_dev.max(f64::MIN_POSITIVE)),
             });
         }

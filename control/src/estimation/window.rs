@@ -24,6 +24,7 @@ struct Part {
     slip: f64,
     harmonic: f64,
     ahead_force: f64,
+    ahead_mu: f64,
     turn: f64,
     rim_difference: f64,
     rim_mean: f64,
@@ -42,6 +43,8 @@ pub(super) struct TurnMeans {
     pub(super) harmonic_m_s: f64,
     /// `(a/g) d/s²`, metres per second.
     pub(super) ahead_force_m_s: f64,
+    /// `a/g`; in reverse that of the mirrored robot.
+    pub(super) ahead_mu: f64,
     pub(super) turn_rad_s: f64,
     pub(super) turn_acceleration_rad_s2: f64,
     /// `u_R − u_L`, metres per second; driving in reverse it is that of the mirrored robot.
@@ -107,6 +110,7 @@ impl TurnWindow {
             slip_m_s: mean(part.slip),
             harmonic_m_s: mean(part.harmonic),
             ahead_force_m_s: mean(part.ahead_force),
+            ahead_mu: mean(part.ahead_mu),
             turn_rad_s: mean(part.turn),
             turn_acceleration_rad_s2: (rates[1] - rates[0]) / block_s,
             rim_difference_m_s: mean(part.rim_difference),
@@ -138,6 +142,7 @@ impl Part {
         self.slip += weight_s * (turning_m_s - sample.gyro_rad_s * arm_m);
         self.harmonic += weight_s / half_sum;
         self.ahead_force += weight_s * turning_m_s * ahead_m_s2 / GRAVITY_M_S2;
+        self.ahead_mu += weight_s * ahead_m_s2 / GRAVITY_M_S2;
         self.turn += weight_s * sample.gyro_rad_s;
         self.rim_difference += weight_s * (rims.right_m_s - rims.left_m_s);
         self.rim_mean += weight_s * rims.sign * 0.5 * (rims.right_m_s + rims.left_m_s);
