@@ -89,7 +89,10 @@ impl Drive {
                 y_m: 0.0,
                 heading_rad: 0.6_f64.atan2(0.9),
             },
-            _ => Pose::default(),
+            Self::StraightThenCircles { .. }
+            | Self::StopAndGo
+            | Self::SteadyStraight
+            | Self::SteadyCircle => Pose::default(),
         }
     }
 

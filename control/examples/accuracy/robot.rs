@@ -98,8 +98,7 @@ impl SeededRobot {
         let noise = spec.noise;
         robot.torque_gain = [0, 1].map(|_| 1.0 + robot.gauss(noise.torque_gain_ratio));
         robot.gyro_offset_rad_s = robot.gauss(noise.gyro_offset_rad_s);
-        robot.accelerometer_offset =
-            [0, 1].map(|_| robot.gauss(noise.accelerometer_offset_m_s2));
+        robot.accelerometer_offset = [0, 1].map(|_| robot.gauss(noise.accelerometer_offset_m_s2));
         robot.fix();
         robot
     }
@@ -191,7 +190,8 @@ impl SeededRobot {
                 right_n_m: self.torque_gain[1] * torques.right_n_m + self.gauss(torque_noise),
             }),
         };
-        self.localisation.predict(gyro_rad_s, wheel_speeds, SAMPLE_S);
+        self.localisation
+            .predict(gyro_rad_s, wheel_speeds, SAMPLE_S);
         self.samples += 1;
         if self.samples.is_multiple_of(SAMPLES_PER_FIX) {
             self.fix();

@@ -75,7 +75,10 @@ fn figures(runs: &[Run]) -> Figures {
     let mean = |value: &dyn Fn(&(f64, f64)) -> f64| {
         errors.iter().map(value).sum::<f64>() * share(1, errors.len())
     };
-    let std_devs = runs.iter().map(|run| run.std_dev).filter(|one| one.is_finite());
+    let std_devs = runs
+        .iter()
+        .map(|run| run.std_dev)
+        .filter(|one| one.is_finite());
     Figures {
         measured: share(errors.len(), runs.len()),
         bias: mean(&|error| error.0),
@@ -107,7 +110,10 @@ pub(crate) fn run(options: &Options) -> Section {
     let mut checks = Vec::new();
     let mut coverages = Vec::new();
     let chosen = std::env::var("ONLY_SCENARIO").unwrap_or_default();
-    for scenario in scenarios().into_iter().filter(|one| one.name.contains(&chosen)) {
+    for scenario in scenarios()
+        .into_iter()
+        .filter(|one| one.name.contains(&chosen))
+    {
         let runs = run_seeded(options.runs, options.threads, |seed| {
             run_one(&scenario, seed)
         });
@@ -140,12 +146,7 @@ pub(crate) fn run(options: &Options) -> Section {
     }
 }
 
-fn check(
-    scenario: &Scenario,
-    found: &Figures,
-    checks: &mut Vec<Check>,
-    coverages: &mut Vec<f64>,
-) {
+fn check(scenario: &Scenario, found: &Figures, checks: &mut Vec<Check>, coverages: &mut Vec<f64>) {
     let name = &scenario.name;
     match scenario.goal {
         Goal::Reports => {}
@@ -296,7 +297,9 @@ fn sweeps(all: &mut Vec<Scenario>) {
             &move |robot| robot.noise.accelerometer_offset_m_s2 = offset_m_s2,
         );
     }
-    push("samples that alias".to_owned(), &|robot| robot.aliases = true);
+    push("samples that alias".to_owned(), &|robot| {
+        robot.aliases = true
+    });
     for ratio in [0.7, 1.4] {
         push(format!("side grip × {ratio}"), &move |robot| {
             robot.tyres.side_grip_ratio = ratio;
@@ -317,7 +320,11 @@ fn tyres(all: &mut Vec<Scenario>) {
         ..TyrePrior::default()
     };
     for (who, told_tyres, goal) in [
-        ("told of a straight rise", TyrePrior::default(), Goal::Reports),
+        (
+            "told of a straight rise",
+            TyrePrior::default(),
+            Goal::Reports,
+        ),
         ("told of a brush", told, Goal::Measures { rms_max: None }),
     ] {
         for has_torque in [true, false] {

@@ -148,12 +148,7 @@ impl AlongFilter {
             rows[0] = self.wheels(&step, ahead_m_s2, gyro_rad_s, model, noise, bound);
         }
         if self.standing >= STANDING_STEPS {
-            rows[1] = Some(self.observe(
-                Parameters::zeros(),
-                0.0,
-                STANDING_NOISE_M_S.powi(2),
-                0.0,
-            ));
+            rows[1] = Some(self.observe(Parameters::zeros(), 0.0, STANDING_NOISE_M_S.powi(2), 0.0));
             let mut regressors = Parameters::zeros();
             regressors[index::GYRO_OFFSET] = 1.0;
             rows[2] = Some(Row::white(
@@ -230,8 +225,7 @@ impl AlongFilter {
             force_m_s * slip * (1.0 + 2.0 / 3.0 * bound.curvature * slip);
         // The measured acceleration is averaged over the step, and so is its offset.
         let felt_noise = (harmonic_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2) / count;
-        let rim_noise =
-            0.5 * (noise.wheel_speed_rad_s * model.wheel_radius_m()).powi(2) / count;
+        let rim_noise = 0.5 * (noise.wheel_speed_rad_s * model.wheel_radius_m()).powi(2) / count;
         regressors[index::AHEAD_OFFSET] = -bound.theta * harmonic_m_s.abs() / GRAVITY_M_S2;
         let spread = rim_noise + bound.theta.powi(2) * felt_noise;
         Some(self.observe(regressors, step.wheels_m_s / count, spread, felt_noise))

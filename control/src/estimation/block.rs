@@ -46,8 +46,6 @@ pub(super) struct Block {
     slip: f64,
     /// Mean curvature of the tyres, per slip.
     curvature: f64,
-    /// Larger friction coefficient along of both sides, measured.
-    mu_side: f64,
     /// Acceleration ahead over gravity, magnitude.
     ahead_mu: f64,
     /// Rim speed of the slower side, metres per second.
@@ -75,8 +73,8 @@ pub(super) struct Block {
 }
 
 impl Block {
-    /// Whether slip was in the linear range, combined from along and across. Along it is θμ where
-    /// θ is known, and above the peak μ stays high enough for that to tell. Before θ is known it
+    /// Whether slip was in the linear range, combined from along and across. Along, the sides'
+    /// difference is measured well; what they have in common is θμ where θ is known. Before that it
     /// comes from the body speed, which is coarse, so the bound is tighter.
     pub(super) fn slips_little(&self, bound: &ThetaBound) -> bool {
         let turning = 0.5 * self.difference_m_s.abs() / self.slower_m_s;
@@ -86,7 +84,9 @@ impl Block {
             SLIP_LINEAR_FIRST_MAX
         };
         let along = match (bound.theta, self.force) {
-            (Some(theta), Some(_)) => theta * self.mu_side,
+            (Some(theta), Some(force)) => {
+                turning + theta * force.mean_m_s.abs() / self.rim_mean_m_s.abs()
+            }
             (None, Some(_)) => turning + self.slip_m_s.unwrap_or(0.0).abs() / self.slower_m_s,
             (_, None) => turning + bound.theta_most * self.ahead_mu,
         };
@@ -277,12 +277,14 @@ impl BlockBuilder {
         let side_mu = self.left_mu.abs().max(self.right_mu.abs()) / count;
         let mu_noise = 2.0 * (noise.torque_mu / count.sqrt()).hypot(0.01);
         let mean_mu = 0.5 * (self.left_mu + self.right_mu) / count;
-        let resistance = (force.is_some() && has_acceleration && lateral < STRAIGHT_SLIP_MAX)
-            .then(|| ValueWithDeviation {
-                value: (mean_mu - ahead_mu) * mean_m_s.signum(),
-                std_dev: (noise.torque_mu * std::f64::consts::FRAC_1_SQRT_2)
-                    .hypot(noise.accelerometer_m_s2 / GRAVITY_M_S2)
-                    / count.sqrt(),
+        let resistance =
+            (force.is_some() && has_acceleration && lateral < STRAIGHT_SLIP_MAX).then(|| {
+                ValueWithDeviation {
+                    value: (mean_mu - ahead_mu) * mean_m_s.signum(),
+                    std_dev: (noise.torque_mu * std::f64::consts::FRAC_1_SQRT_2)
+                        .hypot(noise.accelerometer_m_s2 / GRAVITY_M_S2)
+                        / count.sqrt(),
+                }
             });
         let body_samples = f64::from(self.with_body_speed);
         Some(Block {
@@ -291,7 +293,6 @@ impl BlockBuilder {
             slip_lateral: lateral,
             slip,
             curvature: tyres.curvature,
-            mu_side: side_mu,
             ahead_mu: ahead_mu.abs(),
             slower_m_s,
             difference_m_s,
@@ -336,12 +337,10 @@ fn turning_row(means: &TurnMeans, slip: f64, context: BlockContext<'_>) -> Row {
     regressors[index::THETA] = force_m_s;
     regressors[index::RADIUS_OFFSET] = means.rim_difference_m_s;
     regressors[index::RADIUS_DIFFERENCE] = means.rim_mean_m_s;
-    regressors[index::TRACK] =
-        track_m * (model.effective_track_ratio() - 1.0) * means.turn_rad_s;
+    regressors[index::TRACK] = track_m * (model.effective_track_ratio() - 1.0) * means.turn_rad_s;
     regressors[index::GYRO_OFFSET] = -model.effective_track_m();
     regressors[index::AHEAD_OFFSET] = -theta * means.rim_difference_m_s / GRAVITY_M_S2;
-    regressors[index::CURVATURE] =
-        force_m_s * slip * (1.0 + 2.0 / 3.0 * tyres.curvature * slip);
+    regressors[index::CURVATURE] = force_m_s * slip * (1.0 + 2.0 / 3.0 * tyres.curvature * slip);
     let rim_noise_m_s = noise.wheel_speed_rad_s * model.wheel_radius_m();
     let gyro_noise = noise.gyro_rad_s.powi(2);
     Row {

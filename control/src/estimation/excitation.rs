@@ -27,8 +27,7 @@ pub(super) struct Excitation {
 impl Excitation {
     /// Notes a block's differential row.
     pub(super) fn note_block(&mut self, row: &Row, has_torque: bool) {
-        let scaled =
-            row.regressors[index::THETA] / row.force_noise.sqrt().max(f64::MIN_POSITIVE);
+        let scaled = row.regressors[index::THETA] / row.force_noise.sqrt().max(f64::MIN_POSITIVE);
         self.turning_blocks = (self.turning_blocks + 1.0).min(2.0 * MEMORY_BLOCKS);
         let centred = if has_torque {
             scaled

@@ -85,12 +85,7 @@ struct Motion {
 }
 
 /// The sample of a robot that moves exactly so, in the linear range.
-fn undisturbed(
-    motion: &Motion,
-    model: &RobotModel,
-    theta: f64,
-    has_torque: bool,
-) -> SensorSample {
+fn undisturbed(motion: &Motion, model: &RobotModel, theta: f64, has_torque: bool) -> SensorSample {
     let track_m = model.track_width_m();
     let wheelbase_m = model.wheelbase_m();
     let turn_rad_s = motion.turn_rad_s;

@@ -140,6 +140,10 @@ impl Default for TyrePrior {
 }
 
 /// One sample of the robot's own sensors.
+///
+/// Wheel speeds, turn rate and acceleration are means since the sample before, as encoders that
+/// count and inertial sensors with a filter against aliasing give them. Values of the moment do as
+/// well where nothing changes faster than the samples come.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SensorSample {
     /// Measured wheel speeds.
@@ -360,7 +364,9 @@ impl Estimator {
         block.is_linear &= block.slips_little(&self.bound);
         self.pending.add(&block);
         let innovation = measured.and_then(|solution| solution.innovation(&block));
-        if block.is_linear && let Some(row) = block.differential_row() {
+        if block.is_linear
+            && let Some(row) = block.differential_row()
+        {
             self.excitation.note_block(&row, block.force.is_some());
         }
         let changed = innovation.is_some_and(|value| self.change.update(value));
@@ -465,7 +471,7 @@ impl Estimator {
         let statistics = SegmentStatistics::of(
             &segment,
             &offsets,
-            solution,
+            solution.as_ref(),
             self.accelerometer_offset_mu(),
         );
         self.ground = whole;

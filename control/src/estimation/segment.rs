@@ -42,7 +42,7 @@ impl SegmentStatistics {
     pub(super) fn of(
         sums: &Sums,
         offsets: &OffsetKnowledge,
-        solution: Option<Solution>,
+        solution: Option<&Solution>,
         accelerometer_offset_mu: f64,
     ) -> Self {
         let information = solution.map_or(0.0, |found| found.variance.recip());

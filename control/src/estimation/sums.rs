@@ -1,9 +1,9 @@
 //! Additive sums over blocks: what a stretch of driving tells, whatever the order.
 
+use super::ValueWithDeviation;
 use super::block::Block;
 use super::offsets::OffsetKnowledge;
 use super::regression::{Channel, Row, index};
-use super::ValueWithDeviation;
 
 /// Blocks of straight driving for a rolling resistance.
 const RESISTANCE_BLOCKS_MIN: f64 = 10.0;
