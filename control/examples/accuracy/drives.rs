@@ -42,7 +42,14 @@ pub(crate) struct Driven {
     pub(crate) ever_measured: bool,
     /// At some moment there was said to be new information.
     pub(crate) ever_informed: bool,
+    /// θ and its deviation when it was first said to be measured.
+    pub(crate) first: Option<(f64, f64)>,
+    /// Sums of the segments' information on θ, and of that times θ.
+    pub(crate) segments: (f64, f64),
 }
+
+/// Time of a segment, seconds: about a metre.
+const SEGMENT_S: f64 = 1.7;
 
 impl Drive {
     /// Drives it.
@@ -57,6 +64,7 @@ impl Drive {
         let mut driven = Driven::default();
         let mut time_s = 0.0;
         let mut settles_at_s = settle_s;
+        let mut segment_end_s = SEGMENT_S;
         while time_s < duration_s {
             let command = self.command(time_s, robot, &mut tracker);
             let outcome = robot.act(command);
@@ -72,8 +80,16 @@ impl Drive {
                 robot.estimator.close_segment();
                 robot.estimator.begin_ground();
             }
+            if time_s > segment_end_s {
+                segment_end_s += SEGMENT_S;
+                let segment = robot.estimator.close_segment();
+                driven.segments.0 += segment.theta_information;
+                driven.segments.1 += segment.theta_weighted;
+            }
             if outcome.block_done {
                 let estimate = robot.estimator.estimate();
+                let now = estimate.theta.map(|found| (found.theta, found.std_dev));
+                driven.first = driven.first.or(now);
                 driven.ever_measured |= estimate.theta.is_some();
                 driven.ever_informed |= !estimate.no_new_information;
             }

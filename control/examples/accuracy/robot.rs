@@ -3,11 +3,11 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tread_control::estimation::{Estimator, SensorNoise, SensorSample, TyrePrior, UpdateOutcome};
-use tread_control::friction::FrictionCurve;
+use tread_control::friction::{FrictionCurve, FrictionSpec};
 use tread_control::geometry::Pose;
 use tread_control::localisation::{Localisation, LocalisationNoise, PositionFix};
 use tread_control::measured::{BodyAcceleration, Measured, WheelSpeeds, WheelTorques};
-use tread_control::plant::{Ground, Plant, PlantMeans, PlantSpec, Tyres};
+use tread_control::plant::{Ground, Plant, PlantMeans, PlantSpec, TyreRise, Tyres};
 use tread_control::robot::RobotModel;
 
 /// Sensor samples, seconds.
@@ -33,6 +33,8 @@ pub(crate) struct RobotSpec {
     pub(crate) aliases: bool,
     pub(crate) servo_lag_s: f64,
     pub(crate) tyres: Tyres,
+    /// Brush tyres whose curvature is drawn evenly between these, per slip.
+    pub(crate) curvatures: Option<[f64; 2]>,
     pub(crate) told_tyres: TyrePrior,
 }
 
@@ -47,6 +49,7 @@ impl RobotSpec {
             aliases: false,
             servo_lag_s: 0.05,
             tyres: Tyres::default(),
+            curvatures: None,
             told_tyres: TyrePrior::default(),
         }
     }
@@ -69,8 +72,17 @@ pub(crate) struct SeededRobot {
 }
 
 impl SeededRobot {
-    pub(crate) fn new(spec: RobotSpec, start: Pose, seed: u64) -> Self {
+    pub(crate) fn new(mut spec: RobotSpec, start: Pose, seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        if let Some([least, most]) = spec.curvatures {
+            spec.tyres.rise = TyreRise::Brush;
+            let curvature = least + (most - least) * rng.random::<f64>();
+            let curve = FrictionSpec {
+                peak_slip: 1.0 / (3.0 * curvature),
+                ..spec.curve.into()
+            };
+            spec.curve = curve.try_into().expect("the peak is between 0 and 1");
+        }
         let most = spec.radius_error_max;
         let mut radius = || 1.0 + most * (2.0 * rng.random::<f64>() - 1.0);
         let plant_spec = PlantSpec {

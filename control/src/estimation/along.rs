@@ -14,6 +14,7 @@
 
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
+use super::block::{SideSlips, bent};
 use super::regression::{Parameters, Row, index};
 use super::{SensorNoise, SensorSample, signed_rims};
 
@@ -221,14 +222,19 @@ impl AlongFilter {
         regressors[index::THETA] = force_m_s;
         regressors[index::RADIUS_OFFSET] = harmonic_m_s;
         regressors[index::RADIUS_DIFFERENCE] = 0.25 * rim_difference_m_s;
-        regressors[index::CURVATURE] =
-            force_m_s * slip * (1.0 + 2.0 / 3.0 * bound.curvature * slip);
+        // On a curved tyre the side that slips more carries less: with equal and opposite slip of
+        // the two sides in a turn, both together hold the robot back.
+        let sides = SideSlips::of(harmonic_m_s.abs(), rim_difference_m_s, gyro_rad_s, model);
+        regressors[index::CURVATURE] = bent(force_m_s, slip, bound.curvature)
+            - 0.25 * sides.unequal * sides.apart * harmonic_m_s / bound.theta;
         // The measured acceleration is averaged over the step, and so is its offset.
         let felt_noise = (harmonic_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2) / count;
         let rim_noise = 0.5 * (noise.wheel_speed_rad_s * model.wheel_radius_m()).powi(2) / count;
         regressors[index::AHEAD_OFFSET] = -bound.theta * harmonic_m_s.abs() / GRAVITY_M_S2;
         let spread = rim_noise + bound.theta.powi(2) * felt_noise;
-        Some(self.observe(regressors, step.wheels_m_s / count, spread, felt_noise))
+        let mut row = self.observe(regressors, step.wheels_m_s / count, spread, felt_noise);
+        row.bend = bent(1.0, slip, bound.curvature);
+        Some(row)
     }
 
     /// One measurement of the speed, less what the parameters add to it.
@@ -252,6 +258,7 @@ impl AlongFilter {
             spread,
             // What is wrong in this row stays in the next ones until it has faded.
             force_noise: force_noise * 2.0 / (2.0 - gain),
+            bend: 0.0,
         }
     }
 }

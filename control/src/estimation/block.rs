@@ -103,13 +103,14 @@ impl Block {
         regressors[index::RADIUS_OFFSET] = self.rim_difference_m_s;
         regressors[index::RADIUS_DIFFERENCE] = self.rim_mean_m_s;
         regressors[index::GYRO_OFFSET] = -self.track_width_m;
-        regressors[index::CURVATURE] = self.bent(force.difference_m_s);
+        regressors[index::CURVATURE] = bent(force.difference_m_s, self.slip, self.curvature);
         regressors[index::RESISTANCE] = -self.rim_difference_m_s;
         Some(Row {
             regressors,
             response: self.difference_m_s,
             spread: self.difference_noise,
             force_noise: force.difference_noise,
+            bend: bent(1.0, self.slip, self.curvature),
         })
     }
 
@@ -121,19 +122,15 @@ impl Block {
         regressors[index::THETA] = force.mean_m_s;
         regressors[index::RADIUS_OFFSET] = self.rim_mean_m_s;
         regressors[index::RADIUS_DIFFERENCE] = 0.25 * self.rim_difference_m_s;
-        regressors[index::CURVATURE] = self.bent(force.mean_m_s);
+        regressors[index::CURVATURE] = bent(force.mean_m_s, self.slip, self.curvature);
         regressors[index::RESISTANCE] = -self.rim_mean_m_s;
         Some(Row {
             regressors,
             response: slip_m_s,
             spread: self.slip_noise,
             force_noise: 0.25 * force.difference_noise,
+            bend: bent(1.0, self.slip, self.curvature),
         })
-    }
-
-    /// Regressor of θκ: the force's slip grows with slip itself on a curved tyre.
-    fn bent(&self, force_m_s: f64) -> f64 {
-        force_m_s * self.slip * (1.0 + 2.0 / 3.0 * self.curvature * self.slip)
     }
 
     /// Twice the mean force on the sides, metres per second.
@@ -142,6 +139,43 @@ impl Block {
             .map_or(2.0 * self.ahead_mu * self.rim_mean_m_s.abs(), |force| {
                 2.0 * force.mean_m_s.abs()
             })
+    }
+}
+
+/// Regressor of θκ: the force's slip grows with slip itself on a curved tyre.
+pub(super) fn bent(force_m_s: f64, slip: f64, curvature: f64) -> f64 {
+    force_m_s * slip * (1.0 + 2.0 / 3.0 * curvature * slip)
+}
+
+/// Slips of the two sides in a turn.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct SideSlips {
+    /// Mean combined slip.
+    pub(super) mean: f64,
+    /// Left minus right combined slip.
+    pub(super) unequal: f64,
+    /// Right minus left slip ahead.
+    pub(super) apart: f64,
+}
+
+impl SideSlips {
+    /// At a mean rim speed above zero, all of a robot that drives ahead.
+    pub(super) fn of(
+        rim_m_s: f64,
+        rim_difference_m_s: f64,
+        turn_rad_s: f64,
+        model: &RobotModel,
+    ) -> Self {
+        let apart = (rim_difference_m_s - model.track_width_m() * turn_rad_s) / rim_m_s;
+        let combined =
+            |side_m_s: f64| (0.5 * apart).hypot(0.5 * model.wheelbase_m() * turn_rad_s / side_m_s);
+        let left = combined(rim_m_s - 0.5 * rim_difference_m_s);
+        let right = combined(rim_m_s + 0.5 * rim_difference_m_s);
+        Self {
+            mean: 0.5 * (left + right),
+            unequal: left - right,
+            apart,
+        }
     }
 }
 
@@ -268,7 +302,7 @@ impl BlockBuilder {
         let turning = has_acceleration
             .then(|| self.window.means(self.duration_s))
             .flatten()
-            .map(|means| turning_row(&means, slip, context));
+            .map(|means| turning_row(&means, context));
         let lateral_mu = if self.with_acceleration > 0 {
             self.lateral_m_s2 / f64::from(self.with_acceleration) / GRAVITY_M_S2
         } else {
@@ -318,7 +352,7 @@ impl BlockBuilder {
 }
 
 /// The moment balance as a row.
-fn turning_row(means: &TurnMeans, slip: f64, context: BlockContext<'_>) -> Row {
+fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
     let BlockContext {
         model,
         noise,
@@ -340,7 +374,22 @@ fn turning_row(means: &TurnMeans, slip: f64, context: BlockContext<'_>) -> Row {
     regressors[index::TRACK] = track_m * (model.effective_track_ratio() - 1.0) * means.turn_rad_s;
     regressors[index::GYRO_OFFSET] = -model.effective_track_m();
     regressors[index::AHEAD_OFFSET] = -theta * means.rim_difference_m_s / GRAVITY_M_S2;
-    regressors[index::CURVATURE] = force_m_s * slip * (1.0 + 2.0 / 3.0 * tyres.curvature * slip);
+    // The side that slips more carries less; what that adds to the balance is odd in the turn.
+    let sides = SideSlips::of(
+        means.harmonic_m_s,
+        means.rim_difference_m_s,
+        means.turn_rad_s,
+        model,
+    );
+    let gap = means.rim_difference_m_s / means.harmonic_m_s.powi(2);
+    let lever_m = model.wheelbase_m().powi(2) / track_m;
+    let odd_m_s = means.harmonic_m_s
+        * sides.unequal
+        * (0.5 * sides.apart * gap * means.harmonic_m_s
+            + 0.5 * lever_m * means.turn_rad_s * gap
+            + 2.0 * theta * means.ahead_mu);
+    regressors[index::CURVATURE] =
+        bent(force_m_s, sides.mean, tyres.curvature) - 0.5 * odd_m_s / theta;
     let rim_noise_m_s = noise.wheel_speed_rad_s * model.wheel_radius_m();
     let gyro_noise = noise.gyro_rad_s.powi(2);
     Row {
@@ -352,5 +401,6 @@ fn turning_row(means: &TurnMeans, slip: f64, context: BlockContext<'_>) -> Row {
             / means.ramp_samples
             + (means.rim_difference_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2)
                 / means.samples,
+        bend: bent(1.0, sides.mean, tyres.curvature),
     }
 }

@@ -43,6 +43,7 @@ pub use expectation::{ExpectedAccuracy, expected_accuracy};
 use offsets::OffsetKnowledge;
 use regression::{Solution, SolveInput, solve};
 pub use segment::SegmentStatistics;
+use segment::SegmentTheta;
 use sums::Sums;
 
 /// Time over which samples are averaged, seconds.
@@ -223,6 +224,8 @@ pub struct Estimator {
     offsets: OffsetKnowledge,
     /// Blocks of this ground in segments that are closed.
     ground: Sums,
+    /// Information on θ that these hold together.
+    ground_information: f64,
     /// Blocks of the open segment that are certain to be of this ground.
     segment: Sums,
     /// Blocks since the change detector last stood at zero.
@@ -253,6 +256,7 @@ impl Estimator {
             along: AlongFilter::new(),
             offsets: OffsetKnowledge::unknown(&noise, &tyres),
             ground: Sums::default(),
+            ground_information: 0.0,
             segment: Sums::default(),
             pending: Sums::default(),
             change: ChangeDetector::default(),
@@ -452,28 +456,40 @@ impl Estimator {
 
     /// Ends the segment and gives its additive statistics, which hold no prior on θ. The robot's
     /// own parameters are those known from everything else, and their deviation is inside.
+    ///
+    /// What is not known of the robot itself is the same error in all segments, so that their sum
+    /// would promise too much: none claims more information than it adds to what all of this
+    /// ground's segments know together.
     pub fn close_segment(&mut self) -> SegmentStatistics {
         let segment = self.segment.plus(&self.pending);
         let whole = self.ground.plus(&segment);
-        let theta_ground = self
-            .solve(&whole, None)
-            .map(|solution| solution.theta)
-            .filter(|theta| *theta > 0.0);
+        let ground = self.solve(&whole, None).filter(|found| found.theta > 0.0);
+        let together = ground.map_or(0.0, |found| found.variance.max(0.0).recip());
+        let added = if together.is_finite() {
+            together - self.ground_information
+        } else {
+            0.0
+        };
         let offsets = self.offsets.with_ground(&self.ground, &self.tyres);
-        let solution = theta_ground.and_then(|theta| {
+        let solution = ground.and_then(|ground| {
             let input = SolveInput {
                 offsets: &offsets,
                 tyres: &self.tyres,
-                theta_given: Some(theta),
+                theta_given: Some(ground.theta),
             };
-            solve(&segment, input).filter(|found| found.is_informative(theta))
+            solve(&segment, input).filter(|found| found.is_informative(ground.theta))
+        });
+        let theta = solution.map(|found| SegmentTheta {
+            theta: found.theta,
+            information: found.variance.recip().min(added),
         });
         let statistics = SegmentStatistics::of(
             &segment,
             &offsets,
-            solution.as_ref(),
+            theta.filter(|found| found.information > 0.0),
             self.accelerometer_offset_mu(),
         );
+        self.ground_information = self.ground_information.max(together);
         self.ground = whole;
         self.segment = Sums::default();
         self.pending = Sums::default();
@@ -486,6 +502,7 @@ impl Estimator {
     pub fn begin_ground(&mut self) {
         self.offsets = self.offsets.with_ground(&self.ground, &self.tyres);
         self.ground = Sums::default();
+        self.ground_information = 0.0;
         self.segment = Sums::default();
         self.pending = Sums::default();
         self.change = ChangeDetector::default();

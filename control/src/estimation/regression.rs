@@ -67,6 +67,8 @@ pub(super) struct Row {
     pub(super) spread: f64,
     /// Variance of the force regressor.
     pub(super) force_noise: f64,
+    /// The force's share in the regressor of θκ, which has the same noise.
+    pub(super) bend: f64,
 }
 
 impl Row {
@@ -77,6 +79,7 @@ impl Row {
             response,
             spread,
             force_noise: 0.0,
+            bend: 0.0,
         }
     }
 }
@@ -90,6 +93,8 @@ pub(super) struct Channel {
     response: f64,
     /// Sum of the force regressor's variances.
     force_noise: f64,
+    /// The same times the share in θκ's regressor, and times its square.
+    bent_noise: [f64; 2],
     /// Sum of the response's variances.
     response_noise: f64,
 }
@@ -102,6 +107,7 @@ impl Default for Channel {
             product: Parameters::zeros(),
             response: 0.0,
             force_noise: 0.0,
+            bent_noise: [0.0; 2],
             response_noise: 0.0,
         }
     }
@@ -115,6 +121,8 @@ impl Channel {
         self.product += row.regressors * row.response;
         self.response += row.response * row.response;
         self.force_noise += row.force_noise;
+        self.bent_noise[0] += row.force_noise * row.bend;
+        self.bent_noise[1] += row.force_noise * row.bend * row.bend;
         self.response_noise += row.spread;
     }
 
@@ -127,6 +135,7 @@ impl Channel {
             response: row.response * scale,
             spread: (1.0 - theta * theta * force_noise).max(0.1),
             force_noise,
+            bend: row.bend,
         });
     }
 
@@ -137,6 +146,10 @@ impl Channel {
             product: self.product + other.product,
             response: self.response + other.response,
             force_noise: self.force_noise + other.force_noise,
+            bent_noise: [
+                self.bent_noise[0] + other.bent_noise[0],
+                self.bent_noise[1] + other.bent_noise[1],
+            ],
             response_noise: self.response_noise + other.response_noise,
         }
     }
@@ -175,6 +188,10 @@ impl Normal {
             let force_noise = channel.force_noise / channel.count;
             normal.matrix += channel.square / spread;
             normal.matrix[(index::THETA, index::THETA)] -= channel.force_noise / spread;
+            let [cross, bent] = channel.bent_noise.map(|noise| noise / spread);
+            normal.matrix[(index::THETA, index::CURVATURE)] -= cross;
+            normal.matrix[(index::CURVATURE, index::THETA)] -= cross;
+            normal.matrix[(index::CURVATURE, index::CURVATURE)] -= bent;
             normal.right += channel.product / spread;
             normal.excess += channel.count * (force_noise * spread + (theta * force_noise).powi(2))
                 / (spread * spread);

@@ -3,7 +3,6 @@
 use serde::{Deserialize, Serialize};
 
 use super::offsets::OffsetKnowledge;
-use super::regression::Solution;
 use super::sums::Sums;
 
 /// Additive statistics of one segment. `Λ = 1/σ²` of segments add up, and so do `Λθ`.
@@ -33,6 +32,13 @@ pub struct SegmentStatistics {
     pub saturation_ratio: f64,
 }
 
+/// θ of one segment alone, and the information that it may claim.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct SegmentTheta {
+    pub(super) theta: f64,
+    pub(super) information: f64,
+}
+
 impl SegmentStatistics {
     /// θ of this segment alone; none when it carries no information.
     pub fn theta(&self) -> Option<f64> {
@@ -42,17 +48,17 @@ impl SegmentStatistics {
     pub(super) fn of(
         sums: &Sums,
         offsets: &OffsetKnowledge,
-        solution: Option<&Solution>,
+        theta: Option<SegmentTheta>,
         accelerometer_offset_mu: f64,
     ) -> Self {
-        let information = solution.map_or(0.0, |found| found.variance.recip());
+        let information = theta.map_or(0.0, |found| found.information);
         let track = sums.effective_track(offsets);
         let track_information = track.map_or(0.0, |track| track.std_dev.powi(-2));
         let rolling = sums.rolling_resistance(accelerometer_offset_mu);
         let rolling_information = rolling.map_or(0.0, |rolling| rolling.std_dev.powi(-2));
         Self {
             theta_information: information,
-            theta_weighted: solution.map_or(0.0, |found| information * found.theta),
+            theta_weighted: theta.map_or(0.0, |found| information * found.theta),
             samples: sums.blocks,
             duration_s: sums.duration_s,
             mu_peak_lower_bound: sums.mu_peak(),
