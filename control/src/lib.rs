@@ -6,7 +6,7 @@
 //!
 //! * Words: [`geometry`], [`robot`], [`friction`], [`measured`].
 //! * Planning (may allocate): [`trajectory`] is what is asked for, [`path`] its geometry,
-//!   [`profile`] its timing, [`plan`] both, from where the robot stands.
+//!   [`profile`] its timing, [`excitation`] a wiggle of it, [`plan`] all, from where the robot stands.
 //! * Driving (one call per tick): [`mod@reference`] walks along the plan, [`tracking`] turns errors
 //!   into wheel speeds, [`follower`] runs one mission, [`gate`] has the last word.
 //! * Knowing: [`localisation`] says where the robot is, [`estimation`] how the ground grips.
@@ -15,6 +15,7 @@
 
 pub mod bench;
 pub mod estimation;
+pub mod excitation;
 pub mod follower;
 pub mod friction;
 pub mod gate;

@@ -47,7 +47,7 @@ fn case() -> impl Strategy<Value = Case> {
                 peak_slip: 0.2,
                 sliding_ratio: sliding,
             };
-            let curve = FrictionCurve::try_from(spec).unwrap();
+            let curve = FrictionCurve::try_from(spec).expect("figures within their range");
             Case {
                 velocity,
                 wheels,
@@ -71,7 +71,7 @@ struct Terms {
 fn terms(case: &Case) -> Terms {
     let Setting { model, curve } = &case.setting;
     let slips = SideSlips::of(&case.velocity, case.wheels, model);
-    let shape = SlipShape::at(slips, curve).unwrap();
+    let shape = SlipShape::at(slips, curve).expect("slips below one");
     Terms {
         inputs: shape.inputs(case.wheels, model.wheel_radius_m()),
         shape,
@@ -223,9 +223,9 @@ proptest! {
 }
 
 fn section_iv() -> ClosedLoop {
-    let law = Yi2007::new(Yi2007Config::section_iv()).unwrap();
+    let law = Yi2007::new(Yi2007Config::section_iv()).expect("gains above zero");
     let start = ClosedLoopState::section_iv();
-    ClosedLoop::new(law, 5.0, DesiredPoint::section_iv, start).unwrap()
+    ClosedLoop::new(law, 5.0, DesiredPoint::section_iv, start).expect("K above zero")
 }
 
 #[test]
@@ -233,7 +233,7 @@ fn section_iv_converges_and_its_theta_does_not() {
     let mut run = section_iv();
     let mut lyapunov = run.lyapunov().unwrap();
     let error_m = |run: &ClosedLoop| run.output().unwrap().error.norm();
-    let mut errors_m = vec![error_m(&run)];
+    let mut found_m = vec![error_m(&run)];
     for step in 1..=120_000_u32 {
         run.step(1.0e-3).unwrap();
         let now = run.lyapunov().unwrap();
@@ -244,7 +244,7 @@ fn section_iv_converges_and_its_theta_does_not() {
         );
         lyapunov = now;
         if step % 10_000 == 0 {
-            errors_m.push(error_m(&run));
+            found_m.push(error_m(&run));
         }
     }
     for (place, wanted_m, by_m) in [
@@ -253,7 +253,7 @@ fn section_iv_converges_and_its_theta_does_not() {
         (2, 0.51, 0.01),
         (4, 0.067, 0.003),
     ] {
-        assert!((errors_m[place] - wanted_m).abs() < by_m, "{errors_m:?}");
+        assert!((found_m[place] - wanted_m).abs() < by_m, "{found_m:?}");
     }
     let theta = run.state().theta;
     assert!((theta - 0.9747).abs() < 1.0e-3, "{theta}");

@@ -19,6 +19,9 @@ use std::process::ExitCode;
 
 use report::{Options, Section};
 
+/// One part of the program.
+type Part = fn(&Options) -> Section;
+
 fn main() -> ExitCode {
     let options = match Options::from_arguments(std::env::args().skip(1)) {
         Ok(options) => options,
@@ -27,7 +30,7 @@ fn main() -> ExitCode {
             return ExitCode::from(2);
         }
     };
-    let parts: [(&str, fn(&Options) -> Section); 3] = [
+    let parts: [(&str, Part); 3] = [
         ("tracking", tracking::run),
         ("theta", theta::run),
         ("change", change::run),

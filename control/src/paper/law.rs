@@ -170,7 +170,7 @@ impl Yi2007 {
     ) -> Result<LawOutput, Yi2007Error> {
         let config = &self.config;
         let eta_1 = input.ahead_m_s;
-        if !(eta_1.abs() >= SPEED_MIN_M_S) {
+        if eta_1.is_nan() || eta_1.abs() < SPEED_MIN_M_S {
             return Err(Yi2007Error::Standstill(eta_1));
         }
         let turn_rad_s = -input.left_m_s / config.centre_ahead_m;

@@ -167,9 +167,9 @@ pub fn lateral_forces_n(
         if lever_m.abs() <= 0.0 {
             return None;
         }
-        let force_n = load_n * setting.curve.mu(slip);
-        forces_n[2 * side] = force_n * (half_base_m - centres.ahead_m) / lever_m;
-        forces_n[2 * side + 1] = -force_n * (half_base_m + centres.ahead_m) / lever_m;
+        let ahead_n = load_n * setting.curve.mu(slip);
+        forces_n[2 * side] = ahead_n * (half_base_m - centres.ahead_m) / lever_m;
+        forces_n[2 * side + 1] = -ahead_n * (half_base_m + centres.ahead_m) / lever_m;
     }
     Some(forces_n)
 }
