@@ -10,12 +10,16 @@
 //! yaw counterpart, reach thousands per second at standstill: steps are split so that pole times
 //! step stays within the fourth-order Runge-Kutta method's stable and accurate range.
 
+mod tyres;
+
 use thiserror::Error;
 
 use crate::friction::FrictionCurve;
 use crate::geometry::{Pose, Twist};
 use crate::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 use crate::robot::{GRAVITY_M_S2, RobotModel};
+
+pub use tyres::{TyreRise, Tyres};
 
 /// Reference speed below which slip is regularised, metres per second.
 pub const SLIP_SPEED_FLOOR_M_S: f64 = 0.05;
@@ -41,52 +45,6 @@ pub struct PlantSpec {
     pub right_radius_ratio: f64,
     /// How the tyres grip beyond the ground's curve.
     pub tyres: Tyres,
-}
-
-/// How tyres differ from the isotropic piecewise line of (7).
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Tyres {
-    /// Stiffness across over that along, above 0.
-    pub side_grip_ratio: f64,
-    /// Shape of the rise to the peak.
-    pub rise: TyreRise,
-}
-
-impl Default for Tyres {
-    fn default() -> Self {
-        Self {
-            side_grip_ratio: 1.0,
-            rise: TyreRise::Straight,
-        }
-    }
-}
-
-/// Shape of a tyre's friction over slip up to its peak.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum TyreRise {
-    /// The paper's: straight to the peak, then falling.
-    #[default]
-    Straight,
-    /// A brush's: `μ = K λ (1 − z + z²/3)`, `z = λ/(3λ_m)`, with the same initial slope K and the
-    /// same peak `K λ_m`, reached at `z = 1` and kept beyond it.
-    Brush,
-}
-
-impl TyreRise {
-    /// `μ(|σ|)/|σ|` for a slip magnitude ≥ 0.
-    fn mu_over_slip(self, curve: &FrictionCurve, slip: f64) -> f64 {
-        match self {
-            Self::Straight => curve.mu_over_slip(slip),
-            Self::Brush => {
-                let share = slip / (3.0 * curve.peak_slip());
-                if share < 1.0 {
-                    curve.stiffness() * (1.0 - share + share * share / 3.0)
-                } else {
-                    curve.mu_peak() / slip
-                }
-            }
-        }
-    }
 }
 
 impl Default for PlantSpec {

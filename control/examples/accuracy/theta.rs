@@ -124,11 +124,17 @@ fn figures(scenario: &Scenario, runs: &[Run]) -> Figures {
         ),
         false_alarms: runs.iter().map(|run| run.driven.ground_changes).sum(),
         first_coverage: share(
-            firsts.iter().filter(|error| error.abs() < WIDTHS[2]).count(),
+            firsts
+                .iter()
+                .filter(|error| error.abs() < WIDTHS[2])
+                .count(),
             firsts.len(),
         ),
         segment_coverage: share(
-            fused.iter().filter(|error| error.1.abs() < WIDTHS[2]).count(),
+            fused
+                .iter()
+                .filter(|error| error.1.abs() < WIDTHS[2])
+                .count(),
             fused.len(),
         ),
         segment_rms: (fused.iter().map(|error| error.0 * error.0).sum::<f64>()

@@ -28,11 +28,10 @@ mod offsets;
 mod regression;
 mod segment;
 mod sums;
+mod types;
 mod window;
 
-use serde::{Deserialize, Serialize};
-
-use crate::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
+use crate::measured::WheelSpeeds;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
 use along::{AlongFilter, SlipBound};
@@ -45,6 +44,10 @@ use regression::{Solution, SolveInput, solve};
 pub use segment::SegmentStatistics;
 use segment::SegmentTheta;
 use sums::Sums;
+pub use types::{
+    Estimate, SensorNoise, SensorSample, ThetaMeasurement, TyrePrior, UpdateOutcome,
+    ValueWithDeviation,
+};
 
 /// Time over which samples are averaged, seconds.
 pub const BLOCK_S: f64 = 0.2;
@@ -73,146 +76,6 @@ const LEAPS_MAX: u32 = 5;
 /// Wheel acceleration that is believed, as a multiple of the robot's limit.
 const LEAP_SHARE: f64 = 10.0;
 
-/// Noise of the sensors; white, one standard deviation per sample, unless said otherwise.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct SensorNoise {
-    /// Gyro, radians per second.
-    pub gyro_rad_s: f64,
-    /// Accelerometer, metres per second squared.
-    pub accelerometer_m_s2: f64,
-    /// Offset of the accelerometer, unknown, metres per second squared.
-    pub accelerometer_offset_m_s2: f64,
-    /// Error of the accelerometer's scale, unknown, share. Sampling a rough drive has the same
-    /// effect: what lies between two samples is not seen.
-    pub accelerometer_scale_ratio: f64,
-    /// Wheel speed, radians per second.
-    pub wheel_speed_rad_s: f64,
-    /// Body speed, metres per second.
-    pub body_speed_m_s: f64,
-    /// Wheel torque, as friction coefficient of one side.
-    pub torque_mu: f64,
-    /// Error of each side's torque constant, unknown, share.
-    pub torque_gain_ratio: f64,
-    /// Error of each side's rolling radius, unknown, share.
-    pub radius_ratio: f64,
-    /// Offset of the gyro, unknown, radians per second.
-    pub gyro_offset_rad_s: f64,
-}
-
-impl Default for SensorNoise {
-    fn default() -> Self {
-        Self {
-            gyro_rad_s: 0.003,
-            accelerometer_m_s2: 0.05,
-            accelerometer_offset_m_s2: 0.02,
-            accelerometer_scale_ratio: 0.03,
-            wheel_speed_rad_s: 0.02,
-            body_speed_m_s: 0.02,
-            torque_mu: 0.01,
-            torque_gain_ratio: 0.02,
-            radius_ratio: 0.0115,
-            gyro_offset_rad_s: 0.002,
-        }
-    }
-}
-
-/// What is known about the tyres beforehand.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct TyrePrior {
-    /// How far the tyres' stiffness across may differ from that along, one standard deviation as
-    /// a share. It is learned from turning; it only matters until then.
-    pub side_grip_spread: f64,
-    /// Mean κ of `λ = θμ(1 + κλ + ⅔κ²λ²)`, per slip: 0 for the paper's straight rise, `1/(3λ_p)`
-    /// for a brush-like tyre that peaks like a straight rise to slip `λ_p`.
-    pub curvature: f64,
-    /// Its standard deviation, per slip. It cannot be learned from turns of one radius: where it
-    /// is above zero, intervals are as wide as it makes them.
-    pub curvature_spread: f64,
-}
-
-impl Default for TyrePrior {
-    fn default() -> Self {
-        Self {
-            side_grip_spread: 0.3,
-            curvature: 0.0,
-            curvature_spread: 0.0,
-        }
-    }
-}
-
-/// One sample of the robot's own sensors.
-///
-/// Wheel speeds, turn rate and acceleration are means since the sample before, as encoders that
-/// count and inertial sensors with a filter against aliasing give them. Values of the moment do as
-/// well where nothing changes faster than the samples come.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct SensorSample {
-    /// Measured wheel speeds.
-    pub wheel_speeds: WheelSpeeds,
-    /// Turn rate, radians per second.
-    pub gyro_rad_s: f64,
-    /// Acceleration without gravity, body frame.
-    pub acceleration: Option<BodyAcceleration>,
-    /// Speed ahead, metres per second; only in the sample in which it is new.
-    pub body_speed_m_s: Option<f64>,
-    /// Drive torques per side, where the base gives them.
-    pub wheel_torques: Option<WheelTorques>,
-}
-
-/// What is known about the ground under the robot now.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ThetaMeasurement {
-    /// θ = 1/K.
-    pub theta: f64,
-    /// Its standard deviation, with that of the offsets and the torque constant.
-    pub std_dev: f64,
-    /// Blocks that carry the measurement, weighed by their share of its information.
-    pub effective_samples: f64,
-    /// Time that was used, seconds.
-    pub duration_s: f64,
-}
-
-/// What the estimator can say.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Estimate {
-    /// θ of the present ground; none while it is unexcited.
-    pub theta: Option<ThetaMeasurement>,
-    /// Whether the last block brought no new information on θ.
-    pub no_new_information: bool,
-    /// Friction coefficient that the ground has given at least; none before any force.
-    pub mu_peak_lower_bound: Option<f64>,
-    /// Measured effective track over W; none before enough turning.
-    pub effective_track_ratio: Option<f64>,
-    /// Rolling resistance over load; none before enough straight driving with torque.
-    pub rolling_resistance_ratio: Option<f64>,
-    /// Mean share by which the nominal rolling radii are too large, and its deviation.
-    pub radius_offset: ValueWithDeviation,
-    /// Right minus left of the same, and its deviation.
-    pub radius_difference: ValueWithDeviation,
-    /// Share of blocks beyond the linear range of slip, of those driven fast enough.
-    pub saturation_share: f64,
-    /// Samples dropped because they were not finite or not possible.
-    pub dropped_samples: u64,
-}
-
-/// A figure and its standard deviation.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct ValueWithDeviation {
-    /// The figure.
-    pub value: f64,
-    /// Its standard deviation.
-    pub std_dev: f64,
-}
-
-/// What a sample led to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct UpdateOutcome {
-    /// A block of samples was finished and used.
-    pub block_done: bool,
-    /// The ground has changed: close the segment and call [`Estimator::begin_ground`].
-    pub ground_changed: bool,
-}
-
 /// Measures θ.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Estimator {
@@ -234,6 +97,8 @@ pub struct Estimator {
     excitation: Excitation,
     bound: ThetaBound,
     estimate: Estimate,
+    /// What all blocks of this ground give, where that is a measurement.
+    measured: Option<Solution>,
     last_wheels: Option<WheelSpeeds>,
     skipped_s: f64,
     leaps_in_a_row: u32,
@@ -266,6 +131,7 @@ impl Estimator {
                 theta_most: THETA_MOST_FIRST,
             },
             estimate: Estimate::default(),
+            measured: None,
             last_wheels: None,
             skipped_s: 0.0,
             leaps_in_a_row: 0,
@@ -361,13 +227,11 @@ impl Estimator {
     }
 
     fn take(&mut self, mut block: Block) -> bool {
-        let present = self.ground.plus(&self.segment).plus(&self.pending);
-        let measured = self
-            .solve(&present, None)
-            .filter(|solution| solution.is_measurement(present.blocks));
         block.is_linear &= block.slips_little(&self.bound);
         self.pending.add(&block);
-        let innovation = measured.and_then(|solution| solution.innovation(&block));
+        let innovation = self
+            .measured
+            .and_then(|solution| solution.innovation(&block));
         if block.is_linear
             && let Some(row) = block.differential_row()
         {
@@ -390,6 +254,7 @@ impl Estimator {
             offsets: &self.offsets,
             tyres: &self.tyres,
             theta_given,
+            theta_start: self.bound.theta.unwrap_or(THETA_FIRST),
         };
         solve(sums, input)
     }
@@ -403,24 +268,23 @@ impl Estimator {
     fn refresh(&mut self) {
         let sums = self.ground.plus(&self.segment).plus(&self.pending);
         let solution = self.solve(&sums, None);
-        let theta = solution
-            .filter(|solution| solution.is_measurement(sums.blocks))
-            .map(|solution| {
-                // Errors of the torque constants scale the forces; each side has its own, and the
-                // force difference holds half of each. Errors of the radii cancel: the torque reads
-                // too high by what the rim speed beside it reads too low.
-                let gain = if sums.has_torque() {
-                    self.noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2
-                } else {
-                    0.0
-                };
-                ThetaMeasurement {
-                    theta: solution.theta,
-                    std_dev: (solution.variance + (gain * solution.theta).powi(2)).sqrt(),
-                    effective_samples: sums.effective_samples(),
-                    duration_s: sums.duration_s,
-                }
-            });
+        self.measured = solution.filter(|solution| solution.is_measurement(sums.blocks));
+        let theta = self.measured.map(|solution| {
+            // Errors of the torque constants scale the forces; each side has its own, and the
+            // force difference holds half of each. Errors of the radii cancel: the torque reads
+            // too high by what the rim speed beside it reads too low.
+            let gain = if sums.has_torque() {
+                self.noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2
+            } else {
+                0.0
+            };
+            ThetaMeasurement {
+                theta: solution.theta,
+                std_dev: (solution.variance + (gain * solution.theta).powi(2)).sqrt(),
+                effective_samples: sums.effective_samples(),
+                duration_s: sums.duration_s,
+            }
+        });
         let most = solution.map_or(THETA_MOST_FIRST, |found| {
             found.theta.max(0.0) + 2.0 * found.variance.max(0.0).sqrt()
         });
@@ -433,7 +297,8 @@ impl Estimator {
                 most.min(THETA_MOST_FIRST)
             },
         };
-        let offsets = self.offsets.with_ground(&sums, &self.tyres);
+        let theta_ground = solution.map_or(THETA_FIRST, |found| found.theta);
+        let offsets = self.offsets.with_ground(&sums, &self.tyres, theta_ground);
         let (radius_offset, radius_difference) = offsets.values();
         self.estimate = Estimate {
             theta,
@@ -470,12 +335,16 @@ impl Estimator {
         } else {
             0.0
         };
-        let offsets = self.offsets.with_ground(&self.ground, &self.tyres);
+        let theta_ground = ground.map_or(THETA_FIRST, |found| found.theta);
+        let offsets = self
+            .offsets
+            .with_ground(&self.ground, &self.tyres, theta_ground);
         let solution = ground.and_then(|ground| {
             let input = SolveInput {
                 offsets: &offsets,
                 tyres: &self.tyres,
                 theta_given: Some(ground.theta),
+                theta_start: ground.theta,
             };
             solve(&segment, input).filter(|found| found.is_informative(ground.theta))
         });
@@ -500,7 +369,10 @@ impl Estimator {
     /// Starts on new ground: θ is forgotten, what was learned about the robot stays.
     /// An open segment is dropped; close it first.
     pub fn begin_ground(&mut self) {
-        self.offsets = self.offsets.with_ground(&self.ground, &self.tyres);
+        let theta = self
+            .solve(&self.ground, None)
+            .map_or(THETA_FIRST, |found| found.theta);
+        self.offsets = self.offsets.with_ground(&self.ground, &self.tyres, theta);
         self.ground = Sums::default();
         self.ground_information = 0.0;
         self.segment = Sums::default();

@@ -2,9 +2,7 @@
 
 use nalgebra::{SMatrix, SVector};
 
-use super::regression::{
-    Normal, OFFSETS, ParameterMatrix, Parameters, SolveInput, index, inflation, solve,
-};
+use super::regression::{Normal, OFFSETS, ParameterMatrix, Parameters, index, inflation};
 use super::sums::Sums;
 use super::{SensorNoise, THETA_FIRST, THETA_RANGE, TyrePrior, ValueWithDeviation};
 
@@ -39,18 +37,12 @@ impl OffsetKnowledge {
         }
     }
 
-    /// With what these sums tell about the robot, whatever their θ.
-    pub(super) fn with_ground(&self, sums: &Sums, tyres: &TyrePrior) -> Self {
+    /// With what these sums tell about the robot, whatever their θ; the given one only weighs them.
+    /// Without excitation there is no θ, and the rest is learned all the same.
+    pub(super) fn with_ground(&self, sums: &Sums, tyres: &TyrePrior, theta: f64) -> Self {
         if sums.blocks == 0 {
             return *self;
         }
-        // Without excitation there is no θ, and the rest is learned all the same.
-        let input = SolveInput {
-            offsets: self,
-            tyres,
-            theta_given: None,
-        };
-        let theta = solve(sums, input).map_or(THETA_FIRST, |solution| solution.theta);
         let theta = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
         let channels = sums.channels();
         let mut normal = Normal::of(&channels, theta, tyres);

@@ -9,7 +9,7 @@ use nalgebra::{SMatrix, SVector};
 
 use super::offsets::OffsetKnowledge;
 use super::sums::Sums;
-use super::{BLOCKS_MIN, RELATIVE_STD_DEV_MAX, THETA_FIRST, THETA_RANGE, TyrePrior};
+use super::{BLOCKS_MIN, RELATIVE_STD_DEV_MAX, THETA_RANGE, TyrePrior};
 use crate::estimation::block::Block;
 
 /// Number of parameters.
@@ -252,6 +252,8 @@ pub(super) struct SolveInput<'known> {
     pub(super) tyres: &'known TyrePrior,
     /// Weights of this θ and no other; `None` finds its own.
     pub(super) theta_given: Option<f64>,
+    /// Where the search for weights starts.
+    pub(super) theta_start: f64,
 }
 
 /// Estimates all parameters; none without any excitation.
@@ -260,7 +262,7 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
         return None;
     }
     let channels = sums.channels();
-    let mut theta_weights = input.theta_given.unwrap_or(THETA_FIRST);
+    let mut theta_weights = input.theta_given.unwrap_or(input.theta_start);
     for round in 1..=ROUNDS {
         let normal = Normal::of(&channels, theta_weights, input.tyres).with_offsets(input.offsets);
         let covariance = normal.matrix.cholesky()?.inverse();
