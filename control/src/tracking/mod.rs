@@ -206,7 +206,7 @@ impl Tracker {
         self.integral_1_m = (self.integral_1_m + change_1_m).clamp(-bound, bound);
     }
 
-    /// `θ̂̇ = ρ e_y φ/(1 + φ²) + pull (θ − θ̂)`, φ = v²ω/g, bounded in rate and range.
+    /// `θ̂̇ = ρ e_y φ + pull·c (cθ − θ̂)`, φ = v²ω/g, c the confidence; bounded in rate and range.
     fn adapt(
         &mut self,
         reference: &ReferenceSample,
@@ -221,7 +221,7 @@ impl Tracker {
         } else {
             cross_m
         };
-        let gradient = config.adaptation_gain * error_m * regressor / (1.0 + regressor * regressor);
+        let gradient = config.adaptation_gain * error_m * regressor;
         let pull = knowledge.map_or(0.0, |known| {
             let weight = known.confidence();
             config.adaptation_pull_1_s * weight * (weight * known.theta - self.theta)
