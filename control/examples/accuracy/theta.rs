@@ -17,7 +17,7 @@ const WIDTHS: [f64; 3] = [0.6745, 1.2816, 1.9600];
 enum Goal {
     /// Intervals that hold, and an RMS error of at most this share, where one is asked for.
     Measures { rms_max: Option<f64> },
-    /// As before, but told plainly and not asked for: the robot is told a wrong tyre.
+    /// Told plainly and not asked for: the robot is not what it is told to be.
     Reports,
     /// No measurement at any moment.
     Abstains,
@@ -293,6 +293,14 @@ fn without_torque(all: &mut Vec<Scenario>) {
             goal: Goal::Measures { rms_max: None },
         });
     }
+    let mut aliasing = RobotSpec::on(5.0);
+    aliasing.aliases = true;
+    all.push(Scenario {
+        name: "no torque, stop and go, K 5, samples that alias".to_owned(),
+        drive: Drive::StopAndGo,
+        robot: aliasing,
+        goal: Goal::Reports,
+    });
     for (name, drive) in [
         ("straight", Drive::SteadyStraight),
         ("circle", Drive::SteadyCircle),

@@ -30,6 +30,8 @@ pub(super) struct Force {
 pub(super) struct ThetaBound {
     /// θ, where it is measured.
     pub(super) theta: Option<f64>,
+    /// θ that weighs rows, measured or not.
+    pub(super) theta_weights: f64,
     /// Largest θ that the ground may have, for all that is known.
     pub(super) theta_most: f64,
 }
@@ -110,7 +112,8 @@ impl Block {
             response: self.difference_m_s,
             spread: self.difference_noise,
             force_noise: force.difference_noise,
-            bend: bent(1.0, self.slip, self.curvature),
+            // Torque is measured so well that its noise does not matter there.
+            bend: 0.0,
         })
     }
 
@@ -129,7 +132,8 @@ impl Block {
             response: slip_m_s,
             spread: self.slip_noise,
             force_noise: 0.25 * force.difference_noise,
-            bend: bent(1.0, self.slip, self.curvature),
+            // Torque is measured so well that its noise does not matter there.
+            bend: 0.0,
         })
     }
 

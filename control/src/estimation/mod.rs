@@ -69,6 +69,8 @@ const THETA_FIRST: f64 = 0.2;
 const THETA_RANGE: std::ops::RangeInclusive<f64> = 5.0e-3..=10.0;
 /// Largest θ that is reckoned with before there is any estimate.
 const THETA_MOST_FIRST: f64 = 2.0;
+/// Share of θ that rows on accelerations leave out: products of θ with what is learned meanwhile.
+const MODEL_RATIO: f64 = 1.5e-3;
 /// Longest time between two samples over which anything is averaged, seconds.
 const GAP_MAX_S: f64 = 0.1;
 /// Samples in a row that are refused because the wheels' speed leapt.
@@ -128,6 +130,7 @@ impl Estimator {
             excitation: Excitation::default(),
             bound: ThetaBound {
                 theta: None,
+                theta_weights: THETA_FIRST,
                 theta_most: THETA_MOST_FIRST,
             },
             estimate: Estimate::default(),
@@ -173,7 +176,7 @@ impl Estimator {
             noise: &self.noise,
             tyres: &self.tyres,
             radius_difference: self.estimate.radius_difference.value,
-            theta: self.bound.theta.unwrap_or(THETA_FIRST),
+            theta: self.bound.theta_weights,
         };
         let block = builder.finish(context);
         let ground_changed = block.is_some_and(|block| self.take(block));
@@ -206,7 +209,7 @@ impl Estimator {
     fn step_along(&mut self, sample: &SensorSample, dt_s: f64) {
         let bound = SlipBound {
             theta_most: self.bound.theta_most,
-            theta: self.bound.theta.unwrap_or(THETA_FIRST),
+            theta: self.bound.theta_weights,
             slip_max: if self.bound.theta.is_some() {
                 SLIP_LINEAR_MAX
             } else {
@@ -254,7 +257,7 @@ impl Estimator {
             offsets: &self.offsets,
             tyres: &self.tyres,
             theta_given,
-            theta_start: self.bound.theta.unwrap_or(THETA_FIRST),
+            theta_start: self.bound.theta_weights,
         };
         solve(sums, input)
     }
@@ -276,7 +279,7 @@ impl Estimator {
             let gain = if sums.has_torque() {
                 self.noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2
             } else {
-                0.0
+                MODEL_RATIO
             };
             ThetaMeasurement {
                 theta: solution.theta,
@@ -290,6 +293,11 @@ impl Estimator {
         });
         self.bound = ThetaBound {
             theta: theta.map(|found| found.theta),
+            theta_weights: solution
+                .filter(|found| found.variance > 0.0 && found.variance.sqrt() < found.theta)
+                .map_or(THETA_FIRST, |found| {
+                    found.theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end())
+                }),
             // A measured θ may be beyond what is reckoned with at first.
             theta_most: if theta.is_some() {
                 most
@@ -339,10 +347,12 @@ impl Estimator {
         let offsets = self
             .offsets
             .with_ground(&self.ground, &self.tyres, theta_ground);
+        // How curved the tyres are is one error of all segments too.
+        let tyres = ground.map_or(self.tyres, |found| found.tyres(&self.tyres));
         let solution = ground.and_then(|ground| {
             let input = SolveInput {
                 offsets: &offsets,
-                tyres: &self.tyres,
+                tyres: &tyres,
                 theta_given: Some(ground.theta),
                 theta_start: ground.theta,
             };

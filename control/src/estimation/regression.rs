@@ -55,6 +55,8 @@ const SIGNIFICANCE_MIN: f64 = 6.0;
 const INFLATION_ROWS: f64 = 15.0;
 /// How large rolling resistance over load may be, one standard deviation.
 const ROLLING_SPREAD: f64 = 0.02;
+/// Share of the effect of curved tyres that the rows may miss: they hold it to second order.
+const BEND_SHARE: f64 = 0.1;
 /// Least spread of a tyre's curvature, so that the matrix stays regular.
 const CURVATURE_SPREAD_MIN: f64 = 1.0e-3;
 
@@ -245,6 +247,23 @@ pub(super) fn inflation(channels: &[&Channel], parameters: &Parameters, theta: f
     }
 }
 
+/// How large the regressor of θκ is beside that of θ.
+fn bend_ratio(channels: &[&Channel]) -> f64 {
+    let sum = |parameter: usize| {
+        let squares = channels.iter().map(|channel| {
+            let noise = (channel.response_noise / channel.count.max(1.0)).max(f64::MIN_POSITIVE);
+            channel.square[(parameter, parameter)] / noise
+        });
+        squares.sum::<f64>()
+    };
+    let own = sum(index::THETA);
+    if own > 0.0 {
+        (sum(index::CURVATURE) / own).sqrt()
+    } else {
+        0.0
+    }
+}
+
 /// What a solution starts from.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SolveInput<'known> {
@@ -284,11 +303,14 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
             let across = covariance[(index::THETA, index::RADIUS_OFFSET)];
             let own = covariance[(index::RADIUS_OFFSET, index::RADIUS_OFFSET)];
             let scaled = (2.0 * scale * across + scale * scale * own).max(-0.5 * base);
+            let bend = parameters[index::CURVATURE] * bend_ratio(&channels);
             return Some(Solution {
                 theta,
                 parameters,
                 covariance: covariance * inflation,
-                variance: (base + scaled) * inflation + base * base * normal.excess,
+                variance: (base + scaled) * inflation
+                    + base * base * normal.excess
+                    + (BEND_SHARE * bend).powi(2),
                 significance: 1.0 / (base * normal.noise_std_dev.max(f64::MIN_POSITIVE)),
             });
         }
@@ -317,6 +339,25 @@ impl Solution {
             && self.variance.is_finite()
             && self.variance.sqrt() < RELATIVE_STD_DEV_MAX * self.theta
             && self.significance > SIGNIFICANCE_MIN
+    }
+
+    /// What this tells about the tyres' curvature beyond what was known.
+    pub(super) fn tyres(&self, known: &TyrePrior) -> TyrePrior {
+        let variance = self.covariance[(index::CURVATURE, index::CURVATURE)];
+        let cross = self.covariance[(index::CURVATURE, index::THETA)];
+        let own = self.covariance[(index::THETA, index::THETA)];
+        let curvature = self.parameters[index::CURVATURE] / self.parameters[index::THETA];
+        let of_ratio = variance - 2.0 * curvature * cross + curvature * curvature * own;
+        let spread = of_ratio.max(0.0).sqrt() / self.parameters[index::THETA].abs();
+        if curvature.is_finite() && spread.is_finite() && spread < known.curvature_spread {
+            TyrePrior {
+                curvature,
+                curvature_spread: spread,
+                ..*known
+            }
+        } else {
+            *known
+        }
     }
 
     /// Whether a segment's sums carry information at all, judged by the ground's θ.
