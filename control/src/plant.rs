@@ -23,10 +23,15 @@ pub use tyres::{TyreRise, Tyres};
 
 /// Reference speed below which slip is regularised, metres per second.
 pub const SLIP_SPEED_FLOOR_M_S: f64 = 0.05;
-/// Largest product of slip pole and step.
-const POLE_STEP_MAX: f64 = 0.7;
+/// Largest product of slip pole and step; the method is stable up to 2.78.
+const POLE_STEP_MAX: f64 = 2.4;
 /// Longest internal step, seconds.
-const STEP_MAX_S: f64 = 2.5e-3;
+const STEP_MAX_S: f64 = 5.0e-3;
+/// The same while a side rolls slower than [`SLOW_M_S`]: there the slip's reference speed changes
+/// quickly.
+const STEP_SLOW_MAX_S: f64 = 2.5e-3;
+/// Rim speed that counts as slow, metres per second.
+const SLOW_M_S: f64 = 0.2;
 /// Most internal steps in one call; beyond it the step is cut, which needs `gK/u₀` above 10⁵.
 const STEPS_MAX: usize = 10_000;
 /// Shortest servo lag that is integrated; a shorter one acts as this one, seconds.
@@ -306,7 +311,9 @@ impl Plant {
         let mut sums = MeanSums::default();
         let mut left_s = dt_s;
         for _ in 0..STEPS_MAX {
-            let step_s = self.stable_step_s(ground).min(left_s);
+            // Even parts, so that no sliver of a step is left over.
+            let parts = (left_s / self.stable_step_s(ground)).ceil().max(1.0);
+            let step_s = left_s / parts;
             let before = self.state;
             self.runge_kutta(command, ground, step_s);
             sums.add(&before, &self.state, step_s);
@@ -332,7 +339,12 @@ impl Plant {
         let side_grip = self.spec.tyres.side_grip_ratio.max(1.0);
         let pole_s1 = GRAVITY_M_S2 * stiffness * side_grip / reference_m_s * shape.max(1.0);
         let servo_s = 0.5 * self.spec.servo_lag_s.max(SERVO_LAG_FLOOR_S);
-        (POLE_STEP_MAX / pole_s1).min(servo_s).min(STEP_MAX_S)
+        let step_max_s = if slowest_m_s < SLOW_M_S {
+            STEP_SLOW_MAX_S
+        } else {
+            STEP_MAX_S
+        };
+        (POLE_STEP_MAX / pole_s1).min(servo_s).min(step_max_s)
     }
 
     fn runge_kutta(&mut self, command: WheelSpeeds, ground: &Ground, step_s: f64) {
@@ -392,15 +404,15 @@ impl Plant {
         let mut sum = Contact::default();
         let mut side_n = [0.0; 2];
         for (side, (y_m, rim_m_s, curve)) in sides.into_iter().enumerate() {
-            let reference_m_s = slip_reference_m_s(rim_m_s);
+            let per_speed_s_m = slip_reference_m_s(rim_m_s).recip();
             let slip_ahead =
-                (state.ahead_m_s - state.yaw_rate_rad_s * y_m - rim_m_s) / reference_m_s;
+                (state.ahead_m_s - state.yaw_rate_rad_s * y_m - rim_m_s) * per_speed_s_m;
             for x_m in [half_base_m, -half_base_m] {
                 // The slip across that would give its force on an isotropic tyre.
                 let slip_left = tyres.side_grip_ratio
                     * (state.left_m_s + state.yaw_rate_rad_s * x_m)
-                    / reference_m_s;
-                let slip = slip_ahead.hypot(slip_left);
+                    * per_speed_s_m;
+                let slip = (slip_ahead * slip_ahead + slip_left * slip_left).sqrt();
                 let gain_n = -load_n * tyres.rise.mu_over_slip(curve, slip);
                 let (force_ahead_n, force_left_n) = (gain_n * slip_ahead, gain_n * slip_left);
                 side_n[side] += force_ahead_n;
