@@ -357,7 +357,7 @@ fn sweeps(all: &mut Vec<Scenario>) {
         );
     }
     push("samples that alias".to_owned(), &|robot| {
-        robot.aliases = true
+        robot.aliases = true;
     });
     for ratio in [0.7, 1.4] {
         push(format!("side grip × {ratio}"), &move |robot| {
