@@ -248,6 +248,16 @@ impl Follower {
         };
     }
 
+    /// Limits the speed along the path, metres per second; none lifts the limit.
+    pub fn set_speed_limit(&mut self, limit_m_s: Option<f64>) {
+        self.governor.set_speed_limit(limit_m_s);
+    }
+
+    /// Holds θ̂ and the integral, for instance while something else cuts the command.
+    pub fn hold_adaptation(&mut self, held: bool) {
+        self.tracker.hold_adaptation(held);
+    }
+
     /// One tick.
     pub fn step(
         &mut self,

@@ -6,20 +6,23 @@
 //!
 //! * Words: [`geometry`], [`robot`], [`friction`], [`measured`].
 //! * Planning (may allocate): [`trajectory`] is what is asked for, [`path`] its geometry,
-//!   [`profile`] its timing, [`plan`] both, from where the robot stands.
+//!   [`profile`] its timing, [`excitation`] a wiggle of it, [`plan`] all, from where the robot stands.
 //! * Driving (one call per tick): [`mod@reference`] walks along the plan, [`tracking`] turns errors
 //!   into wheel speeds, [`follower`] runs one mission, [`gate`] has the last word.
 //! * Knowing: [`localisation`] says where the robot is, [`estimation`] how the ground grips.
+//! * [`mod@paper`] is the paper this began with, exactly; its law is a bench, not what ships.
 //! * [`plant`] is the simulated base; [`mod@bench`] holds laws written only for comparison.
 
 pub mod bench;
 pub mod estimation;
+pub mod excitation;
 pub mod follower;
 pub mod friction;
 pub mod gate;
 pub mod geometry;
 pub mod localisation;
 pub mod measured;
+pub mod paper;
 pub mod path;
 pub mod plan;
 pub mod plant;

@@ -10,6 +10,8 @@
 //! yaw counterpart, reach thousands per second at standstill: steps are split so that pole times
 //! step stays within the fourth-order Runge-Kutta method's stable and accurate range.
 
+mod tyres;
+
 use thiserror::Error;
 
 use crate::friction::FrictionCurve;
@@ -17,12 +19,19 @@ use crate::geometry::{Pose, Twist};
 use crate::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
+pub use tyres::{TyreRise, Tyres};
+
 /// Reference speed below which slip is regularised, metres per second.
 pub const SLIP_SPEED_FLOOR_M_S: f64 = 0.05;
-/// Largest product of slip pole and step.
-const POLE_STEP_MAX: f64 = 0.7;
+/// Largest product of slip pole and step; the method is stable up to 2.78.
+const POLE_STEP_MAX: f64 = 2.4;
 /// Longest internal step, seconds.
-const STEP_MAX_S: f64 = 2.5e-3;
+const STEP_MAX_S: f64 = 5.0e-3;
+/// The same while a side rolls slower than [`SLOW_M_S`]: there the slip's reference speed changes
+/// quickly.
+const STEP_SLOW_MAX_S: f64 = 2.5e-3;
+/// Rim speed that counts as slow, metres per second.
+const SLOW_M_S: f64 = 0.2;
 /// Most internal steps in one call; beyond it the step is cut, which needs `gK/u₀` above 10⁵.
 const STEPS_MAX: usize = 10_000;
 /// Shortest servo lag that is integrated; a shorter one acts as this one, seconds.
@@ -39,6 +48,8 @@ pub struct PlantSpec {
     pub left_radius_ratio: f64,
     /// True rolling radius of the right wheels over the model's, about 1.
     pub right_radius_ratio: f64,
+    /// How the tyres grip beyond the ground's curve.
+    pub tyres: Tyres,
 }
 
 impl Default for PlantSpec {
@@ -48,6 +59,7 @@ impl Default for PlantSpec {
             rolling_resistance_ratio: 0.01,
             left_radius_ratio: 1.0,
             right_radius_ratio: 1.0,
+            tyres: Tyres::default(),
         }
     }
 }
@@ -116,6 +128,57 @@ pub struct Plant {
     spec: PlantSpec,
     state: PlantState,
     contact: Contact,
+    means: PlantMeans,
+}
+
+/// Means over the time of one call of [`Plant::step`]: what encoders that count, and inertial
+/// sensors that do not alias, give for it.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct PlantMeans {
+    /// Wheel speeds.
+    pub wheel_speeds: WheelSpeeds,
+    /// Turn rate φ̇, radians per second.
+    pub yaw_rate_rad_s: f64,
+    /// What an accelerometer at the centre of mass feels.
+    pub acceleration: BodyAcceleration,
+}
+
+/// Sums from which [`PlantMeans`] are made.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct MeanSums {
+    left_rad: f64,
+    right_rad: f64,
+    yaw_rad: f64,
+    /// `∫ẏφ̇ dt` and `∫ẋφ̇ dt`, metres per second.
+    left_turned_m_s: f64,
+    ahead_turned_m_s: f64,
+}
+
+impl MeanSums {
+    fn add(&mut self, before: &PlantState, after: &PlantState, step_s: f64) {
+        let half_s = 0.5 * step_s;
+        for state in [before, after] {
+            self.left_rad += half_s * state.wheel_speeds.left_rad_s;
+            self.right_rad += half_s * state.wheel_speeds.right_rad_s;
+            self.yaw_rad += half_s * state.yaw_rate_rad_s;
+            self.left_turned_m_s += half_s * state.left_m_s * state.yaw_rate_rad_s;
+            self.ahead_turned_m_s += half_s * state.ahead_m_s * state.yaw_rate_rad_s;
+        }
+    }
+
+    fn means(&self, start: &PlantState, end: &PlantState, span_s: f64) -> PlantMeans {
+        PlantMeans {
+            wheel_speeds: WheelSpeeds {
+                left_rad_s: self.left_rad / span_s,
+                right_rad_s: self.right_rad / span_s,
+            },
+            yaw_rate_rad_s: self.yaw_rad / span_s,
+            acceleration: BodyAcceleration {
+                ahead_m_s2: (end.ahead_m_s - start.ahead_m_s - self.left_turned_m_s) / span_s,
+                left_m_s2: (end.left_m_s - start.left_m_s + self.ahead_turned_m_s) / span_s,
+            },
+        }
+    }
 }
 
 /// Forces of all contacts on the body.
@@ -153,6 +216,7 @@ impl Plant {
         )?;
         check("left_radius_ratio", spec.left_radius_ratio, 0.5..=2.0)?;
         check("right_radius_ratio", spec.right_radius_ratio, 0.5..=2.0)?;
+        check("side_grip_ratio", spec.tyres.side_grip_ratio, 0.1..=10.0)?;
         if !pose.is_finite() {
             return Err(PlantError::OutOfRange {
                 field: "pose",
@@ -168,6 +232,7 @@ impl Plant {
             spec,
             state,
             contact: Contact::default(),
+            means: PlantMeans::default(),
         })
     }
 
@@ -181,7 +246,12 @@ impl Plant {
         self.state = state;
     }
 
-    /// What an accelerometer at the centre of mass feels, without noise.
+    /// Means over the last step.
+    pub fn means(&self) -> &PlantMeans {
+        &self.means
+    }
+
+    /// What an accelerometer at the centre of mass feels now, without noise.
     pub fn body_acceleration(&self) -> BodyAcceleration {
         BodyAcceleration {
             ahead_m_s2: self.contact.ahead_n / self.model.mass_kg(),
@@ -237,15 +307,22 @@ impl Plant {
             left_rad_s: bounded(command.left_rad_s),
             right_rad_s: bounded(command.right_rad_s),
         };
+        let start = self.state;
+        let mut sums = MeanSums::default();
         let mut left_s = dt_s;
         for _ in 0..STEPS_MAX {
-            let step_s = self.stable_step_s(ground).min(left_s);
+            // Even parts, so that no sliver of a step is left over.
+            let parts = (left_s / self.stable_step_s(ground)).ceil().max(1.0);
+            let step_s = left_s / parts;
+            let before = self.state;
             self.runge_kutta(command, ground, step_s);
+            sums.add(&before, &self.state, step_s);
             left_s -= step_s;
             if left_s <= 1.0e-12 {
                 break;
             }
         }
+        self.means = sums.means(&start, &self.state, dt_s - left_s);
         self.contact = self.contact_forces(&self.state, ground);
     }
 
@@ -259,9 +336,15 @@ impl Plant {
         let reference_m_s = slip_reference_m_s(slowest_m_s);
         let shape = model.mass_kg() * (model.track_width_m().powi(2) + model.wheelbase_m().powi(2))
             / (4.0 * model.yaw_inertia_kg_m2());
-        let pole_s1 = GRAVITY_M_S2 * stiffness / reference_m_s * shape.max(1.0);
+        let side_grip = self.spec.tyres.side_grip_ratio.max(1.0);
+        let pole_s1 = GRAVITY_M_S2 * stiffness * side_grip / reference_m_s * shape.max(1.0);
         let servo_s = 0.5 * self.spec.servo_lag_s.max(SERVO_LAG_FLOOR_S);
-        (POLE_STEP_MAX / pole_s1).min(servo_s).min(STEP_MAX_S)
+        let step_max_s = if slowest_m_s < SLOW_M_S {
+            STEP_SLOW_MAX_S
+        } else {
+            STEP_MAX_S
+        };
+        (POLE_STEP_MAX / pole_s1).min(servo_s).min(step_max_s)
     }
 
     fn runge_kutta(&mut self, command: WheelSpeeds, ground: &Ground, step_s: f64) {
@@ -305,6 +388,7 @@ impl Plant {
         let half_base_m = 0.5 * self.model.wheelbase_m();
         let load_n = 0.5 * self.model.side_load_n();
         let radius_m = self.model.wheel_radius_m();
+        let tyres = &self.spec.tyres;
         let sides = [
             (
                 half_track_m,
@@ -320,13 +404,16 @@ impl Plant {
         let mut sum = Contact::default();
         let mut side_n = [0.0; 2];
         for (side, (y_m, rim_m_s, curve)) in sides.into_iter().enumerate() {
-            let reference_m_s = slip_reference_m_s(rim_m_s);
+            let per_speed_s_m = slip_reference_m_s(rim_m_s).recip();
             let slip_ahead =
-                (state.ahead_m_s - state.yaw_rate_rad_s * y_m - rim_m_s) / reference_m_s;
+                (state.ahead_m_s - state.yaw_rate_rad_s * y_m - rim_m_s) * per_speed_s_m;
             for x_m in [half_base_m, -half_base_m] {
-                let slip_left = (state.left_m_s + state.yaw_rate_rad_s * x_m) / reference_m_s;
-                let slip = slip_ahead.hypot(slip_left);
-                let gain_n = -load_n * curve.mu_over_slip(slip);
+                // The slip across that would give its force on an isotropic tyre.
+                let slip_left = tyres.side_grip_ratio
+                    * (state.left_m_s + state.yaw_rate_rad_s * x_m)
+                    * per_speed_s_m;
+                let slip = (slip_ahead * slip_ahead + slip_left * slip_left).sqrt();
+                let gain_n = -load_n * tyres.rise.mu_over_slip(curve, slip);
                 let (force_ahead_n, force_left_n) = (gain_n * slip_ahead, gain_n * slip_left);
                 side_n[side] += force_ahead_n;
                 sum.left_n += force_left_n;

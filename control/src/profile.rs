@@ -25,6 +25,16 @@ pub(crate) struct NodeLimits {
     pub(crate) acceleration_m_s2: f64,
 }
 
+impl NodeLimits {
+    /// The lower of each limit.
+    pub(crate) fn stricter(&self, other: &Self) -> Self {
+        Self {
+            speed_m_s: self.speed_m_s.min(other.speed_m_s),
+            acceleration_m_s2: self.acceleration_m_s2.min(other.acceleration_m_s2),
+        }
+    }
+}
+
 /// Where one is along the path, and how fast, at a time.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ProfileSample {

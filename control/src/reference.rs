@@ -24,6 +24,11 @@ const LAG_FULL_M: f64 = 0.40;
 /// σ that is aimed at while the wheels are saturated.
 const SATURATED_RATE: f64 = 0.5;
 
+/// How far a speed limit looks ahead, plan seconds.
+const LOOK_AHEAD_S: f64 = 1.5;
+/// Samples of that look.
+const LOOK_AHEAD_STEPS: u8 = 6;
+
 /// Where the robot should be, and how it should move.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ReferenceSample {
@@ -43,6 +48,29 @@ pub struct ReferenceSample {
     pub arc_m: f64,
 }
 
+impl ReferenceSample {
+    /// A place of the plan, passed with another speed and acceleration than planned.
+    fn at(planned: &PlanSample, speed_m_s: f64, acceleration_m_s2: f64) -> Self {
+        let path = &planned.path;
+        Self {
+            pose: path.pose,
+            speed_m_s,
+            acceleration_m_s2,
+            turn_rad_s: path.curvature_1_m * speed_m_s,
+            turn_acceleration_rad_s2: path.curvature_1_m * acceleration_m_s2
+                + path.curvature_slope_1_m2 * speed_m_s * speed_m_s,
+            curvature_1_m: path.curvature_1_m,
+            arc_m: planned.arc_m,
+        }
+    }
+}
+
+impl From<&PlanSample> for ReferenceSample {
+    fn from(planned: &PlanSample) -> Self {
+        Self::at(planned, planned.speed_m_s, planned.acceleration_m_s2)
+    }
+}
+
 /// What the governor looks at in one tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct GovernorInput {
@@ -59,6 +87,7 @@ pub struct Governor {
     rate: f64,
     rate_slope_1_s: f64,
     rate_cap: f64,
+    speed_limit_m_s: Option<f64>,
     stopping: bool,
     brake_m_s2: f64,
     jerk_m_s3: f64,
@@ -72,6 +101,7 @@ impl Governor {
             rate: 1.0,
             rate_slope_1_s: 0.0,
             rate_cap: 1.0,
+            speed_limit_m_s: None,
             stopping: false,
             brake_m_s2: model.limits().linear_acceleration_max_m_s2,
             jerk_m_s3: model.limits().linear_jerk_max_m_s3,
@@ -85,6 +115,30 @@ impl Governor {
         } else {
             0.0
         };
+    }
+
+    /// Caps the speed along the path, metres per second; none lifts the cap. A figure that is no
+    /// number, or not above zero, pauses.
+    pub fn set_speed_limit(&mut self, limit_m_s: Option<f64>) {
+        self.speed_limit_m_s = limit_m_s.map(|limit| {
+            if limit.is_finite() {
+                limit.max(0.0)
+            } else {
+                0.0
+            }
+        });
+    }
+
+    /// The largest σ that keeps the speed below its cap now and over the next second.
+    fn rate_within_speed_limit(&self, plan: &Plan) -> f64 {
+        let Some(limit_m_s) = self.speed_limit_m_s else {
+            return 1.0;
+        };
+        let fastest_m_s = (0..=LOOK_AHEAD_STEPS)
+            .map(|step| LOOK_AHEAD_S * f64::from(step) / f64::from(LOOK_AHEAD_STEPS))
+            .map(|ahead_s| plan.sample(self.clock_s + ahead_s).speed_m_s)
+            .fold(f64::MIN_POSITIVE, f64::max);
+        (limit_m_s / fastest_m_s).min(1.0)
     }
 
     /// Starts to brake along the path, for good.
@@ -131,7 +185,9 @@ impl Governor {
             0.0
         } else {
             let followed = if input.saturated { SATURATED_RATE } else { 1.0 };
-            wait.min(followed).min(self.rate_cap)
+            wait.min(followed)
+                .min(self.rate_cap)
+                .min(self.rate_within_speed_limit(plan))
         };
         // A change of σ asks for σ̇v₁ on top of σ²a₁; braking gets what the limit leaves. The brake
         // is let go as the speed falls, a = √(jv), so that rest is met without a knock.
@@ -179,16 +235,6 @@ impl Governor {
         let speed_m_s = self.rate * planned.speed_m_s;
         let acceleration_m_s2 = self.rate * self.rate * planned.acceleration_m_s2
             + self.rate_slope_1_s * planned.speed_m_s;
-        let path = &planned.path;
-        ReferenceSample {
-            pose: path.pose,
-            speed_m_s,
-            acceleration_m_s2,
-            turn_rad_s: path.curvature_1_m * speed_m_s,
-            turn_acceleration_rad_s2: path.curvature_1_m * acceleration_m_s2
-                + path.curvature_slope_1_m2 * speed_m_s * speed_m_s,
-            curvature_1_m: path.curvature_1_m,
-            arc_m: planned.arc_m,
-        }
+        ReferenceSample::at(planned, speed_m_s, acceleration_m_s2)
     }
 }

@@ -166,6 +166,19 @@ impl RobotModel {
         self.spec.mass_kg * GRAVITY_M_S2 / 2.0
     }
 
+    /// The same robot with accelerations that a peak friction coefficient can give.
+    ///
+    /// Half of `μg` each along and across the path: both at once leave three tenths for the turning
+    /// of the wheels against the ground, and for feedback.
+    pub(crate) fn within_grip(&self, mu_peak: f64) -> Self {
+        let most_m_s2 = 0.5 * mu_peak * GRAVITY_M_S2;
+        let mut spec = self.spec;
+        let limits = &mut spec.limits;
+        limits.linear_acceleration_max_m_s2 = limits.linear_acceleration_max_m_s2.min(most_m_s2);
+        limits.lateral_acceleration_max_m_s2 = limits.lateral_acceleration_max_m_s2.min(most_m_s2);
+        Self { spec }
+    }
+
     /// How much wider than W the robot turns at low speed: `W_eff/W = 1 + (L/W)²`, whatever the
     /// ground. (Moment balance of four isotropic contacts in the linear range of (7).)
     pub fn effective_track_ratio(&self) -> f64 {

@@ -267,11 +267,11 @@ fn figure_8_run(stiffness: f64, servo_lag_s: f64, loop_s: f64, law: Law) -> Cros
     };
     let plan = Plan::new(&figure_8(), start, &model).expect("a path that can be driven");
     let scenario = Scenario {
-        curve: common::curve(stiffness),
         servo_lag_s,
         loop_s,
+        ..Scenario::usual(common::curve(stiffness))
     };
-    cross_track(&plan, start, model, &scenario, law).expect("a valid scenario")
+    cross_track(&plan, model, &scenario, law).expect("a valid scenario")
 }
 
 #[test]
@@ -364,11 +364,10 @@ fn a_robot_of_another_size_drives_as_well() {
     let plan = Plan::new(&figure_8(), start, &model).unwrap();
     for stiffness in [1.0, 5.0, 20.0] {
         let scenario = Scenario {
-            curve: common::curve(stiffness),
-            servo_lag_s: 0.05,
             loop_s: 0.01,
+            ..Scenario::usual(common::curve(stiffness))
         };
-        let found = cross_track(&plan, start, model, &scenario, Law::Shipped(None)).unwrap();
+        let found = cross_track(&plan, model, &scenario, Law::Shipped(None)).unwrap();
         assert!(
             found.rms_m < 0.03 && found.most_m < 0.1,
             "K {stiffness}: {found:?}"

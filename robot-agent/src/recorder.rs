@@ -133,6 +133,10 @@ fn segment_of(closed: &ClosedSegment, configuration: ConfigurationId) -> Segment
         information: statistics.effective_track_information,
         weighted: statistics.effective_track_weighted,
     };
+    let rolling = Information {
+        information: statistics.rolling_resistance_information,
+        weighted: statistics.rolling_resistance_weighted,
+    };
     Segment {
         configuration,
         mission: closed.mission,
@@ -149,8 +153,7 @@ fn segment_of(closed: &ClosedSegment, configuration: ConfigurationId) -> Segment
             weighted: statistics.theta_weighted,
         },
         effective_track_ratio: (track.information > 0.0).then_some(track),
-        // The estimator knows no deviation of it, so there is nothing that could be summed.
-        rolling_resistance: None,
+        rolling_resistance: (rolling.information > 0.0).then_some(rolling),
         mu_peak_lower_bound: statistics.mu_peak_lower_bound,
         samples: u32::try_from(statistics.samples)
             .unwrap_or(SAMPLES_MAX)

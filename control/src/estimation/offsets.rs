@@ -1,62 +1,73 @@
-//! What the robot has learned about its own rolling radii, whatever the ground.
+//! What the robot has learned about itself, whatever the ground: radii, track, sensor offsets.
 
-use nalgebra::{Matrix2, Vector2, Vector3};
+use nalgebra::{SMatrix, SVector};
 
-use super::regression::Sums;
-use super::{THETA_FIRST, THETA_RANGE, ValueWithDeviation};
+use super::regression::{Normal, OFFSETS, ParameterMatrix, Parameters, index, inflation};
+use super::sums::Sums;
+use super::{SensorNoise, THETA_FIRST, THETA_RANGE, TyrePrior, ValueWithDeviation};
 
 /// Standard deviation of θ that is assumed, about [`THETA_FIRST`], when offsets are learned.
 const THETA_VAGUE: f64 = 2.0;
 
-/// What is known about `δ_c` and `δ_d`, in information form.
+/// What is known about the robot's own parameters, in information form.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct OffsetKnowledge {
-    pub(super) information: Matrix2<f64>,
-    pub(super) weighted: Vector2<f64>,
+    pub(super) information: SMatrix<f64, OFFSETS, OFFSETS>,
+    pub(super) weighted: SVector<f64, OFFSETS>,
 }
 
 impl OffsetKnowledge {
-    /// Only how far radii spread: each side by `radius_ratio`, independently.
-    pub(super) fn unknown(radius_ratio: f64) -> Self {
-        let variance = radius_ratio.powi(2).max(1.0e-12);
+    /// Only how far they spread; radii of the two sides independently.
+    pub(super) fn unknown(noise: &SensorNoise, tyres: &TyrePrior) -> Self {
+        let weight = |std_dev: f64| std_dev.max(1.0e-6).powi(-2);
+        let radius = weight(noise.radius_ratio);
+        let mut information = SMatrix::zeros();
+        let mut put = |parameter: usize, value: f64| {
+            information[(parameter - 1, parameter - 1)] = value;
+        };
+        put(index::RADIUS_OFFSET, 2.0 * radius);
+        put(index::RADIUS_DIFFERENCE, 0.5 * radius);
+        put(index::TRACK, weight(tyres.side_grip_spread));
+        put(index::GYRO_OFFSET, weight(noise.gyro_offset_rad_s));
+        put(index::AHEAD_OFFSET, weight(noise.accelerometer_offset_m_s2));
+        put(index::AHEAD_SCALE, weight(noise.accelerometer_scale_ratio));
         Self {
-            information: Matrix2::new(2.0 / variance, 0.0, 0.0, 0.5 / variance),
-            weighted: Vector2::zeros(),
+            information,
+            weighted: SVector::zeros(),
         }
     }
 
-    /// With what these sums tell about the offsets, whatever their θ.
-    pub(super) fn with_ground(&self, sums: &Sums) -> Self {
+    /// With what these sums tell about the robot, whatever their θ; the given one only weighs them.
+    /// Without excitation there is no θ, and the rest is learned all the same.
+    pub(super) fn with_ground(&self, sums: &Sums, tyres: &TyrePrior, theta: f64) -> Self {
         if sums.blocks == 0 {
             return *self;
         }
-        // Without excitation there is no θ, and the offsets are learned all the same.
-        let theta = sums
-            .solve(self)
-            .map_or(THETA_FIRST, |solution| solution.theta);
         let theta = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
-        let normal = sums.normal(theta);
+        let channels = sums.channels();
+        let mut normal = Normal::of(&channels, theta, tyres);
         let vague = THETA_VAGUE.powi(-2);
+        let theta_at = (index::THETA, index::THETA);
         // A corrected square below its own noise is not known to be smaller than that noise.
-        let own = normal.matrix[(0, 0)].max(2.0 * normal.noise_std_dev) + vague;
-        let own_right = normal.right[0] + vague * THETA_FIRST;
-        let cross = Vector2::new(normal.matrix[(1, 0)], normal.matrix[(2, 0)]);
-        let information = normal.matrix.fixed_view::<2, 2>(1, 1) - cross * cross.transpose() / own;
-        let weighted = Vector2::new(normal.right[1], normal.right[2]) - cross * (own_right / own);
-        let Some(covariance) = (self.information + information).try_inverse() else {
+        normal.matrix[theta_at] = normal.matrix[theta_at].max(2.0 * normal.noise_std_dev) + vague;
+        normal.right[index::THETA] += vague * THETA_FIRST;
+        let (matrix, right) = without_ground(&normal.matrix, &normal.right);
+        let Some(together) = (self.information + matrix).cholesky() else {
             return *self;
         };
-        let offsets = covariance * (self.weighted + weighted);
-        let fitted_theta = (own_right - cross.dot(&offsets)) / own;
-        let parameters = Vector3::new(fitted_theta, offsets[0], offsets[1]);
-        let inflation = sums.inflation(&parameters, theta);
-        let together = self.information + information / inflation;
-        if together.cholesky().is_none() {
+        let offsets = together.solve(&(self.weighted + right));
+        let mut parameters = Parameters::zeros();
+        parameters.fixed_rows_mut::<OFFSETS>(1).copy_from(&offsets);
+        parameters[index::THETA] = theta;
+        parameters[index::CURVATURE] = theta * tyres.curvature;
+        let inflation = inflation(&channels, &parameters, theta);
+        let information = self.information + matrix / inflation;
+        if information.cholesky().is_none() {
             return *self;
         }
         Self {
-            information: together,
-            weighted: self.weighted + weighted / inflation,
+            information,
+            weighted: self.weighted + right / inflation,
         }
     }
 
@@ -64,13 +75,33 @@ impl OffsetKnowledge {
     pub(super) fn values(&self) -> (ValueWithDeviation, ValueWithDeviation) {
         let covariance = self
             .information
-            .try_inverse()
-            .unwrap_or_else(Matrix2::zeros);
+            .cholesky()
+            .map_or_else(SMatrix::zeros, |factors| factors.inverse());
         let value = covariance * self.weighted;
-        let of = |index: usize| ValueWithDeviation {
-            value: value[index],
-            std_dev: covariance[(index, index)].max(0.0).sqrt(),
+        let of = |parameter: usize| ValueWithDeviation {
+            value: value[parameter - 1],
+            std_dev: covariance[(parameter - 1, parameter - 1)].max(0.0).sqrt(),
         };
-        (of(0), of(1))
+        (of(index::RADIUS_OFFSET), of(index::RADIUS_DIFFERENCE))
     }
+}
+
+/// The Schur complement that takes what is the ground's out of normal equations.
+fn without_ground(
+    matrix: &ParameterMatrix,
+    right: &Parameters,
+) -> (SMatrix<f64, OFFSETS, OFFSETS>, SVector<f64, OFFSETS>) {
+    let mut matrix = *matrix;
+    let mut right = *right;
+    for parameter in [index::RESISTANCE, index::CURVATURE, index::THETA] {
+        let own = matrix[(parameter, parameter)].max(f64::MIN_POSITIVE);
+        let column = matrix.column(parameter).into_owned();
+        let share = right[parameter] / own;
+        matrix -= column * column.transpose() / own;
+        right -= column * share;
+    }
+    (
+        matrix.fixed_view::<OFFSETS, OFFSETS>(1, 1).into_owned(),
+        right.fixed_rows::<OFFSETS>(1).into_owned(),
+    )
 }

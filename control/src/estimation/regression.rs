@@ -1,111 +1,102 @@
-//! Additive sums of blocks, and the regression of slip on force with errors in variables.
+//! The regression of slip on force with errors in variables.
 //!
-//! Parameters are `(θ, δ_c, δ_d)`; the rows are in the module above. For known noise `σ_x²` of the
-//! force regressor the corrected normal matrix is `M = Σ_c (X_cᵀX_c − n σ_x² e₁e₁ᵀ)/s_c²` with
-//! `s_c² = σ_y² + θ²σ_x²` (found by iteration), and the variance of θ is
+//! Rows are in [`super`] and [`super::along`]. For known noise `σ_x²` of the force regressor the
+//! corrected normal matrix is `M = Σ_c (X_cᵀX_c − n σ_x² e₁e₁ᵀ)/s_c²` with `s_c² = σ_y² + θ²σ_x²`
+//! (found by iteration), and the variance of θ is
 //! `[M⁻¹]₁₁ + [M⁻¹]₁₁² Σ_c n (σ_x² s_c² + θ²σ_x⁴)/s_c⁴` (Fuller, Measurement Error Models, 1987).
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{SMatrix, SVector};
 
 use super::offsets::OffsetKnowledge;
-use super::{
-    BLOCKS_MIN, RELATIVE_STD_DEV_MAX, SLIP_LINEAR_FIRST_MAX, SLIP_LINEAR_MAX, THETA_FIRST,
-    THETA_RANGE, ValueWithDeviation,
-};
+use super::sums::Sums;
+use super::{BLOCKS_MIN, RELATIVE_STD_DEV_MAX, THETA_RANGE, TyrePrior};
+use crate::estimation::block::Block;
+
+/// Number of parameters.
+pub(super) const PARAMETERS: usize = 9;
+/// Number of the robot's own parameters, which follow θ.
+pub(super) const OFFSETS: usize = 6;
+/// A value for each parameter.
+pub(super) type Parameters = SVector<f64, PARAMETERS>;
+/// A value for each pair of parameters.
+pub(super) type ParameterMatrix = SMatrix<f64, PARAMETERS, PARAMETERS>;
+
+/// Which parameter stands where.
+pub(super) mod index {
+    /// θ.
+    pub(in crate::estimation) const THETA: usize = 0;
+    /// `δ_c`, mean share by which nominal radii are too large.
+    pub(in crate::estimation) const RADIUS_OFFSET: usize = 1;
+    /// `δ_d`, right minus left of the same.
+    pub(in crate::estimation) const RADIUS_DIFFERENCE: usize = 2;
+    /// `ε_w`, by which `W_eff/W − 1` differs from `(L/W)²`, as a share of the latter.
+    pub(in crate::estimation) const TRACK: usize = 3;
+    /// `b_g`, the gyro's offset, radians per second.
+    pub(in crate::estimation) const GYRO_OFFSET: usize = 4;
+    /// `b_a`, the accelerometer's offset ahead, metres per second squared.
+    pub(in crate::estimation) const AHEAD_OFFSET: usize = 5;
+    /// Share by which the accelerometer reads too little.
+    pub(in crate::estimation) const AHEAD_SCALE: usize = 6;
+    /// θκ, θ times the tyre's curvature per slip.
+    pub(in crate::estimation) const CURVATURE: usize = 7;
+    /// `θf`, θ times the rolling resistance over load that measured torques hold.
+    pub(in crate::estimation) const RESISTANCE: usize = 8;
+}
 
 /// Rounds of the iteration on the weights.
 const ROUNDS: usize = 5;
+/// Relative step of θ at which that iteration ends.
+const CONVERGED: f64 = 1.0e-4;
 /// Share of a force's effect that the model may miss without the ground having changed.
 const MODEL_SHARE: f64 = 0.05;
-/// Signal over its own noise below which a regressor counts as unexcited.
-const SIGNIFICANCE_MIN: f64 = 4.0;
-/// Blocks from which on the residuals tell whether the assumed noise is too small.
-const INFLATION_BLOCKS: f64 = 10.0;
-/// Blocks of straight driving for a rolling resistance.
-const RESISTANCE_BLOCKS_MIN: f64 = 10.0;
+/// Signal over its own noise below which the regressor counts as unexcited.
+const SIGNIFICANCE_MIN: f64 = 6.0;
+/// Rows from which on the residuals tell whether the assumed noise is too small.
+const INFLATION_ROWS: f64 = 15.0;
+/// How large rolling resistance over load may be, one standard deviation.
+const ROLLING_SPREAD: f64 = 0.02;
+/// Share of the effect of curved tyres that the rows may miss: they hold it to second order.
+const BEND_SHARE: f64 = 0.1;
+/// Least spread of a tyre's curvature, so that the matrix stays regular.
+const CURVATURE_SPREAD_MIN: f64 = 1.0e-3;
 
-/// Force regressors of a block.
+/// One equation, linear in the parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Force {
-    /// `μ_R u_R − μ_L u_L`, metres per second.
-    pub(super) difference_m_s: f64,
-    /// `(μ_R u_R + μ_L u_L)/2`, metres per second.
-    pub(super) mean_m_s: f64,
-    /// Variance of the former; that of the latter is a quarter of it.
-    pub(super) difference_noise: f64,
+pub(super) struct Row {
+    pub(super) regressors: Parameters,
+    pub(super) response: f64,
+    /// Variance of the response, with that of the force at the θ of the time.
+    pub(super) spread: f64,
+    /// Variance of the force regressor.
+    pub(super) force_noise: f64,
+    /// The force's share in the regressor of θκ, which has the same noise.
+    pub(super) bend: f64,
 }
 
-/// Means over one block of samples.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Block {
-    pub(super) duration_s: f64,
-    /// Whether slip was in the linear range.
-    pub(super) is_linear: bool,
-    /// Geometric slip across of the slower side's wheels.
-    pub(super) slip_lateral: f64,
-    /// Larger friction coefficient along of both sides, measured.
-    pub(super) mu_side: f64,
-    /// Rim speed of the slower side, metres per second.
-    pub(super) slower_m_s: f64,
-    /// `u_R − u_L − Wφ̇`, metres per second, and its variance.
-    pub(super) difference_m_s: f64,
-    pub(super) difference_noise: f64,
-    /// `(u_R + u_L)/2 − v`, metres per second, where body speed was new, and its variance.
-    pub(super) slip_m_s: Option<f64>,
-    pub(super) slip_noise: f64,
-    /// `u_R − u_L`, metres per second.
-    pub(super) rim_difference_m_s: f64,
-    /// `(u_R + u_L)/2`, metres per second.
-    pub(super) rim_mean_m_s: f64,
-    pub(super) force: Option<Force>,
-    /// `Wφ̇`, metres per second, and its variance.
-    pub(super) turn_m_s: f64,
-    pub(super) turn_noise: f64,
-    /// Friction coefficient seen, less two standard deviations.
-    pub(super) mu_seen: f64,
-    pub(super) rolling_resistance: Option<f64>,
-}
-
-impl Block {
-    /// How far the force difference stands out of its noise.
-    pub(super) fn force_signal(&self) -> f64 {
-        self.force.map_or(0.0, |force| {
-            force.difference_m_s.abs() / force.difference_noise.sqrt().max(f64::MIN_POSITIVE)
-        })
-    }
-
-    /// Whether slip was in the linear range, combined from along and across. Along it is θμ where
-    /// θ is known, and above the peak μ stays high enough for that to tell. Before θ is known it
-    /// comes from the body speed, which is coarse, so the bound is tighter.
-    pub(super) fn slips_little(&self, theta: Option<f64>) -> bool {
-        let (along, bound) = match (theta, self.slip_m_s) {
-            (Some(theta), _) => (theta * self.mu_side, SLIP_LINEAR_MAX),
-            (None, slip_m_s) => {
-                let fastest_m_s = slip_m_s.unwrap_or(0.0).abs() + 0.5 * self.difference_m_s.abs();
-                (fastest_m_s / self.slower_m_s, SLIP_LINEAR_FIRST_MAX)
-            }
-        };
-        along.hypot(self.slip_lateral) < bound
-    }
-
-    fn difference_row(&self, force: &Force) -> Vector3<f64> {
-        Vector3::new(
-            force.difference_m_s,
-            self.rim_difference_m_s,
-            self.rim_mean_m_s,
-        )
+impl Row {
+    /// A row whose regressors are known.
+    pub(super) fn white(regressors: Parameters, response: f64, spread: f64) -> Self {
+        Self {
+            regressors,
+            response,
+            spread,
+            force_noise: 0.0,
+            bend: 0.0,
+        }
     }
 }
 
 /// Sums of one kind of row.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Channel {
-    count: f64,
-    square: Matrix3<f64>,
-    product: Vector3<f64>,
+pub(super) struct Channel {
+    pub(super) count: f64,
+    square: ParameterMatrix,
+    product: Parameters,
     response: f64,
     /// Sum of the force regressor's variances.
     force_noise: f64,
+    /// The same times the share in θκ's regressor, and times its square.
+    bent_noise: [f64; 2],
     /// Sum of the response's variances.
     response_noise: f64,
 }
@@ -114,32 +105,53 @@ impl Default for Channel {
     fn default() -> Self {
         Self {
             count: 0.0,
-            square: Matrix3::zeros(),
-            product: Vector3::zeros(),
+            square: ParameterMatrix::zeros(),
+            product: Parameters::zeros(),
             response: 0.0,
             force_noise: 0.0,
+            bent_noise: [0.0; 2],
             response_noise: 0.0,
         }
     }
 }
 
 impl Channel {
-    fn add(&mut self, row: Vector3<f64>, response: f64, force_noise: f64, response_noise: f64) {
+    /// Adds a row; its `spread` is that of the response alone.
+    pub(super) fn add(&mut self, row: &Row) {
         self.count += 1.0;
-        self.square += row * row.transpose();
-        self.product += row * response;
-        self.response += response * response;
-        self.force_noise += force_noise;
-        self.response_noise += response_noise;
+        self.square += row.regressors * row.regressors.transpose();
+        self.product += row.regressors * row.response;
+        self.response += row.response * row.response;
+        self.force_noise += row.force_noise;
+        self.bent_noise[0] += row.force_noise * row.bend;
+        self.bent_noise[1] += row.force_noise * row.bend * row.bend;
+        self.response_noise += row.spread;
     }
 
-    fn plus(&self, other: &Self) -> Self {
+    /// Adds a row in units of its own spread, which holds the force's noise at this θ.
+    pub(super) fn add_standardised(&mut self, row: &Row, theta: f64) {
+        let force_noise = row.force_noise / row.spread;
+        let scale = row.spread.sqrt().recip();
+        self.add(&Row {
+            regressors: row.regressors * scale,
+            response: row.response * scale,
+            spread: (1.0 - theta * theta * force_noise).max(0.1),
+            force_noise,
+            bend: row.bend,
+        });
+    }
+
+    pub(super) fn plus(&self, other: &Self) -> Self {
         Self {
             count: self.count + other.count,
             square: self.square + other.square,
             product: self.product + other.product,
             response: self.response + other.response,
             force_noise: self.force_noise + other.force_noise,
+            bent_noise: [
+                self.bent_noise[0] + other.bent_noise[0],
+                self.bent_noise[1] + other.bent_noise[1],
+            ],
             response_noise: self.response_noise + other.response_noise,
         }
     }
@@ -152,244 +164,159 @@ impl Channel {
 
 /// Normal equations at one choice of weights.
 pub(super) struct Normal {
-    pub(super) matrix: Matrix3<f64>,
-    pub(super) right: Vector3<f64>,
+    pub(super) matrix: ParameterMatrix,
+    pub(super) right: Parameters,
     /// `Σ n (σ_x² s² + θ²σ_x⁴)/s⁴`.
     excess: f64,
     /// Standard deviation of the noise in the corrected `M₁₁`.
     pub(super) noise_std_dev: f64,
 }
 
-/// Additive sums over blocks.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Sums {
-    /// Blocks that carry force in the linear range.
-    pub(super) blocks: u64,
-    pub(super) duration_s: f64,
-    difference: Channel,
-    mean: Channel,
-    force_2: f64,
-    force_4: f64,
-    fast_blocks: f64,
-    saturated_blocks: f64,
-    mu_seen: f64,
-    track_square: f64,
-    track_product: f64,
-    track_offset: [f64; 2],
-    track_noise: f64,
-    track_count: f64,
-    resistance: f64,
-    resistance_count: f64,
-}
-
-impl Sums {
-    /// Adds a block.
-    pub(super) fn add(&mut self, block: &Block) {
-        self.fast_blocks += 1.0;
-        if block.force.is_some() {
-            self.mu_seen = self.mu_seen.max(block.mu_seen);
-        }
-        if !block.is_linear {
-            self.saturated_blocks += 1.0;
-            return;
-        }
-        // `u_R − u_L = (W_eff/W)·Wφ̇` plus what the offsets add.
-        self.track_square += block.turn_m_s * block.turn_m_s - block.turn_noise;
-        self.track_product += block.turn_m_s * block.rim_difference_m_s;
-        self.track_offset[0] += block.turn_m_s * block.rim_difference_m_s;
-        self.track_offset[1] += block.turn_m_s * block.rim_mean_m_s;
-        self.track_noise += block.difference_noise;
-        self.track_count += 1.0;
-        let Some(force) = block.force else { return };
-        self.blocks += 1;
-        self.duration_s += block.duration_s;
-        self.difference.add(
-            block.difference_row(&force),
-            block.difference_m_s,
-            force.difference_noise,
-            block.difference_noise,
-        );
-        if let Some(slip_m_s) = block.slip_m_s {
-            let row = Vector3::new(
-                force.mean_m_s,
-                block.rim_mean_m_s,
-                0.25 * block.rim_difference_m_s,
-            );
-            self.mean.add(
-                row,
-                slip_m_s,
-                0.25 * force.difference_noise,
-                block.slip_noise,
-            );
-        }
-        self.force_2 += force.difference_m_s.powi(2);
-        self.force_4 += force.difference_m_s.powi(4);
-        if let Some(resistance) = block.rolling_resistance {
-            self.resistance += resistance;
-            self.resistance_count += 1.0;
-        }
-    }
-
-    /// Sums of both.
-    pub(super) fn plus(&self, other: &Self) -> Self {
-        Self {
-            blocks: self.blocks + other.blocks,
-            duration_s: self.duration_s + other.duration_s,
-            difference: self.difference.plus(&other.difference),
-            mean: self.mean.plus(&other.mean),
-            force_2: self.force_2 + other.force_2,
-            force_4: self.force_4 + other.force_4,
-            fast_blocks: self.fast_blocks + other.fast_blocks,
-            saturated_blocks: self.saturated_blocks + other.saturated_blocks,
-            mu_seen: self.mu_seen.max(other.mu_seen),
-            track_square: self.track_square + other.track_square,
-            track_product: self.track_product + other.track_product,
-            track_offset: [
-                self.track_offset[0] + other.track_offset[0],
-                self.track_offset[1] + other.track_offset[1],
-            ],
-            track_noise: self.track_noise + other.track_noise,
-            track_count: self.track_count + other.track_count,
-            resistance: self.resistance + other.resistance,
-            resistance_count: self.resistance_count + other.resistance_count,
-        }
-    }
-
-    pub(super) fn normal(&self, theta: f64) -> Normal {
-        let mut normal = Normal {
-            matrix: Matrix3::zeros(),
-            right: Vector3::zeros(),
+impl Normal {
+    /// Of these channels, with what is known about the tyres.
+    pub(super) fn of(channels: &[&Channel], theta: f64, tyres: &TyrePrior) -> Self {
+        let mut normal = Self {
+            matrix: ParameterMatrix::zeros(),
+            right: Parameters::zeros(),
             excess: 0.0,
             noise_std_dev: 0.0,
         };
         let mut noise_variance = 0.0;
-        for channel in [&self.difference, &self.mean] {
+        for channel in channels {
             if channel.count < 1.0 {
                 continue;
             }
             let spread = channel.spread(theta);
             let force_noise = channel.force_noise / channel.count;
             normal.matrix += channel.square / spread;
-            normal.matrix[(0, 0)] -= channel.force_noise / spread;
+            normal.matrix[(index::THETA, index::THETA)] -= channel.force_noise / spread;
+            let [cross, bent] = channel.bent_noise.map(|noise| noise / spread);
+            normal.matrix[(index::THETA, index::CURVATURE)] -= cross;
+            normal.matrix[(index::CURVATURE, index::THETA)] -= cross;
+            normal.matrix[(index::CURVATURE, index::CURVATURE)] -= bent;
             normal.right += channel.product / spread;
             normal.excess += channel.count * (force_noise * spread + (theta * force_noise).powi(2))
                 / (spread * spread);
             noise_variance += 2.0 * channel.count * (force_noise / spread).powi(2);
         }
         normal.noise_std_dev = noise_variance.sqrt();
+        // θκ is κ₀θ, give or take.
+        let curvature_std_dev = theta * tyres.curvature_spread.max(CURVATURE_SPREAD_MIN);
+        let mut bend = Parameters::zeros();
+        bend[index::THETA] = -tyres.curvature / curvature_std_dev;
+        bend[index::CURVATURE] = 1.0 / curvature_std_dev;
+        normal.matrix += bend * bend.transpose();
+        let resistance = (index::RESISTANCE, index::RESISTANCE);
+        normal.matrix[resistance] += (theta * ROLLING_SPREAD).powi(-2);
         normal
     }
 
-    /// Estimates all parameters with what is known about the offsets; none without any force.
-    pub(super) fn solve(&self, offsets: &OffsetKnowledge) -> Option<Solution> {
-        self.solve_from(offsets, None)
+    /// Adds what is known about the robot's own parameters.
+    pub(super) fn with_offsets(mut self, offsets: &OffsetKnowledge) -> Self {
+        let mut block = self.matrix.fixed_view_mut::<OFFSETS, OFFSETS>(1, 1);
+        block += offsets.information;
+        let mut right = self.right.fixed_rows_mut::<OFFSETS>(1);
+        right += offsets.weighted;
+        self
     }
+}
 
-    /// As [`Self::solve`], with the weights of a given θ.
-    pub(super) fn solve_from(
-        &self,
-        offsets: &OffsetKnowledge,
-        theta_given: Option<f64>,
-    ) -> Option<Solution> {
-        if self.blocks == 0 {
-            return None;
+/// How much larger the residuals are than the assumed noise; never below one.
+pub(super) fn inflation(channels: &[&Channel], parameters: &Parameters, theta: f64) -> f64 {
+    let mut squares = 0.0;
+    let mut count = 0.0;
+    for channel in channels {
+        if channel.count < 1.0 {
+            continue;
         }
-        let mut theta_weights = theta_given.unwrap_or(THETA_FIRST);
-        for round in 0..ROUNDS {
-            let normal = self.normal(theta_weights);
-            let mut matrix = normal.matrix;
-            let mut right = normal.right;
-            for row in 0..2 {
-                right[row + 1] += offsets.weighted[row];
-                for column in 0..2 {
-                    matrix[(row + 1, column + 1)] += offsets.information[(row, column)];
-                }
-            }
-            let covariance = matrix.cholesky()?.inverse();
-            let parameters = covariance * right;
-            let theta = parameters[0];
-            if theta_given.is_some() || round + 1 == ROUNDS {
-                let inflation = self.inflation(&parameters, theta_weights);
-                let base = covariance[(0, 0)];
-                return Some(Solution {
-                    theta,
-                    parameters,
-                    covariance: covariance * inflation,
-                    variance: base * inflation + base * base * normal.excess,
-                    significance: 1.0 / (base * normal.noise_std_dev.max(f64::MIN_POSITIVE)),
-                });
-            }
-            theta_weights = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
-        }
-        None
+        let fitted = (channel.square * parameters).dot(parameters);
+        let sum = channel.response - 2.0 * channel.product.dot(parameters) + fitted;
+        squares += sum / channel.spread(theta);
+        count += channel.count;
     }
+    if count < INFLATION_ROWS {
+        return 1.0;
+    }
+    // Chance alone makes the ratio vary by √(2/n).
+    let freedom = count - 3.0;
+    let ratio = squares / freedom;
+    if ratio > 1.0 + 2.0 * (2.0 / freedom).sqrt() {
+        ratio
+    } else {
+        1.0
+    }
+}
 
-    /// How much larger the residuals are than the assumed noise; never below one.
-    pub(super) fn inflation(&self, parameters: &Vector3<f64>, theta: f64) -> f64 {
-        let mut squares = 0.0;
-        let mut count = 0.0;
-        for channel in [&self.difference, &self.mean] {
-            if channel.count < 1.0 {
-                continue;
-            }
-            let fitted = (channel.square * parameters).dot(parameters);
-            let sum = channel.response - 2.0 * channel.product.dot(parameters) + fitted;
-            squares += sum / channel.spread(theta);
-            count += channel.count;
-        }
-        if count < INFLATION_BLOCKS {
-            1.0
-        } else {
-            (squares / (count - 3.0)).max(1.0)
-        }
+/// How large the regressor of θκ is beside that of θ.
+fn bend_ratio(channels: &[&Channel]) -> f64 {
+    let sum = |parameter: usize| {
+        let squares = channels.iter().map(|channel| {
+            let noise = (channel.response_noise / channel.count.max(1.0)).max(f64::MIN_POSITIVE);
+            channel.square[(parameter, parameter)] / noise
+        });
+        squares.sum::<f64>()
+    };
+    let own = sum(index::THETA);
+    if own > 0.0 {
+        (sum(index::CURVATURE) / own).sqrt()
+    } else {
+        0.0
     }
+}
 
-    /// Blocks weighed by their share of the force.
-    pub(super) fn effective_samples(&self) -> f64 {
-        if self.force_4 > 0.0 {
-            self.force_2 * self.force_2 / self.force_4
-        } else {
-            0.0
+/// What a solution starts from.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SolveInput<'known> {
+    pub(super) offsets: &'known OffsetKnowledge,
+    pub(super) tyres: &'known TyrePrior,
+    /// Weights of this θ and no other; `None` finds its own.
+    pub(super) theta_given: Option<f64>,
+    /// Where the search for weights starts.
+    pub(super) theta_start: f64,
+}
+
+/// Estimates all parameters; none without any excitation.
+pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
+    if sums.blocks == 0 {
+        return None;
+    }
+    let channels = sums.channels();
+    let mut theta_weights = input.theta_given.unwrap_or(input.theta_start);
+    for round in 1..=ROUNDS {
+        let normal = Normal::of(&channels, theta_weights, input.tyres).with_offsets(input.offsets);
+        let covariance = normal.matrix.cholesky()?.inverse();
+        let parameters = covariance * normal.right;
+        let theta = parameters[index::THETA];
+        let next = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
+        let is_settled = (next - theta_weights).abs() < CONVERGED * theta_weights;
+        if input.theta_given.is_some() || round == ROUNDS || is_settled {
+            let inflation = inflation(&channels, &parameters, theta_weights);
+            let base = covariance[(index::THETA, index::THETA)];
+            let (theta, scale) = if sums.has_torque() {
+                (theta, 0.0)
+            } else {
+                // Force over load is then an acceleration, and the slip that stands for it is
+                // reckoned with a radius too large by δ_c: what is estimated is θ(1 − δ_c). Torque
+                // reads too high by just that share.
+                (theta * (1.0 + parameters[index::RADIUS_OFFSET]), theta)
+            };
+            let across = covariance[(index::THETA, index::RADIUS_OFFSET)];
+            let own = covariance[(index::RADIUS_OFFSET, index::RADIUS_OFFSET)];
+            let scaled = (2.0 * scale * across + scale * scale * own).max(-0.5 * base);
+            let bend = parameters[index::CURVATURE] * bend_ratio(&channels);
+            return Some(Solution {
+                theta,
+                parameters,
+                covariance: covariance * inflation,
+                variance: (base + scaled) * inflation
+                    + base * base * normal.excess
+                    + (BEND_SHARE * bend).powi(2),
+                significance: 1.0 / (base * normal.noise_std_dev.max(f64::MIN_POSITIVE)),
+            });
         }
+        theta_weights = next;
     }
-
-    /// Friction coefficient that the ground has given at least.
-    pub(super) fn mu_peak(&self) -> Option<f64> {
-        (self.mu_seen > 0.0).then_some(self.mu_seen)
-    }
-
-    /// Share of blocks beyond the linear range.
-    pub(super) fn saturation_share(&self) -> f64 {
-        if self.fast_blocks > 0.0 {
-            self.saturated_blocks / self.fast_blocks
-        } else {
-            0.0
-        }
-    }
-
-    /// Rolling resistance over load.
-    pub(super) fn rolling_resistance(&self) -> Option<f64> {
-        (self.resistance_count >= RESISTANCE_BLOCKS_MIN)
-            .then(|| self.resistance / self.resistance_count)
-    }
-
-    /// Effective track over W.
-    pub(super) fn effective_track(&self, offsets: &OffsetKnowledge) -> Option<ValueWithDeviation> {
-        if self.track_count < 1.0 || self.track_square <= 0.0 {
-            return None;
-        }
-        let (common, difference) = offsets.values();
-        let value = (self.track_product
-            - common.value * self.track_offset[0]
-            - difference.value * self.track_offset[1])
-            / self.track_square;
-        let noise = self.track_noise / self.track_count * (1.0 + value * value);
-        let variance = noise / self.track_square
-            + (common.std_dev * self.track_offset[0] / self.track_square).powi(2)
-            + (difference.std_dev * self.track_offset[1] / self.track_square).powi(2);
-        let std_dev = variance.sqrt();
-        (std_dev < 0.1 * value).then_some(ValueWithDeviation { value, std_dev })
-    }
+    None
 }
 
 /// Estimated parameters.
@@ -398,10 +325,10 @@ pub(super) struct Solution {
     pub(super) theta: f64,
     /// Variance of θ with that of the offsets and of the noisy regressor.
     pub(super) variance: f64,
-    /// Corrected square of the force over its own noise.
+    /// Corrected, centred square of the force over its own noise.
     significance: f64,
-    parameters: Vector3<f64>,
-    covariance: Matrix3<f64>,
+    parameters: Parameters,
+    covariance: ParameterMatrix,
 }
 
 impl Solution {
@@ -414,6 +341,25 @@ impl Solution {
             && self.significance > SIGNIFICANCE_MIN
     }
 
+    /// What this tells about the tyres' curvature beyond what was known.
+    pub(super) fn tyres(&self, known: &TyrePrior) -> TyrePrior {
+        let variance = self.covariance[(index::CURVATURE, index::CURVATURE)];
+        let cross = self.covariance[(index::CURVATURE, index::THETA)];
+        let own = self.covariance[(index::THETA, index::THETA)];
+        let curvature = self.parameters[index::CURVATURE] / self.parameters[index::THETA];
+        let of_ratio = variance - 2.0 * curvature * cross + curvature * curvature * own;
+        let spread = of_ratio.max(0.0).sqrt() / self.parameters[index::THETA].abs();
+        if curvature.is_finite() && spread.is_finite() && spread < known.curvature_spread {
+            TyrePrior {
+                curvature,
+                curvature_spread: spread,
+                ..*known
+            }
+        } else {
+            *known
+        }
+    }
+
     /// Whether a segment's sums carry information at all, judged by the ground's θ.
     pub(super) fn is_informative(&self, theta_ground: f64) -> bool {
         self.variance.is_finite()
@@ -424,15 +370,17 @@ impl Solution {
 
     /// Standardised innovation of a block in the direction of θ.
     pub(super) fn innovation(&self, block: &Block) -> Option<f64> {
-        let force = block.force.filter(|_| block.is_linear)?;
-        let row = block.difference_row(&force);
-        let error = block.difference_m_s - row.dot(&self.parameters);
-        let missed =
-            MODEL_SHARE * self.theta * (force.difference_m_s.abs() + 2.0 * force.mean_m_s.abs());
-        let variance = block.difference_noise
-            + self.theta.powi(2) * force.difference_noise
-            + (self.covariance * row).dot(&row)
+        if !block.is_linear {
+            return None;
+        }
+        let row = block.differential_row()?;
+        let force = row.regressors[index::THETA];
+        let error = row.response - row.regressors.dot(&self.parameters);
+        let missed = MODEL_SHARE * self.theta * (force.abs() + block.mean_force_m_s());
+        let variance = row.spread
+            + self.theta.powi(2) * row.force_noise
+            + (self.covariance * row.regressors).dot(&row.regressors)
             + missed * missed;
-        Some(error * force.difference_m_s.signum() / variance.sqrt())
+        Some(error * force.signum() / variance.sqrt())
     }
 }

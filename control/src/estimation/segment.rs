@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::offsets::OffsetKnowledge;
-use super::regression::Sums;
+use super::sums::Sums;
 
 /// Additive statistics of one segment. `Λ = 1/σ²` of segments add up, and so do `Λθ`.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -13,7 +13,7 @@ pub struct SegmentStatistics {
     pub theta_information: f64,
     /// Λθ.
     pub theta_weighted: f64,
-    /// Blocks that carry force in the linear range.
+    /// Blocks in the linear range.
     pub samples: u64,
     /// Their time, seconds.
     pub duration_s: f64,
@@ -23,8 +23,20 @@ pub struct SegmentStatistics {
     pub effective_track_information: f64,
     /// That information times the ratio.
     pub effective_track_weighted: f64,
-    /// Rolling resistance over load, after enough straight driving.
-    pub rolling_resistance_ratio: Option<f64>,
+    /// Information on the rolling resistance over load; 0 before enough straight driving with
+    /// torque. It holds the offset that the accelerometer may have.
+    pub rolling_resistance_information: f64,
+    /// That information times the ratio.
+    pub rolling_resistance_weighted: f64,
+    /// Share of the blocks of this segment beyond the linear range of slip.
+    pub saturation_ratio: f64,
+}
+
+/// θ of one segment alone, and the information that it may claim.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct SegmentTheta {
+    pub(super) theta: f64,
+    pub(super) information: f64,
 }
 
 impl SegmentStatistics {
@@ -33,23 +45,29 @@ impl SegmentStatistics {
         (self.theta_information > 0.0).then(|| self.theta_weighted / self.theta_information)
     }
 
-    pub(super) fn of(sums: &Sums, offsets: &OffsetKnowledge, theta_ground: Option<f64>) -> Self {
-        let solution = theta_ground.filter(|theta| *theta > 0.0).and_then(|theta| {
-            sums.solve_from(offsets, Some(theta))
-                .filter(|found| found.is_informative(theta))
-        });
-        let information = solution.map_or(0.0, |found| found.variance.recip());
+    pub(super) fn of(
+        sums: &Sums,
+        offsets: &OffsetKnowledge,
+        theta: Option<SegmentTheta>,
+        accelerometer_offset_mu: f64,
+    ) -> Self {
+        let information = theta.map_or(0.0, |found| found.information);
         let track = sums.effective_track(offsets);
         let track_information = track.map_or(0.0, |track| track.std_dev.powi(-2));
+        let rolling = sums.rolling_resistance(accelerometer_offset_mu);
+        let rolling_information = rolling.map_or(0.0, |rolling| rolling.std_dev.powi(-2));
         Self {
             theta_information: information,
-            theta_weighted: solution.map_or(0.0, |found| information * found.theta),
+            theta_weighted: theta.map_or(0.0, |found| information * found.theta),
             samples: sums.blocks,
             duration_s: sums.duration_s,
             mu_peak_lower_bound: sums.mu_peak(),
             effective_track_information: track_information,
             effective_track_weighted: track.map_or(0.0, |track| track_information * track.value),
-            rolling_resistance_ratio: sums.rolling_resistance(),
+            rolling_resistance_information: rolling_information,
+            rolling_resistance_weighted: rolling
+                .map_or(0.0, |rolling| rolling_information * rolling.value),
+            saturation_ratio: sums.saturation_share(),
         }
     }
 }

@@ -34,6 +34,9 @@ const NEWTON_STEPS: usize = 4;
 /// Slowest advance along a polynomial, metres per parameter unit; below it the path has a cusp.
 const ADVANCE_MIN: f64 = 1.0e-3;
 
+/// Most that a path may turn over a quarter of a parameter interval, radians; beyond it turns back.
+const TURN_MAX_RAD: f64 = 1.5;
+
 /// One piece of a path.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Piece {
@@ -223,10 +226,19 @@ fn check_turn(
     end: f64,
     piece: usize,
 ) -> Result<(), PathError> {
+    let mut before_rad = None;
     for share in [0.0, 0.25, 0.5, 0.75, 1.0] {
         let parameter = start + share * (end - start);
-        let curvature_1_m = polynomial.sample(parameter).curvature_1_m;
-        let cusp = polynomial.advance(parameter) < ADVANCE_MIN;
+        let PathSample {
+            pose,
+            curvature_1_m,
+            ..
+        } = polynomial.sample(parameter);
+        // Between two places near a cusp the heading turns back, however gentle the bends there.
+        let turned_rad = before_rad.replace(pose.heading_rad).map_or(0.0, |before| {
+            crate::geometry::wrap_angle_rad(pose.heading_rad - before)
+        });
+        let cusp = polynomial.advance(parameter) < ADVANCE_MIN || turned_rad.abs() > TURN_MAX_RAD;
         if cusp || !curvature_1_m.is_finite() || curvature_1_m.abs() > RADIUS_MIN_M.recip() {
             return Err(PathError::TooTight { piece });
         }

@@ -154,12 +154,13 @@ impl SimRobot {
         self.plant.step(self.command, &self.ground, dt_s);
         let state = *self.plant.state();
         let noise = self.noise;
+        let seen = *self.plant.means();
         let wheel_speeds = WheelSpeeds {
-            left_rad_s: state.wheel_speeds.left_rad_s + self.gauss(noise.wheel_speed_rad_s),
-            right_rad_s: state.wheel_speeds.right_rad_s + self.gauss(noise.wheel_speed_rad_s),
+            left_rad_s: seen.wheel_speeds.left_rad_s + self.gauss(noise.wheel_speed_rad_s),
+            right_rad_s: seen.wheel_speeds.right_rad_s + self.gauss(noise.wheel_speed_rad_s),
         };
-        let gyro_rad_s = state.yaw_rate_rad_s + self.gauss(noise.gyro_rad_s);
-        let felt = self.plant.body_acceleration();
+        let gyro_rad_s = seen.yaw_rate_rad_s + self.gauss(noise.gyro_rad_s);
+        let felt = seen.acceleration;
         let torques = self.plant.wheel_torques();
         let torque_noise = noise.torque_mu * self.model.wheel_radius_m() * self.model.side_load_n();
         let body_speed = self.tick.is_multiple_of(10);

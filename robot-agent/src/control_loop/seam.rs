@@ -91,7 +91,7 @@ pub(crate) struct ClosedSegment {
     pub(crate) cell: Cell,
     pub(crate) terrain: Option<usize>,
     pub(crate) distance_m: f64,
-    /// Share of the blocks on this ground with a wheel beyond the linear range.
+    /// Share of the segment's blocks with a wheel beyond the linear range.
     pub(crate) saturation_ratio: f64,
     pub(crate) statistics: SegmentStatistics,
 }

@@ -145,7 +145,6 @@ fn close(
     input: CutInput<'_>,
     estimator: &mut Estimator,
 ) -> Option<ClosedSegment> {
-    let saturation_ratio = estimator.estimate().saturation_share;
     let statistics = estimator.close_segment();
     let site = input.site?;
     let is_informative = statistics.theta_information > 0.0
@@ -163,7 +162,7 @@ fn close(
         cell: open.place.cell,
         terrain: open.place.terrain,
         distance_m: open.distance_m,
-        saturation_ratio,
+        saturation_ratio: statistics.saturation_ratio,
         statistics,
     })
 }

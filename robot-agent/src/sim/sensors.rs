@@ -118,7 +118,9 @@ impl Sensors {
     pub fn sample(&mut self, plant: &Plant, at: Duration) -> SensorSample {
         let spec = self.spec;
         let state = *plant.state();
-        let (acceleration, torques) = (plant.body_acceleration(), plant.wheel_torques());
+        // Encoders count and inertial sensors integrate: each gives its mean since the last sample.
+        let means = *plant.means();
+        let (acceleration, torques) = (means.acceleration, plant.wheel_torques());
         let index = self.samples;
         self.samples += 1;
         let wheel_noise = spec.wheel_speed_rad_s;
@@ -133,7 +135,7 @@ impl Sensors {
         let torque_noise_n_m = self.torque_noise_n_m;
         SensorSample {
             at,
-            yaw_rate_rad_s: Some(self.noisy(state.yaw_rate_rad_s, spec.gyro_rad_s)),
+            yaw_rate_rad_s: Some(self.noisy(means.yaw_rate_rad_s, spec.gyro_rad_s)),
             acceleration: Some(BodyAcceleration {
                 ahead_m_s2: self.noisy(
                     acceleration.ahead_m_s2 + self.bias.ahead_m_s2,
@@ -145,8 +147,8 @@ impl Sensors {
                 ),
             }),
             wheel_speeds: Some(WheelSpeeds {
-                left_rad_s: self.noisy(state.wheel_speeds.left_rad_s, wheel_noise),
-                right_rad_s: self.noisy(state.wheel_speeds.right_rad_s, wheel_noise),
+                left_rad_s: self.noisy(means.wheel_speeds.left_rad_s, wheel_noise),
+                right_rad_s: self.noisy(means.wheel_speeds.right_rad_s, wheel_noise),
             }),
             wheel_torques: Some(WheelTorques {
                 left_n_m: self.noisy(torques.left_n_m * self.torque_scale, torque_noise_n_m),

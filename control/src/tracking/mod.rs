@@ -1,24 +1,35 @@
-//! The shipped tracking law: wheel speeds from tracking errors.
+//! The shipped tracking law: wheel speeds from tracking errors. `docs/control.md` has the proof.
 //!
-//! Lyapunov function `V = ½(e_x² + e_y²) + (1 − cos e_θ)/k_y + θ̃²/(2ρ)`, errors in the frame of the
-//! robot's *course*. On a free base the course differs from the heading by the sideslip
-//! `β = −v ω θ/g` (θ = 1/K, steady turn of the four-wheel sum), so the error's own motion holds
-//! `ė_y = v sin e_θ + (v²ω/g) θ̃`, and `θ̂̇ = ρ e_y v²ω/g` makes V fall: the paper's adaptation (26)
-//! on a law that never inverts a measured velocity, so it is regular at standstill.
+//! The paper's idea on a base that really slips. With errors in the frame of the robot's *course*,
+//! which differs from its heading by the sideslip `β = −vωθ/g` (θ = 1/K, steady turn of the
+//! four-wheel sum), the error's own motion holds `ė_y = v sin e_θ + (v²ω/g) θ̃`. So
+//! `V = ½k_y(e_x² + e_y²) + (1 − cos e_θ) + k_y θ̃²/(2ρ)` falls under `θ̂̇ = ρ e_y v²ω/g`, the
+//! adaptation (26) of the paper, on a law that never inverts a measured velocity: it is regular at
+//! standstill.
 //!
-//! The command is the reference's motion, corrected by the errors (Kanayama's form with integral
-//! action on `e_y`), plus feed-forward: lead for the wheel servo and half a sample, and, weighted by
-//! the confidence in θ, the sideslip above and lead for slip relaxation, `vθ/g` along and
-//! `(vθ/g)·4 I_G/(m(W² + L²))` in yaw. No confidence, no friction feed-forward. θ̂ is bounded in
-//! range and rate, pulled to a measured θ where there is one, and held while the wheels saturate or
-//! the pose is stale. It serves this loop only; what the map gets comes from [`crate::estimation`].
+//! The command is the reference's motion, corrected by the errors (Kanayama's form, with integral
+//! action over the way driven), plus feed-forward with θ̂: the sideslip above, lead for the wheel
+//! servo and half a sample, and lead for slip relaxation, `vθ/g` along and
+//! `(vθ/g)·4 I_G/(m(W² + L²))` in yaw. An inner loop on the measured turn rate, of gain below one,
+//! keeps margin where slip is slow. Gains across the path follow the noise of the pose.
+//!
+//! θ̂ starts at zero: no knowledge, no feed-forward. A known θ pulls it, by the confidence in it. It
+//! is bounded in range and rate, and held while the wheels saturate, something outside cuts the
+//! command, or the pose is stale. It serves this loop only; what the map gets comes from
+//! [`crate::estimation`].
 
-use thiserror::Error;
+mod config;
+mod knowledge;
+mod noise;
 
 use crate::geometry::{Twist, wrap_angle_rad};
 use crate::measured::{Measured, WheelSpeeds};
 use crate::reference::ReferenceSample;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
+
+pub use config::{CrossGains, TrackerConfig, TrackerError};
+pub use knowledge::ThetaKnowledge;
+use noise::NoiseLevel;
 
 /// How much faster than the plan's limits feedback may drive.
 const FEEDBACK_HEADROOM: f64 = 1.2;
@@ -32,91 +43,6 @@ const INTEGRAL_SPEED_MIN_M_S: f64 = 0.05;
 const HEADING_SPEED_MIN_M_S: f64 = 0.15;
 /// Cross-track errors smaller than this do not move θ̂, metres.
 const ADAPTATION_DEAD_ZONE_M: f64 = 5.0e-4;
-
-/// What is known about θ: a map's prior or the robot's own measurement.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ThetaKnowledge {
-    /// θ = 1/K.
-    pub theta: f64,
-    /// Its standard deviation.
-    pub std_dev: f64,
-}
-
-impl ThetaKnowledge {
-    /// Weight of friction feed-forward, 0 to 1: falls with the relative deviation.
-    pub fn confidence(&self) -> f64 {
-        let relative = self.std_dev / self.theta;
-        if self.theta > 0.0 && relative.is_finite() && relative >= 0.0 {
-            1.0 / (1.0 + (3.0 * relative).powi(2))
-        } else {
-            0.0
-        }
-    }
-}
-
-/// Gains and bounds of the law.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TrackerConfig {
-    /// Along-track gain `k_x`, per second.
-    pub along_gain_1_s: f64,
-    /// Cross-track gain `k_y`, per metre squared.
-    pub cross_gain_1_m2: f64,
-    /// Heading gain `k_θ`, per metre.
-    pub heading_gain_1_m: f64,
-    /// Integral gain `k_I` on the cross-track error, per metre squared and second.
-    pub integral_gain_1_m2_s: f64,
-    /// Largest turn of the path's curvature by the integral, per metre.
-    pub integral_max_1_m: f64,
-    /// First-order lag of the wheel servo that is led, seconds.
-    pub servo_lag_s: f64,
-    /// Adaptation gain ρ.
-    pub adaptation_gain: f64,
-    /// Fastest change of θ̂, per second.
-    pub adaptation_rate_max_1_s: f64,
-    /// Pull of θ̂ to a θ that is known, per second, at full confidence.
-    pub adaptation_pull_1_s: f64,
-    /// Smallest θ̂.
-    pub theta_min: f64,
-    /// Largest θ̂.
-    pub theta_max: f64,
-    /// Fastest change of the feed-forward's weight, per second.
-    pub confidence_rate_max_1_s: f64,
-    /// Age of the pose beyond which adaptation and integral are held, seconds.
-    pub pose_age_max_s: f64,
-}
-
-impl Default for TrackerConfig {
-    fn default() -> Self {
-        Self {
-            along_gain_1_s: 3.0,
-            cross_gain_1_m2: 16.0,
-            heading_gain_1_m: 7.0,
-            integral_gain_1_m2_s: 4.0,
-            integral_max_1_m: 0.5,
-            servo_lag_s: 0.05,
-            adaptation_gain: 20.0,
-            adaptation_rate_max_1_s: 0.1,
-            adaptation_pull_1_s: 1.0,
-            theta_min: 0.02,
-            theta_max: 4.0,
-            confidence_rate_max_1_s: 0.5,
-            pose_age_max_s: 0.3,
-        }
-    }
-}
-
-/// Why gains were refused.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-pub enum TrackerError {
-    /// A figure is NaN, infinite or out of its range.
-    #[error("`{field}` is out of its range: {value}")]
-    OutOfRange {
-        /// The field's name.
-        field: &'static str,
-        /// What it held.
-        value: f64,
-    },
-}
 
 /// How far the robot is from its reference.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -157,7 +83,7 @@ pub struct TrackerOutput {
     pub errors: TrackingErrors,
     /// θ̂ in the loop; never a measurement.
     pub theta_loop: f64,
-    /// Weight of friction feed-forward, 0 to 1.
+    /// How much the known θ is believed, 0 to 1.
     pub confidence: f64,
     /// Whether the wheel limits cut the command.
     pub saturated: bool,
@@ -168,68 +94,40 @@ pub struct TrackerOutput {
 pub struct Tracker {
     model: RobotModel,
     config: TrackerConfig,
-    integral_m_s: f64,
+    integral_1_m: f64,
     theta: f64,
-    confidence: f64,
+    noise: NoiseLevel,
     was_saturated: bool,
+    held_from_outside: bool,
 }
 
 impl Tracker {
-    /// A law at rest, with θ̂ where it is told or at 0.2, and no confidence in it.
+    /// A law at rest, with θ̂ at zero.
     ///
     /// # Errors
     /// [`TrackerError`] names a gain or bound that is out of its range.
     pub fn new(model: RobotModel, config: TrackerConfig) -> Result<Self, TrackerError> {
-        let positive = [
-            ("along_gain_1_s", config.along_gain_1_s),
-            ("cross_gain_1_m2", config.cross_gain_1_m2),
-            ("heading_gain_1_m", config.heading_gain_1_m),
-            ("theta_min", config.theta_min),
-            ("theta_max", config.theta_max),
-            ("confidence_rate_max_1_s", config.confidence_rate_max_1_s),
-            ("pose_age_max_s", config.pose_age_max_s),
-        ];
-        let at_least_zero = [
-            ("integral_gain_1_m2_s", config.integral_gain_1_m2_s),
-            ("integral_max_1_m", config.integral_max_1_m),
-            ("servo_lag_s", config.servo_lag_s),
-            ("adaptation_gain", config.adaptation_gain),
-            ("adaptation_rate_max_1_s", config.adaptation_rate_max_1_s),
-            ("adaptation_pull_1_s", config.adaptation_pull_1_s),
-        ];
-        for (field, value) in positive {
-            if !(value.is_finite() && value > 0.0) {
-                return Err(TrackerError::OutOfRange { field, value });
-            }
-        }
-        for (field, value) in at_least_zero {
-            if !(value.is_finite() && value >= 0.0) {
-                return Err(TrackerError::OutOfRange { field, value });
-            }
-        }
-        if config.theta_max < config.theta_min {
-            return Err(TrackerError::OutOfRange {
-                field: "theta_max",
-                value: config.theta_max,
-            });
-        }
+        config.check()?;
         Ok(Self {
             model,
             config,
-            integral_m_s: 0.0,
-            theta: 0.2_f64.clamp(config.theta_min, config.theta_max),
-            confidence: 0.0,
+            integral_1_m: 0.0,
+            theta: 0.0,
+            noise: NoiseLevel::default(),
             was_saturated: false,
+            held_from_outside: false,
         })
+    }
+
+    /// Holds θ̂ and the integral while something outside, such as the gate, cuts the command.
+    pub fn hold_adaptation(&mut self, held: bool) {
+        self.held_from_outside = held;
     }
 
     /// Starts with what a map or an earlier run knows, at its full weight from the first metre.
     pub fn warm_start(&mut self, knowledge: ThetaKnowledge) {
         if knowledge.confidence() > 0.0 {
-            self.theta = knowledge
-                .theta
-                .clamp(self.config.theta_min, self.config.theta_max);
-            self.confidence = knowledge.confidence();
+            self.theta = (knowledge.confidence() * knowledge.theta).min(self.config.theta_max);
         }
     }
 
@@ -247,10 +145,10 @@ impl Tracker {
         dt_s: f64,
     ) -> TrackerOutput {
         let config = self.config;
-        let wanted = knowledge.map_or(0.0, |known| known.confidence());
-        let step = config.confidence_rate_max_1_s * dt_s;
-        self.confidence += (wanted - self.confidence).clamp(-step, step);
-        let theta = self.confidence * self.theta;
+        let theta = self.theta;
+        let density = self.noise.update(measured, dt_s);
+        let middle = config.noise_middle_m_sqrt_s.powi(2);
+        let gains = CrossGains::blend(config.quiet, config.noisy, middle / (middle + density));
 
         let speed_m_s = reference.speed_m_s;
         let sideslip = Sideslip::of(reference, theta, &self.model);
@@ -260,14 +158,15 @@ impl Tracker {
         let heading_rad = wrap_angle_rad(reference.pose.heading_rad - course.heading_rad);
         let along_m = ahead.x_m.clamp(-ALONG_MAX_M, ALONG_MAX_M);
         // Bounded so that a far-off robot comes in at a bounded angle instead of spinning.
-        let cross_max_m = 0.8 * config.heading_gain_1_m / config.cross_gain_1_m2;
+        let cross_max_m = 0.8 * gains.heading_1_m / gains.cross_1_m2;
         let cross_m = ahead.y_m.clamp(-cross_max_m, cross_max_m);
 
         let held = self.was_saturated
+            || self.held_from_outside
             || measured.pose_age_s > config.pose_age_max_s
             || speed_m_s < INTEGRAL_SPEED_MIN_M_S;
         if !held {
-            self.integrate(cross_m, dt_s);
+            self.integrate(gains.integral_1_m3 * cross_m * speed_m_s * dt_s);
             self.adapt(reference, cross_m, knowledge, dt_s);
         }
 
@@ -279,11 +178,11 @@ impl Tracker {
         let linear_m_s = speed_m_s * heading_rad.cos()
             + config.along_gain_1_s * along_m
             + (lead_s + slip_lead_s) * reference.acceleration_m_s2;
-        let angular_rad_s = reference.turn_rad_s - sideslip.rate_rad_s
-            + speed_m_s
-                * (config.cross_gain_1_m2 * cross_m
-                    + config.integral_gain_1_m2_s * self.integral_m_s)
-            + speed_m_s.max(HEADING_SPEED_MIN_M_S) * config.heading_gain_1_m * heading_rad.sin()
+        let wanted_rad_s = reference.turn_rad_s - sideslip.rate_rad_s
+            + speed_m_s * (gains.cross_1_m2 * cross_m + self.integral_1_m)
+            + speed_m_s.max(HEADING_SPEED_MIN_M_S) * gains.heading_1_m * heading_rad.sin();
+        let angular_rad_s = wanted_rad_s
+            + config.yaw_rate_gain * (wanted_rad_s - measured.twist.angular_rad_s)
             + (lead_s + slip_lead_s * yaw_shape) * reference.turn_acceleration_rad_s2;
         let twist = self.bounded(Twist {
             linear_m_s,
@@ -296,20 +195,18 @@ impl Tracker {
             twist: self.model.twist_from_wheel_speeds(wheel_speeds),
             errors: TrackingErrors::between(reference, measured),
             theta_loop: self.theta,
-            confidence: self.confidence,
+            confidence: knowledge.map_or(0.0, |known| known.confidence()),
             saturated,
         }
     }
 
-    fn integrate(&mut self, cross_m: f64, dt_s: f64) {
-        let gain = self.config.integral_gain_1_m2_s;
-        if gain > 0.0 {
-            let bound = self.config.integral_max_1_m / gain;
-            self.integral_m_s = (self.integral_m_s + cross_m * dt_s).clamp(-bound, bound);
-        }
+    /// Bounded, so that it cannot wind up.
+    fn integrate(&mut self, change_1_m: f64) {
+        let bound = self.config.integral_max_1_m;
+        self.integral_1_m = (self.integral_1_m + change_1_m).clamp(-bound, bound);
     }
 
-    /// `θ̂̇ = ρ e_y φ/(1 + φ²) + pull (θ − θ̂)`, φ = v²ω/g, bounded in rate and range.
+    /// `θ̂̇ = ρ e_y φ + pull·c (cθ − θ̂)`, φ = v²ω/g, c the confidence; bounded in rate and range.
     fn adapt(
         &mut self,
         reference: &ReferenceSample,
@@ -324,14 +221,15 @@ impl Tracker {
         } else {
             cross_m
         };
-        let gradient = config.adaptation_gain * error_m * regressor / (1.0 + regressor * regressor);
+        let gradient = config.adaptation_gain * error_m * regressor;
         let pull = knowledge.map_or(0.0, |known| {
-            config.adaptation_pull_1_s * known.confidence() * (known.theta - self.theta)
+            let weight = known.confidence();
+            config.adaptation_pull_1_s * weight * (weight * known.theta - self.theta)
         });
         let bound = config.adaptation_rate_max_1_s;
         // The pull is a way back, not a drift: it may act faster than the gradient.
         let rate = gradient.clamp(-bound, bound) + pull;
-        self.theta = (self.theta + rate * dt_s).clamp(config.theta_min, config.theta_max);
+        self.theta = (self.theta + rate * dt_s).clamp(0.0, config.theta_max);
     }
 
     fn bounded(&self, twist: Twist) -> Twist {

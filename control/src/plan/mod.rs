@@ -6,8 +6,10 @@
 //! from there. Where the path leaves in another
 //! direction than the robot points, [`Plan::start_heading_rad`] tells where to turn on the spot.
 
-use thiserror::Error;
+mod error;
+mod limits;
 
+use crate::excitation::{Excitation, ExcitationSpec, Warp};
 use crate::geometry::{Point, Pose};
 use crate::path::{
     CircleTarget, Knot, Path, PathError, PathSample, Piece, RADIUS_MIN_M, from_here, join_circle,
@@ -16,6 +18,9 @@ use crate::path::{
 use crate::profile::{NodeLimits, SpeedProfile};
 use crate::robot::RobotModel;
 use crate::trajectory::{CircleSpec, Trajectory, WaypointsSpec};
+
+pub use error::PlanError;
+use limits::{WHEEL_SHARE, node_limits, wiggled};
 
 /// Most waypoints of a path.
 pub const WAYPOINTS_MAX: usize = 100_000;
@@ -31,69 +36,23 @@ const ON_START_M: f64 = 0.05;
 const GRID_M: f64 = 0.02;
 /// Most nodes of the timing.
 const GRID_MAX: usize = 1_000_000;
+/// Curvature from which a cell of the timing is looked into, per metre.
+const BEND_LOOKED_INTO_1_M: f64 = 1.0;
+/// Parts of such a cell.
+const PARTS_LOOKED_INTO: u8 = 8;
 /// Fewest cells of the timing.
 const GRID_MIN: usize = 16;
-/// Share of the wheels' speed and acceleration that a plan may ask for; the rest is for feedback.
-const WHEEL_SHARE: f64 = 0.85;
 
-/// Why a trajectory cannot be driven; places count from zero.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-pub enum PlanError {
-    /// A figure is NaN, infinite or too large.
-    #[error("{what} at {place} is not a usable number: {value}")]
-    NotFinite {
-        /// Which figure.
-        what: &'static str,
-        /// Index of the waypoint, 0 for a circle or the start.
-        place: usize,
-        /// What it held.
-        value: f64,
-    },
-    /// A radius that is zero, negative or tighter than [`RADIUS_MIN_M`].
-    #[error("the radius must be at least {RADIUS_MIN_M} m, not {0} m")]
-    Radius(f64),
-    /// No turn, or a negative one.
-    #[error("the number of turns must be above zero, not {0}")]
-    Turns(f64),
-    /// Fewer than two waypoints.
-    #[error("a path needs at least two waypoints, not {0}")]
-    TooFewWaypoints(usize),
-    /// More than [`WAYPOINTS_MAX`] waypoints.
-    #[error("a path may have at most {WAYPOINTS_MAX} waypoints, not {0}")]
-    TooManyWaypoints(usize),
-    /// A waypoint at the same place as the one before.
-    #[error("waypoint {place} is at the same place as the one before")]
-    DuplicateWaypoint {
-        /// Index of the second of the two.
-        place: usize,
-    },
-    /// A speed that is zero or negative.
-    #[error("the speed at {place} must be above zero, not {speed_m_s} m/s")]
-    SpeedNotPositive {
-        /// Index of the waypoint, 0 for a circle or a path's own speed.
-        place: usize,
-        /// What was asked for.
-        speed_m_s: f64,
-    },
-    /// A speed above what the robot can drive.
-    #[error("the speed at {place} is {speed_m_s} m/s, above the robot's limit of {limit_m_s} m/s")]
-    SpeedAboveLimit {
-        /// Index of the waypoint, 0 for a circle or a path's own speed.
-        place: usize,
-        /// What was asked for.
-        speed_m_s: f64,
-        /// The robot's limit.
-        limit_m_s: f64,
-    },
-    /// The path would turn tighter than [`RADIUS_MIN_M`].
-    #[error("the path turns too sharply near waypoint {place}")]
-    TooTight {
-        /// Index of the waypoint at the start of the sharp piece; 0 on the way to a circle.
-        place: usize,
-    },
-    /// The path is longer than [`LENGTH_MAX_M`].
-    #[error("the path is {0} m long, above the limit of {LENGTH_MAX_M} m")]
-    TooLong(f64),
+/// What a plan may do beside its trajectory; nothing by default.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct PlanOptions {
+    /// Speed on the way to the trajectory, metres per second; the trajectory's own when absent.
+    pub approach_speed_m_s: Option<f64>,
+    /// A wiggle of the speed, so that θ can be measured without torque.
+    pub excitation: Option<ExcitationSpec>,
+    /// Lower bound of the ground's peak friction coefficient, above zero: accelerations stay within
+    /// what it can give. Without it only the robot's own limits hold.
+    pub grip_mu: Option<f64>,
 }
 
 /// The plan at one time or place.
@@ -114,6 +73,7 @@ pub struct PlanSample {
 pub struct Plan {
     path: Path,
     profile: SpeedProfile,
+    excitation: Option<Excitation>,
     approach_length_m: f64,
     peak_speed_m_s: f64,
     peak_acceleration_m_s2: f64,
@@ -137,6 +97,34 @@ impl Plan {
         start: Pose,
         model: &RobotModel,
     ) -> Result<Self, PlanError> {
+        Self::with_options(trajectory, start, model, &PlanOptions::default())
+    }
+
+    /// The same with options.
+    ///
+    /// # Errors
+    /// [`PlanError`] names what cannot be driven, and where.
+    pub fn with_options(
+        trajectory: &Trajectory,
+        start: Pose,
+        model: &RobotModel,
+        options: &PlanOptions,
+    ) -> Result<Self, PlanError> {
+        if let Some(speed_m_s) = options.approach_speed_m_s {
+            check_speed(speed_m_s, 0, model)?;
+        }
+        let gripped = match options.grip_mu {
+            Some(mu) if !(mu.is_finite() && mu > 0.0) => {
+                return Err(PlanError::NotFinite {
+                    what: "the grip",
+                    place: 0,
+                    value: mu,
+                });
+            }
+            Some(mu) => model.within_grip(mu),
+            None => *model,
+        };
+        let model = &gripped;
         if !start.is_finite() || start.x_m.abs().max(start.y_m.abs()) > COORDINATE_MAX_M {
             return Err(PlanError::NotFinite {
                 what: "the start pose",
@@ -145,12 +133,17 @@ impl Plan {
             });
         }
         match trajectory {
-            Trajectory::Circle(circle) => Self::circle(circle, start, model),
-            Trajectory::Waypoints(waypoints) => Self::waypoints(waypoints, start, model),
+            Trajectory::Circle(circle) => Self::circle(circle, start, model, options),
+            Trajectory::Waypoints(waypoints) => Self::waypoints(waypoints, start, model, options),
         }
     }
 
-    fn circle(circle: &CircleSpec, start: Pose, model: &RobotModel) -> Result<Self, PlanError> {
+    fn circle(
+        circle: &CircleSpec,
+        start: Pose,
+        model: &RobotModel,
+        options: &PlanOptions,
+    ) -> Result<Self, PlanError> {
         check_coordinate("the centre", 0, circle.center)?;
         if !(circle.radius_m >= RADIUS_MIN_M && circle.radius_m <= COORDINATE_MAX_M) {
             return Err(PlanError::Radius(circle.radius_m));
@@ -163,11 +156,12 @@ impl Plan {
         if length_m > LENGTH_MAX_M {
             return Err(PlanError::TooLong(length_m));
         }
+        let approach_m_s = options.approach_speed_m_s.unwrap_or(circle.speed_m_s);
         let target = CircleTarget {
             center: circle.center,
             radius_m: circle.radius_m,
             sign: circle.direction.sign(),
-            speed_m_s: circle.speed_m_s,
+            speed_m_s: approach_m_s,
         };
         let (legs, join_rad) =
             join_circle(&target, start, model).ok_or(PlanError::TooTight { place: 0 })?;
@@ -185,14 +179,25 @@ impl Plan {
             .chain([arc])
             .collect();
         let path = Path::new(pieces).map_err(|_| PlanError::TooTight { place: 0 })?;
-        let speeds = [SpeedFrom {
-            arc_m: 0.0,
-            speed_m_s: circle.speed_m_s,
-        }];
-        Self::timed(path, &speeds, approach_pieces, model)
+        let speeds = [
+            SpeedFrom {
+                arc_m: 0.0,
+                speed_m_s: approach_m_s,
+            },
+            SpeedFrom {
+                arc_m: path.piece_start_m(approach_pieces),
+                speed_m_s: circle.speed_m_s,
+            },
+        ];
+        Self::timed(path, &speeds, approach_pieces, model, options)
     }
 
-    fn waypoints(spec: &WaypointsSpec, start: Pose, model: &RobotModel) -> Result<Self, PlanError> {
+    fn waypoints(
+        spec: &WaypointsSpec,
+        start: Pose,
+        model: &RobotModel,
+        options: &PlanOptions,
+    ) -> Result<Self, PlanError> {
         let points = &spec.points;
         if points.len() < 2 {
             return Err(PlanError::TooFewWaypoints(points.len()));
@@ -266,15 +271,17 @@ impl Plan {
             speed_m_s: spec.speed_m_s,
         }];
         for piece in 0..path.piece_count() {
-            let waypoint = (piece >= approach_pieces).then(|| &points[place_of(piece)]);
+            let asked = if piece >= approach_pieces {
+                points[place_of(piece)].speed_m_s
+            } else {
+                options.approach_speed_m_s
+            };
             speeds.push(SpeedFrom {
                 arc_m: path.piece_start_m(piece),
-                speed_m_s: waypoint
-                    .and_then(|point| point.speed_m_s)
-                    .unwrap_or(spec.speed_m_s),
+                speed_m_s: asked.unwrap_or(spec.speed_m_s),
             });
         }
-        Self::timed(path, &speeds, approach_pieces, model)
+        Self::timed(path, &speeds, approach_pieces, model, options)
     }
 
     #[expect(
@@ -288,6 +295,7 @@ impl Plan {
         speeds: &[SpeedFrom],
         approach_pieces: usize,
         model: &RobotModel,
+        options: &PlanOptions,
     ) -> Result<Self, PlanError> {
         let length_m = path.length_m();
         if length_m > LENGTH_MAX_M {
@@ -296,7 +304,8 @@ impl Plan {
         let cells = ((length_m / GRID_M).ceil() as usize).clamp(GRID_MIN, GRID_MAX);
         let cell_m = length_m / cells as f64;
         let mut asked = 0;
-        let mut nodes = Vec::with_capacity(cells + 1);
+        let mut nodes: Vec<NodeLimits> = Vec::with_capacity(cells + 1);
+        let mut bend_before_1_m = 0.0;
         for index in 0..=cells {
             let arc_m = cell_m * index as f64;
             while speeds
@@ -305,14 +314,33 @@ impl Plan {
             {
                 asked += 1;
             }
-            nodes.push(node_limits(
-                &path.sample(arc_m),
-                speeds[asked].speed_m_s,
-                model,
-            ));
+            let asked_m_s = speeds[asked].speed_m_s;
+            let here = path.sample(arc_m);
+            let mut node = node_limits(&here, asked_m_s, model);
+            let bend_1_m = here.curvature_1_m.abs();
+            // A sharp bend may have its peak between two nodes: both keep to what is in between.
+            if bend_1_m.max(bend_before_1_m) > BEND_LOOKED_INTO_1_M
+                && let Some(before) = nodes.last_mut()
+            {
+                for part in 1..PARTS_LOOKED_INTO {
+                    let back_m = cell_m * f64::from(part) / f64::from(PARTS_LOOKED_INTO);
+                    let between = path.sample(arc_m - back_m);
+                    let between = node_limits(&between, asked_m_s, model);
+                    *before = before.stricter(&between);
+                    node = node.stricter(&between);
+                }
+            }
+            bend_before_1_m = bend_1_m;
+            nodes.push(node);
         }
-        let profile = SpeedProfile::new(length_m, &nodes, model.limits().linear_jerk_max_m_s3);
+        let mut jerk_m_s3 = model.limits().linear_jerk_max_m_s3;
+        let excitation = match options.excitation {
+            Some(spec) => Some(wiggled(spec, &mut nodes, &mut jerk_m_s3)?),
+            None => None,
+        };
+        let profile = SpeedProfile::new(length_m, &nodes, jerk_m_s3);
         let mut plan = Self {
+            excitation,
             approach_length_m: path.piece_start_m(approach_pieces),
             path,
             profile,
@@ -337,13 +365,27 @@ impl Plan {
 
     /// The plan at a time since its start, seconds; at rest at its ends before and after.
     pub fn sample(&self, time_s: f64) -> PlanSample {
-        let timing = self.profile.sample(time_s);
+        let warp = self.excitation.map_or(
+            Warp {
+                plan_s: time_s,
+                pace: 1.0,
+                pace_rate_1_s: 0.0,
+            },
+            |wiggle| wiggle.warp(time_s),
+        );
+        let timing = self.profile.sample(warp.plan_s);
         PlanSample {
             path: self.path.sample(timing.arc_m),
             arc_m: timing.arc_m,
-            speed_m_s: timing.speed_m_s,
-            acceleration_m_s2: timing.acceleration_m_s2,
+            speed_m_s: warp.pace * timing.speed_m_s,
+            acceleration_m_s2: warp.pace * warp.pace * timing.acceleration_m_s2
+                + warp.pace_rate_1_s * timing.speed_m_s,
         }
+    }
+
+    /// The wiggle of the speed, if there is one, as deep as the limits left it.
+    pub fn excitation(&self) -> Option<&Excitation> {
+        self.excitation.as_ref()
     }
 
     /// The geometry alone.
@@ -363,7 +405,8 @@ impl Plan {
 
     /// Time from rest to rest when nothing slows the robot, without turning on the spot, seconds.
     pub fn duration_s(&self) -> f64 {
-        self.profile.duration_s()
+        let own_s = self.profile.duration_s();
+        self.excitation.map_or(own_s, |wiggle| wiggle.time_s(own_s))
     }
 
     /// Direction in which the path leaves the start, radians.
@@ -394,30 +437,6 @@ impl Plan {
     /// Fastest turn, radians per second.
     pub fn peak_angular_rad_s(&self) -> f64 {
         self.peak_angular_rad_s
-    }
-}
-
-/// What the robot may do where the path bends like this.
-fn node_limits(path: &PathSample, asked_m_s: f64, model: &RobotModel) -> NodeLimits {
-    let limits = model.limits();
-    let bend = path.curvature_1_m.abs();
-    let slope = path.curvature_slope_1_m2.abs();
-    let radius_m = model.wheel_radius_m();
-    let half_track_m = 0.5 * model.effective_track_m();
-    let rim_max_m_s = WHEEL_SHARE * limits.wheel_speed_max_rad_s * radius_m;
-    let rim_max_m_s2 = WHEEL_SHARE * limits.wheel_acceleration_max_rad_s2 * radius_m;
-    // The outer wheels: v (1 + bW/2), and a (1 + bW/2) + v² b' W/2, half of the limit for each.
-    let outer = 1.0 + bend * half_track_m;
-    let floor = f64::MIN_POSITIVE;
-    NodeLimits {
-        speed_m_s: asked_m_s
-            .min((limits.lateral_acceleration_max_m_s2 / bend.max(floor)).sqrt())
-            .min(limits.angular_max_rad_s / bend.max(floor))
-            .min(rim_max_m_s / outer)
-            .min((0.5 * rim_max_m_s2 / (slope * half_track_m).max(floor)).sqrt()),
-        acceleration_m_s2: limits
-            .linear_acceleration_max_m_s2
-            .min(0.5 * rim_max_m_s2 / outer),
     }
 }
 

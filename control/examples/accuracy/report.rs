@@ -1,0 +1,151 @@
+//! Options of the program, and what its parts hand back.
+
+use std::fmt::Write as _;
+
+use serde_json::{Value, json};
+
+/// Most seeded runs per scenario.
+const RUNS_MAX: u32 = 100_000;
+
+/// What was asked for on the command line.
+pub(crate) struct Options {
+    /// Seeded runs per scenario with noise.
+    pub(crate) runs: u32,
+    /// Threads that share the runs.
+    pub(crate) threads: usize,
+    /// One JSON object instead of tables.
+    pub(crate) json: bool,
+    only: Vec<String>,
+}
+
+impl Options {
+    /// Reads the arguments; an error is a sentence for people.
+    pub(crate) fn from_arguments(
+        arguments: impl Iterator<Item = String>,
+    ) -> Result<Self, &'static str> {
+        const USAGE: &str =
+            "accuracy [--runs N] [--threads N] [--json] [--only tracking,theta,change]";
+        let mut options = Self {
+            runs: 200,
+            threads: std::thread::available_parallelism().map_or(1, usize::from),
+            json: false,
+            only: Vec::new(),
+        };
+        let mut arguments = arguments;
+        while let Some(argument) = arguments.next() {
+            let mut value = || arguments.next().ok_or(USAGE);
+            match argument.as_str() {
+                "--json" => options.json = true,
+                "--runs" => options.runs = value()?.parse().map_err(|_| USAGE)?,
+                "--threads" => options.threads = value()?.parse().map_err(|_| USAGE)?,
+                "--only" => options.only = value()?.split(',').map(str::to_owned).collect(),
+                _ => return Err(USAGE),
+            }
+        }
+        let known = ["tracking", "theta", "change"];
+        if options
+            .only
+            .iter()
+            .any(|name| !known.contains(&name.as_str()))
+            || !(1..=RUNS_MAX).contains(&options.runs)
+            || options.threads == 0
+        {
+            return Err(USAGE);
+        }
+        Ok(options)
+    }
+
+    /// Whether a part is to run.
+    pub(crate) fn wants(&self, part: &str) -> bool {
+        self.only.is_empty() || self.only.iter().any(|name| name == part)
+    }
+}
+
+/// One figure that must be reached.
+pub(crate) struct Check {
+    /// What is measured, and where.
+    pub(crate) name: String,
+    /// The goal in words, for instance `≤ 0.6`.
+    pub(crate) goal: String,
+    /// What was measured.
+    pub(crate) value: f64,
+    /// Whether the goal is reached.
+    pub(crate) holds: bool,
+}
+
+impl Check {
+    /// A figure that must not be above a bound; NaN does not hold.
+    pub(crate) fn at_most(name: impl Into<String>, value: f64, bound: f64) -> Self {
+        Self {
+            name: name.into(),
+            goal: format!("≤ {bound}"),
+            value,
+            holds: value <= bound,
+        }
+    }
+
+    /// A figure that must lie between two bounds; NaN does not hold.
+    pub(crate) fn between(
+        name: impl Into<String>,
+        value: f64,
+        range: std::ops::RangeInclusive<f64>,
+    ) -> Self {
+        Self {
+            name: name.into(),
+            goal: format!("{} … {}", range.start(), range.end()),
+            value,
+            holds: range.contains(&value),
+        }
+    }
+}
+
+/// What one part of the program found.
+pub(crate) struct Section {
+    /// The tables for people, Markdown.
+    pub(crate) text: String,
+    /// The same figures for programs.
+    pub(crate) figures: Value,
+    /// What must hold.
+    pub(crate) checks: Vec<Check>,
+}
+
+impl Section {
+    /// Whether every check holds.
+    pub(crate) fn holds(&self) -> bool {
+        self.checks.iter().all(|check| check.holds)
+    }
+}
+
+/// The whole report.
+pub(crate) fn render(sections: &[(&str, Section)], as_json: bool) -> String {
+    let checks = sections.iter().flat_map(|(_, section)| &section.checks);
+    if as_json {
+        let figures: serde_json::Map<String, Value> = sections
+            .iter()
+            .map(|(name, section)| ((*name).to_owned(), section.figures.clone()))
+            .collect();
+        let checks: Vec<Value> = checks
+            .map(|check| {
+                json!({
+                    "name": check.name, "goal": check.goal,
+                    "value": check.value, "holds": check.holds,
+                })
+            })
+            .collect();
+        return json!({ "figures": figures, "checks": checks }).to_string();
+    }
+    let mut text = String::new();
+    for (name, section) in sections {
+        let _ = write!(text, "## {name}\n\n{}\n\n", section.text);
+    }
+    text.push_str("## checks\n\n| figure | goal | value | |\n|---|---|---|---|\n");
+    for check in checks {
+        let verdict = if check.holds { "holds" } else { "FAILS" };
+        let _ = writeln!(
+            text,
+            "| {} | {} | {:.4} | {verdict} |",
+            check.name, check.goal, check.value
+        );
+    }
+    text
+}

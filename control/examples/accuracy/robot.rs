@@ -1,0 +1,241 @@
+//! A seeded robot with noisy sensors around the plant, and what is known of it afterwards.
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use tread_control::estimation::{Estimator, SensorNoise, SensorSample, TyrePrior, UpdateOutcome};
+use tread_control::friction::{FrictionCurve, FrictionSpec};
+use tread_control::geometry::Pose;
+use tread_control::localisation::{Localisation, LocalisationNoise, PositionFix};
+use tread_control::measured::{BodyAcceleration, Measured, WheelSpeeds, WheelTorques};
+use tread_control::plant::{Ground, Plant, PlantMeans, PlantSpec, TyreRise, Tyres};
+use tread_control::robot::RobotModel;
+
+/// Sensor samples, seconds.
+pub(crate) const SAMPLE_S: f64 = 0.005;
+/// Control loop, seconds.
+pub(crate) const LOOP_S: f64 = 0.01;
+const SAMPLES_PER_BODY_SPEED: u32 = 20;
+const SAMPLES_PER_FIX: u32 = 10;
+/// Standard deviations of a position fix: metres, and radians of heading.
+const FIX_NOISE: (f64, f64) = (0.01, 0.005);
+
+/// What a robot of a scenario is like, and what it is told about itself.
+#[derive(Clone, Copy)]
+pub(crate) struct RobotSpec {
+    pub(crate) curve: FrictionCurve,
+    /// Noise of the sensors, and what the estimator is told of it.
+    pub(crate) noise: SensorNoise,
+    /// Largest error of a side's rolling radius; drawn evenly up to it.
+    pub(crate) radius_error_max: f64,
+    pub(crate) has_torque: bool,
+    /// Wheel speed, gyro and accelerometer give the value of the moment, not the mean since the
+    /// last sample: what happens between two samples aliases.
+    pub(crate) aliases: bool,
+    pub(crate) servo_lag_s: f64,
+    pub(crate) tyres: Tyres,
+    /// Brush tyres whose curvature is drawn evenly between these, per slip.
+    pub(crate) curvatures: Option<[f64; 2]>,
+    pub(crate) told_tyres: TyrePrior,
+}
+
+impl RobotSpec {
+    /// Default sensors on isotropic ground of this stiffness.
+    pub(crate) fn on(stiffness: f64) -> Self {
+        Self {
+            curve: FrictionCurve::with_stiffness(stiffness).expect("stiffness is positive"),
+            noise: SensorNoise::default(),
+            radius_error_max: 0.02,
+            has_torque: false,
+            aliases: false,
+            servo_lag_s: 0.05,
+            tyres: Tyres::default(),
+            curvatures: None,
+            told_tyres: TyrePrior::default(),
+        }
+    }
+}
+
+/// The robot.
+pub(crate) struct SeededRobot {
+    pub(crate) model: RobotModel,
+    pub(crate) plant: Plant,
+    pub(crate) ground: Ground,
+    pub(crate) estimator: Estimator,
+    localisation: Localisation,
+    spec: RobotSpec,
+    torque_gain: [f64; 2],
+    gyro_offset_rad_s: f64,
+    accelerometer_offset: [f64; 2],
+    rng: ChaCha8Rng,
+    spare: Option<f64>,
+    samples: u32,
+}
+
+impl SeededRobot {
+    pub(crate) fn new(mut spec: RobotSpec, start: Pose, seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        if let Some([least, most]) = spec.curvatures {
+            spec.tyres.rise = TyreRise::Brush;
+            let curvature = least + (most - least) * rng.random::<f64>();
+            let curve = FrictionSpec {
+                peak_slip: 1.0 / (3.0 * curvature),
+                ..spec.curve.into()
+            };
+            spec.curve = curve.try_into().expect("the peak is between 0 and 1");
+        }
+        let most = spec.radius_error_max;
+        let mut radius = || 1.0 + most * (2.0 * rng.random::<f64>() - 1.0);
+        let plant_spec = PlantSpec {
+            servo_lag_s: spec.servo_lag_s,
+            left_radius_ratio: radius(),
+            right_radius_ratio: radius(),
+            tyres: spec.tyres,
+            ..PlantSpec::default()
+        };
+        let model = RobotModel::yi2007();
+        let mut robot = Self {
+            model,
+            plant: Plant::new(model, plant_spec, start).expect("a scenario's plant is valid"),
+            ground: Ground::uniform(spec.curve),
+            estimator: Estimator::with_tyres(model, spec.noise, spec.told_tyres),
+            localisation: Localisation::new(model, LocalisationNoise::default()),
+            spec,
+            torque_gain: [1.0; 2],
+            gyro_offset_rad_s: 0.0,
+            accelerometer_offset: [0.0; 2],
+            rng,
+            spare: None,
+            samples: 0,
+        };
+        let noise = spec.noise;
+        robot.torque_gain = [0, 1].map(|_| 1.0 + robot.gauss(noise.torque_gain_ratio));
+        robot.gyro_offset_rad_s = robot.gauss(noise.gyro_offset_rad_s);
+        robot.accelerometer_offset = [0, 1].map(|_| robot.gauss(noise.accelerometer_offset_m_s2));
+        robot.fix();
+        robot
+    }
+
+    /// Normal deviate of this standard deviation.
+    pub(crate) fn gauss(&mut self, std_dev: f64) -> f64 {
+        if let Some(spare) = self.spare.take() {
+            return std_dev * spare;
+        }
+        // Box and Muller; the first number is in (0, 1], so that its logarithm is finite.
+        let radius = (-2.0 * (1.0 - self.rng.random::<f64>()).ln()).sqrt();
+        let (sin, cos) = (std::f64::consts::TAU * self.rng.random::<f64>()).sin_cos();
+        self.spare = Some(radius * sin);
+        std_dev * radius * cos
+    }
+
+    fn fix(&mut self) {
+        let pose = self.plant.state().pose;
+        let pose = Pose {
+            x_m: pose.x_m + self.gauss(FIX_NOISE.0),
+            y_m: pose.y_m + self.gauss(FIX_NOISE.0),
+            heading_rad: pose.heading_rad + self.gauss(FIX_NOISE.1),
+        };
+        self.localisation.correct(&PositionFix { pose, age_s: 0.0 });
+    }
+
+    /// What the robot's law may look at.
+    pub(crate) fn measured(&self) -> Measured {
+        Measured {
+            pose: self.localisation.pose().unwrap_or_default(),
+            twist: self.localisation.twist(),
+            wheel_speeds: self.plant.state().wheel_speeds,
+            pose_age_s: self.localisation.fix_age_s(),
+        }
+    }
+
+    /// One tick of the loop under this command.
+    pub(crate) fn act(&mut self, command: WheelSpeeds) -> UpdateOutcome {
+        let mut outcome = UpdateOutcome::default();
+        let mut left_s = LOOP_S;
+        while left_s > 0.5 * SAMPLE_S {
+            let one = self.sample(command);
+            outcome.ground_changed |= one.ground_changed;
+            outcome.block_done |= one.block_done;
+            left_s -= SAMPLE_S;
+        }
+        outcome
+    }
+
+    fn sample(&mut self, command: WheelSpeeds) -> UpdateOutcome {
+        self.plant.step(command, &self.ground, SAMPLE_S);
+        let state = *self.plant.state();
+        let noise = self.spec.noise;
+        let moment = PlantMeans {
+            wheel_speeds: state.wheel_speeds,
+            yaw_rate_rad_s: state.yaw_rate_rad_s,
+            acceleration: self.plant.body_acceleration(),
+        };
+        let seen = if self.spec.aliases {
+            moment
+        } else {
+            *self.plant.means()
+        };
+        let wheel_speeds = WheelSpeeds {
+            left_rad_s: seen.wheel_speeds.left_rad_s + self.gauss(noise.wheel_speed_rad_s),
+            right_rad_s: seen.wheel_speeds.right_rad_s + self.gauss(noise.wheel_speed_rad_s),
+        };
+        let gyro_rad_s =
+            seen.yaw_rate_rad_s + self.gyro_offset_rad_s + self.gauss(noise.gyro_rad_s);
+        let felt = seen.acceleration;
+        let torques = self.plant.wheel_torques();
+        let torque_noise = noise.torque_mu * self.model.wheel_radius_m() * self.model.side_load_n();
+        let has_body_speed = self.samples.is_multiple_of(SAMPLES_PER_BODY_SPEED);
+        let sample = SensorSample {
+            wheel_speeds,
+            gyro_rad_s,
+            acceleration: Some(BodyAcceleration {
+                ahead_m_s2: felt.ahead_m_s2
+                    + self.accelerometer_offset[0]
+                    + self.gauss(noise.accelerometer_m_s2),
+                left_m_s2: felt.left_m_s2
+                    + self.accelerometer_offset[1]
+                    + self.gauss(noise.accelerometer_m_s2),
+            }),
+            body_speed_m_s: has_body_speed
+                .then(|| state.ahead_m_s + self.gauss(noise.body_speed_m_s)),
+            wheel_torques: self.spec.has_torque.then(|| WheelTorques {
+                left_n_m: self.torque_gain[0] * torques.left_n_m + self.gauss(torque_noise),
+                right_n_m: self.torque_gain[1] * torques.right_n_m + self.gauss(torque_noise),
+            }),
+        };
+        self.localisation
+            .predict(gyro_rad_s, wheel_speeds, SAMPLE_S);
+        self.samples += 1;
+        if self.samples.is_multiple_of(SAMPLES_PER_FIX) {
+            self.fix();
+        }
+        self.estimator.update(&sample, SAMPLE_S)
+    }
+}
+
+/// Shares seeded runs among threads; results stand in the order of their seeds.
+pub(crate) fn run_seeded<T: Send>(
+    runs: u32,
+    threads: usize,
+    one: impl Fn(u64) -> T + Sync,
+) -> Vec<T> {
+    let threads = u64::try_from(threads.max(1)).unwrap_or(1);
+    let mut results: Vec<(u64, T)> = std::thread::scope(|scope| {
+        let one = &one;
+        let workers: Vec<_> = (0..threads)
+            .map(|first| {
+                scope.spawn(move || {
+                    (first..u64::from(runs))
+                        .step_by(usize::try_from(threads).unwrap_or(1))
+                        .map(|seed| (seed, one(seed)))
+                        .collect::<Vec<_>>()
+                })
+            })
+            .collect();
+        workers
+            .into_iter()
+            .flat_map(|worker| worker.join().expect("a run does not panic"))
+            .collect()
+    });
+    results.sort_by_key(|(seed, _)| *seed);
+    results.into_iter().map(|(_, result)| result).collect()
+}

@@ -1,0 +1,406 @@
+//! How well θ is measured: bias, RMS error, coverage of the intervals, abstention.
+
+use std::fmt::Write as _;
+
+use serde_json::{Value, json};
+use tread_control::estimation::TyrePrior;
+
+use crate::drives::{Drive, Driven};
+use crate::report::{Check, Options, Section};
+use crate::robot::{RobotSpec, SeededRobot, run_seeded};
+
+/// Half-widths of the 50, 80 and 95 % intervals, standard deviations.
+const WIDTHS: [f64; 3] = [0.6745, 1.2816, 1.9600];
+
+/// What is expected of a scenario.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Goal {
+    /// Intervals that hold, and an RMS error of at most this share, where one is asked for.
+    Measures { rms_max: Option<f64> },
+    /// Told plainly and not asked for: the robot is not what it is told to be.
+    Reports,
+    /// No measurement at any moment.
+    Abstains,
+}
+
+/// One line of the table.
+struct Scenario {
+    name: String,
+    drive: Drive,
+    robot: RobotSpec,
+    goal: Goal,
+}
+
+/// One run's outcome.
+struct Run {
+    /// Error over the truth, and over its own deviation; none where the robot abstained.
+    error: Option<(f64, f64)>,
+    /// That deviation, over the truth.
+    std_dev: f64,
+    driven: Driven,
+}
+
+/// Figures of one scenario.
+struct Figures {
+    measured: f64,
+    bias: f64,
+    rms: f64,
+    std_dev: f64,
+    coverage: [f64; 3],
+    ever_measured: f64,
+    ever_informed: f64,
+    false_alarms: u32,
+    /// Of the first measurement of each run.
+    first_coverage: f64,
+    /// Of θ fused from segments of a metre, as a map does.
+    segment_coverage: f64,
+    segment_rms: f64,
+}
+
+fn run_one(scenario: &Scenario, seed: u64) -> Run {
+    let mut robot = SeededRobot::new(scenario.robot, scenario.drive.start(), seed);
+    let driven = scenario.drive.run(&mut robot);
+    let truth = scenario.robot.curve.theta();
+    let found = robot.estimator.estimate().theta;
+    Run {
+        error: found.map(|found| {
+            let error = found.theta - truth;
+            (error / truth, error / found.std_dev)
+        }),
+        std_dev: found.map_or(f64::NAN, |found| found.std_dev / truth),
+        driven,
+    }
+}
+
+fn figures(scenario: &Scenario, runs: &[Run]) -> Figures {
+    let truth = scenario.robot.curve.theta();
+    // The error of the torque constants is the robot's own: it is not in its segments.
+    let gain = if scenario.robot.has_torque {
+        scenario.robot.noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2
+    } else {
+        0.0
+    };
+    let firsts: Vec<f64> = runs
+        .iter()
+        .filter_map(|run| run.driven.first)
+        .map(|(theta, std_dev)| (theta - truth) / std_dev)
+        .collect();
+    let fused: Vec<(f64, f64)> = runs
+        .iter()
+        .map(|run| run.driven.segments)
+        .filter(|(information, _)| *information > 0.0)
+        .map(|(information, weighted)| {
+            let theta = weighted / information;
+            let std_dev = information.recip().sqrt().hypot(gain * theta);
+            ((theta - truth) / truth, (theta - truth) / std_dev)
+        })
+        .collect();
+    let errors: Vec<(f64, f64)> = runs.iter().filter_map(|run| run.error).collect();
+    #[expect(clippy::cast_precision_loss, reason = "counts of runs are small")]
+    let share = |count: usize, of: usize| count as f64 / of as f64;
+    let mean = |value: &dyn Fn(&(f64, f64)) -> f64| {
+        errors.iter().map(value).sum::<f64>() * share(1, errors.len())
+    };
+    let std_devs = runs
+        .iter()
+        .map(|run| run.std_dev)
+        .filter(|one| one.is_finite());
+    Figures {
+        measured: share(errors.len(), runs.len()),
+        bias: mean(&|error| error.0),
+        rms: mean(&|error| error.0 * error.0).sqrt(),
+        std_dev: std_devs.sum::<f64>() * share(1, errors.len()),
+        coverage: WIDTHS.map(|width| {
+            let held = errors.iter().filter(|error| error.1.abs() < width).count();
+            share(held, errors.len())
+        }),
+        ever_measured: share(
+            runs.iter().filter(|run| run.driven.ever_measured).count(),
+            runs.len(),
+        ),
+        ever_informed: share(
+            runs.iter().filter(|run| run.driven.ever_informed).count(),
+            runs.len(),
+        ),
+        false_alarms: runs.iter().map(|run| run.driven.ground_changes).sum(),
+        first_coverage: share(
+            firsts
+                .iter()
+                .filter(|error| error.abs() < WIDTHS[2])
+                .count(),
+            firsts.len(),
+        ),
+        segment_coverage: share(
+            fused
+                .iter()
+                .filter(|error| error.1.abs() < WIDTHS[2])
+                .count(),
+            fused.len(),
+        ),
+        segment_rms: (fused.iter().map(|error| error.0 * error.0).sum::<f64>()
+            * share(1, fused.len()))
+        .sqrt(),
+    }
+}
+
+/// Runs the part.
+pub(crate) fn run(options: &Options) -> Section {
+    let mut text = String::from(
+        "| scenario | bias % | RMS % | told σ % | in 50 % | in 80 % | in 95 % | abstains % | \
+         false alarms | first in 95 % | segments RMS % | segments in 95 % |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|---|\n",
+    );
+    let mut lines = Vec::new();
+    let mut checks = Vec::new();
+    let mut coverages = Vec::new();
+    let chosen = std::env::var("ONLY_SCENARIO").unwrap_or_default();
+    for scenario in scenarios()
+        .into_iter()
+        .filter(|one| one.name.contains(&chosen))
+    {
+        let runs = run_seeded(options.runs, options.threads, |seed| {
+            run_one(&scenario, seed)
+        });
+        let found = figures(&scenario, &runs);
+        check(&scenario, &found, &mut checks, &mut coverages);
+        let [half, most, nearly_all] = found.coverage.map(|share| 100.0 * share);
+        let _ = writeln!(
+            text,
+            "| {} | {:.2} | {:.2} | {:.2} | {half:.1} | {most:.1} | {nearly_all:.1} | {:.1} | {} | {:.1} \
+             | {:.2} | {:.1} |",
+            scenario.name,
+            100.0 * found.bias,
+            100.0 * found.rms,
+            100.0 * found.std_dev,
+            100.0 * (1.0 - found.measured),
+            found.false_alarms,
+            100.0 * found.first_coverage,
+            100.0 * found.segment_rms,
+            100.0 * found.segment_coverage,
+        );
+        lines.push(line(&scenario.name, &found));
+    }
+    #[expect(clippy::cast_precision_loss, reason = "a count of scenarios")]
+    let average = coverages.iter().sum::<f64>() / coverages.len() as f64;
+    checks.push(Check::between(
+        "95 % intervals hold, all scenarios on average",
+        average,
+        0.94..=0.96,
+    ));
+    Section {
+        text,
+        figures: Value::Array(lines),
+        checks,
+    }
+}
+
+fn check(scenario: &Scenario, found: &Figures, checks: &mut Vec<Check>, coverages: &mut Vec<f64>) {
+    let name = &scenario.name;
+    match scenario.goal {
+        Goal::Reports => {}
+        Goal::Abstains => {
+            checks.push(Check::at_most(
+                format!("{name}: measured at some moment, share of runs"),
+                found.ever_measured,
+                0.0,
+            ));
+            checks.push(Check::at_most(
+                format!("{name}: new information at some moment, share of runs"),
+                found.ever_informed,
+                0.0,
+            ));
+        }
+        Goal::Measures { rms_max } => {
+            if let Some(bound) = rms_max {
+                checks.push(Check::at_most(
+                    format!("{name}: RMS error of θ"),
+                    found.rms,
+                    bound,
+                ));
+            }
+            checks.push(Check::between(
+                format!("{name}: 95 % intervals hold"),
+                found.coverage[2],
+                0.925..=0.975,
+            ));
+            coverages.push(found.coverage[2]);
+        }
+    }
+}
+
+fn line(name: &str, found: &Figures) -> Value {
+    json!({
+        "scenario": name,
+        "bias": found.bias, "rms": found.rms, "told_std_dev": found.std_dev,
+        "coverage_50": found.coverage[0], "coverage_80": found.coverage[1],
+        "coverage_95": found.coverage[2], "abstention": 1.0 - found.measured,
+        "ever_measured": found.ever_measured, "ever_informed": found.ever_informed,
+        "false_alarms": found.false_alarms,
+        "first_coverage_95": found.first_coverage,
+        "segment_rms": found.segment_rms,
+        "segment_coverage_95": found.segment_coverage,
+    })
+}
+
+fn scenarios() -> Vec<Scenario> {
+    let mut all = Vec::new();
+    with_torque(&mut all);
+    without_torque(&mut all);
+    sweeps(&mut all);
+    tyres(&mut all);
+    all
+}
+
+fn with_torque(all: &mut Vec<Scenario>) {
+    for stiffness in [20.0, 5.0, 1.0] {
+        for (gain, rms_max) in [(0.0, 0.01), (0.02, 0.03)] {
+            for radius_m in [6.0, 2.4] {
+                let mut robot = RobotSpec::on(stiffness);
+                robot.has_torque = true;
+                robot.noise.torque_gain_ratio = gain;
+                all.push(Scenario {
+                    name: format!(
+                        "torque, circles R {radius_m} m, K {stiffness}, torque constant ±{} %",
+                        100.0 * gain
+                    ),
+                    drive: Drive::StraightThenCircles { radius_m },
+                    robot,
+                    goal: Goal::Measures {
+                        rms_max: Some(rms_max),
+                    },
+                });
+            }
+        }
+    }
+}
+
+fn without_torque(all: &mut Vec<Scenario>) {
+    for stiffness in [0.5, 1.0, 2.0, 5.0, 10.0, 20.0] {
+        all.push(Scenario {
+            name: format!("no torque, figure-8, K {stiffness}"),
+            drive: Drive::Figure8,
+            robot: RobotSpec::on(stiffness),
+            goal: Goal::Measures {
+                rms_max: (stiffness <= 10.0).then_some(0.10),
+            },
+        });
+    }
+    for stiffness in [0.5, 1.0, 2.0, 5.0] {
+        all.push(Scenario {
+            name: format!("no torque, stop and go, K {stiffness}"),
+            drive: Drive::StopAndGo,
+            robot: RobotSpec::on(stiffness),
+            goal: Goal::Measures { rms_max: None },
+        });
+    }
+    let mut aliasing = RobotSpec::on(5.0);
+    aliasing.aliases = true;
+    all.push(Scenario {
+        name: "no torque, stop and go, K 5, samples that alias".to_owned(),
+        drive: Drive::StopAndGo,
+        robot: aliasing,
+        goal: Goal::Reports,
+    });
+    for (name, drive) in [
+        ("straight", Drive::SteadyStraight),
+        ("circle", Drive::SteadyCircle),
+    ] {
+        for stiffness in [0.5, 5.0] {
+            all.push(Scenario {
+                name: format!("no torque, steady {name}, K {stiffness}"),
+                drive,
+                robot: RobotSpec::on(stiffness),
+                goal: Goal::Abstains,
+            });
+        }
+    }
+}
+
+fn sweeps(all: &mut Vec<Scenario>) {
+    let mut push = |name: String, change: &dyn Fn(&mut RobotSpec)| {
+        for has_torque in [true, false] {
+            let mut robot = RobotSpec::on(5.0);
+            robot.has_torque = has_torque;
+            change(&mut robot);
+            let (drive, what) = if has_torque {
+                (
+                    Drive::StraightThenCircles { radius_m: 6.0 },
+                    "torque, circles R 6 m",
+                )
+            } else {
+                (Drive::Figure8, "no torque, figure-8")
+            };
+            all.push(Scenario {
+                name: format!("{what}, K 5, {name}"),
+                drive,
+                robot,
+                goal: Goal::Measures { rms_max: None },
+            });
+        }
+    };
+    for error in [0.0, 0.01] {
+        push(format!("radii ±{} %", 100.0 * error), &move |robot| {
+            robot.radius_error_max = error;
+            // Evenly spread up to it.
+            robot.noise.radius_ratio = (error / 3.0_f64.sqrt()).max(1.0e-4);
+        });
+    }
+    for lag_s in [0.0, 0.1] {
+        push(format!("lag {lag_s} s"), &move |robot| {
+            robot.servo_lag_s = lag_s;
+        });
+    }
+    for offset_m_s2 in [0.0, 0.1] {
+        push(
+            format!("accelerometer offset ±{offset_m_s2} m/s²"),
+            &move |robot| robot.noise.accelerometer_offset_m_s2 = offset_m_s2,
+        );
+    }
+    push("samples that alias".to_owned(), &|robot| {
+        robot.aliases = true;
+    });
+    for ratio in [0.7, 1.4] {
+        push(format!("side grip × {ratio}"), &move |robot| {
+            robot.tyres.side_grip_ratio = ratio;
+        });
+    }
+}
+
+/// Tyres of a smooth curve; the truth is their initial slope.
+fn tyres(all: &mut Vec<Scenario>) {
+    // κ = 1/(3λ_m) of 0.46 to 2.88: mean 1.67, standard deviation 0.7.
+    let told = TyrePrior {
+        curvature: 1.67,
+        curvature_spread: 0.7,
+        ..TyrePrior::default()
+    };
+    for (who, told_tyres, goal) in [
+        (
+            "told of a straight rise",
+            TyrePrior::default(),
+            Goal::Reports,
+        ),
+        ("told of a brush", told, Goal::Measures { rms_max: None }),
+    ] {
+        for has_torque in [true, false] {
+            let mut robot = RobotSpec::on(5.0);
+            robot.has_torque = has_torque;
+            robot.curvatures = Some([0.46, 2.88]);
+            robot.told_tyres = told_tyres;
+            let (drive, what) = if has_torque {
+                (
+                    Drive::StraightThenCircles { radius_m: 6.0 },
+                    "torque, circles R 6 m",
+                )
+            } else {
+                (Drive::Figure8, "no torque, figure-8")
+            };
+            all.push(Scenario {
+                name: format!("{what}, K 5, brush tyres, {who}"),
+                drive,
+                robot,
+                goal,
+            });
+        }
+    }
+}

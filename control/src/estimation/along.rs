@@ -1,0 +1,264 @@
+//! Speed ahead from accelerometer, wheels and body speed, as rows of the regression.
+//!
+//! A scalar Kalman filter follows the speed v; what it leaves over is white and linear in the
+//! parameters (Friedland's two-stage form), so every innovation is one row. Averaged over short
+//! steps, with `s = (1/u_L + 1/u_R)/2`, `d = 1/u_L − 1/u_R` (combined slip, linear range):
+//!
+//! ```text
+//! (1 + Wφ̇d/4)/s = v + θ (a/g)/s + δ_c/s + δ_d (u_R − u_L)/4        wheels
+//! v_body        = v                                                body speed
+//! 0             = v                                                standing wheels
+//! v̇             = a − b_a − θ v²φ̇²/g                               accelerometer, and sideslip
+//! ```
+//! Below the speed at which slip is defined only the last lines hold: the filter coasts.
+
+use crate::robot::{GRAVITY_M_S2, RobotModel};
+
+use super::block::{SideSlips, bent};
+use super::regression::{Parameters, Row, index};
+use super::{SensorNoise, SensorSample, signed_rims};
+
+/// Time over which samples are averaged, seconds.
+pub(super) const STEP_S: f64 = 0.05;
+/// Variance of an unknown speed, metres squared per second squared.
+const UNKNOWN_M2_S2: f64 = 1.0;
+/// Rim speed up to which wheels stand, metres per second.
+const STANDING_M_S: f64 = 3.0e-3;
+/// Deviation of a standing robot's speed, metres per second.
+const STANDING_NOISE_M_S: f64 = 1.0e-3;
+/// Steps the wheels must have stood before the body does too.
+const STANDING_STEPS: u32 = 3;
+
+/// Averages over one step.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Step {
+    duration_s: f64,
+    samples: f64,
+    usable: f64,
+    rim_m_s: f64,
+    wheels_m_s: f64,
+    harmonic_m_s: f64,
+    force_m_s: f64,
+    rim_difference_m_s: f64,
+    ahead_m_s2: f64,
+    /// Acceleration times the time since the step's start.
+    ahead_late_m_s: f64,
+    gyro_rad_s: f64,
+    /// Speed of the slower side, summed.
+    slower_m_s: f64,
+    body_m_s: f64,
+    body_samples: f64,
+    /// Sum of the times of the body speeds, from the step's start.
+    body_time_s: f64,
+}
+
+/// How far slip may go for a step to be used.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct SlipBound {
+    /// Largest θ that the ground may have, for all that is known.
+    pub(super) theta_most: f64,
+    /// θ that weighs the rows.
+    pub(super) theta: f64,
+    /// Largest combined slip.
+    pub(super) slip_max: f64,
+    /// Mean curvature of the tyres, per slip.
+    pub(super) curvature: f64,
+}
+
+/// The filter.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct AlongFilter {
+    step: Step,
+    speed_m_s: f64,
+    variance: f64,
+    sensitivity: Parameters,
+    /// Change of speed that the last step leaves to its successor.
+    last_share_m_s: f64,
+    last_duration_s: f64,
+    standing: u32,
+    started: bool,
+}
+
+/// Rows of one step: wheels, body speed or standing, and the gyro of a standing robot.
+pub(super) type Rows = [Option<Row>; 3];
+
+impl AlongFilter {
+    pub(super) fn new() -> Self {
+        Self {
+            step: Step::default(),
+            speed_m_s: 0.0,
+            variance: UNKNOWN_M2_S2,
+            sensitivity: Parameters::zeros(),
+            last_share_m_s: 0.0,
+            last_duration_s: 0.0,
+            standing: 0,
+            started: false,
+        }
+    }
+
+    /// Takes a sample; rows when a step is over.
+    pub(super) fn add(
+        &mut self,
+        sample: &SensorSample,
+        dt_s: f64,
+        model: &RobotModel,
+        noise: &SensorNoise,
+        bound: &SlipBound,
+    ) -> Option<Rows> {
+        let acceleration = sample.acceleration?;
+        let step = &mut self.step;
+        let radius_m = model.wheel_radius_m();
+        let mean_m_s =
+            0.5 * radius_m * (sample.wheel_speeds.left_rad_s + sample.wheel_speeds.right_rad_s);
+        step.rim_m_s += mean_m_s;
+        step.samples += 1.0;
+        if let Some(rims) = signed_rims(sample, model) {
+            let inverse = 0.5 * (rims.left_m_s.recip() + rims.right_m_s.recip());
+            let gap = rims.left_m_s.recip() - rims.right_m_s.recip();
+            let turn_m_s = model.track_width_m() * sample.gyro_rad_s;
+            step.usable += 1.0;
+            step.wheels_m_s += rims.sign * (1.0 + 0.25 * turn_m_s * gap) / inverse;
+            step.harmonic_m_s += rims.sign / inverse;
+            step.force_m_s += acceleration.ahead_m_s2 / GRAVITY_M_S2 / inverse;
+            step.rim_difference_m_s +=
+                radius_m * (sample.wheel_speeds.right_rad_s - sample.wheel_speeds.left_rad_s);
+            step.slower_m_s += rims.left_m_s.min(rims.right_m_s);
+        }
+        step.ahead_m_s2 += acceleration.ahead_m_s2;
+        step.ahead_late_m_s += acceleration.ahead_m_s2 * (step.duration_s + 0.5 * dt_s);
+        step.gyro_rad_s += sample.gyro_rad_s;
+        step.duration_s += dt_s;
+        if let Some(body_m_s) = sample.body_speed_m_s {
+            step.body_m_s += body_m_s;
+            step.body_samples += 1.0;
+            step.body_time_s += step.duration_s;
+        }
+        (step.duration_s >= STEP_S - 1.0e-6).then(|| self.finish(model, noise, bound))
+    }
+
+    fn finish(&mut self, model: &RobotModel, noise: &SensorNoise, bound: &SlipBound) -> Rows {
+        let step = std::mem::take(&mut self.step);
+        let count = step.samples;
+        let ahead_m_s2 = step.ahead_m_s2 / count;
+        let gyro_rad_s = step.gyro_rad_s / count;
+        self.predict(&step, ahead_m_s2, gyro_rad_s, noise);
+        let mut rows: Rows = [None; 3];
+        let is_standing = (step.rim_m_s / count).abs() < STANDING_M_S;
+        self.standing = if is_standing { self.standing + 1 } else { 0 };
+        if step.usable >= count {
+            rows[0] = self.wheels(&step, ahead_m_s2, gyro_rad_s, model, noise, bound);
+        }
+        if self.standing >= STANDING_STEPS {
+            rows[1] = Some(self.observe(Parameters::zeros(), 0.0, STANDING_NOISE_M_S.powi(2), 0.0));
+            let mut regressors = Parameters::zeros();
+            regressors[index::GYRO_OFFSET] = 1.0;
+            rows[2] = Some(Row::white(
+                regressors,
+                gyro_rad_s,
+                noise.gyro_rad_s.powi(2) / count,
+            ));
+        } else if step.body_samples > 0.0 {
+            // The samples were taken off the step's middle.
+            let late_s = step.body_time_s / step.body_samples - 0.5 * step.duration_s;
+            let mut regressors = Parameters::zeros();
+            regressors[index::AHEAD_OFFSET] = -late_s;
+            rows[1] = Some(self.observe(
+                regressors,
+                step.body_m_s / step.body_samples - ahead_m_s2 * late_s,
+                noise.body_speed_m_s.powi(2) / step.body_samples,
+                0.0,
+            ));
+        }
+        rows
+    }
+
+    /// From the mean of the last step to that of this one: the acceleration between, weighed by a
+    /// triangle that rises over the last step and falls over this one.
+    fn predict(&mut self, step: &Step, ahead_m_s2: f64, gyro_rad_s: f64, noise: &SensorNoise) {
+        let late_m_s = step.ahead_late_m_s / step.samples;
+        let early_m_s = ahead_m_s2 * step.duration_s - late_m_s;
+        let span_s = 0.5 * (self.last_duration_s + step.duration_s);
+        let gained_m_s = self.last_share_m_s + early_m_s;
+        self.last_share_m_s = late_m_s;
+        self.last_duration_s = step.duration_s;
+        if !self.started {
+            self.started = true;
+            self.speed_m_s = step.rim_m_s / step.samples;
+            return;
+        }
+        self.speed_m_s += gained_m_s;
+        self.sensitivity[index::AHEAD_OFFSET] -= span_s;
+        self.sensitivity[index::AHEAD_SCALE] += gained_m_s;
+        self.sensitivity[index::THETA] -=
+            span_s * (self.speed_m_s * gyro_rad_s).powi(2) / GRAVITY_M_S2;
+        self.variance = (self.variance
+            + (span_s * noise.accelerometer_m_s2).powi(2) / step.samples)
+            .min(UNKNOWN_M2_S2);
+    }
+
+    fn wheels(
+        &mut self,
+        step: &Step,
+        ahead_m_s2: f64,
+        gyro_rad_s: f64,
+        model: &RobotModel,
+        noise: &SensorNoise,
+        bound: &SlipBound,
+    ) -> Option<Row> {
+        let count = step.samples;
+        let slower_m_s = step.slower_m_s / count;
+        let rim_difference_m_s = step.rim_difference_m_s / count;
+        let turn_m_s = model.track_width_m() * gyro_rad_s;
+        let lateral = 0.5 * model.wheelbase_m() * gyro_rad_s.abs() / slower_m_s;
+        let turning = 0.5 * (rim_difference_m_s - turn_m_s).abs() / slower_m_s;
+        let driving = bound.theta_most * ahead_m_s2.abs() / GRAVITY_M_S2;
+        if lateral.hypot(turning + driving) > bound.slip_max {
+            return None;
+        }
+        let harmonic_m_s = step.harmonic_m_s / count;
+        let force_m_s = step.force_m_s / count;
+        let slip = lateral.hypot(turning + bound.theta * ahead_m_s2.abs() / GRAVITY_M_S2);
+        let mut regressors = Parameters::zeros();
+        regressors[index::THETA] = force_m_s;
+        regressors[index::RADIUS_OFFSET] = harmonic_m_s;
+        regressors[index::RADIUS_DIFFERENCE] = 0.25 * rim_difference_m_s;
+        // On a curved tyre the side that slips more carries less: with equal and opposite slip of
+        // the two sides in a turn, both together hold the robot back.
+        let sides = SideSlips::of(harmonic_m_s.abs(), rim_difference_m_s, gyro_rad_s, model);
+        regressors[index::CURVATURE] = bent(force_m_s, slip, bound.curvature)
+            - 0.25 * sides.unequal * sides.apart * harmonic_m_s / bound.theta;
+        // The measured acceleration is averaged over the step, and so is its offset.
+        let felt_noise = (harmonic_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2) / count;
+        let rim_noise = 0.5 * (noise.wheel_speed_rad_s * model.wheel_radius_m()).powi(2) / count;
+        regressors[index::AHEAD_OFFSET] = -bound.theta * harmonic_m_s.abs() / GRAVITY_M_S2;
+        let spread = rim_noise + bound.theta.powi(2) * felt_noise;
+        let mut row = self.observe(regressors, step.wheels_m_s / count, spread, felt_noise);
+        row.bend = bent(1.0, slip, bound.curvature);
+        Some(row)
+    }
+
+    /// One measurement of the speed, less what the parameters add to it.
+    fn observe(
+        &mut self,
+        regressors: Parameters,
+        response_m_s: f64,
+        noise: f64,
+        force_noise: f64,
+    ) -> Row {
+        let spread = self.variance + noise;
+        let gain = self.variance / spread;
+        let row = regressors + self.sensitivity;
+        let innovation_m_s = response_m_s - self.speed_m_s;
+        self.speed_m_s += gain * innovation_m_s;
+        self.sensitivity -= row * gain;
+        self.variance *= 1.0 - gain;
+        Row {
+            regressors: row,
+            response: innovation_m_s,
+            spread,
+            // What is wrong in this row stays in the next ones until it has faded.
+            force_noise: force_noise * 2.0 / (2.0 - gain),
+            bend: 0.0,
+        }
+    }
+}

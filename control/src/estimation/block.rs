@@ -1,0 +1,410 @@
+//! Samples averaged over blocks, and the two differential rows that a block gives.
+
+use super::regression::{Parameters, Row, index};
+use super::window::{TurnMeans, TurnWindow};
+use super::{
+    BLOCK_S, RIM_SPEED_MIN_M_S, SLIP_LINEAR_FIRST_MAX, SLIP_LINEAR_MAX, SensorNoise, SensorSample,
+    TyrePrior, ValueWithDeviation,
+};
+use crate::robot::{GRAVITY_M_S2, RobotModel};
+
+/// Lateral slip beyond which a block is no straight driving, for rolling resistance.
+const STRAIGHT_SLIP_MAX: f64 = 0.01;
+/// Change of speed within a block, as a share, beyond which a body speed taken somewhere in it is
+/// not set against the block's mean force.
+const STEADY_SHARE: f64 = 0.05;
+
+/// Force regressors of a block.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Force {
+    /// `μ_R u_R − μ_L u_L`, metres per second.
+    difference_m_s: f64,
+    /// `(μ_R u_R + μ_L u_L)/2`, metres per second.
+    mean_m_s: f64,
+    /// Variance of the former; that of the latter is a quarter of it.
+    difference_noise: f64,
+}
+
+/// What is known about θ when a block is judged.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct ThetaBound {
+    /// θ, where it is measured.
+    pub(super) theta: Option<f64>,
+    /// θ that weighs rows, measured or not.
+    pub(super) theta_weights: f64,
+    /// Largest θ that the ground may have, for all that is known.
+    pub(super) theta_most: f64,
+}
+
+/// Means over one block of samples.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Block {
+    pub(super) duration_s: f64,
+    /// Whether slip was in the linear range.
+    pub(super) is_linear: bool,
+    /// Geometric slip across of the slower side's wheels.
+    slip_lateral: f64,
+    /// Combined slip by the sides' difference alone.
+    slip: f64,
+    /// Mean curvature of the tyres, per slip.
+    curvature: f64,
+    /// Acceleration ahead over gravity, magnitude.
+    ahead_mu: f64,
+    /// Rim speed of the slower side, metres per second.
+    slower_m_s: f64,
+    /// `u_R − u_L − Wφ̇`, metres per second, and its variance.
+    difference_m_s: f64,
+    pub(super) difference_noise: f64,
+    /// `(u_R + u_L)/2 − v`, metres per second, where body speed was new, and its variance.
+    slip_m_s: Option<f64>,
+    slip_noise: f64,
+    is_steady: bool,
+    /// `u_R − u_L`, metres per second.
+    pub(super) rim_difference_m_s: f64,
+    /// `(u_R + u_L)/2`, metres per second.
+    pub(super) rim_mean_m_s: f64,
+    pub(super) force: Option<Force>,
+    turning: Option<Row>,
+    track_width_m: f64,
+    /// `Wφ̇`, metres per second, and its variance.
+    pub(super) turn_m_s: f64,
+    pub(super) turn_noise: f64,
+    /// Friction coefficient seen, less two standard deviations.
+    pub(super) mu_seen: f64,
+    pub(super) rolling_resistance: Option<ValueWithDeviation>,
+}
+
+impl Block {
+    /// Whether slip was in the linear range, combined from along and across. Along, the sides'
+    /// difference is measured well; what they have in common is θμ where θ is known. Before that it
+    /// comes from the body speed, which is coarse, so the bound is tighter.
+    pub(super) fn slips_little(&self, bound: &ThetaBound) -> bool {
+        let turning = 0.5 * self.difference_m_s.abs() / self.slower_m_s;
+        let limit = if bound.theta.is_some() {
+            SLIP_LINEAR_MAX
+        } else {
+            SLIP_LINEAR_FIRST_MAX
+        };
+        let along = match (bound.theta, self.force) {
+            (Some(theta), Some(force)) => {
+                turning + theta * force.mean_m_s.abs() / self.rim_mean_m_s.abs()
+            }
+            (None, Some(_)) => turning + self.slip_m_s.unwrap_or(0.0).abs() / self.slower_m_s,
+            (_, None) => turning + bound.theta_most * self.ahead_mu,
+        };
+        along.hypot(self.slip_lateral) < limit
+    }
+
+    /// Row of the sides' difference: on measured torques, or else on measured accelerations.
+    pub(super) fn differential_row(&self) -> Option<Row> {
+        let Some(force) = self.force else {
+            return self.turning;
+        };
+        let mut regressors = Parameters::zeros();
+        regressors[index::THETA] = force.difference_m_s;
+        regressors[index::RADIUS_OFFSET] = self.rim_difference_m_s;
+        regressors[index::RADIUS_DIFFERENCE] = self.rim_mean_m_s;
+        regressors[index::GYRO_OFFSET] = -self.track_width_m;
+        regressors[index::CURVATURE] = bent(force.difference_m_s, self.slip, self.curvature);
+        regressors[index::RESISTANCE] = -self.rim_difference_m_s;
+        Some(Row {
+            regressors,
+            response: self.difference_m_s,
+            spread: self.difference_noise,
+            force_noise: force.difference_noise,
+            // Torque is measured so well that its noise does not matter there.
+            bend: 0.0,
+        })
+    }
+
+    /// Row of the sides' mean, on measured torques and body speed.
+    pub(super) fn mean_row(&self) -> Option<Row> {
+        let force = self.force?;
+        let slip_m_s = self.slip_m_s.filter(|_| self.is_steady)?;
+        let mut regressors = Parameters::zeros();
+        regressors[index::THETA] = force.mean_m_s;
+        regressors[index::RADIUS_OFFSET] = self.rim_mean_m_s;
+        regressors[index::RADIUS_DIFFERENCE] = 0.25 * self.rim_difference_m_s;
+        regressors[index::CURVATURE] = bent(force.mean_m_s, self.slip, self.curvature);
+        regressors[index::RESISTANCE] = -self.rim_mean_m_s;
+        Some(Row {
+            regressors,
+            response: slip_m_s,
+            spread: self.slip_noise,
+            force_noise: 0.25 * force.difference_noise,
+            // Torque is measured so well that its noise does not matter there.
+            bend: 0.0,
+        })
+    }
+
+    /// Twice the mean force on the sides, metres per second.
+    pub(super) fn mean_force_m_s(&self) -> f64 {
+        self.force
+            .map_or(2.0 * self.ahead_mu * self.rim_mean_m_s.abs(), |force| {
+                2.0 * force.mean_m_s.abs()
+            })
+    }
+}
+
+/// Regressor of θκ: the force's slip grows with slip itself on a curved tyre.
+pub(super) fn bent(force_m_s: f64, slip: f64, curvature: f64) -> f64 {
+    force_m_s * slip * (1.0 + 2.0 / 3.0 * curvature * slip)
+}
+
+/// Slips of the two sides in a turn.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct SideSlips {
+    /// Mean combined slip.
+    pub(super) mean: f64,
+    /// Left minus right combined slip.
+    pub(super) unequal: f64,
+    /// Right minus left slip ahead.
+    pub(super) apart: f64,
+}
+
+impl SideSlips {
+    /// At a mean rim speed above zero, all of a robot that drives ahead.
+    pub(super) fn of(
+        rim_m_s: f64,
+        rim_difference_m_s: f64,
+        turn_rad_s: f64,
+        model: &RobotModel,
+    ) -> Self {
+        let apart = (rim_difference_m_s - model.track_width_m() * turn_rad_s) / rim_m_s;
+        let combined =
+            |side_m_s: f64| (0.5 * apart).hypot(0.5 * model.wheelbase_m() * turn_rad_s / side_m_s);
+        let left = combined(rim_m_s - 0.5 * rim_difference_m_s);
+        let right = combined(rim_m_s + 0.5 * rim_difference_m_s);
+        Self {
+            mean: 0.5 * (left + right),
+            unequal: left - right,
+            apart,
+        }
+    }
+}
+
+/// Samples of one block.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct BlockBuilder {
+    duration_s: f64,
+    samples: u32,
+    with_torque: u32,
+    with_acceleration: u32,
+    with_body_speed: u32,
+    usable: u32,
+    left_m_s: f64,
+    right_m_s: f64,
+    first_m_s: f64,
+    last_m_s: f64,
+    gyro_rad_s: f64,
+    left_mu: f64,
+    right_mu: f64,
+    left_force_m_s: f64,
+    right_force_m_s: f64,
+    lateral_m_s2: f64,
+    ahead_m_s2: f64,
+    /// Mean rim speed minus body speed where the latter was new.
+    slip_m_s: f64,
+    window: TurnWindow,
+}
+
+/// What blocks are made with.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct BlockContext<'robot> {
+    pub(super) model: &'robot RobotModel,
+    pub(super) noise: &'robot SensorNoise,
+    pub(super) tyres: &'robot TyrePrior,
+    /// `δ_d` as it is known.
+    pub(super) radius_difference: f64,
+    /// θ as it is known.
+    pub(super) theta: f64,
+}
+
+impl BlockBuilder {
+    pub(super) fn is_full(&self) -> bool {
+        self.duration_s >= BLOCK_S - 1.0e-6
+    }
+
+    /// The next block's builder: its window has begun in this one.
+    pub(super) fn next(&self) -> Self {
+        Self {
+            window: self.window.next(),
+            ..Self::default()
+        }
+    }
+
+    pub(super) fn add(&mut self, sample: &SensorSample, model: &RobotModel, dt_s: f64) {
+        let radius_m = model.wheel_radius_m();
+        let left_m_s = sample.wheel_speeds.left_rad_s * radius_m;
+        let right_m_s = sample.wheel_speeds.right_rad_s * radius_m;
+        self.window
+            .add(sample, model, self.duration_s + 0.5 * dt_s, dt_s);
+        self.duration_s += dt_s;
+        self.samples += 1;
+        self.left_m_s += left_m_s;
+        self.right_m_s += right_m_s;
+        self.last_m_s = 0.5 * (left_m_s + right_m_s);
+        if self.samples == 1 {
+            self.first_m_s = self.last_m_s;
+        }
+        self.gyro_rad_s += sample.gyro_rad_s;
+        if left_m_s.abs().min(right_m_s.abs()) > RIM_SPEED_MIN_M_S && left_m_s * right_m_s > 0.0 {
+            self.usable += 1;
+        }
+        if let Some(torques) = sample.wheel_torques {
+            let scale = 1.0 / (radius_m * model.side_load_n());
+            let (left_mu, right_mu) = (torques.left_n_m * scale, torques.right_n_m * scale);
+            self.with_torque += 1;
+            self.left_mu += left_mu;
+            self.right_mu += right_mu;
+            self.left_force_m_s += left_mu * left_m_s.abs();
+            self.right_force_m_s += right_mu * right_m_s.abs();
+        }
+        if let Some(acceleration) = sample.acceleration {
+            self.with_acceleration += 1;
+            self.lateral_m_s2 += acceleration.left_m_s2;
+            self.ahead_m_s2 += acceleration.ahead_m_s2;
+        }
+        if let Some(body_m_s) = sample.body_speed_m_s {
+            self.with_body_speed += 1;
+            self.slip_m_s += 0.5 * (left_m_s + right_m_s) - body_m_s;
+        }
+    }
+
+    /// The block's means; none when the robot was too slow or turned on the spot.
+    pub(super) fn finish(&self, context: BlockContext<'_>) -> Option<Block> {
+        let BlockContext {
+            model,
+            noise,
+            tyres,
+            ..
+        } = context;
+        if self.samples == 0 || self.usable < self.samples {
+            return None;
+        }
+        let count = f64::from(self.samples);
+        let left_m_s = self.left_m_s / count;
+        let right_m_s = self.right_m_s / count;
+        let gyro_rad_s = self.gyro_rad_s / count;
+        let mean_m_s = 0.5 * (left_m_s + right_m_s);
+        let slower_m_s = left_m_s.abs().min(right_m_s.abs());
+        let lateral = 0.5 * model.wheelbase_m() * gyro_rad_s.abs() / slower_m_s;
+        // Slip ahead in the linear range is about the geometric one of a steady turn at most, plus
+        // that of acceleration; the measured difference holds both.
+        let difference_m_s = right_m_s - left_m_s - model.track_width_m() * gyro_rad_s;
+        let slip = lateral.hypot(0.5 * difference_m_s.abs() / slower_m_s);
+        let rim_noise_m_s = noise.wheel_speed_rad_s * model.wheel_radius_m();
+        let force = (self.with_torque == self.samples).then(|| Force {
+            difference_m_s: (self.right_force_m_s - self.left_force_m_s) / count,
+            mean_m_s: 0.5 * (self.right_force_m_s + self.left_force_m_s) / count,
+            difference_noise: noise.torque_mu.powi(2)
+                * (left_m_s * left_m_s + right_m_s * right_m_s)
+                / count,
+        });
+        let has_acceleration = self.with_acceleration == self.samples;
+        let ahead_mu = self.ahead_m_s2 / count / GRAVITY_M_S2;
+        let turning = has_acceleration
+            .then(|| self.window.means(self.duration_s))
+            .flatten()
+            .map(|means| turning_row(&means, context));
+        let lateral_mu = if self.with_acceleration > 0 {
+            self.lateral_m_s2 / f64::from(self.with_acceleration) / GRAVITY_M_S2
+        } else {
+            0.0
+        };
+        let side_mu = self.left_mu.abs().max(self.right_mu.abs()) / count;
+        let mu_noise = 2.0 * (noise.torque_mu / count.sqrt()).hypot(0.01);
+        let mean_mu = 0.5 * (self.left_mu + self.right_mu) / count;
+        let resistance =
+            (force.is_some() && has_acceleration && lateral < STRAIGHT_SLIP_MAX).then(|| {
+                ValueWithDeviation {
+                    value: (mean_mu - ahead_mu) * mean_m_s.signum(),
+                    std_dev: (noise.torque_mu * std::f64::consts::FRAC_1_SQRT_2)
+                        .hypot(noise.accelerometer_m_s2 / GRAVITY_M_S2)
+                        / count.sqrt(),
+                }
+            });
+        let body_samples = f64::from(self.with_body_speed);
+        Some(Block {
+            duration_s: self.duration_s,
+            is_linear: slip < SLIP_LINEAR_MAX,
+            slip_lateral: lateral,
+            slip,
+            curvature: tyres.curvature,
+            ahead_mu: ahead_mu.abs(),
+            slower_m_s,
+            difference_m_s,
+            difference_noise: (2.0 * rim_noise_m_s.powi(2)
+                + (model.track_width_m() * noise.gyro_rad_s).powi(2))
+                / count,
+            slip_m_s: (self.with_body_speed > 0).then(|| self.slip_m_s / body_samples),
+            slip_noise: (noise.body_speed_m_s.powi(2) + 0.5 * rim_noise_m_s.powi(2))
+                / body_samples.max(1.0),
+            is_steady: (self.last_m_s - self.first_m_s).abs()
+                < STEADY_SHARE * mean_m_s.abs() + 4.0 * rim_noise_m_s,
+            rim_difference_m_s: right_m_s - left_m_s,
+            rim_mean_m_s: mean_m_s,
+            force,
+            turning,
+            track_width_m: model.track_width_m(),
+            turn_m_s: model.track_width_m() * gyro_rad_s,
+            turn_noise: (model.track_width_m() * noise.gyro_rad_s).powi(2) / count,
+            mu_seen: (side_mu.hypot(lateral_mu) - mu_noise).max(0.0),
+            rolling_resistance: resistance,
+        })
+    }
+}
+
+/// The moment balance as a row.
+fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
+    let BlockContext {
+        model,
+        noise,
+        tyres,
+        radius_difference,
+        theta,
+    } = context;
+    let track_m = model.track_width_m();
+    // 4 I_G/(m g W), seconds squared.
+    let inertia = 4.0 * model.yaw_inertia_kg_m2() / (model.mass_kg() * GRAVITY_M_S2 * track_m);
+    // What is known of the radii belongs into the rim speeds' difference here, where it multiplies θ.
+    let force_m_s = inertia * means.harmonic_m_s * means.turn_acceleration_rad_s2
+        + means.ahead_force_m_s
+        - radius_difference * means.rim_mean_m_s * means.ahead_mu;
+    let mut regressors = Parameters::zeros();
+    regressors[index::THETA] = force_m_s;
+    regressors[index::RADIUS_OFFSET] = means.rim_difference_m_s;
+    regressors[index::RADIUS_DIFFERENCE] = means.rim_mean_m_s;
+    regressors[index::TRACK] = track_m * (model.effective_track_ratio() - 1.0) * means.turn_rad_s;
+    regressors[index::GYRO_OFFSET] = -model.effective_track_m();
+    regressors[index::AHEAD_OFFSET] = -theta * means.rim_difference_m_s / GRAVITY_M_S2;
+    // The side that slips more carries less; what that adds to the balance is odd in the turn.
+    let sides = SideSlips::of(
+        means.harmonic_m_s,
+        means.rim_difference_m_s,
+        means.turn_rad_s,
+        model,
+    );
+    let gap = means.rim_difference_m_s / means.harmonic_m_s.powi(2);
+    let lever_m = model.wheelbase_m().powi(2) / track_m;
+    let odd_m_s = means.harmonic_m_s
+        * sides.unequal
+        * (0.5 * sides.apart * gap * means.harmonic_m_s
+            + 0.5 * lever_m * means.turn_rad_s * gap
+            + 2.0 * theta * means.ahead_mu);
+    regressors[index::CURVATURE] =
+        bent(force_m_s, sides.mean, tyres.curvature) - 0.5 * odd_m_s / theta;
+    let rim_noise_m_s = noise.wheel_speed_rad_s * model.wheel_radius_m();
+    let gyro_noise = noise.gyro_rad_s.powi(2);
+    Row {
+        regressors,
+        response: means.slip_m_s,
+        spread: (2.0 * rim_noise_m_s.powi(2) + model.effective_track_m().powi(2) * gyro_noise)
+            / means.samples,
+        force_noise: (inertia * means.harmonic_m_s / means.duration_s).powi(2) * 2.0 * gyro_noise
+            / means.ramp_samples
+            + (means.rim_difference_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2)
+                / means.samples,
+        bend: bent(1.0, sides.mean, tyres.curvature),
+    }
+}

@@ -1,0 +1,68 @@
+//! Whether the last seconds brought information on θ.
+//!
+//! The square of the force regressor over its own noise is one on average when nothing excites it.
+//! A running mean of it says whether there was more. Without torque the regressor is an
+//! acceleration, and its sensor's offset is no excitation: there it is taken about its own mean.
+
+use super::regression::{Row, index};
+
+/// Blocks over which is averaged.
+const MEMORY_BLOCKS: f64 = 10.0;
+/// Mean above which there is excitation. Noise alone exceeds it less than once in 10⁸ blocks.
+const PRESENT: f64 = 6.0;
+/// Square of one block that counts at most, so that one wild block is no excitation.
+const SQUARE_MAX: f64 = 30.0;
+
+/// The running means.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Excitation {
+    turning: f64,
+    turning_mean: f64,
+    turning_blocks: f64,
+    along: f64,
+    along_sum: f64,
+    along_rows: f64,
+}
+
+impl Excitation {
+    /// Notes a block's differential row.
+    pub(super) fn note_block(&mut self, row: &Row, has_torque: bool) {
+        let scaled = row.regressors[index::THETA] / row.force_noise.sqrt().max(f64::MIN_POSITIVE);
+        self.turning_blocks = (self.turning_blocks + 1.0).min(2.0 * MEMORY_BLOCKS);
+        let centred = if has_torque {
+            scaled
+        } else if self.turning_blocks <= 1.0 {
+            self.turning_mean = scaled;
+            0.0
+        } else {
+            scaled - self.turning_mean
+        };
+        self.turning_mean += (scaled - self.turning_mean) / self.turning_blocks;
+        self.turning += ((centred * centred).min(SQUARE_MAX) - self.turning) / MEMORY_BLOCKS;
+    }
+
+    /// Notes a row of the speed ahead.
+    pub(super) fn note_along(&mut self, row: &Row) {
+        if row.force_noise > 0.0 {
+            self.along_sum += row.regressors[index::THETA].powi(2) / row.force_noise;
+            self.along_rows += 1.0;
+        }
+    }
+
+    /// Ends a block, driven or not.
+    pub(super) fn end_block(&mut self) {
+        let square = if self.along_rows > 0.0 {
+            self.along_sum / self.along_rows
+        } else {
+            0.0
+        };
+        self.along += (square.min(SQUARE_MAX) - self.along) / MEMORY_BLOCKS;
+        self.along_sum = 0.0;
+        self.along_rows = 0.0;
+    }
+
+    /// Whether there is excitation now.
+    pub(super) fn is_present(&self) -> bool {
+        self.turning.max(self.along) > PRESENT
+    }
+}

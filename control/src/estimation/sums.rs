@@ -1,0 +1,180 @@
+//! Additive sums over blocks: what a stretch of driving tells, whatever the order.
+
+use super::ValueWithDeviation;
+use super::block::Block;
+use super::offsets::OffsetKnowledge;
+use super::regression::{Channel, Row, index};
+
+/// Blocks of straight driving for a rolling resistance.
+const RESISTANCE_BLOCKS_MIN: f64 = 10.0;
+/// Relative deviation above which an effective track is not told.
+const TRACK_STD_DEV_MAX: f64 = 0.1;
+
+/// Additive sums.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Sums {
+    /// Blocks in the linear range that carry a row.
+    pub(super) blocks: u64,
+    pub(super) duration_s: f64,
+    /// Difference of the sides, on the difference of measured torques.
+    difference: Channel,
+    /// Mean of the sides, on the mean of measured torques.
+    mean: Channel,
+    /// Moment balance, on measured accelerations.
+    turning: Channel,
+    /// Innovations of the speed ahead, in units of their own deviation.
+    along: Channel,
+    signal: f64,
+    signal_2: f64,
+    fast_blocks: f64,
+    saturated_blocks: f64,
+    mu_seen: f64,
+    track_square: f64,
+    track_product: f64,
+    track_offset: [f64; 2],
+    track_noise: f64,
+    track_count: f64,
+    resistance: f64,
+    resistance_count: f64,
+    resistance_noise: f64,
+}
+
+impl Sums {
+    /// Adds a block.
+    pub(super) fn add(&mut self, block: &Block) {
+        self.fast_blocks += 1.0;
+        if block.force.is_some() {
+            self.mu_seen = self.mu_seen.max(block.mu_seen);
+        }
+        if !block.is_linear {
+            self.saturated_blocks += 1.0;
+            return;
+        }
+        // `u_R − u_L = (W_eff/W)·Wφ̇` plus what the offsets add.
+        self.track_square += block.turn_m_s * block.turn_m_s - block.turn_noise;
+        self.track_product += block.turn_m_s * block.rim_difference_m_s;
+        self.track_offset[0] += block.turn_m_s * block.rim_difference_m_s;
+        self.track_offset[1] += block.turn_m_s * block.rim_mean_m_s;
+        self.track_noise += block.difference_noise;
+        self.track_count += 1.0;
+        let Some(row) = block.differential_row() else {
+            return;
+        };
+        self.blocks += 1;
+        self.duration_s += block.duration_s;
+        self.note_signal(&row, row.spread);
+        if block.force.is_some() {
+            self.difference.add(&row);
+            if let Some(row) = block.mean_row() {
+                self.mean.add(&row);
+            }
+        } else {
+            self.turning.add(&row);
+        }
+        if let Some(resistance) = block.rolling_resistance {
+            self.resistance += resistance.value;
+            self.resistance_noise += resistance.std_dev.powi(2);
+            self.resistance_count += 1.0;
+        }
+    }
+
+    /// Adds an innovation of the speed ahead, weighed at this θ.
+    pub(super) fn add_along(&mut self, row: &Row, theta: f64) {
+        self.along.add_standardised(row, theta);
+        self.note_signal(row, row.spread);
+    }
+
+    fn note_signal(&mut self, row: &Row, spread: f64) {
+        let signal = row.regressors[index::THETA].powi(2) / spread;
+        self.signal += signal;
+        self.signal_2 += signal * signal;
+    }
+
+    /// Sums of both.
+    pub(super) fn plus(&self, other: &Self) -> Self {
+        Self {
+            blocks: self.blocks + other.blocks,
+            duration_s: self.duration_s + other.duration_s,
+            difference: self.difference.plus(&other.difference),
+            mean: self.mean.plus(&other.mean),
+            turning: self.turning.plus(&other.turning),
+            along: self.along.plus(&other.along),
+            signal: self.signal + other.signal,
+            signal_2: self.signal_2 + other.signal_2,
+            fast_blocks: self.fast_blocks + other.fast_blocks,
+            saturated_blocks: self.saturated_blocks + other.saturated_blocks,
+            mu_seen: self.mu_seen.max(other.mu_seen),
+            track_square: self.track_square + other.track_square,
+            track_product: self.track_product + other.track_product,
+            track_offset: [
+                self.track_offset[0] + other.track_offset[0],
+                self.track_offset[1] + other.track_offset[1],
+            ],
+            track_noise: self.track_noise + other.track_noise,
+            track_count: self.track_count + other.track_count,
+            resistance: self.resistance + other.resistance,
+            resistance_count: self.resistance_count + other.resistance_count,
+            resistance_noise: self.resistance_noise + other.resistance_noise,
+        }
+    }
+
+    /// All kinds of rows.
+    pub(super) fn channels(&self) -> [&Channel; 4] {
+        [&self.difference, &self.mean, &self.turning, &self.along]
+    }
+
+    /// Whether measured torques had a part in it.
+    pub(super) fn has_torque(&self) -> bool {
+        self.difference.count > 0.0
+    }
+
+    /// Rows weighed by their share of the information on θ.
+    pub(super) fn effective_samples(&self) -> f64 {
+        if self.signal_2 > 0.0 {
+            self.signal * self.signal / self.signal_2
+        } else {
+            0.0
+        }
+    }
+
+    /// Friction coefficient that the ground has given at least.
+    pub(super) fn mu_peak(&self) -> Option<f64> {
+        (self.mu_seen > 0.0).then_some(self.mu_seen)
+    }
+
+    /// Share of blocks beyond the linear range.
+    pub(super) fn saturation_share(&self) -> f64 {
+        if self.fast_blocks > 0.0 {
+            self.saturated_blocks / self.fast_blocks
+        } else {
+            0.0
+        }
+    }
+
+    /// Rolling resistance over load. Its deviation holds the offset that the accelerometer may
+    /// have, `offset_mu` over gravity, which no number of blocks takes out.
+    pub(super) fn rolling_resistance(&self, offset_mu: f64) -> Option<ValueWithDeviation> {
+        (self.resistance_count >= RESISTANCE_BLOCKS_MIN).then(|| ValueWithDeviation {
+            value: self.resistance / self.resistance_count,
+            std_dev: (self.resistance_noise.sqrt() / self.resistance_count).hypot(offset_mu),
+        })
+    }
+
+    /// Effective track over W.
+    pub(super) fn effective_track(&self, offsets: &OffsetKnowledge) -> Option<ValueWithDeviation> {
+        if self.track_count < 1.0 || self.track_square <= 0.0 {
+            return None;
+        }
+        let (common, difference) = offsets.values();
+        let value = (self.track_product
+            - common.value * self.track_offset[0]
+            - difference.value * self.track_offset[1])
+            / self.track_square;
+        let noise = self.track_noise / self.track_count * (1.0 + value * value);
+        let variance = noise / self.track_square
+            + (common.std_dev * self.track_offset[0] / self.track_square).powi(2)
+            + (difference.std_dev * self.track_offset[1] / self.track_square).powi(2);
+        let std_dev = variance.sqrt();
+        (std_dev < TRACK_STD_DEV_MAX * value).then_some(ValueWithDeviation { value, std_dev })
+    }
+}

@@ -1,0 +1,145 @@
+//! What goes into the estimator, and what comes out of it.
+
+use serde::{Deserialize, Serialize};
+
+use crate::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
+
+/// Noise of the sensors; white, one standard deviation per sample, unless said otherwise.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct SensorNoise {
+    /// Gyro, radians per second.
+    pub gyro_rad_s: f64,
+    /// Accelerometer, metres per second squared.
+    pub accelerometer_m_s2: f64,
+    /// Offset of the accelerometer, unknown, metres per second squared.
+    pub accelerometer_offset_m_s2: f64,
+    /// Error of the accelerometer's scale, unknown, share. Sampling a rough drive has the same
+    /// effect: what lies between two samples is not seen.
+    pub accelerometer_scale_ratio: f64,
+    /// Wheel speed, radians per second.
+    pub wheel_speed_rad_s: f64,
+    /// Body speed, metres per second.
+    pub body_speed_m_s: f64,
+    /// Wheel torque, as friction coefficient of one side.
+    pub torque_mu: f64,
+    /// Error of each side's torque constant, unknown, share.
+    pub torque_gain_ratio: f64,
+    /// Error of each side's rolling radius, unknown, share.
+    pub radius_ratio: f64,
+    /// Offset of the gyro, unknown, radians per second.
+    pub gyro_offset_rad_s: f64,
+}
+
+impl Default for SensorNoise {
+    fn default() -> Self {
+        Self {
+            gyro_rad_s: 0.003,
+            accelerometer_m_s2: 0.05,
+            accelerometer_offset_m_s2: 0.02,
+            accelerometer_scale_ratio: 0.03,
+            wheel_speed_rad_s: 0.02,
+            body_speed_m_s: 0.02,
+            torque_mu: 0.01,
+            torque_gain_ratio: 0.02,
+            radius_ratio: 0.0115,
+            gyro_offset_rad_s: 0.002,
+        }
+    }
+}
+
+/// What is known about the tyres beforehand.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct TyrePrior {
+    /// How far the tyres' stiffness across may differ from that along, one standard deviation as
+    /// a share. It is learned from turning; it only matters until then.
+    pub side_grip_spread: f64,
+    /// Mean κ of `λ = θμ(1 + κλ + ⅔κ²λ²)`, per slip: 0 for the paper's straight rise, `1/(3λ_p)`
+    /// for a brush-like tyre that peaks like a straight rise to slip `λ_p`.
+    pub curvature: f64,
+    /// Its standard deviation, per slip. It cannot be learned from turns of one radius: where it
+    /// is above zero, intervals are as wide as it makes them.
+    pub curvature_spread: f64,
+}
+
+impl Default for TyrePrior {
+    fn default() -> Self {
+        Self {
+            side_grip_spread: 0.3,
+            curvature: 0.0,
+            curvature_spread: 0.0,
+        }
+    }
+}
+
+/// One sample of the robot's own sensors.
+///
+/// Wheel speeds, turn rate and acceleration are means since the sample before, as encoders that
+/// count and inertial sensors with a filter against aliasing give them. Values of the moment do as
+/// well where nothing changes faster than the samples come.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct SensorSample {
+    /// Measured wheel speeds.
+    pub wheel_speeds: WheelSpeeds,
+    /// Turn rate, radians per second.
+    pub gyro_rad_s: f64,
+    /// Acceleration without gravity, body frame.
+    pub acceleration: Option<BodyAcceleration>,
+    /// Speed ahead, metres per second; only in the sample in which it is new.
+    pub body_speed_m_s: Option<f64>,
+    /// Drive torques per side, where the base gives them.
+    pub wheel_torques: Option<WheelTorques>,
+}
+
+/// What is known about the ground under the robot now.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ThetaMeasurement {
+    /// θ = 1/K.
+    pub theta: f64,
+    /// Its standard deviation, with that of the offsets and the torque constant.
+    pub std_dev: f64,
+    /// Blocks that carry the measurement, weighed by their share of its information.
+    pub effective_samples: f64,
+    /// Time that was used, seconds.
+    pub duration_s: f64,
+}
+
+/// What the estimator can say.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Estimate {
+    /// θ of the present ground; none while it is unexcited.
+    pub theta: Option<ThetaMeasurement>,
+    /// Whether the last block brought no new information on θ.
+    pub no_new_information: bool,
+    /// Friction coefficient that the ground has given at least; none before any force.
+    pub mu_peak_lower_bound: Option<f64>,
+    /// Measured effective track over W; none before enough turning.
+    pub effective_track_ratio: Option<f64>,
+    /// Rolling resistance over load; none before enough straight driving with torque.
+    pub rolling_resistance_ratio: Option<f64>,
+    /// Mean share by which the nominal rolling radii are too large, and its deviation.
+    pub radius_offset: ValueWithDeviation,
+    /// Right minus left of the same, and its deviation.
+    pub radius_difference: ValueWithDeviation,
+    /// Share of blocks beyond the linear range of slip, of those driven fast enough.
+    pub saturation_share: f64,
+    /// Samples dropped because they were not finite or not possible.
+    pub dropped_samples: u64,
+}
+
+/// A figure and its standard deviation.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct ValueWithDeviation {
+    /// The figure.
+    pub value: f64,
+    /// Its standard deviation.
+    pub std_dev: f64,
+}
+
+/// What a sample led to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct UpdateOutcome {
+    /// A block of samples was finished and used.
+    pub block_done: bool,
+    /// The ground has changed: close the segment and call [`super::Estimator::begin_ground`].
+    pub ground_changed: bool,
+}

@@ -1,0 +1,150 @@
+//! The moment balance of a skid-steered base, averaged so that no rate is ever differentiated.
+//!
+//! Combined slip in the linear range gives, with rim speeds u, `s = (1/u_L + 1/u_R)/2`,
+//! `d = 1/u_L − 1/u_R`, whatever the body's speed is (it is eliminated with the force balance):
+//!
+//! ```text
+//! d/s² − φ̇ (W + L²/W − W (d/2s)²) = θ ( 4I_G φ̈/(m g W s) + (a/g) d/s² )
+//! ```
+//! Windows are trapezoids that add up to one: each begins on the ramp on which the one before
+//! ends. Then `∫ψφ̈` is the difference of the gyro's means over two ramps, and no sample is lost.
+
+use super::{BLOCK_S, SensorSample, signed_rims};
+use crate::robot::{GRAVITY_M_S2, RobotModel};
+
+/// Time of a ramp, seconds.
+const RAMP_S: f64 = 0.05;
+
+/// Weighed sums over one window.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Part {
+    weight_s: f64,
+    samples: f64,
+    is_broken: bool,
+    slip: f64,
+    harmonic: f64,
+    ahead_force: f64,
+    ahead_mu: f64,
+    turn: f64,
+    rim_difference: f64,
+    rim_mean: f64,
+    /// Gyro over the ramp, radians per second, and how much of the ramp there was.
+    ramp: [f64; 2],
+    ramp_share: [f64; 2],
+    ramp_samples: f64,
+}
+
+/// Means over one window.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct TurnMeans {
+    /// Left side of the balance, metres per second.
+    pub(super) slip_m_s: f64,
+    /// `1/s`, metres per second.
+    pub(super) harmonic_m_s: f64,
+    /// `(a/g) d/s²`, metres per second.
+    pub(super) ahead_force_m_s: f64,
+    /// `a/g`; in reverse that of the mirrored robot.
+    pub(super) ahead_mu: f64,
+    pub(super) turn_rad_s: f64,
+    pub(super) turn_acceleration_rad_s2: f64,
+    /// `u_R − u_L`, metres per second; driving in reverse it is that of the mirrored robot.
+    pub(super) rim_difference_m_s: f64,
+    /// `(u_R + u_L)/2`, metres per second, negative in reverse.
+    pub(super) rim_mean_m_s: f64,
+    pub(super) duration_s: f64,
+    pub(super) samples: f64,
+    pub(super) ramp_samples: f64,
+}
+
+/// The window that ends with the block, and the one that begins in it.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct TurnWindow {
+    ending: Part,
+    beginning: Part,
+}
+
+impl TurnWindow {
+    /// The window of the next block.
+    pub(super) fn next(&self) -> Self {
+        Self {
+            ending: self.beginning,
+            beginning: Part::default(),
+        }
+    }
+
+    /// Takes a sample whose middle is `time_s` after the block's start.
+    pub(super) fn add(
+        &mut self,
+        sample: &SensorSample,
+        model: &RobotModel,
+        time_s: f64,
+        dt_s: f64,
+    ) {
+        let rise = ((time_s - (BLOCK_S - RAMP_S)) / RAMP_S).clamp(0.0, 1.0);
+        self.ending.add(sample, model, 1.0 - rise, dt_s);
+        if rise <= 0.0 {
+            return;
+        }
+        self.beginning.add(sample, model, rise, dt_s);
+        let share = dt_s / RAMP_S;
+        self.ending.ramp[1] += sample.gyro_rad_s * share;
+        self.ending.ramp_share[1] += share;
+        self.beginning.ramp[0] += sample.gyro_rad_s * share;
+        self.beginning.ramp_share[0] += share;
+        self.beginning.ramp_samples += 1.0;
+    }
+
+    /// Means over the window that ends; none where it is not whole.
+    pub(super) fn means(&self, block_s: f64) -> Option<TurnMeans> {
+        let part = &self.ending;
+        // The first window of a drive has no ramp to begin on.
+        let is_whole = !part.is_broken
+            && part.ramp_share.iter().all(|share| *share > 0.5)
+            && part.weight_s > 0.5 * block_s;
+        if !is_whole {
+            return None;
+        }
+        let mean = |sum: f64| sum / part.weight_s;
+        let rates = [0, 1].map(|end| part.ramp[end] / part.ramp_share[end]);
+        Some(TurnMeans {
+            slip_m_s: mean(part.slip),
+            harmonic_m_s: mean(part.harmonic),
+            ahead_force_m_s: mean(part.ahead_force),
+            ahead_mu: mean(part.ahead_mu),
+            turn_rad_s: mean(part.turn),
+            turn_acceleration_rad_s2: (rates[1] - rates[0]) / block_s,
+            rim_difference_m_s: mean(part.rim_difference),
+            rim_mean_m_s: mean(part.rim_mean),
+            duration_s: block_s,
+            samples: part.samples,
+            ramp_samples: part.ramp_samples.max(1.0),
+        })
+    }
+}
+
+impl Part {
+    fn add(&mut self, sample: &SensorSample, model: &RobotModel, share: f64, dt_s: f64) {
+        let (Some(rims), Some(acceleration)) = (signed_rims(sample, model), sample.acceleration)
+        else {
+            self.is_broken = true;
+            return;
+        };
+        let track_m = model.track_width_m();
+        let half_sum = 0.5 * (rims.left_m_s.recip() + rims.right_m_s.recip());
+        let gap = rims.left_m_s.recip() - rims.right_m_s.recip();
+        let turning_m_s = gap / (half_sum * half_sum);
+        let tight = 0.5 * gap / half_sum;
+        let arm_m = model.effective_track_m() - track_m * tight * tight;
+        let ahead_m_s2 = rims.sign * acceleration.ahead_m_s2;
+        let weight_s = share * dt_s;
+        self.weight_s += weight_s;
+        self.samples += share;
+        self.slip += weight_s * (turning_m_s - sample.gyro_rad_s * arm_m);
+        self.harmonic += weight_s / half_sum;
+        self.ahead_force += weight_s * turning_m_s * ahead_m_s2 / GRAVITY_M_S2;
+        self.ahead_mu += weight_s * ahead_m_s2 / GRAVITY_M_S2;
+        self.turn += weight_s * sample.gyro_rad_s;
+        self.rim_difference += weight_s * (rims.right_m_s - rims.left_m_s);
+        self.rim_mean += weight_s * rims.sign * 0.5 * (rims.right_m_s + rims.left_m_s);
+    }
+}
