@@ -129,6 +129,8 @@ pub struct Plant {
     state: PlantState,
     contact: Contact,
     means: PlantMeans,
+    /// Means of the forward forces of the left and the right side over the last step, newtons.
+    side_ahead_n: [f64; 2],
 }
 
 /// Means over the time of one call of [`Plant::step`]: what encoders that count, and inertial
@@ -233,6 +235,7 @@ impl Plant {
             state,
             contact: Contact::default(),
             means: PlantMeans::default(),
+            side_ahead_n: [0.0; 2],
         })
     }
 
@@ -259,7 +262,9 @@ impl Plant {
         }
     }
 
-    /// True drive torques per side: ground force times rolling radius plus rolling resistance.
+    /// Drive torques per side as means over the last step, like [`Plant::means`]: ground force times
+    /// rolling radius plus rolling resistance. A torque of one moment beside means of all else
+    /// would make slip lag behind force, and θ read low wherever the command moves.
     pub fn wheel_torques(&self) -> WheelTorques {
         let radius_m = self.model.wheel_radius_m();
         let side = |force_n: f64, wheel_rad_s: f64, radius_ratio: f64| {
@@ -268,18 +273,11 @@ impl Plant {
                 self.spec.rolling_resistance_ratio * self.model.side_load_n() * rolling;
             (force_n + resistance_n) * radius_m * radius_ratio
         };
-        let wheels = self.state.wheel_speeds;
+        let wheels = self.means.wheel_speeds;
+        let [left_n, right_n] = self.side_ahead_n;
         WheelTorques {
-            left_n_m: side(
-                self.contact.left_side_ahead_n,
-                wheels.left_rad_s,
-                self.spec.left_radius_ratio,
-            ),
-            right_n_m: side(
-                self.contact.right_side_ahead_n,
-                wheels.right_rad_s,
-                self.spec.right_radius_ratio,
-            ),
+            left_n_m: side(left_n, wheels.left_rad_s, self.spec.left_radius_ratio),
+            right_n_m: side(right_n, wheels.right_rad_s, self.spec.right_radius_ratio),
         }
     }
 
@@ -310,6 +308,8 @@ impl Plant {
         let start = self.state;
         let mut sums = MeanSums::default();
         let mut left_s = dt_s;
+        let mut contact = self.contact_forces(&start, ground);
+        let (mut left_n_s, mut right_n_s) = (0.0, 0.0);
         for _ in 0..STEPS_MAX {
             // Even parts, so that no sliver of a step is left over.
             let parts = (left_s / self.stable_step_s(ground)).ceil().max(1.0);
@@ -317,13 +317,19 @@ impl Plant {
             let before = self.state;
             self.runge_kutta(command, ground, step_s);
             sums.add(&before, &self.state, step_s);
+            let after = self.contact_forces(&self.state, ground);
+            left_n_s += 0.5 * step_s * (contact.left_side_ahead_n + after.left_side_ahead_n);
+            right_n_s += 0.5 * step_s * (contact.right_side_ahead_n + after.right_side_ahead_n);
+            contact = after;
             left_s -= step_s;
             if left_s <= 1.0e-12 {
                 break;
             }
         }
-        self.means = sums.means(&start, &self.state, dt_s - left_s);
-        self.contact = self.contact_forces(&self.state, ground);
+        let span_s = dt_s - left_s;
+        self.means = sums.means(&start, &self.state, span_s);
+        self.side_ahead_n = [left_n_s / span_s, right_n_s / span_s];
+        self.contact = contact;
     }
 
     /// The longest step that keeps the fastest slip pole well inside the stable range.

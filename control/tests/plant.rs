@@ -135,7 +135,7 @@ fn wheel_torque_is_force_times_radius_plus_rolling_resistance() {
         &ground(5.0),
         0.05,
     );
-    let force_n = model.mass_kg() * plant.body_acceleration().ahead_m_s2;
+    let force_n = model.mass_kg() * plant.means().acceleration.ahead_m_s2;
     let torques = plant.wheel_torques();
     let drive_n =
         (torques.left_n_m + torques.right_n_m - 2.0 * rolling_n_m) / model.wheel_radius_m();
