@@ -357,4 +357,16 @@ pub struct LoopStatus {
     pub overruns: u64,
     /// Longest computation of a tick since the last report, microseconds.
     pub tick_max_us: u32,
+    /// Segments lost since the start, because nobody took them from the loop in time.
+    #[serde(default)]
+    pub lost_segments: u64,
+    /// Measurements since the start that belong to no cell, for want of a site or a position.
+    #[serde(default)]
+    pub unplaced_blocks: u64,
+    /// Samples of the base lost since the start, because newer ones came before a tick.
+    #[serde(default)]
+    pub lost_samples: u64,
+    /// Commands of the server lost since the start for want of room; it asks again.
+    #[serde(default)]
+    pub lost_commands: u64,
 }

@@ -152,6 +152,8 @@ pub struct ValueWithDeviation {
 pub struct UpdateOutcome {
     /// A block of samples was finished and used.
     pub block_done: bool,
+    /// In that block a wheel slipped beyond the range in which force grows with slip.
+    pub slips: bool,
     /// The ground has changed: close the segment and call [`Estimator::begin_ground`].
     pub ground_changed: bool,
 }
@@ -202,17 +204,19 @@ impl Estimator {
             return UpdateOutcome::default();
         }
         let builder = std::mem::take(&mut self.block);
-        let ground_changed = match builder.finish(&self.model, &self.noise) {
+        let (ground_changed, slips) = match builder.finish(&self.model, &self.noise) {
             Some(block) => self.take(&block),
-            None => false,
+            None => (false, false),
         };
         UpdateOutcome {
             block_done: true,
+            slips,
             ground_changed,
         }
     }
 
-    fn take(&mut self, block: &Block) -> bool {
+    /// Whether the ground has changed, and whether a wheel slips beyond the linear range.
+    fn take(&mut self, block: &Block) -> (bool, bool) {
         let present = self.ground.plus(&self.segment).plus(&self.pending);
         let before = present.solve(&self.offsets);
         let measured = before.filter(|solution| solution.is_measurement(present.blocks));
@@ -231,7 +235,7 @@ impl Estimator {
             self.segment = self.segment.plus(&self.pending);
             self.pending = Sums::default();
         }
-        changed
+        (changed, !block.is_linear)
     }
 
     /// What is known now.

@@ -3,7 +3,8 @@
 //! ```text
 //!            offer                    report of the loop
 //! (unknown) ───────► held ──────────────────────────────► ended
-//!     │                └ cancel: held, braking ────────────▲
+//!     │              │ ▲ └ cancel: held, braking ──────────▲
+//!     │              └─┘ offer of a higher revision        │
 //!     └ cancel ────────────────────────────────────────────┘
 //! ```
 //!
@@ -57,6 +58,9 @@ pub struct Holder {
 pub enum OfferDecision {
     /// It is new: plan it, hand it to the loop, then [`Holder::take`] it.
     Plan,
+    /// It is a new revision of what is held: plan it from where the robot comes to stand, then
+    /// [`Holder::replace`] the old one and hand it to the loop.
+    Replace,
     /// It is held already: say so again.
     AcceptAgain(PlanSummary),
     /// No, and why.
@@ -114,6 +118,7 @@ impl Holder {
             Some(held) if held.revision == offer.revision && held.plan_hash == offer.plan_hash => {
                 OfferDecision::AcceptAgain(held.plan)
             }
+            Some(held) if held.revision < offer.revision => OfferDecision::Replace,
             Some(held) => {
                 let detail = format!(
                     "mission {mission} is held as revision {} with plan hash {}",
@@ -133,6 +138,49 @@ impl Holder {
             self.held = Some(held);
         }
         is_free
+    }
+
+    /// Puts a higher revision in place of the one in hand and gives the old one back; `None`, and
+    /// nothing changes, where [`Holder::offer`] would not say [`OfferDecision::Replace`].
+    #[must_use]
+    pub fn replace(&mut self, next: Held) -> Option<Held> {
+        let held = self.held.as_mut()?;
+        let is_next = held.mission == next.mission && held.revision < next.revision;
+        is_next.then(|| std::mem::replace(held, next))
+    }
+
+    /// Goes back to a former revision, if the later one could not be handed to the loop.
+    pub fn restore(&mut self, former: Held) {
+        if let Some(held) = self
+            .held
+            .as_mut()
+            .filter(|held| held.mission == former.mission)
+        {
+            *held = former;
+        }
+    }
+
+    /// Whether a mission is held in this revision, to be paused or resumed.
+    ///
+    /// # Errors
+    /// Why not, for the server.
+    pub fn check_held(
+        &self,
+        mission: MissionId,
+        revision: u32,
+    ) -> Result<(), (OfferRefusal, String)> {
+        if let Some(phase) = self.ended_phase(mission) {
+            let detail = format!("it has ended before: {}", name_of(phase));
+            return Err((OfferRefusal::Ended, detail));
+        }
+        match &self.held {
+            Some(held) if held.mission == mission && held.revision == revision => Ok(()),
+            Some(held) if held.mission == mission => Err((
+                OfferRefusal::Conflict,
+                format!("it is held as revision {}", held.revision),
+            )),
+            Some(_) | None => Err((OfferRefusal::Unknown, "it is not held here".to_owned())),
+        }
     }
 
     /// Lets go of a mission that was taken but could not be handed to the loop.
@@ -180,6 +228,9 @@ impl Holder {
 fn name_of(phase: MissionPhase) -> &'static str {
     match phase {
         MissionPhase::Started => "started",
+        MissionPhase::Paused => "paused",
+        MissionPhase::Resumed => "resumed",
+        MissionPhase::Replaced => "replaced",
         MissionPhase::Succeeded => "succeeded",
         MissionPhase::Failed => "failed",
         MissionPhase::Cancelled => "cancelled",
@@ -190,6 +241,7 @@ fn name_of(phase: MissionPhase) -> &'static str {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
+    use tread_api::mission::LinkPolicy;
     use tread_api::trajectory::Trajectory;
     use uuid::Uuid;
 
@@ -232,6 +284,7 @@ mod tests {
             plan_hash,
             trajectory,
             start_within_ms: None,
+            link_policy: LinkPolicy::default(),
         }
     }
 
@@ -261,12 +314,25 @@ mod tests {
                             Some(now) if *now == held => {
                                 prop_assert_eq!(&decision, &OfferDecision::AcceptAgain(PLAN));
                             }
+                            Some(now)
+                                if now.mission == offer.mission && now.revision < revision =>
+                            {
+                                prop_assert_eq!(&decision, &OfferDecision::Replace);
+                            }
                             Some(now) if now.mission == offer.mission => prop_assert!(
                                 matches!(decision, OfferDecision::Refuse(OfferRefusal::Conflict, _))
                             ),
                             Some(_) => prop_assert!(
                                 matches!(decision, OfferDecision::Refuse(OfferRefusal::Busy, _))
                             ),
+                        }
+                        if decision == OfferDecision::Replace {
+                            let former = holder.replace(held.clone());
+                            prop_assert_eq!(former.as_ref(), before.held());
+                            prop_assert_eq!(holder.held(), Some(&held));
+                            prop_assert!(holder.check_held(held.mission, revision).is_ok());
+                        } else {
+                            prop_assert_eq!(holder.replace(held.clone()), None);
                         }
                         prop_assert_eq!(holder.take(held), decision == OfferDecision::Plan);
                     }

@@ -9,13 +9,14 @@ use std::time::Duration;
 use tread_agent::sim::scenario::Scenario;
 use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
 use tread_api::keys::{self, Key, Verb};
+use tread_api::mission::LinkPolicy;
 use tread_api::site::Grid;
 use tread_api::terrain::{TerrainRef, TerrainShape};
 use tread_api::trajectory::Trajectory;
 use tread_api::wire::command::{Answer, Offer};
 use tread_api::wire::hello::{Hello, SiteDefinition, Welcome};
 use tread_api::wire::ingest::{Batch, MissionPhase, Receipt, Record, RecordContent};
-use tread_api::wire::state::{FrictionReport, RobotState};
+use tread_api::wire::state::{FrictionReport, PULSE_PERIOD_MS, RobotState, ServerPulse};
 use tread_api::wire::{self, Refusal, RefusalCode};
 use uuid::Uuid;
 use zenoh::Wait;
@@ -52,6 +53,8 @@ pub(crate) struct Memory {
     pub(crate) records: BTreeMap<(BootId, u64), (RecordContent, usize)>,
     pub(crate) states: Vec<RobotState>,
     pub(crate) frictions: Vec<FrictionReport>,
+    /// The robot's clock in each batch.
+    pub(crate) batch_times: Vec<Option<jiff::Timestamp>>,
     pub(crate) alive: Vec<BootId>,
     pub(crate) gone: Vec<BootId>,
 }
@@ -252,6 +255,24 @@ impl FakeServer {
         })
     }
 
+    /// Lets the robots hear the server until the task is dropped.
+    pub(crate) fn pulse(&self) -> tokio::task::JoinHandle<()> {
+        let (session, key) = (self.session.clone(), keys::pulse(&self.site));
+        #[expect(clippy::disallowed_methods, reason = "a test has no supervisor")]
+        tokio::spawn(async move {
+            let pulse = ServerPulse {
+                server_time: jiff::Timestamp::UNIX_EPOCH,
+            };
+            loop {
+                session
+                    .put(&key, wire::encode(&pulse).unwrap())
+                    .await
+                    .unwrap();
+                tokio::time::sleep(Duration::from_millis(PULSE_PERIOD_MS)).await;
+            }
+        })
+    }
+
     pub(crate) async fn offer(&self, robot: &RobotId, offer: &Offer) -> Answer {
         let payload = wire::encode(offer).unwrap();
         self.command(robot, Verb::Offer, payload)
@@ -288,6 +309,7 @@ fn keep(memory: &mut Memory, batch: Batch) -> Receipt {
             .windows(2)
             .all(|pair| pair[0].seq < pair[1].seq)
     );
+    memory.batch_times.push(batch.robot_time);
     for record in batch.records {
         let name = (batch.boot, record.seq);
         let kept = memory
@@ -315,5 +337,6 @@ pub(crate) fn offer(number: u128, asked: &str) -> Offer {
         plan_hash,
         trajectory,
         start_within_ms: Some(10_000),
+        link_policy: LinkPolicy::default(),
     }
 }

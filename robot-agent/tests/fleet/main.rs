@@ -6,17 +6,16 @@
     reason = "what the helpers of a test cannot do fails the test"
 )]
 
+mod control;
+mod rig;
 mod support;
 
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::Ordering;
 
-use support::{FakeServer, Memory, SharedMemory, eventually, free_port, offer};
-use tempfile::TempDir;
-use tread_agent::sim::scenario::Scenario;
-use tread_agent::{Agent, AgentConfig, RunningAgent};
-use tread_api::ids::{BootId, RobotId};
+use rig::Rig;
+use support::{eventually, offer};
 use tread_api::keys::Verb;
 use tread_api::wire::RefusalCode;
 use tread_api::wire::command::{Answer, Cancel, OfferRefusal, Outcome};
@@ -27,87 +26,6 @@ const SHORT: &str = r#"{"waypoints":{"speed_m_s":0.8,
     "points":[{"x_m":4,"y_m":3},{"x_m":6,"y_m":3.2},{"x_m":7.5,"y_m":4.5}]}}"#;
 const LONG: &str =
     r#"{"circle":{"center":{"x_m":7,"y_m":6},"radius_m":3,"speed_m_s":0.6,"turns":5}}"#;
-
-/// One test's server, agent and folder.
-struct Rig {
-    port: u16,
-    scenario: Scenario,
-    robot: RobotId,
-    folder: TempDir,
-    memory: SharedMemory,
-}
-
-impl Rig {
-    fn new() -> Self {
-        Self {
-            port: free_port(),
-            scenario: Scenario::built_in().unwrap(),
-            robot: "rover-1".parse().unwrap(),
-            folder: TempDir::new().unwrap(),
-            memory: SharedMemory::default(),
-        }
-    }
-
-    fn serve(&self) -> FakeServer {
-        FakeServer::start(self.port, &self.scenario, &self.memory)
-    }
-
-    fn endpoint(&self) -> String {
-        format!("tcp/127.0.0.1:{}", self.port)
-    }
-
-    fn agent(&self) -> RunningAgent {
-        let config = AgentConfig::simulated(
-            self.scenario.clone(),
-            self.robot.clone(),
-            self.endpoint(),
-            self.folder.path().to_owned(),
-        );
-        Agent::start(config.unwrap()).unwrap()
-    }
-
-    /// Waits until the server's memory shows something.
-    async fn sees<T: std::fmt::Debug>(
-        &self,
-        what: &str,
-        mut look: impl FnMut(&Memory) -> Option<T>,
-    ) -> T {
-        eventually(what, || {
-            let memory = self.memory.lock().unwrap();
-            look(&memory).ok_or_else(|| {
-                let phases: Vec<_> = memory.records.keys().collect();
-                let last = memory.states.last();
-                format!(
-                    "{} hellos, records {phases:?}, {last:?}",
-                    memory.hellos.len()
-                )
-            })
-        })
-        .await
-    }
-
-    async fn ready(&self, boot: BootId) {
-        self.sees("the robot is welcome and knows where it is", |memory| {
-            let is_ready = |state: &&tread_api::wire::state::RobotState| {
-                state.boot == boot && state.pose.is_some() && state.terrain_revision == Some(5)
-            };
-            memory.states.iter().rev().find(is_ready).map(|_| ())
-        })
-        .await;
-    }
-
-    fn assert_every_record_came_once_per_name(&self) {
-        let memory = self.memory.lock().unwrap();
-        let mut boots: Vec<BootId> = memory.records.keys().map(|(boot, _)| *boot).collect();
-        boots.dedup();
-        for boot in boots {
-            let of_boot = memory.records.keys().filter(|(other, _)| *other == boot);
-            let seqs: Vec<u64> = of_boot.map(|(_, seq)| *seq).collect();
-            let expected: Vec<u64> = (0..seqs.len() as u64).collect();
-            assert_eq!(seqs, expected, "a gap: something was lost");
-        }
-    }
-}
 
 fn refusal(answer: &Answer) -> Option<OfferRefusal> {
     match &answer.outcome {
