@@ -109,6 +109,39 @@ pub struct PlanSample {
     pub acceleration_m_s2: f64,
 }
 
+/// What makes the robot slower than it was asked to be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum SlowedBy {
+    /// Acceleration across the path.
+    LateralAcceleration,
+    /// Yaw rate.
+    AngularSpeed,
+    /// Wheel speed.
+    WheelSpeed,
+    /// Wheel acceleration where the bend changes.
+    WheelAcceleration,
+    /// Acceleration or braking along the path.
+    LinearAcceleration,
+}
+
+/// A stretch of the path on which one limit makes the robot slower than it was asked to be.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Slowed {
+    /// Which limit.
+    pub by: SlowedBy,
+    /// Arc length of its begin, metres.
+    pub from_m: f64,
+    /// Arc length of its end, metres.
+    pub to_m: f64,
+    /// Slowest speed of the stretch, metres per second.
+    pub speed_min_m_s: f64,
+}
+
+/// Most stretches that a plan names.
+pub const SLOWED_MAX: usize = 1_000;
+/// A robot this near to the speed that was asked for counts as driving it.
+const AS_ASKED: f64 = 0.98;
+
 /// Geometry and timing of one trajectory.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
@@ -119,6 +152,7 @@ pub struct Plan {
     peak_acceleration_m_s2: f64,
     peak_lateral_m_s2: f64,
     peak_angular_rad_s: f64,
+    slowed: Vec<Slowed>,
 }
 
 /// A speed that holds from an arc length on.
@@ -297,6 +331,8 @@ impl Plan {
         let cell_m = length_m / cells as f64;
         let mut asked = 0;
         let mut nodes = Vec::with_capacity(cells + 1);
+        let mut asked_m_s = Vec::with_capacity(cells + 1);
+        let mut bounds = Vec::with_capacity(cells + 1);
         for index in 0..=cells {
             let arc_m = cell_m * index as f64;
             while speeds
@@ -305,11 +341,10 @@ impl Plan {
             {
                 asked += 1;
             }
-            nodes.push(node_limits(
-                &path.sample(arc_m),
-                speeds[asked].speed_m_s,
-                model,
-            ));
+            let (node, by) = node_limits(&path.sample(arc_m), speeds[asked].speed_m_s, model);
+            nodes.push(node);
+            bounds.push(by);
+            asked_m_s.push(speeds[asked].speed_m_s);
         }
         let profile = SpeedProfile::new(length_m, &nodes, model.limits().linear_jerk_max_m_s3);
         let mut plan = Self {
@@ -320,6 +355,7 @@ impl Plan {
             peak_acceleration_m_s2: 0.0,
             peak_lateral_m_s2: 0.0,
             peak_angular_rad_s: 0.0,
+            slowed: Vec::new(),
         };
         let steps = (plan.duration_s() / 0.05).ceil().min(GRID_MAX as f64) as usize + 1;
         for step in 0..=steps {
@@ -331,8 +367,41 @@ impl Plan {
                 .max(sample.acceleration_m_s2.abs());
             plan.peak_lateral_m_s2 = plan.peak_lateral_m_s2.max(turn_rad_s * sample.speed_m_s);
             plan.peak_angular_rad_s = plan.peak_angular_rad_s.max(turn_rad_s);
+            let node = ((sample.arc_m / cell_m) as usize).min(cells);
+            if sample.speed_m_s < AS_ASKED * asked_m_s[node] {
+                let near = sample.speed_m_s >= AS_ASKED * AS_ASKED * nodes[node].speed_m_s;
+                let by = bounds[node].filter(|_| near);
+                let by = by.unwrap_or(SlowedBy::LinearAcceleration);
+                plan.note_slowed(by, sample.arc_m, sample.speed_m_s);
+            }
         }
         Ok(plan)
+    }
+
+    /// Lengthens the last stretch, or begins another.
+    fn note_slowed(&mut self, by: SlowedBy, arc_m: f64, speed_m_s: f64) {
+        // What lies within a few samples of the same limit is one stretch.
+        let reach_m = 4.0 * GRID_M + 0.2 * speed_m_s;
+        let has_room = self.slowed.len() < SLOWED_MAX;
+        match self.slowed.last_mut() {
+            Some(last) if last.by == by && arc_m - last.to_m <= reach_m => {
+                last.to_m = arc_m;
+                last.speed_min_m_s = last.speed_min_m_s.min(speed_m_s);
+            }
+            _ if has_room => self.slowed.push(Slowed {
+                by,
+                from_m: arc_m,
+                to_m: arc_m,
+                speed_min_m_s: speed_m_s,
+            }),
+            _ => {}
+        }
+    }
+
+    /// Where a limit makes the robot slower than it was asked to be, in driving order; at most
+    /// [`SLOWED_MAX`] stretches.
+    pub fn slowed(&self) -> &[Slowed] {
+        &self.slowed
     }
 
     /// The plan at a time since its start, seconds; at rest at its ends before and after.
@@ -398,7 +467,12 @@ impl Plan {
 }
 
 /// What the robot may do where the path bends like this.
-fn node_limits(path: &PathSample, asked_m_s: f64, model: &RobotModel) -> NodeLimits {
+/// The second is the limit that makes it slower than it was asked to be.
+fn node_limits(
+    path: &PathSample,
+    asked_m_s: f64,
+    model: &RobotModel,
+) -> (NodeLimits, Option<SlowedBy>) {
     let limits = model.limits();
     let bend = path.curvature_1_m.abs();
     let slope = path.curvature_slope_1_m2.abs();
@@ -409,16 +483,34 @@ fn node_limits(path: &PathSample, asked_m_s: f64, model: &RobotModel) -> NodeLim
     // The outer wheels: v (1 + bW/2), and a (1 + bW/2) + v² b' W/2, half of the limit for each.
     let outer = 1.0 + bend * half_track_m;
     let floor = f64::MIN_POSITIVE;
-    NodeLimits {
-        speed_m_s: asked_m_s
-            .min((limits.lateral_acceleration_max_m_s2 / bend.max(floor)).sqrt())
-            .min(limits.angular_max_rad_s / bend.max(floor))
-            .min(rim_max_m_s / outer)
-            .min((0.5 * rim_max_m_s2 / (slope * half_track_m).max(floor)).sqrt()),
+    let bounds_m_s = [
+        (
+            SlowedBy::LateralAcceleration,
+            (limits.lateral_acceleration_max_m_s2 / bend.max(floor)).sqrt(),
+        ),
+        (
+            SlowedBy::AngularSpeed,
+            limits.angular_max_rad_s / bend.max(floor),
+        ),
+        (SlowedBy::WheelSpeed, rim_max_m_s / outer),
+        (
+            SlowedBy::WheelAcceleration,
+            (0.5 * rim_max_m_s2 / (slope * half_track_m).max(floor)).sqrt(),
+        ),
+    ];
+    let mut slowest = (asked_m_s, None);
+    for (by, bound_m_s) in bounds_m_s {
+        if bound_m_s < slowest.0 {
+            slowest = (bound_m_s, Some(by));
+        }
+    }
+    let node = NodeLimits {
+        speed_m_s: slowest.0,
         acceleration_m_s2: limits
             .linear_acceleration_max_m_s2
             .min(0.5 * rim_max_m_s2 / outer),
-    }
+    };
+    (node, slowest.1)
 }
 
 fn check_coordinate(what: &'static str, place: usize, point: Point) -> Result<(), PlanError> {

@@ -29,7 +29,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tracing::info;
 
-use self::app::{App, ingest, reconciler};
+use self::app::{App, events, ingest, reconciler};
 use self::clock::Clock;
 pub use self::config::{Config, ServerArgs};
 use self::db::Db;
@@ -83,6 +83,7 @@ impl Server {
         let reconciling =
             reconciler::run(app.clone(), fleet.commands(), supervisor.clone(), stop());
         supervisor.spawn_vital("reconciler", reconciling);
+        supervisor.spawn_vital("events", events::run(app.clone(), stop()));
         let router = http::router(app.clone());
         let serving = http::serve::run(listener, router, app.clone(), supervisor.clone(), stop());
         supervisor.spawn_vital("http", serving);

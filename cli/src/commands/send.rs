@@ -9,7 +9,7 @@ use anyhow::Context;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use jiff::Timestamp;
 use tread_api::ids::MissionId;
-use tread_api::mission::{CreateMission, Mission, MissionState};
+use tread_api::mission::{CreateMission, LinkPolicy, Mission, MissionState, StartPolicy};
 use tread_api::trajectory::{Circle, Direction, Trajectory, Waypoint, Waypoints};
 
 use super::missions::summary;
@@ -34,6 +34,10 @@ pub(super) async fn run(
         robot: order.robot.clone(),
         trajectory,
         latest_start: order.start_within.map(latest_start).transpose()?,
+        priority: 0,
+        start_policy: StartPolicy::default(),
+        link_policy: LinkPolicy::default(),
+        lost_after_s: None,
     };
     let mut mission = client.create_mission(&request).await?;
     if order.wait {

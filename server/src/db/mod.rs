@@ -4,6 +4,9 @@
 //! ([`Db::read`], each transaction a snapshot). `synchronous=FULL`: a commit that returned
 //! survives a power cut.
 
+pub mod alerts;
+pub mod history;
+pub mod idempotency;
 pub mod missions;
 pub mod robots;
 pub mod segments;

@@ -3,6 +3,8 @@
 //! Every route and its description in `/openapi.json` come from one `routes!`. All errors are
 //! problems ([`problem`]); bodies, paths and queries are read by [`extract`] alone.
 
+mod alerts;
+mod events;
 pub mod extract;
 mod friction;
 pub mod health;
@@ -56,6 +58,8 @@ struct Description;
 fn routes() -> OpenApiRouter<App> {
     let missions = OpenApiRouter::new()
         .routes(routes!(missions::list, missions::create))
+        .routes(routes!(missions::replace))
+        .routes(routes!(missions::check))
         .layer(Extension(BodyLimit(MISSION_BODY_MAX)));
     OpenApiRouter::with_openapi(Description::openapi())
         .routes(routes!(health::healthz))
@@ -66,9 +70,14 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(terrains::list, terrains::create))
         .routes(routes!(terrains::get, terrains::replace, terrains::delete))
         .routes(routes!(robots::list))
-        .routes(routes!(robots::get))
+        .routes(routes!(robots::get, robots::change))
+        .routes(routes!(alerts::list))
+        .routes(routes!(alerts::acknowledge))
+        .routes(routes!(events::stream))
         .routes(routes!(missions::get))
         .routes(routes!(missions::cancel))
+        .routes(routes!(missions::pause))
+        .routes(routes!(missions::resume))
         .routes(routes!(friction::terrains))
         .routes(routes!(friction::terrain))
         .routes(routes!(friction::cells))

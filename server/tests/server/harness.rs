@@ -227,6 +227,8 @@ pub(crate) fn report(mission: &Mission, phase: MissionPhase) -> RecordContent {
         phase,
         reason: None,
         progress: None,
+        quality: None,
+        driven: None,
     })
 }
 
