@@ -222,19 +222,25 @@ fn recall_missions(
     let mut holder = memory.load()?;
     let interrupted = holder.held().cloned();
     if let Some(held) = &interrupted {
+        let phase = holder.begin_end(held.mission, MissionPhase::Failed);
+        let reason = if phase == MissionPhase::Cancelled {
+            "cancelled on request; the agent restarted meanwhile"
+        } else {
+            "the agent restarted during the mission"
+        };
         let report = MissionReport {
             mission: held.mission,
             revision: held.revision,
             plan_hash: held.plan_hash,
             at: clock.wall(),
-            phase: MissionPhase::Failed,
-            reason: Some("the agent restarted during the mission".to_owned()),
+            phase,
+            reason: Some(reason.to_owned()),
             progress: None,
             quality: None,
             driven: None,
         };
         outbox.append(&RecordContent::Mission(report))?;
-        holder.end(held.mission, MissionPhase::Failed);
+        holder.end(held.mission, phase);
     }
     let missions = Missions::new(holder, memory);
     if interrupted.is_some() {

@@ -139,6 +139,7 @@ fn held_of(offer: &Offer, plan: PlanSummary) -> Held {
         revision: offer.revision,
         plan_hash: offer.plan_hash,
         plan,
+        is_cancelled: false,
     }
 }
 
@@ -451,6 +452,8 @@ impl Dispatcher {
             CancelDecision::Brake => match self.to_loop.try_send(LoopCommand::Cancel(mission)) {
                 Ok(()) => {
                     info!(mission.id = %mission, reason = cancel.reason, "cancelling {mission}");
+                    // Once this is answered it is cancelled, even if the agent dies on the way.
+                    self.save().await;
                     Outcome::Done
                 }
                 Err(_) => refused(OfferRefusal::NotReady, "the control loop is busy"),

@@ -85,7 +85,8 @@ impl Recorder {
                 progress,
                 job,
             } => {
-                let (mission, phase) = (job.mission, reason.phase());
+                let mission = job.mission;
+                let phase = self.missions.holder().begin_end(mission, reason.phase());
                 info!(
                     mission.id = %mission,
                     driven_m = progress.driven_m,

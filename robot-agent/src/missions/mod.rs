@@ -35,6 +35,9 @@ pub struct Held {
     pub plan_hash: PlanHash,
     /// What was planned.
     pub plan: PlanSummary,
+    /// Whether the server was told that it is cancelled; then it ends as that and nothing else.
+    #[serde(default)]
+    pub is_cancelled: bool,
 }
 
 /// A mission that has ended here.
@@ -51,6 +54,9 @@ pub struct Ended {
 pub struct Holder {
     held: Option<Held>,
     ended: VecDeque<Ended>,
+    /// How the mission in hand ends, while that is being written.
+    #[serde(skip)]
+    ending: Option<MissionPhase>,
 }
 
 /// What to do about an offer.
@@ -111,6 +117,10 @@ impl Holder {
         }
         match &self.held {
             None => OfferDecision::Plan,
+            Some(held) if held.mission == mission && held.is_cancelled => refuse(
+                OfferRefusal::Ended,
+                format!("mission {mission} is being cancelled"),
+            ),
             Some(held) if held.mission != mission => {
                 let detail = format!("mission {} is being driven", held.mission);
                 refuse(OfferRefusal::Busy, detail)
@@ -145,7 +155,10 @@ impl Holder {
     #[must_use]
     pub fn replace(&mut self, next: Held) -> Option<Held> {
         let held = self.held.as_mut()?;
-        let is_next = held.mission == next.mission && held.revision < next.revision;
+        let is_next = held.mission == next.mission
+            && held.revision < next.revision
+            && !held.is_cancelled
+            && self.ending.is_none();
         is_next.then(|| std::mem::replace(held, next))
     }
 
@@ -174,6 +187,9 @@ impl Holder {
             return Err((OfferRefusal::Ended, detail));
         }
         match &self.held {
+            Some(held) if held.mission == mission && held.is_cancelled => {
+                Err((OfferRefusal::Ended, "it is being cancelled".to_owned()))
+            }
             Some(held) if held.mission == mission && held.revision == revision => Ok(()),
             Some(held) if held.mission == mission => Err((
                 OfferRefusal::Conflict,
@@ -190,11 +206,11 @@ impl Holder {
 
     /// What to do about a cancellation; one that comes before its offer is remembered.
     pub fn cancel(&mut self, mission: MissionId) -> CancelDecision {
-        if self
-            .held
-            .as_ref()
-            .is_some_and(|held| held.mission == mission)
-        {
+        if let Some(held) = self.held.as_mut().filter(|held| held.mission == mission) {
+            if let Some(phase) = self.ending.filter(|_| !held.is_cancelled) {
+                return CancelDecision::EndedBefore(phase);
+            }
+            held.is_cancelled = true;
             return CancelDecision::Brake;
         }
         match self.ended_phase(mission) {
@@ -210,8 +226,27 @@ impl Holder {
         }
     }
 
+    /// How the mission in hand ends, before that is reported; from here on it can no longer be
+    /// cancelled. One that the server believes cancelled ends as that, whatever came in between.
+    pub fn begin_end(&mut self, mission: MissionId, phase: MissionPhase) -> MissionPhase {
+        let Some(held) = self.held.as_ref().filter(|held| held.mission == mission) else {
+            return phase;
+        };
+        let phase = if held.is_cancelled {
+            MissionPhase::Cancelled
+        } else {
+            phase
+        };
+        *self.ending.insert(phase)
+    }
+
     /// Ends the mission in hand; `None` if it is not this one.
     pub fn end(&mut self, mission: MissionId, phase: MissionPhase) -> Option<Held> {
+        self.ending.take_if(|_| {
+            self.held
+                .as_ref()
+                .is_some_and(|held| held.mission == mission)
+        });
         let held = self.held.take_if(|held| held.mission == mission)?;
         self.remember(Ended { mission, phase });
         Some(held)
@@ -304,6 +339,7 @@ mod tests {
                             revision,
                             plan_hash: offer.plan_hash,
                             plan: PLAN,
+                            is_cancelled: false,
                         };
                         let is_over = over.contains(&offer.mission);
                         match before.held() {
@@ -311,6 +347,11 @@ mod tests {
                                 matches!(decision, OfferDecision::Refuse(OfferRefusal::Ended, _))
                             ),
                             None => prop_assert_eq!(&decision, &OfferDecision::Plan),
+                            Some(now) if now.mission == held.mission && now.is_cancelled => {
+                                prop_assert!(
+                                    matches!(decision, OfferDecision::Refuse(OfferRefusal::Ended, _))
+                                );
+                            }
                             Some(now) if *now == held => {
                                 prop_assert_eq!(&decision, &OfferDecision::AcceptAgain(PLAN));
                             }
@@ -353,6 +394,18 @@ mod tests {
                     Step::End { mission, succeeded } => {
                         let phase =
                             if succeeded { MissionPhase::Succeeded } else { MissionPhase::Failed };
+                        let was_cancelled = before
+                            .held()
+                            .is_some_and(|held| held.mission == id(mission) && held.is_cancelled);
+                        let phase = holder.begin_end(id(mission), phase);
+                        prop_assert_eq!(phase == MissionPhase::Cancelled, was_cancelled);
+                        if before.held().is_some_and(|held| held.mission == id(mission))
+                            && !was_cancelled
+                        {
+                            // Too late now.
+                            let late = holder.cancel(id(mission));
+                            prop_assert_eq!(late, CancelDecision::EndedBefore(phase));
+                        }
                         if holder.end(id(mission), phase).is_some() {
                             prop_assert!(!over.contains(&id(mission)));
                             over.push(id(mission));
