@@ -14,7 +14,9 @@ use tread_api::friction::{Information, Segment};
 use tread_api::geometry::Pose;
 use tread_api::ids::{BootId, RobotId, SiteId};
 use tread_api::keys;
-use tread_api::robot::{Aged, Capabilities, LoopStatus, OutboxStatus, RobotLimits, RobotMode, RobotModel};
+use tread_api::robot::{
+    Aged, Capabilities, LoopStatus, OutboxStatus, RobotLimits, RobotMode, RobotModel,
+};
 use tread_api::site::Cell;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::ingest::{Batch, Receipt, Record, RecordContent};

@@ -36,22 +36,28 @@ impl App {
     /// Writes down what robots have begun or ceased to say.
     pub(super) async fn sync_alerts(&self) -> Result<(), AppError> {
         for (key, said) in self.presences().take_alert_changes() {
-            if let Err(error) = self.sync_alerts_of(&key, &said).await {
-                self.presences().return_alert_change(&key);
-                return Err(error);
+            match self.sync_alerts_of(&key, &said).await {
+                Ok(true) => {}
+                // A robot may speak before it has introduced itself.
+                Ok(false) => self.presences().return_alert_change(&key),
+                Err(error) => {
+                    self.presences().return_alert_change(&key);
+                    return Err(error);
+                }
             }
         }
         Ok(())
     }
 
-    async fn sync_alerts_of(&self, key: &RobotKey, said: &[AlertReport]) -> Result<(), AppError> {
+    /// False for a robot that is not known yet.
+    async fn sync_alerts_of(&self, key: &RobotKey, said: &[AlertReport]) -> Result<bool, AppError> {
         let said = &said[..said.len().min(ALERTS_MAX)];
         let mut tx = self.db().read().await?;
         let Some(site) = db::sites::find(&mut tx, &key.0).await? else {
-            return Ok(());
+            return Ok(false);
         };
         let Some(robot) = db::robots::find(&mut tx, site.pk, &key.1).await? else {
-            return Ok(());
+            return Ok(false);
         };
         let raised = db::alerts::raised_of(&mut tx, robot.pk).await?;
         drop(tx);
@@ -61,7 +67,7 @@ impl App {
         let gone: Vec<&Alert> = raised.iter().filter(|alert| !has(alert)).collect();
         let new: Vec<&AlertReport> = said.iter().filter(is_new).collect();
         if gone.is_empty() && new.is_empty() {
-            return Ok(());
+            return Ok(true);
         }
         let mut changed = Vec::new();
         let mut tx = self.db().write().await?;
@@ -82,7 +88,7 @@ impl App {
         for alert in &alerts {
             self.hub().alert(alert);
         }
-        Ok(())
+        Ok(true)
     }
 
     async fn raise(
