@@ -15,6 +15,7 @@ pub mod fleet;
 pub mod friction;
 pub mod http;
 mod logging;
+pub mod metrics;
 pub mod supervisor;
 
 use std::ffi::OsString;
@@ -47,6 +48,7 @@ pub struct Server;
 #[derive(Debug)]
 pub struct RunningServer {
     http_address: SocketAddr,
+    metrics_address: Option<SocketAddr>,
     app: App,
     fleet: Fleet,
     supervisor: Supervisor,
@@ -87,9 +89,23 @@ impl Server {
         let router = http::router(app.clone());
         let serving = http::serve::run(listener, router, app.clone(), supervisor.clone(), stop());
         supervisor.spawn_vital("http", serving);
+        let mut metrics_address = None;
+        if let Some(address) = config.metrics {
+            let listener = TcpListener::bind(address)
+                .await
+                .with_context(|| format!("cannot listen for metrics on {address}"))?;
+            let address = listener.local_addr()?;
+            metrics_address = Some(address);
+            let router = http::metrics_router(app.clone());
+            let serving =
+                http::serve::run(listener, router, app.clone(), supervisor.clone(), stop());
+            supervisor.spawn_vital("metrics", serving);
+            info!("metrics on http://{address}/metrics");
+        }
         info!("REST API on http://{http_address}, described at http://{http_address}/docs");
         Ok(RunningServer {
             http_address,
+            metrics_address,
             app,
             fleet,
             supervisor,
@@ -101,6 +117,11 @@ impl RunningServer {
     /// Where the REST API listens.
     pub fn http_address(&self) -> SocketAddr {
         self.http_address
+    }
+
+    /// Where the metrics are, if anywhere.
+    pub fn metrics_address(&self) -> Option<SocketAddr> {
+        self.metrics_address
     }
 
     /// The endpoint that robots connect to, as zenoh writes it.

@@ -29,6 +29,7 @@ use crate::counters::Counters;
 use crate::db::sites::SiteRow;
 use crate::db::{self, Db, DbError, Tx};
 use crate::fleet::presence::Presences;
+use crate::metrics::Requests;
 
 /// Everything that use cases work on; clones are handles to the same.
 #[derive(Debug, Clone)]
@@ -50,6 +51,7 @@ struct Inner {
     hub: Hub,
     keys_in_flight: InFlight,
     checks: Semaphore,
+    requests: Requests,
     /// Counts changes of what is kept of robots.
     robots_generation: AtomicU64,
     started_at: Duration,
@@ -71,6 +73,7 @@ impl App {
             hub,
             keys_in_flight: InFlight::default(),
             checks: Semaphore::new(check::CHECKS_MAX),
+            requests: Requests::default(),
             robots_generation: AtomicU64::new(1),
             started_at,
         };
@@ -125,6 +128,11 @@ impl App {
     /// Where event clients subscribe.
     pub fn hub(&self) -> &Hub {
         &self.inner.hub
+    }
+
+    /// Requests by route.
+    pub fn requests(&self) -> &Requests {
+        &self.inner.requests
     }
 
     fn keys_in_flight(&self) -> &InFlight {

@@ -18,7 +18,7 @@ mod terrains;
 use std::any::Any;
 use std::time::Duration;
 
-use axum::extract::{Request, State};
+use axum::extract::{MatchedPath, Request, State};
 use axum::http::HeaderName;
 use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
@@ -98,6 +98,7 @@ pub fn router(app: App) -> Router {
         .merge(SwaggerUi::new("/docs").url("/openapi.json", openapi))
         .fallback(not_found)
         .method_not_allowed_fallback(method_not_allowed)
+        .layer(from_fn_with_state(app.clone(), measure))
         .layer(from_fn(bound_time))
         .layer(CatchPanicLayer::custom(broken))
         .layer(from_fn_with_state(app.clone(), count_panics))
@@ -105,6 +106,34 @@ pub fn router(app: App) -> Router {
         .layer(PropagateRequestIdLayer::new(REQUEST_ID))
         .layer(SetRequestIdLayer::new(REQUEST_ID, MakeRequestUuid))
         .with_state(app)
+}
+
+/// The page for Prometheus, on an address of its own.
+pub fn metrics_router(app: App) -> Router {
+    Router::new()
+        .route("/metrics", axum::routing::get(metrics))
+        .fallback(not_found)
+        .layer(from_fn(bound_time))
+        .with_state(app)
+}
+
+async fn metrics(State(app): State<App>) -> Result<Response, Problem> {
+    let text = app.metrics().await?;
+    let media_type = "text/plain; version=0.0.4";
+    Ok(([(axum::http::header::CONTENT_TYPE, media_type)], text).into_response())
+}
+
+/// Notes how long each route takes.
+async fn measure(State(app): State<App>, request: Request, next: Next) -> Response {
+    let route = request.extensions().get::<MatchedPath>();
+    let route = route.map_or("none", MatchedPath::as_str).to_owned();
+    let method = request.method().as_str().to_owned();
+    let asked_at = app.clock().elapsed();
+    let response = next.run(request).await;
+    let took = app.clock().elapsed().saturating_sub(asked_at);
+    let status = response.status().as_u16();
+    app.requests().note(&method, &route, status, took);
+    response
 }
 
 async fn not_found() -> Problem {

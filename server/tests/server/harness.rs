@@ -69,6 +69,7 @@ impl Yard {
     async fn start_in(folder: Arc<TempDir>, zenoh: &str) -> Self {
         let config = Config {
             http: "127.0.0.1:0".parse().unwrap(),
+            metrics: Some("127.0.0.1:0".parse().unwrap()),
             zenoh: zenoh.parse().unwrap(),
             database: database(folder.path()),
             site: site(),

@@ -75,7 +75,8 @@ pub(super) fn driven(mission: &Standing, presence: &Presence) -> Option<MissionP
 /// Whether a robot is there without a mission that it took, and with nothing left to report.
 pub(super) fn is_absent(mission: &Standing, presence: &Presence, now: Duration) -> bool {
     let nothing_left = |state: &tread_api::wire::state::RobotState| {
-        Some(state.boot) == mission.boot && state.outbox.pending == 0
+        // A mission that only the robot's state showed as taken has no run yet.
+        mission.boot.is_none_or(|boot| boot == state.boot) && state.outbox.pending == 0
     };
     is_heard(presence, now)
         && driven(mission, presence).is_none()

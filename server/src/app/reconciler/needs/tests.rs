@@ -310,6 +310,8 @@ fn a_robot_that_is_there_without_its_mission_has_forgotten_it_after_a_while() {
     let active = mission(MissionState::Active, Some(boot(1)));
     let idle = presence(&IDLE);
     assert!(is_absent(&active, &idle, ELAPSED));
+    let taken_unseen = mission(MissionState::Active, None);
+    assert!(is_absent(&taken_unseen, &idle, ELAPSED));
     let reporting = presence(&Said { pending: 1, ..IDLE });
     assert!(!is_absent(&active, &reporting, ELAPSED));
     let since = |absent_since| Memory {
