@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 
+use jiff::SignedDuration;
 use tread_agent::missions::Holder;
 use tread_api::friction::StoredSegment;
 use tread_api::ids::BootId;
@@ -10,6 +11,10 @@ use tread_api::wire::ingest::MissionPhase;
 
 use super::{Followed, RunReport, Violation};
 use crate::fleet::{Fleet, SITE};
+
+/// An event's time is taken before its commit, which may have to wait for others; two missions that
+/// overlap by less follow each other. That they do is also an index of the database.
+const EVENT_GRAIN: SignedDuration = SignedDuration::from_millis(250);
 
 /// State and cause of a mission's end.
 pub(super) fn end_of(detail: &MissionDetail) -> String {
@@ -164,24 +169,25 @@ fn two_at_once(details: &[MissionDetail]) -> Option<String> {
                 | MissionState::Cancelling
         )
     };
-    let mut changes: Vec<_> = details
-        .iter()
-        .flat_map(|detail| {
-            let id = detail.mission.id;
-            detail.events.iter().map(move |event| (event.at, id, event))
-        })
-        .collect();
-    // Of one moment, what ends comes before what begins.
-    changes.sort_by_key(|(at, _, event)| (*at, in_hand(event.to)));
-    let mut held = None;
-    for (at, id, event) in changes {
-        if in_hand(event.to) {
-            if held.is_some_and(|other| other != id) {
-                return Some(format!("{id} came into hand at {at} beside {held:?}"));
+    let mut spans = Vec::new();
+    for detail in details {
+        let mut since = None;
+        for event in &detail.events {
+            if in_hand(event.to) {
+                since.get_or_insert(event.at);
+            } else if let Some(since) = since.take() {
+                spans.push((detail.mission.id, since, event.at));
             }
-            held = Some(id);
-        } else if held == Some(id) {
-            held = None;
+        }
+    }
+    for (index, &(id, from, to)) in spans.iter().enumerate() {
+        for &(other, other_from, other_to) in &spans[index + 1..] {
+            let both = to.min(other_to).duration_since(from.max(other_from));
+            if id != other && both > EVENT_GRAIN {
+                return Some(format!(
+                    "{id} and {other} were in hand together for {both:#}"
+                ));
+            }
         }
     }
     None
