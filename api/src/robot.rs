@@ -196,4 +196,7 @@ pub struct LoopStatus {
     pub overruns: u64,
     /// Longest computation of a tick since the last report, microseconds.
     pub tick_max_us: u32,
+    /// Commands refused since the start: they did not parse, or were of another version.
+    #[serde(default)]
+    pub commands_refused: u64,
 }

@@ -3,6 +3,7 @@
 //! One command after the other, so that an offer that comes twice finds the first one decided.
 //! Planning and disks are waited for here, never in the loop.
 
+use std::sync::atomic::Ordering;
 use std::sync::mpsc::{SyncSender, TrySendError};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -115,6 +116,7 @@ impl Dispatcher {
                         .await;
                 }
                 Err(cause) => {
+                    self.shared.commands_refused.fetch_add(1, Ordering::Relaxed);
                     warn!(
                         error = &cause as &dyn std::error::Error,
                         "refused a `{}` command",

@@ -65,6 +65,7 @@ impl Reporter {
                 ticks: snapshot.ticks,
                 overruns: self.shared.overruns.load(Ordering::Relaxed),
                 tick_max_us: self.shared.tick_max_us.swap(0, Ordering::Relaxed),
+                commands_refused: self.shared.commands_refused.load(Ordering::Relaxed),
             },
         }
     }

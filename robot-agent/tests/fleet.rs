@@ -219,6 +219,8 @@ async fn what_cannot_be_understood_or_driven_is_refused_with_a_reason() {
             assert_eq!(refused.unwrap_err().code, code, "{verb:?}");
         }
     }
+    let counted = agent.state().control_loop.commands_refused;
+    assert_eq!(counted, 9, "three payloads to each of three verbs");
     let too_fast = offer(3, &SHORT.replace("0.8", "20.0"));
     let refused = server.offer(&rig.robot, &too_fast).await;
     assert_eq!(

@@ -195,6 +195,8 @@ pub(crate) struct Shared {
     pub(crate) stop: AtomicBool,
     /// Ticks that began more than one period late.
     pub(crate) overruns: AtomicU64,
+    /// Commands refused because they did not parse, or were of another version.
+    pub(crate) commands_refused: AtomicU64,
     /// Longest computation of a tick since it was last taken, microseconds.
     pub(crate) tick_max_us: AtomicU32,
     /// Segments that nobody took in time.
