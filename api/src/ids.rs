@@ -92,6 +92,11 @@ slug! {
     TerrainId
 }
 
+slug! {
+    /// What an alert is about, stable, for programs.
+    AlertCode
+}
+
 macro_rules! uuid_id {
     ($(#[$doc:meta])* $name:ident) => {
         $(#[$doc])*
@@ -134,6 +139,10 @@ macro_rules! uuid_id {
 uuid_id! {
     /// A mission: a version 7 UUID, so that ids sort by creation.
     MissionId
+}
+uuid_id! {
+    /// An alert: a version 7 UUID, so that ids sort by time.
+    AlertId
 }
 uuid_id! {
     /// One run of an agent's process: a new version 4 UUID at each start.

@@ -6,6 +6,7 @@
 //! | `robots/{robot}/state` | published | robot → all |
 //! | `robots/{robot}/friction` | published | robot → all |
 //! | `robots/{robot}/cmd/{verb}` | query | server → robot |
+//! | `server/pulse` | published | server → all robots |
 //! | `server/hello/{robot}` | query | robot → server |
 //! | `server/ingest/{robot}` | query | robot → server |
 
@@ -21,19 +22,31 @@ pub enum Verb {
     Offer,
     /// Cancel a mission.
     Cancel,
+    /// Pause a mission.
+    Pause,
+    /// Let a paused mission go on.
+    Resume,
     /// Take a new definition of the site.
     Site,
 }
 
 impl Verb {
     /// Every verb.
-    pub const ALL: [Self; 3] = [Self::Offer, Self::Cancel, Self::Site];
+    pub const ALL: [Self; 5] = [
+        Self::Offer,
+        Self::Cancel,
+        Self::Pause,
+        Self::Resume,
+        Self::Site,
+    ];
 
     /// The verb as a chunk of a key.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Offer => "offer",
             Self::Cancel => "cancel",
+            Self::Pause => "pause",
+            Self::Resume => "resume",
             Self::Site => "site",
         }
     }
@@ -73,6 +86,11 @@ pub fn commands(site: &SiteId, robot: &RobotId) -> String {
     robot_key(site, robot, "cmd/*")
 }
 
+/// Where the server publishes its pulse.
+pub fn pulse(site: &SiteId) -> String {
+    format!("{ROOT}/{site}/server/pulse")
+}
+
 /// Where a robot introduces itself.
 pub fn hello(site: &SiteId, robot: &RobotId) -> String {
     format!("{ROOT}/{site}/server/hello/{robot}")
@@ -105,6 +123,8 @@ pub enum Key {
     Friction(SiteId, RobotId),
     /// A command to a robot.
     Command(SiteId, RobotId, Verb),
+    /// The server's pulse.
+    Pulse(SiteId),
     /// An introduction.
     Hello(SiteId, RobotId),
     /// An upload.
@@ -129,6 +149,7 @@ impl Key {
             ["robots", robot, "cmd", verb] => {
                 Self::Command(site, robot.parse().ok()?, Verb::from_chunk(verb)?)
             }
+            ["server", "pulse"] => Self::Pulse(site),
             ["server", "hello", robot] => Self::Hello(site, robot.parse().ok()?),
             ["server", "ingest", robot] => Self::Ingest(site, robot.parse().ok()?),
             _ => return None,
@@ -159,6 +180,7 @@ mod tests {
                 command(&site, &robot, Verb::Offer),
                 Key::Command(pair().0, pair().1, Verb::Offer),
             ),
+            (pulse(&site), Key::Pulse(site.clone())),
             (hello(&site, &robot), Key::Hello(pair().0, pair().1)),
             (ingest(&site, &robot), Key::Ingest(pair().0, pair().1)),
         ];

@@ -4,12 +4,26 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use crate::geometry::Point;
 use crate::ids::{BootId, MissionId, PlanHash, RobotId, SiteId};
 use crate::robot::MissionProgress;
 use crate::trajectory::Trajectory;
 
 /// Longest reason or detail in a mission's history, in characters.
 pub const REASON_LENGTH_MAX: usize = 500;
+/// Lowest priority of a mission.
+pub const PRIORITY_MIN: i32 = -100;
+/// Highest priority of a mission.
+pub const PRIORITY_MAX: i32 = 100;
+/// Shortest silence after which a robot may be told to stop, seconds: several heartbeats.
+pub const LINK_SILENCE_MIN_S: f64 = 1.0;
+/// Longest silence after which a robot may be told to stop, and longest bound of a lost robot,
+/// seconds.
+pub const LINK_SILENCE_MAX_S: f64 = 86_400.0;
+/// Most points of a driven path; a longer one is thinned further.
+pub const DRIVEN_POINTS_MAX: usize = 2_000;
+/// Most samples of θ in a quality report; the rest is thinned.
+pub const THETA_SAMPLES_MAX: usize = 64;
 
 /// Where a mission stands. The last five are terminal: they never change again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
@@ -94,6 +108,87 @@ pub struct CreateMission {
     /// Past this time it never starts; it may wait for ever when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub latest_start: Option<Timestamp>,
+    /// Missions of a higher priority are driven first, equal ones in their order; 0 when absent.
+    #[serde(default)]
+    #[schema(minimum = -100, maximum = 100)]
+    pub priority: i32,
+    /// What becomes of the robot's other missions; it waits behind them when absent.
+    #[serde(default)]
+    pub start_policy: StartPolicy,
+    /// What the robot does when it no longer hears the server; it goes on when absent.
+    #[serde(default)]
+    pub link_policy: LinkPolicy,
+    /// How long the robot may stay away before its mission fails as `robot_lost`, seconds. When
+    /// absent: what was left of the plan and a margin, or the silence after which it stops and a
+    /// margin.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 1.0, maximum = 86_400.0)]
+    pub lost_after_s: Option<f64>,
+}
+
+/// What becomes of a robot's other missions when one is asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum StartPolicy {
+    /// The new one waits for its turn.
+    #[default]
+    Append,
+    /// The others are cancelled: the one in hand, and all that wait.
+    Replace,
+    /// The new one is refused if the robot has any other that has not ended.
+    Refuse,
+}
+
+/// What a robot does with its mission when it no longer hears the server.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum LinkPolicy {
+    /// It goes on to the end of the mission.
+    #[default]
+    Continue,
+    /// It brakes along its path and ends the mission as failed, after so long a silence.
+    StopAfter {
+        /// The silence, seconds, [`LINK_SILENCE_MIN_S`] to [`LINK_SILENCE_MAX_S`].
+        #[schema(minimum = 1.0, maximum = 86_400.0)]
+        silence_s: f64,
+    },
+}
+
+impl LinkPolicy {
+    /// Checks its figure.
+    ///
+    /// # Errors
+    /// A sentence, if the silence is out of range.
+    pub fn validate(&self) -> Result<(), String> {
+        match *self {
+            Self::StopAfter { silence_s }
+                if !(LINK_SILENCE_MIN_S..=LINK_SILENCE_MAX_S).contains(&silence_s) =>
+            {
+                Err(format!(
+                    "silence_s must be {LINK_SILENCE_MIN_S} to {LINK_SILENCE_MAX_S}, not {silence_s}"
+                ))
+            }
+            Self::Continue | Self::StopAfter { .. } => Ok(()),
+        }
+    }
+}
+
+/// The body of `POST /v1/missions/{mission}/replace`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ReplaceMission {
+    /// What is to be driven from where the robot is then.
+    pub trajectory: Trajectory,
+}
+
+/// A new revision of a mission that its robot does not hold whole yet.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Replacement {
+    /// The revision that it will be.
+    pub revision: u32,
+    /// What exactly it is.
+    pub plan_hash: PlanHash,
+    /// What is to be driven.
+    pub trajectory: Trajectory,
 }
 
 /// A mission as the server keeps it.
@@ -109,14 +204,26 @@ pub struct Mission {
     pub state: MissionState,
     /// Why it stands there, for people.
     pub reason: Option<String>,
+    /// Why it stands there, for programs.
+    pub cause: Cause,
+    /// Whether it is to be paused; the robot has not answered yet while the state says otherwise.
+    pub pause_wanted: bool,
     /// Counts changes of what is to be driven.
     pub revision: u32,
     /// What exactly is to be driven.
     pub plan_hash: PlanHash,
     /// What is to be driven.
     pub trajectory: Trajectory,
+    /// A new revision that the robot does not hold whole yet.
+    pub replacement: Option<Replacement>,
     /// Past this time it never starts.
     pub latest_start: Option<Timestamp>,
+    /// Missions of a higher priority are driven first.
+    pub priority: i32,
+    /// What the robot does when it no longer hears the server.
+    pub link_policy: LinkPolicy,
+    /// How long the robot may stay away before it counts as lost, seconds, if that was said.
+    pub lost_after_s: Option<f64>,
     /// The run of the agent that took it.
     pub boot: Option<BootId>,
     /// What the robot planned.
@@ -139,6 +246,57 @@ pub struct MissionDetail {
     pub mission: Mission,
     /// What happened to it, oldest first.
     pub events: Vec<MissionEvent>,
+    /// How well it was driven, once the robot has said so.
+    pub quality: Option<MissionQuality>,
+    /// Where the robot really was, once it has said so.
+    pub driven: Option<DrivenPath>,
+}
+
+/// How well a mission was driven, measured by its robot.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
+pub struct MissionQuality {
+    /// Time from the first wheel command to the end, pauses included, seconds.
+    pub duration_s: f64,
+    /// Time that it stood paused, seconds.
+    pub paused_s: f64,
+    /// Distance that the robot travelled, metres.
+    pub distance_m: f64,
+    /// Root of the mean square of the distance from the path, metres.
+    pub cross_track_rms_m: f64,
+    /// Largest distance from the path, metres.
+    pub cross_track_max_m: f64,
+    /// Share of the ticks in which a wheel was at its limit, 0 to 1.
+    pub saturated_ratio: f64,
+    /// How often the ground gave way: changes of friction, and slip beyond the model.
+    pub slip_events: u32,
+    /// Share of the ticks in which the safety gate reduced the command, 0 to 1.
+    pub gate_reduced_ratio: f64,
+    /// How often the safety gate began to hold the robot.
+    pub gate_stops: u32,
+    /// θ along the way, at most [`THETA_SAMPLES_MAX`].
+    pub theta: Vec<ThetaSample>,
+}
+
+/// Friction at one place of a mission.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ThetaSample {
+    /// Arc length, metres.
+    pub driven_m: f64,
+    /// θ̂ of the tracking law.
+    pub theta_loop: f64,
+    /// Measured θ, when it was known.
+    pub theta_measured: Option<f64>,
+    /// Standard deviation of measured θ.
+    pub theta_sd: Option<f64>,
+}
+
+/// Where a robot really was during a mission.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
+pub struct DrivenPath {
+    /// No place of the whole path is further than this from the line through the points, metres.
+    pub tolerance_m: f64,
+    /// The points in their order, at most [`DRIVEN_POINTS_MAX`].
+    pub points: Vec<Point>,
 }
 
 /// What a robot planned for a mission.
@@ -150,6 +308,122 @@ pub struct PlanSummary {
     pub duration_s: f64,
     /// Fastest planned speed, m/s.
     pub speed_peak_m_s: f64,
+}
+
+/// Why a mission moved, for programs. Each edge of the server's table has one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Cause {
+    /// It was asked for.
+    #[default]
+    Requested,
+    /// The server offers it to its robot.
+    Offered,
+    /// The robot cannot take it now; it waits again.
+    Returned,
+    /// The robot has taken it.
+    Accepted,
+    /// The robot will never take it.
+    Rejected,
+    /// A pause is wanted.
+    PauseRequested,
+    /// The robot holds it, standing.
+    Paused,
+    /// It is wanted to go on.
+    ResumeRequested,
+    /// The robot drives it again.
+    Resumed,
+    /// Another trajectory is wanted.
+    ReplaceRequested,
+    /// The robot holds the new revision.
+    Replaced,
+    /// The robot refused the new revision, or it came too late; the old one stands.
+    ReplaceRefused,
+    /// Its end is wanted.
+    CancelRequested,
+    /// Another mission was asked for in its place.
+    Superseded,
+    /// It ended by request.
+    Cancelled,
+    /// It was driven to its end.
+    Succeeded,
+    /// The robot gave it up.
+    Failed,
+    /// Its latest start passed.
+    Expired,
+    /// The robot stayed away past the bound.
+    RobotLost,
+    /// The agent began a new run without it.
+    AgentRestarted,
+    /// The robot is there, does not have it, and has not said how it ended.
+    RobotForgot,
+    /// The robot was retired.
+    RobotRetired,
+    /// Something was only noted, such as a word that came too late.
+    Noted,
+}
+
+impl Cause {
+    /// Every cause.
+    pub const ALL: [Self; 23] = [
+        Self::Requested,
+        Self::Offered,
+        Self::Returned,
+        Self::Accepted,
+        Self::Rejected,
+        Self::PauseRequested,
+        Self::Paused,
+        Self::ResumeRequested,
+        Self::Resumed,
+        Self::ReplaceRequested,
+        Self::Replaced,
+        Self::ReplaceRefused,
+        Self::CancelRequested,
+        Self::Superseded,
+        Self::Cancelled,
+        Self::Succeeded,
+        Self::Failed,
+        Self::Expired,
+        Self::RobotLost,
+        Self::AgentRestarted,
+        Self::RobotForgot,
+        Self::RobotRetired,
+        Self::Noted,
+    ];
+
+    /// The cause's name on the wire and in the database.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Requested => "requested",
+            Self::Offered => "offered",
+            Self::Returned => "returned",
+            Self::Accepted => "accepted",
+            Self::Rejected => "rejected",
+            Self::PauseRequested => "pause_requested",
+            Self::Paused => "paused",
+            Self::ResumeRequested => "resume_requested",
+            Self::Resumed => "resumed",
+            Self::ReplaceRequested => "replace_requested",
+            Self::Replaced => "replaced",
+            Self::ReplaceRefused => "replace_refused",
+            Self::CancelRequested => "cancel_requested",
+            Self::Superseded => "superseded",
+            Self::Cancelled => "cancelled",
+            Self::Succeeded => "succeeded",
+            Self::Failed => "failed",
+            Self::Expired => "expired",
+            Self::RobotLost => "robot_lost",
+            Self::AgentRestarted => "agent_restarted",
+            Self::RobotForgot => "robot_forgot",
+            Self::RobotRetired => "robot_retired",
+            Self::Noted => "noted",
+        }
+    }
+
+    /// The cause of that name.
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|cause| cause.as_str() == name)
+    }
 }
 
 /// Who caused an event.
@@ -193,6 +467,36 @@ pub struct MissionEvent {
     pub from: Option<MissionState>,
     /// The state after; the same as before where only something was noted.
     pub to: MissionState,
+    /// Why, for programs.
+    pub cause: Cause,
     /// Why, for people.
     pub reason: Option<String>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_in_the_database_are_those_on_the_wire() {
+        for cause in Cause::ALL {
+            let name = serde_json::to_value(cause).unwrap();
+            assert_eq!(name, cause.as_str());
+            assert_eq!(Cause::from_name(cause.as_str()), Some(cause));
+        }
+        for state in MissionState::ALL {
+            assert_eq!(serde_json::to_value(state).unwrap(), state.as_str());
+            assert_eq!(MissionState::from_name(state.as_str()), Some(state));
+        }
+    }
+
+    #[test]
+    fn a_silence_that_is_no_time_is_refused() {
+        for silence_s in [f64::NAN, 0.0, -1.0, 0.9, 1e9] {
+            assert!(LinkPolicy::StopAfter { silence_s }.validate().is_err());
+        }
+        assert!(LinkPolicy::StopAfter { silence_s: 5.0 }.validate().is_ok());
+        let said: LinkPolicy = serde_json::from_str("\"continue\"").unwrap();
+        assert_eq!(said, LinkPolicy::default());
+    }
 }

@@ -3,6 +3,9 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use crate::mission::MissionState;
+use crate::trajectory::Place;
+
 /// The media type of a problem.
 pub const PROBLEM_MEDIA_TYPE: &str = "application/problem+json";
 
@@ -42,6 +45,22 @@ pub enum ProblemType {
     BeyondLimits,
     #[serde(rename = "/problems/mission-ended")]
     MissionEnded,
+    #[serde(rename = "/problems/mission-state")]
+    MissionState,
+    #[serde(rename = "/problems/robot-busy")]
+    RobotBusy,
+    #[serde(rename = "/problems/robot-retired")]
+    RobotRetired,
+    #[serde(rename = "/problems/robot-cannot")]
+    RobotCannot,
+    #[serde(rename = "/problems/unknown-alert")]
+    UnknownAlert,
+    #[serde(rename = "/problems/idempotency-key-in-flight")]
+    IdempotencyKeyInFlight,
+    #[serde(rename = "/problems/idempotency-key-reused")]
+    IdempotencyKeyReused,
+    #[serde(rename = "/problems/invalid-header")]
+    InvalidHeader,
     #[serde(rename = "/problems/too-many")]
     TooMany,
     #[serde(rename = "/problems/timeout")]
@@ -54,7 +73,7 @@ pub enum ProblemType {
 
 impl ProblemType {
     /// Every kind.
-    pub const ALL: [Self; 20] = [
+    pub const ALL: [Self; 28] = [
         Self::MalformedBody,
         Self::InvalidBody,
         Self::UnknownField,
@@ -71,6 +90,14 @@ impl ProblemType {
         Self::AlreadyExists,
         Self::BeyondLimits,
         Self::MissionEnded,
+        Self::MissionState,
+        Self::RobotBusy,
+        Self::RobotRetired,
+        Self::RobotCannot,
+        Self::UnknownAlert,
+        Self::IdempotencyKeyInFlight,
+        Self::IdempotencyKeyReused,
+        Self::InvalidHeader,
         Self::TooMany,
         Self::Timeout,
         Self::Unavailable,
@@ -96,6 +123,14 @@ impl ProblemType {
             Self::AlreadyExists => "The identifier is in use",
             Self::BeyondLimits => "The robot cannot do this",
             Self::MissionEnded => "The mission has ended",
+            Self::MissionState => "The mission's present state does not allow this",
+            Self::RobotBusy => "The robot has another mission",
+            Self::RobotRetired => "The robot is retired",
+            Self::RobotCannot => "The robot has no such ability",
+            Self::UnknownAlert => "The alert is not known",
+            Self::IdempotencyKeyInFlight => "A request with this key is being answered",
+            Self::IdempotencyKeyReused => "This key was used for another request",
+            Self::InvalidHeader => "A header does not say something possible",
             Self::TooMany => "There are too many of these",
             Self::Timeout => "The answer took too long",
             Self::Unavailable => "The server cannot answer now",
@@ -120,4 +155,10 @@ pub struct ProblemBody {
     /// Where in the body, as a path such as `trajectory.circle.radius_m`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub field: Option<String>,
+    /// The mission's present state, where that is what forbids it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub state: Option<MissionState>,
+    /// Where along the way it cannot be driven.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub place: Option<Place>,
 }

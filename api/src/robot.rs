@@ -8,7 +8,8 @@ use uuid::Uuid;
 use crate::friction::LiveFriction;
 use crate::geometry::{Pose, Twist};
 use crate::ids::{
-    BootId, ConfigurationId, DERIVED_NAMESPACE, MissionId, PlanHash, RobotId, SiteId,
+    AlertCode, AlertId, BootId, ConfigurationId, DERIVED_NAMESPACE, MissionId, PlanHash, RobotId,
+    SiteId,
 };
 
 /// A robot's model and tyres, as its agent declares them.
@@ -75,16 +76,158 @@ pub enum RobotMode {
     Fault,
 }
 
-/// Whether the server hears a robot.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+/// Whether the server hears a robot. The heartbeat of its control loop decides.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LinkState {
-    /// Heard within the last second and a half.
+    /// Heard a moment ago.
     Online,
-    /// Present on the network, but silent for longer than that.
+    /// Some heartbeats are missing.
     Stale,
-    /// Not on the network.
+    /// Off the network, or silent for more than a second.
     Offline,
+}
+
+impl LinkState {
+    /// Every state.
+    pub const ALL: [Self; 3] = [Self::Online, Self::Stale, Self::Offline];
+
+    /// The state's name on the wire.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Online => "online",
+            Self::Stale => "stale",
+            Self::Offline => "offline",
+        }
+    }
+}
+
+/// Why a robot is not heard.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum LinkCause {
+    /// It is on the network, and its first heartbeat has not come yet.
+    Joining,
+    /// It left the network while it was heard: its agent or the whole robot is off.
+    RobotOff,
+    /// It went silent first: the network between it and the server is down.
+    LinkDown,
+    /// Its agent speaks, and its control loop stands still.
+    LoopStopped,
+    /// The server itself was down, and has not heard it since.
+    ServerRestarted,
+}
+
+/// What a base and its agent can do beyond driving missions to their end.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
+pub struct Capabilities {
+    /// It can pause a mission and drive it on.
+    #[serde(default)]
+    pub pause: bool,
+    /// It can swap a mission for a new revision while it drives.
+    #[serde(default)]
+    pub replace: bool,
+    /// It measures its battery.
+    #[serde(default)]
+    pub battery: bool,
+    /// Rate of the control loop, Hz.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rate_hz: Option<f64>,
+    /// The kind of base, for people.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub base: Option<String>,
+}
+
+/// A robot's battery.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Battery {
+    /// Charge, 0 to 1.
+    pub charge_ratio: f64,
+    /// Voltage, volts.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub voltage_v: Option<f64>,
+    /// Whether it is being charged.
+    #[serde(default)]
+    pub charging: bool,
+}
+
+/// Most alerts of one robot at a time.
+pub const ALERTS_MAX: usize = 32;
+/// Longest text of an alert, in characters.
+pub const ALERT_TEXT_MAX: usize = 300;
+
+/// How much an alert matters.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
+)]
+#[serde(rename_all = "snake_case")]
+pub enum Severity {
+    /// Worth a look.
+    Warning,
+    /// The robot cannot go on without a person.
+    Critical,
+}
+
+impl Severity {
+    /// The severity's name on the wire and in the database.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Warning => "warning",
+            Self::Critical => "critical",
+        }
+    }
+
+    /// The severity of that name.
+    pub fn from_name(name: &str) -> Option<Self> {
+        [Self::Warning, Self::Critical]
+            .into_iter()
+            .find(|severity| severity.as_str() == name)
+    }
+}
+
+/// Something that needs a person's attention now, as the robot says it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct AlertReport {
+    /// What it is, stable, for programs: `[a-z0-9-]{1,63}`, such as `battery-low`.
+    pub code: AlertCode,
+    /// How much it matters.
+    pub severity: Severity,
+    /// What it is, for people; at most [`ALERT_TEXT_MAX`] characters.
+    pub text: String,
+}
+
+/// An alert as the server keeps it: raised, acknowledged, cleared, each once.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Alert {
+    /// The alert's identifier; a code that is raised again later is another alert.
+    pub id: AlertId,
+    /// The robot's site.
+    pub site: SiteId,
+    /// The robot.
+    pub robot: RobotId,
+    /// What it is, for programs.
+    pub code: AlertCode,
+    /// How much it matters.
+    pub severity: Severity,
+    /// What it is, for people.
+    pub text: String,
+    /// When the server first heard of it.
+    pub raised_at: Timestamp,
+    /// When a person said to have seen it.
+    pub acknowledged_at: Option<Timestamp>,
+    /// When the robot no longer said it.
+    pub cleared_at: Option<Timestamp>,
+}
+
+/// The body of `PATCH /v1/sites/{site}/robots/{robot}`; what is absent stays as it is.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+pub struct ChangeRobot {
+    /// Another name for people. The identifier never changes: it is in every key and record.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+    /// A retired robot gets no missions and is not listed; what it measured stays.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub retired: Option<bool>,
 }
 
 /// A value with its age when the answer was made.
@@ -112,12 +255,18 @@ impl<T> Aged<T> {
 pub struct Robot {
     /// The robot's identifier within its site.
     pub id: RobotId,
+    /// Its name for people; the identifier until somebody renames it.
+    pub name: String,
+    /// When it was retired, if it was.
+    pub retired_at: Option<Timestamp>,
     /// The site it belongs to.
     pub site: SiteId,
     /// Model and tyres as last declared.
     pub model: RobotModel,
     /// The identifier of that model and those tyres.
     pub configuration: ConfigurationId,
+    /// What the base and its agent can do.
+    pub capabilities: Capabilities,
     /// Version of the agent.
     pub agent_version: String,
     /// First hello.
@@ -126,6 +275,10 @@ pub struct Robot {
     pub last_hello_at: Timestamp,
     /// Whether the server hears it now.
     pub link: LinkState,
+    /// Why it is not heard; `null` while it is online.
+    pub link_cause: Option<LinkCause>,
+    /// Alerts that have not cleared.
+    pub alerts: Vec<Alert>,
     /// What it said last; `null` if it has said nothing since the server started.
     pub live: Option<RobotLive>,
 }
@@ -139,6 +292,9 @@ pub struct RobotLive {
     pub heard_age_ms: u64,
     /// The robot's own wall clock in that state; it may be wrong.
     pub robot_time: Timestamp,
+    /// How far the robot's wall clock is ahead of the server's, milliseconds, less than a
+    /// heartbeat's way through the network off. Both may be wrong.
+    pub clock_offset_ms: i64,
     /// What the agent is doing.
     pub mode: RobotMode,
     /// What is broken, if anything.
@@ -155,6 +311,8 @@ pub struct RobotLive {
     pub outbox: OutboxStatus,
     /// The control loop.
     pub control_loop: LoopStatus,
+    /// The battery, if the base measures it.
+    pub battery: Option<Battery>,
 }
 
 /// How far a mission has come on the robot.
@@ -172,6 +330,9 @@ pub struct MissionProgress {
     pub length_m: f64,
     /// Distance from the path, metres, positive to its left.
     pub cross_track_m: f64,
+    /// Whether it is held by request: the robot brakes for it, or stands.
+    #[serde(default)]
+    pub paused: bool,
 }
 
 /// The state of a robot's durable store of measurements.
@@ -199,4 +360,16 @@ pub struct LoopStatus {
     /// Commands refused since the start: they did not parse, or were of another version.
     #[serde(default)]
     pub commands_refused: u64,
+    /// Segments lost since the start, because nobody took them from the loop in time.
+    #[serde(default)]
+    pub lost_segments: u64,
+    /// Measurements since the start that belong to no cell, for want of a site or a position.
+    #[serde(default)]
+    pub unplaced_blocks: u64,
+    /// Samples of the base lost since the start, because newer ones came before a tick.
+    #[serde(default)]
+    pub lost_samples: u64,
+    /// Commands of the server lost since the start for want of room; it asks again.
+    #[serde(default)]
+    pub lost_commands: u64,
 }

@@ -66,7 +66,7 @@ pub(crate) enum RemoteCommand {
     Robots(RobotsArguments),
     /// Send a robot on a circle or through waypoints
     Send(SendArguments),
-    /// List missions, show one with its history, or cancel one
+    /// List missions, show one with its history, pause, resume or cancel one
     Missions(MissionsArguments),
     /// List the terrains of a site
     Terrains(TerrainsArguments),
@@ -137,6 +137,15 @@ pub(crate) struct Order {
     /// Never start later than this from now
     #[arg(long, value_name = "TIME", value_parser = duration)]
     pub(crate) start_within: Option<Duration>,
+    /// Missions of a higher priority are driven first
+    #[arg(long, default_value_t = 0, allow_hyphen_values = true)]
+    pub(crate) priority: i32,
+    /// Swap this mission for the new trajectory instead of queueing another
+    #[arg(long, value_name = "MISSION")]
+    pub(crate) replaces: Option<MissionId>,
+    /// Only tell what it would ask of the robot; nothing moves
+    #[arg(long, conflicts_with_all = ["replaces", "wait"])]
+    pub(crate) check: bool,
     /// Wait until the mission has ended, showing its progress
     #[arg(long)]
     pub(crate) wait: bool,
@@ -205,6 +214,16 @@ pub(crate) enum MissionsAction {
         /// The mission
         mission: MissionId,
     },
+    /// Hold a mission: its robot brakes along the path and stands
+    Pause {
+        /// The mission
+        mission: MissionId,
+    },
+    /// Let a paused mission go on
+    Resume {
+        /// The mission
+        mission: MissionId,
+    },
     /// Cancel a mission: its robot brakes along the path
     Cancel {
         /// The mission
@@ -232,9 +251,12 @@ pub(crate) struct FrictionArguments {
 
 #[derive(Debug, Args)]
 pub(crate) struct WatchArguments {
-    /// Time between two looks
+    /// Least time between two pictures
     #[arg(long, value_name = "TIME", default_value = "500ms", value_parser = look_interval)]
     pub(crate) every: Duration,
+    /// Only this robot
+    #[arg(long)]
+    pub(crate) robot: Option<RobotId>,
     #[command(flatten)]
     pub(crate) connection: Connection,
 }

@@ -2,19 +2,22 @@
 
 use std::time::Duration;
 
-use reqwest::{Method, RequestBuilder, StatusCode};
+use reqwest::{Method, RequestBuilder, Response, StatusCode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tread_api::friction::{CellFriction, TerrainFriction};
 use tread_api::ids::{MissionId, RobotId, SiteId, TerrainId};
-use tread_api::mission::{CreateMission, Mission, MissionDetail};
+use tread_api::mission::{CreateMission, Mission, MissionDetail, ReplaceMission};
 use tread_api::page::{PAGE_LIMIT_MAX, Page};
 use tread_api::problem::ProblemBody;
 use tread_api::robot::Robot;
 use tread_api::terrain::{CreateTerrain, Terrain};
+use tread_api::trajectory::{CheckTrajectory, TrajectoryCheck};
 
 /// Longest wait for an answer; planning the longest path takes a while.
 const ANSWER_WAIT_MAX: Duration = Duration::from_secs(30);
+/// Longest life of one stream of events; then it is opened again where it ended.
+const STREAM_WAIT_MAX: Duration = Duration::from_hours(24);
 /// Longest wait for a connection.
 const CONNECT_WAIT_MAX: Duration = Duration::from_secs(3);
 /// Most pages of one list that are followed.
@@ -202,9 +205,69 @@ impl Client {
         self.get(&format!("/v1/missions/{mission}")).await
     }
 
-    pub(crate) async fn cancel_mission(&self, mission: MissionId) -> Result<Mission, ClientError> {
-        self.send(self.request(Method::POST, &format!("/v1/missions/{mission}/cancel")))
+    /// Wants a mission paused, resumed or cancelled.
+    pub(crate) async fn act(&self, mission: MissionId, verb: &str) -> Result<Mission, ClientError> {
+        let path = format!("/v1/missions/{mission}/{verb}");
+        self.send(self.request(Method::POST, &path)).await
+    }
+
+    /// Wants a mission to be another trajectory.
+    pub(crate) async fn replace_mission(
+        &self,
+        mission: MissionId,
+        replacement: &ReplaceMission,
+    ) -> Result<Mission, ClientError> {
+        self.post(&format!("/v1/missions/{mission}/replace"), replacement)
             .await
+    }
+
+    /// What a trajectory would ask of its robot.
+    pub(crate) async fn check_trajectory(
+        &self,
+        check: &CheckTrajectory,
+    ) -> Result<TrajectoryCheck, ClientError> {
+        self.post("/v1/trajectories/check", check).await
+    }
+
+    /// Opens the stream of events of a site, from where `last` points.
+    pub(crate) async fn events(
+        &self,
+        site: &SiteId,
+        robot: Option<&RobotId>,
+        last: Option<&str>,
+    ) -> Result<Response, ClientError> {
+        let mut query = vec![
+            ("site", site.to_string()),
+            ("topics", "robots,missions".to_owned()),
+        ];
+        query.extend(robot.map(|robot| ("robots", robot.to_string())));
+        // The stream has no end of its own.
+        let mut request = self
+            .request(Method::GET, "/v1/events")
+            .query(&query)
+            .timeout(STREAM_WAIT_MAX);
+        if let Some(last) = last {
+            request = request.header("last-event-id", last);
+        }
+        let unreachable = |cause| ClientError::Unreachable {
+            address: self.address.clone(),
+            cause,
+        };
+        let response = request.send().await.map_err(unreachable)?;
+        let status = response.status();
+        if status.is_success() {
+            return Ok(response);
+        }
+        let body = response.bytes().await.map_err(unreachable)?;
+        let problem =
+            serde_json::from_slice(&body).map_err(|cause| ClientError::NotUnderstood {
+                address: self.address.clone(),
+                status,
+                cause,
+            })?;
+        Err(ClientError::Refused {
+            problem: Box::new(problem),
+        })
     }
 
     pub(crate) async fn terrain_friction(

@@ -221,6 +221,11 @@ impl Follower {
         &self.plan
     }
 
+    /// What walks along the plan.
+    pub fn governor(&self) -> &Governor {
+        &self.governor
+    }
+
     /// Where the mission is.
     pub fn status(&self) -> FollowerStatus {
         self.status

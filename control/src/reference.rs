@@ -13,6 +13,10 @@ use crate::robot::RobotModel;
 const SPEED_FLOOR_M_S: f64 = 0.05;
 /// A reference slower than this is brought to rest on a stop, metres per second.
 const REST_M_S: f64 = 2.0e-3;
+/// Step in which coming to rest is foretold, seconds.
+const REST_STEP_S: f64 = 0.02;
+/// Most such steps.
+const REST_STEPS_MAX: u32 = 1_000;
 /// Gain from a gap in σ to its rate, per second.
 const RATE_GAIN_1_S: f64 = 3.0;
 /// Fastest rise of σ, per second.
@@ -219,6 +223,20 @@ impl Governor {
         }
         self.clock_s = (self.clock_s + 0.5 * (before + self.rate) * dt_s).min(plan.duration_s());
         self.reference(&plan.sample(self.clock_s))
+    }
+
+    /// Where the reference comes to rest if it is held from now on.
+    pub fn rest(mut self, plan: &Plan) -> Pose {
+        self.set_rate_cap(0.0);
+        let input = GovernorInput::default();
+        let mut reference = self.sample(plan);
+        for _ in 0..REST_STEPS_MAX {
+            reference = self.step(plan, &input, REST_STEP_S);
+            if reference.speed_m_s < REST_M_S || self.is_at_end(plan) {
+                break;
+            }
+        }
+        reference.pose
     }
 
     /// The present reference.

@@ -171,12 +171,18 @@ impl RobotModel {
     /// Half of `μg` each along and across the path: both at once leave three tenths for the turning
     /// of the wheels against the ground, and for feedback.
     pub(crate) fn within_grip(&self, mu_peak: f64) -> Self {
-        let most_m_s2 = 0.5 * mu_peak * GRAVITY_M_S2;
+        let most_m_s2 = Self::within_grip_m_s2(mu_peak);
         let mut spec = self.spec;
         let limits = &mut spec.limits;
         limits.linear_acceleration_max_m_s2 = limits.linear_acceleration_max_m_s2.min(most_m_s2);
         limits.lateral_acceleration_max_m_s2 = limits.lateral_acceleration_max_m_s2.min(most_m_s2);
         Self { spec }
+    }
+
+    /// Acceleration along or across the path that a plan may ask of ground with this peak friction,
+    /// metres per second squared: half of the peak for each.
+    pub(crate) fn within_grip_m_s2(mu_peak: f64) -> f64 {
+        0.5 * mu_peak * GRAVITY_M_S2
     }
 
     /// How much wider than W the robot turns at low speed: `W_eff/W = 1 + (L/W)²`, whatever the

@@ -6,16 +6,17 @@
 //!      └──commands── dispatcher ◄───────────────────────────┘
 //! ```
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use jiff::SignedDuration;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tracing::{error, info, warn};
 use tread_api::ids::BootId;
-use tread_api::robot::OutboxStatus;
+use tread_api::robot::{Capabilities, OutboxStatus};
 use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
 use tread_api::wire::state::{FrictionReport, RobotState};
@@ -30,7 +31,7 @@ use crate::control_loop::{self, BRAKING_MAX};
 use crate::dispatcher::{Dispatcher, Missions, SiteCell};
 use crate::drive::simulated::{SimMode, SimulatedDrive, SimulatedDriveError};
 use crate::fleet::uploader::{self, Backoff};
-use crate::fleet::{self, FleetLink, Identity, LinkError};
+use crate::fleet::{self, FleetLink, Identity, LinkError, Note, Noted};
 use crate::geometry::control_model;
 use crate::missions::memory::{Memory, MemoryError};
 use crate::outbox::{Outbox, OutboxError};
@@ -40,6 +41,8 @@ use crate::supervisor::{PartEnded, Supervisor};
 
 /// Longest time that a stopping agent waits for the server to take its last records.
 const LAST_UPLOAD_MAX: Duration = Duration::from_secs(1);
+/// Longest pause before an agent first looks for its server.
+const START_JITTER_MAX: Duration = Duration::from_millis(300);
 /// Pause between two looks at what still waits.
 const LAST_UPLOAD_POLL: Duration = Duration::from_millis(10);
 
@@ -95,7 +98,8 @@ impl Agent {
     /// # Errors
     /// [`StartError`]: nothing is left running then.
     pub fn start(config: AgentConfig) -> Result<RunningAgent, StartError> {
-        Self::start_with_clock(config, SystemClock::shared())
+        let ahead = SignedDuration::from_secs(config.drive.clock_ahead_s);
+        Self::start_with_clock(config, Arc::new(SystemClock::new().ahead_by(ahead)))
     }
 
     /// The same with a clock of the caller's.
@@ -115,7 +119,8 @@ impl Agent {
             simulated.start,
             simulated.seed,
             SimMode::Auto,
-        )?;
+        )?
+        .with_charge(simulated.battery_charge_ratio);
         let boot = BootId::from_uuid(Uuid::new_v4());
         let outbox_folder = config.data_dir.join("outbox");
         let outbox = Outbox::open(&outbox_folder, config.outbox, config.robot.clone(), boot)?;
@@ -171,6 +176,7 @@ impl Agent {
             rate_hz: config.rate_hz,
             states: AtomicU64::new(0),
             frictions: AtomicU64::new(0),
+            alerts: Mutex::default(),
         });
         let dispatcher = Arc::new(Dispatcher {
             boot,
@@ -180,6 +186,7 @@ impl Agent {
             site,
             shared: Arc::clone(&shared),
             to_loop: commands,
+            driving: Mutex::default(),
         });
         let (connected, is_connected) = watch::channel(false);
         let online = Online {
@@ -215,23 +222,37 @@ fn recall_missions(
     let mut holder = memory.load()?;
     let interrupted = holder.held().cloned();
     if let Some(held) = &interrupted {
+        let phase = holder.begin_end(held.mission, MissionPhase::Failed);
+        let reason = if phase == MissionPhase::Cancelled {
+            "cancelled on request; the agent restarted meanwhile"
+        } else {
+            "the agent restarted during the mission"
+        };
         let report = MissionReport {
             mission: held.mission,
             revision: held.revision,
             plan_hash: held.plan_hash,
             at: clock.wall(),
-            phase: MissionPhase::Failed,
-            reason: Some("the agent restarted during the mission".to_owned()),
+            phase,
+            reason: Some(reason.to_owned()),
             progress: None,
+            quality: None,
+            driven: None,
         };
         outbox.append(&RecordContent::Mission(report))?;
-        holder.end(held.mission, MissionPhase::Failed);
+        holder.end(held.mission, phase);
     }
     let missions = Missions::new(holder, memory);
     if interrupted.is_some() {
         missions.save();
     }
     Ok(missions)
+}
+
+/// A pause of its own for each run, below [`START_JITTER_MAX`]: the boot is random already.
+fn start_jitter(boot: BootId) -> Duration {
+    let share = f64::from(boot.as_uuid().as_fields().0) / f64::from(u32::MAX);
+    START_JITTER_MAX.mul_f64(share)
 }
 
 /// Everything that needs the network.
@@ -247,7 +268,19 @@ struct Online {
 
 impl Online {
     async fn run(self) {
-        let connecting = FleetLink::connect(&self.config.server, self.identity.clone(), &self.stop);
+        let (shared, clock) = (&self.dispatcher.shared, &self.dispatcher.clock);
+        let (shared, clock) = (Arc::clone(shared), Arc::clone(clock));
+        let note: Note = Arc::new(move |noted| match noted {
+            Noted::ServerHeard => shared.note_server_heard(clock.monotonic()),
+            Noted::CommandLost => Shared::count(&shared.lost_commands),
+        });
+        tokio::select! {
+            // Robots that get power together do not come all at once.
+            () = tokio::time::sleep(start_jitter(self.identity.boot)) => {}
+            () = self.stop.cancelled() => return,
+        }
+        let server = &self.config.server;
+        let connecting = FleetLink::connect(server, self.identity.clone(), note, &self.stop);
         let (link, commands) = match connecting.await {
             Ok(Some((link, commands))) => (Arc::new(link), commands),
             Ok(None) => return,
@@ -265,6 +298,7 @@ impl Online {
         let uploading = uploader::run(
             Arc::clone(&link),
             self.outbox.clone(),
+            Arc::clone(&self.dispatcher.clock),
             is_welcome,
             self.stop.clone(),
         );
@@ -312,6 +346,13 @@ impl Online {
             agent_version: env!("CARGO_PKG_VERSION").to_owned(),
             model: self.config.model.clone(),
             robot_time: self.dispatcher.clock.wall(),
+            capabilities: Capabilities {
+                pause: true,
+                replace: true,
+                battery: true,
+                rate_hz: Some(self.config.rate_hz),
+                base: Some("simulated".to_owned()),
+            },
         };
         match link.hello(&hello).await {
             Ok(welcome) => {

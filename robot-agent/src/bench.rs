@@ -20,6 +20,8 @@ use tread_control::plan::Plan;
 use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
+use crate::control_loop::active::Hold;
+use crate::control_loop::driven::Driven;
 use crate::control_loop::seam::{
     AgentEnds, ClosedSegment, EndReason, Job, LoopCommand, LoopEvent, seam,
 };
@@ -64,6 +66,12 @@ pub struct Bench {
     pub(crate) segments: Vec<ClosedSegment>,
     pub(crate) starts: Vec<MissionId>,
     pub(crate) ended: Vec<(MissionId, EndReason)>,
+    /// Pauses, resumptions and new revisions, as they were reported.
+    pub(crate) news: Vec<MissionPhase>,
+    /// Longest silence of the server that missions bear from now on.
+    pub(crate) silence_max: Option<Duration>,
+    /// The record of the last mission that ended.
+    pub(crate) last_driven: Option<Driven>,
     /// Distance from the path when the last mission ended.
     pub(crate) cross_track_m: f64,
 }
@@ -95,6 +103,33 @@ pub fn site_of(scenario: &Scenario) -> Result<SiteDefinition, String> {
     })
 }
 
+fn mission_of(number: u128) -> MissionId {
+    MissionId::from_uuid(Uuid::from_u128(number))
+}
+
+fn planned(
+    number: u128,
+    revision: u32,
+    trajectory: &Trajectory,
+    start: Pose,
+) -> Result<Box<Job>, BenchError> {
+    let impossible = |problem: String| BenchError::Impossible(problem);
+    let model = RobotModel::yi2007();
+    let plan = Plan::new(&control_trajectory(trajectory), start, &model)
+        .map_err(|refused| impossible(refused.to_string()))?;
+    let follower = Follower::new(plan, model, FollowerConfig::default())
+        .map_err(|refused| impossible(refused.to_string()))?;
+    Ok(Box::new(Job {
+        mission: mission_of(number),
+        revision,
+        plan_hash: PlanHash::from_uuid(Uuid::from_u128(number)),
+        follower,
+        start_by: None,
+        silence_max: None,
+        driven: Driven::new(),
+    }))
+}
+
 /// A base that says nothing.
 struct Silence;
 
@@ -123,6 +158,9 @@ impl Bench {
             segments: Vec::new(),
             starts: Vec::new(),
             ended: Vec::new(),
+            news: Vec::new(),
+            silence_max: None,
+            last_driven: None,
             cross_track_m: f64::NAN,
         })
     }
@@ -146,23 +184,48 @@ impl Bench {
         trajectory: &Trajectory,
         start_by: Option<Duration>,
     ) -> Result<MissionId, BenchError> {
-        let impossible = |problem: String| BenchError::Impossible(problem);
         let (pose, _) = self.ends.shared.snapshot().pose.ok_or(BenchError::NoPose)?;
-        let model = RobotModel::yi2007();
-        let plan = Plan::new(&control_trajectory(trajectory), pose, &model)
-            .map_err(|refused| impossible(refused.to_string()))?;
-        let follower = Follower::new(plan, model, FollowerConfig::default())
-            .map_err(|refused| impossible(refused.to_string()))?;
-        let mission = MissionId::from_uuid(Uuid::from_u128(number));
-        let job = Job {
-            mission,
-            revision: 1,
-            plan_hash: PlanHash::from_uuid(Uuid::from_u128(number)),
-            follower,
-            start_by,
-        };
-        self.ends.commands.send(LoopCommand::Start(Box::new(job)))?;
+        let mut job = planned(number, 1, trajectory, pose)?;
+        job.start_by = start_by;
+        job.silence_max = self.silence_max;
+        let mission = job.mission;
+        self.ends.commands.send(LoopCommand::Start(job))?;
         Ok(mission)
+    }
+
+    /// Holds the mission in hand for its next revision, plans that from where the robot comes to
+    /// stand, and hands it to the loop.
+    ///
+    /// # Errors
+    /// As [`Bench::begin`].
+    pub fn replace(
+        &mut self,
+        number: u128,
+        revision: u32,
+        driving: &Plan,
+        trajectory: &Trajectory,
+    ) -> Result<(), BenchError> {
+        let mission = mission_of(number);
+        let hold = LoopCommand::Hold(mission, Hold::Replacement);
+        self.ends.commands.send(hold)?;
+        self.tick();
+        let governor = self.ends.shared.snapshot().governor;
+        let rest = governor.ok_or(BenchError::Gone)?.rest(driving);
+        let job = planned(number, revision, trajectory, rest)?;
+        Ok(self.ends.commands.send(LoopCommand::Replace(job))?)
+    }
+
+    /// Pauses the mission in hand, or lets it go on.
+    ///
+    /// # Errors
+    /// [`BenchError::Gone`].
+    pub fn pause(&mut self, mission: MissionId, is_wanted: bool) -> Result<(), BenchError> {
+        let command = if is_wanted {
+            LoopCommand::Hold(mission, Hold::Pause)
+        } else {
+            LoopCommand::Release(mission, Hold::Pause)
+        };
+        Ok(self.ends.commands.send(command)?)
     }
 
     /// Moves the base on by one period.
@@ -204,10 +267,14 @@ impl Bench {
                     ..
                 } => {
                     self.ended.push((job.mission, reason));
+                    self.last_driven = Some(job.driven);
                     self.cross_track_m = progress.cross_track_m;
                 }
                 LoopEvent::Segment(segment) => self.segments.push(segment),
-                LoopEvent::Retired(_) => {}
+                LoopEvent::Paused { .. } => self.news.push(MissionPhase::Paused),
+                LoopEvent::Resumed { .. } => self.news.push(MissionPhase::Resumed),
+                LoopEvent::Replaced { .. } => self.news.push(MissionPhase::Replaced),
+                LoopEvent::CameTooLate(_) | LoopEvent::Retired(_) => {}
             }
         }
     }

@@ -5,7 +5,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 
 /// A source of both times. Monotonic time counts from the clock's own origin.
 pub trait Clock: std::fmt::Debug + Send + Sync {
@@ -19,9 +19,14 @@ pub trait Clock: std::fmt::Debug + Send + Sync {
 pub type SharedClock = Arc<dyn Clock>;
 
 /// The machine's clocks; the origin is when this was made.
+///
+/// The wall time is that of the origin and the monotonic time since: it never jumps during a run,
+/// even if the machine's clock is put right by days meanwhile. How far it is off is for the
+/// server to measure, and then holds for every record of the run.
 #[derive(Debug)]
 pub struct SystemClock {
     origin: Instant,
+    wall_origin: Timestamp,
 }
 
 impl SystemClock {
@@ -31,8 +36,23 @@ impl SystemClock {
             clippy::disallowed_methods,
             reason = "this is the clock that others inject"
         )]
-        let origin = Instant::now();
-        Self { origin }
+        let (origin, now) = (Instant::now(), SystemTime::now());
+        // A machine whose clock stands outside the years that RFC 3339 knows reads as 1970.
+        let wall_origin = Timestamp::try_from(now).unwrap_or(Timestamp::UNIX_EPOCH);
+        Self {
+            origin,
+            wall_origin,
+        }
+    }
+
+    /// The same, with a wall clock that is ahead by so much; a simulated fault.
+    #[must_use]
+    pub fn ahead_by(mut self, offset: SignedDuration) -> Self {
+        self.wall_origin = self
+            .wall_origin
+            .checked_add(offset)
+            .unwrap_or(Timestamp::UNIX_EPOCH);
+        self
     }
 
     /// The same, ready to be handed around.
@@ -53,13 +73,10 @@ impl Clock for SystemClock {
     }
 
     fn wall(&self) -> Timestamp {
-        #[expect(
-            clippy::disallowed_methods,
-            reason = "this is the clock that others inject"
-        )]
-        let now = SystemTime::now();
-        // A machine whose clock stands outside the years that RFC 3339 knows reads as 1970.
-        Timestamp::try_from(now).unwrap_or(Timestamp::UNIX_EPOCH)
+        // Saturates at the last year that RFC 3339 knows.
+        self.wall_origin
+            .checked_add(self.monotonic())
+            .unwrap_or(Timestamp::MAX)
     }
 }
 

@@ -1,33 +1,52 @@
-//! Answers the server's commands: offers, cancellations, new definitions of the site.
+//! Answers the server's commands: offers, pauses, cancellations, new definitions of the site.
 //!
-//! One command after the other, so that an offer that comes twice finds the first one decided.
-//! Planning and disks are waited for here, never in the loop.
+//! One offer after the other, so that one that comes twice finds the first one decided; all other
+//! commands beside them, so that no planning delays a cancellation. Planning and disks are waited
+//! for here, never in the loop.
+//!
+//! A new revision of the mission in hand is planned from where the robot comes to stand:
+//! ```text
+//! offer ─► loop holds the mission ─► foretell where it stands ─► plan ─► held ─► loop swaps there
+//!                                                                 └ refused: loop lets it go on
+//! ```
 
-use std::sync::atomic::Ordering;
 use std::sync::mpsc::{SyncSender, TrySendError};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tracing::{error, info, warn};
-use tread_api::ids::BootId;
+use tread_api::ids::{BootId, MissionId};
 use tread_api::keys::Verb;
-use tread_api::mission::PlanSummary;
+use tread_api::mission::{LinkPolicy, PlanSummary};
 use tread_api::robot::RobotMode;
-use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome};
+use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome, Pause, Resume};
 use tread_api::wire::hello::SiteDefinition;
 use tread_api::wire::{self, Refusal, WireError};
 use tread_control::follower::{Follower, FollowerConfig};
+use tread_control::geometry::Pose;
 use tread_control::plan::Plan;
 use tread_control::robot::RobotModel;
 
 use crate::clock::SharedClock;
+use crate::control_loop::active::Hold;
+use crate::control_loop::driven::Driven;
 use crate::control_loop::seam::{Job, LoopCommand, Shared};
 use crate::control_loop::site_view::SiteView;
-use crate::fleet::Commands;
+use crate::fleet::{Commands, IncomingCommand};
 use crate::geometry::control_trajectory;
 use crate::missions::memory::Memory;
 use crate::missions::{CancelDecision, Held, Holder, OfferDecision};
+
+/// Offers that may wait while another is planned; the server asks again for more.
+const OFFERS_MAX: usize = 8;
+/// Longest wait until the loop holds a mission for its next revision.
+const HOLD_WAIT_MAX: Duration = Duration::from_secs(5);
+/// Time between two looks at what the loop does.
+const HOLD_LOOK_EVERY: Duration = Duration::from_millis(5);
+/// A reference slower than this stands as good as, metres per second.
+const STANDS_M_S: f64 = 0.02;
 
 /// The robot's missions, shared by those who answer and those who record.
 #[derive(Debug)]
@@ -88,6 +107,23 @@ pub(crate) struct Dispatcher {
     pub(crate) site: Arc<SiteCell>,
     pub(crate) shared: Arc<Shared>,
     pub(crate) to_loop: SyncSender<LoopCommand>,
+    /// The plan that the loop was given last.
+    pub(crate) driving: Mutex<Option<Driving>>,
+}
+
+/// A plan that was given to the loop, to foretell where the robot comes to stand.
+#[derive(Debug, Clone)]
+pub(crate) struct Driving {
+    mission: MissionId,
+    revision: u32,
+    plan: Arc<Plan>,
+}
+
+/// A plan that can be driven.
+struct Planned {
+    summary: PlanSummary,
+    plan: Arc<Plan>,
+    job: Box<Job>,
 }
 
 fn refused(code: OfferRefusal, detail: impl Into<String>) -> Outcome {
@@ -97,33 +133,72 @@ fn refused(code: OfferRefusal, detail: impl Into<String>) -> Outcome {
     }
 }
 
+fn held_of(offer: &Offer, plan: PlanSummary) -> Held {
+    Held {
+        mission: offer.mission,
+        revision: offer.revision,
+        plan_hash: offer.plan_hash,
+        plan,
+        is_cancelled: false,
+    }
+}
+
+fn driving_of(offer: &Offer, plan: Arc<Plan>) -> Driving {
+    Driving {
+        mission: offer.mission,
+        revision: offer.revision,
+        plan,
+    }
+}
+
+/// Longest silence of the server that a mission bears.
+fn silence_max(policy: LinkPolicy) -> Result<Option<Duration>, String> {
+    policy.validate()?;
+    Ok(match policy {
+        LinkPolicy::Continue => None,
+        LinkPolicy::StopAfter { silence_s } => Some(Duration::from_secs_f64(silence_s)),
+    })
+}
+
 impl Dispatcher {
     /// Answers for ever.
     pub(crate) async fn run(self: Arc<Self>, mut commands: Commands, stop: CancellationToken) {
-        loop {
-            let command = tokio::select! {
-                command = commands.recv() => command,
-                () = stop.cancelled() => return,
-            };
-            let Some(command) = command else { return };
-            match self.decide(command.verb, &command.payload).await {
-                Ok(outcome) => {
-                    command
-                        .answer(&Answer {
-                            boot: self.boot,
-                            outcome,
-                        })
-                        .await;
+        let (to_planner, mut offers) = mpsc::channel(OFFERS_MAX);
+        let answering = async {
+            while let Some(command) = commands.recv().await {
+                if command.verb != Verb::Offer {
+                    self.respond(command).await;
+                } else if to_planner.try_send(command).is_err() {
+                    // Dropped: the server sees no reply and asks again.
+                    Shared::count(&self.shared.lost_commands);
                 }
-                Err(cause) => {
-                    self.shared.commands_refused.fetch_add(1, Ordering::Relaxed);
-                    warn!(
-                        error = &cause as &dyn std::error::Error,
-                        "refused a `{}` command",
-                        command.verb.as_str(),
-                    );
-                    command.refuse(&Refusal::from(&cause)).await;
-                }
+            }
+        };
+        let planning = async {
+            while let Some(offer) = offers.recv().await {
+                self.respond(offer).await;
+            }
+        };
+        tokio::select! {
+            ((), ()) = async { tokio::join!(answering, planning) } => {}
+            () = stop.cancelled() => {}
+        }
+    }
+
+    async fn respond(&self, command: IncomingCommand) {
+        match self.decide(command.verb, &command.payload).await {
+            Ok(outcome) => {
+                let boot = self.boot;
+                command.answer(&Answer { boot, outcome }).await;
+            }
+            Err(cause) => {
+                Shared::count(&self.shared.commands_refused);
+                warn!(
+                    error = &cause as &dyn std::error::Error,
+                    "refused a `{}` command",
+                    command.verb.as_str(),
+                );
+                command.refuse(&Refusal::from(&cause)).await;
             }
         }
     }
@@ -132,6 +207,14 @@ impl Dispatcher {
         Ok(match verb {
             Verb::Offer => self.offer(wire::decode(payload)?).await,
             Verb::Cancel => self.cancel(&wire::decode(payload)?).await,
+            Verb::Pause => {
+                let Pause { mission, revision } = wire::decode(payload)?;
+                self.hold(mission, revision, true)
+            }
+            Verb::Resume => {
+                let Resume { mission, revision } = wire::decode(payload)?;
+                self.hold(mission, revision, false)
+            }
             Verb::Site => {
                 let definition: SiteDefinition = wire::decode(payload)?;
                 if self.take_site(definition) {
@@ -176,7 +259,43 @@ impl Dispatcher {
                 refused(code, detail)
             }
             OfferDecision::Plan => self.plan_and_start(offer, start_by).await,
+            OfferDecision::Replace => {
+                let mission = offer.mission;
+                if !self.tell_loop(LoopCommand::Hold(mission, Hold::Replacement)) {
+                    return refused(OfferRefusal::NotReady, "the control loop is busy");
+                }
+                let outcome = self.plan_and_replace(offer).await;
+                if !matches!(outcome, Outcome::Accepted { .. }) {
+                    // Should it not arrive, the loop lets go by itself after a while.
+                    self.tell_loop(LoopCommand::Release(mission, Hold::Replacement));
+                }
+                outcome
+            }
         }
+    }
+
+    fn tell_loop(&self, command: LoopCommand) -> bool {
+        self.to_loop.try_send(command).is_ok()
+    }
+
+    fn driving(&self) -> MutexGuard<'_, Option<Driving>> {
+        self.driving.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn hold(&self, mission: MissionId, revision: u32, is_pause: bool) -> Outcome {
+        if let Err((code, detail)) = self.missions.holder().check_held(mission, revision) {
+            return refused(code, detail);
+        }
+        let (command, what) = if is_pause {
+            (LoopCommand::Hold(mission, Hold::Pause), "pausing")
+        } else {
+            (LoopCommand::Release(mission, Hold::Pause), "resuming")
+        };
+        if !self.tell_loop(command) {
+            return refused(OfferRefusal::NotReady, "the control loop is busy");
+        }
+        info!(mission.id = %mission, "{what} {mission}");
+        Outcome::Done
     }
 
     async fn plan_and_start(&self, offer: Offer, start_by: Option<Duration>) -> Outcome {
@@ -199,46 +318,26 @@ impl Dispatcher {
                 );
             }
         };
-        let model = self.model;
-        let (mission, revision, plan_hash) = (offer.mission, offer.revision, offer.plan_hash);
-        let planning = tokio::task::spawn_blocking(move || {
-            let trajectory = control_trajectory(&offer.trajectory);
-            let plan = Plan::new(&trajectory, start, &model).map_err(|cause| cause.to_string())?;
-            let summary = PlanSummary {
-                length_m: plan.length_m(),
-                duration_s: plan.duration_s(),
-                speed_peak_m_s: plan.peak_speed_m_s(),
-            };
-            let follower = Follower::new(plan, model, FollowerConfig::default())
-                .map_err(|cause| cause.to_string())?;
-            Ok::<_, String>((summary, follower))
-        });
-        let (plan, follower) = match planning.await {
-            Ok(Ok(planned)) => planned,
-            Ok(Err(detail)) => return refused(OfferRefusal::Impossible, detail),
-            Err(_) => return refused(OfferRefusal::Impossible, "planning ended in a panic"),
+        let planned = match self.plan(&offer, start, start_by).await {
+            Ok(planned) => planned,
+            Err(detail) => return refused(OfferRefusal::Impossible, detail),
         };
         if start_by.is_some_and(|latest| self.clock.monotonic() > latest) {
             return refused(OfferRefusal::TooLate, "its latest start has passed");
         }
         // Held before the loop has it, so that its end cannot be reported before its begin.
-        let held = Held {
-            mission,
-            revision,
-            plan_hash,
-            plan,
-        };
-        if !self.missions.holder().take(held) {
-            return refused(OfferRefusal::Busy, "another mission was taken meanwhile");
+        let (mission, plan) = (offer.mission, planned.summary);
+        if !self.missions.holder().take(held_of(&offer, plan)) {
+            // What came meanwhile says why: a cancellation, or another mission.
+            return match self.missions.holder().offer(&offer) {
+                OfferDecision::Refuse(code, detail) => refused(code, detail),
+                OfferDecision::Plan | OfferDecision::Replace | OfferDecision::AcceptAgain(_) => {
+                    refused(OfferRefusal::NotReady, "another command came first")
+                }
+            };
         }
-        let job = Box::new(Job {
-            mission,
-            revision,
-            plan_hash,
-            follower,
-            start_by,
-        });
-        match self.to_loop.try_send(LoopCommand::Start(job)) {
+        *self.driving() = Some(driving_of(&offer, planned.plan));
+        match self.to_loop.try_send(LoopCommand::Start(planned.job)) {
             Ok(()) => {}
             Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => {
                 self.missions.holder().release(mission);
@@ -255,6 +354,98 @@ impl Dispatcher {
         Outcome::Accepted { plan: Some(plan) }
     }
 
+    /// Swaps the mission in hand for its next revision; the loop holds it already or soon.
+    async fn plan_and_replace(&self, offer: Offer) -> Outcome {
+        let Some(start) = self.rest_of(offer.mission).await else {
+            return refused(OfferRefusal::NotReady, "the robot could not be held");
+        };
+        let planned = match self.plan(&offer, start, None).await {
+            Ok(planned) => planned,
+            Err(detail) => return refused(OfferRefusal::Impossible, detail),
+        };
+        let (mission, plan) = (offer.mission, planned.summary);
+        let Some(former) = self.missions.holder().replace(held_of(&offer, plan)) else {
+            return refused(OfferRefusal::Ended, "the mission ended meanwhile");
+        };
+        if !self.tell_loop(LoopCommand::Replace(planned.job)) {
+            self.missions.holder().restore(former);
+            return refused(OfferRefusal::NotReady, "the control loop is busy");
+        }
+        *self.driving() = Some(driving_of(&offer, planned.plan));
+        let revision = offer.revision;
+        info!(mission.id = %mission, revision, "took revision {revision} of {mission}");
+        self.save().await;
+        Outcome::Accepted { plan: Some(plan) }
+    }
+
+    /// Where the robot comes to stand, once the loop holds the mission.
+    async fn rest_of(&self, mission: MissionId) -> Option<Pose> {
+        let driving = self.driving().clone()?;
+        let looking = async {
+            loop {
+                let snapshot = self.shared.snapshot();
+                let progress = snapshot.mission.filter(|now| now.id == mission)?;
+                // A revision that was taken a moment ago may still wait for the robot to stand.
+                if snapshot.is_held && progress.revision == driving.revision {
+                    let governor = snapshot.governor?;
+                    let (measured, _) = snapshot.pose?;
+                    let speed_m_s = governor.sample(&driving.plan).speed_m_s;
+                    let is_moving = speed_m_s > STANDS_M_S;
+                    return Some((is_moving.then_some(governor), measured));
+                }
+                tokio::time::sleep(HOLD_LOOK_EVERY).await;
+            }
+        };
+        let is_known = driving.mission == mission;
+        let found = tokio::time::timeout(HOLD_WAIT_MAX, looking).await.ok()?;
+        let (moving, measured) = found.filter(|_| is_known)?;
+        let Some(governor) = moving else {
+            return Some(measured);
+        };
+        let foretelling = tokio::task::spawn_blocking(move || governor.rest(&driving.plan));
+        foretelling.await.ok()
+    }
+
+    /// Plans an offer from a pose.
+    async fn plan(
+        &self,
+        offer: &Offer,
+        start: Pose,
+        start_by: Option<Duration>,
+    ) -> Result<Planned, String> {
+        let model = self.model;
+        let offer = offer.clone();
+        let planning = tokio::task::spawn_blocking(move || {
+            let trajectory = control_trajectory(&offer.trajectory);
+            let plan = Plan::new(&trajectory, start, &model).map_err(|cause| cause.to_string())?;
+            let summary = PlanSummary {
+                length_m: plan.length_m(),
+                duration_s: plan.duration_s(),
+                speed_peak_m_s: plan.peak_speed_m_s(),
+            };
+            let kept = Arc::new(plan.clone());
+            let follower = Follower::new(plan, model, FollowerConfig::default())
+                .map_err(|cause| cause.to_string())?;
+            let job = Box::new(Job {
+                mission: offer.mission,
+                revision: offer.revision,
+                plan_hash: offer.plan_hash,
+                follower,
+                start_by,
+                silence_max: silence_max(offer.link_policy)?,
+                driven: Driven::new(),
+            });
+            Ok(Planned {
+                summary,
+                plan: kept,
+                job,
+            })
+        });
+        planning
+            .await
+            .unwrap_or_else(|_| Err("planning ended in a panic".to_owned()))
+    }
+
     async fn cancel(&self, cancel: &Cancel) -> Outcome {
         let mission = cancel.mission;
         let decision = self.missions.holder().cancel(mission);
@@ -262,6 +453,8 @@ impl Dispatcher {
             CancelDecision::Brake => match self.to_loop.try_send(LoopCommand::Cancel(mission)) {
                 Ok(()) => {
                     info!(mission.id = %mission, reason = cancel.reason, "cancelling {mission}");
+                    // Once this is answered it is cancelled, even if the agent dies on the way.
+                    self.save().await;
                     Outcome::Done
                 }
                 Err(_) => refused(OfferRefusal::NotReady, "the control loop is busy"),

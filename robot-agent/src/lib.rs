@@ -6,7 +6,7 @@
 //!
 //! * [`agent`] puts it all together; [`program`] makes a process of it; [`config`] is `robot.toml`.
 //! * The loop: `control_loop`, the base behind [`drive`], the simulated one in [`sim`].
-//! * Around it: [`missions`] (what is held), `dispatcher` (answers), `recorder` and [`outbox`]
+//! * Around it: [`missions`] (what is held), `dispatcher` (answers), `alerts`, `recorder` and [`outbox`]
 //!   (what must not be lost), `reporter` (what may), [`fleet`] (the only one that knows zenoh).
 //! * [`mod@bench`] steps the loop by hand, for tests and figures.
 //! * Below all: [`clock`], `supervisor`, [`geometry`] (between wire and controller).
@@ -25,6 +25,7 @@ pub mod outbox;
 pub mod program;
 pub mod sim;
 
+mod alerts;
 mod control_loop;
 mod dispatcher;
 mod recorder;

@@ -61,13 +61,32 @@ impl Recorder {
                 let report = report_of(&progress, at, MissionPhase::Started);
                 unsaved.push_back(RecordContent::Mission(report));
             }
+            LoopEvent::Paused { at, progress } => {
+                let report = report_of(&progress, at, MissionPhase::Paused);
+                unsaved.push_back(RecordContent::Mission(report));
+            }
+            LoopEvent::Resumed { at, progress } => {
+                let report = report_of(&progress, at, MissionPhase::Resumed);
+                unsaved.push_back(RecordContent::Mission(report));
+            }
+            LoopEvent::Replaced { at, progress, old } => {
+                info!(mission.id = %progress.id, "revision {} is driven now", progress.revision);
+                let report = report_of(&progress, at, MissionPhase::Replaced);
+                unsaved.push_back(RecordContent::Mission(report));
+                drop(old);
+            }
+            LoopEvent::CameTooLate(job) => {
+                let (mission, revision) = (job.mission, job.revision);
+                info!(mission.id = %mission, "revision {revision} came too late");
+            }
             LoopEvent::Ended {
                 at,
                 reason,
                 progress,
                 job,
             } => {
-                let (mission, phase) = (job.mission, reason.phase());
+                let mission = job.mission;
+                let phase = self.missions.holder().begin_end(mission, reason.phase());
                 info!(
                     mission.id = %mission,
                     driven_m = progress.driven_m,
@@ -76,6 +95,8 @@ impl Recorder {
                 );
                 let mut report = report_of(&progress, at, phase);
                 report.reason = reason.text().map(str::to_owned);
+                report.quality = Some(job.driven.quality());
+                report.driven = Some(job.driven.path());
                 // First the record, then the memory: a crash between the two reports twice.
                 unsaved.push_back(RecordContent::Mission(report));
                 self.save(unsaved);
@@ -124,6 +145,8 @@ fn report_of(
         phase,
         reason: None,
         progress: Some(*progress),
+        quality: None,
+        driven: None,
     }
 }
 

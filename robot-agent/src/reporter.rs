@@ -1,16 +1,17 @@
 //! Builds what the robot publishes about itself from the loop's latest snapshot.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 use tread_api::friction::LiveFriction;
-use tread_api::robot::{Aged, LoopStatus};
+use tread_api::robot::{Aged, Battery, LoopStatus};
 use tread_api::wire::state::{FrictionReport, RobotState};
 
+use crate::alerts::{Alerts, Causes};
 use crate::clock::SharedClock;
 use crate::control_loop::seam::Shared;
 use crate::dispatcher::SiteCell;
@@ -29,6 +30,7 @@ pub(crate) struct Reporter {
     pub(crate) rate_hz: f64,
     pub(crate) states: AtomicU64,
     pub(crate) frictions: AtomicU64,
+    pub(crate) alerts: Mutex<Alerts>,
 }
 
 fn aged<T>(value: T, at: Duration, now: Duration) -> Aged<T> {
@@ -44,6 +46,13 @@ impl Reporter {
     pub(crate) fn state(&self) -> RobotState {
         let snapshot = self.shared.snapshot();
         let now = self.clock.monotonic();
+        let outbox = self.outbox.status();
+        let causes = Causes {
+            battery: snapshot.battery,
+            fault: snapshot.fault,
+            outbox,
+        };
+        let counted = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         RobotState {
             robot: self.identity.robot.clone(),
             boot: self.identity.boot,
@@ -59,14 +68,28 @@ impl Reporter {
                 .map(|(twist, at)| aged(wire_twist(twist), at, now)),
             mission: snapshot.mission,
             terrain_revision: snapshot.terrain_revision,
-            outbox: self.outbox.status(),
+            outbox,
             control_loop: LoopStatus {
                 rate_hz: self.rate_hz,
                 ticks: snapshot.ticks,
-                overruns: self.shared.overruns.load(Ordering::Relaxed),
+                overruns: counted(&self.shared.overruns),
+                lost_segments: counted(&self.shared.lost_segments),
+                unplaced_blocks: counted(&self.shared.unplaced_blocks),
+                lost_samples: counted(&self.shared.lost_samples),
+                lost_commands: counted(&self.shared.lost_commands),
                 tick_max_us: self.shared.tick_max_us.swap(0, Ordering::Relaxed),
                 commands_refused: self.shared.commands_refused.load(Ordering::Relaxed),
             },
+            battery: snapshot.battery.map(|battery| Battery {
+                charge_ratio: battery.charge_ratio,
+                voltage_v: Some(battery.voltage_v),
+                charging: false,
+            }),
+            alerts: self
+                .alerts
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .judge(&causes),
         }
     }
 

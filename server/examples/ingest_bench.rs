@@ -168,6 +168,7 @@ impl Bench {
                 .collect::<anyhow::Result<_>>()?;
             let robot = self.robots.get(index).context("no such robot")?.clone();
             let payload = wire::encode(&Batch {
+                robot_time: None,
                 robot,
                 boot: self.boot,
                 records,
@@ -207,6 +208,7 @@ async fn introduce(
             agent_version: "bench".to_owned(),
             model: model(),
             robot_time: app.clock().now(),
+            capabilities: tread_api::robot::Capabilities::default(),
         };
         app.hello(site, &hello)
             .await

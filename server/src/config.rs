@@ -28,6 +28,9 @@ pub struct ServerArgs {
     /// Address of the REST API; port 0 takes a free one
     #[arg(long, value_name = "ADDRESS")]
     pub http: Option<SocketAddr>,
+    /// Address of `/metrics` for Prometheus; none when absent
+    #[arg(long, value_name = "ADDRESS")]
+    pub metrics: Option<SocketAddr>,
     /// Address of the zenoh router that robots connect to; port 0 takes a free one
     #[arg(long, value_name = "ADDRESS")]
     pub zenoh: Option<SocketAddr>,
@@ -60,6 +63,8 @@ pub enum LogFormat {
 pub struct Config {
     /// Address of the REST API, on this machine.
     pub http: SocketAddr,
+    /// Address of `/metrics`, on this machine, if there is to be one.
+    pub metrics: Option<SocketAddr>,
     /// Address of the zenoh router, on this machine.
     pub zenoh: SocketAddr,
     /// The database file.
@@ -94,6 +99,7 @@ impl Default for FrictionConfig {
 #[serde(deny_unknown_fields)]
 struct File {
     http: Option<SocketAddr>,
+    metrics: Option<SocketAddr>,
     zenoh: Option<SocketAddr>,
     database: Option<PathBuf>,
     site: Option<SiteId>,
@@ -165,6 +171,7 @@ impl Config {
                 .http
                 .or(file.http)
                 .unwrap_or_else(|| HTTP_DEFAULT.parse().expect(builtin)),
+            metrics: args.metrics.or(file.metrics),
             zenoh: args
                 .zenoh
                 .or(file.zenoh)
@@ -186,7 +193,9 @@ impl Config {
     }
 
     fn check(&self) -> Result<(), ConfigError> {
-        for (key, address) in [("http", self.http), ("zenoh", self.zenoh)] {
+        let metrics = self.metrics.map(|address| ("metrics", address));
+        let addresses = [("http", self.http), ("zenoh", self.zenoh)];
+        for (key, address) in addresses.into_iter().chain(metrics) {
             if !address.ip().is_loopback() {
                 return Err(ConfigError::NotLoopback { key, address });
             }

@@ -67,6 +67,14 @@ counters! {
     presence_dropped,
     /// Replies that could not be sent because too many were waiting.
     replies_dropped,
+    /// Reports on missions that are none of their robot's, or of other content; without effect.
+    reports_foreign,
+    /// Robots told to end a mission that is none of their open ones here.
+    missions_disowned,
+    /// Times that the router was opened again because it no longer answered.
+    router_reopened,
+    /// Looks at the router that it did not answer.
+    router_probes_failed,
     /// Missions offered to robots, with repetitions.
     offers_sent,
     /// Commands that no robot answered.

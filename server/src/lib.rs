@@ -15,6 +15,7 @@ pub mod fleet;
 pub mod friction;
 pub mod http;
 mod logging;
+pub mod metrics;
 pub mod supervisor;
 
 use std::ffi::OsString;
@@ -29,7 +30,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tracing::info;
 
-use self::app::{App, ingest, reconciler};
+use self::app::{App, events, ingest, reconciler};
 use self::clock::Clock;
 pub use self::config::{Config, ServerArgs};
 use self::db::Db;
@@ -47,6 +48,7 @@ pub struct Server;
 #[derive(Debug)]
 pub struct RunningServer {
     http_address: SocketAddr,
+    metrics_address: Option<SocketAddr>,
     app: App,
     fleet: Fleet,
     supervisor: Supervisor,
@@ -84,12 +86,27 @@ impl Server {
         let reconciling =
             reconciler::run(app.clone(), fleet.commands(), supervisor.clone(), stop());
         supervisor.spawn_vital("reconciler", reconciling);
+        supervisor.spawn_vital("events", events::run(app.clone(), stop()));
         let router = http::router(app.clone());
         let serving = http::serve::run(listener, router, app.clone(), supervisor.clone(), stop());
         supervisor.spawn_vital("http", serving);
+        let mut metrics_address = None;
+        if let Some(address) = config.metrics {
+            let listener = TcpListener::bind(address)
+                .await
+                .with_context(|| format!("cannot listen for metrics on {address}"))?;
+            let address = listener.local_addr()?;
+            metrics_address = Some(address);
+            let router = http::metrics_router(app.clone());
+            let serving =
+                http::serve::run(listener, router, app.clone(), supervisor.clone(), stop());
+            supervisor.spawn_vital("metrics", serving);
+            info!("metrics on http://{address}/metrics");
+        }
         info!("REST API on http://{http_address}, described at http://{http_address}/docs");
         Ok(RunningServer {
             http_address,
+            metrics_address,
             app,
             fleet,
             supervisor,
@@ -101,6 +118,11 @@ impl RunningServer {
     /// Where the REST API listens.
     pub fn http_address(&self) -> SocketAddr {
         self.http_address
+    }
+
+    /// Where the metrics are, if anywhere.
+    pub fn metrics_address(&self) -> Option<SocketAddr> {
+        self.metrics_address
     }
 
     /// The endpoint that robots connect to, as zenoh writes it.

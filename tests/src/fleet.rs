@@ -22,6 +22,8 @@ pub const SITE: &str = "yard";
 pub const GROUND: &str = "slab";
 /// The true θ of that terrain.
 pub const GROUND_THETA: f64 = 0.4;
+/// Lines of a log that are shown when something went wrong.
+const LOG_TAIL_LINES: usize = 60;
 /// Half of its side, metres.
 const GROUND_HALF_M: f64 = 500.0;
 
@@ -36,6 +38,7 @@ pub struct Fleet {
     zenoh: SocketAddr,
     server: Option<Process>,
     agents: HashMap<RobotId, Process>,
+    agent_flags: Vec<String>,
 }
 
 impl Fleet {
@@ -55,6 +58,7 @@ impl Fleet {
             zenoh,
             server: None,
             agents: HashMap::new(),
+            agent_flags: Vec::new(),
         };
         fleet.start_server().await;
         let corner = |x: f64, y: f64| json!({"x_m": GROUND_HALF_M * x, "y_m": GROUND_HALF_M * y});
@@ -80,6 +84,11 @@ impl Fleet {
     /// Where the server's router listens.
     pub fn zenoh_endpoint(&self) -> String {
         format!("tcp/{}", self.zenoh)
+    }
+
+    /// Where the server answers HTTP.
+    pub fn http_address(&self) -> SocketAddr {
+        self.http
     }
 
     /// The database file.
@@ -171,6 +180,33 @@ impl Fleet {
         .await;
     }
 
+    /// Starts an agent behind a relay that is there already, without waiting.
+    pub fn spawn_agent_behind(&mut self, robot: &RobotId, x_m: f64, relay: &Relay) {
+        self.spawn_agent_to(robot, x_m, &format!("tcp/{}", relay.address()));
+    }
+
+    /// Flags that every agent gets from now on, beside its usual ones.
+    pub fn agents_get(&mut self, flags: &[&str]) {
+        self.agent_flags = flags.iter().map(|flag| (*flag).to_owned()).collect();
+    }
+
+    /// Where an agent keeps what outlives it.
+    pub fn robot_folder(&self, robot: &RobotId) -> PathBuf {
+        self.folder.path().join(robot.as_str())
+    }
+
+    /// The last lines that a process logged.
+    pub fn log_tail(&self, name: &str) -> Vec<String> {
+        let log = self.folder.path().join(format!("{name}.log"));
+        let text = std::fs::read_to_string(log).unwrap_or_default();
+        let lines: Vec<&str> = text.lines().collect();
+        let from = lines.len().saturating_sub(LOG_TAIL_LINES);
+        lines[from..]
+            .iter()
+            .map(|line| format!("{name}: {line}"))
+            .collect()
+    }
+
     fn spawn_agent_to(&mut self, robot: &RobotId, x_m: f64, endpoint: &str) {
         let scenario = self.folder.path().join(format!("{robot}.scenario.toml"));
         let stiffness = GROUND_THETA.recip();
@@ -179,17 +215,15 @@ impl Fleet {
              [[robots]]\nid = \"{robot}\"\nx_m = {x_m:?}\ny_m = 0.0\nheading_rad = 0.0\nseed = 7\n"
         );
         std::fs::write(&scenario, text).expect("the temporary folder can be written");
-        let arguments = [
+        let mut arguments = vec![
             "agent".to_owned(),
             format!("--site={SITE}"),
             format!("--robot={robot}"),
             format!("--server={endpoint}"),
-            format!(
-                "--data-dir={}",
-                self.folder.path().join(robot.as_str()).display()
-            ),
+            format!("--data-dir={}", self.robot_folder(robot).display()),
             format!("--scenario={}", scenario.display()),
         ];
+        arguments.extend(self.agent_flags.iter().cloned());
         let process = self.start_process(robot.as_str(), &arguments);
         self.agents.insert(robot.clone(), process);
     }

@@ -5,11 +5,14 @@
 //! * [`rest`]: speaks to the server as any client would.
 //! * [`relay`]: a network between robot and server that can be cut.
 //! * [`wait`]: waits for a state with a bound, and says what was seen last.
+//! * [`chaos`]: runs in which things fail at random, from a seed of [`random`].
 //! * [`light_robot`]: robots without physics, for load.
 
+pub mod chaos;
 pub mod fleet;
 pub mod light_robot;
 pub mod process;
+pub mod random;
 pub mod relay;
 pub mod rest;
 pub mod wait;

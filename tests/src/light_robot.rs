@@ -14,7 +14,9 @@ use tread_api::friction::{Information, Segment};
 use tread_api::geometry::Pose;
 use tread_api::ids::{BootId, RobotId, SiteId};
 use tread_api::keys;
-use tread_api::robot::{Aged, LoopStatus, OutboxStatus, RobotLimits, RobotMode, RobotModel};
+use tread_api::robot::{
+    Aged, Capabilities, LoopStatus, OutboxStatus, RobotLimits, RobotMode, RobotModel,
+};
 use tread_api::site::Cell;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::ingest::{Batch, Receipt, Record, RecordContent};
@@ -127,6 +129,7 @@ impl LightRobot {
             agent_version: env!("CARGO_PKG_VERSION").to_owned(),
             model: model.clone(),
             robot_time: now(),
+            capabilities: Capabilities::default(),
         };
         let welcome = ask(&session, &keys::hello(site, &id), &hello).await?;
         let failed = |error: zenoh::Error| anyhow::anyhow!("zenoh: {error}");
@@ -180,8 +183,11 @@ impl LightRobot {
             outbox: OutboxStatus::default(),
             control_loop: LoopStatus {
                 rate_hz: 100.0,
+                ticks: self.next_state,
                 ..LoopStatus::default()
             },
+            battery: None,
+            alerts: Vec::new(),
         };
         self.next_state += 1;
         let put = self.state_publisher.put(wire::encode(&state)?).await;
@@ -194,6 +200,7 @@ impl LightRobot {
         Batch {
             robot: self.id.clone(),
             boot: self.boot,
+            robot_time: None,
             records,
         }
     }

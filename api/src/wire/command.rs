@@ -7,10 +7,14 @@ use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
 use crate::ids::{BootId, DERIVED_NAMESPACE, MissionId, PlanHash};
-use crate::mission::PlanSummary;
+use crate::mission::{LinkPolicy, PlanSummary};
 use crate::trajectory::Trajectory;
 
 /// `cmd/offer`: drive this mission.
+///
+/// A higher revision of the mission in hand replaces it: the robot plans the new one from where
+/// it is and swaps only when it holds it whole; until its answer the old one goes on, and after a
+/// refusal too.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Offer {
     /// The mission.
@@ -23,6 +27,9 @@ pub struct Offer {
     pub trajectory: Trajectory,
     /// How long from now the mission may still start, milliseconds; `None` for ever.
     pub start_within_ms: Option<u64>,
+    /// What to do when the server is no longer heard.
+    #[serde(default)]
+    pub link_policy: LinkPolicy,
 }
 
 impl Offer {
@@ -42,7 +49,25 @@ pub struct Cancel {
     pub reason: String,
 }
 
-/// A robot's answer to `cmd/offer`, `cmd/cancel` or `cmd/site`.
+/// `cmd/pause`: brake along the path of this mission and hold it, standing.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Pause {
+    /// The mission.
+    pub mission: MissionId,
+    /// Its revision.
+    pub revision: u32,
+}
+
+/// `cmd/resume`: drive this mission on from where it was paused.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Resume {
+    /// The mission.
+    pub mission: MissionId,
+    /// Its revision.
+    pub revision: u32,
+}
+
+/// A robot's answer to any command.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Answer {
     /// The run of the agent that answers.

@@ -4,7 +4,7 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
 use crate::ids::{BootId, RobotId};
-use crate::robot::RobotModel;
+use crate::robot::{Capabilities, RobotModel};
 use crate::site::Grid;
 use crate::terrain::TerrainShape;
 
@@ -21,6 +21,9 @@ pub struct Hello {
     pub model: RobotModel,
     /// The robot's wall clock.
     pub robot_time: Timestamp,
+    /// What the base and its agent can do; nothing beyond driving missions when absent.
+    #[serde(default)]
+    pub capabilities: Capabilities,
 }
 
 /// The server's answer.

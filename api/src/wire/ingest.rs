@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::friction::Segment;
 use crate::ids::{BootId, MissionId, PlanHash, RobotId};
+use crate::mission::{DrivenPath, MissionQuality};
 use crate::robot::MissionProgress;
 
 /// Most records of one batch.
@@ -20,6 +21,10 @@ pub struct Batch {
     pub robot: RobotId,
     /// The run of the agent that made the records; not always the present one.
     pub boot: BootId,
+    /// The robot's wall clock when it sent this. With it the server puts the records' times right
+    /// when the clock is wrong; without it they are taken as they are.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub robot_time: Option<Timestamp>,
     /// The records, at most [`BATCH_RECORDS_MAX`], by rising `seq`.
     pub records: Vec<Record>,
 }
@@ -62,6 +67,12 @@ pub struct MissionReport {
     /// How far it had come.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub progress: Option<MissionProgress>,
+    /// How well it was driven, in the report of its end.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub quality: Option<MissionQuality>,
+    /// Where the robot really was, in the report of its end.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub driven: Option<DrivenPath>,
 }
 
 /// A robot's word on a mission.
@@ -70,6 +81,12 @@ pub struct MissionReport {
 pub enum MissionPhase {
     /// The first wheel command was given.
     Started,
+    /// Held, standing, by request.
+    Paused,
+    /// Driven again after a pause.
+    Resumed,
+    /// A new revision is driven now; the report names it.
+    Replaced,
     /// Driven to its end.
     Succeeded,
     /// Given up.

@@ -6,7 +6,9 @@ use serde::{Deserialize, Serialize};
 use crate::friction::LiveFriction;
 use crate::geometry::{Pose, Twist};
 use crate::ids::{BootId, RobotId};
-use crate::robot::{Aged, LoopStatus, MissionProgress, OutboxStatus, RobotMode};
+use crate::robot::{
+    Aged, AlertReport, Battery, LoopStatus, MissionProgress, OutboxStatus, RobotMode,
+};
 use crate::site::Cell;
 use crate::terrain::TerrainRef;
 
@@ -38,9 +40,28 @@ pub struct RobotState {
     pub terrain_revision: Option<u64>,
     /// Measurements that wait for the server.
     pub outbox: OutboxStatus,
-    /// The control loop.
+    /// The control loop. A robot whose ticks stand still is not alive, whatever else it says.
     pub control_loop: LoopStatus,
+    /// The battery, if the base measures it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub battery: Option<Battery>,
+    /// What needs a person's attention now, at most
+    /// [`ALERTS_MAX`](crate::robot::ALERTS_MAX), each code once.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub alerts: Vec<AlertReport>,
 }
+
+/// The server's pulse, published every [`PULSE_PERIOD_MS`] milliseconds on the site's `pulse` key.
+///
+/// A robot measures by it how long it has not heard the server.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ServerPulse {
+    /// The server's wall clock.
+    pub server_time: Timestamp,
+}
+
+/// How often the server's pulse comes, milliseconds.
+pub const PULSE_PERIOD_MS: u64 = 250;
 
 /// Both friction estimates of a robot, published on its `friction` key.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

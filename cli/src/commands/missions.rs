@@ -27,9 +27,14 @@ pub(super) async fn run(
             let detail = client.mission(*mission).await?;
             output.show(&detail, history)?;
         }
+        Some(MissionsAction::Pause { mission }) => {
+            output.show(&client.act(*mission, "pause").await?, summary)?;
+        }
+        Some(MissionsAction::Resume { mission }) => {
+            output.show(&client.act(*mission, "resume").await?, summary)?;
+        }
         Some(MissionsAction::Cancel { mission }) => {
-            let mission = client.cancel_mission(*mission).await?;
-            output.show(&mission, summary)?;
+            output.show(&client.act(*mission, "cancel").await?, summary)?;
         }
     }
     Ok(ExitCode::SUCCESS)
@@ -100,10 +105,21 @@ fn history(detail: &MissionDetail) -> String {
             plan.length_m, plan.duration_s
         )
     });
+    let quality = detail.quality.as_ref().map(|quality| {
+        format!(
+            "off the path {:.0} mm rms, {:.0} mm at most; saturated {:.1} %, {} slips, {} stops of the gate\n",
+            1e3 * quality.cross_track_rms_m,
+            1e3 * quality.cross_track_max_m,
+            1e2 * quality.saturated_ratio,
+            quality.slip_events,
+            quality.gate_stops
+        )
+    });
     format!(
-        "{}\n{}{}",
+        "{}\n{}{}{}",
         summary(&detail.mission),
         plan.unwrap_or_default(),
+        quality.unwrap_or_default(),
         render(&table)
     )
 }

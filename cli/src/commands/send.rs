@@ -9,8 +9,12 @@ use anyhow::Context;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use jiff::Timestamp;
 use tread_api::ids::MissionId;
-use tread_api::mission::{CreateMission, Mission, MissionState};
-use tread_api::trajectory::{Circle, Direction, Trajectory, Waypoint, Waypoints};
+use tread_api::mission::{
+    CreateMission, LinkPolicy, Mission, MissionState, ReplaceMission, StartPolicy,
+};
+use tread_api::trajectory::{
+    CheckTrajectory, Circle, Direction, Trajectory, TrajectoryCheck, Waypoint, Waypoints,
+};
 
 use super::missions::summary;
 use crate::args::{Order, SendArguments, SendCircle, SendTrajectory, SendWaypoints, waypoint};
@@ -29,11 +33,24 @@ pub(super) async fn run(
         SendTrajectory::Circle(send) => circle(send),
         SendTrajectory::Waypoints(send) => waypoints(send)?,
     };
+    if order.check {
+        return check(trajectory, &order, client, output).await;
+    }
+    if let Some(mission) = order.replaces {
+        let replacement = ReplaceMission { trajectory };
+        let mission = client.replace_mission(mission, &replacement).await?;
+        output.show(&mission, summary)?;
+        return Ok(ExitCode::SUCCESS);
+    }
     let request = CreateMission {
         site: order.connection.site.clone(),
         robot: order.robot.clone(),
         trajectory,
         latest_start: order.start_within.map(latest_start).transpose()?,
+        priority: order.priority,
+        start_policy: StartPolicy::default(),
+        link_policy: LinkPolicy::default(),
+        lost_after_s: None,
     };
     let mut mission = client.create_mission(&request).await?;
     if order.wait {
@@ -46,6 +63,50 @@ pub(super) async fn run(
     } else {
         ExitCode::SUCCESS
     })
+}
+
+/// Tells what a trajectory would ask of its robot.
+async fn check(
+    trajectory: Trajectory,
+    order: &Order,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    let request = CheckTrajectory {
+        site: order.connection.site.clone(),
+        robot: order.robot.clone(),
+        trajectory,
+        start: None,
+    };
+    let checked = client.check_trajectory(&request).await?;
+    output.show(&checked, demands)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn demands(checked: &TrajectoryCheck) -> String {
+    let mut lines = vec![
+        format!(
+            "{:.2} m, {:.2} m of it on the way there, in {:.1} s",
+            checked.length_m, checked.approach_length_m, checked.duration_s
+        ),
+        format!(
+            "at most {:.2} m/s, {:.2} m/s² along, {:.2} m/s² across, {:.2} rad/s",
+            checked.speed_peak_m_s,
+            checked.linear_acceleration_peak_m_s2,
+            checked.lateral_acceleration_peak_m_s2,
+            checked.angular_peak_rad_s
+        ),
+    ];
+    lines.extend(checked.bindings.iter().map(|binding| {
+        format!(
+            "slower than asked, down to {:.2} m/s, from {:.2} to {:.2} m: {:?}",
+            binding.speed_min_m_s,
+            binding.from.arc_m.unwrap_or_default(),
+            binding.to.arc_m.unwrap_or_default(),
+            binding.limit
+        )
+    }));
+    lines.join("\n")
 }
 
 fn circle(send: SendCircle) -> (Trajectory, Order) {

@@ -18,7 +18,7 @@ use anyhow::{Context, bail, ensure};
 use tokio::time::{Instant, MissedTickBehavior};
 use tread_agent::sim::scenario::{Scenario, ScenarioRobot};
 use tread_api::ids::{MissionId, TerrainId};
-use tread_api::mission::{CreateMission, Mission};
+use tread_api::mission::{CreateMission, LinkPolicy, Mission, StartPolicy};
 use tread_api::problem::ProblemType;
 use tread_api::robot::{LinkState, Robot};
 use tread_api::terrain::{CreateTerrain, Terrain, TerrainRef, TerrainShape, terrain_at};
@@ -232,6 +232,10 @@ impl Demo<'_> {
                     robot: mission.robot.clone(),
                     trajectory: mission.trajectory.clone(),
                     latest_start: None,
+                    priority: 0,
+                    start_policy: StartPolicy::default(),
+                    link_policy: LinkPolicy::default(),
+                    lost_after_s: None,
                 };
                 missions.push(self.client.create_mission(&request).await?.id);
             }

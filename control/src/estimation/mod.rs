@@ -179,11 +179,12 @@ impl Estimator {
             theta: self.bound.theta_weights,
         };
         let block = builder.finish(context);
-        let ground_changed = block.is_some_and(|block| self.take(block));
+        let (ground_changed, slips) = block.map_or((false, false), |block| self.take(block));
         self.excitation.end_block();
         self.refresh();
         UpdateOutcome {
             block_done: true,
+            slips,
             ground_changed,
         }
     }
@@ -229,7 +230,8 @@ impl Estimator {
         }
     }
 
-    fn take(&mut self, mut block: Block) -> bool {
+    /// Whether the ground has changed, and whether a wheel slips beyond the linear range.
+    fn take(&mut self, mut block: Block) -> (bool, bool) {
         block.is_linear &= block.slips_little(&self.bound);
         self.pending.add(&block);
         let innovation = self
@@ -249,7 +251,7 @@ impl Estimator {
             self.segment = self.segment.plus(&self.pending);
             self.pending = Sums::default();
         }
-        changed
+        (changed, !block.is_linear)
     }
 
     fn solve(&self, sums: &Sums, theta_given: Option<f64>) -> Option<Solution> {

@@ -140,6 +140,8 @@ pub struct ValueWithDeviation {
 pub struct UpdateOutcome {
     /// A block of samples was finished and used.
     pub block_done: bool,
+    /// In that block a wheel slipped beyond the range in which force grows with slip.
+    pub slips: bool,
     /// The ground has changed: close the segment and call [`super::Estimator::begin_ground`].
     pub ground_changed: bool,
 }

@@ -1,6 +1,6 @@
 //! What the robot may do at each place of a path.
 
-use super::PlanError;
+use super::{PlanError, PlanOptions, SlowedBy};
 use crate::excitation::{Excitation, ExcitationSpec, Room};
 use crate::path::PathSample;
 use crate::profile::NodeLimits;
@@ -35,8 +35,63 @@ pub(super) fn wiggled(
     Ok(excitation)
 }
 
-/// What the robot may do where the path bends like this.
-pub(super) fn node_limits(path: &PathSample, asked_m_s: f64, model: &RobotModel) -> NodeLimits {
+/// What bounds the accelerations: the robot's own limits, or what the ground gives.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Blame {
+    pub(super) along: SlowedBy,
+    pub(super) across: SlowedBy,
+}
+
+impl Blame {
+    /// Of a model whose limits have been brought within the grip already.
+    pub(super) fn of(model: &RobotModel, options: &PlanOptions) -> Self {
+        let limits = model.limits();
+        let grip_m_s2 = options.grip_mu.map(RobotModel::within_grip_m_s2);
+        let grips = |limit_m_s2: f64| grip_m_s2.is_some_and(|grip_m_s2| grip_m_s2 <= limit_m_s2);
+        Self {
+            along: if grips(limits.linear_acceleration_max_m_s2) {
+                SlowedBy::Grip
+            } else {
+                SlowedBy::LinearAcceleration
+            },
+            across: if grips(limits.lateral_acceleration_max_m_s2) {
+                SlowedBy::Grip
+            } else {
+                SlowedBy::LateralAcceleration
+            },
+        }
+    }
+}
+
+/// What the robot may do at a node, and the limit that makes it slower than it was asked to be.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct NodeBounds {
+    pub(super) limits: NodeLimits,
+    pub(super) by: Option<SlowedBy>,
+}
+
+impl NodeBounds {
+    /// The stricter of both in every respect.
+    pub(super) fn stricter(&self, other: &Self) -> Self {
+        Self {
+            limits: self.limits.stricter(&other.limits),
+            by: if other.limits.speed_m_s < self.limits.speed_m_s {
+                other.by
+            } else {
+                self.by
+            },
+        }
+    }
+}
+
+/// What the robot may do where the path bends like this. `lateral` names what bounds its
+/// acceleration across the path.
+pub(super) fn node_limits(
+    path: &PathSample,
+    asked_m_s: f64,
+    model: &RobotModel,
+    lateral: SlowedBy,
+) -> NodeBounds {
     let limits = model.limits();
     let bend = path.curvature_1_m.abs();
     let slope = path.curvature_slope_1_m2.abs();
@@ -47,14 +102,36 @@ pub(super) fn node_limits(path: &PathSample, asked_m_s: f64, model: &RobotModel)
     // The outer wheels: v (1 + bW/2), and a (1 + bW/2) + v² b' W/2, half of the limit for each.
     let outer = 1.0 + bend * half_track_m;
     let floor = f64::MIN_POSITIVE;
-    NodeLimits {
-        speed_m_s: asked_m_s
-            .min((limits.lateral_acceleration_max_m_s2 / bend.max(floor)).sqrt())
-            .min(limits.angular_max_rad_s / bend.max(floor))
-            .min(rim_max_m_s / outer)
-            .min((0.5 * rim_max_m_s2 / (slope * half_track_m).max(floor)).sqrt()),
-        acceleration_m_s2: limits
-            .linear_acceleration_max_m_s2
-            .min(0.5 * rim_max_m_s2 / outer),
+    let bounds_m_s = [
+        (
+            lateral,
+            (limits.lateral_acceleration_max_m_s2 / bend.max(floor)).sqrt(),
+        ),
+        (
+            SlowedBy::AngularSpeed,
+            limits.angular_max_rad_s / bend.max(floor),
+        ),
+        (SlowedBy::WheelSpeed, rim_max_m_s / outer),
+        (
+            SlowedBy::WheelAcceleration,
+            (0.5 * rim_max_m_s2 / (slope * half_track_m).max(floor)).sqrt(),
+        ),
+    ];
+    let mut speed_m_s = asked_m_s;
+    let mut slowed_by = None;
+    for (by, bound_m_s) in bounds_m_s {
+        if bound_m_s < speed_m_s {
+            speed_m_s = bound_m_s;
+            slowed_by = Some(by);
+        }
+    }
+    NodeBounds {
+        limits: NodeLimits {
+            speed_m_s,
+            acceleration_m_s2: limits
+                .linear_acceleration_max_m_s2
+                .min(0.5 * rim_max_m_s2 / outer),
+        },
+        by: slowed_by,
     }
 }

@@ -8,6 +8,7 @@
 
 mod error;
 mod limits;
+mod slowed;
 
 use crate::excitation::{Excitation, ExcitationSpec, Warp};
 use crate::geometry::{Point, Pose};
@@ -20,7 +21,10 @@ use crate::robot::RobotModel;
 use crate::trajectory::{CircleSpec, Trajectory, WaypointsSpec};
 
 pub use error::PlanError;
-use limits::{WHEEL_SHARE, node_limits, wiggled};
+pub use slowed::{SLOWED_MAX, Slowed, SlowedBy};
+
+use limits::{Blame, NodeBounds, WHEEL_SHARE, node_limits, wiggled};
+use slowed::{CellBounds, Stretches};
 
 /// Most waypoints of a path.
 pub const WAYPOINTS_MAX: usize = 100_000;
@@ -79,6 +83,7 @@ pub struct Plan {
     peak_acceleration_m_s2: f64,
     peak_lateral_m_s2: f64,
     peak_angular_rad_s: f64,
+    stretches: Stretches,
 }
 
 /// A speed that holds from an arc length on.
@@ -304,7 +309,9 @@ impl Plan {
         let cells = ((length_m / GRID_M).ceil() as usize).clamp(GRID_MIN, GRID_MAX);
         let cell_m = length_m / cells as f64;
         let mut asked = 0;
-        let mut nodes: Vec<NodeLimits> = Vec::with_capacity(cells + 1);
+        let blame = Blame::of(model, options);
+        let mut bounds: Vec<NodeBounds> = Vec::with_capacity(cells + 1);
+        let mut asked_m_s = Vec::with_capacity(cells + 1);
         let mut bend_before_1_m = 0.0;
         for index in 0..=cells {
             let arc_m = cell_m * index as f64;
@@ -314,25 +321,27 @@ impl Plan {
             {
                 asked += 1;
             }
-            let asked_m_s = speeds[asked].speed_m_s;
+            let speed_m_s = speeds[asked].speed_m_s;
             let here = path.sample(arc_m);
-            let mut node = node_limits(&here, asked_m_s, model);
+            let mut node = node_limits(&here, speed_m_s, model, blame.across);
             let bend_1_m = here.curvature_1_m.abs();
             // A sharp bend may have its peak between two nodes: both keep to what is in between.
             if bend_1_m.max(bend_before_1_m) > BEND_LOOKED_INTO_1_M
-                && let Some(before) = nodes.last_mut()
+                && let Some(before) = bounds.last_mut()
             {
                 for part in 1..PARTS_LOOKED_INTO {
                     let back_m = cell_m * f64::from(part) / f64::from(PARTS_LOOKED_INTO);
                     let between = path.sample(arc_m - back_m);
-                    let between = node_limits(&between, asked_m_s, model);
+                    let between = node_limits(&between, speed_m_s, model, blame.across);
                     *before = before.stricter(&between);
                     node = node.stricter(&between);
                 }
             }
             bend_before_1_m = bend_1_m;
-            nodes.push(node);
+            bounds.push(node);
+            asked_m_s.push(speed_m_s);
         }
+        let mut nodes: Vec<NodeLimits> = bounds.iter().map(|node| node.limits).collect();
         let mut jerk_m_s3 = model.limits().linear_jerk_max_m_s3;
         let excitation = match options.excitation {
             Some(spec) => Some(wiggled(spec, &mut nodes, &mut jerk_m_s3)?),
@@ -348,10 +357,12 @@ impl Plan {
             peak_acceleration_m_s2: 0.0,
             peak_lateral_m_s2: 0.0,
             peak_angular_rad_s: 0.0,
+            stretches: Stretches::default(),
         };
         let steps = (plan.duration_s() / 0.05).ceil().min(GRID_MAX as f64) as usize + 1;
         for step in 0..=steps {
-            let sample = plan.sample(plan.duration_s() * step as f64 / steps as f64);
+            let share = step as f64 / steps as f64;
+            let sample = plan.sample(plan.duration_s() * share);
             let turn_rad_s = (sample.speed_m_s * sample.path.curvature_1_m).abs();
             plan.peak_speed_m_s = plan.peak_speed_m_s.max(sample.speed_m_s);
             plan.peak_acceleration_m_s2 = plan
@@ -359,6 +370,16 @@ impl Plan {
                 .max(sample.acceleration_m_s2.abs());
             plan.peak_lateral_m_s2 = plan.peak_lateral_m_s2.max(turn_rad_s * sample.speed_m_s);
             plan.peak_angular_rad_s = plan.peak_angular_rad_s.max(turn_rad_s);
+            // A wiggle is asked for and slows nothing: the timing without it is looked at.
+            let timing = plan.profile.sample(plan.profile.duration_s() * share);
+            let node = ((timing.arc_m / cell_m) as usize).min(cells);
+            let cell = CellBounds {
+                asked_m_s: asked_m_s[node],
+                left_m_s: nodes[node].speed_m_s,
+                by: bounds[node].by,
+            };
+            plan.stretches
+                .note(timing.arc_m, timing.speed_m_s, &cell, blame.along);
         }
         Ok(plan)
     }
@@ -381,6 +402,12 @@ impl Plan {
             acceleration_m_s2: warp.pace * warp.pace * timing.acceleration_m_s2
                 + warp.pace_rate_1_s * timing.speed_m_s,
         }
+    }
+
+    /// Where a limit makes the robot slower than it was asked to be, in driving order; at most
+    /// [`SLOWED_MAX`] stretches.
+    pub fn slowed(&self) -> &[Slowed] {
+        self.stretches.as_slice()
     }
 
     /// The wiggle of the speed, if there is one, as deep as the limits left it.

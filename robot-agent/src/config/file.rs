@@ -91,6 +91,8 @@ pub(super) struct DriveFile {
     pub(super) y_m: Option<f64>,
     pub(super) heading_rad: Option<f64>,
     pub(super) seed: Option<u64>,
+    pub(super) battery_charge_ratio: Option<f64>,
+    pub(super) clock_ahead_s: Option<i64>,
 }
 
 /// Reads the text of a configuration; `file` is its name in errors.

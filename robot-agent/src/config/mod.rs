@@ -101,6 +101,12 @@ pub struct Flags {
     /// Seed of the simulated base
     #[arg(long)]
     pub seed: Option<u64>,
+    /// Charge of the simulated battery at the start, 0 to 1 [default: 1]
+    #[arg(long)]
+    pub battery_charge: Option<f64>,
+    /// How far the simulated robot's wall clock is ahead, seconds, negative for behind [default: 0]
+    #[arg(long, allow_hyphen_values = true)]
+    pub clock_ahead_s: Option<i64>,
     /// What to log, as in `info,tread_agent=debug`
     #[arg(long, env = "RUST_LOG", default_value = "info,zenoh=warn")]
     pub log: String,
@@ -128,6 +134,10 @@ pub struct SimulatedConfig {
     pub start: Pose,
     /// What makes its sensors and wheels its own.
     pub seed: u64,
+    /// Charge of its battery at the start, 0 to 1.
+    pub battery_charge_ratio: f64,
+    /// How far its wall clock is ahead, seconds.
+    pub clock_ahead_s: i64,
 }
 
 /// A checked configuration.
@@ -322,6 +332,20 @@ fn simulated(
             problem,
         });
     }
+    let from_file = |pick: fn(&DriveFile) -> Option<f64>| file.as_ref().and_then(pick);
+    let battery_charge_ratio = flags
+        .battery_charge
+        .or(from_file(|drive| drive.battery_charge_ratio))
+        .unwrap_or(1.0);
+    within(
+        "drive.battery_charge_ratio",
+        battery_charge_ratio,
+        &(0.0..=1.0),
+    )?;
+    let clock_ahead_s = flags
+        .clock_ahead_s
+        .or(file.as_ref().and_then(|drive| drive.clock_ahead_s))
+        .unwrap_or(0);
     let seed = flags
         .seed
         .or(file.and_then(|drive| drive.seed))
@@ -331,6 +355,8 @@ fn simulated(
         scenario,
         start,
         seed,
+        battery_charge_ratio,
+        clock_ahead_s,
     })
 }
 

@@ -3,6 +3,9 @@
 //! It owns the drive and all control state ([`tick`]). Comms live elsewhere and talk to it
 //! through [`seam`]: a dead network never stalls it. It does no I/O but the drive's.
 
+pub(crate) mod active;
+pub(crate) mod driven;
+mod outgoing;
 pub(crate) mod seam;
 pub(crate) mod segments;
 pub(crate) mod site_view;
@@ -77,5 +80,7 @@ pub(crate) fn run(
     }
 }
 
+#[cfg(test)]
+mod hold_tests;
 #[cfg(test)]
 mod tests;

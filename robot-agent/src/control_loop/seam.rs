@@ -17,8 +17,12 @@ use tread_api::wire::ingest::MissionPhase;
 use tread_control::estimation::SegmentStatistics;
 use tread_control::follower::{FailureReason, Follower};
 use tread_control::geometry::{Pose, Twist};
+use tread_control::reference::Governor;
 
+use super::active::Hold;
+use super::driven::Driven;
 use super::site_view::SiteView;
+use crate::drive::Battery;
 
 /// Commands that may wait for the next tick.
 pub(crate) const COMMANDS_MAX: usize = 16;
@@ -34,6 +38,10 @@ pub(crate) struct Job {
     pub(crate) follower: Follower,
     /// Past this monotonic time it must not start.
     pub(crate) start_by: Option<Duration>,
+    /// Longest silence of the server with which it goes on; for ever when absent.
+    pub(crate) silence_max: Option<Duration>,
+    /// What it turns out to be.
+    pub(crate) driven: Driven,
 }
 
 /// To the loop.
@@ -43,6 +51,12 @@ pub(crate) enum LoopCommand {
     Start(Box<Job>),
     /// Brake along the path and end the mission, if it is this one.
     Cancel(MissionId),
+    /// Hold this mission, standing.
+    Hold(MissionId, Hold),
+    /// Let it go on, if nothing else holds it.
+    Release(MissionId, Hold),
+    /// Drive this revision instead of the one in hand, once the robot stands.
+    Replace(Box<Job>),
     /// The site is like this now.
     Site(Arc<SiteView>),
 }
@@ -56,6 +70,7 @@ pub(crate) enum EndReason {
     TooLate,
     AnotherInHand,
     AgentStopped,
+    ServerSilent,
 }
 
 impl EndReason {
@@ -64,7 +79,9 @@ impl EndReason {
             Self::Reached => MissionPhase::Succeeded,
             Self::Cancelled => MissionPhase::Cancelled,
             Self::TooLate => MissionPhase::Expired,
-            Self::Failed(_) | Self::AnotherInHand | Self::AgentStopped => MissionPhase::Failed,
+            Self::Failed(_) | Self::AnotherInHand | Self::AgentStopped | Self::ServerSilent => {
+                MissionPhase::Failed
+            }
         }
     }
 
@@ -77,6 +94,7 @@ impl EndReason {
             Self::TooLate => Some("its latest start passed before it began"),
             Self::AnotherInHand => Some("another mission was being driven"),
             Self::AgentStopped => Some("the agent was stopped"),
+            Self::ServerSilent => Some("the server was silent for longer than the mission allows"),
         }
     }
 }
@@ -104,6 +122,24 @@ pub(crate) enum LoopEvent {
         at: Timestamp,
         progress: MissionProgress,
     },
+    /// The mission stands paused.
+    Paused {
+        at: Timestamp,
+        progress: MissionProgress,
+    },
+    /// The mission goes on after a pause.
+    Resumed {
+        at: Timestamp,
+        progress: MissionProgress,
+    },
+    /// Another revision is driven from now on; the one before is handed back to be freed.
+    Replaced {
+        at: Timestamp,
+        progress: MissionProgress,
+        old: Box<Job>,
+    },
+    /// A revision came when its mission was over, and is handed back to be freed.
+    CameTooLate(Box<Job>),
     /// A mission ended; what was driven is handed back to be freed elsewhere.
     Ended {
         at: Timestamp,
@@ -151,6 +187,12 @@ pub(crate) struct Snapshot {
     pub twist: Option<(Twist, Duration)>,
     /// The mission that is driven.
     pub mission: Option<MissionProgress>,
+    /// What walks along its plan.
+    pub governor: Option<Governor>,
+    /// What holds the mission.
+    pub is_held: bool,
+    /// The battery, if the base measures it.
+    pub battery: Option<Battery>,
     /// θ̂ of the loop; kept from the last mission, none before the first.
     pub theta_loop: Option<f64>,
     /// θ measured on the present ground.
@@ -176,6 +218,9 @@ impl Default for Snapshot {
             pose: None,
             twist: None,
             mission: None,
+            governor: None,
+            is_held: false,
+            battery: None,
             theta_loop: None,
             theta_measured: None,
             excited: false,
@@ -203,6 +248,12 @@ pub(crate) struct Shared {
     pub(crate) lost_segments: AtomicU64,
     /// Blocks of measurement that belong to no cell, for want of a site or a position.
     pub(crate) unplaced_blocks: AtomicU64,
+    /// Samples of the base that gave way to newer ones before a tick took them.
+    pub(crate) lost_samples: AtomicU64,
+    /// Commands of the server that found no room.
+    pub(crate) lost_commands: AtomicU64,
+    /// When the server was last heard, microseconds of the agent's monotonic clock.
+    server_heard_us: AtomicU64,
 }
 
 impl Shared {
@@ -212,14 +263,26 @@ impl Shared {
     }
 
     /// Leaves a newer one, unless somebody is reading right now: the next tick brings another.
-    pub(super) fn publish(&self, snapshot: Snapshot) {
+    pub(super) fn publish(&self, snapshot: &Snapshot) {
         if let Ok(mut cell) = self.snapshot.try_lock() {
-            *cell = snapshot;
+            *cell = *snapshot;
         }
     }
 
-    pub(super) fn count(counter: &AtomicU64) {
+    pub(crate) fn count(counter: &AtomicU64) {
         counter.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// The server has been heard just now.
+    pub(crate) fn note_server_heard(&self, now: Duration) {
+        let now_us = u64::try_from(now.as_micros()).unwrap_or(u64::MAX);
+        self.server_heard_us.fetch_max(now_us, Ordering::Relaxed);
+    }
+
+    /// How long the server has been silent.
+    pub(crate) fn server_silence(&self, now: Duration) -> Duration {
+        let heard = Duration::from_micros(self.server_heard_us.load(Ordering::Relaxed));
+        now.saturating_sub(heard)
     }
 }
 

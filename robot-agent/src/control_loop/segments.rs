@@ -157,8 +157,12 @@ fn close(
         site: Arc::clone(site),
         mission,
         started_at: open.since.wall,
-        // A wall clock that was set back must not make a segment end before it began.
-        ended_at: input.now.wall.max(open.since.wall),
+        // By the monotonic clock: a wall clock may be set meanwhile, back or on by years.
+        ended_at: open
+            .since
+            .wall
+            .checked_add(input.now.monotonic.saturating_sub(open.since.monotonic))
+            .unwrap_or(open.since.wall),
         cell: open.place.cell,
         terrain: open.place.terrain,
         distance_m: open.distance_m,

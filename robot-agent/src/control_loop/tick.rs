@@ -3,27 +3,27 @@
 //! Pure but for the drive and the channels' ends; nothing here waits, allocates or looks at a
 //! clock. What has to be freed goes out with an event, to be freed by somebody else.
 
-use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::sync::mpsc::TrySendError;
 use std::time::Duration;
 
 use tread_api::friction::ThetaEstimate;
-use tread_api::robot::{MissionProgress, RobotMode};
+use tread_api::robot::RobotMode;
 use tread_control::estimation::{Estimate, Estimator, SensorNoise, SensorSample};
-use tread_control::follower::FollowerStatus;
-use tread_control::gate::{GateInput, GateLimits, gate};
-use tread_control::geometry::Twist;
+use tread_control::gate::{GateCause, GateInput, GateLimits, gate};
+use tread_control::geometry::{Pose, Twist};
 use tread_control::localisation::{FixOutcome, Localisation, LocalisationNoise, PositionFix};
 use tread_control::measured::{Measured, WheelSpeeds};
 use tread_control::robot::RobotModel;
 use tread_control::tracking::ThetaKnowledge;
 
+use super::active::{Active, Hold, News, progress_of};
+use super::driven::TickRecord;
+use super::outgoing::Outgoing;
 use super::seam::{EndReason, Fault, Job, LoopCommand, LoopEnds, LoopEvent, Shared, Snapshot};
 use super::segments::{CutInput, Moment, Place, SegmentCutter};
 use super::site_view::{Footing, SiteView};
-use crate::drive::{Drive, Feedback};
+use crate::drive::{Battery, Drive, Feedback};
 use crate::geometry::wire_point;
 
 /// Oldest word of the base with which it does not count as silent.
@@ -32,18 +32,10 @@ const BASE_SILENT_AFTER: Duration = Duration::from_millis(200);
 const POSITION_LOST_AFTER: Duration = Duration::from_secs(3);
 /// Longest time that one tick is taken to have lasted, seconds; a loop that slept does not leap.
 const TICK_MAX_S: f64 = 0.2;
-/// Mission events that may wait for room in the channel; one mission at a time makes two.
-const UNSENT_MAX: usize = 8;
+/// Longest that a mission is held for a revision that does not come.
+const REPLACEMENT_MAX: Duration = Duration::from_secs(10);
 /// Speed below which the robot counts as standing, m/s and rad/s.
 const STANDING: f64 = 0.02;
-
-/// The mission in hand.
-#[derive(Debug)]
-struct Active {
-    job: Box<Job>,
-    progress: MissionProgress,
-    has_started: bool,
-}
 
 /// The state of the loop between two ticks.
 #[derive(Debug)]
@@ -57,7 +49,7 @@ pub(crate) struct LoopCore {
     cutter: SegmentCutter,
     site: Option<Arc<SiteView>>,
     active: Option<Active>,
-    unsent: VecDeque<LoopEvent>,
+    outgoing: Outgoing,
     command: WheelSpeeds,
     measured_wheels: WheelSpeeds,
     theta_loop: Option<f64>,
@@ -65,6 +57,10 @@ pub(crate) struct LoopCore {
     last_tick: Option<Duration>,
     last_sample: Option<Duration>,
     last_fix: Option<Duration>,
+    /// Whether a wheel slips beyond the model.
+    slips: bool,
+    /// Until when the mission is held for its next revision.
+    replacement_until: Option<Duration>,
     ticks: u64,
 }
 
@@ -74,14 +70,14 @@ impl LoopCore {
         Self {
             model,
             limits: GateLimits::of(&model),
-            ends,
             localisation: Localisation::new(model, LocalisationNoise::default()),
             estimate: estimator.estimate(),
             estimator,
             cutter: SegmentCutter::default(),
             site: None,
             active: None,
-            unsent: VecDeque::with_capacity(UNSENT_MAX),
+            outgoing: Outgoing::new(ends.events.clone(), Arc::clone(&ends.shared)),
+            ends,
             command: WheelSpeeds::default(),
             measured_wheels: WheelSpeeds::default(),
             theta_loop: None,
@@ -89,6 +85,8 @@ impl LoopCore {
             last_tick: None,
             last_sample: None,
             last_fix: None,
+            slips: false,
+            replacement_until: None,
             ticks: 0,
         }
     }
@@ -102,12 +100,13 @@ impl LoopCore {
 
     /// One tick. With `stop`, the robot brakes and its mission ends.
     pub(crate) fn tick(&mut self, now: Moment, stop: bool, drive: &mut dyn Drive) {
-        self.send_unsent();
+        self.outgoing.flush();
         let dt_s = self.time_step_s(now.monotonic);
         let feedback = drive.read(now.monotonic);
         let ground_changed = self.take_samples(&feedback);
         self.take_commands(now, stop);
         self.cut_segments(now, ground_changed, dt_s);
+        self.mind_bounds(now.monotonic);
         let fault = self.fault(now.monotonic);
         let wanted = self.follow(now, fault, dt_s);
         let gated = gate(
@@ -123,6 +122,7 @@ impl LoopCore {
         );
         self.command = gated.wheel_speeds;
         drive.write(self.command);
+        self.record(dt_s, ground_changed, gated.cause);
         if stop {
             self.end_mission(now, EndReason::AgentStopped);
         }
@@ -130,7 +130,42 @@ impl LoopCore {
         self.ticks += 1;
         self.ends
             .shared
-            .publish(self.snapshot(now.monotonic, fault));
+            .publish(&self.snapshot(now.monotonic, fault, drive.battery()));
+    }
+
+    /// What must not last for ever: the server's silence, and waiting for a revision.
+    fn mind_bounds(&mut self, now: Duration) {
+        let Some(active) = &mut self.active else {
+            self.replacement_until = None;
+            return;
+        };
+        if active.minds_silence(self.ends.shared.server_silence(now)) {
+            active.stop(EndReason::ServerSilent);
+        }
+        if self.replacement_until.is_some_and(|until| now > until) {
+            active.hold(Hold::Replacement, false);
+            self.replacement_until = None;
+        }
+    }
+
+    fn record(&mut self, dt_s: f64, ground_changed: bool, gate: Option<GateCause>) {
+        let Some(active) = &mut self.active else {
+            return;
+        };
+        let speed_m_s = self.localisation.twist().linear_m_s.abs();
+        let measured = self.estimate.theta;
+        active.record(TickRecord {
+            dt_s,
+            at: self.localisation.pose().map(Pose::point),
+            driven_m: speed_m_s * dt_s,
+            cross_track_m: None,
+            is_saturated: false,
+            is_paused: false,
+            slips: self.slips || ground_changed,
+            gate,
+            theta_loop: self.theta_loop,
+            theta_measured: measured.map(|theta| (theta.theta, theta.std_dev)),
+        });
     }
 
     fn time_step_s(&mut self, now: Duration) -> f64 {
@@ -142,6 +177,11 @@ impl LoopCore {
     fn take_samples(&mut self, feedback: &Feedback) -> bool {
         let mut ground_changed = false;
         let mut has_new_block = false;
+        let lost = u64::from(feedback.lost());
+        self.ends
+            .shared
+            .lost_samples
+            .fetch_add(lost, Ordering::Relaxed);
         for sample in feedback.samples() {
             let dt_s = self
                 .last_sample
@@ -168,6 +208,9 @@ impl LoopCore {
                         let outcome = self.estimator.update(&taken, dt_s);
                         ground_changed |= outcome.ground_changed;
                         has_new_block |= outcome.block_done;
+                        if outcome.block_done {
+                            self.slips = outcome.slips;
+                        }
                         if outcome.block_done && self.cutter.cell().is_none() {
                             Shared::count(&self.ends.shared.unplaced_blocks);
                         }
@@ -199,34 +242,53 @@ impl LoopCore {
             match command {
                 LoopCommand::Start(job) => self.begin(now, job, stop),
                 LoopCommand::Cancel(mission) => {
-                    if let Some(active) = self
-                        .active
-                        .as_mut()
-                        .filter(|active| active.job.mission == mission)
-                    {
-                        active.job.follower.stop();
+                    if let Some(active) = self.of(mission) {
+                        active.stop(EndReason::Cancelled);
                     }
                 }
+                LoopCommand::Hold(mission, hold) => {
+                    if let Some(active) = self.of(mission) {
+                        active.hold(hold, true);
+                        if hold == Hold::Replacement {
+                            self.replacement_until = Some(now.monotonic + REPLACEMENT_MAX);
+                        }
+                    }
+                }
+                LoopCommand::Release(mission, hold) => {
+                    if let Some(active) = self.of(mission) {
+                        active.hold(hold, false);
+                    }
+                }
+                LoopCommand::Replace(job) => match self.of(job.mission) {
+                    Some(active) => {
+                        // The room of one revision that is replaced before it was driven.
+                        if let Some(unused) = active.replace_at_rest(job) {
+                            self.outgoing.send(LoopEvent::CameTooLate(unused));
+                        }
+                        self.replacement_until = None;
+                    }
+                    None => self.outgoing.send(LoopEvent::CameTooLate(job)),
+                },
                 LoopCommand::Site(site) => {
                     self.cutter.abandon(&mut self.estimator);
                     self.estimate = self.estimator.estimate();
                     if let Some(old) = self.site.replace(site) {
-                        self.send(LoopEvent::Retired(old));
+                        self.outgoing.send(LoopEvent::Retired(old));
                     }
                 }
             }
         }
     }
 
+    /// The mission in hand, if it is this one.
+    fn of(&mut self, mission: tread_api::ids::MissionId) -> Option<&mut Active> {
+        self.active
+            .as_mut()
+            .filter(|active| active.job.mission == mission)
+    }
+
     fn begin(&mut self, now: Moment, mut job: Box<Job>, stop: bool) {
-        let progress = MissionProgress {
-            id: job.mission,
-            revision: job.revision,
-            plan_hash: job.plan_hash,
-            driven_m: 0.0,
-            length_m: job.follower.plan().length_m(),
-            cross_track_m: 0.0,
-        };
+        let progress = progress_of(&job);
         let refusal = if stop {
             Some(EndReason::AgentStopped)
         } else if self.active.is_some() {
@@ -237,7 +299,7 @@ impl LoopCore {
             None
         };
         if let Some(reason) = refusal {
-            self.send(LoopEvent::Ended {
+            self.outgoing.send(LoopEvent::Ended {
                 at: now.wall,
                 reason,
                 progress,
@@ -248,11 +310,7 @@ impl LoopCore {
         if let Some(knowledge) = self.knowledge() {
             job.follower.warm_start(knowledge);
         }
-        self.active = Some(Active {
-            job,
-            progress,
-            has_started: false,
-        });
+        self.active = Some(Active::new(job));
     }
 
     fn knowledge(&self) -> Option<ThetaKnowledge> {
@@ -296,7 +354,7 @@ impl LoopCore {
             self.estimate = self.estimator.estimate();
         }
         if let Some(segment) = cut.segment {
-            self.send(LoopEvent::Segment(segment));
+            self.outgoing.send(LoopEvent::Segment(segment));
         }
     }
 
@@ -323,40 +381,51 @@ impl LoopCore {
             pose_age_s: age_s(now.monotonic, self.last_fix),
         };
         let active = self.active.as_mut()?;
-        let output = active.job.follower.step(&measured, knowledge, dt_s);
-        self.theta_loop = Some(output.theta_loop);
-        active.progress.driven_m = active.progress.driven_m.max(output.progress_m);
-        active.progress.cross_track_m = output.errors.cross_m;
-        let end = match output.status {
-            FollowerStatus::Done => Some(EndReason::Reached),
-            FollowerStatus::Stopped => Some(EndReason::Cancelled),
-            FollowerStatus::Failed(reason) => Some(EndReason::Failed(reason)),
-            FollowerStatus::Approach
-            | FollowerStatus::Tracking
-            | FollowerStatus::Settling
-            | FollowerStatus::Stopping => None,
-        };
-        if let Some(reason) = end {
+        if active.is_at_rest_for_replacement() {
+            let old = active.replace(knowledge);
+            let (at, progress) = (now.wall, active.progress);
+            if let Some(old) = old {
+                self.outgoing
+                    .send(LoopEvent::Replaced { at, progress, old });
+            }
+        }
+        let active = self.active.as_mut()?;
+        let step = active.step(&measured, knowledge, &self.model, self.command, dt_s);
+        if step.theta_loop.is_finite() {
+            self.theta_loop = Some(step.theta_loop);
+        }
+        let (at, progress) = (now.wall, active.progress);
+        match step.news {
+            Some(News::Paused) => self.outgoing.send(LoopEvent::Paused { at, progress }),
+            Some(News::Resumed) => self.outgoing.send(LoopEvent::Resumed { at, progress }),
+            None => {}
+        }
+        if let Some(reason) = step.end {
             self.end_mission(now, reason);
             return None;
         }
         // The gate would brake anyway; a follower that hears of it does not wind up meanwhile.
-        fault.is_none().then_some(output.wheel_speeds)
+        fault.is_none().then_some(step.wanted)
     }
 
     fn end_mission(&mut self, now: Moment, reason: EndReason) {
         if let Some(active) = self.active.take() {
             if !active.has_started {
-                self.send(LoopEvent::Started {
+                self.outgoing.send(LoopEvent::Started {
                     at: now.wall,
                     progress: active.progress,
                 });
             }
-            self.send(LoopEvent::Ended {
+            let progress = active.progress;
+            let (job, next) = active.into_jobs();
+            if let Some(next) = next {
+                self.outgoing.send(LoopEvent::CameTooLate(next));
+            }
+            self.outgoing.send(LoopEvent::Ended {
                 at: now.wall,
                 reason,
-                progress: active.progress,
-                job: active.job,
+                progress,
+                job,
             });
         }
     }
@@ -368,39 +437,13 @@ impl LoopCore {
         };
         active.has_started = true;
         let progress = active.progress;
-        self.send(LoopEvent::Started {
+        self.outgoing.send(LoopEvent::Started {
             at: now.wall,
             progress,
         });
     }
 
-    fn send_unsent(&mut self) {
-        while let Some(event) = self.unsent.pop_front() {
-            if let Err(TrySendError::Full(event)) = self.ends.events.try_send(event) {
-                self.unsent.push_front(event);
-                return;
-            }
-        }
-    }
-
-    /// Hands an event on. What matters waits for room; a segment is lost and counted instead.
-    fn send(&mut self, event: LoopEvent) {
-        let refused = if self.unsent.is_empty() {
-            match self.ends.events.try_send(event) {
-                Ok(()) | Err(TrySendError::Disconnected(_)) => return,
-                Err(TrySendError::Full(event)) => event,
-            }
-        } else {
-            event
-        };
-        if matches!(refused, LoopEvent::Segment(_)) {
-            Shared::count(&self.ends.shared.lost_segments);
-        } else if self.unsent.len() < UNSENT_MAX {
-            self.unsent.push_back(refused);
-        }
-    }
-
-    fn snapshot(&self, now: Duration, fault: Option<Fault>) -> Snapshot {
+    fn snapshot(&self, now: Duration, fault: Option<Fault>, battery: Option<Battery>) -> Snapshot {
         let mode = match (fault, &self.active) {
             (Some(_), _) => RobotMode::Fault,
             (None, Some(_)) => RobotMode::Tracking,
@@ -423,6 +466,12 @@ impl LoopCore {
             pose: pose.zip(self.last_fix),
             twist: twist.zip(self.last_sample),
             mission: self.active.as_ref().map(|active| active.progress),
+            governor: self
+                .active
+                .as_ref()
+                .map(|active| *active.job.follower.governor()),
+            is_held: self.active.as_ref().is_some_and(Active::is_held),
+            battery,
             theta_loop: self.theta_loop.filter(|theta| theta.is_finite()),
             theta_measured: measured
                 .filter(|theta| theta.theta.is_finite() && theta.std_dev.is_finite()),
@@ -455,8 +504,7 @@ impl LoopCore {
 
     /// Hands out what still waits; false if there was no room for all of it.
     pub(crate) fn flush(&mut self) -> bool {
-        self.send_unsent();
-        self.unsent.is_empty()
+        self.outgoing.flush()
     }
 }
 

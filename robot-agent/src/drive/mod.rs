@@ -63,6 +63,15 @@ impl Feedback {
     }
 }
 
+/// A base's battery.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Battery {
+    /// Charge, 0 to 1.
+    pub charge_ratio: f64,
+    /// Voltage, volts.
+    pub voltage_v: f64,
+}
+
 /// A base.
 pub trait Drive: Send {
     /// Everything that the sensors said since the last call.
@@ -70,6 +79,11 @@ pub trait Drive: Send {
 
     /// Commands the wheels; the base keeps this until the next call.
     fn write(&mut self, command: WheelSpeeds);
+
+    /// The battery; none if the base does not measure it.
+    fn battery(&self) -> Option<Battery> {
+        None
+    }
 }
 
 #[cfg(test)]

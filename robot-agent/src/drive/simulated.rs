@@ -10,7 +10,8 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::plant::{Plant, PlantError, PlantSpec, PlantState};
 use tread_control::robot::RobotModel;
 
-use super::{Drive, Feedback};
+use super::{Battery, Drive, Feedback};
+use crate::sim::battery::SimulatedBattery;
 use crate::sim::ground::GroundMap;
 use crate::sim::scenario::{GroundSpec, Scenario, ScenarioError};
 use crate::sim::sensors::{SAMPLE_PERIOD, SensorSpec, Sensors};
@@ -47,6 +48,7 @@ pub struct SimulatedDrive {
     ground: GroundMap,
     sensors: Sensors,
     track_width_m: f64,
+    battery: SimulatedBattery,
     command: WheelSpeeds,
     waiting: Feedback,
     /// Up to when it has been simulated; none before the first call.
@@ -78,10 +80,18 @@ impl SimulatedDrive {
             ground: GroundMap::new(scenario)?,
             sensors,
             track_width_m: model.track_width_m(),
+            battery: SimulatedBattery::new(1.0),
             command: WheelSpeeds::default(),
             waiting: Feedback::default(),
             simulated_to: None,
         })
+    }
+
+    /// The same base with another charge of its battery, 0 to 1.
+    #[must_use]
+    pub fn with_charge(mut self, charge_ratio: f64) -> Self {
+        self.battery = SimulatedBattery::new(charge_ratio);
+        self
     }
 
     /// The true state, for tests and figures.
@@ -112,6 +122,10 @@ impl SimulatedDrive {
                 .under(self.plant.state().pose, self.track_width_m);
             self.plant
                 .step(self.command, &ground, SAMPLE_PERIOD.as_secs_f64());
+            let (wheels, torques) = (self.plant.state().wheel_speeds, self.plant.wheel_torques());
+            let wheels_w =
+                wheels.left_rad_s * torques.left_n_m + wheels.right_rad_s * torques.right_n_m;
+            self.battery.step(wheels_w, SAMPLE_PERIOD.as_secs_f64());
             let sample = self.sensors.sample(&self.plant, at);
             self.waiting.push(sample);
         }
@@ -129,5 +143,9 @@ impl Drive for SimulatedDrive {
 
     fn write(&mut self, command: WheelSpeeds) {
         self.command = command;
+    }
+
+    fn battery(&self) -> Option<Battery> {
+        Some(self.battery.reading())
     }
 }

@@ -41,7 +41,9 @@ const REPLIES_MAX: usize = 4;
 /// First pause before a lost connection is tried again, milliseconds.
 const RETRY_FIRST_MS: u32 = 100;
 /// Longest pause between tries, milliseconds.
-const RETRY_MAX_MS: u32 = 2_000;
+const RETRY_MAX_MS: u32 = 500;
+/// Longest try to connect, milliseconds: a hanging one must not outlast the network's healing.
+const OPEN_TIMEOUT_MS: u32 = 1_000;
 /// After this silence the router takes a robot for gone, milliseconds.
 const LEASE_MS: u32 = 3_000;
 
@@ -55,6 +57,18 @@ pub struct Identity {
     /// This run of the agent.
     pub boot: BootId,
 }
+
+/// What the link notices, for those who count and watch.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Noted {
+    /// The server was heard: its pulse, or a command.
+    ServerHeard,
+    /// A command found no room; the server asks again.
+    CommandLost,
+}
+
+/// Who is told of what the link notices; must not wait.
+pub type Note = Arc<dyn Fn(Noted) + Send + Sync>;
 
 /// Why the link could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -187,6 +201,10 @@ fn session_config(server: &str) -> Result<zenoh::Config, LinkError> {
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
         ("transport/link/tx/lease", LEASE_MS.to_string()),
+        (
+            "transport/unicast/open_timeout",
+            OPEN_TIMEOUT_MS.to_string(),
+        ),
     ];
     let mut config = zenoh::Config::default();
     for (key, value) in settings {
@@ -213,6 +231,7 @@ impl FleetLink {
     pub async fn connect(
         server: &str,
         identity: Identity,
+        note: Note,
         stop: &CancellationToken,
     ) -> Result<Option<(Self, Commands)>, LinkError> {
         let config = session_config(server)?;
@@ -244,16 +263,23 @@ impl FleetLink {
             })?
             .map_err(zenoh_failed("open a session"))?;
         info!(server, "connected to `{server}`");
-        let declaring = tokio::task::spawn_blocking(move || Self::declare(session, identity));
+        let declaring =
+            tokio::task::spawn_blocking(move || Self::declare(session, identity, &note));
         declaring
             .await
             .map_or(Ok(None), |declared| declared.map(Some))
     }
 
-    fn declare(session: zenoh::Session, identity: Identity) -> Result<(Self, Commands), LinkError> {
+    fn declare(
+        session: zenoh::Session,
+        identity: Identity,
+        note: &Note,
+    ) -> Result<(Self, Commands), LinkError> {
         let (site, robot) = (&identity.site, &identity.robot);
         let (command_sender, commands) = mpsc::channel(COMMANDS_MAX);
+        let noted = Arc::clone(note);
         let take_query = move |query: Query| {
+            noted(Noted::ServerHeard);
             let Some(Key::Command(_, _, verb)) = Key::parse(query.key_expr().as_str()) else {
                 // A wildcard or an unknown verb: no reply means not delivered.
                 return;
@@ -270,7 +296,9 @@ impl FleetLink {
                 query,
             };
             // Full: the query is dropped, the server sees no reply and asks again.
-            let _ = command_sender.try_send(command);
+            if command_sender.try_send(command).is_err() {
+                noted(Noted::CommandLost);
+            }
         };
         session
             .declare_queryable(keys::commands(site, robot))
@@ -279,6 +307,13 @@ impl FleetLink {
             .background()
             .wait()
             .map_err(zenoh_failed("declare the commands"))?;
+        let noted = Arc::clone(note);
+        session
+            .declare_subscriber(keys::pulse(site))
+            .callback(move |_| noted(Noted::ServerHeard))
+            .background()
+            .wait()
+            .map_err(zenoh_failed("listen for the server's pulse"))?;
         let publisher = |key: String| {
             let publisher = session.declare_publisher(key);
             publisher.congestion_control(CongestionControl::Drop).wait()

@@ -9,6 +9,7 @@ use tracing::{error, info, warn};
 use tread_api::wire::ingest::{BATCH_RECORDS_MAX, Receipt, RefusedRecord};
 
 use super::{AskError, FleetLink, may_pass_later};
+use crate::clock::SharedClock;
 use crate::outbox::{Outbox, OutboxError, PendingBatch};
 
 /// First pause after a failure.
@@ -40,6 +41,7 @@ impl Backoff {
 pub async fn run(
     link: Arc<FleetLink>,
     outbox: Outbox,
+    clock: SharedClock,
     mut is_welcome: watch::Receiver<bool>,
     stop: CancellationToken,
 ) {
@@ -51,7 +53,7 @@ pub async fn run(
         let mut backoff = Backoff::new();
         let mut records_max = BATCH_RECORDS_MAX;
         loop {
-            match upload_next(&link, &outbox, records_max).await {
+            match upload_next(&link, &outbox, &clock, records_max).await {
                 Ok(Next::Empty) => outbox.arrived().await,
                 Ok(Next::Settled) => {
                     backoff = Backoff::new();
@@ -91,6 +93,7 @@ enum Next {
 async fn upload_next(
     link: &Arc<FleetLink>,
     outbox: &Outbox,
+    clock: &SharedClock,
     records_max: usize,
 ) -> Result<Next, OutboxError> {
     let reading = outbox.clone();
@@ -98,9 +101,11 @@ async fn upload_next(
     let Ok(pending) = reading.await else {
         return Ok(Next::TryLater);
     };
-    let Some(sent) = pending? else {
+    let Some(mut sent) = pending? else {
         return Ok(Next::Empty);
     };
+    // The server puts the records' times right by it, should this clock be wrong.
+    sent.batch.robot_time = Some(clock.wall());
     match link.upload(&sent.batch).await {
         Ok(receipt) => {
             let records = sent.batch.records.len();

@@ -3,7 +3,8 @@
 //! ```text
 //!            offer                    report of the loop
 //! (unknown) ───────► held ──────────────────────────────► ended
-//!     │                └ cancel: held, braking ────────────▲
+//!     │              │ ▲ └ cancel: held, braking ──────────▲
+//!     │              └─┘ offer of a higher revision        │
 //!     └ cancel ────────────────────────────────────────────┘
 //! ```
 //!
@@ -34,6 +35,9 @@ pub struct Held {
     pub plan_hash: PlanHash,
     /// What was planned.
     pub plan: PlanSummary,
+    /// Whether the server was told that it is cancelled; then it ends as that and nothing else.
+    #[serde(default)]
+    pub is_cancelled: bool,
 }
 
 /// A mission that has ended here.
@@ -50,6 +54,9 @@ pub struct Ended {
 pub struct Holder {
     held: Option<Held>,
     ended: VecDeque<Ended>,
+    /// How the mission in hand ends, while that is being written.
+    #[serde(skip)]
+    ending: Option<MissionPhase>,
 }
 
 /// What to do about an offer.
@@ -57,6 +64,9 @@ pub struct Holder {
 pub enum OfferDecision {
     /// It is new: plan it, hand it to the loop, then [`Holder::take`] it.
     Plan,
+    /// It is a new revision of what is held: plan it from where the robot comes to stand, then
+    /// [`Holder::replace`] the old one and hand it to the loop.
+    Replace,
     /// It is held already: say so again.
     AcceptAgain(PlanSummary),
     /// No, and why.
@@ -107,6 +117,10 @@ impl Holder {
         }
         match &self.held {
             None => OfferDecision::Plan,
+            Some(held) if held.mission == mission && held.is_cancelled => refuse(
+                OfferRefusal::Ended,
+                format!("mission {mission} is being cancelled"),
+            ),
             Some(held) if held.mission != mission => {
                 let detail = format!("mission {} is being driven", held.mission);
                 refuse(OfferRefusal::Busy, detail)
@@ -114,6 +128,7 @@ impl Holder {
             Some(held) if held.revision == offer.revision && held.plan_hash == offer.plan_hash => {
                 OfferDecision::AcceptAgain(held.plan)
             }
+            Some(held) if held.revision < offer.revision => OfferDecision::Replace,
             Some(held) => {
                 let detail = format!(
                     "mission {mission} is held as revision {} with plan hash {}",
@@ -135,6 +150,55 @@ impl Holder {
         is_free
     }
 
+    /// Puts a higher revision in place of the one in hand and gives the old one back; `None`, and
+    /// nothing changes, where [`Holder::offer`] would not say [`OfferDecision::Replace`].
+    #[must_use]
+    pub fn replace(&mut self, next: Held) -> Option<Held> {
+        let held = self.held.as_mut()?;
+        let is_next = held.mission == next.mission
+            && held.revision < next.revision
+            && !held.is_cancelled
+            && self.ending.is_none();
+        is_next.then(|| std::mem::replace(held, next))
+    }
+
+    /// Goes back to a former revision, if the later one could not be handed to the loop.
+    pub fn restore(&mut self, former: Held) {
+        if let Some(held) = self
+            .held
+            .as_mut()
+            .filter(|held| held.mission == former.mission)
+        {
+            *held = former;
+        }
+    }
+
+    /// Whether a mission is held in this revision, to be paused or resumed.
+    ///
+    /// # Errors
+    /// Why not, for the server.
+    pub fn check_held(
+        &self,
+        mission: MissionId,
+        revision: u32,
+    ) -> Result<(), (OfferRefusal, String)> {
+        if let Some(phase) = self.ended_phase(mission) {
+            let detail = format!("it has ended before: {}", name_of(phase));
+            return Err((OfferRefusal::Ended, detail));
+        }
+        match &self.held {
+            Some(held) if held.mission == mission && held.is_cancelled => {
+                Err((OfferRefusal::Ended, "it is being cancelled".to_owned()))
+            }
+            Some(held) if held.mission == mission && held.revision == revision => Ok(()),
+            Some(held) if held.mission == mission => Err((
+                OfferRefusal::Conflict,
+                format!("it is held as revision {}", held.revision),
+            )),
+            Some(_) | None => Err((OfferRefusal::Unknown, "it is not held here".to_owned())),
+        }
+    }
+
     /// Lets go of a mission that was taken but could not be handed to the loop.
     pub fn release(&mut self, mission: MissionId) {
         self.held.take_if(|held| held.mission == mission);
@@ -142,11 +206,11 @@ impl Holder {
 
     /// What to do about a cancellation; one that comes before its offer is remembered.
     pub fn cancel(&mut self, mission: MissionId) -> CancelDecision {
-        if self
-            .held
-            .as_ref()
-            .is_some_and(|held| held.mission == mission)
-        {
+        if let Some(held) = self.held.as_mut().filter(|held| held.mission == mission) {
+            if let Some(phase) = self.ending.filter(|_| !held.is_cancelled) {
+                return CancelDecision::EndedBefore(phase);
+            }
+            held.is_cancelled = true;
             return CancelDecision::Brake;
         }
         match self.ended_phase(mission) {
@@ -162,8 +226,27 @@ impl Holder {
         }
     }
 
+    /// How the mission in hand ends, before that is reported; from here on it can no longer be
+    /// cancelled. One that the server believes cancelled ends as that, whatever came in between.
+    pub fn begin_end(&mut self, mission: MissionId, phase: MissionPhase) -> MissionPhase {
+        let Some(held) = self.held.as_ref().filter(|held| held.mission == mission) else {
+            return phase;
+        };
+        let phase = if held.is_cancelled {
+            MissionPhase::Cancelled
+        } else {
+            phase
+        };
+        *self.ending.insert(phase)
+    }
+
     /// Ends the mission in hand; `None` if it is not this one.
     pub fn end(&mut self, mission: MissionId, phase: MissionPhase) -> Option<Held> {
+        self.ending.take_if(|_| {
+            self.held
+                .as_ref()
+                .is_some_and(|held| held.mission == mission)
+        });
         let held = self.held.take_if(|held| held.mission == mission)?;
         self.remember(Ended { mission, phase });
         Some(held)
@@ -180,6 +263,9 @@ impl Holder {
 fn name_of(phase: MissionPhase) -> &'static str {
     match phase {
         MissionPhase::Started => "started",
+        MissionPhase::Paused => "paused",
+        MissionPhase::Resumed => "resumed",
+        MissionPhase::Replaced => "replaced",
         MissionPhase::Succeeded => "succeeded",
         MissionPhase::Failed => "failed",
         MissionPhase::Cancelled => "cancelled",
@@ -190,6 +276,7 @@ fn name_of(phase: MissionPhase) -> &'static str {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
+    use tread_api::mission::LinkPolicy;
     use tread_api::trajectory::Trajectory;
     use uuid::Uuid;
 
@@ -232,6 +319,7 @@ mod tests {
             plan_hash,
             trajectory,
             start_within_ms: None,
+            link_policy: LinkPolicy::default(),
         }
     }
 
@@ -251,6 +339,7 @@ mod tests {
                             revision,
                             plan_hash: offer.plan_hash,
                             plan: PLAN,
+                            is_cancelled: false,
                         };
                         let is_over = over.contains(&offer.mission);
                         match before.held() {
@@ -258,8 +347,18 @@ mod tests {
                                 matches!(decision, OfferDecision::Refuse(OfferRefusal::Ended, _))
                             ),
                             None => prop_assert_eq!(&decision, &OfferDecision::Plan),
+                            Some(now) if now.mission == held.mission && now.is_cancelled => {
+                                prop_assert!(
+                                    matches!(decision, OfferDecision::Refuse(OfferRefusal::Ended, _))
+                                );
+                            }
                             Some(now) if *now == held => {
                                 prop_assert_eq!(&decision, &OfferDecision::AcceptAgain(PLAN));
+                            }
+                            Some(now)
+                                if now.mission == offer.mission && now.revision < revision =>
+                            {
+                                prop_assert_eq!(&decision, &OfferDecision::Replace);
                             }
                             Some(now) if now.mission == offer.mission => prop_assert!(
                                 matches!(decision, OfferDecision::Refuse(OfferRefusal::Conflict, _))
@@ -267,6 +366,14 @@ mod tests {
                             Some(_) => prop_assert!(
                                 matches!(decision, OfferDecision::Refuse(OfferRefusal::Busy, _))
                             ),
+                        }
+                        if decision == OfferDecision::Replace {
+                            let former = holder.replace(held.clone());
+                            prop_assert_eq!(former.as_ref(), before.held());
+                            prop_assert_eq!(holder.held(), Some(&held));
+                            prop_assert!(holder.check_held(held.mission, revision).is_ok());
+                        } else {
+                            prop_assert_eq!(holder.replace(held.clone()), None);
                         }
                         prop_assert_eq!(holder.take(held), decision == OfferDecision::Plan);
                     }
@@ -287,6 +394,18 @@ mod tests {
                     Step::End { mission, succeeded } => {
                         let phase =
                             if succeeded { MissionPhase::Succeeded } else { MissionPhase::Failed };
+                        let was_cancelled = before
+                            .held()
+                            .is_some_and(|held| held.mission == id(mission) && held.is_cancelled);
+                        let phase = holder.begin_end(id(mission), phase);
+                        prop_assert_eq!(phase == MissionPhase::Cancelled, was_cancelled);
+                        if before.held().is_some_and(|held| held.mission == id(mission))
+                            && !was_cancelled
+                        {
+                            // Too late now.
+                            let late = holder.cancel(id(mission));
+                            prop_assert_eq!(late, CancelDecision::EndedBefore(phase));
+                        }
                         if holder.end(id(mission), phase).is_some() {
                             prop_assert!(!over.contains(&id(mission)));
                             over.push(id(mission));

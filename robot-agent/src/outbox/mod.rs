@@ -196,6 +196,7 @@ impl Outbox {
             let batch = Batch {
                 robot: self.shared.robot.clone(),
                 boot: first.boot,
+                robot_time: None,
                 records,
             };
             return Ok(Some(PendingBatch {

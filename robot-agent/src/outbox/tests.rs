@@ -232,6 +232,8 @@ fn report(number: u128) -> RecordContent {
         phase: MissionPhase::Succeeded,
         reason: None,
         progress: None,
+        quality: None,
+        driven: None,
     })
 }
 

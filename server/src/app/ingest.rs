@@ -8,7 +8,7 @@
 use std::collections::{HashMap, HashSet};
 use std::time::Duration;
 
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 use serde_json::value::{RawValue, to_raw_value};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, timeout_at};
@@ -22,7 +22,7 @@ use tread_api::wire::ingest::{
 use tread_api::wire::{Refusal, RefusalCode};
 
 use super::App;
-use super::missions::take_report;
+use super::missions::reports::{Foreign, Reporting, take_report};
 use crate::db::segments::{Inserted, NewSegment};
 use crate::db::sums::SumKey;
 use crate::db::{self, DbError, Tx};
@@ -53,10 +53,7 @@ pub struct Upload {
 
 /// Stores uploads until the stop, then those that already wait.
 pub async fn run(app: App, mut uploads: mpsc::Receiver<Upload>, stop: CancellationToken) {
-    let mut writer = Writer {
-        app,
-        keys: Keys::default(),
-    };
+    let mut writer = Writer::new(app);
     let mut next_begin = Instant::now();
     loop {
         let first = tokio::select! {
@@ -83,7 +80,9 @@ pub async fn run(app: App, mut uploads: mpsc::Receiver<Upload>, stop: Cancellati
     stop.cancelled().await;
 }
 
-struct Writer {
+/// Stores groups of uploads, one transaction each.
+#[derive(Debug)]
+pub struct Writer {
     app: App,
     keys: Keys,
 }
@@ -154,6 +153,7 @@ struct Candidate<'batch> {
     site_pk: i64,
     robot_pk: i64,
     segment: &'batch Segment,
+    ended_at: Timestamp,
     sums: Sums,
     measurement: Box<RawValue>,
 }
@@ -166,11 +166,20 @@ type Outcome = Result<Receipt, Refusal>;
 struct Tally {
     segments: u64,
     reports: u64,
+    foreign: u64,
 }
 
 impl Writer {
+    /// A writer that remembers no keys yet.
+    pub fn new(app: App) -> Self {
+        Self {
+            app,
+            keys: Keys::default(),
+        }
+    }
+
     /// Stores a group, or, if that fails, each of its batches alone; then answers.
-    async fn store(&mut self, group: Vec<Upload>) {
+    pub async fn store(&mut self, group: Vec<Upload>) {
         let outcomes = match self.commit(&group).await {
             Ok(outcomes) => outcomes,
             Err(cause) => {
@@ -219,6 +228,7 @@ impl Writer {
         counters.ingest_transactions.one();
         counters.segments_committed.add(tally.segments);
         counters.mission_reports_committed.add(tally.reports);
+        counters.reports_foreign.add(tally.foreign);
         if tally.reports > 0 {
             self.app.wake();
         }
@@ -245,6 +255,7 @@ impl Writer {
                 continue;
             };
             let boot_pk = self.keys.boot(&mut tx, robot_pk, batch.boot).await?;
+            let skew = Skew::of(batch.robot_time, now);
             let mut receipt = Receipt {
                 committed: 0,
                 duplicates: 0,
@@ -259,26 +270,35 @@ impl Writer {
                 };
                 let keys = (boot_pk, seq_key);
                 match &record.content {
-                    RecordContent::Segment(segment) => match prepared(segment) {
+                    RecordContent::Segment(segment) => match prepared(segment, skew) {
                         Ok((sums, measurement)) => candidates.push(Candidate {
                             upload: index,
                             keys,
                             site_pk,
                             robot_pk,
                             segment,
+                            ended_at: skew.put_right(segment.ended_at),
                             sums,
                             measurement,
                         }),
                         Err(reason) => refuse(reason),
                     },
                     RecordContent::Mission(report) => {
-                        let of = (robot_pk, batch.boot);
-                        match take_new_report(&mut tx, of, keys, report, now).await? {
+                        let of = Reporting {
+                            robot_pk,
+                            boot: batch.boot,
+                            now,
+                            at: skew.put_right(report.at),
+                        };
+                        match take_new_report(&mut tx, of, keys, report).await? {
                             Some(Ok(())) => {
                                 receipt.committed += 1;
                                 tally.reports += 1;
                             }
-                            Some(Err(reason)) => refuse(reason),
+                            Some(Err(Foreign(reason))) => {
+                                refuse(reason);
+                                tally.foreign += 1;
+                            }
                             None => receipt.duplicates += 1,
                         }
                     }
@@ -341,7 +361,7 @@ impl Writer {
                 terrain: segment.terrain.clone(),
                 robot_pk: candidate.robot_pk,
                 configuration_pk: self.keys.configuration(tx, segment.configuration).await?,
-                epoch_h: epoch_h(segment.ended_at),
+                epoch_h: epoch_h(candidate.ended_at),
             };
             let sum = sums.entry(key);
             sum.and_modify(|sum| sum.add(&candidate.sums))
@@ -361,28 +381,56 @@ fn refusal(code: RefusalCode, detail: &str) -> Refusal {
     }
 }
 
-fn prepared(segment: &Segment) -> Result<(Sums, Box<RawValue>), String> {
+/// How wrong a robot's clock is, from the time that it wrote on what it sent.
+///
+/// Small differences are the network's and are left alone, so that a segment has the same epoch
+/// whenever it arrives. With a clock that is wrong by more, the spans are right and the date is
+/// not; the server's date counts then.
+#[derive(Debug, Clone, Copy)]
+struct Skew(SignedDuration);
+
+/// Differences that count as the network's.
+const SKEW_MIN: SignedDuration = SignedDuration::from_secs(30);
+
+impl Skew {
+    fn of(robot_time: Option<Timestamp>, now: Timestamp) -> Self {
+        let ahead = robot_time.map_or(SignedDuration::ZERO, |said| said.duration_since(now));
+        Self(if ahead.abs() > SKEW_MIN {
+            ahead
+        } else {
+            SignedDuration::ZERO
+        })
+    }
+
+    fn put_right(self, at: Timestamp) -> Timestamp {
+        at.checked_sub(self.0).unwrap_or(at)
+    }
+}
+
+fn prepared(segment: &Segment, skew: Skew) -> Result<(Sums, Box<RawValue>), String> {
     segment.validate().map_err(|invalid| invalid.to_string())?;
-    let sums = Sums::of(segment).ok_or_else(|| "theta is out of range".to_owned())?;
-    let measurement = to_raw_value(segment).map_err(|error| error.to_string())?;
+    let mut segment = segment.clone();
+    segment.started_at = skew.put_right(segment.started_at);
+    segment.ended_at = skew.put_right(segment.ended_at);
+    let sums = Sums::of(&segment).ok_or_else(|| "theta is out of range".to_owned())?;
+    let measurement = to_raw_value(&segment).map_err(|error| error.to_string())?;
     Ok((sums, measurement))
 }
 
 /// Takes a report unless it was taken before; `None` says that it was.
 async fn take_new_report(
     tx: &mut Tx,
-    (robot_pk, boot): (i64, BootId),
+    reporting: Reporting,
     (boot_pk, seq): (i64, i64),
     report: &MissionReport,
-    now: Timestamp,
-) -> Result<Option<Result<(), String>>, DbError> {
-    if db::missions::has_report(tx, boot_pk, seq).await? {
+) -> Result<Option<Result<(), Foreign>>, DbError> {
+    if db::history::has_report(tx, boot_pk, seq).await? {
         return Ok(None);
     }
-    let taken = take_report(tx, robot_pk, boot, report, now).await?;
+    let taken = take_report(tx, reporting, report).await?;
     // A report that is refused is refused again, not called a duplicate.
     if taken.is_ok() {
-        db::missions::note_report(tx, boot_pk, seq).await?;
+        db::history::note_report(tx, boot_pk, seq).await?;
     }
     Ok(Some(taken))
 }

@@ -1,5 +1,8 @@
 //! What the server can do: use cases and their transactions. No HTTP, no SQL text.
 
+pub mod alerts;
+pub mod check;
+pub mod events;
 pub mod friction;
 pub mod ingest;
 pub mod missions;
@@ -10,17 +13,23 @@ pub mod sites;
 pub mod terrains;
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use tokio::sync::Notify;
-use tread_api::ids::{MissionId, RobotId, SiteId, TerrainId};
+use tokio::sync::{Notify, Semaphore, SemaphorePermit};
+use tread_api::ids::{AlertId, MissionId, RobotId, SiteId, TerrainId};
+use tread_api::mission::MissionState;
+use tread_api::trajectory::Place;
 
+use self::events::Hub;
+use self::missions::idempotency::InFlight;
 use crate::clock::Clock;
 use crate::config::FrictionConfig;
 use crate::counters::Counters;
 use crate::db::sites::SiteRow;
 use crate::db::{self, Db, DbError, Tx};
 use crate::fleet::presence::Presences;
+use crate::metrics::Requests;
 
 /// Everything that use cases work on; clones are handles to the same.
 #[derive(Debug, Clone)]
@@ -37,6 +46,14 @@ struct Inner {
     presences: Presences,
     /// Wakes the reconciler: what is wanted, or what is, has changed.
     changed: Notify,
+    /// Wakes the feed of events.
+    announced: Notify,
+    hub: Hub,
+    keys_in_flight: InFlight,
+    checks: Semaphore,
+    requests: Requests,
+    /// Counts changes of what is kept of robots.
+    robots_generation: AtomicU64,
     started_at: Duration,
 }
 
@@ -44,6 +61,7 @@ impl App {
     /// The server's use cases on this database and clock.
     pub fn new(db: Db, clock: Clock, friction: FrictionConfig) -> Self {
         let started_at = clock.elapsed();
+        let hub = Hub::new(clock.now());
         let inner = Inner {
             db,
             clock,
@@ -51,6 +69,12 @@ impl App {
             counters: Counters::default(),
             presences: Presences::default(),
             changed: Notify::new(),
+            announced: Notify::new(),
+            hub,
+            keys_in_flight: InFlight::default(),
+            checks: Semaphore::new(check::CHECKS_MAX),
+            requests: Requests::default(),
+            robots_generation: AtomicU64::new(1),
             started_at,
         };
         Self {
@@ -86,9 +110,46 @@ impl App {
             .saturating_sub(self.inner.started_at)
     }
 
-    /// Wakes the reconciler.
+    /// Wakes the reconciler and the feed of events.
     pub fn wake(&self) {
         self.inner.changed.notify_one();
+        self.announce();
+    }
+
+    /// Wakes the feed of events alone.
+    fn announce(&self) {
+        self.inner.announced.notify_one();
+    }
+
+    async fn announced(&self) {
+        self.inner.announced.notified().await;
+    }
+
+    /// Where event clients subscribe.
+    pub fn hub(&self) -> &Hub {
+        &self.inner.hub
+    }
+
+    /// Requests by route.
+    pub fn requests(&self) -> &Requests {
+        &self.inner.requests
+    }
+
+    fn keys_in_flight(&self) -> &InFlight {
+        &self.inner.keys_in_flight
+    }
+
+    /// Waits for a turn to plan; `None` never comes, since nobody closes the semaphore.
+    async fn check_turn(&self) -> Option<SemaphorePermit<'_>> {
+        self.inner.checks.acquire().await.ok()
+    }
+
+    fn robots_changed(&self) {
+        self.inner.robots_generation.fetch_add(1, Ordering::Relaxed);
+    }
+
+    fn robots_generation(&self) -> u64 {
+        self.inner.robots_generation.load(Ordering::Relaxed)
     }
 
     async fn changed(&self) {
@@ -142,13 +203,63 @@ pub enum AppError {
         detail: String,
     },
     /// The mission has ended and cannot be changed.
-    #[error("mission `{id}` has ended: it is {state}")]
+    #[error("mission `{id}` has ended: it is {}", state.as_str())]
     MissionEnded {
         /// The mission.
         id: MissionId,
         /// How it ended.
-        state: &'static str,
+        state: MissionState,
     },
+    /// The mission's state does not allow what is asked.
+    #[error("mission `{id}` is {} and cannot be {asked} now", state.as_str())]
+    MissionState {
+        /// The mission.
+        id: MissionId,
+        /// Where it stands.
+        state: MissionState,
+        /// What was asked.
+        asked: &'static str,
+    },
+    /// The robot has another mission, and the new one was not to wait.
+    #[error("robot `{robot}` has mission `{mission}`, which is {}", state.as_str())]
+    RobotBusy {
+        /// The robot.
+        robot: RobotId,
+        /// The other mission.
+        mission: MissionId,
+        /// Where it stands.
+        state: MissionState,
+    },
+    /// The robot is retired.
+    #[error("robot `{0}` is retired and gets no missions")]
+    RobotRetired(RobotId),
+    /// The robot has no such ability.
+    #[error("robot `{robot}` does not say that it can {what}")]
+    RobotCannot {
+        /// The robot.
+        robot: RobotId,
+        /// Which ability.
+        what: &'static str,
+    },
+    /// The trajectory cannot be driven.
+    #[error("robot `{robot}` cannot drive this: {detail}")]
+    Impossible {
+        /// The robot.
+        robot: RobotId,
+        /// Why.
+        detail: String,
+        /// Where.
+        place: Option<Place>,
+    },
+    /// No alert of that identifier.
+    #[error("alert `{0}` is not known")]
+    UnknownAlert(AlertId),
+    /// A request with the same key is being answered.
+    #[error("a request with this idempotency key is being answered; ask again in a moment")]
+    KeyInFlight,
+    /// The key was used for another request.
+    #[error("this idempotency key was used for another request; take a new one")]
+    KeyReused,
     /// A bound on how many there may be is reached.
     #[error("there are already {count} {what}; that is the most")]
     TooMany {
@@ -179,6 +290,27 @@ pub enum AppError {
 }
 
 impl AppError {
+    /// The mission's state that forbids what is asked.
+    pub fn state(&self) -> Option<MissionState> {
+        if let Self::MissionEnded { state, .. }
+        | Self::MissionState { state, .. }
+        | Self::RobotBusy { state, .. } = *self
+        {
+            Some(state)
+        } else {
+            None
+        }
+    }
+
+    /// Where along the way it cannot be driven.
+    pub fn place(&self) -> Option<Place> {
+        if let Self::Impossible { place, .. } = *self {
+            place
+        } else {
+            None
+        }
+    }
+
     /// The field or parameter that says something impossible.
     pub fn field(&self) -> Option<&'static str> {
         match self {
@@ -191,6 +323,14 @@ impl AppError {
             | Self::AlreadyExists { .. }
             | Self::BeyondLimits { .. }
             | Self::MissionEnded { .. }
+            | Self::MissionState { .. }
+            | Self::RobotBusy { .. }
+            | Self::RobotRetired(_)
+            | Self::RobotCannot { .. }
+            | Self::Impossible { .. }
+            | Self::UnknownAlert(_)
+            | Self::KeyInFlight
+            | Self::KeyReused
             | Self::TooMany { .. }
             | Self::Storage(_) => None,
         }

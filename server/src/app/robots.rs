@@ -2,14 +2,17 @@
 
 use tracing::info;
 use tread_api::ids::{RobotId, SiteId};
+use tread_api::mission::Actor;
 use tread_api::page::Page;
-use tread_api::robot::{Robot, RobotModel};
+use tread_api::robot::{ALERTS_MAX, Alert, ChangeRobot, Robot, RobotModel};
 use tread_api::site::NAME_LENGTH_MAX;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::{Refusal, RefusalCode};
 
+use super::missions::end_all;
+use super::missions::transitions::Change;
 use super::terrains::site_definition;
-use super::{App, AppError, page, site_row};
+use super::{App, AppError, name_or, page, site_row};
 use crate::db;
 use crate::db::robots::{Introduction, RobotRow};
 
@@ -19,13 +22,18 @@ impl App {
         &self,
         site: &SiteId,
         cursor: Option<&str>,
+        retired: bool,
         limit: u32,
     ) -> Result<Page<Robot>, AppError> {
         let mut tx = self.db().read().await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         let after = cursor.unwrap_or_default();
-        let rows = db::robots::list(&mut tx, site_pk, after, limit + 1).await?;
-        let robots = rows.into_iter().map(|row| self.with_live(row)).collect();
+        let rows = db::robots::list(&mut tx, site_pk, after, retired, limit + 1).await?;
+        let mut robots = Vec::with_capacity(rows.len());
+        for row in rows {
+            let alerts = db::alerts::raised_of(&mut tx, row.pk).await?;
+            robots.push(self.with_live(row, alerts));
+        }
         Ok(page(robots, limit, |robot: &Robot| robot.id.to_string()))
     }
 
@@ -35,21 +43,64 @@ impl App {
         let site_pk = site_row(&mut tx, site).await?.pk;
         let row = db::robots::find(&mut tx, site_pk, id).await?;
         let unknown = || AppError::UnknownRobot(site.clone(), id.clone());
-        Ok(self.with_live(row.ok_or_else(unknown)?))
+        let row = row.ok_or_else(unknown)?;
+        let alerts = db::alerts::raised_of(&mut tx, row.pk).await?;
+        Ok(self.with_live(row, alerts))
     }
 
-    fn with_live(&self, row: RobotRow) -> Robot {
+    /// Renames a robot for people, retires it or takes it back. Retiring cancels all its missions.
+    pub async fn change_robot(
+        &self,
+        site: &SiteId,
+        id: &RobotId,
+        change: ChangeRobot,
+    ) -> Result<Robot, AppError> {
+        let now = self.clock().now();
+        let mut tx = self.db().write().await?;
+        let site_pk = site_row(&mut tx, site).await?.pk;
+        let unknown = || AppError::UnknownRobot(site.clone(), id.clone());
+        let found = db::robots::find(&mut tx, site_pk, id).await?;
+        let row = found.ok_or_else(unknown)?;
+        if change.name.is_some() {
+            let name = name_or(change.name, id.as_str())?;
+            db::robots::rename(&mut tx, row.pk, &name).await?;
+        }
+        match (change.retired, row.retired_at) {
+            (Some(true), None) => {
+                let why = (Change::Retire, Actor::Client, Change::Retire.reason());
+                end_all(&mut tx, row.pk, why, now).await?;
+                db::robots::set_retired(&mut tx, row.pk, Some(now)).await?;
+            }
+            (Some(false), Some(_)) => db::robots::set_retired(&mut tx, row.pk, None).await?,
+            (Some(true), Some(_)) | (Some(false), None) | (None, _) => {}
+        }
+        let found = db::robots::find(&mut tx, site_pk, id).await?;
+        let row = found.ok_or_else(unknown)?;
+        let alerts = db::alerts::raised_of(&mut tx, row.pk).await?;
+        tx.commit().await?;
+        self.robots_changed();
+        self.wake();
+        Ok(self.with_live(row, alerts))
+    }
+
+    pub(super) fn with_live(&self, row: RobotRow, mut alerts: Vec<Alert>) -> Robot {
+        alerts.truncate(ALERTS_MAX);
         let now = self.clock().elapsed();
         let presence = self.presences().get(&(row.site.clone(), row.id.clone()));
         Robot {
             id: row.id,
             site: row.site,
+            name: row.name,
+            retired_at: row.retired_at,
             model: row.model,
             configuration: row.configuration,
+            capabilities: row.capabilities,
             agent_version: row.agent_version,
             first_seen_at: row.first_seen_at,
             last_hello_at: row.last_hello_at,
             link: presence.link(now),
+            link_cause: presence.link_cause(now),
+            alerts,
             live: presence.live(now),
         }
     }
@@ -90,6 +141,7 @@ impl App {
         let key = (site.clone(), hello.robot.clone());
         self.presences()
             .hello(key, hello.boot, self.clock().elapsed());
+        self.robots_changed();
         self.wake();
         Ok(welcome)
     }
@@ -105,6 +157,7 @@ impl App {
             boot: hello.boot,
             agent_version: &hello.agent_version,
             model: &hello.model,
+            capabilities: &hello.capabilities,
             at: now,
         };
         db::robots::introduce(&mut tx, row.pk, introduction).await?;
@@ -132,10 +185,13 @@ fn check_model(hello: &Hello) -> Result<(), String> {
         yaw_inertia_kg_m2,
         limits,
     } = &hello.model;
+    let none = String::new();
+    let base = hello.capabilities.base.as_ref().unwrap_or(&none);
     for (field, text) in [
         ("name", name),
         ("tyres", tyres),
         ("agent_version", &hello.agent_version),
+        ("capabilities.base", base),
     ] {
         if text.chars().count() > NAME_LENGTH_MAX {
             return Err(format!(

@@ -21,6 +21,13 @@ impl App {
         Ok(page(sites, limit, |site: &Site| site.id.to_string()))
     }
 
+    /// The names of all sites.
+    pub(crate) async fn all_sites(&self) -> Result<Vec<SiteId>, AppError> {
+        let mut tx = self.db().read().await?;
+        let rows = db::sites::list(&mut tx, "", SITES_MAX).await?;
+        Ok(rows.into_iter().map(|row| row.site.id).collect())
+    }
+
     /// One site.
     pub async fn site(&self, id: &SiteId) -> Result<Site, AppError> {
         let mut tx = self.db().read().await?;

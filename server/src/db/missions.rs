@@ -3,8 +3,10 @@
 use futures_util::StreamExt as _;
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
-use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
-use tread_api::mission::{Actor, Mission, MissionEvent, MissionState, PlanSummary};
+use tread_api::ids::{BootId, MissionId, PlanHash, RobotId, SiteId};
+use tread_api::mission::{
+    Cause, DrivenPath, LinkPolicy, Mission, MissionQuality, MissionState, PlanSummary, Replacement,
+};
 use tread_api::robot::MissionProgress;
 
 use super::{DbError, corrupt, from_json, from_us, parse, to_json, to_us, unsigned};
@@ -25,10 +27,16 @@ struct Raw {
     robot: String,
     state: String,
     reason: Option<String>,
+    cause: String,
+    pause_wanted: bool,
     revision: i64,
     plan_hash: String,
     trajectory: String,
+    replacement: Option<String>,
     latest_start_us: Option<i64>,
+    priority: i64,
+    link_policy: String,
+    lost_after_s: Option<f64>,
     boot: Option<String>,
     plan: Option<String>,
     progress: Option<String>,
@@ -48,10 +56,21 @@ impl TryFrom<Raw> for MissionRow {
             robot: parse("robot", &raw.robot)?,
             state: state(&raw.state)?,
             reason: raw.reason,
+            cause: cause(&raw.cause)?,
+            pause_wanted: raw.pause_wanted,
             revision: unsigned("mission revision", raw.revision)?,
             plan_hash: from_json("plan hash", &format!("\"{}\"", raw.plan_hash))?,
             trajectory: from_json("trajectory", &raw.trajectory)?,
+            replacement: raw
+                .replacement
+                .as_deref()
+                .map(|replacement| from_json("replacement", replacement))
+                .transpose()?,
             latest_start: optional_time(raw.latest_start_us)?,
+            priority: i32::try_from(raw.priority)
+                .map_err(|_range| corrupt("priority", raw.priority))?,
+            link_policy: from_json("link policy", &raw.link_policy)?,
+            lost_after_s: raw.lost_after_s,
             boot: raw
                 .boot
                 .as_deref()
@@ -78,7 +97,11 @@ impl TryFrom<Raw> for MissionRow {
     }
 }
 
-fn state(name: &str) -> Result<MissionState, DbError> {
+pub(super) fn cause(name: &str) -> Result<Cause, DbError> {
+    Cause::from_name(name).ok_or_else(|| corrupt("cause", name))
+}
+
+pub(super) fn state(name: &str) -> Result<MissionState, DbError> {
     MissionState::from_name(name).ok_or_else(|| corrupt("mission state", name))
 }
 
@@ -87,10 +110,12 @@ macro_rules! missions {
         sqlx::query_as!(
             Raw,
             r#"SELECT missions.id, missions.robot_pk, sites.id AS site, robots.id AS robot,
-                   missions.state, missions.reason, missions.revision, missions.plan_hash,
-                   missions.trajectory, missions.latest_start_us, missions.boot, missions.plan,
-                   missions.progress, missions.created_at_us, missions.started_at_us,
-                   missions.ended_at_us
+                   missions.state, missions.reason, missions.cause,
+                   missions.pause_wanted AS "pause_wanted: bool", missions.revision,
+                   missions.plan_hash, missions.trajectory, missions.replacement,
+                   missions.latest_start_us, missions.priority, missions.link_policy,
+                   missions.lost_after_s, missions.boot, missions.plan, missions.progress,
+                   missions.created_at_us, missions.started_at_us, missions.ended_at_us
                FROM missions
                JOIN robots ON robots.pk = missions.robot_pk
                JOIN sites ON sites.pk = robots.site_pk "# + $condition
@@ -107,17 +132,23 @@ pub async fn insert(db: &mut SqliteConnection, row: &MissionRow) -> Result<(), D
     let trajectory = to_json("trajectory", &mission.trajectory)?;
     let latest_start_us = mission.latest_start.map(to_us);
     let created_at_us = to_us(mission.created_at);
+    let cause = mission.cause.as_str();
+    let link_policy = to_json("link policy", &mission.link_policy)?;
     sqlx::query!(
-        "INSERT INTO missions (id, robot_pk, state, revision, plan_hash, trajectory,
-             latest_start_us, created_at_us)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+        "INSERT INTO missions (id, robot_pk, state, cause, revision, plan_hash, trajectory,
+             latest_start_us, priority, link_policy, lost_after_s, created_at_us)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         id,
         row.robot_pk,
         state,
+        cause,
         revision,
         plan_hash,
         trajectory,
         latest_start_us,
+        mission.priority,
+        link_policy,
+        mission.lost_after_s,
         created_at_us,
     )
     .execute(db)
@@ -184,7 +215,7 @@ pub async fn list(
 }
 
 /// Where an open mission stands, without what is to be driven, which may be long.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Standing {
     /// The mission.
     pub id: MissionId,
@@ -198,6 +229,20 @@ pub struct Standing {
     pub reason: Option<String>,
     /// The run of the agent that took it.
     pub boot: Option<BootId>,
+    /// Whether it is to be paused.
+    pub pause_wanted: bool,
+    /// The revision and hash that count now.
+    pub content: (u32, PlanHash),
+    /// The revision and hash that the robot does not hold whole yet.
+    pub replacement: Option<(u32, PlanHash)>,
+    /// Since when its robot has not been heard.
+    pub silent_since: Option<Timestamp>,
+    /// How long its robot may stay away, seconds, if that was said.
+    pub lost_after_s: Option<f64>,
+    /// What its robot does when it no longer hears the server.
+    pub link_policy: LinkPolicy,
+    /// The time that the robot planned for it, seconds.
+    pub duration_s: Option<f64>,
 }
 
 impl From<&Mission> for Standing {
@@ -209,6 +254,16 @@ impl From<&Mission> for Standing {
             state: mission.state,
             reason: mission.reason.clone(),
             boot: mission.boot,
+            pause_wanted: mission.pause_wanted,
+            content: (mission.revision, mission.plan_hash),
+            replacement: mission
+                .replacement
+                .as_ref()
+                .map(|replacement| (replacement.revision, replacement.plan_hash)),
+            silent_since: None,
+            lost_after_s: mission.lost_after_s,
+            link_policy: mission.link_policy,
+            duration_s: mission.plan.map(|plan| plan.duration_s),
         }
     }
 }
@@ -220,6 +275,15 @@ struct RawStanding {
     state: String,
     reason: Option<String>,
     boot: Option<String>,
+    pause_wanted: bool,
+    revision: i64,
+    plan_hash: String,
+    replacement_revision: Option<i64>,
+    replacement_hash: Option<String>,
+    silent_since_us: Option<i64>,
+    lost_after_s: Option<f64>,
+    link_policy: String,
+    duration_s: Option<f64>,
 }
 
 impl TryFrom<RawStanding> for Standing {
@@ -237,6 +301,22 @@ impl TryFrom<RawStanding> for Standing {
                 .as_deref()
                 .map(|boot| parse("boot", boot))
                 .transpose()?,
+            pause_wanted: raw.pause_wanted,
+            content: (
+                unsigned("mission revision", raw.revision)?,
+                parse("plan hash", &raw.plan_hash)?,
+            ),
+            replacement: match (raw.replacement_revision, raw.replacement_hash) {
+                (Some(revision), Some(hash)) => Some((
+                    unsigned("mission revision", revision)?,
+                    parse("plan hash", &hash)?,
+                )),
+                (Some(_), None) | (None, _) => None,
+            },
+            silent_since: raw.silent_since_us.map(from_us).transpose()?,
+            lost_after_s: raw.lost_after_s,
+            link_policy: from_json("link policy", &raw.link_policy)?,
+            duration_s: raw.duration_s,
         })
     }
 }
@@ -246,7 +326,13 @@ macro_rules! standings {
         sqlx::query_as!(
             RawStanding,
             r#"SELECT missions.id, sites.id AS site, robots.id AS robot, missions.state,
-                   missions.reason, missions.boot
+                   missions.reason, missions.boot,
+                   missions.pause_wanted AS "pause_wanted: bool", missions.revision,
+                   missions.plan_hash,
+                   missions.replacement ->> 'revision' AS "replacement_revision: i64",
+                   missions.replacement ->> 'plan_hash' AS "replacement_hash: String",
+                   missions.silent_since_us, missions.lost_after_s, missions.link_policy,
+                   missions.plan ->> 'duration_s' AS "duration_s: f64"
                FROM missions
                JOIN robots ON robots.pk = missions.robot_pk
                JOIN sites ON sites.pk = robots.site_pk "# + $condition
@@ -267,11 +353,15 @@ pub async fn in_hand(db: &mut SqliteConnection) -> Result<Vec<Standing>, DbError
     standings(raw)
 }
 
-/// The oldest queued mission of each robot that has nothing in hand.
+/// The mission that is next in the queue of each robot that has nothing in hand.
 pub async fn next_in_queues(db: &mut SqliteConnection) -> Result<Vec<Standing>, DbError> {
     let raw = standings!(
         "WHERE missions.id IN (
-             SELECT MIN(id) FROM missions WHERE state = 'queued' GROUP BY robot_pk)
+             SELECT id FROM (
+                 SELECT id, ROW_NUMBER() OVER (PARTITION BY robot_pk ORDER BY priority DESC, id)
+                     AS place
+                 FROM missions WHERE state = 'queued')
+             WHERE place = 1)
            AND NOT EXISTS (
              SELECT 1 FROM missions AS other WHERE other.robot_pk = missions.robot_pk
                AND other.state IN ('offered', 'active', 'paused', 'cancelling'))"
@@ -316,12 +406,15 @@ pub async fn compare_and_set(
     id: MissionId,
     from: MissionState,
     to: MissionState,
+    cause: Cause,
     reason: Option<&str>,
 ) -> Result<bool, DbError> {
     let (id, from, to) = (id.to_string(), from.as_str(), to.as_str());
+    let cause = cause.as_str();
     let result = sqlx::query!(
-        "UPDATE missions SET state = ?, reason = ? WHERE id = ? AND state = ?",
+        "UPDATE missions SET state = ?, cause = ?, reason = ? WHERE id = ? AND state = ?",
         to,
+        cause,
         reason,
         id,
         from,
@@ -378,105 +471,161 @@ pub async fn add_facts(
     Ok(())
 }
 
-/// Writes a step into a mission's history.
-pub async fn add_event(
+/// All missions of a robot that have not ended, the one in hand first, then as they are queued.
+pub async fn open_of_robot(
     db: &mut SqliteConnection,
-    id: MissionId,
-    event: &MissionEvent,
-) -> Result<(), DbError> {
-    let (id, at_us, actor) = (id.to_string(), to_us(event.at), event.actor.as_str());
-    let (from, to) = (event.from.map(MissionState::as_str), event.to.as_str());
-    sqlx::query!(
-        "INSERT INTO mission_events (mission, at_us, actor, from_state, to_state, reason)
-         VALUES (?, ?, ?, ?, ?, ?)",
-        id,
-        at_us,
-        actor,
-        from,
-        to,
-        event.reason,
-    )
-    .execute(db)
-    .await?;
-    Ok(())
-}
-
-/// A mission's history, oldest first, at most `limit` steps.
-pub async fn events(
-    db: &mut SqliteConnection,
-    id: MissionId,
-    limit: u32,
-) -> Result<Vec<MissionEvent>, DbError> {
-    let id = id.to_string();
-    let raw = sqlx::query_as!(
-        RawEvent,
-        "SELECT at_us, actor, from_state, to_state, reason FROM mission_events
-         WHERE mission = ? ORDER BY pk LIMIT ?",
-        id,
-        limit,
+    robot_pk: i64,
+) -> Result<Vec<Standing>, DbError> {
+    let raw = standings!(
+        "WHERE missions.robot_pk = ? AND missions.state IN
+             ('queued', 'offered', 'active', 'paused', 'cancelling')
+         ORDER BY missions.state = 'queued', missions.priority DESC, missions.id",
+        robot_pk,
     )
     .fetch_all(db)
     .await?;
-    raw.into_iter().map(MissionEvent::try_from).collect()
+    standings(raw)
 }
 
-struct RawEvent {
-    at_us: i64,
-    actor: String,
-    from_state: Option<String>,
-    to_state: String,
-    reason: Option<String>,
-}
-
-impl TryFrom<RawEvent> for MissionEvent {
-    type Error = DbError;
-
-    fn try_from(raw: RawEvent) -> Result<Self, DbError> {
-        Ok(Self {
-            at: from_us(raw.at_us)?,
-            actor: Actor::from_name(&raw.actor).ok_or_else(|| corrupt("actor", &raw.actor))?,
-            from: raw.from_state.as_deref().map(state).transpose()?,
-            to: state(&raw.to_state)?,
-            reason: raw.reason,
-        })
-    }
-}
-
-/// How many steps a mission's history has.
-pub async fn event_count(db: &mut SqliteConnection, id: MissionId) -> Result<u32, DbError> {
-    let id = id.to_string();
-    let count = sqlx::query_scalar!(
-        r#"SELECT COUNT(*) AS "count!: i64" FROM mission_events WHERE mission = ?"#,
-        id
-    )
-    .fetch_one(db)
-    .await?;
-    unsigned("count", count)
-}
-
-/// Whether a report has been taken before.
-pub async fn has_report(
+/// Wants an open mission paused or not; `false` if it has ended.
+pub async fn want_pause(
     db: &mut SqliteConnection,
-    boot_pk: i64,
-    seq: i64,
+    id: MissionId,
+    wanted: bool,
 ) -> Result<bool, DbError> {
-    let found = sqlx::query_scalar!(
-        r#"SELECT EXISTS (SELECT 1 FROM reports_seen WHERE boot_pk = ? AND seq = ?)
-               AS "found!: bool""#,
-        boot_pk,
-        seq,
-    );
-    Ok(found.fetch_one(db).await?)
+    let id = id.to_string();
+    let result = sqlx::query!(
+        "UPDATE missions SET pause_wanted = ? WHERE id = ? AND state IN
+             ('offered', 'active', 'paused')",
+        wanted,
+        id,
+    )
+    .execute(db)
+    .await?;
+    Ok(result.rows_affected() == 1)
 }
 
-/// Notes that a report has been taken.
-pub async fn note_report(db: &mut SqliteConnection, boot_pk: i64, seq: i64) -> Result<(), DbError> {
+/// Sets or drops the revision that the robot does not hold whole yet.
+pub async fn set_replacement(
+    db: &mut SqliteConnection,
+    id: MissionId,
+    replacement: Option<&Replacement>,
+) -> Result<(), DbError> {
+    let id = id.to_string();
+    let replacement = replacement
+        .map(|replacement| to_json("replacement", replacement))
+        .transpose()?;
     sqlx::query!(
-        "INSERT INTO reports_seen (boot_pk, seq) VALUES (?, ?)",
-        boot_pk,
-        seq
+        "UPDATE missions SET replacement = ? WHERE id = ?",
+        replacement,
+        id,
     )
     .execute(db)
     .await?;
     Ok(())
+}
+
+/// Makes another revision the one that counts; `false` if another one than `from` counted.
+pub async fn swap_content(
+    db: &mut SqliteConnection,
+    id: MissionId,
+    from: u32,
+    to: &Replacement,
+) -> Result<bool, DbError> {
+    let (id, from, revision) = (id.to_string(), i64::from(from), i64::from(to.revision));
+    let (plan_hash, trajectory) = (
+        to.plan_hash.to_string(),
+        to_json("trajectory", &to.trajectory)?,
+    );
+    let result = sqlx::query!(
+        "UPDATE missions SET revision = ?, plan_hash = ?, trajectory = ?, replacement = NULL,
+             plan = NULL, progress = NULL
+         WHERE id = ? AND revision = ?",
+        revision,
+        plan_hash,
+        trajectory,
+        id,
+        from,
+    )
+    .execute(db)
+    .await?;
+    Ok(result.rows_affected() == 1)
+}
+
+/// Notes since when a mission's robot has not been heard, or that it is heard.
+pub async fn set_silence(
+    db: &mut SqliteConnection,
+    id: MissionId,
+    since: Option<Timestamp>,
+) -> Result<(), DbError> {
+    let (id, since_us) = (id.to_string(), since.map(to_us));
+    sqlx::query!(
+        "UPDATE missions SET silent_since_us = ? WHERE id = ?",
+        since_us,
+        id,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Keeps how a mission was driven; a first word counts.
+pub async fn add_outcome(
+    db: &mut SqliteConnection,
+    id: MissionId,
+    quality: Option<&MissionQuality>,
+    driven: Option<&DrivenPath>,
+) -> Result<(), DbError> {
+    let id = id.to_string();
+    let quality = quality
+        .map(|quality| to_json("quality", quality))
+        .transpose()?;
+    let driven = driven
+        .map(|driven| to_json("driven path", driven))
+        .transpose()?;
+    sqlx::query!(
+        "UPDATE missions SET quality = COALESCE(quality, ?), driven = COALESCE(driven, ?)
+         WHERE id = ?",
+        quality,
+        driven,
+        id,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// How a mission was driven, as far as its robot has said so.
+pub async fn outcome(
+    db: &mut SqliteConnection,
+    id: MissionId,
+) -> Result<(Option<MissionQuality>, Option<DrivenPath>), DbError> {
+    let id = id.to_string();
+    let found = sqlx::query!("SELECT quality, driven FROM missions WHERE id = ?", id)
+        .fetch_optional(db)
+        .await?;
+    let Some(found) = found else {
+        return Ok((None, None));
+    };
+    let quality = found.quality.as_deref();
+    let driven = found.driven.as_deref();
+    Ok((
+        quality
+            .map(|quality| from_json("quality", quality))
+            .transpose()?,
+        driven
+            .map(|driven| from_json("driven path", driven))
+            .transpose()?,
+    ))
+}
+
+/// How many missions stand in each state.
+pub async fn counts(db: &mut SqliteConnection) -> Result<Vec<(MissionState, u64)>, DbError> {
+    let rows =
+        sqlx::query!(r#"SELECT state, COUNT(*) AS "count!: i64" FROM missions GROUP BY state"#)
+            .fetch_all(db)
+            .await?;
+    rows.into_iter()
+        .map(|row| Ok((state(&row.state)?, unsigned("count", row.count)?)))
+        .collect()
 }

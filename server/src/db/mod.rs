@@ -4,6 +4,9 @@
 //! ([`Db::read`], each transaction a snapshot). `synchronous=FULL`: a commit that returned
 //! survives a power cut.
 
+pub mod alerts;
+pub mod history;
+pub mod idempotency;
 pub mod missions;
 pub mod robots;
 pub mod segments;
@@ -14,6 +17,7 @@ pub mod terrains;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
@@ -21,6 +25,8 @@ use serde::de::DeserializeOwned;
 use serde::{Serialize, Serializer as _};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{Sqlite, SqlitePool, Transaction};
+
+use crate::metrics::Histogram;
 
 /// Oldest SQLite that is free of the bug that can lose a WAL.
 pub const SQLITE_VERSION_MIN: (u32, u32, u32) = (3, 51, 3);
@@ -98,6 +104,7 @@ pub struct Db {
     writer: SqlitePool,
     readers: SqlitePool,
     version: String,
+    write_waits: Arc<Histogram>,
 }
 
 impl Db {
@@ -156,6 +163,7 @@ impl Db {
             writer,
             readers,
             version,
+            write_waits: Arc::default(),
         })
     }
 
@@ -169,7 +177,15 @@ impl Db {
     /// # Errors
     /// The turn did not come in time, or SQLite failed.
     pub async fn write(&self) -> Result<Tx, DbError> {
-        Ok(self.writer.begin_with("BEGIN IMMEDIATE").await?)
+        let asked_at = tokio::time::Instant::now();
+        let tx = self.writer.begin_with("BEGIN IMMEDIATE").await?;
+        self.write_waits.note(asked_at.elapsed());
+        Ok(tx)
+    }
+
+    /// How long writers waited for their turn.
+    pub fn write_waits(&self) -> &Histogram {
+        &self.write_waits
     }
 
     /// Begins to read one snapshot.

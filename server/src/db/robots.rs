@@ -3,7 +3,7 @@
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::ids::{BootId, ConfigurationId, RobotId, SiteId};
-use tread_api::robot::RobotModel;
+use tread_api::robot::{Capabilities, RobotModel};
 
 use super::{DbError, from_json, from_us, parse, to_json, to_us};
 
@@ -20,6 +20,12 @@ pub struct RobotRow {
     pub model: RobotModel,
     /// The identifier of that model and those tyres.
     pub configuration: ConfigurationId,
+    /// Its name for people; the identifier until somebody renames it.
+    pub name: String,
+    /// When it was retired, if it was.
+    pub retired_at: Option<Timestamp>,
+    /// What the base and its agent can do.
+    pub capabilities: Capabilities,
     /// Version of the agent.
     pub agent_version: String,
     /// The run of the agent that said hello last.
@@ -36,6 +42,9 @@ struct Raw {
     id: String,
     model: String,
     configuration: String,
+    name: Option<String>,
+    retired_at_us: Option<i64>,
+    capabilities: String,
     agent_version: String,
     boot: String,
     first_seen_at_us: i64,
@@ -50,6 +59,9 @@ impl TryFrom<Raw> for RobotRow {
             pk: raw.pk,
             site: parse("site", &raw.site)?,
             id: parse("robot", &raw.id)?,
+            name: raw.name.unwrap_or(raw.id),
+            retired_at: raw.retired_at_us.map(from_us).transpose()?,
+            capabilities: from_json("capabilities", &raw.capabilities)?,
             model: from_json("robot model", &raw.model)?,
             configuration: parse("configuration", &raw.configuration)?,
             agent_version: raw.agent_version,
@@ -66,6 +78,7 @@ macro_rules! robots {
             Raw,
             r#"SELECT robots.pk AS "pk!", sites.id AS site, robots.id,
                    configurations.model AS "model!", configurations.id AS configuration,
+                   robots.name, robots.retired_at_us, robots.capabilities,
                    robots.agent_version, robots.boot, robots.first_seen_at_us,
                    robots.last_hello_at_us
                FROM robots
@@ -89,17 +102,20 @@ pub async fn find(
     raw.map(RobotRow::try_from).transpose()
 }
 
-/// Robots of a site after an identifier, in alphabetical order.
+/// Robots of a site after an identifier, in alphabetical order; retired ones too if asked for.
 pub async fn list(
     db: &mut SqliteConnection,
     site_pk: i64,
     after: &str,
+    retired: bool,
     limit: u32,
 ) -> Result<Vec<RobotRow>, DbError> {
     let rows = robots!(
-        "WHERE robots.site_pk = ? AND robots.id > ? ORDER BY robots.id LIMIT ?",
+        "WHERE robots.site_pk = ? AND robots.id > ? AND (? OR robots.retired_at_us IS NULL)
+         ORDER BY robots.id LIMIT ?",
         site_pk,
         after,
+        retired,
         limit,
     )
     .fetch_all(db)
@@ -118,6 +134,8 @@ pub struct Introduction<'hello> {
     pub agent_version: &'hello str,
     /// Model and tyres.
     pub model: &'hello RobotModel,
+    /// What the base and its agent can do.
+    pub capabilities: &'hello Capabilities,
     /// When it said so.
     pub at: Timestamp,
 }
@@ -133,8 +151,10 @@ pub async fn introduce(
         boot,
         agent_version,
         model,
+        capabilities,
         at,
     } = introduction;
+    let capabilities = to_json("capabilities", capabilities)?;
     let configuration = model.configuration().to_string();
     let model = to_json("robot model", model)?;
     sqlx::query!(
@@ -148,10 +168,10 @@ pub async fn introduce(
     let (id, boot_text, at_us) = (id.as_str(), boot.to_string(), to_us(at));
     let robot_pk = sqlx::query_scalar!(
         r#"INSERT INTO robots (site_pk, id, configuration_pk, agent_version, boot,
-               first_seen_at_us, last_hello_at_us)
-           VALUES (?1, ?2, (SELECT pk FROM configurations WHERE id = ?3), ?4, ?5, ?6, ?6)
+               first_seen_at_us, last_hello_at_us, capabilities)
+           VALUES (?1, ?2, (SELECT pk FROM configurations WHERE id = ?3), ?4, ?5, ?6, ?6, ?7)
            ON CONFLICT (site_pk, id) DO UPDATE SET configuration_pk = excluded.configuration_pk,
-               agent_version = ?4, boot = ?5, last_hello_at_us = ?6
+               agent_version = ?4, boot = ?5, last_hello_at_us = ?6, capabilities = ?7
            RETURNING pk AS "pk!""#,
         site_pk,
         id,
@@ -159,6 +179,7 @@ pub async fn introduce(
         agent_version,
         boot_text,
         at_us,
+        capabilities,
     )
     .fetch_one(&mut *db)
     .await?;
@@ -215,4 +236,37 @@ pub async fn names(db: &mut SqliteConnection) -> Result<Vec<(SiteId, RobotId)>, 
     raw.into_iter()
         .map(|row| Ok((parse("site", &row.site)?, parse("robot", &row.robot)?)))
         .collect()
+}
+
+/// Renames a robot for people.
+pub async fn rename(db: &mut SqliteConnection, robot_pk: i64, name: &str) -> Result<(), DbError> {
+    sqlx::query!("UPDATE robots SET name = ? WHERE pk = ?", name, robot_pk)
+        .execute(db)
+        .await?;
+    Ok(())
+}
+
+/// Retires a robot, or takes it back.
+pub async fn set_retired(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+    at: Option<Timestamp>,
+) -> Result<(), DbError> {
+    let at_us = at.map(to_us);
+    sqlx::query!(
+        "UPDATE robots SET retired_at_us = ? WHERE pk = ?",
+        at_us,
+        robot_pk
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// All robots of all sites, at most `limit`.
+pub async fn all(db: &mut SqliteConnection, limit: u32) -> Result<Vec<RobotRow>, DbError> {
+    let rows = robots!("ORDER BY robots.pk LIMIT ?", limit)
+        .fetch_all(db)
+        .await?;
+    rows.into_iter().map(RobotRow::try_from).collect()
 }

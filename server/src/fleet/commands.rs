@@ -1,5 +1,7 @@
 //! Commands to robots: zenoh queries with an application answer.
 
+use std::pin::Pin;
+use std::sync::Arc;
 use std::time::Duration;
 
 use serde::Serialize;
@@ -13,6 +15,7 @@ use zenoh::Wait as _;
 use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 
 use super::presence::RobotKey;
+use super::router::Current;
 use crate::supervisor::Supervisor;
 
 /// How long a robot may take to answer.
@@ -20,19 +23,26 @@ pub const COMMAND_TIMEOUT: Duration = Duration::from_millis(800);
 /// How long the query itself may take beyond that before it counts as not delivered.
 const MARGIN: Duration = Duration::from_millis(200);
 
-/// Sends commands to robots; clones send through the same session.
+/// An answer on its way.
+pub type Carrying = Pin<Box<dyn Future<Output = Option<Answer>> + Send>>;
+
+/// Carries one command to a robot and its answer back; `None` is not delivered, as far as anyone
+/// knows. The network of a fleet is one, a simulated network in a test another.
+pub trait Carrier: std::fmt::Debug + Send + Sync {
+    /// Carries a payload to what answers at a robot's verb.
+    fn carry(&self, robot: &RobotKey, verb: Verb, payload: Vec<u8>) -> Carrying;
+}
+
+/// Sends commands to robots; clones send through the same carrier.
 #[derive(Debug, Clone)]
 pub struct Commands {
-    session: Session,
-    supervisor: Supervisor,
+    carrier: Arc<dyn Carrier>,
 }
 
 impl Commands {
-    pub(super) fn new(session: Session, supervisor: Supervisor) -> Self {
-        Self {
-            session,
-            supervisor,
-        }
+    /// Commands through a carrier.
+    pub fn new(carrier: Arc<dyn Carrier>) -> Self {
+        Self { carrier }
     }
 
     /// Sends one command and waits for its answer.
@@ -41,45 +51,67 @@ impl Commands {
     /// answer does not read. The same may be sent again without harm.
     pub async fn send<T: Serialize>(
         &self,
-        (site, robot): &RobotKey,
+        robot: &RobotKey,
         verb: Verb,
         command: &T,
     ) -> Option<Answer> {
-        let key = keys::command(site, robot, verb);
         let payload = wire::encode(command)
-            .inspect_err(|error| warn!("cannot write a command for `{key}`: {error}"))
+            .inspect_err(|error| warn!("cannot write a command for `{}`: {error}", robot.1))
             .ok()?;
-        let (answer, answered) = oneshot::channel();
-        let session = self.session.clone();
-        let query_key = key.clone();
-        // Sending blocks its thread when the robot's link is full.
-        let sent = self.supervisor.blocking(move || {
-            let mut answer = Some(answer);
-            session
-                .get(query_key)
-                .payload(payload)
-                .target(QueryTarget::BestMatching)
-                .consolidation(ConsolidationMode::None)
-                .timeout(COMMAND_TIMEOUT)
-                .callback_mut(move |reply| {
-                    // Only the first reply counts: the robot's key belongs to one robot.
-                    if let Some(answer) = answer.take() {
-                        let _ = answer.send(reply);
-                    }
-                })
-                .wait()
-        });
-        let exchange = async {
-            sent.await?
-                .inspect_err(|error| warn!("cannot query `{key}`: {error}"))
-                .ok()?;
-            answered.await.ok()
-        };
-        let reply = tokio::time::timeout(COMMAND_TIMEOUT + MARGIN, exchange)
-            .await
-            .ok()??;
-        read_answer(&key, &reply)
+        self.carrier.carry(robot, verb, payload).await
     }
+}
+
+/// The fleet's network as a carrier.
+#[derive(Debug)]
+pub(super) struct Network {
+    pub(super) session: Arc<Current>,
+    pub(super) supervisor: Supervisor,
+}
+
+impl Carrier for Network {
+    fn carry(&self, (site, robot): &RobotKey, verb: Verb, payload: Vec<u8>) -> Carrying {
+        let key = keys::command(site, robot, verb);
+        let (session, supervisor) = (self.session.get(), self.supervisor.clone());
+        Box::pin(query(session, supervisor, key, payload))
+    }
+}
+
+async fn query(
+    session: Session,
+    supervisor: Supervisor,
+    key: String,
+    payload: Vec<u8>,
+) -> Option<Answer> {
+    let (answer, answered) = oneshot::channel();
+    let query_key = key.clone();
+    // Sending blocks its thread when the robot's link is full.
+    let sent = supervisor.blocking(move || {
+        let mut answer = Some(answer);
+        session
+            .get(query_key)
+            .payload(payload)
+            .target(QueryTarget::BestMatching)
+            .consolidation(ConsolidationMode::None)
+            .timeout(COMMAND_TIMEOUT)
+            .callback_mut(move |reply| {
+                // Only the first reply counts: the robot's key belongs to one robot.
+                if let Some(answer) = answer.take() {
+                    let _ = answer.send(reply);
+                }
+            })
+            .wait()
+    });
+    let exchange = async {
+        sent.await?
+            .inspect_err(|error| warn!("cannot query `{key}`: {error}"))
+            .ok()?;
+        answered.await.ok()
+    };
+    let reply = tokio::time::timeout(COMMAND_TIMEOUT + MARGIN, exchange)
+        .await
+        .ok()??;
+    read_answer(&key, &reply)
 }
 
 fn read_answer(key: &str, reply: &Reply) -> Option<Answer> {

@@ -151,7 +151,7 @@ async fn watch_presence(
             app.presences().token_appeared((site, robot), boot, now);
         } else {
             info!(robot.id = %robot, "robot `{robot}` of site `{site}` is off the network");
-            app.presences().token_gone(&(site, robot), boot);
+            app.presences().token_gone(&(site, robot), boot, now);
         }
         app.wake();
     }
@@ -165,7 +165,7 @@ async fn read_states(app: App, mut published: mpsc::Receiver<Published>, stop: C
                 let named = |state: &RobotState| state.robot == robot;
                 let key: RobotKey = (site, robot.clone());
                 if let Some(state) = read(&app, &message, named) {
-                    match app.presences().state(&key, state, now) {
+                    match app.presences().state(&key, state, now, app.clock().now()) {
                         Heard::News => app.wake(),
                         Heard::Nothing => {}
                         Heard::Stranger => refuse_stranger(&app, &key),

@@ -7,16 +7,20 @@
 pub mod commands;
 mod inbox;
 pub mod presence;
+mod pulse;
 mod requests;
+mod router;
 
 use std::net::{SocketAddr, TcpListener};
+use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 use zenoh::{Config, Session, Wait as _};
 
-use self::commands::Commands;
+use self::commands::{Commands, Network};
+use self::router::Current;
 use crate::app::App;
 use crate::app::ingest::Upload;
 use crate::supervisor::Supervisor;
@@ -62,7 +66,7 @@ pub enum FleetError {
 /// The open network.
 #[derive(Debug)]
 pub struct Fleet {
-    session: Session,
+    session: Arc<Current>,
     supervisor: Supervisor,
     address: SocketAddr,
 }
@@ -76,17 +80,10 @@ impl Fleet {
         let address = with_free_port(address)?;
         // Asked here because the operating system's own words are clearer than zenoh's.
         drop(TcpListener::bind(address).map_err(|cause| FleetError::InUse { address, cause })?);
-        let failed = |reason: String| FleetError::Open { address, reason };
-        let config = config(address).map_err(|error| failed(error.to_string()))?;
-        let opening = supervisor.blocking(move || zenoh::open(config).wait());
-        let session = tokio::time::timeout(SESSION_TIMEOUT, opening)
-            .await
-            .map_err(|_elapsed| failed("it took too long".to_owned()))?
-            .ok_or_else(|| failed("it panicked".to_owned()))?
-            .map_err(|error| failed(error.to_string()))?;
+        let session = open_session(address, &supervisor).await?;
         info!("zenoh router listens on tcp/{address}");
         Ok(Self {
-            session,
+            session: Arc::new(Current::new(session)),
             supervisor,
             address,
         })
@@ -99,41 +96,83 @@ impl Fleet {
 
     /// The way to command robots.
     pub fn commands(&self) -> Commands {
-        Commands::new(self.session.clone(), self.supervisor.clone())
+        Commands::new(Arc::new(Network {
+            session: Arc::clone(&self.session),
+            supervisor: self.supervisor.clone(),
+        }))
     }
 
-    /// Begins to listen to robots.
+    /// Begins to listen to robots, to beat the pulse and to look after the router.
     ///
     /// # Errors
     /// [`FleetError::Open`] if zenoh refuses a declaration.
     pub async fn listen(&self, app: &App, uploads: mpsc::Sender<Upload>) -> Result<(), FleetError> {
         let channels = inbox::Channels::new(&self.supervisor, app, uploads);
-        let session = self.session.clone();
-        let declared = self
-            .supervisor
-            .blocking(move || inbox::declare(&session, &channels))
-            .await;
-        let reason = match declared {
-            Some(Ok(())) => return Ok(()),
-            Some(Err(error)) => error.to_string(),
-            None => "it panicked".to_owned(),
-        };
-        Err(FleetError::Open {
+        declare(
+            self.session.get(),
+            &channels,
+            self.address,
+            &self.supervisor,
+        )
+        .await?;
+        let stop = || self.supervisor.stop_token();
+        let pulse = pulse::run(app.clone(), Arc::clone(&self.session), stop());
+        self.supervisor.spawn_vital("pulse", pulse);
+        let watching = router::watch(router::Watch {
+            app: app.clone(),
+            session: Arc::clone(&self.session),
+            channels,
+            supervisor: self.supervisor.clone(),
             address: self.address,
-            reason,
-        })
+            stop: stop(),
+        });
+        self.supervisor.spawn_vital("router", watching);
+        Ok(())
     }
 
     /// Closes the network; robots keep trying to come back.
     pub async fn close(self) {
-        let session = self.session;
-        let closing = tokio::task::spawn_blocking(move || session.close().wait());
-        match tokio::time::timeout(SESSION_TIMEOUT, closing).await {
-            Ok(Ok(Ok(()))) => {}
-            Ok(Ok(Err(error))) => warn!("zenoh did not close cleanly: {error}"),
-            Ok(Err(_panic)) => warn!("zenoh panicked while closing"),
-            Err(_elapsed) => warn!("zenoh did not close in time"),
-        }
+        close(self.session.get()).await;
+    }
+}
+
+async fn open_session(address: SocketAddr, supervisor: &Supervisor) -> Result<Session, FleetError> {
+    let failed = |reason: String| FleetError::Open { address, reason };
+    let config = config(address).map_err(|error| failed(error.to_string()))?;
+    let opening = supervisor.blocking(move || zenoh::open(config).wait());
+    tokio::time::timeout(SESSION_TIMEOUT, opening)
+        .await
+        .map_err(|_elapsed| failed("it took too long".to_owned()))?
+        .ok_or_else(|| failed("it panicked".to_owned()))?
+        .map_err(|error| failed(error.to_string()))
+}
+
+async fn declare(
+    session: Session,
+    channels: &inbox::Channels,
+    address: SocketAddr,
+    supervisor: &Supervisor,
+) -> Result<(), FleetError> {
+    let channels = channels.clone();
+    let declaring = supervisor.blocking(move || {
+        inbox::declare(&session, &channels)?;
+        router::declare_probe(&session)
+    });
+    let reason = match declaring.await {
+        Some(Ok(())) => return Ok(()),
+        Some(Err(error)) => error.to_string(),
+        None => "it panicked".to_owned(),
+    };
+    Err(FleetError::Open { address, reason })
+}
+
+async fn close(session: Session) {
+    let closing = tokio::task::spawn_blocking(move || session.close().wait());
+    match tokio::time::timeout(SESSION_TIMEOUT, closing).await {
+        Ok(Ok(Ok(()))) => {}
+        Ok(Ok(Err(error))) => warn!("zenoh did not close cleanly: {error}"),
+        Ok(Err(_panic)) => warn!("zenoh panicked while closing"),
+        Err(_elapsed) => warn!("zenoh did not close in time"),
     }
 }
 

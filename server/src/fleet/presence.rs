@@ -1,16 +1,24 @@
 //! Who is on the network now, and what each robot said last. In memory; ages by our own clock.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use jiff::Timestamp;
 use tread_api::friction::LiveFriction;
-use tread_api::ids::{BootId, RobotId, SiteId};
-use tread_api::robot::{Aged, LinkState, RobotLive};
+use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
+use tread_api::robot::{Aged, AlertReport, LinkCause, LinkState, RobotLive, RobotMode};
 use tread_api::wire::state::{FrictionReport, RobotState};
 
-/// How long after its last word a robot counts as heard.
-pub const ONLINE_TIMEOUT: Duration = Duration::from_millis(1_500);
+/// How long after its last heartbeat a robot counts as online: three of them at 5 Hz.
+pub const ONLINE_TIMEOUT: Duration = Duration::from_millis(700);
+/// How long after its last heartbeat a robot counts as offline, whatever its token says.
+pub const OFFLINE_TIMEOUT: Duration = Duration::from_millis(1_400);
+/// A token that goes within this time of a heartbeat was taken away by its robot or by the end of
+/// its process; a network that is down makes the heartbeats stop long before.
+const SUDDEN: Duration = Duration::from_secs(1);
+/// Least time between two events on a robot whose state only moved on.
+const SHOW_PERIOD: Duration = Duration::from_secs(1);
 
 /// Most robots that are kept track of before they have said hello.
 const STRANGERS_MAX: usize = 20_000;
@@ -36,22 +44,64 @@ pub struct Presence {
     welcomed: bool,
     tokens: BTreeSet<BootId>,
     boot: Option<(BootId, Duration)>,
+    /// When the last heartbeat came: a state in which the control loop's ticks had gone on.
     heard_at: Option<Duration>,
+    /// When the last word of any kind came.
+    spoken_at: Option<Duration>,
+    /// Whether the last token went away while the robot was heard.
+    went_suddenly: bool,
+    /// How far the robot's wall clock is ahead, milliseconds: the largest of the last states,
+    /// which had the shortest way.
+    clock_offsets_ms: VecDeque<i64>,
+    alerts_changed: bool,
+    shown: Option<Shown>,
     state: Option<(RobotState, Duration)>,
     friction: Option<(LiveFriction, Duration)>,
 }
 
 impl Presence {
-    /// Whether the server hears the robot.
+    /// Whether the server hears the robot. Its token is a hint: one that is gone shows the end of
+    /// a process at once. Without it, or without heartbeats, a robot is offline.
     pub fn link(&self, now: Duration) -> LinkState {
-        let heard = |at: Duration| now.saturating_sub(at) <= ONLINE_TIMEOUT;
-        if self.tokens.is_empty() {
+        let within = |limit: Duration| self.silent_for(now).is_some_and(|silent| silent <= limit);
+        if self.tokens.is_empty() || !within(OFFLINE_TIMEOUT) {
             LinkState::Offline
-        } else if self.heard_at.is_some_and(heard) {
+        } else if within(ONLINE_TIMEOUT) {
             LinkState::Online
         } else {
             LinkState::Stale
         }
+    }
+
+    /// Why the robot is not heard; `None` while it is online.
+    pub fn link_cause(&self, now: Duration) -> Option<LinkCause> {
+        if self.link(now) == LinkState::Online {
+            return None;
+        }
+        let speaks = self
+            .spoken_at
+            .is_some_and(|at| now.saturating_sub(at) <= ONLINE_TIMEOUT);
+        Some(if self.spoken_at.is_none() && self.tokens.is_empty() {
+            LinkCause::ServerRestarted
+        } else if self.tokens.is_empty() && self.went_suddenly {
+            LinkCause::RobotOff
+        } else if self.heard_at.is_none() && !self.tokens.is_empty() {
+            LinkCause::Joining
+        } else if speaks && !self.tokens.is_empty() {
+            LinkCause::LoopStopped
+        } else {
+            LinkCause::LinkDown
+        })
+    }
+
+    /// Time since the last heartbeat; `None` if there was none.
+    pub fn silent_for(&self, now: Duration) -> Option<Duration> {
+        self.heard_at.map(|at| now.saturating_sub(at))
+    }
+
+    /// How far the robot's wall clock is ahead of the server's, milliseconds.
+    pub fn clock_offset_ms(&self) -> i64 {
+        self.clock_offsets_ms.iter().copied().max().unwrap_or(0)
     }
 
     /// The present run of the agent, and since when it is known.
@@ -75,6 +125,7 @@ impl Presence {
             boot: state.boot,
             heard_age_ms: elapsed_ms,
             robot_time: state.robot_time,
+            clock_offset_ms: self.clock_offset_ms(),
             mode: state.mode,
             fault: state.fault.clone(),
             pose: state.pose.map(|pose| pose.older_by(elapsed_ms)),
@@ -86,6 +137,7 @@ impl Presence {
             }),
             outbox: state.outbox,
             control_loop: state.control_loop,
+            battery: state.battery,
         })
     }
 
@@ -95,6 +147,7 @@ impl Presence {
             self.boot = Some((boot, now));
             self.state = None;
             self.friction = None;
+            self.clock_offsets_ms.clear();
         }
     }
 
@@ -111,6 +164,22 @@ impl Presence {
         }
     }
 }
+
+/// What of a robot was shown to event clients last.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Shown {
+    at: Duration,
+    link: LinkState,
+    cause: Option<LinkCause>,
+    mode: Option<RobotMode>,
+    mission: Option<(MissionId, u32, bool)>,
+    seq: Option<u64>,
+}
+
+/// Robots that are shown afresh at a time.
+const NEWS_MAX: usize = 500;
+/// States of which the clock's offset is kept.
+const OFFSETS_MAX: usize = 16;
 
 /// All robots.
 #[derive(Debug, Default)]
@@ -140,6 +209,90 @@ impl Presences {
             .collect()
     }
 
+    /// The missions that robots which are heard now say they drive.
+    pub fn shown_missions(&self, now: Duration) -> Vec<(RobotKey, MissionId)> {
+        let robots = self.lock();
+        let heard = robots
+            .iter()
+            .filter(|(_, presence)| presence.link(now) != LinkState::Offline);
+        let shown = |presence: &Presence| presence.state()?.mission.map(|mission| mission.id);
+        heard
+            .filter_map(|(key, presence)| Some((key.clone(), shown(presence)?)))
+            .collect()
+    }
+
+    /// What robots say needs attention, of those that said something else before; each is given
+    /// once.
+    pub fn take_alert_changes(&self) -> Vec<(RobotKey, Vec<AlertReport>)> {
+        let mut robots = self.lock();
+        let changed = robots
+            .iter_mut()
+            .filter(|(_, presence)| presence.alerts_changed);
+        let taken = changed.map(|(key, presence)| {
+            presence.alerts_changed = false;
+            let alerts = presence.state().map(|state| state.alerts.clone());
+            (key.clone(), alerts.unwrap_or_default())
+        });
+        taken.collect()
+    }
+
+    /// Gives what could not be written down again.
+    pub fn return_alert_change(&self, key: &RobotKey) {
+        if let Some(presence) = self.lock().get_mut(key) {
+            presence.alerts_changed = true;
+        }
+    }
+
+    /// The robots of which event clients have not seen the present state: at once when link, mode
+    /// or mission changed, and once a second while only figures move on.
+    ///
+    /// At most [`NEWS_MAX`] at a time, so that no client is swamped; the rest comes next.
+    pub fn take_news(&self, now: Duration) -> Vec<RobotKey> {
+        let mut robots = self.lock();
+        let mut news = Vec::new();
+        for (key, presence) in robots.iter_mut() {
+            if !presence.welcomed {
+                continue;
+            }
+            let state = presence.state();
+            let shown = Shown {
+                at: now,
+                link: presence.link(now),
+                cause: presence.link_cause(now),
+                mode: state.map(|state| state.mode),
+                mission: state.and_then(content),
+                seq: state.map(|state| state.seq),
+            };
+            let is_new = presence.shown.is_none_or(|before| {
+                let elapsed = now.saturating_sub(before.at) >= SHOW_PERIOD;
+                let moved = before.seq != shown.seq && elapsed;
+                let same = Shown {
+                    at: before.at,
+                    seq: before.seq,
+                    ..shown
+                };
+                moved || before != same
+            });
+            if is_new {
+                presence.shown = Some(shown);
+                news.push(key.clone());
+            }
+            if news.len() >= NEWS_MAX {
+                break;
+            }
+        }
+        news
+    }
+
+    /// How many robots have each link state.
+    pub fn link_counts(&self, now: Duration) -> [(LinkState, usize); 3] {
+        let robots = self.lock();
+        LinkState::ALL.map(|link| {
+            let has = |presence: &&Presence| presence.welcomed && presence.link(now) == link;
+            (link, robots.values().filter(has).count())
+        })
+    }
+
     /// How many robots are on the network.
     pub fn present_count(&self) -> usize {
         self.lock()
@@ -161,10 +314,12 @@ impl Presences {
     }
 
     /// A robot's token is gone.
-    pub fn token_gone(&self, key: &RobotKey, boot: BootId) {
+    pub fn token_gone(&self, key: &RobotKey, boot: BootId, now: Duration) {
         let mut robots = self.lock();
         if let Some(presence) = robots.get_mut(key) {
             presence.tokens.remove(&boot);
+            let silent = presence.silent_for(now);
+            presence.went_suddenly = silent.is_none_or(|silent| silent <= SUDDEN);
             if !presence.welcomed && presence.tokens.is_empty() {
                 robots.remove(key);
             }
@@ -182,11 +337,17 @@ impl Presences {
         let presence = robots.entry(key).or_default();
         presence.welcomed = true;
         presence.enter_boot(boot, now);
-        presence.heard_at = Some(now);
+        presence.spoken_at = Some(now);
     }
 
     /// A robot sent its state.
-    pub fn state(&self, key: &RobotKey, state: RobotState, now: Duration) -> Heard {
+    pub fn state(
+        &self,
+        key: &RobotKey,
+        state: RobotState,
+        now: Duration,
+        wall: Timestamp,
+    ) -> Heard {
         let mut robots = self.lock();
         let Some(presence) = robots.get_mut(key).filter(|presence| presence.welcomed) else {
             return Heard::Stranger;
@@ -197,11 +358,32 @@ impl Presences {
         }
         let news = presence.state().is_none_or(|before| {
             before.mode != state.mode
-                || before.mission.map(|mission| mission.id) != state.mission.map(|m| m.id)
+                || content(before) != content(&state)
                 || before.terrain_revision != state.terrain_revision
                 || (before.outbox.pending == 0) != (state.outbox.pending == 0)
         });
-        presence.heard_at = Some(now);
+        // States come late and in another order too; a tick that was seen is no heartbeat.
+        let beats = presence
+            .state()
+            .is_none_or(|before| state.control_loop.ticks > before.control_loop.ticks);
+        if beats {
+            presence.heard_at = Some(now);
+        }
+        presence.spoken_at = Some(now);
+        if presence
+            .state()
+            .is_some_and(|before| before.seq >= state.seq)
+        {
+            return if news { Heard::News } else { Heard::Nothing };
+        }
+        let ahead_ms = state.robot_time.duration_since(wall).as_millis();
+        if presence.clock_offsets_ms.len() >= OFFSETS_MAX {
+            presence.clock_offsets_ms.pop_front();
+        }
+        let ahead_ms = i64::try_from(ahead_ms).unwrap_or(i64::MAX);
+        presence.clock_offsets_ms.push_back(ahead_ms);
+        let said = presence.state().map(|before| &before.alerts);
+        presence.alerts_changed |= said != Some(&state.alerts);
         presence.state = Some((state, now));
         if news || !was_online {
             Heard::News
@@ -221,6 +403,12 @@ impl Presences {
         }
         Heard::Nothing
     }
+}
+
+/// What of a robot's mission decides what it needs.
+fn content(state: &RobotState) -> Option<(MissionId, u32, bool)> {
+    let mission = state.mission?;
+    Some((mission.id, mission.revision, mission.paused))
 }
 
 #[cfg(test)]
@@ -251,8 +439,17 @@ mod tests {
             mission: None,
             terrain_revision: None,
             outbox: OutboxStatus::default(),
-            control_loop: LoopStatus::default(),
+            control_loop: LoopStatus {
+                ticks: seq,
+                ..LoopStatus::default()
+            },
+            battery: None,
+            alerts: Vec::new(),
         }
+    }
+
+    fn wall() -> Timestamp {
+        "2026-11-01T00:00:00Z".parse().unwrap()
     }
 
     const SECOND: Duration = Duration::from_secs(1);
@@ -265,10 +462,22 @@ mod tests {
         presences.hello(key(), boot(1), SECOND);
         assert_eq!(link(SECOND), LinkState::Offline);
         presences.token_appeared(key(), boot(1), SECOND);
-        presences.state(&key(), state(boot(1), 0), SECOND);
-        assert_eq!(link(2 * SECOND), LinkState::Online);
-        assert_eq!(link(3 * SECOND), LinkState::Stale);
-        presences.token_gone(&key(), boot(1));
+        assert_eq!(
+            link(SECOND),
+            LinkState::Offline,
+            "present, but not heard yet"
+        );
+        let cause = |now| presences.get(&key()).link_cause(now);
+        assert_eq!(cause(SECOND), Some(LinkCause::Joining));
+        presences.state(&key(), state(boot(1), 0), SECOND, wall());
+        assert_eq!(link(SECOND + ONLINE_TIMEOUT), LinkState::Online);
+        assert_eq!(link(SECOND + OFFLINE_TIMEOUT), LinkState::Stale);
+        assert_eq!(
+            link(3 * SECOND),
+            LinkState::Offline,
+            "whatever its token says"
+        );
+        presences.token_gone(&key(), boot(1), 2 * SECOND);
         assert_eq!(link(SECOND), LinkState::Offline);
     }
 
@@ -277,14 +486,14 @@ mod tests {
         let presences = Presences::default();
         presences.token_appeared(key(), boot(1), SECOND);
         presences.hello(key(), boot(1), SECOND);
-        presences.state(&key(), state(boot(1), 7), SECOND);
-        presences.token_gone(&key(), boot(1));
+        presences.state(&key(), state(boot(1), 7), SECOND, wall());
+        presences.token_gone(&key(), boot(1), 2 * SECOND);
         presences.token_appeared(key(), boot(1), 2 * SECOND);
         assert_eq!(presences.get(&key()).state().unwrap().seq, 7);
         presences.token_appeared(key(), boot(2), 3 * SECOND);
         assert!(presences.get(&key()).state().is_none());
         assert_eq!(
-            presences.state(&key(), state(boot(1), 8), 3 * SECOND),
+            presences.state(&key(), state(boot(1), 8), 3 * SECOND, wall()),
             Heard::Nothing
         );
         assert_eq!(presences.get(&key()).boot(), Some((boot(2), 3 * SECOND)));
@@ -294,7 +503,7 @@ mod tests {
     fn ages_grow_until_the_robot_speaks_again() {
         let presences = Presences::default();
         presences.hello(key(), boot(1), SECOND);
-        presences.state(&key(), state(boot(1), 0), SECOND);
+        presences.state(&key(), state(boot(1), 0), SECOND, wall());
         let live = presences.get(&key()).live(4 * SECOND).unwrap();
         assert_eq!(live.heard_age_ms, 3_000);
     }
@@ -302,15 +511,62 @@ mod tests {
     #[test]
     fn of_a_robot_that_said_no_hello_nothing_is_kept() {
         let presences = Presences::default();
-        let heard = presences.state(&key(), state(boot(1), 0), SECOND);
+        let heard = presences.state(&key(), state(boot(1), 0), SECOND, wall());
         assert_eq!(heard, Heard::Stranger);
         presences.token_appeared(key(), boot(1), SECOND);
         assert_eq!(presences.present_count(), 0);
         assert_eq!(
-            presences.state(&key(), state(boot(1), 0), SECOND),
+            presences.state(&key(), state(boot(1), 0), SECOND, wall()),
             Heard::Stranger
         );
-        presences.token_gone(&key(), boot(1));
+        presences.token_gone(&key(), boot(1), SECOND);
         assert!(presences.lock().is_empty());
+    }
+
+    #[test]
+    fn robot_off_link_down_and_a_loop_that_stands_still_are_told_apart() {
+        let presences = Presences::default();
+        let cause = |now| presences.get(&key()).link_cause(now);
+        assert_eq!(cause(SECOND), Some(LinkCause::ServerRestarted));
+        presences.know(key());
+        presences.token_appeared(key(), boot(1), SECOND);
+        presences.state(&key(), state(boot(1), 1), SECOND, wall());
+        assert_eq!(cause(SECOND), None);
+        assert_eq!(cause(3 * SECOND), Some(LinkCause::LinkDown));
+        // The agent speaks on, and its loop's ticks do not.
+        let mut stuck = state(boot(1), 2);
+        stuck.control_loop.ticks = 1;
+        presences.state(&key(), stuck, 3 * SECOND, wall());
+        assert_eq!(presences.get(&key()).link(3 * SECOND), LinkState::Offline);
+        assert_eq!(cause(3 * SECOND), Some(LinkCause::LoopStopped));
+        presences.state(&key(), state(boot(1), 3), 4 * SECOND, wall());
+        presences.token_gone(&key(), boot(1), 4 * SECOND);
+        assert_eq!(cause(4 * SECOND), Some(LinkCause::RobotOff));
+        presences.token_appeared(key(), boot(1), 5 * SECOND);
+        presences.token_gone(&key(), boot(1), 9 * SECOND);
+        assert_eq!(cause(9 * SECOND), Some(LinkCause::LinkDown));
+    }
+
+    #[test]
+    fn the_clock_offset_is_that_of_the_state_with_the_shortest_way() {
+        let presences = Presences::default();
+        presences.know(key());
+        let said = |seq, late_ms: i64| {
+            let heard_at = wall() + jiff::SignedDuration::from_millis(late_ms - 3_000);
+            presences.state(&key(), state(boot(1), seq), SECOND, heard_at);
+        };
+        said(1, 40);
+        said(2, 2);
+        said(3, 900);
+        assert_eq!(presences.get(&key()).clock_offset_ms(), 2_998);
+    }
+
+    #[test]
+    fn an_older_state_that_comes_late_is_not_shown() {
+        let presences = Presences::default();
+        presences.know(key());
+        presences.state(&key(), state(boot(1), 5), SECOND, wall());
+        presences.state(&key(), state(boot(1), 4), SECOND, wall());
+        assert_eq!(presences.get(&key()).state().unwrap().seq, 5);
     }
 }

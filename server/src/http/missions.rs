@@ -1,17 +1,19 @@
 //! `/v1/missions`.
 
 use axum::extract::State;
-use axum::http::StatusCode;
+use axum::http::{HeaderMap, StatusCode};
 use serde::Deserialize;
 use tread_api::ids::{MissionId, RobotId, SiteId};
-use tread_api::mission::{CreateMission, Mission, MissionDetail, MissionState};
+use tread_api::mission::{CreateMission, Mission, MissionDetail, MissionState, ReplaceMission};
 use tread_api::page::Page;
-use tread_api::problem::ProblemBody;
+use tread_api::problem::{ProblemBody, ProblemType};
+use tread_api::trajectory::{CheckTrajectory, TrajectoryCheck};
 use utoipa::IntoParams;
 
 use super::extract::{Json, Path, Query, cursor, page_limit};
 use super::problem::Problem;
 use crate::app::App;
+use crate::app::missions::idempotency::KEY_LENGTH_MAX;
 use crate::db::missions::MissionFilter;
 
 /// Which missions, and which page of them.
@@ -58,17 +60,35 @@ pub(super) async fn list(
 /// Asks a robot to drive a circle or waypoints. It waits in the robot's queue.
 #[utoipa::path(post, path = "/v1/missions", tag = "missions", operation_id = "create_mission",
     request_body = CreateMission,
+    params(("idempotency-key" = Option<String>, Header,
+        description = "The same request under the same key is answered the same, and done once")),
     responses((status = 201, body = Mission), (status = 404, body = ProblemBody),
         (status = 409, body = ProblemBody), (status = 413, body = ProblemBody),
         (status = 415, body = ProblemBody), (status = 422, body = ProblemBody)))]
 pub(super) async fn create(
     State(app): State<App>,
+    headers: HeaderMap,
     Json(request): Json<CreateMission>,
 ) -> Result<(StatusCode, Json<Mission>), Problem> {
-    Ok((
-        StatusCode::CREATED,
-        Json(app.create_mission(request).await?),
-    ))
+    let mission = match idempotency_key(&headers)? {
+        Some(key) => app.create_mission_once(key, request).await?,
+        None => app.create_mission(request).await?,
+    };
+    Ok((StatusCode::CREATED, Json(mission)))
+}
+
+fn idempotency_key(headers: &HeaderMap) -> Result<Option<&str>, Problem> {
+    let Some(value) = headers.get("idempotency-key") else {
+        return Ok(None);
+    };
+    let key = value.to_str().ok().map(str::trim);
+    let usable = key.filter(|key| (1..=KEY_LENGTH_MAX).contains(&key.len()));
+    usable.map(Some).ok_or_else(|| {
+        let detail = format!("idempotency-key has 1 to {KEY_LENGTH_MAX} visible characters");
+        Problem::new(ProblemType::InvalidHeader)
+            .detail(detail)
+            .field("idempotency-key")
+    })
 }
 
 /// One mission with its history.
@@ -95,4 +115,64 @@ pub(super) async fn cancel(
         StatusCode::ACCEPTED,
         Json(app.cancel_mission(mission).await?),
     ))
+}
+
+/// Wants a mission in hand to be held, the robot standing.
+#[utoipa::path(post, path = "/v1/missions/{mission}/pause", tag = "missions",
+    operation_id = "pause_mission", params(("mission" = MissionId, Path)),
+    responses((status = 202, body = MissionDetail), (status = 404, body = ProblemBody),
+        (status = 409, body = ProblemBody)))]
+pub(super) async fn pause(
+    State(app): State<App>,
+    Path(mission): Path<MissionId>,
+) -> Result<(StatusCode, Json<MissionDetail>), Problem> {
+    Ok((
+        StatusCode::ACCEPTED,
+        Json(app.pause_mission(mission).await?),
+    ))
+}
+
+/// Wants a paused mission to go on.
+#[utoipa::path(post, path = "/v1/missions/{mission}/resume", tag = "missions",
+    operation_id = "resume_mission", params(("mission" = MissionId, Path)),
+    responses((status = 202, body = MissionDetail), (status = 404, body = ProblemBody),
+        (status = 409, body = ProblemBody)))]
+pub(super) async fn resume(
+    State(app): State<App>,
+    Path(mission): Path<MissionId>,
+) -> Result<(StatusCode, Json<MissionDetail>), Problem> {
+    Ok((
+        StatusCode::ACCEPTED,
+        Json(app.resume_mission(mission).await?),
+    ))
+}
+
+/// Wants a mission to be another trajectory. What waits is changed at once, what is in hand when
+/// its robot holds the new revision whole; until then the old one is driven.
+#[utoipa::path(post, path = "/v1/missions/{mission}/replace", tag = "missions",
+    operation_id = "replace_mission", params(("mission" = MissionId, Path)),
+    request_body = ReplaceMission,
+    responses((status = 202, body = MissionDetail), (status = 404, body = ProblemBody),
+        (status = 409, body = ProblemBody), (status = 422, body = ProblemBody)))]
+pub(super) async fn replace(
+    State(app): State<App>,
+    Path(mission): Path<MissionId>,
+    Json(request): Json<ReplaceMission>,
+) -> Result<(StatusCode, Json<MissionDetail>), Problem> {
+    Ok((
+        StatusCode::ACCEPTED,
+        Json(app.replace_mission(mission, request).await?),
+    ))
+}
+
+/// Plans a trajectory for a robot without moving anything.
+#[utoipa::path(post, path = "/v1/trajectories/check", tag = "missions",
+    operation_id = "check_trajectory", request_body = CheckTrajectory,
+    responses((status = 200, body = TrajectoryCheck), (status = 404, body = ProblemBody),
+        (status = 422, body = ProblemBody)))]
+pub(super) async fn check(
+    State(app): State<App>,
+    Json(request): Json<CheckTrajectory>,
+) -> Result<Json<TrajectoryCheck>, Problem> {
+    Ok(Json(app.check_trajectory(request).await?))
 }

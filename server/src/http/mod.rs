@@ -3,6 +3,8 @@
 //! Every route and its description in `/openapi.json` come from one `routes!`. All errors are
 //! problems ([`problem`]); bodies, paths and queries are read by [`extract`] alone.
 
+mod alerts;
+mod events;
 pub mod extract;
 mod friction;
 pub mod health;
@@ -16,7 +18,7 @@ mod terrains;
 use std::any::Any;
 use std::time::Duration;
 
-use axum::extract::{Request, State};
+use axum::extract::{MatchedPath, Request, State};
 use axum::http::HeaderName;
 use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
@@ -56,6 +58,8 @@ struct Description;
 fn routes() -> OpenApiRouter<App> {
     let missions = OpenApiRouter::new()
         .routes(routes!(missions::list, missions::create))
+        .routes(routes!(missions::replace))
+        .routes(routes!(missions::check))
         .layer(Extension(BodyLimit(MISSION_BODY_MAX)));
     OpenApiRouter::with_openapi(Description::openapi())
         .routes(routes!(health::healthz))
@@ -66,9 +70,14 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(terrains::list, terrains::create))
         .routes(routes!(terrains::get, terrains::replace, terrains::delete))
         .routes(routes!(robots::list))
-        .routes(routes!(robots::get))
+        .routes(routes!(robots::get, robots::change))
+        .routes(routes!(alerts::list))
+        .routes(routes!(alerts::acknowledge))
+        .routes(routes!(events::stream))
         .routes(routes!(missions::get))
         .routes(routes!(missions::cancel))
+        .routes(routes!(missions::pause))
+        .routes(routes!(missions::resume))
         .routes(routes!(friction::terrains))
         .routes(routes!(friction::terrain))
         .routes(routes!(friction::cells))
@@ -126,6 +135,7 @@ pub fn router(app: App) -> Router {
         )
         .fallback(not_found)
         .method_not_allowed_fallback(method_not_allowed)
+        .layer(from_fn_with_state(app.clone(), measure))
         .layer(from_fn(bound_time))
         .layer(CatchPanicLayer::custom(broken))
         .layer(from_fn_with_state(app.clone(), count_panics))
@@ -133,6 +143,34 @@ pub fn router(app: App) -> Router {
         .layer(PropagateRequestIdLayer::new(REQUEST_ID))
         .layer(SetRequestIdLayer::new(REQUEST_ID, MakeRequestUuid))
         .with_state(app)
+}
+
+/// The page for Prometheus, on an address of its own.
+pub fn metrics_router(app: App) -> Router {
+    Router::new()
+        .route("/metrics", axum::routing::get(metrics))
+        .fallback(not_found)
+        .layer(from_fn(bound_time))
+        .with_state(app)
+}
+
+async fn metrics(State(app): State<App>) -> Result<Response, Problem> {
+    let text = app.metrics().await?;
+    let media_type = "text/plain; version=0.0.4";
+    Ok(([(axum::http::header::CONTENT_TYPE, media_type)], text).into_response())
+}
+
+/// Notes how long each route takes.
+async fn measure(State(app): State<App>, request: Request, next: Next) -> Response {
+    let route = request.extensions().get::<MatchedPath>();
+    let route = route.map_or("none", MatchedPath::as_str).to_owned();
+    let method = request.method().as_str().to_owned();
+    let asked_at = app.clock().elapsed();
+    let response = next.run(request).await;
+    let took = app.clock().elapsed().saturating_sub(asked_at);
+    let status = response.status().as_u16();
+    app.requests().note(&method, &route, status, took);
+    response
 }
 
 async fn not_found() -> Problem {

@@ -11,19 +11,21 @@ use crate::app::AppError;
 /// An error answer on its way out.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Problem {
-    body: ProblemBody,
+    body: Box<ProblemBody>,
 }
 
 impl Problem {
     /// A problem of that kind.
     pub fn new(kind: ProblemType) -> Self {
-        let body = ProblemBody {
+        let body = Box::new(ProblemBody {
             kind,
             title: kind.title().to_owned(),
             status: status(kind).as_u16(),
             detail: None,
             field: None,
-        };
+            state: None,
+            place: None,
+        });
         Self { body }
     }
 
@@ -44,23 +46,31 @@ impl Problem {
 
 const fn status(kind: ProblemType) -> StatusCode {
     match kind {
-        ProblemType::MalformedBody | ProblemType::InvalidPath | ProblemType::InvalidQuery => {
-            StatusCode::BAD_REQUEST
-        }
-        ProblemType::InvalidBody | ProblemType::UnknownField | ProblemType::BeyondLimits => {
-            StatusCode::UNPROCESSABLE_ENTITY
-        }
+        ProblemType::MalformedBody
+        | ProblemType::InvalidPath
+        | ProblemType::InvalidQuery
+        | ProblemType::InvalidHeader => StatusCode::BAD_REQUEST,
+        ProblemType::InvalidBody
+        | ProblemType::UnknownField
+        | ProblemType::BeyondLimits
+        | ProblemType::IdempotencyKeyReused => StatusCode::UNPROCESSABLE_ENTITY,
         ProblemType::BodyTooLarge => StatusCode::PAYLOAD_TOO_LARGE,
         ProblemType::UnsupportedMediaType => StatusCode::UNSUPPORTED_MEDIA_TYPE,
         ProblemType::NotFound
         | ProblemType::UnknownSite
         | ProblemType::UnknownRobot
         | ProblemType::UnknownTerrain
-        | ProblemType::UnknownMission => StatusCode::NOT_FOUND,
+        | ProblemType::UnknownMission
+        | ProblemType::UnknownAlert => StatusCode::NOT_FOUND,
         ProblemType::MethodNotAllowed => StatusCode::METHOD_NOT_ALLOWED,
-        ProblemType::AlreadyExists | ProblemType::MissionEnded | ProblemType::TooMany => {
-            StatusCode::CONFLICT
-        }
+        ProblemType::AlreadyExists
+        | ProblemType::MissionEnded
+        | ProblemType::MissionState
+        | ProblemType::RobotBusy
+        | ProblemType::RobotRetired
+        | ProblemType::RobotCannot
+        | ProblemType::IdempotencyKeyInFlight
+        | ProblemType::TooMany => StatusCode::CONFLICT,
         ProblemType::Timeout => StatusCode::GATEWAY_TIMEOUT,
         ProblemType::Unavailable => StatusCode::SERVICE_UNAVAILABLE,
         ProblemType::Internal => StatusCode::INTERNAL_SERVER_ERROR,
@@ -75,8 +85,17 @@ impl From<AppError> for Problem {
             AppError::UnknownTerrain(..) => ProblemType::UnknownTerrain,
             AppError::UnknownMission(_) => ProblemType::UnknownMission,
             AppError::AlreadyExists { .. } => ProblemType::AlreadyExists,
-            AppError::BeyondLimits { .. } => ProblemType::BeyondLimits,
+            AppError::BeyondLimits { .. } | AppError::Impossible { .. } => {
+                ProblemType::BeyondLimits
+            }
             AppError::MissionEnded { .. } => ProblemType::MissionEnded,
+            AppError::MissionState { .. } => ProblemType::MissionState,
+            AppError::RobotBusy { .. } => ProblemType::RobotBusy,
+            AppError::RobotRetired(_) => ProblemType::RobotRetired,
+            AppError::RobotCannot { .. } => ProblemType::RobotCannot,
+            AppError::UnknownAlert(_) => ProblemType::UnknownAlert,
+            AppError::KeyInFlight => ProblemType::IdempotencyKeyInFlight,
+            AppError::KeyReused => ProblemType::IdempotencyKeyReused,
             AppError::TooMany { .. } => ProblemType::TooMany,
             AppError::Invalid { .. } => ProblemType::InvalidBody,
             AppError::InvalidQuery { .. } => ProblemType::InvalidQuery,
@@ -87,7 +106,9 @@ impl From<AppError> for Problem {
                     .detail("the cause is in the server's log, under the id of this request");
             }
         };
-        let problem = Self::new(kind).detail(app_error.to_string());
+        let mut problem = Self::new(kind).detail(app_error.to_string());
+        problem.body.state = app_error.state();
+        problem.body.place = app_error.place();
         match app_error.field() {
             Some(field) => problem.field(field),
             None => problem,

@@ -1,28 +1,45 @@
 //! `/v1/sites/{site}/robots`.
 
 use axum::extract::State;
+use serde::Deserialize;
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::page::Page;
 use tread_api::problem::ProblemBody;
-use tread_api::robot::Robot;
+use tread_api::robot::{ChangeRobot, Robot};
+use utoipa::IntoParams;
 
 use super::extract::{Json, Path, Query, page_limit};
 use super::problem::Problem;
-use super::sites::PageQuery;
 use crate::app::App;
+
+/// Which robots, and which page of them.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RobotQuery {
+    /// Retired ones too.
+    #[serde(default)]
+    #[param(required = false)]
+    retired: bool,
+    /// `next_cursor` of the page before.
+    cursor: Option<String>,
+    /// Most entries of the page, 1 to 1000; 100 when absent.
+    limit: Option<u32>,
+}
 
 /// The robots of a site, with their live state.
 #[utoipa::path(get, path = "/v1/sites/{site}/robots", tag = "robots",
-    operation_id = "list_robots", params(("site" = SiteId, Path), PageQuery),
+    operation_id = "list_robots", params(("site" = SiteId, Path), RobotQuery),
     responses((status = 200, body = Page<Robot>), (status = 404, body = ProblemBody)))]
 pub(super) async fn list(
     State(app): State<App>,
     Path(site): Path<SiteId>,
-    Query(query): Query<PageQuery>,
+    Query(query): Query<RobotQuery>,
 ) -> Result<Json<Page<Robot>>, Problem> {
     let limit = page_limit(query.limit)?;
     Ok(Json(
-        app.robots(&site, query.cursor.as_deref(), limit).await?,
+        app.robots(&site, query.cursor.as_deref(), query.retired, limit)
+            .await?,
     ))
 }
 
@@ -35,4 +52,18 @@ pub(super) async fn get(
     Path((site, robot)): Path<(SiteId, RobotId)>,
 ) -> Result<Json<Robot>, Problem> {
     Ok(Json(app.robot(&site, &robot).await?))
+}
+
+/// Renames a robot for people, retires it or takes it back. Retiring cancels all its missions.
+#[utoipa::path(patch, path = "/v1/sites/{site}/robots/{robot}", tag = "robots",
+    operation_id = "change_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
+    request_body = ChangeRobot,
+    responses((status = 200, body = Robot), (status = 404, body = ProblemBody),
+        (status = 422, body = ProblemBody)))]
+pub(super) async fn change(
+    State(app): State<App>,
+    Path((site, robot)): Path<(SiteId, RobotId)>,
+    Json(request): Json<ChangeRobot>,
+) -> Result<Json<Robot>, Problem> {
+    Ok(Json(app.change_robot(&site, &robot, request).await?))
 }

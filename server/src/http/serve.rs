@@ -5,21 +5,25 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
+use axum::http::Request;
+use hyper::body::Incoming;
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
+use tower::ServiceExt as _;
 use tracing::{debug, warn};
 
+use super::events::Cut;
 use crate::app::App;
 use crate::supervisor::Supervisor;
 
 /// How long the headers of a request may take to arrive.
 pub const HEADER_TIMEOUT: Duration = Duration::from_secs(10);
 /// Connections that may be open at once.
-pub const CONNECTIONS_MAX: usize = 1_024;
+pub const CONNECTIONS_MAX: usize = 2_048;
 /// How long open requests may take after the stop.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(5);
 /// Rest after the machine refused a connection, such as for want of file handles.
@@ -65,7 +69,14 @@ async fn connection(stream: TcpStream, router: Router, stop: CancellationToken) 
     if let Err(error) = stream.set_nodelay(true) {
         debug!("cannot send at once: {error}");
     }
-    let service = TowerToHyperService::new(router);
+    // Whoever finds that the peer does not read may cut the connection.
+    let cut = Cut::default();
+    let handle = cut.clone();
+    let service = router.map_request(move |mut request: Request<Incoming>| {
+        request.extensions_mut().insert(handle.clone());
+        request
+    });
+    let service = TowerToHyperService::new(service);
     let connection = http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(HEADER_TIMEOUT)
@@ -73,6 +84,7 @@ async fn connection(stream: TcpStream, router: Router, stop: CancellationToken) 
     let mut connection = std::pin::pin!(connection);
     let ended = tokio::select! {
         ended = connection.as_mut() => Ok(ended),
+        () = cut.0.cancelled() => return debug!("a connection whose peer does not read was cut"),
         () = stop.cancelled() => {
             connection.as_mut().graceful_shutdown();
             tokio::time::timeout(DRAIN_TIMEOUT, connection).await

@@ -69,6 +69,7 @@ impl Yard {
     async fn start_in(folder: Arc<TempDir>, zenoh: &str) -> Self {
         let config = Config {
             http: "127.0.0.1:0".parse().unwrap(),
+            metrics: Some("127.0.0.1:0".parse().unwrap()),
             zenoh: zenoh.parse().unwrap(),
             database: database(folder.path()),
             site: site(),
@@ -227,6 +228,8 @@ pub(crate) fn report(mission: &Mission, phase: MissionPhase) -> RecordContent {
         phase,
         reason: None,
         progress: None,
+        quality: None,
+        driven: None,
     })
 }
 

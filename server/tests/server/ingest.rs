@@ -47,6 +47,7 @@ impl Writer {
                 agent_version: "0".to_owned(),
                 model: model(),
                 robot_time: app.clock().now(),
+                capabilities: tread_api::robot::Capabilities::default(),
             };
             app.hello(&site(), &hello).await.unwrap();
         }
@@ -72,6 +73,7 @@ impl Writer {
         let batch = Batch {
             robot: robot.parse().unwrap(),
             boot: boot(1),
+            robot_time: None,
             records,
         };
         let upload = Upload {

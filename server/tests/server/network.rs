@@ -31,6 +31,7 @@ async fn lies_and_garbage_are_refused_with_a_reason_and_counted() {
     let batch = Batch {
         robot: other.clone(),
         boot: robot.boot,
+        robot_time: None,
         records: Vec::new(),
     };
     let (code, detail) = refused(key(), wire::encode(&batch).unwrap()).await;
@@ -44,6 +45,7 @@ async fn lies_and_garbage_are_refused_with_a_reason_and_counted() {
     let long = Batch {
         robot: robot.id.clone(),
         boot: robot.boot,
+        robot_time: None,
         records: (0..=BATCH_RECORDS_MAX as u64)
             .map(|seq| measured(seq, segment((0, 0), 0.2, 0)))
             .collect(),
@@ -104,6 +106,7 @@ async fn a_hello_to_an_unknown_site_or_of_an_impossible_robot_is_refused() {
         agent_version: "0".to_owned(),
         model: crate::harness::model(),
         robot_time: crate::harness::time("2026-11-01T00:00:00Z"),
+        capabilities: tread_api::robot::Capabilities::default(),
     };
     let nowhere = "nowhere".parse().unwrap();
     let key = keys::hello(&nowhere, &robot);

@@ -1,5 +1,6 @@
 //! A robot whose every word the test chooses.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -7,7 +8,7 @@ use serde::de::DeserializeOwned;
 use tread_api::ids::{BootId, RobotId};
 use tread_api::keys::{self, Key, Verb};
 use tread_api::mission::Mission;
-use tread_api::robot::{LoopStatus, MissionProgress, OutboxStatus, RobotMode};
+use tread_api::robot::{Capabilities, LoopStatus, MissionProgress, OutboxStatus, RobotMode};
 use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome};
 use tread_api::wire::hello::{Hello, SiteDefinition, Welcome};
 use tread_api::wire::ingest::{Batch, MissionPhase, Receipt, Record};
@@ -32,6 +33,7 @@ struct Heard {
     mood: Mood,
     offers: Vec<Offer>,
     cancels: Vec<Cancel>,
+    holds: Vec<Verb>,
     sites: Vec<SiteDefinition>,
 }
 
@@ -42,6 +44,7 @@ pub(crate) struct Robot {
     session: zenoh::Session,
     state: Arc<Mutex<RobotState>>,
     heard: Arc<Mutex<Heard>>,
+    beating: Arc<AtomicBool>,
     _token: zenoh::liveliness::LivelinessToken,
     supervisor: Supervisor,
 }
@@ -91,6 +94,7 @@ impl Robot {
             mood: Mood::Willing,
             offers: Vec::new(),
             cancels: Vec::new(),
+            holds: Vec::new(),
             sites: Vec::new(),
         }));
         let state = Arc::new(Mutex::new(RobotState {
@@ -109,6 +113,8 @@ impl Robot {
                 ..OutboxStatus::default()
             },
             control_loop: LoopStatus::default(),
+            battery: None,
+            alerts: Vec::new(),
         }));
         let (listener, holding) = (Arc::clone(&heard), Arc::clone(&state));
         session
@@ -128,6 +134,8 @@ impl Robot {
             .wait()
             .unwrap();
         let said = Arc::clone(&state);
+        let beating = Arc::new(AtomicBool::new(true));
+        let beats = Arc::clone(&beating);
         let supervisor = Supervisor::new();
         let stop = supervisor.stop_token();
         supervisor.spawn_vital("speaking", async move {
@@ -135,6 +143,7 @@ impl Robot {
                 let payload = {
                     let mut state = said.lock().unwrap();
                     state.seq += 1;
+                    state.control_loop.ticks += u64::from(beats.load(Ordering::Relaxed));
                     wire::encode(&*state).unwrap()
                 };
                 let _ = publisher.put(payload).wait();
@@ -147,6 +156,7 @@ impl Robot {
             session,
             state,
             heard,
+            beating,
             _token: token,
             supervisor,
         };
@@ -168,6 +178,11 @@ impl Robot {
             agent_version: "0.0.1".to_owned(),
             model: model(),
             robot_time: time("2026-11-01T00:00:00Z"),
+            capabilities: Capabilities {
+                pause: true,
+                replace: true,
+                ..Capabilities::default()
+            },
         };
         let welcome: Welcome = eventually("the server answers a hello", async || {
             self.ask(
@@ -206,6 +221,20 @@ impl Robot {
         self.heard.lock().unwrap().sites.clone()
     }
 
+    /// Lets the control loop stand still while the agent speaks on.
+    pub(crate) fn stop_loop(&self) {
+        self.beating.store(false, Ordering::Relaxed);
+    }
+
+    /// Lets it go on.
+    pub(crate) fn start_loop(&self) {
+        self.beating.store(true, Ordering::Relaxed);
+    }
+
+    pub(crate) fn holds(&self) -> Vec<Verb> {
+        self.heard.lock().unwrap().holds.clone()
+    }
+
     pub(crate) fn cancels(&self) -> Vec<Cancel> {
         self.heard.lock().unwrap().cancels.clone()
     }
@@ -218,6 +247,7 @@ impl Robot {
         let batch = Batch {
             robot: self.id.clone(),
             boot,
+            robot_time: None,
             records,
         };
         let key = keys::ingest(&site(), &self.id);
@@ -230,6 +260,19 @@ impl Robot {
 
     /// Reports on a mission by the acknowledged way.
     pub(crate) async fn report(&self, seq: u64, mission: &Mission, phase: MissionPhase) -> Receipt {
+        let ends = !matches!(
+            phase,
+            MissionPhase::Started
+                | MissionPhase::Paused
+                | MissionPhase::Resumed
+                | MissionPhase::Replaced
+        );
+        if ends {
+            self.say(|state| {
+                state.mode = RobotMode::Idle;
+                state.mission = None;
+            });
+        }
         self.upload(vec![Record {
             seq,
             content: report(mission, phase),
@@ -247,6 +290,7 @@ impl Robot {
             driven_m,
             length_m: 18.85,
             cross_track_m: 0.0,
+            paused: false,
         };
         self.say(|state| {
             state.mode = RobotMode::Tracking;
@@ -275,11 +319,43 @@ fn answer(
                     code,
                     detail: "as told".to_owned(),
                 },
-                Mood::Willing => Outcome::Accepted { plan: None },
+                Mood::Willing => {
+                    let offer = heard.offers.last().unwrap();
+                    let mut state = state.lock().unwrap();
+                    state.mode = RobotMode::Tracking;
+                    state.mission = Some(MissionProgress {
+                        id: offer.mission,
+                        revision: offer.revision,
+                        plan_hash: offer.plan_hash,
+                        driven_m: 0.0,
+                        length_m: 18.85,
+                        cross_track_m: 0.0,
+                        paused: false,
+                    });
+                    Outcome::Accepted { plan: None }
+                }
             }
         }
         Verb::Cancel => {
-            heard.cancels.push(wire::decode(&payload).unwrap());
+            let cancel: Cancel = wire::decode(&payload).unwrap();
+            let mut state = state.lock().unwrap();
+            if state.mission.is_some_and(|held| held.id == cancel.mission) {
+                state.mode = RobotMode::Idle;
+                state.mission = None;
+            }
+            heard.cancels.push(cancel);
+            Outcome::Done
+        }
+        Verb::Pause | Verb::Resume => {
+            let mut state = state.lock().unwrap();
+            heard.holds.push(verb);
+            match heard.mood {
+                Mood::Silent => return,
+                Mood::Willing | Mood::Refusing(_) => {}
+            }
+            if let Some(mission) = &mut state.mission {
+                mission.paused = verb == Verb::Pause;
+            }
             Outcome::Done
         }
         Verb::Site => {

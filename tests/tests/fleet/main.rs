@@ -1,6 +1,9 @@
 //! Tests of whole fleets, one process for each part; see `tread_tests` for the harness.
 
 mod bad_input;
+mod chaos;
+mod control;
+mod event_clients;
 mod messages;
 mod missions;
 mod outages;

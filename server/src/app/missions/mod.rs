@@ -2,18 +2,21 @@
 //!
 //! A request writes what is wanted and returns; [`super::reconciler`] makes it so.
 
+pub mod control;
+pub mod idempotency;
+pub(crate) mod reports;
 pub mod transitions;
 
 use jiff::Timestamp;
 use tread_api::ids::{MissionId, RobotId};
 use tread_api::mission::{
-    Actor, CreateMission, Mission, MissionDetail, MissionEvent, MissionState, REASON_LENGTH_MAX,
+    Actor, Cause, CreateMission, LINK_SILENCE_MAX_S, LINK_SILENCE_MIN_S, Mission, MissionDetail,
+    MissionEvent, MissionState, PRIORITY_MAX, PRIORITY_MIN, REASON_LENGTH_MAX, StartPolicy,
 };
 use tread_api::page::Page;
 use tread_api::robot::RobotLimits;
 use tread_api::trajectory::Trajectory;
 use tread_api::wire::command::Offer;
-use tread_api::wire::ingest::{MissionPhase, MissionReport};
 
 use self::transitions::{Change, next};
 use super::{App, AppError, site_row};
@@ -30,35 +33,75 @@ const EVENTS_MAX: u32 = 1_000;
 impl App {
     /// Asks a robot to drive something.
     pub async fn create_mission(&self, request: CreateMission) -> Result<Mission, AppError> {
+        let mut tx = self.db().write().await?;
+        let mission = self.enqueue(&mut tx, request).await?;
+        tx.commit().await?;
+        self.wake();
+        Ok(mission)
+    }
+
+    /// Writes a mission into its robot's queue, as its start policy says.
+    async fn enqueue(&self, tx: &mut Tx, request: CreateMission) -> Result<Mission, AppError> {
+        check_figures(&request)?;
         let CreateMission {
             site,
             robot,
             trajectory,
             latest_start,
+            priority,
+            start_policy,
+            link_policy,
+            lost_after_s,
         } = request;
-        let mut tx = self.db().write().await?;
-        let site_pk = site_row(&mut tx, &site).await?.pk;
-        let robot_row = db::robots::find(&mut tx, site_pk, &robot).await?;
+        let site_pk = site_row(tx, &site).await?.pk;
+        let robot_row = db::robots::find(tx, site_pk, &robot).await?;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
         let robot_row = robot_row.ok_or_else(unknown)?;
+        if robot_row.retired_at.is_some() {
+            return Err(AppError::RobotRetired(robot));
+        }
         check_limits(&robot, &robot_row.model.limits, &trajectory)?;
-        if db::missions::queued_count(&mut tx, robot_row.pk).await? >= QUEUE_MAX {
+        let (id, revision, created_at) = (self.clock().mission_id(), 1, self.clock().now());
+        match start_policy {
+            StartPolicy::Append => {}
+            StartPolicy::Refuse => {
+                let open = db::missions::open_of_robot(tx, robot_row.pk).await?;
+                if let Some(other) = open.first() {
+                    return Err(AppError::RobotBusy {
+                        robot,
+                        mission: other.id,
+                        state: other.state,
+                    });
+                }
+            }
+            StartPolicy::Replace => {
+                let reason = format!("mission `{id}` was asked for in its place");
+                let why = (Change::Supersede, Actor::Client, reason.as_str());
+                end_all(tx, robot_row.pk, why, created_at).await?;
+            }
+        }
+        if db::missions::queued_count(tx, robot_row.pk).await? >= QUEUE_MAX {
             return Err(AppError::TooMany {
                 what: "missions that wait for it",
                 count: QUEUE_MAX,
             });
         }
-        let (id, revision, created_at) = (self.clock().mission_id(), 1, self.clock().now());
         let mission = Mission {
             id,
             site,
             robot,
             state: MissionState::Queued,
             reason: None,
+            cause: Cause::Requested,
+            pause_wanted: false,
             revision,
             plan_hash: Offer::plan_hash_of(id, revision, &trajectory),
             trajectory,
+            replacement: None,
             latest_start,
+            priority,
+            link_policy,
+            lost_after_s,
             boot: None,
             plan: None,
             progress: None,
@@ -70,17 +113,16 @@ impl App {
             robot_pk: robot_row.pk,
             mission,
         };
-        db::missions::insert(&mut tx, &row).await?;
+        db::missions::insert(tx, &row).await?;
         let event = MissionEvent {
             at: created_at,
             actor: Actor::Client,
             from: None,
             to: MissionState::Queued,
+            cause: Cause::Requested,
             reason: None,
         };
-        db::missions::add_event(&mut tx, id, &event).await?;
-        tx.commit().await?;
-        self.wake();
+        db::history::add_event(tx, id, &event).await?;
         Ok(row.mission)
     }
 
@@ -112,45 +154,18 @@ impl App {
         let row = db::missions::find(tx, id)
             .await?
             .ok_or(AppError::UnknownMission(id))?;
-        let events = db::missions::events(tx, id, EVENTS_MAX).await?;
+        let events = db::history::events(tx, id, EVENTS_MAX).await?;
+        let (quality, driven) = db::missions::outcome(tx, id).await?;
         Ok(MissionDetail {
             mission: self.with_progress(row.mission),
             events,
+            quality,
+            driven,
         })
     }
 
-    /// Wants a mission to end: one that waits ends at once, one in hand when its robot says so.
-    pub async fn cancel_mission(&self, id: MissionId) -> Result<MissionDetail, AppError> {
-        let mut tx = self.db().write().await?;
-        let row = db::missions::find(&mut tx, id)
-            .await?
-            .ok_or(AppError::UnknownMission(id))?;
-        let state = row.mission.state;
-        if state.is_terminal() {
-            return Err(AppError::MissionEnded {
-                id,
-                state: state.as_str(),
-            });
-        }
-        // Asked for twice is asked for once.
-        if state != MissionState::Cancelling {
-            let step = Step {
-                change: Change::RequestCancel,
-                actor: Actor::Client,
-                reason: Some("cancelled by request"),
-                at: self.clock().now(),
-                facts: Facts::default(),
-            };
-            take_step(&mut tx, &(&row.mission).into(), step).await?;
-        }
-        let detail = self.mission_detail(&mut tx, id).await?;
-        tx.commit().await?;
-        self.wake();
-        Ok(detail)
-    }
-
     /// The robot's last word on how far it has come, while it still drives this mission.
-    fn with_progress(&self, mut mission: Mission) -> Mission {
+    pub(super) fn with_progress(&self, mut mission: Mission) -> Mission {
         if !mission.state.is_terminal() {
             let presence = self
                 .presences()
@@ -164,7 +179,53 @@ impl App {
     }
 }
 
-fn check_limits(
+fn check_figures(request: &CreateMission) -> Result<(), AppError> {
+    let invalid = |field, detail| Err(AppError::Invalid { field, detail });
+    if !(PRIORITY_MIN..=PRIORITY_MAX).contains(&request.priority) {
+        let detail = format!(
+            "priority must be {PRIORITY_MIN} to {PRIORITY_MAX}, not {}",
+            request.priority
+        );
+        return invalid("priority", detail);
+    }
+    if let Err(detail) = request.link_policy.validate() {
+        return invalid("link_policy", detail);
+    }
+    match request.lost_after_s {
+        Some(lost_after_s)
+            if !(LINK_SILENCE_MIN_S..=LINK_SILENCE_MAX_S).contains(&lost_after_s) =>
+        {
+            let detail = format!(
+                "lost_after_s must be {LINK_SILENCE_MIN_S} to {LINK_SILENCE_MAX_S}, \
+                 not {lost_after_s}"
+            );
+            invalid("lost_after_s", detail)
+        }
+        Some(_) | None => Ok(()),
+    }
+}
+
+/// Wants every open mission of a robot to end.
+pub(super) async fn end_all(
+    tx: &mut Tx,
+    robot_pk: i64,
+    (change, actor, reason): (Change, Actor, &str),
+    at: Timestamp,
+) -> Result<(), DbError> {
+    for open in db::missions::open_of_robot(tx, robot_pk).await? {
+        let step = Step {
+            change,
+            actor,
+            reason: Some(reason),
+            at,
+            facts: Facts::default(),
+        };
+        take_step(tx, &open, step).await?;
+    }
+    Ok(())
+}
+
+pub(super) fn check_limits(
     robot: &RobotId,
     limits: &RobotLimits,
     trajectory: &Trajectory,
@@ -212,8 +273,9 @@ pub(super) async fn take_step(
     let Some(to) = next(from, step.change) else {
         return Ok(None);
     };
-    let reason = step.reason.map(bounded);
-    if !db::missions::compare_and_set(tx, id, from, to, reason.as_deref()).await? {
+    let cause = step.change.cause();
+    let reason = Some(bounded(step.reason.unwrap_or(step.change.reason())));
+    if !db::missions::compare_and_set(tx, id, from, to, cause, reason.as_deref()).await? {
         return Ok(None);
     }
     let ended_at = to
@@ -233,9 +295,10 @@ pub(super) async fn take_step(
         actor: step.actor,
         from: Some(from),
         to,
+        cause,
         reason,
     };
-    db::missions::add_event(tx, id, &event).await?;
+    db::history::add_event(tx, id, &event).await?;
     tracing::info!(
         mission.id = %id, robot.id = %standing.robot,
         "mission `{id}` of robot `{}` went from {} to {}",
@@ -252,81 +315,32 @@ pub(super) async fn note(
     at: Timestamp,
     reason: &str,
 ) -> Result<(), DbError> {
-    let (id, state) = (row.mission.id, row.mission.state);
+    add_note(tx, &row.mission, (actor, Cause::Noted), at, reason).await
+}
+
+/// Notes something with its cause.
+pub(super) async fn add_note(
+    tx: &mut Tx,
+    mission: &Mission,
+    (actor, cause): (Actor, Cause),
+    at: Timestamp,
+    reason: &str,
+) -> Result<(), DbError> {
     // A robot that repeats itself for ever does not fill the disk.
-    if db::missions::event_count(tx, id).await? < EVENTS_MAX / 2 {
-        let reason = Some(bounded(reason));
+    if db::history::event_count(tx, mission.id).await? < EVENTS_MAX / 2 {
         let event = MissionEvent {
             at,
             actor,
-            from: Some(state),
-            to: state,
-            reason,
+            from: Some(mission.state),
+            to: mission.state,
+            cause,
+            reason: Some(bounded(reason)),
         };
-        db::missions::add_event(tx, id, &event).await?;
+        db::history::add_event(tx, mission.id, &event).await?;
     }
     Ok(())
 }
 
 fn bounded(reason: &str) -> String {
     reason.chars().take(REASON_LENGTH_MAX).collect()
-}
-
-/// Takes a robot's durable report on a mission of its own, once; the caller has seen to that.
-///
-/// `Err` in the answer is why the report can never be taken.
-pub(super) async fn take_report(
-    tx: &mut Tx,
-    robot_pk: i64,
-    boot: tread_api::ids::BootId,
-    report: &MissionReport,
-    at: Timestamp,
-) -> Result<Result<(), String>, DbError> {
-    let id = report.mission;
-    let row = db::missions::find(tx, id).await?;
-    let Some(row) = row.filter(|row| row.robot_pk == robot_pk) else {
-        return Ok(Err(format!("mission `{id}` is not one of this robot")));
-    };
-    let mission = &row.mission;
-    if (report.revision, report.plan_hash) != (mission.revision, mission.plan_hash) {
-        return Ok(Err(format!("mission `{id}` was sent with other content")));
-    }
-    let (change, name) = match report.phase {
-        MissionPhase::Started => (Change::Accept, "started"),
-        MissionPhase::Succeeded => (Change::Succeed, "succeeded"),
-        MissionPhase::Failed => (Change::Fail, "failed"),
-        MissionPhase::Cancelled => (Change::Cancel, "cancelled"),
-        MissionPhase::Expired => (Change::Expire, "expired"),
-    };
-    let started = report.phase == MissionPhase::Started;
-    let facts = Facts {
-        boot: Some(boot),
-        plan: None,
-        progress: report.progress,
-        started_at: started.then_some(report.at),
-        ended_at: (!started).then_some(report.at),
-    };
-    let reason = report.reason.as_deref();
-    let step = Step {
-        change,
-        actor: Actor::Robot,
-        reason,
-        at,
-        facts,
-    };
-    if take_step(tx, &mission.into(), step).await?.is_some() {
-        return Ok(Ok(()));
-    }
-    let open = !mission.state.is_terminal();
-    if started && open && mission.started_at.is_none() {
-        db::missions::add_facts(tx, id, facts).await?;
-        note(tx, &row, Actor::Robot, at, "the robot began to drive").await?;
-    } else {
-        let reason = reason
-            .map(|reason| format!(": {reason}"))
-            .unwrap_or_default();
-        let text = format!("the robot reported late that it {name}{reason}");
-        note(tx, &row, Actor::Robot, at, &text).await?;
-    }
-    Ok(Ok(()))
 }

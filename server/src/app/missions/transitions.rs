@@ -1,27 +1,33 @@
-//! Where a mission can go. One pure table; the database enforces it by compare-and-set.
+//! Where a mission can go. One pure table with a cause on every edge; the database enforces it by
+//! compare-and-set.
 //!
 //! ```text
-//!            expire                 cancel
-//!   expired ◄────── queued ───────────────────────► cancelled
-//!      ▲             │  ▲                               ▲
-//!      │       offer │  │ return (busy, not ready)      │
-//!      │ expire      ▼  │            robot cancelled    │
-//!      ├────────── offered ─────────────────────────────┤
-//!      │            │ │ └─────────────── cancel ──┐     │
-//!      │     accept │ │ reject                    ▼     │ robot cancelled
-//!      │            ▼ └─────► rejected        cancelling┤
-//!      ├────────── active ─────────── cancel ─────▲     │
-//!      │            │ │ └───────────────────────────────┘
-//!      │            │ └── succeed ──► succeeded ◄── from offered, cancelling too
-//!      │            └──── fail ─────► failed    ◄── from offered, cancelling too
+//!                      offer               accept                 pause
+//!          ┌─ queued ◄────────► offered ──────────► active ◄────────────────► paused
+//!          │    │      return     │ │ └─ pause ───────┼──────────────────────►  │
+//!          │    │                 │ └──── reject ───► rejected     resume       │
+//!          │    │                 │                   │                         │
+//!          │    │                 └─ cancel wanted ─► cancelling ◄──────────────┤
+//!          │    │                                     │                         │
+//!          │    └──── expire ───────────────────────► │ ◄────── expire ─────────┤
+//!          │                                          ▼                         ▼
+//!          └─ cancel wanted ──► cancelled    succeeded | failed | cancelled | expired
 //! ```
 //!
-//! `paused` is a name that no edge leads to yet. Terminal states never reopen.
+//! * What the *robot* says of an end (`succeed`, `fail`, `cancel`, `expire`) is taken from every
+//!   open state, also from `queued`: a robot may have driven what its server believes returned.
+//! * A *cancel wanted*, by a person, by another mission that takes its place or by the robot's
+//!   retirement, ends what waits at once; what is in hand becomes `cancelling` until the robot has
+//!   answered, or is lost.
+//! * What is in hand fails when its robot is *lost*, when its agent *restarted* without it, or when
+//!   the robot *forgot* it; one that was being cancelled is cancelled then, unless it was lost.
+//!
+//! The states in the last row are terminal: nothing leads out of them, whatever arrives late.
 
-use tread_api::mission::MissionState;
+use tread_api::mission::{Cause, MissionState};
 
 /// What moves a mission.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Change {
     /// The server offers it to its robot.
     Offer,
@@ -31,8 +37,16 @@ pub enum Change {
     Accept,
     /// The robot will never take it.
     Reject,
+    /// The robot holds it, standing.
+    Pause,
+    /// The robot drives it again.
+    Resume,
     /// Somebody wants it to end.
     RequestCancel,
+    /// Another mission is to be driven in its place.
+    Supersede,
+    /// Its robot is retired.
+    Retire,
     /// It ended by request.
     Cancel,
     /// It was driven to its end.
@@ -41,21 +55,78 @@ pub enum Change {
     Fail,
     /// Its latest start passed before it began.
     Expire,
+    /// Its robot stayed away past the bound.
+    LoseRobot,
+    /// Its agent began a new run without it.
+    LoseRun,
+    /// Its robot is there, does not have it, and has not said how it ended.
+    Forget,
 }
 
 impl Change {
     /// Every change.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 16] = [
         Self::Offer,
         Self::Return,
         Self::Accept,
         Self::Reject,
+        Self::Pause,
+        Self::Resume,
         Self::RequestCancel,
+        Self::Supersede,
+        Self::Retire,
         Self::Cancel,
         Self::Succeed,
         Self::Fail,
         Self::Expire,
+        Self::LoseRobot,
+        Self::LoseRun,
+        Self::Forget,
     ];
+
+    /// The cause that its edges carry.
+    pub const fn cause(self) -> Cause {
+        match self {
+            Self::Offer => Cause::Offered,
+            Self::Return => Cause::Returned,
+            Self::Accept => Cause::Accepted,
+            Self::Reject => Cause::Rejected,
+            Self::Pause => Cause::Paused,
+            Self::Resume => Cause::Resumed,
+            Self::RequestCancel => Cause::CancelRequested,
+            Self::Supersede => Cause::Superseded,
+            Self::Retire => Cause::RobotRetired,
+            Self::Cancel => Cause::Cancelled,
+            Self::Succeed => Cause::Succeeded,
+            Self::Fail => Cause::Failed,
+            Self::Expire => Cause::Expired,
+            Self::LoseRobot => Cause::RobotLost,
+            Self::LoseRun => Cause::AgentRestarted,
+            Self::Forget => Cause::RobotForgot,
+        }
+    }
+
+    /// Why, for people, when nobody said it in other words.
+    pub const fn reason(self) -> &'static str {
+        match self {
+            Self::Offer => "offered to the robot",
+            Self::Return => "the robot cannot take it now",
+            Self::Accept => "the robot has taken it",
+            Self::Reject => "the robot will not take it",
+            Self::Pause => "the robot holds it, standing",
+            Self::Resume => "the robot drives it again",
+            Self::RequestCancel => "cancelled by request",
+            Self::Supersede => "another mission was asked for in its place",
+            Self::Retire => "the robot was retired",
+            Self::Cancel => "the robot has ended it by request",
+            Self::Succeed => "driven to its end",
+            Self::Fail => "the robot gave it up",
+            Self::Expire => "its latest start passed before it began",
+            Self::LoseRobot => "the robot stayed away too long",
+            Self::LoseRun => "agent restarted during the mission",
+            Self::Forget => "the robot has ended it without saying how",
+        }
+    }
 }
 
 /// Where a change leads; `None` if it is not for this state.
@@ -64,14 +135,22 @@ pub const fn next(state: MissionState, change: Change) -> Option<MissionState> {
     match (state, change) {
         (S::Queued, Change::Offer) => Some(S::Offered),
         (S::Offered, Change::Return) => Some(S::Queued),
-        (S::Offered, Change::Accept) => Some(S::Active),
+        (S::Offered, Change::Accept) | (S::Paused, Change::Resume) => Some(S::Active),
         (S::Offered, Change::Reject) => Some(S::Rejected),
-        (S::Offered | S::Active, Change::RequestCancel) => Some(S::Cancelling),
-        (S::Queued, Change::RequestCancel)
-        | (S::Offered | S::Active | S::Cancelling, Change::Cancel) => Some(S::Cancelled),
-        (S::Offered | S::Active | S::Cancelling, Change::Succeed) => Some(S::Succeeded),
-        (S::Offered | S::Active | S::Cancelling, Change::Fail) => Some(S::Failed),
-        (S::Queued | S::Offered | S::Active | S::Cancelling, Change::Expire) => Some(S::Expired),
+        (S::Offered | S::Active, Change::Pause) => Some(S::Paused),
+        (
+            S::Offered | S::Active | S::Paused,
+            Change::RequestCancel | Change::Supersede | Change::Retire,
+        ) => Some(S::Cancelling),
+        (S::Queued, Change::RequestCancel | Change::Supersede | Change::Retire)
+        | (S::Cancelling, Change::LoseRun | Change::Forget) => Some(S::Cancelled),
+        (S::Offered | S::Active | S::Paused | S::Cancelling, Change::LoseRobot)
+        | (S::Active | S::Paused, Change::LoseRun)
+        | (S::Queued | S::Offered | S::Active | S::Paused, Change::Forget) => Some(S::Failed),
+        (open, Change::Cancel) if !open.is_terminal() => Some(S::Cancelled),
+        (open, Change::Succeed) if !open.is_terminal() => Some(S::Succeeded),
+        (open, Change::Fail) if !open.is_terminal() => Some(S::Failed),
+        (open, Change::Expire) if !open.is_terminal() => Some(S::Expired),
         _ => None,
     }
 }
@@ -106,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn every_state_but_paused_is_reached_and_every_open_one_can_end() {
+    fn every_state_is_reached_and_every_open_one_can_end() {
         let mut reached = vec![MissionState::Queued];
         let mut index = 0;
         while let Some(&state) = reached.get(index) {
@@ -120,26 +199,48 @@ mod tests {
             index += 1;
         }
         for state in MissionState::ALL {
-            assert_eq!(
-                reached.contains(&state),
-                state != MissionState::Paused,
-                "{state:?}"
-            );
+            assert!(reached.contains(&state), "{state:?}");
             let ends = Change::ALL
                 .into_iter()
                 .filter_map(|change| next(state, change))
                 .any(MissionState::is_terminal);
-            let open = !state.is_terminal() && state != MissionState::Paused;
-            assert_eq!(ends, open, "{state:?}");
+            assert_eq!(ends, !state.is_terminal(), "{state:?}");
+        }
+    }
+
+    #[test]
+    fn every_edge_has_a_cause_and_a_reason_of_its_own() {
+        let mut causes: Vec<Cause> = Change::ALL.into_iter().map(Change::cause).collect();
+        causes.sort_by_key(|cause| cause.as_str());
+        causes.dedup();
+        assert_eq!(causes.len(), Change::ALL.len());
+        for change in Change::ALL {
+            assert!(!change.reason().is_empty());
+            let leads = |state| next(state, change).is_some();
+            assert!(MissionState::ALL.into_iter().any(leads), "{change:?}");
+        }
+    }
+
+    #[test]
+    fn no_edge_stays_where_it_is() {
+        for state in MissionState::ALL {
+            for change in Change::ALL {
+                assert_ne!(next(state, change), Some(state), "{state:?} {change:?}");
+            }
         }
     }
 
     #[test]
     fn a_mission_that_waits_is_cancelled_at_once_and_one_in_hand_when_the_robot_says_so() {
         use MissionState as S;
-        assert_eq!(next(S::Queued, Change::RequestCancel), Some(S::Cancelled));
-        assert_eq!(next(S::Active, Change::RequestCancel), Some(S::Cancelling));
+        for wanted in [Change::RequestCancel, Change::Supersede, Change::Retire] {
+            assert_eq!(next(S::Queued, wanted), Some(S::Cancelled));
+            for in_hand in [S::Offered, S::Active, S::Paused] {
+                assert_eq!(next(in_hand, wanted), Some(S::Cancelling));
+            }
+        }
         assert_eq!(next(S::Cancelling, Change::Accept), None);
         assert_eq!(next(S::Cancelling, Change::Succeed), Some(S::Succeeded));
+        assert_eq!(next(S::Cancelling, Change::LoseRobot), Some(S::Failed));
     }
 }

@@ -3,15 +3,16 @@
 use tracing::warn;
 use tread_api::ids::MissionId;
 use tread_api::keys::Verb;
-use tread_api::mission::{Actor, MissionState};
-use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome};
+use tread_api::mission::{Actor, Cause, MissionState};
+use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome, Pause, Resume};
 
+use crate::app::missions::reports::adopt;
 use crate::app::missions::transitions::Change;
-use crate::app::missions::{Step, take_step};
+use crate::app::missions::{Step, add_note, take_step};
 use crate::app::terrains::site_definition;
 use crate::app::{App, AppError};
 use crate::db;
-use crate::db::missions::{Facts, Standing};
+use crate::db::missions::{Facts, MissionRow, Standing};
 use crate::fleet::commands::Commands;
 use crate::fleet::presence::RobotKey;
 
@@ -27,13 +28,8 @@ pub(super) enum Finished {
 }
 
 /// Moves a mission without its robot.
-pub(super) async fn settle(
-    app: &App,
-    mission: &Standing,
-    change: Change,
-    reason: &str,
-) -> Result<(), AppError> {
-    let step = server_step(app, change, Some(reason), Facts::default());
+pub(super) async fn settle(app: &App, mission: &Standing, change: Change) -> Result<(), AppError> {
+    let step = server_step(app, change, None, Facts::default());
     let mut tx = app.db().write().await?;
     take_step(&mut tx, mission, step).await?;
     tx.commit().await?;
@@ -57,6 +53,14 @@ fn server_step<'step>(
     }
 }
 
+/// How long from now a mission may still start, by the robot's own clock from then on.
+fn start_within_ms(app: &App, row: &MissionRow) -> Option<u64> {
+    row.mission.latest_start.map(|latest| {
+        let left_ms = latest.duration_since(app.clock().now()).as_millis();
+        u64::try_from(left_ms).unwrap_or(0)
+    })
+}
+
 /// Offers a mission and writes down the answer.
 pub(super) async fn offer(
     app: App,
@@ -67,7 +71,10 @@ pub(super) async fn offer(
         let mut tx = app.db().write().await?;
         let step = server_step(&app, Change::Offer, None, Facts::default());
         match take_step(&mut tx, &standing, step).await {
-            Ok(Some(_)) => tx.commit().await?,
+            Ok(Some(_)) => {
+                tx.commit().await?;
+                app.announce();
+            }
             // Cancelled meanwhile, or the robot has another one in hand.
             Ok(None) => return Ok(Finished::Settled),
             Err(error) if error.is_unique_violation() => return Ok(Finished::Again),
@@ -81,17 +88,15 @@ pub(super) async fn offer(
     let Some(row) = row.filter(|row| row.mission.state == MissionState::Offered) else {
         return Ok(Finished::Settled);
     };
+    let start_within_ms = start_within_ms(&app, &row);
     let mission = row.mission;
-    let left = mission.latest_start.map(|latest| {
-        let left_ms = latest.duration_since(app.clock().now()).as_millis();
-        u64::try_from(left_ms).unwrap_or(0)
-    });
     let command = Offer {
         mission: mission.id,
         revision: mission.revision,
         plan_hash: mission.plan_hash,
         trajectory: mission.trajectory,
-        start_within_ms: left,
+        start_within_ms,
+        link_policy: mission.link_policy,
     };
     app.counters().offers_sent.one();
     let key = (mission.site, mission.robot);
@@ -152,19 +157,149 @@ async fn take_offer_answer(
     Ok(how)
 }
 
+/// Offers a new revision of a mission in hand and writes down the answer.
+pub(super) async fn replace(
+    app: App,
+    commands: Commands,
+    standing: Standing,
+) -> Result<Finished, AppError> {
+    let mut tx = app.db().read().await?;
+    let row = db::missions::find(&mut tx, standing.id).await?;
+    drop(tx);
+    let Some(row) = row.filter(|row| !row.mission.state.is_terminal()) else {
+        return Ok(Finished::Settled);
+    };
+    let Some(replacement) = row.mission.replacement.clone() else {
+        return Ok(Finished::Settled);
+    };
+    let command = Offer {
+        mission: row.mission.id,
+        revision: replacement.revision,
+        plan_hash: replacement.plan_hash,
+        trajectory: replacement.trajectory.clone(),
+        // It has begun, so its latest start is behind it.
+        start_within_ms: None,
+        link_policy: row.mission.link_policy,
+    };
+    app.counters().offers_sent.one();
+    let key = (row.mission.site.clone(), row.mission.robot.clone());
+    let Some(answer) = commands.send(&key, Verb::Offer, &command).await else {
+        app.counters().commands_unanswered.one();
+        return Ok(Finished::Again);
+    };
+    let mut tx = app.db().write().await?;
+    let row = db::missions::find(&mut tx, standing.id).await?;
+    let as_sent = |row: &MissionRow| {
+        let hash = row.mission.replacement.as_ref().map(|next| next.plan_hash);
+        hash == Some(replacement.plan_hash) && !row.mission.state.is_terminal()
+    };
+    let Some(row) = row.filter(as_sent) else {
+        return Ok(Finished::Settled);
+    };
+    let how = match &answer.outcome {
+        Outcome::Accepted { .. } | Outcome::Done => {
+            adopt(&mut tx, &row, Actor::Robot, app.clock().now()).await?;
+            let plan = match answer.outcome {
+                Outcome::Accepted { plan } => plan,
+                Outcome::Done | Outcome::Refused { .. } => None,
+            };
+            let facts = Facts {
+                plan,
+                ..Facts::default()
+            };
+            db::missions::add_facts(&mut tx, row.mission.id, facts).await?;
+            Finished::Settled
+        }
+        Outcome::Refused { code, detail } => match code {
+            OfferRefusal::Busy | OfferRefusal::NotReady => return Ok(Finished::Again),
+            OfferRefusal::Ended => return Ok(Finished::EndedThere),
+            OfferRefusal::Conflict
+            | OfferRefusal::Impossible
+            | OfferRefusal::TooLate
+            | OfferRefusal::Unknown
+            | OfferRefusal::Other => {
+                db::missions::set_replacement(&mut tx, row.mission.id, None).await?;
+                let why = (Actor::Robot, Cause::ReplaceRefused);
+                add_note(&mut tx, &row.mission, why, app.clock().now(), detail).await?;
+                Finished::Settled
+            }
+        },
+    };
+    tx.commit().await?;
+    app.wake();
+    Ok(how)
+}
+
+/// Makes the revision that the robot shows the one that counts.
+pub(super) async fn adopt_shown(app: &App, standing: &Standing) -> Result<(), AppError> {
+    let mut tx = app.db().write().await?;
+    if let Some(row) = db::missions::find(&mut tx, standing.id).await? {
+        adopt(&mut tx, &row, Actor::Robot, app.clock().now()).await?;
+        tx.commit().await?;
+        app.wake();
+    }
+    Ok(())
+}
+
+/// Tells a robot to hold a mission or to drive on, and writes down the answer.
+pub(super) async fn hold(
+    app: App,
+    commands: Commands,
+    standing: Standing,
+    held: bool,
+) -> Result<Finished, AppError> {
+    let (mission, (revision, _)) = (standing.id, standing.content);
+    let key = (standing.site.clone(), standing.robot.clone());
+    let answer = if held {
+        let command = Pause { mission, revision };
+        commands.send(&key, Verb::Pause, &command).await
+    } else {
+        let command = Resume { mission, revision };
+        commands.send(&key, Verb::Resume, &command).await
+    };
+    let Some(answer) = answer else {
+        app.counters().commands_unanswered.one();
+        return Ok(Finished::Again);
+    };
+    let (change, wanted) = if held {
+        (Change::Pause, "pause")
+    } else {
+        (Change::Resume, "resume")
+    };
+    match &answer.outcome {
+        Outcome::Done | Outcome::Accepted { .. } => {}
+        Outcome::Refused {
+            code: OfferRefusal::Ended,
+            ..
+        } => return Ok(Finished::EndedThere),
+        Outcome::Refused { detail, .. } => {
+            warn!(mission.id = %mission, "robot `{}` does not {wanted}: {detail}", key.1);
+            return Ok(Finished::Again);
+        }
+    }
+    let mut tx = app.db().write().await?;
+    if let Some(row) = db::missions::find(&mut tx, mission).await? {
+        // Wanted otherwise meanwhile: then that is what the robot hears next.
+        let step = Step {
+            actor: Actor::Robot,
+            ..server_step(&app, change, None, Facts::default())
+        };
+        take_step(&mut tx, &(&row.mission).into(), step).await?;
+        tx.commit().await?;
+    }
+    app.wake();
+    Ok(Finished::Settled)
+}
+
 /// Tells a robot to end a mission and writes down the answer.
 pub(super) async fn cancel(
     app: App,
     commands: Commands,
     mission: Standing,
 ) -> Result<Finished, AppError> {
-    let reason = mission
-        .reason
-        .clone()
-        .unwrap_or_else(|| "cancelled by request".to_owned());
     let command = Cancel {
         mission: mission.id,
-        reason,
+        reason: mission.reason.clone().unwrap_or_default(),
     };
     let key = (mission.site.clone(), mission.robot.clone());
     let Some(answer) = commands.send(&key, Verb::Cancel, &command).await else {
@@ -204,6 +339,39 @@ pub(super) async fn cancel(
     }
     app.wake();
     Ok(Finished::Settled)
+}
+
+/// Tells a robot to end a mission that is none of its open ones here.
+pub(super) async fn disown(
+    app: App,
+    commands: Commands,
+    key: RobotKey,
+    mission: MissionId,
+) -> Result<Finished, AppError> {
+    let mut tx = app.db().read().await?;
+    let row = db::missions::find(&mut tx, mission).await?;
+    drop(tx);
+    let own = row.filter(|row| (&row.mission.site, &row.mission.robot) == (&key.0, &key.1));
+    let reason = match own {
+        Some(row) if !row.mission.state.is_terminal() => return Ok(Finished::Settled),
+        Some(row) => format!(
+            "it has ended at the server: it is {}, {}",
+            row.mission.state.as_str(),
+            row.mission.cause.as_str()
+        ),
+        None => "it is no mission of this robot".to_owned(),
+    };
+    warn!(
+        mission.id = %mission, robot.id = %key.1,
+        "robot `{}` drives mission `{mission}`, and is told to end it: {reason}", key.1
+    );
+    app.counters().missions_disowned.one();
+    let command = Cancel { mission, reason };
+    if commands.send(&key, Verb::Cancel, &command).await.is_none() {
+        app.counters().commands_unanswered.one();
+    }
+    // Its next states show whether it has ended; if not, it is told again.
+    Ok(Finished::Again)
 }
 
 /// Brings a robot its site's terrains.

@@ -6,18 +6,20 @@
 //! at most one of a kind per robot.
 
 mod jobs;
-mod needs;
+pub mod needs;
 
 use std::collections::{HashMap, HashSet};
 use std::time::Duration;
 
+use jiff::SignedDuration;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, error};
 use tread_api::ids::{MissionId, SiteId};
+use tread_api::mission::MissionState;
 
-use self::jobs::{Finished, cancel, offer, push_site, settle};
-use self::needs::{Memory, Need, decide};
+use self::jobs::{Finished, adopt_shown, cancel, disown, hold, offer, push_site, replace, settle};
+use self::needs::{Memory, Need, Now, decide, is_absent, is_heard};
 use super::missions::transitions::Change;
 use super::{App, AppError};
 use crate::db;
@@ -38,12 +40,18 @@ const RETRY_MAX: Duration = Duration::from_secs(2);
 const EXPIRE_MAX: u32 = 1_000;
 /// Most sites that are read in one pass.
 const SITES_MAX: u32 = 1_000;
+/// How long a robot may show a mission that is none of its open ones before it is told: its report
+/// of the end may be on its way.
+const FOREIGN_GRACE: Duration = Duration::from_millis(1_500);
 
 /// A command that is under way or waits to be repeated.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 enum Job {
     Offer(MissionId),
+    Replace(MissionId),
+    Hold(MissionId),
     Cancel(MissionId),
+    Disown(RobotKey),
     Site(RobotKey),
 }
 
@@ -55,16 +63,7 @@ struct Retry {
 
 /// Runs until the stop.
 pub async fn run(app: App, commands: Commands, supervisor: Supervisor, stop: CancellationToken) {
-    let (finished, mut finishing) = mpsc::channel(COMMANDS_MAX);
-    let mut reconciler = Reconciler {
-        app: app.clone(),
-        commands,
-        supervisor,
-        finished,
-        under_way: HashSet::new(),
-        retries: HashMap::new(),
-        memories: HashMap::new(),
-    };
+    let mut reconciler = Reconciler::new(app.clone(), commands, supervisor);
     loop {
         if let Err(error) = reconciler.pass().await {
             error!("cannot reconcile missions: {error:?}");
@@ -73,27 +72,62 @@ pub async fn run(app: App, commands: Commands, supervisor: Supervisor, stop: Can
         tokio::select! {
             biased;
             () = stop.cancelled() => break,
-            Some((job, how)) = finishing.recv() => reconciler.note(job, how),
+            Some((job, how)) = reconciler.finishing.recv() => reconciler.note(job, how),
             () = app.changed() => {}
             () = tokio::time::sleep(pause) => {}
         }
-        while let Ok((job, how)) = finishing.try_recv() {
-            reconciler.note(job, how);
-        }
+        reconciler.note_all();
     }
 }
 
-struct Reconciler {
+/// Compares what is wanted with what is, one pass at a time.
+#[derive(Debug)]
+pub struct Reconciler {
     app: App,
     commands: Commands,
     supervisor: Supervisor,
     finished: mpsc::Sender<(Job, Finished)>,
+    finishing: mpsc::Receiver<(Job, Finished)>,
     under_way: HashSet<Job>,
     retries: HashMap<Job, Retry>,
     memories: HashMap<MissionId, Memory>,
+    /// Missions that robots show and that are none of their open ones here, and since when.
+    foreign: HashMap<RobotKey, (MissionId, Duration)>,
 }
 
 impl Reconciler {
+    /// A reconciler that remembers nothing yet.
+    pub fn new(app: App, commands: Commands, supervisor: Supervisor) -> Self {
+        let (finished, finishing) = mpsc::channel(COMMANDS_MAX);
+        Self {
+            app,
+            commands,
+            supervisor,
+            finished,
+            finishing,
+            under_way: HashSet::new(),
+            retries: HashMap::new(),
+            memories: HashMap::new(),
+            foreign: HashMap::new(),
+        }
+    }
+
+    /// Waits until no command is under way any more.
+    pub async fn rest(&mut self) {
+        while !self.under_way.is_empty() {
+            match self.finishing.recv().await {
+                Some((job, how)) => self.note(job, how),
+                None => break,
+            }
+        }
+    }
+
+    fn note_all(&mut self) {
+        while let Ok((job, how)) = self.finishing.try_recv() {
+            self.note(job, how);
+        }
+    }
+
     /// How long until something is due.
     fn pause(&self) -> Duration {
         let now = self.app.clock().elapsed();
@@ -110,7 +144,11 @@ impl Reconciler {
     fn note(&mut self, job: Job, how: Finished) {
         self.under_way.remove(&job);
         let now = self.app.clock().elapsed();
-        if let (Finished::EndedThere, Job::Offer(id) | Job::Cancel(id)) = (how, &job) {
+        if let (
+            Finished::EndedThere,
+            Job::Offer(id) | Job::Replace(id) | Job::Hold(id) | Job::Cancel(id),
+        ) = (how, &job)
+        {
             self.memories
                 .entry(*id)
                 .or_default()
@@ -132,14 +170,20 @@ impl Reconciler {
         }
     }
 
-    async fn pass(&mut self) -> Result<(), AppError> {
+    /// One pass: reads the database and who is there, and starts what is missing.
+    ///
+    /// # Errors
+    /// The database failed; the next pass does what this one did not.
+    pub async fn pass(&mut self) -> Result<(), AppError> {
         self.expire().await?;
+        self.app.sync_alerts().await?;
         let mut tx = self.app.db().read().await?;
         let mut open = db::missions::in_hand(&mut tx).await?;
         open.extend(db::missions::next_in_queues(&mut tx).await?);
         let sites = db::sites::list(&mut tx, "", SITES_MAX).await?;
         drop(tx);
         self.forget_all_but(&open);
+        self.disown_foreign(&open);
         for mission in open {
             self.serve(mission).await?;
         }
@@ -167,8 +211,7 @@ impl Reconciler {
         let overdue = db::missions::overdue(&mut tx, now, EXPIRE_MAX).await?;
         drop(tx);
         for mission in overdue {
-            let step = (Change::Expire, "its latest start passed while it waited");
-            settle(&self.app, &mission, step.0, step.1).await?;
+            settle(&self.app, &mission, Change::Expire).await?;
         }
         Ok(())
     }
@@ -178,19 +221,99 @@ impl Reconciler {
         let open: HashSet<MissionId> = missions.iter().map(|mission| mission.id).collect();
         self.memories.retain(|id, _| open.contains(id));
         self.retries.retain(|job, _| match job {
-            Job::Offer(id) | Job::Cancel(id) => open.contains(id),
-            Job::Site(_) => true,
+            Job::Offer(id) | Job::Replace(id) | Job::Hold(id) | Job::Cancel(id) => {
+                open.contains(id)
+            }
+            Job::Disown(_) | Job::Site(_) => true,
         });
     }
 
-    async fn serve(&mut self, mission: Standing) -> Result<(), AppError> {
+    /// Finds robots that drive what is none of their open missions here, and tells them.
+    fn disown_foreign(&mut self, open: &[Standing]) {
+        let now = self.app.clock().elapsed();
+        let shown = self.app.presences().shown_missions(now);
+        let mut own: HashMap<MissionId, (&SiteId, &tread_api::ids::RobotId)> = HashMap::new();
+        for mission in open {
+            own.insert(mission.id, (&mission.site, &mission.robot));
+        }
+        let mut foreign = HashMap::new();
+        for (key, id) in shown {
+            if own.get(&id) == Some(&(&key.0, &key.1)) {
+                continue;
+            }
+            let before = self.foreign.get(&key).filter(|(before, _)| *before == id);
+            let since = before.map_or(now, |&(_, since)| since);
+            foreign.insert(key, (id, since));
+        }
+        self.foreign = foreign;
+        let due: Vec<(RobotKey, MissionId)> = self
+            .foreign
+            .iter()
+            .filter(|(_, (_, since))| now.saturating_sub(*since) > FOREIGN_GRACE)
+            .map(|(key, (id, _))| (key.clone(), *id))
+            .collect();
+        for (key, id) in due {
+            let job = Job::Disown(key.clone());
+            if self.is_due(&job) {
+                let (app, commands) = (self.app.clone(), self.commands.clone());
+                self.start(job, disown(app, commands, key, id));
+            }
+        }
+        let foreign = &self.foreign;
+        self.retries.retain(|job, _| match job {
+            Job::Disown(key) => foreign.contains_key(key),
+            Job::Offer(_) | Job::Replace(_) | Job::Hold(_) | Job::Cancel(_) | Job::Site(_) => true,
+        });
+    }
+
+    /// Keeps since when a mission's robot has not been heard.
+    async fn note_silence(&self, mission: &mut Standing, heard: bool) -> Result<(), AppError> {
+        if heard == mission.silent_since.is_none() || mission.state == MissionState::Queued {
+            return Ok(());
+        }
+        let clock = self.app.clock();
+        let key = (mission.site.clone(), mission.robot.clone());
+        let silent = self.app.presences().get(&key).silent_for(clock.elapsed());
+        let silent = SignedDuration::try_from(silent.unwrap_or_default()).unwrap_or_default();
+        let since = (!heard).then(|| clock.now().checked_sub(silent).unwrap_or(clock.now()));
+        let mut tx = self.app.db().write().await?;
+        db::missions::set_silence(&mut tx, mission.id, since).await?;
+        tx.commit().await?;
+        mission.silent_since = since;
+        Ok(())
+    }
+
+    async fn serve(&mut self, mut mission: Standing) -> Result<(), AppError> {
         let key = (mission.site.clone(), mission.robot.clone());
         let presence = self.app.presences().get(&key);
-        let memory = self.memories.get(&mission.id).copied().unwrap_or_default();
+        let now = Now {
+            elapsed: self.app.clock().elapsed(),
+            wall: self.app.clock().now(),
+        };
+        let heard = is_heard(&presence, now.elapsed);
+        self.note_silence(&mut mission, heard).await?;
+        let memory = self.memories.entry(mission.id).or_default();
+        memory.absent_since = is_absent(&mission, &presence, now.elapsed)
+            .then(|| memory.absent_since.unwrap_or(now.elapsed));
+        let memory = *memory;
         let (app, commands) = (self.app.clone(), self.commands.clone());
-        match decide(&mission, &presence, memory, self.app.clock().elapsed()) {
+        match decide(&mission, &presence, memory, now) {
             Need::Wait => {}
-            Need::Settle(change, reason) => settle(&self.app, &mission, change, reason).await?,
+            Need::Settle(change) => settle(&self.app, &mission, change).await?,
+            Need::Adopt => adopt_shown(&self.app, &mission).await?,
+            Need::Replace => {
+                let job = Job::Replace(mission.id);
+                if self.is_due(&job) {
+                    self.start(job, replace(app, commands, mission));
+                }
+            }
+            Need::Pause | Need::Resume => {
+                let job = Job::Hold(mission.id);
+                let held = mission.pause_wanted;
+                if self.is_due(&job) {
+                    self.start(job, hold(app, commands, mission, held));
+                }
+            }
             Need::Offer => {
                 let job = Job::Offer(mission.id);
                 if self.is_due(&job) {
@@ -199,8 +322,11 @@ impl Reconciler {
             }
             Need::Cancel => {
                 let job = Job::Cancel(mission.id);
-                // An offer that is under way is answered first, so that the order is kept.
-                if self.is_due(&job) && !self.under_way.contains(&Job::Offer(mission.id)) {
+                // What is under way is answered first, so that the order is kept.
+                let id = mission.id;
+                let before = [Job::Offer(id), Job::Replace(id), Job::Hold(id)];
+                let is_clear = !before.iter().any(|job| self.under_way.contains(job));
+                if is_clear && self.is_due(&job) {
                     self.start(job, cancel(app, commands, mission));
                 }
             }

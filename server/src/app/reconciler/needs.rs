@@ -2,8 +2,9 @@
 
 use std::time::Duration;
 
-use tread_api::mission::MissionState;
-use tread_api::robot::LinkState;
+use jiff::Timestamp;
+use tread_api::mission::{LinkPolicy, MissionState};
+use tread_api::robot::{LinkState, MissionProgress};
 
 use crate::app::missions::transitions::Change;
 use crate::db::missions::Standing;
@@ -11,6 +12,15 @@ use crate::fleet::presence::Presence;
 
 /// How long the records of an earlier run may take to arrive before a mission counts as lost.
 pub(super) const RESTART_GRACE: Duration = Duration::from_secs(3);
+/// How long a robot may be there without its mission, and without anything left to report, before
+/// the mission counts as forgotten.
+pub(super) const FORGET_GRACE: Duration = Duration::from_secs(5);
+/// How long a robot may stay away beyond what was left of its plan, seconds.
+pub const LOST_MARGIN_S: f64 = 60.0;
+/// How long a robot may stay away when nobody knows how long its plan is, seconds.
+pub const LOST_UNPLANNED_S: f64 = 300.0;
+/// How long a robot may stay away beyond the silence after which it stops by itself, seconds.
+pub const LOST_STOPPED_MARGIN_S: f64 = 30.0;
 
 /// What a mission needs now.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -19,10 +29,18 @@ pub(super) enum Need {
     Wait,
     /// Offer it to its robot.
     Offer,
+    /// Offer its new revision to its robot.
+    Replace,
+    /// The robot holds the new revision: it counts.
+    Adopt,
+    /// Tell its robot to hold it.
+    Pause,
+    /// Tell its robot to drive on.
+    Resume,
     /// Tell its robot to end it.
     Cancel,
-    /// Settle it here, for this reason.
-    Settle(Change, &'static str),
+    /// Settle it here.
+    Settle(Change),
 }
 
 /// What the reconciler remembers of a mission while it is open; losing it does no harm.
@@ -30,48 +48,79 @@ pub(super) enum Need {
 pub(super) struct Memory {
     /// Since when the robot says that the mission has ended there.
     pub(super) ended_since: Option<Duration>,
+    /// Since when the robot has been there without the mission and with nothing left to report.
+    pub(super) absent_since: Option<Duration>,
+}
+
+/// The two clocks.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Now {
+    /// For ages.
+    pub(super) elapsed: Duration,
+    /// For what must hold over a restart.
+    pub(super) wall: Timestamp,
+}
+
+/// Whether a robot is heard well enough to be commanded.
+pub(super) fn is_heard(presence: &Presence, now: Duration) -> bool {
+    presence.link(now) != LinkState::Offline
+}
+
+/// What a robot says of a mission.
+pub(super) fn driven(mission: &Standing, presence: &Presence) -> Option<MissionProgress> {
+    let said = presence.state().and_then(|state| state.mission);
+    said.filter(|driven| driven.id == mission.id)
+}
+
+/// Whether a robot is there without a mission that it took, and with nothing left to report.
+pub(super) fn is_absent(mission: &Standing, presence: &Presence, now: Duration) -> bool {
+    let nothing_left = |state: &tread_api::wire::state::RobotState| {
+        // A mission that only the robot's state showed as taken has no run yet.
+        mission.boot.is_none_or(|boot| boot == state.boot) && state.outbox.pending == 0
+    };
+    is_heard(presence, now)
+        && driven(mission, presence).is_none()
+        && presence.state().is_some_and(nothing_left)
 }
 
 /// Decides what a mission needs, from where it stands and what its robot says.
-pub(super) fn decide(
-    mission: &Standing,
-    presence: &Presence,
-    memory: Memory,
-    now: Duration,
-) -> Need {
-    let online = presence.link(now) == LinkState::Online;
-    let driven = presence.state().and_then(|state| state.mission);
-    let is_driven = driven.is_some_and(|driven| driven.id == mission.id);
-    let waited = |since: Duration| now.saturating_sub(since) > RESTART_GRACE;
-    let ended_there = memory.ended_since.is_some_and(waited);
+pub(super) fn decide(mission: &Standing, presence: &Presence, memory: Memory, now: Now) -> Need {
+    let heard = is_heard(presence, now.elapsed);
+    if !heard && mission.state != MissionState::Queued {
+        return if is_lost(mission, presence, now) {
+            Need::Settle(Change::LoseRobot)
+        } else if is_lost_by_restart(mission, presence, false, now.elapsed) {
+            Need::Settle(Change::LoseRun)
+        } else {
+            Need::Wait
+        };
+    }
+    let said = driven(mission, presence);
+    let longer_than =
+        |grace: Duration| move |since: Duration| now.elapsed.saturating_sub(since) > grace;
+    let ended_there = memory.ended_since.is_some_and(longer_than(RESTART_GRACE));
+    let forgotten = memory.absent_since.is_some_and(longer_than(FORGET_GRACE));
+    let restarted = is_lost_by_restart(mission, presence, said.is_some(), now.elapsed);
     match mission.state {
-        MissionState::Queued | MissionState::Offered if online => {
-            if mission.state == MissionState::Offered && is_driven {
-                Need::Settle(Change::Accept, "the robot drives it")
+        MissionState::Queued | MissionState::Offered if heard => {
+            if mission.state == MissionState::Offered && said.is_some_and(of_present(mission)) {
+                Need::Settle(Change::Accept)
             } else if ended_there {
-                Need::Settle(Change::Fail, "the robot has ended it without saying how")
+                Need::Settle(Change::Forget)
             } else {
                 Need::Offer
             }
         }
-        MissionState::Active | MissionState::Paused => {
-            if is_lost_by_restart(mission, presence, is_driven, now) {
-                Need::Settle(Change::Fail, "agent restarted during the mission")
-            } else {
-                Need::Wait
-            }
+        MissionState::Active | MissionState::Paused | MissionState::Cancelling if restarted => {
+            Need::Settle(Change::LoseRun)
         }
-        MissionState::Cancelling => {
-            if is_lost_by_restart(mission, presence, is_driven, now) {
-                Need::Settle(Change::Cancel, "agent restarted during the mission")
-            } else if ended_there {
-                Need::Settle(Change::Cancel, "the robot has ended it without saying how")
-            } else if online {
-                Need::Cancel
-            } else {
-                Need::Wait
-            }
+        MissionState::Active | MissionState::Paused | MissionState::Cancelling
+            if ended_there || forgotten =>
+        {
+            Need::Settle(Change::Forget)
         }
+        MissionState::Active | MissionState::Paused => in_hand(mission, said),
+        MissionState::Cancelling => Need::Cancel,
         MissionState::Queued
         | MissionState::Offered
         | MissionState::Succeeded
@@ -80,6 +129,58 @@ pub(super) fn decide(
         | MissionState::Rejected
         | MissionState::Expired => Need::Wait,
     }
+}
+
+fn of_present(mission: &Standing) -> impl Fn(MissionProgress) -> bool {
+    let content = mission.content;
+    move |said| (said.revision, said.plan_hash) == content
+}
+
+/// What a mission needs that its robot drives or holds.
+fn in_hand(mission: &Standing, said: Option<MissionProgress>) -> Need {
+    let content = said.map(|said| (said.revision, said.plan_hash));
+    if mission.replacement.is_some() {
+        return if content == mission.replacement {
+            Need::Adopt
+        } else {
+            Need::Replace
+        };
+    }
+    let held = said.is_some_and(|said| said.paused);
+    let paused = mission.state == MissionState::Paused;
+    match (paused, mission.pause_wanted) {
+        (false, true) => Need::Pause,
+        (true, false) => Need::Resume,
+        // A command that came late or twice had its way on the robot: once more.
+        (false, false) if held => Need::Resume,
+        (true, true) if said.is_some() && !held => Need::Pause,
+        (false, false) | (true, true) => Need::Wait,
+    }
+}
+
+/// How long a robot may stay away from a mission.
+pub(super) fn lost_after_s(mission: &Standing, said: Option<MissionProgress>) -> f64 {
+    match (mission.lost_after_s, mission.link_policy) {
+        (Some(lost_after_s), _) => lost_after_s,
+        (None, LinkPolicy::StopAfter { silence_s }) => silence_s + LOST_STOPPED_MARGIN_S,
+        (None, LinkPolicy::Continue) => match mission.duration_s {
+            Some(duration_s) => {
+                let left = said.filter(|said| said.length_m > 0.0).map_or(1.0, |said| {
+                    (1.0 - said.driven_m / said.length_m).clamp(0.0, 1.0)
+                });
+                duration_s * left + LOST_MARGIN_S
+            }
+            None => LOST_UNPLANNED_S,
+        },
+    }
+}
+
+/// Whether a mission's robot has stayed away past its bound.
+fn is_lost(mission: &Standing, presence: &Presence, now: Now) -> bool {
+    let bound_s = lost_after_s(mission, driven(mission, presence));
+    mission
+        .silent_since
+        .is_some_and(|since| now.wall.duration_since(since).as_secs_f64() > bound_s)
 }
 
 /// Whether the agent that took a mission is gone, its records have had their say, and its

@@ -1,6 +1,6 @@
 //! What a mission needs, for what its robot says.
 
-use tread_api::ids::{BootId, MissionId};
+use tread_api::ids::{BootId, MissionId, PlanHash};
 use tread_api::robot::{LoopStatus, MissionProgress, OutboxStatus, RobotMode};
 use tread_api::wire::state::RobotState;
 use uuid::Uuid;
@@ -8,9 +8,16 @@ use uuid::Uuid;
 use super::*;
 use crate::fleet::presence::Presences;
 
-const NOW: Duration = Duration::from_secs(100);
+const ELAPSED: Duration = Duration::from_secs(100);
 const JUST: Duration = Duration::from_millis(99_900);
 const LONG_AGO: Duration = Duration::from_secs(10);
+
+fn now() -> Now {
+    Now {
+        elapsed: ELAPSED,
+        wall: "2026-11-01T12:00:00Z".parse().unwrap(),
+    }
+}
 
 fn boot(number: u128) -> BootId {
     BootId::from_uuid(Uuid::from_u128(number))
@@ -24,7 +31,18 @@ fn mission(state: MissionState, boot: Option<BootId>) -> Standing {
         state,
         reason: None,
         boot,
+        pause_wanted: false,
+        content: (1, hash(1)),
+        replacement: None,
+        silent_since: None,
+        lost_after_s: None,
+        link_policy: LinkPolicy::Continue,
+        duration_s: Some(100.0),
     }
+}
+
+fn hash(number: u128) -> PlanHash {
+    PlanHash::from_uuid(Uuid::from_u128(number))
 }
 
 /// A robot that was first heard at one time and last heard just now.
@@ -33,6 +51,7 @@ struct Said {
     since: Duration,
     drives: bool,
     pending: u64,
+    paused: bool,
 }
 
 fn presence(said: &Said) -> Presence {
@@ -41,10 +60,11 @@ fn presence(said: &Said) -> Presence {
     let progress = MissionProgress {
         id: of.id,
         revision: 1,
-        plan_hash: tread_api::ids::PlanHash::from_uuid(Uuid::nil()),
+        plan_hash: hash(1),
         driven_m: 1.0,
         length_m: 2.0,
         cross_track_m: 0.0,
+        paused: said.paused,
     };
     let state = RobotState {
         robot: of.robot,
@@ -62,11 +82,13 @@ fn presence(said: &Said) -> Presence {
             ..OutboxStatus::default()
         },
         control_loop: LoopStatus::default(),
+        battery: None,
+        alerts: Vec::new(),
     };
     let presences = Presences::default();
     presences.token_appeared(key.clone(), boot(said.boot), said.since);
     presences.hello(key.clone(), state.boot, JUST);
-    presences.state(&key, state, JUST);
+    presences.state(&key, state, JUST, now().wall);
     presences.get(&key)
 }
 
@@ -75,7 +97,7 @@ fn need(state: MissionState, taken_by: Option<u128>, said: &Said) -> Need {
         &mission(state, taken_by.map(boot)),
         &presence(said),
         Memory::default(),
-        NOW,
+        now(),
     )
 }
 
@@ -84,6 +106,7 @@ const IDLE: Said = Said {
     since: LONG_AGO,
     drives: false,
     pending: 0,
+    paused: false,
 };
 
 #[test]
@@ -93,7 +116,7 @@ fn a_mission_is_offered_only_to_a_robot_that_is_heard() {
     for state in MissionState::ALL {
         let standing = mission(state, Some(boot(1)));
         assert_eq!(
-            decide(&standing, &nobody, Memory::default(), NOW),
+            decide(&standing, &nobody, Memory::default(), now()),
             Need::Wait,
             "{state:?}"
         );
@@ -109,7 +132,7 @@ fn an_offer_whose_answer_was_lost_is_repeated_until_the_robot_shows_it() {
     };
     let settled = need(MissionState::Offered, None, &driving);
     assert!(
-        matches!(settled, Need::Settle(Change::Accept, _)),
+        matches!(settled, Need::Settle(Change::Accept)),
         "{settled:?}"
     );
 }
@@ -123,6 +146,7 @@ fn a_restart_loses_a_mission_only_after_the_old_records_had_their_say() {
         since: JUST,
         drives: false,
         pending: 1,
+        paused: false,
     };
     assert_eq!(
         active(&restarted),
@@ -134,14 +158,14 @@ fn a_restart_loses_a_mission_only_after_the_old_records_had_their_say() {
             pending: 0,
             ..restarted
         }),
-        Need::Settle(Change::Fail, _)
+        Need::Settle(Change::LoseRun)
     ));
     let patient = Said {
         since: LONG_AGO,
         pending: 9,
         ..restarted
     };
-    assert!(matches!(active(&patient), Need::Settle(Change::Fail, _)));
+    assert!(matches!(active(&patient), Need::Settle(Change::LoseRun)));
     let resumed = Said {
         drives: true,
         pending: 0,
@@ -157,7 +181,7 @@ fn a_cancellation_is_sent_until_answered_and_ends_with_a_restart() {
     let restarted = Said { boot: 2, ..IDLE };
     let settled = need(MissionState::Cancelling, Some(1), &restarted);
     assert!(
-        matches!(settled, Need::Settle(Change::Cancel, _)),
+        matches!(settled, Need::Settle(Change::LoseRun)),
         "{settled:?}"
     );
 }
@@ -166,13 +190,14 @@ fn a_cancellation_is_sent_until_answered_and_ends_with_a_restart() {
 fn a_mission_that_ended_on_the_robot_without_a_record_does_not_stay_open() {
     let since = |ended_since| Memory {
         ended_since: Some(ended_since),
+        absent_since: None,
     };
     let offered = mission(MissionState::Offered, None);
     let robot = presence(&IDLE);
-    assert_eq!(decide(&offered, &robot, since(JUST), NOW), Need::Offer);
-    let settled = decide(&offered, &robot, since(LONG_AGO), NOW);
+    assert_eq!(decide(&offered, &robot, since(JUST), now()), Need::Offer);
+    let settled = decide(&offered, &robot, since(LONG_AGO), now());
     assert!(
-        matches!(settled, Need::Settle(Change::Fail, _)),
+        matches!(settled, Need::Settle(Change::Forget)),
         "{settled:?}"
     );
 }
@@ -185,4 +210,116 @@ fn what_has_ended_needs_nothing() {
     {
         assert_eq!(need(state, Some(9), &IDLE), Need::Wait, "{state:?}");
     }
+}
+
+#[test]
+fn what_is_wanted_of_a_mission_in_hand_is_sent_until_the_robot_has_done_it() {
+    let driving = Said {
+        drives: true,
+        ..IDLE
+    };
+    let holding = Said {
+        paused: true,
+        ..driving
+    };
+    let needs = |state, pause_wanted, said: &Said| {
+        let mission = Standing {
+            pause_wanted,
+            ..mission(state, Some(boot(1)))
+        };
+        decide(&mission, &presence(said), Memory::default(), now())
+    };
+    let (active, paused) = (MissionState::Active, MissionState::Paused);
+    assert_eq!(needs(active, true, &driving), Need::Pause);
+    assert_eq!(needs(active, false, &driving), Need::Wait);
+    assert_eq!(needs(paused, true, &holding), Need::Wait);
+    assert_eq!(needs(paused, false, &holding), Need::Resume);
+    // A command that came twice or late had its way.
+    assert_eq!(needs(active, false, &holding), Need::Resume);
+    assert_eq!(needs(paused, true, &driving), Need::Pause);
+}
+
+#[test]
+fn a_new_revision_is_offered_until_the_robot_shows_that_it_holds_it() {
+    let replaced = |next| Standing {
+        replacement: Some((2, hash(next))),
+        ..mission(MissionState::Active, Some(boot(1)))
+    };
+    let driving = presence(&Said {
+        drives: true,
+        ..IDLE
+    });
+    let none = Memory::default();
+    assert_eq!(decide(&replaced(2), &driving, none, now()), Need::Replace);
+    let shown = Standing {
+        replacement: Some((1, hash(1))),
+        ..replaced(2)
+    };
+    assert_eq!(decide(&shown, &driving, none, now()), Need::Adopt);
+}
+
+#[test]
+fn a_robot_that_stays_away_past_its_bound_loses_what_it_has_in_hand() {
+    let away_s = |state, away_s: i64| {
+        let since = now().wall - jiff::SignedDuration::from_secs(away_s);
+        let mission = Standing {
+            silent_since: Some(since),
+            ..mission(state, Some(boot(1)))
+        };
+        decide(&mission, &Presence::default(), Memory::default(), now())
+    };
+    for state in [
+        MissionState::Offered,
+        MissionState::Active,
+        MissionState::Paused,
+        MissionState::Cancelling,
+    ] {
+        // The plan takes 100 s, and a margin of a minute.
+        assert_eq!(away_s(state, 150), Need::Wait, "{state:?}");
+        let lost = Need::Settle(Change::LoseRobot);
+        assert_eq!(away_s(state, 170), lost, "{state:?}");
+    }
+    assert_eq!(away_s(MissionState::Queued, 1_000_000), Need::Wait);
+}
+
+#[test]
+fn the_bound_of_a_lost_robot_follows_what_was_said_and_what_is_left() {
+    let of = |link_policy, lost_after_s, duration_s| Standing {
+        lost_after_s,
+        link_policy,
+        duration_s,
+        ..mission(MissionState::Active, None)
+    };
+    let half = driven(
+        &mission(MissionState::Active, None),
+        &presence(&Said {
+            drives: true,
+            ..IDLE
+        }),
+    );
+    let goes_on = LinkPolicy::Continue;
+    let near = |left: f64, right: f64| assert!((left - right).abs() < 1e-9, "{left} {right}");
+    near(lost_after_s(&of(goes_on, Some(5.0), Some(9.0)), half), 5.0);
+    near(lost_after_s(&of(goes_on, None, Some(100.0)), half), 110.0);
+    near(lost_after_s(&of(goes_on, None, None), None), 300.0);
+    let stops = LinkPolicy::StopAfter { silence_s: 7.0 };
+    near(lost_after_s(&of(stops, None, Some(100.0)), half), 37.0);
+}
+
+#[test]
+fn a_robot_that_is_there_without_its_mission_has_forgotten_it_after_a_while() {
+    let active = mission(MissionState::Active, Some(boot(1)));
+    let idle = presence(&IDLE);
+    assert!(is_absent(&active, &idle, ELAPSED));
+    let taken_unseen = mission(MissionState::Active, None);
+    assert!(is_absent(&taken_unseen, &idle, ELAPSED));
+    let reporting = presence(&Said { pending: 1, ..IDLE });
+    assert!(!is_absent(&active, &reporting, ELAPSED));
+    let since = |absent_since| Memory {
+        absent_since: Some(absent_since),
+        ended_since: None,
+    };
+    assert_eq!(decide(&active, &idle, since(JUST), now()), Need::Wait);
+    let forgotten = decide(&active, &idle, since(LONG_AGO), now());
+    assert_eq!(forgotten, Need::Settle(Change::Forget));
 }

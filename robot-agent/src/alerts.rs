@@ -1,0 +1,144 @@
+//! What needs a person's attention, judged from what the agent knows of itself. Pure.
+//!
+//! An alert stands as long as its cause does; the server keeps when it came and went. Figures that
+//! waver have two bounds, so that an alert does not flicker.
+
+use tread_api::ids::AlertCode;
+use tread_api::robot::{AlertReport, OutboxStatus, Severity};
+
+use crate::control_loop::seam::Fault;
+use crate::drive::Battery;
+
+/// Charge below which the battery is low, and above which it no longer is.
+const BATTERY_LOW: (f64, f64) = (0.20, 0.25);
+/// Charge below which the robot will soon stop, and above which it no longer will.
+const BATTERY_CRITICAL: (f64, f64) = (0.05, 0.08);
+/// Records that wait for the server and are worth a look, and no longer are.
+const OUTBOX_LONG: (u64, u64) = (50_000, 25_000);
+
+/// What alerts are judged from.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(crate) struct Causes {
+    pub(crate) battery: Option<Battery>,
+    pub(crate) fault: Option<Fault>,
+    pub(crate) outbox: OutboxStatus,
+}
+
+/// Which wavering alerts stand.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct Alerts {
+    battery_low: bool,
+    battery_critical: bool,
+    outbox_long: bool,
+}
+
+/// Whether a figure counts as below, with the bound that holds in the present state.
+fn is_below<T: PartialOrd + Copy>(value: T, is_so: bool, (enter, leave): (T, T)) -> bool {
+    if is_so { value < leave } else { value < enter }
+}
+
+fn alert(code: &str, severity: Severity, text: String) -> Option<AlertReport> {
+    let code: AlertCode = code.parse().ok()?;
+    Some(AlertReport {
+        code,
+        severity,
+        text,
+    })
+}
+
+impl Alerts {
+    /// The alerts that stand now.
+    pub(crate) fn judge(&mut self, causes: &Causes) -> Vec<AlertReport> {
+        let charge = causes.battery.map(|battery| battery.charge_ratio);
+        self.battery_low =
+            charge.is_some_and(|charge| is_below(charge, self.battery_low, BATTERY_LOW));
+        self.battery_critical =
+            charge.is_some_and(|charge| is_below(charge, self.battery_critical, BATTERY_CRITICAL));
+        let (many, few) = OUTBOX_LONG;
+        let pending = causes.outbox.pending;
+        self.outbox_long = pending > if self.outbox_long { few } else { many };
+        let percent = charge.map_or(0.0, |charge| 100.0 * charge);
+        let battery = if self.battery_critical {
+            let text = format!("the battery is nearly empty: {percent:.0} %");
+            alert("battery-critical", Severity::Critical, text)
+        } else if self.battery_low {
+            let text = format!("the battery is low: {percent:.0} %");
+            alert("battery-low", Severity::Warning, text)
+        } else {
+            None
+        };
+        let fault = causes.fault.and_then(|fault| {
+            let code = match fault {
+                Fault::BaseSilent => "base-silent",
+                Fault::PositionLost => "position-lost",
+            };
+            alert(code, Severity::Critical, fault.text().to_owned())
+        });
+        let long = self.outbox_long.then(|| {
+            let text = "many measurements wait for the server".to_owned();
+            alert("outbox-long", Severity::Warning, text)
+        });
+        let lost = (causes.outbox.dropped > 0).then(|| {
+            let text = "measurements were lost: the store was full".to_owned();
+            alert("outbox-dropped", Severity::Warning, text)
+        });
+        [battery, fault, long.flatten(), lost.flatten()]
+            .into_iter()
+            .flatten()
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn codes(alerts: &[AlertReport]) -> Vec<&str> {
+        alerts.iter().map(|alert| alert.code.as_str()).collect()
+    }
+
+    #[test]
+    fn a_battery_that_wavers_does_not_make_its_alert_flicker() {
+        let mut alerts = Alerts::default();
+        let mut at = |charge_ratio| {
+            let battery = Some(Battery {
+                charge_ratio,
+                voltage_v: 22.0,
+            });
+            alerts.judge(&Causes {
+                battery,
+                ..Causes::default()
+            })
+        };
+        assert!(at(0.21).is_empty());
+        assert_eq!(codes(&at(0.19)), ["battery-low"]);
+        assert_eq!(codes(&at(0.22)), ["battery-low"]);
+        assert!(at(0.26).is_empty());
+        assert_eq!(codes(&at(0.04)), ["battery-critical"]);
+        assert_eq!(codes(&at(0.07)), ["battery-critical"]);
+        assert_eq!(codes(&at(0.09)), ["battery-low"]);
+    }
+
+    #[test]
+    fn faults_and_losses_are_alerts_each_code_once() {
+        let mut alerts = Alerts::default();
+        let mut causes = Causes {
+            fault: Some(Fault::BaseSilent),
+            outbox: OutboxStatus {
+                pending: 60_000,
+                dropped: 1,
+                refused: 0,
+            },
+            ..Causes::default()
+        };
+        let first = alerts.judge(&causes);
+        assert_eq!(
+            codes(&first),
+            ["base-silent", "outbox-long", "outbox-dropped"]
+        );
+        causes.outbox.pending = 30_000;
+        assert!(codes(&alerts.judge(&causes)).contains(&"outbox-long"));
+        causes.outbox.pending = 20_000;
+        assert!(!codes(&alerts.judge(&causes)).contains(&"outbox-long"));
+    }
+}

@@ -1,0 +1,269 @@
+//! The mission that the loop has in hand: driven, held standing, and ended for a reason.
+//!
+//! ```text
+//!          hold (pause, replacement)          stands
+//! driving ─────────────────────────► braking ────────► standing
+//!    ▲ └────────────── cancel, silence ──────┴────────────┤ │
+//!    └──────────────────── release ───────────────────────┘ ▼
+//!                                                         ended
+//! ```
+//! While it stands held, the tracking law rests too: nothing winds up, nothing creeps.
+
+use std::time::Duration;
+
+use tread_api::robot::MissionProgress;
+use tread_control::follower::FollowerStatus;
+use tread_control::gate::GateCause;
+use tread_control::measured::{Measured, WheelSpeeds};
+use tread_control::robot::RobotModel;
+use tread_control::tracking::ThetaKnowledge;
+
+use super::driven::TickRecord;
+use super::seam::{EndReason, Job};
+
+/// Speeds below which a held robot counts as standing, m/s and rad/s.
+const STANDING: f64 = 0.04;
+/// Ticks in a row that it must stand.
+const STANDING_TICKS: u32 = 5;
+
+/// What a tick of a mission gives.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Step {
+    /// What the wheels are to do; rest while it stands held.
+    pub(super) wanted: WheelSpeeds,
+    /// Why it is over, if it is.
+    pub(super) end: Option<EndReason>,
+    /// It has just come to stand by a pause, or has just left that.
+    pub(super) news: Option<News>,
+    /// θ̂ of the tracking law.
+    pub(super) theta_loop: f64,
+}
+
+/// A change that the server is told of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum News {
+    Paused,
+    Resumed,
+}
+
+/// Why a mission is held.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Hold {
+    /// An operator paused it.
+    Pause,
+    /// Its next revision is being planned from where it comes to stand.
+    Replacement,
+}
+
+/// What holds a mission now.
+#[derive(Debug, Clone, Copy, Default)]
+struct Holds {
+    pause: bool,
+    replacement: bool,
+}
+
+/// The mission in hand.
+#[derive(Debug)]
+pub(super) struct Active {
+    pub(super) job: Box<Job>,
+    pub(super) progress: MissionProgress,
+    pub(super) has_started: bool,
+    holds: Holds,
+    standing_ticks: u32,
+    /// Whether the server was told that it stands paused.
+    is_told_paused: bool,
+    stopped_because: EndReason,
+    /// The revision that takes over once the robot stands.
+    next: Option<Box<Job>>,
+    /// Distance from the path in this tick, and whether a wheel was at its limit.
+    tracked: Option<(f64, bool)>,
+}
+
+pub(super) fn progress_of(job: &Job) -> MissionProgress {
+    MissionProgress {
+        id: job.mission,
+        revision: job.revision,
+        plan_hash: job.plan_hash,
+        driven_m: 0.0,
+        length_m: job.follower.plan().length_m(),
+        cross_track_m: 0.0,
+        paused: false,
+    }
+}
+
+impl Active {
+    pub(super) fn new(job: Box<Job>) -> Self {
+        Self {
+            progress: progress_of(&job),
+            job,
+            has_started: false,
+            holds: Holds::default(),
+            standing_ticks: 0,
+            is_told_paused: false,
+            stopped_because: EndReason::Cancelled,
+            next: None,
+            tracked: None,
+        }
+    }
+
+    /// Brakes along the path, for good.
+    pub(super) fn stop(&mut self, because: EndReason) {
+        if self.job.follower.status() != FollowerStatus::Stopping {
+            self.stopped_because = because;
+            self.job.follower.stop();
+        }
+    }
+
+    /// Holds the mission, or lets it go on.
+    pub(super) fn hold(&mut self, hold: Hold, is_wanted: bool) {
+        match hold {
+            Hold::Pause => {
+                self.holds.pause = is_wanted;
+                self.progress.paused = is_wanted;
+            }
+            Hold::Replacement => self.holds.replacement = is_wanted,
+        }
+        let is_held = self.is_held();
+        if !is_held {
+            self.standing_ticks = 0;
+        }
+        self.job.follower.set_pace(if is_held { 0.0 } else { 1.0 });
+    }
+
+    /// Whether it is held, braking or standing.
+    pub(super) fn is_held(&self) -> bool {
+        self.holds.pause || self.holds.replacement
+    }
+
+    fn stands_held(&self) -> bool {
+        self.is_held() && self.standing_ticks >= STANDING_TICKS
+    }
+
+    /// Puts the next revision in place of this one as soon as the robot stands; hands back one
+    /// that waited for that already.
+    pub(super) fn replace_at_rest(&mut self, next: Box<Job>) -> Option<Box<Job>> {
+        self.hold(Hold::Replacement, true);
+        self.next.replace(next)
+    }
+
+    /// Whether the next revision is here and the robot stands for it.
+    pub(super) fn is_at_rest_for_replacement(&self) -> bool {
+        let status = self.job.follower.status();
+        let is_stopping = status == FollowerStatus::Stopping;
+        let is_over = status == FollowerStatus::Done;
+        self.next.is_some() && !is_stopping && (is_over || self.stands_held())
+    }
+
+    /// Puts the next revision in place of this one and hands the old one back. The record of the
+    /// way goes on.
+    pub(super) fn replace(&mut self, knowledge: Option<ThetaKnowledge>) -> Option<Box<Job>> {
+        let mut next = self.next.take()?;
+        std::mem::swap(&mut self.job.driven, &mut next.driven);
+        if let Some(knowledge) = knowledge {
+            next.follower.warm_start(knowledge);
+        }
+        self.progress = MissionProgress {
+            paused: self.holds.pause,
+            ..progress_of(&next)
+        };
+        let old = std::mem::replace(&mut self.job, next);
+        self.hold(Hold::Replacement, false);
+        Some(old)
+    }
+
+    /// What is left in hand when the mission ends.
+    pub(super) fn into_jobs(self) -> (Box<Job>, Option<Box<Job>>) {
+        (self.job, self.next)
+    }
+
+    /// One tick.
+    pub(super) fn step(
+        &mut self,
+        measured: &Measured,
+        knowledge: Option<ThetaKnowledge>,
+        model: &RobotModel,
+        command: WheelSpeeds,
+        dt_s: f64,
+    ) -> Step {
+        self.note_standing(measured, model, command);
+        let news = self.take_news();
+        let status = self.job.follower.status();
+        let is_on_the_way = matches!(status, FollowerStatus::Approach | FollowerStatus::Tracking);
+        if self.stands_held() && is_on_the_way {
+            self.tracked = None;
+            return Step {
+                wanted: WheelSpeeds::default(),
+                end: None,
+                news,
+                theta_loop: f64::NAN,
+            };
+        }
+        let output = self.job.follower.step(measured, knowledge, dt_s);
+        self.progress.driven_m = self.progress.driven_m.max(output.progress_m);
+        self.progress.cross_track_m = output.errors.cross_m;
+        self.tracked = Some((output.errors.cross_m, output.saturated));
+        let end = match output.status {
+            // With a revision to come, an end of the old one is not the end.
+            FollowerStatus::Done if self.holds.replacement => None,
+            FollowerStatus::Done => Some(EndReason::Reached),
+            FollowerStatus::Stopped => Some(self.stopped_because),
+            FollowerStatus::Failed(reason) => Some(EndReason::Failed(reason)),
+            FollowerStatus::Approach
+            | FollowerStatus::Tracking
+            | FollowerStatus::Settling
+            | FollowerStatus::Stopping => None,
+        };
+        Step {
+            wanted: output.wheel_speeds,
+            end,
+            news,
+            theta_loop: output.theta_loop,
+        }
+    }
+
+    fn note_standing(&mut self, measured: &Measured, model: &RobotModel, command: WheelSpeeds) {
+        let command_m_s = command.magnitude_max_rad_s() * model.wheel_radius_m();
+        let stands = self.is_held()
+            && command_m_s < STANDING
+            && measured.twist.linear_m_s.abs() < STANDING
+            && measured.twist.angular_rad_s.abs() < 2.0 * STANDING;
+        self.standing_ticks = if stands || self.stands_held() {
+            self.standing_ticks.saturating_add(1)
+        } else {
+            0
+        };
+    }
+
+    fn take_news(&mut self) -> Option<News> {
+        let is_paused = self.holds.pause && self.stands_held();
+        if is_paused == self.is_told_paused || (self.is_told_paused && self.holds.pause) {
+            return None;
+        }
+        self.is_told_paused = is_paused;
+        Some(if is_paused {
+            News::Paused
+        } else {
+            News::Resumed
+        })
+    }
+
+    /// Adds this tick to the record of the way.
+    pub(super) fn record(&mut self, tick: TickRecord) {
+        let (cross_track_m, is_saturated) = self.tracked.unzip();
+        self.job.driven.add(&TickRecord {
+            cross_track_m,
+            is_saturated: is_saturated.unwrap_or(false),
+            is_paused: self.is_told_paused,
+            // Slowing to rest and speeding up are the gate's usual work while it is held.
+            gate: tick
+                .gate
+                .filter(|cause| !self.is_held() || *cause > GateCause::Speed),
+            ..tick
+        });
+    }
+
+    /// Whether the server has been silent for longer than the mission allows.
+    pub(super) fn minds_silence(&self, silence: Duration) -> bool {
+        self.job.silence_max.is_some_and(|most| silence > most)
+    }
+}

@@ -1,0 +1,396 @@
+//! What a mission really was: the way driven, and how well it was driven.
+//!
+//! All room is taken before the loop has the mission; a full store drops every other entry and
+//! asks for twice the distance between two, so that a mission of any length fits. What is dropped
+//! goes into the tolerance that is stated with the path. [`Driven::quality`] and
+//! [`Driven::path`] are for whoever reports, outside the loop.
+
+use tread_api::geometry::Point as WirePoint;
+use tread_api::mission::{
+    DRIVEN_POINTS_MAX, DrivenPath, MissionQuality, THETA_SAMPLES_MAX, ThetaSample,
+};
+use tread_control::gate::GateCause;
+use tread_control::geometry::Point;
+
+/// First distance between two points, metres.
+const POINT_SPACING_M: f64 = 0.05;
+/// First distance between two samples of θ, metres.
+const THETA_SPACING_M: f64 = 0.25;
+/// Deviation that the report may add, to say a straight line by its ends, metres.
+const LINE_TOLERANCE_M: f64 = 0.01;
+/// Coordinates are reported to this, metres.
+const RESOLUTION_M: f64 = 1.0e-4;
+
+/// What one tick adds.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct TickRecord {
+    pub(crate) dt_s: f64,
+    /// Where the robot is; none while it does not know.
+    pub(crate) at: Option<Point>,
+    /// Way driven in this tick, metres.
+    pub(crate) driven_m: f64,
+    /// Distance from the path, metres; none while it turns on the spot or stands held.
+    pub(crate) cross_track_m: Option<f64>,
+    /// Whether a wheel was at its limit.
+    pub(crate) is_saturated: bool,
+    /// Whether the mission stands paused.
+    pub(crate) is_paused: bool,
+    /// Whether a wheel slips beyond the model, or the ground has just changed.
+    pub(crate) slips: bool,
+    /// Why the gate reduced the command, if it did.
+    pub(crate) gate: Option<GateCause>,
+    /// θ̂ of the tracking law.
+    pub(crate) theta_loop: Option<f64>,
+    /// Measured θ and its standard deviation.
+    pub(crate) theta_measured: Option<(f64, f64)>,
+}
+
+/// The record of one mission.
+#[derive(Debug, Clone)]
+pub(crate) struct Driven {
+    points: Vec<Point>,
+    spacing_m: f64,
+    /// Farthest that the way so far is from the line through the points, metres.
+    tolerance_m: f64,
+    last: Option<Point>,
+    since_point_m: f64,
+    theta: Vec<ThetaSample>,
+    theta_spacing_m: f64,
+    theta_at_m: f64,
+    duration_s: f64,
+    paused_s: f64,
+    distance_m: f64,
+    tracked_s: f64,
+    cross_squared_m2_s: f64,
+    cross_max_m: f64,
+    ticks: u64,
+    saturated_ticks: u64,
+    reduced_ticks: u64,
+    slip_events: u32,
+    gate_stops: u32,
+    was_slipping: bool,
+    was_held_by_gate: bool,
+}
+
+impl Driven {
+    /// The record of a mission that has not begun, with all the room that it will ever need.
+    pub(crate) fn new() -> Self {
+        Self {
+            points: Vec::with_capacity(DRIVEN_POINTS_MAX),
+            spacing_m: POINT_SPACING_M,
+            tolerance_m: 0.0,
+            last: None,
+            since_point_m: 0.0,
+            theta: Vec::with_capacity(THETA_SAMPLES_MAX),
+            theta_spacing_m: THETA_SPACING_M,
+            theta_at_m: 0.0,
+            duration_s: 0.0,
+            paused_s: 0.0,
+            distance_m: 0.0,
+            tracked_s: 0.0,
+            cross_squared_m2_s: 0.0,
+            cross_max_m: 0.0,
+            ticks: 0,
+            saturated_ticks: 0,
+            reduced_ticks: 0,
+            slip_events: 0,
+            gate_stops: 0,
+            was_slipping: false,
+            was_held_by_gate: false,
+        }
+    }
+
+    /// Adds a tick. Does not allocate.
+    pub(crate) fn add(&mut self, tick: &TickRecord) {
+        self.duration_s += tick.dt_s;
+        if tick.is_paused {
+            self.paused_s += tick.dt_s;
+        }
+        self.ticks += 1;
+        self.saturated_ticks += u64::from(tick.is_saturated);
+        self.reduced_ticks += u64::from(tick.gate.is_some());
+        if let Some(cross_m) = tick.cross_track_m.filter(|cross_m| cross_m.is_finite()) {
+            self.tracked_s += tick.dt_s;
+            self.cross_squared_m2_s += cross_m * cross_m * tick.dt_s;
+            self.cross_max_m = self.cross_max_m.max(cross_m.abs());
+        }
+        if tick.slips && !self.was_slipping {
+            self.slip_events = self.slip_events.saturating_add(1);
+        }
+        self.was_slipping = tick.slips;
+        let is_held_by_gate = tick.gate.is_some_and(|cause| cause > GateCause::Speed);
+        if is_held_by_gate && !self.was_held_by_gate {
+            self.gate_stops = self.gate_stops.saturating_add(1);
+        }
+        self.was_held_by_gate = is_held_by_gate;
+        if tick.driven_m.is_finite() {
+            self.distance_m += tick.driven_m.max(0.0);
+        }
+        if let Some(at) = tick.at.filter(|at| at.is_finite()) {
+            self.add_point(at);
+        }
+        self.add_theta(tick);
+    }
+
+    fn add_point(&mut self, at: Point) {
+        let Some(last) = self.last.replace(at) else {
+            self.points.push(at);
+            return;
+        };
+        self.since_point_m += last.distance_m(at);
+        if self.since_point_m < self.spacing_m {
+            return;
+        }
+        // Between two points the way is no longer than this, so it strays by half at the most.
+        self.tolerance_m = self.tolerance_m.max(0.5 * self.since_point_m);
+        self.since_point_m = 0.0;
+        if self.points.len() >= DRIVEN_POINTS_MAX - 1 {
+            self.drop_every_other_point();
+        }
+        self.points.push(at);
+    }
+
+    fn drop_every_other_point(&mut self) {
+        let mut farthest_m: f64 = 0.0;
+        let mut kept = 1;
+        for index in 1..self.points.len() {
+            if index % 2 == 1
+                && let Some(&after) = self.points.get(index + 1)
+            {
+                // Kept places move up only to where they were already read.
+                let off_m = distance_from_line_m(self.points[index], self.points[kept - 1], after);
+                farthest_m = farthest_m.max(off_m);
+                continue;
+            }
+            self.points[kept] = self.points[index];
+            kept += 1;
+        }
+        self.points.truncate(kept);
+        self.tolerance_m += farthest_m;
+        self.spacing_m *= 2.0;
+    }
+
+    fn add_theta(&mut self, tick: &TickRecord) {
+        let Some(theta_loop) = tick.theta_loop.filter(|theta| theta.is_finite()) else {
+            return;
+        };
+        if self.distance_m < self.theta_at_m {
+            return;
+        }
+        if self.theta.len() >= THETA_SAMPLES_MAX {
+            let mut index = 0;
+            self.theta.retain(|_| {
+                index += 1;
+                index % 2 == 1
+            });
+            self.theta_spacing_m *= 2.0;
+        }
+        let measured = tick
+            .theta_measured
+            .filter(|(theta, std_dev)| theta.is_finite() && std_dev.is_finite());
+        self.theta.push(ThetaSample {
+            driven_m: self.distance_m,
+            theta_loop,
+            theta_measured: measured.map(|(theta, _)| theta),
+            theta_sd: measured.map(|(_, std_dev)| std_dev),
+        });
+        self.theta_at_m = self.distance_m + self.theta_spacing_m;
+    }
+
+    /// How well it was driven.
+    pub(crate) fn quality(&self) -> MissionQuality {
+        #[expect(
+            clippy::cast_precision_loss,
+            reason = "a mission has fewer than 2⁵³ ticks"
+        )]
+        let share = |ticks: u64| ticks as f64 / self.ticks.max(1) as f64;
+        let mean_square_m2 = if self.tracked_s > 0.0 {
+            self.cross_squared_m2_s / self.tracked_s
+        } else {
+            0.0
+        };
+        MissionQuality {
+            duration_s: self.duration_s,
+            paused_s: self.paused_s,
+            distance_m: self.distance_m,
+            cross_track_rms_m: mean_square_m2.sqrt(),
+            cross_track_max_m: self.cross_max_m,
+            saturated_ratio: share(self.saturated_ticks),
+            slip_events: self.slip_events,
+            gate_reduced_ratio: share(self.reduced_ticks),
+            gate_stops: self.gate_stops,
+            theta: self.theta.clone(),
+        }
+    }
+
+    /// Where the robot really was, thinned where it went straight.
+    pub(crate) fn path(&self) -> DrivenPath {
+        let mut whole = self.points.clone();
+        if let Some(last) = self.last.filter(|last| whole.last() != Some(last)) {
+            whole.push(last);
+        }
+        let points = thinned(&whole, LINE_TOLERANCE_M);
+        let wire = |point: &Point| WirePoint {
+            x_m: (point.x_m / RESOLUTION_M).round() * RESOLUTION_M,
+            y_m: (point.y_m / RESOLUTION_M).round() * RESOLUTION_M,
+        };
+        DrivenPath {
+            tolerance_m: self.tolerance_m.max(0.5 * self.since_point_m)
+                + LINE_TOLERANCE_M
+                + RESOLUTION_M,
+            points: points.iter().map(wire).collect(),
+        }
+    }
+}
+
+/// Distance of a point from the line between two others, metres.
+fn distance_from_line_m(point: Point, from: Point, to: Point) -> f64 {
+    let (along_x, along_y) = (to.x_m - from.x_m, to.y_m - from.y_m);
+    let length_squared_m2 = along_x * along_x + along_y * along_y;
+    if length_squared_m2 <= 0.0 {
+        return point.distance_m(from);
+    }
+    let share =
+        ((point.x_m - from.x_m) * along_x + (point.y_m - from.y_m) * along_y) / length_squared_m2;
+    let share = share.clamp(0.0, 1.0);
+    point.distance_m(Point {
+        x_m: from.x_m + share * along_x,
+        y_m: from.y_m + share * along_y,
+    })
+}
+
+/// The points without those that lie within a tolerance of the line through the others: the
+/// farthest from each stretch's chord is kept, and the stretch split there.
+fn thinned(points: &[Point], tolerance_m: f64) -> Vec<Point> {
+    let Some(last) = points.len().checked_sub(1) else {
+        return Vec::new();
+    };
+    let mut keep = vec![false; points.len()];
+    keep[0] = true;
+    keep[last] = true;
+    let mut stretches = vec![(0, last)];
+    while let Some((from, to)) = stretches.pop() {
+        let inner = (from + 1..to).map(|index| {
+            let off_m = distance_from_line_m(points[index], points[from], points[to]);
+            (index, off_m)
+        });
+        if let Some((farthest, off_m)) = inner.max_by(|a, b| a.1.total_cmp(&b.1))
+            && off_m > tolerance_m
+        {
+            keep[farthest] = true;
+            stretches.push((from, farthest));
+            stretches.push((farthest, to));
+        }
+    }
+    let kept = points.iter().zip(keep).filter(|(_, keep)| *keep);
+    kept.map(|(point, _)| *point).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn tick(at: Point, driven_m: f64, cross_track_m: f64) -> TickRecord {
+        TickRecord {
+            dt_s: 0.01,
+            at: Some(at),
+            driven_m,
+            cross_track_m: Some(cross_track_m),
+            is_saturated: false,
+            is_paused: false,
+            slips: false,
+            gate: None,
+            theta_loop: Some(0.4),
+            theta_measured: None,
+        }
+    }
+
+    fn distance_from_path_m(point: Point, path: &DrivenPath) -> f64 {
+        let own = |point: &WirePoint| Point {
+            x_m: point.x_m,
+            y_m: point.y_m,
+        };
+        let lines = path.points.windows(2);
+        lines
+            .map(|pair| distance_from_line_m(point, own(&pair[0]), own(&pair[1])))
+            .fold(f64::INFINITY, f64::min)
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(24))]
+        #[test]
+        fn a_path_of_any_length_is_bounded_and_keeps_the_tolerance_that_it_states(
+            steps in prop::collection::vec((0.0..0.03_f64, -0.4..0.4_f64), 2..60),
+            repeats in 1..400_usize,
+        ) {
+            let mut driven = Driven::new();
+            let (mut at, mut heading_rad, mut way) = (Point::default(), 0.0_f64, Vec::new());
+            for _ in 0..repeats {
+                for &(step_m, turn_rad) in &steps {
+                    heading_rad += turn_rad;
+                    at.x_m += step_m * heading_rad.cos();
+                    at.y_m += step_m * heading_rad.sin();
+                    driven.add(&tick(at, step_m, 0.0));
+                    way.push(at);
+                }
+            }
+            let path = driven.path();
+            prop_assert!((1..=DRIVEN_POINTS_MAX).contains(&path.points.len()));
+            prop_assert!(driven.quality().theta.len() <= THETA_SAMPLES_MAX);
+            if path.points.len() > 1 {
+                for point in way.iter().step_by(1 + way.len() / 200) {
+                    let off_m = distance_from_path_m(*point, &path);
+                    prop_assert!(off_m <= path.tolerance_m + 1.0e-9, "{off_m} {}", path.tolerance_m);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_straight_kilometre_is_its_two_ends() {
+        let mut driven = Driven::new();
+        for step in 0..100_000_u32 {
+            let x_m = 0.01 * f64::from(step);
+            driven.add(&tick(Point { x_m, y_m: 2.0 }, 0.01, 0.02));
+        }
+        let path = driven.path();
+        assert_eq!(path.points.len(), 2, "{:?}", path.points);
+        assert!((path.points[1].x_m - 999.99).abs() < 1.0e-6);
+        let quality = driven.quality();
+        assert!((quality.cross_track_rms_m - 0.02).abs() < 1.0e-9);
+        assert!((quality.distance_m - 1_000.0).abs() < 1.0e-6);
+        assert!((32..=THETA_SAMPLES_MAX).contains(&quality.theta.len()));
+        let far = quality.theta.last().unwrap().driven_m;
+        assert!(far > 900.0, "θ was traced to {far} m only");
+    }
+
+    #[test]
+    fn events_are_counted_by_their_beginnings_and_shares_by_ticks() {
+        let mut driven = Driven::new();
+        let usual = tick(Point::default(), 0.0, 0.1);
+        for step in 0..100_u32 {
+            driven.add(&TickRecord {
+                slips: (10..20).contains(&step) || step == 50,
+                gate: match step {
+                    30..40 => Some(GateCause::StaleFeedback),
+                    60..70 => Some(GateCause::Acceleration),
+                    _ => None,
+                },
+                is_saturated: step < 25,
+                is_paused: step >= 90,
+                cross_track_m: (step != 3).then_some(f64::from(step % 2) * 0.2),
+                ..usual
+            });
+        }
+        let quality = driven.quality();
+        assert_eq!((quality.slip_events, quality.gate_stops), (2, 1));
+        assert!((quality.gate_reduced_ratio - 0.2).abs() < 1.0e-12);
+        assert!((quality.saturated_ratio - 0.25).abs() < 1.0e-12);
+        assert!((quality.paused_s - 0.1).abs() < 1.0e-12);
+        assert!((quality.cross_track_max_m - 0.2).abs() < 1.0e-12);
+        let expected_m = (0.04_f64 * 49.0 / 99.0).sqrt();
+        assert!((quality.cross_track_rms_m - expected_m).abs() < 1.0e-12);
+    }
+}

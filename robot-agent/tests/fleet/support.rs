@@ -1,0 +1,342 @@
+//! A tiny server for agents under test: a real zenoh router with the two queryables, and a memory.
+
+use std::collections::BTreeMap;
+use std::net::TcpListener;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use tread_agent::sim::scenario::Scenario;
+use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
+use tread_api::keys::{self, Key, Verb};
+use tread_api::mission::LinkPolicy;
+use tread_api::site::Grid;
+use tread_api::terrain::{TerrainRef, TerrainShape};
+use tread_api::trajectory::Trajectory;
+use tread_api::wire::command::{Answer, Offer};
+use tread_api::wire::hello::{Hello, SiteDefinition, Welcome};
+use tread_api::wire::ingest::{Batch, MissionPhase, Receipt, Record, RecordContent};
+use tread_api::wire::state::{FrictionReport, PULSE_PERIOD_MS, RobotState, ServerPulse};
+use tread_api::wire::{self, Refusal, RefusalCode};
+use uuid::Uuid;
+use zenoh::Wait;
+use zenoh::query::{ConsolidationMode, Query};
+use zenoh::sample::SampleKind;
+
+/// Longest wait for anything in these tests.
+pub(crate) const WAIT_MAX: Duration = Duration::from_secs(30);
+
+/// Waits until a condition holds, and says what was seen last if it does not.
+pub(crate) async fn eventually<T: std::fmt::Debug>(
+    what: &str,
+    mut look: impl FnMut() -> Result<T, String>,
+) -> T {
+    let mut seen = String::new();
+    let waiting = async {
+        loop {
+            match look() {
+                Ok(found) => return found,
+                Err(now) => seen = now,
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    let found = tokio::time::timeout(WAIT_MAX, waiting).await;
+    found.unwrap_or_else(|_| panic!("waited in vain until {what}; last seen: {seen}"))
+}
+
+/// What the fake server remembers; it outlives the router.
+#[derive(Debug, Default)]
+pub(crate) struct Memory {
+    pub(crate) hellos: Vec<Hello>,
+    /// Every record by its name, and how often it came.
+    pub(crate) records: BTreeMap<(BootId, u64), (RecordContent, usize)>,
+    pub(crate) states: Vec<RobotState>,
+    pub(crate) frictions: Vec<FrictionReport>,
+    /// The robot's clock in each batch.
+    pub(crate) batch_times: Vec<Option<jiff::Timestamp>>,
+    pub(crate) alive: Vec<BootId>,
+    pub(crate) gone: Vec<BootId>,
+}
+
+impl Memory {
+    pub(crate) fn phases(&self, mission: MissionId) -> Vec<MissionPhase> {
+        let reports = self
+            .records
+            .values()
+            .filter_map(|(content, _)| match content {
+                RecordContent::Mission(report) if report.mission == mission => Some(report),
+                RecordContent::Mission(_) | RecordContent::Segment(_) => None,
+            });
+        let mut reports: Vec<_> = reports.collect();
+        reports.sort_by_key(|report| report.at);
+        reports.into_iter().map(|report| report.phase).collect()
+    }
+
+    pub(crate) fn segments(&self) -> usize {
+        let is_segment = |content: &RecordContent| matches!(content, RecordContent::Segment(_));
+        self.records
+            .values()
+            .filter(|(content, _)| is_segment(content))
+            .count()
+    }
+}
+
+pub(crate) type SharedMemory = Arc<Mutex<Memory>>;
+
+/// The router, with the server's queryables.
+pub(crate) struct FakeServer {
+    session: zenoh::Session,
+    site: SiteId,
+    /// Receipts that are not sent although the records were kept.
+    pub(crate) receipts_to_lose: Arc<AtomicUsize>,
+    /// Batches with the start of a mission in them are refused as a whole.
+    pub(crate) refuses_starts: Arc<AtomicBool>,
+}
+
+pub(crate) fn free_port() -> u16 {
+    TcpListener::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap()
+        .port()
+}
+
+pub(crate) fn site_of(scenario: &Scenario) -> SiteDefinition {
+    let shapes = scenario.terrains.iter().map(|terrain| TerrainShape {
+        terrain: TerrainRef {
+            id: terrain.id.clone(),
+            revision: 1,
+        },
+        polygon: terrain.outline().unwrap(),
+        layer: terrain.layer,
+    });
+    SiteDefinition {
+        grid: Grid {
+            revision: 1,
+            cell_m: scenario.cell_m,
+        },
+        terrain_revision: 5,
+        terrains: shapes.collect(),
+    }
+}
+
+impl FakeServer {
+    pub(crate) fn start(port: u16, scenario: &Scenario, memory: &SharedMemory) -> Self {
+        let mut config = zenoh::Config::default();
+        for (key, value) in [
+            ("mode", "\"router\"".to_owned()),
+            ("listen/endpoints", format!("[\"tcp/127.0.0.1:{port}\"]")),
+            ("scouting/multicast/enabled", "false".to_owned()),
+            ("scouting/gossip/enabled", "false".to_owned()),
+        ] {
+            config.insert_json5(key, &value).unwrap();
+        }
+        let session = zenoh::open(config).wait().unwrap();
+        let receipts_to_lose = Arc::new(AtomicUsize::new(0));
+        let refuses_starts = Arc::new(AtomicBool::new(false));
+        let server = Self {
+            session,
+            site: scenario.site.clone(),
+            receipts_to_lose,
+            refuses_starts,
+        };
+        server.declare(scenario, memory);
+        server
+    }
+
+    fn declare(&self, scenario: &Scenario, memory: &SharedMemory) {
+        let session = &self.session;
+        let welcome = Welcome {
+            site: site_of(scenario),
+            server_time: jiff::Timestamp::UNIX_EPOCH,
+        };
+        let welcome = wire::encode(&welcome).unwrap();
+        let (kept, answer) = (Arc::clone(memory), welcome);
+        session
+            .declare_queryable(keys::ALL_HELLOS)
+            .complete(true)
+            .callback(move |query| {
+                kept.lock().unwrap().hellos.push(read(&query));
+                query
+                    .reply(query.key_expr().clone(), answer.clone())
+                    .wait()
+                    .unwrap();
+            })
+            .background()
+            .wait()
+            .unwrap();
+        let (kept, to_lose) = (Arc::clone(memory), Arc::clone(&self.receipts_to_lose));
+        let refuses_starts = Arc::clone(&self.refuses_starts);
+        session
+            .declare_queryable(keys::ALL_INGEST)
+            .complete(true)
+            .callback(move |query| {
+                let batch: Batch = read(&query);
+                if refuses_starts.load(Ordering::SeqCst) && batch.records.iter().any(is_start) {
+                    let refusal = Refusal {
+                        code: RefusalCode::Malformed,
+                        detail: "on purpose".to_owned(),
+                    };
+                    let payload = wire::encode(&refusal).unwrap();
+                    query.reply_err(payload).wait().unwrap();
+                    return;
+                }
+                let receipt = keep(&mut kept.lock().unwrap(), batch);
+                let lose = |left: usize| left.checked_sub(1);
+                if to_lose
+                    .fetch_update(Ordering::SeqCst, Ordering::SeqCst, lose)
+                    .is_err()
+                {
+                    let payload = wire::encode(&receipt).unwrap();
+                    query
+                        .reply(query.key_expr().clone(), payload)
+                        .wait()
+                        .unwrap();
+                }
+            })
+            .background()
+            .wait()
+            .unwrap();
+        let kept = Arc::clone(memory);
+        session
+            .declare_subscriber("tread/*/robots/*/*")
+            .callback(move |sample| {
+                let bytes = sample.payload().to_bytes();
+                let mut memory = kept.lock().unwrap();
+                match Key::parse(sample.key_expr().as_str()) {
+                    Some(Key::State(..)) => memory.states.push(wire::decode(&bytes).unwrap()),
+                    Some(Key::Friction(..)) => memory.frictions.push(wire::decode(&bytes).unwrap()),
+                    other => panic!("published on {other:?}"),
+                }
+            })
+            .background()
+            .wait()
+            .unwrap();
+        let kept = Arc::clone(memory);
+        session
+            .liveliness()
+            .declare_subscriber(keys::ALL_ALIVE)
+            .history(true)
+            .callback(move |sample| {
+                let Some(Key::Alive(_, _, boot)) = Key::parse(sample.key_expr().as_str()) else {
+                    panic!("no token: {}", sample.key_expr());
+                };
+                let mut memory = kept.lock().unwrap();
+                match sample.kind() {
+                    SampleKind::Put => memory.alive.push(boot),
+                    SampleKind::Delete => memory.gone.push(boot),
+                }
+            })
+            .background()
+            .wait()
+            .unwrap();
+    }
+
+    /// Sends a command as it stands; `None` when nobody answers.
+    pub(crate) async fn command(
+        &self,
+        robot: &RobotId,
+        verb: Verb,
+        payload: Vec<u8>,
+    ) -> Option<Result<Answer, Refusal>> {
+        let replies = self
+            .session
+            .get(keys::command(&self.site, robot, verb))
+            .payload(payload)
+            .consolidation(ConsolidationMode::None)
+            .timeout(Duration::from_secs(5))
+            .await
+            .unwrap();
+        let reply = replies.recv_async().await.ok()?;
+        Some(match reply.into_result() {
+            Ok(sample) => Ok(wire::decode(&sample.payload().to_bytes()).unwrap()),
+            Err(error) => Err(wire::decode(&error.payload().to_bytes()).unwrap()),
+        })
+    }
+
+    /// Lets the robots hear the server until the task is dropped.
+    pub(crate) fn pulse(&self) -> tokio::task::JoinHandle<()> {
+        let (session, key) = (self.session.clone(), keys::pulse(&self.site));
+        #[expect(clippy::disallowed_methods, reason = "a test has no supervisor")]
+        tokio::spawn(async move {
+            let pulse = ServerPulse {
+                server_time: jiff::Timestamp::UNIX_EPOCH,
+            };
+            loop {
+                session
+                    .put(&key, wire::encode(&pulse).unwrap())
+                    .await
+                    .unwrap();
+                tokio::time::sleep(Duration::from_millis(PULSE_PERIOD_MS)).await;
+            }
+        })
+    }
+
+    pub(crate) async fn offer(&self, robot: &RobotId, offer: &Offer) -> Answer {
+        let payload = wire::encode(offer).unwrap();
+        self.command(robot, Verb::Offer, payload)
+            .await
+            .expect("no answer")
+            .expect("refused")
+    }
+
+    pub(crate) async fn stop(self) {
+        self.session.close().await.unwrap();
+    }
+}
+
+fn is_start(record: &Record) -> bool {
+    match &record.content {
+        RecordContent::Mission(report) => report.phase == MissionPhase::Started,
+        RecordContent::Segment(_) => false,
+    }
+}
+
+fn read<T: serde::de::DeserializeOwned>(query: &Query) -> T {
+    wire::decode(&query.payload().unwrap().to_bytes()).unwrap()
+}
+
+fn keep(memory: &mut Memory, batch: Batch) -> Receipt {
+    let mut receipt = Receipt {
+        committed: 0,
+        duplicates: 0,
+        refused: Vec::new(),
+    };
+    assert!(
+        batch
+            .records
+            .windows(2)
+            .all(|pair| pair[0].seq < pair[1].seq)
+    );
+    memory.batch_times.push(batch.robot_time);
+    for record in batch.records {
+        let name = (batch.boot, record.seq);
+        let kept = memory
+            .records
+            .entry(name)
+            .or_insert((record.content.clone(), 0));
+        assert_eq!(kept.0, record.content, "one name, two contents");
+        kept.1 += 1;
+        if kept.1 == 1 {
+            receipt.committed += 1;
+        } else {
+            receipt.duplicates += 1;
+        }
+    }
+    receipt
+}
+
+pub(crate) fn offer(number: u128, asked: &str) -> Offer {
+    let mission = MissionId::from_uuid(Uuid::from_u128(number));
+    let trajectory: Trajectory = serde_json::from_str(asked).unwrap();
+    let plan_hash = Offer::plan_hash_of(mission, 1, &trajectory);
+    Offer {
+        mission,
+        revision: 1,
+        plan_hash,
+        trajectory,
+        start_within_ms: Some(10_000),
+        link_policy: LinkPolicy::default(),
+    }
+}

@@ -1,0 +1,109 @@
+//! Alerts: what robots say needs a person's attention, kept with its history.
+//!
+//! A robot says all its alerts in each state; the difference to what is raised here raises and
+//! clears. A robot that is not heard clears nothing.
+
+use jiff::Timestamp;
+use tread_api::ids::AlertId;
+use tread_api::page::Page;
+use tread_api::robot::{ALERT_TEXT_MAX, ALERTS_MAX, Alert, AlertReport};
+
+use super::{App, AppError, page};
+use crate::db;
+use crate::db::alerts::AlertFilter;
+use crate::fleet::presence::RobotKey;
+
+impl App {
+    /// Alerts, newest first.
+    pub async fn alerts(&self, filter: &AlertFilter, limit: u32) -> Result<Page<Alert>, AppError> {
+        let mut tx = self.db().read().await?;
+        let alerts = db::alerts::list(&mut tx, filter, limit + 1).await?;
+        Ok(page(alerts, limit, |alert: &Alert| alert.id.to_string()))
+    }
+
+    /// Notes that a person has seen an alert.
+    pub async fn acknowledge_alert(&self, id: AlertId) -> Result<Alert, AppError> {
+        let mut tx = self.db().write().await?;
+        db::alerts::acknowledge(&mut tx, id, self.clock().now()).await?;
+        let found = db::alerts::find(&mut tx, id).await?;
+        let alert = found.ok_or(AppError::UnknownAlert(id))?;
+        tx.commit().await?;
+        self.robots_changed();
+        self.hub().alert(&alert);
+        Ok(alert)
+    }
+
+    /// Writes down what robots have begun or ceased to say.
+    pub(super) async fn sync_alerts(&self) -> Result<(), AppError> {
+        for (key, said) in self.presences().take_alert_changes() {
+            match self.sync_alerts_of(&key, &said).await {
+                Ok(true) => {}
+                // A robot may speak before it has introduced itself.
+                Ok(false) => self.presences().return_alert_change(&key),
+                Err(error) => {
+                    self.presences().return_alert_change(&key);
+                    return Err(error);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// False for a robot that is not known yet.
+    async fn sync_alerts_of(&self, key: &RobotKey, said: &[AlertReport]) -> Result<bool, AppError> {
+        let said = &said[..said.len().min(ALERTS_MAX)];
+        let mut tx = self.db().read().await?;
+        let Some(site) = db::sites::find(&mut tx, &key.0).await? else {
+            return Ok(false);
+        };
+        let Some(robot) = db::robots::find(&mut tx, site.pk, &key.1).await? else {
+            return Ok(false);
+        };
+        let raised = db::alerts::raised_of(&mut tx, robot.pk).await?;
+        drop(tx);
+        let now = self.clock().now();
+        let has = |alert: &Alert| said.iter().any(|report| report.code == alert.code);
+        let is_new = |report: &&AlertReport| !raised.iter().any(|alert| alert.code == report.code);
+        let gone: Vec<&Alert> = raised.iter().filter(|alert| !has(alert)).collect();
+        let new: Vec<&AlertReport> = said.iter().filter(is_new).collect();
+        if gone.is_empty() && new.is_empty() {
+            return Ok(true);
+        }
+        let mut changed = Vec::new();
+        let mut tx = self.db().write().await?;
+        for alert in gone {
+            db::alerts::clear(&mut tx, robot.pk, &alert.code, now).await?;
+            changed.push(alert.id);
+        }
+        for report in new {
+            let id = self.raise(&mut tx, robot.pk, report, now).await?;
+            changed.push(id);
+        }
+        let mut alerts = Vec::new();
+        for id in changed {
+            alerts.extend(db::alerts::find(&mut tx, id).await?);
+        }
+        tx.commit().await?;
+        self.robots_changed();
+        for alert in &alerts {
+            self.hub().alert(alert);
+        }
+        Ok(true)
+    }
+
+    async fn raise(
+        &self,
+        tx: &mut db::Tx,
+        robot_pk: i64,
+        report: &AlertReport,
+        now: Timestamp,
+    ) -> Result<AlertId, AppError> {
+        let id = AlertId::from_uuid(self.clock().mission_id().as_uuid());
+        let report = AlertReport {
+            text: report.text.chars().take(ALERT_TEXT_MAX).collect(),
+            ..report.clone()
+        };
+        db::alerts::raise(tx, robot_pk, id, &report, now).await?;
+        Ok(id)
+    }
+}

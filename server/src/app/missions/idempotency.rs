@@ -1,0 +1,105 @@
+//! `Idempotency-Key`: the same request under the same key gets the same answer, also after a
+//! restart of the server.
+//!
+//! The answer is written in the transaction of the mission that it tells of, so there is never
+//! one without the other. Keys are kept for [`KEPT`].
+
+use std::collections::HashSet;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use jiff::SignedDuration;
+use tread_api::mission::{CreateMission, Mission};
+use uuid::Uuid;
+
+use crate::app::{App, AppError};
+use crate::db;
+use crate::db::idempotency::Given;
+
+/// Longest key, in characters.
+pub const KEY_LENGTH_MAX: usize = 200;
+/// How long a key is kept.
+pub const KEPT: Duration = Duration::from_hours(7 * 24);
+/// Old keys that are forgotten with each new one.
+const FORGET_MAX: u32 = 10;
+/// The name space of request hashes.
+const REQUESTS: Uuid = Uuid::from_u128(0x2d6c_35ab_0f1e_4a8e_9f64_7a0c_9b5e_11d3);
+
+/// The keys whose requests are being answered.
+#[derive(Debug, Default)]
+pub(in crate::app) struct InFlight {
+    keys: Mutex<HashSet<String>>,
+}
+
+impl InFlight {
+    fn lock(&self) -> MutexGuard<'_, HashSet<String>> {
+        self.keys.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Holds a key while its request is being answered.
+struct Holding<'app> {
+    in_flight: &'app InFlight,
+    key: String,
+}
+
+impl<'app> Holding<'app> {
+    fn of(in_flight: &'app InFlight, key: &str) -> Option<Self> {
+        in_flight.lock().insert(key.to_owned()).then(|| Self {
+            in_flight,
+            key: key.to_owned(),
+        })
+    }
+}
+
+impl Drop for Holding<'_> {
+    fn drop(&mut self) {
+        self.in_flight.lock().remove(&self.key);
+    }
+}
+
+impl App {
+    /// Asks a robot to drive something, once for each key.
+    ///
+    /// # Errors
+    /// [`AppError::KeyInFlight`] while the same key is being answered, [`AppError::KeyReused`] if
+    /// it was used for another request, and all of [`App::create_mission`].
+    pub async fn create_mission_once(
+        &self,
+        key: &str,
+        request: CreateMission,
+    ) -> Result<Mission, AppError> {
+        let Some(_holding) = Holding::of(self.keys_in_flight(), key) else {
+            return Err(AppError::KeyInFlight);
+        };
+        let written = serde_json::to_vec(&request).unwrap_or_default();
+        let request_hash = Uuid::new_v5(&REQUESTS, &written);
+        let mut tx = self.db().write().await?;
+        if let Some(given) = db::idempotency::find(&mut tx, key).await? {
+            if given.request_hash != request_hash {
+                return Err(AppError::KeyReused);
+            }
+            let corrupt = |_error| db::DbError::Corrupt {
+                what: "answer",
+                value: given.answer.clone(),
+            };
+            return Ok(serde_json::from_str(&given.answer).map_err(corrupt)?);
+        }
+        let mission = self.enqueue(&mut tx, request).await?;
+        let answer =
+            serde_json::to_string(&mission).map_err(|_error| db::DbError::DoesNotFit("mission"))?;
+        let given = Given {
+            request_hash,
+            answer,
+        };
+        let now = self.clock().now();
+        db::idempotency::insert(&mut tx, key, &given, now).await?;
+        let kept = SignedDuration::try_from(KEPT).unwrap_or(SignedDuration::MAX);
+        if let Ok(before) = now.checked_sub(kept) {
+            db::idempotency::forget_before(&mut tx, before, FORGET_MAX).await?;
+        }
+        tx.commit().await?;
+        self.wake();
+        Ok(mission)
+    }
+}

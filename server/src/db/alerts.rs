@@ -1,0 +1,192 @@
+//! Alerts of robots: raised, acknowledged, cleared.
+
+use jiff::Timestamp;
+use sqlx::SqliteConnection;
+use tread_api::ids::{AlertCode, AlertId, RobotId, SiteId};
+use tread_api::robot::{Alert, AlertReport, Severity};
+
+use super::{DbError, corrupt, from_us, parse, to_us};
+
+struct Raw {
+    id: String,
+    site: String,
+    robot: String,
+    code: String,
+    severity: String,
+    text: String,
+    raised_at_us: i64,
+    acknowledged_at_us: Option<i64>,
+    cleared_at_us: Option<i64>,
+}
+
+impl TryFrom<Raw> for Alert {
+    type Error = DbError;
+
+    fn try_from(raw: Raw) -> Result<Self, DbError> {
+        let severity = Severity::from_name(&raw.severity);
+        Ok(Self {
+            id: parse("alert", &raw.id)?,
+            site: parse("site", &raw.site)?,
+            robot: parse("robot", &raw.robot)?,
+            code: parse("alert code", &raw.code)?,
+            severity: severity.ok_or_else(|| corrupt("severity", &raw.severity))?,
+            text: raw.text,
+            raised_at: from_us(raw.raised_at_us)?,
+            acknowledged_at: raw.acknowledged_at_us.map(from_us).transpose()?,
+            cleared_at: raw.cleared_at_us.map(from_us).transpose()?,
+        })
+    }
+}
+
+macro_rules! alerts {
+    ($condition:tt $(, $argument:expr)* $(,)?) => {
+        sqlx::query_as!(
+            Raw,
+            r#"SELECT alerts.id, sites.id AS site, robots.id AS robot, alerts.code,
+                   alerts.severity, alerts.text, alerts.raised_at_us, alerts.acknowledged_at_us,
+                   alerts.cleared_at_us
+               FROM alerts
+               JOIN robots ON robots.pk = alerts.robot_pk
+               JOIN sites ON sites.pk = robots.site_pk "# + $condition
+            $(, $argument)*
+        )
+    };
+}
+
+fn rows(raw: Vec<Raw>) -> Result<Vec<Alert>, DbError> {
+    raw.into_iter().map(Alert::try_from).collect()
+}
+
+/// Which alerts to list.
+#[derive(Debug, Clone, Default)]
+pub struct AlertFilter {
+    /// Only those of this site.
+    pub site: Option<SiteId>,
+    /// Only those of robots of this name.
+    pub robot: Option<RobotId>,
+    /// Only those that have not cleared.
+    pub raised: bool,
+    /// Only those older than this one.
+    pub before: Option<AlertId>,
+}
+
+/// Alerts, newest first.
+pub async fn list(
+    db: &mut SqliteConnection,
+    filter: &AlertFilter,
+    limit: u32,
+) -> Result<Vec<Alert>, DbError> {
+    let site = filter.site.as_ref().map(SiteId::as_str);
+    let robot = filter.robot.as_ref().map(RobotId::as_str);
+    let before = filter.before.map(|id| id.to_string());
+    let raw = alerts!(
+        "WHERE (?1 IS NULL OR sites.id = ?1) AND (?2 IS NULL OR robots.id = ?2)
+           AND (?3 = FALSE OR alerts.cleared_at_us IS NULL) AND (?4 IS NULL OR alerts.id < ?4)
+         ORDER BY alerts.id DESC LIMIT ?5",
+        site,
+        robot,
+        filter.raised,
+        before,
+        limit,
+    )
+    .fetch_all(db)
+    .await?;
+    rows(raw)
+}
+
+/// All alerts that have not cleared, oldest first, at most `limit`.
+pub async fn raised(db: &mut SqliteConnection, limit: u32) -> Result<Vec<Alert>, DbError> {
+    let raw = alerts!(
+        "WHERE alerts.cleared_at_us IS NULL ORDER BY alerts.id LIMIT ?",
+        limit
+    )
+    .fetch_all(db)
+    .await?;
+    rows(raw)
+}
+
+/// A robot's alerts that have not cleared, oldest first.
+pub async fn raised_of(db: &mut SqliteConnection, robot_pk: i64) -> Result<Vec<Alert>, DbError> {
+    let raw = alerts!(
+        "WHERE alerts.robot_pk = ? AND alerts.cleared_at_us IS NULL ORDER BY alerts.id",
+        robot_pk
+    )
+    .fetch_all(db)
+    .await?;
+    rows(raw)
+}
+
+/// The alert of that identifier.
+pub async fn find(db: &mut SqliteConnection, id: AlertId) -> Result<Option<Alert>, DbError> {
+    let id = id.to_string();
+    let raw = alerts!("WHERE alerts.id = ?", id)
+        .fetch_optional(db)
+        .await?;
+    raw.map(Alert::try_from).transpose()
+}
+
+/// Raises an alert; nothing happens if its code is raised already.
+pub async fn raise(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+    id: AlertId,
+    report: &AlertReport,
+    at: Timestamp,
+) -> Result<(), DbError> {
+    let (id, code, severity) = (
+        id.to_string(),
+        report.code.as_str(),
+        report.severity.as_str(),
+    );
+    let at_us = to_us(at);
+    sqlx::query!(
+        "INSERT INTO alerts (id, robot_pk, code, severity, text, raised_at_us)
+         VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
+        id,
+        robot_pk,
+        code,
+        severity,
+        report.text,
+        at_us,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Clears a robot's alert of that code.
+pub async fn clear(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+    code: &AlertCode,
+    at: Timestamp,
+) -> Result<(), DbError> {
+    let (code, at_us) = (code.as_str(), to_us(at));
+    sqlx::query!(
+        "UPDATE alerts SET cleared_at_us = ?
+         WHERE robot_pk = ? AND code = ? AND cleared_at_us IS NULL",
+        at_us,
+        robot_pk,
+        code,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Notes that a person has seen an alert; a first time counts.
+pub async fn acknowledge(
+    db: &mut SqliteConnection,
+    id: AlertId,
+    at: Timestamp,
+) -> Result<(), DbError> {
+    let (id, at_us) = (id.to_string(), to_us(at));
+    sqlx::query!(
+        "UPDATE alerts SET acknowledged_at_us = COALESCE(acknowledged_at_us, ?) WHERE id = ?",
+        at_us,
+        id,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}

@@ -1,0 +1,177 @@
+//! What happened to missions, and which reports of robots have been taken.
+
+use sqlx::SqliteConnection;
+use tread_api::event::MissionStep;
+use tread_api::ids::MissionId;
+use tread_api::mission::{Actor, MissionEvent, MissionState};
+
+use super::missions::{cause, state};
+use super::{DbError, corrupt, from_us, parse, to_us, unsigned};
+
+/// Writes a step into a mission's history.
+pub async fn add_event(
+    db: &mut SqliteConnection,
+    id: MissionId,
+    event: &MissionEvent,
+) -> Result<(), DbError> {
+    let (id, at_us, actor) = (id.to_string(), to_us(event.at), event.actor.as_str());
+    let (from, to) = (event.from.map(MissionState::as_str), event.to.as_str());
+    let cause = event.cause.as_str();
+    sqlx::query!(
+        "INSERT INTO mission_events (mission, at_us, actor, from_state, to_state, cause, reason)
+         VALUES (?, ?, ?, ?, ?, ?, ?)",
+        id,
+        at_us,
+        actor,
+        from,
+        to,
+        cause,
+        event.reason,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// A mission's history, oldest first, at most `limit` steps.
+pub async fn events(
+    db: &mut SqliteConnection,
+    id: MissionId,
+    limit: u32,
+) -> Result<Vec<MissionEvent>, DbError> {
+    let id = id.to_string();
+    let raw = sqlx::query_as!(
+        RawEvent,
+        "SELECT at_us, actor, from_state, to_state, cause, reason FROM mission_events
+         WHERE mission = ? ORDER BY pk LIMIT ?",
+        id,
+        limit,
+    )
+    .fetch_all(db)
+    .await?;
+    raw.into_iter().map(MissionEvent::try_from).collect()
+}
+
+struct RawEvent {
+    at_us: i64,
+    actor: String,
+    from_state: Option<String>,
+    to_state: String,
+    cause: String,
+    reason: Option<String>,
+}
+
+impl TryFrom<RawEvent> for MissionEvent {
+    type Error = DbError;
+
+    fn try_from(raw: RawEvent) -> Result<Self, DbError> {
+        Ok(Self {
+            at: from_us(raw.at_us)?,
+            actor: Actor::from_name(&raw.actor).ok_or_else(|| corrupt("actor", &raw.actor))?,
+            from: raw.from_state.as_deref().map(state).transpose()?,
+            to: state(&raw.to_state)?,
+            cause: cause(&raw.cause)?,
+            reason: raw.reason,
+        })
+    }
+}
+
+/// How many steps a mission's history has.
+pub async fn event_count(db: &mut SqliteConnection, id: MissionId) -> Result<u32, DbError> {
+    let id = id.to_string();
+    let count = sqlx::query_scalar!(
+        r#"SELECT COUNT(*) AS "count!: i64" FROM mission_events WHERE mission = ?"#,
+        id
+    )
+    .fetch_one(db)
+    .await?;
+    unsigned("count", count)
+}
+
+/// Whether a report has been taken before.
+pub async fn has_report(
+    db: &mut SqliteConnection,
+    boot_pk: i64,
+    seq: i64,
+) -> Result<bool, DbError> {
+    let found = sqlx::query_scalar!(
+        r#"SELECT EXISTS (SELECT 1 FROM reports_seen WHERE boot_pk = ? AND seq = ?)
+               AS "found!: bool""#,
+        boot_pk,
+        seq,
+    );
+    Ok(found.fetch_one(db).await?)
+}
+
+/// Notes that a report has been taken.
+pub async fn note_report(db: &mut SqliteConnection, boot_pk: i64, seq: i64) -> Result<(), DbError> {
+    sqlx::query!(
+        "INSERT INTO reports_seen (boot_pk, seq) VALUES (?, ?)",
+        boot_pk,
+        seq
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// The newest step of all histories; 0 if there is none.
+pub async fn newest_step(db: &mut SqliteConnection) -> Result<i64, DbError> {
+    let newest =
+        sqlx::query_scalar!(r#"SELECT COALESCE(MAX(pk), 0) AS "newest!: i64" FROM mission_events"#);
+    Ok(newest.fetch_one(db).await?)
+}
+
+struct RawStep {
+    pk: i64,
+    mission: String,
+    site: String,
+    robot: String,
+    at_us: i64,
+    actor: String,
+    from_state: Option<String>,
+    to_state: String,
+    cause: String,
+    reason: Option<String>,
+}
+
+/// Steps of all histories after one, in their order, at most `limit`; each with its key.
+pub async fn steps_after(
+    db: &mut SqliteConnection,
+    after: i64,
+    limit: u32,
+) -> Result<Vec<(i64, MissionStep)>, DbError> {
+    let raw = sqlx::query_as!(
+        RawStep,
+        r#"SELECT e.pk AS "pk!", e.mission, sites.id AS site, robots.id AS robot, e.at_us, e.actor,
+               e.from_state, e.to_state, e.cause, e.reason
+           FROM mission_events AS e
+           JOIN missions ON missions.id = e.mission
+           JOIN robots ON robots.pk = missions.robot_pk
+           JOIN sites ON sites.pk = robots.site_pk
+           WHERE e.pk > ? ORDER BY e.pk LIMIT ?"#,
+        after,
+        limit,
+    )
+    .fetch_all(db)
+    .await?;
+    raw.into_iter()
+        .map(|raw| {
+            let step = RawEvent {
+                at_us: raw.at_us,
+                actor: raw.actor,
+                from_state: raw.from_state,
+                to_state: raw.to_state,
+                cause: raw.cause,
+                reason: raw.reason,
+            };
+            let step = MissionStep {
+                mission: parse("mission", &raw.mission)?,
+                site: parse("site", &raw.site)?,
+                robot: parse("robot", &raw.robot)?,
+                step: step.try_into()?,
+            };
+            Ok((raw.pk, step))
+        })
+        .collect()
+}

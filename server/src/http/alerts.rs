@@ -1,0 +1,64 @@
+//! `/v1/alerts`.
+
+use axum::extract::State;
+use serde::Deserialize;
+use tread_api::ids::{AlertId, RobotId, SiteId};
+use tread_api::page::Page;
+use tread_api::problem::ProblemBody;
+use tread_api::robot::Alert;
+use utoipa::IntoParams;
+
+use super::extract::{Json, Path, Query, cursor, page_limit};
+use super::problem::Problem;
+use crate::app::App;
+use crate::db::alerts::AlertFilter;
+
+/// Which alerts, and which page of them.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct AlertQuery {
+    /// Only those of this site.
+    #[param(value_type = Option<String>)]
+    site: Option<SiteId>,
+    /// Only those of this robot.
+    #[param(value_type = Option<String>)]
+    robot: Option<RobotId>,
+    /// Only those that have not cleared.
+    #[serde(default)]
+    #[param(required = false)]
+    raised: bool,
+    /// `next_cursor` of the page before.
+    cursor: Option<String>,
+    /// Most entries of the page, 1 to 1000; 100 when absent.
+    limit: Option<u32>,
+}
+
+/// Alerts with their history, newest first.
+#[utoipa::path(get, path = "/v1/alerts", tag = "alerts", operation_id = "list_alerts",
+    params(AlertQuery),
+    responses((status = 200, body = Page<Alert>), (status = 400, body = ProblemBody)))]
+pub(super) async fn list(
+    State(app): State<App>,
+    Query(query): Query<AlertQuery>,
+) -> Result<Json<Page<Alert>>, Problem> {
+    let limit = page_limit(query.limit)?;
+    let filter = AlertFilter {
+        before: cursor(query.cursor.as_deref())?,
+        site: query.site,
+        robot: query.robot,
+        raised: query.raised,
+    };
+    Ok(Json(app.alerts(&filter, limit).await?))
+}
+
+/// Notes that a person has seen an alert.
+#[utoipa::path(post, path = "/v1/alerts/{alert}/acknowledge", tag = "alerts",
+    operation_id = "acknowledge_alert", params(("alert" = AlertId, Path)),
+    responses((status = 200, body = Alert), (status = 404, body = ProblemBody)))]
+pub(super) async fn acknowledge(
+    State(app): State<App>,
+    Path(alert): Path<AlertId>,
+) -> Result<Json<Alert>, Problem> {
+    Ok(Json(app.acknowledge_alert(alert).await?))
+}

@@ -1,0 +1,124 @@
+//! `GET /v1/events`: server-sent events.
+
+use std::collections::HashSet;
+use std::convert::Infallible;
+use std::str::FromStr;
+
+use axum::Extension;
+use axum::extract::State;
+use axum::http::HeaderMap;
+use axum::response::sse::{Event, KeepAlive, Sse};
+use axum::response::{IntoResponse, Response};
+use futures_util::stream;
+use serde::Deserialize;
+use tokio_util::sync::CancellationToken;
+use tread_api::event::{self, Topic};
+use tread_api::ids::SiteId;
+use tread_api::problem::{ProblemBody, ProblemType};
+use utoipa::IntoParams;
+
+use super::extract::Query;
+use super::problem::Problem;
+use crate::app::App;
+use crate::app::events::{EventFilter, Subscription};
+
+/// Cuts the connection that a request came on.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Cut(pub(super) CancellationToken);
+
+/// What a client wants to hear of.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct EventQuery {
+    /// Only these topics, with commas between them: `missions`, `robots`, `alerts`.
+    topics: Option<String>,
+    /// Only this site.
+    #[param(value_type = Option<String>)]
+    site: Option<SiteId>,
+    /// Only these robots, with commas between them.
+    robots: Option<String>,
+}
+
+/// Everything that changes, from a snapshot on or from where `Last-Event-ID` points.
+#[utoipa::path(get, path = "/v1/events", tag = "events", operation_id = "stream_events",
+    params(EventQuery, ("last-event-id" = Option<String>, Header,
+        description = "The id of the last event that was read")),
+    responses((status = 200, content_type = "text/event-stream", body = event::Event),
+        (status = 400, body = ProblemBody), (status = 409, body = ProblemBody)))]
+pub(super) async fn stream(
+    State(app): State<App>,
+    cut: Option<Extension<Cut>>,
+    Query(query): Query<EventQuery>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let filter = filter(&app, query).await?;
+    let last = headers.get("last-event-id");
+    let last = last.and_then(|last| last.to_str().ok());
+    let cut = cut.map(|Extension(cut)| cut.0).unwrap_or_default();
+    let subscription = app.subscribe(filter, last, cut).await?;
+    let events = stream::unfold(subscription, async |mut subscription: Subscription| {
+        let sent = subscription.next().await?;
+        let mut event = Event::default().event(sent.name).data(&sent.text);
+        if let Some(id) = &sent.id {
+            event = event.id(id);
+        }
+        Some((Ok::<_, Infallible>(event), subscription))
+    });
+    let events = Sse::new(events).keep_alive(KeepAlive::default());
+    Ok(events.into_response())
+}
+
+async fn filter(app: &App, query: EventQuery) -> Result<EventFilter, Problem> {
+    let refused = |field: &str, detail: String| {
+        Problem::new(ProblemType::InvalidQuery)
+            .detail(detail)
+            .field(field)
+    };
+    let topics = listed("topics", query.topics.as_deref(), |name| {
+        let known: Vec<&str> = Topic::ALL.map(Topic::as_str).into();
+        Topic::from_name(name).ok_or_else(|| {
+            let known = known.join("`, `");
+            format!("there is no topic `{}`, only `{known}`", short(name))
+        })
+    })?;
+    let robots = listed("robots", query.robots.as_deref(), |name| {
+        FromStr::from_str(name).map_err(|error: tread_api::ids::InvalidSlug| error.to_string())
+    })?;
+    let filter = EventFilter {
+        topics,
+        site: query.site,
+        robots,
+    };
+    match app.unknown_in(&filter).await? {
+        Some((field, name)) => Err(refused(
+            field,
+            format!("`{name}` names nothing that is known here"),
+        )),
+        None => Ok(filter),
+    }
+}
+
+fn listed<T: Eq + std::hash::Hash>(
+    field: &str,
+    text: Option<&str>,
+    read: impl Fn(&str) -> Result<T, String>,
+) -> Result<HashSet<T>, Problem> {
+    let names = text.map(|text| text.split(',').map(str::trim));
+    let Some(names) = names else {
+        return Ok(HashSet::new());
+    };
+    names
+        .map(|name| {
+            read(name).map_err(|detail| {
+                Problem::new(ProblemType::InvalidQuery)
+                    .detail(detail)
+                    .field(field)
+            })
+        })
+        .collect()
+}
+
+fn short(name: &str) -> String {
+    name.chars().take(80).collect()
+}

@@ -1,0 +1,498 @@
+//! What people want of missions that are there, and what robots make of it.
+
+use std::time::Duration;
+
+use reqwest::StatusCode;
+use serde_json::{Value, json};
+use tread_api::keys::Verb;
+use tread_api::mission::{Cause, Mission, MissionDetail, MissionState};
+use tread_api::robot::{AlertReport, LinkCause, LinkState, Robot as ShownRobot, Severity};
+use tread_api::wire::command::OfferRefusal;
+use tread_api::wire::ingest::MissionPhase;
+
+use crate::harness::{Yard, circle, eventually};
+use crate::robot::{Mood, Robot};
+
+async fn act(yard: &Yard, mission: &Mission, verb: &str, body: &Value) -> (StatusCode, Value) {
+    let path = format!("/v1/missions/{}/{verb}", mission.id);
+    yard.post(&path, body).await
+}
+
+fn causes(detail: &MissionDetail) -> Vec<Cause> {
+    detail.events.iter().map(|event| event.cause).collect()
+}
+
+async fn ask(yard: &Yard, robot: &Robot, more: Value) -> (StatusCode, Value) {
+    let mut body = circle(&robot.id);
+    let fields = body.as_object_mut().unwrap();
+    fields.extend(more.as_object().unwrap().clone());
+    yard.post("/v1/missions", &body).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_mission_is_paused_and_resumed_when_its_robot_says_so() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    let (status, body) = act(&yard, &mission, "pause", &json!({})).await;
+    assert_eq!(status, StatusCode::ACCEPTED, "{body}");
+    assert_eq!(
+        (&body["state"], &body["pause_wanted"]),
+        (&json!("active"), &json!(true))
+    );
+    yard.mission_becomes(mission.id, MissionState::Paused).await;
+    let (status, _) = act(&yard, &mission, "resume", &json!({})).await;
+    assert_eq!(status, StatusCode::ACCEPTED);
+    let resumed = yard.mission_becomes(mission.id, MissionState::Active).await;
+    // A command may come again before the robot's state has shown it.
+    let mut holds = robot.holds();
+    holds.dedup();
+    assert_eq!(holds[..2], [Verb::Pause, Verb::Resume]);
+    let expected = [
+        Cause::PauseRequested,
+        Cause::Paused,
+        Cause::ResumeRequested,
+        Cause::Resumed,
+    ];
+    assert!(
+        causes(&resumed).ends_with(&expected),
+        "{:?}",
+        resumed.events
+    );
+    robot.report(0, &mission, MissionPhase::Succeeded).await;
+    let (status, body) = act(&yard, &mission, "pause", &json!({})).await;
+    assert_eq!(
+        (status, &body["state"]),
+        (StatusCode::CONFLICT, &json!("succeeded"))
+    );
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_the_present_state_forbids_is_refused_with_that_state() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    robot.set_mood(Mood::Refusing(OfferRefusal::Busy));
+    let first = yard.create_mission(&robot.id).await;
+    let second = yard.create_mission(&robot.id).await;
+    let (status, body) = act(&yard, &second, "pause", &json!({})).await;
+    assert_eq!(status, StatusCode::CONFLICT, "{body}");
+    assert_eq!(
+        (&body["type"], &body["state"]),
+        (&json!("/problems/mission-state"), &json!("queued"))
+    );
+    let (status, body) = ask(&yard, &robot, json!({"start_policy": "refuse"})).await;
+    assert_eq!(
+        (status, &body["type"]),
+        (StatusCode::CONFLICT, &json!("/problems/robot-busy"))
+    );
+    let (status, body) = ask(&yard, &robot, json!({"priority": 101})).await;
+    assert_eq!(
+        (status, &body["field"]),
+        (StatusCode::UNPROCESSABLE_ENTITY, &json!("priority"))
+    );
+    let policy = json!({"link_policy": {"stop_after": {"silence_s": 0.1}}});
+    let (status, body) = ask(&yard, &robot, policy).await;
+    assert_eq!(
+        (status, &body["field"]),
+        (StatusCode::UNPROCESSABLE_ENTITY, &json!("link_policy"))
+    );
+    assert!(!yard.mission(first.id).await.mission.state.is_terminal());
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_replacement_counts_when_the_robot_holds_it_and_not_before() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    robot.set_mood(Mood::Silent);
+    let mut other = json!({"trajectory": circle(&robot.id)["trajectory"]});
+    other["trajectory"]["circle"]["radius_m"] = json!(5.0);
+    let (status, body) = act(&yard, &mission, "replace", &other).await;
+    assert_eq!(status, StatusCode::ACCEPTED, "{body}");
+    assert_eq!(
+        (&body["revision"], &body["replacement"]["revision"]),
+        (&json!(1), &json!(2))
+    );
+    let (status, _) = act(&yard, &mission, "replace", &other).await;
+    assert_eq!(status, StatusCode::CONFLICT, "one is on its way");
+    robot.set_mood(Mood::Willing);
+    let swapped = eventually("the new revision counts", async || {
+        let seen = yard.mission(mission.id).await;
+        if seen.mission.revision == 2 {
+            Ok(seen)
+        } else {
+            Err(seen)
+        }
+    })
+    .await;
+    assert_eq!(swapped.mission.state, MissionState::Active);
+    assert_eq!(swapped.mission.replacement, None);
+    assert_ne!(swapped.mission.plan_hash, mission.plan_hash);
+    // The robot had reached the end of the old one just before.
+    robot.report(0, &mission, MissionPhase::Succeeded).await;
+    yard.mission_becomes(mission.id, MissionState::Succeeded)
+        .await;
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_refused_replacement_leaves_the_old_one() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    robot.set_mood(Mood::Refusing(OfferRefusal::Impossible));
+    let other = json!({"trajectory": circle(&robot.id)["trajectory"]});
+    act(&yard, &mission, "replace", &other).await;
+    let refused = eventually("the replacement is gone", async || {
+        let seen = yard.mission(mission.id).await;
+        if seen.mission.replacement.is_none() {
+            Ok(seen)
+        } else {
+            Err(seen)
+        }
+    })
+    .await;
+    assert_eq!(
+        (refused.mission.state, refused.mission.revision),
+        (MissionState::Active, 1)
+    );
+    assert_eq!(causes(&refused).last(), Some(&Cause::ReplaceRefused));
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn higher_priority_goes_first_and_a_replacing_mission_ends_the_others() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let driven = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(driven.id, MissionState::Active).await;
+    let later = yard.create_mission(&robot.id).await;
+    let (_, urgent) = ask(&yard, &robot, json!({"priority": 5})).await;
+    let urgent: Mission = serde_json::from_value(urgent).unwrap();
+    robot.report(0, &driven, MissionPhase::Succeeded).await;
+    yard.mission_becomes(urgent.id, MissionState::Active).await;
+    assert_eq!(
+        yard.mission(later.id).await.mission.state,
+        MissionState::Queued
+    );
+    let (_, sole) = ask(&yard, &robot, json!({"start_policy": "replace"})).await;
+    let sole: Mission = serde_json::from_value(sole).unwrap();
+    let ended = yard
+        .mission_becomes(urgent.id, MissionState::Cancelled)
+        .await;
+    assert!(
+        causes(&ended).contains(&Cause::Superseded),
+        "{:?}",
+        ended.events
+    );
+    assert_eq!(
+        yard.mission(later.id).await.mission.state,
+        MissionState::Cancelled
+    );
+    yard.mission_becomes(sole.id, MissionState::Active).await;
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn one_key_makes_one_mission_also_after_a_restart() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let robot_id = robot.id.clone();
+    drop(robot);
+    let send = async |yard: &Yard, key: &str, body: &Value| {
+        let request = yard.client().post(yard.url("/v1/missions"));
+        yard.send(request.header("idempotency-key", key).json(body))
+            .await
+    };
+    let (status, first) = send(&yard, "k-1", &circle(&robot_id)).await;
+    assert_eq!(status, StatusCode::CREATED, "{first}");
+    assert_eq!(
+        send(&yard, "k-1", &circle(&robot_id)).await,
+        (status, first.clone())
+    );
+    let mut other = circle(&robot_id);
+    other["priority"] = json!(1);
+    let (refused, body) = send(&yard, "k-1", &other).await;
+    assert_eq!(refused, StatusCode::UNPROCESSABLE_ENTITY);
+    assert_eq!(body["type"], "/problems/idempotency-key-reused");
+    let yard = yard.restart().await;
+    assert_eq!(
+        send(&yard, "k-1", &circle(&robot_id)).await,
+        (status, first)
+    );
+    let (_, all) = yard.get_value("/v1/missions").await;
+    assert_eq!(all["items"].as_array().unwrap().len(), 1);
+    let (status, body) = send(&yard, "", &circle(&robot_id)).await;
+    assert_eq!(
+        (status, &body["field"]),
+        (StatusCode::BAD_REQUEST, &json!("idempotency-key"))
+    );
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn the_same_key_many_times_at_once_makes_one_mission() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let body = circle(&robot.id);
+    let sends = (0..20).map(|_| {
+        let request = yard.client().post(yard.url("/v1/missions"));
+        yard.send(request.header("idempotency-key", "same").json(&body))
+    });
+    let mut created = std::collections::BTreeSet::new();
+    for (status, answer) in futures_util::future::join_all(sends).await {
+        if status == StatusCode::CREATED {
+            created.insert(answer["id"].to_string());
+        } else {
+            assert_eq!(answer["type"], "/problems/idempotency-key-in-flight");
+        }
+    }
+    assert_eq!(created.len(), 1, "{created:?}");
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_robot_that_stays_away_loses_its_mission_and_is_told_when_it_comes_back() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let (status, body) = ask(&yard, &robot, json!({"lost_after_s": 1.0})).await;
+    assert_eq!(status, StatusCode::CREATED, "{body}");
+    let mission: Mission = serde_json::from_value(body).unwrap();
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    robot.stop_loop();
+    let lost = yard.mission_becomes(mission.id, MissionState::Failed).await;
+    assert_eq!(lost.mission.cause, Cause::RobotLost);
+    let shown: ShownRobot = yard.get("/v1/sites/yard/robots/rover-1").await;
+    assert_eq!(
+        (shown.link, shown.link_cause),
+        (LinkState::Offline, Some(LinkCause::LoopStopped))
+    );
+    robot.start_loop();
+    eventually("the robot is told", async || {
+        let told = robot
+            .cancels()
+            .iter()
+            .any(|cancel| cancel.mission == mission.id);
+        if told { Ok(()) } else { Err(()) }
+    })
+    .await;
+    robot.report(0, &mission, MissionPhase::Succeeded).await;
+    let after = yard.mission(mission.id).await;
+    assert_eq!(
+        (after.mission.state, after.mission.cause),
+        (MissionState::Failed, Cause::RobotLost)
+    );
+    assert_eq!(causes(&after).last(), Some(&Cause::Noted));
+    assert!(yard.counters().await.missions_disowned >= 1);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_dry_run_tells_duration_and_limits_and_refuses_the_impossible_with_its_place() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mut body = circle(&robot.id);
+    let (status, easy) = yard.post("/v1/trajectories/check", &body).await;
+    assert_eq!(status, StatusCode::OK, "{easy}");
+    let length_m = easy["length_m"].as_f64().unwrap();
+    assert!((length_m - 18.85).abs() < 0.05, "{easy}");
+    assert!(easy["duration_s"].as_f64().unwrap() > length_m / 0.6);
+    // 2 m/s on a radius of 1.5 m asks for 2.7 m/s² across the path, and the robot has 1.
+    body["trajectory"]["circle"]["radius_m"] = json!(1.5);
+    body["trajectory"]["circle"]["speed_m_s"] = json!(2.0);
+    let (status, hard) = yard.post("/v1/trajectories/check", &body).await;
+    assert_eq!(status, StatusCode::OK, "{hard}");
+    let binds = hard["bindings"].as_array().unwrap();
+    assert!(
+        binds
+            .iter()
+            .any(|binding| binding["limit"] == "lateral_acceleration"),
+        "{hard}"
+    );
+    assert!(hard["lateral_acceleration_peak_m_s2"].as_f64().unwrap() < 1.01);
+    let point = |x_m: f64, y_m: f64| json!({"x_m": x_m, "y_m": y_m});
+    let mut points = vec![point(0.0, 0.0), point(1.0, 0.0), point(2.0, 0.0)];
+    points[2]["speed_m_s"] = json!(40.0);
+    body["trajectory"] = json!({"waypoints": {"speed_m_s": 0.5, "points": points}});
+    let (status, refused) = yard.post("/v1/trajectories/check", &body).await;
+    assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{refused}");
+    assert_eq!(refused["place"]["waypoint"], 2, "{refused}");
+    assert!(robot.offers().is_empty(), "nothing moves");
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn alerts_are_raised_once_acknowledged_and_cleared() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    robot.say(|state| {
+        state.alerts = vec![AlertReport {
+            code: "battery-low".parse().unwrap(),
+            severity: Severity::Warning,
+            text: "15 %".to_owned(),
+        }];
+    });
+    let raised = eventually("the alert is raised", async || {
+        let (_, page) = yard.get_value("/v1/alerts?raised=true").await;
+        let first = page["items"].get(0).cloned();
+        first.ok_or(page)
+    })
+    .await;
+    assert_eq!(raised["code"], "battery-low");
+    let path = format!("/v1/alerts/{}/acknowledge", raised["id"].as_str().unwrap());
+    let (status, seen) = yard.post(&path, &json!({})).await;
+    assert_eq!(status, StatusCode::OK);
+    assert!(
+        seen["acknowledged_at"].is_string() && seen["cleared_at"].is_null(),
+        "{seen}"
+    );
+    robot.say(|state| state.alerts.clear());
+    eventually("the alert is cleared", async || {
+        let (_, page) = yard.get_value("/v1/alerts?robot=rover-1").await;
+        let items = page["items"].as_array().unwrap().clone();
+        assert_eq!(items.len(), 1);
+        if items[0]["cleared_at"].is_string() {
+            Ok(())
+        } else {
+            Err(items)
+        }
+    })
+    .await;
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_retired_robot_is_renamed_loses_its_missions_and_gets_no_more() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    let change = async |body: Value| {
+        let request = yard
+            .client()
+            .patch(yard.url("/v1/sites/yard/robots/rover-1"));
+        yard.send(request.json(&body)).await
+    };
+    let (status, body) = change(json!({"name": "Old one", "retired": true})).await;
+    assert_eq!((status, &body["name"]), (StatusCode::OK, &json!("Old one")));
+    let ended = yard
+        .mission_becomes(mission.id, MissionState::Cancelled)
+        .await;
+    assert!(causes(&ended).contains(&Cause::RobotRetired));
+    let (status, body) = yard.post("/v1/missions", &circle(&robot.id)).await;
+    assert_eq!(
+        (status, &body["type"]),
+        (StatusCode::CONFLICT, &json!("/problems/robot-retired"))
+    );
+    let listed = async |query: &str| {
+        let (_, page) = yard
+            .get_value(&format!("/v1/sites/yard/robots{query}"))
+            .await;
+        page["items"].as_array().unwrap().len()
+    };
+    assert_eq!((listed("").await, listed("?retired=true").await), (0, 1));
+    change(json!({"retired": false})).await;
+    assert_eq!(listed("").await, 1);
+    yard.server.stop().await.unwrap();
+}
+
+/// Reads events of a stream until one fits.
+async fn read_until(
+    response: &mut reqwest::Response,
+    text: &mut String,
+    is_it: impl Fn(&str) -> bool,
+) {
+    let reading = async {
+        while !is_it(text) {
+            let chunk = response.chunk().await.unwrap().expect("the stream goes on");
+            text.push_str(&String::from_utf8_lossy(&chunk));
+        }
+    };
+    let read = tokio::time::timeout(Duration::from_secs(15), reading).await;
+    assert!(read.is_ok(), "{text}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn events_begin_with_a_snapshot_follow_what_happens_and_resume() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let open = async |query: &str, last: Option<&str>| {
+        let mut request = yard.client().get(yard.url(&format!("/v1/events{query}")));
+        if let Some(last) = last {
+            request = request.header("last-event-id", last);
+        }
+        request.send().await.unwrap()
+    };
+    let mut stream = open("?topics=missions&robots=rover-1", None).await;
+    assert_eq!(stream.headers()["content-type"], "text/event-stream");
+    let mut text = String::new();
+    read_until(&mut stream, &mut text, |text| {
+        text.contains("event: snapshot_end")
+    })
+    .await;
+    assert!(text.starts_with("event: snapshot_begin"), "{text}");
+    assert!(
+        !text.contains("event: robot"),
+        "only missions were asked for: {text}"
+    );
+    let mission = yard.create_mission(&robot.id).await;
+    let active = "\"to\":\"active\"";
+    read_until(&mut stream, &mut text, |text| text.contains(active)).await;
+    let last = text
+        .lines()
+        .filter_map(|line| line.strip_prefix("id: "))
+        .next_back();
+    let last = last.unwrap().to_owned();
+    drop(stream);
+    robot.report(0, &mission, MissionPhase::Succeeded).await;
+    let mut stream = open("?topics=missions", Some(&last)).await;
+    let mut text = String::new();
+    let succeeded = "\"to\":\"succeeded\"";
+    read_until(&mut stream, &mut text, |text| text.contains(succeeded)).await;
+    assert!(!text.contains("snapshot"), "{text}");
+    assert!(
+        !text.contains("\"to\":\"offered\""),
+        "what was read does not come again: {text}"
+    );
+    for (query, named) in [
+        ("?topics=robots,weather", "weather"),
+        ("?robots=rover-9", "rover-9"),
+        ("?site=moon", "moon"),
+        ("?colour=red", "colour"),
+    ] {
+        let (status, body) = yard.get_value(&format!("/v1/events{query}")).await;
+        assert_eq!(status, StatusCode::BAD_REQUEST, "{body}");
+        assert!(body["detail"].as_str().unwrap().contains(named), "{body}");
+    }
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn metrics_are_on_an_address_of_their_own_and_count_what_happens() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    let address = yard.server.metrics_address().unwrap();
+    let page = yard.client().get(format!("http://{address}/metrics"));
+    let text = page.send().await.unwrap().text().await.unwrap();
+    for line in [
+        "tread_missions{state=\"active\"} 1",
+        "tread_robots{link=\"online\"} 1",
+        "tread_offers_sent_total 1",
+        "tread_http_request_seconds_count{method=\"POST\",route=\"/v1/missions\",status=\"201\"} 1",
+    ] {
+        assert!(
+            text.lines().any(|said| said == line),
+            "{line} is not in {text}"
+        );
+    }
+    let (status, _) = yard.get_value("/metrics").await;
+    assert_eq!(status, StatusCode::NOT_FOUND, "not on the API's address");
+    yard.server.stop().await.unwrap();
+}

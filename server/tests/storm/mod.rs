@@ -1,0 +1,601 @@
+//! Random interleavings of everything that can happen to missions, against a simple reference.
+//!
+//! Real use cases, real reconciler, real SQLite; the network and the robots are simulated in this
+//! process, and so is the time. Messages are lost, delayed, doubled and reordered; robots, server
+//! and links go down at any moment. After every step the history that the server wrote is checked
+//! against the reference; at the end of a run the network heals, and every mission must end, with
+//! both sides of one mind.
+
+mod robot;
+
+use std::collections::{BTreeMap, HashMap};
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use tokio::sync::oneshot;
+use tread_api::ids::{MissionId, RobotId, SiteId};
+use tread_api::keys::Verb;
+use tread_api::mission::{
+    Cause, CreateMission, LinkPolicy, MissionState, ReplaceMission, StartPolicy,
+};
+use tread_api::robot::{Capabilities, RobotLimits, RobotModel};
+use tread_api::trajectory::{Circle, Direction, Trajectory};
+use tread_api::wire::hello::Hello;
+use tread_api::wire::ingest::MissionPhase;
+use tread_api::wire::state::RobotState;
+use tread_server::app::ingest::{Upload, Writer};
+use tread_server::app::reconciler::Reconciler;
+use tread_server::app::{App, AppError};
+use tread_server::clock::Clock;
+use tread_server::config::FrictionConfig;
+use tread_server::db::{self, Db};
+use tread_server::fleet::commands::{Carrier, Carrying, Commands};
+use tread_server::fleet::presence::RobotKey;
+use tread_server::supervisor::Supervisor;
+
+use self::robot::Robot;
+
+/// Robots of one run.
+const ROBOTS: usize = 3;
+/// Missions of one run that requests may name.
+const NAMED_MAX: usize = 40;
+/// Messages that are late at once.
+const LATE_MAX: usize = 30;
+/// Steps within which everything must have ended after the network has healed.
+const HEAL_STEPS: usize = 600;
+
+/// Random numbers from a seed: xorshift64*.
+#[derive(Debug)]
+pub(crate) struct Dice(u64);
+
+impl Dice {
+    pub(crate) fn of(seed: u64) -> Self {
+        Self(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1)
+    }
+
+    fn roll(&mut self) -> u64 {
+        self.0 ^= self.0 >> 12;
+        self.0 ^= self.0 << 25;
+        self.0 ^= self.0 >> 27;
+        self.0.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 33
+    }
+
+    fn below(&mut self, end: usize) -> usize {
+        usize::try_from(self.roll()).unwrap_or(0) % end.max(1)
+    }
+
+    fn percent(&mut self, percent: u64) -> bool {
+        self.roll() % 100 < percent
+    }
+}
+
+/// A message that is still on its way.
+#[derive(Debug)]
+enum Late {
+    Command(usize, Verb, Vec<u8>),
+    State(Box<RobotState>),
+}
+
+/// The robots and the network between them and the server.
+#[derive(Debug)]
+struct World {
+    robots: Vec<Robot>,
+    late: Vec<Late>,
+    dice: Dice,
+    calm: bool,
+}
+
+type Shared = Arc<Mutex<World>>;
+
+fn with<T>(world: &Shared, act: impl FnOnce(&mut World) -> T) -> T {
+    act(&mut world.lock().unwrap_or_else(PoisonError::into_inner))
+}
+
+#[derive(Debug)]
+struct Network(Shared);
+
+impl Carrier for Network {
+    fn carry(&self, (_, robot): &RobotKey, verb: Verb, payload: Vec<u8>) -> Carrying {
+        let answer = with(&self.0, |world| {
+            let index = world.robots.iter().position(|here| here.id == *robot)?;
+            let reachable = world.robots[index].on && world.robots[index].linked;
+            let calm = world.calm;
+            let fate = if calm { 99 } else { world.dice.below(100) };
+            // Lost on the way, or late: the server hears nothing.
+            if !reachable || fate < 15 {
+                return None;
+            }
+            if fate < 25 && world.late.len() < LATE_MAX {
+                world.late.push(Late::Command(index, verb, payload));
+                return None;
+            }
+            if fate < 35 && world.late.len() < LATE_MAX {
+                world.late.push(Late::Command(index, verb, payload.clone()));
+            }
+            let impossible = !calm && world.dice.percent(3);
+            let answer = world.robots[index].answer(verb, &payload, impossible);
+            // Done, and the answer is lost.
+            (fate >= 45).then_some(answer)
+        });
+        Box::pin(std::future::ready(answer))
+    }
+}
+
+/// What the reference knows: where each mission stands, by the history alone.
+#[derive(Debug, Default)]
+struct Reference {
+    missions: BTreeMap<MissionId, (RobotId, MissionState, Cause)>,
+    last_step: i64,
+}
+
+impl Reference {
+    /// Reads what the server wrote, and checks it.
+    async fn follow(&mut self, db: &Db) -> Result<(), String> {
+        let mut tx = db.read().await.map_err(|error| error.to_string())?;
+        let steps = db::history::steps_after(&mut tx, self.last_step, 10_000).await;
+        drop(tx);
+        for (pk, step) in steps.map_err(|error| error.to_string())? {
+            self.last_step = pk;
+            let before = self.missions.get(&step.mission).map(|known| known.1);
+            if before != step.step.from {
+                return Err(format!("{step:?} does not follow {before:?}"));
+            }
+            let moved = before != Some(step.step.to);
+            if moved && before.is_some_and(MissionState::is_terminal) {
+                return Err(format!("revived: {step:?}"));
+            }
+            let cause = match self.missions.get(&step.mission) {
+                Some(&(_, _, cause)) if !moved => cause,
+                _ => step.step.cause,
+            };
+            let standing = (step.robot.clone(), step.step.to, cause);
+            self.missions.insert(step.mission, standing);
+            let mut in_hand: HashMap<&RobotId, usize> = HashMap::new();
+            for (robot, state, _) in self.missions.values() {
+                if !state.is_terminal() && *state != MissionState::Queued {
+                    *in_hand.entry(robot).or_default() += 1;
+                }
+            }
+            if let Some((robot, count)) = in_hand.into_iter().find(|(_, count)| *count > 1) {
+                return Err(format!(
+                    "robot {robot} has {count} missions in hand: {step:?}"
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    fn open(&self) -> Vec<(MissionId, MissionState)> {
+        let standing = self.missions.iter().map(|(id, known)| (*id, known.1));
+        standing.filter(|(_, state)| !state.is_terminal()).collect()
+    }
+}
+
+/// One run.
+struct Storm {
+    world: Shared,
+    clock: Clock,
+    path: PathBuf,
+    app: App,
+    writer: Writer,
+    reconciler: Reconciler,
+    supervisor: Supervisor,
+    reference: Reference,
+    site: SiteId,
+    boots: u64,
+}
+
+async fn app_on(path: &std::path::Path, clock: &Clock, site: &SiteId) -> App {
+    let db = Db::open(path).await.expect("the database opens");
+    let app = App::new(db, clock.clone(), FrictionConfig::default());
+    app.ensure_site(site).await.expect("the site is made");
+    app
+}
+
+/// Runs one storm of so many steps.
+///
+/// # Errors
+/// What the server did wrong, with the seed.
+pub(crate) async fn run(seed: u64, steps: usize) -> Result<usize, String> {
+    let folder = tempfile::tempdir().map_err(|error| error.to_string())?;
+    let path = folder.path().join("storm.db");
+    let mut storm = Storm::start(seed, path).await;
+    let weathered = storm.weather(steps).await;
+    storm
+        .supervisor
+        .stop()
+        .await
+        .map_err(|error| error.to_string())?;
+    storm.app.db().close().await;
+    weathered.map_err(|what| format!("seed {seed}: {what}"))
+}
+
+impl Storm {
+    async fn start(seed: u64, path: PathBuf) -> Self {
+        let site: SiteId = "yard".parse().expect("it is an identifier");
+        let clock = Clock::manual("2026-11-01T00:00:00Z".parse().expect("it is a time"));
+        let robots = (0..ROBOTS).map(|index| {
+            let id = format!("rover-{index}").parse().expect("an identifier");
+            Robot::new(id, index as u64)
+        });
+        let world: Shared = Arc::new(Mutex::new(World {
+            robots: robots.collect(),
+            late: Vec::new(),
+            dice: Dice::of(seed),
+            calm: false,
+        }));
+        let supervisor = Supervisor::new();
+        let app = app_on(&path, &clock, &site).await;
+        let commands = Commands::new(Arc::new(Network(Arc::clone(&world))));
+        let mut storm = Self {
+            reconciler: Reconciler::new(app.clone(), commands, supervisor.clone()),
+            writer: Writer::new(app.clone()),
+            world,
+            clock,
+            path,
+            app,
+            supervisor,
+            reference: Reference::default(),
+            site,
+            boots: ROBOTS as u64,
+        };
+        for index in 0..ROBOTS {
+            storm.greet(index).await;
+        }
+        storm
+    }
+
+    fn dice<T>(&self, roll: impl FnOnce(&mut Dice) -> T) -> T {
+        with(&self.world, |world| roll(&mut world.dice))
+    }
+
+    /// A robot is on the network and says hello.
+    async fn greet(&mut self, index: usize) {
+        let (robot, boot) = with(&self.world, |world| {
+            let robot = &world.robots[index];
+            (robot.id.clone(), robot.boot)
+        });
+        let now = self.clock.elapsed();
+        let key = (self.site.clone(), robot.clone());
+        self.app.presences().token_appeared(key, boot, now);
+        let hello = Hello {
+            robot,
+            boot,
+            agent_version: "0".to_owned(),
+            model: model(),
+            robot_time: self.clock.now(),
+            capabilities: Capabilities {
+                pause: true,
+                replace: true,
+                ..Capabilities::default()
+            },
+        };
+        let welcomed = self.app.hello(&self.site, &hello).await;
+        assert!(welcomed.is_ok(), "{welcomed:?}");
+    }
+
+    async fn weather(&mut self, steps: usize) -> Result<usize, String> {
+        for _ in 0..steps {
+            self.step().await?;
+            self.reference.follow(self.app.db()).await?;
+        }
+        self.heal().await?;
+        let count = self.reference.missions.len();
+        self.agree()?;
+        Ok(count)
+    }
+
+    async fn step(&mut self) -> Result<(), String> {
+        let (what, index) = self.dice(|dice| (dice.below(100), dice.below(ROBOTS)));
+        match what {
+            0..8 => self.create(index).await?,
+            8..20 => self.want().await?,
+            20..38 => {
+                let unlucky = self.dice(|dice| dice.percent(2));
+                with(&self.world, |world| world.robots[index].drive(2.5, unlucky));
+            }
+            38..55 => self.heartbeat(index),
+            55..67 => self.upload(index).await,
+            67..75 => self.deliver_late(),
+            75..77 => self.restart_robot(index).await,
+            77..79 => self.toggle(index).await,
+            79 => self.restart_server().await,
+            80..88 => {
+                let span_ms = self.dice(|dice| dice.below(3_000)) as u64;
+                self.clock.advance(Duration::from_millis(span_ms));
+            }
+            _ => self.reconcile().await?,
+        }
+        Ok(())
+    }
+
+    async fn reconcile(&mut self) -> Result<(), String> {
+        let passed = self.reconciler.pass().await;
+        self.reconciler.rest().await;
+        passed.map_err(|error| format!("{error:?}"))
+    }
+
+    async fn create(&mut self, index: usize) -> Result<(), String> {
+        let robot = with(&self.world, |world| world.robots[index].id.clone());
+        let (policy, priority, bound, late) = self.dice(|dice| {
+            (
+                dice.below(12),
+                dice.below(3),
+                dice.below(3),
+                dice.percent(10),
+            )
+        });
+        let soon = self.clock.now() + jiff::SignedDuration::from_secs(4);
+        let request = CreateMission {
+            site: self.site.clone(),
+            robot,
+            trajectory: circle(3.0),
+            latest_start: late.then_some(soon),
+            priority: i32::try_from(priority).unwrap_or(0),
+            start_policy: match policy {
+                0 => StartPolicy::Replace,
+                1 => StartPolicy::Refuse,
+                _ => StartPolicy::Append,
+            },
+            link_policy: LinkPolicy::Continue,
+            lost_after_s: (bound == 0).then_some(5.0),
+        };
+        allowed(self.app.create_mission(request).await)
+    }
+
+    async fn want(&mut self) -> Result<(), String> {
+        let newest: Vec<MissionId> = self.reference.missions.keys().rev().copied().collect();
+        let (verb, place, radius) =
+            self.dice(|dice| (dice.below(5), dice.below(NAMED_MAX), dice.below(5)));
+        let Some(&id) = newest.get(place % newest.len().max(1)) else {
+            return Ok(());
+        };
+        match verb {
+            0 => allowed(self.app.cancel_mission(id).await),
+            1 => allowed(self.app.pause_mission(id).await),
+            2 | 3 => allowed(self.app.resume_mission(id).await),
+            _ => {
+                #[expect(clippy::cast_precision_loss, reason = "below 5")]
+                let trajectory = circle(2.0 + radius as f64);
+                let request = ReplaceMission { trajectory };
+                allowed(self.app.replace_mission(id, request).await)
+            }
+        }
+    }
+
+    fn heartbeat(&mut self, index: usize) {
+        let heard = with(&self.world, |world| {
+            let robot = &mut world.robots[index];
+            let reachable = robot.on && robot.linked;
+            let state = robot.state();
+            let fate = if world.calm {
+                99
+            } else {
+                world.dice.below(100)
+            };
+            if fate < 25 && world.late.len() < LATE_MAX {
+                world.late.push(Late::State(Box::new(state.clone())));
+            }
+            (reachable && fate >= 15).then_some(state)
+        });
+        if let Some(state) = heard {
+            self.hear(state);
+        }
+    }
+
+    fn hear(&self, state: RobotState) {
+        let key = (self.site.clone(), state.robot.clone());
+        let (now, wall) = (self.clock.elapsed(), self.clock.now());
+        self.app.presences().state(&key, state, now, wall);
+    }
+
+    fn deliver_late(&mut self) {
+        let state = with(&self.world, |world| {
+            if world.late.is_empty() {
+                return None;
+            }
+            let place = world.dice.below(world.late.len());
+            match world.late.swap_remove(place) {
+                Late::State(state) => Some(*state),
+                Late::Command(index, verb, payload) => {
+                    if world.robots[index].on {
+                        world.robots[index].answer(verb, &payload, false);
+                    }
+                    None
+                }
+            }
+        });
+        if let Some(state) = state {
+            self.hear(state);
+        }
+    }
+
+    async fn upload(&mut self, index: usize) {
+        let (batch, doubled, lost) = with(&self.world, |world| {
+            let robot = &world.robots[index];
+            let up = robot.on && robot.linked;
+            let batch = robot.batch(1 + world.dice.below(3)).filter(|_| up);
+            let calm = world.calm;
+            let (doubled, lost) = (world.dice.percent(15), world.dice.percent(20));
+            (batch, doubled && !calm, lost && !calm)
+        });
+        let Some(batch) = batch else { return };
+        for _ in 0..=usize::from(doubled) {
+            let (answer, answered) = oneshot::channel();
+            let upload = Upload {
+                site: self.site.clone(),
+                batch: batch.clone(),
+                answer,
+            };
+            self.writer.store(vec![upload]).await;
+            let taken = matches!(answered.await, Ok(Ok(_)));
+            // The commit is done, and the robot hears of it or not.
+            if taken && !lost {
+                with(&self.world, |world| world.robots[index].answered(&batch));
+            }
+        }
+    }
+
+    async fn restart_robot(&mut self, index: usize) {
+        self.boots += 1;
+        let boot = self.boots;
+        let before = with(&self.world, |world| {
+            let tells = world.dice.percent(50);
+            let robot = &mut world.robots[index];
+            let before = (robot.id.clone(), robot.boot);
+            robot.restart(boot, tells);
+            robot.on = true;
+            before
+        });
+        let now = self.clock.elapsed();
+        let key = (self.site.clone(), before.0);
+        self.app.presences().token_gone(&key, before.1, now);
+        if with(&self.world, |world| world.robots[index].linked) {
+            self.greet(index).await;
+        }
+    }
+
+    async fn toggle(&mut self, index: usize) {
+        let now_up = with(&self.world, |world| {
+            let linked = &mut world.robots[index].linked;
+            *linked = !*linked;
+            *linked
+        });
+        if now_up {
+            self.greet(index).await;
+        }
+    }
+
+    async fn restart_server(&mut self) {
+        self.app.db().close().await;
+        self.app = app_on(&self.path, &self.clock, &self.site).await;
+        self.writer = Writer::new(self.app.clone());
+        let commands = Commands::new(Arc::new(Network(Arc::clone(&self.world))));
+        self.reconciler = Reconciler::new(self.app.clone(), commands, self.supervisor.clone());
+        for index in 0..ROBOTS {
+            if with(&self.world, |world| world.robots[index].linked) {
+                self.greet(index).await;
+            }
+        }
+    }
+
+    /// The network heals, people let everything go on, and time passes.
+    async fn heal(&mut self) -> Result<(), String> {
+        with(&self.world, |world| {
+            world.calm = true;
+            for robot in &mut world.robots {
+                (robot.on, robot.linked) = (true, true);
+            }
+        });
+        for index in 0..ROBOTS {
+            self.greet(index).await;
+        }
+        for _ in 0..HEAL_STEPS {
+            while with(&self.world, |world| !world.late.is_empty()) {
+                self.deliver_late();
+            }
+            for (id, _) in self.reference.open() {
+                allowed(self.app.resume_mission(id).await)?;
+            }
+            for index in 0..ROBOTS {
+                with(&self.world, |world| world.robots[index].drive(2.5, false));
+                self.heartbeat(index);
+                self.upload(index).await;
+            }
+            self.reconcile().await?;
+            self.clock.advance(Duration::from_millis(500));
+            self.reference.follow(self.app.db()).await?;
+            let idle = with(&self.world, |world| {
+                let done = |robot: &Robot| robot.holds().is_none() && robot.batch(1).is_none();
+                world.robots.iter().all(done)
+            });
+            if idle && self.reference.open().is_empty() {
+                return Ok(());
+            }
+        }
+        let held = with(&self.world, |world| {
+            let held = world
+                .robots
+                .iter()
+                .map(|robot| (robot.id.clone(), robot.holds()));
+            held.collect::<Vec<_>>()
+        });
+        let open = self.reference.open();
+        Err(format!(
+            "stuck: open at the server {open:?}, in robots' hands {held:?}"
+        ))
+    }
+
+    /// Both sides say the same of every mission, or policy said that the server decides.
+    fn agree(&self) -> Result<(), String> {
+        with(&self.world, |world| {
+            for (id, (robot, state, cause)) in &self.reference.missions {
+                let of = world.robots.iter().find(|here| here.id == *robot);
+                let Some(phase) = of.and_then(|here| here.ended.get(id)) else {
+                    continue;
+                };
+                let same = matches!(
+                    (phase, state),
+                    (MissionPhase::Succeeded, MissionState::Succeeded)
+                        | (MissionPhase::Failed, MissionState::Failed)
+                        | (MissionPhase::Cancelled, MissionState::Cancelled)
+                );
+                let decided_here = matches!(
+                    cause,
+                    Cause::RobotLost
+                        | Cause::AgentRestarted
+                        | Cause::RobotForgot
+                        | Cause::Rejected
+                        | Cause::Expired
+                );
+                if !same && !decided_here {
+                    return Err(format!(
+                        "mission {id}: the robot says {phase:?}, the server {state:?} by {cause:?}"
+                    ));
+                }
+            }
+            Ok(())
+        })
+    }
+}
+
+/// What may be asked may also be refused; only the database must not fail.
+fn allowed<T>(answer: Result<T, AppError>) -> Result<(), String> {
+    match answer {
+        Err(error @ AppError::Storage(_)) => Err(format!("{error:?}")),
+        Ok(_) | Err(_) => Ok(()),
+    }
+}
+
+fn circle(radius_m: f64) -> Trajectory {
+    Trajectory::Circle(Circle {
+        center: tread_api::geometry::Point { x_m: 0.0, y_m: 0.0 },
+        radius_m,
+        speed_m_s: Some(0.5),
+        period_s: None,
+        direction: Direction::CounterClockwise,
+        turns: 1.0,
+    })
+}
+
+fn model() -> RobotModel {
+    RobotModel {
+        name: "storm".to_owned(),
+        tyres: "any".to_owned(),
+        mass_kg: 50.0,
+        track_width_m: 0.6,
+        wheelbase_m: 0.5,
+        wheel_radius_m: 0.15,
+        yaw_inertia_kg_m2: 3.0,
+        limits: RobotLimits {
+            linear_max_m_s: 2.0,
+            angular_max_rad_s: 1.5,
+            linear_acceleration_max_m_s2: 1.0,
+            lateral_acceleration_max_m_s2: 1.0,
+            linear_jerk_max_m_s3: 5.0,
+            wheel_speed_max_rad_s: 20.0,
+            wheel_acceleration_max_rad_s2: 50.0,
+        },
+    }
+}

@@ -1,0 +1,272 @@
+//! A robot of few lines: what any agent must do about missions, and nothing else.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use tread_api::ids::{BootId, MissionId, PlanHash, RobotId};
+use tread_api::keys::Verb;
+use tread_api::robot::{LoopStatus, MissionProgress, OutboxStatus, RobotMode};
+use tread_api::wire;
+use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome, Pause};
+use tread_api::wire::ingest::{Batch, MissionPhase, MissionReport, Record, RecordContent};
+use tread_api::wire::state::RobotState;
+use uuid::Uuid;
+
+/// A mission in the robot's hand.
+#[derive(Debug, Clone, Copy)]
+struct Held {
+    mission: MissionId,
+    revision: u32,
+    plan_hash: PlanHash,
+    paused: bool,
+    driven_m: f64,
+}
+
+/// The robot: what survives its restarts, and what does not.
+#[derive(Debug)]
+pub(crate) struct Robot {
+    pub(crate) id: RobotId,
+    pub(crate) boot: BootId,
+    pub(crate) on: bool,
+    pub(crate) linked: bool,
+    held: Option<Held>,
+    pub(crate) ended: BTreeMap<MissionId, MissionPhase>,
+    outbox: VecDeque<(BootId, Record)>,
+    next_record: u64,
+    states: u64,
+}
+
+const LENGTH_M: f64 = 10.0;
+
+impl Robot {
+    pub(crate) fn new(id: RobotId, boot: u64) -> Self {
+        Self {
+            id,
+            boot: boot_id(boot),
+            on: true,
+            linked: true,
+            held: None,
+            ended: BTreeMap::new(),
+            outbox: VecDeque::new(),
+            next_record: 0,
+            states: 0,
+        }
+    }
+
+    pub(crate) fn holds(&self) -> Option<MissionId> {
+        self.held.map(|held| held.mission)
+    }
+
+    /// A new run of the agent; what was held is over, and told only if the robot still could.
+    pub(crate) fn restart(&mut self, boot: u64, tells: bool) {
+        self.boot = boot_id(boot);
+        self.next_record = 0;
+        self.states = 0;
+        if let Some(held) = self.held.take() {
+            self.ended.insert(held.mission, MissionPhase::Failed);
+            if tells {
+                self.record(held, MissionPhase::Failed);
+            }
+        }
+    }
+
+    fn record(&mut self, held: Held, phase: MissionPhase) {
+        let report = MissionReport {
+            mission: held.mission,
+            revision: held.revision,
+            plan_hash: held.plan_hash,
+            at: "2026-11-01T00:00:00Z".parse().expect("it is a time"),
+            phase,
+            reason: None,
+            progress: None,
+            quality: None,
+            driven: None,
+        };
+        let record = Record {
+            seq: self.next_record,
+            content: RecordContent::Mission(report),
+        };
+        self.next_record += 1;
+        self.outbox.push_back((self.boot, record));
+    }
+
+    fn end(&mut self, held: Held, phase: MissionPhase) {
+        self.held = None;
+        self.ended.insert(held.mission, phase);
+        self.record(held, phase);
+    }
+
+    /// Drives on; at the end of the way the mission has succeeded, or failed if it is `unlucky`.
+    pub(crate) fn drive(&mut self, distance_m: f64, unlucky: bool) {
+        let Some(mut held) = self.held.filter(|held| !held.paused && self.on) else {
+            return;
+        };
+        held.driven_m += distance_m;
+        self.held = Some(held);
+        if unlucky {
+            self.end(held, MissionPhase::Failed);
+        } else if held.driven_m >= LENGTH_M {
+            self.end(held, MissionPhase::Succeeded);
+        }
+    }
+
+    /// What the robot says of itself now.
+    pub(crate) fn state(&mut self) -> RobotState {
+        self.states += 1;
+        let progress = |held: Held| MissionProgress {
+            id: held.mission,
+            revision: held.revision,
+            plan_hash: held.plan_hash,
+            driven_m: held.driven_m.min(LENGTH_M),
+            length_m: LENGTH_M,
+            cross_track_m: 0.0,
+            paused: held.paused,
+        };
+        RobotState {
+            robot: self.id.clone(),
+            boot: self.boot,
+            seq: self.states,
+            robot_time: "2026-11-01T00:00:00Z".parse().expect("it is a time"),
+            mode: RobotMode::Idle,
+            fault: None,
+            pose: None,
+            twist: None,
+            mission: self.held.map(progress),
+            terrain_revision: None,
+            outbox: OutboxStatus {
+                pending: self.outbox.len() as u64,
+                ..OutboxStatus::default()
+            },
+            control_loop: LoopStatus {
+                ticks: self.states,
+                ..LoopStatus::default()
+            },
+            battery: None,
+            alerts: Vec::new(),
+        }
+    }
+
+    /// The oldest records of one run.
+    pub(crate) fn batch(&self, records_max: usize) -> Option<Batch> {
+        let &(boot, _) = self.outbox.front()?;
+        let of_run = self.outbox.iter().take_while(|(of, _)| *of == boot);
+        Some(Batch {
+            robot: self.id.clone(),
+            boot,
+            robot_time: None,
+            records: of_run
+                .take(records_max)
+                .map(|(_, record)| record.clone())
+                .collect(),
+        })
+    }
+
+    /// The server has answered for a batch.
+    pub(crate) fn answered(&mut self, batch: &Batch) {
+        self.outbox.retain(|(boot, record)| {
+            *boot != batch.boot || !batch.records.iter().any(|sent| sent.seq == record.seq)
+        });
+    }
+
+    /// Answers a command.
+    pub(crate) fn answer(&mut self, verb: Verb, payload: &[u8], impossible: bool) -> Answer {
+        let outcome = match verb {
+            Verb::Offer => self.offer(&wire::decode(payload).expect("an offer"), impossible),
+            Verb::Cancel => self.cancel(&wire::decode(payload).expect("a cancellation")),
+            Verb::Pause | Verb::Resume => {
+                let pause: Pause = wire::decode(payload).expect("a pause or a resumption");
+                self.hold(&pause, verb == Verb::Pause)
+            }
+            Verb::Site => Outcome::Done,
+        };
+        Answer {
+            boot: self.boot,
+            outcome,
+        }
+    }
+
+    fn offer(&mut self, offer: &Offer, impossible: bool) -> Outcome {
+        if self.ended.contains_key(&offer.mission) {
+            return refused(OfferRefusal::Ended);
+        }
+        let content = (offer.revision, offer.plan_hash);
+        let new = Held {
+            mission: offer.mission,
+            revision: offer.revision,
+            plan_hash: offer.plan_hash,
+            paused: false,
+            driven_m: 0.0,
+        };
+        match self.held {
+            None if impossible => refused(OfferRefusal::Impossible),
+            None => {
+                self.held = Some(new);
+                self.record(new, MissionPhase::Started);
+                Outcome::Accepted { plan: None }
+            }
+            Some(held) if held.mission != offer.mission => refused(OfferRefusal::Busy),
+            Some(held) if (held.revision, held.plan_hash) == content => {
+                Outcome::Accepted { plan: None }
+            }
+            Some(held) if held.revision < offer.revision && !impossible => {
+                let new = Held {
+                    paused: held.paused,
+                    ..new
+                };
+                self.held = Some(new);
+                self.record(new, MissionPhase::Replaced);
+                Outcome::Accepted { plan: None }
+            }
+            Some(_) => refused(OfferRefusal::Conflict),
+        }
+    }
+
+    fn cancel(&mut self, cancel: &Cancel) -> Outcome {
+        match self.held.filter(|held| held.mission == cancel.mission) {
+            Some(held) => {
+                self.end(held, MissionPhase::Cancelled);
+                Outcome::Done
+            }
+            None => match self.ended.get(&cancel.mission) {
+                Some(MissionPhase::Cancelled) => Outcome::Done,
+                Some(_) => refused(OfferRefusal::Ended),
+                None => {
+                    self.ended.insert(cancel.mission, MissionPhase::Cancelled);
+                    refused(OfferRefusal::Unknown)
+                }
+            },
+        }
+    }
+
+    fn hold(&mut self, pause: &Pause, paused: bool) -> Outcome {
+        let same = |held: &Held| (held.mission, held.revision) == (pause.mission, pause.revision);
+        let Some(held) = self.held.filter(same) else {
+            return refused(if self.ended.contains_key(&pause.mission) {
+                OfferRefusal::Ended
+            } else {
+                OfferRefusal::Unknown
+            });
+        };
+        if held.paused != paused {
+            let held = Held { paused, ..held };
+            self.held = Some(held);
+            let phase = if paused {
+                MissionPhase::Paused
+            } else {
+                MissionPhase::Resumed
+            };
+            self.record(held, phase);
+        }
+        Outcome::Done
+    }
+}
+
+fn refused(code: OfferRefusal) -> Outcome {
+    Outcome::Refused {
+        code,
+        detail: "so it is".to_owned(),
+    }
+}
+
+fn boot_id(number: u64) -> BootId {
+    BootId::from_uuid(Uuid::from_u128(u128::from(number) + 1))
+}

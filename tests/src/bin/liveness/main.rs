@@ -1,0 +1,168 @@
+//! `liveness`: how soon the server shows that a robot is gone, and that it is back.
+//!
+//! One agent behind a network that can be cut. Measured over and over: from a silent cut to
+//! `offline`, from the death of the agent's process to `offline`, and from the healing of the
+//! network to `online`, after cuts of several lengths, with and without a reset. What is timed is
+//! what a client of the REST API sees, so the poll is in the figures.
+
+use std::io::Write;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::Parser;
+use serde::Serialize;
+use tokio::time::Instant;
+use tread_api::ids::RobotId;
+use tread_api::robot::LinkState;
+use tread_tests::fleet::Fleet;
+use tread_tests::random::Random;
+use tread_tests::relay::Relay;
+
+/// Silent cut to `offline`, at the most.
+const SILENCE_MAX_S: f64 = 1.5;
+/// Death of the agent to `offline`, at the most.
+const DEATH_MAX_S: f64 = 0.2;
+/// Healing to `online`, at the most.
+const HEALING_MAX_S: f64 = 2.0;
+/// Time between two looks.
+const LOOK_EVERY: Duration = Duration::from_millis(5);
+/// Longest wait for any of them.
+const WAIT_MAX: Duration = Duration::from_secs(30);
+/// Longest cut.
+const CUT_MAX_S: f64 = 14.0;
+
+/// Measures how soon a robot is shown gone and back.
+#[derive(Debug, Parser)]
+#[command(name = "liveness")]
+struct Arguments {
+    /// Trials of each kind
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=1_000))]
+    trials: u32,
+    /// What the moments are drawn from
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Print one JSON object instead of a table
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Serialize)]
+struct Check {
+    name: &'static str,
+    goal: String,
+    value: f64,
+    median: f64,
+    holds: bool,
+}
+
+fn check(name: &'static str, most_s: f64, mut seen_s: Vec<f64>) -> Check {
+    seen_s.sort_by(f64::total_cmp);
+    let worst = seen_s.last().copied().unwrap_or(f64::INFINITY);
+    let median = seen_s.get(seen_s.len() / 2).copied();
+    Check {
+        name,
+        goal: format!("<= {most_s}"),
+        value: worst,
+        median: median.unwrap_or(f64::INFINITY),
+        holds: worst <= most_s,
+    }
+}
+
+/// Waits until the server shows a link state and says how long that took, seconds.
+async fn shown(fleet: &Fleet, robot: &RobotId, link: LinkState) -> anyhow::Result<f64> {
+    let began = Instant::now();
+    loop {
+        if fleet.rest.robot(robot).await.map(|robot| robot.link) == Some(link) {
+            return Ok(began.elapsed().as_secs_f64());
+        }
+        anyhow::ensure!(
+            began.elapsed() < WAIT_MAX,
+            "the robot was not shown {link:?} within {WAIT_MAX:?}: {:?}",
+            fleet.log_tail(robot.as_str()),
+        );
+        tokio::time::sleep(LOOK_EVERY).await;
+    }
+}
+
+/// Any moment between two heartbeats.
+async fn settle(random: &mut Random) {
+    tokio::time::sleep(Duration::from_secs_f64(random.between(1.0, 1.5))).await;
+}
+
+async fn cuts(
+    fleet: &Fleet,
+    relay: &Relay,
+    robot: &RobotId,
+    arguments: &Arguments,
+) -> anyhow::Result<(Vec<f64>, Vec<f64>)> {
+    let mut random = Random::new(arguments.seed);
+    let (mut gone_s, mut back_s) = (Vec::new(), Vec::new());
+    for trial in 0..arguments.trials {
+        settle(&mut random).await;
+        relay.cut();
+        gone_s.push(shown(fleet, robot, LinkState::Offline).await?);
+        tokio::time::sleep(Duration::from_secs_f64(random.between(0.0, CUT_MAX_S))).await;
+        if trial % 2 == 1 {
+            relay.reset();
+        }
+        relay.heal();
+        back_s.push(shown(fleet, robot, LinkState::Online).await?);
+    }
+    Ok((gone_s, back_s))
+}
+
+#[tokio::main]
+async fn main() -> anyhow::Result<ExitCode> {
+    let arguments = Arguments::parse();
+    // The executables of this package stand beside each other.
+    let node = std::env::current_exe()?.with_file_name("node");
+    anyhow::ensure!(
+        node.exists(),
+        "{} is missing: build it with `cargo build --release -p tread-tests --bins`",
+        node.display()
+    );
+    let mut fleet = Fleet::start_with(&node).await;
+    let robot: RobotId = "rover-1".parse()?;
+    let relay = fleet.start_agent_behind_relay(&robot, 0.0).await;
+    let (gone_s, back_s) = cuts(&fleet, &relay, &robot, &arguments).await?;
+    let mut random = Random::new(!arguments.seed);
+    let mut died_s = Vec::new();
+    for _ in 0..arguments.trials {
+        settle(&mut random).await;
+        fleet.kill_agent(&robot);
+        died_s.push(shown(&fleet, &robot, LinkState::Offline).await?);
+        fleet.spawn_agent_behind(&robot, 0.0, &relay);
+        shown(&fleet, &robot, LinkState::Online).await?;
+    }
+    let checks = [
+        check("silent partition to offline, s", SILENCE_MAX_S, gone_s),
+        check("process death to offline, s", DEATH_MAX_S, died_s),
+        check("healing to online, s", HEALING_MAX_S, back_s),
+    ];
+    let holds = checks.iter().all(|check| check.holds);
+    let mut output = std::io::stdout().lock();
+    if arguments.json {
+        let report = serde_json::json!({"trials": arguments.trials, "checks": checks});
+        writeln!(output, "{report}")?;
+    } else {
+        for Check {
+            name,
+            goal,
+            value,
+            median,
+            holds,
+        } in &checks
+        {
+            let verdict = if *holds { "holds" } else { "DOES NOT HOLD" };
+            writeln!(
+                output,
+                "{name:34} worst {value:>7.3}, median {median:>7.3}  {goal:>7}  {verdict}"
+            )?;
+        }
+    }
+    Ok(if holds {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    })
+}
