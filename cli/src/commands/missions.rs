@@ -58,14 +58,14 @@ pub(super) fn list(missions: &[Mission]) -> String {
         table.add_row([
             mission.id.to_string(),
             mission.robot.to_string(),
-            mission.state.as_str().to_owned(),
+            state(mission),
             or_dash(
                 mission
                     .progress
                     .map(|progress| percent(progress.driven_m, progress.length_m)),
             ),
             trajectory(&mission.trajectory),
-            mission.created_at.to_string(),
+            format!("{:.0}", mission.created_at),
             mission.reason.clone().unwrap_or_default(),
         ]);
     }
@@ -84,15 +84,33 @@ pub(crate) fn summary(mission: &Mission) -> String {
         mission.id,
         mission.robot,
         trajectory(&mission.trajectory),
-        mission.state.as_str()
+        state(mission)
     )
+}
+
+/// A mission's state, with what is under way.
+fn state(mission: &Mission) -> String {
+    let word = mission.state.as_str();
+    if mission.state.is_terminal() {
+        return word.to_owned();
+    }
+    let is_paused = mission.state == MissionState::Paused;
+    let under_way = match (mission.pause_wanted, is_paused) {
+        (true, false) => Some("pausing"),
+        (false, true) => Some("resuming"),
+        (true, true) | (false, false) => mission.replacement.as_ref().map(|_next| "replacing"),
+    };
+    match under_way {
+        Some(under_way) => format!("{word} ({under_way})"),
+        None => word.to_owned(),
+    }
 }
 
 fn history(detail: &MissionDetail) -> String {
     let mut table = table(["AT", "WHO", "FROM", "TO", "WHY"]);
     for event in &detail.events {
         table.add_row([
-            event.at.to_string(),
+            format!("{:.3}", event.at),
             event.actor.as_str().to_owned(),
             or_dash(event.from.map(MissionState::as_str)),
             event.to.as_str().to_owned(),
@@ -132,8 +150,10 @@ fn trajectory(trajectory: &Trajectory) -> String {
                 Direction::CounterClockwise => "ccw",
                 Direction::Clockwise => "cw",
             };
+            let one = (circle.turns - 1.0).abs() < f64::EPSILON;
+            let turns = if one { "turn" } else { "turns" };
             format!(
-                "circle R {} m, {} turns {way}",
+                "circle R {} m, {} {turns} {way}",
                 circle.radius_m, circle.turns
             )
         }

@@ -109,6 +109,17 @@ async fn follow(
 }
 
 impl Known {
+    /// A mission with the progress that its robot said last; missions are sent when they step.
+    fn fresh(&self, mission: &Mission) -> Mission {
+        let live = self.robots.get(&mission.robot);
+        let said = live.and_then(|robot| robot.live.as_ref()?.mission);
+        let progress = said.filter(|said| said.id == mission.id && !mission.state.is_terminal());
+        Mission {
+            progress: progress.or(mission.progress),
+            ..mission.clone()
+        }
+    }
+
     /// Takes one event; `true` if it tells something new.
     fn take(&mut self, block: &str, output: Output) -> anyhow::Result<bool> {
         let field = |name: &str| block.lines().find_map(|line| line.strip_prefix(name));
@@ -163,7 +174,11 @@ fn show(
             ""
         };
         let robots: Vec<Robot> = look.robots.iter().map(|&robot| robot.clone()).collect();
-        let missions: Vec<Mission> = look.missions.iter().map(|&seen| seen.clone()).collect();
+        let missions: Vec<Mission> = look
+            .missions
+            .iter()
+            .map(|&seen| known.fresh(seen))
+            .collect();
         format!(
             "{screen}site {site} on {}\n\n{}\n\n{}\n",
             client.address(),
