@@ -119,6 +119,10 @@ pub enum LinkCause {
 }
 
 /// What a base and its agent can do beyond driving missions to their end.
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "each is an ability of its own, under its own name on the wire"
+)]
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct Capabilities {
     /// It can pause a mission and drive it on.
@@ -130,6 +134,9 @@ pub struct Capabilities {
     /// It measures its battery.
     #[serde(default)]
     pub battery: bool,
+    /// It measures wheel torque, so that friction shows in steady driving too.
+    #[serde(default)]
+    pub wheel_torque: bool,
     /// Rate of the control loop, Hz.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rate_hz: Option<f64>,

@@ -24,6 +24,12 @@ pub const SPEED_MAX_M_S: f64 = 50.0;
 pub const TURNS_MIN: f64 = 0.05;
 /// Most turns of a circle.
 pub const TURNS_MAX: f64 = 1_000.0;
+/// Deepest wiggle of the speed, as a share of it.
+pub const EXCITATION_DEPTH_MAX: f64 = 0.8;
+/// Shortest period of a wiggle, seconds.
+pub const EXCITATION_PERIOD_MIN_S: f64 = 1.0;
+/// Longest period of a wiggle, seconds.
+pub const EXCITATION_PERIOD_MAX_S: f64 = 20.0;
 
 /// A path to drive, as a user asks for it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -69,6 +75,9 @@ pub struct Circle {
     #[serde(default = "one_turn")]
     #[schema(minimum = 0.05, maximum = 1000.0, default = 1.0)]
     pub turns: f64,
+    /// What the robot may do beside it; nothing when absent.
+    #[serde(default, skip_serializing_if = "TrajectoryOptions::is_none")]
+    pub options: TrajectoryOptions,
 }
 
 impl Circle {
@@ -94,6 +103,84 @@ pub struct Waypoints {
     /// Speed wherever a point does not say otherwise, metres per second.
     #[schema(minimum = 0.01, maximum = 50.0, example = 0.6)]
     pub speed_m_s: f64,
+    /// What the robot may do beside it; nothing when absent.
+    #[serde(default, skip_serializing_if = "TrajectoryOptions::is_none")]
+    pub options: TrajectoryOptions,
+}
+
+/// What a robot may do beside following its trajectory.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
+pub struct TrajectoryOptions {
+    /// Speed on the way to the trajectory, metres per second; the trajectory's own when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0.01, maximum = 50.0)]
+    pub approach_speed_m_s: Option<f64>,
+    /// A wiggle of the speed along the path, so that friction can be measured without torque
+    /// sensing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub excitation: Option<Excitation>,
+}
+
+/// A wiggle of the speed: it falls by the depth and comes back, and never exceeds what was asked.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Excitation {
+    /// By which share the speed falls at most; less where the robot's limits leave less.
+    #[serde(default = "default_depth")]
+    #[schema(exclusive_minimum = 0.0, maximum = 0.8, default = 0.5)]
+    pub depth_ratio: f64,
+    /// Time from one slowing down to the next, seconds.
+    #[serde(default = "default_period")]
+    #[schema(minimum = 1.0, maximum = 20.0, default = 3.0)]
+    pub period_s: f64,
+}
+
+impl Default for Excitation {
+    fn default() -> Self {
+        Self {
+            depth_ratio: default_depth(),
+            period_s: default_period(),
+        }
+    }
+}
+
+fn default_depth() -> f64 {
+    0.5
+}
+
+fn default_period() -> f64 {
+    3.0
+}
+
+impl TrajectoryOptions {
+    /// Whether nothing is asked for.
+    pub fn is_none(&self) -> bool {
+        self.approach_speed_m_s.is_none() && self.excitation.is_none()
+    }
+
+    /// Checks every figure.
+    ///
+    /// # Errors
+    /// [`InvalidTrajectory`] names the one that is out of range.
+    pub fn validate(&self) -> Result<(), InvalidTrajectory> {
+        if let Some(speed_m_s) = self
+            .approach_speed_m_s
+            .filter(|&speed_m_s| !is_speed(speed_m_s))
+        {
+            return Err(InvalidTrajectory::ApproachSpeed(speed_m_s));
+        }
+        let Some(excitation) = self.excitation else {
+            return Ok(());
+        };
+        let depth = excitation.depth_ratio;
+        if !(depth > 0.0 && depth <= EXCITATION_DEPTH_MAX) {
+            return Err(InvalidTrajectory::ExcitationDepth(depth));
+        }
+        let period_s = excitation.period_s;
+        if !(EXCITATION_PERIOD_MIN_S..=EXCITATION_PERIOD_MAX_S).contains(&period_s) {
+            return Err(InvalidTrajectory::ExcitationPeriod(period_s));
+        }
+        Ok(())
+    }
 }
 
 /// One point of a path.
@@ -134,6 +221,28 @@ pub struct CheckTrajectory {
     /// none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start: Option<Pose>,
+    /// Assumed θ of the ground, for the accuracy to expect; what the robot measures now when
+    /// absent, and [`THETA_ASSUMED`] if it measures nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(exclusive_minimum = 0.0, example = 0.2)]
+    pub theta: Option<f64>,
+}
+
+/// θ that a check assumes where nothing is known: firm ground.
+pub const THETA_ASSUMED: f64 = 0.2;
+
+/// How well friction would be measured on a trajectory, by the robot's own estimator.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ExpectedMeasurement {
+    /// The θ of the ground that was assumed.
+    pub theta_assumed: f64,
+    /// Whether the base measures wheel torque.
+    pub wheel_torque: bool,
+    /// Standard deviation of θ at the end, as a share of θ; `null` where the trajectory excites
+    /// too little for a measurement.
+    pub relative_sd: Option<f64>,
+    /// Driving time until the first measurement, seconds.
+    pub first_after_s: Option<f64>,
 }
 
 /// What a trajectory would ask of a robot, planned by the robot's own planner.
@@ -158,6 +267,11 @@ pub struct TrajectoryCheck {
     /// Where a limit makes the robot slower than it was asked to be, in driving order; at most
     /// [`BINDINGS_MAX`].
     pub bindings: Vec<Binding>,
+    /// How deep the wiggle of the speed is that was asked for, as a share of the speed: less than
+    /// asked where the robot's limits leave less.
+    pub excitation_depth_ratio: Option<f64>,
+    /// How well friction would be measured.
+    pub measurement: ExpectedMeasurement,
 }
 
 /// Most stretches that a check names.
@@ -238,6 +352,17 @@ pub enum InvalidTrajectory {
     /// Too few or too many points.
     #[error("a path has {WAYPOINTS_MIN} to {WAYPOINTS_MAX} points, this one has {0}")]
     PointCount(usize),
+    /// The speed on the way to the trajectory is out of range.
+    #[error("approach_speed_m_s must be {SPEED_MIN_M_S} to {SPEED_MAX_M_S}, not {0}")]
+    ApproachSpeed(f64),
+    /// The wiggle's depth is out of range.
+    #[error("excitation.depth_ratio must be above 0, at most {EXCITATION_DEPTH_MAX}, not {0}")]
+    ExcitationDepth(f64),
+    /// The wiggle's period is out of range.
+    #[error(
+        "excitation.period_s must be {EXCITATION_PERIOD_MIN_S} to {EXCITATION_PERIOD_MAX_S}, not {0}"
+    )]
+    ExcitationPeriod(f64),
     /// A point is not finite or too far out.
     #[error("points[{0}] must be within {COORDINATE_MAX_M} m of the origin")]
     PointOffTheMap(usize),
@@ -274,11 +399,10 @@ impl Circle {
             return Err(InvalidTrajectory::SpeedOrPeriod);
         }
         let speed_m_s = self.speed_m_s();
-        if is_speed(speed_m_s) {
-            Ok(())
-        } else {
-            Err(InvalidTrajectory::Speed(speed_m_s))
+        if !is_speed(speed_m_s) {
+            return Err(InvalidTrajectory::Speed(speed_m_s));
         }
+        self.options.validate()
     }
 }
 
@@ -316,21 +440,30 @@ impl Waypoints {
             }
             previous = Some(position);
         }
-        Ok(())
+        self.options.validate()
     }
 }
 
 impl Trajectory {
+    /// What the robot may do beside following it.
+    pub fn options(&self) -> TrajectoryOptions {
+        match self {
+            Self::Circle(circle) => circle.options,
+            Self::Waypoints(waypoints) => waypoints.options,
+        }
+    }
+
     /// The fastest speed that is asked for anywhere, metres per second.
     pub fn speed_max_m_s(&self) -> f64 {
-        match self {
+        let on_it = match self {
             Self::Circle(circle) => circle.speed_m_s(),
             Self::Waypoints(waypoints) => waypoints
                 .points
                 .iter()
                 .filter_map(|point| point.speed_m_s)
                 .fold(waypoints.speed_m_s, f64::max),
-        }
+        };
+        on_it.max(self.options().approach_speed_m_s.unwrap_or(0.0))
     }
 }
 
@@ -346,6 +479,8 @@ struct CircleFields {
     direction: Direction,
     #[serde(default = "one_turn")]
     turns: f64,
+    #[serde(default)]
+    options: TrajectoryOptions,
 }
 
 impl TryFrom<CircleFields> for Circle {
@@ -359,6 +494,7 @@ impl TryFrom<CircleFields> for Circle {
             period_s,
             direction,
             turns,
+            options,
         } = fields;
         let circle = Self {
             center,
@@ -367,6 +503,7 @@ impl TryFrom<CircleFields> for Circle {
             period_s,
             direction,
             turns,
+            options,
         };
         circle.validate()?;
         Ok(circle)
@@ -377,14 +514,24 @@ impl TryFrom<CircleFields> for Circle {
 struct WaypointsFields {
     points: Vec<Waypoint>,
     speed_m_s: f64,
+    #[serde(default)]
+    options: TrajectoryOptions,
 }
 
 impl TryFrom<WaypointsFields> for Waypoints {
     type Error = InvalidTrajectory;
 
     fn try_from(fields: WaypointsFields) -> Result<Self, InvalidTrajectory> {
-        let WaypointsFields { points, speed_m_s } = fields;
-        let waypoints = Self { points, speed_m_s };
+        let WaypointsFields {
+            points,
+            speed_m_s,
+            options,
+        } = fields;
+        let waypoints = Self {
+            points,
+            speed_m_s,
+            options,
+        };
         waypoints.validate()?;
         Ok(waypoints)
     }
@@ -424,6 +571,27 @@ mod tests {
         both["circle"]["period_s"] = json!(3.0);
         assert!(refusal(&both).contains("either speed_m_s or period_s"));
         assert!(refusal(&json!({"square": {}})).contains("square"));
+    }
+
+    #[test]
+    fn options_are_checked_and_absent_ones_are_not_written() {
+        let circle = |options: serde_json::Value| {
+            json!({"circle": {"center": {"x_m": 0.0, "y_m": 0.0}, "radius_m": 2.0,
+                              "speed_m_s": 0.5, "options": options}})
+        };
+        let plain: Trajectory = serde_json::from_value(circle(json!({}))).unwrap();
+        assert!(!serde_json::to_string(&plain).unwrap().contains("options"));
+        let wiggle = serde_json::from_value::<Trajectory>(circle(json!({"excitation": {}})));
+        let asked = wiggle.unwrap().options().excitation;
+        assert_eq!(asked, Some(Excitation::default()));
+        for (options, field) in [
+            (json!({"excitation": {"depth_ratio": 0.9}}), "depth_ratio"),
+            (json!({"excitation": {"depth_ratio": 0.0}}), "depth_ratio"),
+            (json!({"excitation": {"period_s": 0.5}}), "period_s"),
+            (json!({"approach_speed_m_s": -1.0}), "approach_speed_m_s"),
+        ] {
+            assert!(refusal(&circle(options)).contains(field), "{field}");
+        }
     }
 
     #[test]

@@ -350,6 +350,7 @@ impl Online {
                 pause: true,
                 replace: true,
                 battery: true,
+                wheel_torque: true,
                 rate_hz: Some(self.config.rate_hz),
                 base: Some("simulated".to_owned()),
             },

@@ -30,7 +30,7 @@ use crate::control_loop::site_view::SiteView;
 use crate::control_loop::tick::LoopCore;
 use crate::drive::simulated::{SimMode, SimulatedDrive, SimulatedDriveError};
 use crate::drive::{Drive, Feedback};
-use crate::geometry::control_trajectory;
+use crate::geometry::{control_trajectory, plan_options};
 use crate::sim::scenario::Scenario;
 
 /// Time between two ticks on the bench.
@@ -115,7 +115,8 @@ fn planned(
 ) -> Result<Box<Job>, BenchError> {
     let impossible = |problem: String| BenchError::Impossible(problem);
     let model = RobotModel::yi2007();
-    let plan = Plan::new(&control_trajectory(trajectory), start, &model)
+    let asked = control_trajectory(trajectory);
+    let plan = Plan::with_options(&asked, start, &model, &plan_options(trajectory))
         .map_err(|refused| impossible(refused.to_string()))?;
     let follower = Follower::new(plan, model, FollowerConfig::default())
         .map_err(|refused| impossible(refused.to_string()))?;

@@ -35,7 +35,7 @@ use crate::control_loop::driven::Driven;
 use crate::control_loop::seam::{Job, LoopCommand, Shared};
 use crate::control_loop::site_view::SiteView;
 use crate::fleet::{Commands, IncomingCommand};
-use crate::geometry::control_trajectory;
+use crate::geometry::{control_trajectory, plan_options};
 use crate::missions::memory::Memory;
 use crate::missions::{CancelDecision, Held, Holder, OfferDecision};
 
@@ -417,7 +417,9 @@ impl Dispatcher {
         let offer = offer.clone();
         let planning = tokio::task::spawn_blocking(move || {
             let trajectory = control_trajectory(&offer.trajectory);
-            let plan = Plan::new(&trajectory, start, &model).map_err(|cause| cause.to_string())?;
+            let options = plan_options(&offer.trajectory);
+            let plan = Plan::with_options(&trajectory, start, &model, &options)
+                .map_err(|cause| cause.to_string())?;
             let summary = PlanSummary {
                 length_m: plan.length_m(),
                 duration_s: plan.duration_s(),

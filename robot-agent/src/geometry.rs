@@ -4,7 +4,9 @@
 //! turns one into the other.
 
 use tread_api::{geometry as wire, robot, trajectory};
+use tread_control::excitation::ExcitationSpec;
 use tread_control::geometry as control;
+use tread_control::plan::PlanOptions;
 use tread_control::robot::{Limits, RobotModel, RobotModelError, RobotModelSpec};
 use tread_control::trajectory as planned;
 
@@ -115,5 +117,18 @@ pub fn control_trajectory(asked: &trajectory::Trajectory) -> planned::Trajectory
                 speed_m_s: waypoints.speed_m_s,
             })
         }
+    }
+}
+
+/// What a user allows beside the trajectory, in the controller's words.
+pub fn plan_options(asked: &trajectory::Trajectory) -> PlanOptions {
+    let options = asked.options();
+    PlanOptions {
+        approach_speed_m_s: options.approach_speed_m_s,
+        excitation: options.excitation.map(|wiggle| ExcitationSpec {
+            depth_ratio: wiggle.depth_ratio,
+            period_s: wiggle.period_s,
+        }),
+        grip_mu: None,
     }
 }

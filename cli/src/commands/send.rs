@@ -13,7 +13,8 @@ use tread_api::mission::{
     CreateMission, LinkPolicy, Mission, MissionState, ReplaceMission, StartPolicy,
 };
 use tread_api::trajectory::{
-    CheckTrajectory, Circle, Direction, Trajectory, TrajectoryCheck, Waypoint, Waypoints,
+    CheckTrajectory, Circle, Direction, Excitation, Trajectory, TrajectoryCheck, TrajectoryOptions,
+    Waypoint, Waypoints,
 };
 
 use super::missions::summary;
@@ -77,6 +78,7 @@ async fn check(
         robot: order.robot.clone(),
         trajectory,
         start: None,
+        theta: None,
     };
     let checked = client.check_trajectory(&request).await?;
     output.show(&checked, demands)?;
@@ -106,7 +108,32 @@ fn demands(checked: &TrajectoryCheck) -> String {
             binding.limit
         )
     }));
+    if let Some(depth_ratio) = checked.excitation_depth_ratio {
+        lines.push(format!("the speed wiggles by {:.0} %", 1e2 * depth_ratio));
+    }
+    let measurement = checked.measurement;
+    let sensing = if measurement.wheel_torque {
+        "with wheel torque"
+    } else {
+        "without wheel torque"
+    };
+    let assumed = format!("theta {:.2}, {sensing}", measurement.theta_assumed);
+    lines.push(match (measurement.relative_sd, measurement.first_after_s) {
+        (Some(relative_sd), Some(first_after_s)) => format!(
+            "friction measured to about {:.1} % in the end, first after {first_after_s:.0} s ({assumed})",
+            1e2 * relative_sd
+        ),
+        _ => format!("friction not measured: too little excitation ({assumed})"),
+    });
     lines.join("\n")
+}
+
+/// What the flags ask for beside the trajectory.
+fn options(order: &Order) -> TrajectoryOptions {
+    TrajectoryOptions {
+        approach_speed_m_s: order.approach_speed,
+        excitation: order.excite.then(Excitation::default),
+    }
 }
 
 fn circle(send: SendCircle) -> (Trajectory, Order) {
@@ -122,6 +149,7 @@ fn circle(send: SendCircle) -> (Trajectory, Order) {
         period_s: None,
         direction,
         turns: send.turns,
+        options: options(&send.order),
     };
     (Trajectory::Circle(circle), send.order)
 }
@@ -135,6 +163,7 @@ fn waypoints(send: SendWaypoints) -> anyhow::Result<(Trajectory, Order)> {
         Trajectory::Waypoints(Waypoints {
             points,
             speed_m_s: send.speed,
+            options: options(&send.order),
         }),
         send.order,
     ))

@@ -262,3 +262,40 @@ async fn a_robot_whose_clock_is_wrong_by_years_starts_in_time_and_names_its_cloc
     agent.stop().await;
     server.stop().await;
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_wiggle_and_a_slower_approach_are_planned_as_asked() {
+    let rig = Rig::new();
+    let server = rig.serve();
+    let agent = rig.agent();
+    rig.ready(agent.boot()).await;
+    let asked = |options: &str| LONG.replace(r#""turns":5"#, &format!(r#""turns":5{options}"#));
+    let mut durations_s = Vec::new();
+    for (number, options) in [
+        (1, String::new()),
+        (2, r#","options":{"excitation":{}}"#.to_owned()),
+        (3, r#","options":{"approach_speed_m_s":0.1}"#.to_owned()),
+    ] {
+        let offer = offer(number, &asked(&options));
+        let Outcome::Accepted { plan: Some(plan) } = server.offer(&rig.robot, &offer).await.outcome
+        else {
+            panic!("offer {number} was not taken");
+        };
+        durations_s.push(plan.duration_s);
+        let cancel = wire::encode(&Cancel {
+            mission: offer.mission,
+            reason: "the next one".to_owned(),
+        });
+        let answer = server.command(&rig.robot, Verb::Cancel, cancel.unwrap());
+        assert_eq!(answer.await.unwrap().unwrap().outcome, Outcome::Done);
+        rig.sees("it is cancelled", |memory| {
+            let phases = memory.phases(offer.mission);
+            phases.contains(&MissionPhase::Cancelled).then_some(())
+        })
+        .await;
+    }
+    assert!(durations_s[1] > 1.05 * durations_s[0], "{durations_s:?}");
+    assert!(durations_s[2] > 1.02 * durations_s[0], "{durations_s:?}");
+    agent.stop().await;
+    server.stop().await;
+}

@@ -1,13 +1,17 @@
 //! Dry runs: what a trajectory would ask of a robot, planned by the robot's own planner.
 
+use std::ops::RangeInclusive;
+
 use tread_api::geometry::{Point, Pose};
 use tread_api::robot::RobotModel;
 use tread_api::trajectory::{
-    BINDINGS_MAX, Binding, BindingLimit, CheckTrajectory, Direction, Place, Trajectory,
-    TrajectoryCheck, Waypoint,
+    BINDINGS_MAX, Binding, BindingLimit, CheckTrajectory, Direction, ExpectedMeasurement, Place,
+    THETA_ASSUMED, Trajectory, TrajectoryCheck, Waypoint,
 };
+use tread_control::estimation::{SensorNoise, expected_accuracy};
+use tread_control::excitation::{Excitation, ExcitationSpec};
 use tread_control::geometry as control;
-use tread_control::plan::{Plan, PlanError, Slowed, SlowedBy};
+use tread_control::plan::{Plan, PlanError, PlanOptions, Slowed, SlowedBy};
 use tread_control::robot::{self, RobotModelError, RobotModelSpec};
 use tread_control::trajectory as planned;
 
@@ -16,6 +20,8 @@ use crate::db;
 
 /// Dry runs that may be planned at once: a long path keeps a core busy.
 pub const CHECKS_MAX: usize = 2;
+/// θ that may be assumed: from K 1000 to K 0.1.
+const THETA_RANGE: RangeInclusive<f64> = 0.001..=10.0;
 
 impl App {
     /// Plans a trajectory for a robot without moving anything.
@@ -31,7 +37,15 @@ impl App {
             robot,
             trajectory,
             start,
+            theta,
         } = request;
+        if let Some(theta) = theta.filter(|theta| !THETA_RANGE.contains(theta)) {
+            let (least, most) = (THETA_RANGE.start(), THETA_RANGE.end());
+            return Err(AppError::Invalid {
+                field: "theta",
+                detail: format!("theta must be {least} to {most}, not {theta}"),
+            });
+        }
         let mut tx = self.db().read().await?;
         let site_pk = site_row(&mut tx, &site).await?.pk;
         let row = db::robots::find(&mut tx, site_pk, &robot).await?;
@@ -43,10 +57,18 @@ impl App {
         let start = start
             .or(shown.map(|pose| pose.value))
             .unwrap_or_else(|| begin_of(&trajectory));
+        let measured = presence.friction().and_then(|said| said.theta_measured);
+        let ground = AssumedGround {
+            theta: theta
+                .or(measured.map(|measured| measured.theta))
+                .unwrap_or(THETA_ASSUMED),
+            has_torque: row.capabilities.wheel_torque,
+        };
         let _turn = self.check_turn().await;
         // The planner works on a thread of its own: a path may have 100 000 points.
         let model = row.model;
-        let planning = tokio::task::spawn_blocking(move || check(&model, &trajectory, start)).await;
+        let planning =
+            tokio::task::spawn_blocking(move || check(&model, &trajectory, start, ground)).await;
         match planning {
             Ok(checked) => checked.map_err(|refused| AppError::Impossible {
                 robot,
@@ -93,6 +115,13 @@ fn begin_of(trajectory: &Trajectory) -> Pose {
     }
 }
 
+/// What is assumed of the ground and of the base's sensors.
+#[derive(Debug, Clone, Copy)]
+struct AssumedGround {
+    theta: f64,
+    has_torque: bool,
+}
+
 /// Why a trajectory cannot be driven, and where.
 struct Refused {
     detail: String,
@@ -103,6 +132,7 @@ fn check(
     model: &RobotModel,
     trajectory: &Trajectory,
     start: Pose,
+    ground: AssumedGround,
 ) -> Result<TrajectoryCheck, Refused> {
     let model = control_model(model).map_err(|error| Refused {
         detail: error.to_string(),
@@ -113,11 +143,14 @@ fn check(
         y_m: start.y_m,
         heading_rad: start.heading_rad,
     };
-    let plan =
-        Plan::new(&control_trajectory(trajectory), from, &model).map_err(|error| Refused {
+    let options = plan_options(trajectory);
+    let plan = Plan::with_options(&control_trajectory(trajectory), from, &model, &options)
+        .map_err(|error| Refused {
             detail: error.to_string(),
             place: place_of(error, trajectory),
         })?;
+    let AssumedGround { theta, has_torque } = ground;
+    let expected = expected_accuracy(&plan, &model, SensorNoise::default(), theta, has_torque);
     let bindings = plan.slowed().iter().take(BINDINGS_MAX);
     Ok(TrajectoryCheck {
         start,
@@ -129,6 +162,13 @@ fn check(
         lateral_acceleration_peak_m_s2: plan.peak_lateral_acceleration_m_s2(),
         angular_peak_rad_s: plan.peak_angular_rad_s(),
         bindings: bindings.map(|slowed| binding(&plan, slowed)).collect(),
+        excitation_depth_ratio: plan.excitation().map(Excitation::depth_ratio),
+        measurement: ExpectedMeasurement {
+            theta_assumed: theta,
+            wheel_torque: has_torque,
+            relative_sd: expected.relative_std_dev,
+            first_after_s: expected.first_after_s,
+        },
     })
 }
 
@@ -234,5 +274,18 @@ fn control_trajectory(asked: &Trajectory) -> planned::Trajectory {
                 speed_m_s: waypoints.speed_m_s,
             })
         }
+    }
+}
+
+/// What a user allows beside the trajectory, in the controller's words.
+fn plan_options(asked: &Trajectory) -> PlanOptions {
+    let options = asked.options();
+    PlanOptions {
+        approach_speed_m_s: options.approach_speed_m_s,
+        excitation: options.excitation.map(|wiggle| ExcitationSpec {
+            depth_ratio: wiggle.depth_ratio,
+            period_s: wiggle.period_s,
+        }),
+        grip_mu: None,
     }
 }

@@ -114,6 +114,11 @@ impl Presence {
         self.state.as_ref().map(|(state, _at)| state)
     }
 
+    /// Both friction estimates that the robot sent last.
+    pub fn friction(&self) -> Option<LiveFriction> {
+        self.friction.map(|(friction, _at)| friction)
+    }
+
     /// What the robot said last, every age grown by the time since.
     pub fn live(&self, now: Duration) -> Option<RobotLive> {
         let (state, at) = self.state.as_ref()?;

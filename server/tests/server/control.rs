@@ -327,6 +327,41 @@ async fn a_dry_run_tells_duration_and_limits_and_refuses_the_impossible_with_its
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_dry_run_tells_how_well_friction_would_be_measured() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mut body = circle(&robot.id);
+    let check = async |body: &Value| yard.post("/v1/trajectories/check", body).await;
+    let (_, steady) = check(&body).await;
+    assert_eq!(steady["measurement"]["theta_assumed"], 0.2, "{steady}");
+    let none = &steady["measurement"]["relative_sd"];
+    assert!(
+        none.is_null(),
+        "a steady circle tells a base without torque nothing: {steady}"
+    );
+    let points = json!([{"x_m": 0.0, "y_m": 0.0}, {"x_m": 20.0, "y_m": 0.0}]);
+    body["trajectory"] = json!({"waypoints": {"points": points, "speed_m_s": 0.6,
+        "options": {"excitation": {"depth_ratio": 0.5}}}});
+    body["theta"] = json!(0.5);
+    let (_, excited) = check(&body).await;
+    assert_eq!(excited["measurement"]["theta_assumed"], 0.5, "{excited}");
+    let relative_sd = excited["measurement"]["relative_sd"].as_f64();
+    assert!(
+        relative_sd.is_some_and(|relative_sd| (0.001..0.3).contains(&relative_sd)),
+        "{excited}"
+    );
+    let depth = excited["excitation_depth_ratio"].as_f64().unwrap();
+    assert!(depth > 0.05 && depth <= 0.5, "{excited}");
+    let longer = |checked: &Value| checked["duration_s"].as_f64().unwrap();
+    assert!(longer(&excited) > longer(&steady), "{excited}");
+    body["theta"] = json!(-1.0);
+    let (status, refused) = check(&body).await;
+    assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{refused}");
+    assert_eq!(refused["field"], "theta", "{refused}");
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn alerts_are_raised_once_acknowledged_and_cleared() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;

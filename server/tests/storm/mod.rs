@@ -20,7 +20,7 @@ use tread_api::mission::{
     Cause, CreateMission, LinkPolicy, MissionState, ReplaceMission, StartPolicy,
 };
 use tread_api::robot::{Capabilities, RobotLimits, RobotModel};
-use tread_api::trajectory::{Circle, Direction, Trajectory};
+use tread_api::trajectory::{Circle, Direction, Trajectory, TrajectoryOptions};
 use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::MissionPhase;
 use tread_api::wire::state::RobotState;
@@ -576,6 +576,7 @@ fn circle(radius_m: f64) -> Trajectory {
         period_s: None,
         direction: Direction::CounterClockwise,
         turns: 1.0,
+        options: TrajectoryOptions::default(),
     })
 }
 
