@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use serde_json::{Value, json};
-use tread_control::estimation::TyrePrior;
+use tread_control::estimation::{MODEL_RATIO, TyrePrior};
 
 use crate::drives::{Drive, Driven};
 use crate::report::{Check, Options, Section};
@@ -49,6 +49,8 @@ struct Figures {
     coverage: [f64; 3],
     ever_measured: f64,
     ever_informed: f64,
+    /// Some segment claimed information.
+    ever_claimed: f64,
     false_alarms: u32,
     /// Of the first measurement of each run.
     first_coverage: f64,
@@ -74,11 +76,12 @@ fn run_one(scenario: &Scenario, seed: u64) -> Run {
 
 fn figures(scenario: &Scenario, runs: &[Run]) -> Figures {
     let truth = scenario.robot.curve.theta();
-    // The error of the torque constants is the robot's own: it is not in its segments.
+    // The error of the torque constants, or of the model, is the robot's own: it is not in its
+    // segments.
     let gain = if scenario.robot.has_torque {
         scenario.robot.noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2
     } else {
-        0.0
+        MODEL_RATIO
     };
     let firsts: Vec<f64> = runs
         .iter()
@@ -120,6 +123,12 @@ fn figures(scenario: &Scenario, runs: &[Run]) -> Figures {
         ),
         ever_informed: share(
             runs.iter().filter(|run| run.driven.ever_informed).count(),
+            runs.len(),
+        ),
+        ever_claimed: share(
+            runs.iter()
+                .filter(|run| run.driven.segments.0 > 0.0)
+                .count(),
             runs.len(),
         ),
         false_alarms: runs.iter().map(|run| run.driven.ground_changes).sum(),
@@ -209,6 +218,11 @@ fn check(scenario: &Scenario, found: &Figures, checks: &mut Vec<Check>, coverage
                 found.ever_informed,
                 0.0,
             ));
+            checks.push(Check::at_most(
+                format!("{name}: information in some segment, share of runs"),
+                found.ever_claimed,
+                0.0,
+            ));
         }
         Goal::Measures { rms_max } => {
             if let Some(bound) = rms_max {
@@ -235,7 +249,7 @@ fn line(name: &str, found: &Figures) -> Value {
         "coverage_50": found.coverage[0], "coverage_80": found.coverage[1],
         "coverage_95": found.coverage[2], "abstention": 1.0 - found.measured,
         "ever_measured": found.ever_measured, "ever_informed": found.ever_informed,
-        "false_alarms": found.false_alarms,
+        "ever_claimed": found.ever_claimed, "false_alarms": found.false_alarms,
         "first_coverage_95": found.first_coverage,
         "segment_rms": found.segment_rms,
         "segment_coverage_95": found.segment_coverage,
