@@ -328,7 +328,7 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
             let mut of_theta = Parameters::zeros();
             of_theta[index::THETA] = 1.0;
             of_theta[index::RADIUS_OFFSET] = scale;
-            let bend = parameters[index::CURVATURE] * bend_ratio(&channels);
+            let missed = BEND_SHARE * parameters[index::CURVATURE] * bend_ratio(&channels);
             return Some(Solution {
                 theta,
                 parameters,
@@ -337,7 +337,8 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
                 of_theta,
                 variance: (base + scaled) * inflation
                     + base * base * normal.excess
-                    + (BEND_SHARE * bend).powi(2),
+                    + missed * missed,
+                missed,
                 significance: 1.0 / (base * normal.noise_std_dev.max(f64::MIN_POSITIVE)),
             });
         }
@@ -360,6 +361,8 @@ pub(super) struct Solution {
     inflation: f64,
     /// How θ follows from the parameters.
     of_theta: Parameters,
+    /// What rows to second order may miss of curved tyres, in θ; alike everywhere.
+    missed: f64,
 }
 
 impl Solution {
@@ -385,7 +388,7 @@ impl Solution {
         let width = theta * tyres.curvature_spread.max(CURVATURE_SPREAD_MIN);
         let gain = (its[index::CURVATURE] - tyres.curvature * its[index::THETA]) * theta
             / (width * width);
-        of_offsets + gain * bend
+        of_offsets + gain * bend + self.missed * later.missed
     }
 
     /// Whether the force varied enough, apart from the offsets, to call this a measurement.
