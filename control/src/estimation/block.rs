@@ -406,11 +406,9 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
     let difference_noise = 2.0 * rim_noise_m_s.powi(2) / means.samples;
     let mut common_noise = Parameters::zeros();
     common_noise[index::RADIUS_OFFSET] = difference_noise;
-    common_noise[index::TRACK] = -track_m
-        * (model.effective_track_ratio() - 1.0)
-        * model.effective_track_m()
-        * gyro_noise
-        / means.samples;
+    common_noise[index::TRACK] =
+        -track_m * (model.effective_track_ratio() - 1.0) * model.effective_track_m() * gyro_noise
+            / means.samples;
     common_noise[index::AHEAD_OFFSET] = -theta * difference_noise / GRAVITY_M_S2;
     Row {
         regressors,

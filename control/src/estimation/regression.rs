@@ -386,8 +386,8 @@ impl Solution {
         let curvature = self.parameters[index::CURVATURE] / theta;
         let bend = (mine[index::CURVATURE] - curvature * mine[index::THETA]) / theta;
         let width = theta * tyres.curvature_spread.max(CURVATURE_SPREAD_MIN);
-        let gain = (its[index::CURVATURE] - tyres.curvature * its[index::THETA]) * theta
-            / (width * width);
+        let gain =
+            (its[index::CURVATURE] - tyres.curvature * its[index::THETA]) * theta / (width * width);
         of_offsets + gain * bend + self.missed * later.missed
     }
 

@@ -40,6 +40,9 @@ const GRID_MAX: usize = 1_000_000;
 const BEND_LOOKED_INTO_1_M: f64 = 1.0;
 /// Parts of such a cell.
 const PARTS_LOOKED_INTO: u8 = 8;
+/// Peak friction coefficient that is reckoned with on the way to a trajectory while nothing is
+/// known of the ground.
+const GRIP_UNKNOWN_MU: f64 = 0.14;
 /// Fewest cells of the timing.
 const GRID_MIN: usize = 16;
 
@@ -163,8 +166,8 @@ impl Plan {
             sign: circle.direction.sign(),
             speed_m_s: approach_m_s,
         };
-        let (legs, join_rad) =
-            join_circle(&target, start, model).ok_or(PlanError::TooTight { place: 0 })?;
+        let (legs, join_rad) = join_circle(&target, start, &on_approach(model, options))
+            .ok_or(PlanError::TooTight { place: 0 })?;
         let arc = Piece::Arc {
             center: circle.center,
             radius_m: circle.radius_m,
@@ -246,7 +249,8 @@ impl Plan {
         };
         let mut approach_pieces = usize::from(first == 0);
         let path = if first == 0
-            && let Some((path, legs)) = joined_from_afar(&knots, start, spec.speed_m_s, model)
+            && let Some((path, legs)) =
+                joined_from_afar(&knots, start, spec.speed_m_s, &on_approach(model, options))
         {
             approach_pieces = legs;
             path
@@ -306,6 +310,8 @@ impl Plan {
         let mut asked = 0;
         let mut nodes: Vec<NodeLimits> = Vec::with_capacity(cells + 1);
         let mut bend_before_1_m = 0.0;
+        let approach_end_m = path.piece_start_m(approach_pieces);
+        let careful = on_approach(model, options);
         for index in 0..=cells {
             let arc_m = cell_m * index as f64;
             while speeds
@@ -315,6 +321,11 @@ impl Plan {
                 asked += 1;
             }
             let asked_m_s = speeds[asked].speed_m_s;
+            let model = if arc_m < approach_end_m {
+                &careful
+            } else {
+                model
+            };
             let here = path.sample(arc_m);
             let mut node = node_limits(&here, asked_m_s, model);
             let bend_1_m = here.curvature_1_m.abs();
@@ -447,6 +458,15 @@ fn check_coordinate(what: &'static str, place: usize, point: Point) -> Result<()
         }
     }
     Ok(())
+}
+
+/// What the robot may do on its way to the trajectory.
+fn on_approach(model: &RobotModel, options: &PlanOptions) -> RobotModel {
+    match options.grip_mu {
+        // The model has been bounded already.
+        Some(_) => *model,
+        None => model.within_grip(GRIP_UNKNOWN_MU),
+    }
 }
 
 fn check_speed(speed_m_s: f64, place: usize, model: &RobotModel) -> Result<(), PlanError> {
