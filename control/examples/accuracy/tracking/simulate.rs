@@ -152,18 +152,15 @@ impl Sensors {
         self.count += 1;
         let noise = self.noise;
         let mut gauss = |deviation: f64| deviation * normal(&mut self.rng);
-        let (state, felt, torques) = (
-            plant.state(),
-            plant.body_acceleration(),
-            plant.wheel_torques(),
-        );
+        let (state, seen, torques) = (plant.state(), plant.means(), plant.wheel_torques());
+        let felt = seen.acceleration;
         let torque_noise = noise.torque_mu * self.model.wheel_radius_m() * self.model.side_load_n();
         SensorSample {
             wheel_speeds: WheelSpeeds {
-                left_rad_s: state.wheel_speeds.left_rad_s + gauss(noise.wheel_speed_rad_s),
-                right_rad_s: state.wheel_speeds.right_rad_s + gauss(noise.wheel_speed_rad_s),
+                left_rad_s: seen.wheel_speeds.left_rad_s + gauss(noise.wheel_speed_rad_s),
+                right_rad_s: seen.wheel_speeds.right_rad_s + gauss(noise.wheel_speed_rad_s),
             },
-            gyro_rad_s: state.yaw_rate_rad_s + gauss(noise.gyro_rad_s),
+            gyro_rad_s: seen.yaw_rate_rad_s + gauss(noise.gyro_rad_s),
             acceleration: Some(BodyAcceleration {
                 ahead_m_s2: felt.ahead_m_s2 + gauss(noise.accelerometer_m_s2),
                 left_m_s2: felt.left_m_s2 + gauss(noise.accelerometer_m_s2),
