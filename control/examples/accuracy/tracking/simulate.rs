@@ -66,6 +66,7 @@ pub(crate) enum Knowing {
 /// One run.
 #[derive(Debug, Clone)]
 pub(crate) struct Case<'a> {
+    pub(crate) model: RobotModel,
     pub(crate) course: &'a Course,
     pub(crate) terrain: Terrain,
     pub(crate) lag_s: f64,
@@ -179,7 +180,7 @@ impl Sensors {
 
 /// Drives one law to the end of the course, or until it is lost.
 pub(crate) fn simulate(case: &Case, law: Law, knowing: Knowing) -> Trace {
-    let model = RobotModel::yi2007();
+    let model = case.model;
     let start_pose = case.course.sample(0.0).pose;
     let first = curve(case.terrain.stiffness(0.0, start_pose));
     let scenario = Scenario {
