@@ -258,6 +258,20 @@ proptest! {
     }
 }
 
+#[test]
+fn a_start_beside_the_circle_on_slippery_ground_ends_well() {
+    // Found by chance once; the leg to the circle was too quick for the ground.
+    for turned_rad in [-0.02, 0.0, 0.02] {
+        let start = Pose {
+            x_m: 6.3126,
+            y_m: 0.0,
+            heading_rad: -1.336 + turned_rad,
+        };
+        let (rms_m, most_m) = drive(&circle(Direction::Clockwise, 0.5), start, 0.5, true);
+        assert!(rms_m < 0.1 && most_m < 0.3, "{rms_m} m, {most_m} m");
+    }
+}
+
 fn figure_8_run(stiffness: f64, servo_lag_s: f64, loop_s: f64, law: Law) -> CrossTrack {
     let model = RobotModel::yi2007();
     let start = Pose {
