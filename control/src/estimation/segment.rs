@@ -104,3 +104,41 @@ impl SegmentStatistics {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn segments_with_a_common_error_never_claim_more_than_their_sum_keeps(
+            segments in prop::collection::vec((0.1..10.0_f64, 0.0..1.0_f64), 1..20),
+        ) {
+            let mut claims = Claims::default();
+            let mut weights: Vec<f64> = Vec::new();
+            let mut variance_sum = 0.0;
+            for (variance, correlation) in segments {
+                let shared = 0.1 * correlation;
+                let weight = claims.add(variance, shared);
+                prop_assert!((0.0..=variance.recip()).contains(&weight));
+                let before: f64 = weights.iter().sum();
+                variance_sum += weight * (weight * variance + 2.0 * before * shared);
+                weights.push(weight);
+            }
+            let information: f64 = weights.iter().sum();
+            prop_assert!(variance_sum <= information * (1.0 + 1.0e-9));
+        }
+
+        #[test]
+        fn segments_that_share_nothing_claim_all_they_have(
+            variances in prop::collection::vec(0.1..10.0_f64, 1..20),
+        ) {
+            let mut claims = Claims::default();
+            for variance in variances {
+                prop_assert!((claims.add(variance, 0.0) * variance - 1.0).abs() < 1.0e-9);
+            }
+        }
+    }
+}
