@@ -304,7 +304,8 @@ pub enum BindingLimit {
     WheelAcceleration,
     /// Acceleration or braking along the path, up to the next slower place.
     LinearAcceleration,
-    /// What the ground is known to give, along or across the path.
+    /// What the ground is known to give, along or across the path; on the way to the trajectory a
+    /// cautious guess where nothing is known.
     Grip,
 }
 

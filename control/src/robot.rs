@@ -9,6 +9,12 @@ use crate::measured::WheelSpeeds;
 /// Standard gravity, metres per second squared.
 pub const GRAVITY_M_S2: f64 = 9.81;
 
+/// Share of the grip that a plan may use along the path.
+const GRIP_SHARE_ALONG: f64 = 0.58;
+/// Share of the grip that a plan may use across the path: both together leave three tenths for turning
+/// the body and for feedback.
+const GRIP_SHARE_ACROSS: f64 = 0.4;
+
 /// What a robot may do at most. Every figure is finite and above zero.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Limits {
@@ -168,21 +174,27 @@ impl RobotModel {
 
     /// The same robot with accelerations that a peak friction coefficient can give.
     ///
-    /// Half of `μg` each along and across the path: both at once leave three tenths for the turning
-    /// of the wheels against the ground, and for feedback.
+    /// Only a share of `μg`: the rest turns the wheels against the ground, and serves feedback.
     pub(crate) fn within_grip(&self, mu_peak: f64) -> Self {
-        let most_m_s2 = Self::within_grip_m_s2(mu_peak);
+        let along_m_s2 = Self::grip_along_m_s2(mu_peak);
+        let across_m_s2 = Self::grip_across_m_s2(mu_peak);
         let mut spec = self.spec;
         let limits = &mut spec.limits;
-        limits.linear_acceleration_max_m_s2 = limits.linear_acceleration_max_m_s2.min(most_m_s2);
-        limits.lateral_acceleration_max_m_s2 = limits.lateral_acceleration_max_m_s2.min(most_m_s2);
+        limits.linear_acceleration_max_m_s2 = limits.linear_acceleration_max_m_s2.min(along_m_s2);
+        limits.lateral_acceleration_max_m_s2 =
+            limits.lateral_acceleration_max_m_s2.min(across_m_s2);
         Self { spec }
     }
 
-    /// Acceleration along or across the path that a plan may ask of ground with this peak friction,
-    /// metres per second squared: half of the peak for each.
-    pub(crate) fn within_grip_m_s2(mu_peak: f64) -> f64 {
-        0.5 * mu_peak * GRAVITY_M_S2
+    /// Acceleration along the path that a plan may ask of ground with this peak friction, metres per
+    /// second squared.
+    pub(crate) fn grip_along_m_s2(mu_peak: f64) -> f64 {
+        GRIP_SHARE_ALONG * mu_peak * GRAVITY_M_S2
+    }
+
+    /// The same across the path.
+    pub(crate) fn grip_across_m_s2(mu_peak: f64) -> f64 {
+        GRIP_SHARE_ACROSS * mu_peak * GRAVITY_M_S2
     }
 
     /// How much wider than W the robot turns at low speed: `W_eff/W = 1 + (L/W)²`, whatever the

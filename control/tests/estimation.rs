@@ -227,8 +227,10 @@ fn the_accuracy_expected_of_a_plan_is_the_one_that_is_reached() {
         robot.drive(&mut follower, 60.0, |_, _, _| {});
         let found = robot.estimator.estimate().theta.unwrap();
         let ratio = found.std_dev / found.theta / expected_ratio;
+        // To promise too much would be worse than too little: the commands of a loop on noisy poses
+        // excite θ beyond what the plan does, most where the ground is firm.
         assert!(
-            (0.5..2.0).contains(&ratio),
+            (0.4..1.3).contains(&ratio),
             "K {stiffness}, torque {torque}: expected {expected_ratio}, got {found:?}"
         );
     }
@@ -466,6 +468,6 @@ fn cells_of_a_mission_fuse_to_an_honest_interval() {
     }
     let rms: f64 = (squares / f64::from(runs)).sqrt();
     eprintln!("fused {held} of {runs}, live {live_held} of {live}, RMS {rms}");
-    assert!(held * 100 >= runs * 88 && live_held * 100 >= live * 90);
+    assert!(held * 100 >= runs * 90 && live_held * 100 >= live * 90);
     assert!(live * 10 >= runs * 9 && rms < 0.06);
 }

@@ -57,8 +57,8 @@ struct Noticed {
     delay_s: Option<f64>,
 }
 
-fn drive(spec: RobotSpec, change: Option<FrictionCurve>, duration_s: f64, seed: u64) -> Noticed {
-    let mut robot = SeededRobot::new(spec, Pose::default(), seed);
+fn drive(spec: &RobotSpec, change: Option<FrictionCurve>, duration_s: f64, seed: u64) -> Noticed {
+    let mut robot = SeededRobot::new(*spec, Pose::default(), seed);
     let model = RobotModel::yi2007();
     // The border comes at another place of the bend in each run.
     let border_s = BEFORE_S + 0.37 * f64::from(u32::try_from(seed % 64).unwrap_or(0));
@@ -153,7 +153,7 @@ fn changes(
     let curve = RobotSpec::on(1.0 / border.theta_after).curve;
     let runs = run_seeded(options.runs, options.threads, |seed| {
         drive(
-            spec(border.theta_before, border.has_torque),
+            &spec(border.theta_before, border.has_torque),
             Some(curve),
             0.0,
             seed,
@@ -212,7 +212,7 @@ fn quiet(
 ) {
     let runs = (options.runs / CHANGES_PER_QUIET).max(1);
     let alarms: u32 = run_seeded(runs, options.threads, |seed| {
-        drive(spec(theta, has_torque), None, QUIET_S, seed).false_alarms
+        drive(&spec(theta, has_torque), None, QUIET_S, seed).false_alarms
     })
     .into_iter()
     .sum();

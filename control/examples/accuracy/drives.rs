@@ -10,8 +10,14 @@ use crate::robot::{LOOP_S, SeededRobot};
 /// A way to drive.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Drive {
-    /// 10 s straight, then 25 s on a circle to the left and 25 s to the right, 0.6 m/s.
-    StraightThenCircles { radius_m: f64 },
+    /// 10 s straight, then 25 s on a circle to the left and 25 s to the right.
+    StraightThenCircles { radius_m: f64, speed_m_s: f64 },
+    /// Bends that swing from side to side, for 40 s from standstill.
+    Weave {
+        speed_m_s: f64,
+        curvature_1_m: f64,
+        period_s: f64,
+    },
     /// (6 sin 0.15t, 2 sin 0.3t) m for 40 s from standstill, tracked with noisy localisation.
     Figure8,
     /// Straight, from standstill to 0.6 m/s and back every 4 s, for 60 s.
@@ -22,8 +28,8 @@ pub(crate) enum Drive {
     SteadyCircle,
 }
 
-/// Speed of all but the figure-8, metres per second.
-const SPEED_M_S: f64 = 0.6;
+/// Usual speed of all but the figure-8, metres per second.
+pub(crate) const SPEED_M_S: f64 = 0.6;
 /// Acceleration from and to standstill, metres per second squared.
 const RAMP_M_S2: f64 = 0.5;
 /// Time in which the curvature changes, seconds.
@@ -56,7 +62,7 @@ impl Drive {
     pub(crate) fn run(self, robot: &mut SeededRobot) -> Driven {
         let (duration_s, settle_s) = match self {
             Self::StraightThenCircles { .. } | Self::StopAndGo => (60.0, None),
-            Self::Figure8 => (40.0, None),
+            Self::Figure8 | Self::Weave { .. } => (40.0, None),
             Self::SteadyStraight | Self::SteadyCircle => (SETTLE_S + 40.0, Some(SETTLE_S)),
         };
         let mut tracker = Tracker::new(robot.model, TrackerConfig::default())
@@ -106,6 +112,7 @@ impl Drive {
                 heading_rad: 0.6_f64.atan2(0.9),
             },
             Self::StraightThenCircles { .. }
+            | Self::Weave { .. }
             | Self::StopAndGo
             | Self::SteadyStraight
             | Self::SteadyCircle => Pose::default(),
@@ -117,10 +124,12 @@ impl Drive {
             linear_m_s,
             angular_rad_s: 0.0,
         };
-        let gathered_m_s = (RAMP_M_S2 * time_s).min(SPEED_M_S);
-        let curved = |curvature_1_m: f64| Twist {
-            linear_m_s: gathered_m_s,
-            angular_rad_s: gathered_m_s * curvature_1_m,
+        let gathered = |speed_m_s: f64, curvature_1_m: f64| {
+            let linear_m_s = (RAMP_M_S2 * time_s).min(speed_m_s);
+            Twist {
+                linear_m_s,
+                angular_rad_s: linear_m_s * curvature_1_m,
+            }
         };
         let twist = match self {
             Self::Figure8 => {
@@ -136,12 +145,23 @@ impl Drive {
                 let down_m_s = RAMP_M_S2 * (3.4 - phase_s);
                 straight(up_m_s.min(down_m_s).clamp(0.0, SPEED_M_S))
             }
-            Self::SteadyStraight => straight(gathered_m_s),
-            Self::SteadyCircle => curved(1.0 / 6.0),
-            Self::StraightThenCircles { radius_m } => {
+            Self::SteadyStraight => gathered(SPEED_M_S, 0.0),
+            Self::SteadyCircle => gathered(SPEED_M_S, 1.0 / 6.0),
+            Self::Weave {
+                speed_m_s,
+                curvature_1_m,
+                period_s,
+            } => {
+                let phase_rad = std::f64::consts::TAU * time_s / period_s;
+                gathered(speed_m_s, curvature_1_m * phase_rad.sin())
+            }
+            Self::StraightThenCircles {
+                radius_m,
+                speed_m_s,
+            } => {
                 let left = ((time_s - 10.0) / CURVE_S).clamp(0.0, 1.0);
                 let right = ((time_s - 35.0) / CURVE_S).clamp(0.0, 2.0);
-                curved((left - right) / radius_m)
+                gathered(speed_m_s, (left - right) / radius_m)
             }
         };
         robot.model.wheel_speeds_from_twist(twist)

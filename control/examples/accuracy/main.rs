@@ -1,7 +1,7 @@
 //! How well the robot tracks, how well it measures θ, how soon it notices other ground.
 //!
 //! `cargo run --release -p tread-control --example accuracy -- [--runs N] [--threads N] [--json]
-//! [--only tracking,theta,change]`
+//! [--only tracking,theta,change,held-out]`
 //!
 //! Every run is seeded. Prints tables, or with `--json` one object with the tables' figures and
 //! `checks`; the process fails if one does not hold.
@@ -10,6 +10,7 @@
 
 mod change;
 mod drives;
+mod held_out;
 mod report;
 mod robot;
 mod theta;
@@ -30,10 +31,11 @@ fn main() -> ExitCode {
             return ExitCode::from(2);
         }
     };
-    let parts: [(&str, Part); 3] = [
+    let parts: [(&str, Part); 4] = [
         ("tracking", tracking::run),
         ("theta", theta::run),
         ("change", change::run),
+        ("held-out", held_out::run),
     ];
     let sections: Vec<(&str, Section)> = parts
         .into_iter()

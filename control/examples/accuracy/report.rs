@@ -24,7 +24,7 @@ impl Options {
         arguments: impl Iterator<Item = String>,
     ) -> Result<Self, &'static str> {
         const USAGE: &str =
-            "accuracy [--runs N] [--threads N] [--json] [--only tracking,theta,change]";
+            "accuracy [--runs N] [--threads N] [--json] [--only tracking,theta,change,held-out]";
         let mut options = Self {
             runs: 200,
             threads: std::thread::available_parallelism().map_or(1, usize::from),
@@ -42,7 +42,7 @@ impl Options {
                 _ => return Err(USAGE),
             }
         }
-        let known = ["tracking", "theta", "change"];
+        let known = ["tracking", "theta", "change", "held-out"];
         if options
             .only
             .iter()

@@ -22,6 +22,7 @@ const FIX_NOISE: (f64, f64) = (0.01, 0.005);
 /// What a robot of a scenario is like, and what it is told about itself.
 #[derive(Clone, Copy)]
 pub(crate) struct RobotSpec {
+    pub(crate) model: RobotModel,
     pub(crate) curve: FrictionCurve,
     /// Noise of the sensors, and what the estimator is told of it.
     pub(crate) noise: SensorNoise,
@@ -42,6 +43,7 @@ impl RobotSpec {
     /// Default sensors on isotropic ground of this stiffness.
     pub(crate) fn on(stiffness: f64) -> Self {
         Self {
+            model: RobotModel::yi2007(),
             curve: FrictionCurve::with_stiffness(stiffness).expect("stiffness is positive"),
             noise: SensorNoise::default(),
             radius_error_max: 0.02,
@@ -92,7 +94,7 @@ impl SeededRobot {
             tyres: spec.tyres,
             ..PlantSpec::default()
         };
-        let model = RobotModel::yi2007();
+        let model = spec.model;
         let mut robot = Self {
             model,
             plant: Plant::new(model, plant_spec, start).expect("a scenario's plant is valid"),

@@ -2,6 +2,7 @@
 
 mod courses;
 mod figures;
+pub(crate) mod held_out;
 mod simulate;
 
 use std::fmt::Write as _;
@@ -10,6 +11,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use serde_json::{Value, json};
 use tread_control::bench::{Course, KanayamaGains, Law, PursuitConfig, Track};
 
+use tread_control::robot::RobotModel;
 use tread_control::tracking::TrackerConfig;
 
 use crate::report::{Options, Section};
@@ -68,6 +70,7 @@ pub(crate) fn run(options: &Options) -> Section {
         options.threads,
         |&(name, course, terrain, lag_s, noisy)| {
             let case = Case {
+                model: RobotModel::yi2007(),
                 course,
                 terrain,
                 lag_s,
@@ -129,10 +132,10 @@ fn tuned(heading_1_m: f64) -> Law {
     })
 }
 
-/// Root mean square over the seeds, and the largest, of one law.
+/// Root mean square over seeds from the case's on, and the largest, of one law.
 fn score(case: &Case, seeds: u64, law: Law, knowing: Knowing) -> (f64, f64) {
     let (mut sum, mut most_m) = (0.0, 0.0_f64);
-    for seed in 0..seeds {
+    for seed in case.seed..case.seed + seeds {
         let trace = simulate(
             &Case {
                 seed,

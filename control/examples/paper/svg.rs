@@ -6,8 +6,10 @@ const WIDTH: f64 = 640.0;
 const HEIGHT: f64 = 480.0;
 const LEFT: f64 = 70.0;
 const RIGHT: f64 = 20.0;
-const TOP: f64 = 40.0;
+const TOP: f64 = 56.0;
 const BOTTOM: f64 = 55.0;
+/// Width of one entry of the legend.
+const ENTRY: f64 = 220.0;
 /// Colours that differ for colour-blind readers too.
 const COLOURS: [&str; 4] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7"];
 
@@ -74,7 +76,7 @@ impl Frame {
     /// Round figures along an axis: steps of 1, 2 or 5 times a power of ten.
     fn ticks(&self, axis: usize) -> Vec<f64> {
         let span = self.high[axis] - self.low[axis];
-        let rough = span / 6.0;
+        let rough = span / 8.0;
         let power = 10.0_f64.powf(rough.log10().floor());
         let step = [1.0, 2.0, 5.0, 10.0]
             .map(|factor| factor * power)
@@ -146,17 +148,21 @@ pub(crate) fn render(plot: &Plot) -> String {
     );
     for (index, curve) in plot.curves.iter().enumerate() {
         let colour = COLOURS[index % COLOURS.len()];
-        svg.push_str("<polyline fill=\"none\" stroke-width=\"1.6\" stroke=\"");
-        let _ = write!(svg, "{colour}\" points=\"");
+        // The first curve is the wider one: it shows where the others cover it.
+        let width = if index == 0 { 3.2 } else { 1.4 };
+        let _ = write!(
+            svg,
+            "<polyline fill=\"none\" stroke-width=\"{width}\" stroke=\"{colour}\" points=\""
+        );
         for [x, y] in &curve.points {
             let _ = write!(svg, "{:.1},{:.1} ", frame.x(*x), frame.y(*y));
         }
-        let row = 14.0 * f64::from(u32::try_from(index).unwrap_or(0));
+        let left = LEFT + ENTRY * f64::from(u32::try_from(index).unwrap_or(0));
         let _ = writeln!(
             svg,
-            "\"/>\n<text x=\"{}\" y=\"{}\" text-anchor=\"end\" fill=\"{colour}\">{}</text>",
-            high_x - 8.0,
-            high_y + 16.0 + row,
+            "\"/>\n<path d=\"M{left} 40h24\" stroke-width=\"{width}\" stroke=\"{colour}\"/>\
+             <text x=\"{}\" y=\"44\">{}</text>",
+            left + 30.0,
             curve.name
         );
     }

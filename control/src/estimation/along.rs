@@ -259,6 +259,7 @@ impl AlongFilter {
             // What is wrong in this row stays in the next ones until it has faded.
             force_noise: force_noise * 2.0 / (2.0 - gain),
             bend: 0.0,
+            common_noise: Parameters::zeros(),
         }
     }
 }

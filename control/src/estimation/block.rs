@@ -59,8 +59,9 @@ pub(super) struct Block {
     slip_m_s: Option<f64>,
     slip_noise: f64,
     is_steady: bool,
-    /// `u_R − u_L`, metres per second.
+    /// `u_R − u_L`, metres per second, and its variance.
     pub(super) rim_difference_m_s: f64,
+    rim_difference_noise: f64,
     /// `(u_R + u_L)/2`, metres per second.
     pub(super) rim_mean_m_s: f64,
     pub(super) force: Option<Force>,
@@ -107,6 +108,9 @@ impl Block {
         regressors[index::GYRO_OFFSET] = -self.track_width_m;
         regressors[index::CURVATURE] = bent(force.difference_m_s, self.slip, self.curvature);
         regressors[index::RESISTANCE] = -self.rim_difference_m_s;
+        let mut common_noise = Parameters::zeros();
+        common_noise[index::RADIUS_OFFSET] = self.rim_difference_noise;
+        common_noise[index::RESISTANCE] = -self.rim_difference_noise;
         Some(Row {
             regressors,
             response: self.difference_m_s,
@@ -114,6 +118,7 @@ impl Block {
             force_noise: force.difference_noise,
             // Torque is measured so well that its noise does not matter there.
             bend: 0.0,
+            common_noise,
         })
     }
 
@@ -134,6 +139,7 @@ impl Block {
             force_noise: 0.25 * force.difference_noise,
             // Torque is measured so well that its noise does not matter there.
             bend: 0.0,
+            common_noise: Parameters::zeros(),
         })
     }
 
@@ -343,6 +349,7 @@ impl BlockBuilder {
             is_steady: (self.last_m_s - self.first_m_s).abs()
                 < STEADY_SHARE * mean_m_s.abs() + 4.0 * rim_noise_m_s,
             rim_difference_m_s: right_m_s - left_m_s,
+            rim_difference_noise: 2.0 * rim_noise_m_s.powi(2) / count,
             rim_mean_m_s: mean_m_s,
             force,
             turning,
@@ -396,6 +403,13 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
         bent(force_m_s, sides.mean, tyres.curvature) - 0.5 * odd_m_s / theta;
     let rim_noise_m_s = noise.wheel_speed_rad_s * model.wheel_radius_m();
     let gyro_noise = noise.gyro_rad_s.powi(2);
+    let difference_noise = 2.0 * rim_noise_m_s.powi(2) / means.samples;
+    let mut common_noise = Parameters::zeros();
+    common_noise[index::RADIUS_OFFSET] = difference_noise;
+    common_noise[index::TRACK] =
+        -track_m * (model.effective_track_ratio() - 1.0) * model.effective_track_m() * gyro_noise
+            / means.samples;
+    common_noise[index::AHEAD_OFFSET] = -theta * difference_noise / GRAVITY_M_S2;
     Row {
         regressors,
         response: means.slip_m_s,
@@ -406,5 +420,6 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
             + (means.rim_difference_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2)
                 / means.samples,
         bend: bent(1.0, sides.mean, tyres.curvature),
+        common_noise,
     }
 }

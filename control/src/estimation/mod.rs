@@ -42,7 +42,7 @@ pub use expectation::{ExpectedAccuracy, expected_accuracy};
 use offsets::OffsetKnowledge;
 use regression::{Solution, SolveInput, solve};
 pub use segment::SegmentStatistics;
-use segment::SegmentTheta;
+use segment::{Claims, SegmentTheta};
 use sums::Sums;
 pub use types::{
     Estimate, SensorNoise, SensorSample, ThetaMeasurement, TyrePrior, UpdateOutcome,
@@ -70,7 +70,8 @@ const THETA_RANGE: std::ops::RangeInclusive<f64> = 5.0e-3..=10.0;
 /// Largest θ that is reckoned with before there is any estimate.
 const THETA_MOST_FIRST: f64 = 2.0;
 /// Share of θ that rows on accelerations leave out: products of θ with what is learned meanwhile.
-const MODEL_RATIO: f64 = 1.5e-3;
+/// One error of all of a robot's segments; with torque that of the torque constants is.
+pub const MODEL_RATIO: f64 = 1.5e-3;
 /// Longest time between two samples over which anything is averaged, seconds.
 const GAP_MAX_S: f64 = 0.1;
 /// Samples in a row that are refused because the wheels' speed leapt.
@@ -89,8 +90,8 @@ pub struct Estimator {
     offsets: OffsetKnowledge,
     /// Blocks of this ground in segments that are closed.
     ground: Sums,
-    /// Information on θ that these hold together.
-    ground_information: f64,
+    /// What their sum promises on θ.
+    claims: Claims,
     /// Blocks of the open segment that are certain to be of this ground.
     segment: Sums,
     /// Blocks since the change detector last stood at zero.
@@ -123,7 +124,7 @@ impl Estimator {
             along: AlongFilter::new(),
             offsets: OffsetKnowledge::unknown(&noise, &tyres),
             ground: Sums::default(),
-            ground_information: 0.0,
+            claims: Claims::default(),
             segment: Sums::default(),
             pending: Sums::default(),
             change: ChangeDetector::default(),
@@ -333,24 +334,23 @@ impl Estimator {
     /// own parameters are those known from everything else, and their deviation is inside.
     ///
     /// What is not known of the robot itself is the same error in all segments, so that their sum
-    /// would promise too much: none claims more information than it adds to what all of this
-    /// ground's segments know together.
+    /// would promise too much: each claims as much as the sum of this ground's segments can keep.
     pub fn close_segment(&mut self) -> SegmentStatistics {
         let segment = self.segment.plus(&self.pending);
+        let before = self
+            .solve(&self.ground, None)
+            .filter(|found| found.theta > 0.0);
         let whole = self.ground.plus(&segment);
-        let ground = self.solve(&whole, None).filter(|found| found.theta > 0.0);
-        let together = ground.map_or(0.0, |found| found.variance.max(0.0).recip());
-        let added = if together.is_finite() {
-            together - self.ground_information
-        } else {
-            0.0
-        };
-        let theta_ground = ground.map_or(THETA_FIRST, |found| found.theta);
-        let offsets = self
-            .offsets
-            .with_ground(&self.ground, &self.tyres, theta_ground);
-        // How curved the tyres are is one error of all segments too.
-        let tyres = ground.map_or(self.tyres, |found| found.tyres(&self.tyres));
+        // Where all blocks together are no measurement, none of them is one.
+        let ground = self
+            .solve(&whole, None)
+            .filter(|found| found.is_measurement(whole.blocks));
+        let offsets = self.offsets.with_ground(
+            &self.ground,
+            &self.tyres,
+            before.map_or(THETA_FIRST, |found| found.theta),
+        );
+        let tyres = before.map_or(self.tyres, |found| found.tyres(&self.tyres));
         let solution = ground.and_then(|ground| {
             let input = SolveInput {
                 offsets: &offsets,
@@ -360,9 +360,12 @@ impl Estimator {
             };
             solve(&segment, input).filter(|found| found.is_informative(ground.theta))
         });
-        let theta = solution.map(|found| SegmentTheta {
-            theta: found.theta,
-            information: found.variance.recip().min(added),
+        let theta = solution.map(|found| {
+            let shared = before.map_or(0.0, |before| before.shared_with(&found, &offsets, &tyres));
+            SegmentTheta {
+                theta: found.theta,
+                information: self.claims.add(found.variance, shared),
+            }
         });
         let statistics = SegmentStatistics::of(
             &segment,
@@ -370,7 +373,6 @@ impl Estimator {
             theta.filter(|found| found.information > 0.0),
             self.accelerometer_offset_mu(),
         );
-        self.ground_information = self.ground_information.max(together);
         self.ground = whole;
         self.segment = Sums::default();
         self.pending = Sums::default();
@@ -384,9 +386,12 @@ impl Estimator {
         let theta = self
             .solve(&self.ground, None)
             .map_or(THETA_FIRST, |found| found.theta);
-        self.offsets = self.offsets.with_ground(&self.ground, &self.tyres, theta);
+        self.offsets = self
+            .offsets
+            .with_ground(&self.ground, &self.tyres, theta)
+            .on_new_ground();
         self.ground = Sums::default();
-        self.ground_information = 0.0;
+        self.claims = Claims::default();
         self.segment = Sums::default();
         self.pending = Sums::default();
         self.change = ChangeDetector::default();

@@ -9,11 +9,18 @@ use super::{SensorNoise, THETA_FIRST, THETA_RANGE, TyrePrior, ValueWithDeviation
 /// Standard deviation of θ that is assumed, about [`THETA_FIRST`], when offsets are learned.
 const THETA_VAGUE: f64 = 2.0;
 
+/// Information on `θf` while nothing is known: far below what anything else tells.
+const RESISTANCE_VAGUE: f64 = 1.0;
+
 /// What is known about the robot's own parameters, in information form.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct OffsetKnowledge {
     pub(super) information: SMatrix<f64, OFFSETS, OFFSETS>,
     pub(super) weighted: SVector<f64, OFFSETS>,
+    /// Whether the present ground has had a word on its rolling resistance. Like `δ_c` it acts on
+    /// both rows with torque, and only their difference can be learned: what one block takes for
+    /// the one, the next must not take for the other.
+    pub(super) knows_resistance: bool,
 }
 
 impl OffsetKnowledge {
@@ -31,10 +38,30 @@ impl OffsetKnowledge {
         put(index::GYRO_OFFSET, weight(noise.gyro_offset_rad_s));
         put(index::AHEAD_OFFSET, weight(noise.accelerometer_offset_m_s2));
         put(index::AHEAD_SCALE, weight(noise.accelerometer_scale_ratio));
+        put(index::RESISTANCE, RESISTANCE_VAGUE);
         Self {
             information,
             weighted: SVector::zeros(),
+            knows_resistance: false,
         }
+    }
+
+    /// Without what is the ground's own, for new ground.
+    pub(super) fn on_new_ground(&self) -> Self {
+        let mut known = *self;
+        let place = index::RESISTANCE - 1;
+        let own = known.information[(place, place)].max(f64::MIN_POSITIVE);
+        let column = known.information.column(place).into_owned();
+        known.information -= column * column.transpose() / own;
+        known.weighted -= column * (known.weighted[place] / own);
+        for other in 0..OFFSETS {
+            known.information[(place, other)] = 0.0;
+            known.information[(other, place)] = 0.0;
+        }
+        known.information[(place, place)] = RESISTANCE_VAGUE;
+        known.weighted[place] = 0.0;
+        known.knows_resistance = false;
+        known
     }
 
     /// With what these sums tell about the robot, whatever their θ; the given one only weighs them.
@@ -45,7 +72,7 @@ impl OffsetKnowledge {
         }
         let theta = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
         let channels = sums.channels();
-        let mut normal = Normal::of(&channels, theta, tyres);
+        let mut normal = Normal::of(&channels, theta, tyres).with_resistance(self, theta);
         let vague = THETA_VAGUE.powi(-2);
         let theta_at = (index::THETA, index::THETA);
         // A corrected square below its own noise is not known to be smaller than that noise.
@@ -68,6 +95,7 @@ impl OffsetKnowledge {
         Self {
             information,
             weighted: self.weighted + right / inflation,
+            knows_resistance: true,
         }
     }
 
@@ -86,14 +114,14 @@ impl OffsetKnowledge {
     }
 }
 
-/// The Schur complement that takes what is the ground's out of normal equations.
+/// The Schur complement that takes θ and θκ out of normal equations.
 fn without_ground(
     matrix: &ParameterMatrix,
     right: &Parameters,
 ) -> (SMatrix<f64, OFFSETS, OFFSETS>, SVector<f64, OFFSETS>) {
     let mut matrix = *matrix;
     let mut right = *right;
-    for parameter in [index::RESISTANCE, index::CURVATURE, index::THETA] {
+    for parameter in [index::CURVATURE, index::THETA] {
         let own = matrix[(parameter, parameter)].max(f64::MIN_POSITIVE);
         let column = matrix.column(parameter).into_owned();
         let share = right[parameter] / own;

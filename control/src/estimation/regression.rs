@@ -4,6 +4,8 @@
 //! corrected normal matrix is `M = Σ_c (X_cᵀX_c − n σ_x² e₁e₁ᵀ)/s_c²` with `s_c² = σ_y² + θ²σ_x²`
 //! (found by iteration), and the variance of θ is
 //! `[M⁻¹]₁₁ + [M⁻¹]₁₁² Σ_c n (σ_x² s_c² + θ²σ_x⁴)/s_c⁴` (Fuller, Measurement Error Models, 1987).
+//! Noise that the response shares with another regressor, `u_R − u_L` beside `δ_c` above all, is
+//! taken out of their product: θ would read low by up to a third of its deviation.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -14,8 +16,9 @@ use crate::estimation::block::Block;
 
 /// Number of parameters.
 pub(super) const PARAMETERS: usize = 9;
-/// Number of the robot's own parameters, which follow θ.
-pub(super) const OFFSETS: usize = 6;
+/// Number of the parameters that all segments of a ground share, which follow θ: the robot's own,
+/// and the rolling resistance.
+pub(super) const OFFSETS: usize = 7;
 /// A value for each parameter.
 pub(super) type Parameters = SVector<f64, PARAMETERS>;
 /// A value for each pair of parameters.
@@ -37,10 +40,11 @@ pub(super) mod index {
     pub(in crate::estimation) const AHEAD_OFFSET: usize = 5;
     /// Share by which the accelerometer reads too little.
     pub(in crate::estimation) const AHEAD_SCALE: usize = 6;
+    /// `θf`, θ times the rolling resistance over load that measured torques hold. It is the
+    /// ground's: new ground forgets it.
+    pub(in crate::estimation) const RESISTANCE: usize = 7;
     /// θκ, θ times the tyre's curvature per slip.
-    pub(in crate::estimation) const CURVATURE: usize = 7;
-    /// `θf`, θ times the rolling resistance over load that measured torques hold.
-    pub(in crate::estimation) const RESISTANCE: usize = 8;
+    pub(in crate::estimation) const CURVATURE: usize = 8;
 }
 
 /// Rounds of the iteration on the weights.
@@ -71,6 +75,9 @@ pub(super) struct Row {
     pub(super) force_noise: f64,
     /// The force's share in the regressor of θκ, which has the same noise.
     pub(super) bend: f64,
+    /// Covariance of the other regressors' noise with that of the response: rim speeds and turn
+    /// rate stand on both sides.
+    pub(super) common_noise: Parameters,
 }
 
 impl Row {
@@ -82,6 +89,7 @@ impl Row {
             spread,
             force_noise: 0.0,
             bend: 0.0,
+            common_noise: Parameters::zeros(),
         }
     }
 }
@@ -97,6 +105,7 @@ pub(super) struct Channel {
     force_noise: f64,
     /// The same times the share in θκ's regressor, and times its square.
     bent_noise: [f64; 2],
+    common_noise: Parameters,
     /// Sum of the response's variances.
     response_noise: f64,
 }
@@ -110,6 +119,7 @@ impl Default for Channel {
             response: 0.0,
             force_noise: 0.0,
             bent_noise: [0.0; 2],
+            common_noise: Parameters::zeros(),
             response_noise: 0.0,
         }
     }
@@ -125,6 +135,7 @@ impl Channel {
         self.force_noise += row.force_noise;
         self.bent_noise[0] += row.force_noise * row.bend;
         self.bent_noise[1] += row.force_noise * row.bend * row.bend;
+        self.common_noise += row.common_noise;
         self.response_noise += row.spread;
     }
 
@@ -133,6 +144,7 @@ impl Channel {
         let force_noise = row.force_noise / row.spread;
         let scale = row.spread.sqrt().recip();
         self.add(&Row {
+            common_noise: row.common_noise * (scale * scale),
             regressors: row.regressors * scale,
             response: row.response * scale,
             spread: (1.0 - theta * theta * force_noise).max(0.1),
@@ -152,6 +164,7 @@ impl Channel {
                 self.bent_noise[0] + other.bent_noise[0],
                 self.bent_noise[1] + other.bent_noise[1],
             ],
+            common_noise: self.common_noise + other.common_noise,
             response_noise: self.response_noise + other.response_noise,
         }
     }
@@ -194,7 +207,7 @@ impl Normal {
             normal.matrix[(index::THETA, index::CURVATURE)] -= cross;
             normal.matrix[(index::CURVATURE, index::THETA)] -= cross;
             normal.matrix[(index::CURVATURE, index::CURVATURE)] -= bent;
-            normal.right += channel.product / spread;
+            normal.right += (channel.product - channel.common_noise) / spread;
             normal.excess += channel.count * (force_noise * spread + (theta * force_noise).powi(2))
                 / (spread * spread);
             noise_variance += 2.0 * channel.count * (force_noise / spread).powi(2);
@@ -206,9 +219,16 @@ impl Normal {
         bend[index::THETA] = -tyres.curvature / curvature_std_dev;
         bend[index::CURVATURE] = 1.0 / curvature_std_dev;
         normal.matrix += bend * bend.transpose();
-        let resistance = (index::RESISTANCE, index::RESISTANCE);
-        normal.matrix[resistance] += (theta * ROLLING_SPREAD).powi(-2);
         normal
+    }
+
+    /// Adds how large rolling resistance may be at this θ, where the ground has not told yet.
+    pub(super) fn with_resistance(mut self, offsets: &OffsetKnowledge, theta: f64) -> Self {
+        if !offsets.knows_resistance {
+            let resistance = (index::RESISTANCE, index::RESISTANCE);
+            self.matrix[resistance] += (theta * ROLLING_SPREAD).powi(-2);
+        }
+        self
     }
 
     /// Adds what is known about the robot's own parameters.
@@ -283,7 +303,9 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
     let channels = sums.channels();
     let mut theta_weights = input.theta_given.unwrap_or(input.theta_start);
     for round in 1..=ROUNDS {
-        let normal = Normal::of(&channels, theta_weights, input.tyres).with_offsets(input.offsets);
+        let normal = Normal::of(&channels, theta_weights, input.tyres)
+            .with_resistance(input.offsets, theta_weights)
+            .with_offsets(input.offsets);
         let covariance = normal.matrix.cholesky()?.inverse();
         let parameters = covariance * normal.right;
         let theta = parameters[index::THETA];
@@ -303,14 +325,20 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
             let across = covariance[(index::THETA, index::RADIUS_OFFSET)];
             let own = covariance[(index::RADIUS_OFFSET, index::RADIUS_OFFSET)];
             let scaled = (2.0 * scale * across + scale * scale * own).max(-0.5 * base);
-            let bend = parameters[index::CURVATURE] * bend_ratio(&channels);
+            let mut of_theta = Parameters::zeros();
+            of_theta[index::THETA] = 1.0;
+            of_theta[index::RADIUS_OFFSET] = scale;
+            let missed = BEND_SHARE * parameters[index::CURVATURE] * bend_ratio(&channels);
             return Some(Solution {
                 theta,
                 parameters,
                 covariance: covariance * inflation,
+                inflation,
+                of_theta,
                 variance: (base + scaled) * inflation
                     + base * base * normal.excess
-                    + (BEND_SHARE * bend).powi(2),
+                    + missed * missed,
+                missed,
                 significance: 1.0 / (base * normal.noise_std_dev.max(f64::MIN_POSITIVE)),
             });
         }
@@ -329,9 +357,40 @@ pub(super) struct Solution {
     significance: f64,
     parameters: Parameters,
     covariance: ParameterMatrix,
+    /// Share of the covariance by which residuals were larger than assumed.
+    inflation: f64,
+    /// How θ follows from the parameters.
+    of_theta: Parameters,
+    /// What rows to second order may miss of curved tyres, in θ; alike everywhere.
+    missed: f64,
 }
 
 impl Solution {
+    /// Covariance of θ's error here with that of θ of other rows, which were solved with what
+    /// these rows tell of the robot and its tyres: what all of them share.
+    ///
+    /// An estimate that is the best one of all rows before has the same covariance with any
+    /// unbiased one of a part of them, so it does not matter which part those others were.
+    pub(super) fn shared_with(
+        &self,
+        later: &Self,
+        offsets: &OffsetKnowledge,
+        tyres: &TyrePrior,
+    ) -> f64 {
+        let mine = self.covariance * self.of_theta;
+        let its = later.covariance * later.of_theta / later.inflation;
+        let followed = offsets.information * its.fixed_rows::<OFFSETS>(1);
+        let of_offsets = followed.dot(&mine.fixed_rows::<OFFSETS>(1));
+        // θκ = κθ give or take: what moves κ moves θ by as much as that prior weighs.
+        let theta = self.parameters[index::THETA];
+        let curvature = self.parameters[index::CURVATURE] / theta;
+        let bend = (mine[index::CURVATURE] - curvature * mine[index::THETA]) / theta;
+        let width = theta * tyres.curvature_spread.max(CURVATURE_SPREAD_MIN);
+        let gain =
+            (its[index::CURVATURE] - tyres.curvature * its[index::THETA]) * theta / (width * width);
+        of_offsets + gain * bend + self.missed * later.missed
+    }
+
     /// Whether the force varied enough, apart from the offsets, to call this a measurement.
     pub(super) fn is_measurement(&self, blocks: u64) -> bool {
         blocks >= BLOCKS_MIN

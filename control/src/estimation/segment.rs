@@ -39,6 +39,39 @@ pub(super) struct SegmentTheta {
     pub(super) information: f64,
 }
 
+/// What the segments of one ground promise together.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Claims {
+    /// Sum of the information claimed, W.
+    information: f64,
+    /// True variance of θ fused from these segments, V ≤ 1/W.
+    variance: f64,
+}
+
+impl Claims {
+    /// The information that the next segment may claim: the most with which the sum still keeps
+    /// its promise. `variance` σ² is of this segment's θ, `shared` c its covariance with those
+    /// before.
+    ///
+    /// With weights W and w the fused variance is `(W²V + w²σ² + 2Wwc)/(W + w)²`; that it is at
+    /// most `1/(W + w)` is a quadratic in w.
+    pub(super) fn add(&mut self, variance: f64, shared: f64) -> f64 {
+        let (sum, own) = (self.information, variance.recip());
+        let room = 1.0 - 2.0 * sum * shared;
+        let slack = sum * (1.0 - sum * self.variance).max(0.0);
+        let most = 0.5 * own * (room + (room * room + 4.0 * variance * slack).sqrt());
+        let claimed = most.clamp(0.0, own);
+        let together = sum + claimed;
+        if together > 0.0 {
+            self.variance = (sum * sum * self.variance
+                + claimed * (claimed * variance + 2.0 * sum * shared))
+                / (together * together);
+        }
+        self.information = together;
+        claimed
+    }
+}
+
 impl SegmentStatistics {
     /// θ of this segment alone; none when it carries no information.
     pub fn theta(&self) -> Option<f64> {
@@ -68,6 +101,44 @@ impl SegmentStatistics {
             rolling_resistance_weighted: rolling
                 .map_or(0.0, |rolling| rolling_information * rolling.value),
             saturation_ratio: sums.saturation_share(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn segments_with_a_common_error_never_claim_more_than_their_sum_keeps(
+            segments in prop::collection::vec((0.1..10.0_f64, 0.0..1.0_f64), 1..20),
+        ) {
+            let mut claims = Claims::default();
+            let mut weights: Vec<f64> = Vec::new();
+            let mut variance_sum = 0.0;
+            for (variance, correlation) in segments {
+                let shared = 0.1 * correlation;
+                let weight = claims.add(variance, shared);
+                prop_assert!((0.0..=variance.recip()).contains(&weight));
+                let before: f64 = weights.iter().sum();
+                variance_sum += weight * (weight * variance + 2.0 * before * shared);
+                weights.push(weight);
+            }
+            let information: f64 = weights.iter().sum();
+            prop_assert!(variance_sum <= information * (1.0 + 1.0e-9));
+        }
+
+        #[test]
+        fn segments_that_share_nothing_claim_all_they_have(
+            variances in prop::collection::vec(0.1..10.0_f64, 1..20),
+        ) {
+            let mut claims = Claims::default();
+            for variance in variances {
+                prop_assert!((claims.add(variance, 0.0) * variance - 1.0).abs() < 1.0e-9);
+            }
         }
     }
 }

@@ -2,8 +2,9 @@
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 
+use super::leg_time::{LegTime, Ring};
 use super::polynomial::Derivatives;
-use super::{Path, Piece, Polynomial, RADIUS_MIN_M};
+use super::{Path, Piece, Polynomial};
 use crate::geometry::{Point, Pose, wrap_angle_rad};
 use crate::robot::RobotModel;
 
@@ -21,14 +22,9 @@ const STRETCHES: [f64; 5] = [1.0, 1.15, 1.35, 1.7, 2.4];
 const RUN_INS_M: [f64; 3] = [0.5, 1.0, 2.0];
 /// Start directions that are tried, radians from the direction of the place.
 const TURNS_RAD: [f64; 5] = [-1.0, -0.5, 0.0, 0.5, 1.0];
-/// Points at which a leg's time is summed.
-const TIME_STEPS: u32 = 48;
-/// Points at which the time of a spline's piece is summed.
-const PIECE_TIME_STEPS: u32 = 10;
-/// Slowest advance of a curve over that at its end; a slower one is about to come to a point.
-const ADVANCE_SHARE_MIN: f64 = 0.05;
-/// Tightest turn of a leg, metres.
-const LEG_RADIUS_MIN_M: f64 = 2.0 * RADIUS_MIN_M;
+/// Paces of the parameter at a leg's start that are tried, over that at its end: a slow one bends
+/// early, while the robot gathers speed.
+const START_PACES: [f64; 2] = [1.0, 0.4];
 /// Turn rate reckoned for turning on the spot, share of the limit.
 const SPOT_TURN_SHARE: f64 = 0.4;
 
@@ -96,13 +92,23 @@ pub(crate) fn join_circle(
         let time_s = spot_turn_s(start, target.heading_rad(nearest_rad), model);
         best = Some((time_s, Vec::new(), nearest_rad));
     }
+    let timing = LegTime {
+        speed_m_s: target.speed_m_s,
+        model,
+        ring: Some(Ring {
+            center: target.center,
+            radius_m: target.radius_m,
+        }),
+    };
     // From the nearest place on, the way the circle is driven, so that a good bound comes early.
     for place in 0..PLACES {
         let place_rad = nearest_rad + target.sign * TAU * f64::from(place) / f64::from(PLACES);
         let end = target.derivatives(place_rad);
         let bound_s = best.as_ref().map_or(f64::INFINITY, |(best_s, ..)| *best_s);
         // What is left of the circle counts nothing: turns are counted from the join.
-        if let Some((time_s, legs)) = join(start, &end, bound_s, target.speed_m_s, model) {
+        if let Some((time_s, legs)) = join(start, &end, bound_s, &timing)
+            && time_s < bound_s
+        {
             best = Some((time_s, legs, place_rad));
         }
     }
@@ -118,11 +124,10 @@ pub(crate) fn join(
     start: Pose,
     end: &Derivatives,
     bound_s: f64,
-    speed_m_s: f64,
-    model: &RobotModel,
+    timing: &LegTime<'_>,
 ) -> Option<(f64, Vec<Polynomial>)> {
     let mut best: Option<(f64, Vec<Polynomial>)> = None;
-    if let Some((time_s, leg)) = curve(start, end, bound_s, speed_m_s, model) {
+    if let Some((time_s, leg)) = curve(start, end, bound_s, timing) {
         best = Some((time_s, vec![leg]));
     }
     let pace = end[1].x_m.hypot(end[1].y_m);
@@ -137,15 +142,19 @@ pub(crate) fn join(
         };
         let still = Point::default();
         let bound_s = best.as_ref().map_or(bound_s, |(best_s, _)| *best_s);
-        let Some(last) = leg(behind, ahead.y_m.atan2(ahead.x_m), end, run_in_m) else {
+        let Some(last) = leg(behind, ahead.y_m.atan2(ahead.x_m), end, run_in_m, 1.0) else {
             continue;
         };
-        let Some(last_s) = leg_time_s(&last, bound_s, speed_m_s, model) else {
+        let Some(last_s) = timing.of_leg_s(&last, false, bound_s) else {
             continue;
         };
         let entry = [behind, ahead, still, still, still];
-        let Some((first_s, first)) = curve(start, &entry, bound_s - last_s, speed_m_s, model)
-        else {
+        let before = LegTime {
+            // Where the second curve counts, the first does to its end.
+            ring: timing.ring.filter(|_| last_s <= 0.0),
+            ..*timing
+        };
+        let Some((first_s, first)) = curve(start, &entry, bound_s - last_s, &before) else {
             continue;
         };
         let pieces = vec![first, last];
@@ -161,8 +170,7 @@ fn curve(
     start: Pose,
     end: &Derivatives,
     mut bound_s: f64,
-    speed_m_s: f64,
-    model: &RobotModel,
+    timing: &LegTime<'_>,
 ) -> Option<(f64, Polynomial)> {
     let chord_m = start.point().distance_m(end[0]);
     if chord_m < LEG_MIN_M {
@@ -172,15 +180,23 @@ fn curve(
     let aimed = TURNS_RAD.map(|turn_rad| bearing_rad + turn_rad);
     let mut best: Option<(f64, Polynomial)> = None;
     for heading_rad in std::iter::once(start.heading_rad).chain(aimed) {
-        let turn_s = spot_turn_s(start, heading_rad, model);
-        if turn_s + chord_m / speed_m_s > bound_s {
+        let turn_s = spot_turn_s(start, heading_rad, timing.model);
+        let least_m = timing
+            .ring
+            .map_or(chord_m, |ring| ring.distance_m(start.point()).min(chord_m));
+        if turn_s + least_m / timing.speed_m_s > bound_s {
             continue;
         }
-        for stretch in STRETCHES {
-            let timed = leg(start.point(), heading_rad, end, stretch * chord_m).and_then(|leg| {
-                leg_time_s(&leg, bound_s - turn_s, speed_m_s, model)
-                    .map(|time_s| (time_s + turn_s, leg))
-            });
+        let shapes = STRETCHES
+            .into_iter()
+            .flat_map(|stretch| START_PACES.map(|pace| (stretch, pace)));
+        for (stretch, pace) in shapes {
+            let timed =
+                leg(start.point(), heading_rad, end, stretch * chord_m, pace).and_then(|leg| {
+                    timing
+                        .of_leg_s(&leg, true, bound_s - turn_s)
+                        .map(|time_s| (time_s + turn_s, leg))
+                });
             if let Some((time_s, leg)) = timed
                 && Path::new(vec![Piece::Polynomial(leg)]).is_ok()
             {
@@ -196,72 +212,27 @@ fn curve(
 fn spot_turn_s(start: Pose, heading_rad: f64, model: &RobotModel) -> f64 {
     let turn_rad = wrap_angle_rad(heading_rad - start.heading_rad).abs();
     if turn_rad > ALIGNED_RAD {
-        0.5 + turn_rad / (SPOT_TURN_SHARE * model.limits().angular_max_rad_s)
+        0.7 + turn_rad / (SPOT_TURN_SHARE * model.limits().angular_max_rad_s)
     } else {
         0.0
     }
 }
 
-/// A leg of about a length, that joins at the path's own pace of its parameter.
-fn leg(start: Point, heading_rad: f64, end: &Derivatives, length_m: f64) -> Option<Polynomial> {
+/// A leg of about a length, that joins at the path's own pace of its parameter, and starts with a
+/// share of it.
+fn leg(
+    start: Point,
+    heading_rad: f64,
+    end: &Derivatives,
+    length_m: f64,
+    start_pace: f64,
+) -> Option<Polynomial> {
     let (sin, cos) = heading_rad.sin_cos();
     let pace = end[1].x_m.hypot(end[1].y_m);
     let still = Point::default();
     let ahead = Point {
-        x_m: pace * cos,
-        y_m: pace * sin,
+        x_m: start_pace * pace * cos,
+        y_m: start_pace * pace * sin,
     };
     Polynomial::nonic(&[start, ahead, still, still, still], end, length_m / pace)
-}
-
-/// About how long a leg takes, seconds; none when it is too tight to drive, or slower than a bound.
-fn leg_time_s(leg: &Polynomial, bound_s: f64, speed_m_s: f64, model: &RobotModel) -> Option<f64> {
-    time_s(
-        leg,
-        (TIME_STEPS, LEG_RADIUS_MIN_M),
-        bound_s,
-        speed_m_s,
-        model,
-    )
-}
-
-/// About how long a piece of a spline takes, seconds; none when it is too tight to drive.
-pub(crate) fn piece_time_s(piece: &Polynomial, speed_m_s: f64, model: &RobotModel) -> Option<f64> {
-    time_s(
-        piece,
-        (PIECE_TIME_STEPS, RADIUS_MIN_M),
-        f64::INFINITY,
-        speed_m_s,
-        model,
-    )
-}
-
-fn time_s(
-    curve: &Polynomial,
-    (steps, radius_min_m): (u32, f64),
-    bound_s: f64,
-    speed_m_s: f64,
-    model: &RobotModel,
-) -> Option<f64> {
-    let limits = model.limits();
-    let mut time_s = 0.0;
-    let pace = curve.advance(curve.span());
-    let width = curve.span() / f64::from(steps);
-    for step in 0..steps {
-        let parameter = (f64::from(step) + 0.5) * width;
-        let bend = curve.sample(parameter).curvature_1_m.abs().max(1.0e-6);
-        let advance = curve.advance(parameter);
-        if bend > radius_min_m.recip() || advance < ADVANCE_SHARE_MIN * pace {
-            return None;
-        }
-        // Half the limits: a curve that needs them all is no good one.
-        let fastest_m_s = speed_m_s
-            .min((0.5 * limits.lateral_acceleration_max_m_s2 / bend).sqrt())
-            .min(0.5 * limits.angular_max_rad_s / bend);
-        time_s += advance * width / fastest_m_s;
-        if time_s > bound_s {
-            return None;
-        }
-    }
-    Some(time_s)
 }

@@ -8,6 +8,7 @@
 #![expect(clippy::cast_precision_loss, reason = "counts stay far below 2^52")]
 
 mod join;
+mod leg_time;
 mod polynomial;
 mod route;
 mod spline;

@@ -1,6 +1,7 @@
 //! A path through waypoints from where the robot stands: the quickest of several splines.
 
-use super::join::{join, piece_time_s};
+use super::join::join;
+use super::leg_time::{LegTime, piece_time_s};
 use super::spline::{Knot, min_jerk_spline};
 use super::{Path, PathError, Piece, Polynomial};
 use crate::geometry::{Pose, wrap_angle_rad};
@@ -29,7 +30,12 @@ pub(crate) fn joined_from_afar(
     let (spline, _) = best_spline(knots, speed_m_s, model).ok()?;
     let begin = spline.first()?;
     let derivatives = [0, 1, 2, 3, 4].map(|order| begin.derivative(order, 0.0));
-    let (_, legs) = join(start, &derivatives, f64::INFINITY, speed_m_s, model)?;
+    let timing = LegTime {
+        speed_m_s,
+        model,
+        ring: None,
+    };
+    let (_, legs) = join(start, &derivatives, f64::INFINITY, &timing)?;
     let count = legs.len();
     let pieces = legs
         .into_iter()

@@ -1,6 +1,6 @@
 //! What the robot may do at each place of a path.
 
-use super::{PlanError, PlanOptions, SlowedBy};
+use super::{PlanError, SlowedBy};
 use crate::excitation::{Excitation, ExcitationSpec, Room};
 use crate::path::PathSample;
 use crate::profile::NodeLimits;
@@ -44,17 +44,24 @@ pub(super) struct Blame {
 
 impl Blame {
     /// Of a model whose limits have been brought within the grip already.
-    pub(super) fn of(model: &RobotModel, options: &PlanOptions) -> Self {
+    pub(super) fn of(model: &RobotModel, grip_mu: Option<f64>) -> Self {
         let limits = model.limits();
-        let grip_m_s2 = options.grip_mu.map(RobotModel::within_grip_m_s2);
-        let grips = |limit_m_s2: f64| grip_m_s2.is_some_and(|grip_m_s2| grip_m_s2 <= limit_m_s2);
+        let gives = |at_m_s2: fn(f64) -> f64, limit_m_s2: f64| {
+            grip_mu.is_some_and(|mu| at_m_s2(mu) <= limit_m_s2)
+        };
         Self {
-            along: if grips(limits.linear_acceleration_max_m_s2) {
+            along: if gives(
+                RobotModel::grip_along_m_s2,
+                limits.linear_acceleration_max_m_s2,
+            ) {
                 SlowedBy::Grip
             } else {
                 SlowedBy::LinearAcceleration
             },
-            across: if grips(limits.lateral_acceleration_max_m_s2) {
+            across: if gives(
+                RobotModel::grip_across_m_s2,
+                limits.lateral_acceleration_max_m_s2,
+            ) {
                 SlowedBy::Grip
             } else {
                 SlowedBy::LateralAcceleration

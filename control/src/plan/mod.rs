@@ -44,6 +44,9 @@ const GRID_MAX: usize = 1_000_000;
 const BEND_LOOKED_INTO_1_M: f64 = 1.0;
 /// Parts of such a cell.
 const PARTS_LOOKED_INTO: u8 = 8;
+/// Peak friction coefficient that is reckoned with on the way to a trajectory while nothing is
+/// known of the ground.
+const GRIP_UNKNOWN_MU: f64 = 0.14;
 /// Fewest cells of the timing.
 const GRID_MIN: usize = 16;
 
@@ -168,8 +171,8 @@ impl Plan {
             sign: circle.direction.sign(),
             speed_m_s: approach_m_s,
         };
-        let (legs, join_rad) =
-            join_circle(&target, start, model).ok_or(PlanError::TooTight { place: 0 })?;
+        let (legs, join_rad) = join_circle(&target, start, &on_approach(model, options))
+            .ok_or(PlanError::TooTight { place: 0 })?;
         let arc = Piece::Arc {
             center: circle.center,
             radius_m: circle.radius_m,
@@ -251,7 +254,8 @@ impl Plan {
         };
         let mut approach_pieces = usize::from(first == 0);
         let path = if first == 0
-            && let Some((path, legs)) = joined_from_afar(&knots, start, spec.speed_m_s, model)
+            && let Some((path, legs)) =
+                joined_from_afar(&knots, start, spec.speed_m_s, &on_approach(model, options))
         {
             approach_pieces = legs;
             path
@@ -309,10 +313,14 @@ impl Plan {
         let cells = ((length_m / GRID_M).ceil() as usize).clamp(GRID_MIN, GRID_MAX);
         let cell_m = length_m / cells as f64;
         let mut asked = 0;
-        let blame = Blame::of(model, options);
+        let blame = Blame::of(model, options.grip_mu);
         let mut bounds: Vec<NodeBounds> = Vec::with_capacity(cells + 1);
         let mut asked_m_s = Vec::with_capacity(cells + 1);
         let mut bend_before_1_m = 0.0;
+        let approach_end_m = path.piece_start_m(approach_pieces);
+        let careful = on_approach(model, options);
+        let careful_grip = options.grip_mu.unwrap_or(GRIP_UNKNOWN_MU);
+        let careful_blame = Blame::of(&careful, Some(careful_grip));
         for index in 0..=cells {
             let arc_m = cell_m * index as f64;
             while speeds
@@ -322,8 +330,13 @@ impl Plan {
                 asked += 1;
             }
             let speed_m_s = speeds[asked].speed_m_s;
+            let (model, across) = if arc_m < approach_end_m {
+                (&careful, careful_blame.across)
+            } else {
+                (model, blame.across)
+            };
             let here = path.sample(arc_m);
-            let mut node = node_limits(&here, speed_m_s, model, blame.across);
+            let mut node = node_limits(&here, speed_m_s, model, across);
             let bend_1_m = here.curvature_1_m.abs();
             // A sharp bend may have its peak between two nodes: both keep to what is in between.
             if bend_1_m.max(bend_before_1_m) > BEND_LOOKED_INTO_1_M
@@ -332,7 +345,7 @@ impl Plan {
                 for part in 1..PARTS_LOOKED_INTO {
                     let back_m = cell_m * f64::from(part) / f64::from(PARTS_LOOKED_INTO);
                     let between = path.sample(arc_m - back_m);
-                    let between = node_limits(&between, speed_m_s, model, blame.across);
+                    let between = node_limits(&between, speed_m_s, model, across);
                     *before = before.stricter(&between);
                     node = node.stricter(&between);
                 }
@@ -378,8 +391,13 @@ impl Plan {
                 left_m_s: nodes[node].speed_m_s,
                 by: bounds[node].by,
             };
+            let along = if timing.arc_m < approach_end_m {
+                careful_blame.along
+            } else {
+                blame.along
+            };
             plan.stretches
-                .note(timing.arc_m, timing.speed_m_s, &cell, blame.along);
+                .note(timing.arc_m, timing.speed_m_s, &cell, along);
         }
         Ok(plan)
     }
@@ -474,6 +492,15 @@ fn check_coordinate(what: &'static str, place: usize, point: Point) -> Result<()
         }
     }
     Ok(())
+}
+
+/// What the robot may do on its way to the trajectory.
+fn on_approach(model: &RobotModel, options: &PlanOptions) -> RobotModel {
+    match options.grip_mu {
+        // The model has been bounded already.
+        Some(_) => *model,
+        None => model.within_grip(GRIP_UNKNOWN_MU),
+    }
 }
 
 fn check_speed(speed_m_s: f64, place: usize, model: &RobotModel) -> Result<(), PlanError> {

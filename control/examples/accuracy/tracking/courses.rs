@@ -1,6 +1,6 @@
 //! The courses of the comparison.
 
-use std::f64::consts::{FRAC_PI_2, TAU};
+use std::f64::consts::FRAC_PI_2;
 
 use tread_control::bench::{Course, Figure8};
 use tread_control::geometry::{Point, Pose};
@@ -35,8 +35,9 @@ pub(super) fn all() -> [(&'static str, Course); 3] {
     ]
 }
 
-fn plan(trajectory: &Trajectory, start: Pose) -> Course {
-    let plan = Plan::new(trajectory, start, &RobotModel::yi2007());
+/// A planned course.
+pub(super) fn plan(trajectory: &Trajectory, start: Pose, model: &RobotModel) -> Course {
+    let plan = Plan::new(trajectory, start, model);
     Course::Plan(plan.expect("the courses can be driven"))
 }
 
@@ -57,7 +58,7 @@ fn circle() -> Course {
         y_m: 0.0,
         heading_rad: FRAC_PI_2,
     };
-    plan(&circle_trajectory(), start)
+    plan(&circle_trajectory(), start, &RobotModel::yi2007())
 }
 
 fn waypoints() -> Course {
@@ -72,8 +73,8 @@ fn waypoints() -> Course {
         speed_m_s: 0.6,
     });
     let start = Pose {
-        heading_rad: -0.1 * TAU / TAU,
+        heading_rad: -0.1,
         ..Pose::default()
     };
-    plan(&trajectory, start)
+    plan(&trajectory, start, &RobotModel::yi2007())
 }

@@ -126,6 +126,7 @@ fn before_theta_is_known(courses: &Courses, threads: usize, found: &mut Found) {
 
 fn case(course: &Course, terrain: Terrain) -> Case<'_> {
     Case {
+        model: RobotModel::yi2007(),
         course,
         terrain,
         lag_s: LAG_S,

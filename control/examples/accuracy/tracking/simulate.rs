@@ -66,6 +66,7 @@ pub(crate) enum Knowing {
 /// One run.
 #[derive(Debug, Clone)]
 pub(crate) struct Case<'a> {
+    pub(crate) model: RobotModel,
     pub(crate) course: &'a Course,
     pub(crate) terrain: Terrain,
     pub(crate) lag_s: f64,
@@ -152,18 +153,15 @@ impl Sensors {
         self.count += 1;
         let noise = self.noise;
         let mut gauss = |deviation: f64| deviation * normal(&mut self.rng);
-        let (state, felt, torques) = (
-            plant.state(),
-            plant.body_acceleration(),
-            plant.wheel_torques(),
-        );
+        let (state, seen, torques) = (plant.state(), plant.means(), plant.wheel_torques());
+        let felt = seen.acceleration;
         let torque_noise = noise.torque_mu * self.model.wheel_radius_m() * self.model.side_load_n();
         SensorSample {
             wheel_speeds: WheelSpeeds {
-                left_rad_s: state.wheel_speeds.left_rad_s + gauss(noise.wheel_speed_rad_s),
-                right_rad_s: state.wheel_speeds.right_rad_s + gauss(noise.wheel_speed_rad_s),
+                left_rad_s: seen.wheel_speeds.left_rad_s + gauss(noise.wheel_speed_rad_s),
+                right_rad_s: seen.wheel_speeds.right_rad_s + gauss(noise.wheel_speed_rad_s),
             },
-            gyro_rad_s: state.yaw_rate_rad_s + gauss(noise.gyro_rad_s),
+            gyro_rad_s: seen.yaw_rate_rad_s + gauss(noise.gyro_rad_s),
             acceleration: Some(BodyAcceleration {
                 ahead_m_s2: felt.ahead_m_s2 + gauss(noise.accelerometer_m_s2),
                 left_m_s2: felt.left_m_s2 + gauss(noise.accelerometer_m_s2),
@@ -182,7 +180,7 @@ impl Sensors {
 
 /// Drives one law to the end of the course, or until it is lost.
 pub(crate) fn simulate(case: &Case, law: Law, knowing: Knowing) -> Trace {
-    let model = RobotModel::yi2007();
+    let model = case.model;
     let start_pose = case.course.sample(0.0).pose;
     let first = curve(case.terrain.stiffness(0.0, start_pose));
     let scenario = Scenario {
