@@ -195,10 +195,15 @@ impl Fleet {
         self.folder.path().join(robot.as_str())
     }
 
+    /// All that the runs of a process have logged.
+    pub fn log(&self, name: &str) -> String {
+        let log = self.folder.path().join(format!("{name}.log"));
+        std::fs::read_to_string(log).unwrap_or_default()
+    }
+
     /// The last lines that a process logged.
     pub fn log_tail(&self, name: &str) -> Vec<String> {
-        let log = self.folder.path().join(format!("{name}.log"));
-        let text = std::fs::read_to_string(log).unwrap_or_default();
+        let text = self.log(name);
         let lines: Vec<&str> = text.lines().collect();
         let from = lines.len().saturating_sub(LOG_TAIL_LINES);
         lines[from..]

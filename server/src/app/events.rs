@@ -468,15 +468,22 @@ impl Feed {
             self.app.announce();
         }
         let mut moved = HashSet::new();
+        let mut ended = HashSet::new();
         for (pk, step) in steps {
             last = pk;
             moved.insert(step.mission);
+            if step.step.to.is_terminal() && step.step.from != Some(step.step.to) {
+                ended.insert(step.mission);
+            }
             let robot = (step.site.clone(), step.robot.clone());
             let event = Event::Step(Box::new(step));
             self.app.hub().publish(&event, Topic::Missions, robot);
         }
         for id in moved {
             if let Some(row) = db::missions::find(&mut tx, id).await? {
+                if ended.contains(&id) {
+                    self.app.mission_durations().note(&row.mission);
+                }
                 let mission = self.app.with_progress(row.mission);
                 let robot = (mission.site.clone(), mission.robot.clone());
                 let event = Event::Mission(Box::new(mission));

@@ -94,12 +94,13 @@ impl Fleet {
         self.address
     }
 
-    /// The way to command robots.
-    pub fn commands(&self) -> Commands {
-        Commands::new(Arc::new(Network {
+    /// The way to command the robots that an app knows.
+    pub fn commands(&self, app: &App) -> Commands {
+        let network = Network {
             session: Arc::clone(&self.session),
             supervisor: self.supervisor.clone(),
-        }))
+        };
+        Commands::new(Arc::new(network), app.clone())
     }
 
     /// Begins to listen to robots, to beat the pulse and to look after the router.
