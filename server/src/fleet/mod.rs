@@ -69,6 +69,7 @@ pub struct Fleet {
     session: Arc<Current>,
     supervisor: Supervisor,
     address: SocketAddr,
+    probe_period: Duration,
 }
 
 impl Fleet {
@@ -86,6 +87,7 @@ impl Fleet {
             session: Arc::new(Current::new(session)),
             supervisor,
             address,
+            probe_period: router::PROBE_PERIOD,
         })
     }
 
@@ -125,6 +127,7 @@ impl Fleet {
             channels,
             supervisor: self.supervisor.clone(),
             address: self.address,
+            period: self.probe_period,
             stop: stop(),
         });
         self.supervisor.spawn_vital("router", watching);
