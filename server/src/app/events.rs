@@ -31,7 +31,7 @@ pub const CLIENTS_MAX: usize = 1_500;
 /// Events that wait for one client.
 pub const CLIENT_BUFFER: usize = 4_096;
 /// Bytes of events that wait for one client; a single event may be larger.
-pub const CLIENT_BYTES_MAX: usize = 16 * 1024 * 1024;
+pub const CLIENT_BYTES_MAX: usize = 4 * 1024 * 1024;
 /// Newest events that are kept for clients that come back.
 pub const KEPT_EVENTS_MAX: usize = 8_192;
 /// Bytes of them.

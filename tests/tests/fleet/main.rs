@@ -4,6 +4,7 @@ mod bad_input;
 mod chaos;
 mod control;
 mod event_clients;
+mod identity;
 mod messages;
 mod missions;
 mod outages;
