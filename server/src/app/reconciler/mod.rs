@@ -341,7 +341,14 @@ impl Reconciler {
             .then(|| memory.differs_from.unwrap_or(now.elapsed));
         let memory = *memory;
         let (app, commands) = (self.app.clone(), self.commands.clone());
-        match decide(&mission, &presence, memory, now) {
+        let need = decide(&mission, &presence, memory, now);
+        // What is wanted anew later does not wait for what was wanted before.
+        for (held, wanted) in [(true, Need::Pause), (false, Need::Resume)] {
+            if need != wanted {
+                self.retries.remove(&Job::Hold(mission.id, held));
+            }
+        }
+        match need {
             Need::Wait => {}
             Need::Settle(change) => settle(&self.app, &mission, change).await?,
             Need::Adopt => adopt_shown(&self.app, &mission).await?,
