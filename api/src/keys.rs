@@ -81,6 +81,15 @@ pub fn command(site: &SiteId, robot: &RobotId, verb: Verb) -> String {
     robot_key(site, robot, &format!("cmd/{}", verb.as_str()))
 }
 
+/// The parameter of a command's selector that names the run of the agent that it is for. A run of
+/// another name does not answer; without it, every run does.
+pub const RUN: &str = "boot";
+
+/// The selector of a command to one run of the agent.
+pub fn to_run(command: &str, boot: BootId) -> String {
+    format!("{command}?{RUN}={boot}")
+}
+
 /// Every command to one robot.
 pub fn commands(site: &SiteId, robot: &RobotId) -> String {
     robot_key(site, robot, "cmd/*")

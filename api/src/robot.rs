@@ -337,7 +337,7 @@ pub struct MissionProgress {
     pub length_m: f64,
     /// Distance from the path, metres, positive to its left.
     pub cross_track_m: f64,
-    /// Whether it is held by request: the robot brakes for it, or stands.
+    /// Whether the robot stands, held by request; it may still brake for that while this is false.
     #[serde(default)]
     pub paused: bool,
 }

@@ -120,7 +120,8 @@ impl Agent {
             simulated.seed,
             SimMode::Auto,
         )?
-        .with_charge(simulated.battery_charge_ratio);
+        .with_charge(simulated.battery_charge_ratio)
+        .with_stall(simulated.stall);
         let boot = BootId::from_uuid(Uuid::new_v4());
         let outbox_folder = config.data_dir.join("outbox");
         let outbox = Outbox::open(&outbox_folder, config.outbox, config.robot.clone(), boot)?;

@@ -59,6 +59,9 @@ counters! {
     refused_impersonation,
     /// States and friction reports of robots that have not said hello.
     refused_unknown_robot,
+    /// States and friction reports of another run of the agent than the one that said hello last:
+    /// stragglers, or a second agent under the robot's name.
+    refused_other_run,
     /// Messages to a site that is not known.
     refused_unknown_site,
     /// Messages on a key that is none of ours.

@@ -83,8 +83,12 @@ impl Server {
         let (uploads, uploads_in) = mpsc::channel(ingest::UPLOADS_WAITING_MAX);
         supervisor.spawn_vital("ingest", ingest::run(app.clone(), uploads_in, stop()));
         fleet.listen(&app, uploads).await?;
-        let reconciling =
-            reconciler::run(app.clone(), fleet.commands(), supervisor.clone(), stop());
+        let reconciling = reconciler::run(
+            app.clone(),
+            fleet.commands(&app),
+            supervisor.clone(),
+            stop(),
+        );
         supervisor.spawn_vital("reconciler", reconciling);
         supervisor.spawn_vital("events", events::run(app.clone(), stop()));
         let router = http::router(app.clone());

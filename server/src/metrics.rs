@@ -6,9 +6,14 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
+use std::panic::Location;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
+
+use tokio::sync::mpsc;
+use tread_api::mission::Mission;
+use tread_api::problem::ProblemType;
 
 use crate::app::{App, AppError};
 use crate::db;
@@ -18,19 +23,40 @@ const BOUNDS_S: [f64; 10] = [0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.5, 
 /// Most routes, methods and statuses that are told apart.
 const SERIES_MAX: usize = 1_000;
 
+/// Upper bounds of the buckets of missions, seconds.
+const MISSION_BOUNDS_S: [f64; 10] = [
+    5.0, 15.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1_800.0, 3_600.0, 14_400.0,
+];
+
 /// How long something took, in buckets.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Histogram {
+    bounds_s: [f64; BOUNDS_S.len()],
     buckets: [AtomicU64; BOUNDS_S.len()],
     count: AtomicU64,
     sum_us: AtomicU64,
 }
 
+impl Default for Histogram {
+    fn default() -> Self {
+        Self::of(BOUNDS_S)
+    }
+}
+
 impl Histogram {
+    fn of(bounds_s: [f64; BOUNDS_S.len()]) -> Self {
+        Self {
+            bounds_s,
+            buckets: Default::default(),
+            count: AtomicU64::default(),
+            sum_us: AtomicU64::default(),
+        }
+    }
+
     /// Notes one.
     pub fn note(&self, took: Duration) {
         let took_s = took.as_secs_f64();
-        for (bucket, bound_s) in self.buckets.iter().zip(BOUNDS_S) {
+        for (bucket, bound_s) in self.buckets.iter().zip(self.bounds_s) {
             if took_s <= bound_s {
                 bucket.fetch_add(1, Ordering::Relaxed);
             }
@@ -43,7 +69,7 @@ impl Histogram {
     fn write(&self, text: &mut String, name: &str, labels: &str) {
         let comma = if labels.is_empty() { "" } else { "," };
         let count = self.count.load(Ordering::Relaxed);
-        for (bucket, bound_s) in self.buckets.iter().zip(BOUNDS_S) {
+        for (bucket, bound_s) in self.buckets.iter().zip(self.bounds_s) {
             let value = bucket.load(Ordering::Relaxed);
             line(
                 text,
@@ -74,6 +100,98 @@ impl Requests {
         let key = (method.to_owned(), route.to_owned(), status);
         if series.len() < SERIES_MAX || series.contains_key(&key) {
             series.entry(key).or_default().note(took);
+        }
+    }
+}
+
+/// Transactions by kind: by the use case that began them, and whether they write.
+#[derive(Debug, Default)]
+pub struct Transactions {
+    series: Mutex<BTreeMap<(&'static str, bool), Histogram>>,
+}
+
+impl Transactions {
+    /// Notes one, from its turn to its end: where it was begun, and whether it writes.
+    pub fn note(&self, begun: &'static Location<'static>, writes: bool, took: Duration) {
+        let file = begun.file();
+        let kind = file.rsplit_once("src/").map_or(file, |(_, file)| file);
+        let kind = kind.trim_start_matches("app/").trim_end_matches(".rs");
+        let mut series = self.series.lock().unwrap_or_else(PoisonError::into_inner);
+        // As many as there are source files.
+        series.entry((kind, writes)).or_default().note(took);
+    }
+}
+
+/// Answers that refuse, by the type of their problem.
+#[derive(Debug, Default)]
+pub struct Refusals {
+    series: Mutex<BTreeMap<String, u64>>,
+}
+
+impl Refusals {
+    /// Counts one.
+    pub fn note(&self, kind: ProblemType) {
+        let named = serde_json::to_value(kind).unwrap_or_default();
+        let reason = named.as_str().unwrap_or_default();
+        let reason = reason.trim_start_matches("/problems/").to_owned();
+        let mut series = self.series.lock().unwrap_or_else(PoisonError::into_inner);
+        *series.entry(reason).or_default() += 1;
+    }
+}
+
+/// How long missions took from their start on the robot to their end, by the end.
+#[derive(Debug, Default)]
+pub struct MissionDurations {
+    series: Mutex<BTreeMap<&'static str, Histogram>>,
+}
+
+impl MissionDurations {
+    /// Notes a mission that has ended; one that never began has no duration.
+    pub fn note(&self, mission: &Mission) {
+        let (Some(began), Some(ended)) = (mission.started_at, mission.ended_at) else {
+            return;
+        };
+        let took = Duration::try_from(ended.duration_since(began)).unwrap_or_default();
+        let mut series = self.series.lock().unwrap_or_else(PoisonError::into_inner);
+        let histogram = series.entry(mission.state.as_str());
+        histogram
+            .or_insert_with(|| Histogram::of(MISSION_BOUNDS_S))
+            .note(took);
+    }
+}
+
+type Depth = Box<dyn Fn() -> usize + Send + Sync>;
+
+/// The server's queues, looked at when somebody asks.
+#[derive(Default)]
+pub struct Queues {
+    depths: Mutex<Vec<(&'static str, Depth)>>,
+}
+
+impl std::fmt::Debug for Queues {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Queues").finish_non_exhaustive()
+    }
+}
+
+impl Queues {
+    /// Shows a queue under a name, for as long as somebody can still send into it.
+    pub fn show<T: Send + 'static>(&self, name: &'static str, queue: &mpsc::Sender<T>) {
+        let queue = queue.downgrade();
+        let depth = move || {
+            let waiting = |queue: mpsc::Sender<T>| queue.max_capacity() - queue.capacity();
+            queue.upgrade().map_or(0, waiting)
+        };
+        let mut depths = self.depths.lock().unwrap_or_else(PoisonError::into_inner);
+        depths.push((name, Box::new(depth)));
+    }
+
+    fn write(&self, text: &mut String) {
+        let name = "tread_queue_depth";
+        head(text, name, "gauge", "What waits in each queue.");
+        let depths = self.depths.lock().unwrap_or_else(PoisonError::into_inner);
+        for (queue, depth) in depths.iter() {
+            line(text, &format!("{name}{{queue=\"{queue}\"}} {}", depth()));
         }
     }
 }
@@ -151,6 +269,30 @@ impl App {
             head(&mut text, &name, "counter", "See GET /v1/server.");
             line(&mut text, &format!("{name} {value}"));
         }
+        self.queues().write(&mut text);
+        self.write_refusals(&mut text, counters.as_object());
+        let name = "tread_mission_seconds";
+        head(
+            &mut text,
+            name,
+            "histogram",
+            "Missions from start to end, by end.",
+        );
+        let series = &self.mission_durations().series;
+        let series = series.lock().unwrap_or_else(PoisonError::into_inner);
+        for (state, histogram) in series.iter() {
+            histogram.write(&mut text, name, &format!("state=\"{state}\""));
+        }
+        drop(series);
+        let name = "tread_db_transaction_seconds";
+        head(&mut text, name, "histogram", "Transactions by use case.");
+        let series = &self.db().transactions().series;
+        let series = series.lock().unwrap_or_else(PoisonError::into_inner);
+        for ((kind, writes), histogram) in series.iter() {
+            let labels = format!("kind=\"{kind}\",writes=\"{writes}\"");
+            histogram.write(&mut text, name, &labels);
+        }
+        drop(series);
         let name = "tread_db_write_wait_seconds";
         head(&mut text, name, "histogram", "Wait for the turn to write.");
         self.db().write_waits().write(&mut text, name, "");
@@ -163,6 +305,33 @@ impl App {
             histogram.write(&mut text, name, &labels);
         }
         Ok(text)
+    }
+
+    /// What was refused, by reason: of robots by the counters that say so, of REST by the problem.
+    fn write_refusals(
+        &self,
+        text: &mut String,
+        counters: Option<&serde_json::Map<String, serde_json::Value>>,
+    ) {
+        let name = "tread_refusals_total";
+        head(text, name, "counter", "What was refused, by reason.");
+        for (counter, value) in counters.into_iter().flatten() {
+            let of_message = counter.strip_prefix("refused_");
+            let of_record = ["records_refused", "reports_foreign", "missions_disowned"];
+            let listed = of_record
+                .contains(&counter.as_str())
+                .then_some(counter.as_str());
+            if let Some(reason) = of_message.or(listed) {
+                let labels = format!("of=\"robot\",reason=\"{reason}\"");
+                line(text, &format!("{name}{{{labels}}} {value}"));
+            }
+        }
+        let series = &self.refusals().series;
+        let series = series.lock().unwrap_or_else(PoisonError::into_inner);
+        for (reason, count) in series.iter() {
+            let labels = format!("of=\"request\",reason=\"{reason}\"");
+            line(text, &format!("{name}{{{labels}}} {count}"));
+        }
     }
 }
 

@@ -185,6 +185,18 @@ impl Fleet {
         self.spawn_agent_to(robot, x_m, &format!("tcp/{}", relay.address()));
     }
 
+    /// Starts a second agent under a robot's name, on a disk of its own, without waiting. From
+    /// here on it is what the harness calls `{robot}-second`.
+    ///
+    /// # Panics
+    /// If the robot's name is too long for that.
+    pub fn spawn_second_agent(&mut self, robot: &RobotId, x_m: f64) -> RobotId {
+        let second = format!("{robot}-second").parse().expect("a longer name");
+        let endpoint = self.zenoh_endpoint();
+        self.spawn_named(&second, robot, x_m, &endpoint);
+        second
+    }
+
     /// Flags that every agent gets from now on, beside its usual ones.
     pub fn agents_get(&mut self, flags: &[&str]) {
         self.agent_flags = flags.iter().map(|flag| (*flag).to_owned()).collect();
@@ -195,10 +207,15 @@ impl Fleet {
         self.folder.path().join(robot.as_str())
     }
 
+    /// All that the runs of a process have logged.
+    pub fn log(&self, name: &str) -> String {
+        let log = self.folder.path().join(format!("{name}.log"));
+        std::fs::read_to_string(log).unwrap_or_default()
+    }
+
     /// The last lines that a process logged.
     pub fn log_tail(&self, name: &str) -> Vec<String> {
-        let log = self.folder.path().join(format!("{name}.log"));
-        let text = std::fs::read_to_string(log).unwrap_or_default();
+        let text = self.log(name);
         let lines: Vec<&str> = text.lines().collect();
         let from = lines.len().saturating_sub(LOG_TAIL_LINES);
         lines[from..]
@@ -208,7 +225,12 @@ impl Fleet {
     }
 
     fn spawn_agent_to(&mut self, robot: &RobotId, x_m: f64, endpoint: &str) {
-        let scenario = self.folder.path().join(format!("{robot}.scenario.toml"));
+        self.spawn_named(robot, robot, x_m, endpoint);
+    }
+
+    /// Starts an agent of `robot` that the harness knows as `name`.
+    fn spawn_named(&mut self, name: &RobotId, robot: &RobotId, x_m: f64, endpoint: &str) {
+        let scenario = self.folder.path().join(format!("{name}.scenario.toml"));
         let stiffness = GROUND_THETA.recip();
         let text = format!(
             "site = \"{SITE}\"\ncell_m = 1.0\nterrains = []\n[ground]\nstiffness = {stiffness}\n\
@@ -220,12 +242,12 @@ impl Fleet {
             format!("--site={SITE}"),
             format!("--robot={robot}"),
             format!("--server={endpoint}"),
-            format!("--data-dir={}", self.robot_folder(robot).display()),
+            format!("--data-dir={}", self.robot_folder(name).display()),
             format!("--scenario={}", scenario.display()),
         ];
         arguments.extend(self.agent_flags.iter().cloned());
-        let process = self.start_process(robot.as_str(), &arguments);
-        self.agents.insert(robot.clone(), process);
+        let process = self.start_process(name.as_str(), &arguments);
+        self.agents.insert(name.clone(), process);
     }
 
     /// Ends an agent as a power cut would.

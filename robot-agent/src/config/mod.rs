@@ -14,6 +14,7 @@ use tread_control::geometry::Pose;
 
 use file::{DriveFile, FileConfig};
 
+use crate::drive::simulated::Stall;
 use crate::geometry::{control_model, paper_robot};
 use crate::outbox;
 use crate::sim::scenario::{BUILT_IN_NAME, Scenario, ScenarioError};
@@ -107,6 +108,10 @@ pub struct Flags {
     /// How far the simulated robot's wall clock is ahead, seconds, negative for behind [default: 0]
     #[arg(long, allow_hyphen_values = true)]
     pub clock_ahead_s: Option<i64>,
+    /// A fault of the simulated base: after so many seconds its reading blocks, for so many more,
+    /// with a comma between them
+    #[arg(long, value_parser = parse_stall)]
+    pub stall_s: Option<Stall>,
     /// What to log, as in `info,tread_agent=debug`
     #[arg(long, env = "RUST_LOG", default_value = "info,zenoh=warn")]
     pub log: String,
@@ -138,6 +143,8 @@ pub struct SimulatedConfig {
     pub battery_charge_ratio: f64,
     /// How far its wall clock is ahead, seconds.
     pub clock_ahead_s: i64,
+    /// Its fault, if it is to have one.
+    pub stall: Option<Stall>,
 }
 
 /// A checked configuration.
@@ -241,6 +248,26 @@ fn parse_start(text: &str) -> Result<Pose, String> {
             others.len()
         )),
     }
+}
+
+/// `after,lasting` of the simulated base's fault, seconds.
+fn parse_stall(text: &str) -> Result<Stall, String> {
+    let span = |part: &str| {
+        let number: f64 = part
+            .trim()
+            .parse()
+            .map_err(|_| format!("`{part}` is no number"))?;
+        let in_range = (0.0..=3_600.0).contains(&number);
+        let outside = || format!("{number} is not within 0 to 3600 s");
+        in_range
+            .then(|| Duration::from_secs_f64(number))
+            .ok_or_else(outside)
+    };
+    let (after, lasting) = text.split_once(',').ok_or("two numbers are needed")?;
+    Ok(Stall {
+        after: span(after)?,
+        lasting: span(lasting)?,
+    })
 }
 
 fn assemble(
@@ -357,6 +384,7 @@ fn simulated(
         seed,
         battery_charge_ratio,
         clock_ahead_s,
+        stall: flags.stall_s,
     })
 }
 

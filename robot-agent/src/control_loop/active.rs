@@ -117,10 +117,7 @@ impl Active {
     /// Holds the mission, or lets it go on.
     pub(super) fn hold(&mut self, hold: Hold, is_wanted: bool) {
         match hold {
-            Hold::Pause => {
-                self.holds.pause = is_wanted;
-                self.progress.paused = is_wanted;
-            }
+            Hold::Pause => self.holds.pause = is_wanted,
             Hold::Replacement => self.holds.replacement = is_wanted,
         }
         let is_held = self.is_held();
@@ -163,7 +160,7 @@ impl Active {
             next.follower.warm_start(knowledge);
         }
         self.progress = MissionProgress {
-            paused: self.holds.pause,
+            paused: self.is_told_paused,
             ..progress_of(&next)
         };
         let old = std::mem::replace(&mut self.job, next);
@@ -240,6 +237,7 @@ impl Active {
             return None;
         }
         self.is_told_paused = is_paused;
+        self.progress.paused = is_paused;
         Some(if is_paused {
             News::Paused
         } else {

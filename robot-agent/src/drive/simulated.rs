@@ -40,6 +40,15 @@ pub enum SimulatedDriveError {
     Ground(#[from] ScenarioError),
 }
 
+/// A fault of the base: reading it blocks once, as a stuck bus would.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Stall {
+    /// When, from the first reading on.
+    pub after: Duration,
+    /// For how long.
+    pub lasting: Duration,
+}
+
 /// A simulated base.
 #[derive(Debug, Clone)]
 pub struct SimulatedDrive {
@@ -53,6 +62,8 @@ pub struct SimulatedDrive {
     waiting: Feedback,
     /// Up to when it has been simulated; none before the first call.
     simulated_to: Option<Duration>,
+    stall: Option<Stall>,
+    first_read_at: Option<Duration>,
 }
 
 impl SimulatedDrive {
@@ -84,6 +95,8 @@ impl SimulatedDrive {
             command: WheelSpeeds::default(),
             waiting: Feedback::default(),
             simulated_to: None,
+            stall: None,
+            first_read_at: None,
         })
     }
 
@@ -91,6 +104,13 @@ impl SimulatedDrive {
     #[must_use]
     pub fn with_charge(mut self, charge_ratio: f64) -> Self {
         self.battery = SimulatedBattery::new(charge_ratio);
+        self
+    }
+
+    /// The same base with a fault.
+    #[must_use]
+    pub fn with_stall(mut self, stall: Option<Stall>) -> Self {
+        self.stall = stall;
         self
     }
 
@@ -135,6 +155,10 @@ impl SimulatedDrive {
 
 impl Drive for SimulatedDrive {
     fn read(&mut self, now: Duration) -> Feedback {
+        let since_first = now.saturating_sub(*self.first_read_at.get_or_insert(now));
+        if let Some(stall) = self.stall.take_if(|stall| since_first >= stall.after) {
+            std::thread::sleep(stall.lasting);
+        }
         if self.mode == SimMode::Auto {
             self.advance(now);
         }

@@ -278,7 +278,16 @@ impl FleetLink {
         let (site, robot) = (&identity.site, &identity.robot);
         let (command_sender, commands) = mpsc::channel(COMMANDS_MAX);
         let noted = Arc::clone(note);
+        let own_run = identity.boot.to_string();
         let take_query = move |query: Query| {
+            // For another agent under this robot's name: no reply from here.
+            if query
+                .parameters()
+                .get(keys::RUN)
+                .is_some_and(|run| run != own_run)
+            {
+                return;
+            }
             noted(Noted::ServerHeard);
             let Some(Key::Command(_, _, verb)) = Key::parse(query.key_expr().as_str()) else {
                 // A wildcard or an unknown verb: no reply means not delivered.

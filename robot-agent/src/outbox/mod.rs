@@ -253,6 +253,11 @@ impl Outbox {
         }
     }
 
+    /// How many records this folder has ever taken, over all runs.
+    pub fn appended(&self) -> u64 {
+        locked(&self.shared.store).appended()
+    }
+
     /// Waits until something has been appended since the last call.
     pub async fn arrived(&self) {
         self.shared.arrived.notified().await;

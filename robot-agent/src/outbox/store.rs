@@ -273,6 +273,11 @@ impl Store {
         Ok((first_ordinal, at))
     }
 
+    /// How many records were ever appended: ordinals begin with 0 and have no gap.
+    pub(super) fn appended(&self) -> u64 {
+        self.next_ordinal
+    }
+
     /// Appends a record; it is safe from a crash after the next sync. A full store drops its
     /// oldest records for it.
     pub(super) fn append(&mut self, content: &[u8]) -> Result<RecordName, StoreError> {

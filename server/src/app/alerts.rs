@@ -8,7 +8,7 @@ use tread_api::ids::AlertId;
 use tread_api::page::Page;
 use tread_api::robot::{ALERT_TEXT_MAX, ALERTS_MAX, Alert, AlertReport};
 
-use super::{App, AppError, page};
+use super::{App, AppError, check_named, page};
 use crate::db;
 use crate::db::alerts::AlertFilter;
 use crate::fleet::presence::RobotKey;
@@ -17,6 +17,7 @@ impl App {
     /// Alerts, newest first.
     pub async fn alerts(&self, filter: &AlertFilter, limit: u32) -> Result<Page<Alert>, AppError> {
         let mut tx = self.db().read().await?;
+        check_named(&mut tx, filter.site.as_ref(), filter.robot.as_ref()).await?;
         let alerts = db::alerts::list(&mut tx, filter, limit + 1).await?;
         Ok(page(alerts, limit, |alert: &Alert| alert.id.to_string()))
     }

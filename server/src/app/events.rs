@@ -7,6 +7,7 @@
 //! newest events are kept, so that a client that comes back soon misses nothing.
 
 use std::collections::{HashMap, HashSet, VecDeque};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -29,8 +30,12 @@ use crate::fleet::presence::RobotKey;
 pub const CLIENTS_MAX: usize = 1_500;
 /// Events that wait for one client.
 pub const CLIENT_BUFFER: usize = 4_096;
+/// Bytes of events that wait for one client; a single event may be larger.
+pub const CLIENT_BYTES_MAX: usize = 4 * 1024 * 1024;
 /// Newest events that are kept for clients that come back.
 pub const KEPT_EVENTS_MAX: usize = 8_192;
+/// Bytes of them.
+pub const KEPT_BYTES_MAX: usize = 32 * 1024 * 1024;
 /// How often robots are looked at.
 pub const FEED_PERIOD: Duration = Duration::from_millis(100);
 /// Steps of missions in one look.
@@ -103,6 +108,7 @@ pub struct Hub {
 struct HubState {
     seq: u64,
     kept: VecDeque<Arc<Sent>>,
+    kept_bytes: usize,
     clients: HashMap<u64, Client>,
     dropped: Vec<(Option<Duration>, CancellationToken)>,
     next_client: u64,
@@ -113,7 +119,19 @@ struct HubState {
 struct Client {
     filter: EventFilter,
     buffer: mpsc::Sender<Arc<Sent>>,
+    /// Bytes that wait in the buffer.
+    waiting: Arc<AtomicUsize>,
     cut: CancellationToken,
+}
+
+impl Client {
+    /// Puts an event into the buffer; false if it is full.
+    fn take(&self, event: &Arc<Sent>) -> bool {
+        let bytes = event.text.len();
+        let before = self.waiting.fetch_add(bytes, Ordering::Relaxed);
+        (before == 0 || before + bytes <= CLIENT_BYTES_MAX)
+            && self.buffer.try_send(Arc::clone(event)).is_ok()
+    }
 }
 
 /// A client's end of its buffer; dropping it ends the subscription.
@@ -122,6 +140,7 @@ pub struct Subscription {
     app: App,
     id: u64,
     events: mpsc::Receiver<Arc<Sent>>,
+    waiting: Arc<AtomicUsize>,
     /// What comes first: a snapshot, or what was missed.
     first: VecDeque<Arc<Sent>>,
     covered: u64,
@@ -144,7 +163,11 @@ impl Subscription {
             return None;
         }
         loop {
-            match self.events.recv().await {
+            let event = self.events.recv().await;
+            if let Some(event) = &event {
+                self.waiting.fetch_sub(event.text.len(), Ordering::Relaxed);
+            }
+            match event {
                 // The snapshot holds it already.
                 Some(event) if event.seq <= self.covered => {}
                 Some(event) => return Some(event),
@@ -223,14 +246,18 @@ impl Hub {
             seq,
             ..unnumbered(event, Some(topic), Some(robot))
         });
-        if state.kept.len() >= KEPT_EVENTS_MAX {
-            state.kept.pop_front();
-        }
+        state.kept_bytes += sent.text.len();
         state.kept.push_back(Arc::clone(&sent));
+        while state.kept.len() > KEPT_EVENTS_MAX || state.kept_bytes > KEPT_BYTES_MAX {
+            let Some(oldest) = state.kept.pop_front() else {
+                break;
+            };
+            state.kept_bytes -= oldest.text.len();
+        }
         let mut slow = Vec::new();
         for (&id, client) in &state.clients {
             let wanted = client.filter.lets_through(sent.topic, sent.robot.as_ref());
-            if wanted && client.buffer.try_send(Arc::clone(&sent)).is_err() {
+            if wanted && !client.take(&sent) {
                 slow.push(id);
             }
         }
@@ -291,9 +318,11 @@ impl App {
         cut: CancellationToken,
     ) -> Result<Subscription, AppError> {
         let (buffer, events) = mpsc::channel(CLIENT_BUFFER);
+        let waiting = Arc::new(AtomicUsize::new(0));
         let client = Client {
             filter: filter.clone(),
             buffer,
+            waiting: Arc::clone(&waiting),
             cut,
         };
         let (id, covered) = {
@@ -313,6 +342,7 @@ impl App {
             app: self.clone(),
             id,
             events,
+            waiting,
             first: VecDeque::new(),
             covered,
             ended: false,
@@ -468,15 +498,22 @@ impl Feed {
             self.app.announce();
         }
         let mut moved = HashSet::new();
+        let mut ended = HashSet::new();
         for (pk, step) in steps {
             last = pk;
             moved.insert(step.mission);
+            if step.step.to.is_terminal() && step.step.from != Some(step.step.to) {
+                ended.insert(step.mission);
+            }
             let robot = (step.site.clone(), step.robot.clone());
             let event = Event::Step(Box::new(step));
             self.app.hub().publish(&event, Topic::Missions, robot);
         }
         for id in moved {
             if let Some(row) = db::missions::find(&mut tx, id).await? {
+                if ended.contains(&id) {
+                    self.app.mission_durations().note(&row.mission);
+                }
                 let mission = self.app.with_progress(row.mission);
                 let robot = (mission.site.clone(), mission.robot.clone());
                 let event = Event::Mission(Box::new(mission));

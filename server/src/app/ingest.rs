@@ -236,11 +236,11 @@ impl Writer {
     }
 
     async fn commit_once(&mut self, group: &[Upload]) -> Result<(Vec<Outcome>, Tally), DbError> {
-        let now = self.app.clock().now();
         let mut outcomes: Vec<Outcome> = Vec::with_capacity(group.len());
         let mut candidates = Vec::new();
         let mut tally = Tally::default();
         let mut tx = self.app.db().write().await?;
+        let now = self.app.clock().now();
         for (index, upload) in group.iter().enumerate() {
             let Upload { site, batch, .. } = upload;
             if batch.records.len() > BATCH_RECORDS_MAX {
@@ -256,6 +256,7 @@ impl Writer {
             };
             let boot_pk = self.keys.boot(&mut tx, robot_pk, batch.boot).await?;
             let skew = Skew::of(batch.robot_time, now);
+            let put_right = |at| skew.put_right(at, now);
             let mut receipt = Receipt {
                 committed: 0,
                 duplicates: 0,
@@ -270,14 +271,14 @@ impl Writer {
                 };
                 let keys = (boot_pk, seq_key);
                 match &record.content {
-                    RecordContent::Segment(segment) => match prepared(segment, skew) {
-                        Ok((sums, measurement)) => candidates.push(Candidate {
+                    RecordContent::Segment(segment) => match prepared(segment, put_right) {
+                        Ok((ended_at, sums, measurement)) => candidates.push(Candidate {
                             upload: index,
                             keys,
                             site_pk,
                             robot_pk,
                             segment,
-                            ended_at: skew.put_right(segment.ended_at),
+                            ended_at,
                             sums,
                             measurement,
                         }),
@@ -288,7 +289,7 @@ impl Writer {
                             robot_pk,
                             boot: batch.boot,
                             now,
-                            at: skew.put_right(report.at),
+                            at: put_right(report.at),
                         };
                         match take_new_report(&mut tx, of, keys, report).await? {
                             Some(Ok(())) => {
@@ -402,19 +403,32 @@ impl Skew {
         })
     }
 
-    fn put_right(self, at: Timestamp) -> Timestamp {
-        at.checked_sub(self.0).unwrap_or(at)
+    /// A record from the future all the same is of an earlier run, whose clock was wrong and can no
+    /// longer be asked; what has arrived cannot have been measured later than now.
+    fn put_right(self, at: Timestamp, now: Timestamp) -> Timestamp {
+        let at = at.checked_sub(self.0).unwrap_or(at);
+        if at.duration_since(now) > SKEW_MIN {
+            now
+        } else {
+            at
+        }
     }
 }
 
-fn prepared(segment: &Segment, skew: Skew) -> Result<(Sums, Box<RawValue>), String> {
+/// A segment with its times put right: when it ended, its sums, and its text.
+fn prepared(
+    segment: &Segment,
+    put_right: impl Fn(Timestamp) -> Timestamp,
+) -> Result<(Timestamp, Sums, Box<RawValue>), String> {
     segment.validate().map_err(|invalid| invalid.to_string())?;
     let mut segment = segment.clone();
-    segment.started_at = skew.put_right(segment.started_at);
-    segment.ended_at = skew.put_right(segment.ended_at);
+    let span = segment.ended_at.duration_since(segment.started_at);
+    segment.ended_at = put_right(segment.ended_at);
+    let started_at = segment.ended_at.checked_sub(span);
+    segment.started_at = started_at.unwrap_or(segment.ended_at);
     let sums = Sums::of(&segment).ok_or_else(|| "theta is out of range".to_owned())?;
     let measurement = to_raw_value(&segment).map_err(|error| error.to_string())?;
-    Ok((sums, measurement))
+    Ok((segment.ended_at, sums, measurement))
 }
 
 /// Takes a report unless it was taken before; `None` says that it was.

@@ -29,7 +29,7 @@ use crate::counters::Counters;
 use crate::db::sites::SiteRow;
 use crate::db::{self, Db, DbError, Tx};
 use crate::fleet::presence::Presences;
-use crate::metrics::Requests;
+use crate::metrics::{MissionDurations, Queues, Refusals, Requests};
 
 /// Everything that use cases work on; clones are handles to the same.
 #[derive(Debug, Clone)]
@@ -52,6 +52,9 @@ struct Inner {
     keys_in_flight: InFlight,
     checks: Semaphore,
     requests: Requests,
+    refusals: Refusals,
+    queues: Queues,
+    mission_durations: MissionDurations,
     /// Counts changes of what is kept of robots.
     robots_generation: AtomicU64,
     started_at: Duration,
@@ -74,6 +77,9 @@ impl App {
             keys_in_flight: InFlight::default(),
             checks: Semaphore::new(check::CHECKS_MAX),
             requests: Requests::default(),
+            refusals: Refusals::default(),
+            queues: Queues::default(),
+            mission_durations: MissionDurations::default(),
             robots_generation: AtomicU64::new(1),
             started_at,
         };
@@ -133,6 +139,21 @@ impl App {
     /// Requests by route.
     pub fn requests(&self) -> &Requests {
         &self.inner.requests
+    }
+
+    /// Answers that refuse, by reason.
+    pub fn refusals(&self) -> &Refusals {
+        &self.inner.refusals
+    }
+
+    /// Queues whose depths are shown.
+    pub fn queues(&self) -> &Queues {
+        &self.inner.queues
+    }
+
+    /// How long missions took.
+    pub fn mission_durations(&self) -> &MissionDurations {
+        &self.inner.mission_durations
     }
 
     fn keys_in_flight(&self) -> &InFlight {
@@ -340,6 +361,29 @@ impl AppError {
 impl From<sqlx::Error> for AppError {
     fn from(error: sqlx::Error) -> Self {
         Self::Storage(error.into())
+    }
+}
+
+/// Refuses a filter that names what is not known here.
+async fn check_named(
+    tx: &mut Tx,
+    site: Option<&SiteId>,
+    robot: Option<&RobotId>,
+) -> Result<(), AppError> {
+    let unknown = |parameter, name: &str| {
+        let detail = format!("`{name}` names nothing that is known here");
+        Err(AppError::InvalidQuery { parameter, detail })
+    };
+    if let Some(site) = site
+        && db::sites::find(tx, site).await?.is_none()
+    {
+        return unknown("site", site.as_str());
+    }
+    match robot {
+        Some(robot) if !db::robots::is_known(tx, site, robot).await? => {
+            unknown("robot", robot.as_str())
+        }
+        Some(_) | None => Ok(()),
     }
 }
 

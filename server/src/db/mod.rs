@@ -15,6 +15,8 @@ pub mod sums;
 pub mod terrains;
 
 use std::fmt::Display;
+use std::ops::{Deref, DerefMut};
+use std::panic::Location;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
@@ -24,9 +26,10 @@ use jiff::Timestamp;
 use serde::de::DeserializeOwned;
 use serde::{Serialize, Serializer as _};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
-use sqlx::{Sqlite, SqlitePool, Transaction};
+use sqlx::{Sqlite, SqliteConnection, SqlitePool, Transaction};
+use tokio::time::Instant;
 
-use crate::metrics::Histogram;
+use crate::metrics::{Histogram, Transactions};
 
 /// Oldest SQLite that is free of the bug that can lose a WAL.
 pub const SQLITE_VERSION_MIN: (u32, u32, u32) = (3, 51, 3);
@@ -37,8 +40,55 @@ const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long SQLite waits for a lock that another process holds.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// A transaction on the database.
-pub type Tx = Transaction<'static, Sqlite>;
+/// A transaction on the database, rolled back unless it is committed.
+#[derive(Debug)]
+pub struct Tx {
+    inner: Transaction<'static, Sqlite>,
+    noted: Noted,
+}
+
+/// Notes how long a transaction took when it is over.
+#[derive(Debug)]
+struct Noted {
+    transactions: Arc<Transactions>,
+    begun: &'static Location<'static>,
+    writes: bool,
+    began_at: Instant,
+}
+
+impl Drop for Noted {
+    fn drop(&mut self) {
+        let took = self.began_at.elapsed();
+        self.transactions.note(self.begun, self.writes, took);
+    }
+}
+
+impl Tx {
+    /// Makes what was written last.
+    ///
+    /// # Errors
+    /// SQLite failed; nothing is written then.
+    pub async fn commit(self) -> Result<(), sqlx::Error> {
+        let Self { inner, noted } = self;
+        let committed = inner.commit().await;
+        drop(noted);
+        committed
+    }
+}
+
+impl Deref for Tx {
+    type Target = SqliteConnection;
+
+    fn deref(&self) -> &SqliteConnection {
+        &self.inner
+    }
+}
+
+impl DerefMut for Tx {
+    fn deref_mut(&mut self) -> &mut SqliteConnection {
+        &mut self.inner
+    }
+}
 
 /// Why the database did not do it.
 #[derive(Debug, thiserror::Error)]
@@ -105,6 +155,7 @@ pub struct Db {
     readers: SqlitePool,
     version: String,
     write_waits: Arc<Histogram>,
+    transactions: Arc<Transactions>,
 }
 
 impl Db {
@@ -164,6 +215,7 @@ impl Db {
             readers,
             version,
             write_waits: Arc::default(),
+            transactions: Arc::default(),
         })
     }
 
@@ -176,11 +228,35 @@ impl Db {
     ///
     /// # Errors
     /// The turn did not come in time, or SQLite failed.
-    pub async fn write(&self) -> Result<Tx, DbError> {
-        let asked_at = tokio::time::Instant::now();
-        let tx = self.writer.begin_with("BEGIN IMMEDIATE").await?;
-        self.write_waits.note(asked_at.elapsed());
-        Ok(tx)
+    #[track_caller]
+    pub fn write(&self) -> impl Future<Output = Result<Tx, DbError>> + use<'_> {
+        let begun = Location::caller();
+        async move {
+            let asked_at = Instant::now();
+            let inner = self.writer.begin_with("BEGIN IMMEDIATE").await?;
+            self.write_waits.note(asked_at.elapsed());
+            Ok(self.timed(inner, begun, true))
+        }
+    }
+
+    fn timed(
+        &self,
+        inner: Transaction<'static, Sqlite>,
+        begun: &'static Location<'static>,
+        writes: bool,
+    ) -> Tx {
+        let noted = Noted {
+            transactions: Arc::clone(&self.transactions),
+            begun,
+            writes,
+            began_at: Instant::now(),
+        };
+        Tx { inner, noted }
+    }
+
+    /// How long transactions took.
+    pub fn transactions(&self) -> &Transactions {
+        &self.transactions
     }
 
     /// How long writers waited for their turn.
@@ -192,8 +268,13 @@ impl Db {
     ///
     /// # Errors
     /// No connection became free in time, or SQLite failed.
-    pub async fn read(&self) -> Result<Tx, DbError> {
-        Ok(self.readers.begin().await?)
+    #[track_caller]
+    pub fn read(&self) -> impl Future<Output = Result<Tx, DbError>> + use<'_> {
+        let begun = Location::caller();
+        async move {
+            let inner = self.readers.begin().await?;
+            Ok(self.timed(inner, begun, false))
+        }
     }
 
     /// Closes all connections after what they are doing; the file is whole then.

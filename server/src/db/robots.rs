@@ -102,6 +102,23 @@ pub async fn find(
     raw.map(RobotRow::try_from).transpose()
 }
 
+/// Whether any robot has that name, in that site if one is given.
+pub async fn is_known(
+    db: &mut SqliteConnection,
+    site: Option<&SiteId>,
+    id: &RobotId,
+) -> Result<bool, DbError> {
+    let (id, site) = (id.as_str(), site.map(SiteId::as_str));
+    let found = sqlx::query_scalar!(
+        r#"SELECT EXISTS (
+               SELECT 1 FROM robots JOIN sites ON sites.pk = robots.site_pk
+               WHERE robots.id = ?1 AND (?2 IS NULL OR sites.id = ?2)) AS "found!: bool""#,
+        id,
+        site,
+    );
+    Ok(found.fetch_one(db).await?)
+}
+
 /// Robots of a site after an identifier, in alphabetical order; retired ones too if asked for.
 pub async fn list(
     db: &mut SqliteConnection,

@@ -7,6 +7,7 @@ use std::time::Duration;
 use serde::Serialize;
 use tokio::sync::oneshot;
 use tracing::{debug, warn};
+use tread_api::ids::BootId;
 use tread_api::keys::{self, Verb};
 use tread_api::wire::command::Answer;
 use tread_api::wire::{self, Refusal};
@@ -16,6 +17,7 @@ use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 
 use super::presence::RobotKey;
 use super::router::Current;
+use crate::app::App;
 use crate::supervisor::Supervisor;
 
 /// How long a robot may take to answer.
@@ -29,36 +31,60 @@ pub type Carrying = Pin<Box<dyn Future<Output = Option<Answer>> + Send>>;
 /// Carries one command to a robot and its answer back; `None` is not delivered, as far as anyone
 /// knows. The network of a fleet is one, a simulated network in a test another.
 pub trait Carrier: std::fmt::Debug + Send + Sync {
-    /// Carries a payload to what answers at a robot's verb.
-    fn carry(&self, robot: &RobotKey, verb: Verb, payload: Vec<u8>) -> Carrying;
+    /// Carries a payload to what answers at a robot's verb: to that run of its agent alone, or to
+    /// whatever runs under its name.
+    fn carry(
+        &self,
+        robot: &RobotKey,
+        run: Option<BootId>,
+        verb: Verb,
+        payload: Vec<u8>,
+    ) -> Carrying;
 }
 
 /// Sends commands to robots; clones send through the same carrier.
 #[derive(Debug, Clone)]
 pub struct Commands {
     carrier: Arc<dyn Carrier>,
+    app: App,
 }
 
 impl Commands {
-    /// Commands through a carrier.
-    pub fn new(carrier: Arc<dyn Carrier>) -> Self {
-        Self { carrier }
+    /// Commands through a carrier, to the robots that an app knows.
+    pub fn new(carrier: Arc<dyn Carrier>, app: App) -> Self {
+        Self { carrier, app }
     }
 
-    /// Sends one command and waits for its answer.
+    /// Sends one command to a robot's present run and waits for its answer.
     ///
-    /// `None` means not delivered, as far as anyone knows: no robot answered in time, or its
-    /// answer does not read. The same may be sent again without harm.
+    /// `None` as for [`Commands::send_to`].
     pub async fn send<T: Serialize>(
         &self,
         robot: &RobotKey,
         verb: Verb,
         command: &T,
     ) -> Option<Answer> {
+        let present = self.app.presences().get(robot).boot();
+        let run = present.map(|(boot, _since)| boot);
+        self.send_to(robot, run, verb, command).await
+    }
+
+    /// Sends one command to one run of a robot's agent, or to all under its name, and waits for
+    /// the first answer.
+    ///
+    /// `None` means not delivered, as far as anyone knows: no robot answered in time, or its
+    /// answer does not read. The same may be sent again without harm.
+    pub async fn send_to<T: Serialize>(
+        &self,
+        robot: &RobotKey,
+        run: Option<BootId>,
+        verb: Verb,
+        command: &T,
+    ) -> Option<Answer> {
         let payload = wire::encode(command)
             .inspect_err(|error| warn!("cannot write a command for `{}`: {error}", robot.1))
             .ok()?;
-        self.carrier.carry(robot, verb, payload).await
+        self.carrier.carry(robot, run, verb, payload).await
     }
 }
 
@@ -70,8 +96,17 @@ pub(super) struct Network {
 }
 
 impl Carrier for Network {
-    fn carry(&self, (site, robot): &RobotKey, verb: Verb, payload: Vec<u8>) -> Carrying {
-        let key = keys::command(site, robot, verb);
+    fn carry(
+        &self,
+        (site, robot): &RobotKey,
+        run: Option<BootId>,
+        verb: Verb,
+        payload: Vec<u8>,
+    ) -> Carrying {
+        let mut key = keys::command(site, robot, verb);
+        if let Some(boot) = run {
+            key = keys::to_run(&key, boot);
+        }
         let (session, supervisor) = (self.session.get(), self.supervisor.clone());
         Box::pin(query(session, supervisor, key, payload))
     }
@@ -91,7 +126,8 @@ async fn query(
         session
             .get(query_key)
             .payload(payload)
-            .target(QueryTarget::BestMatching)
+            // A second agent under the same name must not swallow what is for the first.
+            .target(QueryTarget::All)
             .consolidation(ConsolidationMode::None)
             .timeout(COMMAND_TIMEOUT)
             .callback_mut(move |reply| {

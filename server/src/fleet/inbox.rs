@@ -60,6 +60,12 @@ impl Channels {
         let (states, states_in) = mpsc::channel(STATES_WAITING_MAX);
         let (hellos, hellos_in) = mpsc::channel(HELLOS_WAITING_MAX);
         let (uploads, uploads_in) = mpsc::channel(UPLOADS_WAITING_MAX);
+        let queues = app.queues();
+        queues.show("presence", &presence);
+        queues.show("states", &states);
+        queues.show("hellos", &hellos);
+        queues.show("uploads", &uploads);
+        queues.show("ingest", &uploads_out);
         let stop = || supervisor.stop_token();
         supervisor.spawn_vital("presence", watch_presence(app.clone(), presence_in, stop()));
         supervisor.spawn_vital("states", read_states(app.clone(), states_in, stop()));
@@ -169,16 +175,19 @@ async fn read_states(app: App, mut published: mpsc::Receiver<Published>, stop: C
                         Heard::News => app.wake(),
                         Heard::Nothing => {}
                         Heard::Stranger => refuse_stranger(&app, &key),
+                        Heard::Other => app.counters().refused_other_run.one(),
                     }
                 }
             }
             Some(Key::Friction(site, robot)) => {
                 let named = |report: &FrictionReport| report.robot == robot;
                 let key: RobotKey = (site, robot.clone());
-                if let Some(report) = read(&app, &message, named)
-                    && app.presences().friction(&key, &report, now) == Heard::Stranger
-                {
-                    refuse_stranger(&app, &key);
+                if let Some(report) = read(&app, &message, named) {
+                    match app.presences().friction(&key, &report, now) {
+                        Heard::News | Heard::Nothing => {}
+                        Heard::Stranger => refuse_stranger(&app, &key),
+                        Heard::Other => app.counters().refused_other_run.one(),
+                    }
                 }
             }
             Some(_) | None => refuse_key(&app, &message.key),

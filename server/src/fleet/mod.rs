@@ -69,6 +69,7 @@ pub struct Fleet {
     session: Arc<Current>,
     supervisor: Supervisor,
     address: SocketAddr,
+    probe_period: Duration,
 }
 
 impl Fleet {
@@ -86,6 +87,7 @@ impl Fleet {
             session: Arc::new(Current::new(session)),
             supervisor,
             address,
+            probe_period: router::PROBE_PERIOD,
         })
     }
 
@@ -94,12 +96,13 @@ impl Fleet {
         self.address
     }
 
-    /// The way to command robots.
-    pub fn commands(&self) -> Commands {
-        Commands::new(Arc::new(Network {
+    /// The way to command the robots that an app knows.
+    pub fn commands(&self, app: &App) -> Commands {
+        let network = Network {
             session: Arc::clone(&self.session),
             supervisor: self.supervisor.clone(),
-        }))
+        };
+        Commands::new(Arc::new(network), app.clone())
     }
 
     /// Begins to listen to robots, to beat the pulse and to look after the router.
@@ -124,6 +127,7 @@ impl Fleet {
             channels,
             supervisor: self.supervisor.clone(),
             address: self.address,
+            period: self.probe_period,
             stop: stop(),
         });
         self.supervisor.spawn_vital("router", watching);

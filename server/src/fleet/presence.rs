@@ -1,5 +1,7 @@
 //! Who is on the network now, and what each robot said last. In memory; ages by our own clock.
 
+mod rivals;
+
 use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -9,6 +11,9 @@ use tread_api::friction::LiveFriction;
 use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
 use tread_api::robot::{Aged, AlertReport, LinkCause, LinkState, RobotLive, RobotMode};
 use tread_api::wire::state::{FrictionReport, RobotState};
+
+use self::rivals::OtherRun;
+pub use self::rivals::Rival;
 
 /// How long after its last heartbeat a robot counts as online: three of them at 5 Hz.
 pub const ONLINE_TIMEOUT: Duration = Duration::from_millis(700);
@@ -33,6 +38,8 @@ pub enum Heard {
     News,
     /// The robot has not said hello; nothing of it is kept.
     Stranger,
+    /// It is of another run of the agent than the present one; nothing of it is shown.
+    Other,
 }
 
 /// A robot's name with its site.
@@ -54,6 +61,7 @@ pub struct Presence {
     /// which had the shortest way.
     clock_offsets_ms: VecDeque<i64>,
     alerts_changed: bool,
+    other: Option<OtherRun>,
     shown: Option<Shown>,
     state: Option<(RobotState, Duration)>,
     friction: Option<(LiveFriction, Duration)>,
@@ -153,6 +161,9 @@ impl Presence {
             self.state = None;
             self.friction = None;
             self.clock_offsets_ms.clear();
+            if self.other.is_some_and(|other| other.boot == boot) {
+                self.forget_other();
+            }
         }
     }
 
@@ -233,10 +244,12 @@ impl Presences {
         let changed = robots
             .iter_mut()
             .filter(|(_, presence)| presence.alerts_changed);
-        let taken = changed.map(|(key, presence)| {
+        let taken = changed.filter_map(|(key, presence)| {
+            // Without a state of the present run nobody knows what the robot itself says.
+            let own = presence.state()?.alerts.clone();
+            let alerts = presence.rival_alert().into_iter().chain(own).collect();
             presence.alerts_changed = false;
-            let alerts = presence.state().map(|state| state.alerts.clone());
-            (key.clone(), alerts.unwrap_or_default())
+            Some((key.clone(), alerts))
         });
         taken.collect()
     }
@@ -359,7 +372,8 @@ impl Presences {
         };
         let was_online = presence.link(now) == LinkState::Online;
         if !presence.takes(state.boot, now) {
-            return Heard::Nothing;
+            presence.note_other(&state, now);
+            return Heard::Other;
         }
         let news = presence.state().is_none_or(|before| {
             before.mode != state.mode
@@ -403,9 +417,10 @@ impl Presences {
         let Some(presence) = robots.get_mut(key).filter(|presence| presence.welcomed) else {
             return Heard::Stranger;
         };
-        if presence.takes(report.boot, now) {
-            presence.friction = Some((report.friction, now));
+        if !presence.takes(report.boot, now) {
+            return Heard::Other;
         }
+        presence.friction = Some((report.friction, now));
         Heard::Nothing
     }
 }
@@ -423,15 +438,15 @@ mod tests {
 
     use super::*;
 
-    fn key() -> RobotKey {
+    pub(super) fn key() -> RobotKey {
         ("yard".parse().unwrap(), "rover-1".parse().unwrap())
     }
 
-    fn boot(number: u128) -> BootId {
+    pub(super) fn boot(number: u128) -> BootId {
         BootId::from_uuid(Uuid::from_u128(number))
     }
 
-    fn state(boot: BootId, seq: u64) -> RobotState {
+    pub(super) fn state(boot: BootId, seq: u64) -> RobotState {
         RobotState {
             robot: key().1,
             boot,
@@ -453,11 +468,11 @@ mod tests {
         }
     }
 
-    fn wall() -> Timestamp {
+    pub(super) fn wall() -> Timestamp {
         "2026-11-01T00:00:00Z".parse().unwrap()
     }
 
-    const SECOND: Duration = Duration::from_secs(1);
+    pub(super) const SECOND: Duration = Duration::from_secs(1);
 
     #[test]
     fn silence_is_stale_and_a_lost_token_is_offline() {
@@ -499,9 +514,10 @@ mod tests {
         assert!(presences.get(&key()).state().is_none());
         assert_eq!(
             presences.state(&key(), state(boot(1), 8), 3 * SECOND, wall()),
-            Heard::Nothing
+            Heard::Other
         );
         assert_eq!(presences.get(&key()).boot(), Some((boot(2), 3 * SECOND)));
+        assert!(presences.take_rivals(4 * SECOND).is_empty());
     }
 
     #[test]

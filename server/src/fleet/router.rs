@@ -18,7 +18,7 @@ use crate::supervisor::Supervisor;
 /// The key that the router answers itself on.
 const PROBE_KEY: &str = "tread/self/probe";
 /// Time between two looks.
-const PROBE_PERIOD: Duration = Duration::from_secs(10);
+pub(super) const PROBE_PERIOD: Duration = Duration::from_secs(10);
 /// How long one look may take, connection and all.
 const PROBE_TIMEOUT: Duration = Duration::from_secs(3);
 /// Looks in a row without an answer after which the router is opened again.
@@ -63,6 +63,8 @@ pub(super) struct Watch {
     pub(super) channels: Channels,
     pub(super) supervisor: Supervisor,
     pub(super) address: SocketAddr,
+    /// Time between two looks.
+    pub(super) period: Duration,
     pub(super) stop: CancellationToken,
 }
 
@@ -73,7 +75,7 @@ pub(super) async fn watch(watch: Watch) {
         tokio::select! {
             biased;
             () = watch.stop.cancelled() => return,
-            () = tokio::time::sleep(PROBE_PERIOD) => {}
+            () = tokio::time::sleep(watch.period) => {}
         }
         let looking = watch.supervisor.blocking({
             let address = watch.address;
@@ -132,4 +134,63 @@ fn probe(address: SocketAddr) -> bool {
         Ok(answered)
     };
     asked().unwrap_or(false)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::Ipv4Addr;
+
+    use tokio::sync::mpsc;
+    use zenoh::Wait as _;
+
+    use super::super::Fleet;
+    use super::*;
+    use crate::clock::Clock;
+    use crate::config::FrictionConfig;
+    use crate::db::Db;
+
+    const PATIENCE: Duration = Duration::from_secs(30);
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_router_that_no_longer_answers_is_opened_again_and_takes_robots() {
+        let folder = tempfile::tempdir().unwrap();
+        let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
+        let app = App::new(db, Clock::system(), FrictionConfig::default());
+        let supervisor = Supervisor::new();
+        let address = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
+        let mut fleet = Fleet::open(address, supervisor.clone()).await.unwrap();
+        fleet.probe_period = Duration::from_millis(50);
+        let (uploads, _uploads_in) = mpsc::channel(1);
+        fleet.listen(&app, uploads).await.unwrap();
+        let answers = async |wanted: bool| {
+            let address = fleet.address();
+            let looking = async {
+                while tokio::task::spawn_blocking(move || probe(address))
+                    .await
+                    .unwrap()
+                    != wanted
+                {
+                    tokio::time::sleep(Duration::from_millis(20)).await;
+                }
+            };
+            tokio::time::timeout(PATIENCE, looking).await.unwrap();
+        };
+        answers(true).await;
+        assert_eq!(app.counters().router_reopened.get(), 0);
+        let session = fleet.session.get();
+        tokio::task::spawn_blocking(move || session.close().wait())
+            .await
+            .unwrap()
+            .unwrap();
+        let reopened = async {
+            while app.counters().router_reopened.get() == 0 {
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+        };
+        tokio::time::timeout(PATIENCE, reopened).await.unwrap();
+        assert!(app.counters().router_probes_failed.get() >= u64::from(FAILURES_MAX));
+        answers(true).await;
+        supervisor.stop().await.unwrap();
+        fleet.close().await;
+    }
 }

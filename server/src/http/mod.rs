@@ -36,7 +36,7 @@ use utoipa_axum::routes;
 use utoipa_swagger_ui::SwaggerUi;
 
 use self::extract::BodyLimit;
-use self::problem::Problem;
+use self::problem::{Problem, Refused};
 use crate::app::App;
 
 /// Largest body of `POST /v1/missions`: a path of the most waypoints.
@@ -170,6 +170,9 @@ async fn measure(State(app): State<App>, request: Request, next: Next) -> Respon
     let took = app.clock().elapsed().saturating_sub(asked_at);
     let status = response.status().as_u16();
     app.requests().note(&method, &route, status, took);
+    if let Some(Refused(kind)) = response.extensions().get() {
+        app.refusals().note(*kind);
+    }
     response
 }
 

@@ -14,6 +14,10 @@ pub struct Problem {
     body: Box<ProblemBody>,
 }
 
+/// Marks an answer as a problem of that type.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Refused(pub(super) ProblemType);
+
 impl Problem {
     /// A problem of that kind.
     pub fn new(kind: ProblemType) -> Self {
@@ -126,6 +130,7 @@ impl IntoResponse for Problem {
         response
             .headers_mut()
             .insert(header::CONTENT_TYPE, media_type);
+        response.extensions_mut().insert(Refused(self.body.kind));
         response
     }
 }

@@ -70,6 +70,88 @@ async fn a_mission_is_paused_and_resumed_when_its_robot_says_so() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_mission_is_paused_when_its_robot_stands_and_not_when_it_was_told() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    robot.set_mood(Mood::Braking);
+    act(&yard, &mission, "pause", &json!({})).await;
+    eventually("the robot was told", async || {
+        let holds = robot.holds();
+        if holds.is_empty() { Err(holds) } else { Ok(()) }
+    })
+    .await;
+    // It was told, it has answered, and it drives still.
+    tokio::time::sleep(Duration::from_millis(1_500)).await;
+    let braking = yard.mission(mission.id).await;
+    assert_eq!(braking.mission.state, MissionState::Active);
+    assert!(braking.mission.pause_wanted);
+    assert_eq!(robot.holds(), [Verb::Pause], "once is enough for a while");
+    robot.report(0, &mission, MissionPhase::Paused).await;
+    assert_eq!(
+        yard.mission(mission.id).await.mission.state,
+        MissionState::Paused
+    );
+    act(&yard, &mission, "resume", &json!({})).await;
+    eventually("the robot was told to go on", async || {
+        let holds = robot.holds();
+        if holds.contains(&Verb::Resume) {
+            Ok(())
+        } else {
+            Err(holds)
+        }
+    })
+    .await;
+    robot.report(1, &mission, MissionPhase::Resumed).await;
+    let resumed = yard.mission(mission.id).await;
+    assert_eq!(resumed.mission.state, MissionState::Active);
+    let robots = |cause| {
+        let mut events = resumed.events.iter();
+        let event = events.find(|event| event.cause == cause).unwrap();
+        event.actor == tread_api::mission::Actor::Robot
+    };
+    assert!(robots(Cause::Paused) && robots(Cause::Resumed));
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_mission_that_only_the_robots_state_shows_as_taken_knows_its_run() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    robot.set_mood(Mood::Silent);
+    let mission = yard.create_mission(&robot.id).await;
+    eventually("it is offered", async || {
+        let offers = robot.offers().len();
+        if offers > 0 { Ok(()) } else { Err(offers) }
+    })
+    .await;
+    robot.drive(&mission, 0.5);
+    let active = yard.mission_becomes(mission.id, MissionState::Active).await;
+    assert_eq!(active.mission.boot, Some(robot.boot));
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_filter_that_names_nothing_known_is_named() {
+    let yard = Yard::start().await;
+    let _robot = Robot::join(&yard, "rover-1").await;
+    for (query, field) in [
+        ("/v1/missions?robot=nobody", "robot"),
+        ("/v1/missions?site=moon", "site"),
+        ("/v1/missions?site=moon&robot=rover-1", "site"),
+        ("/v1/alerts?robot=nobody", "robot"),
+    ] {
+        let (status, body) = yard.get_value(query).await;
+        assert_eq!(status, StatusCode::BAD_REQUEST, "{query}: {body}");
+        assert_eq!(body["field"], field, "{query}: {body}");
+    }
+    let (status, body) = yard.get_value("/v1/missions?site=yard&robot=rover-1").await;
+    assert_eq!(status, StatusCode::OK, "{body}");
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_the_present_state_forbids_is_refused_with_that_state() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;

@@ -1,10 +1,11 @@
 //! Sent twice is counted once, in whatever order it comes; and the map says what was measured.
 
+use jiff::SignedDuration;
 use proptest::prelude::*;
 use proptest::test_runner::{Config as ProptestConfig, TestRunner};
 use serde_json::{Value, json};
 use tokio::sync::{mpsc, oneshot};
-use tread_api::friction::{CellFriction, StoredSegment, TerrainFriction};
+use tread_api::friction::{CellFriction, Segment, StoredSegment, TerrainFriction};
 use tread_api::ids::BootId;
 use tread_api::page::Page;
 use tread_api::wire::hello::Hello;
@@ -286,4 +287,52 @@ async fn a_new_name_keeps_the_friction_of_the_ground_and_a_new_outline_does_not(
     replace(lawn("South lawn", 8.0)).await;
     assert_eq!(known().await, 0);
     yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn times_of_a_wrong_clock_are_put_right_and_nothing_of_it_is_lost() {
+    let writer = Writer::start().await;
+    let now = time("2026-11-01T00:00:00Z");
+    let day_s = 86_400;
+    // How far the records' clock is ahead, what the batch says of the clock, when it counts.
+    let cases = [
+        (5 * day_s, Some(5 * day_s), -60),
+        (-9 * day_s, Some(-9 * day_s), -60),
+        // What the network takes is no wrong clock.
+        (0, Some(-2), -60),
+        // An earlier run was days ahead, and nobody can ask its clock any more.
+        (5 * day_s, Some(0), 0),
+        (5 * day_s, None, 0),
+    ];
+    for (number, (ahead_s, said_s, counts_s)) in (0_u16..).zip(cases) {
+        let seq = u64::from(number);
+        let shifted = |by_s: i64| now + SignedDuration::from_secs(by_s);
+        let mut segment = segment((i32::from(number), 0), 0.2, 0);
+        segment.started_at = shifted(ahead_s - 70);
+        segment.ended_at = shifted(ahead_s - 60);
+        let (answer, answered) = oneshot::channel();
+        let batch = Batch {
+            robot: "rover-1".parse().unwrap(),
+            boot: boot(1),
+            robot_time: said_s.map(shifted),
+            records: vec![measured(seq, segment)],
+        };
+        let upload = Upload {
+            site: site(),
+            batch,
+            answer,
+        };
+        writer.uploads.send(upload).await.unwrap();
+        assert_eq!(answered.await.unwrap().unwrap().committed, 1);
+        let mut tx = writer.app.db().read().await.unwrap();
+        let text: String = sqlx::query_scalar("SELECT measurement FROM segments WHERE seq = ?")
+            .bind(i64::from(number))
+            .fetch_one(&mut *tx)
+            .await
+            .unwrap();
+        let stored: Segment = serde_json::from_str(&text).unwrap();
+        assert_eq!(stored.ended_at, shifted(counts_s), "case {number}");
+        let span = stored.ended_at.duration_since(stored.started_at);
+        assert_eq!(span.as_secs(), 10, "case {number}");
+    }
 }

@@ -10,6 +10,8 @@ mod harness;
 #[cfg(test)]
 mod ingest;
 #[cfg(test)]
+mod metrics;
+#[cfg(test)]
 mod missions;
 #[cfg(test)]
 mod network;
@@ -21,3 +23,5 @@ mod program;
 mod resources;
 #[cfg(test)]
 mod robot;
+#[cfg(test)]
+mod slow_client;

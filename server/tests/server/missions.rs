@@ -1,6 +1,9 @@
 //! Missions from the request to their end, whatever arrives late, twice or not at all.
 
+use std::time::Duration;
+
 use reqwest::StatusCode;
+use serde_json::json;
 use tread_api::ids::BootId;
 use tread_api::mission::{Actor, Mission, MissionState};
 use tread_api::page::Page;
@@ -206,6 +209,11 @@ async fn a_mission_that_waits_past_its_latest_start_expires() {
     drop(robot);
     let mut body = circle(&id);
     body["latest_start"] = "2026-01-01T00:00:00Z".into();
+    let (status, problem) = yard.post("/v1/missions", &body).await;
+    assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{problem}");
+    assert_eq!(problem["field"], "latest_start");
+    let soon = yard.server.app().clock().now() + Duration::from_millis(300);
+    body["latest_start"] = json!(soon);
     let (status, body) = yard.post("/v1/missions", &body).await;
     assert_eq!(status, StatusCode::CREATED, "{body}");
     let mission: Mission = serde_json::from_value(body).unwrap();

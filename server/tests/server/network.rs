@@ -1,13 +1,15 @@
 //! Messages that are not what they should be are refused with a reason and a counter.
 
+use jiff::SignedDuration;
 use tread_api::ids::RobotId;
 use tread_api::keys;
 use tread_api::wire;
 use tread_api::wire::ingest::{BATCH_RECORDS_MAX, Batch, Receipt};
+use tread_api::wire::state::{PULSE_PERIOD_MS, ServerPulse};
 use tread_api::wire::{RefusalCode, hello::Welcome};
 use zenoh::Wait as _;
 
-use crate::harness::{Yard, ask, eventually, measured, segment, site};
+use crate::harness::{PATIENCE, Yard, ask, eventually, measured, segment, site};
 use crate::robot::{Robot, session};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -120,5 +122,38 @@ async fn a_hello_to_an_unknown_site_or_of_an_impossible_robot_is_refused() {
     assert!(refusal.detail.contains("mass_kg"), "{refusal:?}");
     let (status, _) = yard.get_value("/v1/sites/yard/robots/rover-1").await;
     assert_eq!(status, 404);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_servers_pulse_beats_on_every_site_and_tells_its_time() {
+    let yard = Yard::start().await;
+    let session = session(&yard).await;
+    let (beat, mut beats) = tokio::sync::mpsc::channel(64);
+    session
+        .declare_subscriber(keys::pulse(&site()))
+        .callback(move |sample| {
+            let pulse: ServerPulse = wire::decode(&sample.payload().to_bytes()).unwrap();
+            let _ = beat.try_send(pulse.server_time);
+        })
+        .background()
+        .wait()
+        .unwrap();
+    let mut times = Vec::new();
+    for _ in 0..8 {
+        let next = tokio::time::timeout(PATIENCE, beats.recv()).await;
+        times.push(next.unwrap().unwrap());
+    }
+    let clock = yard.server.app().clock();
+    let off = clock.now().duration_since(times[7]);
+    assert!(off.abs() < SignedDuration::from_secs(2), "{off:#}");
+    let span_ms = times[7].duration_since(times[0]).as_millis();
+    let expected_ms = 7 * i128::from(PULSE_PERIOD_MS);
+    // A busy machine may make it late, never early by a whole beat.
+    assert!(
+        span_ms > expected_ms - i128::from(PULSE_PERIOD_MS),
+        "{span_ms}"
+    );
+    session.close().wait().unwrap();
     yard.server.stop().await.unwrap();
 }

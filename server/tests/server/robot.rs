@@ -26,6 +26,8 @@ pub(crate) enum Mood {
     Willing,
     Refusing(OfferRefusal),
     Silent,
+    /// Takes a pause and goes on braking for it.
+    Braking,
 }
 
 #[derive(Debug)]
@@ -319,7 +321,7 @@ fn answer(
                     code,
                     detail: "as told".to_owned(),
                 },
-                Mood::Willing => {
+                Mood::Willing | Mood::Braking => {
                     let offer = heard.offers.last().unwrap();
                     let mut state = state.lock().unwrap();
                     state.mode = RobotMode::Tracking;
@@ -351,9 +353,11 @@ fn answer(
             heard.holds.push(verb);
             match heard.mood {
                 Mood::Silent => return,
-                Mood::Willing | Mood::Refusing(_) => {}
+                Mood::Willing | Mood::Refusing(_) | Mood::Braking => {}
             }
-            if let Some(mission) = &mut state.mission {
+            if heard.mood != Mood::Braking
+                && let Some(mission) = &mut state.mission
+            {
                 mission.paused = verb == Verb::Pause;
             }
             Outcome::Done

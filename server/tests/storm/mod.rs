@@ -14,7 +14,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::oneshot;
-use tread_api::ids::{MissionId, RobotId, SiteId};
+use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
 use tread_api::keys::Verb;
 use tread_api::mission::{
     Cause, CreateMission, LinkPolicy, MissionState, ReplaceMission, StartPolicy,
@@ -73,7 +73,7 @@ impl Dice {
 /// A message that is still on its way.
 #[derive(Debug)]
 enum Late {
-    Command(usize, Verb, Vec<u8>),
+    Command(usize, Option<BootId>, Verb, Vec<u8>),
     State(Box<RobotState>),
 }
 
@@ -96,10 +96,17 @@ fn with<T>(world: &Shared, act: impl FnOnce(&mut World) -> T) -> T {
 struct Network(Shared);
 
 impl Carrier for Network {
-    fn carry(&self, (_, robot): &RobotKey, verb: Verb, payload: Vec<u8>) -> Carrying {
+    fn carry(
+        &self,
+        (_, robot): &RobotKey,
+        run: Option<BootId>,
+        verb: Verb,
+        payload: Vec<u8>,
+    ) -> Carrying {
         let answer = with(&self.0, |world| {
             let index = world.robots.iter().position(|here| here.id == *robot)?;
-            let reachable = world.robots[index].on && world.robots[index].linked;
+            let there = &world.robots[index];
+            let reachable = there.on && there.linked && there.is_run(run);
             let calm = world.calm;
             let fate = if calm { 99 } else { world.dice.below(100) };
             // Lost on the way, or late: the server hears nothing.
@@ -107,11 +114,13 @@ impl Carrier for Network {
                 return None;
             }
             if fate < 25 && world.late.len() < LATE_MAX {
-                world.late.push(Late::Command(index, verb, payload));
+                world.late.push(Late::Command(index, run, verb, payload));
                 return None;
             }
             if fate < 35 && world.late.len() < LATE_MAX {
-                world.late.push(Late::Command(index, verb, payload.clone()));
+                world
+                    .late
+                    .push(Late::Command(index, run, verb, payload.clone()));
             }
             let impossible = !calm && world.dice.percent(3);
             let answer = world.robots[index].answer(verb, &payload, impossible);
@@ -227,7 +236,7 @@ impl Storm {
         }));
         let supervisor = Supervisor::new();
         let app = app_on(&path, &clock, &site).await;
-        let commands = Commands::new(Arc::new(Network(Arc::clone(&world))));
+        let commands = Commands::new(Arc::new(Network(Arc::clone(&world))), app.clone());
         let mut storm = Self {
             reconciler: Reconciler::new(app.clone(), commands, supervisor.clone()),
             writer: Writer::new(app.clone()),
@@ -398,8 +407,8 @@ impl Storm {
             let place = world.dice.below(world.late.len());
             match world.late.swap_remove(place) {
                 Late::State(state) => Some(*state),
-                Late::Command(index, verb, payload) => {
-                    if world.robots[index].on {
+                Late::Command(index, run, verb, payload) => {
+                    if world.robots[index].on && world.robots[index].is_run(run) {
                         world.robots[index].answer(verb, &payload, false);
                     }
                     None
@@ -471,7 +480,7 @@ impl Storm {
         self.app.db().close().await;
         self.app = app_on(&self.path, &self.clock, &self.site).await;
         self.writer = Writer::new(self.app.clone());
-        let commands = Commands::new(Arc::new(Network(Arc::clone(&self.world))));
+        let commands = Commands::new(Arc::new(Network(Arc::clone(&self.world))), self.app.clone());
         self.reconciler = Reconciler::new(self.app.clone(), commands, self.supervisor.clone());
         for index in 0..ROBOTS {
             if with(&self.world, |world| world.robots[index].linked) {

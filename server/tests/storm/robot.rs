@@ -17,6 +17,8 @@ struct Held {
     mission: MissionId,
     revision: u32,
     plan_hash: PlanHash,
+    /// Whether it is to be held; it stands after its next drive.
+    to_stand: bool,
     paused: bool,
     driven_m: f64,
 }
@@ -50,6 +52,11 @@ impl Robot {
             next_record: 0,
             states: 0,
         }
+    }
+
+    /// Whether that run of the agent is the present one; none names whatever runs.
+    pub(crate) fn is_run(&self, run: Option<BootId>) -> bool {
+        run.is_none_or(|run| run == self.boot)
     }
 
     pub(crate) fn holds(&self) -> Option<MissionId> {
@@ -97,9 +104,18 @@ impl Robot {
 
     /// Drives on; at the end of the way the mission has succeeded, or failed if it is `unlucky`.
     pub(crate) fn drive(&mut self, distance_m: f64, unlucky: bool) {
-        let Some(mut held) = self.held.filter(|held| !held.paused && self.on) else {
+        let Some(mut held) = self.held.filter(|_| self.on) else {
             return;
         };
+        if held.to_stand != held.paused {
+            held.paused = held.to_stand;
+            self.held = Some(held);
+            let (paused, resumed) = (MissionPhase::Paused, MissionPhase::Resumed);
+            self.record(held, if held.paused { paused } else { resumed });
+        }
+        if held.paused {
+            return;
+        }
         held.driven_m += distance_m;
         self.held = Some(held);
         if unlucky {
@@ -193,6 +209,7 @@ impl Robot {
             mission: offer.mission,
             revision: offer.revision,
             plan_hash: offer.plan_hash,
+            to_stand: false,
             paused: false,
             driven_m: 0.0,
         };
@@ -209,6 +226,7 @@ impl Robot {
             }
             Some(held) if held.revision < offer.revision && !impossible => {
                 let new = Held {
+                    to_stand: held.to_stand,
                     paused: held.paused,
                     ..new
                 };
@@ -246,16 +264,10 @@ impl Robot {
                 OfferRefusal::Unknown
             });
         };
-        if held.paused != paused {
-            let held = Held { paused, ..held };
-            self.held = Some(held);
-            let phase = if paused {
-                MissionPhase::Paused
-            } else {
-                MissionPhase::Resumed
-            };
-            self.record(held, phase);
-        }
+        self.held = Some(Held {
+            to_stand: paused,
+            ..held
+        });
         Outcome::Done
     }
 }

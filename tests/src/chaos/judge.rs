@@ -1,20 +1,17 @@
 //! What must hold after a run, whatever failed in it.
 
-use std::collections::HashMap;
+use std::path::Path;
 
-use jiff::SignedDuration;
+use sqlx::ConnectOptions as _;
+use sqlx::sqlite::SqliteConnectOptions;
 use tread_agent::missions::Holder;
-use tread_api::friction::StoredSegment;
-use tread_api::ids::BootId;
+use tread_agent::outbox::{Limits, Outbox};
+use tread_api::ids::{BootId, RobotId};
 use tread_api::mission::{Cause, MissionDetail, MissionState};
 use tread_api::wire::ingest::MissionPhase;
 
 use super::{Followed, RunReport, Violation};
-use crate::fleet::{Fleet, SITE};
-
-/// An event's time is taken before its commit, which may have to wait for others; two missions that
-/// overlap by less follow each other. That they do is also an index of the database.
-const EVENT_GRAIN: SignedDuration = SignedDuration::from_millis(250);
+use crate::fleet::Fleet;
 
 /// State and cause of a mission's end.
 pub(super) fn end_of(detail: &MissionDetail) -> String {
@@ -70,11 +67,6 @@ pub(super) fn judge(
                 }
             }
         }
-    }
-    if let Some(first) = details.first()
-        && let Some(text) = two_at_once(details)
-    {
-        note("two_at_once", first, &text);
     }
 }
 
@@ -158,57 +150,141 @@ fn disagreement(detail: &MissionDetail, memory: &Holder) -> Option<String> {
     (!is_kept).then(|| format!("the robot says {phase:?}"))
 }
 
-/// Whether two missions were in the robot's hands at the same time, by the server's events.
-fn two_at_once(details: &[MissionDetail]) -> Option<String> {
-    let in_hand = |state: MissionState| {
-        matches!(
-            state,
-            MissionState::Offered
-                | MissionState::Active
-                | MissionState::Paused
-                | MissionState::Cancelling
-        )
-    };
-    let mut spans = Vec::new();
-    for detail in details {
-        let mut since = None;
-        for event in &detail.events {
-            if in_hand(event.to) {
-                since.get_or_insert(event.at);
-            } else if let Some(since) = since.take() {
-                spans.push((detail.mission.id, since, event.at));
-            }
+/// A step of the server's history.
+type Step = (String, String);
+
+/// Whether two missions were in the robot's hands at the same time, by the order in which the
+/// server committed its history. Times do not matter.
+fn two_at_once(steps: &[Step]) -> Option<String> {
+    let mut in_hand: Vec<&str> = Vec::new();
+    for (mission, state) in steps {
+        let state = MissionState::from_name(state)?;
+        let is_in_hand = !state.is_terminal() && state != MissionState::Queued;
+        in_hand.retain(|held| held != mission);
+        if is_in_hand {
+            in_hand.push(mission);
         }
-    }
-    for (index, &(id, from, to)) in spans.iter().enumerate() {
-        for &(other, other_from, other_to) in &spans[index + 1..] {
-            let both = to.min(other_to).duration_since(from.max(other_from));
-            if id != other && both > EVENT_GRAIN {
-                return Some(format!(
-                    "{id} and {other} were in hand together for {both:#}"
-                ));
-            }
+        if in_hand.len() > 1 {
+            return Some(format!("{in_hand:?} were in hand together"));
         }
     }
     None
 }
 
-/// Every segment is stored once.
-pub(super) async fn judge_records(fleet: &Fleet, report: &mut RunReport) {
-    let segments: Vec<StoredSegment> = fleet.rest.all(&format!("/v1/sites/{SITE}/segments")).await;
-    let mut by_boot: HashMap<BootId, Vec<u64>> = HashMap::new();
-    for segment in &segments {
-        by_boot.entry(segment.boot).or_default().push(segment.seq);
-    }
-    for (boot, mut seqs) in by_boot {
-        let count = seqs.len();
-        seqs.sort_unstable();
-        seqs.dedup();
-        if seqs.len() != count {
-            report.violations.push(Violation {
-                kind: "records",
-                text: format!("boot {boot} has a segment twice"),
-            });
+/// Whether the robot took a mission before it had ended the one before, by the order of its own
+/// log; a new run begins with nothing.
+fn two_on_the_robot(log: &str) -> Option<String> {
+    let mut held: Option<&str> = None;
+    for line in log.lines() {
+        if line.contains("agent of `") {
+            held = None;
+        } else if let Some((_, taken)) = line.split_once("took mission ") {
+            let taken = taken.split_whitespace().next().unwrap_or_default();
+            if let Some(held) = held.replace(taken) {
+                return Some(format!("the robot took {taken} while it had {held}"));
+            }
+        } else if line.contains(" ended: ") && held.is_some_and(|held| line.contains(held)) {
+            held = None;
         }
+    }
+    None
+}
+
+/// Holds what is on the disks against each other: what the robot ever wrote down is at the server,
+/// each record once, and the histories are of one mission after the other.
+pub(super) async fn judge_disks(fleet: &Fleet, robot: &RobotId, report: &mut RunReport) {
+    let mut note = |kind: &'static str, text: String| {
+        report.violations.push(Violation { kind, text });
+    };
+    match server_side(&fleet.database()).await {
+        Ok((steps, records)) => {
+            if let Some(text) = two_at_once(&steps) {
+                note("two_at_once", text);
+            }
+            if let Some(text) = lost_records(&fleet.robot_folder(robot), robot, records) {
+                note("records", text);
+            }
+        }
+        Err(cause) => note("records", format!("the database cannot be read: {cause}")),
+    }
+    if let Some(text) = two_on_the_robot(&fleet.log(robot.as_str())) {
+        note("two_at_once", text);
+    }
+}
+
+/// The history of all missions in its order, and the names of all records that were taken.
+async fn server_side(database: &Path) -> Result<(Vec<Step>, Vec<(String, i64)>), sqlx::Error> {
+    let options = SqliteConnectOptions::new()
+        .filename(database)
+        .read_only(true);
+    let mut db = options.connect().await?;
+    let steps = sqlx::query_as("SELECT mission, to_state FROM mission_events ORDER BY pk")
+        .fetch_all(&mut db)
+        .await?;
+    let records = sqlx::query_as(
+        "SELECT boots.id, seq FROM (SELECT boot_pk, seq FROM segments UNION ALL
+             SELECT boot_pk, seq FROM reports_seen) AS taken
+         JOIN boots ON boots.pk = taken.boot_pk ORDER BY boots.id, seq",
+    )
+    .fetch_all(&mut db)
+    .await?;
+    Ok((steps, records))
+}
+
+/// What of the robot's records is not at the server, or there twice. A process that is killed
+/// loses nothing that it had written, so all that was ever appended must have arrived.
+fn lost_records(folder: &Path, robot: &RobotId, records: Vec<(String, i64)>) -> Option<String> {
+    let boot = BootId::from_uuid(uuid::Uuid::nil());
+    let folder = folder.join("outbox");
+    let outbox = match Outbox::open(&folder, Limits::default(), robot.clone(), boot) {
+        Ok(outbox) => outbox,
+        Err(cause) => return Some(format!("the outbox cannot be read: {cause}")),
+    };
+    let (appended, status) = (outbox.appended(), outbox.status());
+    let arrived = records.len() as u64;
+    let mut distinct = records;
+    distinct.dedup();
+    let is_whole = appended == arrived
+        && distinct.len() as u64 == arrived
+        && (status.pending, status.dropped, status.refused) == (0, 0, 0);
+    (!is_whole).then(|| {
+        format!(
+            "the robot wrote {appended} records, {arrived} are at the server, {} of them \
+             distinct; {status:?}",
+            distinct.len()
+        )
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn steps(told: &[(&str, &str)]) -> Vec<Step> {
+        let owned = |&(mission, state): &(&str, &str)| (mission.to_owned(), state.to_owned());
+        told.iter().map(owned).collect()
+    }
+
+    #[test]
+    fn one_mission_after_the_other_is_told_from_two_at_once() {
+        let after = steps(&[
+            ("a", "offered"),
+            ("b", "queued"),
+            ("a", "active"),
+            ("a", "failed"),
+            ("b", "offered"),
+            ("a", "failed"),
+        ]);
+        assert_eq!(two_at_once(&after), None);
+        let both = steps(&[("a", "offered"), ("b", "offered"), ("a", "failed")]);
+        assert!(two_at_once(&both).is_some());
+    }
+
+    #[test]
+    fn the_robots_own_log_shows_a_second_mission_in_hand() {
+        let after = "agent of `r` runs\ntook mission m1 x\nmission m1 ended: Failed\n\
+                     took mission m2\nagent of `r` runs\ntook mission m3\n";
+        assert_eq!(two_on_the_robot(after), None);
+        assert!(two_on_the_robot("took mission m1 x\ntook mission m2 x\n").is_some());
     }
 }

@@ -106,7 +106,7 @@ pub async fn run(node: &Path, seed: u64) -> RunReport {
     report.ends = details.iter().map(judge::end_of).collect();
     let memory = robots_memory(&mut fleet, &robot, &details).await;
     judge::judge(&followed, &details, memory.as_ref(), &mut report);
-    judge::judge_records(&fleet, &mut report).await;
+    judge::judge_disks(&fleet, &robot, &mut report).await;
     if report.violations.is_empty() {
         report.actions.clear();
     } else {

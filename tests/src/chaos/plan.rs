@@ -82,7 +82,7 @@ fn asked(random: &mut Random, robot: &str, now: jiff::Timestamp) -> Asked {
         body["lost_after_s"] = json!(LOST_AFTER_S);
     }
     if expires {
-        let latest = now + Duration::from_secs_f64(random.between(1.0, 12.0));
+        let latest = now + Duration::from_secs_f64(random.between(2.5, 12.0));
         body["latest_start"] = json!(latest);
     }
     Asked {

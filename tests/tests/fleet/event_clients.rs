@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use serde_json::Value;
+use serde_json::{Value, json};
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::net::{TcpSocket, TcpStream};
 use tokio::task::JoinSet;
@@ -20,10 +20,15 @@ const MEMORY_MAX: u64 = 200_000_000;
 /// Events of robots that each reader must see after the deaf one has joined.
 const EVENTS_EACH: usize = 5;
 
-async fn open(stream: TcpStream) -> BufReader<TcpStream> {
+/// Missions whose events fill the buffer of the one that never reads, and the sockets before it.
+const LONG_MISSIONS: usize = 8;
+
+async fn open(stream: TcpStream, topics: &str) -> BufReader<TcpStream> {
     let mut stream = stream;
-    let request = "GET /v1/events?topics=robots HTTP/1.1\r\nhost: test\r\n\
-                   accept: text/event-stream\r\n\r\n";
+    let request = format!(
+        "GET /v1/events?topics={topics} HTTP/1.1\r\nhost: test\r\n\
+         accept: text/event-stream\r\n\r\n"
+    );
     let sent = stream.write_all(request.as_bytes()).await;
     sent.expect("the server listens");
     BufReader::new(stream)
@@ -62,11 +67,11 @@ async fn of_a_thousand_event_clients_one_that_never_reads_disturbs_nobody() {
     // A socket that takes next to nothing, so that what is sent piles up at the server.
     let socket = TcpSocket::new_v4().unwrap();
     socket.set_recv_buffer_size(4_096).unwrap();
-    let deaf = open(socket.connect(address).await.unwrap()).await;
+    let mut deaf = open(socket.connect(address).await.unwrap(), "robots,missions").await;
     let mut readers = JoinSet::new();
     for _ in 0..READERS {
         let stream = TcpStream::connect(address).await.unwrap();
-        readers.spawn(async move { read_events(open(stream).await, EVENTS_EACH).await });
+        readers.spawn(async move { read_events(open(stream, "robots").await, EVENTS_EACH).await });
     }
     let talking = async {
         loop {
@@ -83,9 +88,23 @@ async fn of_a_thousand_event_clients_one_that_never_reads_disturbs_nobody() {
         }
         whole
     };
+    // Two events of about a megabyte each, for nobody but the one that does not read.
+    let asking = async {
+        let points: Vec<Value> = (0..30_000_u32)
+            .map(|index| json!({"x_m": 0.1 * f64::from(index), "y_m": 0.123_456_789}))
+            .collect();
+        let trajectory = json!({"waypoints": {"speed_m_s": 0.5, "points": points}});
+        let robot = "light-0".parse().unwrap();
+        for _ in 0..LONG_MISSIONS {
+            let mission = fleet.rest.send(&robot, trajectory.clone()).await;
+            let path = format!("/v1/missions/{mission}/cancel");
+            fleet.rest.post(&path, &Value::Null).await;
+        }
+    };
+    let both = async { tokio::join!(reading, asking).0 };
     let whole = tokio::select! {
         () = talking => 0,
-        whole = tokio::time::timeout(4 * SHORT, reading) => whole.expect("the readers are served"),
+        whole = tokio::time::timeout(6 * SHORT, both) => whole.expect("the readers are served"),
     };
     assert_eq!(whole, READERS, "some clients were cut off");
     let used = fleet.server_usage().unwrap();
@@ -96,5 +115,17 @@ async fn of_a_thousand_event_clients_one_that_never_reads_disturbs_nobody() {
     );
     let health: Value = fleet.rest.get("/v1/server").await;
     assert!(!health.is_null());
-    drop(deaf);
+    // It was dropped: what it had is there, and then its end, or the cut.
+    let draining = async {
+        let mut line = Vec::new();
+        while deaf
+            .read_until(b'\n', &mut line)
+            .await
+            .is_ok_and(|count| count > 0)
+        {
+            line.clear();
+        }
+    };
+    let drained = tokio::time::timeout(SHORT, draining).await;
+    drained.expect("the client that never reads was dropped");
 }

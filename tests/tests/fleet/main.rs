@@ -4,6 +4,8 @@ mod bad_input;
 mod chaos;
 mod control;
 mod event_clients;
+mod impostors;
+
 mod messages;
 mod missions;
 mod outages;

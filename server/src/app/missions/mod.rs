@@ -19,7 +19,7 @@ use tread_api::trajectory::Trajectory;
 use tread_api::wire::command::Offer;
 
 use self::transitions::{Change, next};
-use super::{App, AppError, site_row};
+use super::{App, AppError, check_named, site_row};
 use crate::db::missions::{Facts, MissionFilter, MissionRow, Standing};
 use crate::db::{self, DbError, Tx};
 
@@ -62,6 +62,13 @@ impl App {
         }
         check_limits(&robot, &robot_row.model.limits, &trajectory)?;
         let (id, revision, created_at) = (self.clock().mission_id(), 1, self.clock().now());
+        if let Some(latest) = latest_start.filter(|latest| *latest <= created_at) {
+            let detail = format!("latest_start {latest} has passed: it would never start");
+            return Err(AppError::Invalid {
+                field: "latest_start",
+                detail,
+            });
+        }
         match start_policy {
             StartPolicy::Append => {}
             StartPolicy::Refuse => {
@@ -133,9 +140,7 @@ impl App {
         limit: u32,
     ) -> Result<Page<Mission>, AppError> {
         let mut tx = self.db().read().await?;
-        if let Some(site) = &filter.site {
-            site_row(&mut tx, site).await?;
-        }
+        check_named(&mut tx, filter.site.as_ref(), filter.robot.as_ref()).await?;
         let (rows, more) = db::missions::list(&mut tx, filter, limit, PAGE_BYTES_MAX).await?;
         let last = rows.last().filter(|_| more);
         let next_cursor = last.map(|row| row.mission.id.to_string());

@@ -14,13 +14,15 @@ use crate::app::{App, AppError};
 use crate::db;
 use crate::db::missions::{Facts, MissionRow, Standing};
 use crate::fleet::commands::Commands;
-use crate::fleet::presence::RobotKey;
+use crate::fleet::presence::{Rival, RobotKey};
 
 /// How a command went.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Finished {
     /// It needs no repetition.
     Settled,
+    /// The robot will do it, and says so when it has; repeated only if it does not for long.
+    Delivered,
     /// It was not delivered, or the robot cannot yet.
     Again,
     /// The robot says that the mission has ended there.
@@ -29,8 +31,17 @@ pub(super) enum Finished {
 
 /// Moves a mission without its robot.
 pub(super) async fn settle(app: &App, mission: &Standing, change: Change) -> Result<(), AppError> {
-    let step = server_step(app, change, None, Facts::default());
+    // A robot that shows a mission is the run that took it.
+    let taken_by = || app.presences().get(&key_of(mission)).boot();
+    let facts = Facts {
+        boot: (change == Change::Accept)
+            .then(taken_by)
+            .flatten()
+            .map(|(boot, _since)| boot),
+        ..Facts::default()
+    };
     let mut tx = app.db().write().await?;
+    let step = server_step(app, change, None, facts);
     take_step(&mut tx, mission, step).await?;
     tx.commit().await?;
     // The robot's next mission may go now.
@@ -38,6 +49,11 @@ pub(super) async fn settle(app: &App, mission: &Standing, change: Change) -> Res
     Ok(())
 }
 
+fn key_of(mission: &Standing) -> RobotKey {
+    (mission.site.clone(), mission.robot.clone())
+}
+
+/// A step of the server's; made within the transaction, so that times are in the order of commits.
 fn server_step<'step>(
     app: &App,
     change: Change,
@@ -241,7 +257,7 @@ pub(super) async fn adopt_shown(app: &App, standing: &Standing) -> Result<(), Ap
     Ok(())
 }
 
-/// Tells a robot to hold a mission or to drive on, and writes down the answer.
+/// Tells a robot to hold a mission or to drive on.
 pub(super) async fn hold(
     app: App,
     commands: Commands,
@@ -261,34 +277,20 @@ pub(super) async fn hold(
         app.counters().commands_unanswered.one();
         return Ok(Finished::Again);
     };
-    let (change, wanted) = if held {
-        (Change::Pause, "pause")
-    } else {
-        (Change::Resume, "resume")
-    };
     match &answer.outcome {
-        Outcome::Done | Outcome::Accepted { .. } => {}
+        // It brakes or speeds up now. The mission moves when the robot says that it stands, or
+        // that it drives on.
+        Outcome::Done | Outcome::Accepted { .. } => Ok(Finished::Delivered),
         Outcome::Refused {
             code: OfferRefusal::Ended,
             ..
-        } => return Ok(Finished::EndedThere),
+        } => Ok(Finished::EndedThere),
         Outcome::Refused { detail, .. } => {
+            let wanted = if held { "pause" } else { "resume" };
             warn!(mission.id = %mission, "robot `{}` does not {wanted}: {detail}", key.1);
-            return Ok(Finished::Again);
+            Ok(Finished::Again)
         }
     }
-    let mut tx = app.db().write().await?;
-    if let Some(row) = db::missions::find(&mut tx, mission).await? {
-        // Wanted otherwise meanwhile: then that is what the robot hears next.
-        let step = Step {
-            actor: Actor::Robot,
-            ..server_step(&app, change, None, Facts::default())
-        };
-        take_step(&mut tx, &(&row.mission).into(), step).await?;
-        tx.commit().await?;
-    }
-    app.wake();
-    Ok(Finished::Settled)
 }
 
 /// Tells a robot to end a mission and writes down the answer.
@@ -372,6 +374,28 @@ pub(super) async fn disown(
     }
     // Its next states show whether it has ended; if not, it is told again.
     Ok(Finished::Again)
+}
+
+/// Tells an agent that runs under another one's name to end the mission that it drives.
+pub(super) async fn end_rival(app: App, commands: Commands, rival: Rival) -> Finished {
+    let Rival { key, boot, mission } = rival;
+    let Some(mission) = mission else {
+        return Finished::Settled;
+    };
+    warn!(
+        mission.id = %mission, robot.id = %key.1,
+        "a second agent drives mission `{mission}` under the name of robot `{}`, as boot {boot}, \
+         and is told to end it", key.1
+    );
+    app.counters().missions_disowned.one();
+    let reason = "another agent has taken this robot's name".to_owned();
+    let command = Cancel { mission, reason };
+    let answer = commands.send_to(&key, Some(boot), Verb::Cancel, &command);
+    if answer.await.is_none() {
+        app.counters().commands_unanswered.one();
+    }
+    // Its next states show whether it has ended; if not, it is told again.
+    Finished::Again
 }
 
 /// Brings a robot its site's terrains.

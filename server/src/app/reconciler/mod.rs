@@ -18,14 +18,16 @@ use tracing::{debug, error};
 use tread_api::ids::{MissionId, SiteId};
 use tread_api::mission::MissionState;
 
-use self::jobs::{Finished, adopt_shown, cancel, disown, hold, offer, push_site, replace, settle};
-use self::needs::{Memory, Need, Now, decide, is_absent, is_heard};
+use self::jobs::{
+    Finished, adopt_shown, cancel, disown, end_rival, hold, offer, push_site, replace, settle,
+};
+use self::needs::{Memory, Need, Now, decide, is_absent, is_heard, is_held_otherwise};
 use super::missions::transitions::Change;
 use super::{App, AppError};
 use crate::db;
 use crate::db::missions::Standing;
 use crate::fleet::commands::Commands;
-use crate::fleet::presence::RobotKey;
+use crate::fleet::presence::{Rival, RobotKey};
 use crate::supervisor::Supervisor;
 
 /// How often it looks although nothing woke it.
@@ -49,9 +51,11 @@ const FOREIGN_GRACE: Duration = Duration::from_millis(1_500);
 enum Job {
     Offer(MissionId),
     Replace(MissionId),
-    Hold(MissionId),
+    /// To pause it, or to let it go on.
+    Hold(MissionId, bool),
     Cancel(MissionId),
     Disown(RobotKey),
+    EndRival(RobotKey),
     Site(RobotKey),
 }
 
@@ -146,7 +150,7 @@ impl Reconciler {
         let now = self.app.clock().elapsed();
         if let (
             Finished::EndedThere,
-            Job::Offer(id) | Job::Replace(id) | Job::Hold(id) | Job::Cancel(id),
+            Job::Offer(id) | Job::Replace(id) | Job::Hold(id, _) | Job::Cancel(id),
         ) = (how, &job)
         {
             self.memories
@@ -159,7 +163,11 @@ impl Reconciler {
             self.retries.remove(&job);
         } else {
             let before = self.retries.get(&job);
-            let wait = before.map_or(RETRY_MIN, |retry| (retry.wait * 2).min(RETRY_MAX));
+            let wait = match (how, before) {
+                (Finished::Delivered, _) => RETRY_MAX,
+                (_, None) => RETRY_MIN,
+                (_, Some(retry)) => (retry.wait * 2).min(RETRY_MAX),
+            };
             self.retries.insert(
                 job,
                 Retry {
@@ -176,6 +184,7 @@ impl Reconciler {
     /// The database failed; the next pass does what this one did not.
     pub async fn pass(&mut self) -> Result<(), AppError> {
         self.expire().await?;
+        self.end_rivals();
         self.app.sync_alerts().await?;
         let mut tx = self.app.db().read().await?;
         let mut open = db::missions::in_hand(&mut tx).await?;
@@ -221,11 +230,39 @@ impl Reconciler {
         let open: HashSet<MissionId> = missions.iter().map(|mission| mission.id).collect();
         self.memories.retain(|id, _| open.contains(id));
         self.retries.retain(|job, _| match job {
-            Job::Offer(id) | Job::Replace(id) | Job::Hold(id) | Job::Cancel(id) => {
+            Job::Offer(id) | Job::Replace(id) | Job::Hold(id, _) | Job::Cancel(id) => {
                 open.contains(id)
             }
-            Job::Disown(_) | Job::Site(_) => true,
+            Job::Disown(_) | Job::EndRival(_) | Job::Site(_) => true,
         });
+    }
+
+    /// Finds agents that drive a mission under the name of another one, and tells them to end it.
+    fn end_rivals(&mut self) {
+        let rivals = self.app.presences().take_rivals(self.app.clock().elapsed());
+        let driving = |key: &RobotKey| {
+            let of_key = |rival: &&Rival| rival.key == *key && rival.mission.is_some();
+            rivals.iter().find(of_key)
+        };
+        self.retries.retain(|job, _| match job {
+            Job::EndRival(key) => driving(key).is_some(),
+            Job::Offer(_)
+            | Job::Replace(_)
+            | Job::Hold(..)
+            | Job::Cancel(_)
+            | Job::Disown(_)
+            | Job::Site(_) => true,
+        });
+        for rival in rivals {
+            let job = Job::EndRival(rival.key.clone());
+            if rival.mission.is_some() && self.is_due(&job) {
+                let (app, commands) = (self.app.clone(), self.commands.clone());
+                self.start(
+                    job,
+                    async move { Ok(end_rival(app, commands, rival).await) },
+                );
+            }
+        }
     }
 
     /// Finds robots that drive what is none of their open missions here, and tells them.
@@ -262,7 +299,12 @@ impl Reconciler {
         let foreign = &self.foreign;
         self.retries.retain(|job, _| match job {
             Job::Disown(key) => foreign.contains_key(key),
-            Job::Offer(_) | Job::Replace(_) | Job::Hold(_) | Job::Cancel(_) | Job::Site(_) => true,
+            Job::Offer(_)
+            | Job::Replace(_)
+            | Job::Hold(..)
+            | Job::Cancel(_)
+            | Job::EndRival(_)
+            | Job::Site(_) => true,
         });
     }
 
@@ -295,9 +337,18 @@ impl Reconciler {
         let memory = self.memories.entry(mission.id).or_default();
         memory.absent_since = is_absent(&mission, &presence, now.elapsed)
             .then(|| memory.absent_since.unwrap_or(now.elapsed));
+        memory.differs_from = is_held_otherwise(&mission, &presence)
+            .then(|| memory.differs_from.unwrap_or(now.elapsed));
         let memory = *memory;
         let (app, commands) = (self.app.clone(), self.commands.clone());
-        match decide(&mission, &presence, memory, now) {
+        let need = decide(&mission, &presence, memory, now);
+        // What is wanted anew later does not wait for what was wanted before.
+        for (held, wanted) in [(true, Need::Pause), (false, Need::Resume)] {
+            if need != wanted {
+                self.retries.remove(&Job::Hold(mission.id, held));
+            }
+        }
+        match need {
             Need::Wait => {}
             Need::Settle(change) => settle(&self.app, &mission, change).await?,
             Need::Adopt => adopt_shown(&self.app, &mission).await?,
@@ -308,8 +359,8 @@ impl Reconciler {
                 }
             }
             Need::Pause | Need::Resume => {
-                let job = Job::Hold(mission.id);
                 let held = mission.pause_wanted;
+                let job = Job::Hold(mission.id, held);
                 if self.is_due(&job) {
                     self.start(job, hold(app, commands, mission, held));
                 }
@@ -324,7 +375,12 @@ impl Reconciler {
                 let job = Job::Cancel(mission.id);
                 // What is under way is answered first, so that the order is kept.
                 let id = mission.id;
-                let before = [Job::Offer(id), Job::Replace(id), Job::Hold(id)];
+                let before = [
+                    Job::Offer(id),
+                    Job::Replace(id),
+                    Job::Hold(id, true),
+                    Job::Hold(id, false),
+                ];
                 let is_clear = !before.iter().any(|job| self.under_way.contains(job));
                 if is_clear && self.is_due(&job) {
                     self.start(job, cancel(app, commands, mission));

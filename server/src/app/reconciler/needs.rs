@@ -15,6 +15,9 @@ pub(super) const RESTART_GRACE: Duration = Duration::from_secs(3);
 /// How long a robot may be there without its mission, and without anything left to report, before
 /// the mission counts as forgotten.
 pub(super) const FORGET_GRACE: Duration = Duration::from_secs(5);
+/// How long a robot may show a mission as paused, or as driven, before that counts although its
+/// record has not come; the other way round, before it is told again.
+pub(super) const HOLD_GRACE: Duration = Duration::from_secs(1);
 /// How long a robot may stay away beyond what was left of its plan, seconds.
 pub const LOST_MARGIN_S: f64 = 60.0;
 /// How long a robot may stay away when nobody knows how long its plan is, seconds.
@@ -50,6 +53,8 @@ pub(super) struct Memory {
     pub(super) ended_since: Option<Duration>,
     /// Since when the robot has been there without the mission and with nothing left to report.
     pub(super) absent_since: Option<Duration>,
+    /// Since when the robot has shown it as paused while it is not, or the other way round.
+    pub(super) differs_from: Option<Duration>,
 }
 
 /// The two clocks.
@@ -81,6 +86,23 @@ pub(super) fn is_absent(mission: &Standing, presence: &Presence, now: Duration) 
     is_heard(presence, now)
         && driven(mission, presence).is_none()
         && presence.state().is_some_and(nothing_left)
+}
+
+/// Whether a robot shows a mission as paused that is active here, or the other way round.
+pub(super) fn is_held_otherwise(mission: &Standing, presence: &Presence) -> bool {
+    let here = match mission.state {
+        MissionState::Active => false,
+        MissionState::Paused => true,
+        MissionState::Queued
+        | MissionState::Offered
+        | MissionState::Cancelling
+        | MissionState::Succeeded
+        | MissionState::Failed
+        | MissionState::Cancelled
+        | MissionState::Rejected
+        | MissionState::Expired => return false,
+    };
+    driven(mission, presence).is_some_and(|said| said.paused != here)
 }
 
 /// Decides what a mission needs, from where it stands and what its robot says.
@@ -119,7 +141,10 @@ pub(super) fn decide(mission: &Standing, presence: &Presence, memory: Memory, no
         {
             Need::Settle(Change::Forget)
         }
-        MissionState::Active | MissionState::Paused => in_hand(mission, said),
+        MissionState::Active | MissionState::Paused => {
+            let differs = memory.differs_from.is_some_and(longer_than(HOLD_GRACE));
+            in_hand(mission, said, differs)
+        }
         MissionState::Cancelling => Need::Cancel,
         MissionState::Queued
         | MissionState::Offered
@@ -136,8 +161,9 @@ fn of_present(mission: &Standing) -> impl Fn(MissionProgress) -> bool {
     move |said| (said.revision, said.plan_hash) == content
 }
 
-/// What a mission needs that its robot drives or holds.
-fn in_hand(mission: &Standing, said: Option<MissionProgress>) -> Need {
+/// What a mission needs that its robot drives or holds; `differs` when the robot has shown it as
+/// paused for a while and the server has not, or the other way round.
+fn in_hand(mission: &Standing, said: Option<MissionProgress>, differs: bool) -> Need {
     let content = said.map(|said| (said.revision, said.plan_hash));
     if mission.replacement.is_some() {
         return if content == mission.replacement {
@@ -146,14 +172,15 @@ fn in_hand(mission: &Standing, said: Option<MissionProgress>) -> Need {
             Need::Replace
         };
     }
-    let held = said.is_some_and(|said| said.paused);
-    let paused = mission.state == MissionState::Paused;
-    match (paused, mission.pause_wanted) {
+    match (mission.state == MissionState::Paused, mission.pause_wanted) {
+        // The robot's record says so at once; its state, when that is slow.
+        (false, true) if differs => Need::Settle(Change::Pause),
+        (true, false) if differs => Need::Settle(Change::Resume),
         (false, true) => Need::Pause,
         (true, false) => Need::Resume,
         // A command that came late or twice had its way on the robot: once more.
-        (false, false) if held => Need::Resume,
-        (true, true) if said.is_some() && !held => Need::Pause,
+        (false, false) if differs => Need::Resume,
+        (true, true) if differs => Need::Pause,
         (false, false) | (true, true) => Need::Wait,
     }
 }

@@ -190,7 +190,7 @@ fn a_cancellation_is_sent_until_answered_and_ends_with_a_restart() {
 fn a_mission_that_ended_on_the_robot_without_a_record_does_not_stay_open() {
     let since = |ended_since| Memory {
         ended_since: Some(ended_since),
-        absent_since: None,
+        ..Memory::default()
     };
     let offered = mission(MissionState::Offered, None);
     let robot = presence(&IDLE);
@@ -222,21 +222,34 @@ fn what_is_wanted_of_a_mission_in_hand_is_sent_until_the_robot_has_done_it() {
         paused: true,
         ..driving
     };
-    let needs = |state, pause_wanted, said: &Said| {
+    let needs = |state, pause_wanted, said: &Said, differs_from| {
         let mission = Standing {
             pause_wanted,
             ..mission(state, Some(boot(1)))
         };
-        decide(&mission, &presence(said), Memory::default(), now())
+        let presence = presence(said);
+        let memory = Memory {
+            differs_from: is_held_otherwise(&mission, &presence).then_some(differs_from),
+            ..Memory::default()
+        };
+        decide(&mission, &presence, memory, now())
     };
     let (active, paused) = (MissionState::Active, MissionState::Paused);
-    assert_eq!(needs(active, true, &driving), Need::Pause);
-    assert_eq!(needs(active, false, &driving), Need::Wait);
-    assert_eq!(needs(paused, true, &holding), Need::Wait);
-    assert_eq!(needs(paused, false, &holding), Need::Resume);
+    assert_eq!(needs(active, true, &driving, LONG_AGO), Need::Pause);
+    assert_eq!(needs(active, false, &driving, LONG_AGO), Need::Wait);
+    assert_eq!(needs(paused, true, &holding, LONG_AGO), Need::Wait);
+    assert_eq!(needs(paused, false, &holding, LONG_AGO), Need::Resume);
+    // The record of it is on its way, or was lost.
+    assert_eq!(needs(active, true, &holding, JUST), Need::Pause);
+    let pause = Need::Settle(Change::Pause);
+    assert_eq!(needs(active, true, &holding, LONG_AGO), pause);
+    assert_eq!(needs(paused, false, &driving, JUST), Need::Resume);
+    let resume = Need::Settle(Change::Resume);
+    assert_eq!(needs(paused, false, &driving, LONG_AGO), resume);
     // A command that came twice or late had its way.
-    assert_eq!(needs(active, false, &holding), Need::Resume);
-    assert_eq!(needs(paused, true, &driving), Need::Pause);
+    assert_eq!(needs(active, false, &holding, JUST), Need::Wait);
+    assert_eq!(needs(active, false, &holding, LONG_AGO), Need::Resume);
+    assert_eq!(needs(paused, true, &driving, LONG_AGO), Need::Pause);
 }
 
 #[test]
@@ -317,7 +330,7 @@ fn a_robot_that_is_there_without_its_mission_has_forgotten_it_after_a_while() {
     assert!(!is_absent(&active, &reporting, ELAPSED));
     let since = |absent_since| Memory {
         absent_since: Some(absent_since),
-        ended_since: None,
+        ..Memory::default()
     };
     assert_eq!(decide(&active, &idle, since(JUST), now()), Need::Wait);
     let forgotten = decide(&active, &idle, since(LONG_AGO), now());

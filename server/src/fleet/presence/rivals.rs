@@ -1,0 +1,155 @@
+//! Two agents under one robot's name.
+//!
+//! The newest hello is the robot. What another run says meanwhile is refused; when it goes on
+//! saying so, it is a second agent: an alert names both, and it is told to end what it drives.
+
+use std::time::Duration;
+
+use tread_api::ids::{BootId, MissionId};
+use tread_api::robot::{AlertReport, Severity};
+use tread_api::wire::state::RobotState;
+
+use super::{Presence, Presences, RobotKey};
+
+/// How long two agents must have spoken under one name before that is said aloud: what was under
+/// way when an agent was replaced has long arrived then.
+const RIVAL_AFTER: Duration = Duration::from_secs(1);
+/// How long after its last heartbeat a second agent under a robot's name counts as gone.
+const RIVAL_GONE: Duration = Duration::from_secs(3);
+/// The code of the alert of two agents under one name.
+const RIVAL_ALERT: &str = "two-agents";
+
+/// A second agent that speaks under a robot's name.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Rival {
+    /// Whose name it has.
+    pub key: RobotKey,
+    /// Its run.
+    pub boot: BootId,
+    /// The mission that it says it drives.
+    pub mission: Option<MissionId>,
+}
+
+/// What is known of a run that speaks beside the present one.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct OtherRun {
+    pub(super) boot: BootId,
+    since: Duration,
+    /// When its control loop's ticks went on last.
+    heard_at: Duration,
+    ticks: u64,
+    mission: Option<MissionId>,
+    /// Whether it has spoken for longer than what may have been under way.
+    is_rival: bool,
+}
+
+impl Presence {
+    pub(super) fn forget_other(&mut self) {
+        let other = self.other.take();
+        self.alerts_changed |= other.is_some_and(|other| other.is_rival);
+    }
+
+    /// Notes a state of another run than the present one, while that is alive.
+    pub(super) fn note_other(&mut self, state: &RobotState, now: Duration) {
+        let ticks = state.control_loop.ticks;
+        let fresh = OtherRun {
+            boot: state.boot,
+            since: now,
+            heard_at: now,
+            ticks,
+            mission: state.mission.map(|mission| mission.id),
+            is_rival: false,
+        };
+        match &mut self.other {
+            Some(other) if other.boot == state.boot => {
+                if ticks <= other.ticks {
+                    return;
+                }
+                let is_sure = now.saturating_sub(other.since) >= RIVAL_AFTER;
+                self.alerts_changed |= is_sure && !other.is_rival;
+                *other = OtherRun {
+                    since: other.since,
+                    is_rival: is_sure || other.is_rival,
+                    ..fresh
+                };
+            }
+            // One at a time; the next is noted when this one has gone.
+            Some(_) => {}
+            None => self.other = Some(fresh),
+        }
+    }
+
+    /// What the server itself says needs attention.
+    pub(super) fn rival_alert(&self) -> Option<AlertReport> {
+        let other = self.other.filter(|other| other.is_rival)?;
+        let (present, _since) = self.boot?;
+        Some(AlertReport {
+            code: RIVAL_ALERT.parse().ok()?,
+            severity: Severity::Critical,
+            text: format!(
+                "two agents run under this name: boot {present} counts as the robot, boot {} is \
+                 refused",
+                other.boot
+            ),
+        })
+    }
+}
+
+impl Presences {
+    /// The agents that speak under the name of another one, after those that have gone silent are
+    /// forgotten.
+    pub fn take_rivals(&self, now: Duration) -> Vec<Rival> {
+        let mut robots = self.lock();
+        let mut rivals = Vec::new();
+        for (key, presence) in robots.iter_mut() {
+            let Some(other) = presence.other else {
+                continue;
+            };
+            if now.saturating_sub(other.heard_at) > RIVAL_GONE {
+                presence.forget_other();
+            } else if other.is_rival {
+                rivals.push(Rival {
+                    key: key.clone(),
+                    boot: other.boot,
+                    mission: other.mission,
+                });
+            }
+        }
+        rivals
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Heard;
+    use super::super::tests::{SECOND, boot, key, state, wall};
+    use super::*;
+
+    #[test]
+    fn a_second_agent_under_one_name_is_named_until_it_is_silent() {
+        let presences = Presences::default();
+        let says = |number, seq, at| presences.state(&key(), state(boot(number), seq), at, wall());
+        for number in [1, 2] {
+            presences.token_appeared(key(), boot(number), SECOND);
+            presences.hello(key(), boot(number), SECOND);
+        }
+        says(2, 1, SECOND);
+        presences.take_alert_changes();
+        assert_eq!(says(1, 8, SECOND), Heard::Other);
+        // A straggler that is told twice is no second agent.
+        assert_eq!(says(1, 8, 3 * SECOND), Heard::Other);
+        assert!(presences.take_rivals(3 * SECOND).is_empty());
+        assert_eq!(says(1, 9, 3 * SECOND), Heard::Other);
+        let rivals = presences.take_rivals(3 * SECOND);
+        assert_eq!(rivals.len(), 1);
+        assert_eq!(rivals[0].boot, boot(1));
+        let (_, alerts) = presences.take_alert_changes().remove(0);
+        for number in [1, 2] {
+            assert!(alerts[0].text.contains(&boot(number).to_string()));
+        }
+        assert!(presences.take_alert_changes().is_empty());
+        assert!(presences.take_rivals(7 * SECOND).is_empty());
+        let (_, alerts) = presences.take_alert_changes().remove(0);
+        assert!(alerts.is_empty(), "{alerts:?}");
+    }
+}

@@ -1,0 +1,79 @@
+//! The metrics say what happened, and nobody looks for one that does not exist.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use reqwest::StatusCode;
+use tread_api::mission::MissionState;
+use tread_api::wire::ingest::MissionPhase;
+
+use crate::harness::{Yard, eventually};
+use crate::robot::Robot;
+
+async fn page(yard: &Yard) -> String {
+    let address = yard.server.metrics_address().unwrap();
+    let page = yard.client().get(format!("http://{address}/metrics"));
+    page.send().await.unwrap().text().await.unwrap()
+}
+
+/// Every name of ours in a text.
+fn names(text: &str) -> BTreeSet<String> {
+    let words = text.split(|letter: char| !(letter.is_ascii_alphanumeric() || letter == '_'));
+    let ours = words.filter(|word| word.starts_with("tread_"));
+    ours.map(str::to_owned).collect()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn missions_refusals_queues_and_transactions_are_measured() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    robot.report(0, &mission, MissionPhase::Started).await;
+    robot.report(1, &mission, MissionPhase::Succeeded).await;
+    yard.mission_becomes(mission.id, MissionState::Succeeded)
+        .await;
+    let (status, _) = yard.get_value("/v1/missions?robot=nobody").await;
+    assert_eq!(status, StatusCode::BAD_REQUEST);
+    for wanted in [
+        "tread_mission_seconds_count{state=\"succeeded\"} 1",
+        "tread_refusals_total{of=\"request\",reason=\"invalid-query\"} 1",
+        "tread_refusals_total{of=\"robot\",reason=\"malformed\"} 0",
+        "tread_queue_depth{queue=\"ingest\"} 0",
+        "tread_db_transaction_seconds_count{kind=\"ingest\",writes=\"true\"} 2",
+        "tread_db_transaction_seconds_count{kind=\"missions/mod\",writes=\"true\"} 1",
+    ] {
+        eventually(wanted, async || {
+            let text = page(&yard).await;
+            let found = text.lines().any(|line| line == wanted);
+            if found { Ok(()) } else { Err(text) }
+        })
+        .await;
+    }
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn alert_rules_and_dashboard_name_only_metrics_that_exist() {
+    let yard = Yard::start().await;
+    let text = page(&yard).await;
+    let mut exist = BTreeSet::new();
+    for line in text.lines() {
+        let Some(rest) = line.strip_prefix("# TYPE ") else {
+            continue;
+        };
+        let (name, kind) = rest.split_once(' ').unwrap();
+        exist.insert(name.to_owned());
+        if kind == "histogram" {
+            exist.extend(["bucket", "sum", "count"].map(|part| format!("{name}_{part}")));
+        }
+    }
+    let deploy = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy");
+    for file in ["prometheus-alerts.yml", "grafana-dashboard.json"] {
+        let looked_for = names(&std::fs::read_to_string(deploy.join(file)).unwrap());
+        assert!(looked_for.len() > 5, "{file}: {looked_for:?}");
+        let missing: Vec<&String> = looked_for.difference(&exist).collect();
+        assert!(missing.is_empty(), "{file} looks for {missing:?}");
+    }
+    yard.server.stop().await.unwrap();
+}
