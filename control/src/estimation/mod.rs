@@ -18,7 +18,7 @@
 //! The robot's own parameters survive changes of the ground; θ, f and κ are the ground's. Samples
 //! are averaged over blocks; the noise of the regressor is taken out of its square (errors in
 //! variables), and its effect is part of the deviation. Only the difference of `δ_c` and θf shows,
-//! so what is known of it goes from segment to segment as a whole ([`offsets`]). Where nothing
+//! so what is known of it goes from segment to segment as a whole (`offsets.rs`). Where nothing
 //! excites θ, there is no θ: `None`.
 
 mod along;
