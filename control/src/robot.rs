@@ -11,8 +11,8 @@ pub const GRAVITY_M_S2: f64 = 9.81;
 
 /// Share of the grip that a plan may use along the path.
 const GRIP_SHARE_ALONG: f64 = 0.58;
-/// Share of the grip that a plan may use across the path: both together leave three tenths for turning
-/// the body and for feedback.
+/// Share of the grip that a plan may use across the path: both together leave three tenths for
+/// turning the body and for feedback.
 const GRIP_SHARE_ACROSS: f64 = 0.4;
 
 /// What a robot may do at most. Every figure is finite and above zero.

@@ -3,21 +3,23 @@
 //! This is the figure that reaches the map; it never mixes with θ̂ of the loop. Per side, in the
 //! linear range, `λ = θ μ` holds exactly under combined slip: slip is regressed on force, from
 //! *measured* wheel speed, gyro, accelerometer, body speed and wheel torque. Every row is linear in
-//! seven parameters: θ; what is the robot's own, namely `δ_c` and `δ_d` (the shares by which nominal
+//! nine parameters: θ; what is the robot's own, namely `δ_c` and `δ_d` (the shares by which nominal
 //! radii are too large, mean and right minus left), the effective track, the gyro's and the
-//! accelerometer's offset; and θκ, the bend of a curved tyre. In metres per second, u rim speeds:
+//! accelerometer's offset and the latter's scale; θf, rolling resistance f in measured torques; and
+//! θκ, the bend of a curved tyre. In metres per second, u rim speeds:
 //!
 //! ```text
 //! with wheel torque
-//!   u_R − u_L − Wφ̇     = θ (μ_R u_R − μ_L u_L)   + δ_c (u_R − u_L) + δ_d (u_R + u_L)/2 − W b_g
-//!   (u_R + u_L)/2 − v  = θ (μ_R u_R + μ_L u_L)/2 + δ_c (u_R + u_L)/2 + δ_d (u_R − u_L)/4
+//!   u_R − u_L − Wφ̇    = θ (μ_R u_R − μ_L u_L)   + (δ_c − θf)(u_R − u_L)   + δ_d (u_R + u_L)/2 − W b_g
+//!   (u_R + u_L)/2 − v = θ (μ_R u_R + μ_L u_L)/2 + (δ_c − θf)(u_R + u_L)/2 + δ_d (u_R − u_L)/4
 //! without
 //!   the moment balance ([`window`]) and the innovations of the speed ahead ([`along`])
 //! ```
-//! The robot's own parameters survive changes of the ground, θ is the ground's. Samples are
-//! averaged over blocks; the noise of the regressor is taken out of its square (errors in
-//! variables), and its effect is part of the deviation. Rolling resistance acts like `δ_c` in both
-//! rows with torque and needs no state there. Where nothing excites θ, there is no θ: `None`.
+//! The robot's own parameters survive changes of the ground; θ, f and κ are the ground's. Samples
+//! are averaged over blocks; the noise of the regressor is taken out of its square (errors in
+//! variables), and its effect is part of the deviation. Only the difference of `δ_c` and θf shows,
+//! so what is known of it goes from segment to segment as a whole (`offsets.rs`). Where nothing
+//! excites θ, there is no θ: `None`.
 
 mod along;
 mod block;
