@@ -28,6 +28,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use clap::Parser as _;
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
@@ -218,6 +219,16 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
     }
 }
 
+/// Lets the process have as many connections open as the machine allows: the usual soft limit is
+/// below the bounds of the accept loop.
+fn raise_file_limit() {
+    let raised = getrlimit(Resource::RLIMIT_NOFILE)
+        .and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most));
+    if let Err(error) = raised {
+        warn!("cannot raise the limit of open files: {error}");
+    }
+}
+
 fn run_init(args: init::InitArgs) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -232,6 +243,7 @@ fn run_init(args: init::InitArgs) -> anyhow::Result<()> {
 pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
     logging::start(args)?;
     let config = Config::load(args)?;
+    raise_file_limit();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()?;

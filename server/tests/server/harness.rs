@@ -20,7 +20,8 @@ use tread_api::terrain::TerrainRef;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, Record, RecordContent};
 use tread_api::wire::{self, Refusal};
 use tread_server::app::identity::FirstAdmin;
-use tread_server::config::{FrictionConfig, WebConfig};
+use tread_server::clock::Clock;
+use tread_server::config::{FrictionConfig, TlsFiles, WebConfig};
 use tread_server::counters::CounterValues;
 use tread_server::{Config, RunningServer, Server};
 use zenoh::Wait as _;
@@ -73,7 +74,9 @@ pub(crate) fn client(token: Option<&str>) -> reqwest::Client {
         let value = format!("Bearer {token}").parse().unwrap();
         headers.insert(reqwest::header::AUTHORIZATION, value);
     }
-    let builder = reqwest::Client::builder().default_headers(headers);
+    let builder = reqwest::Client::builder()
+        .default_headers(headers)
+        .tls_certs_only([]);
     builder.build().unwrap()
 }
 
@@ -82,22 +85,27 @@ impl Yard {
         Self::start_in(Arc::new(tempfile::tempdir().unwrap()), "127.0.0.1:0").await
     }
 
+    /// A server whose clock stands until it is moved.
+    pub(crate) async fn start_at(wall: Timestamp) -> Self {
+        let folder = Arc::new(tempfile::tempdir().unwrap());
+        let config = config(folder.path(), "127.0.0.1:0");
+        let server = Server::start_with_clock(config, Clock::manual(wall));
+        Self::of(folder, server.await.unwrap()).await
+    }
+
+    pub(crate) async fn start_with_tls(tls: TlsFiles) -> Self {
+        let folder = Arc::new(tempfile::tempdir().unwrap());
+        let mut config = config(folder.path(), "127.0.0.1:0");
+        config.tls = Some(tls);
+        Self::of(folder, Server::start(config).await.unwrap()).await
+    }
+
     async fn start_in(folder: Arc<TempDir>, zenoh: &str) -> Self {
-        let config = Config {
-            http: "127.0.0.1:0".parse().unwrap(),
-            metrics: Some("127.0.0.1:0".parse().unwrap()),
-            zenoh: zenoh.parse().unwrap(),
-            database: database(folder.path()),
-            site: site(),
-            friction: FrictionConfig::default(),
-            tls: None,
-            web: WebConfig {
-                hosts: vec!["tread.test".to_owned()],
-                allowed_origins: vec!["https://dash.test".parse().unwrap()],
-                behind_https: false,
-            },
-        };
-        let server = Server::start(config).await.unwrap();
+        let config = config(folder.path(), zenoh);
+        Self::of(folder, Server::start(config).await.unwrap()).await
+    }
+
+    async fn of(folder: Arc<TempDir>, server: RunningServer) -> Self {
         let admin = FirstAdmin {
             name: "tests".to_owned(),
             valid_days: 1,
@@ -200,6 +208,23 @@ impl Yard {
             }
         })
         .await
+    }
+}
+
+fn config(folder: &Path, zenoh: &str) -> Config {
+    Config {
+        http: "127.0.0.1:0".parse().unwrap(),
+        metrics: Some("127.0.0.1:0".parse().unwrap()),
+        zenoh: zenoh.parse().unwrap(),
+        database: database(folder),
+        site: site(),
+        friction: FrictionConfig::default(),
+        tls: None,
+        web: WebConfig {
+            hosts: vec!["tread.test".to_owned()],
+            allowed_origins: vec!["https://dash.test".parse().unwrap()],
+            behind_https: false,
+        },
     }
 }
 

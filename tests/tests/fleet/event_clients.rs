@@ -20,10 +20,12 @@ const MEMORY_MAX: u64 = 200_000_000;
 /// Events of robots that each reader must see after the deaf one has joined.
 const EVENTS_EACH: usize = 5;
 
-async fn open(stream: TcpStream) -> BufReader<TcpStream> {
+async fn open(stream: TcpStream, token: &str) -> BufReader<TcpStream> {
     let mut stream = stream;
-    let request = "GET /v1/events?topics=robots HTTP/1.1\r\nhost: test\r\n\
-                   accept: text/event-stream\r\n\r\n";
+    let request = format!(
+        "GET /v1/events?topics=robots HTTP/1.1\r\nhost: localhost\r\n\
+         authorization: Bearer {token}\r\naccept: text/event-stream\r\n\r\n"
+    );
     let sent = stream.write_all(request.as_bytes()).await;
     sent.expect("the server listens");
     BufReader::new(stream)
@@ -62,11 +64,12 @@ async fn of_a_thousand_event_clients_one_that_never_reads_disturbs_nobody() {
     // A socket that takes next to nothing, so that what is sent piles up at the server.
     let socket = TcpSocket::new_v4().unwrap();
     socket.set_recv_buffer_size(4_096).unwrap();
-    let deaf = open(socket.connect(address).await.unwrap()).await;
+    let deaf = open(socket.connect(address).await.unwrap(), fleet.token()).await;
     let mut readers = JoinSet::new();
     for _ in 0..READERS {
         let stream = TcpStream::connect(address).await.unwrap();
-        readers.spawn(async move { read_events(open(stream).await, EVENTS_EACH).await });
+        let token = fleet.token().to_owned();
+        readers.spawn(async move { read_events(open(stream, &token).await, EVENTS_EACH).await });
     }
     let talking = async {
         loop {
