@@ -145,6 +145,14 @@ uuid_id! {
     AlertId
 }
 uuid_id! {
+    /// A token of a person or a program: a version 7 UUID; no secret.
+    TokenId
+}
+uuid_id! {
+    /// A browser's session: a version 7 UUID; no secret.
+    SessionId
+}
+uuid_id! {
     /// One run of an agent's process: a new version 4 UUID at each start.
     BootId
 }

@@ -4,7 +4,7 @@
 //! so a change here is a change of the protocol.
 //!
 //! * REST shapes: [`site`], [`terrain`], [`robot`], [`trajectory`], [`mission`], [`friction`],
-//!   [`event`], [`page`], [`problem`].
+//!   [`event`], [`identity`], [`page`], [`problem`].
 //! * zenoh shapes: [`wire`], with the key expressions in [`keys`].
 //!
 //! Units are SI and stand last in a name (`_m`, `_m_s`, `_rad`). A site's frame is metric and
@@ -14,6 +14,7 @@
 pub mod event;
 pub mod friction;
 pub mod geometry;
+pub mod identity;
 pub mod ids;
 pub mod keys;
 pub mod mission;

@@ -61,6 +61,20 @@ pub enum ProblemType {
     IdempotencyKeyReused,
     #[serde(rename = "/problems/invalid-header")]
     InvalidHeader,
+    #[serde(rename = "/problems/unauthenticated")]
+    Unauthenticated,
+    #[serde(rename = "/problems/forbidden")]
+    Forbidden,
+    #[serde(rename = "/problems/too-many-attempts")]
+    TooManyAttempts,
+    #[serde(rename = "/problems/foreign-origin")]
+    ForeignOrigin,
+    #[serde(rename = "/problems/unknown-host")]
+    UnknownHost,
+    #[serde(rename = "/problems/unknown-token")]
+    UnknownToken,
+    #[serde(rename = "/problems/request-too-long")]
+    RequestTooLong,
     #[serde(rename = "/problems/too-many")]
     TooMany,
     #[serde(rename = "/problems/timeout")]
@@ -73,7 +87,7 @@ pub enum ProblemType {
 
 impl ProblemType {
     /// Every kind.
-    pub const ALL: [Self; 28] = [
+    pub const ALL: [Self; 35] = [
         Self::MalformedBody,
         Self::InvalidBody,
         Self::UnknownField,
@@ -98,6 +112,13 @@ impl ProblemType {
         Self::IdempotencyKeyInFlight,
         Self::IdempotencyKeyReused,
         Self::InvalidHeader,
+        Self::Unauthenticated,
+        Self::Forbidden,
+        Self::TooManyAttempts,
+        Self::ForeignOrigin,
+        Self::UnknownHost,
+        Self::UnknownToken,
+        Self::RequestTooLong,
         Self::TooMany,
         Self::Timeout,
         Self::Unavailable,
@@ -131,6 +152,13 @@ impl ProblemType {
             Self::IdempotencyKeyInFlight => "A request with this key is being answered",
             Self::IdempotencyKeyReused => "This key was used for another request",
             Self::InvalidHeader => "A header does not say something possible",
+            Self::Unauthenticated => "A valid token is needed",
+            Self::Forbidden => "The token's role does not allow this",
+            Self::TooManyAttempts => "There were too many failed attempts",
+            Self::ForeignOrigin => "Another site's page may not ask for this",
+            Self::UnknownHost => "This server does not go by that name",
+            Self::UnknownToken => "The token is not known",
+            Self::RequestTooLong => "The path or query is too long",
             Self::TooMany => "There are too many of these",
             Self::Timeout => "The answer took too long",
             Self::Unavailable => "The server cannot answer now",

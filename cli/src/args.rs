@@ -1,5 +1,7 @@
 //! The words of the command line.
 
+mod identity;
+
 use std::ffi::OsString;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -8,6 +10,9 @@ use clap::{Args, Parser, Subcommand};
 use tread_api::geometry::Point;
 use tread_api::ids::{MissionId, RobotId, SiteId, TerrainId};
 use tread_api::trajectory::Waypoint;
+
+use self::identity::Showing;
+pub(crate) use self::identity::{AuditArguments, PlainArguments, TokensAction, TokensArguments};
 
 /// Where a server answers, unless told otherwise.
 pub(crate) const SERVER_DEFAULT: &str = "http://127.0.0.1:8420";
@@ -74,6 +79,18 @@ pub(crate) enum RemoteCommand {
     Friction(FrictionArguments),
     /// Show robots and missions as they change, until interrupted
     Watch(WatchArguments),
+    /// Sign in to a server: the token is read from the input, or from `--token-file`, and kept
+    Login(PlainArguments),
+    /// Forget the token of a server
+    Logout(PlainArguments),
+    /// Show who the token in use is, and what it may do
+    Whoami(PlainArguments),
+    /// Print the token in use, for other programs such as curl
+    Token(PlainArguments),
+    /// List tokens, make or revoke one
+    Tokens(TokensArguments),
+    /// Show who changed what, and who was refused
+    Audit(AuditArguments),
 }
 
 impl RemoteCommand {
@@ -88,6 +105,12 @@ impl RemoteCommand {
             Self::Terrains(arguments) => &arguments.connection,
             Self::Friction(arguments) => &arguments.connection,
             Self::Watch(arguments) => &arguments.connection,
+            Self::Login(arguments)
+            | Self::Logout(arguments)
+            | Self::Whoami(arguments)
+            | Self::Token(arguments) => &arguments.connection,
+            Self::Tokens(arguments) => &arguments.connection,
+            Self::Audit(arguments) => &arguments.connection,
         }
     }
 }
@@ -98,6 +121,8 @@ pub(crate) struct Connection {
     /// Address of the server
     #[arg(long, global = true, env = "TREAD_SERVER", default_value = SERVER_DEFAULT, value_name = "URL")]
     pub(crate) server: String,
+    #[command(flatten)]
+    pub(crate) showing: Showing,
     /// Site to look at
     #[arg(long, global = true, env = "TREAD_SITE", default_value = SITE_DEFAULT)]
     pub(crate) site: SiteId,

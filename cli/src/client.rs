@@ -1,15 +1,19 @@
 //! A client of the REST API.
 
+use std::io;
+use std::net::IpAddr;
+use std::path::Path;
 use std::time::Duration;
 
-use reqwest::{Method, RequestBuilder, Response, StatusCode};
+use reqwest::{Certificate, Method, RequestBuilder, Response, StatusCode, Url};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tread_api::friction::{CellFriction, TerrainFriction};
-use tread_api::ids::{MissionId, RobotId, SiteId, TerrainId};
+use tread_api::identity::{AuditEntry, CreateToken, CreatedToken, Session, Token};
+use tread_api::ids::{MissionId, RobotId, SiteId, TerrainId, TokenId};
 use tread_api::mission::{CreateMission, Mission, MissionDetail, ReplaceMission};
 use tread_api::page::{PAGE_LIMIT_MAX, Page};
-use tread_api::problem::ProblemBody;
+use tread_api::problem::{ProblemBody, ProblemType};
 use tread_api::robot::Robot;
 use tread_api::terrain::{CreateTerrain, Terrain};
 use tread_api::trajectory::{CheckTrajectory, TrajectoryCheck};
@@ -29,6 +33,18 @@ pub(crate) enum ClientError {
     /// The address is not one.
     #[error("`{address}` is not the address of a server: use one like http://127.0.0.1:8420")]
     Address { address: String },
+    /// A token would go over the network for everybody to read.
+    #[error(
+        "a token is not sent to {address} without TLS: use https, or an address of this machine"
+    )]
+    ClearText { address: String },
+    /// The certificate to trust is none.
+    #[error("cannot trust the certificate in `{file}`")]
+    Authority {
+        file: String,
+        #[source]
+        cause: std::io::Error,
+    },
     /// Nothing answers there.
     #[error(
         "no server answers at {address}: start one with `tread demo` or `tread-server`, or name \
@@ -57,9 +73,33 @@ fn refusal(problem: &ProblemBody) -> String {
     if let Some(field) = &problem.field {
         text = format!("{text}, at `{field}`");
     }
+    if problem.kind == ProblemType::Unauthenticated {
+        return format!(
+            "{text}: sign in with `tread login`, or give one with --token-file or TREAD_TOKEN"
+        );
+    }
     match &problem.detail {
         Some(detail) => format!("{text}: {detail}"),
         None => text,
+    }
+}
+
+/// An address as it is written everywhere.
+pub(crate) fn address_of(address: &str) -> &str {
+    address.trim_end_matches('/')
+}
+
+/// Whether only this machine reads what is sent to a host.
+fn is_here(url: &Url) -> bool {
+    match url.host_str() {
+        Some("localhost") => true,
+        Some(host) => {
+            let address = host.trim_start_matches('[').trim_end_matches(']');
+            address
+                .parse()
+                .is_ok_and(|address: IpAddr| address.is_loopback())
+        }
+        None => false,
     }
 }
 
@@ -67,29 +107,64 @@ fn refusal(problem: &ProblemBody) -> String {
 #[derive(Debug, Clone)]
 pub(crate) struct Client {
     address: String,
+    token: Option<String>,
     http: reqwest::Client,
 }
 
+fn certificates(file: &Path) -> Result<Vec<Certificate>, ClientError> {
+    let unusable = |cause| ClientError::Authority {
+        file: file.display().to_string(),
+        cause,
+    };
+    let text = std::fs::read(file).map_err(unusable)?;
+    let found = Certificate::from_pem_bundle(&text);
+    found.map_err(|error| unusable(io::Error::new(io::ErrorKind::InvalidData, error)))
+}
+
 impl Client {
-    pub(crate) fn new(address: &str) -> Result<Self, ClientError> {
+    /// A client that shows this token, and trusts this authority instead of the machine's.
+    pub(crate) fn new(
+        address: &str,
+        token: Option<&str>,
+        authority: Option<&Path>,
+    ) -> Result<Self, ClientError> {
         let invalid = || ClientError::Address {
             address: address.to_owned(),
         };
-        let url = reqwest::Url::parse(address).map_err(|_| invalid())?;
-        if url.scheme() != "http" || url.host().is_none() {
+        let url = Url::parse(address).map_err(|_| invalid())?;
+        if !matches!(url.scheme(), "http" | "https") || url.host().is_none() {
             return Err(invalid());
         }
-        let address = address.trim_end_matches('/').to_owned();
-        let http = reqwest::Client::builder()
+        let is_tls = url.scheme() == "https";
+        let address = address_of(address).to_owned();
+        if token.is_some() && !is_tls && !is_here(&url) {
+            return Err(ClientError::ClearText { address });
+        }
+        let mut builder = reqwest::Client::builder()
             .timeout(ANSWER_WAIT_MAX)
             .connect_timeout(CONNECT_WAIT_MAX)
-            .user_agent(concat!("tread/", env!("CARGO_PKG_VERSION")))
-            .build()
-            .map_err(|cause| ClientError::Unreachable {
-                address: address.clone(),
-                cause,
-            })?;
-        Ok(Self { address, http })
+            .user_agent(concat!("tread/", env!("CARGO_PKG_VERSION")));
+        builder = match authority {
+            Some(file) => builder.tls_certs_only(certificates(file)?),
+            None if is_tls => builder,
+            // Nobody is trusted, so that no machine's certificates need be read.
+            None => builder.tls_certs_only([]),
+        };
+        let http = builder.build().map_err(|cause| ClientError::Unreachable {
+            address: address.clone(),
+            cause,
+        })?;
+        let token = token.map(str::to_owned);
+        Ok(Self {
+            address,
+            token,
+            http,
+        })
+    }
+
+    /// The token that is shown.
+    pub(crate) fn token(&self) -> Option<&str> {
+        self.token.as_deref()
     }
 
     pub(crate) fn address(&self) -> &str {
@@ -97,7 +172,11 @@ impl Client {
     }
 
     fn request(&self, method: Method, path: &str) -> RequestBuilder {
-        self.http.request(method, format!("{}{path}", self.address))
+        let request = self.http.request(method, format!("{}{path}", self.address));
+        match &self.token {
+            Some(token) => request.bearer_auth(token),
+            None => request,
+        }
     }
 
     async fn send<T: DeserializeOwned>(&self, request: RequestBuilder) -> Result<T, ClientError> {
@@ -152,6 +231,43 @@ impl Client {
             }
         }
         Ok(items)
+    }
+
+    /// Who the token is.
+    pub(crate) async fn session(&self) -> Result<Session, ClientError> {
+        self.get("/v1/session").await
+    }
+
+    pub(crate) async fn tokens(&self) -> Result<Vec<Token>, ClientError> {
+        self.all("/v1/tokens").await
+    }
+
+    pub(crate) async fn create_token(
+        &self,
+        request: &CreateToken,
+    ) -> Result<CreatedToken, ClientError> {
+        self.post("/v1/tokens", request).await
+    }
+
+    pub(crate) async fn revoke_token(&self, token: TokenId) -> Result<Token, ClientError> {
+        let path = format!("/v1/tokens/{token}");
+        self.send(self.request(Method::DELETE, &path)).await
+    }
+
+    /// The newest entries of the audit log, at most `limit`.
+    pub(crate) async fn audit(
+        &self,
+        who: Option<&str>,
+        refused: bool,
+        limit: u32,
+    ) -> Result<Page<AuditEntry>, ClientError> {
+        let mut query = vec![
+            ("limit", limit.to_string()),
+            ("refused", refused.to_string()),
+        ];
+        query.extend(who.map(|who| ("who", who.to_owned())));
+        self.send(self.request(Method::GET, "/v1/audit").query(&query))
+            .await
     }
 
     /// Whether the server is ready to work.
@@ -287,5 +403,38 @@ impl Client {
         site: &SiteId,
     ) -> Result<Vec<CellFriction>, ClientError> {
         self.all(&format!("/v1/sites/{site}/friction/cells")).await
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_token_goes_over_the_network_only_by_tls() {
+        let _first = rustls::crypto::ring::default_provider().install_default();
+        let to = |address| Client::new(address, Some("t"), None).map(|_| ());
+        for here in [
+            "http://127.0.0.1:8420/",
+            "http://[::1]:8420",
+            "http://localhost:1",
+        ] {
+            assert!(to(here).is_ok(), "{here}");
+        }
+        for away in [
+            "http://192.0.2.1:8420",
+            "http://tread.example",
+            "http://localhost.example",
+        ] {
+            assert!(
+                matches!(to(away), Err(ClientError::ClearText { .. })),
+                "{away}"
+            );
+            assert!(Client::new(away, None, None).is_ok());
+        }
+        assert!(matches!(
+            to("ftp://127.0.0.1"),
+            Err(ClientError::Address { .. })
+        ));
     }
 }

@@ -7,6 +7,7 @@
 mod args;
 mod client;
 mod commands;
+mod credentials;
 mod demo;
 mod output;
 
@@ -17,6 +18,8 @@ use clap::Parser;
 use crate::args::{Arguments, Command};
 
 fn main() -> ExitCode {
+    // The first call counts, and there is no other.
+    let _first = rustls::crypto::ring::default_provider().install_default();
     let words = std::env::args_os().map(args::shield_negative_points);
     match Arguments::parse_from(words).command {
         Command::Server(arguments) => {

@@ -10,6 +10,8 @@ use clap::{Args, ValueEnum};
 use serde::Deserialize;
 use tread_api::ids::SiteId;
 
+use crate::identity::origin::{Names, Origin};
+
 /// Address of the REST API when nothing else is said.
 pub const HTTP_DEFAULT: &str = "127.0.0.1:8420";
 /// Address of the zenoh router when nothing else is said.
@@ -73,6 +75,32 @@ pub struct Config {
     pub site: SiteId,
     /// How measurements of several robots and times are weighed.
     pub friction: FrictionConfig,
+    /// The REST API's certificate; without one it listens on this machine alone.
+    pub tls: Option<TlsFiles>,
+    /// What browsers may do.
+    pub web: WebConfig,
+}
+
+/// Certificate and key of the REST API, both PEM.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TlsFiles {
+    /// The certificate, followed by those between it and its authority.
+    pub certificate: PathBuf,
+    /// Its private key.
+    pub key: PathBuf,
+}
+
+/// What browsers may do.
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct WebConfig {
+    /// Names of this server besides `localhost` and its addresses.
+    pub hosts: Vec<String>,
+    /// Origins of foreign pages that may ask with a token of their own.
+    pub allowed_origins: Vec<Origin>,
+    /// A proxy before this server ends TLS: browsers come by `https`.
+    pub behind_https: bool,
 }
 
 /// How measurements of several robots and times are weighed.
@@ -105,6 +133,9 @@ struct File {
     site: Option<SiteId>,
     #[serde(default)]
     friction: FrictionConfig,
+    tls: Option<TlsFiles>,
+    #[serde(default)]
+    web: WebConfig,
 }
 
 /// Why the server cannot start with this configuration.
@@ -140,15 +171,14 @@ pub enum ConfigError {
         value: f64,
     },
     /// An address that others can reach.
-    #[error(
-        "`{key}` is {address}, which other machines can reach; as long as people and robots do \
-         not have to prove who they are, use an address of this machine such as 127.0.0.1"
-    )]
+    #[error("`{key}` is {address}, which other machines can reach without TLS: {cure}")]
     NotLoopback {
         /// Which key.
         key: &'static str,
         /// What was given.
         address: SocketAddr,
+        /// What to do.
+        cure: &'static str,
     },
 }
 
@@ -187,17 +217,32 @@ impl Config {
                 .or(file.site)
                 .unwrap_or_else(|| SITE_DEFAULT.parse().expect(builtin)),
             friction: file.friction,
+            tls: file.tls,
+            web: file.web,
         };
         config.check()?;
         Ok(config)
     }
 
+    /// The names that the server goes by.
+    pub fn names(&self) -> Names {
+        Names {
+            hosts: self.web.hosts.clone(),
+            allowed_origins: self.web.allowed_origins.clone(),
+            is_tls: self.tls.is_some() || self.web.behind_https,
+        }
+    }
+
     fn check(&self) -> Result<(), ConfigError> {
-        let metrics = self.metrics.map(|address| ("metrics", address));
-        let addresses = [("http", self.http), ("zenoh", self.zenoh)];
-        for (key, address) in addresses.into_iter().chain(metrics) {
+        const HERE: &str = "use an address of this machine such as 127.0.0.1";
+        const TLS: &str = "give `certificate` and `key` under `[tls]`, or use an address of this \
+                           machine such as 127.0.0.1";
+        let metrics = self.metrics.map(|address| ("metrics", address, HERE));
+        let http = self.tls.is_none().then_some(("http", self.http, TLS));
+        let zenoh = Some(("zenoh", self.zenoh, HERE));
+        for (key, address, cure) in [http, zenoh, metrics].into_iter().flatten() {
             if !address.ip().is_loopback() {
-                return Err(ConfigError::NotLoopback { key, address });
+                return Err(ConfigError::NotLoopback { key, address, cure });
             }
         }
         let FrictionConfig {
@@ -296,6 +341,32 @@ mod tests {
             assert!(error.contains("other machines can reach"), "{error}");
         }
         assert!(load("http = \"[::1]:8080\"").is_ok());
+    }
+
+    #[test]
+    fn with_a_certificate_the_rest_api_may_be_reached_and_the_rest_may_not() {
+        let tls = "[tls]\ncertificate = \"c.pem\"\nkey = \"k.pem\"";
+        let config = load(&format!("http = \"0.0.0.0:443\"\n{tls}")).unwrap();
+        assert!(config.names().is_tls);
+        for key in ["zenoh", "metrics"] {
+            let error = load(&format!("{key} = \"0.0.0.0:1\"\n{tls}")).unwrap_err();
+            assert!(
+                error.to_string().contains("other machines can reach"),
+                "{error}"
+            );
+        }
+        let half = load("[tls]\ncertificate = \"c.pem\"").unwrap_err();
+        assert!(half.to_string().contains("key"), "{half}");
+    }
+
+    #[test]
+    fn an_origin_that_is_none_is_named() {
+        let error = load("[web]\nallowed_origins = [\"*\"]").unwrap_err();
+        let said = error.to_string();
+        assert!(
+            said.contains("line 2") && said.contains("`*` is no origin"),
+            "{said}"
+        );
     }
 
     #[test]

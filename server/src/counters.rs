@@ -84,6 +84,36 @@ counters! {
     commands_unanswered,
     /// HTTP connections refused because too many were open.
     http_connections_refused,
+    /// HTTP connections ended to make room for new ones: idle, or without a whole request.
+    http_connections_displaced,
+    /// HTTP connections on which nothing came in time, or no TLS.
+    http_connections_silent,
+    /// TLS handshakes that failed.
+    http_tls_failed,
+    /// Requests without a token where one is needed.
+    refused_no_token,
+    /// Requests with a token that cannot be one.
+    refused_token_malformed,
+    /// Requests with a token that is not kept here.
+    refused_token_unknown,
+    /// Requests with a token whose time is over.
+    refused_token_expired,
+    /// Requests with a token that was revoked.
+    refused_token_revoked,
+    /// Requests with a token that were not looked at after too many failures.
+    refused_locked,
+    /// Requests that the token's role does not allow.
+    refused_role,
+    /// Requests of another site's page.
+    refused_origin,
+    /// Requests to a name that is not this server's.
+    refused_host,
+    /// Requests whose path or query is too long.
+    refused_too_long,
+    /// Refused attempts that the audit log leaves out because there are too many.
+    audit_refusals_left_out,
+    /// Entries of the audit log that found the queue full.
+    audit_dropped,
     /// Requests whose handler panicked.
     http_panics,
 }

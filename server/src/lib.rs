@@ -14,6 +14,8 @@ pub mod db;
 pub mod fleet;
 pub mod friction;
 pub mod http;
+pub mod identity;
+mod init;
 mod logging;
 pub mod metrics;
 pub mod supervisor;
@@ -21,20 +23,25 @@ pub mod supervisor;
 use std::ffi::OsString;
 use std::net::SocketAddr;
 use std::process::ExitCode;
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
 use clap::Parser as _;
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
-use tracing::info;
+use tracing::{info, warn};
 
+use self::app::identity::audit;
 use self::app::{App, events, ingest, reconciler};
 use self::clock::Clock;
 pub use self::config::{Config, ServerArgs};
 use self::db::Db;
 use self::fleet::Fleet;
+use self::http::serve::Serving;
+use self::http::tls::Tls;
 use self::supervisor::Supervisor;
 
 /// How long threads that block may take after everything else has stopped.
@@ -68,6 +75,8 @@ impl Server {
     /// # Errors
     /// As [`Server::start`].
     pub async fn start_with_clock(config: Config, clock: Clock) -> anyhow::Result<RunningServer> {
+        let names = config.names();
+        let tls = config.tls.map(Tls::load).transpose()?.map(Arc::new);
         let db = Db::open(&config.database).await?;
         let app = App::new(db, clock, config.friction);
         app.ensure_site(&config.site).await?;
@@ -91,8 +100,18 @@ impl Server {
         );
         supervisor.spawn_vital("reconciler", reconciling);
         supervisor.spawn_vital("events", events::run(app.clone(), stop()));
-        let router = http::router(app.clone());
-        let serving = http::serve::run(listener, router, app.clone(), supervisor.clone(), stop());
+        supervisor.spawn_vital("audit", audit::run(app.clone(), stop()));
+        let router = http::router(app.clone(), names);
+        if let Some(tls) = &tls {
+            supervisor.spawn_vital("certificate", http::tls::watch(Arc::clone(tls), stop()));
+        }
+        let scheme = if tls.is_some() { "https" } else { "http" };
+        let serving = Serving {
+            listener,
+            router,
+            tls,
+        };
+        let serving = http::serve::run(serving, app.clone(), supervisor.clone(), stop());
         supervisor.spawn_vital("http", serving);
         let mut metrics_address = None;
         if let Some(address) = config.metrics {
@@ -101,13 +120,19 @@ impl Server {
                 .with_context(|| format!("cannot listen for metrics on {address}"))?;
             let address = listener.local_addr()?;
             metrics_address = Some(address);
-            let router = http::metrics_router(app.clone());
-            let serving =
-                http::serve::run(listener, router, app.clone(), supervisor.clone(), stop());
+            let serving = Serving {
+                listener,
+                router: http::metrics_router(app.clone()),
+                tls: None,
+            };
+            let serving = http::serve::run(serving, app.clone(), supervisor.clone(), stop());
             supervisor.spawn_vital("metrics", serving);
             info!("metrics on http://{address}/metrics");
         }
-        info!("REST API on http://{http_address}, described at http://{http_address}/docs");
+        info!("REST API on {scheme}://{http_address}, described at {scheme}://{http_address}/docs");
+        if app.admin_count().await? == 0 {
+            warn!("nobody can sign in yet: make the first admin's token with `tread-server init`");
+        }
         Ok(RunningServer {
             http_address,
             metrics_address,
@@ -158,10 +183,18 @@ impl RunningServer {
 
 /// Tread's server: missions to robots, friction from robots, one REST API.
 #[derive(Debug, clap::Parser)]
-#[command(name = "tread-server", version)]
+#[command(name = "tread-server", version, args_conflicts_with_subcommands = true)]
 struct Command {
+    #[command(subcommand)]
+    action: Option<Action>,
     #[command(flatten)]
     server: ServerArgs,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Action {
+    /// Make the first admin's token of a server, and tell it this once
+    Init(init::InitArgs),
 }
 
 /// The whole program with these arguments, the first of which is its name.
@@ -177,13 +210,34 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
             return ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(2));
         }
     };
-    match run(&command.server) {
+    let ended = match command.action {
+        Some(Action::Init(args)) => run_init(args),
+        None => run(&command.server),
+    };
+    match ended {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
             ExitCode::FAILURE
         }
     }
+}
+
+/// Lets the process have as many connections open as the machine allows: the usual soft limit is
+/// below the bounds of the accept loop.
+fn raise_file_limit() {
+    let raised = getrlimit(Resource::RLIMIT_NOFILE)
+        .and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most));
+    if let Err(error) = raised {
+        warn!("cannot raise the limit of open files: {error}");
+    }
+}
+
+fn run_init(args: init::InitArgs) -> anyhow::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()?;
+    runtime.block_on(init::run(args))
 }
 
 /// The whole program: configuration, logging, server, until a signal or a failure.
@@ -193,6 +247,7 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
 pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
     logging::start(args)?;
     let config = Config::load(args)?;
+    raise_file_limit();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()?;

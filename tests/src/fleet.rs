@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
-use std::process::ExitStatus;
+use std::process::{Command, ExitStatus};
 
 use anyhow::Context;
 use serde_json::json;
@@ -32,6 +32,7 @@ const GROUND_HALF_M: f64 = 500.0;
 pub struct Fleet {
     /// A client of the server.
     pub rest: Rest,
+    token: String,
     node: PathBuf,
     folder: TempDir,
     http: SocketAddr,
@@ -50,8 +51,10 @@ impl Fleet {
     pub async fn start_with(node: &Path) -> Self {
         let (http, zenoh) = (free_address(), free_address());
         let folder = tempfile::tempdir().expect("a temporary folder");
+        let token = first_token(node, folder.path());
         let mut fleet = Self {
-            rest: Rest::new(format!("http://{http}")),
+            rest: Rest::new(format!("http://{http}"), &token),
+            token,
             node: node.to_owned(),
             folder,
             http,
@@ -91,9 +94,14 @@ impl Fleet {
         self.http
     }
 
+    /// An admin's token.
+    pub fn token(&self) -> &str {
+        &self.token
+    }
+
     /// The database file.
     pub fn database(&self) -> PathBuf {
-        self.folder.path().join("tread.db")
+        database(self.folder.path())
     }
 
     /// What the server process has used; `None` when it does not run.
@@ -271,6 +279,23 @@ impl Fleet {
         let log = self.folder.path().join(format!("{name}.log"));
         Process::start(name, &self.node, arguments, &log).expect("the node can be started")
     }
+}
+
+fn database(folder: &Path) -> PathBuf {
+    folder.join("tread.db")
+}
+
+/// Makes the database with an admin's token in it, as one does before a server's first start.
+fn first_token(node: &Path, folder: &Path) -> String {
+    let made = Command::new(node)
+        .args(["server", "init"])
+        .arg(format!("--database={}", database(folder).display()))
+        .output()
+        .expect("the node can be started");
+    let said = String::from_utf8_lossy(&made.stderr);
+    assert!(made.status.success(), "no token was made: {said}");
+    let token = String::from_utf8(made.stdout).expect("a token is text");
+    token.trim().to_owned()
 }
 
 /// A port of the loopback that is free now.

@@ -1,5 +1,6 @@
 //! The REST API as any client speaks it.
 
+use reqwest::header::{AUTHORIZATION, HeaderValue};
 use reqwest::{Method, StatusCode};
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
@@ -22,12 +23,21 @@ pub struct Rest {
 }
 
 impl Rest {
-    /// A client of the server at `address`, such as `http://127.0.0.1:8420`.
-    pub fn new(address: String) -> Self {
-        Self {
-            address,
-            http: reqwest::Client::new(),
-        }
+    /// A client of the server at `address`, such as `http://127.0.0.1:8420`, that shows this
+    /// token.
+    ///
+    /// # Panics
+    /// If no client can be made.
+    pub fn new(address: String, token: &str) -> Self {
+        // The first call counts; all install the same.
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let bearer = HeaderValue::try_from(format!("Bearer {token}")).expect("a token is text");
+        let http = reqwest::Client::builder()
+            .default_headers([(AUTHORIZATION, bearer)].into_iter().collect())
+            .tls_certs_only([])
+            .build()
+            .expect("a client needs nothing of the machine");
+        Self { address, http }
     }
 
     /// Sends a request and returns status and body; `None` if nobody answers.

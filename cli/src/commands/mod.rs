@@ -1,6 +1,7 @@
 //! The commands that talk to a running server, a file each.
 
 mod friction;
+mod identity;
 mod missions;
 mod robots;
 mod send;
@@ -10,15 +11,29 @@ mod watch;
 use std::process::ExitCode;
 
 use crate::args::RemoteCommand;
-use crate::client::Client;
+use crate::client::{Client, address_of};
+use crate::credentials;
 use crate::output::Output;
 
 /// Runs one command.
 pub(crate) async fn run(command: RemoteCommand) -> anyhow::Result<ExitCode> {
     let connection = command.connection().clone();
-    let client = Client::new(&connection.server)?;
     let output = Output::new(connection.json);
+    if let RemoteCommand::Login(_) = command {
+        return identity::login(&connection, output).await;
+    }
+    let showing = &connection.showing;
+    let address = address_of(&connection.server);
+    let token = credentials::find(address, showing.token_file.as_deref())?;
+    let client = Client::new(address, token.as_deref(), showing.ca.as_deref())?;
     match command {
+        RemoteCommand::Login(_) | RemoteCommand::Whoami(_) => {
+            identity::whoami(&client, output).await
+        }
+        RemoteCommand::Logout(_) => identity::logout(&client, output),
+        RemoteCommand::Token(_) => identity::token(&client),
+        RemoteCommand::Tokens(arguments) => identity::tokens(arguments, &client, output).await,
+        RemoteCommand::Audit(arguments) => identity::audit(&arguments, &client, output).await,
         RemoteCommand::Robots(arguments) => robots::run(&arguments, &client, output).await,
         RemoteCommand::Send(arguments) => send::run(arguments, &client, output).await,
         RemoteCommand::Missions(arguments) => missions::run(&arguments, &client, output).await,

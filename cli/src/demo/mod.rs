@@ -28,6 +28,7 @@ use self::progress::Progress;
 use self::report::Report;
 use crate::args::DemoArguments;
 use crate::client::{Client, ClientError};
+use crate::credentials::{self, Store};
 use crate::output::{json_line, line, note};
 
 /// Longest wait for the server or the robots to be there.
@@ -55,7 +56,9 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
 
     tell("starting server, database and router …");
     let mut processes = Processes::start_server(folder.path(), arguments.port, &scenario.site)?;
-    let client = Client::new(&processes.api_address())?;
+    let token = credentials::read_token(&processes.token_file())?;
+    let client = Client::new(&processes.api_address(), Some(&token), None)?;
+    let _signed_in = SignedIn::keep(client.address(), &token);
     let outcome = async {
         let demo = Demo {
             scenario: &scenario,
@@ -116,12 +119,47 @@ fn choose_robots(scenario: &Scenario, count: u32) -> anyhow::Result<Vec<Scenario
 fn welcome(client: &Client, processes: &Processes, folder: &Path, missions: usize) -> String {
     format!(
         "\n  REST API       {api}/v1\n  documentation  {api}/docs\n  zenoh router   {}\n  \
-         data and logs  {}\n\n{missions} missions sent; try `tread watch --server {api}` in \
-         another terminal.\n",
+         data and logs  {}\n  admin's token  {}\n\n{missions} missions sent; try \
+         `tread watch --server {api}` in another terminal: it finds the token.\n",
         processes.zenoh_endpoint(),
         folder.display(),
+        processes.token_file().display(),
         api = client.address(),
     )
+}
+
+/// The demo's token among those of this user, so that `tread` finds it while the demo runs.
+struct SignedIn {
+    store: Option<Store>,
+    address: String,
+    token: String,
+}
+
+impl SignedIn {
+    fn keep(address: &str, token: &str) -> Self {
+        let store = Store::of_user().filter(|store| match store.keep(address, token) {
+            Ok(()) => true,
+            Err(error) => {
+                note(&format!("other commands need --token-file: {error:#}"));
+                false
+            }
+        });
+        let (address, token) = (address.to_owned(), token.to_owned());
+        Self {
+            store,
+            address,
+            token,
+        }
+    }
+}
+
+impl Drop for SignedIn {
+    fn drop(&mut self) {
+        if let Some(store) = &self.store {
+            // A token that is left behind opens nothing: its server is gone.
+            let _ = store.forget(&self.address, Some(&self.token));
+        }
+    }
 }
 
 /// Where the demo keeps its files.

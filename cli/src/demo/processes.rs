@@ -15,6 +15,8 @@ use tread_api::ids::SiteId;
 
 /// Port of the zenoh router, if it is free.
 const ZENOH_PORT: u16 = 7447;
+/// Days that a demo's token is valid.
+const TOKEN_VALID_DAYS: u32 = 7;
 /// Ports that are tried from the one that was asked for.
 const PORTS_TRIED: u16 = 50;
 /// Longest wait for processes that were asked to stop.
@@ -35,6 +37,7 @@ struct Part {
 pub(super) struct Processes {
     http: SocketAddr,
     zenoh: SocketAddr,
+    token_file: PathBuf,
     parts: Vec<Part>,
 }
 
@@ -46,8 +49,10 @@ impl Processes {
         let mut processes = Self {
             http,
             zenoh,
+            token_file: folder.join("admin.token"),
             parts: Vec::new(),
         };
+        processes.make_token(folder)?;
         let arguments = [
             "server".to_owned(),
             format!("--http={http}"),
@@ -57,6 +62,31 @@ impl Processes {
         ];
         processes.start("server", &arguments, folder)?;
         Ok(processes)
+    }
+
+    /// Makes the database and an admin's token in it, as one does before a server's first start.
+    fn make_token(&self, folder: &Path) -> anyhow::Result<()> {
+        let program = std::env::current_exe().context("cannot find this executable")?;
+        let made = Command::new(program)
+            .args(["server", "init", "--force", "--name=demo"])
+            .arg(format!("--valid-days={TOKEN_VALID_DAYS}"))
+            .arg(format!("--database={}", folder.join("tread.db").display()))
+            .arg(format!("--token-file={}", self.token_file.display()))
+            .stdin(Stdio::null())
+            .output()
+            .context("cannot make the demo's token")?;
+        if !made.status.success() {
+            bail!(
+                "cannot make the demo's token: {}",
+                String::from_utf8_lossy(&made.stderr).trim()
+            );
+        }
+        Ok(())
+    }
+
+    /// The file with an admin's token.
+    pub(super) fn token_file(&self) -> PathBuf {
+        self.token_file.clone()
     }
 
     /// Starts the agent of one robot.

@@ -4,6 +4,7 @@ pub mod alerts;
 pub mod check;
 pub mod events;
 pub mod friction;
+pub mod identity;
 pub mod ingest;
 pub mod missions;
 pub mod reconciler;
@@ -17,11 +18,12 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use tokio::sync::{Notify, Semaphore, SemaphorePermit};
-use tread_api::ids::{AlertId, MissionId, RobotId, SiteId, TerrainId};
+use tread_api::ids::{AlertId, MissionId, RobotId, SiteId, TerrainId, TokenId};
 use tread_api::mission::MissionState;
 use tread_api::trajectory::Place;
 
 use self::events::Hub;
+use self::identity::Identity;
 use self::missions::idempotency::InFlight;
 use crate::clock::Clock;
 use crate::config::FrictionConfig;
@@ -51,6 +53,7 @@ struct Inner {
     hub: Hub,
     keys_in_flight: InFlight,
     checks: Semaphore,
+    identity: Identity,
     requests: Requests,
     refusals: Refusals,
     queues: Queues,
@@ -76,6 +79,7 @@ impl App {
             hub,
             keys_in_flight: InFlight::default(),
             checks: Semaphore::new(check::CHECKS_MAX),
+            identity: Identity::default(),
             requests: Requests::default(),
             refusals: Refusals::default(),
             queues: Queues::default(),
@@ -154,6 +158,10 @@ impl App {
     /// How long missions took.
     pub fn mission_durations(&self) -> &MissionDurations {
         &self.inner.mission_durations
+    }
+
+    fn identity(&self) -> &Identity {
+        &self.inner.identity
     }
 
     fn keys_in_flight(&self) -> &InFlight {
@@ -275,6 +283,12 @@ pub enum AppError {
     /// No alert of that identifier.
     #[error("alert `{0}` is not known")]
     UnknownAlert(AlertId),
+    /// No token of that identifier.
+    #[error("token `{0}` is not known")]
+    UnknownToken(TokenId),
+    /// The operating system gives no random numbers.
+    #[error("the operating system gives no random numbers: {0}")]
+    NoRandomness(String),
     /// A request with the same key is being answered.
     #[error("a request with this idempotency key is being answered; ask again in a moment")]
     KeyInFlight,
@@ -350,6 +364,8 @@ impl AppError {
             | Self::RobotCannot { .. }
             | Self::Impossible { .. }
             | Self::UnknownAlert(_)
+            | Self::UnknownToken(_)
+            | Self::NoRandomness(_)
             | Self::KeyInFlight
             | Self::KeyReused
             | Self::TooMany { .. }

@@ -5,14 +5,17 @@
 //! survives a power cut.
 
 pub mod alerts;
+pub mod audit;
 pub mod history;
 pub mod idempotency;
 pub mod missions;
 pub mod robots;
 pub mod segments;
+pub mod sessions;
 pub mod sites;
 pub mod sums;
 pub mod terrains;
+pub mod tokens;
 
 use std::fmt::Display;
 use std::ops::{Deref, DerefMut};

@@ -36,6 +36,7 @@ pub(super) struct AlertQuery {
 
 /// Alerts with their history, newest first.
 #[utoipa::path(get, path = "/v1/alerts", tag = "alerts", operation_id = "list_alerts",
+    security(("token" = ["viewer"])),
     params(AlertQuery),
     responses((status = 200, body = Page<Alert>), (status = 400, body = ProblemBody)))]
 pub(super) async fn list(
@@ -54,6 +55,7 @@ pub(super) async fn list(
 
 /// Notes that a person has seen an alert.
 #[utoipa::path(post, path = "/v1/alerts/{alert}/acknowledge", tag = "alerts",
+    security(("token" = ["operator"])),
     operation_id = "acknowledge_alert", params(("alert" = AlertId, Path)),
     responses((status = 200, body = Alert), (status = 404, body = ProblemBody)))]
 pub(super) async fn acknowledge(

@@ -42,6 +42,7 @@ pub(super) struct EventQuery {
 
 /// Everything that changes, from a snapshot on or from where `Last-Event-ID` points.
 #[utoipa::path(get, path = "/v1/events", tag = "events", operation_id = "stream_events",
+    security(("token" = ["viewer"])),
     params(EventQuery, ("last-event-id" = Option<String>, Header,
         description = "The id of the last event that was read")),
     responses((status = 200, content_type = "text/event-stream", body = event::Event),

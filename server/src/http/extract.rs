@@ -14,6 +14,7 @@ use serde::de::DeserializeOwned;
 use tread_api::page::{PAGE_LIMIT_DEFAULT, PAGE_LIMIT_MAX};
 use tread_api::problem::ProblemType;
 
+use super::identity::guard::AuditSlot;
 use super::problem::Problem;
 
 /// Fields that are not known and are named in the answer.
@@ -41,7 +42,12 @@ impl<S: Send + Sync, T: DeserializeOwned + Serialize> FromRequest<S> for Json<T>
         }
         let limit = request.extensions().get::<BodyLimit>().copied();
         let limit = limit.unwrap_or(BodyLimit(super::BODY_MAX));
-        parse(&read(request.into_body(), limit).await?).map(Self)
+        let slot = request.extensions().get::<AuditSlot>().cloned();
+        let parsed = parse(&read(request.into_body(), limit).await?)?;
+        if let Some(slot) = slot {
+            slot.leave(&serde_json::to_value(&parsed).unwrap_or_default());
+        }
+        Ok(Self(parsed))
     }
 }
 

@@ -18,6 +18,7 @@ use crate::db::segments::SegmentFilter;
 
 /// Friction of every terrain of a site.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains", tag = "friction",
+    security(("token" = ["viewer"])),
     operation_id = "list_terrain_friction", params(("site" = SiteId, Path), PageQuery),
     responses((status = 200, body = Page<TerrainFriction>), (status = 404, body = ProblemBody)))]
 pub(super) async fn terrains(
@@ -34,6 +35,7 @@ pub(super) async fn terrains(
 
 /// Friction of one terrain, per robot model.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains/{terrain}", tag = "friction",
+    security(("token" = ["viewer"])),
     operation_id = "get_terrain_friction",
     params(("site" = SiteId, Path), ("terrain" = TerrainId, Path)),
     responses((status = 200, body = TerrainFriction), (status = 404, body = ProblemBody)))]
@@ -66,6 +68,7 @@ pub(super) struct CellQuery {
 
 /// Friction per cell.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/cells", tag = "friction",
+    security(("token" = ["viewer"])),
     operation_id = "list_cell_friction", params(("site" = SiteId, Path), CellQuery),
     responses((status = 200, body = Page<CellFriction>), (status = 400, body = ProblemBody),
         (status = 404, body = ProblemBody)))]
@@ -110,6 +113,7 @@ pub(super) struct SegmentQuery {
 
 /// Raw measurements in the order of their commits.
 #[utoipa::path(get, path = "/v1/sites/{site}/segments", tag = "friction",
+    security(("token" = ["viewer"])),
     operation_id = "list_segments", params(("site" = SiteId, Path), SegmentQuery),
     responses((status = 200, body = Page<StoredSegment>), (status = 400, body = ProblemBody),
         (status = 404, body = ProblemBody)))]

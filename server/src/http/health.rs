@@ -58,6 +58,7 @@ pub(super) async fn readyz(State(app): State<App>) -> Result<Json<Health>, Probl
 
 /// Version, uptime and counters.
 #[utoipa::path(get, path = "/v1/server", tag = "server", operation_id = "get_server",
+    security(("token" = ["viewer"])),
     responses((status = 200, body = ServerStatus)))]
 pub(super) async fn status(State(app): State<App>) -> Json<ServerStatus> {
     Json(ServerStatus {

@@ -37,6 +37,7 @@ pub(super) struct MissionQuery {
 
 /// Missions, newest first.
 #[utoipa::path(get, path = "/v1/missions", tag = "missions", operation_id = "list_missions",
+    security(("token" = ["viewer"])),
     params(MissionQuery),
     responses((status = 200, body = Page<Mission>), (status = 400, body = ProblemBody)))]
 pub(super) async fn list(
@@ -59,6 +60,7 @@ pub(super) async fn list(
 
 /// Asks a robot to drive a circle or waypoints. It waits in the robot's queue.
 #[utoipa::path(post, path = "/v1/missions", tag = "missions", operation_id = "create_mission",
+    security(("token" = ["operator"])),
     request_body = CreateMission,
     params(("idempotency-key" = Option<String>, Header,
         description = "The same request under the same key is answered the same, and done once")),
@@ -93,6 +95,7 @@ fn idempotency_key(headers: &HeaderMap) -> Result<Option<&str>, Problem> {
 
 /// One mission with its history.
 #[utoipa::path(get, path = "/v1/missions/{mission}", tag = "missions",
+    security(("token" = ["viewer"])),
     operation_id = "get_mission", params(("mission" = MissionId, Path)),
     responses((status = 200, body = MissionDetail), (status = 404, body = ProblemBody)))]
 pub(super) async fn get(
@@ -104,6 +107,7 @@ pub(super) async fn get(
 
 /// Wants a mission to end. One that waits ends at once, one in hand when its robot has answered.
 #[utoipa::path(post, path = "/v1/missions/{mission}/cancel", tag = "missions",
+    security(("token" = ["operator"])),
     operation_id = "cancel_mission", params(("mission" = MissionId, Path)),
     responses((status = 202, body = MissionDetail), (status = 404, body = ProblemBody),
         (status = 409, body = ProblemBody)))]
@@ -119,6 +123,7 @@ pub(super) async fn cancel(
 
 /// Wants a mission in hand to be held, the robot standing.
 #[utoipa::path(post, path = "/v1/missions/{mission}/pause", tag = "missions",
+    security(("token" = ["operator"])),
     operation_id = "pause_mission", params(("mission" = MissionId, Path)),
     responses((status = 202, body = MissionDetail), (status = 404, body = ProblemBody),
         (status = 409, body = ProblemBody)))]
@@ -134,6 +139,7 @@ pub(super) async fn pause(
 
 /// Wants a paused mission to go on.
 #[utoipa::path(post, path = "/v1/missions/{mission}/resume", tag = "missions",
+    security(("token" = ["operator"])),
     operation_id = "resume_mission", params(("mission" = MissionId, Path)),
     responses((status = 202, body = MissionDetail), (status = 404, body = ProblemBody),
         (status = 409, body = ProblemBody)))]
@@ -150,6 +156,7 @@ pub(super) async fn resume(
 /// Wants a mission to be another trajectory. What waits is changed at once, what is in hand when
 /// its robot holds the new revision whole; until then the old one is driven.
 #[utoipa::path(post, path = "/v1/missions/{mission}/replace", tag = "missions",
+    security(("token" = ["operator"])),
     operation_id = "replace_mission", params(("mission" = MissionId, Path)),
     request_body = ReplaceMission,
     responses((status = 202, body = MissionDetail), (status = 404, body = ProblemBody),
@@ -167,6 +174,7 @@ pub(super) async fn replace(
 
 /// Plans a trajectory for a robot without moving anything.
 #[utoipa::path(post, path = "/v1/trajectories/check", tag = "missions",
+    security(("token" = ["operator"])),
     operation_id = "check_trajectory", request_body = CheckTrajectory,
     responses((status = 200, body = TrajectoryCheck), (status = 404, body = ProblemBody),
         (status = 422, body = ProblemBody)))]

@@ -4,18 +4,22 @@
 //! problems ([`problem`]); bodies, paths and queries are read by [`extract`] alone.
 
 mod alerts;
+pub mod connections;
 mod events;
 pub mod extract;
 mod friction;
 pub mod health;
+mod identity;
 mod missions;
 pub mod problem;
 mod robots;
 pub mod serve;
 mod sites;
 mod terrains;
+pub mod tls;
 
 use std::any::Any;
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::extract::{MatchedPath, Request, State};
@@ -36,8 +40,12 @@ use utoipa_axum::routes;
 use utoipa_swagger_ui::SwaggerUi;
 
 use self::extract::BodyLimit;
+pub use self::identity::access::{Access, Needed, PUBLIC};
+use self::identity::guard::{self, Guard};
+use self::identity::{audit, browser, session, tokens};
 use self::problem::{Problem, Refused};
 use crate::app::App;
+use crate::identity::origin::Names;
 
 /// Largest body of `POST /v1/missions`: a path of the most waypoints.
 pub const MISSION_BODY_MAX: usize = 16 * 1024 * 1024;
@@ -65,6 +73,10 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(health::healthz))
         .routes(routes!(health::readyz))
         .routes(routes!(health::status))
+        .routes(routes!(session::create, session::get, session::end))
+        .routes(routes!(tokens::list, tokens::create))
+        .routes(routes!(tokens::revoke))
+        .routes(routes!(audit::list))
         .routes(routes!(sites::list, sites::create))
         .routes(routes!(sites::get))
         .routes(routes!(terrains::list, terrains::create))
@@ -91,14 +103,21 @@ pub fn openapi() -> OpenApi {
     with_problems(routes().to_openapi())
 }
 
-/// Says of every operation that its errors are problems.
+/// What every route needs, from the description of the API.
+pub fn access() -> Access {
+    Access::of(&openapi())
+}
+
+/// Says of every operation that its errors are problems, and how to show who asks.
 fn with_problems(mut openapi: OpenApi) -> OpenApi {
+    identity::access::describe(&mut openapi);
     for item in openapi.paths.paths.values_mut() {
         let operations = [
             &mut item.get,
             &mut item.put,
             &mut item.post,
             &mut item.delete,
+            &mut item.patch,
         ];
         for operation in operations.into_iter().flatten() {
             let problem = ResponseBuilder::new()
@@ -123,22 +142,33 @@ fn with_problems(mut openapi: OpenApi) -> OpenApi {
     openapi
 }
 
-/// The whole API on these use cases.
-pub fn router(app: App) -> Router {
+/// The whole API on these use cases, for a server that goes by these names.
+pub fn router(app: App, names: Names) -> Router {
     let (router, openapi) = routes().split_for_parts();
-    router
+    let openapi = with_problems(openapi);
+    let names = Arc::new(names);
+    let guard = Guard::new(app.clone(), Access::of(&openapi), Arc::clone(&names));
+    let router = router
         .merge(
             SwaggerUi::new("/docs")
-                .url("/openapi.json", with_problems(openapi))
+                .url("/openapi.json", openapi)
                 // Without this the page shows the description to a validator on another host.
                 .config(utoipa_swagger_ui::Config::default().validator_url("none")),
         )
         .fallback(not_found)
         .method_not_allowed_fallback(method_not_allowed)
+        .layer(from_fn_with_state(guard, guard::stand))
+        .layer(Extension(Arc::clone(&names)));
+    let router = match browser::foreign_pages(&names.allowed_origins) {
+        Some(foreign_pages) => router.layer(foreign_pages),
+        None => router,
+    };
+    router
         .layer(from_fn_with_state(app.clone(), measure))
         .layer(from_fn(bound_time))
         .layer(CatchPanicLayer::custom(broken))
         .layer(from_fn_with_state(app.clone(), count_panics))
+        .layer(from_fn_with_state(names, browser::set_headers))
         .layer(TraceLayer::new_for_http().make_span_with(span))
         .layer(PropagateRequestIdLayer::new(REQUEST_ID))
         .layer(SetRequestIdLayer::new(REQUEST_ID, MakeRequestUuid))
@@ -147,9 +177,11 @@ pub fn router(app: App) -> Router {
 
 /// The page for Prometheus, on an address of its own.
 pub fn metrics_router(app: App) -> Router {
+    let guard = Guard::new(app.clone(), Access::open("/metrics"), Arc::default());
     Router::new()
         .route("/metrics", axum::routing::get(metrics))
         .fallback(not_found)
+        .layer(from_fn_with_state(guard, guard::stand))
         .layer(from_fn(bound_time))
         .with_state(app)
 }

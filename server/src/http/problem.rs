@@ -65,7 +65,8 @@ const fn status(kind: ProblemType) -> StatusCode {
         | ProblemType::UnknownRobot
         | ProblemType::UnknownTerrain
         | ProblemType::UnknownMission
-        | ProblemType::UnknownAlert => StatusCode::NOT_FOUND,
+        | ProblemType::UnknownAlert
+        | ProblemType::UnknownToken => StatusCode::NOT_FOUND,
         ProblemType::MethodNotAllowed => StatusCode::METHOD_NOT_ALLOWED,
         ProblemType::AlreadyExists
         | ProblemType::MissionEnded
@@ -75,6 +76,11 @@ const fn status(kind: ProblemType) -> StatusCode {
         | ProblemType::RobotCannot
         | ProblemType::IdempotencyKeyInFlight
         | ProblemType::TooMany => StatusCode::CONFLICT,
+        ProblemType::Unauthenticated => StatusCode::UNAUTHORIZED,
+        ProblemType::Forbidden | ProblemType::ForeignOrigin => StatusCode::FORBIDDEN,
+        ProblemType::TooManyAttempts => StatusCode::TOO_MANY_REQUESTS,
+        ProblemType::UnknownHost => StatusCode::MISDIRECTED_REQUEST,
+        ProblemType::RequestTooLong => StatusCode::URI_TOO_LONG,
         ProblemType::Timeout => StatusCode::GATEWAY_TIMEOUT,
         ProblemType::Unavailable => StatusCode::SERVICE_UNAVAILABLE,
         ProblemType::Internal => StatusCode::INTERNAL_SERVER_ERROR,
@@ -98,11 +104,16 @@ impl From<AppError> for Problem {
             AppError::RobotRetired(_) => ProblemType::RobotRetired,
             AppError::RobotCannot { .. } => ProblemType::RobotCannot,
             AppError::UnknownAlert(_) => ProblemType::UnknownAlert,
+            AppError::UnknownToken(_) => ProblemType::UnknownToken,
             AppError::KeyInFlight => ProblemType::IdempotencyKeyInFlight,
             AppError::KeyReused => ProblemType::IdempotencyKeyReused,
             AppError::TooMany { .. } => ProblemType::TooMany,
             AppError::Invalid { .. } => ProblemType::InvalidBody,
             AppError::InvalidQuery { .. } => ProblemType::InvalidQuery,
+            AppError::NoRandomness(_) => {
+                error!("a request failed: {app_error}");
+                ProblemType::Internal
+            }
             AppError::Storage(cause) => {
                 // The cause is for the log alone, and is logged here once.
                 error!("a request failed: {cause:?}");

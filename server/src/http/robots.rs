@@ -29,6 +29,7 @@ pub(super) struct RobotQuery {
 
 /// The robots of a site, with their live state.
 #[utoipa::path(get, path = "/v1/sites/{site}/robots", tag = "robots",
+    security(("token" = ["viewer"])),
     operation_id = "list_robots", params(("site" = SiteId, Path), RobotQuery),
     responses((status = 200, body = Page<Robot>), (status = 404, body = ProblemBody)))]
 pub(super) async fn list(
@@ -45,6 +46,7 @@ pub(super) async fn list(
 
 /// One robot with its live state and the age of every value.
 #[utoipa::path(get, path = "/v1/sites/{site}/robots/{robot}", tag = "robots",
+    security(("token" = ["viewer"])),
     operation_id = "get_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
     responses((status = 200, body = Robot), (status = 404, body = ProblemBody)))]
 pub(super) async fn get(
@@ -56,6 +58,7 @@ pub(super) async fn get(
 
 /// Renames a robot for people, retires it or takes it back. Retiring cancels all its missions.
 #[utoipa::path(patch, path = "/v1/sites/{site}/robots/{robot}", tag = "robots",
+    security(("token" = ["operator"])),
     operation_id = "change_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
     request_body = ChangeRobot,
     responses((status = 200, body = Robot), (status = 404, body = ProblemBody),

@@ -1,96 +1,206 @@
 //! The accept loop. Ours, because half-sent headers must not hold a connection for ever, and
-//! because the number of connections has a bound.
+//! because the number of connections has bounds (see [`super::connections`]).
 
+use std::net::SocketAddr;
+use std::pin::Pin;
 use std::sync::Arc;
+use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::Router;
+use axum::body::{Body, Bytes, HttpBody};
 use axum::http::Request;
-use hyper::body::Incoming;
+use hyper::body::{Frame, Incoming, SizeHint};
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 use tower::ServiceExt as _;
 use tracing::{debug, warn};
 
+use super::connections::{AtWork, BOUNDS, Connections, Slot};
 use super::events::Cut;
+use super::identity::guard::Peer;
+use super::tls::Tls;
 use crate::app::App;
 use crate::supervisor::Supervisor;
 
-/// How long the headers of a request may take to arrive.
+/// How long the first byte of a connection may take to arrive.
+pub const FIRST_BYTE_TIMEOUT: Duration = Duration::from_secs(5);
+/// How long a TLS handshake may take.
+pub const TLS_TIMEOUT: Duration = Duration::from_secs(5);
+/// How long the headers of a request may take to arrive, and how long a connection may be idle.
 pub const HEADER_TIMEOUT: Duration = Duration::from_secs(10);
-/// Connections that may be open at once.
-pub const CONNECTIONS_MAX: usize = 2_048;
+/// Most bytes of a request's head.
+const HEAD_MAX: usize = 64 * 1024;
 /// How long open requests may take after the stop.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(5);
 /// Rest after the machine refused a connection, such as for want of file handles.
 const ACCEPT_REST: Duration = Duration::from_millis(100);
 
+/// What is served where.
+#[derive(Debug)]
+pub struct Serving {
+    /// Where connections come in.
+    pub listener: TcpListener,
+    /// What answers.
+    pub router: Router,
+    /// TLS on it, if any.
+    pub tls: Option<Arc<Tls>>,
+}
+
 /// Serves connections until the stop.
-pub async fn run(
-    listener: TcpListener,
-    router: Router,
-    app: App,
-    supervisor: Supervisor,
-    stop: CancellationToken,
-) {
-    let slots = Arc::new(Semaphore::new(CONNECTIONS_MAX));
+pub async fn run(serving: Serving, app: App, supervisor: Supervisor, stop: CancellationToken) {
+    let connections = Connections::new(BOUNDS);
     loop {
         let accepted = tokio::select! {
             biased;
             () = stop.cancelled() => return,
-            accepted = listener.accept() => accepted,
+            accepted = serving.listener.accept() => accepted,
         };
-        let stream = match accepted {
-            Ok((stream, _peer)) => stream,
+        let (stream, peer) = match accepted {
+            Ok(accepted) => accepted,
             Err(error) => {
                 warn!("cannot accept a connection: {error}");
                 tokio::time::sleep(ACCEPT_REST).await;
                 continue;
             }
         };
-        let Ok(slot) = Arc::clone(&slots).try_acquire_owned() else {
+        let cut = CancellationToken::new();
+        let Some(admitted) = connections.admit(peer.ip(), cut.clone()) else {
             app.counters().http_connections_refused.one();
             continue;
         };
-        let serving = connection(stream, router.clone(), stop.clone());
-        supervisor.spawn_passing("connection", async move {
-            serving.await;
-            drop(slot);
-        });
+        let displaced = u64::try_from(admitted.displaced).unwrap_or_default();
+        app.counters().http_connections_displaced.add(displaced);
+        let connection = Connection {
+            peer,
+            slot: admitted.slot,
+            cut,
+            router: serving.router.clone(),
+            tls: serving.tls.clone(),
+            app: app.clone(),
+            stop: stop.clone(),
+        };
+        supervisor.spawn_passing("connection", connection.serve(stream));
     }
 }
 
-async fn connection(stream: TcpStream, router: Router, stop: CancellationToken) {
-    // Answers are small and wanted at once.
-    if let Err(error) = stream.set_nodelay(true) {
-        debug!("cannot send at once: {error}");
-    }
-    // Whoever finds that the peer does not read may cut the connection.
-    let cut = Cut::default();
-    let handle = cut.clone();
-    let service = router.map_request(move |mut request: Request<Incoming>| {
-        request.extensions_mut().insert(handle.clone());
-        request
-    });
-    let service = TowerToHyperService::new(service);
-    let connection = http1::Builder::new()
-        .timer(TokioTimer::new())
-        .header_read_timeout(HEADER_TIMEOUT)
-        .serve_connection(TokioIo::new(stream), service);
-    let mut connection = std::pin::pin!(connection);
-    let ended = tokio::select! {
-        ended = connection.as_mut() => Ok(ended),
-        () = cut.0.cancelled() => return debug!("a connection whose peer does not read was cut"),
-        () = stop.cancelled() => {
-            connection.as_mut().graceful_shutdown();
-            tokio::time::timeout(DRAIN_TIMEOUT, connection).await
+/// One connection.
+struct Connection {
+    peer: SocketAddr,
+    slot: Arc<Slot>,
+    cut: CancellationToken,
+    router: Router,
+    tls: Option<Arc<Tls>>,
+    app: App,
+    stop: CancellationToken,
+}
+
+impl Connection {
+    async fn serve(self, stream: TcpStream) {
+        // Answers are small and wanted at once.
+        if let Err(error) = stream.set_nodelay(true) {
+            debug!("cannot send at once: {error}");
         }
-    };
-    if let Ok(Err(error)) = ended {
-        debug!("a connection broke: {error}");
+        let (cut, stop) = (self.cut.clone(), self.stop.clone());
+        tokio::select! {
+            () = self.begin(stream) => {}
+            () = cut.cancelled() => debug!("a connection was cut to make room, or is not read"),
+            () = async {
+                stop.cancelled().await;
+                tokio::time::sleep(DRAIN_TIMEOUT).await;
+            } => {}
+        }
+    }
+
+    async fn begin(self, stream: TcpStream) {
+        let counters = self.app.counters();
+        let first = tokio::time::timeout(FIRST_BYTE_TIMEOUT, stream.peek(&mut [0])).await;
+        if !matches!(first, Ok(Ok(1))) {
+            counters.http_connections_silent.one();
+            return;
+        }
+        let Some(tls) = self.tls.clone() else {
+            return self.answer(stream).await;
+        };
+        let handshake = tls.acceptor().accept(stream);
+        match tokio::time::timeout(TLS_TIMEOUT, handshake).await {
+            Ok(Ok(stream)) => self.answer(stream).await,
+            Ok(Err(error)) => {
+                counters.http_tls_failed.one();
+                debug!("a TLS handshake failed: {error}");
+            }
+            Err(_elapsed) => counters.http_connections_silent.one(),
+        }
+    }
+
+    async fn answer(self, stream: impl AsyncRead + AsyncWrite + Send + Unpin + 'static) {
+        let Self {
+            peer, slot, cut, ..
+        } = self;
+        let service = tower::service_fn(move |request: Request<Incoming>| {
+            let at_work = slot.work();
+            let mut request = request.map(Body::new);
+            let extensions = request.extensions_mut();
+            // Whoever finds that the peer does not read may cut the connection.
+            extensions.insert(Cut(cut.clone()));
+            extensions.insert(Peer(peer));
+            extensions.insert(Arc::clone(&slot));
+            let answering = self.router.clone().oneshot(request);
+            async move {
+                Ok::<_, std::convert::Infallible>(answering.await?.map(|body| {
+                    Body::new(Given {
+                        body,
+                        _at_work: at_work,
+                    })
+                }))
+            }
+        });
+        let connection = http1::Builder::new()
+            .timer(TokioTimer::new())
+            .header_read_timeout(HEADER_TIMEOUT)
+            .max_buf_size(HEAD_MAX)
+            .serve_connection(TokioIo::new(stream), TowerToHyperService::new(service))
+            .with_upgrades();
+        let mut connection = std::pin::pin!(connection);
+        let ended = tokio::select! {
+            ended = connection.as_mut() => ended,
+            () = self.stop.cancelled() => {
+                connection.as_mut().graceful_shutdown();
+                connection.await
+            }
+        };
+        if let Err(error) = ended {
+            debug!("a connection broke: {error}");
+        }
+    }
+}
+
+/// An answer's body; its connection is at work until it has been given.
+struct Given {
+    body: Body,
+    _at_work: AtWork,
+}
+
+impl HttpBody for Given {
+    type Data = Bytes;
+    type Error = axum::Error;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
+        Pin::new(&mut self.body).poll_frame(context)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
     }
 }

@@ -26,6 +26,7 @@ pub(super) struct PageQuery {
 
 /// All sites.
 #[utoipa::path(get, path = "/v1/sites", tag = "sites", operation_id = "list_sites",
+    security(("token" = ["viewer"])),
     params(PageQuery),
     responses((status = 200, body = Page<Site>), (status = 400, body = ProblemBody)))]
 pub(super) async fn list(
@@ -38,6 +39,7 @@ pub(super) async fn list(
 
 /// One site.
 #[utoipa::path(get, path = "/v1/sites/{site}", tag = "sites", operation_id = "get_site",
+    security(("token" = ["viewer"])),
     params(("site" = SiteId, Path)),
     responses((status = 200, body = Site), (status = 404, body = ProblemBody)))]
 pub(super) async fn get(
@@ -49,6 +51,7 @@ pub(super) async fn get(
 
 /// Makes a site.
 #[utoipa::path(post, path = "/v1/sites", tag = "sites", operation_id = "create_site",
+    security(("token" = ["admin"])),
     request_body = CreateSite,
     responses((status = 201, body = Site), (status = 409, body = ProblemBody),
         (status = 422, body = ProblemBody)))]

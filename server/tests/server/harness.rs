@@ -11,6 +11,7 @@ use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 use tread_api::friction::{Information, Segment};
+use tread_api::identity::{CreateToken, CreatedToken, Role};
 use tread_api::ids::{MissionId, RobotId, SiteId};
 use tread_api::mission::{Mission, MissionDetail, MissionState};
 use tread_api::robot::{RobotLimits, RobotModel};
@@ -18,7 +19,9 @@ use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, Record, RecordContent};
 use tread_api::wire::{self, Refusal};
-use tread_server::config::FrictionConfig;
+use tread_server::app::identity::FirstAdmin;
+use tread_server::clock::Clock;
+use tread_server::config::{FrictionConfig, TlsFiles, WebConfig};
 use tread_server::counters::CounterValues;
 use tread_server::{Config, RunningServer, Server};
 use zenoh::Wait as _;
@@ -59,6 +62,22 @@ pub(crate) struct Yard {
     pub(crate) folder: Arc<TempDir>,
     pub(crate) server: RunningServer,
     client: reqwest::Client,
+    admin: String,
+}
+
+/// A client that shows a token, if any.
+pub(crate) fn client(token: Option<&str>) -> reqwest::Client {
+    // The first call counts; all install the same.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    let mut headers = reqwest::header::HeaderMap::new();
+    if let Some(token) = token {
+        let value = format!("Bearer {token}").parse().unwrap();
+        headers.insert(reqwest::header::AUTHORIZATION, value);
+    }
+    let builder = reqwest::Client::builder()
+        .default_headers(headers)
+        .tls_certs_only([]);
+    builder.build().unwrap()
 }
 
 impl Yard {
@@ -66,21 +85,58 @@ impl Yard {
         Self::start_in(Arc::new(tempfile::tempdir().unwrap()), "127.0.0.1:0").await
     }
 
+    /// A server whose clock stands until it is moved.
+    pub(crate) async fn start_at(wall: Timestamp) -> Self {
+        let folder = Arc::new(tempfile::tempdir().unwrap());
+        let config = config(folder.path(), "127.0.0.1:0");
+        let server = Server::start_with_clock(config, Clock::manual(wall));
+        Self::of(folder, server.await.unwrap()).await
+    }
+
+    pub(crate) async fn start_with_tls(tls: TlsFiles) -> Self {
+        let folder = Arc::new(tempfile::tempdir().unwrap());
+        let mut config = config(folder.path(), "127.0.0.1:0");
+        config.tls = Some(tls);
+        Self::of(folder, Server::start(config).await.unwrap()).await
+    }
+
     async fn start_in(folder: Arc<TempDir>, zenoh: &str) -> Self {
-        let config = Config {
-            http: "127.0.0.1:0".parse().unwrap(),
-            metrics: Some("127.0.0.1:0".parse().unwrap()),
-            zenoh: zenoh.parse().unwrap(),
-            database: database(folder.path()),
-            site: site(),
-            friction: FrictionConfig::default(),
+        let config = config(folder.path(), zenoh);
+        Self::of(folder, Server::start(config).await.unwrap()).await
+    }
+
+    async fn of(folder: Arc<TempDir>, server: RunningServer) -> Self {
+        let admin = FirstAdmin {
+            name: "tests".to_owned(),
+            valid_days: 1,
+            force: true,
         };
-        let server = Server::start(config).await.unwrap();
+        let admin = server.app().create_first_admin(admin).await.unwrap().secret;
         Self {
             folder,
             server,
-            client: reqwest::Client::new(),
+            client: client(Some(&admin)),
+            admin,
         }
+    }
+
+    /// The secret of an admin's token.
+    pub(crate) fn admin(&self) -> &str {
+        &self.admin
+    }
+
+    /// The secret of a new token.
+    pub(crate) async fn token(&self, name: &str, role: Role) -> CreatedToken {
+        let request = CreateToken {
+            name: name.to_owned(),
+            role,
+            valid_days: None,
+        };
+        self.server
+            .app()
+            .create_token(request, "test")
+            .await
+            .unwrap()
     }
 
     /// Stops the server and starts another on the same database and network address.
@@ -152,6 +208,23 @@ impl Yard {
             }
         })
         .await
+    }
+}
+
+fn config(folder: &Path, zenoh: &str) -> Config {
+    Config {
+        http: "127.0.0.1:0".parse().unwrap(),
+        metrics: Some("127.0.0.1:0".parse().unwrap()),
+        zenoh: zenoh.parse().unwrap(),
+        database: database(folder),
+        site: site(),
+        friction: FrictionConfig::default(),
+        tls: None,
+        web: WebConfig {
+            hosts: vec!["tread.test".to_owned()],
+            allowed_origins: vec!["https://dash.test".parse().unwrap()],
+            behind_https: false,
+        },
     }
 }
 

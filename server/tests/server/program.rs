@@ -3,7 +3,7 @@
 use std::process::{Command, Output, Stdio};
 use std::time::Duration;
 
-use crate::harness::{PATIENCE, eventually};
+use crate::harness::{PATIENCE, client, eventually};
 
 fn program(arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_tread-server"));
@@ -80,10 +80,21 @@ async fn the_program_starts_makes_its_database_and_stops_when_asked() {
         address.ok_or(log)
     })
     .await;
-    let site = reqwest::get(format!("{address}/v1/sites/field"))
-        .await
-        .unwrap();
-    assert_eq!(site.status(), 200);
+    let database_flag = format!("--database={}", database.display());
+    let init = || program(&["init", &database_flag]).output().unwrap();
+    let first = init();
+    assert!(first.status.success(), "{}", said(&first));
+    let token = String::from_utf8(first.stdout).unwrap();
+    let asking = client(Some(token.trim()));
+    let site = asking.get(format!("{address}/v1/sites/field"));
+    assert_eq!(site.send().await.unwrap().status(), 200);
+    let second = init();
+    assert_eq!(second.status.code(), Some(1));
+    assert!(
+        second.stdout.is_empty() && said(&second).contains("--force"),
+        "{}",
+        said(&second)
+    );
     assert!(database.is_file());
     let asked = Command::new("kill")
         .arg(child.id().to_string())

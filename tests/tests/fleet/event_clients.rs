@@ -23,11 +23,11 @@ const EVENTS_EACH: usize = 5;
 /// Missions whose events fill the buffer of the one that never reads, and the sockets before it.
 const LONG_MISSIONS: usize = 8;
 
-async fn open(stream: TcpStream, topics: &str) -> BufReader<TcpStream> {
+async fn open(stream: TcpStream, topics: &str, token: &str) -> BufReader<TcpStream> {
     let mut stream = stream;
     let request = format!(
-        "GET /v1/events?topics={topics} HTTP/1.1\r\nhost: test\r\n\
-         accept: text/event-stream\r\n\r\n"
+        "GET /v1/events?topics={topics} HTTP/1.1\r\nhost: localhost\r\n\
+         authorization: Bearer {token}\r\naccept: text/event-stream\r\n\r\n"
     );
     let sent = stream.write_all(request.as_bytes()).await;
     sent.expect("the server listens");
@@ -67,11 +67,15 @@ async fn of_a_thousand_event_clients_one_that_never_reads_disturbs_nobody() {
     // A socket that takes next to nothing, so that what is sent piles up at the server.
     let socket = TcpSocket::new_v4().unwrap();
     socket.set_recv_buffer_size(4_096).unwrap();
-    let mut deaf = open(socket.connect(address).await.unwrap(), "robots,missions").await;
+    let deaf = socket.connect(address).await.unwrap();
+    let mut deaf = open(deaf, "robots,missions", fleet.token()).await;
     let mut readers = JoinSet::new();
     for _ in 0..READERS {
         let stream = TcpStream::connect(address).await.unwrap();
-        readers.spawn(async move { read_events(open(stream, "robots").await, EVENTS_EACH).await });
+        let token = fleet.token().to_owned();
+        readers.spawn(async move {
+            read_events(open(stream, "robots", &token).await, EVENTS_EACH).await
+        });
     }
     let talking = async {
         loop {

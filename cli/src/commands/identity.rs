@@ -1,0 +1,186 @@
+//! `tread login`, `logout`, `whoami`, `token`, `tokens` and `audit`.
+
+use std::io::{IsTerminal as _, Read as _};
+use std::process::ExitCode;
+
+use anyhow::{Context as _, ensure};
+use serde_json::json;
+use tread_api::identity::{AuditEntry, CreateToken, Session, Token};
+
+use crate::args::{AuditArguments, Connection, TokensAction, TokensArguments};
+use crate::client::Client;
+use crate::credentials::{self, Store};
+use crate::output::{Output, line, note, or_dash, render, table};
+
+/// Longest token that is read.
+const TOKEN_MAX: u64 = 1_024;
+
+fn store() -> anyhow::Result<Store> {
+    Store::of_user().context("there is no home to keep tokens in: set HOME or TREAD_CREDENTIALS")
+}
+
+/// Reads a token, sees whether the server takes it, and keeps it for that server.
+pub(super) async fn login(connection: &Connection, output: Output) -> anyhow::Result<ExitCode> {
+    let token = match &connection.showing.token_file {
+        Some(file) => credentials::read_token(file)?,
+        None => tokio::task::spawn_blocking(read_from_input).await??,
+    };
+    let client = Client::new(
+        &connection.server,
+        Some(&token),
+        connection.showing.ca.as_deref(),
+    )?;
+    let session = client.session().await?;
+    let store = store()?;
+    store.keep(client.address(), &token)?;
+    note(&format!("kept in {}", store.path().display()));
+    output.show(&session, who)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn read_from_input() -> anyhow::Result<String> {
+    let input = std::io::stdin();
+    if input.is_terminal() {
+        note("paste the token, then press Enter and Ctrl-D:");
+    }
+    let mut text = String::new();
+    input
+        .take(TOKEN_MAX)
+        .read_to_string(&mut text)
+        .context("cannot read the token")?;
+    let token = text.trim();
+    ensure!(!token.is_empty(), "no token was given");
+    Ok(token.to_owned())
+}
+
+/// Forgets the token for a server; the token stays valid.
+pub(super) fn logout(client: &Client, output: Output) -> anyhow::Result<ExitCode> {
+    store()?.forget(client.address(), None)?;
+    output.show(&json!({"server": client.address()}), |_| {
+        format!(
+            "forgotten for {}; the token itself stays valid until it is revoked",
+            client.address()
+        )
+    })?;
+    Ok(ExitCode::SUCCESS)
+}
+
+pub(super) async fn whoami(client: &Client, output: Output) -> anyhow::Result<ExitCode> {
+    output.show(&client.session().await?, who)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Prints the token in use, for other programs.
+pub(super) fn token(client: &Client) -> anyhow::Result<ExitCode> {
+    let token = client
+        .token()
+        .context("there is no token for this server: use `tread login`")?;
+    line(token)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn who(session: &Session) -> String {
+    format!(
+        "{}, {}, until {}",
+        session.name, session.role, session.expires_at
+    )
+}
+
+pub(super) async fn tokens(
+    arguments: TokensArguments,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    match arguments.action {
+        None | Some(TokensAction::List) => {
+            output.show(&client.tokens().await?, |tokens| list(tokens))?;
+        }
+        Some(TokensAction::Create {
+            name,
+            role,
+            valid_days,
+        }) => {
+            let request = CreateToken {
+                name,
+                role,
+                valid_days: Some(valid_days),
+            };
+            let created = client.create_token(&request).await?;
+            if !output.is_json() {
+                let Token {
+                    name,
+                    role,
+                    expires_at,
+                    ..
+                } = &created.token;
+                note(&format!(
+                    "{role} `{name}`, until {expires_at}; it is told this once:"
+                ));
+            }
+            output.show(&created, |created| created.secret.clone())?;
+        }
+        Some(TokensAction::Revoke { token }) => {
+            let revoked = client.revoke_token(token).await?;
+            output.show(&revoked, |token| format!("`{}` is revoked", token.name))?;
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn list(tokens: &[Token]) -> String {
+    let mut table = table([
+        "TOKEN",
+        "NAME",
+        "ROLE",
+        "MADE BY",
+        "EXPIRES",
+        "LAST USED",
+        "REVOKED",
+    ]);
+    for token in tokens {
+        table.add_row([
+            token.id.to_string(),
+            token.name.clone(),
+            token.role.to_string(),
+            token.created_by.clone(),
+            format!("{:.0}", token.expires_at),
+            or_dash(token.last_used_at.map(|at| format!("{at:.0}"))),
+            or_dash(token.revoked_at.map(|at| format!("{at:.0}"))),
+        ]);
+    }
+    render(&table)
+}
+
+pub(super) async fn audit(
+    arguments: &AuditArguments,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    let who = arguments.who.as_deref();
+    let page = client
+        .audit(who, arguments.refused, arguments.limit)
+        .await?;
+    output.show(&page.items, |entries| audited(entries))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn audited(entries: &[AuditEntry]) -> String {
+    let mut table = table(["AT", "WHO", "ROLE", "FROM", "ASKED", "STATUS", "WHAT"]);
+    for entry in entries {
+        let what = entry
+            .what
+            .as_ref()
+            .map(ToString::to_string)
+            .unwrap_or_default();
+        table.add_row([
+            format!("{:.0}", entry.at),
+            or_dash(entry.who.as_ref()),
+            or_dash(entry.role),
+            entry.address.clone(),
+            format!("{} {}", entry.method, entry.path),
+            entry.status.to_string(),
+            what,
+        ]);
+    }
+    render(&table)
+}

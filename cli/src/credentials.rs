@@ -1,0 +1,192 @@
+//! Tokens that this user has signed in with, by server, in a file that only the user can read.
+//!
+//! A token is looked for in this order: `--token-file`, the variable `TREAD_TOKEN`, this file.
+
+use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions};
+use std::io::{self, Write as _};
+use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _, OpenOptionsExt as _};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, ensure};
+
+/// The variable with a token.
+const TOKEN_VARIABLE: &str = "TREAD_TOKEN";
+/// The variable that names another file than the usual one.
+const FILE_VARIABLE: &str = "TREAD_CREDENTIALS";
+/// Bits of a mode that let others read or write.
+const OTHERS: u32 = 0o077;
+
+/// The token to show to a server, if there is any.
+pub(crate) fn find(address: &str, token_file: Option<&Path>) -> anyhow::Result<Option<String>> {
+    if let Some(file) = token_file {
+        return read_token(file).map(Some);
+    }
+    if let Some(token) = std::env::var_os(TOKEN_VARIABLE).filter(|token| !token.is_empty()) {
+        let token = token.into_string().ok().context("TREAD_TOKEN is no text")?;
+        return Ok(Some(token.trim().to_owned()));
+    }
+    match Store::of_user() {
+        Some(store) => store.find(address),
+        None => Ok(None),
+    }
+}
+
+/// Reads a file that holds a token and nothing else.
+pub(crate) fn read_token(file: &Path) -> anyhow::Result<String> {
+    let text = std::fs::read_to_string(file)
+        .with_context(|| format!("cannot read the token in {}", file.display()))?;
+    let token = text.trim();
+    ensure!(!token.is_empty(), "{} holds no token", file.display());
+    Ok(token.to_owned())
+}
+
+/// The file.
+#[derive(Debug, Clone)]
+pub(crate) struct Store {
+    file: PathBuf,
+}
+
+impl Store {
+    /// This user's; `None` for one without a home.
+    pub(crate) fn of_user() -> Option<Self> {
+        let of = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty());
+        let folder = || {
+            let config = of("XDG_CONFIG_HOME").map(PathBuf::from);
+            config.or_else(|| of("HOME").map(|home| PathBuf::from(home).join(".config")))
+        };
+        let named = of(FILE_VARIABLE).map(PathBuf::from);
+        let file = named.or_else(|| Some(folder()?.join("tread").join("credentials.json")))?;
+        Some(Self { file })
+    }
+
+    /// Where it is.
+    pub(crate) fn path(&self) -> &Path {
+        &self.file
+    }
+
+    fn find(&self, address: &str) -> anyhow::Result<Option<String>> {
+        Ok(self.read()?.remove(address))
+    }
+
+    /// Keeps a token for a server.
+    pub(crate) fn keep(&self, address: &str, token: &str) -> anyhow::Result<()> {
+        self.change(|kept| {
+            kept.insert(address.to_owned(), token.to_owned());
+            true
+        })
+    }
+
+    /// Forgets the token for a server, or only if it is this one.
+    pub(crate) fn forget(&self, address: &str, only: Option<&str>) -> anyhow::Result<()> {
+        self.change(|kept| {
+            let kept_one = kept.get(address);
+            let goes = kept_one.is_some_and(|kept| only.is_none_or(|only| only == kept));
+            goes && kept.remove(address).is_some()
+        })
+    }
+
+    fn read(&self) -> anyhow::Result<BTreeMap<String, String>> {
+        let named = || format!("cannot read {}", self.file.display());
+        let text = match std::fs::read_to_string(&self.file) {
+            Ok(text) => text,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(BTreeMap::new()),
+            Err(error) => return Err(error).with_context(named),
+        };
+        let mode = std::fs::metadata(&self.file).with_context(named)?.mode();
+        ensure!(
+            mode & OTHERS == 0,
+            "others can read the tokens in {}: `chmod 600` it, and revoke them if somebody has",
+            self.file.display()
+        );
+        serde_json::from_str(&text).with_context(named)
+    }
+
+    /// Changes the file whole, one process after the other.
+    fn change(
+        &self,
+        change: impl FnOnce(&mut BTreeMap<String, String>) -> bool,
+    ) -> anyhow::Result<()> {
+        let named = || format!("cannot write {}", self.file.display());
+        let folder = self.file.parent().context("the file has a folder")?;
+        let mut making = std::fs::DirBuilder::new();
+        making
+            .recursive(true)
+            .mode(0o700)
+            .create(folder)
+            .with_context(named)?;
+        let private = || {
+            let mut options = OpenOptions::new();
+            options.write(true).create(true).truncate(true).mode(0o600);
+            options
+        };
+        let lock: File = private().open(self.beside("lock")).with_context(named)?;
+        lock.lock().with_context(named)?;
+        let mut kept = self.read()?;
+        if !change(&mut kept) {
+            return Ok(());
+        }
+        let new = self.beside("new");
+        let mut file = private().open(&new).with_context(named)?;
+        file.write_all(&serde_json::to_vec_pretty(&kept)?)
+            .with_context(named)?;
+        file.sync_all().with_context(named)?;
+        std::fs::rename(&new, &self.file).with_context(named)
+    }
+
+    fn beside(&self, ending: &str) -> PathBuf {
+        let mut name = self.file.file_name().unwrap_or_default().to_owned();
+        name.push(format!(".{ending}"));
+        self.file.with_file_name(name)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt as _;
+
+    use super::*;
+
+    fn store() -> (tempfile::TempDir, Store) {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("tread").join("credentials.json");
+        (folder, Store { file })
+    }
+
+    #[test]
+    fn a_token_is_kept_for_its_server_alone_and_nobody_else_can_read_it() {
+        let (_folder, store) = store();
+        assert_eq!(store.find("http://a").unwrap(), None);
+        store.keep("http://a", "one").unwrap();
+        store.keep("http://b", "two").unwrap();
+        assert_eq!(store.find("http://a").unwrap().as_deref(), Some("one"));
+        assert_eq!(std::fs::metadata(store.path()).unwrap().mode() & OTHERS, 0);
+        store.forget("http://a", Some("another")).unwrap();
+        assert!(store.find("http://a").unwrap().is_some());
+        store.forget("http://a", Some("one")).unwrap();
+        store.forget("http://b", None).unwrap();
+        assert_eq!(store.read().unwrap(), BTreeMap::new());
+    }
+
+    #[test]
+    fn a_file_that_others_can_read_is_not_used() {
+        let (_folder, store) = store();
+        store.keep("http://a", "one").unwrap();
+        let open = std::fs::Permissions::from_mode(0o644);
+        std::fs::set_permissions(store.path(), open).unwrap();
+        let said = store.find("http://a").unwrap_err().to_string();
+        assert!(said.contains("chmod 600"), "{said}");
+    }
+
+    #[test]
+    fn many_at_once_lose_nothing() {
+        let (_folder, store) = store();
+        std::thread::scope(|scope| {
+            for number in 0..8 {
+                let store = &store;
+                scope.spawn(move || store.keep(&format!("http://{number}"), "x").unwrap());
+            }
+        });
+        assert_eq!(store.read().unwrap().len(), 8);
+    }
+}

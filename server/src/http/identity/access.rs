@@ -1,0 +1,206 @@
+//! The table of roles: method and route to what they need, read from the API's description.
+
+use std::collections::HashMap;
+
+use axum::http::Method;
+use serde_json::Value;
+use tread_api::identity::Role;
+use utoipa::openapi::OpenApi;
+use utoipa::openapi::security::{ApiKey, ApiKeyValue, HttpAuthScheme, HttpBuilder, SecurityScheme};
+
+use super::browser::COOKIE;
+
+/// What anybody may ask for: this list and nothing else.
+pub const PUBLIC: [(&str, &str); 7] = [
+    ("GET", "/healthz"),
+    ("GET", "/readyz"),
+    ("POST", "/v1/session"),
+    ("GET", "/openapi.json"),
+    ("GET", "/docs"),
+    ("GET", "/docs/"),
+    ("GET", "/docs/{*rest}"),
+];
+/// The scheme that each route names with its role.
+const TOKEN_SCHEME: &str = "token";
+/// The same by a browser's cookie, added here.
+const SESSION_SCHEME: &str = "session";
+
+/// What a route needs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Needed {
+    /// Nothing.
+    Nothing,
+    /// A token of this role or a stronger one.
+    Role(Role),
+}
+
+/// What every route needs.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Access {
+    routes: HashMap<String, Vec<(Method, Needed)>>,
+}
+
+impl Access {
+    /// Reads the table from the description. An operation that names no role and is not public
+    /// is left out, and so refused.
+    pub fn of(openapi: &OpenApi) -> Self {
+        let mut access = Self::default();
+        for (method, path) in PUBLIC {
+            access.insert(path, method, Needed::Nothing);
+        }
+        let description = serde_json::to_value(openapi).unwrap_or_default();
+        let paths = description["paths"].as_object();
+        for (path, operations) in paths.into_iter().flatten() {
+            for (method, operation) in operations.as_object().into_iter().flatten() {
+                let method = method.to_ascii_uppercase();
+                if PUBLIC.contains(&(&method, path)) {
+                    continue;
+                }
+                match role_of(operation) {
+                    Some(role) => access.insert(path, &method, Needed::Role(role)),
+                    None => tracing::error!("{method} {path} names no role and is refused"),
+                }
+            }
+        }
+        access
+    }
+
+    /// A table of one route that anybody may read.
+    pub(in crate::http) fn open(path: &str) -> Self {
+        let mut access = Self::default();
+        access.insert(path, "GET", Needed::Nothing);
+        access
+    }
+
+    fn insert(&mut self, path: &str, method: &str, needed: Needed) {
+        if let Ok(method) = method.parse() {
+            let methods = self.routes.entry(path.to_owned()).or_default();
+            methods.push((method, needed));
+        }
+    }
+
+    /// What a route needs; `None` for a method that it does not have.
+    pub fn needed(&self, method: &Method, route: &str) -> Option<Needed> {
+        // Whoever may read something may ask for its headers alone.
+        let method = if method == Method::HEAD {
+            &Method::GET
+        } else {
+            method
+        };
+        let methods = self.routes.get(route)?;
+        methods
+            .iter()
+            .find(|(of, _)| of == method)
+            .map(|(_, needed)| *needed)
+    }
+
+    /// The methods of a route, as the `Allow` header lists them; `None` for an unknown route.
+    pub fn methods(&self, route: &str) -> Option<String> {
+        let methods = self.routes.get(route)?.iter();
+        let mut names: Vec<&str> = methods.map(|(method, _)| method.as_str()).collect();
+        if names.contains(&"GET") {
+            names.push("HEAD");
+        }
+        names.sort_unstable();
+        Some(names.join(","))
+    }
+}
+
+/// The role that an operation names; `None` unless it names exactly one that exists.
+fn role_of(operation: &Value) -> Option<Role> {
+    let requirements = operation["security"].as_array()?;
+    let roles = requirements
+        .iter()
+        .find_map(|requirement| requirement.get(TOKEN_SCHEME))?;
+    match roles.as_array()?.as_slice() {
+        [role] => Role::from_name(role.as_str()?),
+        _ => None,
+    }
+}
+
+/// Describes the schemes, and lets each route that takes a token take a session too.
+pub(in crate::http) fn describe(openapi: &mut OpenApi) {
+    let bearer = HttpBuilder::new()
+        .scheme(HttpAuthScheme::Bearer)
+        .description(Some(
+            "A token: `authorization: Bearer tread_…`. The roles that a route names are those \
+             that may ask for it; a stronger role includes the weaker ones.",
+        ))
+        .build();
+    let cookie = ApiKeyValue::with_description(
+        COOKIE,
+        "A browser's session, from `POST /v1/session`; `__Host-` stands before its name under TLS.",
+    );
+    let components = openapi.components.get_or_insert_default();
+    components.add_security_scheme(TOKEN_SCHEME, SecurityScheme::Http(bearer));
+    components.add_security_scheme(
+        SESSION_SCHEME,
+        SecurityScheme::ApiKey(ApiKey::Cookie(cookie)),
+    );
+    for item in openapi.paths.paths.values_mut() {
+        let operations = [
+            &mut item.get,
+            &mut item.put,
+            &mut item.post,
+            &mut item.delete,
+            &mut item.patch,
+        ];
+        for operation in operations.into_iter().flatten() {
+            let written = serde_json::to_value(&*operation).unwrap_or_default();
+            if let (Some(role), Some(security)) = (role_of(&written), &mut operation.security) {
+                security.push(utoipa::openapi::SecurityRequirement::new(
+                    SESSION_SCHEME,
+                    [role.as_str()],
+                ));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn operation(security: Value) -> Value {
+        serde_json::json!({ "security": security })
+    }
+
+    #[test]
+    fn an_operation_needs_exactly_one_role_that_exists() {
+        use serde_json::json;
+        assert_eq!(
+            role_of(&operation(json!([{"token": ["admin"]}]))),
+            Some(Role::Admin)
+        );
+        for wrong in [
+            json!([]),
+            json!(null),
+            json!([{}]),
+            json!([{"token": []}]),
+            json!([{"token": ["root"]}]),
+            json!([{"token": ["viewer", "admin"]}]),
+            json!([{"session": ["viewer"]}]),
+        ] {
+            assert_eq!(role_of(&operation(wrong.clone())), None, "{wrong}");
+        }
+    }
+
+    #[test]
+    fn what_the_description_does_not_say_is_refused() {
+        #[derive(utoipa::OpenApi)]
+        struct Empty;
+        let mut openapi = <Empty as utoipa::OpenApi>::openapi();
+        openapi.paths.paths.insert(
+            "/v1/forgotten".to_owned(),
+            serde_json::from_value(serde_json::json!({"get": {"responses": {}}})).unwrap(),
+        );
+        let access = Access::of(&openapi);
+        assert_eq!(access.needed(&Method::GET, "/v1/forgotten"), None);
+        assert_eq!(
+            access.needed(&Method::HEAD, "/healthz"),
+            Some(Needed::Nothing)
+        );
+        assert_eq!(access.needed(&Method::POST, "/healthz"), None);
+        assert_eq!(access.methods("/healthz").as_deref(), Some("GET,HEAD"));
+    }
+}

@@ -1,0 +1,422 @@
+//! The guard before every route: host, origin, token, role; then the audit log.
+//!
+//! It works on what the router matched, so no handler can be reached past it. The answer to a
+//! token that is wrong, expired or revoked is one and the same.
+
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::sync::{Arc, OnceLock};
+
+use axum::body::Body;
+use axum::extract::{FromRequestParts, MatchedPath, Request, State};
+use axum::http::request::Parts;
+use axum::http::{HeaderMap, HeaderValue, Method, header};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use futures_util::StreamExt as _;
+use serde_json::Value;
+use tread_api::identity::{AuditEntry, Role};
+use tread_api::problem::ProblemType;
+
+use super::access::{Access, Needed};
+use super::browser;
+use crate::app::App;
+use crate::app::identity::{Credential, Shown, SignInError};
+use crate::counters::Counter;
+use crate::http::REQUEST_ID;
+use crate::http::problem::Problem;
+use crate::identity::origin::{Names, Provenance};
+use crate::identity::redact::redacted;
+
+/// Longest query of a request, bytes.
+const QUERY_MAX: usize = 4_096;
+/// Longest path of a request, bytes.
+const PATH_MAX: usize = 2_048;
+/// Longest path and request id that the audit log keeps, in characters.
+const AUDIT_TEXT_MAX: usize = 200;
+
+/// Where a request came from, an extension set by the accept loop.
+#[derive(Debug, Clone, Copy)]
+pub(in crate::http) struct Peer(pub(in crate::http) SocketAddr);
+
+/// Who asks: behind the guard there is always one, on all but the public routes.
+#[derive(Debug, Clone)]
+pub(in crate::http) struct Subject(pub(in crate::http) Arc<Credential>);
+
+impl<S: Send + Sync> FromRequestParts<S> for Subject {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, _state: &S) -> Result<Self, Problem> {
+        let subject = parts.extensions.get::<Self>().cloned();
+        subject.ok_or_else(|| Problem::new(ProblemType::Unauthenticated))
+    }
+}
+
+/// Where the body of a change is left for the audit log.
+#[derive(Debug, Clone, Default)]
+pub(in crate::http) struct AuditSlot(Arc<OnceLock<Value>>);
+
+impl AuditSlot {
+    /// Leaves a body, without its secrets.
+    pub(in crate::http) fn leave(&self, body: &Value) {
+        // The first one is the request's; there is no second.
+        let _ = self.0.set(redacted(body));
+    }
+}
+
+/// Who signed in with this request, an extension of the answer.
+#[derive(Debug, Clone)]
+pub(super) struct SignedIn(pub(super) Arc<Credential>);
+
+/// What the guard knows.
+#[derive(Debug, Clone)]
+pub(in crate::http) struct Guard {
+    app: App,
+    access: Arc<Access>,
+    names: Arc<Names>,
+}
+
+/// A refusal: what is told, and what is counted.
+struct Refusal {
+    response: Response,
+    who: Option<Arc<Credential>>,
+    is_audited: bool,
+}
+
+impl Guard {
+    pub(in crate::http) fn new(app: App, access: Access, names: Arc<Names>) -> Self {
+        let access = Arc::new(access);
+        Self { app, access, names }
+    }
+
+    fn refuse(&self, counter: &Counter, problem: Problem) -> Refusal {
+        counter.one();
+        Refusal {
+            response: problem.into_response(),
+            who: None,
+            is_audited: true,
+        }
+    }
+
+    /// Refuses what is wrong before anybody is asked who they are.
+    fn check_form(&self, request: &Request) -> Result<(), Refusal> {
+        let counters = self.app.counters();
+        let uri = request.uri();
+        let query_length = uri.query().map_or(0, str::len);
+        if query_length > QUERY_MAX || uri.path().len() > PATH_MAX {
+            let detail = format!("at most {PATH_MAX} bytes of path and {QUERY_MAX} of query");
+            let problem = Problem::new(ProblemType::RequestTooLong).detail(detail);
+            return Err(self.refuse(&counters.refused_too_long, problem));
+        }
+        let host = provenance(request.headers()).host;
+        if !host.is_some_and(|host| self.names.knows(host)) {
+            let detail = "the `host` header must be an address of this server, `localhost`, or one \
+                          of `hosts` in its configuration";
+            let problem = Problem::new(ProblemType::UnknownHost).detail(detail);
+            return Err(self.refuse(&counters.refused_host, problem));
+        }
+        Ok(())
+    }
+
+    fn check_origin(
+        &self,
+        method: &Method,
+        headers: &HeaderMap,
+        by: Option<Shown>,
+    ) -> Result<(), Refusal> {
+        let from = provenance(headers);
+        let is_browser = from.origin.is_some() || from.fetch_site.is_some();
+        let is_upgrade = headers.contains_key(header::UPGRADE);
+        let may = match by {
+            // A browser sends its cookie whoever's page asks.
+            Some(Shown::Session) if is_upgrade || is_change(method) => {
+                self.names.is_own_page(&from)
+            }
+            _ if is_upgrade => self.names.may_open_socket(&from),
+            // The sign-in: a stranger's page must not sign a person in as somebody else.
+            None if is_browser && is_change(method) => self.names.is_own_page(&from),
+            None | Some(_) => true,
+        };
+        if may {
+            return Ok(());
+        }
+        let detail = "ask from this server's own page, or with a token and from an origin of \
+                      `allowed_origins` in its configuration";
+        let problem = Problem::new(ProblemType::ForeignOrigin).detail(detail);
+        Err(self.refuse(&self.app.counters().refused_origin, problem))
+    }
+
+    async fn check_subject(
+        &self,
+        method: &Method,
+        headers: &HeaderMap,
+        address: IpAddr,
+        needed: Role,
+    ) -> Result<Arc<Credential>, Refusal> {
+        let counters = self.app.counters();
+        let Some((text, shown)) = shown(headers, self.names.is_tls) else {
+            let mut refusal = self.refuse(&counters.refused_no_token, unauthenticated());
+            // Whoever shows nothing has tried nothing.
+            refusal.is_audited = false;
+            say_how(&mut refusal.response);
+            return Err(refusal);
+        };
+        self.check_origin(method, headers, Some(shown))?;
+        let found = self.app.authenticate(address, text, shown).await;
+        let credential = found.map_err(|error| {
+            let mut response = sign_in_problem(&self.app, &error);
+            if shown == Shown::Session && response.status() == 401 {
+                // So that the browser ceases to show what is over.
+                browser::take_cookie(response.headers_mut(), self.names.is_tls);
+            }
+            Refusal {
+                response,
+                who: None,
+                is_audited: true,
+            }
+        })?;
+        if credential.role.includes(needed) {
+            return Ok(credential);
+        }
+        let detail = format!(
+            "this needs the role {needed}, and `{}` is {}",
+            credential.name, credential.role
+        );
+        let problem = Problem::new(ProblemType::Forbidden).detail(detail);
+        let mut refusal = self.refuse(&counters.refused_role, problem);
+        refusal.who = Some(credential);
+        Err(refusal)
+    }
+
+    fn note(
+        &self,
+        asked: Asked,
+        response: &Response,
+        who: Option<&Arc<Credential>>,
+        is_change: bool,
+    ) {
+        let entry = AuditEntry {
+            id: 0,
+            at: self.app.clock().now(),
+            who: who.map(|who| who.name.clone()),
+            token: who.map(|who| who.token),
+            role: who.map(|who| who.role),
+            address: asked.address.to_string(),
+            method: asked.method,
+            route: asked.route,
+            path: asked.path,
+            status: response.status().as_u16(),
+            request_id: asked.request_id,
+            what: asked.slot.0.get().cloned().filter(|what| !what.is_null()),
+        };
+        self.app.audit(entry, is_change);
+    }
+}
+
+/// What the audit log says of a request.
+struct Asked {
+    address: IpAddr,
+    method: String,
+    route: String,
+    path: String,
+    request_id: String,
+    slot: AuditSlot,
+}
+
+fn asked(request: &Request, route: &str) -> Asked {
+    let short = |text: &str| text.chars().take(AUDIT_TEXT_MAX).collect();
+    let request_id = request.headers().get(REQUEST_ID);
+    Asked {
+        address: address(request),
+        method: short(request.method().as_str()),
+        route: route.to_owned(),
+        path: short(request.uri().path()),
+        request_id: short(
+            request_id
+                .and_then(|id| id.to_str().ok())
+                .unwrap_or_default(),
+        ),
+        slot: AuditSlot::default(),
+    }
+}
+
+/// Lets through who may.
+pub(in crate::http) async fn stand(
+    State(guard): State<Guard>,
+    mut request: Request,
+    next: Next,
+) -> Response {
+    let route = request.extensions().get::<MatchedPath>();
+    let route = route.map(|route| route.as_str().to_owned());
+    let asked = asked(&request, route.as_deref().unwrap_or("none"));
+    let admitted = match guard.check_form(&request) {
+        Ok(()) => match &route {
+            Some(route) => guard.admit(&mut request, route).await,
+            // What matches nothing is answered by the fallback, which knows nothing either.
+            None => return next.run(request).await,
+        },
+        Err(refusal) => Err(refusal),
+    };
+    let subject = match admitted {
+        Ok(subject) => subject,
+        Err(refusal) => {
+            if refusal.is_audited {
+                guard.note(asked, &refusal.response, refusal.who.as_ref(), false);
+            }
+            return refusal.response;
+        }
+    };
+    let is_change = is_change(request.method());
+    if is_change {
+        request.extensions_mut().insert(asked.slot.clone());
+    }
+    let response = next.run(request).await;
+    if is_change {
+        let signed_in = response.extensions().get::<SignedIn>().cloned();
+        let who = subject.clone().or(signed_in.map(|SignedIn(who)| who));
+        let by_nobody = who.is_none();
+        guard.note(asked, &response, who.as_ref(), !by_nobody);
+    }
+    match subject {
+        Some(subject) => end_with(&guard.app, subject, response),
+        None => response,
+    }
+}
+
+impl Guard {
+    /// Who is let through to a route; nobody in particular to a public one.
+    async fn admit(
+        &self,
+        request: &mut Request,
+        route: &str,
+    ) -> Result<Option<Arc<Credential>>, Refusal> {
+        match self.access.needed(request.method(), route) {
+            Some(Needed::Nothing) => {
+                self.check_origin(request.method(), request.headers(), None)?;
+                Ok(None)
+            }
+            Some(Needed::Role(needed)) => {
+                let address = address(request);
+                let (method, headers) = (request.method(), request.headers());
+                let credential = self.check_subject(method, headers, address, needed).await?;
+                request
+                    .extensions_mut()
+                    .insert(Subject(Arc::clone(&credential)));
+                Ok(Some(credential))
+            }
+            None => {
+                let detail = "the API is described at /docs";
+                let methods = self.access.methods(route);
+                let kind = match methods {
+                    Some(_) => ProblemType::MethodNotAllowed,
+                    None => ProblemType::NotFound,
+                };
+                let mut response = Problem::new(kind).detail(detail).into_response();
+                if let Some(methods) = methods.and_then(|names| HeaderValue::try_from(names).ok()) {
+                    response.headers_mut().insert(header::ALLOW, methods);
+                }
+                Err(Refusal {
+                    response,
+                    who: None,
+                    is_audited: false,
+                })
+            }
+        }
+    }
+}
+
+/// Ends a stream of events with the token or session that asked for it.
+fn end_with(app: &App, subject: Arc<Credential>, response: Response) -> Response {
+    let media_type = response.headers().get(header::CONTENT_TYPE);
+    if media_type.is_none_or(|media_type| media_type != "text/event-stream") {
+        return response;
+    }
+    let left = subject.expires_at.duration_since(app.clock().now());
+    let left = std::time::Duration::try_from(left).unwrap_or_default();
+    let over = async move {
+        let ended = subject.ended();
+        tokio::select! {
+            () = ended.cancelled() => {}
+            () = tokio::time::sleep(left) => {}
+        }
+    };
+    response.map(|body| Body::from_stream(body.into_data_stream().take_until(Box::pin(over))))
+}
+
+/// The answer to a secret that opens nothing; counts the cause.
+pub(super) fn sign_in_problem(app: &App, error: &SignInError) -> Response {
+    let counters = app.counters();
+    let counter = match error {
+        SignInError::Malformed => &counters.refused_token_malformed,
+        SignInError::Unknown => &counters.refused_token_unknown,
+        SignInError::Expired => &counters.refused_token_expired,
+        SignInError::Revoked => &counters.refused_token_revoked,
+        SignInError::Locked(left) => {
+            counters.refused_locked.one();
+            let problem = Problem::new(ProblemType::TooManyAttempts).detail(error.to_string());
+            let mut response = problem.into_response();
+            let seconds = HeaderValue::from(left.as_secs() + 1);
+            response.headers_mut().insert(header::RETRY_AFTER, seconds);
+            return response;
+        }
+        SignInError::Storage(cause) => {
+            tracing::error!("cannot look up a token: {cause:?}");
+            return Problem::new(ProblemType::Internal).into_response();
+        }
+    };
+    counter.one();
+    let mut response = unauthenticated().into_response();
+    say_how(&mut response);
+    response
+}
+
+pub(super) fn unauthenticated() -> Problem {
+    Problem::new(ProblemType::Unauthenticated)
+        .detail("send a valid token as `authorization: Bearer …`, or sign in at /v1/session")
+}
+
+fn say_how(response: &mut Response) {
+    let how = HeaderValue::from_static("Bearer realm=\"tread\"");
+    response.headers_mut().insert(header::WWW_AUTHENTICATE, how);
+}
+
+/// The secret that a request shows, and how; a header counts before a cookie.
+fn shown(headers: &HeaderMap, is_tls: bool) -> Option<(&str, Shown)> {
+    if let Some(value) = headers.get(header::AUTHORIZATION) {
+        let text = value.to_str().unwrap_or_default();
+        let (scheme, secret) = text.split_once(' ').unwrap_or_default();
+        let is_bearer = scheme.eq_ignore_ascii_case("bearer");
+        let secret = if is_bearer { secret.trim() } else { "" };
+        return Some((secret, Shown::Token));
+    }
+    browser::shown_cookie(headers, is_tls).map(|secret| (secret, Shown::Session))
+}
+
+/// The address that a request came from.
+pub(super) fn address(request: &Request) -> IpAddr {
+    let peer = request.extensions().get::<Peer>();
+    let address = peer.map_or(IpAddr::V4(Ipv4Addr::UNSPECIFIED), |Peer(peer)| peer.ip());
+    address.to_canonical()
+}
+
+fn is_change(method: &Method) -> bool {
+    !(method == Method::GET || method == Method::HEAD || method == Method::OPTIONS)
+}
+
+fn provenance(headers: &HeaderMap) -> Provenance<'_> {
+    let text = |name: &str| {
+        let mut values = headers.get_all(name).iter();
+        let first = values.next()?;
+        // Two of them are one too many: which one counts would be a matter of taste.
+        let only = if values.next().is_some() {
+            None
+        } else {
+            first.to_str().ok()
+        };
+        Some(only.unwrap_or_default())
+    };
+    Provenance {
+        host: text("host"),
+        origin: text("origin"),
+        fetch_site: text("sec-fetch-site"),
+    }
+}

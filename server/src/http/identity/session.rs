@@ -1,0 +1,80 @@
+//! `/v1/session`: a browser signs in with a token and gets a cookie.
+
+use std::sync::Arc;
+
+use axum::extract::{Extension, State};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use tread_api::identity::{CreateSession, Session};
+use tread_api::problem::ProblemBody;
+
+use super::browser;
+use super::guard::{Peer, SignedIn, Subject, sign_in_problem, unauthenticated};
+use crate::app::identity::Shown;
+use crate::app::{App, AppError};
+use crate::http::extract::Json;
+use crate::http::problem::Problem;
+use crate::identity::origin::Names;
+
+/// Signs a browser in: the answer sets a cookie, and says who it is.
+#[utoipa::path(post, path = "/v1/session", tag = "identity", operation_id = "create_session",
+    request_body = CreateSession,
+    responses((status = 201, body = Session), (status = 401, body = ProblemBody),
+        (status = 429, body = ProblemBody)))]
+pub(in crate::http) async fn create(
+    State(app): State<App>,
+    Extension(names): Extension<Arc<Names>>,
+    peer: Option<Extension<Peer>>,
+    Json(request): Json<CreateSession>,
+) -> Result<Response, Problem> {
+    let address = peer.map(|Extension(Peer(peer))| peer.ip());
+    let address = address.unwrap_or([0, 0, 0, 0].into()).to_canonical();
+    let found = app
+        .authenticate(address, request.token.trim(), Shown::Token)
+        .await;
+    let credential = match found {
+        Ok(credential) => credential,
+        Err(error) => return Ok(sign_in_problem(&app, &error)),
+    };
+    let opened = app.open_session(&credential).await;
+    let (credential, secret) = opened.map_err(|error| match error {
+        // It was revoked in between.
+        AppError::UnknownToken(_) => unauthenticated(),
+        other => other.into(),
+    })?;
+    let left = credential.expires_at.duration_since(app.clock().now());
+    let answer = (StatusCode::CREATED, Json(credential.session()));
+    let mut response = answer.into_response();
+    let lasts_s = left.as_secs();
+    browser::give_cookie(
+        response.headers_mut(),
+        names.is_tls,
+        secret.reveal(),
+        lasts_s,
+    );
+    response.extensions_mut().insert(SignedIn(credential));
+    Ok(response)
+}
+
+/// Who asks, by token or cookie.
+#[utoipa::path(get, path = "/v1/session", tag = "identity", operation_id = "get_session",
+    security(("token" = ["viewer"])), responses((status = 200, body = Session)))]
+pub(in crate::http) async fn get(Subject(subject): Subject) -> Json<Session> {
+    Json(subject.session())
+}
+
+/// Signs a browser out. A token stays valid: an admin revokes it.
+#[utoipa::path(delete, path = "/v1/session", tag = "identity", operation_id = "end_session",
+    security(("token" = ["viewer"])), responses((status = 204)))]
+pub(in crate::http) async fn end(
+    State(app): State<App>,
+    Extension(names): Extension<Arc<Names>>,
+    Subject(subject): Subject,
+) -> Result<Response, Problem> {
+    if let Some(session) = subject.session {
+        app.end_session(session).await?;
+    }
+    let mut response = StatusCode::NO_CONTENT.into_response();
+    browser::take_cookie(response.headers_mut(), names.is_tls);
+    Ok(response)
+}

@@ -1,0 +1,65 @@
+//! `/v1/tokens`.
+
+use axum::extract::State;
+use axum::http::StatusCode;
+use serde::Deserialize;
+use tread_api::identity::{CreateToken, CreatedToken, Token};
+use tread_api::ids::TokenId;
+use tread_api::page::Page;
+use tread_api::problem::ProblemBody;
+use utoipa::IntoParams;
+
+use super::guard::Subject;
+use crate::app::App;
+use crate::http::extract::{Json, Path, Query, cursor, page_limit};
+use crate::http::problem::Problem;
+
+/// Which page of the tokens.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct TokenQuery {
+    /// `next_cursor` of the page before.
+    cursor: Option<String>,
+    /// Most entries of the page, 1 to 1000; 100 when absent.
+    limit: Option<u32>,
+}
+
+/// Tokens, newest first, dead ones too. Secrets are told once and never again.
+#[utoipa::path(get, path = "/v1/tokens", tag = "identity", operation_id = "list_tokens",
+    security(("token" = ["admin"])), params(TokenQuery),
+    responses((status = 200, body = Page<Token>), (status = 400, body = ProblemBody)))]
+pub(in crate::http) async fn list(
+    State(app): State<App>,
+    Query(query): Query<TokenQuery>,
+) -> Result<Json<Page<Token>>, Problem> {
+    let limit = page_limit(query.limit)?;
+    let before = cursor(query.cursor.as_deref())?;
+    Ok(Json(app.tokens(before, limit).await?))
+}
+
+/// Makes a token. Its secret is in this answer and nowhere else.
+#[utoipa::path(post, path = "/v1/tokens", tag = "identity", operation_id = "create_token",
+    security(("token" = ["admin"])), request_body = CreateToken,
+    responses((status = 201, body = CreatedToken), (status = 409, body = ProblemBody),
+        (status = 422, body = ProblemBody)))]
+pub(in crate::http) async fn create(
+    State(app): State<App>,
+    Subject(subject): Subject,
+    Json(request): Json<CreateToken>,
+) -> Result<(StatusCode, Json<CreatedToken>), Problem> {
+    let created = app.create_token(request, &subject.name).await?;
+    Ok((StatusCode::CREATED, Json(created)))
+}
+
+/// Revokes a token: it is refused from now on, its sessions end, and its open streams close.
+#[utoipa::path(delete, path = "/v1/tokens/{token}", tag = "identity",
+    operation_id = "revoke_token", security(("token" = ["admin"])),
+    params(("token" = TokenId, Path)),
+    responses((status = 200, body = Token), (status = 404, body = ProblemBody)))]
+pub(in crate::http) async fn revoke(
+    State(app): State<App>,
+    Path(token): Path<TokenId>,
+) -> Result<Json<Token>, Problem> {
+    Ok(Json(app.revoke_token(token).await?))
+}

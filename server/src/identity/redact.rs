@@ -1,0 +1,81 @@
+//! What of a request's body is kept in the audit log: little, and no secrets.
+
+use serde_json::{Map, Value};
+
+/// Most bytes of JSON that are kept.
+pub const KEPT_MAX: usize = 1_024;
+/// Longest text that is kept of one field when the whole is too long, in characters.
+const TEXT_MAX: usize = 100;
+/// Names of fields, or parts of them, whose values are never kept.
+const SECRET_NAMES: [&str; 5] = ["token", "secret", "password", "passphrase", "key"];
+
+/// A body without secrets; one that is long is kept only in its outermost short fields.
+pub fn redacted(body: &Value) -> Value {
+    let clean = without_secrets(body);
+    if is_short(&clean) {
+        return clean;
+    }
+    let Value::Object(fields) = clean else {
+        return Value::Null;
+    };
+    let mut kept = Map::new();
+    for (name, field) in fields {
+        let short = match field {
+            Value::String(text) if text.chars().count() > TEXT_MAX => continue,
+            Value::Array(_) | Value::Object(_) => continue,
+            short @ (Value::String(_) | Value::Null | Value::Bool(_) | Value::Number(_)) => short,
+        };
+        kept.insert(name, short);
+        if !is_short(&Value::Object(kept.clone())) {
+            return Value::Null;
+        }
+    }
+    Value::Object(kept)
+}
+
+fn is_short(value: &Value) -> bool {
+    serde_json::to_string(value).is_ok_and(|text| text.len() <= KEPT_MAX)
+}
+
+fn is_secret(name: &str) -> bool {
+    let name = name.to_ascii_lowercase();
+    SECRET_NAMES.iter().any(|secret| name.contains(secret))
+}
+
+fn without_secrets(value: &Value) -> Value {
+    match value {
+        Value::Object(fields) => Value::Object(
+            fields
+                .iter()
+                .filter(|(name, _)| !is_secret(name))
+                .map(|(name, field)| (name.clone(), without_secrets(field)))
+                .collect(),
+        ),
+        Value::Array(items) => Value::Array(items.iter().map(without_secrets).collect()),
+        Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) => value.clone(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn secrets_are_left_out_however_deep() {
+        let body = json!({"name": "x", "token": "tread_a_1", "in": [{"Join_Secret": 1, "y": 2}]});
+        assert_eq!(redacted(&body), json!({"name": "x", "in": [{"y": 2}]}));
+    }
+
+    #[test]
+    fn a_long_body_keeps_its_short_fields() {
+        let points: Vec<Value> = (0..1_000).map(|x| json!({"x_m": x, "y_m": 0})).collect();
+        let body = json!({"site": "yard", "priority": 3, "trajectory": {"points": points},
+                          "note": "n".repeat(2_000)});
+        assert_eq!(redacted(&body), json!({"site": "yard", "priority": 3}));
+        assert_eq!(redacted(&json!(["x".repeat(2_000)])), Value::Null);
+        let wide: Map<String, Value> = (0..999).map(|n| (format!("f{n}"), json!(n))).collect();
+        assert_eq!(redacted(&Value::Object(wide)), Value::Null);
+    }
+}

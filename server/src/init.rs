@@ -1,0 +1,93 @@
+//! `tread-server init`: the first admin's token of a server.
+//!
+//! Whoever can write the database may make one; the server need not run, and may. The token is
+//! told once: on standard output, or into a file that only its owner can read.
+
+use std::io::{self, Write as _};
+use std::os::unix::fs::OpenOptionsExt as _;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use clap::Args;
+use tread_api::identity::TOKEN_DAYS_MAX;
+
+use crate::app::App;
+use crate::app::identity::FirstAdmin;
+use crate::clock::Clock;
+use crate::config::{Config, ServerArgs};
+use crate::db::Db;
+
+/// Arguments of `tread-server init`.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct InitArgs {
+    /// Configuration file of the server, TOML
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Database file, created when missing
+    #[arg(long, value_name = "FILE")]
+    database: Option<PathBuf>,
+    /// What people call the token
+    #[arg(long, default_value = "admin")]
+    name: String,
+    /// Days until it is refused
+    #[arg(long, value_name = "DAYS", default_value_t = 365,
+        value_parser = clap::value_parser!(u32).range(1..=i64::from(TOKEN_DAYS_MAX)))]
+    valid_days: u32,
+    /// Write the token into this file, which only its owner can read, instead of printing it
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+    /// Make one though there is an admin; a valid token of the same name is revoked
+    #[arg(long)]
+    force: bool,
+}
+
+/// Makes the token and tells it.
+///
+/// # Errors
+/// There is an admin and it is not forced; database or file cannot be written.
+pub(crate) async fn run(args: InitArgs) -> anyhow::Result<()> {
+    let config = Config::load(&ServerArgs {
+        config: args.config,
+        database: args.database,
+        ..ServerArgs::default()
+    })?;
+    let db = Db::open(&config.database).await?;
+    let app = App::new(db, Clock::system(), config.friction);
+    let first = FirstAdmin {
+        name: args.name,
+        valid_days: args.valid_days,
+        force: args.force,
+    };
+    let created = app.create_first_admin(first).await;
+    app.db().close().await;
+    let created = created
+        .context("cannot make the first admin's token (with --force another one is made)")?;
+    match &args.token_file {
+        Some(file) => write_secret(file, &created.secret)
+            .with_context(|| format!("cannot write {}", file.display()))?,
+        None => writeln!(io::stdout().lock(), "{}", created.secret).context("cannot print")?,
+    }
+    let (name, expires_at) = (&created.token.name, created.token.expires_at);
+    eprintln!("admin's token `{name}`, valid until {expires_at}; it is told this once");
+    Ok(())
+}
+
+/// Writes a file that only its owner can read, whole or not at all.
+fn write_secret(file: &Path, secret: &str) -> io::Result<()> {
+    let mut name = file.file_name().unwrap_or_default().to_owned();
+    name.push(format!(".{}.new", std::process::id()));
+    let new = file.with_file_name(name);
+    let written = || {
+        let mut options = std::fs::OpenOptions::new();
+        options.write(true).create_new(true).mode(0o600);
+        let mut handle = options.open(&new)?;
+        handle.write_all(secret.as_bytes())?;
+        handle.write_all(b"\n")?;
+        handle.sync_all()?;
+        std::fs::rename(&new, file)
+    };
+    written().inspect_err(|_| {
+        // What is half written is of no use; why it is, is told.
+        let _ = std::fs::remove_file(&new);
+    })
+}

@@ -1,0 +1,183 @@
+//! Tokens: made, used, revoked; failures are counted and lock.
+
+use std::time::Duration;
+
+use reqwest::StatusCode;
+use serde_json::{Value, json};
+use tread_api::identity::Role;
+use tread_server::identity::attempts::{FAILURES_MAX, LOCK_FIRST};
+
+use crate::harness::{PATIENCE, Yard, client, eventually, time};
+
+async fn ask(yard: &Yard, token: &str) -> (StatusCode, Value) {
+    yard.send(client(Some(token)).get(yard.url("/v1/sites")))
+        .await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_token_is_told_once_and_kept_nowhere() {
+    let yard = Yard::start().await;
+    let (status, made) = yard
+        .post(
+            "/v1/tokens",
+            &json!({"name": " desk ", "role": "operator", "valid_days": 3}),
+        )
+        .await;
+    assert_eq!(status, StatusCode::CREATED, "{made}");
+    let secret = made["secret"].as_str().unwrap();
+    assert!(secret.starts_with("tread_o_"));
+    assert_eq!(made["token"]["name"], "desk");
+    assert_eq!(made["token"]["created_by"], "tests");
+    assert_eq!(ask(&yard, secret).await.0, StatusCode::OK);
+    let (_, listed) = yard.get_value("/v1/tokens").await;
+    assert!(!listed.to_string().contains(secret));
+    assert_eq!(listed["items"][0]["name"], "desk");
+    let (status, who) = yard
+        .send(client(Some(secret)).get(yard.url("/v1/session")))
+        .await;
+    assert_eq!((status, &who["role"]), (StatusCode::OK, &json!("operator")));
+    let folder = yard.folder.clone();
+    eventually("the audit log and the last use are written", async || {
+        let (_, listed) = yard.get_value("/v1/tokens").await;
+        let (_, audit) = yard.get_value("/v1/audit").await;
+        let used = listed["items"][0]["last_used_at"].is_string();
+        let audited = audit["items"]
+            .as_array()
+            .is_some_and(|items| items.len() > 1);
+        if used && audited {
+            Ok(())
+        } else {
+            Err((listed, audit))
+        }
+    })
+    .await;
+    yard.server.stop().await.unwrap();
+    for file in std::fs::read_dir(folder.path()).unwrap() {
+        let kept = std::fs::read(file.unwrap().path()).unwrap();
+        let digits = &secret.as_bytes()["tread_o_".len()..];
+        assert!(!kept.windows(digits.len()).any(|window| window == digits));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_a_token_may_not_be_is_refused_with_its_field() {
+    let yard = Yard::start().await;
+    for (body, status, field) in [
+        (json!({"name": "", "role": "viewer"}), 422, "name"),
+        (json!({"name": "a\nb", "role": "viewer"}), 422, "name"),
+        (
+            json!({"name": "x".repeat(81), "role": "viewer"}),
+            422,
+            "name",
+        ),
+        (json!({"name": "x", "role": "root"}), 422, "role"),
+        (
+            json!({"name": "x", "role": "viewer", "valid_days": 0}),
+            422,
+            "valid_days",
+        ),
+        (
+            json!({"name": "x", "role": "viewer", "valid_days": 1_827}),
+            422,
+            "valid_days",
+        ),
+        (
+            json!({"name": "x", "role": "viewer", "for_ever": true}),
+            422,
+            "for_ever",
+        ),
+        (json!({"name": "tests", "role": "viewer"}), 409, ""),
+    ] {
+        let (answered, said) = yard.post("/v1/tokens", &body).await;
+        assert_eq!(answered, status, "{body}: {said}");
+        assert_eq!(
+            said["field"].as_str().unwrap_or_default(),
+            field,
+            "{body}: {said}"
+        );
+    }
+    let unknown = yard.url("/v1/tokens/0192f0c1-2b3c-7d4e-8f50-617283940a1b");
+    let (status, _) = yard.send(yard.client().delete(unknown)).await;
+    assert_eq!(status, StatusCode::NOT_FOUND);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_revoked_token_is_refused_at_once_and_its_streams_close() {
+    let yard = Yard::start().await;
+    let made = yard.token("screen", Role::Viewer).await;
+    let screen = client(Some(&made.secret));
+    let mut stream = screen.get(yard.url("/v1/events")).send().await.unwrap();
+    assert!(stream.chunk().await.unwrap().is_some(), "the stream begins");
+    let (status, _) = yard
+        .send(
+            yard.client()
+                .delete(yard.url(&format!("/v1/tokens/{}", made.token.id))),
+        )
+        .await;
+    assert_eq!(status, StatusCode::OK);
+    assert_eq!(ask(&yard, &made.secret).await.0, StatusCode::UNAUTHORIZED);
+    let ends = async { while let Ok(Some(_)) = stream.chunk().await {} };
+    tokio::time::timeout(PATIENCE, ends)
+        .await
+        .expect("the stream ends with its token");
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_token_outlives_a_restart_and_a_revoked_one_does_not_come_back() {
+    let yard = Yard::start().await;
+    let kept = yard.token("kept", Role::Viewer).await;
+    let gone = yard.token("gone", Role::Viewer).await;
+    yard.server.app().revoke_token(gone.token.id).await.unwrap();
+    let yard = yard.restart().await;
+    assert_eq!(ask(&yard, &kept.secret).await.0, StatusCode::OK);
+    assert_eq!(ask(&yard, &gone.secret).await.0, StatusCode::UNAUTHORIZED);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn failures_lock_the_address_for_strangers_and_for_nobody_who_is_signed_in() {
+    let yard = Yard::start_at(time("2026-11-01T00:00:00Z")).await;
+    let working = yard.token("working", Role::Operator).await.secret;
+    let fresh = yard.token("fresh", Role::Operator).await.secret;
+    assert_eq!(ask(&yard, &working).await.0, StatusCode::OK);
+    for _ in 0..FAILURES_MAX {
+        assert_eq!(
+            ask(&yard, "tread_a_guess").await.0,
+            StatusCode::UNAUTHORIZED
+        );
+    }
+    let guessed = client(Some("tread_a_guess"))
+        .get(yard.url("/v1/sites"))
+        .send()
+        .await
+        .unwrap();
+    assert_eq!(guessed.status(), StatusCode::TOO_MANY_REQUESTS);
+    let wait_s: u64 = guessed.headers()["retry-after"]
+        .to_str()
+        .unwrap()
+        .parse()
+        .unwrap();
+    assert!((1..=LOCK_FIRST.as_secs() + 1).contains(&wait_s));
+    let (status, good) = ask(&yard, &fresh).await;
+    assert_eq!(
+        status,
+        StatusCode::TOO_MANY_REQUESTS,
+        "a good token shows while locked"
+    );
+    let (_, bad) = ask(&yard, "tread_a_guess").await;
+    assert_eq!(good, bad);
+    assert_eq!(
+        ask(&yard, &working).await.0,
+        StatusCode::OK,
+        "who works goes on working"
+    );
+    yard.server
+        .app()
+        .clock()
+        .advance(LOCK_FIRST + Duration::from_secs(1));
+    assert_eq!(ask(&yard, &fresh).await.0, StatusCode::OK);
+    assert!(yard.server.app().counters().values().refused_locked >= 3);
+    yard.server.stop().await.unwrap();
+}
