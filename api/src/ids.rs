@@ -93,6 +93,11 @@ slug! {
 }
 
 slug! {
+    /// A program that limits a robot from outside, such as an obstacle detection.
+    HolderId
+}
+
+slug! {
     /// What an alert is about, stable, for programs.
     AlertCode
 }
@@ -143,6 +148,10 @@ uuid_id! {
 uuid_id! {
     /// An alert: a version 7 UUID, so that ids sort by time.
     AlertId
+}
+uuid_id! {
+    /// A stop: a version 7 UUID, so that ids sort by time.
+    StopId
 }
 uuid_id! {
     /// One run of an agent's process: a new version 4 UUID at each start.

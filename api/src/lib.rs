@@ -4,7 +4,7 @@
 //! so a change here is a change of the protocol.
 //!
 //! * REST shapes: [`site`], [`terrain`], [`robot`], [`trajectory`], [`mission`], [`friction`],
-//!   [`event`], [`page`], [`problem`].
+//!   [`safety`], [`event`], [`page`], [`problem`].
 //! * zenoh shapes: [`wire`], with the key expressions in [`keys`].
 //!
 //! Units are SI and stand last in a name (`_m`, `_m_s`, `_rad`). A site's frame is metric and
@@ -20,6 +20,7 @@ pub mod mission;
 pub mod page;
 pub mod problem;
 pub mod robot;
+pub mod safety;
 pub mod site;
 pub mod terrain;
 pub mod trajectory;
