@@ -213,6 +213,31 @@ pub enum InvalidGeofence {
     Corners(usize),
 }
 
+/// The body of `PUT /v1/sites/{site}/geofence`: replaces the whole of it.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
+pub struct ReplaceGeofence {
+    /// Where robots may be; anywhere when empty.
+    #[serde(default)]
+    pub keep_in: Vec<Polygon>,
+    /// Where robots may not be.
+    #[serde(default)]
+    pub keep_out: Vec<Polygon>,
+}
+
+/// The body of `PUT /v1/sites/{site}/robots/{robot}/limits/{holder}`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct SetLimit {
+    /// Whether the robot is to stand.
+    #[serde(default)]
+    pub hold: bool,
+    /// Fastest speed, m/s, not negative; as before when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub linear_max_m_s: Option<f64>,
+    /// How long it lasts, milliseconds, at most an hour; say it again before it ends.
+    #[schema(minimum = 1, maximum = 3_600_000)]
+    pub for_ms: u64,
+}
+
 impl Geofence {
     /// Whether it bounds nothing.
     pub fn is_empty(&self) -> bool {

@@ -72,6 +72,8 @@ pub struct Stop {
     pub unconfirmed: bool,
     /// Who asked last to clear it.
     pub clear_asked_by: Option<String>,
+    /// When that was.
+    pub clear_asked_at: Option<Timestamp>,
     /// When the robot had cleared it.
     pub cleared_at: Option<Timestamp>,
 }

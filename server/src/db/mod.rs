@@ -5,12 +5,14 @@
 //! survives a power cut.
 
 pub mod alerts;
+pub mod geofences;
 pub mod history;
 pub mod idempotency;
 pub mod missions;
 pub mod robots;
 pub mod segments;
 pub mod sites;
+pub mod stops;
 pub mod sums;
 pub mod terrains;
 

@@ -12,6 +12,7 @@ use tread_api::wire::command::Answer;
 use tread_api::wire::{self, Refusal};
 use zenoh::Session;
 use zenoh::Wait as _;
+use zenoh::qos::Priority;
 use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 
 use super::presence::RobotKey;
@@ -73,7 +74,23 @@ impl Carrier for Network {
     fn carry(&self, (site, robot): &RobotKey, verb: Verb, payload: Vec<u8>) -> Carrying {
         let key = keys::command(site, robot, verb);
         let (session, supervisor) = (self.session.get(), self.supervisor.clone());
-        Box::pin(query(session, supervisor, key, payload))
+        Box::pin(query(
+            session,
+            supervisor,
+            key,
+            (priority_of(verb), payload),
+        ))
+    }
+}
+
+/// What slows a robot down goes before everything else on its link.
+const fn priority_of(verb: Verb) -> Priority {
+    match verb {
+        Verb::Stop => Priority::RealTime,
+        Verb::Clear | Verb::Lease | Verb::Limit | Verb::Pause | Verb::Cancel => {
+            Priority::InteractiveHigh
+        }
+        Verb::Offer | Verb::Resume | Verb::Site => Priority::Data,
     }
 }
 
@@ -81,7 +98,7 @@ async fn query(
     session: Session,
     supervisor: Supervisor,
     key: String,
-    payload: Vec<u8>,
+    (priority, payload): (Priority, Vec<u8>),
 ) -> Option<Answer> {
     let (answer, answered) = oneshot::channel();
     let query_key = key.clone();
@@ -91,6 +108,8 @@ async fn query(
         session
             .get(query_key)
             .payload(payload)
+            .priority(priority)
+            .express(priority == Priority::RealTime)
             .target(QueryTarget::BestMatching)
             .consolidation(ConsolidationMode::None)
             .timeout(COMMAND_TIMEOUT)

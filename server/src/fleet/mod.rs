@@ -10,6 +10,7 @@ pub mod presence;
 mod pulse;
 mod requests;
 mod router;
+pub mod teleop;
 
 use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
@@ -21,6 +22,7 @@ use zenoh::{Config, Session, Wait as _};
 
 use self::commands::{Commands, Network};
 use self::router::Current;
+use self::teleop::Teleop;
 use crate::app::App;
 use crate::app::ingest::Upload;
 use crate::supervisor::Supervisor;
@@ -100,6 +102,11 @@ impl Fleet {
             session: Arc::clone(&self.session),
             supervisor: self.supervisor.clone(),
         }))
+    }
+
+    /// The way of drive commands.
+    pub fn teleop(&self) -> Teleop {
+        Teleop::new(Arc::clone(&self.session), self.supervisor.clone())
     }
 
     /// Begins to listen to robots, to beat the pulse and to look after the router.

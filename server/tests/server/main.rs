@@ -6,6 +6,10 @@ mod bad_input;
 #[cfg(test)]
 mod control;
 #[cfg(test)]
+mod drive;
+#[cfg(test)]
+mod geofence;
+#[cfg(test)]
 mod harness;
 #[cfg(test)]
 mod ingest;
@@ -21,3 +25,5 @@ mod program;
 mod resources;
 #[cfg(test)]
 mod robot;
+#[cfg(test)]
+mod stops;

@@ -15,10 +15,12 @@ use jiff::SignedDuration;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, error};
-use tread_api::ids::{MissionId, SiteId};
+use tread_api::ids::{MissionId, SiteId, StopId};
 use tread_api::mission::MissionState;
 
-use self::jobs::{Finished, adopt_shown, cancel, disown, hold, offer, push_site, replace, settle};
+use self::jobs::{
+    Finished, adopt_shown, cancel, disown, hold, offer, push_site, replace, settle, stop_again,
+};
 use self::needs::{Memory, Need, Now, decide, is_absent, is_heard};
 use super::missions::transitions::Change;
 use super::{App, AppError};
@@ -32,6 +34,10 @@ use crate::supervisor::Supervisor;
 pub const PERIOD: Duration = Duration::from_millis(500);
 /// Commands that may be under way at once.
 const COMMANDS_MAX: usize = 64;
+/// Stops that may be under way at once, beside all other commands.
+const STOPS_UNDER_WAY_MAX: usize = 256;
+/// Longest wait before a stop is repeated.
+const STOP_RETRY_MAX: Duration = Duration::from_millis(400);
 /// First wait before a command is repeated; it doubles each time.
 const RETRY_MIN: Duration = Duration::from_millis(100);
 /// Longest wait before a command is repeated.
@@ -47,6 +53,7 @@ const FOREIGN_GRACE: Duration = Duration::from_millis(1_500);
 /// A command that is under way or waits to be repeated.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 enum Job {
+    Stop(StopId),
     Offer(MissionId),
     Replace(MissionId),
     Hold(MissionId),
@@ -98,7 +105,7 @@ pub struct Reconciler {
 impl Reconciler {
     /// A reconciler that remembers nothing yet.
     pub fn new(app: App, commands: Commands, supervisor: Supervisor) -> Self {
-        let (finished, finishing) = mpsc::channel(COMMANDS_MAX);
+        let (finished, finishing) = mpsc::channel(COMMANDS_MAX + STOPS_UNDER_WAY_MAX);
         Self {
             app,
             commands,
@@ -159,7 +166,16 @@ impl Reconciler {
             self.retries.remove(&job);
         } else {
             let before = self.retries.get(&job);
-            let wait = before.map_or(RETRY_MIN, |retry| (retry.wait * 2).min(RETRY_MAX));
+            let most = match job {
+                Job::Stop(_) => STOP_RETRY_MAX,
+                Job::Offer(_)
+                | Job::Replace(_)
+                | Job::Hold(_)
+                | Job::Cancel(_)
+                | Job::Disown(_)
+                | Job::Site(_) => RETRY_MAX,
+            };
+            let wait = before.map_or(RETRY_MIN, |retry| (retry.wait * 2).min(most));
             self.retries.insert(
                 job,
                 Retry {
@@ -175,6 +191,7 @@ impl Reconciler {
     /// # Errors
     /// The database failed; the next pass does what this one did not.
     pub async fn pass(&mut self) -> Result<(), AppError> {
+        self.stop_again().await;
         self.expire().await?;
         self.app.sync_alerts().await?;
         let mut tx = self.app.db().read().await?;
@@ -187,13 +204,20 @@ impl Reconciler {
         for mission in open {
             self.serve(mission).await?;
         }
-        let wanted: HashMap<SiteId, u64> = sites
+        let wanted: HashMap<SiteId, (u64, u64)> = sites
             .into_iter()
-            .map(|row| (row.site.id, row.site.terrain_revision))
+            .map(|row| {
+                let (terrains, fence) = (row.site.terrain_revision, row.site.geofence_revision);
+                (row.site.id, (terrains, fence))
+            })
             .collect();
         for (key, held) in self.app.presences().online(self.app.clock().elapsed()) {
             // Without any definition the robot will say hello, and gets one.
-            let lags = held.is_some_and(|held| wanted.get(&key.0).is_some_and(|&now| now != held));
+            let lags = wanted.get(&key.0).is_some_and(|&(terrains, fence)| {
+                held.terrains.is_some_and(|held| held != terrains)
+                    // A robot that knows no geofences says nothing of them.
+                    || held.fence.is_some_and(|held| held != fence)
+            });
             let job = Job::Site(key.clone());
             if lags && self.is_due(&job) {
                 let (app, commands) = (self.app.clone(), self.commands.clone());
@@ -203,6 +227,28 @@ impl Reconciler {
             }
         }
         Ok(())
+    }
+
+    /// Tells robots again what they have not confirmed. Whatever else fails, this goes on.
+    async fn stop_again(&mut self) {
+        let again = match self.app.tend_stops().await {
+            Ok(again) => again,
+            Err(error) => return error!("cannot look after stops: {error:?}"),
+        };
+        let wanted: HashSet<StopId> = again.iter().map(|stop| stop.id).collect();
+        self.retries
+            .retain(|job, _| !matches!(job, Job::Stop(id) if !wanted.contains(id)));
+        for stop in again {
+            let key = (stop.site.clone(), stop.robot.clone());
+            let presence = self.app.presences().get(&key);
+            let job = Job::Stop(stop.id);
+            // Any sign of life will do, also that of an agent whose loop stands still.
+            let is_there = presence.is_there(self.app.clock().elapsed());
+            if is_there && self.is_due(&job) {
+                let (app, commands) = (self.app.clone(), self.commands.clone());
+                self.start(job, stop_again(app, commands, stop));
+            }
+        }
     }
 
     async fn expire(&self) -> Result<(), AppError> {
@@ -224,7 +270,7 @@ impl Reconciler {
             Job::Offer(id) | Job::Replace(id) | Job::Hold(id) | Job::Cancel(id) => {
                 open.contains(id)
             }
-            Job::Disown(_) | Job::Site(_) => true,
+            Job::Disown(_) | Job::Site(_) | Job::Stop(_) => true,
         });
     }
 
@@ -262,7 +308,12 @@ impl Reconciler {
         let foreign = &self.foreign;
         self.retries.retain(|job, _| match job {
             Job::Disown(key) => foreign.contains_key(key),
-            Job::Offer(_) | Job::Replace(_) | Job::Hold(_) | Job::Cancel(_) | Job::Site(_) => true,
+            Job::Offer(_)
+            | Job::Replace(_)
+            | Job::Hold(_)
+            | Job::Cancel(_)
+            | Job::Site(_)
+            | Job::Stop(_) => true,
         });
     }
 
@@ -336,7 +387,14 @@ impl Reconciler {
 
     fn is_due(&self, job: &Job) -> bool {
         let now = self.app.clock().elapsed();
-        self.under_way.len() < COMMANDS_MAX
+        let is_stop = |job: &&Job| matches!(job, Job::Stop(_));
+        let stops = self.under_way.iter().filter(is_stop).count();
+        let has_room = if is_stop(&job) {
+            stops < STOPS_UNDER_WAY_MAX
+        } else {
+            self.under_way.len() - stops < COMMANDS_MAX
+        };
+        has_room
             && !self.under_way.contains(job)
             && self.retries.get(job).is_none_or(|retry| retry.due <= now)
     }

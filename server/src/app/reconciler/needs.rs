@@ -119,7 +119,11 @@ pub(super) fn decide(mission: &Standing, presence: &Presence, memory: Memory, no
         {
             Need::Settle(Change::Forget)
         }
-        MissionState::Active | MissionState::Paused => in_hand(mission, said),
+        MissionState::Active | MissionState::Paused => match in_hand(mission, said) {
+            // Whoever stopped it or drives it by hand has written down that it is to be held.
+            Need::Resume if presence.is_in_hands() => Need::Wait,
+            need => need,
+        },
         MissionState::Cancelling => Need::Cancel,
         MissionState::Queued
         | MissionState::Offered
