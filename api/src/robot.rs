@@ -121,6 +121,10 @@ pub enum LinkCause {
 
 /// What a base and its agent can do beyond driving missions to their end.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "each says one independent ability, by name on the wire"
+)]
 pub struct Capabilities {
     /// It can pause a mission and drive it on.
     #[serde(default)]

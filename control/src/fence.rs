@@ -12,6 +12,7 @@
 //! through, slowly. Nothing here allocates after [`Fence::new`].
 
 use crate::geometry::{Point, Pose, Twist};
+use crate::plan::Plan;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
 /// Distance kept from a fence beyond the robot's own radius, metres.
@@ -29,6 +30,8 @@ pub const REACTION_S: f64 = 0.20;
 const STEPS_MAX: u32 = 24;
 /// Shortest step along an arc, metres; clearance below this counts as none.
 const STEP_MIN_M: f64 = 0.005;
+/// Shortest step along a planned way, metres.
+const BREACH_STEP_M: f64 = 0.02;
 /// Step by which motion from outside is tried, metres.
 const RETURN_STEP_M: f64 = 0.05;
 
@@ -75,8 +78,8 @@ pub struct Fence {
 /// Where something leaves the allowed ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Breach {
-    /// Where in the order of the points.
-    pub index: usize,
+    /// Way from the start to there, metres.
+    pub arc_m: f64,
     /// The centre of the robot there.
     pub point: Point,
     /// How far the robot's disc is outside there, metres.
@@ -193,24 +196,42 @@ impl Fence {
         away.fold(inside_m, f64::min)
     }
 
-    /// The first of some points at which a disc leaves the allowed ground.
+    /// The first place at which a robot that drives a plan, with the margin that it keeps anyway,
+    /// would leave the allowed ground.
+    pub fn plan_breach(&self, plan: &Plan, model: &RobotModel) -> Option<Breach> {
+        let radius_m = disc_radius_m(model) + MARGIN_M;
+        let point_at = |arc_m: f64| plan.path().sample(arc_m).pose.point();
+        self.first_breach(point_at, plan.length_m(), radius_m)
+    }
+
+    /// The first place along a way at which a disc leaves the allowed ground.
     pub fn first_breach(
         &self,
-        points: impl IntoIterator<Item = Point>,
+        point_at: impl Fn(f64) -> Point,
+        length_m: f64,
         radius_m: f64,
     ) -> Option<Breach> {
         if self.is_empty() {
             return None;
         }
-        points.into_iter().enumerate().find_map(|(index, point)| {
+        let mut arc_m = 0.0;
+        loop {
+            let point = point_at(arc_m);
             let depth_m = radius_m - self.clearance_m(point);
             // Not a number is no permission.
-            (depth_m > 0.0 || depth_m.is_nan()).then_some(Breach {
-                index,
-                point,
-                depth_m,
-            })
-        })
+            if depth_m > 0.0 || depth_m.is_nan() {
+                return Some(Breach {
+                    arc_m,
+                    point,
+                    depth_m,
+                });
+            }
+            if arc_m >= length_m {
+                return None;
+            }
+            // Clearance cannot be used up before so much more of the way.
+            arc_m = (arc_m + (-depth_m).max(BREACH_STEP_M)).min(length_m);
+        }
     }
 
     /// How far a disc may go along its arc, metres, at most `most_m`; 0 outside.
@@ -459,21 +480,22 @@ mod tests {
     #[test]
     fn a_path_that_crosses_is_named_by_its_place() {
         let fence = yard();
-        let points = |y_m: f64| {
-            (0..100).map(move |step| Point {
-                x_m: -4.0 + 0.1 * f64::from(step),
+        let line = |y_m: f64| {
+            move |arc_m: f64| Point {
+                x_m: arc_m - 4.0,
                 y_m,
-            })
+            }
         };
-        assert_eq!(fence.first_breach(points(-1.0), 0.3), None);
-        let breach = fence.first_breach(points(2.0), 0.3).unwrap();
-        assert!((breach.point.x_m - 1.2).abs() < 0.15, "{breach:?}");
-        let nowhere = [Point {
+        assert_eq!(fence.first_breach(line(-1.0), 10.0, 0.3), None);
+        let breach = fence.first_breach(line(2.0), 10.0, 0.3).unwrap();
+        assert!((breach.point.x_m - 1.2).abs() < 0.05, "{breach:?}");
+        assert!((breach.arc_m - 5.2).abs() < 0.05, "{breach:?}");
+        let nowhere = |_: f64| Point {
             x_m: f64::NAN,
             y_m: 0.0,
-        }];
-        assert!(fence.first_breach(nowhere, 0.3).is_some());
-        assert_eq!(Fence::default().first_breach(nowhere, 0.3), None);
+        };
+        assert!(fence.first_breach(nowhere, 1.0, 0.3).is_some());
+        assert_eq!(Fence::default().first_breach(nowhere, 1.0, 0.3), None);
     }
 
     #[test]

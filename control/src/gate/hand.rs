@@ -143,7 +143,7 @@ mod tests {
             for _ in 0..300 {
                 let next = approach(now, target, &model, 0.01);
                 let (low, high) = (now.linear_m_s.min(to), now.linear_m_s.max(to));
-                prop_assert!((low..=high).contains(&next.linear_m_s));
+                prop_assert!((low - 1.0e-12..=high + 1.0e-12).contains(&next.linear_m_s));
                 now = next;
             }
             prop_assert!((now.linear_m_s - to).abs() < 1.0e-9);

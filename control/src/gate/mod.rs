@@ -186,6 +186,8 @@ pub struct GateInput {
 pub struct GateOutput {
     /// Wheel speeds for the base.
     pub wheel_speeds: WheelSpeeds,
+    /// What they are on the ramp to.
+    pub target: WheelSpeeds,
     /// The strictest cause of a reduction; none when the command passed whole.
     pub cause: Option<GateCause>,
 }
@@ -266,6 +268,7 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
     }
     GateOutput {
         wheel_speeds,
+        target,
         cause,
     }
 }

@@ -144,6 +144,7 @@ fn a_command_within_all_limits_passes_whole() {
         gate(&input, &limits),
         GateOutput {
             wheel_speeds: command,
+            target: command,
             cause: None
         }
     );
