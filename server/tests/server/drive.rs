@@ -220,7 +220,7 @@ async fn a_frame_that_makes_no_sense_closes_the_socket_with_a_code_and_the_robot
     for (frame, code) in [
         (Message::text("{\"drive\":"), 1007),
         (Message::text(nan), 1007),
-        (Message::text(infinite), 1007),
+        (Message::text(infinite), 1008),
         (Message::text(null), 1008),
         (Message::text(extra), 1008),
         (Message::text("{\"fly\": {}}"), 1008),
