@@ -31,6 +31,11 @@ use crate::supervisor::Supervisor;
 const SESSIONS_MAX: u32 = 10_000;
 /// Most connections that may be in the middle of their opening.
 const ACCEPT_PENDING_MAX: u32 = 1_000;
+/// What the system may keep of what is sent to one robot, bytes. Priorities act only above it: on
+/// a narrow link a larger one would let drive commands wait behind everything else.
+const SEND_BUFFER_BYTES: u32 = 16 * 1024;
+/// Most bytes that are sent at once, for the same reason.
+const BATCH_BYTES: u32 = 8 * 1024;
 /// How long the session may take to open, and to close.
 const SESSION_TIMEOUT: Duration = Duration::from_secs(10);
 
@@ -197,7 +202,11 @@ fn config(address: SocketAddr) -> zenoh::Result<Config> {
     let mut config = Config::default();
     let settings = [
         ("mode", "\"router\"".to_owned()),
-        ("listen/endpoints", format!("[\"tcp/{address}\"]")),
+        (
+            "listen/endpoints",
+            format!("[\"tcp/{address}#so_sndbuf={SEND_BUFFER_BYTES}\"]"),
+        ),
+        ("transport/link/tx/batch_size", BATCH_BYTES.to_string()),
         // Nothing is discovered and nothing is advertised.
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
