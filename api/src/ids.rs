@@ -93,6 +93,11 @@ slug! {
 }
 
 slug! {
+    /// A program that limits a robot from outside, such as an obstacle detection.
+    HolderId
+}
+
+slug! {
     /// What an alert is about, stable, for programs.
     AlertCode
 }
@@ -151,6 +156,10 @@ uuid_id! {
 uuid_id! {
     /// A browser's session: a version 7 UUID; no secret.
     SessionId
+}
+uuid_id! {
+    /// A stop: a version 7 UUID, so that ids sort by time.
+    StopId
 }
 uuid_id! {
     /// One run of an agent's process: a new version 4 UUID at each start.

@@ -6,11 +6,13 @@
 //! | `robots/{robot}/state` | published | robot → all |
 //! | `robots/{robot}/friction` | published | robot → all |
 //! | `robots/{robot}/cmd/{verb}` | query | server → robot |
+//! | `robots/{robot}/teleop` | published | server → robot |
+//! | `robots/{robot}/limit/{holder}` | published | any program → robot |
 //! | `server/pulse` | published | server → all robots |
 //! | `server/hello/{robot}` | query | robot → server |
 //! | `server/ingest/{robot}` | query | robot → server |
 
-use crate::ids::{BootId, RobotId, SiteId};
+use crate::ids::{BootId, HolderId, RobotId, SiteId};
 
 /// The first chunk of every key.
 pub const ROOT: &str = "tread";
@@ -28,16 +30,28 @@ pub enum Verb {
     Resume,
     /// Take a new definition of the site.
     Site,
+    /// Stop and latch.
+    Stop,
+    /// End a stop.
+    Clear,
+    /// Acquire, take or release the lease of driving by hand.
+    Lease,
+    /// Hold or slow the robot from outside.
+    Limit,
 }
 
 impl Verb {
     /// Every verb.
-    pub const ALL: [Self; 5] = [
+    pub const ALL: [Self; 9] = [
         Self::Offer,
         Self::Cancel,
         Self::Pause,
         Self::Resume,
         Self::Site,
+        Self::Stop,
+        Self::Clear,
+        Self::Lease,
+        Self::Limit,
     ];
 
     /// The verb as a chunk of a key.
@@ -48,6 +62,10 @@ impl Verb {
             Self::Pause => "pause",
             Self::Resume => "resume",
             Self::Site => "site",
+            Self::Stop => "stop",
+            Self::Clear => "clear",
+            Self::Lease => "lease",
+            Self::Limit => "limit",
         }
     }
 
@@ -95,6 +113,21 @@ pub fn commands(site: &SiteId, robot: &RobotId) -> String {
     robot_key(site, robot, "cmd/*")
 }
 
+/// Where drive commands to a robot are published.
+pub fn teleop(site: &SiteId, robot: &RobotId) -> String {
+    robot_key(site, robot, "teleop")
+}
+
+/// Where one holder publishes its limits of a robot.
+pub fn limit(site: &SiteId, robot: &RobotId, holder: &HolderId) -> String {
+    robot_key(site, robot, &format!("limit/{holder}"))
+}
+
+/// The limits of a robot by all holders.
+pub fn limits(site: &SiteId, robot: &RobotId) -> String {
+    robot_key(site, robot, "limit/*")
+}
+
 /// Where the server publishes its pulse.
 pub fn pulse(site: &SiteId) -> String {
     format!("{ROOT}/{site}/server/pulse")
@@ -132,6 +165,10 @@ pub enum Key {
     Friction(SiteId, RobotId),
     /// A command to a robot.
     Command(SiteId, RobotId, Verb),
+    /// Drive commands to a robot.
+    Teleop(SiteId, RobotId),
+    /// A holder's limits of a robot.
+    Limit(SiteId, RobotId, HolderId),
     /// The server's pulse.
     Pulse(SiteId),
     /// An introduction.
@@ -158,6 +195,10 @@ impl Key {
             ["robots", robot, "cmd", verb] => {
                 Self::Command(site, robot.parse().ok()?, Verb::from_chunk(verb)?)
             }
+            ["robots", robot, "teleop"] => Self::Teleop(site, robot.parse().ok()?),
+            ["robots", robot, "limit", holder] => {
+                Self::Limit(site, robot.parse().ok()?, holder.parse().ok()?)
+            }
             ["server", "pulse"] => Self::Pulse(site),
             ["server", "hello", robot] => Self::Hello(site, robot.parse().ok()?),
             ["server", "ingest", robot] => Self::Ingest(site, robot.parse().ok()?),
@@ -177,6 +218,7 @@ mod tests {
         let site: SiteId = "yard".parse().unwrap();
         let robot: RobotId = "rover-1".parse().unwrap();
         let boot = BootId::from_uuid(Uuid::from_u128(7));
+        let holder: HolderId = "lidar".parse().unwrap();
         let pair = || (site.clone(), robot.clone());
         let cases = [
             (
@@ -188,6 +230,11 @@ mod tests {
             (
                 command(&site, &robot, Verb::Offer),
                 Key::Command(pair().0, pair().1, Verb::Offer),
+            ),
+            (teleop(&site, &robot), Key::Teleop(pair().0, pair().1)),
+            (
+                limit(&site, &robot, &holder),
+                Key::Limit(pair().0, pair().1, holder.clone()),
             ),
             (pulse(&site), Key::Pulse(site.clone())),
             (hello(&site, &robot), Key::Hello(pair().0, pair().1)),

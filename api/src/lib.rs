@@ -4,13 +4,14 @@
 //! so a change here is a change of the protocol.
 //!
 //! * REST shapes: [`site`], [`terrain`], [`robot`], [`trajectory`], [`mission`], [`friction`],
-//!   [`event`], [`identity`], [`page`], [`problem`].
+//!   [`safety`], [`stop`], [`drive`], [`event`], [`identity`], [`page`], [`problem`].
 //! * zenoh shapes: [`wire`], with the key expressions in [`keys`].
 //!
 //! Units are SI and stand last in a name (`_m`, `_m_s`, `_rad`). A site's frame is metric and
 //! right-handed, x east-like, y north-like; headings are counter-clockwise from x. A value that is
 //! not known is `null`, never a default. Integers stay below 2⁵³.
 
+pub mod drive;
 pub mod event;
 pub mod friction;
 pub mod geometry;
@@ -21,7 +22,9 @@ pub mod mission;
 pub mod page;
 pub mod problem;
 pub mod robot;
+pub mod safety;
 pub mod site;
+pub mod stop;
 pub mod terrain;
 pub mod trajectory;
 pub mod wire;

@@ -55,6 +55,20 @@ pub enum ProblemType {
     RobotCannot,
     #[serde(rename = "/problems/unknown-alert")]
     UnknownAlert,
+    #[serde(rename = "/problems/unknown-stop")]
+    UnknownStop,
+    #[serde(rename = "/problems/stop-not-cleared")]
+    StopNotCleared,
+    #[serde(rename = "/problems/robot-unreachable")]
+    RobotUnreachable,
+    #[serde(rename = "/problems/robot-refused")]
+    RobotRefused,
+    #[serde(rename = "/problems/crosses-geofence")]
+    CrossesGeofence,
+    #[serde(rename = "/problems/robot-outside-geofence")]
+    RobotOutsideGeofence,
+    #[serde(rename = "/problems/changed-meanwhile")]
+    ChangedMeanwhile,
     #[serde(rename = "/problems/idempotency-key-in-flight")]
     IdempotencyKeyInFlight,
     #[serde(rename = "/problems/idempotency-key-reused")]
@@ -87,7 +101,7 @@ pub enum ProblemType {
 
 impl ProblemType {
     /// Every kind.
-    pub const ALL: [Self; 35] = [
+    pub const ALL: [Self; 42] = [
         Self::MalformedBody,
         Self::InvalidBody,
         Self::UnknownField,
@@ -109,6 +123,13 @@ impl ProblemType {
         Self::RobotRetired,
         Self::RobotCannot,
         Self::UnknownAlert,
+        Self::UnknownStop,
+        Self::StopNotCleared,
+        Self::RobotUnreachable,
+        Self::RobotRefused,
+        Self::CrossesGeofence,
+        Self::RobotOutsideGeofence,
+        Self::ChangedMeanwhile,
         Self::IdempotencyKeyInFlight,
         Self::IdempotencyKeyReused,
         Self::InvalidHeader,
@@ -149,6 +170,13 @@ impl ProblemType {
             Self::RobotRetired => "The robot is retired",
             Self::RobotCannot => "The robot has no such ability",
             Self::UnknownAlert => "The alert is not known",
+            Self::UnknownStop => "The stop is not known",
+            Self::StopNotCleared => "The robot has not cleared the stop",
+            Self::RobotUnreachable => "The robot does not answer",
+            Self::RobotRefused => "The robot refuses",
+            Self::CrossesGeofence => "The way leaves where robots may be",
+            Self::RobotOutsideGeofence => "A robot would stand outside the geofence",
+            Self::ChangedMeanwhile => "It was changed meanwhile",
             Self::IdempotencyKeyInFlight => "A request with this key is being answered",
             Self::IdempotencyKeyReused => "This key was used for another request",
             Self::InvalidHeader => "A header does not say something possible",

@@ -11,6 +11,7 @@ use crate::ids::{
     AlertCode, AlertId, BootId, ConfigurationId, DERIVED_NAMESPACE, MissionId, PlanHash, RobotId,
     SiteId,
 };
+use crate::safety::SafetyStatus;
 
 /// A robot's model and tyres, as its agent declares them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -137,6 +138,12 @@ pub struct Capabilities {
     /// It measures wheel torque, so that friction shows in steady driving too.
     #[serde(default)]
     pub wheel_torque: bool,
+    /// It latches stops, keeps to geofences and takes external limits.
+    #[serde(default)]
+    pub stop: bool,
+    /// It can be driven by hand.
+    #[serde(default)]
+    pub teleop: bool,
     /// Rate of the control loop, Hz.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rate_hz: Option<f64>,
@@ -320,6 +327,8 @@ pub struct RobotLive {
     pub control_loop: LoopStatus,
     /// The battery, if the base measures it.
     pub battery: Option<Battery>,
+    /// What may only slow the robot down.
+    pub safety: SafetyStatus,
 }
 
 /// How far a mission has come on the robot.
@@ -337,9 +346,28 @@ pub struct MissionProgress {
     pub length_m: f64,
     /// Distance from the path, metres, positive to its left.
     pub cross_track_m: f64,
-    /// Whether the robot stands, held by request; it may still brake for that while this is false.
+    /// Whether it stands, held until somebody resumes it; it may still brake for that while this is
+    /// false.
     #[serde(default)]
     pub paused: bool,
+    /// What holds it so; absent while nothing does. It is here while the robot still brakes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub paused_by: Option<PauseCause>,
+}
+
+/// What paused a mission. Whatever it was, only a request resumes it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum PauseCause {
+    /// A request to pause it.
+    Request,
+    /// The robot is driven by hand.
+    Teleoperation,
+    /// The robot was stopped.
+    Stop,
+    /// Any cause of a newer peer.
+    #[serde(other)]
+    Other,
 }
 
 /// The state of a robot's durable store of measurements.

@@ -96,6 +96,9 @@ pub struct Site {
     pub grid: Grid,
     /// Counts changes of the site's terrains.
     pub terrain_revision: u64,
+    /// Counts changes of the site's geofence.
+    #[serde(default)]
+    pub geofence_revision: u64,
     /// When the site was made.
     pub created_at: Timestamp,
 }

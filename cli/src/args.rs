@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
 use tread_api::geometry::Point;
-use tread_api::ids::{MissionId, RobotId, SiteId, TerrainId};
+use tread_api::ids::{HolderId, MissionId, RobotId, SiteId, StopId, TerrainId};
 use tread_api::trajectory::Waypoint;
 
 use self::identity::Showing;
@@ -77,6 +77,16 @@ pub(crate) enum RemoteCommand {
     Terrains(TerrainsArguments),
     /// Show what is known of the friction of a site's ground
     Friction(FrictionArguments),
+    /// Stop robots at once, and latch it; exits with 1 while one has not confirmed
+    Stop(StopArguments),
+    /// Clear a robot's stop, when it stands; nothing starts by it
+    Clear(ClearArguments),
+    /// Drive a robot by hand, in this terminal
+    Drive(DriveArguments),
+    /// List, set or end what other programs hold or slow a robot by
+    Limits(LimitsArguments),
+    /// Show or replace where the robots of a site may be
+    Geofence(GeofenceArguments),
     /// Show robots and missions as they change, until interrupted
     Watch(WatchArguments),
     /// Sign in to a server: the token is read from the input, or from `--token-file`, and kept
@@ -111,6 +121,11 @@ impl RemoteCommand {
             | Self::Token(arguments) => &arguments.connection,
             Self::Tokens(arguments) => &arguments.connection,
             Self::Audit(arguments) => &arguments.connection,
+            Self::Stop(arguments) => &arguments.connection,
+            Self::Clear(arguments) => &arguments.connection,
+            Self::Drive(arguments) => &arguments.connection,
+            Self::Limits(arguments) => &arguments.connection,
+            Self::Geofence(arguments) => &arguments.connection,
         }
     }
 }
@@ -293,6 +308,102 @@ pub(crate) struct WatchArguments {
 }
 
 #[derive(Debug, Args)]
+pub(crate) struct StopArguments {
+    /// Robots to stop
+    #[arg(required_unless_present = "all")]
+    pub(crate) robots: Vec<RobotId>,
+    /// Stop every robot of every site
+    #[arg(long, conflicts_with = "robots")]
+    pub(crate) all: bool,
+    /// Who stops, for others to see
+    #[arg(long, env = "USER")]
+    pub(crate) by: Option<String>,
+    /// Why
+    #[arg(long)]
+    pub(crate) reason: Option<String>,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ClearArguments {
+    /// Robot whose stop is cleared
+    pub(crate) robot: RobotId,
+    /// The stop; shown with its reason when absent, and nothing is cleared
+    pub(crate) stop: Option<StopId>,
+    /// Who clears, for others to see
+    #[arg(long, env = "USER")]
+    pub(crate) by: Option<String>,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct DriveArguments {
+    /// Robot to drive
+    pub(crate) robot: RobotId,
+    /// Who drives, for others to see
+    #[arg(long, env = "USER", default_value = "somebody")]
+    pub(crate) name: String,
+    /// Take the lease from whoever drives now
+    #[arg(long)]
+    pub(crate) take: bool,
+    /// Forward speed, metres per second
+    #[arg(long, value_name = "M/S", default_value_t = 0.4, value_parser = positive)]
+    pub(crate) speed: f64,
+    /// Yaw rate, radians per second
+    #[arg(long, value_name = "RAD/S", default_value_t = 0.6, value_parser = positive)]
+    pub(crate) turn: f64,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct LimitsArguments {
+    /// Robot to look at
+    pub(crate) robot: RobotId,
+    #[command(subcommand)]
+    pub(crate) action: Option<LimitsAction>,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum LimitsAction {
+    /// Hold or slow the robot for a while
+    Set {
+        /// Who limits
+        holder: HolderId,
+        /// The robot is to stand
+        #[arg(long, required_unless_present = "speed")]
+        hold: bool,
+        /// Fastest speed, metres per second
+        #[arg(long, value_name = "M/S", value_parser = finite)]
+        speed: Option<f64>,
+        /// How long it lasts
+        #[arg(long = "for", value_name = "TIME", value_parser = duration)]
+        lasting: Duration,
+    },
+    /// End a holder's limit
+    End {
+        /// Who limits
+        holder: HolderId,
+    },
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct GeofenceArguments {
+    /// Replace it by this file: JSON `{"keep_in": [[{"x_m": …, "y_m": …}, …], …], "keep_out": […]}`
+    #[arg(long, value_name = "FILE")]
+    pub(crate) set: Option<PathBuf>,
+    /// Only if it is still at this revision
+    #[arg(long, requires = "set")]
+    pub(crate) revision: Option<u64>,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Args)]
 pub(crate) struct DemoArguments {
     /// How many robots, out of the scenario
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=DEMO_ROBOTS_MAX))]
@@ -350,6 +461,14 @@ fn finite(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(number) if number.is_finite() => Ok(number),
         _ => Err("give a number".to_owned()),
+    }
+}
+
+/// Reads a number above zero.
+fn positive(text: &str) -> Result<f64, String> {
+    match finite(text) {
+        Ok(number) if number > 0.0 => Ok(number),
+        _ => Err("give a number above 0".to_owned()),
     }
 }
 

@@ -10,11 +10,13 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tread_api::friction::{CellFriction, TerrainFriction};
 use tread_api::identity::{AuditEntry, CreateToken, CreatedToken, Session, Token};
-use tread_api::ids::{MissionId, RobotId, SiteId, TerrainId, TokenId};
+use tread_api::ids::{HolderId, MissionId, RobotId, SiteId, TerrainId, TokenId};
 use tread_api::mission::{CreateMission, Mission, MissionDetail, ReplaceMission};
 use tread_api::page::{PAGE_LIMIT_MAX, Page};
 use tread_api::problem::{ProblemBody, ProblemType};
 use tread_api::robot::Robot;
+use tread_api::safety::{Geofence, LimitStatus, ReplaceGeofence, SetLimit};
+use tread_api::stop::{ClearStop, FleetStop, Stop, StopFleet, StopRobot};
 use tread_api::terrain::{CreateTerrain, Terrain};
 use tread_api::trajectory::{CheckTrajectory, TrajectoryCheck};
 
@@ -202,6 +204,29 @@ impl Client {
         }
     }
 
+    /// Sends what has no answer but that it is done.
+    async fn send_for_nothing(&self, request: RequestBuilder) -> Result<(), ClientError> {
+        let unreachable = |cause| ClientError::Unreachable {
+            address: self.address.clone(),
+            cause,
+        };
+        let response = request.send().await.map_err(unreachable)?;
+        let status = response.status();
+        if status.is_success() {
+            return Ok(());
+        }
+        let body = response.bytes().await.map_err(unreachable)?;
+        let problem =
+            serde_json::from_slice(&body).map_err(|cause| ClientError::NotUnderstood {
+                address: self.address.clone(),
+                status,
+                cause,
+            })?;
+        Err(ClientError::Refused {
+            problem: Box::new(problem),
+        })
+    }
+
     async fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
         self.send(self.request(Method::GET, path)).await
     }
@@ -343,6 +368,76 @@ impl Client {
         check: &CheckTrajectory,
     ) -> Result<TrajectoryCheck, ClientError> {
         self.post("/v1/trajectories/check", check).await
+    }
+
+    pub(crate) async fn stop_robot(
+        &self,
+        site: &SiteId,
+        robot: &RobotId,
+        words: &StopRobot,
+    ) -> Result<Stop, ClientError> {
+        self.post(&format!("/v1/sites/{site}/robots/{robot}/stop"), words)
+            .await
+    }
+
+    pub(crate) async fn stop_fleet(&self, words: &StopFleet) -> Result<FleetStop, ClientError> {
+        self.post("/v1/stop", words).await
+    }
+
+    pub(crate) async fn clear_stop(
+        &self,
+        site: &SiteId,
+        robot: &RobotId,
+        clear: &ClearStop,
+    ) -> Result<Stop, ClientError> {
+        self.post(
+            &format!("/v1/sites/{site}/robots/{robot}/stop/clear"),
+            clear,
+        )
+        .await
+    }
+
+    pub(crate) async fn limits(
+        &self,
+        site: &SiteId,
+        robot: &RobotId,
+    ) -> Result<Page<LimitStatus>, ClientError> {
+        self.get(&format!("/v1/sites/{site}/robots/{robot}/limits"))
+            .await
+    }
+
+    /// Sets a holder's limit, or ends it.
+    pub(crate) async fn change_limit(
+        &self,
+        site: &SiteId,
+        robot: &RobotId,
+        holder: &HolderId,
+        limit: Option<&SetLimit>,
+    ) -> Result<(), ClientError> {
+        let path = format!("/v1/sites/{site}/robots/{robot}/limits/{holder}");
+        let request = match limit {
+            Some(limit) => self.request(Method::PUT, &path).json(limit),
+            None => self.request(Method::DELETE, &path),
+        };
+        self.send_for_nothing(request).await
+    }
+
+    pub(crate) async fn geofence(&self, site: &SiteId) -> Result<Geofence, ClientError> {
+        self.get(&format!("/v1/sites/{site}/geofence")).await
+    }
+
+    pub(crate) async fn replace_geofence(
+        &self,
+        site: &SiteId,
+        geofence: &ReplaceGeofence,
+        revision: Option<u64>,
+    ) -> Result<Geofence, ClientError> {
+        let path = format!("/v1/sites/{site}/geofence");
+        let mut request = self.request(Method::PUT, &path).json(geofence);
+        if let Some(revision) = revision {
+            request = request.header("if-match", format!("\"{revision}\""));
+        }
+        self.send(request).await
     }
 
     /// Opens the stream of events of a site, from where `last` points.

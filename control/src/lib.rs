@@ -8,7 +8,8 @@
 //! * Planning (may allocate): [`trajectory`] is what is asked for, [`path`] its geometry,
 //!   [`profile`] its timing, [`excitation`] a wiggle of it, [`plan`] all, from where the robot stands.
 //! * Driving (one call per tick): [`mod@reference`] walks along the plan, [`tracking`] turns errors
-//!   into wheel speeds, [`follower`] runs one mission, [`gate`] has the last word.
+//!   into wheel speeds, [`follower`] runs one mission, [`mod@gate`] has the last word, [`fence`] says
+//!   how fast a robot may be where it is.
 //! * Knowing: [`localisation`] says where the robot is, [`estimation`] how the ground grips.
 //! * [`mod@paper`] is the paper this began with, exactly; its law is a bench, not what ships.
 //! * [`plant`] is the simulated base; [`mod@bench`] holds laws written only for comparison.
@@ -16,6 +17,7 @@
 pub mod bench;
 pub mod estimation;
 pub mod excitation;
+pub mod fence;
 pub mod follower;
 pub mod friction;
 pub mod gate;

@@ -20,23 +20,24 @@ use tread_api::robot::{Capabilities, OutboxStatus};
 use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
 use tread_api::wire::state::{FrictionReport, RobotState};
-use tread_control::robot::RobotModelError;
+use tread_control::robot::{RobotModel, RobotModelError};
 use uuid::Uuid;
 
 use crate::clock::{SharedClock, SystemClock};
-use crate::config::AgentConfig;
+use crate::config::{AgentConfig, SimulatedConfig};
 use crate::control_loop::seam::{AgentEnds, Shared, seam};
 use crate::control_loop::tick::LoopCore;
 use crate::control_loop::{self, BRAKING_MAX};
 use crate::dispatcher::{Dispatcher, Missions, SiteCell};
 use crate::drive::simulated::{SimMode, SimulatedDrive, SimulatedDriveError};
 use crate::fleet::uploader::{self, Backoff};
-use crate::fleet::{self, FleetLink, Identity, LinkError, Note, Noted};
+use crate::fleet::{self, FleetLink, Identity, LinkError, Listeners, Note, Noted};
 use crate::geometry::control_model;
 use crate::missions::memory::{Memory, MemoryError};
 use crate::outbox::{Outbox, OutboxError};
 use crate::recorder::Recorder;
 use crate::reporter::{Reporter, every, log_losses};
+use crate::safety::{Safety, watchdog};
 use crate::supervisor::{PartEnded, Supervisor};
 
 /// Longest time that a stopping agent waits for the server to take its last records.
@@ -112,16 +113,7 @@ impl Agent {
     ) -> Result<RunningAgent, StartError> {
         let model = control_model(&config.model)?;
         fleet::check_endpoint(&config.server)?;
-        let simulated = &config.drive;
-        let drive = SimulatedDrive::new(
-            &simulated.scenario,
-            model,
-            simulated.start,
-            simulated.seed,
-            SimMode::Auto,
-        )?
-        .with_charge(simulated.battery_charge_ratio)
-        .with_stall(simulated.stall);
+        let drive = simulated_drive(&config.drive, model)?;
         let boot = BootId::from_uuid(Uuid::new_v4());
         let outbox_folder = config.data_dir.join("outbox");
         let outbox = Outbox::open(&outbox_folder, config.outbox, config.robot.clone(), boot)?;
@@ -147,6 +139,14 @@ impl Agent {
             missions: Arc::clone(&missions),
             outbox: outbox.clone(),
         };
+        let safety = Safety::open(
+            &config.data_dir,
+            boot,
+            model,
+            &config.required_holders,
+            Arc::clone(&shared.safety),
+            Arc::clone(&clock),
+        );
         let core = LoopCore::new(model, loop_ends);
         let (loop_clock, period) = (Arc::clone(&clock), config.period());
         let no_thread = |part| move |source| StartError::Thread { part, source };
@@ -158,6 +158,7 @@ impl Agent {
                 control_loop::run(core, Box::new(drive), &loop_clock, period);
             })
             .map_err(no_thread("control loop"))?;
+        let watchdog = watch_loop(&supervisor, &shared, &clock).map_err(no_thread("watchdog"))?;
         supervisor.spawn(
             "outbox",
             outbox.clone().keep_synced(supervisor.stop_token()),
@@ -173,6 +174,7 @@ impl Agent {
             clock: Arc::clone(&clock),
             shared: Arc::clone(&shared),
             site: Arc::clone(&site),
+            safety: Arc::clone(&safety),
             outbox: outbox.clone(),
             rate_hz: config.rate_hz,
             states: AtomicU64::new(0),
@@ -186,6 +188,7 @@ impl Agent {
             missions,
             site,
             shared: Arc::clone(&shared),
+            safety,
             to_loop: commands,
             driving: Mutex::default(),
         });
@@ -208,9 +211,30 @@ impl Agent {
             outbox,
             reporter,
             is_connected,
-            threads: vec![looping, recording],
+            threads: vec![looping, recording, watchdog],
         })
     }
+}
+
+fn simulated_drive(
+    simulated: &SimulatedConfig,
+    model: RobotModel,
+) -> Result<SimulatedDrive, SimulatedDriveError> {
+    let (start, seed) = (simulated.start, simulated.seed);
+    let drive = SimulatedDrive::new(&simulated.scenario, model, start, seed, SimMode::Auto)?;
+    let drive = drive.with_charge(simulated.battery_charge_ratio);
+    Ok(drive.with_stall(simulated.stall))
+}
+
+fn watch_loop(
+    supervisor: &Supervisor,
+    shared: &Arc<Shared>,
+    clock: &SharedClock,
+) -> std::io::Result<JoinHandle<()>> {
+    let (shared, clock) = (Arc::clone(shared), Arc::clone(clock));
+    supervisor.spawn_thread("watchdog of the control loop", move || {
+        watchdog::run(&shared, &clock);
+    })
 }
 
 /// Reads the mission memory; what was in hand when the agent died is reported as failed.
@@ -281,7 +305,14 @@ impl Online {
             () = self.stop.cancelled() => return,
         }
         let server = &self.config.server;
-        let connecting = FleetLink::connect(server, self.identity.clone(), note, &self.stop);
+        let listeners = Listeners {
+            note,
+            urgent: {
+                let safety = Arc::clone(&self.dispatcher.safety);
+                Arc::new(move |urgent| safety.take_urgent(urgent))
+            },
+        };
+        let connecting = FleetLink::connect(server, self.identity.clone(), listeners, &self.stop);
         let (link, commands) = match connecting.await {
             Ok(Some((link, commands))) => (Arc::new(link), commands),
             Ok(None) => return,
@@ -352,6 +383,8 @@ impl Online {
                 replace: true,
                 battery: true,
                 wheel_torque: true,
+                stop: true,
+                teleop: true,
                 rate_hz: Some(self.config.rate_hz),
                 base: Some("simulated".to_owned()),
             },

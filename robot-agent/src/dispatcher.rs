@@ -38,9 +38,14 @@ use crate::fleet::{Commands, IncomingCommand};
 use crate::geometry::{control_trajectory, plan_options};
 use crate::missions::memory::Memory;
 use crate::missions::{CancelDecision, Held, Holder, OfferDecision};
+use crate::safety::{Safety, answers};
 
 /// Offers that may wait while another is planned; the server asks again for more.
 const OFFERS_MAX: usize = 8;
+/// Stops, leases and limits that may wait while one is written to the disk.
+const URGENT_MAX: usize = 32;
+/// Farthest that a robot may be from where a paused mission goes on, metres.
+const RESUME_WITHIN_M: f64 = 0.5;
 /// Longest wait until the loop holds a mission for its next revision.
 const HOLD_WAIT_MAX: Duration = Duration::from_secs(5);
 /// Time between two looks at what the loop does.
@@ -106,6 +111,7 @@ pub(crate) struct Dispatcher {
     pub(crate) missions: Arc<Missions>,
     pub(crate) site: Arc<SiteCell>,
     pub(crate) shared: Arc<Shared>,
+    pub(crate) safety: Arc<Safety>,
     pub(crate) to_loop: SyncSender<LoopCommand>,
     /// The plan that the loop was given last.
     pub(crate) driving: Mutex<Option<Driving>>,
@@ -164,14 +170,26 @@ impl Dispatcher {
     /// Answers for ever.
     pub(crate) async fn run(self: Arc<Self>, mut commands: Commands, stop: CancellationToken) {
         let (to_planner, mut offers) = mpsc::channel(OFFERS_MAX);
+        let (to_guard, mut urgent) = mpsc::channel(URGENT_MAX);
         let answering = async {
             while let Some(command) = commands.recv().await {
-                if command.verb != Verb::Offer {
-                    self.respond(command).await;
-                } else if to_planner.try_send(command).is_err() {
+                let lane = match command.verb {
+                    Verb::Offer => &to_planner,
+                    Verb::Stop | Verb::Clear | Verb::Lease | Verb::Limit => &to_guard,
+                    Verb::Cancel | Verb::Pause | Verb::Resume | Verb::Site => {
+                        self.respond(command).await;
+                        continue;
+                    }
+                };
+                if lane.try_send(command).is_err() {
                     // Dropped: the server sees no reply and asks again.
                     Shared::count(&self.shared.lost_commands);
                 }
+            }
+        };
+        let guarding = async {
+            while let Some(command) = urgent.recv().await {
+                self.respond(command).await;
             }
         };
         let planning = async {
@@ -180,7 +198,7 @@ impl Dispatcher {
             }
         };
         tokio::select! {
-            ((), ()) = async { tokio::join!(answering, planning) } => {}
+            ((), (), ()) = async { tokio::join!(answering, guarding, planning) } => {}
             () = stop.cancelled() => {}
         }
     }
@@ -217,12 +235,22 @@ impl Dispatcher {
             }
             Verb::Site => {
                 let definition: SiteDefinition = wire::decode(payload)?;
-                if self.take_site(definition) {
+                let checked = definition.geofence.validate();
+                if let Err(cause) = checked {
+                    refused(OfferRefusal::Impossible, cause.to_string())
+                } else if self.take_site(definition) {
                     Outcome::Done
                 } else {
                     refused(OfferRefusal::NotReady, "the control loop is busy")
                 }
             }
+            Verb::Stop => answers::stop(&self.safety, &wire::decode(payload)?).await,
+            Verb::Clear => {
+                let clear = wire::decode(payload)?;
+                answers::clear(&self.safety, &self.shared, &self.clock, &clear).await
+            }
+            Verb::Lease => answers::lease(&self.safety, &wire::decode(payload)?),
+            Verb::Limit => answers::limit(&self.safety, &wire::decode(payload)?),
         })
     }
 
@@ -286,6 +314,9 @@ impl Dispatcher {
         if let Err((code, detail)) = self.missions.holder().check_held(mission, revision) {
             return refused(code, detail);
         }
+        if !is_pause && let Err(refusal) = self.may_resume() {
+            return refusal;
+        }
         let (command, what) = if is_pause {
             (LoopCommand::Hold(mission, Hold::Pause), "pausing")
         } else {
@@ -296,6 +327,27 @@ impl Dispatcher {
         }
         info!(mission.id = %mission, "{what} {mission}");
         Outcome::Done
+    }
+
+    /// Whether a paused mission may go on now.
+    fn may_resume(&self) -> Result<(), Outcome> {
+        if let Some(latch) = self.safety.latch() {
+            let detail = format!("stopped by {}: {}", latch.by, latch.reason);
+            return Err(refused(OfferRefusal::Stopped, detail));
+        }
+        if let Some(lease) = self.safety.lease_now() {
+            let detail = format!("{} drives the robot by hand", lease.driver.name);
+            return Err(refused(OfferRefusal::Leased, detail));
+        }
+        match self.shared.snapshot().off_path_m {
+            Some(off_m) if off_m.is_nan() || off_m > RESUME_WITHIN_M => Err(refused(
+                OfferRefusal::Impossible,
+                format!(
+                    "the robot is {off_m:.1} m from where the mission goes on: drive it back, or replace the mission"
+                ),
+            )),
+            Some(_) | None => Ok(()),
+        }
     }
 
     async fn plan_and_start(&self, offer: Offer, start_by: Option<Duration>) -> Outcome {
@@ -414,12 +466,19 @@ impl Dispatcher {
         start_by: Option<Duration>,
     ) -> Result<Planned, String> {
         let model = self.model;
+        let view = self.site.view();
         let offer = offer.clone();
         let planning = tokio::task::spawn_blocking(move || {
             let trajectory = control_trajectory(&offer.trajectory);
             let options = plan_options(&offer.trajectory);
             let plan = Plan::with_options(&trajectory, start, &model, &options)
                 .map_err(|cause| cause.to_string())?;
+            if let Some(breach) = view.and_then(|view| view.fence().plan_breach(&plan, &model)) {
+                return Err(format!(
+                    "the way leaves the geofence at ({:.1} m, {:.1} m), {:.1} m along it",
+                    breach.point.x_m, breach.point.y_m, breach.arc_m,
+                ));
+            }
             let summary = PlanSummary {
                 length_m: plan.length_m(),
                 duration_s: plan.duration_s(),

@@ -3,8 +3,9 @@
 //! Both crates know nobody, so each has its own points and poses; this is the only place that
 //! turns one into the other.
 
-use tread_api::{geometry as wire, robot, trajectory};
+use tread_api::{geometry as wire, robot, safety, trajectory};
 use tread_control::excitation::ExcitationSpec;
+use tread_control::fence::Fence;
 use tread_control::geometry as control;
 use tread_control::plan::PlanOptions;
 use tread_control::robot::{Limits, RobotModel, RobotModelError, RobotModelSpec};
@@ -33,6 +34,18 @@ pub(crate) fn control_point(point: wire::Point) -> control::Point {
         x_m: point.x_m,
         y_m: point.y_m,
     }
+}
+
+/// A geofence for the controller.
+pub fn fence_of(geofence: &safety::Geofence) -> Fence {
+    let rings = |polygons: &[wire::Polygon]| {
+        let corners = |polygon: &wire::Polygon| {
+            let corners = polygon.corners().iter();
+            corners.map(|corner| control_point(*corner)).collect()
+        };
+        polygons.iter().map(corners).collect()
+    };
+    Fence::new(rings(&geofence.keep_in), rings(&geofence.keep_out))
 }
 
 /// The position of a pose for the wire.

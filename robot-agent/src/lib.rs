@@ -8,6 +8,7 @@
 //! * The loop: `control_loop`, the base behind [`drive`], the simulated one in [`sim`].
 //! * Around it: [`missions`] (what is held), `dispatcher` (answers), `alerts`, `recorder` and [`outbox`]
 //!   (what must not be lost), `reporter` (what may), [`fleet`] (the only one that knows zenoh).
+//! * `safety`: what may only slow the robot down, and driving by hand.
 //! * [`mod@bench`] steps the loop by hand, for tests and figures.
 //! * Below all: [`clock`], `supervisor`, [`geometry`] (between wire and controller).
 //!
@@ -28,8 +29,10 @@ pub mod sim;
 mod alerts;
 mod control_loop;
 mod dispatcher;
+mod durable;
 mod recorder;
 mod reporter;
+mod safety;
 mod supervisor;
 
 pub use agent::{Agent, RunningAgent};

@@ -9,15 +9,18 @@ use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 use tread_api::friction::LiveFriction;
 use tread_api::robot::{Aged, Battery, LoopStatus};
+use tread_api::safety::{self, GateCount, GateStatus, SafetyStatus};
 use tread_api::wire::state::{FrictionReport, RobotState};
+use tread_control::gate::GateCause;
 
 use crate::alerts::{Alerts, Causes};
 use crate::clock::SharedClock;
-use crate::control_loop::seam::Shared;
+use crate::control_loop::seam::{Shared, Snapshot};
 use crate::dispatcher::SiteCell;
 use crate::fleet::{FleetLink, Identity};
 use crate::geometry::{wire_pose, wire_twist};
 use crate::outbox::Outbox;
+use crate::safety::{Safety, microseconds};
 
 /// Who tells others how the robot is.
 #[derive(Debug)]
@@ -26,11 +29,32 @@ pub(crate) struct Reporter {
     pub(crate) clock: SharedClock,
     pub(crate) shared: Arc<Shared>,
     pub(crate) site: Arc<SiteCell>,
+    pub(crate) safety: Arc<Safety>,
     pub(crate) outbox: Outbox,
     pub(crate) rate_hz: f64,
     pub(crate) states: AtomicU64,
     pub(crate) frictions: AtomicU64,
     pub(crate) alerts: Mutex<Alerts>,
+}
+
+/// A cause for the wire.
+fn wire_cause(cause: GateCause) -> safety::GateCause {
+    match cause {
+        GateCause::Acceleration => safety::GateCause::Acceleration,
+        GateCause::Speed => safety::GateCause::Speed,
+        GateCause::CommandAge => safety::GateCause::CommandAge,
+        GateCause::ExternalLimit => safety::GateCause::ExternalLimit,
+        GateCause::Fence => safety::GateCause::Fence,
+        GateCause::NotFinite => safety::GateCause::NotFinite,
+        GateCause::NoCommand => safety::GateCause::NoCommand,
+        GateCause::Lease => safety::GateCause::Lease,
+        GateCause::LinkPolicy => safety::GateCause::LinkPolicy,
+        GateCause::ExternalHold => safety::GateCause::ExternalHold,
+        GateCause::StalePosition => safety::GateCause::StalePosition,
+        GateCause::Tilt => safety::GateCause::Tilt,
+        GateCause::StaleFeedback => safety::GateCause::StaleFeedback,
+        GateCause::Stop => safety::GateCause::Stop,
+    }
 }
 
 fn aged<T>(value: T, at: Duration, now: Duration) -> Aged<T> {
@@ -58,6 +82,7 @@ impl Reporter {
             boot: self.identity.boot,
             seq: self.states.fetch_add(1, Ordering::Relaxed),
             robot_time: self.clock.wall(),
+            monotonic_us: Some(microseconds(now)),
             mode: snapshot.mode,
             fault: snapshot.fault.map(|fault| fault.text().to_owned()),
             pose: snapshot
@@ -90,6 +115,32 @@ impl Reporter {
                 .lock()
                 .unwrap_or_else(PoisonError::into_inner)
                 .judge(&causes),
+            safety: self.safety_status(&snapshot),
+        }
+    }
+
+    fn safety_status(&self, snapshot: &Snapshot) -> SafetyStatus {
+        let gate = &snapshot.gate;
+        let counts = GateCause::ALL.into_iter().zip(gate.counts);
+        let (limits, limits_refused) = self.safety.limits_status();
+        SafetyStatus {
+            stop: self.safety.latch(),
+            lease: self.safety.lease_now(),
+            drive: self.safety.drive_status(),
+            gate: GateStatus {
+                cause: gate.cause.map(wire_cause),
+                reduced_ticks: gate.reduced_ticks,
+                counts: counts
+                    .filter(|(_, times)| *times > 0)
+                    .map(|(cause, times)| GateCount {
+                        cause: wire_cause(cause),
+                        times,
+                    })
+                    .collect(),
+            },
+            limits,
+            limits_refused,
+            fence_revision: snapshot.fence_revision,
         }
     }
 

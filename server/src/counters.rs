@@ -82,6 +82,20 @@ counters! {
     offers_sent,
     /// Commands that no robot answered.
     commands_unanswered,
+    /// Stops sent to robots, with repetitions.
+    stops_sent,
+    /// Stops that their robots had not confirmed within 300 ms.
+    stops_unconfirmed,
+    /// Stops that robots no longer showed although nobody had cleared them; sent again.
+    stops_lost,
+    /// Drive commands sent to robots.
+    drive_commands_sent,
+    /// Drive commands that a newer one of the same socket replaced before they were sent.
+    drive_commands_replaced,
+    /// Drive sockets closed because a frame was malformed, too large or not allowed.
+    drive_frames_refused,
+    /// Drivers whose socket was lost while they had the lease; their robots were told to stand.
+    drivers_lost,
     /// HTTP connections refused because too many were open.
     http_connections_refused,
     /// HTTP connections ended to make room for new ones: idle, or without a whole request.

@@ -35,7 +35,7 @@ use tokio::sync::mpsc;
 use tracing::{info, warn};
 
 use self::app::identity::audit;
-use self::app::{App, events, ingest, reconciler};
+use self::app::{App, Links, events, ingest, reconciler};
 use self::clock::Clock;
 pub use self::config::{Config, ServerArgs};
 use self::db::Db;
@@ -89,6 +89,11 @@ impl Server {
         let supervisor = Supervisor::new();
         let stop = || supervisor.stop_token();
         let fleet = Fleet::open(config.zenoh, supervisor.clone()).await?;
+        app.connect(Links {
+            commands: fleet.commands(&app),
+            teleop: fleet.teleop(),
+            supervisor: supervisor.clone(),
+        });
         let (uploads, uploads_in) = mpsc::channel(ingest::UPLOADS_WAITING_MAX);
         supervisor.spawn_vital("ingest", ingest::run(app.clone(), uploads_in, stop()));
         fleet.listen(&app, uploads).await?;

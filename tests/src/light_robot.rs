@@ -188,6 +188,8 @@ impl LightRobot {
             },
             battery: None,
             alerts: Vec::new(),
+            monotonic_us: None,
+            safety: tread_api::safety::SafetyStatus::default(),
         };
         self.next_state += 1;
         let put = self.state_publisher.put(wire::encode(&state)?).await;

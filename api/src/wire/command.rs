@@ -87,6 +87,11 @@ pub enum Outcome {
     },
     /// The command has taken effect, now or already before.
     Done,
+    /// The lease of driving by hand is given; the run that gave it is that of the answer.
+    Leased {
+        /// The lease.
+        epoch: u64,
+    },
     /// The robot will not.
     Refused {
         /// For programs.
@@ -112,8 +117,16 @@ pub enum OfferRefusal {
     NotReady,
     /// The latest start has passed.
     TooLate,
-    /// The mission is not known here.
+    /// The mission, or whatever the command names, is not known here.
     Unknown,
+    /// Somebody else drives the robot by hand; the detail names who.
+    Leased,
+    /// A stop is in force.
+    Stopped,
+    /// The robot does not stand.
+    Moving,
+    /// There are too many of these.
+    TooMany,
     /// Any code of a newer peer.
     #[serde(other)]
     Other,

@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::ids::{BootId, RobotId};
 use crate::robot::{Capabilities, RobotModel};
+use crate::safety::Geofence;
 use crate::site::Grid;
 use crate::terrain::TerrainShape;
 
@@ -44,4 +45,7 @@ pub struct SiteDefinition {
     pub terrain_revision: u64,
     /// All terrains.
     pub terrains: Vec<TerrainShape>,
+    /// Where robots may be. An older server has none, an older robot ignores it.
+    #[serde(default)]
+    pub geofence: Geofence,
 }

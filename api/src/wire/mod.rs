@@ -6,6 +6,7 @@
 pub mod command;
 pub mod hello;
 pub mod ingest;
+pub mod safety;
 pub mod state;
 
 use serde::de::DeserializeOwned;

@@ -9,6 +9,7 @@ use crate::ids::{BootId, RobotId};
 use crate::robot::{
     Aged, AlertReport, Battery, LoopStatus, MissionProgress, OutboxStatus, RobotMode,
 };
+use crate::safety::SafetyStatus;
 use crate::site::Cell;
 use crate::terrain::TerrainRef;
 
@@ -25,6 +26,10 @@ pub struct RobotState {
     pub seq: u64,
     /// The robot's wall clock; it may be wrong.
     pub robot_time: Timestamp,
+    /// The agent's monotonic clock at sending, microseconds: what end times for this run are told
+    /// in. An older agent has none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub monotonic_us: Option<u64>,
     /// What the agent is doing.
     pub mode: RobotMode,
     /// What is broken, if anything.
@@ -49,6 +54,9 @@ pub struct RobotState {
     /// [`ALERTS_MAX`](crate::robot::ALERTS_MAX), each code once.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub alerts: Vec<AlertReport>,
+    /// What may only slow the robot down. Absent from an older agent.
+    #[serde(default)]
+    pub safety: SafetyStatus,
 }
 
 /// The server's pulse, published every [`PULSE_PERIOD_MS`] milliseconds on the site's `pulse` key.

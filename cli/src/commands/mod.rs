@@ -1,10 +1,14 @@
 //! The commands that talk to a running server, a file each.
 
+mod drive;
 mod friction;
+mod geofence;
 mod identity;
+mod limits;
 mod missions;
 mod robots;
 mod send;
+mod stops;
 mod terrains;
 mod watch;
 
@@ -39,6 +43,11 @@ pub(crate) async fn run(command: RemoteCommand) -> anyhow::Result<ExitCode> {
         RemoteCommand::Missions(arguments) => missions::run(&arguments, &client, output).await,
         RemoteCommand::Terrains(arguments) => terrains::run(&arguments, &client, output).await,
         RemoteCommand::Friction(arguments) => friction::run(&arguments, &client, output).await,
+        RemoteCommand::Stop(arguments) => stops::stop(arguments, &client, output).await,
+        RemoteCommand::Clear(arguments) => stops::clear(arguments, &client, output).await,
+        RemoteCommand::Drive(arguments) => drive::run(&arguments, &client).await,
+        RemoteCommand::Limits(arguments) => limits::run(arguments, &client, output).await,
+        RemoteCommand::Geofence(arguments) => geofence::run(&arguments, &client, output).await,
         RemoteCommand::Watch(arguments) => watch::run(&arguments, &client, output).await,
     }
 }

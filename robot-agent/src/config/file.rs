@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use serde::Deserialize;
-use tread_api::ids::{RobotId, SiteId};
+use tread_api::ids::{HolderId, RobotId, SiteId};
 use tread_api::robot::RobotModel;
 
 use super::ConfigError;
@@ -19,6 +19,7 @@ pub(super) struct FileConfig {
     pub(super) rate_hz: Option<f64>,
     pub(super) state_rate_hz: Option<f64>,
     pub(super) friction_rate_hz: Option<f64>,
+    pub(super) required_holders: Option<Vec<HolderId>>,
     pub(super) model: Option<ModelFile>,
     pub(super) drive: Option<DriveFile>,
 }

@@ -8,8 +8,9 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Parser;
-use tread_api::ids::{RobotId, SiteId};
+use tread_api::ids::{HolderId, RobotId, SiteId};
 use tread_api::robot::RobotModel;
+use tread_api::safety::LIMITS_MAX;
 use tread_control::geometry::Pose;
 
 use file::{DriveFile, FileConfig};
@@ -168,6 +169,9 @@ pub struct AgentConfig {
     pub model: RobotModel,
     /// The base.
     pub drive: SimulatedConfig,
+    /// Holders of external limits whose silence holds the robot, at most
+    /// [`LIMITS_MAX`](tread_api::safety::LIMITS_MAX).
+    pub required_holders: Vec<HolderId>,
     /// Bounds of the outbox.
     pub outbox: outbox::Limits,
 }
@@ -311,6 +315,13 @@ fn assemble(
         problem: refused.to_string(),
     })?;
     let server = flags.server.clone().or(file.server);
+    let required_holders = file.required_holders.unwrap_or_default();
+    if required_holders.len() > LIMITS_MAX {
+        return Err(ConfigError::OutOfRange {
+            key: "required_holders",
+            problem: format!("at most {LIMITS_MAX} programs may limit a robot"),
+        });
+    }
     Ok(AgentConfig {
         drive: simulated(flags, file.drive, scenario, &robot)?,
         site,
@@ -321,6 +332,7 @@ fn assemble(
         state_rate_hz,
         friction_rate_hz,
         model,
+        required_holders,
         outbox: outbox::Limits::default(),
     })
 }

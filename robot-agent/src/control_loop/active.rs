@@ -1,7 +1,7 @@
 //! The mission that the loop has in hand: driven, held standing, and ended for a reason.
 //!
 //! ```text
-//!          hold (pause, replacement)          stands
+//!          hold (pause, revision, outside)    stands
 //! driving ─────────────────────────► braking ────────► standing
 //!    ▲ └────────────── cancel, silence ──────┴────────────┤ │
 //!    └──────────────────── release ───────────────────────┘ ▼
@@ -11,7 +11,7 @@
 
 use std::time::Duration;
 
-use tread_api::robot::MissionProgress;
+use tread_api::robot::{MissionProgress, PauseCause};
 use tread_control::follower::FollowerStatus;
 use tread_control::gate::GateCause;
 use tread_control::measured::{Measured, WheelSpeeds};
@@ -53,6 +53,8 @@ pub(crate) enum Hold {
     Pause,
     /// Its next revision is being planned from where it comes to stand.
     Replacement,
+    /// Somebody outside holds the robot; it goes on by itself when that ends.
+    Outside,
 }
 
 /// What holds a mission now.
@@ -60,6 +62,7 @@ pub(crate) enum Hold {
 struct Holds {
     pause: bool,
     replacement: bool,
+    outside: bool,
 }
 
 /// The mission in hand.
@@ -88,6 +91,7 @@ pub(super) fn progress_of(job: &Job) -> MissionProgress {
         length_m: job.follower.plan().length_m(),
         cross_track_m: 0.0,
         paused: false,
+        paused_by: None,
     }
 }
 
@@ -114,11 +118,37 @@ impl Active {
         }
     }
 
+    /// Pauses the mission until somebody resumes it; the strictest cause is the one reported.
+    pub(super) fn pause(&mut self, cause: PauseCause) {
+        let rank = |cause: PauseCause| match cause {
+            PauseCause::Other => 0,
+            PauseCause::Request => 1,
+            PauseCause::Teleoperation => 2,
+            PauseCause::Stop => 3,
+        };
+        let is_stricter = |present: PauseCause| rank(cause) > rank(present);
+        if self.progress.paused_by.is_none_or(is_stricter) {
+            self.hold(Hold::Pause, true);
+            self.progress.paused_by = Some(cause);
+        }
+    }
+
     /// Holds the mission, or lets it go on.
     pub(super) fn hold(&mut self, hold: Hold, is_wanted: bool) {
-        match hold {
-            Hold::Pause => self.holds.pause = is_wanted,
-            Hold::Replacement => self.holds.replacement = is_wanted,
+        let present = match hold {
+            Hold::Pause => {
+                self.progress.paused_by = match self.progress.paused_by {
+                    _ if !is_wanted => None,
+                    None => Some(PauseCause::Request),
+                    known => known,
+                };
+                &mut self.holds.pause
+            }
+            Hold::Replacement => &mut self.holds.replacement,
+            Hold::Outside => &mut self.holds.outside,
+        };
+        if std::mem::replace(present, is_wanted) == is_wanted {
+            return;
         }
         let is_held = self.is_held();
         if !is_held {
@@ -129,7 +159,22 @@ impl Active {
 
     /// Whether it is held, braking or standing.
     pub(super) fn is_held(&self) -> bool {
-        self.holds.pause || self.holds.replacement
+        self.holds.pause || self.holds.replacement || self.holds.outside
+    }
+
+    /// Whether it leaves the wheels to others: it stands held, or is over but for a revision.
+    pub(super) fn rests(&self) -> bool {
+        self.stands_held() && self.job.follower.status() != FollowerStatus::Stopping
+    }
+
+    /// Limits the speed along the path, metres per second.
+    pub(super) fn limit_speed(&mut self, limit_m_s: Option<f64>) {
+        self.job.follower.set_speed_limit(limit_m_s);
+    }
+
+    /// Holds the law's adaptation.
+    pub(super) fn hold_adaptation(&mut self, is_held: bool) {
+        self.job.follower.hold_adaptation(is_held);
     }
 
     fn stands_held(&self) -> bool {
@@ -161,10 +206,14 @@ impl Active {
         }
         self.progress = MissionProgress {
             paused: self.is_told_paused,
+            paused_by: self.progress.paused_by,
             ..progress_of(&next)
         };
         let old = std::mem::replace(&mut self.job, next);
         self.hold(Hold::Replacement, false);
+        if self.is_held() {
+            self.job.follower.set_pace(0.0);
+        }
         Some(old)
     }
 

@@ -16,6 +16,7 @@ use tread_api::site::Cell;
 use tread_api::wire::ingest::MissionPhase;
 use tread_control::estimation::SegmentStatistics;
 use tread_control::follower::{FailureReason, Follower};
+use tread_control::gate::GateCause;
 use tread_control::geometry::{Pose, Twist};
 use tread_control::reference::Governor;
 
@@ -23,6 +24,7 @@ use super::active::Hold;
 use super::driven::Driven;
 use super::site_view::SiteView;
 use crate::drive::Battery;
+use crate::safety::SafetyCell;
 
 /// Commands that may wait for the next tick.
 pub(crate) const COMMANDS_MAX: usize = 16;
@@ -172,6 +174,19 @@ impl Fault {
     }
 }
 
+/// What the gate did since the start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct GateSnapshot {
+    /// The strictest cause in the last tick.
+    pub(crate) cause: Option<GateCause>,
+    /// Whether it was on the way to rest, or there.
+    pub(crate) target_rests: bool,
+    /// Ticks in which it reduced a command.
+    pub(crate) reduced_ticks: u64,
+    /// How often each cause began, in the order of [`GateCause::ALL`].
+    pub(crate) counts: [u64; GateCause::ALL.len()],
+}
+
 /// What the loop last said of itself.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Snapshot {
@@ -191,6 +206,14 @@ pub(crate) struct Snapshot {
     pub governor: Option<Governor>,
     /// What holds the mission.
     pub is_held: bool,
+    /// How far the robot is from where its held mission goes on, metres.
+    pub off_path_m: Option<f64>,
+    /// Whether the wheels are commanded to rest and do.
+    pub stands: bool,
+    /// What the gate does.
+    pub(crate) gate: GateSnapshot,
+    /// The revision of the geofence that the loop keeps to.
+    pub fence_revision: Option<u64>,
     /// The battery, if the base measures it.
     pub battery: Option<Battery>,
     /// θ̂ of the loop; kept from the last mission, none before the first.
@@ -220,6 +243,10 @@ impl Default for Snapshot {
             mission: None,
             governor: None,
             is_held: false,
+            off_path_m: None,
+            stands: false,
+            gate: GateSnapshot::default(),
+            fence_revision: None,
             battery: None,
             theta_loop: None,
             theta_measured: None,
@@ -236,6 +263,10 @@ impl Default for Snapshot {
 #[derive(Debug, Default)]
 pub(crate) struct Shared {
     snapshot: Mutex<Snapshot>,
+    /// What may only slow the robot down.
+    pub(crate) safety: Arc<SafetyCell>,
+    /// Ticks since the start, for whoever watches the loop.
+    pub(crate) ticks: AtomicU64,
     /// Tells the loop to brake and end.
     pub(crate) stop: AtomicBool,
     /// Ticks that began more than one period late.

@@ -5,8 +5,11 @@ use tread_api::geometry::Point;
 use tread_api::site::{Cell, Grid};
 use tread_api::terrain::TerrainRef;
 use tread_api::wire::hello::SiteDefinition;
+use tread_control::fence::Fence;
 use tread_control::geometry::Pose;
 use tread_control::robot::RobotModel;
+
+use crate::geometry::fence_of;
 
 /// How far a robot must be outside a cell before it counts as having left it, metres: more than
 /// the noise of its position, so that a path along a border does not chop its segments.
@@ -61,6 +64,7 @@ pub(crate) enum Footing {
 #[derive(Debug)]
 pub(crate) struct SiteView {
     definition: SiteDefinition,
+    fence: Fence,
     bounds: Vec<Bounds>,
     /// Places in the definition, the one that counts first.
     order: Vec<usize>,
@@ -81,8 +85,10 @@ impl SiteView {
                 .cmp(&left.layer)
                 .then_with(|| left.terrain.id.cmp(&right.terrain.id))
         });
+        let fence = fence_of(&definition.geofence);
         Self {
             definition,
+            fence,
             bounds,
             order,
         }
@@ -94,6 +100,15 @@ impl SiteView {
 
     pub(crate) fn terrain_revision(&self) -> u64 {
         self.definition.terrain_revision
+    }
+
+    /// Where the robot may be.
+    pub(crate) fn fence(&self) -> &Fence {
+        &self.fence
+    }
+
+    pub(crate) fn fence_revision(&self) -> u64 {
+        self.definition.geofence.revision
     }
 
     /// The terrain at a place in the definition.
@@ -150,6 +165,7 @@ impl SiteView {
 mod tests {
     use proptest::prelude::*;
     use tread_api::geometry::Polygon;
+    use tread_api::safety::Geofence;
     use tread_api::terrain::{TerrainShape, terrain_at};
 
     use super::*;
@@ -180,6 +196,7 @@ mod tests {
             grid,
             terrain_revision: 3,
             terrains,
+            geofence: Geofence::default(),
         }
     }
 

@@ -28,6 +28,8 @@ pub struct SensorSample {
     pub wheel_torques: Option<WheelTorques>,
     /// Speed of the body over ground, ahead, metres per second.
     pub body_speed_m_s: Option<f64>,
+    /// How far the robot leans from level, radians.
+    pub tilt_rad: Option<f64>,
     /// A position fix in the site's frame.
     pub position: Option<Pose>,
 }

@@ -10,7 +10,7 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::plant::{Plant, PlantError, PlantSpec, PlantState};
 use tread_control::robot::RobotModel;
 
-use super::{Battery, Drive, Feedback};
+use super::{Battery, Drive, Feedback, SensorSample};
 use crate::sim::battery::SimulatedBattery;
 use crate::sim::ground::GroundMap;
 use crate::sim::scenario::{GroundSpec, Scenario, ScenarioError};
@@ -18,6 +18,10 @@ use crate::sim::sensors::{SAMPLE_PERIOD, SensorSpec, Sensors};
 
 /// Most simulated time of one call; a process that slept longer finds its robot paused.
 const CATCH_UP_MAX: Duration = Duration::from_secs(1);
+
+/// Longest time that the base drives on without a new command; then it stops its wheels, as every
+/// base must.
+pub const COMMAND_TIMEOUT: Duration = Duration::from_millis(300);
 
 /// What moves the simulated time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -59,6 +63,9 @@ pub struct SimulatedDrive {
     track_width_m: f64,
     battery: SimulatedBattery,
     command: WheelSpeeds,
+    /// When the command came, in simulated time.
+    commanded_at: Duration,
+    tilt_rad: f64,
     waiting: Feedback,
     /// Up to when it has been simulated; none before the first call.
     simulated_to: Option<Duration>,
@@ -93,6 +100,8 @@ impl SimulatedDrive {
             track_width_m: model.track_width_m(),
             battery: SimulatedBattery::new(1.0),
             command: WheelSpeeds::default(),
+            commanded_at: Duration::ZERO,
+            tilt_rad: 0.0,
             waiting: Feedback::default(),
             simulated_to: None,
             stall: None,
@@ -112,6 +121,11 @@ impl SimulatedDrive {
     pub fn with_stall(mut self, stall: Option<Stall>) -> Self {
         self.stall = stall;
         self
+    }
+
+    /// Leans the base from level, radians; a simulated fault.
+    pub fn lean(&mut self, tilt_rad: f64) {
+        self.tilt_rad = tilt_rad;
     }
 
     /// The true state, for tests and figures.
@@ -137,6 +151,9 @@ impl SimulatedDrive {
         let mut at = from.max(now.saturating_sub(CATCH_UP_MAX));
         while at + SAMPLE_PERIOD <= now {
             at += SAMPLE_PERIOD;
+            if at.saturating_sub(self.commanded_at) > COMMAND_TIMEOUT {
+                self.command = WheelSpeeds::default();
+            }
             let ground = self
                 .ground
                 .under(self.plant.state().pose, self.track_width_m);
@@ -147,7 +164,10 @@ impl SimulatedDrive {
                 wheels.left_rad_s * torques.left_n_m + wheels.right_rad_s * torques.right_n_m;
             self.battery.step(wheels_w, SAMPLE_PERIOD.as_secs_f64());
             let sample = self.sensors.sample(&self.plant, at);
-            self.waiting.push(sample);
+            self.waiting.push(SensorSample {
+                tilt_rad: Some(self.tilt_rad),
+                ..sample
+            });
         }
         self.simulated_to = Some(at);
     }
@@ -167,6 +187,7 @@ impl Drive for SimulatedDrive {
 
     fn write(&mut self, command: WheelSpeeds) {
         self.command = command;
+        self.commanded_at = self.simulated_to.unwrap_or_default();
     }
 
     fn battery(&self) -> Option<Battery> {

@@ -14,8 +14,9 @@ use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
-use tread_api::ids::{BootId, RobotId, SiteId};
+use tread_api::ids::{BootId, HolderId, RobotId, SiteId};
 use tread_api::keys::{self, Key, Verb};
+use tread_api::safety::SMALL_PAYLOAD_MAX;
 use tread_api::wire::command::Answer;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::ingest::{Batch, Receipt};
@@ -69,6 +70,35 @@ pub enum Noted {
 
 /// Who is told of what the link notices; must not wait.
 pub type Note = Arc<dyn Fn(Noted) + Send + Sync>;
+
+/// What must not wait in any queue, as it came.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Urgent<'payload> {
+    /// A stop; it is answered later, as a command.
+    Stop(&'payload [u8]),
+    /// A drive command.
+    Drive(&'payload [u8]),
+    /// A limit by this holder.
+    Limit(&'payload HolderId, &'payload [u8]),
+}
+
+/// Who takes what must not wait; must not wait either.
+pub type TakeUrgent = Arc<dyn Fn(Urgent<'_>) + Send + Sync>;
+
+/// Who hears what comes in besides commands.
+#[derive(Clone)]
+pub struct Listeners {
+    /// Is told of what the link notices.
+    pub note: Note,
+    /// Takes what must not wait.
+    pub urgent: TakeUrgent,
+}
+
+impl std::fmt::Debug for Listeners {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.write_str("Listeners")
+    }
+}
 
 /// Why the link could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -231,7 +261,7 @@ impl FleetLink {
     pub async fn connect(
         server: &str,
         identity: Identity,
-        note: Note,
+        listeners: Listeners,
         stop: &CancellationToken,
     ) -> Result<Option<(Self, Commands)>, LinkError> {
         let config = session_config(server)?;
@@ -264,7 +294,7 @@ impl FleetLink {
             .map_err(zenoh_failed("open a session"))?;
         info!(server, "connected to `{server}`");
         let declaring =
-            tokio::task::spawn_blocking(move || Self::declare(session, identity, &note));
+            tokio::task::spawn_blocking(move || Self::declare(session, identity, &listeners));
         declaring
             .await
             .map_or(Ok(None), |declared| declared.map(Some))
@@ -273,11 +303,11 @@ impl FleetLink {
     fn declare(
         session: zenoh::Session,
         identity: Identity,
-        note: &Note,
+        listeners: &Listeners,
     ) -> Result<(Self, Commands), LinkError> {
         let (site, robot) = (&identity.site, &identity.robot);
         let (command_sender, commands) = mpsc::channel(COMMANDS_MAX);
-        let noted = Arc::clone(note);
+        let (noted, urgent) = (Arc::clone(&listeners.note), Arc::clone(&listeners.urgent));
         let own_run = identity.boot.to_string();
         let take_query = move |query: Query| {
             // For another agent under this robot's name: no reply from here.
@@ -299,6 +329,9 @@ impl FleetLink {
                 return;
             }
             let payload = query.payload().map(|bytes| bytes.to_bytes().into_owned());
+            if let (Verb::Stop, Some(payload)) = (verb, &payload) {
+                urgent(Urgent::Stop(payload));
+            }
             let command = IncomingCommand {
                 verb,
                 payload: payload.unwrap_or_default(),
@@ -316,7 +349,8 @@ impl FleetLink {
             .background()
             .wait()
             .map_err(zenoh_failed("declare the commands"))?;
-        let noted = Arc::clone(note);
+        Self::listen_urgently(&session, site, robot, &listeners.urgent)?;
+        let noted = Arc::clone(&listeners.note);
         session
             .declare_subscriber(keys::pulse(site))
             .callback(move |_| noted(Noted::ServerHeard))
@@ -368,6 +402,35 @@ impl FleetLink {
             server_seen,
         };
         Ok((link, commands))
+    }
+
+    /// Drive commands and limits: the latest counts, so each is taken in its callback.
+    fn listen_urgently(
+        session: &zenoh::Session,
+        site: &SiteId,
+        robot: &RobotId,
+        urgent: &TakeUrgent,
+    ) -> Result<(), LinkError> {
+        let take = Arc::clone(urgent);
+        session
+            .declare_subscriber(keys::teleop(site, robot))
+            .callback(move |sample| {
+                take(Urgent::Drive(&small(sample.payload())));
+            })
+            .background()
+            .wait()
+            .map_err(zenoh_failed("listen for drive commands"))?;
+        let take = Arc::clone(urgent);
+        session
+            .declare_subscriber(keys::limits(site, robot))
+            .callback(move |sample| {
+                if let Some(Key::Limit(_, _, holder)) = Key::parse(sample.key_expr().as_str()) {
+                    take(Urgent::Limit(&holder, &small(sample.payload())));
+                }
+            })
+            .background()
+            .wait()
+            .map_err(zenoh_failed("listen for limits"))
     }
 
     /// Counts how often the server has come into reach; changes with each (re)connection.
@@ -462,6 +525,14 @@ impl FleetLink {
             Ok(Err(_)) | Err(_) => warn!("the session did not close in time"),
         }
     }
+}
+
+/// The bytes of a small payload; a larger one becomes nothing, which does not parse.
+fn small(payload: &zenoh::bytes::ZBytes) -> Vec<u8> {
+    if payload.len() > SMALL_PAYLOAD_MAX {
+        return Vec::new();
+    }
+    payload.to_bytes().into_owned()
 }
 
 #[derive(Debug, Clone, Copy)]

@@ -1,13 +1,13 @@
 //! What the robot knows of missions, on its disk: one JSON file, replaced as a whole.
 
-use std::fs::{self, File};
-use std::io::{self, Write};
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use super::Holder;
+use crate::durable;
 
 const FILE_NAME: &str = "missions.json";
-const NEW_FILE_NAME: &str = "missions.json.new";
 
 /// Why the memory could not be read or written.
 #[derive(Debug, thiserror::Error)]
@@ -71,22 +71,13 @@ impl Memory {
     /// # Errors
     /// [`MemoryError`] when the disk refuses; the former content stays then.
     pub fn save(&self, holder: &Holder) -> Result<(), MemoryError> {
-        let path = self.folder.join(NEW_FILE_NAME);
-        let failed = |source| MemoryError::File {
+        let text = serde_json::to_vec(holder).map_err(io::Error::from);
+        let written = text.and_then(|text| durable::replace(&self.folder, FILE_NAME, &text));
+        written.map_err(|source| MemoryError::File {
             action: "written",
-            path: path.clone(),
+            path: self.folder.join(FILE_NAME),
             source,
-        };
-        let text = serde_json::to_vec(holder)
-            .map_err(io::Error::from)
-            .map_err(failed)?;
-        let mut file = File::create(&path).map_err(failed)?;
-        file.write_all(&text).map_err(failed)?;
-        file.sync_data().map_err(failed)?;
-        fs::rename(&path, self.folder.join(FILE_NAME)).map_err(failed)?;
-        File::open(&self.folder)
-            .and_then(|folder| folder.sync_all())
-            .map_err(failed)
+        })
     }
 }
 

@@ -155,6 +155,7 @@ impl Sensors {
                 right_n_m: self.noisy(torques.right_n_m * self.torque_scale, torque_noise_n_m),
             }),
             body_speed_m_s,
+            tilt_rad: None,
             position,
         }
     }

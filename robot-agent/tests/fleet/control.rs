@@ -51,7 +51,7 @@ async fn resume(server: &FakeServer, rig: &Rig, mission: MissionId, revision: u3
 fn refusal(outcome: &Outcome) -> Option<OfferRefusal> {
     match outcome {
         Outcome::Refused { code, .. } => Some(*code),
-        Outcome::Accepted { .. } | Outcome::Done => None,
+        Outcome::Accepted { .. } | Outcome::Done | Outcome::Leased { .. } => None,
     }
 }
 

@@ -8,6 +8,7 @@
 
 mod control;
 mod rig;
+mod safety;
 mod support;
 
 use std::path::Path;
@@ -30,7 +31,7 @@ const LONG: &str =
 fn refusal(answer: &Answer) -> Option<OfferRefusal> {
     match &answer.outcome {
         Outcome::Refused { code, .. } => Some(*code),
-        Outcome::Accepted { .. } | Outcome::Done => None,
+        Outcome::Accepted { .. } | Outcome::Done | Outcome::Leased { .. } => None,
     }
 }
 

@@ -10,6 +10,7 @@ use tread_agent::sim::scenario::Scenario;
 use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
 use tread_api::keys::{self, Key, Verb};
 use tread_api::mission::LinkPolicy;
+use tread_api::safety::Geofence;
 use tread_api::site::Grid;
 use tread_api::terrain::{TerrainRef, TerrainShape};
 use tread_api::trajectory::Trajectory;
@@ -118,6 +119,7 @@ pub(crate) fn site_of(scenario: &Scenario) -> SiteDefinition {
         },
         terrain_revision: 5,
         terrains: shapes.collect(),
+        geofence: Geofence::default(),
     }
 }
 
@@ -253,6 +255,11 @@ impl FakeServer {
             Ok(sample) => Ok(wire::decode(&sample.payload().to_bytes()).unwrap()),
             Err(error) => Err(wire::decode(&error.payload().to_bytes()).unwrap()),
         })
+    }
+
+    /// Publishes, as the server or another program would.
+    pub(crate) async fn publish(&self, key: &str, payload: Vec<u8>) {
+        self.session.put(key, payload).await.unwrap();
     }
 
     /// Lets the robots hear the server until the task is dropped.

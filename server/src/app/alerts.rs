@@ -4,10 +4,11 @@
 //! clears. A robot that is not heard clears nothing.
 
 use jiff::Timestamp;
-use tread_api::ids::AlertId;
+use tread_api::ids::{AlertCode, AlertId};
 use tread_api::page::Page;
-use tread_api::robot::{ALERT_TEXT_MAX, ALERTS_MAX, Alert, AlertReport};
+use tread_api::robot::{ALERT_TEXT_MAX, ALERTS_MAX, Alert, AlertReport, Severity};
 
+use super::stops::UNCONFIRMED_ALERT;
 use super::{App, AppError, check_named, page};
 use crate::db;
 use crate::db::alerts::AlertFilter;
@@ -65,7 +66,10 @@ impl App {
         let now = self.clock().now();
         let has = |alert: &Alert| said.iter().any(|report| report.code == alert.code);
         let is_new = |report: &&AlertReport| !raised.iter().any(|alert| alert.code == report.code);
-        let gone: Vec<&Alert> = raised.iter().filter(|alert| !has(alert)).collect();
+        // What the server itself has raised is not for the robot to end.
+        let own = |alert: &&Alert| alert.code.as_str() == UNCONFIRMED_ALERT;
+        let gone = raised.iter().filter(|alert| !has(alert) && !own(alert));
+        let gone: Vec<&Alert> = gone.collect();
         let new: Vec<&AlertReport> = said.iter().filter(is_new).collect();
         if gone.is_empty() && new.is_empty() {
             return Ok(true);
@@ -90,6 +94,56 @@ impl App {
             self.hub().alert(alert);
         }
         Ok(true)
+    }
+
+    /// Raises an alert of the server's own about a robot, unless it is raised already.
+    pub(super) async fn begin_alert(
+        &self,
+        tx: &mut db::Tx,
+        robot_pk: i64,
+        (code, severity, text): (&'static str, Severity, String),
+    ) -> Result<Option<Alert>, AppError> {
+        let Ok(code) = code.parse::<AlertCode>() else {
+            return Ok(None);
+        };
+        let raised = db::alerts::raised_of(tx, robot_pk).await?;
+        if raised.iter().any(|alert| alert.code == code) {
+            return Ok(None);
+        }
+        let report = AlertReport {
+            code,
+            severity,
+            text,
+        };
+        let id = self
+            .raise(tx, robot_pk, &report, self.clock().now())
+            .await?;
+        Ok(db::alerts::find(tx, id).await?)
+    }
+
+    /// Ends an alert of the server's own.
+    pub(super) async fn end_alert(
+        &self,
+        tx: &mut db::Tx,
+        robot_pk: i64,
+        code: &'static str,
+    ) -> Result<Option<Alert>, AppError> {
+        let raised = db::alerts::raised_of(tx, robot_pk).await?;
+        let Some(alert) = raised.into_iter().find(|alert| alert.code.as_str() == code) else {
+            return Ok(None);
+        };
+        db::alerts::clear(tx, robot_pk, &alert.code, self.clock().now()).await?;
+        Ok(db::alerts::find(tx, alert.id).await?)
+    }
+
+    /// Shows alerts that were written.
+    pub(super) fn show_alerts(&self, alerts: &[Alert]) {
+        if !alerts.is_empty() {
+            self.robots_changed();
+        }
+        for alert in alerts {
+            self.hub().alert(alert);
+        }
     }
 
     async fn raise(

@@ -2,14 +2,17 @@
 
 use std::ops::RangeInclusive;
 
-use tread_api::geometry::{Point, Pose};
+use tread_api::geometry::{Point, Polygon, Pose};
+use tread_api::ids::{RobotId, SiteId};
 use tread_api::robot::RobotModel;
+use tread_api::safety::Geofence;
 use tread_api::trajectory::{
     BINDINGS_MAX, Binding, BindingLimit, CheckTrajectory, Direction, ExpectedMeasurement, Place,
     THETA_ASSUMED, Trajectory, TrajectoryCheck, Waypoint,
 };
 use tread_control::estimation::{SensorNoise, expected_accuracy};
 use tread_control::excitation::{Excitation, ExcitationSpec};
+use tread_control::fence::{Fence, MARGIN_M, disc_radius_m};
 use tread_control::geometry as control;
 use tread_control::plan::{Plan, PlanError, PlanOptions, Slowed, SlowedBy};
 use tread_control::robot::{self, RobotModelError, RobotModelSpec};
@@ -22,6 +25,10 @@ use crate::db;
 pub const CHECKS_MAX: usize = 2;
 /// θ that may be assumed: from K 1000 to K 0.1.
 const THETA_RANGE: RangeInclusive<f64> = 0.001..=10.0;
+/// Least step in which a path is compared with a geofence, metres.
+const FENCE_STEP_M: f64 = 0.02;
+/// Most steps of that; the least one grows with longer paths.
+const FENCE_STEPS_MAX: f64 = 500_000.0;
 
 impl App {
     /// Plans a trajectory for a robot without moving anything.
@@ -51,6 +58,7 @@ impl App {
         let row = db::robots::find(&mut tx, site_pk, &robot).await?;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
         let row = row.ok_or_else(unknown)?;
+        let fence = control_fence(&db::geofences::present(&mut tx, site_pk).await?);
         drop(tx);
         let presence = self.presences().get(&(site.clone(), robot.clone()));
         let shown = presence.state().and_then(|state| state.pose);
@@ -67,19 +75,52 @@ impl App {
         let _turn = self.check_turn().await;
         // The planner works on a thread of its own: a path may have 100 000 points.
         let model = row.model;
-        let planning =
-            tokio::task::spawn_blocking(move || check(&model, &trajectory, start, ground)).await;
-        match planning {
-            Ok(checked) => checked.map_err(|refused| AppError::Impossible {
-                robot,
-                detail: refused.detail,
-                place: refused.place,
-            }),
+        let checking = move || check(&model, &trajectory, start, ground, &fence);
+        match tokio::task::spawn_blocking(checking).await {
+            Ok(checked) => checked.map_err(|refused| refused.of(robot)),
             Err(_panic) => Err(AppError::Impossible {
                 robot,
                 detail: "the planner broke on it".to_owned(),
                 place: None,
             }),
+        }
+    }
+}
+
+impl App {
+    /// Refuses a trajectory that leaves the site's geofence, whatever way the robot comes to its
+    /// begin. Without a geofence it costs nothing.
+    ///
+    /// # Errors
+    /// [`AppError::CrossesGeofence`] names the place.
+    pub(super) async fn check_fence(
+        &self,
+        (site, robot): (&SiteId, &RobotId),
+        trajectory: &Trajectory,
+    ) -> Result<(), AppError> {
+        let mut tx = self.db().read().await?;
+        let Some(site_row) = db::sites::find(&mut tx, site).await? else {
+            return Ok(());
+        };
+        let fence = control_fence(&db::geofences::present(&mut tx, site_row.pk).await?);
+        let row = db::robots::find(&mut tx, site_row.pk, robot).await?;
+        drop(tx);
+        let Some(row) = row.filter(|_| !fence.is_empty()) else {
+            return Ok(());
+        };
+        let _turn = self.check_turn().await;
+        let trajectory = trajectory.clone();
+        let checking = move || {
+            let from = begin_of(&trajectory);
+            match planned(&row.model, &trajectory, from) {
+                Ok(planned) => fenced(&planned, &trajectory, &fence),
+                // What cannot be planned is the robot's to refuse.
+                Err(_impossible) => Ok(()),
+            }
+        };
+        match tokio::task::spawn_blocking(checking).await {
+            Ok(checked) => checked.map_err(|refused| refused.of(robot.clone())),
+            Err(_panic) => Ok(()),
         }
     }
 }
@@ -126,17 +167,43 @@ struct AssumedGround {
 struct Refused {
     detail: String,
     place: Option<Place>,
+    /// Whether it leaves the geofence.
+    crosses: bool,
 }
 
-fn check(
-    model: &RobotModel,
-    trajectory: &Trajectory,
-    start: Pose,
-    ground: AssumedGround,
-) -> Result<TrajectoryCheck, Refused> {
+impl Refused {
+    fn of(self, robot: RobotId) -> AppError {
+        let Self {
+            detail,
+            place,
+            crosses,
+        } = self;
+        match place {
+            Some(place) if crosses => AppError::CrossesGeofence {
+                robot,
+                detail,
+                place,
+            },
+            place => AppError::Impossible {
+                robot,
+                detail,
+                place,
+            },
+        }
+    }
+}
+
+/// A plan with the model that it was made for.
+struct Planned {
+    model: robot::RobotModel,
+    plan: Plan,
+}
+
+fn planned(model: &RobotModel, trajectory: &Trajectory, start: Pose) -> Result<Planned, Refused> {
     let model = control_model(model).map_err(|error| Refused {
         detail: error.to_string(),
         place: None,
+        crosses: false,
     })?;
     let from = control::Pose {
         x_m: start.x_m,
@@ -148,9 +215,24 @@ fn check(
         .map_err(|error| Refused {
             detail: error.to_string(),
             place: place_of(error, trajectory),
+            crosses: false,
         })?;
+    Ok(Planned { model, plan })
+}
+
+fn check(
+    model: &RobotModel,
+    trajectory: &Trajectory,
+    start: Pose,
+    ground: AssumedGround,
+    fence: &Fence,
+) -> Result<TrajectoryCheck, Refused> {
+    let planned = planned(model, trajectory, start)?;
+    fenced(&planned, trajectory, fence)?;
+    let plan = &planned.plan;
     let AssumedGround { theta, has_torque } = ground;
-    let expected = expected_accuracy(&plan, &model, SensorNoise::default(), theta, has_torque);
+    let noise = SensorNoise::default();
+    let expected = expected_accuracy(plan, &planned.model, noise, theta, has_torque);
     let bindings = plan.slowed().iter().take(BINDINGS_MAX);
     Ok(TrajectoryCheck {
         start,
@@ -161,7 +243,7 @@ fn check(
         linear_acceleration_peak_m_s2: plan.peak_acceleration_m_s2(),
         lateral_acceleration_peak_m_s2: plan.peak_lateral_acceleration_m_s2(),
         angular_peak_rad_s: plan.peak_angular_rad_s(),
-        bindings: bindings.map(|slowed| binding(&plan, slowed)).collect(),
+        bindings: bindings.map(|slowed| binding(plan, slowed)).collect(),
         excitation_depth_ratio: plan.excitation().map(Excitation::depth_ratio),
         measurement: ExpectedMeasurement {
             theta_assumed: theta,
@@ -170,6 +252,74 @@ fn check(
             first_after_s: expected.first_after_s,
         },
     })
+}
+
+/// Walks the path in steps of the clearance that is left, so that no crossing is stepped over.
+fn fenced(
+    Planned { model, plan }: &Planned,
+    trajectory: &Trajectory,
+    fence: &Fence,
+) -> Result<(), Refused> {
+    if fence.is_empty() {
+        return Ok(());
+    }
+    let keep_m = disc_radius_m(model) + MARGIN_M;
+    // Further turns of a circle go where the first one went.
+    let length_m = match trajectory {
+        Trajectory::Circle(circle) => {
+            let once_m = plan.approach_length_m() + std::f64::consts::TAU * circle.radius_m;
+            plan.length_m().min(once_m)
+        }
+        Trajectory::Waypoints(_) => plan.length_m(),
+    };
+    let step_min_m = (length_m / FENCE_STEPS_MAX).max(FENCE_STEP_M);
+    let mut arc_m = 0.0;
+    while arc_m <= length_m {
+        let pose = plan.path().sample(arc_m).pose;
+        let point = control::Point {
+            x_m: pose.x_m,
+            y_m: pose.y_m,
+        };
+        let spare_m = fence.clearance_m(point) - keep_m;
+        if spare_m.is_nan() || spare_m < 0.0 {
+            let point = Point {
+                x_m: point.x_m,
+                y_m: point.y_m,
+            };
+            let detail = format!(
+                "at x {:.2} m, y {:.2} m its body would come {:.2} m too near to the border of \
+                 where robots may be",
+                point.x_m, point.y_m, -spare_m
+            );
+            return Err(Refused {
+                detail,
+                place: Some(Place {
+                    arc_m: Some(arc_m),
+                    waypoint: None,
+                    point,
+                }),
+                crosses: true,
+            });
+        }
+        arc_m += spare_m.max(step_min_m);
+    }
+    Ok(())
+}
+
+/// A geofence as the planner sees it.
+fn control_fence(geofence: &Geofence) -> Fence {
+    let rings = |polygons: &[Polygon]| {
+        let ring = |polygon: &Polygon| {
+            let corners = polygon.corners().iter();
+            let corner = |corner: &Point| control::Point {
+                x_m: corner.x_m,
+                y_m: corner.y_m,
+            };
+            corners.map(corner).collect()
+        };
+        polygons.iter().map(ring).collect()
+    };
+    Fence::new(rings(&geofence.keep_in), rings(&geofence.keep_out))
 }
 
 fn binding(plan: &Plan, slowed: &Slowed) -> Binding {

@@ -4,21 +4,26 @@ pub mod alerts;
 pub mod check;
 pub mod events;
 pub mod friction;
+pub mod geofence;
 pub mod identity;
 pub mod ingest;
+pub mod limits;
 pub mod missions;
 pub mod reconciler;
 pub mod robots;
 pub mod segments;
 pub mod sites;
+pub mod stops;
+pub mod teleop;
 pub mod terrains;
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use tokio::sync::{Notify, Semaphore, SemaphorePermit};
-use tread_api::ids::{AlertId, MissionId, RobotId, SiteId, TerrainId, TokenId};
+use tread_api::geometry::Point;
+use tread_api::ids::{AlertId, MissionId, RobotId, SiteId, StopId, TerrainId, TokenId};
 use tread_api::mission::MissionState;
 use tread_api::trajectory::Place;
 
@@ -30,8 +35,11 @@ use crate::config::FrictionConfig;
 use crate::counters::Counters;
 use crate::db::sites::SiteRow;
 use crate::db::{self, Db, DbError, Tx};
+use crate::fleet::commands::Commands;
 use crate::fleet::presence::Presences;
+use crate::fleet::teleop::Teleop;
 use crate::metrics::{MissionDurations, Queues, Refusals, Requests};
+use crate::supervisor::Supervisor;
 
 /// Everything that use cases work on; clones are handles to the same.
 #[derive(Debug, Clone)]
@@ -45,7 +53,7 @@ struct Inner {
     clock: Clock,
     friction: FrictionConfig,
     counters: Counters,
-    presences: Presences,
+    presences: Arc<Presences>,
     /// Wakes the reconciler: what is wanted, or what is, has changed.
     changed: Notify,
     /// Wakes the feed of events.
@@ -61,6 +69,19 @@ struct Inner {
     /// Counts changes of what is kept of robots.
     robots_generation: AtomicU64,
     started_at: Duration,
+    links: OnceLock<Links>,
+    drive_slots: Arc<Semaphore>,
+}
+
+/// What use cases reach robots by, once the network is open.
+#[derive(Debug, Clone)]
+pub struct Links {
+    /// Commands with answers.
+    pub commands: Commands,
+    /// Drive commands, which have none.
+    pub teleop: Teleop,
+    /// Starts what goes on after a request was answered.
+    pub supervisor: Supervisor,
 }
 
 impl App {
@@ -73,7 +94,7 @@ impl App {
             clock,
             friction,
             counters: Counters::default(),
-            presences: Presences::default(),
+            presences: Arc::default(),
             changed: Notify::new(),
             announced: Notify::new(),
             hub,
@@ -86,10 +107,21 @@ impl App {
             mission_durations: MissionDurations::default(),
             robots_generation: AtomicU64::new(1),
             started_at,
+            links: OnceLock::new(),
+            drive_slots: Arc::new(Semaphore::new(teleop::SESSIONS_MAX)),
         };
         Self {
             inner: Arc::new(inner),
         }
+    }
+
+    /// Gives the use cases the way to the robots; the first time counts.
+    pub fn connect(&self, links: Links) {
+        let _ = self.inner.links.set(links);
+    }
+
+    fn links(&self) -> Option<&Links> {
+        self.inner.links.get()
     }
 
     /// The database.
@@ -108,7 +140,7 @@ impl App {
     }
 
     /// Who is on the network now.
-    pub fn presences(&self) -> &Presences {
+    pub fn presences(&self) -> &Arc<Presences> {
         &self.inner.presences
     }
 
@@ -289,6 +321,56 @@ pub enum AppError {
     /// The operating system gives no random numbers.
     #[error("the operating system gives no random numbers: {0}")]
     NoRandomness(String),
+    /// No stop of that identifier.
+    #[error("stop `{0}` is not known for this robot")]
+    UnknownStop(StopId),
+    /// The robot did not clear a stop.
+    #[error("robot `{robot}` has not cleared the stop: {detail}")]
+    StopNotCleared {
+        /// The robot.
+        robot: RobotId,
+        /// Why.
+        detail: String,
+    },
+    /// The robot does not answer.
+    #[error("robot `{0}` does not answer; nobody knows whether it has heard")]
+    RobotUnreachable(RobotId),
+    /// The robot will not.
+    #[error("robot `{robot}` refuses: {detail}")]
+    RobotRefused {
+        /// The robot.
+        robot: RobotId,
+        /// Why.
+        detail: String,
+    },
+    /// The way leaves where robots of the site may be.
+    #[error("robot `{robot}` may not drive this: {detail}")]
+    CrossesGeofence {
+        /// The robot.
+        robot: RobotId,
+        /// Which polygon.
+        detail: String,
+        /// Where.
+        place: Place,
+    },
+    /// A geofence would leave a robot outside.
+    #[error("robot `{robot}` stands at x {:.2} m, y {:.2} m, outside this geofence", point.x_m, point.y_m)]
+    OutsideGeofence {
+        /// The robot.
+        robot: RobotId,
+        /// Where it stands.
+        point: Point,
+    },
+    /// Somebody else changed it first.
+    #[error("the {what} is at revision {present} now, not {expected}")]
+    ChangedMeanwhile {
+        /// What was to be changed.
+        what: &'static str,
+        /// Its revision.
+        present: u64,
+        /// The revision that was named.
+        expected: u64,
+    },
     /// A request with the same key is being answered.
     #[error("a request with this idempotency key is being answered; ask again in a moment")]
     KeyInFlight,
@@ -341,6 +423,14 @@ impl AppError {
     pub fn place(&self) -> Option<Place> {
         if let Self::Impossible { place, .. } = *self {
             place
+        } else if let Self::CrossesGeofence { place, .. } = *self {
+            Some(place)
+        } else if let Self::OutsideGeofence { point, .. } = *self {
+            Some(Place {
+                arc_m: None,
+                waypoint: None,
+                point,
+            })
         } else {
             None
         }
@@ -366,6 +456,13 @@ impl AppError {
             | Self::UnknownAlert(_)
             | Self::UnknownToken(_)
             | Self::NoRandomness(_)
+            | Self::UnknownStop(_)
+            | Self::StopNotCleared { .. }
+            | Self::RobotUnreachable(_)
+            | Self::RobotRefused { .. }
+            | Self::CrossesGeofence { .. }
+            | Self::OutsideGeofence { .. }
+            | Self::ChangedMeanwhile { .. }
             | Self::KeyInFlight
             | Self::KeyReused
             | Self::TooMany { .. }

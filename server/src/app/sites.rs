@@ -53,6 +53,7 @@ impl App {
                 cell_m,
             },
             terrain_revision: 0,
+            geofence_revision: 0,
             created_at: self.clock().now(),
         };
         let mut tx = self.db().write().await?;

@@ -144,6 +144,7 @@ pub(super) async fn site_definition(
         return Ok(None);
     };
     let terrains = db::terrains::list(tx, row.pk).await?;
+    let geofence = db::geofences::present(tx, row.pk).await?;
     let shape = |terrain: Terrain| TerrainShape {
         terrain: TerrainRef {
             id: terrain.id,
@@ -156,5 +157,6 @@ pub(super) async fn site_definition(
         grid: row.site.grid,
         terrain_revision: row.site.terrain_revision,
         terrains: terrains.into_iter().map(shape).collect(),
+        geofence,
     }))
 }

@@ -353,14 +353,15 @@ pub async fn in_hand(db: &mut SqliteConnection) -> Result<Vec<Standing>, DbError
     standings(raw)
 }
 
-/// The mission that is next in the queue of each robot that has nothing in hand.
+/// The mission that is next in the queue of each robot that has nothing in hand; one that is held
+/// is passed over.
 pub async fn next_in_queues(db: &mut SqliteConnection) -> Result<Vec<Standing>, DbError> {
     let raw = standings!(
         "WHERE missions.id IN (
              SELECT id FROM (
                  SELECT id, ROW_NUMBER() OVER (PARTITION BY robot_pk ORDER BY priority DESC, id)
                      AS place
-                 FROM missions WHERE state = 'queued')
+                 FROM missions WHERE state = 'queued' AND pause_wanted = 0)
              WHERE place = 1)
            AND NOT EXISTS (
              SELECT 1 FROM missions AS other WHERE other.robot_pk = missions.robot_pk
@@ -496,7 +497,7 @@ pub async fn want_pause(
     let id = id.to_string();
     let result = sqlx::query!(
         "UPDATE missions SET pause_wanted = ? WHERE id = ? AND state IN
-             ('offered', 'active', 'paused')",
+             ('queued', 'offered', 'active', 'paused')",
         wanted,
         id,
     )

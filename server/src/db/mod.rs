@@ -6,6 +6,7 @@
 
 pub mod alerts;
 pub mod audit;
+pub mod geofences;
 pub mod history;
 pub mod idempotency;
 pub mod missions;
@@ -13,6 +14,7 @@ pub mod robots;
 pub mod segments;
 pub mod sessions;
 pub mod sites;
+pub mod stops;
 pub mod sums;
 pub mod terrains;
 pub mod tokens;

@@ -119,6 +119,24 @@ pub async fn is_known(
     Ok(found.fetch_one(db).await?)
 }
 
+/// The key of the robot of that name in that site.
+pub async fn pk_of(
+    db: &mut SqliteConnection,
+    site: &SiteId,
+    robot: &RobotId,
+) -> Result<Option<i64>, DbError> {
+    let (site, robot) = (site.as_str(), robot.as_str());
+    let pk = sqlx::query_scalar!(
+        r#"SELECT robots.pk AS "pk!" FROM robots JOIN sites ON sites.pk = robots.site_pk
+           WHERE sites.id = ? AND robots.id = ?"#,
+        site,
+        robot,
+    )
+    .fetch_optional(db)
+    .await?;
+    Ok(pk)
+}
+
 /// Robots of a site after an identifier, in alphabetical order; retired ones too if asked for.
 pub async fn list(
     db: &mut SqliteConnection,

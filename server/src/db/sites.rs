@@ -22,6 +22,7 @@ struct Raw {
     grid_revision: i64,
     cell_m: f64,
     terrain_revision: i64,
+    geofence_revision: i64,
     created_at_us: i64,
 }
 
@@ -38,6 +39,7 @@ impl TryFrom<Raw> for SiteRow {
             name: raw.name,
             grid,
             terrain_revision: unsigned("terrain revision", raw.terrain_revision)?,
+            geofence_revision: unsigned("geofence revision", raw.geofence_revision)?,
             created_at: from_us(raw.created_at_us)?,
         };
         Ok(Self { pk: raw.pk, site })
@@ -67,7 +69,9 @@ pub async fn find(db: &mut SqliteConnection, id: &SiteId) -> Result<Option<SiteR
     let id = id.as_str();
     let raw = sqlx::query_as!(
         Raw,
-        r#"SELECT pk AS "pk!", id, name, grid_revision, cell_m, terrain_revision, created_at_us
+        r#"SELECT pk AS "pk!", id, name, grid_revision, cell_m, terrain_revision, created_at_us,
+               COALESCE((SELECT MAX(revision) FROM geofences WHERE site_pk = sites.pk), 0)
+                   AS "geofence_revision!: i64"
            FROM sites WHERE id = ?"#,
         id,
     )
@@ -84,7 +88,9 @@ pub async fn list(
 ) -> Result<Vec<SiteRow>, DbError> {
     let rows = sqlx::query_as!(
         Raw,
-        r#"SELECT pk AS "pk!", id, name, grid_revision, cell_m, terrain_revision, created_at_us
+        r#"SELECT pk AS "pk!", id, name, grid_revision, cell_m, terrain_revision, created_at_us,
+               COALESCE((SELECT MAX(revision) FROM geofences WHERE site_pk = sites.pk), 0)
+                   AS "geofence_revision!: i64"
            FROM sites WHERE id > ? ORDER BY id LIMIT ?"#,
         after,
         limit,

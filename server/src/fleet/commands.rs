@@ -13,11 +13,11 @@ use tread_api::wire::command::Answer;
 use tread_api::wire::{self, Refusal};
 use zenoh::Session;
 use zenoh::Wait as _;
+use zenoh::qos::Priority;
 use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 
-use super::presence::RobotKey;
+use super::presence::{Presences, RobotKey};
 use super::router::Current;
-use crate::app::App;
 use crate::supervisor::Supervisor;
 
 /// How long a robot may take to answer.
@@ -46,13 +46,13 @@ pub trait Carrier: std::fmt::Debug + Send + Sync {
 #[derive(Debug, Clone)]
 pub struct Commands {
     carrier: Arc<dyn Carrier>,
-    app: App,
+    presences: Arc<Presences>,
 }
 
 impl Commands {
-    /// Commands through a carrier, to the robots that an app knows.
-    pub fn new(carrier: Arc<dyn Carrier>, app: App) -> Self {
-        Self { carrier, app }
+    /// Commands through a carrier; `presences` tell which run of an agent is the present one.
+    pub fn new(carrier: Arc<dyn Carrier>, presences: Arc<Presences>) -> Self {
+        Self { carrier, presences }
     }
 
     /// Sends one command to a robot's present run and waits for its answer.
@@ -64,7 +64,7 @@ impl Commands {
         verb: Verb,
         command: &T,
     ) -> Option<Answer> {
-        let present = self.app.presences().get(robot).boot();
+        let present = self.presences.get(robot).boot();
         let run = present.map(|(boot, _since)| boot);
         self.send_to(robot, run, verb, command).await
     }
@@ -108,7 +108,23 @@ impl Carrier for Network {
             key = keys::to_run(&key, boot);
         }
         let (session, supervisor) = (self.session.get(), self.supervisor.clone());
-        Box::pin(query(session, supervisor, key, payload))
+        Box::pin(query(
+            session,
+            supervisor,
+            key,
+            (priority_of(verb), payload),
+        ))
+    }
+}
+
+/// What slows a robot down goes before everything else on its link.
+const fn priority_of(verb: Verb) -> Priority {
+    match verb {
+        Verb::Stop => Priority::RealTime,
+        Verb::Clear | Verb::Lease | Verb::Limit | Verb::Pause | Verb::Cancel => {
+            Priority::InteractiveHigh
+        }
+        Verb::Offer | Verb::Resume | Verb::Site => Priority::Data,
     }
 }
 
@@ -116,7 +132,7 @@ async fn query(
     session: Session,
     supervisor: Supervisor,
     key: String,
-    payload: Vec<u8>,
+    (priority, payload): (Priority, Vec<u8>),
 ) -> Option<Answer> {
     let (answer, answered) = oneshot::channel();
     let query_key = key.clone();
@@ -126,6 +142,8 @@ async fn query(
         session
             .get(query_key)
             .payload(payload)
+            .priority(priority)
+            .express(priority == Priority::RealTime)
             // A second agent under the same name must not swallow what is for the first.
             .target(QueryTarget::All)
             .consolidation(ConsolidationMode::None)

@@ -10,6 +10,7 @@ pub mod presence;
 mod pulse;
 mod requests;
 mod router;
+pub mod teleop;
 
 use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
@@ -21,6 +22,7 @@ use zenoh::{Config, Session, Wait as _};
 
 use self::commands::{Commands, Network};
 use self::router::Current;
+use self::teleop::Teleop;
 use crate::app::App;
 use crate::app::ingest::Upload;
 use crate::supervisor::Supervisor;
@@ -29,6 +31,11 @@ use crate::supervisor::Supervisor;
 const SESSIONS_MAX: u32 = 10_000;
 /// Most connections that may be in the middle of their opening.
 const ACCEPT_PENDING_MAX: u32 = 1_000;
+/// What the system may keep of what is sent to one robot, bytes. Priorities act only above it: on
+/// a narrow link a larger one would let drive commands wait behind everything else.
+const SEND_BUFFER_BYTES: u32 = 16 * 1024;
+/// Most bytes that are sent at once, for the same reason.
+const BATCH_BYTES: u32 = 8 * 1024;
 /// How long the session may take to open, and to close.
 const SESSION_TIMEOUT: Duration = Duration::from_secs(10);
 
@@ -102,7 +109,12 @@ impl Fleet {
             session: Arc::clone(&self.session),
             supervisor: self.supervisor.clone(),
         };
-        Commands::new(Arc::new(network), app.clone())
+        Commands::new(Arc::new(network), Arc::clone(app.presences()))
+    }
+
+    /// The way of drive commands.
+    pub fn teleop(&self) -> Teleop {
+        Teleop::new(Arc::clone(&self.session), self.supervisor.clone())
     }
 
     /// Begins to listen to robots, to beat the pulse and to look after the router.
@@ -194,7 +206,11 @@ fn config(address: SocketAddr) -> zenoh::Result<Config> {
     let mut config = Config::default();
     let settings = [
         ("mode", "\"router\"".to_owned()),
-        ("listen/endpoints", format!("[\"tcp/{address}\"]")),
+        (
+            "listen/endpoints",
+            format!("[\"tcp/{address}#so_sndbuf={SEND_BUFFER_BYTES}\"]"),
+        ),
+        ("transport/link/tx/batch_size", BATCH_BYTES.to_string()),
         // Nothing is discovered and nothing is advertised.
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use tread_api::friction::LiveFriction;
-use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
+use tread_api::ids::{BootId, MissionId, RobotId, SiteId, StopId};
 use tread_api::robot::{Aged, AlertReport, LinkCause, LinkState, RobotLive, RobotMode};
 use tread_api::wire::state::{FrictionReport, RobotState};
 
@@ -42,6 +42,15 @@ pub enum Heard {
     Other,
 }
 
+/// What a robot holds of its site.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Held {
+    /// The revision of its terrains.
+    pub terrains: Option<u64>,
+    /// The revision of its geofence; `None` also of a robot that knows no geofences.
+    pub fence: Option<u64>,
+}
+
 /// A robot's name with its site.
 pub type RobotKey = (SiteId, RobotId);
 
@@ -60,6 +69,8 @@ pub struct Presence {
     /// How far the robot's wall clock is ahead, milliseconds: the largest of the last states,
     /// which had the shortest way.
     clock_offsets_ms: VecDeque<i64>,
+    /// How far the robot's monotonic clock is ahead of ours, microseconds, likewise.
+    monotonic_offsets_us: VecDeque<i64>,
     alerts_changed: bool,
     other: Option<OtherRun>,
     shown: Option<Shown>,
@@ -112,6 +123,36 @@ impl Presence {
         self.clock_offsets_ms.iter().copied().max().unwrap_or(0)
     }
 
+    /// The robot's monotonic clock now, microseconds, as told by the state that had the shortest
+    /// way: it lags by that way, so an end that is written with it comes too early, never too
+    /// late. With the run that it belongs to; `None` for a robot that does not say.
+    pub fn robot_clock_us(&self, now: Duration) -> Option<(BootId, u64)> {
+        let (boot, _since) = self.boot?;
+        let ahead_us = self.monotonic_offsets_us.iter().copied().max()?;
+        let now_us = i64::try_from(now.as_micros()).ok()?;
+        let clock_us = u64::try_from(now_us.saturating_add(ahead_us)).ok()?;
+        Some((boot, clock_us))
+    }
+
+    /// Whether a stop is in force on the robot, or a person drives it.
+    pub fn is_in_hands(&self) -> bool {
+        let safety = self.state().map(|state| &state.safety);
+        safety.is_some_and(|safety| safety.stop.is_some() || safety.lease.is_some())
+    }
+
+    /// Whether anything was heard of the robot of late, or its token is there.
+    pub fn is_there(&self, now: Duration) -> bool {
+        let spoke = self
+            .spoken_at
+            .is_some_and(|at| now.saturating_sub(at) <= OFFLINE_TIMEOUT);
+        spoke || !self.tokens.is_empty()
+    }
+
+    /// Time since the last state came.
+    pub fn state_age(&self, now: Duration) -> Option<Duration> {
+        self.state.as_ref().map(|(_, at)| now.saturating_sub(*at))
+    }
+
     /// The present run of the agent, and since when it is known.
     pub fn boot(&self) -> Option<(BootId, Duration)> {
         self.boot
@@ -151,6 +192,7 @@ impl Presence {
             outbox: state.outbox,
             control_loop: state.control_loop,
             battery: state.battery,
+            safety: state.safety.clone(),
         })
     }
 
@@ -164,6 +206,7 @@ impl Presence {
             if self.other.is_some_and(|other| other.boot == boot) {
                 self.forget_other();
             }
+            self.monotonic_offsets_us.clear();
         }
     }
 
@@ -189,6 +232,8 @@ struct Shown {
     cause: Option<LinkCause>,
     mode: Option<RobotMode>,
     mission: Option<(MissionId, u32, bool)>,
+    stop: Option<StopId>,
+    lease: Option<u64>,
     seq: Option<u64>,
 }
 
@@ -213,13 +258,56 @@ impl Presences {
         self.lock().get(key).cloned().unwrap_or_default()
     }
 
-    /// The robots that are heard now, with the revision of the terrains that each holds.
-    pub fn online(&self, now: Duration) -> Vec<(RobotKey, Option<u64>)> {
+    /// Whether a robot has ever said hello.
+    pub fn is_known(&self, key: &RobotKey) -> bool {
+        self.lock()
+            .get(key)
+            .is_some_and(|presence| presence.welcomed)
+    }
+
+    /// A robot has answered that it cleared a stop; its next state will say so too.
+    pub fn stop_cleared(&self, key: &RobotKey, id: StopId) {
+        if let Some((state, _at)) = self
+            .lock()
+            .get_mut(key)
+            .and_then(|presence| presence.state.as_mut())
+        {
+            let stop = &mut state.safety.stop;
+            if stop.as_ref().is_some_and(|latch| latch.id == id) {
+                *stop = None;
+            }
+        }
+    }
+
+    /// Every robot that has ever said hello.
+    pub fn known(&self) -> Vec<RobotKey> {
+        let robots = self.lock();
+        let known = robots.iter().filter(|(_, presence)| presence.welcomed);
+        known.map(|(key, _)| key.clone()).collect()
+    }
+
+    /// The stops that robots show to be in force.
+    pub fn shown_stops(&self) -> Vec<(RobotKey, StopId)> {
+        let robots = self.lock();
+        let shown = |(key, presence): (&RobotKey, &Presence)| {
+            Some((key.clone(), presence.state().and_then(stop_of)?))
+        };
+        robots.iter().filter_map(shown).collect()
+    }
+
+    /// The robots that are heard now, with the revisions of terrains and geofence that each holds.
+    pub fn online(&self, now: Duration) -> Vec<(RobotKey, Held)> {
         let robots = self.lock();
         let online = robots
             .iter()
             .filter(|(_, presence)| presence.link(now) == LinkState::Online);
-        let held = |presence: &Presence| presence.state().and_then(|state| state.terrain_revision);
+        let held = |presence: &Presence| {
+            let state = presence.state();
+            Held {
+                terrains: state.and_then(|state| state.terrain_revision),
+                fence: state.and_then(|state| state.safety.fence_revision),
+            }
+        };
         online
             .map(|(key, presence)| (key.clone(), held(presence)))
             .collect()
@@ -279,6 +367,8 @@ impl Presences {
                 cause: presence.link_cause(now),
                 mode: state.map(|state| state.mode),
                 mission: state.and_then(content),
+                stop: state.and_then(stop_of),
+                lease: state.and_then(lease_of),
                 seq: state.map(|state| state.seq),
             };
             let is_new = presence.shown.is_none_or(|before| {
@@ -378,6 +468,9 @@ impl Presences {
         let news = presence.state().is_none_or(|before| {
             before.mode != state.mode
                 || content(before) != content(&state)
+                || stop_of(before) != stop_of(&state)
+                || lease_of(before) != lease_of(&state)
+                || before.safety.fence_revision != state.safety.fence_revision
                 || before.terrain_revision != state.terrain_revision
                 || (before.outbox.pending == 0) != (state.outbox.pending == 0)
         });
@@ -401,6 +494,12 @@ impl Presences {
         }
         let ahead_ms = i64::try_from(ahead_ms).unwrap_or(i64::MAX);
         presence.clock_offsets_ms.push_back(ahead_ms);
+        if let Some(ahead_us) = monotonic_offset_us(&state, now) {
+            if presence.monotonic_offsets_us.len() >= OFFSETS_MAX {
+                presence.monotonic_offsets_us.pop_front();
+            }
+            presence.monotonic_offsets_us.push_back(ahead_us);
+        }
         let said = presence.state().map(|before| &before.alerts);
         presence.alerts_changed |= said != Some(&state.alerts);
         presence.state = Some((state, now));
@@ -425,6 +524,21 @@ impl Presences {
     }
 }
 
+/// How far a robot's monotonic clock is ahead of ours, less the way of this state.
+fn monotonic_offset_us(state: &RobotState, now: Duration) -> Option<i64> {
+    let robot_us = i64::try_from(state.monotonic_us?).ok()?;
+    let now_us = i64::try_from(now.as_micros()).ok()?;
+    Some(robot_us - now_us)
+}
+
+fn stop_of(state: &RobotState) -> Option<StopId> {
+    state.safety.stop.as_ref().map(|latch| latch.id)
+}
+
+fn lease_of(state: &RobotState) -> Option<u64> {
+    state.safety.lease.as_ref().map(|lease| lease.epoch)
+}
+
 /// What of a robot's mission decides what it needs.
 fn content(state: &RobotState) -> Option<(MissionId, u32, bool)> {
     let mission = state.mission?;
@@ -434,6 +548,7 @@ fn content(state: &RobotState) -> Option<(MissionId, u32, bool)> {
 #[cfg(test)]
 mod tests {
     use tread_api::robot::{LoopStatus, OutboxStatus, RobotMode};
+    use tread_api::safety::SafetyStatus;
     use uuid::Uuid;
 
     use super::*;
@@ -465,6 +580,8 @@ mod tests {
             },
             battery: None,
             alerts: Vec::new(),
+            monotonic_us: None,
+            safety: SafetyStatus::default(),
         }
     }
 

@@ -5,16 +5,20 @@
 
 mod alerts;
 pub mod connections;
+mod drive;
 mod events;
 pub mod extract;
 mod friction;
+mod geofence;
 pub mod health;
 mod identity;
+mod limits;
 mod missions;
 pub mod problem;
 mod robots;
 pub mod serve;
 mod sites;
+mod stops;
 mod terrains;
 pub mod tls;
 
@@ -57,10 +61,13 @@ pub const REQUEST_TIMEOUT: Duration = Duration::from_secs(15);
 const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 
 #[derive(utoipa::OpenApi)]
-#[openapi(info(
-    title = "Tread",
-    description = "Missions for skid-steered robots, and the friction that they measure.",
-))]
+#[openapi(
+    info(
+        title = "Tread",
+        description = "Missions for skid-steered robots, and the friction that they measure.",
+    ),
+    components(schemas(tread_api::drive::DriveRequest))
+)]
 struct Description;
 
 fn routes() -> OpenApiRouter<App> {
@@ -90,6 +97,14 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(missions::cancel))
         .routes(routes!(missions::pause))
         .routes(routes!(missions::resume))
+        .routes(routes!(stops::stop))
+        .routes(routes!(stops::stop_fleet))
+        .routes(routes!(stops::clear))
+        .routes(routes!(stops::list))
+        .routes(routes!(drive::drive))
+        .routes(routes!(limits::list))
+        .routes(routes!(limits::set, limits::end))
+        .routes(routes!(geofence::get, geofence::replace))
         .routes(routes!(friction::terrains))
         .routes(routes!(friction::terrain))
         .routes(routes!(friction::cells))

@@ -57,6 +57,8 @@ const fn status(kind: ProblemType) -> StatusCode {
         ProblemType::InvalidBody
         | ProblemType::UnknownField
         | ProblemType::BeyondLimits
+        | ProblemType::CrossesGeofence
+        | ProblemType::RobotOutsideGeofence
         | ProblemType::IdempotencyKeyReused => StatusCode::UNPROCESSABLE_ENTITY,
         ProblemType::BodyTooLarge => StatusCode::PAYLOAD_TOO_LARGE,
         ProblemType::UnsupportedMediaType => StatusCode::UNSUPPORTED_MEDIA_TYPE,
@@ -66,7 +68,8 @@ const fn status(kind: ProblemType) -> StatusCode {
         | ProblemType::UnknownTerrain
         | ProblemType::UnknownMission
         | ProblemType::UnknownAlert
-        | ProblemType::UnknownToken => StatusCode::NOT_FOUND,
+        | ProblemType::UnknownToken
+        | ProblemType::UnknownStop => StatusCode::NOT_FOUND,
         ProblemType::MethodNotAllowed => StatusCode::METHOD_NOT_ALLOWED,
         ProblemType::AlreadyExists
         | ProblemType::MissionEnded
@@ -74,6 +77,8 @@ const fn status(kind: ProblemType) -> StatusCode {
         | ProblemType::RobotBusy
         | ProblemType::RobotRetired
         | ProblemType::RobotCannot
+        | ProblemType::RobotRefused
+        | ProblemType::StopNotCleared
         | ProblemType::IdempotencyKeyInFlight
         | ProblemType::TooMany => StatusCode::CONFLICT,
         ProblemType::Unauthenticated => StatusCode::UNAUTHORIZED,
@@ -82,7 +87,8 @@ const fn status(kind: ProblemType) -> StatusCode {
         ProblemType::UnknownHost => StatusCode::MISDIRECTED_REQUEST,
         ProblemType::RequestTooLong => StatusCode::URI_TOO_LONG,
         ProblemType::Timeout => StatusCode::GATEWAY_TIMEOUT,
-        ProblemType::Unavailable => StatusCode::SERVICE_UNAVAILABLE,
+        ProblemType::ChangedMeanwhile => StatusCode::PRECONDITION_FAILED,
+        ProblemType::Unavailable | ProblemType::RobotUnreachable => StatusCode::SERVICE_UNAVAILABLE,
         ProblemType::Internal => StatusCode::INTERNAL_SERVER_ERROR,
     }
 }
@@ -105,6 +111,13 @@ impl From<AppError> for Problem {
             AppError::RobotCannot { .. } => ProblemType::RobotCannot,
             AppError::UnknownAlert(_) => ProblemType::UnknownAlert,
             AppError::UnknownToken(_) => ProblemType::UnknownToken,
+            AppError::UnknownStop(_) => ProblemType::UnknownStop,
+            AppError::StopNotCleared { .. } => ProblemType::StopNotCleared,
+            AppError::RobotUnreachable(_) => ProblemType::RobotUnreachable,
+            AppError::RobotRefused { .. } => ProblemType::RobotRefused,
+            AppError::CrossesGeofence { .. } => ProblemType::CrossesGeofence,
+            AppError::OutsideGeofence { .. } => ProblemType::RobotOutsideGeofence,
+            AppError::ChangedMeanwhile { .. } => ProblemType::ChangedMeanwhile,
             AppError::KeyInFlight => ProblemType::IdempotencyKeyInFlight,
             AppError::KeyReused => ProblemType::IdempotencyKeyReused,
             AppError::TooMany { .. } => ProblemType::TooMany,

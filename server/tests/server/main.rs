@@ -6,6 +6,10 @@ mod bad_input;
 #[cfg(test)]
 mod control;
 #[cfg(test)]
+mod drive;
+#[cfg(test)]
+mod geofence;
+#[cfg(test)]
 mod harness;
 #[cfg(test)]
 mod identity;
@@ -27,3 +31,5 @@ mod resources;
 mod robot;
 #[cfg(test)]
 mod slow_client;
+#[cfg(test)]
+mod stops;

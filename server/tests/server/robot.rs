@@ -9,9 +9,13 @@ use tread_api::ids::{BootId, RobotId};
 use tread_api::keys::{self, Key, Verb};
 use tread_api::mission::Mission;
 use tread_api::robot::{Capabilities, LoopStatus, MissionProgress, OutboxStatus, RobotMode};
+use tread_api::safety::{Lease, SafetyStatus, StopLatch};
 use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome};
 use tread_api::wire::hello::{Hello, SiteDefinition, Welcome};
 use tread_api::wire::ingest::{Batch, MissionPhase, Receipt, Record};
+use tread_api::wire::safety::{
+    ClearStop, DriveCommand, ExternalLimit, LeaseAction, LeaseCommand, Stop,
+};
 use tread_api::wire::state::RobotState;
 use tread_api::wire::{self, Refusal};
 use tread_server::supervisor::Supervisor;
@@ -37,6 +41,13 @@ struct Heard {
     cancels: Vec<Cancel>,
     holds: Vec<Verb>,
     sites: Vec<SiteDefinition>,
+    stops: Vec<Stop>,
+    clears: Vec<ClearStop>,
+    leases: Vec<LeaseCommand>,
+    limits: Vec<ExternalLimit>,
+    drives: Vec<DriveCommand>,
+    deaf_to_stops: bool,
+    epoch: u64,
 }
 
 /// A robot on the network that says what the test tells it to.
@@ -98,6 +109,13 @@ impl Robot {
             cancels: Vec::new(),
             holds: Vec::new(),
             sites: Vec::new(),
+            stops: Vec::new(),
+            clears: Vec::new(),
+            leases: Vec::new(),
+            limits: Vec::new(),
+            drives: Vec::new(),
+            deaf_to_stops: false,
+            epoch: 0,
         }));
         let state = Arc::new(Mutex::new(RobotState {
             robot: id.clone(),
@@ -117,12 +135,24 @@ impl Robot {
             control_loop: LoopStatus::default(),
             battery: None,
             alerts: Vec::new(),
+            monotonic_us: None,
+            safety: SafetyStatus::default(),
         }));
         let (listener, holding) = (Arc::clone(&heard), Arc::clone(&state));
         session
             .declare_queryable(keys::commands(&site(), &id))
             .complete(true)
             .callback(move |query| answer(&query, boot, &listener, &holding))
+            .background()
+            .wait()
+            .unwrap();
+        let driven = Arc::clone(&heard);
+        session
+            .declare_subscriber(keys::teleop(&site(), &id))
+            .callback(move |sample| {
+                let command = wire::decode(&sample.payload().to_bytes()).unwrap();
+                driven.lock().unwrap().drives.push(command);
+            })
             .background()
             .wait()
             .unwrap();
@@ -140,11 +170,13 @@ impl Robot {
         let beats = Arc::clone(&beating);
         let supervisor = Supervisor::new();
         let stop = supervisor.stop_token();
+        let clock = tokio::time::Instant::now();
         supervisor.spawn_vital("speaking", async move {
             while !stop.is_cancelled() {
                 let payload = {
                     let mut state = said.lock().unwrap();
                     state.seq += 1;
+                    state.monotonic_us = Some(u64::try_from(clock.elapsed().as_micros()).unwrap());
                     state.control_loop.ticks += u64::from(beats.load(Ordering::Relaxed));
                     wire::encode(&*state).unwrap()
                 };
@@ -183,6 +215,8 @@ impl Robot {
             capabilities: Capabilities {
                 pause: true,
                 replace: true,
+                stop: true,
+                teleop: true,
                 ..Capabilities::default()
             },
         };
@@ -194,7 +228,10 @@ impl Robot {
             .await
         })
         .await;
-        self.state.lock().unwrap().terrain_revision = Some(welcome.site.terrain_revision);
+        self.say(|state| {
+            state.terrain_revision = Some(welcome.site.terrain_revision);
+            state.safety.fence_revision = Some(welcome.site.geofence.revision);
+        });
         welcome
     }
 
@@ -221,6 +258,31 @@ impl Robot {
 
     pub(crate) fn sites(&self) -> Vec<SiteDefinition> {
         self.heard.lock().unwrap().sites.clone()
+    }
+
+    /// Lets it hear no stop, or hear them again.
+    pub(crate) fn be_deaf_to_stops(&self, deaf: bool) {
+        self.heard.lock().unwrap().deaf_to_stops = deaf;
+    }
+
+    pub(crate) fn stops(&self) -> Vec<Stop> {
+        self.heard.lock().unwrap().stops.clone()
+    }
+
+    pub(crate) fn leases(&self) -> Vec<LeaseCommand> {
+        self.heard.lock().unwrap().leases.clone()
+    }
+
+    pub(crate) fn limits(&self) -> Vec<ExternalLimit> {
+        self.heard.lock().unwrap().limits.clone()
+    }
+
+    pub(crate) fn drives(&self) -> Vec<DriveCommand> {
+        self.heard.lock().unwrap().drives.clone()
+    }
+
+    pub(crate) fn state(&self) -> RobotState {
+        self.state.lock().unwrap().clone()
     }
 
     /// Lets the control loop stand still while the agent speaks on.
@@ -293,6 +355,7 @@ impl Robot {
             length_m: 18.85,
             cross_track_m: 0.0,
             paused: false,
+            paused_by: None,
         };
         self.say(|state| {
             state.mode = RobotMode::Tracking;
@@ -333,6 +396,7 @@ fn answer(
                         length_m: 18.85,
                         cross_track_m: 0.0,
                         paused: false,
+                        paused_by: None,
                     });
                     Outcome::Accepted { plan: None }
                 }
@@ -364,8 +428,73 @@ fn answer(
         }
         Verb::Site => {
             let definition: SiteDefinition = wire::decode(&payload).unwrap();
-            state.lock().unwrap().terrain_revision = Some(definition.terrain_revision);
+            let mut state = state.lock().unwrap();
+            state.terrain_revision = Some(definition.terrain_revision);
+            state.safety.fence_revision = Some(definition.geofence.revision);
             heard.sites.push(definition);
+            Outcome::Done
+        }
+        Verb::Stop => {
+            if heard.deaf_to_stops {
+                return;
+            }
+            let stop: Stop = wire::decode(&payload).unwrap();
+            let mut state = state.lock().unwrap();
+            state.mode = RobotMode::Stopped;
+            if let Some(mission) = &mut state.mission {
+                mission.paused = true;
+            }
+            state.safety.stop = Some(StopLatch {
+                id: stop.stop,
+                by: stop.by.clone(),
+                reason: stop.reason.clone(),
+                since: stop.at,
+            });
+            heard.stops.push(stop);
+            Outcome::Done
+        }
+        Verb::Clear => {
+            let clear: ClearStop = wire::decode(&payload).unwrap();
+            let mut state = state.lock().unwrap();
+            let newest = state.safety.stop.as_ref().map(|latch| latch.id);
+            if newest.is_some_and(|newest| newest != clear.stop) {
+                Outcome::Refused {
+                    code: OfferRefusal::Conflict,
+                    detail: "a newer stop is in force".to_owned(),
+                }
+            } else {
+                state.safety.stop = None;
+                state.mode = RobotMode::Idle;
+                heard.clears.push(clear);
+                Outcome::Done
+            }
+        }
+        Verb::Lease => {
+            let lease: LeaseCommand = wire::decode(&payload).unwrap();
+            let mut state = state.lock().unwrap();
+            let other = state.safety.lease.clone();
+            let other = other.filter(|other| other.driver.client != lease.holder.client);
+            heard.leases.push(lease.clone());
+            match (lease.action, other) {
+                (LeaseAction::Acquire, Some(other)) => Outcome::Refused {
+                    code: OfferRefusal::Leased,
+                    detail: format!("`{}` drives it", other.driver.name),
+                },
+                (LeaseAction::Acquire | LeaseAction::Take, _) => {
+                    heard.epoch += 1;
+                    let epoch = heard.epoch;
+                    let driver = lease.holder;
+                    state.safety.lease = Some(Lease { epoch, driver });
+                    Outcome::Leased { epoch }
+                }
+                (LeaseAction::Release, other) => {
+                    state.safety.lease = other;
+                    Outcome::Done
+                }
+            }
+        }
+        Verb::Limit => {
+            heard.limits.push(wire::decode(&payload).unwrap());
             Outcome::Done
         }
     };

@@ -236,7 +236,10 @@ impl Storm {
         }));
         let supervisor = Supervisor::new();
         let app = app_on(&path, &clock, &site).await;
-        let commands = Commands::new(Arc::new(Network(Arc::clone(&world))), app.clone());
+        let commands = Commands::new(
+            Arc::new(Network(Arc::clone(&world))),
+            Arc::clone(app.presences()),
+        );
         let mut storm = Self {
             reconciler: Reconciler::new(app.clone(), commands, supervisor.clone()),
             writer: Writer::new(app.clone()),
@@ -480,7 +483,10 @@ impl Storm {
         self.app.db().close().await;
         self.app = app_on(&self.path, &self.clock, &self.site).await;
         self.writer = Writer::new(self.app.clone());
-        let commands = Commands::new(Arc::new(Network(Arc::clone(&self.world))), self.app.clone());
+        let commands = Commands::new(
+            Arc::new(Network(Arc::clone(&self.world))),
+            Arc::clone(self.app.presences()),
+        );
         self.reconciler = Reconciler::new(self.app.clone(), commands, self.supervisor.clone());
         for index in 0..ROBOTS {
             if with(&self.world, |world| world.robots[index].linked) {

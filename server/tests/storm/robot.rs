@@ -136,6 +136,7 @@ impl Robot {
             length_m: LENGTH_M,
             cross_track_m: 0.0,
             paused: held.paused,
+            paused_by: None,
         };
         RobotState {
             robot: self.id.clone(),
@@ -158,6 +159,8 @@ impl Robot {
             },
             battery: None,
             alerts: Vec::new(),
+            monotonic_us: None,
+            safety: tread_api::safety::SafetyStatus::default(),
         }
     }
 
@@ -193,6 +196,7 @@ impl Robot {
                 self.hold(&pause, verb == Verb::Pause)
             }
             Verb::Site => Outcome::Done,
+            Verb::Stop | Verb::Clear | Verb::Lease | Verb::Limit => refused(OfferRefusal::Other),
         };
         Answer {
             boot: self.boot,

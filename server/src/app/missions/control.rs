@@ -3,8 +3,11 @@
 //! Each only writes what is wanted; the reconciler brings it to the robot, and the robot's answer
 //! moves the mission. Wanted twice is wanted once.
 
+use jiff::Timestamp;
 use tread_api::ids::MissionId;
-use tread_api::mission::{Actor, Cause, MissionDetail, MissionState, ReplaceMission, Replacement};
+use tread_api::mission::{
+    Actor, Cause, Mission, MissionDetail, MissionEvent, MissionState, ReplaceMission, Replacement,
+};
 use tread_api::wire::command::Offer;
 
 use super::transitions::Change;
@@ -12,7 +15,7 @@ use super::{Step, add_note, check_limits, take_step};
 use crate::app::{App, AppError};
 use crate::db::missions::{Facts, MissionRow};
 use crate::db::robots::RobotRow;
-use crate::db::{self, Tx};
+use crate::db::{self, DbError, Tx};
 
 impl App {
     /// Wants a mission to end: one that waits ends at once, one in hand when its robot says so.
@@ -52,11 +55,17 @@ impl App {
         let row = open_row(&mut tx, id).await?;
         let mission = &row.mission;
         let state = mission.state;
-        if !matches!(
+        // One that waits and was held, because its robot was stopped or driven by hand, waits on.
+        let held_in_queue = state == MissionState::Queued && mission.pause_wanted && !wanted;
+        let in_hand = matches!(
             state,
             MissionState::Offered | MissionState::Active | MissionState::Paused
-        ) {
+        );
+        if !in_hand && !held_in_queue {
             return Err(AppError::MissionState { id, state, asked });
+        }
+        if !wanted {
+            self.check_free(&mut tx, mission).await?;
         }
         if wanted && !robot_of(&mut tx, &row).await?.capabilities.pause {
             return Err(AppError::RobotCannot {
@@ -72,6 +81,25 @@ impl App {
         self.written(tx, id).await
     }
 
+    /// Refuses to let a mission go on while its robot is stopped or driven by hand: it would start
+    /// by itself afterwards.
+    async fn check_free(&self, tx: &mut Tx, mission: &Mission) -> Result<(), AppError> {
+        let (site, robot) = (&mission.site, &mission.robot);
+        let presence = self.presences().get(&(site.clone(), robot.clone()));
+        let safety = presence.state().map(|state| &state.safety);
+        let detail = if db::stops::is_stopped(tx, site, robot).await?
+            || safety.is_some_and(|safety| safety.stop.is_some())
+        {
+            "a stop is in force; clear it first".to_owned()
+        } else if let Some(lease) = safety.and_then(|safety| safety.lease.as_ref()) {
+            format!("`{}` drives it by hand", lease.driver.name)
+        } else {
+            return Ok(());
+        };
+        let robot = robot.clone();
+        Err(AppError::RobotRefused { robot, detail })
+    }
+
     /// Wants a mission to be another trajectory. What waits is changed at once; what is in hand
     /// when its robot holds the new revision whole, and until then the old one is driven.
     pub async fn replace_mission(
@@ -80,6 +108,11 @@ impl App {
         request: ReplaceMission,
     ) -> Result<MissionDetail, AppError> {
         let asked = "replaced";
+        let mut tx = self.db().read().await?;
+        let row = open_row(&mut tx, id).await?;
+        drop(tx);
+        let robot = (&row.mission.site, &row.mission.robot);
+        self.check_fence(robot, &request.trajectory).await?;
         let mut tx = self.db().write().await?;
         let row = open_row(&mut tx, id).await?;
         let mission = &row.mission;
@@ -120,6 +153,30 @@ impl App {
         self.wake();
         Ok(detail)
     }
+}
+
+/// Holds everything that a robot has in hand or that waits for it, because somebody stopped it or
+/// drives it by hand: nothing of it goes on until a person says so.
+pub(in crate::app) async fn hold_all(
+    tx: &mut Tx,
+    robot_pk: i64,
+    reason: &str,
+    at: Timestamp,
+) -> Result<(), DbError> {
+    for open in db::missions::open_of_robot(tx, robot_pk).await? {
+        if !open.pause_wanted && db::missions::want_pause(tx, open.id, true).await? {
+            let event = MissionEvent {
+                at,
+                actor: Actor::Server,
+                from: Some(open.state),
+                to: open.state,
+                cause: Cause::PauseRequested,
+                reason: Some(reason.to_owned()),
+            };
+            db::history::add_event(tx, open.id, &event).await?;
+        }
+    }
+    Ok(())
 }
 
 async fn open_row(tx: &mut Tx, id: MissionId) -> Result<MissionRow, AppError> {

@@ -33,6 +33,8 @@ const EVENTS_MAX: u32 = 1_000;
 impl App {
     /// Asks a robot to drive something.
     pub async fn create_mission(&self, request: CreateMission) -> Result<Mission, AppError> {
+        let robot = (&request.site, &request.robot);
+        self.check_fence(robot, &request.trajectory).await?;
         let mut tx = self.db().write().await?;
         let mission = self.enqueue(&mut tx, request).await?;
         tx.commit().await?;
@@ -116,11 +118,16 @@ impl App {
             started_at: None,
             ended_at: None,
         };
-        let row = MissionRow {
+        let mut row = MissionRow {
             robot_pk: robot_row.pk,
             mission,
         };
         db::missions::insert(tx, &row).await?;
+        if self.is_in_hands(tx, &row.mission).await? {
+            // It would start by itself once the robot is free again.
+            db::missions::want_pause(tx, id, true).await?;
+            row.mission.pause_wanted = true;
+        }
         let event = MissionEvent {
             at: created_at,
             actor: Actor::Client,
@@ -131,6 +138,13 @@ impl App {
         };
         db::history::add_event(tx, id, &event).await?;
         Ok(row.mission)
+    }
+
+    /// Whether a mission's robot is stopped, or driven by hand.
+    async fn is_in_hands(&self, tx: &mut Tx, mission: &Mission) -> Result<bool, AppError> {
+        let (site, robot) = (&mission.site, &mission.robot);
+        let presence = self.presences().get(&(site.clone(), robot.clone()));
+        Ok(presence.is_in_hands() || db::stops::is_stopped(tx, site, robot).await?)
     }
 
     /// Missions, newest first.

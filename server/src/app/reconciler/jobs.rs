@@ -4,11 +4,13 @@ use tracing::warn;
 use tread_api::ids::MissionId;
 use tread_api::keys::Verb;
 use tread_api::mission::{Actor, Cause, MissionState};
+use tread_api::stop::Stop;
 use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome, Pause, Resume};
 
 use crate::app::missions::reports::adopt;
 use crate::app::missions::transitions::Change;
 use crate::app::missions::{Step, add_note, take_step};
+use crate::app::stops::tell;
 use crate::app::terrains::site_definition;
 use crate::app::{App, AppError};
 use crate::db;
@@ -138,11 +140,15 @@ async fn take_offer_answer(
             (Change::Accept, None, Finished::Settled)
         }
         // Out of place, but it says that the robot will do it.
-        Outcome::Done => (Change::Accept, None, Finished::Settled),
+        Outcome::Done | Outcome::Leased { .. } => (Change::Accept, None, Finished::Settled),
         Outcome::Refused { code, detail } => {
             let detail = Some(detail.as_str());
             match code {
-                OfferRefusal::Busy | OfferRefusal::NotReady => {
+                OfferRefusal::Busy
+                | OfferRefusal::NotReady
+                | OfferRefusal::Leased
+                | OfferRefusal::Stopped
+                | OfferRefusal::Moving => {
                     facts = Facts::default();
                     (Change::Return, detail, Finished::Again)
                 }
@@ -152,6 +158,7 @@ async fn take_offer_answer(
                 OfferRefusal::Conflict
                 | OfferRefusal::Impossible
                 | OfferRefusal::Unknown
+                | OfferRefusal::TooMany
                 | OfferRefusal::Other => (Change::Reject, detail, Finished::Settled),
             }
         }
@@ -213,11 +220,11 @@ pub(super) async fn replace(
         return Ok(Finished::Settled);
     };
     let how = match &answer.outcome {
-        Outcome::Accepted { .. } | Outcome::Done => {
+        Outcome::Accepted { .. } | Outcome::Done | Outcome::Leased { .. } => {
             adopt(&mut tx, &row, Actor::Robot, app.clock().now()).await?;
             let plan = match answer.outcome {
                 Outcome::Accepted { plan } => plan,
-                Outcome::Done | Outcome::Refused { .. } => None,
+                Outcome::Done | Outcome::Leased { .. } | Outcome::Refused { .. } => None,
             };
             let facts = Facts {
                 plan,
@@ -227,12 +234,17 @@ pub(super) async fn replace(
             Finished::Settled
         }
         Outcome::Refused { code, detail } => match code {
-            OfferRefusal::Busy | OfferRefusal::NotReady => return Ok(Finished::Again),
+            OfferRefusal::Busy
+            | OfferRefusal::NotReady
+            | OfferRefusal::Leased
+            | OfferRefusal::Stopped
+            | OfferRefusal::Moving => return Ok(Finished::Again),
             OfferRefusal::Ended => return Ok(Finished::EndedThere),
             OfferRefusal::Conflict
             | OfferRefusal::Impossible
             | OfferRefusal::TooLate
             | OfferRefusal::Unknown
+            | OfferRefusal::TooMany
             | OfferRefusal::Other => {
                 db::missions::set_replacement(&mut tx, row.mission.id, None).await?;
                 let why = (Actor::Robot, Cause::ReplaceRefused);
@@ -280,7 +292,9 @@ pub(super) async fn hold(
     match &answer.outcome {
         // It brakes or speeds up now. The mission moves when the robot says that it stands, or
         // that it drives on.
-        Outcome::Done | Outcome::Accepted { .. } => Ok(Finished::Delivered),
+        Outcome::Done | Outcome::Accepted { .. } | Outcome::Leased { .. } => {
+            Ok(Finished::Delivered)
+        }
         Outcome::Refused {
             code: OfferRefusal::Ended,
             ..
@@ -309,7 +323,7 @@ pub(super) async fn cancel(
         return Ok(Finished::Again);
     };
     let detail = match &answer.outcome {
-        Outcome::Done | Outcome::Accepted { .. } => None,
+        Outcome::Done | Outcome::Accepted { .. } | Outcome::Leased { .. } => None,
         Outcome::Refused {
             code: OfferRefusal::Unknown,
             ..
@@ -398,6 +412,21 @@ pub(super) async fn end_rival(app: App, commands: Commands, rival: Rival) -> Fin
     Finished::Again
 }
 
+/// Tells a robot again to stop, and writes down that it has confirmed.
+pub(super) async fn stop_again(
+    app: App,
+    commands: Commands,
+    stop: Stop,
+) -> Result<Finished, AppError> {
+    if !tell(&app, &commands, &stop).await {
+        app.note_unconfirmed(&[&stop]).await?;
+        return Ok(Finished::Again);
+    }
+    let confirmed = (stop.id, app.clock().now());
+    app.note_confirmed(&[stop], &[confirmed]).await?;
+    Ok(Finished::Settled)
+}
+
 /// Brings a robot its site's terrains.
 pub(super) async fn push_site(
     app: App,
@@ -413,7 +442,7 @@ pub(super) async fn push_site(
     match commands.send(&key, Verb::Site, &definition).await {
         // Its next state shows the new revision; if not, it is sent again.
         Some(Answer {
-            outcome: Outcome::Done | Outcome::Accepted { .. },
+            outcome: Outcome::Done | Outcome::Accepted { .. } | Outcome::Leased { .. },
             ..
         }) => Ok(Finished::Again),
         Some(Answer {

@@ -15,11 +15,12 @@ use jiff::SignedDuration;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, error};
-use tread_api::ids::{MissionId, SiteId};
+use tread_api::ids::{MissionId, SiteId, StopId};
 use tread_api::mission::MissionState;
 
 use self::jobs::{
     Finished, adopt_shown, cancel, disown, end_rival, hold, offer, push_site, replace, settle,
+    stop_again,
 };
 use self::needs::{Memory, Need, Now, decide, is_absent, is_heard, is_held_otherwise};
 use super::missions::transitions::Change;
@@ -34,6 +35,10 @@ use crate::supervisor::Supervisor;
 pub const PERIOD: Duration = Duration::from_millis(500);
 /// Commands that may be under way at once.
 const COMMANDS_MAX: usize = 64;
+/// Stops that may be under way at once, beside all other commands.
+const STOPS_UNDER_WAY_MAX: usize = 256;
+/// Longest wait before a stop is repeated.
+const STOP_RETRY_MAX: Duration = Duration::from_millis(400);
 /// First wait before a command is repeated; it doubles each time.
 const RETRY_MIN: Duration = Duration::from_millis(100);
 /// Longest wait before a command is repeated.
@@ -49,6 +54,7 @@ const FOREIGN_GRACE: Duration = Duration::from_millis(1_500);
 /// A command that is under way or waits to be repeated.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 enum Job {
+    Stop(StopId),
     Offer(MissionId),
     Replace(MissionId),
     /// To pause it, or to let it go on.
@@ -102,7 +108,7 @@ pub struct Reconciler {
 impl Reconciler {
     /// A reconciler that remembers nothing yet.
     pub fn new(app: App, commands: Commands, supervisor: Supervisor) -> Self {
-        let (finished, finishing) = mpsc::channel(COMMANDS_MAX);
+        let (finished, finishing) = mpsc::channel(COMMANDS_MAX + STOPS_UNDER_WAY_MAX);
         Self {
             app,
             commands,
@@ -163,10 +169,20 @@ impl Reconciler {
             self.retries.remove(&job);
         } else {
             let before = self.retries.get(&job);
+            let most = match job {
+                Job::Stop(_) => STOP_RETRY_MAX,
+                Job::Offer(_)
+                | Job::Replace(_)
+                | Job::Hold(..)
+                | Job::Cancel(_)
+                | Job::Disown(_)
+                | Job::EndRival(_)
+                | Job::Site(_) => RETRY_MAX,
+            };
             let wait = match (how, before) {
-                (Finished::Delivered, _) => RETRY_MAX,
+                (Finished::Delivered, _) => most,
                 (_, None) => RETRY_MIN,
-                (_, Some(retry)) => (retry.wait * 2).min(RETRY_MAX),
+                (_, Some(retry)) => (retry.wait * 2).min(most),
             };
             self.retries.insert(
                 job,
@@ -183,6 +199,7 @@ impl Reconciler {
     /// # Errors
     /// The database failed; the next pass does what this one did not.
     pub async fn pass(&mut self) -> Result<(), AppError> {
+        self.stop_again().await;
         self.expire().await?;
         self.end_rivals();
         self.app.sync_alerts().await?;
@@ -196,13 +213,20 @@ impl Reconciler {
         for mission in open {
             self.serve(mission).await?;
         }
-        let wanted: HashMap<SiteId, u64> = sites
+        let wanted: HashMap<SiteId, (u64, u64)> = sites
             .into_iter()
-            .map(|row| (row.site.id, row.site.terrain_revision))
+            .map(|row| {
+                let (terrains, fence) = (row.site.terrain_revision, row.site.geofence_revision);
+                (row.site.id, (terrains, fence))
+            })
             .collect();
         for (key, held) in self.app.presences().online(self.app.clock().elapsed()) {
             // Without any definition the robot will say hello, and gets one.
-            let lags = held.is_some_and(|held| wanted.get(&key.0).is_some_and(|&now| now != held));
+            let lags = wanted.get(&key.0).is_some_and(|&(terrains, fence)| {
+                held.terrains.is_some_and(|held| held != terrains)
+                    // A robot that knows no geofences says nothing of them.
+                    || held.fence.is_some_and(|held| held != fence)
+            });
             let job = Job::Site(key.clone());
             if lags && self.is_due(&job) {
                 let (app, commands) = (self.app.clone(), self.commands.clone());
@@ -212,6 +236,28 @@ impl Reconciler {
             }
         }
         Ok(())
+    }
+
+    /// Tells robots again what they have not confirmed. Whatever else fails, this goes on.
+    async fn stop_again(&mut self) {
+        let again = match self.app.tend_stops().await {
+            Ok(again) => again,
+            Err(error) => return error!("cannot look after stops: {error:?}"),
+        };
+        let wanted: HashSet<StopId> = again.iter().map(|stop| stop.id).collect();
+        self.retries
+            .retain(|job, _| !matches!(job, Job::Stop(id) if !wanted.contains(id)));
+        for stop in again {
+            let key = (stop.site.clone(), stop.robot.clone());
+            let presence = self.app.presences().get(&key);
+            let job = Job::Stop(stop.id);
+            // Any sign of life will do, also that of an agent whose loop stands still.
+            let is_there = presence.is_there(self.app.clock().elapsed());
+            if is_there && self.is_due(&job) {
+                let (app, commands) = (self.app.clone(), self.commands.clone());
+                self.start(job, stop_again(app, commands, stop));
+            }
+        }
     }
 
     async fn expire(&self) -> Result<(), AppError> {
@@ -233,7 +279,7 @@ impl Reconciler {
             Job::Offer(id) | Job::Replace(id) | Job::Hold(id, _) | Job::Cancel(id) => {
                 open.contains(id)
             }
-            Job::Disown(_) | Job::EndRival(_) | Job::Site(_) => true,
+            Job::Disown(_) | Job::EndRival(_) | Job::Site(_) | Job::Stop(_) => true,
         });
     }
 
@@ -251,7 +297,8 @@ impl Reconciler {
             | Job::Hold(..)
             | Job::Cancel(_)
             | Job::Disown(_)
-            | Job::Site(_) => true,
+            | Job::Site(_)
+            | Job::Stop(_) => true,
         });
         for rival in rivals {
             let job = Job::EndRival(rival.key.clone());
@@ -304,7 +351,8 @@ impl Reconciler {
             | Job::Hold(..)
             | Job::Cancel(_)
             | Job::EndRival(_)
-            | Job::Site(_) => true,
+            | Job::Site(_)
+            | Job::Stop(_) => true,
         });
     }
 
@@ -392,7 +440,14 @@ impl Reconciler {
 
     fn is_due(&self, job: &Job) -> bool {
         let now = self.app.clock().elapsed();
-        self.under_way.len() < COMMANDS_MAX
+        let is_stop = |job: &&Job| matches!(job, Job::Stop(_));
+        let stops = self.under_way.iter().filter(is_stop).count();
+        let has_room = if is_stop(&job) {
+            stops < STOPS_UNDER_WAY_MAX
+        } else {
+            self.under_way.len() - stops < COMMANDS_MAX
+        };
+        has_room
             && !self.under_way.contains(job)
             && self.retries.get(job).is_none_or(|retry| retry.due <= now)
     }

@@ -143,7 +143,11 @@ pub(super) fn decide(mission: &Standing, presence: &Presence, memory: Memory, no
         }
         MissionState::Active | MissionState::Paused => {
             let differs = memory.differs_from.is_some_and(longer_than(HOLD_GRACE));
-            in_hand(mission, said, differs)
+            match in_hand(mission, said, differs) {
+                // Whoever stopped it or drives it by hand has written down that it is to be held.
+                Need::Resume if presence.is_in_hands() => Need::Wait,
+                need => need,
+            }
         }
         MissionState::Cancelling => Need::Cancel,
         MissionState::Queued

@@ -65,6 +65,7 @@ fn presence(said: &Said) -> Presence {
         length_m: 2.0,
         cross_track_m: 0.0,
         paused: said.paused,
+        paused_by: None,
     };
     let state = RobotState {
         robot: of.robot,
@@ -84,6 +85,8 @@ fn presence(said: &Said) -> Presence {
         control_loop: LoopStatus::default(),
         battery: None,
         alerts: Vec::new(),
+        monotonic_us: None,
+        safety: tread_api::safety::SafetyStatus::default(),
     };
     let presences = Presences::default();
     presences.token_appeared(key.clone(), boot(said.boot), said.since);

@@ -3,23 +3,31 @@
 //! No thread, no clock, no network, so runs repeat to the bit and go as fast as the machine does.
 //! For tests, figures and benchmarks.
 
+pub mod hand_trials;
+pub mod lease_model;
+
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::mpsc::SendError;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use tread_api::ids::{MissionId, PlanHash};
+use tread_api::ids::{BootId, MissionId, PlanHash};
+use tread_api::safety::Geofence;
 use tread_api::site::Grid;
 use tread_api::terrain::{TerrainRef, TerrainShape};
 use tread_api::trajectory::Trajectory;
+use tread_api::wire::command::Outcome;
 use tread_api::wire::hello::SiteDefinition;
 use tread_api::wire::ingest::MissionPhase;
+use tread_api::wire::safety::LeaseCommand;
 use tread_control::follower::{Follower, FollowerConfig};
 use tread_control::geometry::Pose;
 use tread_control::plan::Plan;
 use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
+use crate::clock::{ManualClock, SharedClock};
 use crate::control_loop::active::Hold;
 use crate::control_loop::driven::Driven;
 use crate::control_loop::seam::{
@@ -31,10 +39,19 @@ use crate::control_loop::tick::LoopCore;
 use crate::drive::simulated::{SimMode, SimulatedDrive, SimulatedDriveError};
 use crate::drive::{Drive, Feedback};
 use crate::geometry::{control_trajectory, plan_options};
+use crate::safety::{Safety, answers, microseconds};
 use crate::sim::scenario::Scenario;
 
 /// Time between two ticks on the bench.
 pub const PERIOD: Duration = Duration::from_millis(10);
+
+/// When the bench begins, by its clock.
+const START_AT: Duration = Duration::from_secs(1);
+
+/// The run of the agent that the bench stands for.
+pub fn boot() -> BootId {
+    BootId::from_uuid(Uuid::from_u128(1))
+}
 
 /// Why the bench could not do what it was asked.
 #[derive(Debug, thiserror::Error)]
@@ -62,6 +79,8 @@ pub struct Bench {
     pub(crate) core: LoopCore,
     pub(crate) drive: SimulatedDrive,
     pub(crate) ends: AgentEnds,
+    pub(crate) safety: Arc<Safety>,
+    clock: Arc<ManualClock>,
     pub(crate) now: Duration,
     pub(crate) segments: Vec<ClosedSegment>,
     pub(crate) starts: Vec<MissionId>,
@@ -100,6 +119,7 @@ pub fn site_of(scenario: &Scenario) -> Result<SiteDefinition, String> {
         grid,
         terrain_revision: 1,
         terrains,
+        geofence: Geofence::default(),
     })
 }
 
@@ -150,12 +170,25 @@ impl Bench {
     pub fn new(scenario: &Scenario, start: Pose, seed: u64) -> Result<Self, SimulatedDriveError> {
         let model = RobotModel::yi2007();
         let (loop_ends, ends) = seam();
+        let clock = Arc::new(ManualClock::new(Timestamp::UNIX_EPOCH));
+        clock.advance(START_AT);
+        let safety = Safety::open(
+            // Nothing is there, and nothing is written while nobody waits for a confirmation.
+            Path::new("no-such-folder"),
+            boot(),
+            model,
+            &[],
+            Arc::clone(&ends.shared.safety),
+            Arc::clone(&clock) as SharedClock,
+        );
         let drive = SimulatedDrive::new(scenario, model, start, seed, SimMode::Explicit)?;
         Ok(Self {
             core: LoopCore::new(model, loop_ends),
             drive,
             ends,
-            now: Duration::from_secs(1),
+            safety,
+            clock,
+            now: START_AT,
             segments: Vec::new(),
             starts: Vec::new(),
             ended: Vec::new(),
@@ -231,8 +264,45 @@ impl Bench {
 
     /// Moves the base on by one period.
     pub fn simulate(&mut self) {
-        self.now += PERIOD;
+        self.pass_time(PERIOD);
         self.drive.advance(self.now);
+    }
+
+    /// Lets time pass.
+    fn pass_time(&mut self, time: Duration) {
+        self.now += time;
+        self.clock.advance(time);
+    }
+
+    /// The robot's clock, as end times are told, microseconds.
+    pub fn now_us(&self) -> u64 {
+        microseconds(self.now)
+    }
+
+    /// Acquires, takes or releases the lease of driving by hand.
+    pub fn lease(&self, command: &LeaseCommand) -> Outcome {
+        answers::lease(&self.safety, command)
+    }
+
+    /// Hands over a drive command as it comes from the network; true if it counts.
+    pub fn drive_by_hand(&self, payload: &[u8]) -> bool {
+        let accepted = || {
+            let status = self.safety.drive_status();
+            status.map_or(0, |status| status.counts.accepted)
+        };
+        let before = accepted();
+        self.safety.take_drive(payload);
+        accepted() > before
+    }
+
+    /// Whether the wheels' target is zero.
+    pub fn target_rests(&self) -> bool {
+        self.ends.shared.snapshot().gate.target_rests
+    }
+
+    /// Whether the robot stands.
+    pub fn stands(&self) -> bool {
+        self.core.stands()
     }
 
     fn moment(&self) -> Moment {
@@ -250,7 +320,7 @@ impl Bench {
 
     /// One period in which the base says nothing and does nothing.
     pub fn tick_without_base(&mut self) {
-        self.now += PERIOD;
+        self.pass_time(PERIOD);
         let now = self.moment();
         self.core.tick(now, false, &mut Silence);
         self.collect();

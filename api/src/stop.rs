@@ -1,0 +1,90 @@
+//! Stops over REST: stop a robot or a fleet at once, see what became of it, clear it.
+//!
+//! A stop is not a safety-rated emergency stop: it goes over a network and through programs.
+
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use crate::ids::{RobotId, SiteId, StopId};
+
+/// How long a robot may take to confirm a stop before the stop is shown as unconfirmed,
+/// milliseconds.
+pub const STOP_CONFIRM_MAX_MS: u64 = 300;
+/// Longest name of who stops, and longest reason, in characters; what is longer is cut.
+pub const STOP_TEXT_MAX: usize = 200;
+
+/// The body of `POST /v1/sites/{site}/robots/{robot}/stop`; it may be left out, and one that does
+/// not read stops the robot all the same.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+pub struct StopRobot {
+    /// Who stops, for people.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub by: Option<String>,
+    /// Why, for people.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reason: Option<String>,
+}
+
+/// The body of `POST /v1/stop`; it may be left out, and one that does not read stops every robot.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+pub struct StopFleet {
+    /// Only the robots of this site.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub site: Option<SiteId>,
+    /// Who stops, for people.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub by: Option<String>,
+    /// Why, for people.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reason: Option<String>,
+}
+
+/// The body of `POST /v1/sites/{site}/robots/{robot}/stop/clear`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct ClearStop {
+    /// The newest stop of the robot: a clear never clears one that its author has not seen.
+    pub stop: StopId,
+    /// Who clears, for people.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub by: Option<String>,
+}
+
+/// A stop of one robot with what became of it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct Stop {
+    /// The stop's identifier; needed to clear it.
+    pub id: StopId,
+    /// The robot's site.
+    pub site: SiteId,
+    /// The robot.
+    pub robot: RobotId,
+    /// Who stopped.
+    pub by: String,
+    /// Why.
+    pub reason: String,
+    /// When the server was asked.
+    pub wanted_at: Timestamp,
+    /// When the server heard that the robot's wheels are told to stand and that it will remember
+    /// the stop over a restart; `null` until then.
+    pub confirmed_at: Option<Timestamp>,
+    /// Whether the robot has not confirmed within 300 ms. It is told again until it does.
+    pub unconfirmed: bool,
+    /// Who asked last to clear it.
+    pub clear_asked_by: Option<String>,
+    /// When that was.
+    pub clear_asked_at: Option<Timestamp>,
+    /// When the robot had cleared it.
+    pub cleared_at: Option<Timestamp>,
+}
+
+/// The answer to `POST /v1/stop`: one stop for each robot.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct FleetStop {
+    /// How many robots had confirmed when the answer was made.
+    pub confirmed: usize,
+    /// How many had not; they are told again until they do.
+    pub unconfirmed: usize,
+    /// The stops.
+    pub stops: Vec<Stop>,
+}

@@ -1,0 +1,187 @@
+//! Stops, leases, drive commands and external limits on zenoh.
+//!
+//! End times are on the robot's own monotonic clock (`monotonic_us` of its state), with the run of
+//! the agent that they belong to: another run refuses them. Whoever writes one estimates that
+//! clock from the state that had the shortest way. The estimate lags by that way, so an end comes
+//! too early, never too late.
+
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use uuid::Uuid;
+
+use crate::geometry::Twist;
+use crate::ids::{BootId, HolderId, StopId};
+use crate::safety::{DRIVE_AHEAD_MAX_US, Driver, LIMIT_AHEAD_MAX_US};
+
+/// `cmd/stop`: command zero, latch, and answer `done` once the latch is on the disk.
+///
+/// Works in every state and needs no lease. The same twice is one stop.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Stop {
+    /// The stop.
+    pub stop: StopId,
+    /// Who stops, for people.
+    pub by: String,
+    /// Why, for people.
+    pub reason: String,
+    /// When it was asked for, by the sender's clock.
+    pub at: Timestamp,
+}
+
+/// `cmd/clear`: end the stop that is in force, if it is this one and the robot stands.
+///
+/// `done` also when this stop was cleared before; refused as `conflict` when a newer stop is in
+/// force, as `moving` while the robot moves. Nothing starts by itself afterwards.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ClearStop {
+    /// The newest stop that its sender knows of.
+    pub stop: StopId,
+    /// Who clears, for people.
+    pub by: String,
+}
+
+/// What is wanted with a lease.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LeaseAction {
+    /// Have it, if nobody else does; the same again for whoever has it.
+    Acquire,
+    /// Have it, whoever does now.
+    Take,
+    /// Give it back.
+    Release,
+}
+
+/// `cmd/lease`: acquire, take or release the lease of driving by hand.
+///
+/// Answered by `leased`, by `done` (released), or refused as `leased` with a detail that names who
+/// has it. A lease holds the mission in hand: it stays paused until it is resumed by request.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LeaseCommand {
+    /// Makes the command idempotent: the same request again gets the same answer and changes
+    /// nothing.
+    pub request: Uuid,
+    /// What is wanted.
+    pub action: LeaseAction,
+    /// Who wants it.
+    pub holder: Driver,
+}
+
+/// On the robot's `teleop` key: drive like this until then.
+///
+/// Taken only with the present run and lease, a number above all before, and an end in the future
+/// that is no more than a second away. Anything else changes nothing and is counted. Once the last
+/// end has passed, the target is zero in the next tick.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct DriveCommand {
+    /// The run of the agent.
+    pub boot: BootId,
+    /// The lease.
+    pub epoch: u64,
+    /// Counts the commands of this lease.
+    pub seq: u64,
+    /// The robot's clock when it was sent, as the sender estimates it, microseconds. The robot
+    /// measures its age by it and slows down when that is high.
+    pub sent_us: u64,
+    /// The robot's clock at which it ends, microseconds.
+    pub until_us: u64,
+    /// What is wanted.
+    pub twist: Twist,
+}
+
+/// On the robot's `limit/{holder}` key, or by `cmd/limit`: hold or slow down until then.
+///
+/// The highest `seq` of a holder counts while it lasts (microseconds of any clock that never falls
+/// do well). `until_us` in the past, such as 0, ends the holder's limit at once. A holder that
+/// the robot's configuration calls required holds the robot by its silence.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ExternalLimit {
+    /// Who limits; the same as in the key.
+    pub holder: HolderId,
+    /// The run of the agent.
+    pub boot: BootId,
+    /// The robot's clock at which it ends, microseconds, at most an hour ahead.
+    pub until_us: u64,
+    /// Orders the limits of this holder.
+    pub seq: u64,
+    /// Whether the robot is to stand.
+    #[serde(default)]
+    pub hold: bool,
+    /// Fastest speed, m/s; as before when absent.
+    #[serde(default)]
+    pub linear_max_m_s: Option<f64>,
+}
+
+impl DriveCommand {
+    /// Whether its end lies ahead and not too far, at the robot's clock `now_us`.
+    pub const fn is_in_time(&self, now_us: u64) -> bool {
+        now_us < self.until_us && self.until_us - now_us <= DRIVE_AHEAD_MAX_US
+    }
+}
+
+impl ExternalLimit {
+    /// Checks what does not depend on time.
+    ///
+    /// # Errors
+    /// A sentence, if the speed is negative or no number.
+    pub fn validate(&self) -> Result<(), String> {
+        match self.linear_max_m_s {
+            Some(most_m_s) if !(most_m_s.is_finite() && most_m_s >= 0.0) => Err(format!(
+                "linear_max_m_s must be finite and not negative, not {most_m_s}"
+            )),
+            Some(_) | None => Ok(()),
+        }
+    }
+
+    /// Whether its end is too far ahead, at the robot's clock `now_us`.
+    pub const fn is_too_long(&self, now_us: u64) -> bool {
+        self.until_us.saturating_sub(now_us) > LIMIT_AHEAD_MAX_US
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wire;
+
+    #[test]
+    fn a_drive_command_is_in_time_between_now_and_a_second() {
+        let command = |until_us| DriveCommand {
+            boot: BootId::from_uuid(Uuid::from_u128(1)),
+            epoch: 1,
+            seq: 1,
+            sent_us: 0,
+            until_us,
+            twist: Twist::default(),
+        };
+        for (until_us, is_in_time) in [
+            (0, false),
+            (1_000, false),
+            (1_001, true),
+            (1_001_000, true),
+            (1_001_001, false),
+            (u64::MAX, false),
+        ] {
+            assert_eq!(
+                command(until_us).is_in_time(1_000),
+                is_in_time,
+                "{until_us}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_drive_command_that_is_no_number_does_not_parse() {
+        let good = r#"{"v":1,"body":{"boot":"00000000-0000-0000-0000-000000000001","epoch":2,
+            "seq":3,"sent_us":4,"until_us":5,"twist":{"linear_m_s":0.5,"angular_rad_s":-0.1}}}"#;
+        let command: DriveCommand = wire::decode(good.as_bytes()).unwrap();
+        assert_eq!((command.epoch, command.seq), (2, 3));
+        for bad in ["NaN", "1e999", "null", "\"0.5\"", "-Infinity"] {
+            let text = good.replace("0.5", bad);
+            assert!(
+                wire::decode::<DriveCommand>(text.as_bytes()).is_err(),
+                "{bad}"
+            );
+        }
+    }
+}

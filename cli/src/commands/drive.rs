@@ -1,0 +1,402 @@
+//! `tread drive`: drive a robot by hand in the terminal.
+//!
+//! A terminal says when a key is pressed and repeats it while it is held, but not when it is let
+//! go: so a key drives for a moment, longer than the pause before it repeats. Without a key the
+//! robot stands. The terminal is put back as it was on every way out.
+
+use std::io::{self, IsTerminal as _, Write as _};
+use std::process::ExitCode;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
+use crossterm::{cursor, execute, terminal};
+use futures_util::{SinkExt as _, StreamExt as _};
+use tokio::net::TcpStream;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::mpsc;
+use tokio::time::{Instant, MissedTickBehavior};
+use tokio_tungstenite::tungstenite::{Error, Message};
+use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async};
+use tread_api::drive::{
+    Drive, DriveRequest, DriveUpdate, DriveView, DriverName, Nothing, StopWords,
+};
+
+use super::robots::{link_name, mode_name};
+use crate::args::DriveArguments;
+use crate::client::Client;
+use crate::output::{age, line};
+
+/// Time between two drive commands.
+const SEND_PERIOD: Duration = Duration::from_millis(50);
+/// How long each command lasts, milliseconds.
+const FOR_MS: u64 = 200;
+/// How long a key drives after it was seen last: longer than the pause before keys repeat.
+const KEY_HOLDS: Duration = Duration::from_millis(550);
+/// Keys that may wait.
+const KEYS_MAX: usize = 64;
+/// How often the keyboard is looked at, so that its thread ends soon after the rest.
+const KEY_POLL: Duration = Duration::from_millis(50);
+/// Longest wait for the server.
+const CONNECT_MAX: Duration = Duration::from_secs(5);
+/// What the keys do.
+const HELP: &str = "arrows or WASD drive · space stands · x stops and latches · q quits";
+
+type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
+
+/// A terminal that gives keys at once; it is as before when this is dropped, also by a panic.
+struct RawTerminal;
+
+impl RawTerminal {
+    fn enter() -> anyhow::Result<Self> {
+        terminal::enable_raw_mode().context("cannot read single keys from this terminal")?;
+        let raw = Self;
+        execute!(io::stdout(), cursor::Hide).context("cannot print")?;
+        Ok(raw)
+    }
+
+    /// Writes one line over the one before.
+    fn show(&self, text: &str) -> anyhow::Result<()> {
+        let (width, _) = terminal::size().unwrap_or((80, 24));
+        let text: String = text.chars().take(usize::from(width.max(2)) - 1).collect();
+        let mut out = io::stdout();
+        execute!(out, terminal::Clear(terminal::ClearType::CurrentLine)).context("cannot print")?;
+        write!(out, "\r{text}").context("cannot print")?;
+        out.flush().context("cannot print")
+    }
+
+    /// Writes a line that stays.
+    fn say(&self, text: &str) -> anyhow::Result<()> {
+        self.show(text)?;
+        write!(io::stdout(), "\r\n").context("cannot print")
+    }
+}
+
+impl Drop for RawTerminal {
+    fn drop(&mut self) {
+        // Nothing more can be done for a terminal that refuses.
+        let _ = terminal::disable_raw_mode();
+        let _ = execute!(io::stdout(), cursor::Show);
+        let _ = writeln!(io::stdout());
+    }
+}
+
+/// What a key is for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Meaning {
+    /// Shares of the full speed and of the full yaw rate.
+    Move(f64, f64),
+    Stand,
+    Stop,
+    Quit,
+    Nothing,
+}
+
+fn meaning(key: KeyEvent) -> Meaning {
+    if key.kind == KeyEventKind::Release {
+        return Meaning::Nothing;
+    }
+    if key.modifiers.contains(KeyModifiers::CONTROL) {
+        return match key.code {
+            KeyCode::Char('c' | 'd') => Meaning::Quit,
+            _ => Meaning::Nothing,
+        };
+    }
+    match key.code {
+        KeyCode::Up | KeyCode::Char('w' | 'W') => Meaning::Move(1.0, 0.0),
+        KeyCode::Down | KeyCode::Char('s' | 'S') => Meaning::Move(-1.0, 0.0),
+        KeyCode::Left | KeyCode::Char('a' | 'A') => Meaning::Move(0.0, 1.0),
+        KeyCode::Right | KeyCode::Char('d' | 'D') => Meaning::Move(0.0, -1.0),
+        KeyCode::Char(' ') => Meaning::Stand,
+        KeyCode::Char('x' | 'X') => Meaning::Stop,
+        KeyCode::Char('q' | 'Q') | KeyCode::Esc => Meaning::Quit,
+        _ => Meaning::Nothing,
+    }
+}
+
+/// What the keys of the last moment ask for: along and around, each as long as its key.
+#[derive(Debug, Clone, Copy, Default)]
+struct Keys {
+    along: Option<(f64, Instant)>,
+    around: Option<(f64, Instant)>,
+}
+
+impl Keys {
+    fn press(&mut self, (along, around): (f64, f64), now: Instant) {
+        if along == 0.0 {
+            self.around = Some((around, now));
+        } else {
+            self.along = Some((along, now));
+        }
+    }
+
+    fn shares(&self, now: Instant) -> (f64, f64) {
+        let share = |key: Option<(f64, Instant)>| {
+            let held = key.filter(|(_, at)| now.saturating_duration_since(*at) < KEY_HOLDS);
+            held.map_or(0.0, |(share, _)| share)
+        };
+        (share(self.along), share(self.around))
+    }
+}
+
+/// Reads keys on a thread of its own until nobody takes them.
+fn read_keys(keys: &mpsc::Sender<KeyEvent>) {
+    while !keys.is_closed() {
+        match event::poll(KEY_POLL) {
+            Ok(false) => {}
+            Ok(true) => match event::read() {
+                // What does not fit is one key more of those that are held.
+                Ok(Event::Key(key)) => _ = keys.try_send(key),
+                Ok(_) => {}
+                Err(_) => return,
+            },
+            Err(_) => return,
+        }
+    }
+}
+
+pub(super) async fn run(arguments: &DriveArguments, client: &Client) -> anyhow::Result<ExitCode> {
+    if !io::stdin().is_terminal() || !io::stdout().is_terminal() {
+        bail!("driving needs a terminal; programs use the WebSocket");
+    }
+    let mut socket = connect(arguments, client).await?;
+    let driver = DriverName {
+        name: arguments.name.clone(),
+    };
+    let wanted = if arguments.take {
+        DriveRequest::Take(driver)
+    } else {
+        DriveRequest::Acquire(driver)
+    };
+    send(&mut socket, &wanted).await?;
+    line(HELP)?;
+    let (keys, mut pressed) = mpsc::channel(KEYS_MAX);
+    let terminal = RawTerminal::enter()?;
+    let reading = std::thread::spawn(move || read_keys(&keys));
+    let ended = Driving {
+        terminal: &terminal,
+        arguments,
+        keys: Keys::default(),
+        has_lease: false,
+        is_refused: false,
+    }
+    .run(&mut socket, &mut pressed)
+    .await;
+    drop(terminal);
+    drop(pressed);
+    // The server lets the robot stand when the socket closes, whether or not this arrives.
+    let _ = send(&mut socket, &DriveRequest::Release(Nothing {})).await;
+    let _ = tokio::time::timeout(CONNECT_MAX, socket.close(None)).await;
+    let _ = tokio::task::spawn_blocking(move || reading.join()).await;
+    ended
+}
+
+async fn connect(arguments: &DriveArguments, client: &Client) -> anyhow::Result<Socket> {
+    let (site, robot) = (&arguments.connection.site, &arguments.robot);
+    // Whether it is known is asked first, for a clear word.
+    client.robot(site, robot).await?;
+    let address = client.address().replacen("http://", "ws://", 1);
+    let url = format!("{address}/v1/sites/{site}/robots/{robot}/drive");
+    let connecting = tokio::time::timeout(CONNECT_MAX, connect_async(&url));
+    let (socket, _) = connecting
+        .await
+        .with_context(|| format!("{url} does not answer"))?
+        .with_context(|| format!("cannot open {url}"))?;
+    Ok(socket)
+}
+
+async fn send(socket: &mut Socket, request: &DriveRequest) -> anyhow::Result<()> {
+    let text = serde_json::to_string(request).context("cannot write a request")?;
+    match socket.send(Message::text(text)).await {
+        Ok(()) | Err(Error::ConnectionClosed | Error::AlreadyClosed) => Ok(()),
+        Err(error) => Err(error).context("the connection to the server is lost"),
+    }
+}
+
+struct Driving<'terminal> {
+    terminal: &'terminal RawTerminal,
+    arguments: &'terminal DriveArguments,
+    keys: Keys,
+    has_lease: bool,
+    is_refused: bool,
+}
+
+impl Driving<'_> {
+    async fn run(
+        mut self,
+        socket: &mut Socket,
+        pressed: &mut mpsc::Receiver<KeyEvent>,
+    ) -> anyhow::Result<ExitCode> {
+        let mut terminate = signal(SignalKind::terminate())?;
+        let mut hang_up = signal(SignalKind::hangup())?;
+        let mut ticks = tokio::time::interval(SEND_PERIOD);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        loop {
+            tokio::select! {
+                _ = terminate.recv() => return Ok(ExitCode::SUCCESS),
+                _ = hang_up.recv() => return Ok(ExitCode::SUCCESS),
+                key = pressed.recv() => {
+                    let Some(key) = key else {
+                        bail!("the terminal gives no more keys");
+                    };
+                    if !self.press(socket, key).await? {
+                        return Ok(ExitCode::SUCCESS);
+                    }
+                }
+                _ = ticks.tick() => self.drive(socket).await?,
+                frame = socket.next() => match frame {
+                    Some(Ok(Message::Text(text))) => {
+                        self.read(&text)?;
+                        if self.is_refused {
+                            return Ok(ExitCode::FAILURE);
+                        }
+                    }
+                    Some(Ok(Message::Close(frame))) => {
+                        let why = frame.map(|frame| frame.reason.to_string());
+                        bail!("the server closed the connection: {}", why.unwrap_or_default());
+                    }
+                    Some(Ok(_)) => {}
+                    Some(Err(error)) => {
+                        return Err(error).context("the connection to the server is lost");
+                    }
+                    None => bail!("the server closed the connection"),
+                },
+            }
+        }
+    }
+
+    /// Whether to go on.
+    async fn press(&mut self, socket: &mut Socket, key: KeyEvent) -> anyhow::Result<bool> {
+        match meaning(key) {
+            Meaning::Move(along, around) => self.keys.press((along, around), Instant::now()),
+            Meaning::Stand => {
+                self.keys = Keys::default();
+                self.drive(socket).await?;
+            }
+            Meaning::Stop => {
+                self.keys = Keys::default();
+                let words = StopWords {
+                    by: Some(self.arguments.name.clone()),
+                    reason: Some("from the terminal".to_owned()),
+                };
+                send(socket, &DriveRequest::Stop(words)).await?;
+            }
+            Meaning::Quit => return Ok(false),
+            Meaning::Nothing => {}
+        }
+        Ok(true)
+    }
+
+    async fn drive(&self, socket: &mut Socket) -> anyhow::Result<()> {
+        if !self.has_lease {
+            return Ok(());
+        }
+        let (along, around) = self.keys.shares(Instant::now());
+        let drive = Drive {
+            linear_m_s: along * self.arguments.speed,
+            angular_rad_s: around * self.arguments.turn,
+            for_ms: Some(FOR_MS),
+        };
+        send(socket, &DriveRequest::Drive(drive)).await
+    }
+
+    fn read(&mut self, text: &str) -> anyhow::Result<()> {
+        let update: DriveUpdate =
+            serde_json::from_str(text).context("the server said something not known here")?;
+        match update {
+            DriveUpdate::Welcome { .. } => Ok(()),
+            DriveUpdate::Leased(lease) => {
+                self.has_lease = true;
+                self.terminal
+                    .say(&format!("lease {} is yours", lease.epoch))
+            }
+            DriveUpdate::Released { detail, .. } => {
+                self.has_lease = false;
+                self.is_refused = true;
+                self.terminal.say(&format!("the lease is over: {detail}"))
+            }
+            DriveUpdate::Refused { detail, .. } => {
+                // Without a lease there is nothing more to do here.
+                self.is_refused = !self.has_lease;
+                self.terminal.say(&format!("refused: {detail}"))
+            }
+            DriveUpdate::Stopped(stop) => {
+                let how = if stop.confirmed_at.is_some() {
+                    "confirmed"
+                } else {
+                    "NOT CONFIRMED, it is told again"
+                };
+                let text = format!(
+                    "stopped, {how}; clear it with: tread clear {} {}",
+                    stop.robot, stop.id
+                );
+                self.terminal.say(&text)
+            }
+            DriveUpdate::View(view) => self.terminal.show(&status(&view)),
+            DriveUpdate::Ended { detail } => self.terminal.say(&format!("ended: {detail}")),
+        }
+    }
+}
+
+fn status(view: &DriveView) -> String {
+    let mode = view.mode.map_or("-", mode_name);
+    let speed = view.twist.map_or_else(
+        || "-".to_owned(),
+        |twist| {
+            let twist = twist.value;
+            format!(
+                "{:+.2} m/s {:+.2} rad/s",
+                twist.linear_m_s, twist.angular_rad_s
+            )
+        },
+    );
+    let latency = view.latency_ms.map_or_else(
+        || "-".to_owned(),
+        |latency_ms| format!("{latency_ms:.0} ms"),
+    );
+    let heard = view.heard_age_ms.map_or_else(|| "-".to_owned(), age);
+    let driver = view.safety.lease.as_ref();
+    let driver = driver.map_or("nobody", |lease| lease.driver.name.as_str());
+    let stop = view.safety.stop.as_ref();
+    let stop = stop.map_or(String::new(), |stop| format!(" · STOPPED by {}", stop.by));
+    format!(
+        "{} · {mode} · {speed} · latency {latency} · heard {heard} ago · driver {driver}{stop}",
+        link_name(view.link)
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn key(code: KeyCode) -> KeyEvent {
+        KeyEvent::new(code, KeyModifiers::NONE)
+    }
+
+    #[test]
+    fn keys_drive_for_a_moment_and_both_ways_at_once() {
+        let (mut keys, start) = (Keys::default(), Instant::now());
+        assert_eq!(keys.shares(start), (0.0, 0.0));
+        keys.press((1.0, 0.0), start);
+        keys.press((0.0, -1.0), start + KEY_HOLDS / 2);
+        assert_eq!(keys.shares(start + KEY_HOLDS / 2), (1.0, -1.0));
+        assert_eq!(keys.shares(start + KEY_HOLDS), (0.0, -1.0));
+        assert_eq!(keys.shares(start + 2 * KEY_HOLDS), (0.0, 0.0));
+    }
+
+    #[test]
+    fn every_key_means_what_the_help_says() {
+        assert_eq!(meaning(key(KeyCode::Up)), Meaning::Move(1.0, 0.0));
+        assert_eq!(meaning(key(KeyCode::Char('a'))), Meaning::Move(0.0, 1.0));
+        assert_eq!(meaning(key(KeyCode::Char(' '))), Meaning::Stand);
+        assert_eq!(meaning(key(KeyCode::Char('x'))), Meaning::Stop);
+        assert_eq!(meaning(key(KeyCode::Esc)), Meaning::Quit);
+        assert_eq!(meaning(key(KeyCode::Char('d'))), Meaning::Move(0.0, -1.0));
+        let control_c = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);
+        assert_eq!(meaning(control_c), Meaning::Quit);
+        let mut released = key(KeyCode::Up);
+        released.kind = KeyEventKind::Release;
+        assert_eq!(meaning(released), Meaning::Nothing);
+        assert_eq!(meaning(key(KeyCode::F(1))), Meaning::Nothing);
+    }
+}

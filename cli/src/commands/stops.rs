@@ -1,0 +1,121 @@
+//! `tread stop` and `tread clear`.
+
+use std::process::ExitCode;
+
+use tread_api::stop::{ClearStop, FleetStop, Stop, StopFleet, StopRobot};
+
+use crate::args::{ClearArguments, StopArguments};
+use crate::client::Client;
+use crate::output::{Output, line, render, table};
+
+pub(super) async fn stop(
+    arguments: StopArguments,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    let StopArguments {
+        robots,
+        all,
+        by,
+        reason,
+        connection,
+    } = arguments;
+    let stopped = if all {
+        let site = None;
+        client.stop_fleet(&StopFleet { site, by, reason }).await?
+    } else {
+        // All at once: no robot waits for another.
+        let words = StopRobot { by, reason };
+        let asking = robots
+            .iter()
+            .map(|robot| client.stop_robot(&connection.site, robot, &words));
+        let (mut stops, mut failed) = (Vec::new(), None);
+        for answer in futures_util::future::join_all(asking).await {
+            match answer {
+                Ok(stop) => stops.push(stop),
+                Err(error) => failed = Some(error),
+            }
+        }
+        if let Some(error) = failed {
+            if !stops.is_empty() {
+                line(&list(&stops))?;
+            }
+            return Err(error.into());
+        }
+        let confirmed = stops.iter().filter(|stop| stop.confirmed_at.is_some());
+        let confirmed = confirmed.count();
+        FleetStop {
+            confirmed,
+            unconfirmed: stops.len() - confirmed,
+            stops,
+        }
+    };
+    output.show(&stopped, |stopped| list(&stopped.stops))?;
+    Ok(if stopped.unconfirmed == 0 {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    })
+}
+
+fn list(stops: &[Stop]) -> String {
+    if stops.is_empty() {
+        return "there is no robot to stop".to_owned();
+    }
+    let mut table = table(["ROBOT", "SITE", "CONFIRMED", "STOP"]);
+    for stop in stops {
+        let confirmed = if stop.confirmed_at.is_some() {
+            "yes"
+        } else {
+            "NOT YET, it is told again"
+        };
+        table.add_row([
+            stop.robot.to_string(),
+            stop.site.to_string(),
+            confirmed.to_owned(),
+            stop.id.to_string(),
+        ]);
+    }
+    render(&table)
+}
+
+pub(super) async fn clear(
+    arguments: ClearArguments,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    let ClearArguments {
+        robot,
+        stop,
+        by,
+        connection,
+    } = arguments;
+    let site = &connection.site;
+    if let Some(stop) = stop {
+        let cleared = client
+            .clear_stop(site, &robot, &ClearStop { stop, by })
+            .await?;
+        output.show(&cleared, |stop| {
+            format!(
+                "the stop of {} is cleared; nothing starts by it",
+                stop.robot
+            )
+        })?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    // Whoever clears has seen what it is that they clear.
+    let live = client.robot(site, &robot).await?.live;
+    let latch = live.and_then(|live| live.safety.stop);
+    output.show(&latch, |latch| match latch {
+        Some(latch) => format!(
+            "{robot} was stopped by {}: {}\nclear it with: tread clear {robot} {}",
+            latch.by, latch.reason, latch.id
+        ),
+        None => format!("{robot} shows no stop"),
+    })?;
+    Ok(if latch.is_some() {
+        ExitCode::FAILURE
+    } else {
+        ExitCode::SUCCESS
+    })
+}

@@ -1,0 +1,181 @@
+//! What a twist wanted by hand becomes before the gate: within the robot's limits, on a ramp.
+//!
+//! Late commands slow the robot down: above [`AGE_FULL_S`] the share of its speed falls in a
+//! straight line to [`SHARE_LEAST`] at [`AGE_LEAST_S`]. [`AgeMeter`] keeps the worst age of late, so
+//! that one command that came quickly does not make up for many that did not.
+
+use crate::geometry::Twist;
+use crate::robot::RobotModel;
+
+/// Age of commands up to which the whole speed is allowed, seconds.
+pub const AGE_FULL_S: f64 = 0.15;
+/// Age of commands from which on only the least share is allowed, seconds.
+pub const AGE_LEAST_S: f64 = 0.5;
+/// The least share of the speed.
+pub const SHARE_LEAST: f64 = 0.2;
+/// Share of the worst age that is forgotten with each command that comes sooner.
+const FORGOTTEN_SHARE: f64 = 0.05;
+
+/// Keeps the worst age of commands of late.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct AgeMeter {
+    worst_s: Option<f64>,
+}
+
+impl AgeMeter {
+    /// A command came at this age.
+    pub fn note(&mut self, age_s: f64) {
+        // An age that is no number is taken for a bad one.
+        let age_s = if age_s.is_finite() {
+            age_s.max(0.0)
+        } else {
+            AGE_LEAST_S
+        };
+        self.worst_s = Some(match self.worst_s {
+            Some(worst_s) if worst_s > age_s => worst_s + FORGOTTEN_SHARE * (age_s - worst_s),
+            Some(_) | None => age_s,
+        });
+    }
+
+    /// The worst age of late, seconds; none before the first command.
+    pub fn worst_s(&self) -> Option<f64> {
+        self.worst_s
+    }
+
+    /// The share of the speed that it allows.
+    pub fn speed_share(&self) -> f64 {
+        self.worst_s.map_or(1.0, speed_share)
+    }
+}
+
+/// The share of the speed that commands of this age allow, [`SHARE_LEAST`] to 1.
+pub fn speed_share(age_s: f64) -> f64 {
+    if !age_s.is_finite() {
+        return SHARE_LEAST;
+    }
+    let late = ((age_s - AGE_FULL_S) / (AGE_LEAST_S - AGE_FULL_S)).clamp(0.0, 1.0);
+    (1.0 - late * (1.0 - SHARE_LEAST)).max(SHARE_LEAST)
+}
+
+/// The twist within the robot's limits, bent the same way; true if it was above one. What is not
+/// finite becomes rest.
+pub fn within_limits(twist: Twist, model: &RobotModel) -> (Twist, bool) {
+    if !twist.is_finite() {
+        return (Twist::default(), true);
+    }
+    let limits = model.limits();
+    let over = |value: f64, most: f64| {
+        if value.abs() > most {
+            value.abs() / most
+        } else {
+            1.0
+        }
+    };
+    let mut over_ratio = over(twist.linear_m_s, limits.linear_max_m_s)
+        .max(over(twist.angular_rad_s, limits.angular_max_rad_s));
+    // Across: v·ω, which falls with the square of the share.
+    let across_m_s2 = twist.linear_m_s * twist.angular_rad_s;
+    over_ratio = over_ratio.max(over(across_m_s2, limits.lateral_acceleration_max_m_s2).sqrt());
+    let wheels = model.wheel_speeds_from_twist(twist).magnitude_max_rad_s();
+    over_ratio = over_ratio.max(over(wheels, limits.wheel_speed_max_rad_s));
+    let within = Twist {
+        linear_m_s: twist.linear_m_s / over_ratio,
+        angular_rad_s: twist.angular_rad_s / over_ratio,
+    };
+    (within, over_ratio > 1.0)
+}
+
+/// One tick from `previous` towards `target`, at the robot's accelerations; towards rest at twice
+/// that, as it brakes.
+pub fn approach(previous: Twist, target: Twist, model: &RobotModel, dt_s: f64) -> Twist {
+    let dt_s = if dt_s.is_finite() { dt_s.max(0.0) } else { 0.0 };
+    let linear = model.limits().linear_acceleration_max_m_s2 * dt_s;
+    // The wheels' share of a turn is as strong as that along the path.
+    let angular = linear / (0.5 * model.effective_track_m());
+    Twist {
+        linear_m_s: step(previous.linear_m_s, target.linear_m_s, linear),
+        angular_rad_s: step(previous.angular_rad_s, target.angular_rad_s, angular),
+    }
+}
+
+fn step(previous: f64, target: f64, rise: f64) -> f64 {
+    let is_slowing = previous * target <= 0.0 || target.abs() < previous.abs();
+    let most = if is_slowing { 2.0 * rise } else { rise };
+    previous + (target - previous).clamp(-most, most)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn a_twist_is_only_reduced_and_bends_the_same_way(
+            linear_m_s in -9.0..9.0_f64, angular_rad_s in -9.0..9.0_f64,
+        ) {
+            let model = RobotModel::yi2007();
+            let asked = Twist { linear_m_s, angular_rad_s };
+            let (within, was_over) = within_limits(asked, &model);
+            prop_assert_eq!(was_over, within != asked);
+            prop_assert!(within.linear_m_s.abs() <= asked.linear_m_s.abs().min(1.0) + 1.0e-12);
+            prop_assert!(within.angular_rad_s.abs() <= asked.angular_rad_s.abs().min(2.0) + 1.0e-12);
+            let across_m_s2 = (within.linear_m_s * within.angular_rad_s).abs();
+            prop_assert!(across_m_s2 <= 1.0 + 1.0e-9);
+            let cross = within.linear_m_s * angular_rad_s - within.angular_rad_s * linear_m_s;
+            prop_assert!(cross.abs() < 1.0e-9);
+        }
+
+        #[test]
+        fn an_older_command_never_allows_more(age_s in 0.0..2.0_f64, more_s in 0.0..1.0_f64) {
+            prop_assert!(speed_share(age_s + more_s) <= speed_share(age_s));
+            prop_assert!((SHARE_LEAST..=1.0).contains(&speed_share(age_s)));
+        }
+
+        #[test]
+        fn the_ramp_reaches_its_target_and_never_passes_it(
+            from in -1.0..1.0_f64, to in -1.0..1.0_f64,
+        ) {
+            let model = RobotModel::yi2007();
+            let target = Twist { linear_m_s: to, angular_rad_s: -to };
+            let mut now = Twist { linear_m_s: from, angular_rad_s: from };
+            for _ in 0..300 {
+                let next = approach(now, target, &model, 0.01);
+                let (low, high) = (now.linear_m_s.min(to), now.linear_m_s.max(to));
+                prop_assert!((low - 1.0e-12..=high + 1.0e-12).contains(&next.linear_m_s));
+                now = next;
+            }
+            prop_assert!((now.linear_m_s - to).abs() < 1.0e-9);
+            prop_assert!((now.angular_rad_s + to).abs() < 1.0e-9);
+        }
+    }
+
+    #[test]
+    fn one_quick_command_does_not_make_up_for_late_ones() {
+        let mut meter = AgeMeter::default();
+        assert!((meter.speed_share() - 1.0).abs() < 1.0e-12);
+        meter.note(0.5);
+        assert!((meter.speed_share() - SHARE_LEAST).abs() < 1.0e-12);
+        meter.note(0.01);
+        assert!(meter.speed_share() < 0.3);
+        for _ in 0..100 {
+            meter.note(0.01);
+        }
+        assert!((meter.speed_share() - 1.0).abs() < 1.0e-12);
+        meter.note(f64::NAN);
+        assert!(meter.speed_share() < 0.3, "no number is a bad age");
+    }
+
+    #[test]
+    fn what_is_no_number_is_rest() {
+        let model = RobotModel::yi2007();
+        for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            let twist = Twist {
+                linear_m_s: bad,
+                angular_rad_s: 0.1,
+            };
+            assert_eq!(within_limits(twist, &model), (Twist::default(), true));
+        }
+    }
+}

@@ -1,0 +1,327 @@
+//! The last word before the wheels: it can only reduce a command.
+//!
+//! A stop, a stale base, a lost position, a lean, a hold from outside, silence of whoever must be
+//! heard, or a command that is not finite asks for rest; limits and caps of the speed cut what is
+//! left, both sides by the same share, so that a cut command bends the same way. Speeding up is
+//! bounded by the wheels' acceleration, slowing down for a reason by the braking limit: rest is met
+//! on a ramp, along the arc that was being driven. The strictest cause is reported: the order of
+//! [`GateCause`].
+
+pub mod hand;
+
+use crate::measured::WheelSpeeds;
+use crate::robot::RobotModel;
+
+/// Why a command was reduced; later ones are stricter.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, serde::Serialize, serde::Deserialize,
+)]
+#[serde(rename_all = "snake_case")]
+pub enum GateCause {
+    /// The command changed faster than the wheels may.
+    Acceleration,
+    /// The command was above the wheels' speed limit.
+    Speed,
+    /// Commands by hand come late: the slower the link, the slower the robot.
+    CommandAge,
+    /// A limit from outside.
+    ExternalLimit,
+    /// A fence is near, or has been crossed.
+    Fence,
+    /// The command was not a number.
+    NotFinite,
+    /// There was no command.
+    NoCommand,
+    /// Whoever drives by hand is silent.
+    Lease,
+    /// The server has been silent for longer than the mission allows.
+    LinkPolicy,
+    /// A hold from outside.
+    ExternalHold,
+    /// The robot does not know where it is.
+    StalePosition,
+    /// The robot leans too far.
+    Tilt,
+    /// The base has not been heard for too long.
+    StaleFeedback,
+    /// A stop is in force.
+    Stop,
+}
+
+impl GateCause {
+    /// Every cause, in order.
+    pub const ALL: [Self; 14] = [
+        Self::Acceleration,
+        Self::Speed,
+        Self::CommandAge,
+        Self::ExternalLimit,
+        Self::Fence,
+        Self::NotFinite,
+        Self::NoCommand,
+        Self::Lease,
+        Self::LinkPolicy,
+        Self::ExternalHold,
+        Self::StalePosition,
+        Self::Tilt,
+        Self::StaleFeedback,
+        Self::Stop,
+    ];
+
+    /// Whether it comes from outside the command: more than a command that is cut to the robot's
+    /// own limits.
+    pub fn is_intervention(self) -> bool {
+        self > Self::Speed
+    }
+}
+
+/// Everything outside the command that may reduce it; by default nothing does.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "each says whether one independent reason holds"
+)]
+pub struct Reasons {
+    /// A stop is latched.
+    pub is_stopped: bool,
+    /// How far the robot leans from level, radians, if the base measures it. What is not a number
+    /// holds like a lean that is too far.
+    pub tilt_rad: Option<f64>,
+    /// The robot must know where it is, and does not.
+    pub is_position_lost: bool,
+    /// Somebody outside holds the robot.
+    pub is_held_outside: bool,
+    /// The server has been silent for longer than it may.
+    pub is_link_silent: bool,
+    /// Whoever drives by hand is silent.
+    pub is_driver_silent: bool,
+    /// Fastest speed that keeps the robot inside its fence, metres per second.
+    pub fence_max_m_s: Option<f64>,
+    /// Fastest speed that somebody outside allows, metres per second.
+    pub outside_max_m_s: Option<f64>,
+    /// Fastest speed that the age of commands by hand allows, metres per second.
+    pub command_age_max_m_s: Option<f64>,
+}
+
+impl Reasons {
+    /// The strictest reason for rest, if there is one.
+    fn hold(&self, limits: &GateLimits) -> Option<GateCause> {
+        let leans = self
+            .tilt_rad
+            .is_some_and(|tilt_rad| tilt_rad.is_nan() || tilt_rad.abs() > limits.tilt_max_rad);
+        [
+            (self.is_stopped, GateCause::Stop),
+            (leans, GateCause::Tilt),
+            (self.is_position_lost, GateCause::StalePosition),
+            (self.is_held_outside, GateCause::ExternalHold),
+            (self.is_link_silent, GateCause::LinkPolicy),
+            (self.is_driver_silent, GateCause::Lease),
+        ]
+        .into_iter()
+        .find_map(|(is_so, cause)| is_so.then_some(cause))
+    }
+
+    fn caps(&self) -> [(Option<f64>, GateCause); 3] {
+        [
+            (self.command_age_max_m_s, GateCause::CommandAge),
+            (self.outside_max_m_s, GateCause::ExternalLimit),
+            (self.fence_max_m_s, GateCause::Fence),
+        ]
+    }
+}
+
+/// Bounds of the gate.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GateLimits {
+    /// Fastest wheel, radians per second.
+    pub wheel_speed_max_rad_s: f64,
+    /// Fastest speeding up of a wheel, radians per second squared.
+    pub wheel_acceleration_max_rad_s2: f64,
+    /// Fastest slowing down of a wheel, radians per second squared.
+    pub wheel_braking_max_rad_s2: f64,
+    /// Oldest feedback of the base that is trusted, seconds.
+    pub feedback_age_max_s: f64,
+    /// Farthest that the robot may lean from level, radians.
+    pub tilt_max_rad: f64,
+    /// Rolling radius of a wheel, metres.
+    pub wheel_radius_m: f64,
+}
+
+/// Farthest that a robot may lean from level unless said otherwise, radians: 25 degrees.
+pub const TILT_MAX_RAD: f64 = 0.436;
+
+impl GateLimits {
+    /// Limits of a robot; it brakes no harder along the path than twice its planned braking, so
+    /// that a turn can be undone at the same time.
+    pub fn of(model: &RobotModel) -> Self {
+        let limits = model.limits();
+        let braking = 2.0 * limits.linear_acceleration_max_m_s2 / model.wheel_radius_m();
+        Self {
+            wheel_speed_max_rad_s: limits.wheel_speed_max_rad_s,
+            wheel_acceleration_max_rad_s2: limits.wheel_acceleration_max_rad_s2,
+            wheel_braking_max_rad_s2: braking.min(limits.wheel_acceleration_max_rad_s2),
+            feedback_age_max_s: 0.2,
+            tilt_max_rad: TILT_MAX_RAD,
+            wheel_radius_m: model.wheel_radius_m(),
+        }
+    }
+}
+
+/// What the gate looks at in one tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GateInput {
+    /// What is wanted; none asks for rest.
+    pub command: Option<WheelSpeeds>,
+    /// What the gate let through last.
+    pub previous: WheelSpeeds,
+    /// Whether a stop is in force.
+    pub stop: bool,
+    /// Age of the last word from the base, seconds.
+    pub feedback_age_s: f64,
+    /// Time since the gate's last word, seconds.
+    pub dt_s: f64,
+}
+
+/// What the gate lets through.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GateOutput {
+    /// Wheel speeds for the base.
+    pub wheel_speeds: WheelSpeeds,
+    /// What they are on the ramp to.
+    pub target: WheelSpeeds,
+    /// The strictest cause of a reduction; none when the command passed whole.
+    pub cause: Option<GateCause>,
+}
+
+/// Lets a command through, reduced where it must be, for no reason but those of the input.
+pub fn gate(input: &GateInput, limits: &GateLimits) -> GateOutput {
+    gate_with(input, &Reasons::default(), limits)
+}
+
+/// Lets a command through, reduced where it must be.
+pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> GateOutput {
+    let mut cause: Option<GateCause> = None;
+    let mut note = |new: GateCause| cause = cause.max(Some(new));
+    let rest = WheelSpeeds::default();
+    let mut target = match input.command {
+        None => {
+            note(GateCause::NoCommand);
+            rest
+        }
+        Some(command) if !command.is_finite() => {
+            note(GateCause::NotFinite);
+            rest
+        }
+        Some(command) => command,
+    };
+    let is_fresh =
+        input.feedback_age_s.is_finite() && input.feedback_age_s <= limits.feedback_age_max_s;
+    let hold = if input.stop {
+        Some(GateCause::Stop)
+    } else {
+        let stale = (!is_fresh).then_some(GateCause::StaleFeedback);
+        stale.max(reasons.hold(limits))
+    };
+    if let Some(hold) = hold {
+        note(hold);
+        target = rest;
+    }
+    let fastest_rad_s = target.magnitude_max_rad_s();
+    if fastest_rad_s > limits.wheel_speed_max_rad_s {
+        note(GateCause::Speed);
+        target = scaled(target, limits.wheel_speed_max_rad_s / fastest_rad_s);
+    }
+    let mut is_capped = false;
+    for (most_m_s, capped_by) in reasons.caps() {
+        let Some(most_m_s) = most_m_s else {
+            continue;
+        };
+        // A cap that is no number is no permission.
+        let most_m_s = if most_m_s.is_nan() {
+            0.0
+        } else {
+            most_m_s.max(0.0)
+        };
+        let ahead_m_s =
+            0.5 * limits.wheel_radius_m * (target.left_rad_s + target.right_rad_s).abs();
+        if ahead_m_s > most_m_s {
+            note(capped_by);
+            is_capped = true;
+            target = scaled(target, most_m_s / ahead_m_s);
+        }
+    }
+    let previous = if input.previous.is_finite() {
+        input.previous
+    } else {
+        rest
+    };
+    let dt_s = if input.dt_s.is_finite() {
+        input.dt_s.max(0.0)
+    } else {
+        0.0
+    };
+    let wheel_speeds = ramped(previous, target, is_capped, limits, dt_s);
+    let is_short = |got: f64, wanted: f64| (got - wanted).abs() > 1.0e-9;
+    if is_short(wheel_speeds.left_rad_s, target.left_rad_s)
+        || is_short(wheel_speeds.right_rad_s, target.right_rad_s)
+    {
+        note(GateCause::Acceleration);
+    }
+    GateOutput {
+        wheel_speeds,
+        target,
+        cause,
+    }
+}
+
+fn scaled(speeds: WheelSpeeds, share: f64) -> WheelSpeeds {
+    WheelSpeeds {
+        left_rad_s: speeds.left_rad_s * share,
+        right_rad_s: speeds.right_rad_s * share,
+    }
+}
+
+/// From `previous` towards `target` as far as `dt_s` allows.
+///
+/// While the command stands, both sides may change at the wheels' rate, for turning back and
+/// forth; on the way to rest, and where a cap cuts, the braking ramp holds. Rest is met by both
+/// sides at once, so that the robot stays on its arc.
+fn ramped(
+    previous: WheelSpeeds,
+    target: WheelSpeeds,
+    is_capped: bool,
+    limits: &GateLimits,
+    dt_s: f64,
+) -> WheelSpeeds {
+    let up = limits.wheel_acceleration_max_rad_s2 * dt_s;
+    let braking = limits.wheel_braking_max_rad_s2 * dt_s;
+    if target == WheelSpeeds::default() {
+        let fastest_rad_s = previous.magnitude_max_rad_s();
+        if fastest_rad_s <= braking {
+            return target;
+        }
+        return scaled(previous, 1.0 - braking / fastest_rad_s);
+    }
+    let down = if is_capped { braking } else { up };
+    WheelSpeeds {
+        left_rad_s: ramp(previous.left_rad_s, target.left_rad_s, up, down),
+        right_rad_s: ramp(previous.right_rad_s, target.right_rad_s, up, down),
+    }
+}
+
+/// From `previous` towards `target`: away from zero by `up` at most, towards zero by `down`; a
+/// change of sign stops at zero for a tick.
+fn ramp(previous: f64, target: f64, up: f64, down: f64) -> f64 {
+    if previous * target < 0.0 {
+        return (previous.abs() - down).max(0.0).copysign(previous);
+    }
+    let sign = if previous.abs() > 0.0 {
+        previous
+    } else {
+        target
+    };
+    let (from, to) = (previous.abs(), target.abs());
+    (from + (to - from).clamp(-down, up)).copysign(sign)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,311 @@
+//! Random drivers on a random network, against a model that is told what was sent.
+//!
+//! Messages are lost, delayed, doubled and reordered; drivers come, take, go silent and come back;
+//! old runs and old leases speak. The model knows from the messages alone which commands count.
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use tread_api::geometry::Twist;
+use tread_api::ids::BootId;
+use tread_api::safety::{DRIVE_AHEAD_MAX_US, DriveCounts, Driver, LEASE_SILENCE_MAX_US};
+use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
+use tread_control::robot::RobotModel;
+use uuid::Uuid;
+
+use crate::safety::operator::{LeaseAnswer, LeaseRefusal, Operator, Verdict};
+
+/// Drivers that compete.
+const DRIVERS: usize = 4;
+/// Messages that are under way at a time.
+const UNDER_WAY_MAX: usize = 64;
+
+fn boot(number: u128) -> BootId {
+    BootId::from_uuid(Uuid::from_u128(number))
+}
+
+fn driver(number: usize) -> Driver {
+    Driver {
+        client: Uuid::from_u128(100 + number as u128),
+        name: format!("driver {number}"),
+    }
+}
+
+/// What a run of the model found.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LeaseModelReport {
+    /// Steps of the model.
+    pub steps: u64,
+    /// Leases that were given.
+    pub leases: u64,
+    /// Commands that were taken and should not have been.
+    pub wrongly_accepted: u64,
+    /// Commands that were not taken and should have been.
+    pub wrongly_refused: u64,
+    /// Commands that lasted beyond their end.
+    pub outlived: u64,
+    /// Leases that were given away while somebody had them, or epochs that fell.
+    pub stolen: u64,
+    /// What became of the commands.
+    pub counts: DriveCounts,
+}
+
+/// Runs the model.
+pub fn run(steps: u64, seed: u64) -> LeaseModelReport {
+    let mut world = World::new(seed);
+    for _ in 0..steps {
+        world.step();
+    }
+    let counts = world.operator.status().map(|status| status.counts);
+    LeaseModelReport {
+        steps,
+        counts: counts.unwrap_or_default(),
+        ..world.report
+    }
+}
+
+#[derive(Debug, Clone)]
+enum Message {
+    Lease(LeaseCommand, usize),
+    Drive(DriveCommand, usize),
+}
+
+/// A driver's side: which lease it believes to have.
+#[derive(Debug, Clone, Copy, Default)]
+struct Side {
+    epoch: Option<u64>,
+    seq: u64,
+}
+
+/// What must hold, told from the messages alone.
+#[derive(Debug, Default)]
+struct Truth {
+    /// Who was given which epoch.
+    granted: Vec<(u64, usize)>,
+    /// The greatest number taken in the newest lease.
+    last_seq: Option<u64>,
+    /// Until when what was last taken lasts.
+    until_us: u64,
+    /// When the driver was last heard, if the lease was not given back.
+    heard_us: Option<u64>,
+}
+
+impl Truth {
+    fn is_leased(&self, now_us: u64) -> bool {
+        self.heard_us
+            .is_some_and(|heard_us| now_us < heard_us + LEASE_SILENCE_MAX_US)
+    }
+}
+
+struct World {
+    random: ChaCha8Rng,
+    operator: Operator,
+    sides: [Side; DRIVERS],
+    under_way: Vec<(u64, Message)>,
+    truth: Truth,
+    now_us: u64,
+    requests: u128,
+    /// Requests by which a lease was given back.
+    released: Vec<Uuid>,
+    report: LeaseModelReport,
+}
+
+impl World {
+    fn new(seed: u64) -> Self {
+        Self {
+            random: ChaCha8Rng::seed_from_u64(seed),
+            operator: Operator::new(boot(1), RobotModel::yi2007()),
+            sides: [Side::default(); DRIVERS],
+            under_way: Vec::new(),
+            truth: Truth::default(),
+            now_us: 1_000_000,
+            requests: 0,
+            released: Vec::new(),
+            report: LeaseModelReport::default(),
+        }
+    }
+
+    fn chance(&mut self, share: f64) -> bool {
+        self.random.random_bool(share)
+    }
+
+    fn post(&mut self, message: &Message) {
+        if self.chance(0.1) || self.under_way.len() >= UNDER_WAY_MAX {
+            return;
+        }
+        let copies = if self.chance(0.1) { 2 } else { 1 };
+        for _ in 0..copies {
+            let delay_us = if self.chance(0.05) {
+                self.random.random_range(0..8_000_000)
+            } else {
+                self.random.random_range(0..200_000)
+            };
+            self.under_way
+                .push((self.now_us + delay_us, message.clone()));
+        }
+    }
+
+    fn act(&mut self) {
+        let number = self.random.random_range(0..DRIVERS);
+        if self.chance(0.03) {
+            let action = match self.random.random_range(0..4) {
+                0 | 1 => LeaseAction::Acquire,
+                2 => LeaseAction::Take,
+                _ => LeaseAction::Release,
+            };
+            self.requests += 1;
+            let command = LeaseCommand {
+                request: Uuid::from_u128(self.requests),
+                action,
+                holder: driver(number),
+            };
+            self.post(&Message::Lease(command, number));
+            return;
+        }
+        let side = &mut self.sides[number];
+        side.seq += 1;
+        let (epoch, seq) = (side.epoch.unwrap_or(0), side.seq);
+        let old = self.chance(0.05);
+        let odd = self.random.random_range(0..40);
+        let ahead_us = match odd {
+            0 => 0,
+            1 => DRIVE_AHEAD_MAX_US + 1_000_000,
+            _ => self.random.random_range(50_000..600_000),
+        };
+        let linear_m_s = match odd {
+            2 => f64::NAN,
+            3 => f64::INFINITY,
+            4 => 50.0,
+            _ => self.random.random_range(-1.0..1.0),
+        };
+        let command = DriveCommand {
+            boot: boot(if odd == 5 { 2 } else { 1 }),
+            epoch: if old { epoch.saturating_sub(1) } else { epoch },
+            seq,
+            sent_us: self.now_us,
+            until_us: self.now_us + ahead_us,
+            twist: Twist {
+                linear_m_s,
+                angular_rad_s: 0.1,
+            },
+        };
+        self.post(&Message::Drive(command, number));
+    }
+
+    fn arrive(&mut self, message: Message) {
+        match message {
+            Message::Lease(command, number) => {
+                let before = self.operator.lease_at(self.now_us).cloned();
+                if before.is_some() != self.truth.is_leased(self.now_us) {
+                    self.report.stolen += 1;
+                }
+                let answer = self.operator.lease(&command, self.now_us);
+                let is_known = self.released.contains(&command.request);
+                if answer == Ok(LeaseAnswer::Released) && !is_known {
+                    self.truth.heard_us = None;
+                    self.released.push(command.request);
+                }
+                if let Ok(LeaseAnswer::Leased(epoch)) = answer {
+                    let newest = self.truth.granted.last().map_or(0, |&(epoch, _)| epoch);
+                    self.report.stolen += u64::from(epoch < newest);
+                    if epoch > newest {
+                        self.report.leases += 1;
+                        self.truth.granted.push((epoch, number));
+                        self.truth.last_seq = None;
+                        self.truth.until_us = 0;
+                        self.truth.heard_us = Some(self.now_us);
+                        let is_free = before.is_none();
+                        let is_take = command.action == LeaseAction::Take;
+                        self.report.stolen += u64::from(!is_free && !is_take);
+                    }
+                    let present = self.operator.lease_at(self.now_us);
+                    let is_its_own = present.is_some_and(|lease| lease.driver == driver(number));
+                    self.report.stolen += u64::from(!is_its_own);
+                    // The driver hears of it, as often as not.
+                    if self.chance(0.9) {
+                        self.sides[number] = Side {
+                            epoch: Some(epoch),
+                            seq: self.sides[number].seq,
+                        };
+                    }
+                }
+                if let Err(LeaseRefusal::Held(other)) = answer {
+                    let is_named = before.is_some_and(|lease| lease.driver == other);
+                    self.report.stolen += u64::from(!is_named);
+                }
+                if !self.truth.is_leased(self.now_us) {
+                    self.truth.until_us = 0;
+                }
+            }
+            Message::Drive(command, number) => {
+                let is_leased = self.truth.is_leased(self.now_us);
+                let newest = self.truth.granted.last().copied();
+                let is_good = command.boot == boot(1)
+                    && is_leased
+                    && newest == Some((command.epoch, number))
+                    && self.truth.last_seq.is_none_or(|last| command.seq > last)
+                    && command.until_us > self.now_us
+                    && command.until_us <= self.now_us + DRIVE_AHEAD_MAX_US
+                    && command.twist.linear_m_s.is_finite();
+                let is_taken = self.operator.drive(&command, self.now_us) == Verdict::Accepted;
+                self.report.wrongly_accepted += u64::from(is_taken && !is_good);
+                self.report.wrongly_refused += u64::from(is_good && !is_taken);
+                if is_taken {
+                    self.truth.last_seq = Some(command.seq);
+                    self.truth.until_us = command.until_us;
+                    self.truth.heard_us = Some(self.now_us);
+                }
+            }
+        }
+    }
+
+    fn step(&mut self) {
+        self.now_us += self.random.random_range(0..20_000);
+        if self.chance(0.0005) {
+            // Everybody is silent for a while.
+            self.now_us += 6_000_000;
+        }
+        self.act();
+        let now_us = self.now_us;
+        while let Some(place) = self
+            .under_way
+            .iter()
+            .position(|(at_us, _)| *at_us <= now_us)
+        {
+            let (_, message) = self.under_way.swap_remove(place);
+            self.arrive(message);
+        }
+        let wanted = self.operator.view().wanted_at(now_us);
+        if let Some(wanted) = wanted {
+            let is_sane = wanted.is_finite() && wanted.linear_m_s.abs() <= 1.0;
+            self.report.outlived += u64::from(now_us >= self.truth.until_us || !is_sane);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_stale_expired_old_or_foreign_command_is_ever_taken_and_no_good_one_refused() {
+        let report = run(100_000, 5);
+        assert_eq!(report.wrongly_accepted, 0, "{report:?}");
+        assert_eq!(report.wrongly_refused, 0, "{report:?}");
+        assert_eq!((report.outlived, report.stolen), (0, 0), "{report:?}");
+        let counts = report.counts;
+        for (what, count) in [
+            ("accepted", counts.accepted),
+            ("over the limit", counts.over_limit),
+            ("malformed", counts.malformed),
+            ("foreign", counts.foreign),
+            ("out of order", counts.out_of_order),
+            ("expired", counts.expired),
+            ("leases", report.leases),
+        ] {
+            assert!(
+                count > 20,
+                "only {count} {what}: the model tries too little"
+            );
+        }
+    }
+}

@@ -1,0 +1,221 @@
+//! What may only slow the robot down, in the loop: stops, hands, limits, fences, and the gate.
+//!
+//! The view of [`crate::safety`] is copied at the start of each tick, if nobody is writing it; the
+//! last copy carries its own ends, so that nothing lasts longer for being read late.
+
+use std::time::Duration;
+
+use tread_api::robot::PauseCause;
+use tread_control::fence::{FenceInput, MU_UNKNOWN};
+use tread_control::gate::hand::approach;
+use tread_control::gate::{GateCause, GateInput, GateOutput, Reasons, gate_with};
+use tread_control::geometry::Twist;
+use tread_control::measured::WheelSpeeds;
+
+use super::{LoopCore, STANDING, age_s};
+use crate::control_loop::BRAKING_MAX;
+use crate::control_loop::active::{Active, Hold};
+use crate::control_loop::seam::{EndReason, Fault, GateSnapshot};
+use crate::safety::{LoopView, microseconds};
+
+/// What the guard knows between two ticks.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Guard {
+    view: LoopView,
+    now_us: u64,
+    /// The number of the stop in force; 0 for none.
+    stop: u64,
+    gate: GateSnapshot,
+    last_cause: Option<GateCause>,
+}
+
+impl Guard {
+    /// Whether a stop is in force.
+    pub(super) fn is_stopped(&self) -> bool {
+        self.stop != 0
+    }
+
+    /// Whether somebody has the lease of driving by hand.
+    pub(super) fn is_leased(&self) -> bool {
+        self.view.hand.is_leased(self.now_us)
+    }
+
+    /// What the gate did so far.
+    pub(super) fn gate(&self) -> GateSnapshot {
+        self.gate
+    }
+
+    fn count(&mut self, gated: &GateOutput) {
+        let cause = gated.cause;
+        self.gate.cause = cause;
+        self.gate.target_rests = gated.target == WheelSpeeds::default();
+        self.gate.reduced_ticks += u64::from(cause.is_some());
+        if let Some(cause) = cause.filter(|cause| self.last_cause != Some(*cause)) {
+            self.gate.counts[cause as usize] += 1;
+        }
+        self.last_cause = cause;
+    }
+}
+
+/// What drives in this tick.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Wanted {
+    wheels: WheelSpeeds,
+    is_by_hand: bool,
+    is_driver_silent: bool,
+}
+
+impl LoopCore {
+    /// Looks at stops, leases and limits, and holds the mission in hand where they ask for it.
+    pub(super) fn look_at_safety(&mut self, now: Duration) {
+        let shared = &self.ends.shared;
+        self.guard.now_us = microseconds(now);
+        self.guard.stop = shared.safety.stop();
+        if let Some(view) = shared.safety.try_view() {
+            self.guard.view = view;
+        }
+        let guard = &self.guard;
+        let Some(active) = &mut self.active else {
+            return;
+        };
+        if guard.is_stopped() {
+            active.pause(PauseCause::Stop);
+        } else if guard.is_leased() {
+            active.pause(PauseCause::Teleoperation);
+        }
+        let limits = &guard.view.limits;
+        let most_m_s = limits.linear_max_m_s(guard.now_us);
+        let is_held = limits.holds(guard.now_us) || most_m_s.is_some_and(|most| most < STANDING);
+        active.hold(Hold::Outside, is_held);
+        active.limit_speed(most_m_s);
+    }
+
+    /// What the wheels are to do: what the hand wants, or what the mission wants.
+    pub(super) fn choose(&self, by_mission: Option<WheelSpeeds>, dt_s: f64) -> Wanted {
+        let hand = &self.guard.view.hand;
+        // A mission that is still braking for the lease comes to rest first.
+        let is_mission_at_rest = self.active.as_ref().is_none_or(Active::rests);
+        if !(hand.is_leased(self.guard.now_us) && is_mission_at_rest) {
+            return Wanted {
+                wheels: by_mission.unwrap_or_default(),
+                is_by_hand: false,
+                is_driver_silent: false,
+            };
+        }
+        let wanted = hand.wanted_at(self.guard.now_us);
+        let previous = self.model.twist_from_wheel_speeds(self.command);
+        let twist = approach(previous, wanted.unwrap_or_default(), &self.model, dt_s);
+        Wanted {
+            wheels: self.model.wheel_speeds_from_twist(twist),
+            is_by_hand: true,
+            is_driver_silent: wanted.is_none(),
+        }
+    }
+
+    fn fence_max_m_s(&self, wanted: Twist) -> (Option<f64>, bool) {
+        let Some(site) = self.site.as_ref().filter(|site| !site.fence().is_empty()) else {
+            return (None, false);
+        };
+        let Some(pose) = self.localisation.pose() else {
+            return (None, true);
+        };
+        let seen = self.estimate.mu_peak_lower_bound;
+        // Ground that has not slipped yet is taken for no worse than unknown ground.
+        let mu_lower = if self.slips {
+            seen
+        } else {
+            seen.map(|mu| mu.max(MU_UNKNOWN))
+        };
+        let input = FenceInput {
+            pose,
+            position_std_dev_m: self.localisation.position_std_dev_m(),
+            present: self.localisation.twist(),
+            wanted,
+            mu_lower,
+        };
+        (site.fence().judge(&input, &self.model).speed_max_m_s, false)
+    }
+
+    fn reasons(&self, now: Duration, fault: Option<Fault>, wanted: &Wanted) -> Reasons {
+        let guard = &self.guard;
+        let rest = WheelSpeeds::default();
+        let is_moving = wanted.wheels != rest || self.command != rest;
+        let twist = self.model.twist_from_wheel_speeds(wanted.wheels);
+        let (fence_max_m_s, is_fence_blind) = if is_moving {
+            self.fence_max_m_s(twist)
+        } else {
+            (None, false)
+        };
+        let is_driving = self.active.is_some() || wanted.is_by_hand;
+        let is_position_lost = fault == Some(Fault::PositionLost) && is_driving;
+        let share = guard.view.hand.speed_share;
+        let linear_max_m_s = self.model.limits().linear_max_m_s;
+        Reasons {
+            is_stopped: guard.is_stopped(),
+            tilt_rad: self.tilt_rad,
+            is_position_lost: is_position_lost || is_fence_blind,
+            is_held_outside: guard.view.limits.holds(guard.now_us),
+            is_link_silent: self.is_long_silent(now),
+            is_driver_silent: wanted.is_driver_silent,
+            fence_max_m_s,
+            outside_max_m_s: guard.view.limits.linear_max_m_s(guard.now_us),
+            command_age_max_m_s: (wanted.is_by_hand && share < 1.0)
+                .then_some(share * linear_max_m_s),
+        }
+    }
+
+    /// Whether the mission should long have ended for the server's silence.
+    fn is_long_silent(&self, now: Duration) -> bool {
+        let silence = self.ends.shared.server_silence(now);
+        let active = self.active.as_ref();
+        active.is_some_and(|active| active.minds_silence(silence.saturating_sub(BRAKING_MAX)))
+    }
+
+    /// Lets through what may be, reduced.
+    pub(super) fn pass(
+        &mut self,
+        now: Duration,
+        fault: Option<Fault>,
+        wanted: Wanted,
+        stop: bool,
+        dt_s: f64,
+    ) -> GateOutput {
+        let reasons = self.reasons(now, fault, &wanted);
+        let gated = gate_with(
+            &GateInput {
+                // A robot without a mission holds still: that is a command, not the lack of one.
+                command: Some(wanted.wheels),
+                previous: self.command,
+                stop,
+                feedback_age_s: age_s(now, self.last_sample),
+                dt_s,
+            },
+            &reasons,
+            &self.limits,
+        );
+        self.guard.count(&gated);
+        gated
+    }
+
+    /// The base has the command: a stop that the gate knew of has set the target to zero.
+    pub(super) fn note_written(&self) {
+        if self.guard.is_stopped() {
+            self.ends.shared.safety.note_zeroed(self.guard.stop);
+        }
+    }
+
+    /// What must not last for ever: the server's silence, and waiting for a revision.
+    pub(super) fn mind_bounds(&mut self, now: Duration) {
+        let Some(active) = &mut self.active else {
+            self.replacement_until = None;
+            return;
+        };
+        if active.minds_silence(self.ends.shared.server_silence(now)) {
+            active.stop(EndReason::ServerSilent);
+        }
+        if self.replacement_until.is_some_and(|until| now > until) {
+            active.hold(Hold::Replacement, false);
+            self.replacement_until = None;
+        }
+    }
+}

@@ -1,0 +1,164 @@
+//! One tick of the control loop: read → localise → estimate → track → gate → write.
+//!
+//! Pure but for the drive and the channels' ends; nothing here waits, allocates or looks at a
+//! clock. What has to be freed goes out with an event, to be freed by somebody else. [`sensing`] is
+//! what comes from the base, [`orders`] what comes from the rest of the agent, [`guard`] what may only
+//! slow the robot down, [`snapshot`] what goes out.
+
+mod guard;
+mod orders;
+mod sensing;
+mod snapshot;
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use tread_control::estimation::{Estimate, Estimator, SensorNoise};
+use tread_control::gate::GateLimits;
+use tread_control::localisation::{Localisation, LocalisationNoise};
+use tread_control::measured::WheelSpeeds;
+use tread_control::robot::RobotModel;
+
+use super::active::Active;
+use super::outgoing::Outgoing;
+use super::seam::{EndReason, LoopEnds, Shared};
+use super::segments::{Moment, SegmentCutter};
+use super::site_view::{Footing, SiteView};
+use crate::drive::Drive;
+use guard::Guard;
+
+/// Longest time that one tick is taken to have lasted, seconds; a loop that slept does not leap.
+const TICK_MAX_S: f64 = 0.2;
+/// Speed below which the robot counts as standing, m/s and rad/s.
+const STANDING: f64 = 0.02;
+
+/// The state of the loop between two ticks.
+#[derive(Debug)]
+pub(crate) struct LoopCore {
+    model: RobotModel,
+    limits: GateLimits,
+    ends: LoopEnds,
+    localisation: Localisation,
+    estimator: Estimator,
+    estimate: Estimate,
+    cutter: SegmentCutter,
+    site: Option<Arc<SiteView>>,
+    active: Option<Active>,
+    outgoing: Outgoing,
+    command: WheelSpeeds,
+    measured_wheels: WheelSpeeds,
+    theta_loop: Option<f64>,
+    footing: Option<Footing>,
+    last_tick: Option<Duration>,
+    last_sample: Option<Duration>,
+    last_fix: Option<Duration>,
+    /// How far the robot leans, if the base measures it.
+    tilt_rad: Option<f64>,
+    guard: Guard,
+    /// Whether a wheel slips beyond the model.
+    slips: bool,
+    /// Until when the mission is held for its next revision.
+    replacement_until: Option<Duration>,
+    ticks: u64,
+}
+
+impl LoopCore {
+    pub(crate) fn new(model: RobotModel, ends: LoopEnds) -> Self {
+        let estimator = Estimator::new(model, SensorNoise::default());
+        Self {
+            model,
+            limits: GateLimits::of(&model),
+            localisation: Localisation::new(model, LocalisationNoise::default()),
+            estimate: estimator.estimate(),
+            estimator,
+            cutter: SegmentCutter::default(),
+            site: None,
+            active: None,
+            outgoing: Outgoing::new(ends.events.clone(), Arc::clone(&ends.shared)),
+            ends,
+            command: WheelSpeeds::default(),
+            measured_wheels: WheelSpeeds::default(),
+            theta_loop: None,
+            footing: None,
+            last_tick: None,
+            last_sample: None,
+            last_fix: None,
+            tilt_rad: None,
+            guard: Guard::default(),
+            slips: false,
+            replacement_until: None,
+            ticks: 0,
+        }
+    }
+
+    /// Whether the wheels are commanded to rest and do.
+    pub(crate) fn stands(&self) -> bool {
+        let radius_m = self.model.wheel_radius_m();
+        self.command == WheelSpeeds::default()
+            && self.measured_wheels.magnitude_max_rad_s() * radius_m < 5.0 * STANDING
+    }
+
+    /// One tick. With `stop`, the robot brakes and its mission ends.
+    pub(crate) fn tick(&mut self, now: Moment, stop: bool, drive: &mut dyn Drive) {
+        self.outgoing.flush();
+        let dt_s = self.time_step_s(now.monotonic);
+        let feedback = drive.read(now.monotonic);
+        let ground_changed = self.take_samples(&feedback);
+        self.take_commands(now, stop);
+        self.cut_segments(now, ground_changed, dt_s);
+        self.look_at_safety(now.monotonic);
+        self.mind_bounds(now.monotonic);
+        let fault = self.fault(now.monotonic);
+        let by_mission = self.follow(now, fault, dt_s);
+        let wanted = self.choose(by_mission, dt_s);
+        let gated = self.pass(now.monotonic, fault, wanted, stop, dt_s);
+        self.command = gated.wheel_speeds;
+        drive.write(self.command);
+        self.note_written();
+        self.record(dt_s, ground_changed, gated.cause);
+        if stop {
+            self.end_mission(now, EndReason::AgentStopped);
+        }
+        self.report_start(now);
+        self.ticks += 1;
+        self.ends.shared.ticks.store(self.ticks, Ordering::Relaxed);
+        self.ends
+            .shared
+            .publish(&self.snapshot(now.monotonic, fault, drive.battery()));
+    }
+
+    fn time_step_s(&mut self, now: Duration) -> f64 {
+        let before = self.last_tick.replace(now).unwrap_or(now);
+        now.saturating_sub(before).as_secs_f64().min(TICK_MAX_S)
+    }
+
+    /// Notes how long a tick computed.
+    pub(crate) fn note_tick_time(&self, took: Duration) {
+        let microseconds = u32::try_from(took.as_micros()).unwrap_or(u32::MAX);
+        self.ends
+            .shared
+            .tick_max_us
+            .fetch_max(microseconds, Ordering::Relaxed);
+    }
+
+    /// Notes a tick that began more than one period late.
+    pub(crate) fn note_overrun(&self) {
+        Shared::count(&self.ends.shared.overruns);
+    }
+
+    /// Whether the rest of the agent wants the loop to end.
+    pub(crate) fn is_told_to_stop(&self) -> bool {
+        self.ends.shared.stop.load(Ordering::Relaxed)
+    }
+
+    /// Hands out what still waits; false if there was no room for all of it.
+    pub(crate) fn flush(&mut self) -> bool {
+        self.outgoing.flush()
+    }
+}
+
+/// Age of something, seconds; infinite for what never was.
+fn age_s(now: Duration, at: Option<Duration>) -> f64 {
+    at.map_or(f64::INFINITY, |at| now.saturating_sub(at).as_secs_f64())
+}

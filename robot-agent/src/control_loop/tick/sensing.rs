@@ -1,0 +1,143 @@
+//! What the base says: where the robot is, how the ground grips, and what is broken.
+
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use tread_control::estimation::SensorSample;
+use tread_control::localisation::{FixOutcome, PositionFix};
+use tread_control::tracking::ThetaKnowledge;
+
+use super::{LoopCore, TICK_MAX_S};
+use crate::control_loop::seam::{Fault, LoopEvent, Shared};
+use crate::control_loop::segments::{CutInput, Moment, Place};
+use crate::control_loop::site_view::Footing;
+use crate::drive::Feedback;
+use crate::geometry::wire_point;
+
+/// Oldest word of the base with which it does not count as silent.
+const BASE_SILENT_AFTER: Duration = Duration::from_millis(200);
+/// Oldest position fix with which the position does not count as lost.
+const POSITION_LOST_AFTER: Duration = Duration::from_secs(3);
+
+impl LoopCore {
+    /// Takes what the base said; true if the estimator found the ground changed.
+    pub(super) fn take_samples(&mut self, feedback: &Feedback) -> bool {
+        let mut ground_changed = false;
+        let mut has_new_block = false;
+        let lost = u64::from(feedback.lost());
+        self.ends
+            .shared
+            .lost_samples
+            .fetch_add(lost, Ordering::Relaxed);
+        for sample in feedback.samples() {
+            if sample.tilt_rad.is_some() {
+                self.tilt_rad = sample.tilt_rad;
+            }
+            let gyro_rad_s = sample.yaw_rate_rad_s.filter(|rate| rate.is_finite());
+            let wheel_speeds = sample.wheel_speeds.filter(|speeds| speeds.is_finite());
+            if let (Some(gyro_rad_s), Some(wheel_speeds)) = (gyro_rad_s, wheel_speeds) {
+                let dt_s = self
+                    .last_sample
+                    .map_or(0.0, |last| sample.at.saturating_sub(last).as_secs_f64())
+                    .min(TICK_MAX_S);
+                // Only what can be used counts as a word of the base: one that says nothing but
+                // nonsense is as good as silent.
+                self.last_sample = Some(sample.at);
+                self.measured_wheels = wheel_speeds;
+                if dt_s > 0.0 {
+                    self.localisation.predict(gyro_rad_s, wheel_speeds, dt_s);
+                    // With wheels on two grounds there is no one θ to learn.
+                    if self.footing != Some(Footing::Mixed) {
+                        let taken = SensorSample {
+                            wheel_speeds,
+                            gyro_rad_s,
+                            acceleration: sample.acceleration,
+                            body_speed_m_s: sample.body_speed_m_s,
+                            wheel_torques: sample.wheel_torques,
+                        };
+                        let outcome = self.estimator.update(&taken, dt_s);
+                        ground_changed |= outcome.ground_changed;
+                        has_new_block |= outcome.block_done;
+                        if outcome.block_done {
+                            self.slips = outcome.slips;
+                        }
+                        if outcome.block_done && self.cutter.cell().is_none() {
+                            Shared::count(&self.ends.shared.unplaced_blocks);
+                        }
+                    }
+                }
+            }
+            if let Some(pose) = sample.position {
+                let fix = PositionFix { pose, age_s: 0.0 };
+                match self.localisation.correct(&fix) {
+                    FixOutcome::Started | FixOutcome::Fused | FixOutcome::Restarted => {
+                        self.last_fix = Some(sample.at);
+                    }
+                    FixOutcome::Invalid | FixOutcome::Outlier => {}
+                }
+            }
+        }
+        if has_new_block {
+            self.estimate = self.estimator.estimate();
+        }
+        ground_changed
+    }
+
+    pub(super) fn knowledge(&self) -> Option<ThetaKnowledge> {
+        let measured = self.estimate.theta?;
+        Some(ThetaKnowledge {
+            theta: measured.theta,
+            std_dev: measured.std_dev,
+        })
+    }
+
+    pub(super) fn cut_segments(&mut self, now: Moment, ground_changed: bool, dt_s: f64) {
+        let pose = self.localisation.pose();
+        let mut place = None;
+        self.footing = None;
+        if let (Some(site), Some(pose)) = (&self.site, pose) {
+            let footing = site.footing(pose, &self.model);
+            self.footing = Some(footing);
+            let former = self.cutter.cell();
+            if let (Footing::Whole(terrain), Some(cell)) =
+                (footing, site.cell(wire_point(pose), former))
+            {
+                place = Some(Place { cell, terrain });
+            }
+        }
+        let speed_m_s = self.localisation.twist().linear_m_s.abs();
+        let input = CutInput {
+            now,
+            place,
+            site: self.site.as_ref(),
+            mission: self.active.as_ref().map(|active| active.job.mission),
+            driven_m: if speed_m_s.is_finite() {
+                speed_m_s * dt_s
+            } else {
+                0.0
+            },
+            ground_changed,
+        };
+        let cut = self.cutter.step(input, &mut self.estimator);
+        if cut.is_new_ground {
+            // What was known of the ground before says nothing here.
+            self.estimate = self.estimator.estimate();
+        }
+        if let Some(segment) = cut.segment {
+            self.outgoing.send(LoopEvent::Segment(segment));
+        }
+    }
+
+    pub(super) fn fault(&self, now: Duration) -> Option<Fault> {
+        let is_older = |at: Option<Duration>, most: Duration| {
+            at.is_some_and(|at| now.saturating_sub(at) > most)
+        };
+        if is_older(self.last_sample, BASE_SILENT_AFTER) {
+            Some(Fault::BaseSilent)
+        } else if is_older(self.last_fix, POSITION_LOST_AFTER) {
+            Some(Fault::PositionLost)
+        } else {
+            None
+        }
+    }
+}

@@ -1,0 +1,314 @@
+//! What programs outside allow: holds and speed limits, each with its holder and end. Pure.
+//!
+//! The newest limit of a holder counts until its end. A holder that the configuration calls
+//! required holds the robot while it is silent; of any other an ended limit has no effect.
+
+use tread_api::ids::{BootId, HolderId};
+use tread_api::safety::{LIMITS_MAX, LimitStatus};
+use tread_api::wire::safety::ExternalLimit;
+
+/// Why a limit is refused.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum LimitRefusal {
+    /// It is for another run of the agent.
+    Foreign,
+    /// It is not newer than one that was taken before.
+    OutOfOrder,
+    /// Its end is too far ahead.
+    TooLong,
+    /// Its speed is none.
+    Invalid(String),
+    /// There are too many holders.
+    TooMany,
+}
+
+/// One holder's limit as the loop sees it.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Entry {
+    is_required: bool,
+    until_us: u64,
+    hold: bool,
+    linear_max_m_s: Option<f64>,
+}
+
+impl Entry {
+    fn holds(&self, now_us: u64) -> bool {
+        if now_us < self.until_us {
+            self.hold
+        } else {
+            self.is_required
+        }
+    }
+
+    fn limit_m_s(&self, now_us: u64) -> Option<f64> {
+        self.linear_max_m_s.filter(|_| now_us < self.until_us)
+    }
+}
+
+/// All limits, to be looked at in a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(crate) struct LimitsView {
+    entries: [Entry; LIMITS_MAX],
+    count: usize,
+}
+
+impl LimitsView {
+    fn present(&self) -> &[Entry] {
+        &self.entries[..self.count]
+    }
+
+    /// Whether the robot is held.
+    pub(crate) fn holds(&self, now_us: u64) -> bool {
+        self.present().iter().any(|entry| entry.holds(now_us))
+    }
+
+    /// The lowest limit of the speed, metres per second.
+    pub(crate) fn linear_max_m_s(&self, now_us: u64) -> Option<f64> {
+        let limits = self.present().iter();
+        limits
+            .filter_map(|entry| entry.limit_m_s(now_us))
+            .reduce(f64::min)
+    }
+}
+
+#[derive(Debug, Clone)]
+struct Holder {
+    id: HolderId,
+    entry: Entry,
+    seq: Option<u64>,
+    /// Up to here an older limit, come late, could still be in time.
+    guarded_until_us: u64,
+}
+
+/// The limits that are known.
+#[derive(Debug, Clone)]
+pub(crate) struct ExternalLimits {
+    boot: BootId,
+    holders: Vec<Holder>,
+    refused: u64,
+}
+
+impl ExternalLimits {
+    /// Nothing but the holders that are required, at most [`LIMITS_MAX`]; they are silent.
+    pub(crate) fn new(boot: BootId, required: &[HolderId]) -> Self {
+        let mut holders = Vec::with_capacity(LIMITS_MAX);
+        let required = required.iter().take(LIMITS_MAX).map(|id| Holder {
+            id: id.clone(),
+            entry: Entry {
+                is_required: true,
+                ..Entry::default()
+            },
+            seq: None,
+            guarded_until_us: 0,
+        });
+        holders.extend(required);
+        Self {
+            boot,
+            holders,
+            refused: 0,
+        }
+    }
+
+    /// Takes a limit.
+    ///
+    /// # Errors
+    /// [`LimitRefusal`]; it is counted, and nothing changes.
+    pub(crate) fn take(&mut self, limit: &ExternalLimit, now_us: u64) -> Result<(), LimitRefusal> {
+        let taken = self.try_take(limit, now_us);
+        if taken.is_err() {
+            self.refused += 1;
+        }
+        taken
+    }
+
+    fn try_take(&mut self, limit: &ExternalLimit, now_us: u64) -> Result<(), LimitRefusal> {
+        if limit.boot != self.boot {
+            return Err(LimitRefusal::Foreign);
+        }
+        limit.validate().map_err(LimitRefusal::Invalid)?;
+        if limit.is_too_long(now_us) {
+            return Err(LimitRefusal::TooLong);
+        }
+        let place = self
+            .holders
+            .iter()
+            .position(|holder| holder.id == limit.holder);
+        let place = match place {
+            Some(place) => place,
+            None => self.make_room(limit, now_us)?,
+        };
+        let holder = &mut self.holders[place];
+        let is_guarded = now_us < holder.guarded_until_us;
+        if is_guarded && holder.seq.is_some_and(|last| limit.seq <= last) {
+            return Err(LimitRefusal::OutOfOrder);
+        }
+        holder.seq = Some(limit.seq);
+        holder.guarded_until_us = holder.guarded_until_us.max(limit.until_us);
+        holder.entry = Entry {
+            is_required: holder.entry.is_required,
+            until_us: limit.until_us,
+            hold: limit.hold,
+            linear_max_m_s: limit.linear_max_m_s,
+        };
+        Ok(())
+    }
+
+    fn make_room(&mut self, limit: &ExternalLimit, now_us: u64) -> Result<usize, LimitRefusal> {
+        if self.holders.len() >= LIMITS_MAX {
+            self.holders
+                .retain(|holder| holder.entry.is_required || now_us < holder.guarded_until_us);
+        }
+        if self.holders.len() >= LIMITS_MAX {
+            return Err(LimitRefusal::TooMany);
+        }
+        self.holders.push(Holder {
+            id: limit.holder.clone(),
+            entry: Entry::default(),
+            seq: None,
+            guarded_until_us: 0,
+        });
+        Ok(self.holders.len() - 1)
+    }
+
+    /// Counts one that does not parse, or is too large.
+    pub(crate) fn note_malformed(&mut self) {
+        self.refused += 1;
+    }
+
+    /// How many were refused.
+    pub(crate) fn refused(&self) -> u64 {
+        self.refused
+    }
+
+    /// What the loop needs.
+    pub(crate) fn view(&self) -> LimitsView {
+        let mut view = LimitsView {
+            count: self.holders.len(),
+            ..LimitsView::default()
+        };
+        for (entry, holder) in view.entries.iter_mut().zip(&self.holders) {
+            *entry = holder.entry;
+        }
+        view
+    }
+
+    /// For the robot's state: limits in force, and required holders.
+    pub(crate) fn status(&self, now_us: u64) -> Vec<LimitStatus> {
+        let of_note = self
+            .holders
+            .iter()
+            .filter(|holder| holder.entry.is_required || now_us < holder.entry.until_us);
+        of_note
+            .map(|holder| LimitStatus {
+                holder: holder.id.clone(),
+                required: holder.entry.is_required,
+                hold: holder.entry.holds(now_us),
+                linear_max_m_s: holder.entry.limit_m_s(now_us),
+                ends_in_ms: holder
+                    .entry
+                    .until_us
+                    .checked_sub(now_us)
+                    .filter(|left_us| *left_us > 0)
+                    .map(|left_us| left_us / 1_000),
+            })
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use uuid::Uuid;
+
+    use super::*;
+
+    fn boot() -> BootId {
+        BootId::from_uuid(Uuid::from_u128(5))
+    }
+
+    fn limit(holder: &str, seq: u64, until_us: u64, hold: bool) -> ExternalLimit {
+        ExternalLimit {
+            holder: holder.parse().unwrap(),
+            boot: boot(),
+            until_us,
+            seq,
+            hold,
+            linear_max_m_s: Some(0.3),
+        }
+    }
+
+    #[test]
+    fn a_required_holder_holds_by_its_silence_and_any_other_only_while_it_lasts() {
+        let mut limits = ExternalLimits::new(boot(), &["lidar".parse().unwrap()]);
+        assert!(limits.view().holds(0), "not heard yet");
+        limits.take(&limit("lidar", 1, 1_000, false), 10).unwrap();
+        assert!(!limits.view().holds(999));
+        assert_eq!(limits.view().linear_max_m_s(999), Some(0.3));
+        assert!(limits.view().holds(1_000), "silent again");
+        assert_eq!(limits.view().linear_max_m_s(1_000), None);
+        limits
+            .take(&limit("lidar", 2, 9_000, false), 1_000)
+            .unwrap();
+        limits.take(&limit("boss", 1, 3_000, true), 1_000).unwrap();
+        assert!(limits.view().holds(2_999));
+        assert!(!limits.view().holds(3_000));
+        limits.take(&limit("lidar", 3, 0, false), 3_000).unwrap();
+        assert!(limits.view().holds(3_000), "ended by its holder is silence");
+    }
+
+    #[test]
+    fn too_many_holders_foreign_and_endless_limits_are_refused() {
+        let mut limits = ExternalLimits::new(boot(), &["lidar".parse().unwrap()]);
+        for number in 1..LIMITS_MAX {
+            let holder = format!("h{number}");
+            limits.take(&limit(&holder, 1, 1_000, true), 0).unwrap();
+        }
+        let one_more = limit("one-more", 1, 2_000, true);
+        assert_eq!(limits.take(&one_more, 0), Err(LimitRefusal::TooMany));
+        assert_eq!(
+            limits.take(&one_more, 1_000),
+            Ok(()),
+            "ended ones make room"
+        );
+        let mut foreign = one_more.clone();
+        foreign.boot = BootId::from_uuid(Uuid::from_u128(6));
+        assert_eq!(limits.take(&foreign, 0), Err(LimitRefusal::Foreign));
+        let endless = limit("one-more", 9, u64::MAX, true);
+        assert_eq!(limits.take(&endless, 0), Err(LimitRefusal::TooLong));
+        for bad in [f64::NAN, -1.0, f64::INFINITY] {
+            let mut limit = limit("one-more", 10, 3_000, true);
+            limit.linear_max_m_s = Some(bad);
+            let refused = limits.take(&limit, 0);
+            assert!(matches!(refused, Err(LimitRefusal::Invalid(_))), "{bad}");
+        }
+        assert_eq!(limits.refused(), 6);
+    }
+
+    proptest! {
+        #[test]
+        fn whatever_the_order_of_arrival_the_newest_that_is_in_time_counts(
+            sent in prop::collection::vec((0..5_000_u64, any::<bool>()), 1..12),
+            order in any::<prop::sample::Index>(),
+            doubles in 0..4_usize,
+        ) {
+            // All arrive at once, in any rotation, some twice: the highest number wins.
+            let mut arrivals: Vec<ExternalLimit> = sent
+                .iter()
+                .zip(1_u64..)
+                .map(|(&(until_us, hold), seq)| limit("h", seq, 10_000 + until_us, hold))
+                .collect();
+            let newest = arrivals.last().cloned().unwrap();
+            let turn = order.index(arrivals.len());
+            arrivals.rotate_left(turn);
+            let again: Vec<_> = arrivals.iter().take(doubles).cloned().collect();
+            arrivals.extend(again);
+            let mut limits = ExternalLimits::new(boot(), &[]);
+            for arrival in &arrivals {
+                let _ = limits.take(arrival, 0);
+            }
+            let view = limits.view();
+            prop_assert_eq!(view.holds(newest.until_us - 1), newest.hold);
+            prop_assert!(!view.holds(newest.until_us));
+        }
+    }
+}

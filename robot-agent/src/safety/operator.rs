@@ -1,0 +1,336 @@
+//! Driving by hand on the robot: who has the lease, and which commands count. Pure.
+//!
+//! ```text
+//!            acquire, take                 release, silence of 5 s
+//! nobody ─────────────────► leased (epoch) ───────────────────────► nobody
+//!                            │         ▲
+//!                            └─────────┘ take: another driver, the next epoch
+//! ```
+//! A command counts if it names this run and this lease, is newer than all before, is a number, and
+//! ends within the second to come. All else changes nothing and is counted. What is wanted lasts
+//! until the end of the last command and not a tick longer, whoever holds the lease.
+
+use std::collections::VecDeque;
+
+use tread_api::ids::BootId;
+use tread_api::safety::{
+    BY_LENGTH_MAX, DriveCounts, DriveStatus, Driver, LEASE_SILENCE_MAX_US, Lease,
+};
+use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
+use tread_control::gate::hand::{AgeMeter, within_limits};
+use tread_control::geometry::Twist;
+use tread_control::robot::RobotModel;
+use uuid::Uuid;
+
+/// Requests for a lease whose answers are remembered.
+const ANSWERED_MAX: usize = 64;
+
+/// What a request for a lease got.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum LeaseAnswer {
+    /// The lease of this epoch.
+    Leased(u64),
+    /// The lease is given back.
+    Released,
+}
+
+/// Why a lease is refused.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum LeaseRefusal {
+    /// Somebody else has it.
+    Held(Driver),
+    /// The same request was granted before, and the lease has gone on since.
+    Over,
+}
+
+/// What became of a command.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Verdict {
+    Accepted,
+    Foreign,
+    OutOfOrder,
+    Expired,
+    NotFinite,
+}
+
+#[derive(Debug, Clone)]
+struct Held {
+    lease: Lease,
+    heard_us: u64,
+    last_seq: Option<u64>,
+}
+
+/// What the loop needs to know of it.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(crate) struct HandView {
+    /// The lease in force, and until when without another command.
+    pub(crate) lease: Option<(u64, u64)>,
+    /// What is wanted, and until when.
+    pub(crate) wanted: Option<(Twist, u64)>,
+    /// Share of the speed that the age of commands allows.
+    pub(crate) speed_share: f64,
+}
+
+impl HandView {
+    /// Whether somebody drives by hand.
+    pub(crate) fn is_leased(&self, now_us: u64) -> bool {
+        self.lease.is_some_and(|(_, until_us)| now_us < until_us)
+    }
+
+    /// What is wanted now; none once its end has passed.
+    pub(crate) fn wanted_at(&self, now_us: u64) -> Option<Twist> {
+        let (twist, until_us) = self.wanted?;
+        (now_us < until_us && self.is_leased(now_us)).then_some(twist)
+    }
+}
+
+/// The state of driving by hand.
+#[derive(Debug, Clone)]
+pub(crate) struct Operator {
+    boot: BootId,
+    model: RobotModel,
+    epoch: u64,
+    held: Option<Held>,
+    wanted: Option<(Twist, u64)>,
+    meter: AgeMeter,
+    counts: DriveCounts,
+    answered: VecDeque<(Uuid, LeaseAnswer)>,
+}
+
+impl Operator {
+    pub(crate) fn new(boot: BootId, model: RobotModel) -> Self {
+        Self {
+            boot,
+            model,
+            epoch: 0,
+            held: None,
+            wanted: None,
+            meter: AgeMeter::default(),
+            counts: DriveCounts::default(),
+            answered: VecDeque::with_capacity(ANSWERED_MAX),
+        }
+    }
+
+    fn free_if_silent(&mut self, now_us: u64) {
+        let is_silent = self
+            .held
+            .as_ref()
+            .is_some_and(|held| now_us >= held.heard_us.saturating_add(LEASE_SILENCE_MAX_US));
+        if is_silent {
+            self.free();
+        }
+    }
+
+    fn free(&mut self) {
+        self.held = None;
+        self.wanted = None;
+    }
+
+    fn grant(&mut self, driver: &Driver, now_us: u64) -> LeaseAnswer {
+        self.free();
+        self.epoch += 1;
+        let driver = Driver {
+            client: driver.client,
+            name: driver.name.chars().take(BY_LENGTH_MAX).collect(),
+        };
+        self.held = Some(Held {
+            lease: Lease {
+                epoch: self.epoch,
+                driver,
+            },
+            heard_us: now_us,
+            last_seq: None,
+        });
+        self.meter = AgeMeter::default();
+        LeaseAnswer::Leased(self.epoch)
+    }
+
+    /// Acquires, takes or releases the lease.
+    ///
+    /// # Errors
+    /// [`LeaseRefusal`].
+    pub(crate) fn lease(
+        &mut self,
+        command: &LeaseCommand,
+        now_us: u64,
+    ) -> Result<LeaseAnswer, LeaseRefusal> {
+        self.free_if_silent(now_us);
+        let known = self
+            .answered
+            .iter()
+            .find(|(request, _)| *request == command.request);
+        let present = self.held.as_ref().map(|held| &held.lease);
+        if let Some(&(_, answer)) = known {
+            return match answer {
+                LeaseAnswer::Leased(epoch) if present.map(|lease| lease.epoch) != Some(epoch) => {
+                    Err(LeaseRefusal::Over)
+                }
+                LeaseAnswer::Leased(_) | LeaseAnswer::Released => Ok(answer),
+            };
+        }
+        let client = command.holder.client;
+        let other = present.filter(|lease| lease.driver.client != client);
+        let answer = match (command.action, present, other) {
+            (LeaseAction::Acquire | LeaseAction::Release, _, Some(other)) => {
+                return Err(LeaseRefusal::Held(other.driver.clone()));
+            }
+            (LeaseAction::Acquire, Some(own), None) => LeaseAnswer::Leased(own.epoch),
+            (LeaseAction::Acquire, None, None) | (LeaseAction::Take, _, _) => {
+                self.grant(&command.holder, now_us)
+            }
+            (LeaseAction::Release, _, None) => {
+                self.free();
+                LeaseAnswer::Released
+            }
+        };
+        if self.answered.len() >= ANSWERED_MAX {
+            self.answered.pop_front();
+        }
+        self.answered.push_back((command.request, answer));
+        Ok(answer)
+    }
+
+    /// Takes a command, if it counts.
+    pub(crate) fn drive(&mut self, command: &DriveCommand, now_us: u64) -> Verdict {
+        self.free_if_silent(now_us);
+        let verdict = self.judge(command, now_us);
+        let count = match verdict {
+            Verdict::Accepted => &mut self.counts.accepted,
+            Verdict::Foreign => &mut self.counts.foreign,
+            Verdict::OutOfOrder => &mut self.counts.out_of_order,
+            Verdict::Expired => &mut self.counts.expired,
+            Verdict::NotFinite => &mut self.counts.malformed,
+        };
+        *count += 1;
+        if verdict != Verdict::Accepted {
+            return verdict;
+        }
+        let asked = Twist {
+            linear_m_s: command.twist.linear_m_s,
+            angular_rad_s: command.twist.angular_rad_s,
+        };
+        let (within, is_over) = within_limits(asked, &self.model);
+        self.counts.over_limit += u64::from(is_over);
+        self.wanted = Some((within, command.until_us));
+        let age_us = now_us.saturating_sub(command.sent_us);
+        self.meter.note(seconds_of(age_us));
+        if let Some(held) = &mut self.held {
+            held.heard_us = now_us;
+            held.last_seq = Some(command.seq);
+        }
+        verdict
+    }
+
+    fn judge(&self, command: &DriveCommand, now_us: u64) -> Verdict {
+        let Some(held) = self
+            .held
+            .as_ref()
+            .filter(|held| command.boot == self.boot && command.epoch == held.lease.epoch)
+        else {
+            return Verdict::Foreign;
+        };
+        if held.last_seq.is_some_and(|last| command.seq <= last) {
+            Verdict::OutOfOrder
+        } else if !command.is_in_time(now_us) {
+            Verdict::Expired
+        } else if !(command.twist.linear_m_s.is_finite() && command.twist.angular_rad_s.is_finite())
+        {
+            Verdict::NotFinite
+        } else {
+            Verdict::Accepted
+        }
+    }
+
+    /// Counts a command that does not parse, or is too large.
+    pub(crate) fn note_malformed(&mut self) {
+        self.counts.malformed += 1;
+    }
+
+    /// What the loop needs.
+    pub(crate) fn view(&self) -> HandView {
+        HandView {
+            lease: self.held.as_ref().map(|held| {
+                let until_us = held.heard_us.saturating_add(LEASE_SILENCE_MAX_US);
+                (held.lease.epoch, until_us)
+            }),
+            wanted: self.wanted,
+            speed_share: self.meter.speed_share(),
+        }
+    }
+
+    /// The lease in force.
+    pub(crate) fn lease_at(&self, now_us: u64) -> Option<&Lease> {
+        let held = self.held.as_ref()?;
+        let until_us = held.heard_us.saturating_add(LEASE_SILENCE_MAX_US);
+        (now_us < until_us).then_some(&held.lease)
+    }
+
+    /// For the robot's state; none before the first lease.
+    pub(crate) fn status(&self) -> Option<DriveStatus> {
+        let is_silent = self.counts == DriveCounts::default();
+        (self.epoch > 0 || !is_silent).then(|| DriveStatus {
+            command_age_ms: self.meter.worst_s().map(|age_s| 1_000.0 * age_s),
+            speed_share: self.meter.speed_share(),
+            counts: self.counts,
+        })
+    }
+}
+
+/// Microseconds as seconds.
+fn seconds_of(time_us: u64) -> f64 {
+    std::time::Duration::from_micros(time_us).as_secs_f64()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn boot(number: u128) -> BootId {
+        BootId::from_uuid(Uuid::from_u128(number))
+    }
+
+    fn driver(number: u128) -> Driver {
+        Driver {
+            client: Uuid::from_u128(100 + number),
+            name: format!("driver {number}"),
+        }
+    }
+
+    fn request(number: u128, action: LeaseAction, who: u128) -> LeaseCommand {
+        LeaseCommand {
+            request: Uuid::from_u128(number),
+            action,
+            holder: driver(who),
+        }
+    }
+
+    #[test]
+    fn a_refusal_names_the_holder_and_a_taken_lease_is_gone_for_good() {
+        let mut operator = Operator::new(boot(1), RobotModel::yi2007());
+        let first = operator.lease(&request(1, LeaseAction::Acquire, 0), 0);
+        assert_eq!(first, Ok(LeaseAnswer::Leased(1)));
+        let refused = operator.lease(&request(2, LeaseAction::Acquire, 1), 0);
+        assert_eq!(refused, Err(LeaseRefusal::Held(driver(0))));
+        let taken = operator.lease(&request(3, LeaseAction::Take, 1), 0);
+        assert_eq!(taken, Ok(LeaseAnswer::Leased(2)));
+        // The first one's request comes twice; it must not steal the lease back, nor be told that
+        // it has it.
+        let again = operator.lease(&request(1, LeaseAction::Acquire, 0), 0);
+        assert_eq!(again, Err(LeaseRefusal::Over));
+        let released = operator.lease(&request(4, LeaseAction::Release, 0), 0);
+        assert_eq!(released, Err(LeaseRefusal::Held(driver(1))));
+        assert_eq!(operator.lease_at(0).unwrap().driver, driver(1));
+    }
+
+    #[test]
+    fn a_lease_whose_driver_is_silent_frees_itself() {
+        let mut operator = Operator::new(boot(1), RobotModel::yi2007());
+        operator
+            .lease(&request(1, LeaseAction::Acquire, 0), 0)
+            .unwrap();
+        assert!(operator.lease_at(LEASE_SILENCE_MAX_US - 1).is_some());
+        assert!(operator.lease_at(LEASE_SILENCE_MAX_US).is_none());
+        let next = operator.lease(&request(2, LeaseAction::Acquire, 1), LEASE_SILENCE_MAX_US);
+        assert_eq!(next, Ok(LeaseAnswer::Leased(2)));
+    }
+}

@@ -1,0 +1,270 @@
+//! Stops, leases, drive commands and limits over real zenoh.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use tread_api::geometry::Twist;
+use tread_api::ids::{BootId, StopId};
+use tread_api::keys::{self, Verb};
+use tread_api::robot::{PauseCause, RobotMode};
+use tread_api::safety::Driver;
+use tread_api::wire;
+use tread_api::wire::command::{OfferRefusal, Outcome};
+use tread_api::wire::ingest::MissionPhase;
+use tread_api::wire::safety::{
+    ClearStop, DriveCommand, ExternalLimit, LeaseAction, LeaseCommand, Stop,
+};
+use tread_api::wire::state::RobotState;
+use uuid::Uuid;
+
+use crate::rig::Rig;
+use crate::support::{FakeServer, offer};
+
+const LONG: &str = r#"{"waypoints":{"speed_m_s":0.8,
+    "points":[{"x_m":4,"y_m":3},{"x_m":8,"y_m":3.2},{"x_m":11,"y_m":4.5},{"x_m":11,"y_m":9}]}}"#;
+
+fn stop_id(number: u128) -> StopId {
+    StopId::from_uuid(Uuid::from_u128(number))
+}
+
+async fn send<T: serde::Serialize>(
+    server: &FakeServer,
+    rig: &Rig,
+    verb: Verb,
+    body: &T,
+) -> Outcome {
+    let payload = wire::encode(body).unwrap();
+    let answer = server.command(&rig.robot, verb, payload).await;
+    answer.expect("no answer").expect("refused").outcome
+}
+
+async fn stop(server: &FakeServer, rig: &Rig, number: u128) -> Outcome {
+    let stop = Stop {
+        stop: stop_id(number),
+        by: "an operator".to_owned(),
+        reason: "a person on the way".to_owned(),
+        at: Timestamp::UNIX_EPOCH,
+    };
+    send(server, rig, Verb::Stop, &stop).await
+}
+
+async fn clear(server: &FakeServer, rig: &Rig, number: u128) -> Outcome {
+    let clear = ClearStop {
+        stop: stop_id(number),
+        by: "an operator".to_owned(),
+    };
+    send(server, rig, Verb::Clear, &clear).await
+}
+
+async fn lease(
+    server: &FakeServer,
+    rig: &Rig,
+    request: u128,
+    action: LeaseAction,
+    who: u128,
+) -> Outcome {
+    let command = LeaseCommand {
+        request: Uuid::from_u128(request),
+        action,
+        holder: Driver {
+            client: Uuid::from_u128(who),
+            name: format!("driver {who}"),
+        },
+    };
+    send(server, rig, Verb::Lease, &command).await
+}
+
+fn code(outcome: &Outcome) -> Option<OfferRefusal> {
+    match outcome {
+        Outcome::Refused { code, .. } => Some(*code),
+        Outcome::Accepted { .. } | Outcome::Done | Outcome::Leased { .. } => None,
+    }
+}
+
+async fn state_of(
+    rig: &Rig,
+    boot: BootId,
+    what: &str,
+    is_so: impl Fn(&RobotState) -> bool,
+) -> RobotState {
+    rig.sees(what, |memory| {
+        let last = memory.states.iter().rev().find(|state| state.boot == boot);
+        last.filter(|state| is_so(state)).cloned()
+    })
+    .await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_is_confirmed_survives_a_restart_and_is_cleared_only_by_its_newest_name() {
+    let rig = Rig::new();
+    let server = rig.serve();
+    let agent = rig.agent();
+    rig.ready(agent.boot()).await;
+    let offered = offer(1, LONG);
+    server.offer(&rig.robot, &offered).await;
+    state_of(&rig, agent.boot(), "it drives", |state| {
+        state.mission.is_some_and(|mission| mission.driven_m > 0.3)
+    })
+    .await;
+    assert_eq!(stop(&server, &rig, 1).await, Outcome::Done);
+    assert_eq!(agent.state().mode, RobotMode::Stopped);
+    assert_eq!(stop(&server, &rig, 1).await, Outcome::Done, "doubled");
+    let moving = clear(&server, &rig, 1).await;
+    assert_eq!(code(&moving), Some(OfferRefusal::Moving));
+    assert_eq!(stop(&server, &rig, 2).await, Outcome::Done);
+    let stopped = state_of(&rig, agent.boot(), "the mission is paused", |state| {
+        state.mission.is_some_and(|mission| mission.paused)
+            && state
+                .twist
+                .is_some_and(|twist| twist.value.linear_m_s.abs() < 0.02)
+    })
+    .await;
+    assert_eq!(stopped.mission.unwrap().paused_by, Some(PauseCause::Stop));
+    assert_eq!(stopped.safety.stop.as_ref().unwrap().id, stop_id(2));
+    assert!(stopped.monotonic_us.is_some());
+    let older = clear(&server, &rig, 1).await;
+    assert_eq!(code(&older), Some(OfferRefusal::Conflict), "{older:?}");
+    rig.sees("the pause is reported", |memory| {
+        let phases = memory.phases(offered.mission);
+        phases.contains(&MissionPhase::Paused).then_some(())
+    })
+    .await;
+    let other = server.offer(&rig.robot, &offer(2, LONG)).await;
+    assert_eq!(code(&other.outcome), Some(OfferRefusal::Busy));
+    agent.stop().await;
+
+    let agent = rig.agent();
+    assert_eq!(agent.state().safety.stop.unwrap().id, stop_id(2));
+    rig.ready(agent.boot()).await;
+    let refused = server.offer(&rig.robot, &offer(3, LONG)).await;
+    assert_eq!(code(&refused.outcome), Some(OfferRefusal::NotReady));
+    assert_eq!(clear(&server, &rig, 2).await, Outcome::Done);
+    assert_eq!(clear(&server, &rig, 2).await, Outcome::Done, "doubled");
+    assert_eq!(stop(&server, &rig, 2).await, Outcome::Done, "come late");
+    assert_eq!(
+        agent.state().safety.stop,
+        None,
+        "a late double stops nobody"
+    );
+    let unknown = clear(&server, &rig, 9).await;
+    assert_eq!(code(&unknown), Some(OfferRefusal::Unknown));
+    agent.stop().await;
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_agent_that_cannot_read_its_latch_starts_stopped() {
+    let rig = Rig::new();
+    std::fs::write(rig.folder.path().join("stop.json"), b"garbage").unwrap();
+    let agent = rig.agent();
+    assert!(agent.state().safety.stop.is_some());
+    agent.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_robot_is_driven_by_hand_by_one_driver_and_stops_with_its_silence() {
+    let rig = Rig::new();
+    let server = rig.serve();
+    let agent = rig.agent();
+    rig.ready(agent.boot()).await;
+    let first = lease(&server, &rig, 1, LeaseAction::Acquire, 1).await;
+    let Outcome::Leased { epoch } = first else {
+        panic!("{first:?}");
+    };
+    let refused = lease(&server, &rig, 2, LeaseAction::Acquire, 2).await;
+    assert_eq!(code(&refused), Some(OfferRefusal::Leased));
+    let site = "yard".parse().unwrap();
+    let key = keys::teleop(&site, &rig.robot);
+    let mut fastest_m_s: f64 = 0.0;
+    for seq in 1..=30 {
+        let now_us = agent.state().monotonic_us.unwrap();
+        let command = DriveCommand {
+            boot: agent.boot(),
+            epoch,
+            seq,
+            sent_us: now_us,
+            until_us: now_us + 300_000,
+            twist: Twist {
+                linear_m_s: 0.5,
+                angular_rad_s: 0.0,
+            },
+        };
+        server.publish(&key, wire::encode(&command).unwrap()).await;
+        tokio::time::sleep(Duration::from_millis(50)).await;
+        let speed = agent
+            .state()
+            .twist
+            .map_or(0.0, |twist| twist.value.linear_m_s);
+        fastest_m_s = fastest_m_s.max(speed);
+    }
+    assert!(fastest_m_s > 0.3, "{fastest_m_s}");
+    let state = agent.state();
+    assert_eq!(state.mode, RobotMode::Teleoperated);
+    assert_eq!(state.safety.lease.unwrap().driver.name, "driver 1");
+    assert!(state.safety.drive.unwrap().counts.accepted >= 25);
+    server.publish(&key, b"nonsense".to_vec()).await;
+    state_of(&rig, agent.boot(), "it stands", |state| {
+        let stands = state
+            .twist
+            .is_some_and(|twist| twist.value.linear_m_s.abs() < 0.02);
+        stands && state.safety.drive.unwrap().counts.malformed == 1
+    })
+    .await;
+    let released = lease(&server, &rig, 3, LeaseAction::Release, 1).await;
+    assert_eq!(released, Outcome::Done);
+    assert_eq!(agent.state().safety.lease, None);
+    agent.stop().await;
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_program_outside_holds_the_robot_and_a_required_one_by_its_silence() {
+    let rig = Rig::new();
+    let server = rig.serve();
+    let mut config = rig.config();
+    config.required_holders = vec!["lidar".parse().unwrap()];
+    let agent = tread_agent::Agent::start(config).unwrap();
+    rig.ready(agent.boot()).await;
+    let status = agent.state().safety;
+    assert!(status.limits[0].required && status.limits[0].hold);
+    let limit = |seq: u64, for_us: u64| ExternalLimit {
+        holder: "lidar".parse().unwrap(),
+        boot: agent.boot(),
+        until_us: agent.state().monotonic_us.unwrap() + for_us,
+        seq,
+        hold: false,
+        linear_max_m_s: Some(0.3),
+    };
+    let site = "yard".parse().unwrap();
+    let key = keys::limit(&site, &rig.robot, &"lidar".parse().unwrap());
+    server
+        .publish(&key, wire::encode(&limit(1, 60_000_000)).unwrap())
+        .await;
+    let free = state_of(&rig, agent.boot(), "the limit is known", |state| {
+        state.safety.limits.first().is_some_and(|limit| !limit.hold)
+    })
+    .await;
+    assert_eq!(free.safety.limits[0].linear_max_m_s, Some(0.3));
+    server.offer(&rig.robot, &offer(1, LONG)).await;
+    state_of(&rig, agent.boot(), "it drives", |state| {
+        state.mission.is_some_and(|mission| mission.driven_m > 0.3)
+    })
+    .await;
+    assert!(agent.state().twist.unwrap().value.linear_m_s < 0.4);
+    let mut hold = limit(2, 60_000_000);
+    hold.hold = true;
+    assert_eq!(send(&server, &rig, Verb::Limit, &hold).await, Outcome::Done);
+    state_of(&rig, agent.boot(), "it stands", |state| {
+        state
+            .twist
+            .is_some_and(|twist| twist.value.linear_m_s.abs() < 0.02)
+    })
+    .await;
+    let mut foreign = limit(3, 60_000_000);
+    foreign.boot = BootId::from_uuid(Uuid::from_u128(3));
+    let refused = send(&server, &rig, Verb::Limit, &foreign).await;
+    assert_eq!(code(&refused), Some(OfferRefusal::Conflict));
+    assert_eq!(agent.state().safety.limits_refused, 1);
+    agent.stop().await;
+    server.stop().await;
+}

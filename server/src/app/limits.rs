@@ -1,0 +1,122 @@
+//! External limits over REST: another program holds or slows a robot for a while.
+//!
+//! The server only passes them on; the robot keeps them, and what ends there ends. A program that
+//! speaks zenoh publishes them itself.
+
+use std::time::Duration;
+
+use tread_api::ids::{HolderId, RobotId, SiteId};
+use tread_api::keys::Verb;
+use tread_api::page::Page;
+use tread_api::safety::{LIMIT_AHEAD_MAX_US, LimitStatus, SetLimit};
+use tread_api::wire::command::Outcome;
+use tread_api::wire::safety::ExternalLimit;
+
+use super::{App, AppError, site_row};
+use crate::db;
+use crate::fleet::presence::RobotKey;
+
+/// Longest limit, milliseconds.
+const FOR_MAX_MS: u64 = LIMIT_AHEAD_MAX_US / 1_000;
+
+impl App {
+    /// The external limits that a robot says it has.
+    pub async fn limits(
+        &self,
+        site: &SiteId,
+        robot: &RobotId,
+    ) -> Result<Page<LimitStatus>, AppError> {
+        self.known_robot(site, robot).await?;
+        let presence = self.presences().get(&(site.clone(), robot.clone()));
+        let limits = presence.state().map(|state| state.safety.limits.clone());
+        Ok(Page {
+            items: limits.unwrap_or_default(),
+            next_cursor: None,
+        })
+    }
+
+    /// Limits a robot for a while.
+    ///
+    /// # Errors
+    /// The figures are impossible, or the robot does not answer or refuses.
+    pub async fn set_limit(
+        &self,
+        (site, robot): (&SiteId, &RobotId),
+        holder: HolderId,
+        limit: SetLimit,
+    ) -> Result<(), AppError> {
+        if !(1..=FOR_MAX_MS).contains(&limit.for_ms) {
+            return Err(AppError::Invalid {
+                field: "for_ms",
+                detail: format!("for_ms must be 1 to {FOR_MAX_MS}, not {}", limit.for_ms),
+            });
+        }
+        self.send_limit((site, robot), holder, Some(limit)).await
+    }
+
+    /// Ends a holder's limit of a robot. A holder that the robot must hear holds it from then on.
+    ///
+    /// # Errors
+    /// The robot does not answer, or refuses.
+    pub async fn end_limit(
+        &self,
+        (site, robot): (&SiteId, &RobotId),
+        holder: HolderId,
+    ) -> Result<(), AppError> {
+        self.send_limit((site, robot), holder, None).await
+    }
+
+    async fn send_limit(
+        &self,
+        (site, robot): (&SiteId, &RobotId),
+        holder: HolderId,
+        limit: Option<SetLimit>,
+    ) -> Result<(), AppError> {
+        self.known_robot(site, robot).await?;
+        let key: RobotKey = (site.clone(), robot.clone());
+        let unreachable = || AppError::RobotUnreachable(robot.clone());
+        let links = self.links().ok_or_else(unreachable)?;
+        let now = self.clock().elapsed();
+        let clock = self.presences().get(&key).robot_clock_us(now);
+        let (boot, clock_us) = clock.ok_or_else(unreachable)?;
+        let lasting = limit.map_or(Duration::ZERO, |limit| Duration::from_millis(limit.for_ms));
+        let lasting_us = u64::try_from(lasting.as_micros()).unwrap_or(0);
+        let command = ExternalLimit {
+            holder,
+            boot,
+            until_us: limit.map_or(0, |_| clock_us.saturating_add(lasting_us)),
+            // The wall clock orders the limits of one holder also over a restart of the server.
+            seq: u64::try_from(self.clock().now().as_microsecond()).unwrap_or(0),
+            hold: limit.is_some_and(|limit| limit.hold),
+            linear_max_m_s: limit.and_then(|limit| limit.linear_max_m_s),
+        };
+        command.validate().map_err(|detail| AppError::Invalid {
+            field: "linear_max_m_s",
+            detail,
+        })?;
+        let answer = links.commands.send(&key, Verb::Limit, &command).await;
+        let Some(answer) = answer else {
+            self.counters().commands_unanswered.one();
+            return Err(unreachable());
+        };
+        match answer.outcome {
+            Outcome::Refused { detail, .. } => Err(AppError::RobotRefused {
+                robot: robot.clone(),
+                detail,
+            }),
+            Outcome::Done | Outcome::Accepted { .. } | Outcome::Leased { .. } => Ok(()),
+        }
+    }
+
+    /// Checks that a robot has said hello once.
+    pub(super) async fn known_robot(&self, site: &SiteId, robot: &RobotId) -> Result<(), AppError> {
+        if self.presences().is_known(&(site.clone(), robot.clone())) {
+            return Ok(());
+        }
+        let mut tx = self.db().read().await?;
+        let site_pk = site_row(&mut tx, site).await?.pk;
+        let found = db::robots::find(&mut tx, site_pk, robot).await?;
+        let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
+        found.map(|_row| ()).ok_or_else(unknown)
+    }
+}

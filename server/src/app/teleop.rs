@@ -1,0 +1,392 @@
+//! Driving by hand: one session for each connection, of which at most one has a robot's lease.
+//!
+//! The robot gives the lease and is the truth of it. A session only passes on: it puts the
+//! robot's own time and the lease's epoch into commands, so that whatever comes late, from an old
+//! lease or from another run of the agent is refused there. A session that ends in any way while
+//! it has the lease tells the robot to stand at once and gives the lease back.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::OwnedSemaphorePermit;
+use tokio_util::sync::CancellationToken;
+use tracing::{info, warn};
+use tread_api::drive::{
+    DRIVE_FOR_DEFAULT_MS, DRIVE_FOR_MAX_MS, DRIVE_FOR_MIN_MS, Drive, DriveRefusal, DriveView,
+    ReleaseCause,
+};
+use tread_api::geometry::Twist;
+use tread_api::ids::{BootId, RobotId, SiteId};
+use tread_api::keys::Verb;
+use tread_api::safety::{BY_LENGTH_MAX, Driver, Lease};
+use tread_api::stop::Stop;
+use tread_api::wire::command::{OfferRefusal, Outcome};
+use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
+use uuid::Uuid;
+
+use super::missions::control::hold_all;
+use super::stops::StopWords;
+use super::{App, AppError, Links};
+use crate::db;
+use crate::fleet::presence::RobotKey;
+use crate::fleet::teleop::Line;
+
+/// Most drive connections at once.
+pub const SESSIONS_MAX: usize = 512;
+/// Tries to give a lease back after its connection was lost; the robot frees it by itself.
+const RELEASE_TRIES: u32 = 5;
+/// Wait between two of them.
+const RELEASE_RETRY: Duration = Duration::from_millis(300);
+/// How long a command to stand lasts: as long as the robot would need to do it by itself.
+const STAND_FOR: Duration = Duration::from_millis(250);
+/// How long the robot's states may still show another lease after one was given: they are on
+/// their way while the answer comes.
+const LEASE_GRACE: Duration = Duration::from_secs(1);
+
+/// Why something was not done, for programs and for people.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Refused {
+    /// For programs.
+    pub cause: DriveRefusal,
+    /// For people.
+    pub detail: String,
+}
+
+fn refused(cause: DriveRefusal, detail: impl Into<String>) -> Refused {
+    Refused {
+        cause,
+        detail: detail.into(),
+    }
+}
+
+/// A lease that the robot gave to this session.
+#[derive(Debug)]
+struct Held {
+    lease: Lease,
+    boot: BootId,
+    since: Duration,
+    line: Line,
+    next_seq: u64,
+}
+
+/// One connection to one robot.
+#[derive(Debug)]
+pub struct Session {
+    app: App,
+    links: Links,
+    key: RobotKey,
+    client: Uuid,
+    held: Option<Held>,
+}
+
+impl App {
+    /// Begins a session that only observes.
+    ///
+    /// # Errors
+    /// The robot has never said hello, or the network is not open.
+    pub async fn begin_drive(&self, site: &SiteId, robot: &RobotId) -> Result<Session, AppError> {
+        self.known_robot(site, robot).await?;
+        let unreachable = || AppError::RobotUnreachable(robot.clone());
+        let links = self.links().ok_or_else(unreachable)?.clone();
+        Ok(Session {
+            app: self.clone(),
+            links,
+            key: (site.clone(), robot.clone()),
+            client: Uuid::new_v4(),
+            held: None,
+        })
+    }
+
+    /// A place for one more drive connection.
+    ///
+    /// # Errors
+    /// There are [`SESSIONS_MAX`] already.
+    pub fn drive_slot(&self) -> Result<OwnedSemaphorePermit, AppError> {
+        let slot = Arc::clone(&self.inner.drive_slots).try_acquire_owned();
+        slot.map_err(|_full| AppError::TooMany {
+            what: "drive connections",
+            count: SESSIONS_MAX,
+        })
+    }
+
+    /// Holds everything that a robot has in hand or in its queue while somebody drives it.
+    async fn hold_for_driver(&self, key: &RobotKey, name: &str) -> Result<(), AppError> {
+        let mut tx = self.db().write().await?;
+        if let Some(robot_pk) = db::robots::pk_of(&mut tx, &key.0, &key.1).await? {
+            let reason = format!("`{name}` drives the robot by hand");
+            hold_all(&mut tx, robot_pk, &reason, self.clock().now()).await?;
+        }
+        tx.commit().await?;
+        self.wake();
+        Ok(())
+    }
+}
+
+impl Session {
+    /// The session's name in leases.
+    pub fn client(&self) -> Uuid {
+        self.client
+    }
+
+    /// Cancelled when the server stops.
+    pub fn stop_token(&self) -> CancellationToken {
+        self.links.supervisor.stop_token()
+    }
+
+    /// Ends the session: a robot that it drives is told to stand, and the lease is given back.
+    pub fn end(&mut self) {
+        if self.held.is_some() {
+            let robot = &self.key.1;
+            warn!(robot.id = %robot, "the driver of robot `{robot}` is gone; it is told to stand");
+            self.app.counters().drivers_lost.one();
+            self.release();
+        }
+    }
+
+    /// Asks the robot for the lease; `take` has it whoever has it now.
+    ///
+    /// # Errors
+    /// [`DriveRefusal::Leased`] names who has it; or the robot does not answer, or will not.
+    pub async fn acquire(&mut self, name: &str, take: bool) -> Result<Lease, Refused> {
+        let name: String = name.trim().chars().take(BY_LENGTH_MAX).collect();
+        if name.is_empty() {
+            let detail = "whoever drives says who that is";
+            return Err(refused(DriveRefusal::Refused, detail));
+        }
+        let driver = Driver {
+            client: self.client,
+            name,
+        };
+        let action = if take {
+            LeaseAction::Take
+        } else {
+            LeaseAction::Acquire
+        };
+        let command = LeaseCommand {
+            request: Uuid::new_v4(),
+            action,
+            holder: driver.clone(),
+        };
+        let answer = self.links.commands.send(&self.key, Verb::Lease, &command);
+        let Some(answer) = answer.await else {
+            self.app.counters().commands_unanswered.one();
+            let detail = "the robot does not answer";
+            return Err(refused(DriveRefusal::Unreachable, detail));
+        };
+        let epoch = match answer.outcome {
+            Outcome::Leased { epoch } => epoch,
+            Outcome::Refused { code, detail } => {
+                let cause = match code {
+                    OfferRefusal::Leased => DriveRefusal::Leased,
+                    OfferRefusal::Stopped => DriveRefusal::Stopped,
+                    OfferRefusal::Busy
+                    | OfferRefusal::Conflict
+                    | OfferRefusal::Ended
+                    | OfferRefusal::Impossible
+                    | OfferRefusal::NotReady
+                    | OfferRefusal::TooLate
+                    | OfferRefusal::Unknown
+                    | OfferRefusal::Moving
+                    | OfferRefusal::TooMany
+                    | OfferRefusal::Other => DriveRefusal::Refused,
+                };
+                return Err(refused(cause, detail));
+            }
+            Outcome::Done | Outcome::Accepted { .. } => {
+                let detail = "the robot's answer makes no sense";
+                return Err(refused(DriveRefusal::Refused, detail));
+            }
+        };
+        let lease = Lease { epoch, driver };
+        // The same lease again goes on where it was.
+        let is_same = |held: &&mut Held| (held.lease.epoch, held.boot) == (epoch, answer.boot);
+        if let Some(held) = self.held.as_mut().filter(is_same) {
+            held.lease = lease.clone();
+            return Ok(lease);
+        }
+        let line = self.links.teleop.open(&self.key).await;
+        let Some(line) = line else {
+            self.give_back(lease);
+            let detail = "the network to the robot is not open";
+            return Err(refused(DriveRefusal::Unreachable, detail));
+        };
+        let name = &lease.driver.name;
+        info!(robot.id = %self.key.1, "robot `{}` is driven by hand by `{name}`", self.key.1);
+        self.held = Some(Held {
+            lease: lease.clone(),
+            boot: answer.boot,
+            since: self.app.clock().elapsed(),
+            line,
+            next_seq: 1,
+        });
+        if let Err(error) = self.app.hold_for_driver(&self.key, name).await {
+            warn!("cannot write down that missions are held for a driver: {error:?}");
+        }
+        Ok(lease)
+    }
+
+    /// Passes one command on; it lasts as long as it says, and no longer than the bound.
+    ///
+    /// # Errors
+    /// This session has no lease, the robot is stopped, or its clock is not known.
+    pub fn drive(&mut self, drive: Drive) -> Result<(), Refused> {
+        let asked_ms = drive.for_ms.unwrap_or(DRIVE_FOR_DEFAULT_MS);
+        let for_ms = asked_ms.clamp(DRIVE_FOR_MIN_MS, DRIVE_FOR_MAX_MS);
+        let twist = Twist {
+            linear_m_s: drive.linear_m_s,
+            angular_rad_s: drive.angular_rad_s,
+        };
+        self.send(twist, Duration::from_millis(for_ms))?;
+        let presence = self.app.presences().get(&self.key);
+        let stop = presence.state().and_then(|state| state.safety.stop.clone());
+        // The robot would not move, and its driver is to know why.
+        stop.map_or(Ok(()), |stop| {
+            let detail = format!("stopped by {}: {}", stop.by, stop.reason);
+            Err(refused(DriveRefusal::Stopped, detail))
+        })
+    }
+
+    fn send(&mut self, twist: Twist, lasting: Duration) -> Result<(), Refused> {
+        let no_lease = || refused(DriveRefusal::NoLease, "acquire the lease first");
+        let held = self.held.as_mut().ok_or_else(no_lease)?;
+        let now = self.app.clock().elapsed();
+        let clock = self.app.presences().get(&self.key).robot_clock_us(now);
+        let (boot, sent_us) = clock.ok_or_else(|| {
+            refused(
+                DriveRefusal::Unreachable,
+                "the robot has not been heard yet",
+            )
+        })?;
+        if boot != held.boot {
+            return Err(no_lease());
+        }
+        let lasting_us = u64::try_from(lasting.as_micros()).unwrap_or(0);
+        let command = DriveCommand {
+            boot,
+            epoch: held.lease.epoch,
+            seq: held.next_seq,
+            sent_us,
+            until_us: sent_us.saturating_add(lasting_us),
+            twist,
+        };
+        held.next_seq += 1;
+        self.app.counters().drive_commands_sent.one();
+        if held.line.send(&command) {
+            Ok(())
+        } else {
+            let detail = "the network to the robot is not open";
+            Err(refused(DriveRefusal::Unreachable, detail))
+        }
+    }
+
+    /// Gives the lease back; the robot's target is zero at once.
+    pub fn release(&mut self) -> bool {
+        // Without the robot's clock it stands when its last command ends.
+        let _ = self.send(Twist::default(), STAND_FOR);
+        match self.held.take() {
+            Some(held) => {
+                self.give_back(held.lease);
+                true
+            }
+            None => false,
+        }
+    }
+
+    /// Tells the robot in the background that a lease is over.
+    fn give_back(&self, lease: Lease) {
+        let (app, links, key) = (self.app.clone(), self.links.clone(), self.key.clone());
+        let ending = links.supervisor.stop_token();
+        let supervisor = links.supervisor.clone();
+        supervisor.spawn_passing("release", async move {
+            let command = LeaseCommand {
+                request: Uuid::new_v4(),
+                action: LeaseAction::Release,
+                holder: lease.driver,
+            };
+            for _ in 0..RELEASE_TRIES {
+                let answer = links.commands.send(&key, Verb::Lease, &command).await;
+                if answer.is_some() || ending.is_cancelled() {
+                    return;
+                }
+                app.counters().commands_unanswered.one();
+                tokio::time::sleep(RELEASE_RETRY).await;
+            }
+        });
+    }
+
+    /// Stops the robot; needs no lease.
+    ///
+    /// # Errors
+    /// As [`App::stop_robot`].
+    pub async fn stop(&mut self, words: StopWords) -> Result<Stop, AppError> {
+        let driver = self
+            .held
+            .as_ref()
+            .map(|held| held.lease.driver.name.clone());
+        let words = StopWords {
+            by: words.by.or(driver),
+            ..words
+        };
+        let (site, robot) = (&self.key.0, &self.key.1);
+        self.app.stop_robot(site, robot, words).await
+    }
+
+    /// Whether the robot's states say that this session's lease is over; the session has none
+    /// then.
+    pub fn lost_lease(&mut self) -> Option<(ReleaseCause, String)> {
+        let held = self.held.as_ref()?;
+        let now = self.app.clock().elapsed();
+        let presence = self.app.presences().get(&self.key);
+        let state = presence.state()?;
+        let other_run = presence.boot().is_some_and(|(boot, _)| boot != held.boot);
+        let shown = state.safety.lease.as_ref();
+        let is_own = shown.is_some_and(|shown| shown.epoch == held.lease.epoch);
+        if !other_run && (is_own || now.saturating_sub(held.since) < LEASE_GRACE) {
+            return None;
+        }
+        let lost = match shown.filter(|shown| shown.epoch > held.lease.epoch || other_run) {
+            Some(other) => {
+                let detail = format!("`{}` has taken it", other.driver.name);
+                (ReleaseCause::Taken, detail)
+            }
+            None if other_run => {
+                let detail = "the robot's agent has restarted".to_owned();
+                (ReleaseCause::Lost, detail)
+            }
+            None => {
+                let detail = "the robot has freed it".to_owned();
+                (ReleaseCause::Lost, detail)
+            }
+        };
+        self.held = None;
+        Some(lost)
+    }
+
+    /// The robot as it was heard last; `socket` is the connection's way there and back.
+    pub fn view(&self, socket: Option<Duration>) -> DriveView {
+        let now = self.app.clock().elapsed();
+        let presence = self.app.presences().get(&self.key);
+        let live = presence.live(now);
+        let safety = live.as_ref().map(|live| live.safety.clone());
+        let safety = safety.unwrap_or_default();
+        let socket_ms = socket.map(|way| way.as_secs_f64() * 1e3);
+        let command_age_ms = safety.drive.and_then(|drive| drive.command_age_ms);
+        DriveView {
+            link: presence.link(now),
+            heard_age_ms: live.as_ref().map(|live| live.heard_age_ms),
+            mode: live.as_ref().map(|live| live.mode),
+            pose: live.as_ref().and_then(|live| live.pose),
+            twist: live.as_ref().and_then(|live| live.twist),
+            mission: live.as_ref().and_then(|live| live.mission),
+            safety,
+            latency_ms: command_age_ms.zip(socket_ms).map(|(age, way)| age + way),
+            socket_ms,
+        }
+    }
+}
+
+impl Drop for Session {
+    fn drop(&mut self) {
+        self.end();
+    }
+}

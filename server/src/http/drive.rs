@@ -1,0 +1,336 @@
+//! `GET /v1/sites/{site}/robots/{robot}/drive`: a WebSocket to watch a robot and to drive it.
+//!
+//! One JSON object in each text frame ([`DriveRequest`] in, [`DriveUpdate`] out). A frame that is
+//! none closes the socket with a code, and a driver's robot stands:
+//!
+//! | code | |
+//! |---|---|
+//! | 1001 | the server stops |
+//! | 1003 | a binary frame |
+//! | 1007 | a text that is not JSON |
+//! | 1008 | JSON that says nothing known, or too few pongs |
+//! | 1009 | a frame above [`DRIVE_FRAME_MAX`] bytes |
+
+use std::error::Error as _;
+use std::time::Duration;
+
+use axum::extract::State;
+use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade, close_code};
+use axum::response::Response;
+use futures_util::FutureExt as _;
+use tokio::time::{Instant, MissedTickBehavior};
+use tokio_util::sync::CancellationToken;
+use tread_api::drive::{
+    DRIVE_FRAME_MAX, DRIVE_VIEW_PERIOD_MS, Drive, DriveRefusal, DriveRequest, DriveUpdate,
+    ReleaseCause,
+};
+use tread_api::ids::{RobotId, SiteId};
+use tread_api::problem::{ProblemBody, ProblemType};
+
+use super::extract::Path;
+use super::problem::Problem;
+use crate::app::App;
+use crate::app::stops::StopWords;
+use crate::app::teleop::{Refused, Session};
+
+/// Time between two pings.
+const PING_PERIOD: Duration = Duration::from_secs(1);
+/// How long a client may say nothing, not even a pong, before its socket counts as lost.
+const SILENCE_MAX: Duration = Duration::from_secs(3);
+/// How long a frame to a client may take; one that does not read is lost.
+const SEND_MAX: Duration = Duration::from_secs(1);
+/// Frames that are read before they are acted on, so that the newest drive command counts.
+const DRAIN_MAX: usize = 64;
+/// Least time between two refusals of drive commands for the same cause: a driver sends many.
+const REFUSAL_PERIOD: Duration = Duration::from_millis(500);
+
+/// A WebSocket to watch a robot and to drive it: one JSON object in each text frame, `DriveRequest`
+/// from the client, `DriveUpdate` from the server.
+#[utoipa::path(get, path = "/v1/sites/{site}/robots/{robot}/drive", tag = "safety",
+    operation_id = "drive_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
+    responses((status = 101, description = "The frames of the socket", body = DriveUpdate),
+        (status = 400, body = ProblemBody), (status = 404, body = ProblemBody),
+        (status = 409, body = ProblemBody)))]
+pub(super) async fn drive(
+    State(app): State<App>,
+    Path((site, robot)): Path<(SiteId, RobotId)>,
+    upgrade: Result<WebSocketUpgrade, axum::extract::ws::rejection::WebSocketUpgradeRejection>,
+) -> Result<Response, Problem> {
+    let upgrade = upgrade.map_err(|rejection| {
+        Problem::new(ProblemType::InvalidHeader)
+            .detail(format!("this is a WebSocket: {}", rejection.body_text()))
+    })?;
+    let session = app.begin_drive(&site, &robot).await?;
+    let slot = app.drive_slot()?;
+    let stop = session.stop_token();
+    let upgrade = upgrade
+        .max_frame_size(DRIVE_FRAME_MAX)
+        .max_message_size(DRIVE_FRAME_MAX);
+    Ok(upgrade.on_upgrade(move |socket| async move {
+        let mut connection = Connection {
+            app,
+            socket,
+            session,
+            heard_at: Instant::now(),
+            ping_due: Instant::now(),
+            pinged_at: None,
+            socket_way: None,
+            refused_at: None,
+        };
+        let end = connection.run(&stop).await;
+        connection.end(end).await;
+        drop(slot);
+    }))
+}
+
+/// How a socket ends.
+enum End {
+    /// The client closed it, or it is lost.
+    Gone,
+    /// The server closes it.
+    Closed { code: u16, detail: String },
+}
+
+struct Connection {
+    app: App,
+    socket: WebSocket,
+    session: Session,
+    heard_at: Instant,
+    ping_due: Instant,
+    /// When the ping went out that is not answered yet.
+    pinged_at: Option<Instant>,
+    /// The way to the client and back, as the last pong showed.
+    socket_way: Option<Duration>,
+    refused_at: Option<(DriveRefusal, Instant)>,
+}
+
+impl Connection {
+    async fn run(&mut self, stop: &CancellationToken) -> End {
+        let client = self.session.client();
+        if let Err(end) = self.send(&DriveUpdate::Welcome { client }).await {
+            return end;
+        }
+        let mut views = tokio::time::interval(Duration::from_millis(DRIVE_VIEW_PERIOD_MS));
+        views.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        loop {
+            let went = tokio::select! {
+                biased;
+                () = stop.cancelled() => Err(End::Closed {
+                    code: close_code::AWAY,
+                    detail: "the server stops".to_owned(),
+                }),
+                frame = self.socket.recv() => self.receive(frame).await,
+                _ = views.tick() => self.show().await,
+            };
+            if let Err(end) = went {
+                return end;
+            }
+        }
+    }
+
+    /// Reads what has come, and acts on it; of drive commands in a row the last one counts.
+    async fn receive(&mut self, frame: Option<Result<Message, axum::Error>>) -> Result<(), End> {
+        let mut requests = Vec::new();
+        let mut next = Some(frame);
+        let mut refused = None;
+        while let Some(frame) = next {
+            match self.read(frame) {
+                Ok(request) => requests.extend(request),
+                Err(end) => {
+                    refused = Some(end);
+                    break;
+                }
+            }
+            next = if requests.len() < DRAIN_MAX {
+                self.socket.recv().now_or_never()
+            } else {
+                None
+            };
+        }
+        if let Some(End::Closed { .. }) = refused {
+            // What came with a frame that makes no sense is not driven either.
+            requests.retain(|request| matches!(request, DriveRequest::Stop(_)));
+        }
+        let newer: Vec<bool> = requests
+            .iter()
+            .skip(1)
+            .map(|request| matches!(request, DriveRequest::Drive(_)))
+            .chain([false])
+            .collect();
+        for (request, newer) in requests.into_iter().zip(newer) {
+            match request {
+                DriveRequest::Drive(_) if newer => {
+                    self.app.counters().drive_commands_replaced.one()
+                }
+                DriveRequest::Drive(drive) => self.drive(drive).await?,
+                DriveRequest::Acquire(driver) => self.acquire(&driver.name, false).await?,
+                DriveRequest::Take(driver) => self.acquire(&driver.name, true).await?,
+                DriveRequest::Release(_) => self.release().await?,
+                DriveRequest::Stop(words) => {
+                    let words = StopWords {
+                        by: words.by,
+                        reason: words.reason,
+                    };
+                    self.stop(words).await?;
+                }
+            }
+        }
+        refused.map_or(Ok(()), Err)
+    }
+
+    fn read(
+        &mut self,
+        frame: Option<Result<Message, axum::Error>>,
+    ) -> Result<Option<DriveRequest>, End> {
+        let refused = |code, detail: String| {
+            self.app.counters().drive_frames_refused.one();
+            Err(End::Closed { code, detail })
+        };
+        let message = match frame {
+            None => return Err(End::Gone),
+            Some(Ok(message)) => message,
+            Some(Err(error)) => {
+                return fault(&error)
+                    .map_or(Err(End::Gone), |(code, detail)| refused(code, detail));
+            }
+        };
+        self.heard_at = Instant::now();
+        match message {
+            Message::Text(text) => match serde_json::from_str(&text) {
+                Ok(request) => Ok(Some(request)),
+                Err(error) if error.is_data() => refused(close_code::POLICY, error.to_string()),
+                Err(error) => {
+                    // A variant that is not known is a syntax error to the parser.
+                    let is_json = serde_json::from_str::<serde::de::IgnoredAny>(&text).is_ok();
+                    let code = if is_json {
+                        close_code::POLICY
+                    } else {
+                        close_code::INVALID
+                    };
+                    refused(code, error.to_string())
+                }
+            },
+            Message::Binary(_) => {
+                let detail = "text frames with JSON, please".to_owned();
+                refused(close_code::UNSUPPORTED, detail)
+            }
+            Message::Pong(_) => {
+                self.socket_way = self.pinged_at.take().map(|at| at.elapsed());
+                Ok(None)
+            }
+            Message::Ping(_) => Ok(None),
+            Message::Close(_) => Err(End::Gone),
+        }
+    }
+
+    async fn acquire(&mut self, name: &str, take: bool) -> Result<(), End> {
+        let update = match self.session.acquire(name, take).await {
+            Ok(lease) => DriveUpdate::Leased(lease),
+            Err(Refused { cause, detail }) => DriveUpdate::Refused { cause, detail },
+        };
+        self.send(&update).await
+    }
+
+    async fn release(&mut self) -> Result<(), End> {
+        if self.session.release() {
+            let released = DriveUpdate::Released {
+                cause: ReleaseCause::Released,
+                detail: "given back".to_owned(),
+            };
+            return self.send(&released).await;
+        }
+        Ok(())
+    }
+
+    async fn drive(&mut self, drive: Drive) -> Result<(), End> {
+        let Err(Refused { cause, detail }) = self.session.drive(drive) else {
+            return Ok(());
+        };
+        let is_said = self
+            .refused_at
+            .is_some_and(|(said, at)| said == cause && at.elapsed() < REFUSAL_PERIOD);
+        if is_said {
+            return Ok(());
+        }
+        self.refused_at = Some((cause, Instant::now()));
+        self.send(&DriveUpdate::Refused { cause, detail }).await
+    }
+
+    async fn stop(&mut self, words: StopWords) -> Result<(), End> {
+        let update = match self.session.stop(words).await {
+            Ok(stop) => DriveUpdate::Stopped(Box::new(stop)),
+            Err(error) => DriveUpdate::Refused {
+                cause: DriveRefusal::Unreachable,
+                detail: error.to_string(),
+            },
+        };
+        self.send(&update).await
+    }
+
+    /// Shows the robot, pings, and looks whether the lease and the client are still there.
+    async fn show(&mut self) -> Result<(), End> {
+        if self.heard_at.elapsed() > SILENCE_MAX {
+            return Err(End::Closed {
+                code: close_code::POLICY,
+                detail: "nothing was heard of this socket, not even a pong".to_owned(),
+            });
+        }
+        if let Some((cause, detail)) = self.session.lost_lease() {
+            self.send(&DriveUpdate::Released { cause, detail }).await?;
+        }
+        let now = Instant::now();
+        if now >= self.ping_due {
+            self.ping_due = now + PING_PERIOD;
+            self.pinged_at = Some(now);
+            self.put(Message::Ping(Vec::new().into())).await?;
+        }
+        let view = self.session.view(self.socket_way);
+        self.send(&DriveUpdate::View(Box::new(view))).await
+    }
+
+    async fn send(&mut self, update: &DriveUpdate) -> Result<(), End> {
+        let text = serde_json::to_string(update).unwrap_or_default();
+        self.put(Message::Text(text.into())).await
+    }
+
+    async fn put(&mut self, message: Message) -> Result<(), End> {
+        match tokio::time::timeout(SEND_MAX, self.socket.send(message)).await {
+            Ok(Ok(())) => Ok(()),
+            Ok(Err(_)) | Err(_) => Err(End::Gone),
+        }
+    }
+
+    /// Lets the robot stand first, then says why the socket ends.
+    async fn end(mut self, end: End) {
+        self.session.end();
+        if let End::Closed { code, detail } = end {
+            let update = DriveUpdate::Ended {
+                detail: detail.clone(),
+            };
+            if self.send(&update).await.is_ok() {
+                // A reason has at most 123 bytes.
+                let reason: String = detail.chars().filter(char::is_ascii).take(120).collect();
+                let frame = CloseFrame {
+                    code,
+                    reason: reason.into(),
+                };
+                // A client that is gone needs no reason.
+                let _ = self.put(Message::Close(Some(frame))).await;
+            }
+        }
+    }
+}
+
+/// The close code for what a client did; `None` if the connection is just gone.
+fn fault(error: &axum::Error) -> Option<(u16, String)> {
+    use tokio_tungstenite::tungstenite::Error;
+    match error.source()?.downcast_ref::<Error>()? {
+        Error::Capacity(_) => {
+            let detail = format!("a frame has at most {DRIVE_FRAME_MAX} bytes");
+            Some((close_code::SIZE, detail))
+        }
+        Error::Utf8(_) => Some((close_code::INVALID, "a text is UTF-8".to_owned())),
+        Error::Protocol(cause) => Some((close_code::PROTOCOL, cause.to_string())),
+        _ => None,
+    }
+}

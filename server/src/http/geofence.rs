@@ -1,0 +1,63 @@
+//! `/v1/sites/{site}/geofence`.
+
+use axum::extract::State;
+use axum::http::{HeaderMap, header};
+use axum::response::{IntoResponse, Response};
+use tread_api::ids::SiteId;
+use tread_api::problem::{ProblemBody, ProblemType};
+use tread_api::safety::{Geofence, ReplaceGeofence};
+
+use super::extract::{Json, Path};
+use super::problem::Problem;
+use crate::app::App;
+
+/// Where the robots of a site may be. The `ETag` is the revision.
+#[utoipa::path(get, path = "/v1/sites/{site}/geofence", tag = "safety",
+    operation_id = "get_geofence", params(("site" = SiteId, Path)),
+    responses((status = 200, body = Geofence), (status = 404, body = ProblemBody)))]
+pub(super) async fn get(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+) -> Result<Response, Problem> {
+    Ok(tagged(app.geofence(&site).await?))
+}
+
+/// Replaces where robots may be, with `If-Match` only if nobody else did meanwhile.
+#[utoipa::path(put, path = "/v1/sites/{site}/geofence", tag = "safety",
+    operation_id = "replace_geofence", params(("site" = SiteId, Path),
+        ("if-match" = Option<String>, Header, description = "The revision that is replaced")),
+    request_body = ReplaceGeofence,
+    responses((status = 200, body = Geofence), (status = 404, body = ProblemBody),
+        (status = 412, body = ProblemBody), (status = 422, body = ProblemBody)))]
+pub(super) async fn replace(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+    headers: HeaderMap,
+    Json(request): Json<ReplaceGeofence>,
+) -> Result<Response, Problem> {
+    let expected = expected(&headers)?;
+    Ok(tagged(
+        app.replace_geofence(&site, request, expected).await?,
+    ))
+}
+
+fn tagged(geofence: Geofence) -> Response {
+    let tag = format!("\"{}\"", geofence.revision);
+    ([(header::ETAG, tag)], Json(geofence)).into_response()
+}
+
+fn expected(headers: &HeaderMap) -> Result<Option<u64>, Problem> {
+    let Some(tag) = headers.get(header::IF_MATCH) else {
+        return Ok(None);
+    };
+    let text = tag.to_str().unwrap_or_default().trim().trim_matches('"');
+    if text == "*" {
+        return Ok(None);
+    }
+    let wrong = |_error| {
+        Problem::new(ProblemType::InvalidHeader)
+            .detail("If-Match is the revision, as in the ETag")
+            .field("if-match")
+    };
+    text.parse().map(Some).map_err(wrong)
+}

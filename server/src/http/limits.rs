@@ -1,0 +1,55 @@
+//! `/v1/sites/{site}/robots/{robot}/limits`: what other programs hold or slow a robot by.
+
+use axum::extract::State;
+use axum::http::StatusCode;
+use tread_api::ids::{HolderId, RobotId, SiteId};
+use tread_api::page::Page;
+use tread_api::problem::ProblemBody;
+use tread_api::safety::{LimitStatus, SetLimit};
+
+use super::extract::{Json, Path};
+use super::problem::Problem;
+use crate::app::App;
+
+/// The external limits that a robot says it has.
+#[utoipa::path(get, path = "/v1/sites/{site}/robots/{robot}/limits", tag = "safety",
+    operation_id = "list_limits", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
+    responses((status = 200, body = Page<LimitStatus>), (status = 404, body = ProblemBody)))]
+pub(super) async fn list(
+    State(app): State<App>,
+    Path((site, robot)): Path<(SiteId, RobotId)>,
+) -> Result<Json<Page<LimitStatus>>, Problem> {
+    Ok(Json(app.limits(&site, &robot).await?))
+}
+
+/// Holds or slows a robot for a while; say it again before it ends.
+#[utoipa::path(put, path = "/v1/sites/{site}/robots/{robot}/limits/{holder}", tag = "safety",
+    operation_id = "set_limit", params(("site" = SiteId, Path), ("robot" = RobotId, Path),
+        ("holder" = HolderId, Path)),
+    request_body = SetLimit,
+    responses((status = 204, description = "The robot has taken it"),
+        (status = 404, body = ProblemBody), (status = 409, body = ProblemBody),
+        (status = 422, body = ProblemBody), (status = 503, body = ProblemBody)))]
+pub(super) async fn set(
+    State(app): State<App>,
+    Path((site, robot, holder)): Path<(SiteId, RobotId, HolderId)>,
+    Json(request): Json<SetLimit>,
+) -> Result<StatusCode, Problem> {
+    app.set_limit((&site, &robot), holder, request).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+/// Ends a holder's limit. A holder that the robot must hear holds it from then on.
+#[utoipa::path(delete, path = "/v1/sites/{site}/robots/{robot}/limits/{holder}", tag = "safety",
+    operation_id = "end_limit", params(("site" = SiteId, Path), ("robot" = RobotId, Path),
+        ("holder" = HolderId, Path)),
+    responses((status = 204, description = "The robot has ended it"),
+        (status = 404, body = ProblemBody), (status = 409, body = ProblemBody),
+        (status = 503, body = ProblemBody)))]
+pub(super) async fn end(
+    State(app): State<App>,
+    Path((site, robot, holder)): Path<(SiteId, RobotId, HolderId)>,
+) -> Result<StatusCode, Problem> {
+    app.end_limit((&site, &robot), holder).await?;
+    Ok(StatusCode::NO_CONTENT)
+}

@@ -1,0 +1,369 @@
+//! Driving by hand over the WebSocket: one driver, observers, and a robot that stands whenever
+//! anything about its driver is wrong.
+
+use futures_util::{SinkExt as _, StreamExt as _};
+use serde_json::{Value, json};
+use tokio::net::TcpStream;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async};
+use tread_api::drive::{DriveRefusal, DriveUpdate, DriveView, ReleaseCause};
+use tread_api::geometry::Twist;
+use tread_api::mission::MissionState;
+use tread_api::safety::Lease;
+use tread_api::wire::safety::LeaseAction;
+
+use crate::harness::{PATIENCE, Yard, eventually};
+use crate::robot::Robot;
+
+/// A client of the drive socket.
+pub(crate) struct Socket(WebSocketStream<MaybeTlsStream<TcpStream>>);
+
+impl Socket {
+    pub(crate) async fn open(yard: &Yard, robot: &str) -> Self {
+        let url = yard.url(&format!("/v1/sites/yard/robots/{robot}/drive"));
+        let (socket, _) = connect_async(url.replace("http://", "ws://"))
+            .await
+            .unwrap();
+        let mut socket = Self(socket);
+        let first = socket.update().await;
+        assert!(matches!(first, DriveUpdate::Welcome { .. }), "{first:?}");
+        socket
+    }
+
+    async fn send(&mut self, request: &Value) {
+        self.put(Message::text(request.to_string())).await;
+    }
+
+    async fn put(&mut self, message: Message) {
+        self.0.send(message).await.unwrap();
+    }
+
+    /// The next frame that is no view and no ping.
+    async fn update(&mut self) -> DriveUpdate {
+        let reading = async {
+            loop {
+                match self.0.next().await.unwrap().unwrap() {
+                    Message::Text(text) => {
+                        let update = serde_json::from_str(&text).unwrap();
+                        if !matches!(update, DriveUpdate::View(_)) {
+                            return update;
+                        }
+                    }
+                    Message::Ping(_) => {}
+                    other => panic!("{other:?}"),
+                }
+            }
+        };
+        tokio::time::timeout(PATIENCE, reading).await.unwrap()
+    }
+
+    async fn view(&mut self, is: impl Fn(&DriveView) -> bool) -> DriveView {
+        let reading = async {
+            loop {
+                if let Some(Ok(Message::Text(text))) = self.0.next().await
+                    && let DriveUpdate::View(view) = serde_json::from_str(&text).unwrap()
+                    && is(&view)
+                {
+                    return *view;
+                }
+            }
+        };
+        tokio::time::timeout(PATIENCE, reading).await.unwrap()
+    }
+
+    /// Waits for the server's close, and gives its code.
+    async fn closed(&mut self) -> u16 {
+        let reading = async {
+            loop {
+                match self.0.next().await {
+                    Some(Ok(Message::Close(Some(frame)))) => return u16::from(frame.code),
+                    Some(Ok(_)) => {}
+                    other => panic!("ended without a code: {other:?}"),
+                }
+            }
+        };
+        tokio::time::timeout(PATIENCE, reading).await.unwrap()
+    }
+
+    async fn acquire(&mut self, name: &str) -> Lease {
+        // End times are told in the robot's time, which its states tell.
+        self.view(|view| view.heard_age_ms.is_some()).await;
+        self.send(&json!({"acquire": {"name": name}})).await;
+        match self.update().await {
+            DriveUpdate::Leased(lease) => lease,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    async fn drive(&mut self, linear_m_s: f64) {
+        let drive = json!({"linear_m_s": linear_m_s, "angular_rad_s": 0.1, "for_ms": 300});
+        self.send(&json!({"drive": drive})).await;
+    }
+}
+
+async fn driven_at(robot: &Robot, linear_m_s: f64) {
+    let what = format!("the robot is told {linear_m_s} m/s");
+    eventually(&what, async || {
+        let last = robot
+            .drives()
+            .last()
+            .map(|command| command.twist.linear_m_s);
+        let is = last.is_some_and(|last| (last - linear_m_s).abs() < 1e-9);
+        if is { Ok(()) } else { Err(last) }
+    })
+    .await;
+}
+
+/// Waits until the robot's newest command is to stand and its lease is given back.
+async fn stands(robot: &Robot) {
+    driven_at(robot, 0.0).await;
+    eventually("the lease is given back", async || {
+        let last = robot.leases().last().map(|lease| lease.action);
+        if last == Some(LeaseAction::Release) {
+            Ok(())
+        } else {
+            Err(last)
+        }
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_driver_drives_in_robot_time_and_losing_the_driver_lets_the_robot_stand() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    let mut observer = Socket::open(&yard, "rover-1").await;
+    let mut driver = Socket::open(&yard, "rover-1").await;
+    driver.view(|view| view.heard_age_ms.is_some()).await;
+    let lease = driver.acquire("Ann").await;
+    assert_eq!((lease.epoch, lease.driver.name.as_str()), (1, "Ann"));
+    driver.drive(0.4).await;
+    driven_at(&robot, 0.4).await;
+    let state = robot.state();
+    let command = robot.drives()[0];
+    assert_eq!(
+        (command.boot, command.epoch, command.seq),
+        (robot.boot, 1, 1)
+    );
+    assert_eq!(command.until_us - command.sent_us, 300_000);
+    let now_us = state.monotonic_us.unwrap();
+    assert!(
+        command.sent_us <= now_us + 100_000,
+        "{command:?} at {now_us}"
+    );
+    assert!(command.twist.angular_rad_s > 0.0);
+    driver.drive(0.5).await;
+    driven_at(&robot, 0.5).await;
+    assert!(robot.drives().last().unwrap().seq > command.seq);
+    // What the robot had in hand is held.
+    let held = yard.mission_becomes(mission.id, MissionState::Paused).await;
+    assert!(held.mission.pause_wanted);
+    let resume = format!("/v1/missions/{}/resume", mission.id);
+    let (status, body) = yard.post(&resume, &Value::Null).await;
+    assert_eq!(status, 409, "{body}");
+    assert!(body["detail"].as_str().unwrap().contains("Ann"), "{body}");
+
+    // The other one sees it, may not drive, and its end changes nothing.
+    let seen = observer.view(|view| view.safety.lease.is_some()).await;
+    assert_eq!(seen.safety.lease.unwrap().driver.name, "Ann");
+    observer.drive(1.0).await;
+    let refused = observer.update().await;
+    assert!(matches!(
+        refused,
+        DriveUpdate::Refused {
+            cause: DriveRefusal::NoLease,
+            ..
+        }
+    ));
+    observer.send(&json!({"acquire": {"name": "Bob"}})).await;
+    match observer.update().await {
+        DriveUpdate::Refused { cause, detail } => {
+            assert_eq!(cause, DriveRefusal::Leased);
+            assert!(detail.contains("Ann"), "{detail}");
+        }
+        other => panic!("{other:?}"),
+    }
+    drop(observer);
+    driver.drive(0.3).await;
+    driven_at(&robot, 0.3).await;
+    assert!(
+        robot
+            .leases()
+            .iter()
+            .all(|lease| lease.action == LeaseAction::Acquire)
+    );
+
+    // Without a word: the connection breaks.
+    drop(driver);
+    stands(&robot).await;
+    assert_eq!(robot.drives().last().unwrap().twist, Twist::default());
+    assert_eq!(yard.counters().await.drivers_lost, 1);
+    // The mission goes on only by request.
+    assert_eq!(
+        yard.mission(mission.id).await.mission.state,
+        MissionState::Paused
+    );
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_frame_that_makes_no_sense_closes_the_socket_with_a_code_and_the_robot_stands() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let long = format!("{{\"acquire\": {{\"name\": \"{}\"}}}}", "x".repeat(5_000));
+    let nan = r#"{"drive": {"linear_m_s": NaN, "angular_rad_s": 0}}"#;
+    let infinite = r#"{"drive": {"linear_m_s": 1e999, "angular_rad_s": 0}}"#;
+    let null = r#"{"drive": {"linear_m_s": null, "angular_rad_s": 0}}"#;
+    let extra = r#"{"drive": {"linear_m_s": 1, "angular_rad_s": 0, "faster": true}}"#;
+    for (frame, code) in [
+        (Message::text("{\"drive\":"), 1007),
+        (Message::text(nan), 1007),
+        (Message::text(infinite), 1008),
+        (Message::text(null), 1008),
+        (Message::text(extra), 1008),
+        (Message::text("{\"fly\": {}}"), 1008),
+        (Message::text("[]"), 1008),
+        (Message::binary(vec![1, 2, 3]), 1003),
+        (Message::text(long), 1009),
+    ] {
+        let mut driver = Socket::open(&yard, "rover-1").await;
+        driver.acquire("Ann").await;
+        driver.drive(0.5).await;
+        driven_at(&robot, 0.5).await;
+        let what = format!("{frame:?}").chars().take(60).collect::<String>();
+        driver.put(frame).await;
+        assert_eq!(driver.closed().await, code, "{what}");
+        stands(&robot).await;
+    }
+    assert!(yard.counters().await.drive_frames_refused >= 9);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_lease_is_taken_by_force_given_back_and_lost_with_the_robots_run() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mut ann = Socket::open(&yard, "rover-1").await;
+    let mut bob = Socket::open(&yard, "rover-1").await;
+    ann.acquire("Ann").await;
+    bob.send(&json!({"take": {"name": "Bob"}})).await;
+    let DriveUpdate::Leased(lease) = bob.update().await else {
+        panic!("not leased");
+    };
+    assert_eq!(lease.epoch, 2);
+    match ann.update().await {
+        DriveUpdate::Released { cause, detail } => {
+            assert_eq!(cause, ReleaseCause::Taken);
+            assert!(detail.contains("Bob"), "{detail}");
+        }
+        other => panic!("{other:?}"),
+    }
+    ann.drive(0.9).await;
+    assert!(matches!(
+        ann.update().await,
+        DriveUpdate::Refused {
+            cause: DriveRefusal::NoLease,
+            ..
+        }
+    ));
+    bob.drive(0.2).await;
+    driven_at(&robot, 0.2).await;
+    bob.send(&json!({"release": {}})).await;
+    let released = bob.update().await;
+    assert!(matches!(
+        released,
+        DriveUpdate::Released {
+            cause: ReleaseCause::Released,
+            ..
+        }
+    ));
+    stands(&robot).await;
+    assert_eq!(yard.counters().await.drivers_lost, 0);
+
+    ann.acquire("Ann").await;
+    let robot = robot.reboot(&yard).await;
+    let lost = ann.update().await;
+    assert!(
+        matches!(
+            lost,
+            DriveUpdate::Released {
+                cause: ReleaseCause::Lost,
+                ..
+            }
+        ),
+        "{lost:?}"
+    );
+    drop(robot);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn anybody_on_the_socket_may_stop_and_a_server_that_stops_lets_the_robot_stand() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mut observer = Socket::open(&yard, "rover-1").await;
+    observer
+        .send(&json!({"stop": {"by": "Bob", "reason": "smoke"}}))
+        .await;
+    match observer.update().await {
+        DriveUpdate::Stopped(stop) => assert!(stop.confirmed_at.is_some(), "{stop:?}"),
+        other => panic!("{other:?}"),
+    }
+    assert_eq!(robot.stops()[0].reason, "smoke");
+    // A lease is given, and nothing is driven: the driver hears why.
+    let mut driver = Socket::open(&yard, "rover-1").await;
+    driver.view(|view| view.safety.stop.is_some()).await;
+    driver.acquire("Ann").await;
+    driver.drive(0.5).await;
+    let refused = driver.update().await;
+    assert!(matches!(
+        refused,
+        DriveUpdate::Refused {
+            cause: DriveRefusal::Stopped,
+            ..
+        }
+    ));
+    yard.server.stop().await.unwrap();
+    assert_eq!(driver.closed().await, 1001);
+    stands(&robot).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn of_a_flood_of_commands_the_newest_counts_and_a_plain_request_is_told_what_this_is() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mut driver = Socket::open(&yard, "rover-1").await;
+    driver.acquire("Ann").await;
+    for number in 0..2_000 {
+        let drive = json!({"linear_m_s": f64::from(number) * 1e-4, "angular_rad_s": 0.0});
+        driver
+            .0
+            .feed(Message::text(json!({"drive": drive}).to_string()))
+            .await
+            .unwrap();
+    }
+    driver.0.flush().await.unwrap();
+    driven_at(&robot, 0.1999).await;
+    let seqs: Vec<u64> = robot.drives().iter().map(|command| command.seq).collect();
+    assert!(seqs.is_sorted());
+    let counters = yard.counters().await;
+    assert_eq!(
+        counters.drive_commands_sent + counters.drive_commands_replaced,
+        2_000
+    );
+    let (status, body) = yard.get_value("/v1/sites/yard/robots/rover-1/drive").await;
+    assert_eq!(
+        (status.as_u16(), body["type"].as_str()),
+        (400, Some("/problems/invalid-header"))
+    );
+    let url = yard
+        .url("/v1/sites/yard/robots/nobody/drive")
+        .replace("http://", "ws://");
+    assert!(
+        connect_async(url).await.is_err(),
+        "a robot that is not known was driven"
+    );
+    yard.server.stop().await.unwrap();
+}

@@ -1,0 +1,309 @@
+//! Stops: at once, confirmed or shown as unconfirmed, repeated, cleared; and nothing starts by
+//! itself afterwards.
+
+use std::time::{Duration, Instant};
+
+use reqwest::StatusCode;
+use serde_json::{Value, json};
+use tread_api::mission::MissionState;
+use tread_api::page::Page;
+use tread_api::robot::Alert;
+use tread_api::stop::{FleetStop, Stop};
+use tread_api::wire::ingest::MissionPhase;
+
+use crate::harness::{Yard, eventually};
+use crate::robot::Robot;
+
+const STOP: &str = "/v1/sites/yard/robots/rover-1/stop";
+const CLEAR: &str = "/v1/sites/yard/robots/rover-1/stop/clear";
+
+impl Yard {
+    async fn stop_robot(&self, body: &Value) -> Stop {
+        let (status, body) = self.post(STOP, body).await;
+        assert_eq!(status, StatusCode::OK, "{body}");
+        serde_json::from_value(body).unwrap()
+    }
+
+    async fn stop_becomes(&self, what: &str, is: impl Fn(&Stop) -> bool) -> Stop {
+        eventually(what, async || {
+            let page: Page<Stop> = self.get("/v1/stops").await;
+            let newest = page.items.into_iter().next();
+            newest.clone().filter(|stop| is(stop)).ok_or(newest)
+        })
+        .await
+    }
+
+    async fn raised(&self) -> Vec<String> {
+        let page: Page<Alert> = self.get("/v1/alerts?raised=true").await;
+        let code = |alert: Alert| alert.code.as_str().to_owned();
+        page.items.into_iter().map(code).collect()
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_is_confirmed_shown_and_cleared_and_nothing_goes_on_by_itself() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let driven = yard.create_mission(&robot.id).await;
+    let waiting = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(driven.id, MissionState::Active).await;
+
+    let stop = yard
+        .stop_robot(&json!({"by": "Ann", "reason": "a child on the yard"}))
+        .await;
+    assert!(stop.confirmed_at.is_some() && !stop.unconfirmed, "{stop:?}");
+    let heard = robot.stops();
+    assert_eq!(heard.len(), 1);
+    assert_eq!(
+        (
+            heard[0].stop,
+            heard[0].by.as_str(),
+            heard[0].reason.as_str()
+        ),
+        (stop.id, "Ann", "a child on the yard")
+    );
+    let held = eventually("all missions are held", async || {
+        let held = (
+            yard.mission(driven.id).await,
+            yard.mission(waiting.id).await,
+        );
+        let both = held.0.mission.pause_wanted && held.1.mission.pause_wanted;
+        let paused = held.0.mission.state == MissionState::Paused;
+        if both && paused { Ok(held) } else { Err(held) }
+    })
+    .await;
+    assert_eq!(held.1.mission.state, MissionState::Queued);
+    // What is asked for now must wait too, and nothing can be resumed.
+    let later = yard.create_mission(&robot.id).await;
+    assert!(later.pause_wanted);
+    let resume = format!("/v1/missions/{}/resume", driven.id);
+    let (status, body) = yard.post(&resume, &Value::Null).await;
+    assert_eq!(
+        (status, body["type"].as_str()),
+        (StatusCode::CONFLICT, Some("/problems/robot-refused")),
+        "{body}"
+    );
+
+    let (status, body) = yard
+        .post(CLEAR, &json!({"stop": stop.id, "by": "Bob"}))
+        .await;
+    assert_eq!(status, StatusCode::OK, "{body}");
+    let cleared: Stop = serde_json::from_value(body).unwrap();
+    assert!(cleared.cleared_at.is_some());
+    assert_eq!(cleared.clear_asked_by.as_deref(), Some("Bob"));
+
+    // The mission in hand ends; the queue does not move until somebody says so.
+    robot.report(0, &driven, MissionPhase::Failed).await;
+    yard.mission_becomes(driven.id, MissionState::Failed).await;
+    let fresh = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(fresh.id, MissionState::Active).await;
+    robot.report(1, &fresh, MissionPhase::Succeeded).await;
+    yard.mission_becomes(fresh.id, MissionState::Succeeded)
+        .await;
+    assert_eq!(
+        yard.mission(waiting.id).await.mission.state,
+        MissionState::Queued
+    );
+    assert!(
+        !robot
+            .offers()
+            .iter()
+            .any(|offer| offer.mission == waiting.id)
+    );
+    let resume = format!("/v1/missions/{}/resume", waiting.id);
+    let (status, body) = yard.post(&resume, &Value::Null).await;
+    assert_eq!(status, StatusCode::ACCEPTED, "{body}");
+    yard.mission_becomes(waiting.id, MissionState::Active).await;
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_robot_that_does_not_confirm_is_shown_and_told_again_over_a_restart() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    robot.be_deaf_to_stops(true);
+    let asked_at = Instant::now();
+    let stop = yard.stop_robot(&json!({})).await;
+    assert!(asked_at.elapsed() < Duration::from_secs(2));
+    assert!(stop.unconfirmed && stop.confirmed_at.is_none(), "{stop:?}");
+    eventually("the alert is raised", async || {
+        let raised = yard.raised().await;
+        let has = raised.iter().any(|code| code == "stop-unconfirmed");
+        if has { Ok(()) } else { Err(raised) }
+    })
+    .await;
+    assert!(yard.counters().await.stops_unconfirmed >= 1);
+
+    let yard = yard.restart().await;
+    yard.stop_becomes("it is still wanted", |stop| stop.unconfirmed)
+        .await;
+    robot.be_deaf_to_stops(false);
+    let confirmed = yard
+        .stop_becomes("the robot has confirmed", |stop| {
+            stop.confirmed_at.is_some()
+        })
+        .await;
+    assert_eq!(confirmed.id, stop.id);
+    assert_eq!(robot.stops()[0].stop, stop.id);
+    eventually("the alert is over", async || {
+        let raised = yard.raised().await;
+        if raised.is_empty() {
+            Ok(())
+        } else {
+            Err(raised)
+        }
+    })
+    .await;
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_that_the_robot_forgot_is_sent_again_and_one_of_its_own_is_adopted() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let stop = yard.stop_robot(&json!({"by": "Ann"})).await;
+    yard.stop_becomes("it is written", |stop| stop.confirmed_at.is_some())
+        .await;
+    robot.say(|state| state.safety.stop = None);
+    eventually("it is told again", async || {
+        let count = robot.stops().len();
+        if count >= 2 { Ok(()) } else { Err(count) }
+    })
+    .await;
+    assert_eq!(yard.counters().await.stops_lost, 1);
+    assert!(robot.stops().iter().all(|heard| heard.stop == stop.id));
+    eventually("it can be cleared", async || {
+        let (status, body) = yard.post(CLEAR, &json!({"stop": stop.id})).await;
+        if status == StatusCode::OK {
+            Ok(())
+        } else {
+            Err(body)
+        }
+    })
+    .await;
+
+    let own = uuid::Uuid::from_u128(7);
+    robot.say(|state| {
+        state.safety.stop = Some(tread_api::safety::StopLatch {
+            id: tread_api::ids::StopId::from_uuid(own),
+            by: "rover-1".to_owned(),
+            reason: "its memory of stops does not read".to_owned(),
+            since: "2026-11-01T00:00:00Z".parse().unwrap(),
+        });
+    });
+    eventually("the robot's own stop is listed", async || {
+        let page: Page<Stop> = yard.get("/v1/stops?in_force=true").await;
+        let found = page
+            .items
+            .iter()
+            .any(|stop| stop.id.as_uuid() == own && stop.by == "rover-1");
+        if found { Ok(()) } else { Err(page.items) }
+    })
+    .await;
+    let (status, body) = yard.post(CLEAR, &json!({"stop": own})).await;
+    assert_eq!(status, StatusCode::OK, "{body}");
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_clear_names_the_newest_stop_and_reaches_the_robot_or_nothing_is_cleared() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let first = yard.stop_robot(&json!({})).await;
+    let second = yard.stop_robot(&json!({})).await;
+    yard.stop_becomes("both are written", |stop| {
+        stop.id == second.id && stop.confirmed_at.is_some()
+    })
+    .await;
+    let (status, body) = yard.post(CLEAR, &json!({"stop": first.id})).await;
+    assert_eq!(status, StatusCode::CONFLICT, "{body}");
+    assert_eq!(body["type"], "/problems/stop-not-cleared");
+    assert!(body["detail"].as_str().unwrap().contains("newer"), "{body}");
+    let (status, body) = yard
+        .post(CLEAR, &json!({"stop": uuid::Uuid::from_u128(9)}))
+        .await;
+    assert_eq!(
+        (status, body["type"].as_str()),
+        (StatusCode::NOT_FOUND, Some("/problems/unknown-stop"))
+    );
+    drop(robot);
+    let (status, body) = yard.post(CLEAR, &json!({"stop": second.id})).await;
+    assert_eq!(status, StatusCode::SERVICE_UNAVAILABLE, "{body}");
+    let page: Page<Stop> = yard.get("/v1/stops?in_force=true").await;
+    assert_eq!(page.items.len(), 2);
+    let robot = Robot::join(&yard, "rover-1").await;
+    // A robot that came back without the stop, although somebody had asked to clear it, has
+    // cleared it as far as anyone knows; a clear now is harmless.
+    let (status, body) = yard.post(CLEAR, &json!({"stop": second.id})).await;
+    assert_eq!(status, StatusCode::OK, "{body}");
+    let page: Page<Stop> = yard.get("/v1/stops?in_force=true").await;
+    assert!(
+        page.items.is_empty(),
+        "the older one is covered: {:?}",
+        page.items
+    );
+    drop(robot);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_fleet_stop_reaches_every_robot_and_says_who_has_not_confirmed() {
+    let yard = Yard::start().await;
+    let near = Robot::join(&yard, "rover-1").await;
+    let far = Robot::join(&yard, "rover-2").await;
+    drop(Robot::join(&yard, "rover-3").await);
+    let (status, body) = yard
+        .post("/v1/stop", &json!({"site": "yard", "by": "Ann"}))
+        .await;
+    assert_eq!(status, StatusCode::OK, "{body}");
+    let stopped: FleetStop = serde_json::from_value(body).unwrap();
+    assert_eq!(
+        (stopped.confirmed, stopped.unconfirmed),
+        (2, 1),
+        "{stopped:?}"
+    );
+    let missing = stopped.stops.iter().find(|stop| stop.unconfirmed).unwrap();
+    assert_eq!(missing.robot.as_str(), "rover-3");
+    assert_eq!((near.stops().len(), far.stops().len()), (1, 1));
+    let (status, _) = yard.post("/v1/stop", &json!({"site": "nowhere"})).await;
+    assert_eq!(status, StatusCode::NOT_FOUND);
+    // It comes back, and hears of it.
+    let back = Robot::join(&yard, "rover-3").await;
+    eventually("the robot that was away has heard", async || {
+        let heard = back.stops();
+        if heard.iter().any(|stop| stop.stop == missing.id) {
+            Ok(())
+        } else {
+            Err(heard)
+        }
+    })
+    .await;
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_whose_body_is_wrong_or_missing_stops_all_the_same() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let bare = yard.client().post(yard.url(STOP));
+    let garbage = yard.client().post(yard.url(STOP)).body("{\"by\": ");
+    let unknown = yard
+        .client()
+        .post(yard.url("/v1/stop"))
+        .json(&json!({"sight": "yard"}));
+    let mut told = 0;
+    for request in [bare, garbage, unknown] {
+        let (status, body) = yard.send(request).await;
+        assert_eq!(status, StatusCode::OK, "{body}");
+        told += 1;
+        assert_eq!(robot.stops().len(), told);
+    }
+    let (status, body) = yard
+        .post("/v1/sites/yard/robots/nobody/stop", &json!({}))
+        .await;
+    assert_eq!(
+        (status, body["type"].as_str()),
+        (StatusCode::NOT_FOUND, Some("/problems/unknown-robot"))
+    );
+    yard.server.stop().await.unwrap();
+}

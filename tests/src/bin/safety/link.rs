@@ -1,0 +1,168 @@
+//! How old drive commands are at a robot behind a narrow link that bulk fills.
+//!
+//! The commands go the whole way: WebSocket, server, zenoh, link, agent. What the robot says of
+//! their age is by the server's estimate of the robot's clock, which only makes them look older.
+
+use std::time::Duration;
+
+use anyhow::Context;
+use futures_util::{SinkExt as _, StreamExt as _};
+use tokio::net::TcpStream;
+use tokio::time::{Instant, MissedTickBehavior};
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async};
+use tread_api::drive::{Drive, DriveRequest, DriveUpdate, DriverName};
+use tread_api::keys;
+use tread_tests::fleet::{Fleet, SITE};
+use tread_tests::light_robot::open_session;
+use tread_tests::relay::Relay;
+use zenoh::qos::CongestionControl;
+
+use crate::robots::{name, start};
+use crate::{Arguments, Check, figure, quantile};
+
+/// The robot's number, apart from all others.
+const NUMBER: u32 = 901;
+/// What the link carries, bytes a second.
+const LINK_BYTES_PER_S: f64 = 1e6;
+/// Bulk that is offered to it, bytes a second and in each message.
+const BULK_BYTES_PER_S: f64 = 2e6;
+const BULK_MESSAGE_BYTES: usize = 4_096;
+/// Time between two drive commands.
+const DRIVE_PERIOD: Duration = Duration::from_millis(50);
+/// Age of drive commands, 99 % of them, at the most.
+const AGE_MAX_MS: f64 = 120.0;
+/// Share of the commands that must arrive.
+const ARRIVED_MIN: f64 = 0.9;
+/// Time for the bulk to fill the link before it counts.
+const FILL: Duration = Duration::from_secs(2);
+
+type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
+
+pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Result<Vec<Check>> {
+    let folder = tempfile::tempdir()?;
+    let target = fleet.zenoh_endpoint().trim_start_matches("tcp/").parse()?;
+    let relay = Relay::start_narrow(target, LINK_BYTES_PER_S).await?;
+    let endpoint = format!("tcp/{}", relay.address());
+    let robot = name(NUMBER)?;
+    let agent = start(NUMBER, &endpoint, folder.path())?;
+    fleet.robot_is_online(&robot).await;
+    let mut socket = acquire(fleet).await?;
+
+    // The robot listens to this key, so that the router sends all of it down the link.
+    let session = open_session(&fleet.zenoh_endpoint()).await?;
+    let bulk = session
+        .declare_publisher(keys::limit(&fleet.site(), &robot, &"bulk".parse()?))
+        .congestion_control(CongestionControl::Drop)
+        .await
+        .map_err(|error| anyhow::anyhow!("zenoh: {error}"))?;
+    #[expect(clippy::cast_precision_loss, reason = "a message's length")]
+    let gap = Duration::from_secs_f64(BULK_MESSAGE_BYTES as f64 / BULK_BYTES_PER_S);
+    let mut bulk_ticks = tokio::time::interval(gap);
+    bulk_ticks.set_missed_tick_behavior(MissedTickBehavior::Burst);
+    let mut filling = tokio::task::JoinSet::new();
+    filling.spawn(async move {
+        let payload = vec![b' '; BULK_MESSAGE_BYTES];
+        loop {
+            bulk_ticks.tick().await;
+            if bulk.put(payload.clone()).await.is_err() {
+                return;
+            }
+        }
+    });
+
+    let counted = || {
+        let state = agent.state();
+        let refused = state.safety.limits_refused;
+        let drive = state.safety.drive;
+        let drive = drive.map(|drive| (drive.counts.accepted, drive.command_age_ms));
+        (drive.unwrap_or_default(), refused)
+    };
+    let mut ages_ms = Vec::new();
+    let mut sent = 0_u64;
+    let mut before = None;
+    let mut ticks = tokio::time::interval(DRIVE_PERIOD);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let began = Instant::now();
+    let drive = DriveRequest::Drive(Drive {
+        linear_m_s: 0.2,
+        angular_rad_s: 0.2,
+        for_ms: Some(400),
+    });
+    while began.elapsed() < FILL + Duration::from_secs(arguments.seconds) {
+        tokio::select! {
+            _ = ticks.tick() => {
+                send(&mut socket, &drive).await?;
+                if began.elapsed() > FILL {
+                    let ((accepted, age_ms), refused) = counted();
+                    before.get_or_insert((accepted, refused));
+                    ages_ms.extend(age_ms);
+                    sent += 1;
+                }
+            }
+            frame = socket.next() => {
+                frame.context("the server closed the socket")??;
+            }
+        }
+    }
+    let ((accepted, _), refused) = counted();
+    let before = before.unwrap_or_default();
+    filling.shutdown().await;
+    agent.stop().await;
+    let seconds = figure(arguments.seconds);
+    // Each bulk message that arrives is one limit that the robot refuses.
+    #[expect(clippy::cast_precision_loss, reason = "a message's length")]
+    let carried = figure(refused - before.1) * BULK_MESSAGE_BYTES as f64 / seconds;
+    Ok(vec![
+        Check::at_least(
+            "link: bulk carried, share of the link",
+            0.7,
+            carried / LINK_BYTES_PER_S,
+        ),
+        Check::at_most(
+            "link: command age at the robot, p50, ms",
+            AGE_MAX_MS,
+            quantile(&mut ages_ms, 0.5),
+        ),
+        Check::at_most(
+            "link: command age at the robot, p99, ms",
+            AGE_MAX_MS,
+            quantile(&mut ages_ms, 0.99),
+        ),
+        Check::at_least(
+            "link: drive commands that arrived, share",
+            ARRIVED_MIN,
+            figure(accepted - before.0) / figure(sent),
+        ),
+    ])
+}
+
+async fn acquire(fleet: &Fleet) -> anyhow::Result<Socket> {
+    let robot = name(NUMBER)?;
+    let address = fleet.http_address();
+    let url = format!("ws://{address}/v1/sites/{SITE}/robots/{robot}/drive");
+    let (mut socket, _) = connect_async(url).await?;
+    let driver = DriverName {
+        name: "safety".to_owned(),
+    };
+    send(&mut socket, &DriveRequest::Acquire(driver)).await?;
+    loop {
+        let frame = socket
+            .next()
+            .await
+            .context("the server closed the socket")??;
+        let Message::Text(text) = frame else {
+            continue;
+        };
+        match serde_json::from_str(&text)? {
+            DriveUpdate::Leased(_) => return Ok(socket),
+            DriveUpdate::Refused { detail, .. } => anyhow::bail!("no lease: {detail}"),
+            _ => {}
+        }
+    }
+}
+
+async fn send(socket: &mut Socket, request: &DriveRequest) -> anyhow::Result<()> {
+    let text = serde_json::to_string(request)?;
+    Ok(socket.send(Message::text(text)).await?)
+}

@@ -1,0 +1,133 @@
+//! From the REST call of a stop until every robot has confirmed.
+
+use anyhow::Context;
+use reqwest::Method;
+use serde_json::{Value, json};
+use tokio::time::Instant;
+use tread_agent::RunningAgent;
+use tread_api::ids::RobotId;
+use tread_api::robot::RobotMode;
+use tread_api::stop::{FleetStop, Stop};
+use tread_tests::fleet::{Fleet, SITE};
+use tread_tests::wait::{DRIVE, SHORT, eventually};
+
+use crate::robots::{APART_M, name, start};
+use crate::{Arguments, Check, figure, quantile};
+
+/// From the call to a target of zero, 99 % of them, at the most.
+const STOP_MAX_MS: f64 = 50.0;
+/// From the call until all of a fleet have confirmed, at the most.
+const FLEET_MAX_MS: f64 = 200.0;
+/// Agents that are started at a time.
+const AT_ONCE: u32 = 10;
+
+pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Result<Vec<Check>> {
+    let folder = tempfile::tempdir()?;
+    let mut agents = Vec::new();
+    for first in (0..arguments.robots).step_by(AT_ONCE as usize) {
+        let numbers = first..arguments.robots.min(first + AT_ONCE);
+        for number in numbers.clone() {
+            agents.push(start(number, &fleet.zenoh_endpoint(), folder.path())?);
+        }
+        for number in numbers {
+            fleet.robot_is_online(&name(number)?).await;
+        }
+    }
+    let mut missions = Vec::new();
+    for number in 0..arguments.robots {
+        let center = json!({"x_m": APART_M * f64::from(number), "y_m": 2.0});
+        let circle = json!({"circle": {"center": center, "radius_m": 2.0, "speed_m_s": 0.5,
+                                       "turns": 900.0}});
+        missions.push(fleet.rest.send(&name(number)?, circle).await);
+    }
+    let (mut single_ms, mut fleet_ms) = (Vec::new(), Vec::new());
+    let (mut unconfirmed, mut not_zero) = (0, 0);
+    let mut moving = 0;
+    for _ in 0..arguments.rounds {
+        all_drive(&agents).await;
+        for (number, agent) in (0..).zip(&agents) {
+            moving += u64::from(is_moving(agent));
+            let path = format!("/v1/sites/{SITE}/robots/{}/stop", name(number)?);
+            let called_at = Instant::now();
+            let stop: Stop = serde_json::from_value(fleet.rest.post(&path, &json!({})).await)?;
+            single_ms.push(called_at.elapsed().as_secs_f64() * 1e3);
+            unconfirmed += u64::from(stop.confirmed_at.is_none());
+            not_zero += u64::from(agent.state().mode != RobotMode::Stopped);
+        }
+        go_on(fleet, &agents, &missions).await?;
+        all_drive(&agents).await;
+        let called_at = Instant::now();
+        let answer = fleet.rest.post("/v1/stop", &json!({"site": SITE})).await;
+        fleet_ms.push(called_at.elapsed().as_secs_f64() * 1e3);
+        let stopped: FleetStop = serde_json::from_value(answer)?;
+        unconfirmed += stopped.unconfirmed as u64;
+        let runs_on = |agent: &&RunningAgent| agent.state().mode != RobotMode::Stopped;
+        not_zero += agents.iter().filter(runs_on).count() as u64;
+        go_on(fleet, &agents, &missions).await?;
+    }
+    for agent in agents {
+        agent.stop().await;
+    }
+    let p50_ms = quantile(&mut single_ms, 0.5);
+    let p99_ms = quantile(&mut single_ms, 0.99);
+    Ok(vec![
+        Check::at_least("stop: robots", 1.0, f64::from(arguments.robots)),
+        Check::at_least("stop: robots that moved", 1.0, figure(moving)),
+        Check::at_most("stop: call to confirmed, p50, ms", STOP_MAX_MS, p50_ms),
+        Check::at_most("stop: call to confirmed, p99, ms", STOP_MAX_MS, p99_ms),
+        Check::at_most(
+            "stop: whole fleet confirmed, worst, ms",
+            FLEET_MAX_MS,
+            quantile(&mut fleet_ms, 1.0),
+        ),
+        Check::at_most("stop: not confirmed in 300 ms", 0.0, figure(unconfirmed)),
+        Check::at_most("stop: confirmed and not stopped", 0.0, figure(not_zero)),
+    ])
+}
+
+fn is_moving(agent: &RunningAgent) -> bool {
+    let twist = agent.state().twist;
+    twist.is_some_and(|twist| twist.value.linear_m_s > 0.1)
+}
+
+async fn all_drive(agents: &[RunningAgent]) {
+    let look = || async { agents.iter().filter(|agent| !is_moving(agent)).count() };
+    eventually("all robots drive", DRIVE, look, |standing| *standing == 0).await;
+}
+
+/// Clears every stop and lets every mission go on.
+async fn go_on(
+    fleet: &Fleet,
+    agents: &[RunningAgent],
+    missions: &[tread_api::ids::MissionId],
+) -> anyhow::Result<()> {
+    for (number, (agent, mission)) in (0..).zip(agents.iter().zip(missions)) {
+        let robot = name(number)?;
+        clear(fleet, agent, &robot).await?;
+        let path = format!("/v1/missions/{mission}/resume");
+        let look = || fleet.rest.call(Method::POST, &path, Some(&Value::Null));
+        eventually("the mission may go on", SHORT, look, |answer| {
+            answer
+                .as_ref()
+                .is_some_and(|(status, _)| status.is_success())
+        })
+        .await;
+    }
+    Ok(())
+}
+
+async fn clear(fleet: &Fleet, agent: &RunningAgent, robot: &RobotId) -> anyhow::Result<()> {
+    let latch = agent.state().safety.stop;
+    let latch = latch.context("a stopped robot shows its stop")?;
+    let path = format!("/v1/sites/{SITE}/robots/{robot}/stop/clear");
+    let body = json!({"stop": latch.id, "by": "safety"});
+    // It is refused while the robot still brakes.
+    let look = || fleet.rest.call(Method::POST, &path, Some(&body));
+    eventually("the stop is cleared", SHORT, look, |answer| {
+        answer
+            .as_ref()
+            .is_some_and(|(status, _)| status.is_success())
+    })
+    .await;
+    Ok(())
+}
