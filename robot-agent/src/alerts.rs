@@ -21,6 +21,7 @@ const OUTBOX_LONG: (u64, u64) = (50_000, 25_000);
 pub(crate) struct Causes {
     pub(crate) battery: Option<Battery>,
     pub(crate) fault: Option<Fault>,
+    pub(crate) is_stopped: bool,
     pub(crate) outbox: OutboxStatus,
 }
 
@@ -82,10 +83,20 @@ impl Alerts {
             let text = "measurements were lost: the store was full".to_owned();
             alert("outbox-dropped", Severity::Warning, text)
         });
-        [battery, fault, long.flatten(), lost.flatten()]
-            .into_iter()
-            .flatten()
-            .collect()
+        let stopped = causes.is_stopped.then(|| {
+            let text = "the robot is stopped until an operator clears it".to_owned();
+            alert("stopped", Severity::Critical, text)
+        });
+        [
+            battery,
+            fault,
+            stopped.flatten(),
+            long.flatten(),
+            lost.flatten(),
+        ]
+        .into_iter()
+        .flatten()
+        .collect()
     }
 }
 

@@ -16,7 +16,7 @@ use std::time::Duration;
 
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
-use tracing::{error, info, warn};
+use tracing::{info, warn};
 use tread_api::ids::{BootId, MissionId};
 use tread_api::keys::Verb;
 use tread_api::mission::{LinkPolicy, PlanSummary};
@@ -36,8 +36,8 @@ use crate::control_loop::seam::{Job, LoopCommand, Shared};
 use crate::control_loop::site_view::SiteView;
 use crate::fleet::{Commands, IncomingCommand};
 use crate::geometry::{control_trajectory, plan_options};
-use crate::missions::memory::Memory;
-use crate::missions::{CancelDecision, Held, Holder, OfferDecision};
+use crate::knowledge::{Missions, SiteCell};
+use crate::missions::{CancelDecision, Held, OfferDecision};
 use crate::safety::{Safety, answers};
 
 /// Offers that may wait while another is planned; the server asks again for more.
@@ -52,55 +52,6 @@ const HOLD_WAIT_MAX: Duration = Duration::from_secs(5);
 const HOLD_LOOK_EVERY: Duration = Duration::from_millis(5);
 /// A reference slower than this stands as good as, metres per second.
 const STANDS_M_S: f64 = 0.02;
-
-/// The robot's missions, shared by those who answer and those who record.
-#[derive(Debug)]
-pub(crate) struct Missions {
-    holder: Mutex<Holder>,
-    memory: Memory,
-}
-
-impl Missions {
-    pub(crate) fn new(holder: Holder, memory: Memory) -> Arc<Self> {
-        Arc::new(Self {
-            holder: Mutex::new(holder),
-            memory,
-        })
-    }
-
-    pub(crate) fn holder(&self) -> MutexGuard<'_, Holder> {
-        self.holder.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Makes what is known safe from a crash. Blocks.
-    pub(crate) fn save(&self) {
-        // The lock is not held while the disk is waited for.
-        let holder = self.holder().clone();
-        if let Err(cause) = self.memory.save(&holder) {
-            error!(
-                error = &cause as &dyn std::error::Error,
-                "cannot save the missions"
-            );
-        }
-    }
-}
-
-/// Where the site's definition is kept for those outside the loop.
-#[derive(Debug, Default)]
-pub(crate) struct SiteCell {
-    view: Mutex<Option<(SiteDefinition, Arc<SiteView>)>>,
-}
-
-impl SiteCell {
-    fn lock(&self) -> MutexGuard<'_, Option<(SiteDefinition, Arc<SiteView>)>> {
-        self.view.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// The view that was last handed to the loop.
-    pub(crate) fn view(&self) -> Option<Arc<SiteView>> {
-        self.lock().as_ref().map(|(_, view)| Arc::clone(view))
-    }
-}
 
 /// Who answers commands.
 #[derive(Debug)]

@@ -30,6 +30,7 @@ mod alerts;
 mod control_loop;
 mod dispatcher;
 mod durable;
+mod knowledge;
 mod recorder;
 mod reporter;
 mod safety;

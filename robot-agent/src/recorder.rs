@@ -14,7 +14,7 @@ use tread_api::robot::MissionProgress;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
 
 use crate::control_loop::seam::{ClosedSegment, LoopEvent};
-use crate::dispatcher::Missions;
+use crate::knowledge::Missions;
 use crate::outbox::Outbox;
 
 /// Pause between two tries on a disk that refuses.

@@ -16,9 +16,9 @@ use tread_control::gate::GateCause;
 use crate::alerts::{Alerts, Causes};
 use crate::clock::SharedClock;
 use crate::control_loop::seam::{Shared, Snapshot};
-use crate::dispatcher::SiteCell;
 use crate::fleet::{FleetLink, Identity};
 use crate::geometry::{wire_pose, wire_twist};
+use crate::knowledge::SiteCell;
 use crate::outbox::Outbox;
 use crate::safety::{Safety, microseconds};
 
@@ -74,6 +74,7 @@ impl Reporter {
         let causes = Causes {
             battery: snapshot.battery,
             fault: snapshot.fault,
+            is_stopped: self.shared.safety.stop() != 0,
             outbox,
         };
         let counted = |counter: &AtomicU64| counter.load(Ordering::Relaxed);

@@ -4,10 +4,16 @@ use std::alloc::System;
 use std::time::Duration;
 
 use stats_alloc::{INSTRUMENTED_SYSTEM, Region, Stats, StatsAlloc};
-use tread_agent::bench::{Bench, site_of};
+use tread_agent::bench::{Bench, boot, site_of};
 use tread_agent::sim::scenario::Scenario;
+use tread_api::geometry::{Point, Polygon, Twist};
+use tread_api::safety::{Driver, Geofence};
+use tread_api::wire;
+use tread_api::wire::command::Outcome;
 use tread_api::wire::ingest::MissionPhase;
+use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
 use tread_control::geometry::Pose;
+use uuid::Uuid;
 
 #[global_allocator]
 static ALLOCATOR: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
@@ -46,4 +52,63 @@ fn no_tick_of_a_mission_across_cells_and_terrains_allocates() {
         }
     }
     panic!("the mission did not end");
+}
+
+fn fence() -> Geofence {
+    let corners = [(1.0, 1.0), (9.0, 1.0), (9.0, 6.0), (1.0, 6.0)];
+    let corners = corners.map(|(x_m, y_m)| Point { x_m, y_m });
+    Geofence {
+        revision: 1,
+        keep_in: vec![Polygon::new(corners.to_vec()).expect("a rectangle")],
+        keep_out: Vec::new(),
+    }
+}
+
+#[test]
+fn no_tick_of_driving_by_hand_to_a_fence_and_into_silence_allocates() {
+    let scenario = Scenario::built_in().unwrap();
+    let start = Pose {
+        x_m: 4.0,
+        y_m: 3.0,
+        heading_rad: 0.0,
+    };
+    let mut bench = Bench::new(&scenario, start, 3).unwrap();
+    let mut site = site_of(&scenario).unwrap();
+    site.geofence = fence();
+    bench.know_site(site).unwrap();
+    bench.run_for(Duration::from_secs(1));
+    let lease = bench.lease(&LeaseCommand {
+        request: Uuid::from_u128(1),
+        action: LeaseAction::Acquire,
+        holder: Driver {
+            client: Uuid::from_u128(2),
+            name: "a driver".to_owned(),
+        },
+    });
+    let Outcome::Leased { epoch } = lease else {
+        panic!("{lease:?}");
+    };
+    // Up to the fence, then silence until the lease has freed itself.
+    for tick in 0..2_000_u64 {
+        if tick < 1_000 && tick % 5 == 0 {
+            let command = DriveCommand {
+                boot: boot(),
+                epoch,
+                seq: tick,
+                sent_us: bench.now_us(),
+                until_us: bench.now_us() + 200_000,
+                twist: Twist {
+                    linear_m_s: 0.8,
+                    angular_rad_s: 0.0,
+                },
+            };
+            assert!(bench.drive_by_hand(&wire::encode(&command).unwrap()));
+        }
+        bench.simulate();
+        let region = Region::new(ALLOCATOR);
+        bench.tick_loop(false);
+        assert_eq!(region.change(), Stats::default(), "tick {tick}");
+        bench.collect();
+    }
+    assert!(bench.stands());
 }

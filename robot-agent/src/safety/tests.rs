@@ -11,8 +11,10 @@ use tread_api::wire;
 use tread_api::wire::command::{OfferRefusal, Outcome};
 use tread_api::wire::ingest::MissionPhase;
 use tread_api::wire::safety::{DriveCommand, ExternalLimit, LeaseAction, LeaseCommand, Stop};
+use tread_control::fence::disc_radius_m;
 use tread_control::gate::GateCause;
 use tread_control::geometry::Pose;
+use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
 use crate::bench::{Bench, boot, site_of};
@@ -287,6 +289,36 @@ fn a_robot_that_leans_too_far_or_says_nonsense_stops() {
     bench.run_for(2 * SECOND);
     assert!(bench.stands());
     assert_eq!(cause(&bench), Some(GateCause::Tilt));
+
+    let (mut bench, _) = driving();
+    for _ in 0..21 {
+        bench.tick_with_nonsense();
+    }
+    assert!(bench.target_rests());
+    assert_eq!(cause(&bench), Some(GateCause::StaleFeedback));
+    assert_eq!(mode(&bench), RobotMode::Fault);
+}
+
+#[test]
+fn a_mission_brakes_before_a_fence_that_was_drawn_across_its_way() {
+    let (mut bench, mission) = driving();
+    let corners = [(9.0, 2.0), (10.0, 2.0), (10.0, 6.0), (9.0, 6.0)];
+    let corners = corners.map(|(x_m, y_m)| Point { x_m, y_m });
+    let mut site = site_of(&Scenario::built_in().unwrap()).unwrap();
+    site.geofence = Geofence {
+        revision: 7,
+        keep_in: Vec::new(),
+        keep_out: vec![Polygon::new(corners.to_vec()).unwrap()],
+    };
+    assert!(bench.drive.truth().pose.x_m < 7.6, "too late for this test");
+    bench.know_site(site).unwrap();
+    bench.run_for(10 * SECOND);
+    let x_m = bench.drive.truth().pose.x_m;
+    let radius_m = disc_radius_m(&RobotModel::yi2007());
+    assert!(x_m < 9.0 - radius_m, "at {x_m} m");
+    assert_eq!(cause(&bench), Some(GateCause::Fence));
+    bench.run_for(30 * SECOND);
+    assert_eq!(bench.end_of(mission), Some(MissionPhase::Failed));
 }
 
 fn yard() -> Geofence {
@@ -320,8 +352,7 @@ fn a_hand_cannot_drive_through_a_fence() {
             let at = bench.drive.truth().pose.point();
             least_m = least_m.min(fence.clearance_m(at));
         }
-        let radius_m =
-            tread_control::fence::disc_radius_m(&tread_control::robot::RobotModel::yi2007());
+        let radius_m = disc_radius_m(&RobotModel::yi2007());
         assert!(
             least_m > radius_m,
             "came within {least_m} m with {linear_m_s} {angular_rad_s}"

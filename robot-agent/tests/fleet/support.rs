@@ -209,6 +209,7 @@ impl FakeServer {
                 match Key::parse(sample.key_expr().as_str()) {
                     Some(Key::State(..)) => memory.states.push(wire::decode(&bytes).unwrap()),
                     Some(Key::Friction(..)) => memory.frictions.push(wire::decode(&bytes).unwrap()),
+                    Some(Key::Teleop(..)) => {}
                     other => panic!("published on {other:?}"),
                 }
             })

@@ -143,10 +143,12 @@ pub(super) fn decide(mission: &Standing, presence: &Presence, memory: Memory, no
         }
         MissionState::Active | MissionState::Paused => {
             let differs = memory.differs_from.is_some_and(longer_than(HOLD_GRACE));
-            match in_hand(mission, said, differs) {
-                // Whoever stopped it or drives it by hand has written down that it is to be held.
-                Need::Resume if presence.is_in_hands() => Need::Wait,
-                need => need,
+            let need = in_hand(mission, said, differs);
+            // Whoever stopped it or drives it by hand has written down that it is to be held.
+            if need == Need::Resume && presence.is_in_hands() {
+                Need::Wait
+            } else {
+                need
             }
         }
         MissionState::Cancelling => Need::Cancel,

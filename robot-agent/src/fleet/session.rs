@@ -1,0 +1,89 @@
+//! How the robot's session is opened: a client that connects for ever, with short queues below.
+
+use std::str::FromStr;
+
+use super::{LinkError, zenoh_failed};
+
+/// First pause before a lost connection is tried again, milliseconds.
+const RETRY_FIRST_MS: u32 = 100;
+/// Longest pause between tries, milliseconds.
+const RETRY_MAX_MS: u32 = 500;
+/// Longest try to connect, milliseconds: a hanging one must not outlast the network's healing.
+const OPEN_TIMEOUT_MS: u32 = 1_000;
+/// After this silence the router takes a robot for gone, milliseconds.
+const LEASE_MS: u32 = 3_000;
+/// Send buffer of the kernel, bytes.
+const SEND_BUFFER_BYTES: u32 = 32_768;
+/// Largest batch that zenoh hands to the kernel at once, bytes.
+const BATCH_BYTES: u16 = 8_192;
+
+/// The endpoint with a small send buffer of the kernel, unless it names one: priorities act only
+/// above that buffer, so on a slow link a large one makes everything wait behind the bulk.
+fn with_small_buffer(server: &str) -> String {
+    let is_stream = server.starts_with("tcp/") || server.starts_with("tls/");
+    if !is_stream || server.contains("so_sndbuf") {
+        return server.to_owned();
+    }
+    let joint = if server.contains('#') { ';' } else { '#' };
+    format!("{server}{joint}so_sndbuf={SEND_BUFFER_BYTES}")
+}
+
+/// How the robot's session is opened.
+///
+/// # Errors
+/// [`LinkError`] for an endpoint that is none.
+pub(super) fn session_config(server: &str) -> Result<zenoh::Config, LinkError> {
+    let endpoint_failed = |problem: String| LinkError::Endpoint {
+        endpoint: server.to_owned(),
+        problem,
+    };
+    zenoh::config::EndPoint::from_str(server)
+        .map_err(|problem| endpoint_failed(problem.to_string()))?;
+    let endpoints = serde_json::json!([with_small_buffer(server)]).to_string();
+    let retry = serde_json::json!({
+        "period_init_ms": RETRY_FIRST_MS,
+        "period_max_ms": RETRY_MAX_MS,
+        "period_increase_factor": 2.0,
+    });
+    let settings = [
+        ("mode", "\"client\"".to_owned()),
+        ("connect/endpoints", endpoints),
+        ("connect/timeout_ms", "-1".to_owned()),
+        ("connect/retry", retry.to_string()),
+        ("listen/endpoints", "[]".to_owned()),
+        ("scouting/multicast/enabled", "false".to_owned()),
+        ("scouting/gossip/enabled", "false".to_owned()),
+        ("transport/link/tx/lease", LEASE_MS.to_string()),
+        ("transport/link/tx/batch_size", BATCH_BYTES.to_string()),
+        (
+            "transport/unicast/open_timeout",
+            OPEN_TIMEOUT_MS.to_string(),
+        ),
+    ];
+    let mut config = zenoh::Config::default();
+    for (key, value) in settings {
+        config
+            .insert_json5(key, &value)
+            .map_err(zenoh_failed("take its configuration"))?;
+    }
+    Ok(config)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stream_gets_a_small_send_buffer_unless_it_names_one() {
+        for (given, used) in [
+            ("tcp/h:7447", "tcp/h:7447#so_sndbuf=32768"),
+            ("tls/h:7447#a=b", "tls/h:7447#a=b;so_sndbuf=32768"),
+            ("tcp/h:7447#so_sndbuf=9000", "tcp/h:7447#so_sndbuf=9000"),
+            ("quic/h:7447", "quic/h:7447"),
+        ] {
+            assert_eq!(with_small_buffer(given), used);
+        }
+        assert!(session_config("tcp/127.0.0.1:7447").is_ok());
+        assert!(session_config("nonsense").is_err());
+    }
+}
