@@ -7,6 +7,7 @@ mod event_clients;
 mod messages;
 mod missions;
 mod outages;
+mod safety;
 
 use std::path::Path;
 

@@ -119,11 +119,15 @@ pub(super) fn decide(mission: &Standing, presence: &Presence, memory: Memory, no
         {
             Need::Settle(Change::Forget)
         }
-        MissionState::Active | MissionState::Paused => match in_hand(mission, said) {
+        MissionState::Active | MissionState::Paused => {
+            let need = in_hand(mission, said);
             // Whoever stopped it or drives it by hand has written down that it is to be held.
-            Need::Resume if presence.is_in_hands() => Need::Wait,
-            need => need,
-        },
+            if need == Need::Resume && presence.is_in_hands() {
+                Need::Wait
+            } else {
+                need
+            }
+        }
         MissionState::Cancelling => Need::Cancel,
         MissionState::Queued
         | MissionState::Offered
