@@ -355,6 +355,15 @@ pub struct MissionProgress {
     pub paused_by: Option<PauseCause>,
 }
 
+impl MissionProgress {
+    /// Whether the robot paused it of itself, for a stop or for driving by hand: then only a
+    /// person lets it go on.
+    pub fn is_paused_for_safety(&self) -> bool {
+        let is_for_safety = |cause| matches!(cause, PauseCause::Stop | PauseCause::Teleoperation);
+        self.paused && self.paused_by.is_some_and(is_for_safety)
+    }
+}
+
 /// What paused a mission. Whatever it was, only a request resumes it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]

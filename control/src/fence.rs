@@ -35,33 +35,68 @@ const BREACH_STEP_M: f64 = 0.02;
 /// Step by which motion from outside is tried, metres.
 const RETURN_STEP_M: f64 = 0.05;
 
+/// One side of a polygon, prepared.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Side {
+    from: Point,
+    to: Point,
+    inverse_length_1_m2: f64,
+}
+
 #[derive(Debug, Clone, PartialEq)]
 struct Ring {
-    corners: Vec<Point>,
+    sides: Vec<Side>,
+    low: Point,
+    high: Point,
 }
 
 impl Ring {
+    fn new(corners: &[Point]) -> Self {
+        let next = corners.iter().cycle().skip(1);
+        let sides = corners.iter().zip(next).map(|(&from, &to)| Side {
+            from,
+            to,
+            inverse_length_1_m2: from.distance_m(to).powi(2).recip(),
+        });
+        let least =
+            |pick: fn(&Point) -> f64| corners.iter().map(pick).fold(f64::INFINITY, f64::min);
+        let most =
+            |pick: fn(&Point) -> f64| corners.iter().map(pick).fold(f64::NEG_INFINITY, f64::max);
+        Self {
+            sides: sides.collect(),
+            low: Point {
+                x_m: least(|corner| corner.x_m),
+                y_m: least(|corner| corner.y_m),
+            },
+            high: Point {
+                x_m: most(|corner| corner.x_m),
+                y_m: most(|corner| corner.y_m),
+            },
+        }
+    }
+
+    /// A lower bound of the distance from outside; 0 within the polygon's box.
+    fn outside_at_least_m(&self, point: Point) -> f64 {
+        let off = |value: f64, low: f64, high: f64| (low - value).max(value - high).max(0.0);
+        let x_m = off(point.x_m, self.low.x_m, self.high.x_m);
+        x_m.max(off(point.y_m, self.low.y_m, self.high.y_m))
+    }
+
     /// Distance to the border, positive inside.
     fn depth_m(&self, point: Point) -> f64 {
         let mut nearest_m2 = f64::INFINITY;
         let mut is_inside = false;
-        let Some(&last) = self.corners.last() else {
-            return f64::NEG_INFINITY;
-        };
-        let mut from = last;
-        for &to in &self.corners {
+        for side in &self.sides {
+            let (from, to) = (side.from, side.to);
             let (side_x, side_y) = (to.x_m - from.x_m, to.y_m - from.y_m);
             let (x_m, y_m) = (point.x_m - from.x_m, point.y_m - from.y_m);
-            let length_m2 = side_x * side_x + side_y * side_y;
-            let share = ((x_m * side_x + y_m * side_y) / length_m2).clamp(0.0, 1.0);
+            let share = ((x_m * side_x + y_m * side_y) * side.inverse_length_1_m2).clamp(0.0, 1.0);
             let (off_x, off_y) = (x_m - share * side_x, y_m - share * side_y);
             nearest_m2 = nearest_m2.min(off_x * off_x + off_y * off_y);
-            if (from.y_m > point.y_m) != (to.y_m > point.y_m)
-                && x_m < side_x * (point.y_m - from.y_m) / side_y
-            {
-                is_inside = !is_inside;
-            }
-            from = to;
+            // Whether the ray to the right crosses this side, without a division.
+            let is_upward = to.y_m > from.y_m;
+            let is_beside = (from.y_m > point.y_m) != (to.y_m > point.y_m);
+            is_inside ^= is_beside && ((x_m * side_y < side_x * y_m) == is_upward);
         }
         let distance_m = nearest_m2.sqrt();
         if is_inside { distance_m } else { -distance_m }
@@ -163,12 +198,8 @@ fn along_arc(pose: Pose, curvature_1_m: f64, way_m: f64) -> Pose {
 impl Fence {
     /// A fence of polygons, each its corners in order.
     pub fn new(keep_in: Vec<Vec<Point>>, keep_out: Vec<Vec<Point>>) -> Self {
-        let rings = |polygons: Vec<Vec<Point>>| {
-            polygons
-                .into_iter()
-                .map(|corners| Ring { corners })
-                .collect()
-        };
+        let rings =
+            |polygons: Vec<Vec<Point>>| polygons.iter().map(|corners| Ring::new(corners)).collect();
         Self {
             keep_in: rings(keep_in),
             keep_out: rings(keep_out),
@@ -192,8 +223,14 @@ impl Fence {
         } else {
             depths.fold(f64::NEG_INFINITY, f64::max)
         };
-        let away = self.keep_out.iter().map(|ring| -ring.depth_m(point));
-        away.fold(inside_m, f64::min)
+        let mut clearance_m = inside_m;
+        for ring in &self.keep_out {
+            // One that is farther than the nearest so far need not be looked at.
+            if ring.outside_at_least_m(point) < clearance_m {
+                clearance_m = clearance_m.min(-ring.depth_m(point));
+            }
+        }
+        clearance_m
     }
 
     /// The first place at which a robot that drives a plan, with the margin that it keeps anyway,
@@ -419,6 +456,45 @@ mod tests {
                     let left_m = fence.clearance_m(pose.point()) - radius_m;
                     prop_assert!(left_m > 0.0, "left by {left_m} at {pose:?}");
                 }
+            }
+        }
+    }
+
+    #[test]
+    fn a_concave_polygon_is_inside_where_it_is() {
+        // A horseshoe that is open to the right.
+        let corners = [
+            (0.0, 0.0),
+            (4.0, 0.0),
+            (4.0, 1.0),
+            (1.0, 1.0),
+            (1.0, 3.0),
+            (4.0, 3.0),
+            (4.0, 4.0),
+            (0.0, 4.0),
+        ];
+        let corners: Vec<Point> = corners
+            .into_iter()
+            .map(|(x_m, y_m)| Point { x_m, y_m })
+            .collect();
+        let mut turned = corners.clone();
+        turned.reverse();
+        for corners in [corners, turned] {
+            let fence = Fence::new(vec![corners], Vec::new());
+            for (x_m, y_m, clearance_m) in [
+                (0.5, 2.0, 0.5),
+                (3.0, 0.5, 0.5),
+                (3.0, 3.5, 0.5),
+                (2.0, 2.0, -1.0),
+                (5.0, 0.5, -1.0),
+                (-1.0, 2.0, -1.0),
+                (0.5, 0.5, 0.5),
+            ] {
+                let got_m = fence.clearance_m(Point { x_m, y_m });
+                assert!(
+                    (got_m - clearance_m).abs() < 1.0e-12,
+                    "{x_m} {y_m}: {got_m}"
+                );
             }
         }
     }

@@ -233,7 +233,30 @@ impl App {
                 &format!("tread_robots{{link=\"{name}\"}} {count}"),
             );
         }
+        let name = "tread_robots_reduced";
+        let help = "Robots that are heard and slowed down, by the strictest cause.";
+        head(&mut text, name, "gauge", help);
+        for (cause, count) in self.presences().gate_causes(self.clock().elapsed()) {
+            line(&mut text, &format!("{name}{{cause=\"{cause}\"}} {count}"));
+        }
+        let stops = self.stops_in_force().await?;
+        let open = stops.iter().filter(|stop| stop.unconfirmed).count();
         let gauges = [
+            (
+                "tread_stops_in_force",
+                stops.len(),
+                "Stops that are not cleared.",
+            ),
+            (
+                "tread_stops_unconfirmed",
+                open,
+                "Stops that their robots have not confirmed within 300 ms.",
+            ),
+            (
+                "tread_drive_clients",
+                self.drive_clients(),
+                "Drive sockets that are open.",
+            ),
             (
                 "tread_event_clients",
                 self.hub().client_count(),

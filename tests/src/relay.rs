@@ -41,19 +41,27 @@ impl Relay {
     ///
     /// # Errors
     /// No port could be bound.
+    #[expect(
+        clippy::unused_async,
+        reason = "it needs the runtime that it is awaited on"
+    )]
     pub async fn start(target: SocketAddr) -> anyhow::Result<Self> {
-        Self::start_with(target, None).await
+        Self::start_with(target, None)
     }
 
     /// The same for a link that carries at most so many bytes a second each way.
     ///
     /// # Errors
     /// No port could be bound.
+    #[expect(
+        clippy::unused_async,
+        reason = "it needs the runtime that it is awaited on"
+    )]
     pub async fn start_narrow(target: SocketAddr, bytes_per_s: f64) -> anyhow::Result<Self> {
-        Self::start_with(target, Some(bytes_per_s)).await
+        Self::start_with(target, Some(bytes_per_s))
     }
 
-    async fn start_with(target: SocketAddr, bytes_per_s: Option<f64>) -> anyhow::Result<Self> {
+    fn start_with(target: SocketAddr, bytes_per_s: Option<f64>) -> anyhow::Result<Self> {
         let socket = TcpSocket::new_v4()?;
         if bytes_per_s.is_some() {
             // What connects here inherits it.
@@ -193,7 +201,7 @@ mod tests {
         let began = Instant::now();
         let mut sending = JoinSet::new();
         sending.spawn(async move {
-            near.write_all(&[7; 500_000]).await.unwrap();
+            near.write_all(&vec![7; 500_000]).await.unwrap();
             near
         });
         far.read_exact(&mut vec![0; 500_000]).await.unwrap();

@@ -56,6 +56,7 @@ impl RawTerminal {
     }
 
     /// Writes one line over the one before.
+    #[expect(clippy::unused_self, reason = "the terminal must be raw for it")]
     fn show(&self, text: &str) -> anyhow::Result<()> {
         let (width, _) = terminal::size().unwrap_or((80, 24));
         let text: String = text.chars().take(usize::from(width.max(2)) - 1).collect();
@@ -92,6 +93,10 @@ enum Meaning {
     Nothing,
 }
 
+#[expect(
+    clippy::wildcard_enum_match_arm,
+    reason = "all other keys mean nothing"
+)]
 fn meaning(key: KeyEvent) -> Meaning {
     if key.kind == KeyEventKind::Release {
         return Meaning::Nothing;

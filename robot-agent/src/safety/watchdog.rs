@@ -20,6 +20,9 @@ pub(crate) const SAY_AFTER: Duration = Duration::from_millis(500);
 /// Standstill after which the agent ends.
 pub(crate) const END_AFTER: Duration = Duration::from_secs(2);
 
+/// Longest time between two looks by which the loop is judged.
+pub(crate) const OWN_GAP_MAX: Duration = Duration::from_millis(300);
+
 /// What a look finds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Finding {
@@ -38,6 +41,7 @@ pub(crate) enum Finding {
 pub(crate) struct TickWatch {
     ticks: u64,
     since: Duration,
+    looked: Duration,
     is_said: bool,
 }
 
@@ -46,17 +50,24 @@ impl TickWatch {
         Self {
             ticks: 0,
             since: now,
+            looked: now,
             is_said: false,
         }
     }
 
-    /// One look.
+    /// One look. After a gap in its own looks it begins anew: then the whole process was frozen or
+    /// starved, and the loop must get its chance to tick first.
     pub(crate) fn look(&mut self, ticks: u64, now: Duration) -> Finding {
+        let gap = now.saturating_sub(std::mem::replace(&mut self.looked, now));
+        if gap > OWN_GAP_MAX {
+            self.since = now;
+        }
         if ticks != self.ticks {
             let was_said = self.is_said;
             *self = Self {
                 ticks,
                 since: now,
+                looked: now,
                 is_said: false,
             };
             return if was_said {
@@ -99,17 +110,36 @@ pub(crate) fn run(shared: &Arc<Shared>, clock: &SharedClock) {
 mod tests {
     use super::*;
 
+    /// Looks every 100 ms at a loop with so many ticks; the last finding that is not fine.
+    fn look_until(watch: &mut TickWatch, ticks: u64, from_ms: u64, to_ms: u64) -> Vec<Finding> {
+        let looks = (from_ms..=to_ms).step_by(100).map(Duration::from_millis);
+        let findings = looks.map(|now| watch.look(ticks, now));
+        findings
+            .filter(|finding| *finding != Finding::Fine)
+            .collect()
+    }
+
     #[test]
     fn a_loop_that_stands_still_is_said_once_and_then_given_up() {
-        let at = Duration::from_millis;
-        let mut watch = TickWatch::new(at(0));
-        assert_eq!(watch.look(1, at(100)), Finding::Fine);
-        assert_eq!(watch.look(1, at(599)), Finding::Fine);
-        assert_eq!(watch.look(1, at(600)), Finding::StandsStill);
-        assert_eq!(watch.look(1, at(700)), Finding::Fine);
-        assert_eq!(watch.look(2, at(800)), Finding::TicksAgain);
-        assert_eq!(watch.look(2, at(1_300)), Finding::StandsStill);
-        assert_eq!(watch.look(2, at(2_799)), Finding::Fine);
-        assert_eq!(watch.look(2, at(2_800)), Finding::GiveUp);
+        let mut watch = TickWatch::new(Duration::ZERO);
+        assert_eq!(look_until(&mut watch, 1, 100, 500), []);
+        assert_eq!(look_until(&mut watch, 1, 600, 900), [Finding::StandsStill]);
+        assert_eq!(
+            look_until(&mut watch, 2, 1_000, 1_400),
+            [Finding::TicksAgain]
+        );
+        assert_eq!(
+            look_until(&mut watch, 2, 1_500, 2_900),
+            [Finding::StandsStill]
+        );
+        assert_eq!(look_until(&mut watch, 2, 3_000, 3_000), [Finding::GiveUp]);
+    }
+
+    #[test]
+    fn a_process_that_was_frozen_as_a_whole_is_not_given_up() {
+        let mut watch = TickWatch::new(Duration::ZERO);
+        assert_eq!(look_until(&mut watch, 1, 100, 300), []);
+        assert_eq!(look_until(&mut watch, 1, 60_000, 60_400), []);
+        assert_eq!(look_until(&mut watch, 2, 60_500, 60_500), []);
     }
 }

@@ -3,11 +3,11 @@
 use std::time::Duration;
 
 use jiff::Timestamp;
-use tread_api::geometry::Twist;
+use tread_api::geometry::{Point, Polygon, Twist};
 use tread_api::ids::{BootId, StopId};
 use tread_api::keys::{self, Verb};
 use tread_api::robot::{PauseCause, RobotMode};
-use tread_api::safety::Driver;
+use tread_api::safety::{Driver, Geofence};
 use tread_api::wire;
 use tread_api::wire::command::{OfferRefusal, Outcome};
 use tread_api::wire::ingest::MissionPhase;
@@ -18,7 +18,7 @@ use tread_api::wire::state::RobotState;
 use uuid::Uuid;
 
 use crate::rig::Rig;
-use crate::support::{FakeServer, offer};
+use crate::support::{FakeServer, offer, site_of};
 
 const LONG: &str = r#"{"waypoints":{"speed_m_s":0.8,
     "points":[{"x_m":4,"y_m":3},{"x_m":8,"y_m":3.2},{"x_m":11,"y_m":4.5},{"x_m":11,"y_m":9}]}}"#;
@@ -265,6 +265,38 @@ async fn a_program_outside_holds_the_robot_and_a_required_one_by_its_silence() {
     let refused = send(&server, &rig, Verb::Limit, &foreign).await;
     assert_eq!(code(&refused), Some(OfferRefusal::Conflict));
     assert_eq!(agent.state().safety.limits_refused, 1);
+    agent.stop().await;
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_mission_that_would_leave_the_fence_is_refused_with_the_place() {
+    let rig = Rig::new();
+    let server = rig.serve();
+    let agent = rig.agent();
+    rig.ready(agent.boot()).await;
+    let corners = [(2.0, 1.0), (9.0, 1.0), (9.0, 6.0), (2.0, 6.0)];
+    let corners = corners.map(|(x_m, y_m)| Point { x_m, y_m });
+    let mut site = site_of(&rig.scenario);
+    site.geofence = Geofence {
+        revision: 3,
+        keep_in: vec![Polygon::new(corners.to_vec()).unwrap()],
+        keep_out: Vec::new(),
+    };
+    assert_eq!(send(&server, &rig, Verb::Site, &site).await, Outcome::Done);
+    state_of(&rig, agent.boot(), "it knows the fence", |state| {
+        state.safety.fence_revision == Some(3)
+    })
+    .await;
+    let refused = server.offer(&rig.robot, &offer(1, LONG)).await.outcome;
+    let Outcome::Refused { code, detail } = refused else {
+        panic!("{refused:?}");
+    };
+    assert_eq!(code, OfferRefusal::Impossible);
+    assert!(detail.contains("geofence at (8."), "{detail}");
+    site.geofence.keep_out = vec![site.geofence.keep_in[0].clone(); 64];
+    let too_large = send(&server, &rig, Verb::Site, &site).await;
+    assert_eq!(self::code(&too_large), Some(OfferRefusal::Impossible));
     agent.stop().await;
     server.stop().await;
 }

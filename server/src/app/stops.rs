@@ -239,7 +239,7 @@ impl App {
     }
 
     /// Stops that the reconciler looks at.
-    pub(super) async fn stops_in_force(&self) -> Result<Vec<Stop>, AppError> {
+    pub(crate) async fn stops_in_force(&self) -> Result<Vec<Stop>, AppError> {
         let mut tx = self.db().read().await?;
         let stops = db::stops::in_force(&mut tx, IN_FORCE_MAX).await?;
         let shown = stops.into_iter().map(|stop| self.with_confirmation(stop));

@@ -97,6 +97,11 @@ impl App {
         })
     }
 
+    /// How many drive connections there are.
+    pub(crate) fn drive_clients(&self) -> usize {
+        SESSIONS_MAX - self.inner.drive_slots.available_permits()
+    }
+
     /// A place for one more drive connection.
     ///
     /// # Errors

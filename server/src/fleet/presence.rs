@@ -2,7 +2,7 @@
 
 mod rivals;
 
-use std::collections::{BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -390,6 +390,25 @@ impl Presences {
             }
         }
         news
+    }
+
+    /// How many robots that are heard are slowed down, by the name of the strictest cause.
+    pub fn gate_causes(&self, now: Duration) -> BTreeMap<String, usize> {
+        let robots = self.lock();
+        let mut causes = BTreeMap::new();
+        for presence in robots.values() {
+            let state = presence
+                .state()
+                .filter(|_| presence.link(now) != LinkState::Offline);
+            let cause = state.and_then(|state| state.safety.gate.cause);
+            // A cause's name is that on the wire.
+            if let Some(serde_json::Value::String(name)) =
+                cause.and_then(|cause| serde_json::to_value(cause).ok())
+            {
+                *causes.entry(name).or_insert(0) += 1;
+            }
+        }
+        causes
     }
 
     /// How many robots have each link state.

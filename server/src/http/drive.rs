@@ -160,7 +160,7 @@ impl Connection {
         for (request, newer) in requests.into_iter().zip(newer) {
             match request {
                 DriveRequest::Drive(_) if newer => {
-                    self.app.counters().drive_commands_replaced.one()
+                    self.app.counters().drive_commands_replaced.one();
                 }
                 DriveRequest::Drive(drive) => self.drive(drive).await?,
                 DriveRequest::Acquire(driver) => self.acquire(&driver.name, false).await?,
@@ -324,13 +324,15 @@ impl Connection {
 /// The close code for what a client did; `None` if the connection is just gone.
 fn fault(error: &axum::Error) -> Option<(u16, String)> {
     use tokio_tungstenite::tungstenite::Error;
-    match error.source()?.downcast_ref::<Error>()? {
-        Error::Capacity(_) => {
-            let detail = format!("a frame has at most {DRIVE_FRAME_MAX} bytes");
-            Some((close_code::SIZE, detail))
-        }
-        Error::Utf8(_) => Some((close_code::INVALID, "a text is UTF-8".to_owned())),
-        Error::Protocol(cause) => Some((close_code::PROTOCOL, cause.to_string())),
-        _ => None,
+    let cause = error.source()?.downcast_ref::<Error>()?;
+    if let Error::Capacity(_) = cause {
+        let detail = format!("a frame has at most {DRIVE_FRAME_MAX} bytes");
+        Some((close_code::SIZE, detail))
+    } else if let Error::Utf8(_) = cause {
+        Some((close_code::INVALID, "a text is UTF-8".to_owned()))
+    } else if let Error::Protocol(broken) = cause {
+        Some((close_code::PROTOCOL, broken.to_string()))
+    } else {
+        None
     }
 }

@@ -42,15 +42,11 @@ impl Socket {
     async fn update(&mut self) -> DriveUpdate {
         let reading = async {
             loop {
-                match self.0.next().await.unwrap().unwrap() {
-                    Message::Text(text) => {
-                        let update = serde_json::from_str(&text).unwrap();
-                        if !matches!(update, DriveUpdate::View(_)) {
-                            return update;
-                        }
+                if let Message::Text(text) = self.0.next().await.unwrap().unwrap() {
+                    let update = serde_json::from_str(&text).unwrap();
+                    if !matches!(update, DriveUpdate::View(_)) {
+                        return update;
                     }
-                    Message::Ping(_) => {}
-                    other => panic!("{other:?}"),
                 }
             }
         };
@@ -89,10 +85,11 @@ impl Socket {
         // End times are told in the robot's time, which its states tell.
         self.view(|view| view.heard_age_ms.is_some()).await;
         self.send(&json!({"acquire": {"name": name}})).await;
-        match self.update().await {
-            DriveUpdate::Leased(lease) => lease,
-            other => panic!("{other:?}"),
-        }
+        let update = self.update().await;
+        let DriveUpdate::Leased(lease) = update else {
+            panic!("{update:?}");
+        };
+        lease
     }
 
     async fn drive(&mut self, linear_m_s: f64) {
@@ -178,13 +175,13 @@ async fn a_driver_drives_in_robot_time_and_losing_the_driver_lets_the_robot_stan
         }
     ));
     observer.send(&json!({"acquire": {"name": "Bob"}})).await;
-    match observer.update().await {
-        DriveUpdate::Refused { cause, detail } => {
-            assert_eq!(cause, DriveRefusal::Leased);
-            assert!(detail.contains("Ann"), "{detail}");
-        }
-        other => panic!("{other:?}"),
-    }
+    let update = observer.update().await;
+    let DriveUpdate::Refused { cause, detail } = update else {
+        panic!("{update:?}");
+    };
+    assert_eq!(cause, DriveRefusal::Leased);
+    assert!(detail.contains("Ann"), "{detail}");
+
     drop(observer);
     driver.drive(0.3).await;
     driven_at(&robot, 0.3).await;
@@ -253,13 +250,13 @@ async fn a_lease_is_taken_by_force_given_back_and_lost_with_the_robots_run() {
         panic!("not leased");
     };
     assert_eq!(lease.epoch, 2);
-    match ann.update().await {
-        DriveUpdate::Released { cause, detail } => {
-            assert_eq!(cause, ReleaseCause::Taken);
-            assert!(detail.contains("Bob"), "{detail}");
-        }
-        other => panic!("{other:?}"),
-    }
+    let update = ann.update().await;
+    let DriveUpdate::Released { cause, detail } = update else {
+        panic!("{update:?}");
+    };
+    assert_eq!(cause, ReleaseCause::Taken);
+    assert!(detail.contains("Bob"), "{detail}");
+
     ann.drive(0.9).await;
     assert!(matches!(
         ann.update().await,
@@ -307,10 +304,11 @@ async fn anybody_on_the_socket_may_stop_and_a_server_that_stops_lets_the_robot_s
     observer
         .send(&json!({"stop": {"by": "Bob", "reason": "smoke"}}))
         .await;
-    match observer.update().await {
-        DriveUpdate::Stopped(stop) => assert!(stop.confirmed_at.is_some(), "{stop:?}"),
-        other => panic!("{other:?}"),
-    }
+    let update = observer.update().await;
+    let DriveUpdate::Stopped(stop) = update else {
+        panic!("{update:?}");
+    };
+    assert!(stop.confirmed_at.is_some(), "{stop:?}");
     assert_eq!(robot.stops()[0].reason, "smoke");
     // A lease is given, and nothing is driven: the driver hears why.
     let mut driver = Socket::open(&yard, "rover-1").await;

@@ -434,12 +434,34 @@ fn answer(
             heard.sites.push(definition);
             Outcome::Done
         }
+        Verb::Stop | Verb::Clear | Verb::Lease | Verb::Limit => {
+            let mut state = state.lock().unwrap();
+            match in_safety(verb, &payload, &mut heard, &mut state) {
+                Some(outcome) => outcome,
+                None => return,
+            }
+        }
+    };
+    let payload = wire::encode(&Answer { boot, outcome }).unwrap();
+    query
+        .reply(query.key_expr().clone(), payload)
+        .wait()
+        .unwrap();
+}
+
+/// What it answers to all that may only slow it down; `None` is silence.
+fn in_safety(
+    verb: Verb,
+    payload: &[u8],
+    heard: &mut Heard,
+    state: &mut RobotState,
+) -> Option<Outcome> {
+    Some(match verb {
         Verb::Stop => {
             if heard.deaf_to_stops {
-                return;
+                return None;
             }
-            let stop: Stop = wire::decode(&payload).unwrap();
-            let mut state = state.lock().unwrap();
+            let stop: Stop = wire::decode(payload).unwrap();
             state.mode = RobotMode::Stopped;
             if let Some(mission) = &mut state.mission {
                 mission.paused = true;
@@ -454,8 +476,7 @@ fn answer(
             Outcome::Done
         }
         Verb::Clear => {
-            let clear: ClearStop = wire::decode(&payload).unwrap();
-            let mut state = state.lock().unwrap();
+            let clear: ClearStop = wire::decode(payload).unwrap();
             let newest = state.safety.stop.as_ref().map(|latch| latch.id);
             if newest.is_some_and(|newest| newest != clear.stop) {
                 Outcome::Refused {
@@ -470,8 +491,7 @@ fn answer(
             }
         }
         Verb::Lease => {
-            let lease: LeaseCommand = wire::decode(&payload).unwrap();
-            let mut state = state.lock().unwrap();
+            let lease: LeaseCommand = wire::decode(payload).unwrap();
             let other = state.safety.lease.clone();
             let other = other.filter(|other| other.driver.client != lease.holder.client);
             heard.leases.push(lease.clone());
@@ -494,13 +514,9 @@ fn answer(
             }
         }
         Verb::Limit => {
-            heard.limits.push(wire::decode(&payload).unwrap());
+            heard.limits.push(wire::decode(payload).unwrap());
             Outcome::Done
         }
-    };
-    let payload = wire::encode(&Answer { boot, outcome }).unwrap();
-    query
-        .reply(query.key_expr().clone(), payload)
-        .wait()
-        .unwrap();
+        Verb::Offer | Verb::Cancel | Verb::Pause | Verb::Resume | Verb::Site => return None,
+    })
 }

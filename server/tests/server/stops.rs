@@ -1,10 +1,11 @@
 //! Stops: at once, confirmed or shown as unconfirmed, repeated, cleared; and nothing starts by
 //! itself afterwards.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use reqwest::StatusCode;
 use serde_json::{Value, json};
+use tokio::time::Instant;
 use tread_api::mission::MissionState;
 use tread_api::page::Page;
 use tread_api::robot::Alert;

@@ -9,6 +9,7 @@ mod impostors;
 mod messages;
 mod missions;
 mod outages;
+mod safety;
 
 use std::path::Path;
 

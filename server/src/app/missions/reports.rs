@@ -3,6 +3,7 @@
 use jiff::Timestamp;
 use tread_api::ids::BootId;
 use tread_api::mission::{Actor, Cause, DRIVEN_POINTS_MAX, Mission, THETA_SAMPLES_MAX};
+use tread_api::robot::MissionProgress;
 use tread_api::wire::ingest::{MissionPhase, MissionReport};
 
 use super::transitions::Change;
@@ -153,6 +154,10 @@ async fn take_phase(
     let Some(change) = change else {
         return Ok(());
     };
+    let is_for_safety = |progress: &MissionProgress| progress.is_paused_for_safety();
+    if report.phase == MissionPhase::Paused && report.progress.as_ref().is_some_and(is_for_safety) {
+        db::missions::want_pause(tx, mission.id, true).await?;
+    }
     let reason = report.reason.as_deref();
     let step = Step {
         change,

@@ -184,6 +184,9 @@ fn in_hand(mission: &Standing, said: Option<MissionProgress>, differs: bool) -> 
         (true, false) if differs => Need::Settle(Change::Resume),
         (false, true) => Need::Pause,
         (true, false) => Need::Resume,
+        // Whoever stopped the robot, or drove it by hand: only a person lets the mission go on. The
+        // robot's report of the pause makes that what is wanted here too.
+        (false, false) if said.is_some_and(|said| said.is_paused_for_safety()) => Need::Wait,
         // A command that came late or twice had its way on the robot: once more.
         (false, false) if differs => Need::Resume,
         (true, true) if differs => Need::Pause,

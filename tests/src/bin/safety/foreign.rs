@@ -63,10 +63,59 @@ async fn lease(
     };
     let key = keys::command(&fleet.site(), &name(NUMBER)?, Verb::Lease);
     let answer: Answer = ask(session, &key, &command).await?;
-    match answer.outcome {
-        Outcome::Leased { epoch } => Ok((answer.boot, epoch)),
-        other => anyhow::bail!("the robot gives no lease: {other:?}"),
-    }
+    let Outcome::Leased { epoch } = answer.outcome else {
+        anyhow::bail!("the robot gives no lease: {:?}", answer.outcome);
+    };
+    Ok((answer.boot, epoch))
+}
+
+/// A command like the right one, with one thing wrong.
+fn wrong(random: &mut Random, right: DriveCommand, old_epoch: u64) -> anyhow::Result<Vec<u8>> {
+    let (epoch, seq, now_us) = (right.epoch, right.seq, right.sent_us);
+    let wrong = DriveCommand {
+        // Above all that were taken, so that only one thing is wrong.
+        seq: seq + 1,
+        // What is right asks for rest: one that is wrong and taken would be seen.
+        twist: Twist {
+            linear_m_s: 0.8,
+            angular_rad_s: 0.5,
+        },
+        ..right
+    };
+    let stranger = BootId::from_uuid(Uuid::new_v4());
+    let too_far = DRIVE_AHEAD_MAX_US * (2 + below(random, 1_000));
+    let wrong = match below(random, KINDS) {
+        0 => DriveCommand {
+            boot: stranger,
+            ..wrong
+        },
+        1 => DriveCommand {
+            epoch: old_epoch,
+            ..wrong
+        },
+        2 => DriveCommand {
+            epoch: epoch + 1,
+            ..wrong
+        },
+        3 => DriveCommand {
+            seq: below(random, seq) + 1,
+            ..wrong
+        },
+        4 => DriveCommand {
+            until_us: below(random, now_us),
+            ..wrong
+        },
+        5 => DriveCommand {
+            until_us: now_us + too_far,
+            ..wrong
+        },
+        6 => {
+            let text = String::from_utf8(wire::encode(&wrong)?)?;
+            return Ok(text.replace("0.8", "NaN").into_bytes());
+        }
+        _ => return Ok(vec![b'{'; 1 + usize::try_from(below(random, 4_000))?]),
+    };
+    Ok(wire::encode(&wrong)?)
 }
 
 pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Result<Vec<Check>> {
@@ -85,11 +134,6 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
     let mut random = Random::new(arguments.seed);
     let (mut seq, mut good, mut bad) = (0, 0, 0);
     let most = arguments.foreign * TRIES_MAX;
-    // What is wrong asks for motion, what is right for rest: one that is taken would be seen.
-    let motion = Twist {
-        linear_m_s: 0.8,
-        angular_rad_s: 0.5,
-    };
     while refused(counts(&agent)) < arguments.foreign && bad < most {
         let now_us = agent
             .state()
@@ -107,43 +151,7 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
         put(&publisher, wire::encode(&right)?).await?;
         good += 1;
         for _ in 0..BURST {
-            let wrong = DriveCommand {
-                // Above all that were taken, so that only one thing is wrong.
-                seq: seq + 1,
-                twist: motion,
-                ..right
-            };
-            let payload = match below(&mut random, KINDS) {
-                0 => wire::encode(&DriveCommand {
-                    boot: BootId::from_uuid(Uuid::new_v4()),
-                    ..wrong
-                })?,
-                1 => wire::encode(&DriveCommand {
-                    epoch: old_epoch,
-                    ..wrong
-                })?,
-                2 => wire::encode(&DriveCommand {
-                    epoch: epoch + 1,
-                    ..wrong
-                })?,
-                3 => wire::encode(&DriveCommand {
-                    seq: below(&mut random, seq) + 1,
-                    ..wrong
-                })?,
-                4 => wire::encode(&DriveCommand {
-                    until_us: below(&mut random, now_us),
-                    ..wrong
-                })?,
-                5 => wire::encode(&DriveCommand {
-                    until_us: now_us + DRIVE_AHEAD_MAX_US * (2 + below(&mut random, 1_000)),
-                    ..wrong
-                })?,
-                6 => String::from_utf8(wire::encode(&wrong)?)?
-                    .replace("0.8", "NaN")
-                    .into_bytes(),
-                _ => vec![b'{'; 1 + usize::try_from(below(&mut random, 4_000))?],
-            };
-            put(&publisher, payload).await?;
+            put(&publisher, wrong(&mut random, right, old_epoch)?).await?;
             bad += 1;
         }
         tokio::time::sleep(BREATH).await;

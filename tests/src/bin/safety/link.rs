@@ -94,9 +94,9 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
             _ = ticks.tick() => {
                 send(&mut socket, &drive).await?;
                 if began.elapsed() > FILL {
-                    let ((accepted, age_ms), refused) = counted();
+                    let ((accepted, oldest_ms), refused) = counted();
                     before.get_or_insert((accepted, refused));
-                    ages_ms.extend(age_ms);
+                    ages_ms.extend(oldest_ms);
                     sent += 1;
                 }
             }
@@ -154,10 +154,12 @@ async fn acquire(fleet: &Fleet) -> anyhow::Result<Socket> {
         let Message::Text(text) = frame else {
             continue;
         };
-        match serde_json::from_str(&text)? {
-            DriveUpdate::Leased(_) => return Ok(socket),
-            DriveUpdate::Refused { detail, .. } => anyhow::bail!("no lease: {detail}"),
-            _ => {}
+        let update = serde_json::from_str(&text)?;
+        if let DriveUpdate::Leased(_) = update {
+            return Ok(socket);
+        }
+        if let DriveUpdate::Refused { detail, .. } = update {
+            anyhow::bail!("no lease: {detail}");
         }
     }
 }

@@ -1,7 +1,7 @@
 //! What a mission needs, for what its robot says.
 
 use tread_api::ids::{BootId, MissionId, PlanHash};
-use tread_api::robot::{LoopStatus, MissionProgress, OutboxStatus, RobotMode};
+use tread_api::robot::{LoopStatus, MissionProgress, OutboxStatus, PauseCause, RobotMode};
 use tread_api::wire::state::RobotState;
 use uuid::Uuid;
 
@@ -52,6 +52,7 @@ struct Said {
     drives: bool,
     pending: u64,
     paused: bool,
+    paused_by: Option<PauseCause>,
 }
 
 fn presence(said: &Said) -> Presence {
@@ -65,7 +66,7 @@ fn presence(said: &Said) -> Presence {
         length_m: 2.0,
         cross_track_m: 0.0,
         paused: said.paused,
-        paused_by: None,
+        paused_by: said.paused_by,
     };
     let state = RobotState {
         robot: of.robot,
@@ -110,6 +111,7 @@ const IDLE: Said = Said {
     drives: false,
     pending: 0,
     paused: false,
+    paused_by: None,
 };
 
 #[test]
@@ -150,6 +152,7 @@ fn a_restart_loses_a_mission_only_after_the_old_records_had_their_say() {
         drives: false,
         pending: 1,
         paused: false,
+        paused_by: None,
     };
     assert_eq!(
         active(&restarted),
@@ -253,6 +256,15 @@ fn what_is_wanted_of_a_mission_in_hand_is_sent_until_the_robot_has_done_it() {
     assert_eq!(needs(active, false, &holding, JUST), Need::Wait);
     assert_eq!(needs(active, false, &holding, LONG_AGO), Need::Resume);
     assert_eq!(needs(paused, true, &driving, LONG_AGO), Need::Pause);
+    // Stopped, or driven by hand: nothing goes on before a person wants it.
+    for cause in [PauseCause::Stop, PauseCause::Teleoperation] {
+        let held = Said {
+            paused_by: Some(cause),
+            ..holding
+        };
+        assert_eq!(needs(active, false, &held, LONG_AGO), Need::Wait);
+        assert_eq!(needs(paused, false, &held, LONG_AGO), Need::Resume);
+    }
 }
 
 #[test]
