@@ -206,6 +206,20 @@ fn head(text: &mut String, name: &str, kind: &str, help: &str) {
     line(text, &format!("# TYPE {name} {kind}"));
 }
 
+/// Reasons to refuse whoever asks over HTTP, before the request is looked at.
+const OF_CLIENTS: [&str; 10] = [
+    "host",
+    "locked",
+    "no_token",
+    "origin",
+    "role",
+    "token_expired",
+    "token_malformed",
+    "token_revoked",
+    "token_unknown",
+    "too_long",
+];
+
 impl App {
     /// All metrics as text.
     ///
@@ -213,31 +227,47 @@ impl App {
     /// The database failed.
     pub async fn metrics(&self) -> Result<String, AppError> {
         let mut text = String::new();
+        self.write_fleet(&mut text).await?;
+        self.write_clients(&mut text);
+        let name = "tread_uptime_seconds";
+        head(&mut text, name, "gauge", "Time since the start.");
+        line(
+            &mut text,
+            &format!("{name} {}", self.uptime().as_secs_f64()),
+        );
+        let counters = serde_json::to_value(self.counters().values()).unwrap_or_default();
+        for (counter, value) in counters.as_object().into_iter().flatten() {
+            let name = format!("tread_{counter}_total");
+            head(&mut text, &name, "counter", "See GET /v1/server.");
+            line(&mut text, &format!("{name} {value}"));
+        }
+        self.queues().write(&mut text);
+        self.write_refusals(&mut text, counters.as_object());
+        self.write_durations(&mut text);
+        Ok(text)
+    }
+
+    /// Missions, robots and stops.
+    async fn write_fleet(&self, text: &mut String) -> Result<(), AppError> {
         let mut tx = self.db().read().await?;
         let counts = db::missions::counts(&mut tx).await?;
         drop(tx);
-        head(&mut text, "tread_missions", "gauge", "Missions by state.");
+        head(text, "tread_missions", "gauge", "Missions by state.");
         for state in tread_api::mission::MissionState::ALL {
             let found = counts.iter().find(|(of, _)| *of == state);
             let (name, count) = (state.as_str(), found.map_or(0, |(_, count)| *count));
-            line(
-                &mut text,
-                &format!("tread_missions{{state=\"{name}\"}} {count}"),
-            );
+            line(text, &format!("tread_missions{{state=\"{name}\"}} {count}"));
         }
-        head(&mut text, "tread_robots", "gauge", "Robots by link state.");
+        head(text, "tread_robots", "gauge", "Robots by link state.");
         for (link, count) in self.presences().link_counts(self.clock().elapsed()) {
             let name = link.as_str();
-            line(
-                &mut text,
-                &format!("tread_robots{{link=\"{name}\"}} {count}"),
-            );
+            line(text, &format!("tread_robots{{link=\"{name}\"}} {count}"));
         }
         let name = "tread_robots_reduced";
         let help = "Robots that are heard and slowed down, by the strictest cause.";
-        head(&mut text, name, "gauge", help);
+        head(text, name, "gauge", help);
         for (cause, count) in self.presences().gate_causes(self.clock().elapsed()) {
-            line(&mut text, &format!("{name}{{cause=\"{cause}\"}} {count}"));
+            line(text, &format!("{name}{{cause=\"{cause}\"}} {count}"));
         }
         let stops = self.stops_in_force().await?;
         let open = stops.iter().filter(|stop| stop.unconfirmed).count();
@@ -252,6 +282,17 @@ impl App {
                 open,
                 "Stops that their robots have not confirmed within 300 ms.",
             ),
+        ];
+        for (name, value, help) in gauges {
+            head(text, name, "gauge", help);
+            line(text, &format!("{name} {value}"));
+        }
+        Ok(())
+    }
+
+    /// Those who drive by hand and those who read events.
+    fn write_clients(&self, text: &mut String) {
+        let gauges = [
             (
                 "tread_drive_clients",
                 self.drive_clients(),
@@ -269,34 +310,19 @@ impl App {
             ),
         ];
         for (name, value, help) in gauges {
-            head(&mut text, name, "gauge", help);
-            line(&mut text, &format!("{name} {value}"));
+            head(text, name, "gauge", help);
+            line(text, &format!("{name} {value}"));
         }
         let name = "tread_event_clients_dropped_total";
-        head(
-            &mut text,
-            name,
-            "counter",
-            "Event clients that read too slowly.",
-        );
-        line(&mut text, &format!("{name} {}", self.hub().dropped_count()));
-        let name = "tread_uptime_seconds";
-        head(&mut text, name, "gauge", "Time since the start.");
-        line(
-            &mut text,
-            &format!("{name} {}", self.uptime().as_secs_f64()),
-        );
-        let counters = serde_json::to_value(self.counters().values()).unwrap_or_default();
-        for (counter, value) in counters.as_object().into_iter().flatten() {
-            let name = format!("tread_{counter}_total");
-            head(&mut text, &name, "counter", "See GET /v1/server.");
-            line(&mut text, &format!("{name} {value}"));
-        }
-        self.queues().write(&mut text);
-        self.write_refusals(&mut text, counters.as_object());
+        head(text, name, "counter", "Event clients that read too slowly.");
+        line(text, &format!("{name} {}", self.hub().dropped_count()));
+    }
+
+    /// How long things took.
+    fn write_durations(&self, text: &mut String) {
         let name = "tread_mission_seconds";
         head(
-            &mut text,
+            text,
             name,
             "histogram",
             "Missions from start to end, by end.",
@@ -304,33 +330,33 @@ impl App {
         let series = &self.mission_durations().series;
         let series = series.lock().unwrap_or_else(PoisonError::into_inner);
         for (state, histogram) in series.iter() {
-            histogram.write(&mut text, name, &format!("state=\"{state}\""));
+            histogram.write(text, name, &format!("state=\"{state}\""));
         }
         drop(series);
         let name = "tread_db_transaction_seconds";
-        head(&mut text, name, "histogram", "Transactions by use case.");
+        head(text, name, "histogram", "Transactions by use case.");
         let series = &self.db().transactions().series;
         let series = series.lock().unwrap_or_else(PoisonError::into_inner);
         for ((kind, writes), histogram) in series.iter() {
             let labels = format!("kind=\"{kind}\",writes=\"{writes}\"");
-            histogram.write(&mut text, name, &labels);
+            histogram.write(text, name, &labels);
         }
         drop(series);
         let name = "tread_db_write_wait_seconds";
-        head(&mut text, name, "histogram", "Wait for the turn to write.");
-        self.db().write_waits().write(&mut text, name, "");
+        head(text, name, "histogram", "Wait for the turn to write.");
+        self.db().write_waits().write(text, name, "");
         let name = "tread_http_request_seconds";
-        head(&mut text, name, "histogram", "Requests by route.");
+        head(text, name, "histogram", "Requests by route.");
         let series = &self.requests().series;
         let series = series.lock().unwrap_or_else(PoisonError::into_inner);
         for ((method, route, status), histogram) in series.iter() {
             let labels = format!("method=\"{method}\",route=\"{route}\",status=\"{status}\"");
-            histogram.write(&mut text, name, &labels);
+            histogram.write(text, name, &labels);
         }
-        Ok(text)
     }
 
-    /// What was refused, by reason: of robots by the counters that say so, of REST by the problem.
+    /// What was refused, by reason: of robots by the counters that say so, of clients by those of
+    /// identity, of requests by the problem.
     fn write_refusals(
         &self,
         text: &mut String,
@@ -345,7 +371,12 @@ impl App {
                 .contains(&counter.as_str())
                 .then_some(counter.as_str());
             if let Some(reason) = of_message.or(listed) {
-                let labels = format!("of=\"robot\",reason=\"{reason}\"");
+                let of = if OF_CLIENTS.contains(&reason) {
+                    "client"
+                } else {
+                    "robot"
+                };
+                let labels = format!("of=\"{of}\",reason=\"{reason}\"");
                 line(text, &format!("{name}{{{labels}}} {value}"));
             }
         }

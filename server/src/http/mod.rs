@@ -53,6 +53,8 @@ use crate::identity::origin::Names;
 
 /// Largest body of `POST /v1/missions`: a path of the most waypoints.
 pub const MISSION_BODY_MAX: usize = 16 * 1024 * 1024;
+/// Largest body of a sign-in, which anybody may send.
+pub const SIGN_IN_BODY_MAX: usize = 4 * 1024;
 /// Largest body of all other requests.
 pub const BODY_MAX: usize = 1024 * 1024;
 /// How long a request may take.
@@ -76,11 +78,13 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(missions::replace))
         .routes(routes!(missions::check))
         .layer(Extension(BodyLimit(MISSION_BODY_MAX)));
+    let session = OpenApiRouter::new()
+        .routes(routes!(session::create, session::get, session::end))
+        .layer(Extension(BodyLimit(SIGN_IN_BODY_MAX)));
     OpenApiRouter::with_openapi(Description::openapi())
         .routes(routes!(health::healthz))
         .routes(routes!(health::readyz))
         .routes(routes!(health::status))
-        .routes(routes!(session::create, session::get, session::end))
         .routes(routes!(tokens::list, tokens::create))
         .routes(routes!(tokens::revoke))
         .routes(routes!(audit::list))
@@ -111,6 +115,7 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(friction::segments))
         .layer(Extension(BodyLimit(BODY_MAX)))
         .merge(missions)
+        .merge(session)
 }
 
 /// The description of the API.

@@ -1,5 +1,6 @@
 //! The program as a service manager sees it.
 
+use std::os::unix::fs::PermissionsExt as _;
 use std::process::{Command, Output, Stdio};
 use std::time::Duration;
 
@@ -96,6 +97,32 @@ async fn the_program_starts_makes_its_database_and_stops_when_asked() {
         said(&second)
     );
     assert!(database.is_file());
+    let file = folder.path().join("admin.token");
+    let to_file = format!("--token-file={}", file.display());
+    let again = program(&["init", "--force", &to_file, &database_flag])
+        .output()
+        .unwrap();
+    assert!(
+        again.status.success() && again.stdout.is_empty(),
+        "{}",
+        said(&again)
+    );
+    let mode = std::fs::metadata(&file).unwrap().permissions().mode();
+    assert_eq!(mode & 0o777, 0o600);
+    let newer = std::fs::read_to_string(&file).unwrap();
+    let of = async |token: &str| {
+        let asked = client(Some(token.trim())).get(format!("{address}/v1/session"));
+        asked.send().await.unwrap().status()
+    };
+    assert_eq!(of(&newer).await, 200);
+    eventually(
+        "the running server has noticed that the first one was replaced",
+        async || {
+            let status = of(&token).await;
+            if status == 401 { Ok(()) } else { Err(status) }
+        },
+    )
+    .await;
     let asked = Command::new("kill")
         .arg(child.id().to_string())
         .status()

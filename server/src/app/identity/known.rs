@@ -1,12 +1,13 @@
-//! Who has shown a good secret, in memory: asked once for each secret, then known until it
-//! expires or is ended.
+//! Who has shown a good secret, in memory: looked up once, then known until it expires or is
+//! ended, and looked up again now and then, since `tread-server init` may have replaced it.
 //!
 //! A look-up that began before something was ended must not be kept after it: each end raises the
 //! generation, and only what was looked up within the present one is kept.
 
 use std::collections::HashMap;
-use std::sync::atomic::{AtomicI64, Ordering};
+use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 use tokio_util::sync::CancellationToken;
@@ -20,6 +21,9 @@ use crate::identity::secret::Fingerprint;
 const KNOWN_MAX: usize = 4_096;
 /// A token's last use is noted this often at the most.
 const TOUCH_EVERY: SignedDuration = SignedDuration::from_mins(10);
+
+/// How long who is known is not looked up again.
+const FRESH: Duration = Duration::from_secs(5);
 
 /// Somebody who has shown a good secret.
 #[derive(Debug)]
@@ -36,6 +40,8 @@ pub struct Credential {
     pub expires_at: Timestamp,
     ended: CancellationToken,
     touched_us: AtomicI64,
+    /// When it was looked up last, on the monotonic clock.
+    checked_ms: AtomicU64,
 }
 
 impl Credential {
@@ -43,6 +49,7 @@ impl Credential {
         token: &tread_api::identity::Token,
         session: Option<SessionId>,
         expires_at: Timestamp,
+        checked_at: Duration,
     ) -> Self {
         let touched = token.last_used_at;
         Self {
@@ -53,7 +60,19 @@ impl Credential {
             expires_at,
             ended: CancellationToken::new(),
             touched_us: AtomicI64::new(touched.map_or(i64::MIN, Timestamp::as_microsecond)),
+            checked_ms: AtomicU64::new(to_ms(checked_at)),
         }
+    }
+
+    /// Whether it was looked up a moment ago.
+    pub(super) fn is_fresh(&self, now: Duration) -> bool {
+        let checked_ms = self.checked_ms.load(Ordering::Relaxed);
+        to_ms(now).saturating_sub(checked_ms) < to_ms(FRESH)
+    }
+
+    /// Notes that it was looked up and still holds.
+    pub(super) fn checked(&self, now: Duration) {
+        self.checked_ms.store(to_ms(now), Ordering::Relaxed);
     }
 
     /// Cancelled when the token is revoked or the session ended; whatever stays open for long
@@ -83,6 +102,10 @@ impl Credential {
             .fetch_update(Ordering::Relaxed, Ordering::Relaxed, due)
             .is_ok()
     }
+}
+
+fn to_ms(time: Duration) -> u64 {
+    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
 /// All who are known.
@@ -175,7 +198,7 @@ mod tests {
             revoked_at: None,
             last_used_at: None,
         };
-        Credential::new(&token, None, expires_at)
+        Credential::new(&token, None, expires_at, Duration::ZERO)
     }
 
     fn secret(byte: u8) -> Fingerprint {
@@ -208,6 +231,15 @@ mod tests {
         known.end(|known| known.name == "desk");
         assert!(second.ended().is_cancelled());
         assert!(known.find(&secret(2), time(1)).is_none());
+    }
+
+    #[test]
+    fn who_is_known_is_looked_up_again_after_a_while() {
+        let known = credential(time(9));
+        let seconds = Duration::from_secs;
+        assert!(known.is_fresh(seconds(4)) && !known.is_fresh(seconds(5)));
+        known.checked(seconds(5));
+        assert!(known.is_fresh(seconds(9)) && !known.is_fresh(seconds(10)));
     }
 
     #[test]

@@ -252,12 +252,11 @@ impl App {
             Kind::Token(_) => shown == Shown::Token,
             Kind::Session => shown == Shown::Session,
         });
-        if let Some(secret) = &secret {
-            let known = &self.identity().known;
-            if let Some(credential) = known.find(&secret.fingerprint(), self.clock().now()) {
-                self.used(&credential);
-                return Ok(credential);
-            }
+        if let Some(secret) = &secret
+            && let Some(credential) = self.known(secret).await?
+        {
+            self.used(&credential);
+            return Ok(credential);
         }
         let mut sources = vec![Source::of_address(address)];
         sources.extend(
@@ -278,6 +277,47 @@ impl App {
             Err(_) => self.failed(sources),
         }
         found
+    }
+
+    /// Who is known in memory, and still holds.
+    async fn known(&self, secret: &Secret) -> Result<Option<Arc<Credential>>, DbError> {
+        let known = &self.identity().known;
+        let found = known.find(&secret.fingerprint(), self.clock().now());
+        let Some(credential) = found else {
+            return Ok(None);
+        };
+        if credential.is_fresh(self.clock().elapsed()) {
+            return Ok(Some(credential));
+        }
+        match self.kept(secret).await {
+            Ok(_) => {
+                credential.checked(self.clock().elapsed());
+                Ok(Some(credential))
+            }
+            Err(SignInError::Storage(cause)) => Err(cause),
+            Err(_gone) => {
+                known.end(|other| std::ptr::eq(other, &raw const *credential));
+                Ok(None)
+            }
+        }
+    }
+
+    /// What the database says of a secret.
+    async fn kept(&self, secret: &Secret) -> Result<Credential, SignInError> {
+        let (now, elapsed) = (self.clock().now(), self.clock().elapsed());
+        let fingerprint = secret.fingerprint();
+        let mut tx = self.db().read().await?;
+        let (token, session, expires_at) = match secret.kind() {
+            Kind::Token(_) => token_of(&mut tx, &fingerprint).await?,
+            Kind::Session => session_of(&mut tx, &fingerprint).await?,
+        };
+        if token.revoked_at.is_some() {
+            Err(SignInError::Revoked)
+        } else if expires_at <= now {
+            Err(SignInError::Expired)
+        } else {
+            Ok(Credential::new(&token, session, expires_at, elapsed))
+        }
     }
 
     fn used(&self, credential: &Credential) {
@@ -309,13 +349,8 @@ impl App {
         let known = &self.identity().known;
         for _ in 0..LOOK_UPS_MAX {
             let generation = known.generation();
+            let credential = self.kept(secret).await?;
             let now = self.clock().now();
-            let mut tx = self.db().read().await?;
-            let credential = match secret.kind() {
-                Kind::Token(_) => token_of(&mut tx, &fingerprint, now).await?,
-                Kind::Session => session_of(&mut tx, &fingerprint, now).await?,
-            };
-            drop(tx);
             if let Some(kept) = known.keep(fingerprint, credential, generation, now) {
                 return Ok(kept);
             }
@@ -384,41 +419,30 @@ impl App {
     }
 }
 
+/// The token of a secret, and when it expires.
 async fn token_of(
     tx: &mut Tx,
     fingerprint: &Fingerprint,
-    now: Timestamp,
-) -> Result<Credential, SignInError> {
+) -> Result<(Token, Option<SessionId>, Timestamp), SignInError> {
     let kept = db::tokens::by_lookup(tx, fingerprint).await?;
     let kept = kept.filter(|kept| fingerprint.matches(&kept.hash));
     let token = kept.ok_or(SignInError::Unknown)?.token;
-    if token.revoked_at.is_some() {
-        Err(SignInError::Revoked)
-    } else if token.expires_at <= now {
-        Err(SignInError::Expired)
-    } else {
-        Ok(Credential::new(&token, None, token.expires_at))
-    }
+    let expires_at = token.expires_at;
+    Ok((token, None, expires_at))
 }
 
+/// The session of a secret with its token, and when the first of them expires.
 async fn session_of(
     tx: &mut Tx,
     fingerprint: &Fingerprint,
-    now: Timestamp,
-) -> Result<Credential, SignInError> {
+) -> Result<(Token, Option<SessionId>, Timestamp), SignInError> {
     let kept = db::sessions::by_lookup(tx, fingerprint).await?;
     let kept = kept.filter(|kept| fingerprint.matches(&kept.hash));
     let session = kept.ok_or(SignInError::Unknown)?;
     let token = db::tokens::find(tx, session.token).await?;
     let token = token.ok_or(SignInError::Unknown)?;
     let expires_at = session.expires_at.min(token.expires_at);
-    if token.revoked_at.is_some() {
-        Err(SignInError::Revoked)
-    } else if expires_at <= now {
-        Err(SignInError::Expired)
-    } else {
-        Ok(Credential::new(&token, Some(session.id), expires_at))
-    }
+    Ok((token, Some(session.id), expires_at))
 }
 
 /// A new secret of the operating system's random numbers: the only place that makes one.

@@ -56,9 +56,10 @@ impl Access {
                 if PUBLIC.contains(&(&method, path)) {
                     continue;
                 }
-                match role_of(operation) {
-                    Some(role) => access.insert(path, &method, Needed::Role(role)),
-                    None => tracing::error!("{method} {path} names no role and is refused"),
+                if let Some(role) = role_of(operation) {
+                    access.insert(path, &method, Needed::Role(role));
+                } else {
+                    tracing::error!("{method} {path} names no role and is refused");
                 }
             }
         }
@@ -161,7 +162,7 @@ pub(in crate::http) fn describe(openapi: &mut OpenApi) {
 mod tests {
     use super::*;
 
-    fn operation(security: Value) -> Value {
+    fn operation(security: &Value) -> Value {
         serde_json::json!({ "security": security })
     }
 
@@ -169,7 +170,7 @@ mod tests {
     fn an_operation_needs_exactly_one_role_that_exists() {
         use serde_json::json;
         assert_eq!(
-            role_of(&operation(json!([{"token": ["admin"]}]))),
+            role_of(&operation(&json!([{"token": ["admin"]}]))),
             Some(Role::Admin)
         );
         for wrong in [
@@ -181,7 +182,7 @@ mod tests {
             json!([{"token": ["viewer", "admin"]}]),
             json!([{"session": ["viewer"]}]),
         ] {
-            assert_eq!(role_of(&operation(wrong.clone())), None, "{wrong}");
+            assert_eq!(role_of(&operation(&wrong)), None, "{wrong}");
         }
     }
 

@@ -77,24 +77,30 @@ pub(in crate::http) struct Guard {
 
 /// A refusal: what is told, and what is counted.
 struct Refusal {
-    response: Response,
+    response: Box<Response>,
     who: Option<Arc<Credential>>,
     is_audited: bool,
+}
+
+impl Refusal {
+    fn of(response: Response) -> Self {
+        Self {
+            response: Box::new(response),
+            who: None,
+            is_audited: true,
+        }
+    }
+
+    fn counted(counter: &Counter, problem: Problem) -> Self {
+        counter.one();
+        Self::of(problem.into_response())
+    }
 }
 
 impl Guard {
     pub(in crate::http) fn new(app: App, access: Access, names: Arc<Names>) -> Self {
         let access = Arc::new(access);
         Self { app, access, names }
-    }
-
-    fn refuse(&self, counter: &Counter, problem: Problem) -> Refusal {
-        counter.one();
-        Refusal {
-            response: problem.into_response(),
-            who: None,
-            is_audited: true,
-        }
     }
 
     /// Refuses what is wrong before anybody is asked who they are.
@@ -105,14 +111,14 @@ impl Guard {
         if query_length > QUERY_MAX || uri.path().len() > PATH_MAX {
             let detail = format!("at most {PATH_MAX} bytes of path and {QUERY_MAX} of query");
             let problem = Problem::new(ProblemType::RequestTooLong).detail(detail);
-            return Err(self.refuse(&counters.refused_too_long, problem));
+            return Err(Refusal::counted(&counters.refused_too_long, problem));
         }
         let host = provenance(request.headers()).host;
         if !host.is_some_and(|host| self.names.knows(host)) {
             let detail = "the `host` header must be an address of this server, `localhost`, or one \
                           of `hosts` in its configuration";
             let problem = Problem::new(ProblemType::UnknownHost).detail(detail);
-            return Err(self.refuse(&counters.refused_host, problem));
+            return Err(Refusal::counted(&counters.refused_host, problem));
         }
         Ok(())
     }
@@ -142,7 +148,10 @@ impl Guard {
         let detail = "ask from this server's own page, or with a token and from an origin of \
                       `allowed_origins` in its configuration";
         let problem = Problem::new(ProblemType::ForeignOrigin).detail(detail);
-        Err(self.refuse(&self.app.counters().refused_origin, problem))
+        Err(Refusal::counted(
+            &self.app.counters().refused_origin,
+            problem,
+        ))
     }
 
     async fn check_subject(
@@ -154,7 +163,7 @@ impl Guard {
     ) -> Result<Arc<Credential>, Refusal> {
         let counters = self.app.counters();
         let Some((text, shown)) = shown(headers, self.names.is_tls) else {
-            let mut refusal = self.refuse(&counters.refused_no_token, unauthenticated());
+            let mut refusal = Refusal::counted(&counters.refused_no_token, unauthenticated());
             // Whoever shows nothing has tried nothing.
             refusal.is_audited = false;
             say_how(&mut refusal.response);
@@ -168,11 +177,7 @@ impl Guard {
                 // So that the browser ceases to show what is over.
                 browser::take_cookie(response.headers_mut(), self.names.is_tls);
             }
-            Refusal {
-                response,
-                who: None,
-                is_audited: true,
-            }
+            Refusal::of(response)
         })?;
         if credential.role.includes(needed) {
             return Ok(credential);
@@ -182,7 +187,7 @@ impl Guard {
             credential.name, credential.role
         );
         let problem = Problem::new(ProblemType::Forbidden).detail(detail);
-        let mut refusal = self.refuse(&counters.refused_role, problem);
+        let mut refusal = Refusal::counted(&counters.refused_role, problem);
         refusal.who = Some(credential);
         Err(refusal)
     }
@@ -262,7 +267,7 @@ pub(in crate::http) async fn stand(
             if refusal.is_audited {
                 guard.note(asked, &refusal.response, refusal.who.as_ref(), false);
             }
-            return refusal.response;
+            return *refusal.response;
         }
     };
     let is_change = is_change(request.method());
@@ -314,11 +319,9 @@ impl Guard {
                 if let Some(methods) = methods.and_then(|names| HeaderValue::try_from(names).ok()) {
                     response.headers_mut().insert(header::ALLOW, methods);
                 }
-                Err(Refusal {
-                    response,
-                    who: None,
-                    is_audited: false,
-                })
+                let mut refusal = Refusal::of(response);
+                refusal.is_audited = false;
+                Err(refusal)
             }
         }
     }

@@ -37,10 +37,12 @@ pub(in crate::http) async fn create(
         Err(error) => return Ok(sign_in_problem(&app, &error)),
     };
     let opened = app.open_session(&credential).await;
-    let (credential, secret) = opened.map_err(|error| match error {
-        // It was revoked in between.
-        AppError::UnknownToken(_) => unauthenticated(),
-        other => other.into(),
+    let (credential, secret) = opened.map_err(|error| {
+        if matches!(error, AppError::UnknownToken(_)) {
+            // It was revoked in between.
+            return unauthenticated();
+        }
+        error.into()
     })?;
     let left = credential.expires_at.duration_since(app.clock().now());
     let answer = (StatusCode::CREATED, Json(credential.session()));

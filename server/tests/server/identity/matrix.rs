@@ -67,6 +67,7 @@ fn filled(path: &str) -> String {
 #[test]
 fn every_operation_names_one_role_or_is_on_the_named_list() {
     assert_eq!(PUBLIC, OPEN);
+    let access = tread_server::http::access();
     for (method, path, security) in operations() {
         if is_open(&method, &path) {
             assert!(
@@ -88,7 +89,7 @@ fn every_operation_names_one_role_or_is_on_the_named_list() {
             is_admins,
             "{method} {path} is for {role}"
         );
-        let needed = tread_server::http::access().needed(&method, &path);
+        let needed = access.needed(&method, &path);
         assert_eq!(needed, Some(Needed::Role(role)), "{method} {path}");
         let reads = method == Method::GET || path == "/v1/session" || path.ends_with("/stop");
         if !reads {

@@ -20,6 +20,7 @@ use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use serde::Serialize;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
+use tokio::runtime::Handle;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior};
 use tread_tests::fleet::Fleet;
@@ -178,11 +179,16 @@ impl Asker {
 }
 
 /// Opens half-open connections that stay, or come again, until the result is dropped.
-fn attack(address: SocketAddr, count: u32, reopened: &Arc<AtomicU64>) -> JoinSet<()> {
+fn attack(
+    attacker: &Handle,
+    address: SocketAddr,
+    count: u32,
+    reopened: &Arc<AtomicU64>,
+) -> JoinSet<()> {
     let mut open = JoinSet::new();
     for number in 0..count {
         let reopened = Arc::clone(reopened);
-        open.spawn(async move {
+        let attacking = async move {
             // Over the time to settle, not all in one moment.
             tokio::time::sleep(SETTLE * number / (2 * count)).await;
             loop {
@@ -195,14 +201,25 @@ fn attack(address: SocketAddr, count: u32, reopened: &Arc<AtomicU64>) -> JoinSet
                 reopened.fetch_add(1, Ordering::Relaxed);
                 tokio::time::sleep(REOPEN_REST).await;
             }
-        });
+        };
+        open.spawn_on(attacking, attacker);
     }
     open
 }
 
-#[tokio::main]
-async fn main() -> anyhow::Result<ExitCode> {
-    let arguments = Arguments::parse();
+fn main() -> anyhow::Result<ExitCode> {
+    // A runtime for each, so that what is measured is the server and not the attacker's tasks.
+    let runtime = || {
+        tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()
+    };
+    let attacker = runtime()?;
+    runtime()?.block_on(measure(Arguments::parse(), attacker.handle()))
+}
+
+async fn measure(arguments: Arguments, attacker: &Handle) -> anyhow::Result<ExitCode> {
     let (_, most) = getrlimit(Resource::RLIMIT_NOFILE)?;
     setrlimit(Resource::RLIMIT_NOFILE, most, most)?;
     anyhow::ensure!(
@@ -236,7 +253,7 @@ async fn main() -> anyhow::Result<ExitCode> {
             } else {
                 0
             };
-            let open = attack(address, count, &reopened);
+            let open = attack(attacker, address, count, &reopened);
             tokio::time::sleep(SETTLE).await;
             let rate_hz = arguments.rate_hz / 2;
             tokio::try_join!(
