@@ -48,7 +48,7 @@ pub struct HandReport {
     /// Trials in which the robot took more way to rest than `v²/2a + v·0.25 s`, or did not rest;
     /// `a` is the braking ramp, or what the ground gives where that is less.
     pub overruns: u64,
-    /// The largest share of that way that was used.
+    /// The largest share of that way, with 5 mm for noise, that was used.
     pub worst_way_share: f64,
 }
 
@@ -172,22 +172,30 @@ impl Trial<'_> {
         let until = self.bench.now + SETTLE_MAX;
         let model = RobotModel::yi2007();
         let ramp_m_s2 = GateLimits::of(&model).wheel_braking_max_rad_s2 * model.wheel_radius_m();
-        // Ground on which locked wheels give less than the ramp asks for is the ground's matter.
-        let ground = self.bench.drive.ground_truth().curve();
-        let ground_m_s2 = ground.map_or(0.0, |curve| curve.mu(1.0) * GRAVITY_M_S2);
-        let braking_m_s2 = ramp_m_s2.min(ground_m_s2);
+        let mut braking_m_s2 = ramp_m_s2;
         // Way since the last end, and the speed then; begins anew with every end.
         let mut since: Option<(u64, f64, f64)> = None;
         while self.bench.now < until {
             let before = self.bench.drive.truth().pose.point();
+            let before_us = self.bench.now_us();
             self.tick();
+            // Where locked wheels give less than the ramp asks for, that is the ground's matter.
+            let ground = self.bench.drive.ground_truth().curve();
+            let ground_m_s2 = ground.map_or(0.0, |curve| curve.mu(1.0) * GRAVITY_M_S2);
+            braking_m_s2 = braking_m_s2.min(ground_m_s2);
             let truth = self.bench.drive.truth();
             let step_m = before.distance_m(truth.pose.point());
             let (now_us, speed_m_s) = (self.bench.now_us(), truth.twist().linear_m_s.abs());
             match self.last_end {
                 Some((end_us, _)) if now_us >= end_us => match &mut since {
                     Some((known_us, _, way_m)) if *known_us == end_us => *way_m += step_m,
-                    Some(_) | None => since = Some((end_us, speed_m_s, step_m)),
+                    Some(_) | None => {
+                        // Of this tick's way only what came after the end.
+                        let after = Duration::from_micros(now_us - end_us.max(before_us));
+                        let whole = Duration::from_micros(now_us - before_us);
+                        let share = after.as_secs_f64() / whole.as_secs_f64();
+                        since = Some((end_us, speed_m_s, share * step_m));
+                    }
                 },
                 Some(_) | None => {}
             }
@@ -197,7 +205,9 @@ impl Trial<'_> {
                     let report = &mut *self.report;
                     report.fastest_m_s = report.fastest_m_s.max(speed_m_s);
                     if speed_m_s > 0.1 {
-                        report.worst_way_share = report.worst_way_share.max(way_m / allowed_m);
+                        report.worst_way_share = report
+                            .worst_way_share
+                            .max(way_m / (allowed_m + MEASURING_M));
                     }
                     report.overruns += u64::from(way_m > allowed_m + MEASURING_M);
                 }
