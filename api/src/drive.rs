@@ -138,6 +138,8 @@ pub enum DriveRefusal {
     NoLease,
     /// A stop is in force; nothing is driven until it is cleared.
     Stopped,
+    /// The token's role may watch and stop, not drive.
+    Forbidden,
     /// The robot does not answer, or has not been heard.
     Unreachable,
     /// The robot will not.

@@ -16,7 +16,7 @@ use tokio::net::TcpStream;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior};
-use tokio_tungstenite::tungstenite::{Error, Message};
+use tokio_tungstenite::tungstenite::{ClientRequestBuilder, Error, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async};
 use tread_api::drive::{
     Drive, DriveRequest, DriveUpdate, DriveView, DriverName, Nothing, StopWords,
@@ -202,7 +202,20 @@ async fn connect(arguments: &DriveArguments, client: &Client) -> anyhow::Result<
     client.robot(site, robot).await?;
     let address = client.address().replacen("http://", "ws://", 1);
     let url = format!("{address}/v1/sites/{site}/robots/{robot}/drive");
-    let connecting = tokio::time::timeout(CONNECT_MAX, connect_async(&url));
+    if !url.starts_with("ws://") {
+        bail!(
+            "`tread drive` cannot speak TLS yet: run it on the server's machine, or through a tunnel \
+             to its loopback address"
+        );
+    }
+    let uri = url
+        .parse()
+        .with_context(|| format!("{url} is no address"))?;
+    let mut request = ClientRequestBuilder::new(uri);
+    if let Some(token) = client.token() {
+        request = request.with_header("authorization", format!("Bearer {token}"));
+    }
+    let connecting = tokio::time::timeout(CONNECT_MAX, connect_async(request));
     let (socket, _) = connecting
         .await
         .with_context(|| format!("{url} does not answer"))?

@@ -23,7 +23,7 @@ use tread_api::keys::Verb;
 use tread_api::page::Page;
 use tread_api::robot::Severity;
 use tread_api::stop::{FleetStop, STOP_CONFIRM_MAX_MS, STOP_TEXT_MAX, Stop};
-use tread_api::wire::command::Outcome;
+use tread_api::wire::command::{Answer, Outcome};
 use tread_api::wire::safety::{ClearStop, Stop as StopCommand};
 
 use super::missions::control::hold_all;
@@ -402,11 +402,10 @@ pub(super) async fn tell(app: &App, commands: &Commands, stop: &Stop) -> bool {
     let key = (stop.site.clone(), stop.robot.clone());
     app.counters().stops_sent.one();
     // Whatever runs under the robot's name stops; only its present run can confirm.
-    let (_anybody, answer) = tokio::join!(
-        commands.send_to(&key, None, Verb::Stop, &command),
-        commands.send(&key, Verb::Stop, &command),
-    );
-    match answer.map(|answer| answer.outcome) {
+    let present = app.presences().get(&key).boot().map(|(boot, _since)| boot);
+    let answer = commands.send_to(&key, None, Verb::Stop, &command).await;
+    let confirms = |answer: &Answer| present.is_none_or(|boot| boot == answer.boot);
+    match answer.filter(confirms).map(|answer| answer.outcome) {
         Some(Outcome::Refused { detail, .. }) => {
             error!(robot.id = %stop.robot, "robot `{}` does not stop: {detail}", stop.robot);
             false

@@ -8,12 +8,14 @@
 //! | 1001 | the server stops |
 //! | 1003 | a binary frame |
 //! | 1007 | a text that is not JSON |
-//! | 1008 | JSON that says nothing known, or too few pongs |
+//! | 1008 | JSON that says nothing known, too few pongs, or a token that has ended |
 //! | 1009 | a frame above [`DRIVE_FRAME_MAX`] bytes |
 
 use std::error::Error as _;
+use std::sync::Arc;
 use std::time::Duration;
 
+use axum::Extension;
 use axum::extract::State;
 use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade, close_code};
 use axum::response::Response;
@@ -24,12 +26,16 @@ use tread_api::drive::{
     DRIVE_FRAME_MAX, DRIVE_VIEW_PERIOD_MS, Drive, DriveRefusal, DriveRequest, DriveUpdate,
     ReleaseCause,
 };
+use tread_api::identity::Role;
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::problem::{ProblemBody, ProblemType};
 
+use super::connections::Slot;
 use super::extract::Path;
+use super::identity::guard::Subject;
 use super::problem::Problem;
 use crate::app::App;
+use crate::app::identity::Credential;
 use crate::app::stops::StopWords;
 use crate::app::teleop::{Refused, Session};
 
@@ -45,14 +51,18 @@ const DRAIN_MAX: usize = 64;
 const REFUSAL_PERIOD: Duration = Duration::from_millis(500);
 
 /// A WebSocket to watch a robot and to drive it: one JSON object in each text frame, `DriveRequest`
-/// from the client, `DriveUpdate` from the server.
+/// from the client, `DriveUpdate` from the server. Whoever may read may watch and stop; to drive
+/// takes an operator.
 #[utoipa::path(get, path = "/v1/sites/{site}/robots/{robot}/drive", tag = "safety",
+    security(("token" = ["viewer"])),
     operation_id = "drive_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
     responses((status = 101, description = "The frames of the socket", body = DriveUpdate),
         (status = 400, body = ProblemBody), (status = 404, body = ProblemBody),
         (status = 409, body = ProblemBody)))]
 pub(super) async fn drive(
     State(app): State<App>,
+    Subject(subject): Subject,
+    place: Option<Extension<Arc<Slot>>>,
     Path((site, robot)): Path<(SiteId, RobotId)>,
     upgrade: Result<WebSocketUpgrade, axum::extract::ws::rejection::WebSocketUpgradeRejection>,
 ) -> Result<Response, Problem> {
@@ -62,6 +72,8 @@ pub(super) async fn drive(
     })?;
     let session = app.begin_drive(&site, &robot).await?;
     let slot = app.drive_slot()?;
+    // A socket is no idle connection that gives way to new ones.
+    let at_work = place.map(|Extension(place)| place.work());
     let stop = session.stop_token();
     let upgrade = upgrade
         .max_frame_size(DRIVE_FRAME_MAX)
@@ -71,6 +83,7 @@ pub(super) async fn drive(
             app,
             socket,
             session,
+            subject,
             heard_at: Instant::now(),
             ping_due: Instant::now(),
             pinged_at: None,
@@ -79,7 +92,7 @@ pub(super) async fn drive(
         };
         let end = connection.run(&stop).await;
         connection.end(end).await;
-        drop(slot);
+        drop((slot, at_work));
     }))
 }
 
@@ -95,6 +108,7 @@ struct Connection {
     app: App,
     socket: WebSocket,
     session: Session,
+    subject: Arc<Credential>,
     heard_at: Instant,
     ping_due: Instant,
     /// When the ping went out that is not answered yet.
@@ -112,6 +126,7 @@ impl Connection {
         }
         let mut views = tokio::time::interval(Duration::from_millis(DRIVE_VIEW_PERIOD_MS));
         views.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        let ended = self.subject.ended();
         loop {
             let went = tokio::select! {
                 biased;
@@ -119,6 +134,7 @@ impl Connection {
                     code: close_code::AWAY,
                     detail: "the server stops".to_owned(),
                 }),
+                () = ended.cancelled() => Err(signed_out()),
                 frame = self.socket.recv() => self.receive(frame).await,
                 _ = views.tick() => self.show().await,
             };
@@ -168,7 +184,7 @@ impl Connection {
                 DriveRequest::Release(_) => self.release().await?,
                 DriveRequest::Stop(words) => {
                     let words = StopWords {
-                        by: words.by,
+                        by: words.by.or_else(|| Some(self.subject.name.clone())),
                         reason: words.reason,
                     };
                     self.stop(words).await?;
@@ -224,6 +240,13 @@ impl Connection {
     }
 
     async fn acquire(&mut self, name: &str, take: bool) -> Result<(), End> {
+        if self.subject.role < Role::Operator {
+            let refused = DriveUpdate::Refused {
+                cause: DriveRefusal::Forbidden,
+                detail: "to drive takes a token of an operator".to_owned(),
+            };
+            return self.send(&refused).await;
+        }
         let update = match self.session.acquire(name, take).await {
             Ok(lease) => DriveUpdate::Leased(lease),
             Err(Refused { cause, detail }) => DriveUpdate::Refused { cause, detail },
@@ -275,6 +298,9 @@ impl Connection {
                 detail: "nothing was heard of this socket, not even a pong".to_owned(),
             });
         }
+        if self.app.clock().now() >= self.subject.expires_at {
+            return Err(signed_out());
+        }
         if let Some((cause, detail)) = self.session.lost_lease() {
             self.send(&DriveUpdate::Released { cause, detail }).await?;
         }
@@ -318,6 +344,13 @@ impl Connection {
                 let _ = self.put(Message::Close(Some(frame))).await;
             }
         }
+    }
+}
+
+fn signed_out() -> End {
+    End::Closed {
+        code: close_code::POLICY,
+        detail: "the token or session has ended".to_owned(),
     }
 }
 

@@ -4,10 +4,11 @@
 use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::{Value, json};
 use tokio::net::TcpStream;
-use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::{ClientRequestBuilder, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async};
 use tread_api::drive::{DriveRefusal, DriveUpdate, DriveView, ReleaseCause};
 use tread_api::geometry::Twist;
+use tread_api::identity::Role;
 use tread_api::mission::MissionState;
 use tread_api::safety::Lease;
 use tread_api::wire::safety::LeaseAction;
@@ -15,15 +16,22 @@ use tread_api::wire::safety::LeaseAction;
 use crate::harness::{PATIENCE, Yard, eventually};
 use crate::robot::Robot;
 
+fn request(yard: &Yard, robot: &str, token: &str) -> ClientRequestBuilder {
+    let url = yard.url(&format!("/v1/sites/yard/robots/{robot}/drive"));
+    let url = url.replace("http://", "ws://").parse().unwrap();
+    ClientRequestBuilder::new(url).with_header("authorization", format!("Bearer {token}"))
+}
+
 /// A client of the drive socket.
 pub(crate) struct Socket(WebSocketStream<MaybeTlsStream<TcpStream>>);
 
 impl Socket {
     pub(crate) async fn open(yard: &Yard, robot: &str) -> Self {
-        let url = yard.url(&format!("/v1/sites/yard/robots/{robot}/drive"));
-        let (socket, _) = connect_async(url.replace("http://", "ws://"))
-            .await
-            .unwrap();
+        Self::open_as(yard, robot, yard.admin()).await
+    }
+
+    async fn open_as(yard: &Yard, robot: &str, token: &str) -> Self {
+        let (socket, _) = connect_async(request(yard, robot, token)).await.unwrap();
         let mut socket = Self(socket);
         let first = socket.update().await;
         assert!(matches!(first, DriveUpdate::Welcome { .. }), "{first:?}");
@@ -356,12 +364,41 @@ async fn of_a_flood_of_commands_the_newest_counts_and_a_plain_request_is_told_wh
         (status.as_u16(), body["type"].as_str()),
         (400, Some("/problems/invalid-header"))
     );
-    let url = yard
-        .url("/v1/sites/yard/robots/nobody/drive")
-        .replace("http://", "ws://");
+    let nobody = request(&yard, "nobody", yard.admin());
     assert!(
-        connect_async(url).await.is_err(),
+        connect_async(nobody).await.is_err(),
         "a robot that is not known was driven"
     );
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_viewer_watches_and_stops_but_does_not_drive_and_a_revoked_token_ends_the_socket() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let viewer = yard.token("eyes", Role::Viewer).await;
+    let mut socket = Socket::open_as(&yard, robot.id.as_str(), &viewer.secret).await;
+    socket.send(&json!({"acquire": {"name": "Eve"}})).await;
+    let refused = socket.update().await;
+    assert!(
+        matches!(
+            refused,
+            DriveUpdate::Refused {
+                cause: DriveRefusal::Forbidden,
+                ..
+            }
+        ),
+        "{refused:?}"
+    );
+    socket.send(&json!({"stop": {}})).await;
+    let DriveUpdate::Stopped(stop) = socket.update().await else {
+        panic!("a viewer could not stop");
+    };
+    assert_eq!(stop.by, "eyes", "the token's name says who");
+    let revoke = yard
+        .client()
+        .delete(yard.url(&format!("/v1/tokens/{}", viewer.token.id)));
+    assert!(yard.send(revoke).await.0.is_success());
+    assert_eq!(socket.closed().await, 1008);
     yard.server.stop().await.unwrap();
 }

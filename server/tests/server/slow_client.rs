@@ -31,7 +31,11 @@ async fn deaf(yard: &Yard) -> TcpStream {
     let socket = TcpSocket::new_v4().unwrap();
     socket.set_recv_buffer_size(4_096).unwrap();
     let mut stream = socket.connect(yard.server.http_address()).await.unwrap();
-    let request = "GET /v1/events HTTP/1.1\r\nhost: test\r\naccept: text/event-stream\r\n\r\n";
+    let request = format!(
+        "GET /v1/events HTTP/1.1\r\nhost: localhost\r\nauthorization: Bearer {}\r\n\
+         accept: text/event-stream\r\n\r\n",
+        yard.admin()
+    );
     stream.write_all(request.as_bytes()).await.unwrap();
     stream
 }

@@ -6,7 +6,7 @@ use futures_util::{SinkExt as _, StreamExt as _};
 use reqwest::Method;
 use serde_json::{Value, json};
 use tokio_tungstenite::connect_async;
-use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::{ClientRequestBuilder, Message};
 use tread_api::drive::{Drive, DriveRequest, DriveUpdate, DriverName};
 use tread_api::ids::RobotId;
 use tread_api::mission::MissionState;
@@ -115,7 +115,9 @@ async fn a_robot_is_driven_by_hand_within_its_fence_and_stands_when_its_driver_i
 
     let address = fleet.http_address();
     let url = format!("ws://{address}/v1/sites/{SITE}/robots/{}/drive", robot());
-    let (mut socket, _) = connect_async(url).await.unwrap();
+    let request = ClientRequestBuilder::new(url.parse().unwrap())
+        .with_header("authorization", format!("Bearer {}", fleet.token()));
+    let (mut socket, _) = connect_async(request).await.unwrap();
     let say = |request: &DriveRequest| Message::text(serde_json::to_string(request).unwrap());
     let driver = DriverName {
         name: "Ann".to_owned(),

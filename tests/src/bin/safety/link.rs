@@ -9,7 +9,7 @@ use anyhow::Context;
 use futures_util::{SinkExt as _, StreamExt as _};
 use tokio::net::TcpStream;
 use tokio::time::{Instant, MissedTickBehavior};
-use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::{ClientRequestBuilder, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async};
 use tread_api::drive::{Drive, DriveRequest, DriveUpdate, DriverName};
 use tread_api::keys;
@@ -141,7 +141,9 @@ async fn acquire(fleet: &Fleet) -> anyhow::Result<Socket> {
     let robot = name(NUMBER)?;
     let address = fleet.http_address();
     let url = format!("ws://{address}/v1/sites/{SITE}/robots/{robot}/drive");
-    let (mut socket, _) = connect_async(url).await?;
+    let request = ClientRequestBuilder::new(url.parse()?)
+        .with_header("authorization", format!("Bearer {}", fleet.token()));
+    let (mut socket, _) = connect_async(request).await?;
     let driver = DriverName {
         name: "safety".to_owned(),
     };
