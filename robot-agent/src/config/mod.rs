@@ -170,7 +170,7 @@ pub struct AgentConfig {
     /// The base.
     pub drive: SimulatedConfig,
     /// Holders of external limits whose silence holds the robot, at most
-    /// [`LIMITS_MAX`](tread_api::safety::LIMITS_MAX).
+    /// [`LIMITS_MAX`].
     pub required_holders: Vec<HolderId>,
     /// Bounds of the outbox.
     pub outbox: outbox::Limits,

@@ -89,7 +89,8 @@ async fn of_two_agents_under_one_name_the_newest_counts_and_the_other_ends_its_m
 async fn a_robot_whose_loop_stands_still_is_offline_although_its_agent_speaks() {
     let mut fleet = fleet().await;
     let robot: RobotId = "rover-1".parse().unwrap();
-    fleet.agents_get(&["--stall-s=5,5"]);
+    // Shorter than the 2 s after which the agent's own watchdog would end it.
+    fleet.agents_get(&["--stall-s=5,1.9"]);
     fleet.start_agent(&robot, 0.0).await;
     let link = || async {
         let seen = fleet.rest.robot(&robot).await;
