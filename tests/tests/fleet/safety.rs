@@ -43,7 +43,7 @@ async fn a_stop_outlives_its_agent_and_its_clear_starts_nothing() {
     let stop = fleet.rest.post(&path, &json!({"by": "Ann"})).await;
     let stop: Stop = serde_json::from_value(stop).unwrap();
     assert!(stop.confirmed_at.is_some(), "{stop:?}");
-    live(&fleet, "it stands", |live| speed_m_s(live).abs() < 0.02).await;
+    let before = live(&fleet, "it stands", |live| speed_m_s(live).abs() < 0.02).await;
     fleet
         .rest
         .mission_reaches(driven, &[MissionState::Paused], SHORT)
@@ -52,7 +52,7 @@ async fn a_stop_outlives_its_agent_and_its_clear_starts_nothing() {
     fleet.kill_agent(&robot());
     fleet.start_agent(&robot(), 0.0).await;
     let back = live(&fleet, "it is stopped still", |live| {
-        live.mode == RobotMode::Stopped
+        live.boot != before.boot && live.mode == RobotMode::Stopped
     })
     .await;
     assert_eq!(back.safety.stop.map(|latch| latch.id), Some(stop.id));
