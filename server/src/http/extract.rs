@@ -43,9 +43,10 @@ impl<S: Send + Sync, T: DeserializeOwned + Serialize> FromRequest<S> for Json<T>
         let limit = request.extensions().get::<BodyLimit>().copied();
         let limit = limit.unwrap_or(BodyLimit(super::BODY_MAX));
         let slot = request.extensions().get::<AuditSlot>().cloned();
-        let parsed = parse(&read(request.into_body(), limit).await?)?;
+        let body = read(request.into_body(), limit).await?;
+        let parsed = parse(&body)?;
         if let Some(slot) = slot {
-            slot.leave(&serde_json::to_value(&parsed).unwrap_or_default());
+            slot.leave(&body);
         }
         Ok(Self(parsed))
     }

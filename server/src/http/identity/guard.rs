@@ -25,7 +25,7 @@ use crate::counters::Counter;
 use crate::http::REQUEST_ID;
 use crate::http::problem::Problem;
 use crate::identity::origin::{Names, Provenance};
-use crate::identity::redact::redacted;
+use crate::identity::redact::redacted_text;
 
 /// Longest query of a request, bytes.
 const QUERY_MAX: usize = 4_096;
@@ -57,9 +57,9 @@ pub(in crate::http) struct AuditSlot(Arc<OnceLock<Value>>);
 
 impl AuditSlot {
     /// Leaves a body, without its secrets.
-    pub(in crate::http) fn leave(&self, body: &Value) {
+    pub(in crate::http) fn leave(&self, body: &[u8]) {
         // The first one is the request's; there is no second.
-        let _ = self.0.set(redacted(body));
+        let _ = self.0.set(redacted_text(body));
     }
 }
 
