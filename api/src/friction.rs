@@ -7,6 +7,7 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use crate::geometry::Point;
 use crate::ids::{ConfigurationId, MissionId, RobotId};
 use crate::site::Cell;
 use crate::terrain::{TerrainClass, TerrainRef};
@@ -110,7 +111,9 @@ impl Segment {
             return Err(InvalidSegment::EndsBeforeStart);
         }
         check(
-            self.theta.information > 0.0 && information(&self.theta, THETA_MAX),
+            self.theta.information > 0.0
+                && self.theta.weighted > 0.0
+                && information(&self.theta, THETA_MAX),
             "theta",
         )?;
         let track = self.effective_track_ratio.as_ref();
@@ -160,6 +163,9 @@ pub struct ThetaEstimate {
 /// Standard deviations to either side of a 95 % interval.
 pub const NORMAL_95: f64 = 1.959_963_984_540_054;
 
+/// Standard deviations to either side of a 90 % interval, each end of which is passed by 5 %.
+pub const NORMAL_90: f64 = 1.644_853_626_951_472_7;
+
 impl ThetaEstimate {
     /// The 95 % interval, low and high; θ is never negative.
     pub fn interval_95(&self) -> (f64, f64) {
@@ -181,14 +187,50 @@ pub struct FusedFriction {
     pub theta_high_95: f64,
     /// Friction stiffness K = 1/θ.
     pub stiffness: f64,
-    /// Largest friction coefficient seen, a lower bound of the peak.
+    /// What is undercut and what is exceeded once in twenty times.
+    pub bounds: FrictionBounds,
+    /// Largest friction coefficient that the ground has shown of late, a lower bound of the peak;
+    /// `null` when nothing was shown lately or before the ground changed.
     pub mu_peak_lower_bound: Option<f64>,
-    /// Segments behind it.
+    /// Ratio of effective to geometric track; `null` where no turning showed it.
+    pub effective_track_ratio: Option<ValueEstimate>,
+    /// Rolling resistance coefficient; `null` where no torque showed it.
+    pub rolling_resistance: Option<ValueEstimate>,
+    /// Segments that were ever measured here: how often it was visited.
     pub segments: u64,
-    /// Robots behind it.
+    /// Robots behind the estimate.
     pub robots: u32,
     /// End of the newest measurement.
     pub newest_at: Timestamp,
+    /// Age of the newest measurement, seconds.
+    pub age_s: f64,
+    /// Whether measurements differ by more than chance and the robots' own biases let them.
+    pub disputed: bool,
+    /// Since when the ground is as it is, if it is known to have been otherwise; what was measured
+    /// before does not count.
+    pub changed_at: Option<Timestamp>,
+}
+
+/// Bounds in the sense of COVESA VSS `RoadFriction`: with the most probable value between them.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct FrictionBounds {
+    /// θ is below this with 5 %.
+    pub theta_lower_5: f64,
+    /// θ is above this with 5 %.
+    pub theta_upper_95: f64,
+    /// K is below this with 5 %: 1 / `theta_upper_95`.
+    pub stiffness_lower_5: f64,
+    /// K is above this with 5 %; `null` when the measurements set no such bound.
+    pub stiffness_upper_95: Option<f64>,
+}
+
+/// A value with its standard deviation.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ValueEstimate {
+    /// The value.
+    pub value: f64,
+    /// Its standard deviation.
+    pub std_dev: f64,
 }
 
 /// The friction of one terrain.
@@ -213,6 +255,162 @@ pub struct ModelFriction {
     pub model: String,
     /// What is known; `null` when nothing is.
     pub friction: Option<FusedFriction>,
+    /// What ground of this class is like elsewhere, where nobody has measured this one.
+    #[serde(default)]
+    pub prior: Option<ClassPrior>,
+    /// The declared normalisation that brought other models' measurements to this one's θ, if any.
+    #[serde(default)]
+    pub normalisation: Option<String>,
+}
+
+/// An expectation from the same class of ground elsewhere. It is no measurement of this ground.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ClassPrior {
+    /// The class.
+    pub class: TerrainClass,
+    /// θ to expect.
+    pub theta: f64,
+    /// Its standard deviation, with how terrains of one class differ.
+    pub std_dev: f64,
+    /// Terrains that it was learned from.
+    pub terrains: u32,
+}
+
+/// What is known of a terrain as it was at several times.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct TerrainHistory {
+    /// The terrain at its present revision.
+    pub terrain: TerrainRef,
+    /// The oldest time first.
+    pub items: Vec<TerrainAt>,
+}
+
+/// What was known of a terrain at one time.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct TerrainAt {
+    /// The time.
+    pub at: Timestamp,
+    /// Per robot model.
+    pub models: Vec<ModelFriction>,
+}
+
+/// What is known of the ground at a point.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct PointFriction {
+    /// The cell.
+    pub cell: Cell,
+    /// The terrain under the point; `null` where none is drawn. Only measurements on it count.
+    pub terrain: Option<TerrainRef>,
+    /// Per robot model.
+    pub models: Vec<ModelFriction>,
+}
+
+/// The body of `POST /v1/sites/{site}/friction/path`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct AskPath {
+    /// Corners of the path, 2 to 10 000, at most 10 km.
+    pub points: Vec<Point>,
+    /// Who is to drive it; its model decides whose measurements count, its limits what speed follows.
+    pub robot: RobotId,
+    /// As of when; now when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub as_of: Option<Timestamp>,
+    /// A declared normalisation, to count other models' measurements too.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub normalisation: Option<String>,
+}
+
+/// What is known along a path.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct PathFriction {
+    /// Length, metres.
+    pub length_m: f64,
+    /// The robot model whose θ this is.
+    pub configuration: ConfigurationId,
+    /// The normalisation that was used, if any.
+    pub normalisation: Option<String>,
+    /// Share of the length on which somebody has measured, 0 to 1.
+    pub known_ratio: f64,
+    /// Pieces of the path, each in one cell, in order.
+    pub pieces: Vec<PathPiece>,
+}
+
+/// What is known of one piece of a path.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct PathPiece {
+    /// Begin, metres along the path.
+    pub from_m: f64,
+    /// The cell.
+    pub cell: Cell,
+    /// θ; `null` when nothing is known.
+    pub theta: Option<f64>,
+    /// Its standard deviation.
+    pub std_dev: Option<f64>,
+    /// θ is above this with 5 %.
+    pub theta_upper_95: Option<f64>,
+    /// Age of the newest measurement, seconds.
+    pub age_s: Option<f64>,
+    /// Whether measurements contradict each other.
+    pub disputed: bool,
+    /// Friction coefficient to plan with: the larger of what was shown of late and a cautious
+    /// value, within what keeps the wheels' slip in the linear range at `theta_upper_95`.
+    pub grip_mu: f64,
+    /// Speed that follows at its begin, metres per second: curves and stopping with that grip and
+    /// the robot's limits, the robot standing at the end of the path.
+    pub speed_m_s: f64,
+}
+
+/// How a cell differs between two times.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct CellDifference {
+    /// The cell.
+    pub cell: Cell,
+    /// The terrain; `null` where none was drawn.
+    pub terrain: Option<TerrainRef>,
+    /// The robot model and tyres.
+    pub configuration: ConfigurationId,
+    /// What was known at the first time.
+    pub before: Option<FusedFriction>,
+    /// What was known at the second time.
+    pub after: Option<FusedFriction>,
+    /// Difference of θ in its own standard deviations; `null` unless both are known.
+    pub deviations: Option<f64>,
+}
+
+/// Where a visit would teach most.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct VisitSuggestion {
+    /// The cell.
+    pub cell: Cell,
+    /// Its middle.
+    pub center: Point,
+    /// The terrain; `null` where none is drawn.
+    pub terrain: Option<TerrainRef>,
+    /// By what factor a visit would shrink the standard deviation of θ, as its natural logarithm;
+    /// for unknown ground that of an expectation from nothing.
+    pub gain: f64,
+    /// Standard deviation of θ over θ now; `null` when nothing is known.
+    pub relative_deviation: Option<f64>,
+    /// Whether measurements contradict each other.
+    pub disputed: bool,
+}
+
+/// What one robot has put into the map of a site.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct RobotContribution {
+    /// The robot.
+    pub robot: RobotId,
+    /// Cells that it has measured.
+    pub cells: u64,
+    /// Its segments.
+    pub segments: u64,
+    /// Begin of the hour or day of its first measurement.
+    pub first_at: Timestamp,
+    /// End of its newest measurement.
+    pub newest_at: Timestamp,
+    /// Median of its θ over the one of all robots of its models together, over the terrains that it
+    /// has measured: its bias as far as it shows. `null` where it has measured alone.
+    pub bias_ratio: Option<f64>,
 }
 
 /// The friction of one cell, per terrain and robot model.
@@ -220,12 +418,17 @@ pub struct ModelFriction {
 pub struct CellFriction {
     /// The cell.
     pub cell: Cell,
+    /// Side of the cell, metres; `ix` and `iy` count squares of this size.
+    pub size_m: f64,
     /// The terrain; `null` where none was drawn. A border cell is listed once per terrain.
     pub terrain: Option<TerrainRef>,
     /// The robot model and tyres.
     pub configuration: ConfigurationId,
     /// What is known.
     pub friction: FusedFriction,
+    /// The declared normalisation that brought other models' measurements to this one's θ, if any.
+    #[serde(default)]
+    pub normalisation: Option<String>,
 }
 
 /// A segment as the server stored it.
@@ -243,4 +446,36 @@ pub struct StoredSegment {
     pub received_at: Timestamp,
     /// The measurement.
     pub segment: Segment,
+}
+
+/// The body of `POST /v1/sites/{site}/robots/{robot}/withdrawals`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct CreateWithdrawal {
+    /// A time of the first hour; from the beginning when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub from: Option<Timestamp>,
+    /// A time of the last hour; the present one when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub to: Option<Timestamp>,
+    /// Why, for people.
+    pub reason: String,
+}
+
+/// What a robot measured in some whole hours does not count.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct Withdrawal {
+    /// Its number.
+    pub id: i64,
+    /// Whose measurements.
+    pub robot: RobotId,
+    /// Begin of the first hour.
+    pub from: Timestamp,
+    /// End of the last hour.
+    pub before: Timestamp,
+    /// Why.
+    pub reason: String,
+    /// Who said so.
+    pub by: String,
+    /// When.
+    pub at: Timestamp,
 }

@@ -287,6 +287,8 @@ pub struct Robot {
     pub first_seen_at: Timestamp,
     /// Last hello.
     pub last_hello_at: Timestamp,
+    /// What became of its measurements.
+    pub measurements: MeasurementsTaken,
     /// Whether the server hears it now.
     pub link: LinkState,
     /// Why it is not heard; `null` while it is online.
@@ -295,6 +297,17 @@ pub struct Robot {
     pub alerts: Vec<Alert>,
     /// What it said last; `null` if it has said nothing since the server started.
     pub live: Option<RobotLive>,
+}
+
+/// What became of a robot's measurements, beside those that are on the map.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct MeasurementsTaken {
+    /// How many were impossible and will never be taken.
+    pub refused: u64,
+    /// Why the last of them was.
+    pub refused_why: Option<String>,
+    /// How many are from a time that has not come, and wait until the clock of their run is known.
+    pub aside: u64,
 }
 
 /// What a robot said last, each value with its age.

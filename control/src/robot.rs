@@ -188,12 +188,12 @@ impl RobotModel {
 
     /// Acceleration along the path that a plan may ask of ground with this peak friction, metres per
     /// second squared.
-    pub(crate) fn grip_along_m_s2(mu_peak: f64) -> f64 {
+    pub fn grip_along_m_s2(mu_peak: f64) -> f64 {
         GRIP_SHARE_ALONG * mu_peak * GRAVITY_M_S2
     }
 
     /// The same across the path.
-    pub(crate) fn grip_across_m_s2(mu_peak: f64) -> f64 {
+    pub fn grip_across_m_s2(mu_peak: f64) -> f64 {
         GRIP_SHARE_ACROSS * mu_peak * GRAVITY_M_S2
     }
 

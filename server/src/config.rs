@@ -3,13 +3,15 @@
 //! An unknown key, an impossible value or an address beyond this machine stops the start, with a
 //! sentence that names file, line and key.
 
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use serde::Deserialize;
-use tread_api::ids::SiteId;
+use tread_api::ids::{ConfigurationId, SiteId};
 
+use crate::friction::index::Normalisation;
 use crate::identity::origin::{Names, Origin};
 
 /// Address of the REST API when nothing else is said.
@@ -75,6 +77,8 @@ pub struct Config {
     pub site: SiteId,
     /// How measurements of several robots and times are weighed.
     pub friction: FrictionConfig,
+    /// How the θ of robot models is brought to that of others, where an answer asks for it.
+    pub normalisations: Vec<Normalisation>,
     /// The REST API's certificate; without one it listens on this machine alone.
     pub tls: Option<TlsFiles>,
     /// What browsers may do.
@@ -111,6 +115,9 @@ pub struct FrictionConfig {
     pub robot_bias_ratio: f64,
     /// Growth of a measurement's variance with its age, `q`, θ² per second; not negative.
     pub drift_variance_per_s: f64,
+    /// How long a friction coefficient that was seen says something of the ground, seconds; 1 to
+    /// 10⁹.
+    pub mu_peak_age_max_s: f64,
 }
 
 impl Default for FrictionConfig {
@@ -119,8 +126,64 @@ impl Default for FrictionConfig {
             robot_bias_ratio: 0.08,
             // A deviation of 0.02 after a day: a tenth of θ on ordinary ground.
             drift_variance_per_s: 4.6e-9,
+            mu_peak_age_max_s: 6.0 * 3_600.0,
         }
     }
+}
+
+impl FrictionConfig {
+    fn check(&self) -> Result<(), ConfigError> {
+        let Self {
+            robot_bias_ratio,
+            drift_variance_per_s,
+            mu_peak_age_max_s,
+        } = *self;
+        let ratio = ("0 to 1", 0.0..=1.0);
+        let span = ("1 to 1e9", 1.0..=1.0e9);
+        for (key, value, (range, bounds)) in [
+            ("friction.robot_bias_ratio", robot_bias_ratio, ratio.clone()),
+            ("friction.drift_variance_per_s", drift_variance_per_s, ratio),
+            ("friction.mu_peak_age_max_s", mu_peak_age_max_s, span),
+        ] {
+            // TOML can say `nan`, which no range contains.
+            if !bounds.contains(&value) {
+                return Err(ConfigError::OutOfRange { key, range, value });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// One normalisation of the configuration file.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct NormalisationFields {
+    reference: ConfigurationId,
+    ratios: BTreeMap<ConfigurationId, f64>,
+}
+
+/// θ of one model over that of another on the same ground.
+const RATIOS: std::ops::RangeInclusive<f64> = 0.01..=100.0;
+
+fn normalisations(
+    fields: BTreeMap<String, NormalisationFields>,
+) -> Result<Vec<Normalisation>, ConfigError> {
+    let mut declared = Vec::new();
+    for (name, NormalisationFields { reference, ratios }) in fields {
+        if let Some(&value) = ratios.values().find(|ratio| !RATIOS.contains(ratio)) {
+            return Err(ConfigError::OutOfRange {
+                key: "normalisations.*.ratios",
+                range: "0.01 to 100",
+                value,
+            });
+        }
+        declared.push(Normalisation {
+            name,
+            reference,
+            ratios,
+        });
+    }
+    Ok(declared)
 }
 
 #[derive(Debug, Default, Deserialize)]
@@ -133,6 +196,8 @@ struct File {
     site: Option<SiteId>,
     #[serde(default)]
     friction: FrictionConfig,
+    #[serde(default)]
+    normalisations: BTreeMap<String, NormalisationFields>,
     tls: Option<TlsFiles>,
     #[serde(default)]
     web: WebConfig,
@@ -217,6 +282,7 @@ impl Config {
                 .or(file.site)
                 .unwrap_or_else(|| SITE_DEFAULT.parse().expect(builtin)),
             friction: file.friction,
+            normalisations: normalisations(file.normalisations)?,
             tls: file.tls,
             web: file.web,
         };
@@ -245,26 +311,7 @@ impl Config {
                 return Err(ConfigError::NotLoopback { key, address, cure });
             }
         }
-        let FrictionConfig {
-            robot_bias_ratio,
-            drift_variance_per_s,
-        } = self.friction;
-        // TOML can say `nan`, which no range contains.
-        if !(0.0..=1.0).contains(&robot_bias_ratio) {
-            return Err(ConfigError::OutOfRange {
-                key: "friction.robot_bias_ratio",
-                range: "0 to 1",
-                value: robot_bias_ratio,
-            });
-        }
-        if !(0.0..=1.0).contains(&drift_variance_per_s) {
-            return Err(ConfigError::OutOfRange {
-                key: "friction.drift_variance_per_s",
-                range: "0 to 1",
-                value: drift_variance_per_s,
-            });
-        }
-        Ok(())
+        self.friction.check()
     }
 }
 
@@ -328,6 +375,22 @@ mod tests {
             .unwrap_err()
             .to_string();
         assert!(nan.contains("friction.robot_bias_ratio"), "{nan}");
+    }
+
+    #[test]
+    fn a_normalisation_names_its_reference_and_its_ratios() {
+        let id = "11111111-1111-4111-8111-111111111111";
+        let text = |ratio: &str| {
+            format!(
+                "[normalisations.all]\nreference = \"{id}\"\nratios = {{ \"{id}\" = {ratio} }}\n"
+            )
+        };
+        let declared = load(&text("1.3")).unwrap().normalisations;
+        assert_eq!(declared[0].name, "all");
+        for bad in ["0.0", "-1.0", "nan"] {
+            let error = load(&text(bad)).unwrap_err().to_string();
+            assert!(error.contains("ratios"), "{error}");
+        }
     }
 
     #[test]

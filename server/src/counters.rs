@@ -35,6 +35,8 @@ counters! {
     records_duplicate,
     /// Records that can never be taken: impossible numbers, or not this robot's mission.
     records_refused,
+    /// Segments from a time that had not come, put aside until their run's clock is known.
+    segments_aside,
     /// Mission reports taken.
     mission_reports_committed,
     /// Batches answered.

@@ -79,8 +79,10 @@ impl Server {
         let tls = config.tls.map(Tls::load).transpose()?.map(Arc::new);
         let db = Db::open(&config.database).await?;
         let app = App::new(db, clock, config.friction);
+        app.declare(config.normalisations);
         app.ensure_site(&config.site).await?;
         app.know_robots().await?;
+        app.load_map().await?;
         let listener = TcpListener::bind(config.http)
             .await
             .with_context(|| format!("cannot listen for HTTP on {}", config.http))?;

@@ -5,28 +5,37 @@
 //! newly inserted segments are folded into the cell sums, in the
 //! same transaction, and the answer goes out after the commit. Sent twice is counted once.
 
+mod keys;
+mod prepared;
+
+use std::collections::hash_map::Entry;
 use std::collections::{HashMap, HashSet};
 use std::time::Duration;
 
-use jiff::{SignedDuration, Timestamp};
-use serde_json::value::{RawValue, to_raw_value};
+use jiff::Timestamp;
+use serde_json::value::RawValue;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, timeout_at};
 use tokio_util::sync::CancellationToken;
 use tracing::{error, warn};
-use tread_api::friction::Segment;
-use tread_api::ids::{BootId, ConfigurationId, RobotId, SiteId};
+use tread_api::ids::{RobotId, SiteId};
+use tread_api::site::Grid;
 use tread_api::wire::ingest::{
     BATCH_RECORDS_MAX, Batch, MissionReport, Receipt, RecordContent, RefusedRecord,
 };
 use tread_api::wire::{Refusal, RefusalCode};
 
+use self::keys::{Keys, RobotKeys};
+use self::prepared::{Prepared, Ready, Skew, prepared};
 use super::App;
+use super::map::Folded;
 use super::missions::reports::{Foreign, Reporting, take_report};
+use crate::db::aside::Origin;
 use crate::db::segments::{Inserted, NewSegment};
 use crate::db::sums::SumKey;
+use crate::db::withdrawals::WithdrawalRow;
 use crate::db::{self, DbError, Tx};
-use crate::friction::{Sums, epoch_h};
+use crate::friction::epoch_h;
 
 /// Uploads that wait for the writer.
 pub const UPLOADS_WAITING_MAX: usize = 256;
@@ -37,8 +46,10 @@ const GROUP_RECORDS_MAX: usize = 2_000;
 const GROUP_INTERVAL: Duration = Duration::from_millis(25);
 /// Integers on the wire and in JSON stay exact below this.
 const SEQ_MAX: u64 = 1 << 53;
-/// Keys kept in memory before they are looked up afresh.
-const KEYS_MAX: usize = 100_000;
+/// Measurements of one robot that may wait for the clock of their run.
+const ASIDE_MAX: u64 = 10_000;
+/// Measurements that one upload may take out of waiting.
+const RELEASED_MAX: u32 = 500;
 
 /// One batch of one robot, and where its answer goes.
 #[derive(Debug)]
@@ -87,75 +98,15 @@ pub struct Writer {
     keys: Keys,
 }
 
-/// Keys of the database that do not change once they are written.
-#[derive(Debug, Default)]
-struct Keys {
-    robots: HashMap<(SiteId, RobotId), (i64, i64)>,
-    boots: HashMap<(i64, BootId), i64>,
-    configurations: HashMap<ConfigurationId, i64>,
-}
-
-impl Keys {
-    fn forget(&mut self) {
-        *self = Self::default();
-    }
-
-    fn bound(&mut self) {
-        if self.robots.len() + self.boots.len() + self.configurations.len() > KEYS_MAX {
-            self.forget();
-        }
-    }
-
-    async fn robot(
-        &mut self,
-        tx: &mut Tx,
-        site: &SiteId,
-        robot: &RobotId,
-    ) -> Result<Option<(i64, i64)>, DbError> {
-        let key = (site.clone(), robot.clone());
-        if let Some(&found) = self.robots.get(&key) {
-            return Ok(Some(found));
-        }
-        let Some(site_row) = db::sites::find(tx, site).await? else {
-            return Ok(None);
-        };
-        let found = db::robots::find(tx, site_row.pk, robot).await?;
-        let found = found.map(|row| (site_row.pk, row.pk));
-        if let Some(found) = found {
-            self.robots.insert(key, found);
-        }
-        Ok(found)
-    }
-
-    async fn boot(&mut self, tx: &mut Tx, robot_pk: i64, boot: BootId) -> Result<i64, DbError> {
-        if let Some(&found) = self.boots.get(&(robot_pk, boot)) {
-            return Ok(found);
-        }
-        let key = db::robots::boot_key(tx, robot_pk, boot).await?;
-        self.boots.insert((robot_pk, boot), key);
-        Ok(key)
-    }
-
-    async fn configuration(&mut self, tx: &mut Tx, id: ConfigurationId) -> Result<i64, DbError> {
-        if let Some(&found) = self.configurations.get(&id) {
-            return Ok(found);
-        }
-        let key = db::robots::configuration_key(tx, id).await?;
-        self.configurations.insert(id, key);
-        Ok(key)
-    }
-}
-
-/// A segment that is possible, ready to be stored.
-struct Candidate<'batch> {
-    upload: usize,
+/// A segment on its way into the database.
+struct Candidate<'group> {
+    /// The upload whose receipt counts it; `None` for one that had waited.
+    upload: Option<usize>,
     keys: (i64, i64),
     site_pk: i64,
     robot_pk: i64,
-    segment: &'batch Segment,
-    ended_at: Timestamp,
-    sums: Sums,
-    measurement: Box<RawValue>,
+    robot: &'group RobotId,
+    ready: Box<Ready>,
 }
 
 /// What became of one batch.
@@ -167,6 +118,23 @@ struct Tally {
     segments: u64,
     reports: u64,
     foreign: u64,
+    aside: u64,
+}
+
+impl Tally {
+    fn note_report(&mut self, taken: Option<Result<(), Foreign>>, seq: u64, receipt: &mut Receipt) {
+        match taken {
+            Some(Ok(())) => {
+                receipt.committed += 1;
+                self.reports += 1;
+            }
+            Some(Err(Foreign(reason))) => {
+                receipt.refused.push(RefusedRecord { seq, reason });
+                self.foreign += 1;
+            }
+            None => receipt.duplicates += 1,
+        }
+    }
 }
 
 impl Writer {
@@ -229,6 +197,7 @@ impl Writer {
         counters.segments_committed.add(tally.segments);
         counters.mission_reports_committed.add(tally.reports);
         counters.reports_foreign.add(tally.foreign);
+        counters.segments_aside.add(tally.aside);
         if tally.reports > 0 {
             self.app.wake();
         }
@@ -239,24 +208,38 @@ impl Writer {
         let mut outcomes: Vec<Outcome> = Vec::with_capacity(group.len());
         let mut candidates = Vec::new();
         let mut tally = Tally::default();
-        let mut tx = self.app.db().write().await?;
+        let app = self.app.clone();
+        let _turn = app.maps().turn().await;
+        let mut tx = app.db().write().await?;
         let now = self.app.clock().now();
         for (index, upload) in group.iter().enumerate() {
             let Upload { site, batch, .. } = upload;
-            if batch.records.len() > BATCH_RECORDS_MAX {
-                let detail = format!("a batch has at most {BATCH_RECORDS_MAX} records");
-                outcomes.push(Err(refusal(RefusalCode::Malformed, &detail)));
+            let found = self.keys.robot(&app, &mut tx, (site, &batch.robot)).await?;
+            if let Some(refused) = refused_whole(upload, found.is_some()) {
+                outcomes.push(Err(refused));
                 continue;
             }
-            let Some((site_pk, robot_pk)) = self.keys.robot(&mut tx, site, &batch.robot).await?
-            else {
-                let detail = "the robot is not known here: say hello first";
-                outcomes.push(Err(refusal(RefusalCode::Busy, detail)));
-                continue;
-            };
+            let Some(robot_keys) = found else { continue };
+            let RobotKeys {
+                site_pk,
+                robot_pk,
+                grid,
+            } = robot_keys;
             let boot_pk = self.keys.boot(&mut tx, robot_pk, batch.boot).await?;
             let skew = Skew::of(batch.robot_time, now);
-            let put_right = |at| skew.put_right(at, now);
+            let candidate = |upload, keys, ready| Candidate {
+                upload,
+                keys,
+                site_pk,
+                robot_pk,
+                robot: &batch.robot,
+                ready,
+            };
+            if batch.robot_time.is_some() {
+                for (keys, ready) in released(&mut tx, boot_pk, &grid, skew).await? {
+                    candidates.push(candidate(None, keys, ready));
+                }
+            }
             let mut receipt = Receipt {
                 committed: 0,
                 duplicates: 0,
@@ -271,17 +254,27 @@ impl Writer {
                 };
                 let keys = (boot_pk, seq_key);
                 match &record.content {
-                    RecordContent::Segment(segment) => match prepared(segment, put_right) {
-                        Ok((ended_at, sums, measurement)) => candidates.push(Candidate {
-                            upload: index,
-                            keys,
-                            site_pk,
-                            robot_pk,
-                            segment,
-                            ended_at,
-                            sums,
-                            measurement,
-                        }),
+                    RecordContent::Segment(segment) => match prepared(segment, &grid, skew) {
+                        Ok(Prepared::Ready(ready)) => {
+                            candidates.push(candidate(Some(index), keys, ready));
+                        }
+                        Ok(Prepared::Ahead(measurement)) => {
+                            let origin = Origin {
+                                boot_pk,
+                                seq: seq_key,
+                                site_pk,
+                                robot_pk,
+                            };
+                            let times = (segment.ended_at, now);
+                            match put_aside(&mut tx, origin, times, &measurement).await? {
+                                Ok(true) => {
+                                    receipt.committed += 1;
+                                    tally.aside += 1;
+                                }
+                                Ok(false) => receipt.duplicates += 1,
+                                Err(reason) => refuse(reason),
+                            }
+                        }
                         Err(reason) => refuse(reason),
                     },
                     RecordContent::Mission(report) => {
@@ -289,31 +282,25 @@ impl Writer {
                             robot_pk,
                             boot: batch.boot,
                             now,
-                            at: put_right(report.at),
+                            at: skew.put_right(report.at),
                         };
-                        match take_new_report(&mut tx, of, keys, report).await? {
-                            Some(Ok(())) => {
-                                receipt.committed += 1;
-                                tally.reports += 1;
-                            }
-                            Some(Err(Foreign(reason))) => {
-                                refuse(reason);
-                                tally.foreign += 1;
-                            }
-                            None => receipt.duplicates += 1,
-                        }
+                        let taken = take_new_report(&mut tx, of, keys, report).await?;
+                        tally.note_report(taken, seq, &mut receipt);
                     }
                 }
             }
+            count_refused(&mut tx, robot_pk, &receipt).await?;
             outcomes.push(Ok(receipt));
         }
-        self.insert(&mut tx, &candidates, now, &mut outcomes, &mut tally)
+        let folded = self
+            .insert(&mut tx, &candidates, now, &mut outcomes, &mut tally)
             .await?;
         tx.commit().await?;
+        app.maps().fold(&folded);
         Ok((outcomes, tally))
     }
 
-    /// Stores segments and folds those that are new.
+    /// Stores segments and folds those that are new and not withdrawn.
     async fn insert(
         &mut self,
         tx: &mut Tx,
@@ -321,58 +308,80 @@ impl Writer {
         now: Timestamp,
         outcomes: &mut [Outcome],
         tally: &mut Tally,
-    ) -> Result<(), DbError> {
-        let rows: Vec<NewSegment<'_>> = candidates
-            .iter()
-            .map(|candidate| {
-                let terrain = candidate.segment.terrain.as_ref();
-                let terrain = terrain.map_or("", |terrain| terrain.id.as_str());
-                let Candidate {
-                    keys,
-                    robot_pk,
-                    site_pk,
-                    ref measurement,
-                    ..
-                } = *candidate;
-                NewSegment(keys.0, keys.1, robot_pk, site_pk, terrain, measurement)
-            })
-            .collect();
+    ) -> Result<Vec<Folded>, DbError> {
         let mut new: Option<HashSet<(i64, i64)>> =
-            match db::segments::insert_new(tx, &rows, now).await? {
+            match db::segments::insert_new(tx, &rows(candidates), now).await? {
                 Inserted::All => None,
                 Inserted::Only(keys) => Some(keys.into_iter().collect()),
             };
-        let mut sums: HashMap<SumKey, Sums> = HashMap::new();
+        let withdrawals = db::withdrawals::all(tx).await?;
+        let mut folded: HashMap<SumKey, Folded> = HashMap::new();
         for candidate in candidates {
-            let Some(Ok(receipt)) = outcomes.get_mut(candidate.upload) else {
-                continue;
-            };
             // One that stands twice in this very group is new once.
-            if new.as_mut().is_some_and(|new| !new.remove(&candidate.keys)) {
-                receipt.duplicates += 1;
+            let is_new = new.as_mut().is_none_or(|new| new.remove(&candidate.keys));
+            let upload = candidate.upload.and_then(|upload| outcomes.get_mut(upload));
+            if let Some(Ok(receipt)) = upload {
+                if is_new {
+                    receipt.committed += 1;
+                } else {
+                    receipt.duplicates += 1;
+                }
+            }
+            if !is_new {
                 continue;
             }
-            receipt.committed += 1;
             tally.segments += 1;
-            let segment = candidate.segment;
+            let Ready { segment, sums, .. } = &*candidate.ready;
+            let configuration = segment.configuration;
             let key = SumKey {
                 site_pk: candidate.site_pk,
                 cell: segment.cell,
                 grid_revision: segment.grid_revision,
                 terrain: segment.terrain.clone(),
                 robot_pk: candidate.robot_pk,
-                configuration_pk: self.keys.configuration(tx, segment.configuration).await?,
-                epoch_h: epoch_h(candidate.ended_at),
+                configuration_pk: self.keys.configuration(tx, configuration).await?,
+                epoch_h: epoch_h(segment.ended_at),
             };
-            let sum = sums.entry(key);
-            sum.and_modify(|sum| sum.add(&candidate.sums))
-                .or_insert(candidate.sums);
+            if withdrawals.iter().any(|row| is_withdrawn(row, &key)) {
+                continue;
+            }
+            match folded.entry(key) {
+                Entry::Occupied(mut present) => present.get_mut().sums.add(sums),
+                Entry::Vacant(room) => {
+                    let key = room.key().clone();
+                    room.insert(Folded {
+                        key,
+                        robot: candidate.robot.clone(),
+                        configuration,
+                        sums: *sums,
+                    });
+                }
+            }
         }
         // In the order of the table, so that neighbours share their pages.
-        let mut sums: Vec<(SumKey, Sums)> = sums.into_iter().collect();
-        sums.sort_unstable_by_key(|(key, _)| (key.robot_pk, key.epoch_h, key.cell.iy, key.cell.ix));
-        db::sums::add(tx, sums.iter().map(|(key, sums)| (key, sums))).await
+        let mut folded: Vec<Folded> = folded.into_values().collect();
+        folded.sort_unstable_by_key(|Folded { key, .. }| {
+            (key.robot_pk, key.epoch_h, key.cell.iy, key.cell.ix)
+        });
+        db::sums::add(tx, folded.iter().map(|part| (&part.key, &part.sums))).await?;
+        Ok(folded)
     }
+}
+
+fn rows<'group>(candidates: &'group [Candidate<'_>]) -> Vec<NewSegment<'group>> {
+    let row = |candidate: &'group Candidate<'_>| {
+        let terrain = candidate.ready.segment.terrain.as_ref();
+        let terrain = terrain.map_or("", |terrain| terrain.id.as_str());
+        let (boot_pk, seq) = candidate.keys;
+        let (robot_pk, site_pk) = (candidate.robot_pk, candidate.site_pk);
+        let measurement = &*candidate.ready.measurement;
+        NewSegment(boot_pk, seq, robot_pk, site_pk, terrain, measurement)
+    };
+    candidates.iter().map(row).collect()
+}
+
+fn is_withdrawn(row: &WithdrawalRow, key: &SumKey) -> bool {
+    row.robot_pk == key.robot_pk && (row.from_h..=row.to_h).contains(&key.epoch_h)
 }
 
 fn refusal(code: RefusalCode, detail: &str) -> Refusal {
@@ -382,53 +391,56 @@ fn refusal(code: RefusalCode, detail: &str) -> Refusal {
     }
 }
 
-/// How wrong a robot's clock is, from the time that it wrote on what it sent.
-///
-/// Small differences are the network's and are left alone, so that a segment has the same epoch
-/// whenever it arrives. With a clock that is wrong by more, the spans are right and the date is
-/// not; the server's date counts then.
-#[derive(Debug, Clone, Copy)]
-struct Skew(SignedDuration);
-
-/// Differences that count as the network's.
-const SKEW_MIN: SignedDuration = SignedDuration::from_secs(30);
-
-impl Skew {
-    fn of(robot_time: Option<Timestamp>, now: Timestamp) -> Self {
-        let ahead = robot_time.map_or(SignedDuration::ZERO, |said| said.duration_since(now));
-        Self(if ahead.abs() > SKEW_MIN {
-            ahead
-        } else {
-            SignedDuration::ZERO
-        })
-    }
-
-    /// A record from the future all the same is of an earlier run, whose clock was wrong and can no
-    /// longer be asked; what has arrived cannot have been measured later than now.
-    fn put_right(self, at: Timestamp, now: Timestamp) -> Timestamp {
-        let at = at.checked_sub(self.0).unwrap_or(at);
-        if at.duration_since(now) > SKEW_MIN {
-            now
-        } else {
-            at
-        }
-    }
+/// Shows on a robot what can never be taken of it.
+async fn count_refused(tx: &mut Tx, robot_pk: i64, receipt: &Receipt) -> Result<(), DbError> {
+    let Some(last) = receipt.refused.last() else {
+        return Ok(());
+    };
+    let count = receipt.refused.len() as u64;
+    db::robots::count_refused(tx, robot_pk, count, &last.reason).await
 }
 
-/// A segment with its times put right: when it ended, its sums, and its text.
-fn prepared(
-    segment: &Segment,
-    put_right: impl Fn(Timestamp) -> Timestamp,
-) -> Result<(Timestamp, Sums, Box<RawValue>), String> {
-    segment.validate().map_err(|invalid| invalid.to_string())?;
-    let mut segment = segment.clone();
-    let span = segment.ended_at.duration_since(segment.started_at);
-    segment.ended_at = put_right(segment.ended_at);
-    let started_at = segment.ended_at.checked_sub(span);
-    segment.started_at = started_at.unwrap_or(segment.ended_at);
-    let sums = Sums::of(&segment).ok_or_else(|| "theta is out of range".to_owned())?;
-    let measurement = to_raw_value(&segment).map_err(|error| error.to_string())?;
-    Ok((segment.ended_at, sums, measurement))
+/// The answer to a batch that is taken whole or not at all.
+fn refused_whole(group: &Upload, is_known: bool) -> Option<Refusal> {
+    if group.batch.records.len() > BATCH_RECORDS_MAX {
+        let detail = format!("a batch has at most {BATCH_RECORDS_MAX} records");
+        return Some(refusal(RefusalCode::Malformed, &detail));
+    }
+    let detail = "the robot is not known here: say hello first";
+    (!is_known).then(|| refusal(RefusalCode::Busy, detail))
+}
+
+/// What has waited for the clock of a run that tells it now.
+async fn released(
+    tx: &mut Tx,
+    boot_pk: i64,
+    grid: &Grid,
+    skew: Skew,
+) -> Result<Vec<((i64, i64), Box<Ready>)>, DbError> {
+    let waiting = db::aside::take(tx, boot_pk, skew.latest_us(), RELEASED_MAX).await?;
+    let ready = |aside: db::aside::Aside| match prepared(&aside.segment, grid, skew) {
+        Ok(Prepared::Ready(ready)) => Some(((boot_pk, aside.seq), ready)),
+        // It was possible when it came, and its time is none of the future now.
+        Ok(Prepared::Ahead(_)) | Err(_) => None,
+    };
+    Ok(waiting.into_iter().filter_map(ready).collect())
+}
+
+/// Keeps a segment from the future until the clock of its run is known; whether it is new, or why
+/// it cannot be kept.
+async fn put_aside(
+    tx: &mut Tx,
+    origin: Origin,
+    (ended_at, now): (Timestamp, Timestamp),
+    measurement: &RawValue,
+) -> Result<Result<bool, String>, DbError> {
+    if db::aside::count(tx, origin.robot_pk).await? >= ASIDE_MAX {
+        return Ok(Err(format!(
+            "{ASIDE_MAX} of this robot's measurements already wait for their clock"
+        )));
+    }
+    let times = (ended_at.as_microsecond(), now.as_microsecond());
+    Ok(Ok(db::aside::put(tx, origin, times, measurement).await?))
 }
 
 /// Takes a report unless it was taken before; `None` says that it was.

@@ -8,6 +8,7 @@ pub mod geofence;
 pub mod identity;
 pub mod ingest;
 pub mod limits;
+mod map;
 pub mod missions;
 pub mod reconciler;
 pub mod robots;
@@ -16,6 +17,7 @@ pub mod sites;
 pub mod stops;
 pub mod teleop;
 pub mod terrains;
+pub mod withdrawals;
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -29,6 +31,7 @@ use tread_api::trajectory::Place;
 
 use self::events::Hub;
 use self::identity::Identity;
+use self::map::Maps;
 use self::missions::idempotency::InFlight;
 use crate::clock::Clock;
 use crate::config::FrictionConfig;
@@ -38,6 +41,7 @@ use crate::db::{self, Db, DbError, Tx};
 use crate::fleet::commands::Commands;
 use crate::fleet::presence::Presences;
 use crate::fleet::teleop::Teleop;
+use crate::friction::index::Normalisation;
 use crate::metrics::{MissionDurations, Queues, Refusals, Requests};
 use crate::supervisor::Supervisor;
 
@@ -62,6 +66,7 @@ struct Inner {
     keys_in_flight: InFlight,
     checks: Semaphore,
     identity: Identity,
+    maps: Maps,
     requests: Requests,
     refusals: Refusals,
     queues: Queues,
@@ -70,6 +75,7 @@ struct Inner {
     robots_generation: AtomicU64,
     started_at: Duration,
     links: OnceLock<Links>,
+    normalisations: OnceLock<Vec<Normalisation>>,
     drive_slots: Arc<Semaphore>,
 }
 
@@ -101,6 +107,7 @@ impl App {
             keys_in_flight: InFlight::default(),
             checks: Semaphore::new(check::CHECKS_MAX),
             identity: Identity::default(),
+            maps: Maps::default(),
             requests: Requests::default(),
             refusals: Refusals::default(),
             queues: Queues::default(),
@@ -108,6 +115,7 @@ impl App {
             robots_generation: AtomicU64::new(1),
             started_at,
             links: OnceLock::new(),
+            normalisations: OnceLock::new(),
             drive_slots: Arc::new(Semaphore::new(teleop::SESSIONS_MAX)),
         };
         Self {
@@ -118,6 +126,15 @@ impl App {
     /// Gives the use cases the way to the robots; the first time counts.
     pub fn connect(&self, links: Links) {
         let _ = self.inner.links.set(links);
+    }
+
+    /// Declares how robot models may be joined; the first time counts.
+    pub fn declare(&self, normalisations: Vec<Normalisation>) {
+        let _ = self.inner.normalisations.set(normalisations);
+    }
+
+    fn normalisations(&self) -> &[Normalisation] {
+        self.inner.normalisations.get().map_or(&[], Vec::as_slice)
     }
 
     fn links(&self) -> Option<&Links> {
@@ -190,6 +207,10 @@ impl App {
     /// How long missions took.
     pub fn mission_durations(&self) -> &MissionDurations {
         &self.inner.mission_durations
+    }
+
+    fn maps(&self) -> &Maps {
+        &self.inner.maps
     }
 
     fn identity(&self) -> &Identity {

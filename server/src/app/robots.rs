@@ -98,6 +98,7 @@ impl App {
             agent_version: row.agent_version,
             first_seen_at: row.first_seen_at,
             last_hello_at: row.last_hello_at,
+            measurements: row.measurements,
             link: presence.link(now),
             link_cause: presence.link_cause(now),
             alerts,

@@ -5,6 +5,7 @@
 //! survives a power cut.
 
 pub mod alerts;
+pub mod aside;
 pub mod audit;
 pub mod geofences;
 pub mod history;
@@ -18,6 +19,7 @@ pub mod stops;
 pub mod sums;
 pub mod terrains;
 pub mod tokens;
+pub mod withdrawals;
 
 use std::fmt::Display;
 use std::ops::{Deref, DerefMut};

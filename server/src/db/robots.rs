@@ -1,11 +1,13 @@
 //! Robots, their configurations, and the runs of their agents.
 
+use std::collections::HashMap;
+
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::ids::{BootId, ConfigurationId, RobotId, SiteId};
-use tread_api::robot::{Capabilities, RobotModel};
+use tread_api::robot::{Capabilities, MeasurementsTaken, RobotModel};
 
-use super::{DbError, from_json, from_us, parse, to_json, to_us};
+use super::{DbError, from_json, from_us, parse, to_json, to_us, unsigned};
 
 /// A robot as the database keeps it.
 #[derive(Debug, Clone)]
@@ -34,6 +36,8 @@ pub struct RobotRow {
     pub first_seen_at: Timestamp,
     /// Last hello.
     pub last_hello_at: Timestamp,
+    /// What became of its measurements.
+    pub measurements: MeasurementsTaken,
 }
 
 struct Raw {
@@ -49,6 +53,9 @@ struct Raw {
     boot: String,
     first_seen_at_us: i64,
     last_hello_at_us: i64,
+    segments_refused: i64,
+    segments_refused_why: Option<String>,
+    segments_aside: i64,
 }
 
 impl TryFrom<Raw> for RobotRow {
@@ -68,6 +75,11 @@ impl TryFrom<Raw> for RobotRow {
             boot: parse("boot", &raw.boot)?,
             first_seen_at: from_us(raw.first_seen_at_us)?,
             last_hello_at: from_us(raw.last_hello_at_us)?,
+            measurements: MeasurementsTaken {
+                refused: unsigned("count", raw.segments_refused)?,
+                refused_why: raw.segments_refused_why,
+                aside: unsigned("count", raw.segments_aside)?,
+            },
         })
     }
 }
@@ -80,7 +92,10 @@ macro_rules! robots {
                    configurations.model AS "model!", configurations.id AS configuration,
                    robots.name, robots.retired_at_us, robots.capabilities,
                    robots.agent_version, robots.boot, robots.first_seen_at_us,
-                   robots.last_hello_at_us
+                   robots.last_hello_at_us, robots.segments_refused,
+                   robots.segments_refused_why,
+                   (SELECT COUNT(*) FROM segments_aside a WHERE a.robot_pk = robots.pk)
+                       AS "segments_aside!: i64"
                FROM robots
                JOIN sites ON sites.pk = robots.site_pk
                JOIN configurations ON configurations.pk = robots.configuration_pk "# + $condition,
@@ -304,4 +319,71 @@ pub async fn all(db: &mut SqliteConnection, limit: u32) -> Result<Vec<RobotRow>,
         .fetch_all(db)
         .await?;
     rows.into_iter().map(RobotRow::try_from).collect()
+}
+
+/// Names of all robots by their keys.
+pub async fn ids_by_key(db: &mut SqliteConnection) -> Result<HashMap<i64, RobotId>, DbError> {
+    let rows = sqlx::query!(r#"SELECT pk AS "pk!", id FROM robots"#);
+    let rows = rows.fetch_all(db).await?;
+    let named = |pk, id: &str| Ok((pk, parse("robot", id)?));
+    rows.iter().map(|row| named(row.pk, &row.id)).collect()
+}
+
+/// Names of a site's robots by their keys.
+pub async fn of_site_by_key(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+) -> Result<HashMap<i64, RobotId>, DbError> {
+    let rows = sqlx::query!(
+        r#"SELECT pk AS "pk!", id FROM robots WHERE site_pk = ?"#,
+        site_pk
+    );
+    let rows = rows.fetch_all(db).await?;
+    let named = |pk, id: &str| Ok((pk, parse("robot", id)?));
+    rows.iter().map(|row| named(row.pk, &row.id)).collect()
+}
+
+/// Identifiers of all configurations by their keys.
+pub async fn configurations_by_key(
+    db: &mut SqliteConnection,
+) -> Result<HashMap<i64, ConfigurationId>, DbError> {
+    let rows = sqlx::query!(r#"SELECT pk AS "pk!", id FROM configurations"#);
+    let rows = rows.fetch_all(db).await?;
+    let named = |pk, id: &str| Ok((pk, parse("configuration", id)?));
+    rows.iter().map(|row| named(row.pk, &row.id)).collect()
+}
+
+/// Names of the models of those configurations that a robot has declared.
+pub async fn model_names(
+    db: &mut SqliteConnection,
+) -> Result<HashMap<ConfigurationId, String>, DbError> {
+    let rows = sqlx::query!(
+        r#"SELECT id, model ->> '$.name' AS "name!: String" FROM configurations
+           WHERE model IS NOT NULL"#
+    );
+    let rows = rows.fetch_all(db).await?;
+    let named = |id: &str, name| Ok((parse("configuration", id)?, name));
+    rows.into_iter()
+        .map(|row| named(&row.id, row.name))
+        .collect()
+}
+
+/// Counts measurements of a robot that can never be taken, and says why the last one cannot.
+pub async fn count_refused(
+    db: &mut SqliteConnection,
+    pk: i64,
+    count: u64,
+    why: &str,
+) -> Result<(), DbError> {
+    let count = i64::try_from(count).unwrap_or(i64::MAX);
+    sqlx::query!(
+        "UPDATE robots SET segments_refused = segments_refused + ?2, segments_refused_why = ?3
+         WHERE pk = ?1",
+        pk,
+        count,
+        why,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
 }

@@ -13,6 +13,8 @@ pub struct SiteRow {
     pub pk: i64,
     /// The site.
     pub site: Site,
+    /// Hours of measuring before this one are read as days.
+    pub merged_before_h: i64,
 }
 
 struct Raw {
@@ -24,6 +26,7 @@ struct Raw {
     terrain_revision: i64,
     geofence_revision: i64,
     created_at_us: i64,
+    merged_before_h: i64,
 }
 
 impl TryFrom<Raw> for SiteRow {
@@ -42,7 +45,11 @@ impl TryFrom<Raw> for SiteRow {
             geofence_revision: unsigned("geofence revision", raw.geofence_revision)?,
             created_at: from_us(raw.created_at_us)?,
         };
-        Ok(Self { pk: raw.pk, site })
+        Ok(Self {
+            pk: raw.pk,
+            site,
+            merged_before_h: raw.merged_before_h,
+        })
     }
 }
 
@@ -70,6 +77,7 @@ pub async fn find(db: &mut SqliteConnection, id: &SiteId) -> Result<Option<SiteR
     let raw = sqlx::query_as!(
         Raw,
         r#"SELECT pk AS "pk!", id, name, grid_revision, cell_m, terrain_revision, created_at_us,
+               merged_before_h,
                COALESCE((SELECT MAX(revision) FROM geofences WHERE site_pk = sites.pk), 0)
                    AS "geofence_revision!: i64"
            FROM sites WHERE id = ?"#,
@@ -89,6 +97,7 @@ pub async fn list(
     let rows = sqlx::query_as!(
         Raw,
         r#"SELECT pk AS "pk!", id, name, grid_revision, cell_m, terrain_revision, created_at_us,
+               merged_before_h,
                COALESCE((SELECT MAX(revision) FROM geofences WHERE site_pk = sites.pk), 0)
                    AS "geofence_revision!: i64"
            FROM sites WHERE id > ? ORDER BY id LIMIT ?"#,
@@ -105,6 +114,22 @@ pub async fn count_terrain_change(db: &mut SqliteConnection, pk: i64) -> Result<
     sqlx::query!(
         "UPDATE sites SET terrain_revision = terrain_revision + 1 WHERE pk = ?",
         pk
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Has hours before this one, a multiple of 24, read as days from now on; never takes it back.
+pub async fn merge_before(
+    db: &mut SqliteConnection,
+    pk: i64,
+    before_h: i64,
+) -> Result<(), DbError> {
+    sqlx::query!(
+        "UPDATE sites SET merged_before_h = ?2 WHERE pk = ?1 AND merged_before_h < ?2",
+        pk,
+        before_h,
     )
     .execute(db)
     .await?;

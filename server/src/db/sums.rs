@@ -1,13 +1,15 @@
 //! Sums of measurements per cell, ground, robot, configuration and hour of measuring.
 
+use futures_util::TryStreamExt as _;
 use sqlx::SqliteConnection;
-use tread_api::ids::{ConfigurationId, RobotId, TerrainId};
+use tread_api::friction::Information;
 use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
 
-use super::{DbError, corrupt, from_us, object_json, parse, to_json, unsigned};
+use super::{DbError, corrupt, object_json, parse, to_json, unsigned};
 use crate::friction::Sums;
 use crate::friction::fixed::Fixed;
+use crate::friction::sums::{Pair, Pass};
 
 /// What one sum is about.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -28,6 +30,37 @@ pub struct SumKey {
     pub configuration_pk: i64,
 }
 
+/// The numbers of a sum, in the order of the statement that reads them.
+fn numbers(key: &SumKey, sums: &Sums) -> Result<String, DbError> {
+    let terrain = key.terrain.as_ref();
+    let halves = |fixed: Fixed| fixed.halves().ok_or(DbError::DoesNotFit("sum"));
+    let (cell, newest) = (key.cell, sums.newest);
+    to_json(
+        "sum",
+        &(
+            (key.site_pk, cell.iy, cell.ix, key.grid_revision),
+            terrain.map_or(0, |terrain| terrain.revision),
+            (key.robot_pk, key.configuration_pk, key.epoch_h),
+            (
+                halves(sums.theta.information)?,
+                halves(sums.theta.weighted)?,
+                halves(sums.theta_square)?,
+                halves(sums.track.information)?,
+                halves(sums.track.weighted)?,
+                halves(sums.rolling.information)?,
+                halves(sums.rolling.weighted)?,
+            ),
+            (sums.segments, sums.samples, sums.mu_peak),
+            (
+                newest.ended_at_us,
+                newest.theta.map(|theta| theta.information),
+                newest.theta.map(|theta| theta.weighted),
+                newest.mu_peak,
+            ),
+        ),
+    )
+}
+
 /// Adds sums to those that are there, in one statement.
 pub async fn add<'sums>(
     db: &mut SqliteConnection,
@@ -36,36 +69,32 @@ pub async fn add<'sums>(
     let mut rows = Vec::new();
     for (key, sums) in sums {
         let terrain = key.terrain.as_ref();
-        let out_of_range = || DbError::DoesNotFit("sum");
-        let (information_hi, information_lo) =
-            sums.information.halves().ok_or_else(out_of_range)?;
-        let (weighted_hi, weighted_lo) = sums.weighted.halves().ok_or_else(out_of_range)?;
-        let (cell, newest_at_us) = (key.cell, sums.newest_at.as_microsecond());
-        let numbers = to_json(
-            "sum",
-            &(
-                (key.site_pk, cell.iy, cell.ix, key.grid_revision),
-                terrain.map_or(0, |terrain| terrain.revision),
-                (key.robot_pk, key.configuration_pk, key.epoch_h),
-                (information_hi, information_lo, weighted_hi, weighted_lo),
-                (sums.segments, sums.samples, sums.mu_peak, newest_at_us),
-            ),
-        )?;
-        rows.push((numbers, terrain.map_or("", |terrain| terrain.id.as_str())));
+        let terrain = terrain.map_or("", |terrain| terrain.id.as_str());
+        rows.push((numbers(key, sums)?, terrain));
     }
     if rows.is_empty() {
         return Ok(());
     }
     // The numbers are the key and the terrain is the value, which is the cheapest to take apart.
     let rows = object_json("sum", rows)?;
+    // Of two newest passes the later counts, of equally late ones the one with larger numbers; NULL
+    // is smaller than any number, and nothing is smaller than -1 here.
     sqlx::query!(
         "INSERT INTO cell_sums (site_pk, iy, ix, grid_revision, terrain, terrain_revision,
              robot_pk, configuration_pk, epoch_h, information_hi, information_lo, weighted_hi,
-             weighted_lo, segments, samples, mu_peak, newest_at_us)
+             weighted_lo, square_hi, square_lo, track_information_hi, track_information_lo,
+             track_weighted_hi, track_weighted_lo, rolling_information_hi, rolling_information_lo,
+             rolling_weighted_hi, rolling_weighted_lo, segments, samples, mu_peak, newest_at_us,
+             newest_information, newest_weighted, newest_mu)
          SELECT key ->> '$[0][0]', key ->> '$[0][1]', key ->> '$[0][2]', key ->> '$[0][3]',
              value, key ->> 1, key ->> '$[2][0]', key ->> '$[2][1]', key ->> '$[2][2]',
-             key ->> '$[3][0]', key ->> '$[3][1]', key ->> '$[3][2]', key ->> '$[3][3]',
-             key ->> '$[4][0]', key ->> '$[4][1]', key ->> '$[4][2]', key ->> '$[4][3]'
+             key ->> '$[3][0][0]', key ->> '$[3][0][1]', key ->> '$[3][1][0]',
+             key ->> '$[3][1][1]', key ->> '$[3][2][0]', key ->> '$[3][2][1]',
+             key ->> '$[3][3][0]', key ->> '$[3][3][1]', key ->> '$[3][4][0]',
+             key ->> '$[3][4][1]', key ->> '$[3][5][0]', key ->> '$[3][5][1]',
+             key ->> '$[3][6][0]', key ->> '$[3][6][1]', key ->> '$[4][0]', key ->> '$[4][1]',
+             key ->> '$[4][2]', key ->> '$[5][0]', key ->> '$[5][1]', key ->> '$[5][2]',
+             key ->> '$[5][3]'
          FROM json_each(?) WHERE true
          ON CONFLICT DO UPDATE SET
              information_hi = information_hi + excluded.information_hi
@@ -74,9 +103,42 @@ pub async fn add<'sums>(
              weighted_hi = weighted_hi + excluded.weighted_hi
                  + ((weighted_lo + excluded.weighted_lo) >> 32),
              weighted_lo = (weighted_lo + excluded.weighted_lo) & 4294967295,
+             square_hi = square_hi + excluded.square_hi
+                 + ((square_lo + excluded.square_lo) >> 32),
+             square_lo = (square_lo + excluded.square_lo) & 4294967295,
+             track_information_hi = track_information_hi + excluded.track_information_hi
+                 + ((track_information_lo + excluded.track_information_lo) >> 32),
+             track_information_lo =
+                 (track_information_lo + excluded.track_information_lo) & 4294967295,
+             track_weighted_hi = track_weighted_hi + excluded.track_weighted_hi
+                 + ((track_weighted_lo + excluded.track_weighted_lo) >> 32),
+             track_weighted_lo = (track_weighted_lo + excluded.track_weighted_lo) & 4294967295,
+             rolling_information_hi = rolling_information_hi + excluded.rolling_information_hi
+                 + ((rolling_information_lo + excluded.rolling_information_lo) >> 32),
+             rolling_information_lo =
+                 (rolling_information_lo + excluded.rolling_information_lo) & 4294967295,
+             rolling_weighted_hi = rolling_weighted_hi + excluded.rolling_weighted_hi
+                 + ((rolling_weighted_lo + excluded.rolling_weighted_lo) >> 32),
+             rolling_weighted_lo =
+                 (rolling_weighted_lo + excluded.rolling_weighted_lo) & 4294967295,
              segments = segments + excluded.segments,
              samples = samples + excluded.samples,
              mu_peak = COALESCE(MAX(mu_peak, excluded.mu_peak), mu_peak, excluded.mu_peak),
+             newest_information = CASE WHEN (excluded.newest_at_us, COALESCE(excluded.newest_information, -1),
+                     COALESCE(excluded.newest_weighted, -1), COALESCE(excluded.newest_mu, -1))
+                     > (newest_at_us, COALESCE(newest_information, -1),
+                     COALESCE(newest_weighted, -1), COALESCE(newest_mu, -1))
+                 THEN excluded.newest_information ELSE newest_information END,
+             newest_weighted = CASE WHEN (excluded.newest_at_us, COALESCE(excluded.newest_information, -1),
+                     COALESCE(excluded.newest_weighted, -1), COALESCE(excluded.newest_mu, -1))
+                     > (newest_at_us, COALESCE(newest_information, -1),
+                     COALESCE(newest_weighted, -1), COALESCE(newest_mu, -1))
+                 THEN excluded.newest_weighted ELSE newest_weighted END,
+             newest_mu = CASE WHEN (excluded.newest_at_us, COALESCE(excluded.newest_information, -1),
+                     COALESCE(excluded.newest_weighted, -1), COALESCE(excluded.newest_mu, -1))
+                     > (newest_at_us, COALESCE(newest_information, -1),
+                     COALESCE(newest_weighted, -1), COALESCE(newest_mu, -1))
+                 THEN excluded.newest_mu ELSE newest_mu END,
              newest_at_us = MAX(newest_at_us, excluded.newest_at_us)",
         rows,
     )
@@ -85,39 +147,46 @@ pub async fn add<'sums>(
     Ok(())
 }
 
-/// A sum over cells for one robot, configuration and hour.
+/// A sum of one robot, configuration and hour in one cell, as it is stored.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SumRow {
-    /// The cell; the first one where several are summed.
-    pub cell: Cell,
-    /// The ground, if any is drawn.
-    pub terrain: Option<TerrainRef>,
-    /// The configuration that measured.
-    pub configuration: ConfigurationId,
-    /// The configuration's model, if a robot has declared it.
-    pub model: Option<String>,
-    /// The robot that measured.
-    pub robot: RobotId,
+    /// What it is about.
+    pub key: SumKey,
     /// The sums.
     pub sums: Sums,
 }
 
 struct Raw {
+    site_pk: i64,
     ix: i64,
     iy: i64,
+    grid_revision: i64,
     terrain: String,
     terrain_revision: i64,
-    configuration: String,
-    model: Option<String>,
-    robot: String,
+    robot_pk: i64,
+    configuration_pk: i64,
+    epoch_h: i64,
     information_hi: i64,
     information_lo: i64,
     weighted_hi: i64,
     weighted_lo: i64,
+    square_hi: i64,
+    square_lo: i64,
+    track_information_hi: i64,
+    track_information_lo: i64,
+    track_weighted_hi: i64,
+    track_weighted_lo: i64,
+    rolling_information_hi: i64,
+    rolling_information_lo: i64,
+    rolling_weighted_hi: i64,
+    rolling_weighted_lo: i64,
     segments: i64,
     samples: i64,
     mu_peak: Option<f64>,
     newest_at_us: i64,
+    newest_information: Option<f64>,
+    newest_weighted: Option<f64>,
+    newest_mu: Option<f64>,
 }
 
 impl TryFrom<Raw> for SumRow {
@@ -133,126 +202,89 @@ impl TryFrom<Raw> for SumRow {
                 revision: unsigned("terrain revision", raw.terrain_revision)?,
             })
         };
-        let sums = Sums {
-            information: Fixed::from_halves(raw.information_hi, raw.information_lo),
-            weighted: Fixed::from_halves(raw.weighted_hi, raw.weighted_lo),
-            segments: unsigned("count", raw.segments)?,
-            samples: unsigned("count", raw.samples)?,
-            mu_peak: raw.mu_peak,
-            newest_at: from_us(raw.newest_at_us)?,
-        };
-        Ok(Self {
+        let key = SumKey {
+            robot_pk: raw.robot_pk,
+            epoch_h: raw.epoch_h,
             cell: Cell {
                 ix: index(raw.ix)?,
                 iy: index(raw.iy)?,
             },
             terrain,
-            configuration: parse("configuration", &raw.configuration)?,
-            model: raw.model,
-            robot: parse("robot", &raw.robot)?,
-            sums,
-        })
+            grid_revision: unsigned("grid revision", raw.grid_revision)?,
+            site_pk: raw.site_pk,
+            configuration_pk: raw.configuration_pk,
+        };
+        let fixed = Fixed::from_halves;
+        let newest_theta = raw.newest_information.zip(raw.newest_weighted);
+        let sums = Sums {
+            theta: Pair {
+                information: fixed(raw.information_hi, raw.information_lo),
+                weighted: fixed(raw.weighted_hi, raw.weighted_lo),
+            },
+            theta_square: fixed(raw.square_hi, raw.square_lo),
+            track: Pair {
+                information: fixed(raw.track_information_hi, raw.track_information_lo),
+                weighted: fixed(raw.track_weighted_hi, raw.track_weighted_lo),
+            },
+            rolling: Pair {
+                information: fixed(raw.rolling_information_hi, raw.rolling_information_lo),
+                weighted: fixed(raw.rolling_weighted_hi, raw.rolling_weighted_lo),
+            },
+            segments: unsigned("count", raw.segments)?,
+            samples: unsigned("count", raw.samples)?,
+            mu_peak: raw.mu_peak,
+            newest: Pass {
+                ended_at_us: raw.newest_at_us,
+                theta: newest_theta.map(|(information, weighted)| Information {
+                    information,
+                    weighted,
+                }),
+                mu_peak: raw.newest_mu,
+            },
+        };
+        Ok(Self { key, sums })
     }
 }
 
-/// Sums over all cells of one terrain, by configuration, robot and hour, in that order.
-///
-/// All revisions with the present polygon and class count: a new name changes no ground.
-pub async fn of_terrain(
-    db: &mut SqliteConnection,
-    site_pk: i64,
-    terrain: &TerrainId,
-) -> Result<Vec<SumRow>, DbError> {
-    let terrain = terrain.as_str();
-    let raw = sqlx::query_as!(
+/// Gives every sum to `take`, in no order, without holding them all.
+pub async fn each(db: &mut SqliteConnection, mut take: impl FnMut(SumRow)) -> Result<(), DbError> {
+    let mut rows = sqlx::query_as!(
         Raw,
-        r#"SELECT MIN(s.ix) AS "ix!: i64", MIN(s.iy) AS "iy!: i64", t.id AS "terrain!",
-               t.revision AS "terrain_revision!",
-               configurations.id AS "configuration!",
-               configurations.model ->> '$.name' AS "model: String", robots.id AS "robot!",
-               SUM(s.information_hi) AS "information_hi!: i64",
-               SUM(s.information_lo) AS "information_lo!: i64",
-               SUM(s.weighted_hi) AS "weighted_hi!: i64",
-               SUM(s.weighted_lo) AS "weighted_lo!: i64",
-               SUM(s.segments) AS "segments!: i64", SUM(s.samples) AS "samples!: i64",
-               MAX(s.mu_peak) AS "mu_peak: f64", MAX(s.newest_at_us) AS "newest_at_us!: i64"
-           FROM terrains t
-           JOIN terrain_revisions r ON r.site_pk = t.site_pk AND r.id = t.id
-               AND r.polygon = t.polygon AND r.class = t.class
-           JOIN cell_sums s ON s.site_pk = r.site_pk AND s.terrain = r.id
-               AND s.terrain_revision = r.revision
-           JOIN robots ON robots.pk = s.robot_pk
-           JOIN configurations ON configurations.pk = s.configuration_pk
-           WHERE t.site_pk = ?1 AND t.id = ?2
-           GROUP BY configurations.id, robots.id, s.epoch_h
-           ORDER BY configurations.id, robots.id, s.epoch_h"#,
-        site_pk,
-        terrain,
+        r#"SELECT site_pk, ix, iy, grid_revision, terrain, terrain_revision, robot_pk,
+               configuration_pk, epoch_h, information_hi, information_lo, weighted_hi, weighted_lo,
+               square_hi, square_lo, track_information_hi, track_information_lo,
+               track_weighted_hi, track_weighted_lo, rolling_information_hi,
+               rolling_information_lo, rolling_weighted_hi, rolling_weighted_lo, segments,
+               samples, mu_peak, newest_at_us, newest_information, newest_weighted, newest_mu
+           FROM cell_sums"#,
     )
-    .fetch_all(db)
-    .await?;
-    raw.into_iter().map(SumRow::try_from).collect()
+    .fetch(db);
+    while let Some(raw) = rows.try_next().await? {
+        take(SumRow::try_from(raw)?);
+    }
+    Ok(())
 }
 
-/// A rectangle of cells, both ends included, of one grid.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct CellRange {
-    /// The grid.
-    pub grid_revision: u32,
-    /// The lowest column and row.
-    pub min: Cell,
-    /// The highest column and row.
-    pub max: Cell,
-    /// Only cells after this one, row by row.
-    pub after: Option<Cell>,
-}
-
-/// Sums of the first `limit` cells of a rectangle that hold any, row by row; within a cell by
-/// terrain, configuration, robot and hour.
-pub async fn of_cells(
+/// Sums of one robot whose hours are before `before_h` and not the first of their day, at most
+/// `limit`, in the order of the table.
+pub async fn unmerged(
     db: &mut SqliteConnection,
-    site_pk: i64,
-    range: CellRange,
+    robot_pk: i64,
+    before_h: i64,
     limit: u32,
 ) -> Result<Vec<SumRow>, DbError> {
-    let CellRange {
-        grid_revision,
-        min,
-        max,
-        after,
-    } = range;
-    // Before the first cell of all: the row below the rectangle.
-    let after_row = after.map_or(i64::from(min.iy) - 1, |cell| i64::from(cell.iy));
-    let after_column = after.map_or(0, |cell| i64::from(cell.ix));
     let raw = sqlx::query_as!(
         Raw,
-        r#"WITH found AS MATERIALIZED (
-               SELECT DISTINCT iy, ix FROM cell_sums
-               WHERE site_pk = ?1 AND iy BETWEEN ?3 AND ?5 AND ix BETWEEN ?4 AND ?6
-                   AND (iy, ix) > (?7, ?8) AND grid_revision = ?2
-               ORDER BY iy, ix LIMIT ?9)
-           SELECT s.ix AS "ix!", s.iy AS "iy!", s.terrain AS "terrain!",
-               s.terrain_revision AS "terrain_revision!", configurations.id AS "configuration!",
-               configurations.model ->> '$.name' AS "model: String", robots.id AS "robot!",
-               s.information_hi AS "information_hi!", s.information_lo AS "information_lo!",
-               s.weighted_hi AS "weighted_hi!", s.weighted_lo AS "weighted_lo!",
-               s.segments AS "segments!", s.samples AS "samples!", s.mu_peak,
-               s.newest_at_us AS "newest_at_us!"
-           FROM found
-           JOIN cell_sums s ON s.site_pk = ?1 AND s.iy = found.iy AND s.ix = found.ix
-               AND s.grid_revision = ?2
-           JOIN robots ON robots.pk = s.robot_pk
-           JOIN configurations ON configurations.pk = s.configuration_pk
-           ORDER BY s.iy, s.ix, s.terrain, s.terrain_revision, configurations.id, robots.id,
-               s.epoch_h"#,
-        site_pk,
-        grid_revision,
-        min.iy,
-        min.ix,
-        max.iy,
-        max.ix,
-        after_row,
-        after_column,
+        r#"SELECT site_pk, ix, iy, grid_revision, terrain, terrain_revision, robot_pk,
+               configuration_pk, epoch_h, information_hi, information_lo, weighted_hi, weighted_lo,
+               square_hi, square_lo, track_information_hi, track_information_lo,
+               track_weighted_hi, track_weighted_lo, rolling_information_hi,
+               rolling_information_lo, rolling_weighted_hi, rolling_weighted_lo, segments,
+               samples, mu_peak, newest_at_us, newest_information, newest_weighted, newest_mu
+           FROM cell_sums WHERE robot_pk = ?1 AND epoch_h < ?2 AND epoch_h % 24 <> 0
+           LIMIT ?3"#,
+        robot_pk,
+        before_h,
         limit,
     )
     .fetch_all(db)
@@ -260,26 +292,52 @@ pub async fn of_cells(
     raw.into_iter().map(SumRow::try_from).collect()
 }
 
-/// Every sum of a site, for comparing whole states.
-pub async fn all(db: &mut SqliteConnection, site_pk: i64) -> Result<Vec<SumRow>, DbError> {
-    let raw = sqlx::query_as!(
-        Raw,
-        r#"SELECT s.ix AS "ix!", s.iy AS "iy!", s.terrain AS "terrain!",
-               s.terrain_revision AS "terrain_revision!", configurations.id AS "configuration!",
-               configurations.model ->> '$.name' AS "model: String", robots.id AS "robot!",
-               s.information_hi AS "information_hi!", s.information_lo AS "information_lo!",
-               s.weighted_hi AS "weighted_hi!", s.weighted_lo AS "weighted_lo!",
-               s.segments AS "segments!", s.samples AS "samples!", s.mu_peak,
-               s.newest_at_us AS "newest_at_us!"
-           FROM cell_sums s
-           JOIN robots ON robots.pk = s.robot_pk
-           JOIN configurations ON configurations.pk = s.configuration_pk
-           WHERE s.site_pk = ?
-           ORDER BY s.iy, s.ix, s.grid_revision, s.terrain, s.terrain_revision, robots.id,
-               configurations.id, s.epoch_h"#,
+/// Removes one sum; `false` if it is not there.
+pub async fn remove(db: &mut SqliteConnection, key: &SumKey) -> Result<bool, DbError> {
+    let terrain = key.terrain.as_ref();
+    let id = terrain.map_or("", |terrain| terrain.id.as_str());
+    let revision = terrain.map_or(0, |terrain| terrain.revision);
+    let SumKey {
+        robot_pk,
+        epoch_h,
+        cell,
+        grid_revision,
         site_pk,
+        configuration_pk,
+        ..
+    } = *key;
+    let done = sqlx::query!(
+        "DELETE FROM cell_sums WHERE robot_pk = ? AND epoch_h = ? AND iy = ? AND ix = ?
+             AND terrain = ? AND terrain_revision = ? AND grid_revision = ? AND site_pk = ?
+             AND configuration_pk = ?",
+        robot_pk,
+        epoch_h,
+        cell.iy,
+        cell.ix,
+        id,
+        revision,
+        grid_revision,
+        site_pk,
+        configuration_pk,
     )
-    .fetch_all(db)
+    .execute(db)
     .await?;
-    raw.into_iter().map(SumRow::try_from).collect()
+    Ok(done.rows_affected() == 1)
+}
+
+/// Removes the sums of a robot from one hour to another, both included; how many there were.
+pub async fn remove_hours(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+    (from_h, to_h): (i64, i64),
+) -> Result<u64, DbError> {
+    let done = sqlx::query!(
+        "DELETE FROM cell_sums WHERE robot_pk = ? AND epoch_h BETWEEN ? AND ?",
+        robot_pk,
+        from_h,
+        to_h,
+    )
+    .execute(db)
+    .await?;
+    Ok(done.rows_affected())
 }

@@ -1,5 +1,7 @@
 //! Terrains as they are drawn now, and every revision that ever was.
 
+use std::collections::HashMap;
+
 use sqlx::SqliteConnection;
 use tread_api::ids::TerrainId;
 use tread_api::terrain::{Terrain, TerrainClass};
@@ -92,6 +94,29 @@ pub async fn last_revision(
     .fetch_one(db)
     .await?;
     unsigned("terrain revision", revision)
+}
+
+/// Of each terrain of a site, the revisions that are the same ground as the present one: its
+/// polygon and class. A new name changes no ground.
+pub async fn same_ground(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+) -> Result<HashMap<TerrainId, Vec<u32>>, DbError> {
+    let rows = sqlx::query!(
+        r#"SELECT t.id, r.revision FROM terrains t
+           JOIN terrain_revisions r ON r.site_pk = t.site_pk AND r.id = t.id
+               AND r.polygon = t.polygon AND r.class = t.class
+           WHERE t.site_pk = ? ORDER BY t.id, r.revision"#,
+        site_pk,
+    )
+    .fetch_all(db)
+    .await?;
+    let mut revisions: HashMap<TerrainId, Vec<u32>> = HashMap::new();
+    for row in rows {
+        let of_terrain = revisions.entry(parse("terrain", &row.id)?).or_default();
+        of_terrain.push(unsigned("terrain revision", row.revision)?);
+    }
+    Ok(revisions)
 }
 
 /// Writes a terrain's present revision and keeps it in the history.

@@ -6,6 +6,7 @@
 mod alerts;
 pub mod connections;
 mod drive;
+mod etag;
 mod events;
 pub mod extract;
 mod friction;
@@ -21,6 +22,7 @@ mod sites;
 mod stops;
 mod terrains;
 pub mod tls;
+mod withdrawals;
 
 use std::any::Any;
 use std::sync::Arc;
@@ -111,8 +113,16 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(geofence::get, geofence::replace))
         .routes(routes!(friction::terrains))
         .routes(routes!(friction::terrain))
-        .routes(routes!(friction::cells))
+        .routes(routes!(friction::history))
+        .routes(routes!(friction::robots))
+        .routes(routes!(friction::places::cells))
+        .routes(routes!(friction::places::point))
+        .routes(routes!(friction::places::path))
+        .routes(routes!(friction::places::difference))
+        .routes(routes!(friction::places::visits))
         .routes(routes!(friction::segments))
+        .routes(routes!(withdrawals::create))
+        .routes(routes!(withdrawals::list))
         .layer(Extension(BodyLimit(BODY_MAX)))
         .merge(missions)
         .merge(session)

@@ -219,6 +219,7 @@ fn config(folder: &Path, zenoh: &str) -> Config {
         database: database(folder),
         site: site(),
         friction: FrictionConfig::default(),
+        normalisations: Vec::new(),
         tls: None,
         web: WebConfig {
             hosts: vec!["tread.test".to_owned()],

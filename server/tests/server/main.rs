@@ -8,6 +8,8 @@ mod control;
 #[cfg(test)]
 mod drive;
 #[cfg(test)]
+mod friction;
+#[cfg(test)]
 mod geofence;
 #[cfg(test)]
 mod harness;
@@ -15,6 +17,8 @@ mod harness;
 mod identity;
 #[cfg(test)]
 mod ingest;
+#[cfg(test)]
+mod map;
 #[cfg(test)]
 mod metrics;
 #[cfg(test)]

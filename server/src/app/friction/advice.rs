@@ -1,0 +1,170 @@
+//! Where a visit would teach most, and what each robot has put in.
+
+use std::collections::BTreeMap;
+
+use jiff::Timestamp;
+use tread_api::friction::{RobotContribution, VisitSuggestion};
+use tread_api::geometry::Point;
+use tread_api::ids::{RobotId, SiteId};
+use tread_api::page::Page;
+use tread_api::site::Cell;
+
+use super::cells::{Area, Drawn};
+use super::{App, AppError, Asked, Reading, SiteView, page, terrain_ref};
+use crate::friction::Ground;
+use crate::friction::index::SiteMap;
+
+/// Most cells that one question about visits looks at.
+const LOOKED_AT_MAX: f64 = 262_144.0;
+/// Deviation of θ over θ of one ordinary visit by one robot, with the robot's own bias.
+const VISIT_DEVIATION_RATIO: f64 = 0.13;
+/// The same of ground of which nothing is known: a factor of three either way.
+const UNKNOWN_DEVIATION_RATIO: f64 = 1.1;
+/// Seconds of an hour.
+const HOUR_S: i64 = 3_600;
+
+impl App {
+    /// Cells of a box in which a visit would shrink the deviation of θ most, the best first.
+    pub async fn visits_worth_most(
+        &self,
+        site: &SiteId,
+        asked: &Asked,
+        area: Area,
+        limit: u32,
+    ) -> Result<Page<VisitSuggestion>, AppError> {
+        let reading = Reading::new(self, asked)?;
+        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let grid = view.row.site.grid;
+        let count = area.count(grid.cell_m);
+        if count > LOOKED_AT_MAX {
+            return Err(AppError::InvalidQuery {
+                parameter: "x_min_m",
+                detail: format!("this box has {count} cells; at most {LOOKED_AT_MAX} here"),
+            });
+        }
+        let (min, max) = area.cells(&grid)?;
+        let drawn = Drawn::new(&view.terrains);
+        let mut found = self.maps().look(&view.row, |map| {
+            let cells =
+                (min.iy..=max.iy).flat_map(|iy| (min.ix..=max.ix).map(move |ix| Cell { ix, iy }));
+            let suggestion = |cell: Cell| {
+                let center = grid.center_of(cell);
+                suggested(map, &drawn, &reading, cell, center)
+            };
+            cells.filter_map(suggestion).collect::<Vec<_>>()
+        });
+        found.sort_by(|left, right| {
+            let by_gain = right.gain.total_cmp(&left.gain);
+            by_gain.then_with(|| (left.cell.iy, left.cell.ix).cmp(&(right.cell.iy, right.cell.ix)))
+        });
+        found.truncate(usize::try_from(limit).unwrap_or(usize::MAX));
+        Ok(Page {
+            items: found,
+            next_cursor: None,
+        })
+    }
+
+    /// What each robot has put into the map of a site, by name.
+    pub async fn contributions(
+        &self,
+        site: &SiteId,
+        cursor: Option<&str>,
+        limit: u32,
+    ) -> Result<Page<RobotContribution>, AppError> {
+        let reading = Reading::new(self, &Asked::default())?;
+        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let found = self.maps().look(&view.row, |map| {
+            let biases = biases(map, &view, &reading);
+            let contributions = map.contributions().into_iter();
+            let listed = contributions
+                .filter(|found| cursor.is_none_or(|after| found.robot.as_str() > after));
+            let time = |at: Result<Timestamp, _>| at.unwrap_or(Timestamp::MAX);
+            let shown = listed.map(|found| RobotContribution {
+                bias_ratio: biases.get(&found.robot).copied(),
+                robot: found.robot,
+                cells: found.cells,
+                segments: found.segments,
+                first_at: time(Timestamp::from_second(found.first_epoch_h * HOUR_S)),
+                newest_at: time(Timestamp::from_microsecond(found.newest_at_us)),
+            });
+            shown.collect()
+        });
+        Ok(page(found, limit, |found: &RobotContribution| {
+            found.robot.to_string()
+        }))
+    }
+}
+
+fn suggested(
+    map: &SiteMap,
+    drawn: &Drawn<'_>,
+    reading: &Reading<'_>,
+    cell: Cell,
+    center: Point,
+) -> Option<VisitSuggestion> {
+    let terrain = drawn.at(center);
+    let known = map
+        .cell(cell, reading.choice())
+        .into_iter()
+        .filter(|group| group.terrain.map(|found| &found.id) == terrain.map(|found| &found.id))
+        .filter_map(|group| reading.fused(group, Ground::Cell))
+        .min_by(|left, right| left.std_dev.total_cmp(&right.std_dev));
+    // Nobody is sent to where nothing is drawn and nobody has been.
+    if terrain.is_none() && known.is_none() {
+        return None;
+    }
+    let relative = known.map(|known| known.std_dev / known.theta);
+    let now = relative.unwrap_or(UNKNOWN_DEVIATION_RATIO);
+    // Two words on the same value: 1/σ'² = 1/σ² + 1/σ_v².
+    let gain = 0.5 * (now / VISIT_DEVIATION_RATIO).powi(2).ln_1p();
+    Some(VisitSuggestion {
+        cell,
+        center,
+        terrain: terrain.map(terrain_ref),
+        gain,
+        relative_deviation: relative,
+        disputed: known.is_some_and(|known| known.disputed),
+    })
+}
+
+/// Each robot's θ over the one of all robots of its model, the median over terrains.
+fn biases(map: &SiteMap, view: &SiteView, reading: &Reading<'_>) -> BTreeMap<RobotId, f64> {
+    let mut ratios: BTreeMap<RobotId, Vec<f64>> = BTreeMap::new();
+    for terrain in &view.terrains {
+        let groups = map.terrain(
+            |found| found.id == terrain.id && view.is_present(found),
+            reading.choice(),
+        );
+        for group in groups {
+            let robots: Vec<(u32, Option<f64>)> = group
+                .seen
+                .chunk_by(|left, right| left.robot == right.robot)
+                .map(|seen| {
+                    let mut alone = group.clone();
+                    alone.seen = seen.to_vec();
+                    let theta = reading.fused(alone, Ground::Area).map(|known| known.theta);
+                    (seen[0].robot, theta)
+                })
+                .collect();
+            if robots.len() < 2 {
+                continue;
+            }
+            let Some(common) = reading.fused(group, Ground::Area) else {
+                continue;
+            };
+            for (rank, theta) in robots {
+                if let (Some(robot), Some(theta)) = (map.robot_of_rank(rank), theta) {
+                    let of_robot = ratios.entry(robot.clone()).or_default();
+                    of_robot.push(theta / common.theta);
+                }
+            }
+        }
+    }
+    ratios
+        .into_iter()
+        .filter_map(|(robot, mut ratios)| {
+            ratios.sort_unstable_by(f64::total_cmp);
+            Some((robot, *ratios.get(ratios.len() / 2)?))
+        })
+        .collect()
+}

@@ -1,0 +1,436 @@
+//! What is known of places: a point, the cells of a box, and how they differ between two times.
+
+use std::collections::BTreeMap;
+
+use jiff::Timestamp;
+use tread_api::friction::{CellDifference, CellFriction, ModelFriction, PointFriction};
+use tread_api::geometry::{COORDINATE_MAX_M, Point};
+use tread_api::ids::{ConfigurationId, SiteId};
+use tread_api::page::Page;
+use tread_api::site::{CELL_MAX_M, Cell, Grid};
+use tread_api::terrain::{Terrain, TerrainRef, TerrainShape, terrain_at};
+
+use super::{App, AppError, Asked, Reading, SiteView, page, site_row, terrain_ref};
+use crate::friction::Ground;
+use crate::friction::index::{Group, SiteMap};
+
+/// Most cells that a box with a resolution may have.
+pub const CELLS_MAX: f64 = 4_194_304.0;
+
+/// A rectangle of a site.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Area {
+    /// The corner with the lowest coordinates.
+    pub min: Point,
+    /// The corner with the highest coordinates.
+    pub max: Point,
+}
+
+impl Area {
+    /// From bounds that may be left out: the whole map then.
+    ///
+    /// # Errors
+    /// A bound that is no place, or a box that is inside out.
+    pub fn new(
+        min: (Option<f64>, Option<f64>),
+        max: (Option<f64>, Option<f64>),
+    ) -> Result<Self, AppError> {
+        for (parameter, low, high) in [("x_max_m", min.0, max.0), ("y_max_m", min.1, max.1)] {
+            let low = low.unwrap_or(-COORDINATE_MAX_M);
+            let high = high.unwrap_or(COORDINATE_MAX_M);
+            let bounds = -COORDINATE_MAX_M..=COORDINATE_MAX_M;
+            if !bounds.contains(&low) || !bounds.contains(&high) {
+                return Err(AppError::InvalidQuery {
+                    parameter,
+                    detail: format!(
+                        "a box lies on the map, within {COORDINATE_MAX_M} m of the origin"
+                    ),
+                });
+            }
+            if low > high {
+                return Err(AppError::InvalidQuery {
+                    parameter,
+                    detail: format!("the box is inside out: {low} m to {high} m"),
+                });
+            }
+        }
+        let point = |(x_m, y_m): (Option<f64>, Option<f64>), otherwise: f64| Point {
+            x_m: x_m.unwrap_or(otherwise),
+            y_m: y_m.unwrap_or(otherwise),
+        };
+        Ok(Self {
+            min: point(min, -COORDINATE_MAX_M),
+            max: point(max, COORDINATE_MAX_M),
+        })
+    }
+
+    /// The first and last cell of the box in a grid with cells of this size.
+    pub(super) fn cells(&self, grid: &Grid) -> Result<(Cell, Cell), AppError> {
+        let cell = |point| {
+            grid.cell_at(point).ok_or_else(|| AppError::InvalidQuery {
+                parameter: "x_min_m",
+                detail: "the box must be on the map".to_owned(),
+            })
+        };
+        Ok((cell(self.min)?, cell(self.max)?))
+    }
+
+    /// How many cells of this size it has, as a number that may be large.
+    pub(super) fn count(&self, size_m: f64) -> f64 {
+        let count = |low: f64, high: f64| ((high - low) / size_m).floor() + 1.0;
+        count(self.min.x_m, self.max.x_m) * count(self.min.y_m, self.max.y_m)
+    }
+}
+
+/// Which cells are asked for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CellsAsked<'query> {
+    /// Where.
+    pub area: Area,
+    /// Side of the squares that cells are put together to, metres; the grid's own when absent.
+    pub resolution_m: Option<f64>,
+    /// The last cell of the page before.
+    pub cursor: Option<&'query str>,
+    /// Most cells.
+    pub limit: u32,
+}
+
+impl App {
+    /// The friction of the cells in an area, row by row. The limit counts cells; a cell gives one
+    /// entry per terrain and robot model.
+    pub async fn friction_of_cells(
+        &self,
+        site: &SiteId,
+        asked: &Asked,
+        cells: CellsAsked<'_>,
+    ) -> Result<Page<CellFriction>, AppError> {
+        let CellsAsked {
+            area,
+            resolution_m,
+            cursor,
+            limit,
+        } = cells;
+        let reading = Reading::new(self, asked)?;
+        let after = cursor.map(read_cursor).transpose()?;
+        let row = site_row(&mut self.db().read().await?, site).await?;
+        let grid = row.site.grid;
+        let factor = factor(&grid, resolution_m, &area)?;
+        let size_m = grid.cell_m * f64::from(factor);
+        let bounds = area.cells(&Grid {
+            cell_m: size_m,
+            ..grid
+        })?;
+        let wanted = usize::try_from(limit)
+            .unwrap_or(usize::MAX)
+            .saturating_add(1);
+        Ok(self.maps().look(&row, |map| {
+            let found = squares(map, factor, bounds, after, wanted);
+            let cells = page(found, limit, |(cell, _)| format!("{},{}", cell.ix, cell.iy));
+            let mut items = Vec::new();
+            for (cell, parts) in cells.items {
+                let (groups, ground) = match parts {
+                    None => (map.cell(cell, reading.choice()), Ground::Cell),
+                    Some(parts) => (map.area(&parts, reading.choice()), Ground::Area),
+                };
+                for group in groups {
+                    let (terrain, configuration) = (group.terrain.cloned(), group.configuration);
+                    if let Some(friction) = reading.fused(group, ground) {
+                        items.push(CellFriction {
+                            cell,
+                            size_m,
+                            terrain,
+                            configuration,
+                            friction,
+                            normalisation: reading.normalisation(),
+                        });
+                    }
+                }
+            }
+            Page {
+                items,
+                next_cursor: cells.next_cursor,
+            }
+        }))
+    }
+
+    /// What is known of the ground at a point: only what was measured on the terrain under it.
+    pub async fn friction_at(
+        &self,
+        site: &SiteId,
+        asked: &Asked,
+        point: Point,
+    ) -> Result<PointFriction, AppError> {
+        let reading = Reading::new(self, asked)?;
+        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let off_the_map = || AppError::InvalidQuery {
+            parameter: "x_m",
+            detail: format!("a point lies on the map, within {COORDINATE_MAX_M} m of the origin"),
+        };
+        let cell = view.row.site.grid.cell_at(point).ok_or_else(off_the_map)?;
+        let drawn = Drawn::new(&view.terrains);
+        let terrain = drawn.at(point);
+        let measured = self.maps().look(&view.row, |map| {
+            let groups = map.cell(cell, reading.choice()).into_iter();
+            let here = groups.filter(|group| is_here(&view, group.terrain, terrain));
+            let models = same_ground(here).into_iter().map(|group| ModelFriction {
+                configuration: group.configuration,
+                model: view.model(group.configuration),
+                friction: reading.fused(group, Ground::Cell),
+                prior: None,
+                normalisation: reading.normalisation(),
+            });
+            models.collect::<Vec<_>>()
+        });
+        // What the class is like elsewhere is asked only where nothing was measured.
+        let models = match terrain {
+            Some(terrain) if measured.is_empty() => {
+                let classes = self.classes(&view, &reading);
+                let models = classes.models(&view, &reading, terrain).into_iter();
+                let expected = models.map(|model| ModelFriction {
+                    prior: classes.prior(terrain, model.configuration),
+                    friction: None,
+                    ..model
+                });
+                expected.filter(|model| model.prior.is_some()).collect()
+            }
+            _ => measured,
+        };
+        Ok(PointFriction {
+            cell,
+            terrain: terrain.map(terrain_ref),
+            models,
+        })
+    }
+
+    /// How cells that were measured between two times differ from before to after.
+    pub async fn friction_difference(
+        &self,
+        site: &SiteId,
+        asked: &Asked,
+        (from, to): (Timestamp, Option<Timestamp>),
+        cells: CellsAsked<'_>,
+    ) -> Result<Page<CellDifference>, AppError> {
+        let asked = Asked {
+            as_of: to,
+            ..asked.clone()
+        };
+        let late = Reading::new(self, &asked)?;
+        if from.as_microsecond() > late.now_us {
+            return Err(AppError::InvalidQuery {
+                parameter: "to",
+                detail: "to lies before from".to_owned(),
+            });
+        }
+        let early = late.at(from);
+        let after = cells.cursor.map(read_cursor).transpose()?;
+        let row = site_row(&mut self.db().read().await?, site).await?;
+        let (min, max) = cells.area.cells(&row.site.grid)?;
+        let wanted = usize::try_from(cells.limit).unwrap_or(usize::MAX);
+        Ok(self.maps().look(&row, |map| {
+            let measured = map.cells_in(min, max, after).filter(|&cell| {
+                let newest = map.newest_at_us(cell, late.choice());
+                newest.is_some_and(|newest_us| newest_us > from.as_microsecond())
+            });
+            let found: Vec<Cell> = measured.take(wanted.saturating_add(1)).collect();
+            let cells = page(found, cells.limit, |cell| {
+                format!("{},{}", cell.ix, cell.iy)
+            });
+            let items = cells
+                .items
+                .into_iter()
+                .flat_map(|cell| differences(map, cell, &early, &late));
+            Page {
+                items: items.collect(),
+                next_cursor: cells.next_cursor,
+            }
+        }))
+    }
+}
+
+fn differences(
+    map: &SiteMap,
+    cell: Cell,
+    early: &Reading<'_>,
+    late: &Reading<'_>,
+) -> Vec<CellDifference> {
+    type Key = (Option<TerrainRef>, ConfigurationId);
+    let key = |group: &Group<'_>| -> Key { (group.terrain.cloned(), group.configuration) };
+    let mut before: BTreeMap<Key, _> = map
+        .cell(cell, early.choice())
+        .into_iter()
+        .filter_map(|group| Some((key(&group), early.fused(group, Ground::Cell)?)))
+        .collect();
+    let after = map.cell(cell, late.choice()).into_iter();
+    let both = after.map(|group| {
+        let key = key(&group);
+        let before = before.remove(&key);
+        let after = late.fused(group, Ground::Cell);
+        let deviations = before.zip(after).map(|(before, after)| {
+            (after.theta - before.theta) / before.std_dev.hypot(after.std_dev)
+        });
+        CellDifference {
+            cell,
+            terrain: key.0,
+            configuration: key.1,
+            before,
+            after,
+            deviations,
+        }
+    });
+    both.collect()
+}
+
+/// Whether what was measured on a ground counts where this terrain is drawn now.
+pub(super) fn is_here(
+    view: &SiteView,
+    measured_on: Option<&TerrainRef>,
+    drawn: Option<&Terrain>,
+) -> bool {
+    match (measured_on, drawn) {
+        (None, None) => true,
+        (Some(found), Some(terrain)) => found.id == terrain.id && view.is_present(found),
+        (None, Some(_)) | (Some(_), None) => false,
+    }
+}
+
+/// Revisions that are the same ground, together.
+pub(super) fn same_ground<'map>(groups: impl Iterator<Item = Group<'map>>) -> Vec<Group<'map>> {
+    let mut joined: Vec<Group<'map>> = Vec::new();
+    for group in groups {
+        let same = joined
+            .iter_mut()
+            .find(|present| present.configuration == group.configuration);
+        match same {
+            Some(present) => present.seen.extend(group.seen),
+            None => joined.push(group),
+        }
+    }
+    joined
+}
+
+/// The terrains as they are drawn, to find the one under a point.
+pub(super) struct Drawn<'view> {
+    terrains: &'view [Terrain],
+    shapes: Vec<TerrainShape>,
+}
+
+impl<'view> Drawn<'view> {
+    pub(super) fn new(terrains: &'view [Terrain]) -> Self {
+        let shape = |terrain: &Terrain| TerrainShape {
+            terrain: terrain_ref(terrain),
+            polygon: terrain.polygon.clone(),
+            layer: terrain.layer,
+        };
+        Self {
+            terrains,
+            shapes: terrains.iter().map(shape).collect(),
+        }
+    }
+
+    pub(super) fn at(&self, point: Point) -> Option<&'view Terrain> {
+        let shape = terrain_at(&self.shapes, point)?;
+        self.terrains
+            .iter()
+            .find(|terrain| terrain.id == shape.terrain.id)
+    }
+}
+
+/// Cells of the grid along a side of a square of this resolution.
+fn factor(grid: &Grid, resolution_m: Option<f64>, area: &Area) -> Result<i32, AppError> {
+    let Some(resolution_m) = resolution_m else {
+        return Ok(1);
+    };
+    let invalid = |detail| AppError::InvalidQuery {
+        parameter: "resolution_m",
+        detail,
+    };
+    let ratio = resolution_m / grid.cell_m;
+    if !(grid.cell_m..=CELL_MAX_M * 100.0).contains(&resolution_m)
+        || (ratio - ratio.round()).abs() > 1.0e-9 * ratio
+    {
+        return Err(invalid(format!(
+            "resolution_m must be a whole multiple of the grid's {} m up to {} m",
+            grid.cell_m,
+            CELL_MAX_M * 100.0
+        )));
+    }
+    let count = area.count(resolution_m);
+    if count > CELLS_MAX {
+        return Err(invalid(format!(
+            "this would be {count} cells; a box may have {CELLS_MAX}"
+        )));
+    }
+    #[expect(clippy::cast_possible_truncation, reason = "at most 100 000")]
+    let factor = ratio.round() as i32;
+    Ok(factor)
+}
+
+/// A square and the cells of the grid in it that hold anything; none where it is a cell itself.
+type Square = (Cell, Option<Vec<Cell>>);
+
+/// Squares that hold anything, row by row.
+fn squares(
+    map: &SiteMap,
+    factor: i32,
+    (min, max): (Cell, Cell),
+    after: Option<Cell>,
+    wanted: usize,
+) -> Vec<Square> {
+    if factor == 1 {
+        let cells = map.cells_in(min, max, after).take(wanted);
+        return cells.map(|cell| (cell, None)).collect();
+    }
+    let first = |square: Cell| Cell {
+        ix: square.ix.saturating_mul(factor),
+        iy: square.iy.saturating_mul(factor),
+    };
+    let last = |square: Cell| Cell {
+        ix: first(square).ix.saturating_add(factor - 1),
+        iy: first(square).iy.saturating_add(factor - 1),
+    };
+    let mut found: Vec<Square> = Vec::new();
+    let mut row = after.map_or(min.iy, |after| after.iy.max(min.iy));
+    while row <= max.iy && found.len() < wanted {
+        // The next row of the grid with anything in it tells the next row of squares.
+        let low = first(Cell {
+            ix: min.ix,
+            iy: row,
+        });
+        let Some(next) = map.cells_in(low, last(max), None).next() else {
+            break;
+        };
+        row = next.iy.div_euclid(factor);
+        let low = first(Cell {
+            ix: min.ix,
+            iy: row,
+        });
+        let high = last(Cell {
+            ix: max.ix,
+            iy: row,
+        });
+        let mut columns: BTreeMap<i32, Vec<Cell>> = BTreeMap::new();
+        for cell in map.cells_in(low, high, None) {
+            let column = columns.entry(cell.ix.div_euclid(factor)).or_default();
+            column.push(cell);
+        }
+        let is_new = |ix: i32| after.is_none_or(|after| (row, ix) > (after.iy, after.ix));
+        let squares = columns.into_iter().filter(|&(ix, _)| is_new(ix));
+        found.extend(squares.map(|(ix, cells)| (Cell { ix, iy: row }, Some(cells))));
+        let Some(next) = row.checked_add(1) else {
+            break;
+        };
+        row = next;
+    }
+    found.truncate(wanted);
+    found
+}
+
+fn read_cursor(cursor: &str) -> Result<Cell, AppError> {
+    let cell = cursor.split_once(',').and_then(|(ix, iy)| {
+        Some(Cell {
+            ix: ix.parse().ok()?,
+            iy: iy.parse().ok()?,
+        })
+    });
+    cell.ok_or_else(|| crate::app::bad_cursor(cursor))
+}

@@ -1,0 +1,201 @@
+//! What the map says, made from the sums at the time of reading.
+
+mod advice;
+mod cells;
+mod path;
+mod prior;
+mod reading;
+
+use std::collections::HashMap;
+
+use jiff::{SignedDuration, Timestamp};
+use tread_api::friction::{ModelFriction, TerrainAt, TerrainFriction, TerrainHistory};
+use tread_api::ids::{ConfigurationId, SiteId, TerrainId};
+use tread_api::page::Page;
+use tread_api::terrain::{Terrain, TerrainRef};
+
+pub use self::cells::{Area, CELLS_MAX, CellsAsked};
+use self::prior::Classes;
+pub use self::reading::Asked;
+pub(super) use self::reading::Reading;
+use super::{App, AppError, page, site_row};
+use crate::db::sites::SiteRow;
+use crate::db::{self, Tx};
+use crate::friction::Ground;
+
+/// The model's name while only measurements have named the configuration.
+const UNKNOWN_MODEL: &str = "not declared";
+/// Most times of one history.
+const TIMES_MAX: i64 = 1_000;
+
+/// Everything that answers about a site's terrains need from the database.
+pub(super) struct SiteView {
+    pub(super) row: SiteRow,
+    pub(super) terrains: Vec<Terrain>,
+    /// Of each terrain, the revisions that are the same ground as the present one.
+    revisions: HashMap<TerrainId, Vec<u32>>,
+    models: HashMap<ConfigurationId, String>,
+}
+
+impl SiteView {
+    pub(super) async fn read(tx: &mut Tx, site: &SiteId) -> Result<Self, AppError> {
+        let row = site_row(tx, site).await?;
+        let terrains = db::terrains::list(tx, row.pk).await?;
+        let revisions = db::terrains::same_ground(tx, row.pk).await?;
+        let models = db::robots::model_names(tx).await?;
+        Ok(Self {
+            row,
+            terrains,
+            revisions,
+            models,
+        })
+    }
+
+    /// Whether a measurement on this revision is one of the ground as it is drawn now.
+    pub(super) fn is_present(&self, found: &TerrainRef) -> bool {
+        let revisions = self.revisions.get(&found.id);
+        revisions.is_some_and(|revisions| revisions.contains(&found.revision))
+    }
+
+    fn find(&self, site: &SiteId, id: &TerrainId) -> Result<&Terrain, AppError> {
+        let unknown = || AppError::UnknownTerrain(site.clone(), id.clone());
+        let mut terrains = self.terrains.iter();
+        terrains
+            .find(|terrain| terrain.id == *id)
+            .ok_or_else(unknown)
+    }
+
+    pub(super) fn model(&self, configuration: ConfigurationId) -> String {
+        let name = self.models.get(&configuration);
+        name.cloned().unwrap_or_else(|| UNKNOWN_MODEL.to_owned())
+    }
+}
+
+impl App {
+    /// The friction of every terrain of a site, after a cursor.
+    pub async fn friction_of_terrains(
+        &self,
+        site: &SiteId,
+        asked: &Asked,
+        cursor: Option<&str>,
+        limit: u32,
+    ) -> Result<Page<TerrainFriction>, AppError> {
+        let reading = Reading::new(self, asked)?;
+        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let classes = self.classes(&view, &reading);
+        let wanted = |terrain: &&Terrain| cursor.is_none_or(|after| terrain.id.as_str() > after);
+        let listed: Vec<&Terrain> = view.terrains.iter().filter(wanted).collect();
+        let Page { items, next_cursor } = page(listed, limit, |terrain| terrain.id.to_string());
+        let items = items
+            .into_iter()
+            .map(|terrain| terrain_friction(terrain, classes.models(&view, &reading, terrain)));
+        Ok(Page {
+            items: items.collect(),
+            next_cursor,
+        })
+    }
+
+    /// The friction of one terrain.
+    pub async fn friction_of_terrain(
+        &self,
+        site: &SiteId,
+        id: &TerrainId,
+        asked: &Asked,
+    ) -> Result<TerrainFriction, AppError> {
+        let reading = Reading::new(self, asked)?;
+        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let terrain = view.find(site, id)?;
+        let classes = self.classes(&view, &reading);
+        let models = classes.models(&view, &reading, terrain);
+        Ok(terrain_friction(terrain, models))
+    }
+
+    /// The friction of one terrain as it was known at equally spaced times, the last of them `to`.
+    pub async fn history_of_terrain(
+        &self,
+        (site, id): (&SiteId, &TerrainId),
+        asked: &Asked,
+        (from, to): (Timestamp, Option<Timestamp>),
+        step: SignedDuration,
+    ) -> Result<TerrainHistory, AppError> {
+        let to = to.unwrap_or_else(|| self.clock().now());
+        let invalid = |parameter, detail| AppError::InvalidQuery { parameter, detail };
+        if to < from {
+            return Err(invalid("to", "to lies before from".to_owned()));
+        }
+        let steps = to.duration_since(from).as_secs() / step.as_secs().max(1);
+        if steps >= TIMES_MAX {
+            let detail = format!(
+                "this would give {} times; at most {TIMES_MAX}",
+                steps.saturating_add(1)
+            );
+            return Err(invalid("step_s", detail));
+        }
+        let reading = Reading::new(self, asked)?;
+        Reading::new(
+            self,
+            &Asked {
+                as_of: Some(to),
+                ..asked.clone()
+            },
+        )?;
+        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let terrain = view.find(site, id)?;
+        let mut items = Vec::new();
+        for index in 0..=steps {
+            let back = step.saturating_mul(i32::try_from(steps - index).unwrap_or(i32::MAX));
+            let at = to.checked_sub(back).unwrap_or(from);
+            let models = self.measured_models(&view, &reading.at(at), terrain);
+            items.push(TerrainAt { at, models });
+        }
+        Ok(TerrainHistory {
+            terrain: terrain_ref(terrain),
+            items,
+        })
+    }
+
+    /// What was measured of a terrain, per robot model.
+    fn measured_models(
+        &self,
+        view: &SiteView,
+        reading: &Reading<'_>,
+        terrain: &Terrain,
+    ) -> Vec<ModelFriction> {
+        let is_wanted = |found: &TerrainRef| found.id == terrain.id && view.is_present(found);
+        self.maps().look(&view.row, |map| {
+            let groups = map.terrain(is_wanted, reading.choice());
+            let models = groups.into_iter().map(|group| ModelFriction {
+                configuration: group.configuration,
+                model: view.model(group.configuration),
+                friction: reading.fused(group, Ground::Area),
+                prior: None,
+                normalisation: reading.normalisation(),
+            });
+            models.collect()
+        })
+    }
+
+    fn classes(&self, view: &SiteView, reading: &Reading<'_>) -> Classes {
+        let measured = view.terrains.iter().map(|terrain| {
+            let models = self.measured_models(view, reading, terrain);
+            (terrain.id.clone(), terrain.class, models)
+        });
+        Classes::new(measured.collect())
+    }
+}
+
+fn terrain_ref(terrain: &Terrain) -> TerrainRef {
+    TerrainRef {
+        id: terrain.id.clone(),
+        revision: terrain.revision,
+    }
+}
+
+fn terrain_friction(terrain: &Terrain, models: Vec<ModelFriction>) -> TerrainFriction {
+    TerrainFriction {
+        models,
+        terrain: terrain_ref(terrain),
+        name: terrain.name.clone(),
+        class: terrain.class,
+    }
+}

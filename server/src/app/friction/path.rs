@@ -1,0 +1,318 @@
+//! What is known along a path, and the speed that follows.
+//!
+//! Curves are driven with `v² ≤ a_across/κ`, and the robot must be able to stand at the end and to
+//! be as slow as each later piece asks: `v² ≤ v_next² + 2·a_along·Δs`. Both accelerations come from
+//! the grip of the piece, a lower bound, through the shares that the robot's own planner uses.
+
+use tread_api::friction::{AskPath, FusedFriction, PathFriction, PathPiece};
+use tread_api::geometry::Point;
+use tread_api::ids::SiteId;
+use tread_api::robot::RobotModel;
+use tread_api::site::{Cell, Grid};
+use tread_control::robot::RobotModel as PlannedModel;
+
+use super::cells::{Drawn, is_here, same_ground};
+use super::{App, AppError, Asked, Reading, SiteView};
+use crate::db;
+use crate::friction::Ground;
+use crate::friction::index::SiteMap;
+
+/// Longest path, metres.
+const LENGTH_MAX_M: f64 = 10_000.0;
+/// Fewest and most corners.
+const POINTS: std::ops::RangeInclusive<usize> = 2..=10_000;
+/// Most pieces, however small the cells are.
+const PIECES_MAX: usize = 100_000;
+/// Friction coefficient that is reckoned with where nothing better is known; the planner's own.
+const GRIP_CAUTIOUS_MU: f64 = 0.14;
+/// Slip up to which friction grows in proportion to it.
+const SLIP_LINEAR: f64 = 0.2;
+
+impl App {
+    /// What is known along a path, for a robot.
+    ///
+    /// # Errors
+    /// Site or robot is not known, or the path is none.
+    pub async fn friction_along(
+        &self,
+        site: &SiteId,
+        request: AskPath,
+    ) -> Result<PathFriction, AppError> {
+        let AskPath {
+            points,
+            robot,
+            as_of,
+            normalisation,
+        } = request;
+        let mut tx = self.db().read().await?;
+        let view = SiteView::read(&mut tx, site).await?;
+        let found = db::robots::find(&mut tx, view.row.pk, &robot).await?;
+        drop(tx);
+        let found = found.ok_or_else(|| AppError::UnknownRobot(site.clone(), robot.clone()))?;
+        let asked = Asked {
+            as_of,
+            configuration: Some(found.configuration),
+            normalisation,
+        };
+        let reading = Reading::new(self, &asked).map_err(in_body)?;
+        let length_m = checked_length(&points)?;
+        let cut = cut(&points, &view.row.site.grid)?;
+        let drawn = Drawn::new(&view.terrains);
+        let mut pieces: Vec<PathPiece> = self.maps().look(&view.row, |map| {
+            let piece = |cut: &Cut| {
+                let known = known_at(map, &view, &drawn, &reading, cut);
+                described(cut, known.as_ref())
+            };
+            cut.iter().map(piece).collect()
+        });
+        set_speeds(&mut pieces, &cut, length_m, &found.model);
+        let known_m: f64 = pieces
+            .iter()
+            .zip(&cut)
+            .filter(|(piece, _)| piece.theta.is_some())
+            .map(|(_, cut)| cut.length_m)
+            .sum();
+        Ok(PathFriction {
+            length_m,
+            configuration: found.configuration,
+            normalisation: reading.normalisation(),
+            known_ratio: (known_m / length_m).min(1.0),
+            pieces,
+        })
+    }
+}
+
+/// The planner's friction coefficient: the larger of what was shown of late and a cautious value,
+/// within what needs no more than linear slip.
+pub(in crate::app) fn grip_mu(known: Option<&FusedFriction>) -> f64 {
+    let shown = known.and_then(|known| known.mu_peak_lower_bound);
+    let grip = shown.unwrap_or(0.0).max(GRIP_CAUTIOUS_MU);
+    known.map_or(grip, |known| {
+        grip.min(SLIP_LINEAR * known.bounds.stiffness_lower_5)
+    })
+}
+
+fn in_body(error: AppError) -> AppError {
+    if let AppError::InvalidQuery { parameter, detail } = error {
+        let field = parameter;
+        AppError::Invalid { field, detail }
+    } else {
+        error
+    }
+}
+
+fn invalid(detail: String) -> AppError {
+    AppError::Invalid {
+        field: "points",
+        detail,
+    }
+}
+
+fn checked_length(points: &[Point]) -> Result<f64, AppError> {
+    if !POINTS.contains(&points.len()) {
+        return Err(invalid(format!(
+            "a path has {} to {} points, not {}",
+            POINTS.start(),
+            POINTS.end(),
+            points.len()
+        )));
+    }
+    if let Some(index) = points.iter().position(|point| !point.is_on_the_map()) {
+        return Err(invalid(format!("point {index} is not on the map")));
+    }
+    let length_m: f64 = points
+        .windows(2)
+        .map(|pair| pair[0].distance_m(pair[1]))
+        .sum();
+    if length_m > LENGTH_MAX_M {
+        let detail = format!("a path is at most {LENGTH_MAX_M} m long, not {length_m:.0}");
+        return Err(invalid(detail));
+    }
+    if length_m <= 0.0 {
+        return Err(invalid("the path has no length".to_owned()));
+    }
+    Ok(length_m)
+}
+
+/// A piece of a side of the path, in one cell.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(in crate::app) struct Cut {
+    pub(in crate::app) from_m: f64,
+    pub(in crate::app) length_m: f64,
+    pub(in crate::app) cell: Cell,
+    pub(in crate::app) middle: Point,
+    /// Curvature at its begin, where that is a corner of the path; per metre.
+    curvature_1_m: f64,
+}
+
+/// Cuts a path where it passes from cell to cell.
+fn cut(points: &[Point], grid: &Grid) -> Result<Vec<Cut>, AppError> {
+    let mut pieces: Vec<Cut> = Vec::new();
+    let mut from_m = 0.0;
+    for (index, pair) in points.windows(2).enumerate() {
+        let (begin, end) = (pair[0], pair[1]);
+        let side_m = begin.distance_m(end);
+        if side_m <= 0.0 {
+            continue;
+        }
+        let curvature_1_m = match index {
+            0 => 0.0,
+            _ => curvature(points[index - 1], begin, end),
+        };
+        let at = |share: f64| Point {
+            x_m: begin.x_m + share * (end.x_m - begin.x_m),
+            y_m: begin.y_m + share * (end.y_m - begin.y_m),
+        };
+        let mut shares = crossings((begin.x_m, end.x_m), grid.cell_m);
+        shares.extend(crossings((begin.y_m, end.y_m), grid.cell_m));
+        shares.extend([0.0, 1.0]);
+        shares.sort_unstable_by(f64::total_cmp);
+        for (place, pair) in shares.windows(2).enumerate() {
+            let length_m = (pair[1] - pair[0]) * side_m;
+            if length_m <= 1.0e-9 && place > 0 {
+                continue;
+            }
+            let middle = at(f64::midpoint(pair[0], pair[1]));
+            let off = || invalid("the path leaves the map".to_owned());
+            pieces.push(Cut {
+                from_m: from_m + pair[0] * side_m,
+                length_m,
+                cell: grid.cell_at(middle).ok_or_else(off)?,
+                middle,
+                curvature_1_m: if place == 0 { curvature_1_m } else { 0.0 },
+            });
+            if pieces.len() > PIECES_MAX {
+                let detail = format!("the path passes through more than {PIECES_MAX} cells");
+                return Err(invalid(detail));
+            }
+        }
+        from_m += side_m;
+    }
+    Ok(pieces)
+}
+
+/// Shares of a side at which one coordinate passes a border between cells.
+fn crossings((from_m, to_m): (f64, f64), cell_m: f64) -> Vec<f64> {
+    let (low, high) = (from_m.min(to_m) / cell_m, from_m.max(to_m) / cell_m);
+    let mut border = low.floor() + 1.0;
+    let mut shares = Vec::new();
+    while border < high {
+        shares.push((border * cell_m - from_m) / (to_m - from_m));
+        border += 1.0;
+    }
+    shares
+}
+
+/// Curvature of the circle through three points, per metre; a turn back is as sharp as can be.
+fn curvature(a: Point, b: Point, c: Point) -> f64 {
+    let (ab, bc, ca) = (a.distance_m(b), b.distance_m(c), c.distance_m(a));
+    let doubled_area =
+        ((b.x_m - a.x_m) * (c.y_m - a.y_m) - (b.y_m - a.y_m) * (c.x_m - a.x_m)).abs();
+    let product = ab * bc * ca;
+    let along = (b.x_m - a.x_m) * (c.x_m - b.x_m) + (b.y_m - a.y_m) * (c.y_m - b.y_m);
+    if product <= 0.0 || (along < 0.0 && doubled_area <= 1.0e-12) {
+        if ab > 0.0 && bc > 0.0 {
+            f64::INFINITY
+        } else {
+            0.0
+        }
+    } else {
+        2.0 * doubled_area / product
+    }
+}
+
+fn known_at(
+    map: &SiteMap,
+    view: &SiteView,
+    drawn: &Drawn<'_>,
+    reading: &Reading<'_>,
+    cut: &Cut,
+) -> Option<FusedFriction> {
+    let groups = map.cell(cut.cell, reading.choice());
+    if groups.is_empty() {
+        return None;
+    }
+    let terrain = drawn.at(cut.middle);
+    let here = groups
+        .into_iter()
+        .filter(|group| is_here(view, group.terrain, terrain));
+    let group = same_ground(here).into_iter().next()?;
+    reading.fused(group, Ground::Cell)
+}
+
+fn described(cut: &Cut, known: Option<&FusedFriction>) -> PathPiece {
+    PathPiece {
+        from_m: cut.from_m,
+        cell: cut.cell,
+        theta: known.map(|known| known.theta),
+        std_dev: known.map(|known| known.std_dev),
+        theta_upper_95: known.map(|known| known.bounds.theta_upper_95),
+        age_s: known.map(|known| known.age_s),
+        disputed: known.is_some_and(|known| known.disputed),
+        grip_mu: grip_mu(known),
+        speed_m_s: 0.0,
+    }
+}
+
+/// From the end, where the robot stands, back to the begin.
+fn set_speeds(pieces: &mut [PathPiece], cut: &[Cut], length_m: f64, model: &RobotModel) {
+    let limits = model.limits;
+    let mut next_m_s = 0.0_f64;
+    let mut next_at_m = length_m;
+    for (piece, cut) in pieces.iter_mut().zip(cut).rev() {
+        let along = PlannedModel::grip_along_m_s2(piece.grip_mu);
+        let along = along.min(limits.linear_acceleration_max_m_s2);
+        let across = PlannedModel::grip_across_m_s2(piece.grip_mu);
+        let across = across.min(limits.lateral_acceleration_max_m_s2);
+        let braked = (next_m_s * next_m_s + 2.0 * along * (next_at_m - cut.from_m)).sqrt();
+        let curve = if cut.curvature_1_m > 0.0 {
+            let turn = limits.angular_max_rad_s / cut.curvature_1_m;
+            (across / cut.curvature_1_m).sqrt().min(turn)
+        } else {
+            f64::INFINITY
+        };
+        piece.speed_m_s = braked.min(curve).min(limits.linear_max_m_s);
+        (next_m_s, next_at_m) = (piece.speed_m_s, cut.from_m);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn point(x_m: f64, y_m: f64) -> Point {
+        Point { x_m, y_m }
+    }
+
+    #[test]
+    fn curvature_is_that_of_the_circle_through_the_points() {
+        let on = |angle: f64| point(5.0 * angle.cos(), 5.0 * angle.sin());
+        assert!((curvature(on(0.0), on(0.1), on(0.3)) - 0.2).abs() < 1e-9);
+        let straight = curvature(point(0.0, 0.0), point(1.0, 0.0), point(3.0, 0.0));
+        assert!(straight.abs() < 1e-12);
+        let back = curvature(point(0.0, 0.0), point(1.0, 0.0), point(0.5, 0.0));
+        assert!(back.is_infinite());
+    }
+
+    proptest! {
+        #[test]
+        fn pieces_cover_the_path_and_each_lies_in_its_cell(
+            corners in prop::collection::vec((-50.0_f64..50.0, -50.0_f64..50.0), 2..12),
+            cell_m in 0.3_f64..5.0,
+        ) {
+            let points: Vec<Point> = corners.iter().map(|&(x_m, y_m)| point(x_m, y_m)).collect();
+            let grid = Grid { revision: 1, cell_m };
+            let length_m = checked_length(&points).unwrap();
+            let pieces = cut(&points, &grid).unwrap();
+            let sum: f64 = pieces.iter().map(|piece| piece.length_m).sum();
+            prop_assert!((sum - length_m).abs() < 1e-6 * length_m);
+            prop_assert!(pieces.is_sorted_by(|left, right| left.from_m <= right.from_m));
+            for piece in &pieces {
+                prop_assert!(piece.length_m <= cell_m * 1.5);
+                prop_assert_eq!(grid.cell_at(piece.middle), Some(piece.cell));
+            }
+        }
+    }
+}

@@ -1,0 +1,102 @@
+//! What to expect of ground that nobody has measured: the same class elsewhere on the site.
+//!
+//! It stands beside what was measured, marked as what it is, and never goes into it.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use tread_api::friction::{ClassPrior, ModelFriction};
+use tread_api::ids::{ConfigurationId, TerrainId};
+use tread_api::terrain::{Terrain, TerrainClass};
+
+use super::{Reading, SiteView};
+
+/// How terrains of one class differ, as a share of θ, while few of them are known.
+const SPREAD_RATIO: f64 = 0.4;
+/// Terrains that this assumption counts as.
+const SPREAD_TERRAINS: f64 = 2.0;
+
+/// What was measured of every terrain of a site.
+pub(super) struct Classes {
+    terrains: Vec<(TerrainId, TerrainClass, Vec<ModelFriction>)>,
+}
+
+impl Classes {
+    pub(super) fn new(terrains: Vec<(TerrainId, TerrainClass, Vec<ModelFriction>)>) -> Self {
+        Self { terrains }
+    }
+
+    /// What is known of a terrain per robot model; an expectation for those that know nothing of it
+    /// and something of its class.
+    pub(super) fn models(
+        &self,
+        view: &SiteView,
+        reading: &Reading<'_>,
+        terrain: &Terrain,
+    ) -> Vec<ModelFriction> {
+        let mut own: BTreeMap<ConfigurationId, ModelFriction> = self
+            .terrains
+            .iter()
+            .filter(|(id, ..)| *id == terrain.id)
+            .flat_map(|(_, _, models)| models.iter())
+            .map(|model| (model.configuration, model.clone()))
+            .collect();
+        let elsewhere: BTreeSet<ConfigurationId> = self
+            .of_class(terrain)
+            .map(|model| model.configuration)
+            .collect();
+        for configuration in elsewhere {
+            let entry = own.entry(configuration).or_insert_with(|| ModelFriction {
+                configuration,
+                model: view.model(configuration),
+                friction: None,
+                prior: None,
+                normalisation: reading.normalisation(),
+            });
+            if entry.friction.is_none() {
+                entry.prior = self.prior(terrain, configuration);
+            }
+        }
+        own.into_values().collect()
+    }
+
+    fn of_class(&self, terrain: &Terrain) -> impl Iterator<Item = &ModelFriction> {
+        let (own, wanted) = (terrain.id.clone(), terrain.class);
+        self.terrains
+            .iter()
+            .filter(move |(id, class, _)| *id != own && *class == wanted)
+            .flat_map(|(_, _, models)| models.iter())
+            .filter(|model| model.friction.is_some())
+    }
+
+    /// The mean of the class's other terrains, with how much they differ and how sure each is.
+    pub(super) fn prior(
+        &self,
+        terrain: &Terrain,
+        configuration: ConfigurationId,
+    ) -> Option<ClassPrior> {
+        let known: Vec<(f64, f64)> = self
+            .of_class(terrain)
+            .filter(|model| model.configuration == configuration)
+            .filter_map(|model| model.friction.map(|known| (known.theta, known.std_dev)))
+            .collect();
+        let terrains = u32::try_from(known.len()).ok().filter(|&count| count > 0)?;
+        let count = f64::from(terrains);
+        let plain = known.iter().map(|(theta, _)| theta).sum::<f64>() / count;
+        let apart: f64 = known.iter().map(|(theta, _)| (theta - plain).powi(2)).sum();
+        let assumed = SPREAD_TERRAINS * (SPREAD_RATIO * plain).powi(2);
+        let spread = (assumed + apart) / (SPREAD_TERRAINS + count - 1.0);
+        let weight = |std_dev: f64| (spread + std_dev * std_dev).recip();
+        let sum: f64 = known.iter().map(|&(_, std_dev)| weight(std_dev)).sum();
+        let theta = known
+            .iter()
+            .map(|&(theta, std_dev)| weight(std_dev) * theta)
+            .sum::<f64>()
+            / sum;
+        Some(ClassPrior {
+            class: terrain.class,
+            theta,
+            std_dev: (spread + sum.recip()).sqrt(),
+            terrains,
+        })
+    }
+}

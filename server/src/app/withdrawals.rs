@@ -1,0 +1,131 @@
+//! Withdrawing what a robot measured: the map is then as if it had never come.
+//!
+//! The sums of the hours go, and what comes late of them does not count either. Raw segments stay
+//! where they are. Hours that are merged into days can only be withdrawn by whole days.
+
+use jiff::Timestamp;
+use tread_api::friction::{CreateWithdrawal, Withdrawal};
+use tread_api::ids::{RobotId, SiteId};
+use tread_api::page::Page;
+
+use super::{App, AppError, page, site_row};
+use crate::db;
+use crate::db::withdrawals::WithdrawalRow;
+use crate::friction::sums::DAY_H;
+use crate::friction::{bucket_h, epoch_h};
+
+/// Most withdrawals of one server; each segment that comes is held against them.
+const WITHDRAWALS_MAX: usize = 1_000;
+/// Longest reason, in characters.
+const REASON_LENGTH_MAX: usize = 500;
+/// Seconds of an hour.
+const HOUR_S: i64 = 3_600;
+
+impl App {
+    /// Withdraws what a robot measured in whole hours, from all sites' maps that it is on.
+    ///
+    /// # Errors
+    /// Site or robot is not known, the hours are none, or they cut through a merged day.
+    pub async fn withdraw(
+        &self,
+        (site, robot): (&SiteId, &RobotId),
+        request: CreateWithdrawal,
+        by: &str,
+    ) -> Result<Withdrawal, AppError> {
+        let CreateWithdrawal { from, to, reason } = request;
+        let reason = reason.trim().to_owned();
+        if reason.is_empty() || reason.chars().count() > REASON_LENGTH_MAX {
+            return Err(AppError::Invalid {
+                field: "reason",
+                detail: format!("a reason has 1 to {REASON_LENGTH_MAX} characters"),
+            });
+        }
+        let now = self.clock().now();
+        let _turn = self.maps().turn().await;
+        let mut tx = self.db().write().await?;
+        let site_row = site_row(&mut tx, site).await?;
+        let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
+        let found = db::robots::find(&mut tx, site_row.pk, robot).await?;
+        let robot_pk = found.ok_or_else(unknown)?.pk;
+        let from_h = from.map_or(0, epoch_h).max(0);
+        let to_h = to.map_or(epoch_h(now), epoch_h);
+        let merged_before_h = site_row.merged_before_h;
+        check_hours((from_h, to_h), merged_before_h)?;
+        let count = db::withdrawals::count(&mut tx).await?;
+        if count >= WITHDRAWALS_MAX {
+            return Err(AppError::TooMany {
+                what: "withdrawals",
+                count,
+            });
+        }
+        let mut row = WithdrawalRow {
+            pk: 0,
+            robot_pk,
+            from_h,
+            to_h,
+            reason,
+            by: by.to_owned(),
+            at: now,
+        };
+        row.pk = db::withdrawals::insert(&mut tx, &row).await?;
+        let removed = db::sums::remove_hours(&mut tx, robot_pk, (from_h, to_h)).await?;
+        tx.commit().await?;
+        self.maps()
+            .change(&site_row, |map| map.withdraw(robot, (from_h, to_h)));
+        tracing::info!(robot.id = %robot, "{removed} sums of robot `{robot}` were withdrawn");
+        Ok(to_api(row, robot.clone()))
+    }
+
+    /// Withdrawals of a site, the oldest first, after a cursor.
+    pub async fn withdrawals(
+        &self,
+        site: &SiteId,
+        cursor: Option<i64>,
+        limit: u32,
+    ) -> Result<Page<Withdrawal>, AppError> {
+        let mut tx = self.db().read().await?;
+        let site_row = site_row(&mut tx, site).await?;
+        let robots = db::robots::of_site_by_key(&mut tx, site_row.pk).await?;
+        let rows = db::withdrawals::all(&mut tx).await?;
+        let found = rows.into_iter().filter_map(|row| {
+            let robot = robots.get(&row.robot_pk)?.clone();
+            (row.pk > cursor.unwrap_or(0)).then(|| to_api(row, robot))
+        });
+        Ok(page(found.collect(), limit, |found| found.id.to_string()))
+    }
+}
+
+fn check_hours((from_h, to_h): (i64, i64), merged_before_h: i64) -> Result<(), AppError> {
+    let time = |hour: i64| Timestamp::from_second(hour * HOUR_S).unwrap_or(Timestamp::MAX);
+    if to_h < from_h {
+        return Err(AppError::Invalid {
+            field: "to",
+            detail: "to lies before from".to_owned(),
+        });
+    }
+    let cuts_begin = bucket_h(from_h, merged_before_h) != from_h;
+    let ends_day = to_h >= merged_before_h || to_h.rem_euclid(DAY_H) == DAY_H - 1;
+    if cuts_begin || !ends_day {
+        return Err(AppError::Invalid {
+            field: if cuts_begin { "from" } else { "to" },
+            detail: format!(
+                "hours before {} are merged into days: give whole ones",
+                time(merged_before_h)
+            ),
+        });
+    }
+    Ok(())
+}
+
+fn to_api(row: WithdrawalRow, robot: RobotId) -> Withdrawal {
+    let time = |hour: i64| Timestamp::from_second(hour * HOUR_S).unwrap_or(Timestamp::MAX);
+    Withdrawal {
+        id: row.pk,
+        robot,
+        from: time(row.from_h),
+        before: time(row.to_h + 1),
+        reason: row.reason,
+        by: row.by,
+        at: row.at,
+    }
+}

@@ -1,0 +1,99 @@
+//! Measurements from a time that has not come, kept until the clock of their run is known.
+
+use serde_json::value::RawValue;
+use sqlx::SqliteConnection;
+use tread_api::friction::Segment;
+
+use super::{DbError, from_json, unsigned};
+
+/// A measurement that waits.
+#[derive(Debug, Clone)]
+pub struct Aside {
+    /// Its number within its run.
+    pub seq: i64,
+    /// The measurement, with the times of the robot's clock.
+    pub segment: Segment,
+}
+
+/// Where a measurement comes from.
+#[derive(Debug, Clone, Copy)]
+pub struct Origin {
+    /// Key of the run of the agent.
+    pub boot_pk: i64,
+    /// Its number within that run.
+    pub seq: i64,
+    /// Key of the site.
+    pub site_pk: i64,
+    /// Key of the robot.
+    pub robot_pk: i64,
+}
+
+/// Puts a measurement aside; `false` if it is there or on the map already.
+pub async fn put(
+    db: &mut SqliteConnection,
+    origin: Origin,
+    (ended_at_us, received_at_us): (i64, i64),
+    measurement: &RawValue,
+) -> Result<bool, DbError> {
+    let Origin {
+        boot_pk,
+        seq,
+        site_pk,
+        robot_pk,
+    } = origin;
+    let text = measurement.get();
+    let done = sqlx::query!(
+        "INSERT INTO segments_aside
+             (boot_pk, seq, site_pk, robot_pk, ended_at_us, received_at_us, measurement)
+         SELECT ?1, ?2, ?3, ?4, ?5, ?6, ?7
+         WHERE NOT EXISTS (SELECT 1 FROM segments WHERE boot_pk = ?1 AND seq = ?2)
+         ON CONFLICT DO NOTHING",
+        boot_pk,
+        seq,
+        site_pk,
+        robot_pk,
+        ended_at_us,
+        received_at_us,
+        text,
+    )
+    .execute(db)
+    .await?;
+    Ok(done.rows_affected() == 1)
+}
+
+/// How many of a robot's measurements wait.
+pub async fn count(db: &mut SqliteConnection, robot_pk: i64) -> Result<u64, DbError> {
+    let count = sqlx::query_scalar!(
+        r#"SELECT COUNT(*) AS "count!: i64" FROM segments_aside WHERE robot_pk = ?"#,
+        robot_pk
+    );
+    unsigned("count", count.fetch_one(db).await?)
+}
+
+/// Takes out what waits of a run and ended before a time of its own clock, at most `limit`.
+pub async fn take(
+    db: &mut SqliteConnection,
+    boot_pk: i64,
+    ended_before_us: i64,
+    limit: u32,
+) -> Result<Vec<Aside>, DbError> {
+    let rows = sqlx::query!(
+        r#"DELETE FROM segments_aside WHERE boot_pk = ?1 AND seq IN (
+               SELECT seq FROM segments_aside WHERE boot_pk = ?1 AND ended_at_us <= ?2
+               ORDER BY seq LIMIT ?3)
+           RETURNING seq AS "seq!", measurement AS "measurement!""#,
+        boot_pk,
+        ended_before_us,
+        limit,
+    )
+    .fetch_all(db)
+    .await?;
+    rows.into_iter()
+        .map(|row| {
+            Ok(Aside {
+                seq: row.seq,
+                segment: from_json("measurement", &row.measurement)?,
+            })
+        })
+        .collect()
+}

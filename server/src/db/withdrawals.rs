@@ -1,0 +1,71 @@
+//! Whose measurements of which hours do not count.
+
+use jiff::Timestamp;
+use sqlx::SqliteConnection;
+
+use super::{DbError, from_us, to_us, unsigned};
+
+/// Hours of a robot that do not count, both ends included.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct WithdrawalRow {
+    /// Its number.
+    pub pk: i64,
+    /// Key of the robot.
+    pub robot_pk: i64,
+    /// The first hour.
+    pub from_h: i64,
+    /// The last hour.
+    pub to_h: i64,
+    /// Why.
+    pub reason: String,
+    /// Who said so.
+    pub by: String,
+    /// When.
+    pub at: Timestamp,
+}
+
+/// All of them, the oldest first.
+pub async fn all(db: &mut SqliteConnection) -> Result<Vec<WithdrawalRow>, DbError> {
+    let rows = sqlx::query!(
+        r#"SELECT pk AS "pk!", robot_pk, from_h, to_h, reason, withdrawn_by, withdrawn_at_us
+           FROM withdrawals ORDER BY pk"#
+    );
+    let rows = rows.fetch_all(db).await?;
+    rows.into_iter()
+        .map(|row| {
+            Ok(WithdrawalRow {
+                pk: row.pk,
+                robot_pk: row.robot_pk,
+                from_h: row.from_h,
+                to_h: row.to_h,
+                reason: row.reason,
+                by: row.withdrawn_by,
+                at: from_us(row.withdrawn_at_us)?,
+            })
+        })
+        .collect()
+}
+
+/// How many there are.
+pub async fn count(db: &mut SqliteConnection) -> Result<usize, DbError> {
+    let count = sqlx::query_scalar!(r#"SELECT COUNT(*) AS "count!: i64" FROM withdrawals"#);
+    unsigned("count", count.fetch_one(db).await?)
+}
+
+/// Adds one; its number.
+pub async fn insert(db: &mut SqliteConnection, row: &WithdrawalRow) -> Result<i64, DbError> {
+    let at_us = to_us(row.at);
+    let done = sqlx::query!(
+        "INSERT INTO withdrawals (robot_pk, from_h, to_h, reason, withdrawn_by, withdrawn_at_us)
+         VALUES (?, ?, ?, ?, ?, ?)",
+        row.robot_pk,
+        row.from_h,
+        row.to_h,
+        row.reason,
+        row.by,
+        at_us,
+    )
+    .execute(db)
+    .await?;
+    Ok(done.last_insert_rowid())
+}

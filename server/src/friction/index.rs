@@ -1,0 +1,673 @@
+//! The map in memory: every sum of the database, where a question finds it at once.
+//!
+//! It equals what the database says, and is changed after each commit by what was committed. Cells
+//! lie row by row, so that a box is some runs of neighbours and a path some lookups. What is kept
+//! of a (cell, terrain, robot, configuration, epoch) takes 136 bytes besides its place.
+
+use std::collections::BTreeMap;
+use std::ops::Bound;
+
+use jiff::Timestamp;
+use tread_api::friction::Information;
+use tread_api::ids::{ConfigurationId, RobotId};
+use tread_api::site::Cell;
+use tread_api::terrain::TerrainRef;
+
+use super::fixed::Fixed;
+use super::sums::{Pair, Pass, bucket_h};
+use super::{Seen, Sums};
+
+/// Side of the squares of cells whose changes are counted together.
+const BLOCK_CELLS: i32 = 64;
+/// Seconds of an hour.
+const HOUR_S: i64 = 3_600;
+/// Steps per unit in which a friction coefficient is kept.
+const MU_STEPS: f64 = 1.0e6;
+
+/// A robot, configuration or terrain by its place in [`Names`].
+type Number = u32;
+
+/// Names of what sums are about, each once.
+#[derive(Debug, Default)]
+pub struct Names {
+    robots: Interned<RobotId>,
+    configurations: Interned<ConfigurationId>,
+    terrains: Interned<Option<TerrainRef>>,
+}
+
+#[derive(Debug)]
+struct Interned<T> {
+    numbers: BTreeMap<T, Number>,
+    names: Vec<T>,
+    /// Place of each number in the order of the names, which does not depend on who came first.
+    ranks: Vec<u32>,
+}
+
+impl<T> Default for Interned<T> {
+    fn default() -> Self {
+        Self {
+            numbers: BTreeMap::new(),
+            names: Vec::new(),
+            ranks: Vec::new(),
+        }
+    }
+}
+
+impl<T: Ord + Clone> Interned<T> {
+    fn number(&mut self, name: &T) -> Number {
+        if let Some(&number) = self.numbers.get(name) {
+            return number;
+        }
+        let number = Number::try_from(self.names.len()).unwrap_or(Number::MAX);
+        self.names.push(name.clone());
+        self.numbers.insert(name.clone(), number);
+        self.ranks.resize(self.names.len(), 0);
+        for (&number, rank) in self.numbers.values().zip(0..) {
+            self.ranks[number as usize] = rank;
+        }
+        number
+    }
+
+    fn name(&self, number: Number) -> &T {
+        &self.names[number as usize]
+    }
+
+    fn rank(&self, number: Number) -> u32 {
+        self.ranks[number as usize]
+    }
+}
+
+/// What a sum is about, within a cell.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct PartKey {
+    terrain: Number,
+    configuration: Number,
+    robot: Number,
+    epoch_h: i32,
+}
+
+/// Sums as they are kept in memory: the same numbers in less room.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Part {
+    hi: [i64; 7],
+    lo: [u32; 7],
+    key: PartKey,
+    segments: u32,
+    /// A friction coefficient in steps, plus one; 0 for none.
+    mu_peak: u32,
+    newest_mu: u32,
+    newest_at_us: i64,
+    /// Information of the newest pass; 0, which no pass has, when it is not known.
+    newest_information: f64,
+    newest_weighted: f64,
+}
+
+fn pack_mu(mu: Option<f64>) -> u32 {
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "0 to 10 units"
+    )]
+    mu.map_or(0, |mu| (mu * MU_STEPS + 1.0e-6).floor() as u32 + 1)
+}
+
+fn unpack_mu(steps: u32) -> Option<f64> {
+    (steps > 0).then(|| f64::from(steps - 1) / MU_STEPS)
+}
+
+impl Part {
+    fn new(key: PartKey, sums: &Sums) -> Self {
+        let mut part = Self {
+            hi: [0; 7],
+            lo: [0; 7],
+            key,
+            segments: u32::try_from(sums.segments).unwrap_or(u32::MAX),
+            mu_peak: pack_mu(sums.mu_peak),
+            newest_mu: pack_mu(sums.newest.mu_peak),
+            newest_at_us: sums.newest.ended_at_us,
+            newest_information: sums.newest.theta.map_or(0.0, |theta| theta.information),
+            newest_weighted: sums.newest.theta.map_or(0.0, |theta| theta.weighted),
+        };
+        let fixed = [
+            sums.theta.information,
+            sums.theta.weighted,
+            sums.theta_square,
+            sums.track.information,
+            sums.track.weighted,
+            sums.rolling.information,
+            sums.rolling.weighted,
+        ];
+        for (index, fixed) in fixed.into_iter().enumerate() {
+            // Beyond this the database has refused the sum.
+            let (hi, lo) = fixed.halves().unwrap_or((i64::MAX, 0));
+            part.hi[index] = hi;
+            part.lo[index] = u32::try_from(lo).unwrap_or_default();
+        }
+        part
+    }
+
+    fn sums(&self) -> Sums {
+        let fixed = |index: usize| Fixed::from_halves(self.hi[index], i64::from(self.lo[index]));
+        let pair = |index| Pair {
+            information: fixed(index),
+            weighted: fixed(index + 1),
+        };
+        Sums {
+            theta: pair(0),
+            theta_square: fixed(2),
+            track: pair(3),
+            rolling: pair(5),
+            segments: u64::from(self.segments),
+            samples: 0,
+            mu_peak: unpack_mu(self.mu_peak),
+            newest: Pass {
+                ended_at_us: self.newest_at_us,
+                theta: (self.newest_information > 0.0).then_some(Information {
+                    information: self.newest_information,
+                    weighted: self.newest_weighted,
+                }),
+                mu_peak: unpack_mu(self.newest_mu),
+            },
+        }
+    }
+
+    fn add(&mut self, sums: &Sums) {
+        let mut whole = self.sums();
+        whole.add(sums);
+        *self = Self::new(self.key, &whole);
+    }
+}
+
+/// A sum with the names of what it is about.
+#[derive(Debug, Clone, Copy)]
+pub struct Labelled<'names> {
+    /// The cell.
+    pub cell: Cell,
+    /// The grid that cut the cell; sums of another one than the map's are not on the map.
+    pub grid_revision: u32,
+    /// The ground, if any is drawn.
+    pub terrain: &'names Option<TerrainRef>,
+    /// The configuration that measured.
+    pub configuration: ConfigurationId,
+    /// The robot that measured.
+    pub robot: &'names RobotId,
+    /// Hour of measuring.
+    pub epoch_h: i64,
+}
+
+/// The map of one site.
+#[derive(Debug, Default)]
+pub struct SiteMap {
+    names: Names,
+    grid_revision: u32,
+    merged_before_h: i64,
+    /// By row and column, both shifted so that they sort as numbers without sign.
+    cells: BTreeMap<u64, Box<[Part]>>,
+    /// The same summed over cells, for terrains.
+    totals: BTreeMap<PartKey, Sums>,
+    /// Changes of each square of cells.
+    blocks: BTreeMap<(i32, i32), u64>,
+    generation: u64,
+}
+
+fn place(cell: Cell) -> u64 {
+    let unsigned = |index: i32| u64::from((index ^ i32::MIN).cast_unsigned());
+    unsigned(cell.iy) << 32 | unsigned(cell.ix)
+}
+
+fn cell_at(place: u64) -> Cell {
+    let signed = |bits: u64| (u32::try_from(bits).unwrap_or_default().cast_signed()) ^ i32::MIN;
+    Cell {
+        ix: signed(place & 0xFFFF_FFFF),
+        iy: signed(place >> 32),
+    }
+}
+
+/// Which measurements count, and how.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Choice<'choice> {
+    /// Only epochs that had begun by then.
+    pub as_of: Option<Timestamp>,
+    /// Only this configuration.
+    pub configuration: Option<ConfigurationId>,
+    /// Only this robot.
+    pub robot: Option<&'choice RobotId>,
+    /// Configurations whose θ is brought to that of another one.
+    pub normalisation: Option<&'choice Normalisation>,
+}
+
+/// Factors that bring the θ of several configurations to that of one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Normalisation {
+    /// Its name.
+    pub name: String,
+    /// The configuration in whose θ the answer is.
+    pub reference: ConfigurationId,
+    /// θ of a configuration as a multiple of the reference's, on the same ground.
+    pub ratios: BTreeMap<ConfigurationId, f64>,
+}
+
+impl Normalisation {
+    /// The factor of a configuration; `None` if it is not one of those that are joined.
+    fn ratio(&self, configuration: ConfigurationId) -> Option<f64> {
+        if configuration == self.reference {
+            Some(1.0)
+        } else {
+            self.ratios.get(&configuration).copied()
+        }
+    }
+}
+
+/// What was seen of one piece of ground by robots of one configuration.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Group<'map> {
+    /// The ground, if any is drawn; `None` for all revisions of a terrain, too.
+    pub terrain: Option<&'map TerrainRef>,
+    /// The configuration.
+    pub configuration: ConfigurationId,
+    /// What each robot saw in each epoch.
+    pub seen: Vec<Seen<u32>>,
+}
+
+impl SiteMap {
+    /// An empty map of this grid, in which hours before this one are read as days.
+    pub fn new(grid_revision: u32, merged_before_h: i64) -> Self {
+        Self {
+            grid_revision,
+            merged_before_h,
+            ..Self::default()
+        }
+    }
+
+    /// Adds sums to those that are there.
+    pub fn add(&mut self, labelled: Labelled<'_>, sums: &Sums) {
+        if labelled.grid_revision != self.grid_revision {
+            return;
+        }
+        let epoch_h = bucket_h(labelled.epoch_h, self.merged_before_h);
+        let key = PartKey {
+            terrain: self.names.terrains.number(labelled.terrain),
+            configuration: self.names.configurations.number(&labelled.configuration),
+            robot: self.names.robots.number(labelled.robot),
+            epoch_h: i32::try_from(epoch_h).unwrap_or(i32::MAX),
+        };
+        let parts = self.cells.entry(place(labelled.cell)).or_default();
+        match parts.binary_search_by_key(&key, |part| part.key) {
+            Ok(index) => parts[index].add(sums),
+            Err(index) => {
+                let mut longer = Vec::with_capacity(parts.len() + 1);
+                longer.extend_from_slice(&parts[..index]);
+                longer.push(Part::new(key, sums));
+                longer.extend_from_slice(&parts[index..]);
+                *parts = longer.into_boxed_slice();
+            }
+        }
+        let total = self.totals.entry(key);
+        total
+            .and_modify(|total| total.add(sums))
+            .or_insert_with(|| Sums {
+                samples: 0,
+                ..*sums
+            });
+        self.note(labelled.cell);
+    }
+
+    fn note(&mut self, cell: Cell) {
+        self.generation += 1;
+        self.blocks.insert(block_of(cell), self.generation);
+    }
+
+    /// Forgets what a robot measured from one hour to another, both included.
+    pub fn withdraw(&mut self, robot: &RobotId, (from_h, to_h): (i64, i64)) {
+        let Some(&robot) = self.names.robots.numbers.get(robot) else {
+            return;
+        };
+        let goes =
+            |key: &PartKey| key.robot == robot && (from_h..=to_h).contains(&i64::from(key.epoch_h));
+        let mut changed = Vec::new();
+        for (&place, parts) in &mut self.cells {
+            if parts.iter().any(|part| goes(&part.key)) {
+                let kept = parts.iter().filter(|part| !goes(&part.key));
+                *parts = kept.copied().collect();
+                changed.push(cell_at(place));
+            }
+        }
+        self.cells.retain(|_place, parts| !parts.is_empty());
+        self.totals.retain(|key, _sums| !goes(key));
+        for cell in changed {
+            self.note(cell);
+        }
+    }
+
+    /// Reads hours before this one as days from now on.
+    pub fn merge_before(&mut self, before_h: i64) {
+        if before_h <= self.merged_before_h {
+            return;
+        }
+        self.merged_before_h = before_h;
+        let bucket = |key: PartKey| PartKey {
+            epoch_h: i32::try_from(bucket_h(i64::from(key.epoch_h), before_h)).unwrap_or(i32::MAX),
+            ..key
+        };
+        for parts in self.cells.values_mut() {
+            if parts.iter().all(|part| bucket(part.key) == part.key) {
+                continue;
+            }
+            let mut merged: Vec<Part> = Vec::with_capacity(parts.len());
+            for part in &*parts {
+                let key = bucket(part.key);
+                match merged.last_mut().filter(|last| last.key == key) {
+                    Some(last) => last.add(&part.sums()),
+                    None => merged.push(Part { key, ..*part }),
+                }
+            }
+            *parts = merged.into_boxed_slice();
+        }
+        let mut totals: BTreeMap<PartKey, Sums> = BTreeMap::new();
+        for (&key, sums) in &self.totals {
+            let total = totals.entry(bucket(key));
+            total.and_modify(|total| total.add(sums)).or_insert(*sums);
+        }
+        self.totals = totals;
+        self.generation += 1;
+        for block in self.blocks.values_mut() {
+            *block = self.generation;
+        }
+    }
+
+    /// Hours before this one are read as days.
+    pub fn merged_before_h(&self) -> i64 {
+        self.merged_before_h
+    }
+
+    /// Counts all changes.
+    pub fn generation(&self) -> u64 {
+        self.generation
+    }
+
+    /// Something that changes when a cell of the box does.
+    pub fn generation_in(&self, min: Cell, max: Cell) -> u64 {
+        let (min, max) = (block_of(min), block_of(max));
+        let rows = self.blocks.range(min..=max);
+        let within = rows.filter(|((_row, column), _)| (min.1..=max.1).contains(column));
+        within.fold(0, |newest, (_block, &generation)| newest.max(generation))
+    }
+
+    /// Cells that hold anything.
+    pub fn cell_count(&self) -> usize {
+        self.cells.len()
+    }
+
+    /// Sums of (cell, terrain, robot, configuration, epoch).
+    pub fn part_count(&self) -> usize {
+        self.cells.values().map(|parts| parts.len()).sum()
+    }
+
+    /// What was seen of one cell, per terrain and configuration.
+    pub fn cell(&self, cell: Cell, choice: Choice<'_>) -> Vec<Group<'_>> {
+        let parts = self.cells.get(&place(cell));
+        parts.map_or_else(Vec::new, |parts| self.groups(parts, choice))
+    }
+
+    /// End of the newest pass through a cell, microseconds since 1970.
+    pub fn newest_at_us(&self, cell: Cell, choice: Choice<'_>) -> Option<i64> {
+        let parts = self.cells.get(&place(cell))?;
+        let counted = parts.iter().filter(|part| self.counts(&part.key, &choice));
+        counted.map(|part| part.newest_at_us).max()
+    }
+
+    /// The robot whose name has that place among all of them.
+    pub fn robot_of_rank(&self, rank: u32) -> Option<&RobotId> {
+        self.names.robots.numbers.keys().nth(rank as usize)
+    }
+
+    /// What was seen of several cells together, each robot's summed, per terrain and configuration.
+    pub fn area(&self, cells: &[Cell], choice: Choice<'_>) -> Vec<Group<'_>> {
+        let parts = cells
+            .iter()
+            .filter_map(|&cell| self.cells.get(&place(cell)));
+        let mut sums: BTreeMap<PartKey, Sums> = BTreeMap::new();
+        for part in parts.flat_map(|parts| parts.iter()) {
+            if self.counts(&part.key, &choice) {
+                sums.entry(part.key)
+                    .and_modify(|sums| sums.add(&part.sums()))
+                    .or_insert_with(|| part.sums());
+            }
+        }
+        let parts: Vec<Part> = sums
+            .iter()
+            .map(|(&key, sums)| Part::new(key, sums))
+            .collect();
+        self.groups(&parts, choice)
+    }
+
+    /// The cells of a box that hold anything, row by row, after one of them.
+    pub fn cells_in(
+        &self,
+        min: Cell,
+        max: Cell,
+        after: Option<Cell>,
+    ) -> impl Iterator<Item = Cell> + '_ {
+        let start = match after {
+            Some(after) if place(after) >= place(min) => Bound::Excluded(place(after)),
+            Some(_) | None => Bound::Included(place(min)),
+        };
+        let mut next = start;
+        std::iter::from_fn(move || {
+            loop {
+                let last = Bound::Included(place(max));
+                if let (Bound::Included(low) | Bound::Excluded(low), Bound::Included(high)) =
+                    (next, last)
+                    && (low > high || (low == high && matches!(next, Bound::Excluded(_))))
+                {
+                    return None;
+                }
+                let (&found, _parts) = self.cells.range((next, last)).next()?;
+                let cell = cell_at(found);
+                if cell.ix < min.ix {
+                    next = Bound::Included(place(Cell { ix: min.ix, ..cell }));
+                } else if cell.ix > max.ix {
+                    // On to the next row, if there is one.
+                    let iy = cell.iy.checked_add(1)?;
+                    next = Bound::Included(place(Cell { ix: min.ix, iy }));
+                } else {
+                    next = Bound::Excluded(found);
+                    return Some(cell);
+                }
+            }
+        })
+    }
+
+    /// What was seen of terrains that `is_wanted`, each robot's cells summed, per configuration; the
+    /// revisions that are wanted count as one ground.
+    pub fn terrain(
+        &self,
+        is_wanted: impl Fn(&TerrainRef) -> bool,
+        choice: Choice<'_>,
+    ) -> Vec<Group<'_>> {
+        let wanted: Vec<Number> = (0..)
+            .zip(&self.names.terrains.names)
+            .filter(|(_, terrain)| terrain.as_ref().is_some_and(&is_wanted))
+            .map(|(number, _)| number)
+            .collect();
+        let mut sums: BTreeMap<(ConfigurationId, u32, i32), Sums> = BTreeMap::new();
+        for &terrain in &wanted {
+            let first = PartKey {
+                terrain,
+                configuration: 0,
+                robot: 0,
+                epoch_h: i32::MIN,
+            };
+            for (key, total) in self.totals.range(first..) {
+                if key.terrain != terrain {
+                    break;
+                }
+                if self.counts(key, &choice) {
+                    let configuration = *self.names.configurations.name(key.configuration);
+                    let rank = self.names.robots.rank(key.robot);
+                    sums.entry((configuration, rank, key.epoch_h))
+                        .and_modify(|sums| sums.add(total))
+                        .or_insert(*total);
+                }
+            }
+        }
+        let mut groups: BTreeMap<ConfigurationId, Group<'_>> = BTreeMap::new();
+        for ((configuration, rank, epoch_h), sums) in sums {
+            let Some(seen) = Seen::of(rank, i64::from(epoch_h), &sums) else {
+                continue;
+            };
+            let (configuration, seen) = normalised(configuration, seen, choice.normalisation);
+            let group = groups.entry(configuration).or_insert_with(|| Group {
+                terrain: None,
+                configuration,
+                seen: Vec::new(),
+            });
+            group.seen.push(seen);
+        }
+        groups.into_values().collect()
+    }
+
+    fn counts(&self, key: &PartKey, choice: &Choice<'_>) -> bool {
+        let names = &self.names;
+        choice
+            .as_of
+            .is_none_or(|as_of| i64::from(key.epoch_h) * HOUR_S <= as_of.as_second())
+            && choice
+                .robot
+                .is_none_or(|robot| names.robots.name(key.robot) == robot)
+            && choice.configuration.is_none_or(|configuration| {
+                let this = *names.configurations.name(key.configuration);
+                this == configuration
+                    || choice.normalisation.is_some_and(|normalisation| {
+                        normalisation.reference == configuration
+                            && normalisation.ratio(this).is_some()
+                    })
+            })
+    }
+
+    /// Parts of one cell, which are sorted by key, as groups in the order of their names.
+    fn groups(&self, parts: &[Part], choice: Choice<'_>) -> Vec<Group<'_>> {
+        let mut groups: Vec<Group<'_>> = Vec::new();
+        for part in parts.iter().filter(|part| self.counts(&part.key, &choice)) {
+            let PartKey {
+                terrain,
+                configuration,
+                robot,
+                epoch_h,
+            } = part.key;
+            let rank = self.names.robots.rank(robot);
+            let Some(seen) = Seen::of(rank, i64::from(epoch_h), &part.sums()) else {
+                continue;
+            };
+            let configuration = *self.names.configurations.name(configuration);
+            let terrain = self.names.terrains.name(terrain).as_ref();
+            let (configuration, seen) = normalised(configuration, seen, choice.normalisation);
+            let group = groups
+                .iter_mut()
+                .find(|group| group.configuration == configuration && group.terrain == terrain);
+            match group {
+                Some(group) => group.seen.push(seen),
+                None => groups.push(Group {
+                    terrain,
+                    configuration,
+                    seen: vec![seen],
+                }),
+            }
+        }
+        groups.sort_unstable_by_key(|group| (group.terrain, group.configuration));
+        groups
+    }
+
+    /// How much each robot has put in: cells, segments, epochs from and to.
+    pub fn contributions(&self) -> Vec<Contribution> {
+        let mut found: BTreeMap<Number, Contribution> = BTreeMap::new();
+        let mut note = |key: &PartKey, cells: u64, sums: Option<&Sums>| {
+            let entry = found.entry(key.robot).or_insert_with(|| Contribution {
+                robot: self.names.robots.name(key.robot).clone(),
+                cells: 0,
+                segments: 0,
+                first_epoch_h: i64::MAX,
+                newest_at_us: i64::MIN,
+            });
+            entry.cells += cells;
+            if let Some(sums) = sums {
+                entry.segments += sums.segments;
+                entry.first_epoch_h = entry.first_epoch_h.min(i64::from(key.epoch_h));
+                entry.newest_at_us = entry.newest_at_us.max(sums.newest.ended_at_us);
+            }
+        };
+        for (key, sums) in &self.totals {
+            note(key, 0, Some(sums));
+        }
+        for parts in self.cells.values() {
+            let mut robots: Vec<&PartKey> = parts.iter().map(|part| &part.key).collect();
+            robots.sort_unstable_by_key(|key| key.robot);
+            robots.dedup_by_key(|key| key.robot);
+            for key in robots {
+                note(key, 1, None);
+            }
+        }
+        let mut contributions: Vec<Contribution> = found.into_values().collect();
+        contributions.sort_unstable_by(|left, right| left.robot.cmp(&right.robot));
+        contributions
+    }
+}
+
+/// What one robot has put into a map.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Contribution {
+    /// The robot.
+    pub robot: RobotId,
+    /// Cells that it has measured.
+    pub cells: u64,
+    /// Its segments.
+    pub segments: u64,
+    /// First hour of its first epoch.
+    pub first_epoch_h: i64,
+    /// End of its newest segment, microseconds since 1970.
+    pub newest_at_us: i64,
+}
+
+fn block_of(cell: Cell) -> (i32, i32) {
+    (
+        cell.iy.div_euclid(BLOCK_CELLS),
+        cell.ix.div_euclid(BLOCK_CELLS),
+    )
+}
+
+/// A configuration's word in the θ of the one that it is brought to, if it is.
+fn normalised(
+    configuration: ConfigurationId,
+    seen: Seen<u32>,
+    normalisation: Option<&Normalisation>,
+) -> (ConfigurationId, Seen<u32>) {
+    let Some((normalisation, ratio)) = normalisation
+        .and_then(|normalisation| Some((normalisation, normalisation.ratio(configuration)?)))
+    else {
+        return (configuration, seen);
+    };
+    (normalisation.reference, seen.scaled(ratio))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_part_takes_no_more_room_than_was_promised() {
+        assert_eq!(size_of::<Part>(), 136);
+    }
+
+    #[test]
+    fn places_sort_row_by_row_and_give_back_their_cell() {
+        let cells = [(5, -2), (-7, -1), (3, -1), (i32::MIN, 0), (0, 0), (4, 9)];
+        let places: Vec<u64> = cells
+            .iter()
+            .map(|&(ix, iy)| place(Cell { ix, iy }))
+            .collect();
+        assert!(places.is_sorted(), "{places:?}");
+        for ((ix, iy), place) in cells.into_iter().zip(places) {
+            assert_eq!(cell_at(place), Cell { ix, iy });
+        }
+    }
+}

@@ -1,0 +1,51 @@
+//! Answers that a client need not fetch again while they are the same.
+
+use std::hash::{DefaultHasher, Hash as _, Hasher as _};
+
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+use tread_api::problem::ProblemType;
+
+use super::problem::Problem;
+
+/// JSON with an `ETag` of its content; 304 without a body to who has it already.
+pub(super) fn json<T: Serialize>(headers: &HeaderMap, answer: &T) -> Response {
+    match serde_json::to_vec(answer) {
+        Ok(text) => bytes(headers, "application/json", text),
+        Err(error) => {
+            tracing::error!("cannot write an answer: {error}");
+            Problem::new(ProblemType::Internal).into_response()
+        }
+    }
+}
+
+/// A body of any kind, likewise.
+pub(super) fn bytes(headers: &HeaderMap, media_type: &'static str, body: Vec<u8>) -> Response {
+    let mut hasher = DefaultHasher::new();
+    media_type.hash(&mut hasher);
+    body.hash(&mut hasher);
+    let tag = format!("\"{:016x}-{:x}\"", hasher.finish(), body.len());
+    let response = if is_held(headers, &tag) {
+        StatusCode::NOT_MODIFIED.into_response()
+    } else {
+        let media_type = HeaderValue::from_static(media_type);
+        ([(header::CONTENT_TYPE, media_type)], body).into_response()
+    };
+    let cached = [
+        (header::ETAG, tag),
+        // Held, but asked for again each time: the map changes while robots drive.
+        (header::CACHE_CONTROL, "private, no-cache".to_owned()),
+    ];
+    (cached, response).into_response()
+}
+
+/// Whether the client says that it has this.
+fn is_held(headers: &HeaderMap, tag: &str) -> bool {
+    let held = headers.get_all(header::IF_NONE_MATCH).into_iter();
+    let mut listed = held
+        .filter_map(|value| value.to_str().ok())
+        .flat_map(|value| value.split(','))
+        .map(|entry| entry.trim().trim_start_matches("W/"));
+    listed.any(|entry| entry == tag || entry == "*")
+}

@@ -1,0 +1,214 @@
+//! `/v1/sites/{site}/friction` and `/v1/sites/{site}/segments`.
+//!
+//! Every answer about the map has an `ETag` and takes `as_of`: the map as it was known then, in
+//! whole epochs (those that had begun), with the ages of then.
+
+pub(super) mod places;
+
+use axum::extract::State;
+use axum::http::HeaderMap;
+use axum::response::Response;
+use jiff::{SignedDuration, Timestamp};
+use serde::Deserialize;
+use tread_api::friction::{RobotContribution, StoredSegment, TerrainFriction, TerrainHistory};
+use tread_api::ids::{ConfigurationId, RobotId, SiteId, TerrainId};
+use tread_api::page::Page;
+use tread_api::problem::{ProblemBody, ProblemType};
+use utoipa::IntoParams;
+
+use super::etag;
+use super::extract::{Json, Path, Query, cursor, page_limit};
+use super::problem::Problem;
+use super::sites::PageQuery;
+use crate::app::App;
+use crate::app::friction::Asked;
+use crate::db::segments::SegmentFilter;
+
+/// Longest step of a history, seconds: a year.
+const STEP_MAX_S: i64 = 366 * 86_400;
+
+/// What is asked for of a terrain.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ReadingQuery {
+    /// As of when; now when absent.
+    as_of: Option<Timestamp>,
+    /// Only measurements of this robot model and tyres.
+    #[param(value_type = Option<String>)]
+    configuration: Option<ConfigurationId>,
+    /// A declared normalisation that joins robot models.
+    normalisation: Option<String>,
+    /// `next_cursor` of the page before.
+    cursor: Option<String>,
+    /// Most entries of the page, 1 to 1000; 100 when absent.
+    limit: Option<u32>,
+}
+
+impl ReadingQuery {
+    fn asked(&self) -> Asked {
+        Asked {
+            as_of: self.as_of,
+            configuration: self.configuration,
+            normalisation: self.normalisation.clone(),
+        }
+    }
+}
+
+/// Friction of every terrain of a site.
+#[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains", tag = "friction",
+    security(("token" = ["viewer"])),
+    operation_id = "list_terrain_friction", params(("site" = SiteId, Path), ReadingQuery),
+    responses((status = 200, body = Page<TerrainFriction>), (status = 304),
+        (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
+pub(super) async fn terrains(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+    Query(query): Query<ReadingQuery>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let limit = page_limit(query.limit)?;
+    let (asked, cursor) = (query.asked(), query.cursor.as_deref());
+    let found = app.friction_of_terrains(&site, &asked, cursor, limit);
+    Ok(etag::json(&headers, &found.await?))
+}
+
+/// What is asked for of one terrain.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct OneQuery {
+    /// As of when; now when absent.
+    as_of: Option<Timestamp>,
+    /// Only measurements of this robot model and tyres.
+    #[param(value_type = Option<String>)]
+    configuration: Option<ConfigurationId>,
+    /// A declared normalisation that joins robot models.
+    normalisation: Option<String>,
+}
+
+/// Friction of one terrain, per robot model.
+#[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains/{terrain}", tag = "friction",
+    security(("token" = ["viewer"])),
+    operation_id = "get_terrain_friction",
+    params(("site" = SiteId, Path), ("terrain" = TerrainId, Path), OneQuery),
+    responses((status = 200, body = TerrainFriction), (status = 304),
+        (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
+pub(super) async fn terrain(
+    State(app): State<App>,
+    Path((site, terrain)): Path<(SiteId, TerrainId)>,
+    Query(query): Query<OneQuery>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let asked = Asked {
+        as_of: query.as_of,
+        configuration: query.configuration,
+        normalisation: query.normalisation,
+    };
+    let found = app.friction_of_terrain(&site, &terrain, &asked).await?;
+    Ok(etag::json(&headers, &found))
+}
+
+/// Which times of a terrain's history.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct HistoryQuery {
+    /// The oldest time.
+    from: Timestamp,
+    /// The newest time; now when absent.
+    to: Option<Timestamp>,
+    /// Seconds from one time to the next, at least 60; an hour when absent. At most 1000 times.
+    step_s: Option<i64>,
+    /// Only measurements of this robot model and tyres.
+    #[param(value_type = Option<String>)]
+    configuration: Option<ConfigurationId>,
+    /// A declared normalisation that joins robot models.
+    normalisation: Option<String>,
+}
+
+/// Friction of one terrain as it was known at equally spaced times.
+#[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains/{terrain}/history",
+    tag = "friction", security(("token" = ["viewer"])),
+    operation_id = "get_terrain_history",
+    params(("site" = SiteId, Path), ("terrain" = TerrainId, Path), HistoryQuery),
+    responses((status = 200, body = TerrainHistory), (status = 304),
+        (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
+pub(super) async fn history(
+    State(app): State<App>,
+    Path((site, terrain)): Path<(SiteId, TerrainId)>,
+    Query(query): Query<HistoryQuery>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let step_s = query.step_s.unwrap_or(3_600);
+    if !(60..=STEP_MAX_S).contains(&step_s) {
+        let detail = format!("step_s must be 60 to {STEP_MAX_S}, not {step_s}");
+        return Err(Problem::new(ProblemType::InvalidQuery)
+            .detail(detail)
+            .field("step_s"));
+    }
+    let asked = Asked {
+        as_of: None,
+        configuration: query.configuration,
+        normalisation: query.normalisation,
+    };
+    let (times, step) = ((query.from, query.to), SignedDuration::from_secs(step_s));
+    let found = app.history_of_terrain((&site, &terrain), &asked, times, step);
+    Ok(etag::json(&headers, &found.await?))
+}
+
+/// What each robot has put into the map.
+#[utoipa::path(get, path = "/v1/sites/{site}/friction/robots", tag = "friction",
+    security(("token" = ["viewer"])),
+    operation_id = "list_contributions", params(("site" = SiteId, Path), PageQuery),
+    responses((status = 200, body = Page<RobotContribution>), (status = 304),
+        (status = 404, body = ProblemBody)))]
+pub(super) async fn robots(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+    Query(query): Query<PageQuery>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let limit = page_limit(query.limit)?;
+    let found = app.contributions(&site, query.cursor.as_deref(), limit);
+    Ok(etag::json(&headers, &found.await?))
+}
+
+/// Which raw measurements, and which page of them.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct SegmentQuery {
+    /// Only those of this robot.
+    #[param(value_type = Option<String>)]
+    robot: Option<RobotId>,
+    /// Only those on this terrain.
+    #[param(value_type = Option<String>)]
+    terrain: Option<TerrainId>,
+    /// `next_cursor` of the page before.
+    cursor: Option<String>,
+    /// Most entries of the page, 1 to 1000; 100 when absent.
+    limit: Option<u32>,
+}
+
+/// Raw measurements in the order of their commits.
+#[utoipa::path(get, path = "/v1/sites/{site}/segments", tag = "friction",
+    security(("token" = ["viewer"])),
+    operation_id = "list_segments", params(("site" = SiteId, Path), SegmentQuery),
+    responses((status = 200, body = Page<StoredSegment>), (status = 400, body = ProblemBody),
+        (status = 404, body = ProblemBody)))]
+pub(super) async fn segments(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+    Query(query): Query<SegmentQuery>,
+) -> Result<Json<Page<StoredSegment>>, Problem> {
+    let limit = page_limit(query.limit)?;
+    let after = cursor(query.cursor.as_deref())?.unwrap_or(0);
+    let SegmentQuery { robot, terrain, .. } = query;
+    let filter = SegmentFilter {
+        robot,
+        terrain,
+        after,
+    };
+    Ok(Json(app.segments(&site, &filter, limit).await?))
+}

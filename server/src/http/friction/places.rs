@@ -1,0 +1,251 @@
+//! What is known of a point, a box and a path.
+
+use axum::extract::State;
+use axum::http::HeaderMap;
+use axum::response::Response;
+use jiff::Timestamp;
+use serde::Deserialize;
+use tread_api::friction::{
+    AskPath, CellDifference, CellFriction, PathFriction, PointFriction, VisitSuggestion,
+};
+use tread_api::geometry::Point;
+use tread_api::ids::{ConfigurationId, SiteId};
+use tread_api::page::Page;
+use tread_api::problem::ProblemBody;
+use utoipa::IntoParams;
+
+use crate::app::App;
+use crate::app::friction::{Area, Asked, CellsAsked};
+use crate::http::etag;
+use crate::http::extract::{Json, Path, Query, page_limit};
+use crate::http::problem::Problem;
+
+/// Which cells, and which page of them.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct CellQuery {
+    /// Lowest x of the area, metres; the whole map when absent.
+    x_min_m: Option<f64>,
+    /// Lowest y of the area, metres.
+    y_min_m: Option<f64>,
+    /// Highest x of the area, metres.
+    x_max_m: Option<f64>,
+    /// Highest y of the area, metres.
+    y_max_m: Option<f64>,
+    /// Side of the squares that cells are put together to, metres, a multiple of the grid's; the
+    /// box may have 4 194 304 of them. Different ground is never put together.
+    resolution_m: Option<f64>,
+    /// As of when; now when absent.
+    as_of: Option<Timestamp>,
+    /// Only measurements of this robot model and tyres.
+    #[param(value_type = Option<String>)]
+    configuration: Option<ConfigurationId>,
+    /// A declared normalisation that joins robot models.
+    normalisation: Option<String>,
+    /// `next_cursor` of the page before.
+    cursor: Option<String>,
+    /// Most cells of the page, 1 to 1000; 100 when absent. A cell has one entry per terrain and
+    /// robot model.
+    limit: Option<u32>,
+}
+
+/// Friction per cell.
+#[utoipa::path(get, path = "/v1/sites/{site}/friction/cells", tag = "friction",
+    security(("token" = ["viewer"])),
+    operation_id = "list_cell_friction", params(("site" = SiteId, Path), CellQuery),
+    responses((status = 200, body = Page<CellFriction>), (status = 304),
+        (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
+pub(in crate::http) async fn cells(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+    Query(query): Query<CellQuery>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let asked = Asked {
+        as_of: query.as_of,
+        configuration: query.configuration,
+        normalisation: query.normalisation,
+    };
+    let cells = CellsAsked {
+        area: Area::new(
+            (query.x_min_m, query.y_min_m),
+            (query.x_max_m, query.y_max_m),
+        )?,
+        resolution_m: query.resolution_m,
+        cursor: query.cursor.as_deref(),
+        limit: page_limit(query.limit)?,
+    };
+    let found = app.friction_of_cells(&site, &asked, cells).await?;
+    Ok(etag::json(&headers, &found))
+}
+
+/// Which point.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct PointQuery {
+    /// East-like coordinate, metres.
+    x_m: f64,
+    /// North-like coordinate, metres.
+    y_m: f64,
+    /// As of when; now when absent.
+    as_of: Option<Timestamp>,
+    /// Only measurements of this robot model and tyres.
+    #[param(value_type = Option<String>)]
+    configuration: Option<ConfigurationId>,
+    /// A declared normalisation that joins robot models.
+    normalisation: Option<String>,
+}
+
+/// Friction at a point, of the terrain under it alone.
+#[utoipa::path(get, path = "/v1/sites/{site}/friction/point", tag = "friction",
+    security(("token" = ["viewer"])),
+    operation_id = "get_point_friction", params(("site" = SiteId, Path), PointQuery),
+    responses((status = 200, body = PointFriction), (status = 304),
+        (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
+pub(in crate::http) async fn point(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+    Query(query): Query<PointQuery>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let asked = Asked {
+        as_of: query.as_of,
+        configuration: query.configuration,
+        normalisation: query.normalisation,
+    };
+    let point = Point {
+        x_m: query.x_m,
+        y_m: query.y_m,
+    };
+    let found = app.friction_at(&site, &asked, point).await?;
+    Ok(etag::json(&headers, &found))
+}
+
+/// Friction along a path, how sure it is, and the speed that follows for a robot.
+#[utoipa::path(post, path = "/v1/sites/{site}/friction/path", tag = "friction",
+    security(("token" = ["operator"])),
+    operation_id = "ask_path_friction", params(("site" = SiteId, Path)),
+    request_body = AskPath,
+    responses((status = 200, body = PathFriction), (status = 304),
+        (status = 404, body = ProblemBody), (status = 422, body = ProblemBody)))]
+pub(in crate::http) async fn path(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+    headers: HeaderMap,
+    Json(request): Json<AskPath>,
+) -> Result<Response, Problem> {
+    let found = app.friction_along(&site, request).await?;
+    Ok(etag::json(&headers, &found))
+}
+
+/// Which times and cells.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct DifferenceQuery {
+    /// The first time.
+    from: Timestamp,
+    /// The second time; now when absent.
+    to: Option<Timestamp>,
+    /// Lowest x of the area, metres; the whole map when absent.
+    x_min_m: Option<f64>,
+    /// Lowest y of the area, metres.
+    y_min_m: Option<f64>,
+    /// Highest x of the area, metres.
+    x_max_m: Option<f64>,
+    /// Highest y of the area, metres.
+    y_max_m: Option<f64>,
+    /// Only measurements of this robot model and tyres.
+    #[param(value_type = Option<String>)]
+    configuration: Option<ConfigurationId>,
+    /// A declared normalisation that joins robot models.
+    normalisation: Option<String>,
+    /// `next_cursor` of the page before.
+    cursor: Option<String>,
+    /// Most cells of the page, 1 to 1000; 100 when absent.
+    limit: Option<u32>,
+}
+
+/// How cells that were measured between two times differ from the first to the second.
+#[utoipa::path(get, path = "/v1/sites/{site}/friction/difference", tag = "friction",
+    security(("token" = ["viewer"])),
+    operation_id = "list_friction_differences",
+    params(("site" = SiteId, Path), DifferenceQuery),
+    responses((status = 200, body = Page<CellDifference>), (status = 304),
+        (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
+pub(in crate::http) async fn difference(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+    Query(query): Query<DifferenceQuery>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let asked = Asked {
+        as_of: None,
+        configuration: query.configuration,
+        normalisation: query.normalisation,
+    };
+    let cells = CellsAsked {
+        area: Area::new(
+            (query.x_min_m, query.y_min_m),
+            (query.x_max_m, query.y_max_m),
+        )?,
+        resolution_m: None,
+        cursor: query.cursor.as_deref(),
+        limit: page_limit(query.limit)?,
+    };
+    let times = (query.from, query.to);
+    let found = app.friction_difference(&site, &asked, times, cells);
+    Ok(etag::json(&headers, &found.await?))
+}
+
+/// Where to look for visits that teach.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct VisitQuery {
+    /// Lowest x of the area, metres. It may have 262 144 cells.
+    x_min_m: f64,
+    /// Lowest y of the area, metres.
+    y_min_m: f64,
+    /// Highest x of the area, metres.
+    x_max_m: f64,
+    /// Highest y of the area, metres.
+    y_max_m: f64,
+    /// As of when; now when absent.
+    as_of: Option<Timestamp>,
+    /// Only measurements of this robot model and tyres.
+    #[param(value_type = Option<String>)]
+    configuration: Option<ConfigurationId>,
+    /// A declared normalisation that joins robot models.
+    normalisation: Option<String>,
+    /// Most cells, 1 to 1000; 100 when absent.
+    limit: Option<u32>,
+}
+
+/// Cells in which a visit would teach most about θ, the best first.
+#[utoipa::path(get, path = "/v1/sites/{site}/friction/visits", tag = "friction",
+    security(("token" = ["viewer"])),
+    operation_id = "list_visit_suggestions", params(("site" = SiteId, Path), VisitQuery),
+    responses((status = 200, body = Page<VisitSuggestion>), (status = 304),
+        (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
+pub(in crate::http) async fn visits(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+    Query(query): Query<VisitQuery>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let asked = Asked {
+        as_of: query.as_of,
+        configuration: query.configuration,
+        normalisation: query.normalisation,
+    };
+    let area = Area::new(
+        (Some(query.x_min_m), Some(query.y_min_m)),
+        (Some(query.x_max_m), Some(query.y_max_m)),
+    )?;
+    let limit = page_limit(query.limit)?;
+    let found = app.visits_worth_most(&site, &asked, area, limit);
+    Ok(etag::json(&headers, &found.await?))
+}

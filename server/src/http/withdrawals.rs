@@ -1,0 +1,48 @@
+//! `/v1/sites/{site}/withdrawals` and `/v1/sites/{site}/robots/{robot}/withdrawals`.
+
+use axum::extract::State;
+use axum::http::StatusCode;
+use tread_api::friction::{CreateWithdrawal, Withdrawal};
+use tread_api::ids::{RobotId, SiteId};
+use tread_api::page::Page;
+use tread_api::problem::ProblemBody;
+
+use super::extract::{Json, Path, Query, cursor, page_limit};
+use super::identity::guard::Subject;
+use super::problem::Problem;
+use super::sites::PageQuery;
+use crate::app::App;
+
+/// Takes what a robot measured in some hours off the map, for good: the map is then as if it had
+/// never come, and what comes late of these hours does not count either.
+#[utoipa::path(post, path = "/v1/sites/{site}/robots/{robot}/withdrawals", tag = "friction",
+    security(("token" = ["operator"])),
+    operation_id = "withdraw_measurements",
+    params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
+    request_body = CreateWithdrawal,
+    responses((status = 201, body = Withdrawal), (status = 404, body = ProblemBody),
+        (status = 409, body = ProblemBody), (status = 422, body = ProblemBody)))]
+pub(super) async fn create(
+    State(app): State<App>,
+    Subject(subject): Subject,
+    Path((site, robot)): Path<(SiteId, RobotId)>,
+    Json(request): Json<CreateWithdrawal>,
+) -> Result<(StatusCode, Json<Withdrawal>), Problem> {
+    let withdrawal = app.withdraw((&site, &robot), request, &subject.name);
+    Ok((StatusCode::CREATED, Json(withdrawal.await?)))
+}
+
+/// What was taken off the map, the oldest first.
+#[utoipa::path(get, path = "/v1/sites/{site}/withdrawals", tag = "friction",
+    security(("token" = ["viewer"])),
+    operation_id = "list_withdrawals", params(("site" = SiteId, Path), PageQuery),
+    responses((status = 200, body = Page<Withdrawal>), (status = 404, body = ProblemBody)))]
+pub(super) async fn list(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+    Query(query): Query<PageQuery>,
+) -> Result<Json<Page<Withdrawal>>, Problem> {
+    let limit = page_limit(query.limit)?;
+    let after = cursor(query.cursor.as_deref())?;
+    Ok(Json(app.withdrawals(&site, after, limit).await?))
+}
