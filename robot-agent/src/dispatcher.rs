@@ -26,12 +26,13 @@ use tread_api::wire::hello::SiteDefinition;
 use tread_api::wire::{self, Refusal, WireError};
 use tread_control::follower::{Follower, FollowerConfig};
 use tread_control::geometry::Pose;
-use tread_control::plan::Plan;
+use tread_control::plan::{Plan, PlanOptions};
 use tread_control::robot::RobotModel;
 
 use crate::clock::SharedClock;
 use crate::control_loop::active::Hold;
 use crate::control_loop::driven::Driven;
+use crate::control_loop::prior::Prior;
 use crate::control_loop::seam::{Job, LoopCommand, Shared};
 use crate::control_loop::site_view::SiteView;
 use crate::fleet::{Commands, IncomingCommand};
@@ -421,7 +422,11 @@ impl Dispatcher {
         let offer = offer.clone();
         let planning = tokio::task::spawn_blocking(move || {
             let trajectory = control_trajectory(&offer.trajectory);
-            let options = plan_options(&offer.trajectory);
+            let prior = Prior::new(offer.prior.as_ref());
+            let options = PlanOptions {
+                grip_mu: prior.grip_mu(),
+                ..plan_options(&offer.trajectory)
+            };
             let plan = Plan::with_options(&trajectory, start, &model, &options)
                 .map_err(|cause| cause.to_string())?;
             if let Some(breach) = view.and_then(|view| view.fence().plan_breach(&plan, &model)) {
@@ -443,6 +448,7 @@ impl Dispatcher {
                 revision: offer.revision,
                 plan_hash: offer.plan_hash,
                 follower,
+                prior,
                 start_by,
                 silence_max: silence_max(offer.link_policy)?,
                 driven: Driven::new(),

@@ -6,8 +6,10 @@
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
+use crate::friction::THETA_MAX;
 use crate::ids::{BootId, DERIVED_NAMESPACE, MissionId, PlanHash};
 use crate::mission::{LinkPolicy, PlanSummary};
+use crate::site::Cell;
 use crate::trajectory::Trajectory;
 
 /// `cmd/offer`: drive this mission.
@@ -30,6 +32,48 @@ pub struct Offer {
     /// What to do when the server is no longer heard.
     #[serde(default)]
     pub link_policy: LinkPolicy,
+    /// What the map knows along the way; absent when it knows nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub prior: Option<PathPrior>,
+}
+
+/// Most cells of a prior.
+pub const PRIOR_CELLS_MAX: usize = 4_096;
+
+/// What the map knows along a way. It helps the robot to drive and never goes into what it
+/// measures; nor is it part of what is to be driven.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PathPrior {
+    /// The grid that cuts the cells.
+    pub grid_revision: u32,
+    /// Friction coefficient to plan with: the lowest along the way, above zero.
+    pub grip_mu: f64,
+    /// Cells of one ground of which θ is known, at most [`PRIOR_CELLS_MAX`].
+    pub cells: Vec<CellPrior>,
+}
+
+/// What the map knows of a cell.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct CellPrior {
+    /// The cell.
+    pub cell: Cell,
+    /// θ for the robot's model, above zero.
+    pub theta: f64,
+    /// Its standard deviation, with age and biases, above zero.
+    pub std_dev: f64,
+}
+
+impl PathPrior {
+    /// Whether every number is possible and there are not too many.
+    pub fn is_possible(&self) -> bool {
+        let is_positive = |value: f64| value.is_finite() && value > 0.0;
+        let is_known = |cell: &CellPrior| {
+            is_positive(cell.theta) && cell.theta <= THETA_MAX && is_positive(cell.std_dev)
+        };
+        is_positive(self.grip_mu)
+            && self.cells.len() <= PRIOR_CELLS_MAX
+            && self.cells.iter().all(is_known)
+    }
 }
 
 impl Offer {

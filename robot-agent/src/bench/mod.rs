@@ -17,20 +17,21 @@ use tread_api::safety::Geofence;
 use tread_api::site::Grid;
 use tread_api::terrain::{TerrainRef, TerrainShape};
 use tread_api::trajectory::Trajectory;
-use tread_api::wire::command::Outcome;
+use tread_api::wire::command::{Outcome, PathPrior};
 use tread_api::wire::hello::SiteDefinition;
 use tread_api::wire::ingest::MissionPhase;
 use tread_api::wire::safety::LeaseCommand;
 use tread_control::follower::{Follower, FollowerConfig};
 use tread_control::geometry::Pose;
 use tread_control::measured::WheelSpeeds;
-use tread_control::plan::Plan;
+use tread_control::plan::{Plan, PlanOptions};
 use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
 use crate::clock::{ManualClock, SharedClock};
 use crate::control_loop::active::Hold;
 use crate::control_loop::driven::Driven;
+use crate::control_loop::prior::Prior;
 use crate::control_loop::seam::{
     AgentEnds, ClosedSegment, EndReason, Job, LoopCommand, LoopEvent, seam,
 };
@@ -90,6 +91,8 @@ pub struct Bench {
     pub(crate) news: Vec<MissionPhase>,
     /// Longest silence of the server that missions bear from now on.
     pub(crate) silence_max: Option<Duration>,
+    /// What a map knows along the way of missions from now on.
+    prior: Prior,
     /// The record of the last mission that ended.
     pub(crate) last_driven: Option<Driven>,
     /// Distance from the path when the last mission ended.
@@ -133,15 +136,21 @@ fn planned(
     revision: u32,
     trajectory: &Trajectory,
     start: Pose,
+    prior: &Prior,
 ) -> Result<Box<Job>, BenchError> {
     let impossible = |problem: String| BenchError::Impossible(problem);
     let model = RobotModel::yi2007();
     let asked = control_trajectory(trajectory);
-    let plan = Plan::with_options(&asked, start, &model, &plan_options(trajectory))
+    let options = PlanOptions {
+        grip_mu: prior.grip_mu(),
+        ..plan_options(trajectory)
+    };
+    let plan = Plan::with_options(&asked, start, &model, &options)
         .map_err(|refused| impossible(refused.to_string()))?;
     let follower = Follower::new(plan, model, FollowerConfig::default())
         .map_err(|refused| impossible(refused.to_string()))?;
     Ok(Box::new(Job {
+        prior: prior.clone(),
         mission: mission_of(number),
         revision,
         plan_hash: PlanHash::from_uuid(Uuid::from_u128(number)),
@@ -216,6 +225,7 @@ impl Bench {
             ended: Vec::new(),
             news: Vec::new(),
             silence_max: None,
+            prior: Prior::default(),
             last_driven: None,
             cross_track_m: f64::NAN,
         })
@@ -230,6 +240,11 @@ impl Bench {
         Ok(self.ends.commands.send(LoopCommand::Site(view))?)
     }
 
+    /// Tells the robot what a map knows, from its next mission on.
+    pub fn tell(&mut self, prior: &PathPrior) {
+        self.prior = Prior::new(Some(prior));
+    }
+
     /// Plans a trajectory from where the robot stands and hands it to the loop.
     ///
     /// # Errors
@@ -241,7 +256,7 @@ impl Bench {
         start_by: Option<Duration>,
     ) -> Result<MissionId, BenchError> {
         let (pose, _) = self.ends.shared.snapshot().pose.ok_or(BenchError::NoPose)?;
-        let mut job = planned(number, 1, trajectory, pose)?;
+        let mut job = planned(number, 1, trajectory, pose, &self.prior)?;
         job.start_by = start_by;
         job.silence_max = self.silence_max;
         let mission = job.mission;
@@ -267,7 +282,7 @@ impl Bench {
         self.tick();
         let governor = self.ends.shared.snapshot().governor;
         let rest = governor.ok_or(BenchError::Gone)?.rest(driving);
-        let job = planned(number, revision, trajectory, rest)?;
+        let job = planned(number, revision, trajectory, rest, &self.prior)?;
         Ok(self.ends.commands.send(LoopCommand::Replace(job))?)
     }
 

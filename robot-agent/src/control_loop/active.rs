@@ -19,6 +19,7 @@ use tread_control::robot::RobotModel;
 use tread_control::tracking::ThetaKnowledge;
 
 use super::driven::TickRecord;
+use super::prior::Prior;
 use super::seam::{EndReason, Job};
 
 /// Speeds below which a held robot counts as standing, m/s and rad/s.
@@ -215,6 +216,15 @@ impl Active {
             self.job.follower.set_pace(0.0);
         }
         Some(old)
+    }
+
+    /// What the map knows along the way that is driven, or is to be once the robot stands.
+    pub(super) fn prior(&self) -> &Prior {
+        let coming = self
+            .next
+            .as_ref()
+            .filter(|_| self.is_at_rest_for_replacement());
+        &coming.unwrap_or(&self.job).prior
     }
 
     /// What is left in hand when the mission ends.

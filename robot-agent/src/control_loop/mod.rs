@@ -6,6 +6,7 @@
 pub(crate) mod active;
 pub(crate) mod driven;
 mod outgoing;
+pub(crate) mod prior;
 pub(crate) mod seam;
 pub(crate) mod segments;
 pub(crate) mod site_view;
@@ -82,5 +83,7 @@ pub(crate) fn run(
 
 #[cfg(test)]
 mod hold_tests;
+#[cfg(test)]
+mod prior_tests;
 #[cfg(test)]
 mod tests;

@@ -22,6 +22,7 @@ use tread_control::reference::Governor;
 
 use super::active::Hold;
 use super::driven::Driven;
+use super::prior::Prior;
 use super::site_view::SiteView;
 use crate::drive::Battery;
 use crate::safety::SafetyCell;
@@ -38,6 +39,8 @@ pub(crate) struct Job {
     pub(crate) revision: u32,
     pub(crate) plan_hash: PlanHash,
     pub(crate) follower: Follower,
+    /// What the map knows along the way.
+    pub(crate) prior: Prior,
     /// Past this monotonic time it must not start.
     pub(crate) start_by: Option<Duration>,
     /// Longest silence of the server with which it goes on; for ever when absent.

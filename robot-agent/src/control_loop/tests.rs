@@ -19,21 +19,26 @@ use crate::sim::scenario::Scenario;
 /// Longest simulated time of a test's mission.
 const MISSION_MAX: Duration = Duration::from_mins(3);
 
-fn site_of(scenario: &Scenario) -> SiteDefinition {
+pub(super) fn site_of(scenario: &Scenario) -> SiteDefinition {
     crate::bench::site_of(scenario).unwrap()
 }
 
-fn bench_at(scenario: &Scenario, start: Pose, seed: u64) -> Bench {
+pub(super) fn bench_at(scenario: &Scenario, start: Pose, seed: u64) -> Bench {
     Bench::new(scenario, start, seed).unwrap()
 }
 
 impl Bench {
-    fn start(&mut self, number: u128, asked: &str, start_by: Option<Duration>) -> MissionId {
+    pub(super) fn start(
+        &mut self,
+        number: u128,
+        asked: &str,
+        start_by: Option<Duration>,
+    ) -> MissionId {
         let trajectory = serde_json::from_str(asked).unwrap();
         self.begin(number, &trajectory, start_by).unwrap()
     }
 
-    fn drive_to_the_end(&mut self, number: u128, asked: &str) -> EndReason {
+    pub(super) fn drive_to_the_end(&mut self, number: u128, asked: &str) -> EndReason {
         let mission = self.start(number, asked, None);
         let until = self.now + MISSION_MAX;
         let mut farthest_m: f64 = 0.0;
@@ -54,7 +59,7 @@ impl Bench {
     }
 }
 
-fn one_ground(stiffness: f64) -> Scenario {
+pub(super) fn one_ground(stiffness: f64) -> Scenario {
     let text = format!(
         r#"
 site = "bench"
@@ -70,14 +75,14 @@ stiffness = {stiffness}
     Scenario::parse("bench", &text).unwrap()
 }
 
-const ORIGIN: Pose = Pose {
+pub(super) const ORIGIN: Pose = Pose {
     x_m: 0.0,
     y_m: 0.0,
     heading_rad: 0.0,
 };
-const LINE: &str = r#"{"waypoints":{"speed_m_s":0.6,
+pub(super) const LINE: &str = r#"{"waypoints":{"speed_m_s":0.6,
     "points":[{"x_m":0,"y_m":0},{"x_m":6,"y_m":0},{"x_m":10,"y_m":2},{"x_m":10,"y_m":6}]}}"#;
-const CIRCLE: &str =
+pub(super) const CIRCLE: &str =
     r#"{"circle":{"center":{"x_m":7.0,"y_m":6.0},"radius_m":3.0,"speed_m_s":0.6}}"#;
 
 #[test]

@@ -10,7 +10,7 @@ use tread_api::friction::{
 use tread_api::page::Page;
 use tread_api::wire::ingest::Record;
 
-use crate::harness::{Yard, measured, segment};
+use crate::harness::{Yard, eventually, measured, segment};
 use crate::robot::Robot;
 
 const BASE: &str = "/v1/sites/yard/friction";
@@ -259,6 +259,45 @@ async fn a_path_tells_what_is_known_and_how_fast_it_may_be_driven() {
     let body = json!({"robot": "nobody", "points": []});
     let (status, _) = yard.post(&format!("{BASE}/path"), &body).await;
     assert_eq!(status, StatusCode::NOT_FOUND);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_dispatch_tells_the_robot_what_the_map_knows_along_its_way() {
+    let yard = measured_yard().await;
+    let robot = Robot::join(&yard, "rover-3").await;
+    let offered = async |begin_x_m: f64, y_m: f64| {
+        let body = json!({"site": "yard", "robot": "rover-3", "trajectory": {"waypoints": {
+            "speed_m_s": 0.5, "points": [{"x_m": begin_x_m, "y_m": y_m},
+                                         {"x_m": begin_x_m + 7.0, "y_m": y_m}]}}});
+        let (status, said) = yard.post("/v1/missions", &body).await;
+        assert_eq!(status, StatusCode::CREATED, "{said}");
+        let id: tread_api::ids::MissionId = serde_json::from_value(said["id"].clone()).unwrap();
+        let offer = eventually("the offer comes", async || {
+            let offers = robot.offers();
+            let mut offers = offers.into_iter().filter(|offer| offer.mission == id);
+            offers.next().ok_or("none")
+        })
+        .await;
+        let url = yard.url(&format!("/v1/missions/{id}/cancel"));
+        let (status, said) = yard.send(yard.client().post(url).json(&json!({}))).await;
+        assert!(status.is_success(), "{said}");
+        offer.prior
+    };
+    assert_eq!(offered(5.5, 9.5).await, None, "nobody has driven there");
+    let prior = offered(5.5, 0.5).await.unwrap();
+    let cells: Vec<i32> = prior.cells.iter().map(|known| known.cell.ix).collect();
+    assert_eq!(
+        cells,
+        [5, 6, 7, 8, 9, 11, 12],
+        "the border cell has two grounds"
+    );
+    assert!((prior.cells[0].theta - 0.2).abs() < 0.01, "{prior:?}");
+    assert!((prior.cells[6].theta - 0.05).abs() < 0.01, "{prior:?}");
+    assert!(
+        close(prior.grip_mu, 0.14),
+        "nothing was shown there of late"
+    );
     yard.server.stop().await.unwrap();
 }
 

@@ -91,7 +91,7 @@ impl LoopCore {
             });
             return;
         }
-        if let Some(knowledge) = self.knowledge() {
+        if let Some(knowledge) = self.knowledge(&job.prior) {
             job.follower.warm_start(knowledge);
         }
         self.active = Some(Active::new(job));
@@ -104,7 +104,8 @@ impl LoopCore {
         fault: Option<Fault>,
         dt_s: f64,
     ) -> Option<WheelSpeeds> {
-        let knowledge = self.knowledge();
+        let active = self.active.as_ref()?;
+        let knowledge = self.knowledge(active.prior());
         let measured = self.measured(now.monotonic);
         let active = self.active.as_mut()?;
         if active.is_at_rest_for_replacement() {

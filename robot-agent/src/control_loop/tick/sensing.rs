@@ -8,6 +8,7 @@ use tread_control::localisation::{FixOutcome, PositionFix};
 use tread_control::tracking::ThetaKnowledge;
 
 use super::{LoopCore, TICK_MAX_S};
+use crate::control_loop::prior::{Prior, told};
 use crate::control_loop::seam::{Fault, LoopEvent, Shared};
 use crate::control_loop::segments::{CutInput, Moment, Place};
 use crate::control_loop::site_view::Footing;
@@ -83,12 +84,20 @@ impl LoopCore {
         ground_changed
     }
 
-    pub(super) fn knowledge(&self) -> Option<ThetaKnowledge> {
-        let measured = self.estimate.theta?;
-        Some(ThetaKnowledge {
+    /// What the law is told about the ground: what was measured, and what the map knows of the
+    /// cell. The estimator itself never hears of the map.
+    pub(super) fn knowledge(&self, prior: &Prior) -> Option<ThetaKnowledge> {
+        let measured = self.estimate.theta.map(|measured| ThetaKnowledge {
             theta: measured.theta,
             std_dev: measured.std_dev,
-        })
+        });
+        let site = self.site.as_ref();
+        let cell = site.zip(self.localisation.pose()).and_then(|(site, pose)| {
+            let grid = site.grid();
+            let cell = grid.cell_at(wire_point(pose))?;
+            prior.at(grid.revision, cell)
+        });
+        told(measured, cell)
     }
 
     pub(super) fn cut_segments(&mut self, now: Moment, ground_changed: bool, dt_s: f64) {

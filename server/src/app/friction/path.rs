@@ -4,11 +4,15 @@
 //! be as slow as each later piece asks: `v² ≤ v_next² + 2·a_along·Δs`. Both accelerations come from
 //! the grip of the piece, a lower bound, through the shares that the robot's own planner uses.
 
+use std::collections::BTreeMap;
+
 use tread_api::friction::{AskPath, FusedFriction, PathFriction, PathPiece};
 use tread_api::geometry::Point;
-use tread_api::ids::SiteId;
+use tread_api::ids::{RobotId, SiteId};
 use tread_api::robot::RobotModel;
 use tread_api::site::{Cell, Grid};
+use tread_api::trajectory::{Trajectory, Waypoint};
+use tread_api::wire::command::{CellPrior, PRIOR_CELLS_MAX, PathPrior};
 use tread_control::robot::RobotModel as PlannedModel;
 
 use super::cells::{Drawn, is_here, same_ground};
@@ -25,6 +29,8 @@ const POINTS: std::ops::RangeInclusive<usize> = 2..=10_000;
 const PIECES_MAX: usize = 100_000;
 /// Friction coefficient that is reckoned with where nothing better is known; the planner's own.
 const GRIP_CAUTIOUS_MU: f64 = 0.14;
+/// Corners that a circle is looked at with.
+const CIRCLE_CORNERS: u32 = 256;
 /// Slip up to which friction grows in proportion to it.
 const SLIP_LINEAR: f64 = 0.2;
 
@@ -79,6 +85,78 @@ impl App {
             known_ratio: (known_m / length_m).min(1.0),
             pieces,
         })
+    }
+}
+
+impl App {
+    /// What a robot is told of the ground along a trajectory; `None` when nothing is known of it.
+    ///
+    /// Cells with several grounds are left out: the robot could not tell them apart.
+    pub(in crate::app) async fn prior_along(
+        &self,
+        (site, robot): (&SiteId, &RobotId),
+        trajectory: &Trajectory,
+    ) -> Result<Option<PathPrior>, AppError> {
+        let mut tx = self.db().read().await?;
+        let view = SiteView::read(&mut tx, site).await?;
+        let found = db::robots::find(&mut tx, view.row.pk, robot).await?;
+        drop(tx);
+        let Some(found) = found else { return Ok(None) };
+        let asked = Asked {
+            configuration: Some(found.configuration),
+            ..Asked::default()
+        };
+        let reading = Reading::new(self, &asked)?;
+        let points = corners(trajectory);
+        // What is too long to look at in one go is driven as before there was a map.
+        let Ok(cut) = checked_length(&points).and_then(|_| cut(&points, &view.row.site.grid))
+        else {
+            return Ok(None);
+        };
+        let drawn = Drawn::new(&view.terrains);
+        let mut grip_least_mu = f64::INFINITY;
+        let mut cells: BTreeMap<(i32, i32), CellPrior> = BTreeMap::new();
+        self.maps().look(&view.row, |map| {
+            for cut in &cut {
+                let known = known_at(map, &view, &drawn, &reading, cut);
+                grip_least_mu = grip_least_mu.min(grip_mu(known.as_ref()));
+                let has_one_ground = map.cell(cut.cell, reading.choice()).len() == 1;
+                if let Some(known) = known.filter(|_| has_one_ground) {
+                    let prior = CellPrior {
+                        cell: cut.cell,
+                        theta: known.theta,
+                        std_dev: known.std_dev,
+                    };
+                    cells.insert((cut.cell.iy, cut.cell.ix), prior);
+                }
+            }
+        });
+        let cells: Vec<CellPrior> = cells.into_values().take(PRIOR_CELLS_MAX).collect();
+        let prior = PathPrior {
+            grid_revision: view.row.site.grid.revision,
+            grip_mu: grip_least_mu,
+            cells,
+        };
+        Ok(Some(prior).filter(|prior| !prior.cells.is_empty() && prior.is_possible()))
+    }
+}
+
+/// Points along a trajectory, near enough to know its cells.
+fn corners(trajectory: &Trajectory) -> Vec<Point> {
+    match trajectory {
+        Trajectory::Circle(circle) => (0..=CIRCLE_CORNERS)
+            .map(|number| {
+                let share = f64::from(number) / f64::from(CIRCLE_CORNERS);
+                let angle = std::f64::consts::TAU * share;
+                Point {
+                    x_m: circle.center.x_m + circle.radius_m * angle.cos(),
+                    y_m: circle.center.y_m + circle.radius_m * angle.sin(),
+                }
+            })
+            .collect(),
+        Trajectory::Waypoints(waypoints) => {
+            waypoints.points.iter().map(Waypoint::position).collect()
+        }
     }
 }
 

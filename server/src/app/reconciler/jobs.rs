@@ -108,7 +108,9 @@ pub(super) async fn offer(
     };
     let start_within_ms = start_within_ms(&app, &row);
     let mission = row.mission;
+    let prior = app.prior_along((&mission.site, &mission.robot), &mission.trajectory);
     let command = Offer {
+        prior: prior.await?,
         mission: mission.id,
         revision: mission.revision,
         plan_hash: mission.plan_hash,
@@ -195,7 +197,10 @@ pub(super) async fn replace(
     let Some(replacement) = row.mission.replacement.clone() else {
         return Ok(Finished::Settled);
     };
+    let named = (&row.mission.site, &row.mission.robot);
+    let prior = app.prior_along(named, &replacement.trajectory).await?;
     let command = Offer {
+        prior,
         mission: row.mission.id,
         revision: replacement.revision,
         plan_hash: replacement.plan_hash,

@@ -1,0 +1,146 @@
+//! What the map knows along the way of a mission, for the law and the plan.
+//!
+//! It stands beside what the robot measures and never goes into it: segments come from the
+//! estimator alone, which does not know this module.
+
+use tread_api::site::Cell;
+use tread_api::wire::command::PathPrior;
+use tread_control::tracking::ThetaKnowledge;
+
+/// Standard deviations from which the robot's own measurement is believed alone: the ground is not
+/// as the map has it.
+const CONTRADICTION_DEVIATIONS: f64 = 4.0;
+
+/// The prior of one mission; empty when the map knows nothing.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Prior {
+    grid_revision: u32,
+    grip_mu: Option<f64>,
+    /// By row and column.
+    cells: Box<[(Cell, ThetaKnowledge)]>,
+}
+
+impl Prior {
+    /// Takes what came with an offer, whole or not at all.
+    pub(crate) fn new(prior: Option<&PathPrior>) -> Self {
+        let Some(prior) = prior.filter(|prior| prior.is_possible()) else {
+            return Self::default();
+        };
+        let mut cells: Vec<(Cell, ThetaKnowledge)> = prior
+            .cells
+            .iter()
+            .map(|known| {
+                let knowledge = ThetaKnowledge {
+                    theta: known.theta,
+                    std_dev: known.std_dev,
+                };
+                (known.cell, knowledge)
+            })
+            .collect();
+        cells.sort_by_key(|(cell, _)| (cell.iy, cell.ix));
+        Self {
+            grid_revision: prior.grid_revision,
+            grip_mu: Some(prior.grip_mu),
+            cells: cells.into_boxed_slice(),
+        }
+    }
+
+    /// Friction coefficient to plan with.
+    pub(crate) fn grip_mu(&self) -> Option<f64> {
+        self.grip_mu
+    }
+
+    /// What is known of a cell of that grid. Does not allocate.
+    pub(crate) fn at(&self, grid_revision: u32, cell: Cell) -> Option<ThetaKnowledge> {
+        if grid_revision != self.grid_revision {
+            return None;
+        }
+        let key = (cell.iy, cell.ix);
+        let found = self
+            .cells
+            .binary_search_by_key(&key, |(cell, _)| (cell.iy, cell.ix));
+        found.ok().map(|index| self.cells[index].1)
+    }
+}
+
+/// Both words on the ground together; the robot's own alone where they contradict each other.
+pub(crate) fn told(
+    measured: Option<ThetaKnowledge>,
+    prior: Option<ThetaKnowledge>,
+) -> Option<ThetaKnowledge> {
+    match (measured, prior) {
+        (Some(measured), Some(prior)) => {
+            let apart = (measured.theta - prior.theta).abs();
+            let deviation = measured.std_dev.hypot(prior.std_dev);
+            if apart > CONTRADICTION_DEVIATIONS * deviation {
+                Some(measured)
+            } else {
+                Some(measured.fused(prior))
+            }
+        }
+        (measured, prior) => measured.or(prior),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tread_api::wire::command::CellPrior;
+
+    use super::*;
+
+    fn knowledge(theta: f64, std_dev: f64) -> ThetaKnowledge {
+        ThetaKnowledge { theta, std_dev }
+    }
+
+    fn prior(cells: Vec<CellPrior>) -> PathPrior {
+        PathPrior {
+            grid_revision: 1,
+            grip_mu: 0.3,
+            cells,
+        }
+    }
+
+    fn cell(ix: i32, iy: i32, theta: f64) -> CellPrior {
+        CellPrior {
+            cell: Cell { ix, iy },
+            theta,
+            std_dev: 0.02,
+        }
+    }
+
+    #[test]
+    fn a_cell_is_found_in_its_grid_and_nowhere_else() {
+        let offered = prior(vec![cell(5, -2, 0.5), cell(-3, 4, 0.2), cell(0, 0, 1.0)]);
+        let kept = Prior::new(Some(&offered));
+        let theta = |ix, iy| kept.at(1, Cell { ix, iy }).map(|known| known.theta);
+        assert_eq!(theta(-3, 4), Some(0.2));
+        assert_eq!(theta(5, -2), Some(0.5));
+        assert_eq!(theta(4, -3), None);
+        assert_eq!(kept.at(2, Cell { ix: 0, iy: 0 }), None);
+        assert_eq!(kept.grip_mu(), Some(0.3));
+    }
+
+    #[test]
+    fn a_prior_with_an_impossible_number_is_none() {
+        for bad in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+            let offered = prior(vec![cell(0, 0, 0.2), cell(1, 0, bad)]);
+            assert_eq!(Prior::new(Some(&offered)), Prior::default());
+            let offered = PathPrior {
+                grip_mu: bad,
+                ..prior(Vec::new())
+            };
+            assert_eq!(Prior::new(Some(&offered)), Prior::default());
+        }
+    }
+
+    #[test]
+    fn both_words_count_and_a_contradicted_map_does_not() {
+        let measured = knowledge(0.21, 0.02);
+        let both = told(Some(measured), Some(knowledge(0.19, 0.02))).unwrap();
+        assert!((both.theta - 0.2).abs() < 1e-9 && both.std_dev < 0.02);
+        assert_eq!(told(None, Some(measured)), Some(measured));
+        assert_eq!(told(Some(measured), None), Some(measured));
+        let wrong = knowledge(1.4, 0.05);
+        assert_eq!(told(Some(measured), Some(wrong)), Some(measured));
+    }
+}
