@@ -8,6 +8,10 @@ mod control;
 #[cfg(test)]
 mod drive;
 #[cfg(test)]
+mod dry_run;
+#[cfg(test)]
+mod events;
+#[cfg(test)]
 mod geofence;
 #[cfg(test)]
 mod harness;
@@ -29,6 +33,8 @@ mod program;
 mod resources;
 #[cfg(test)]
 mod robot;
+#[cfg(test)]
+mod robots;
 #[cfg(test)]
 mod slow_client;
 #[cfg(test)]
