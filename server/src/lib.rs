@@ -35,7 +35,7 @@ use tokio::sync::mpsc;
 use tracing::{info, warn};
 
 use self::app::identity::audit;
-use self::app::{App, Links, events, ingest, reconciler};
+use self::app::{App, Links, events, ingest, merging, reconciler};
 use self::clock::Clock;
 pub use self::config::{Config, ServerArgs};
 use self::db::Db;
@@ -107,6 +107,7 @@ impl Server {
         );
         supervisor.spawn_vital("reconciler", reconciling);
         supervisor.spawn_vital("events", events::run(app.clone(), stop()));
+        supervisor.spawn_vital("merging", merging::run(app.clone(), stop()));
         supervisor.spawn_vital("audit", audit::run(app.clone(), stop()));
         let router = http::router(app.clone(), names);
         if let Some(tls) = &tls {

@@ -87,7 +87,7 @@ fn little_grip_makes_a_slower_plan() {
         let mut bench = knowing_bench(5.0, 5, Some(&prior));
         let begun = bench.now;
         assert_eq!(bench.drive_to_the_end(1, LINE), EndReason::Reached);
-        (bench.now - begun).as_secs_f64()
+        bench.now.saturating_sub(begun).as_secs_f64()
     };
     let (grip, ice) = (duration_s(0.6), duration_s(0.03));
     assert!(ice > grip + 2.0, "{grip} s with grip, {ice} s without");

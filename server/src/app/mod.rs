@@ -10,6 +10,7 @@ pub mod identity;
 pub mod ingest;
 pub mod limits;
 mod map;
+pub mod merging;
 pub mod missions;
 pub mod reconciler;
 pub mod robots;

@@ -265,6 +265,19 @@ pub async fn each(db: &mut SqliteConnection, mut take: impl FnMut(SumRow)) -> Re
     Ok(())
 }
 
+/// A robot with hours to merge, and the horizon of its site; `None` when there are none.
+pub async fn one_unmerged(db: &mut SqliteConnection) -> Result<Option<(i64, i64)>, DbError> {
+    let row = sqlx::query!(
+        r#"SELECT robots.pk AS "pk!", sites.merged_before_h FROM robots
+           JOIN sites ON sites.pk = robots.site_pk
+           WHERE EXISTS (SELECT 1 FROM cell_sums s WHERE s.robot_pk = robots.pk
+               AND s.epoch_h < sites.merged_before_h AND s.epoch_h % 24 <> 0)
+           LIMIT 1"#
+    );
+    let row = row.fetch_optional(db).await?;
+    Ok(row.map(|row| (row.pk, row.merged_before_h)))
+}
+
 /// Sums of one robot whose hours are before `before_h` and not the first of their day, at most
 /// `limit`, in the order of the table.
 pub async fn unmerged(

@@ -1,5 +1,7 @@
 //! What comes onto the map, what does not, and what is taken off it again.
 
+use std::time::Duration;
+
 use jiff::SignedDuration;
 use reqwest::StatusCode;
 use serde_json::{Value, json};
@@ -8,7 +10,10 @@ use tread_api::friction::{CellFriction, Segment, Withdrawal};
 use tread_api::page::Page;
 use tread_api::robot::Robot as ShownRobot;
 use tread_api::wire::ingest::{Batch, Receipt, Record};
+use tread_server::app::App;
+use tread_server::app::friction::{Area, Asked, CellsAsked};
 use tread_server::app::ingest::Upload;
+use tread_server::config::FrictionConfig;
 
 use crate::harness::{Yard, measured, segment, site, time};
 use crate::ingest::{Writer, boot};
@@ -119,7 +124,8 @@ async fn what_is_impossible_is_refused_counted_and_shown_and_its_neighbours_are_
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_restart_reads_the_same_map() {
-    let mut yard = Yard::start().await;
+    let yard =
+        Yard::start_at(segment((0, 0), 0.2, 0).ended_at + SignedDuration::from_hours(12)).await;
     for name in ["rover-2", "rover-1"] {
         let robot = Robot::join(&yard, name).await;
         let drive = (0..40).map(|seq| {
@@ -132,17 +138,16 @@ async fn a_restart_reads_the_same_map() {
         });
         robot.upload(drive.collect()).await.unwrap();
     }
-    let as_of = "?as_of=2026-11-01T00:00:00Z";
-    let before: Value = yard.get(&format!("{CELLS}{as_of}")).await;
-    assert_eq!(before["items"].as_array().unwrap().len(), 7);
-    yard = yard.restart().await;
-    assert_eq!(yard.get::<Value>(&format!("{CELLS}{as_of}")).await, before);
+    let before = said(yard.server.app()).await;
+    assert_eq!(before.items.len(), 7);
+    assert_eq!(said(&restarted(yard.server.app()).await).await, before);
     yard.server.stop().await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_robot_that_is_withdrawn_leaves_the_map_as_if_it_had_never_come() {
-    let yard = Yard::start().await;
+    let yard =
+        Yard::start_at(segment((0, 0), 0.2, 0).ended_at + SignedDuration::from_hours(12)).await;
     let good = Robot::join(&yard, "rover-1").await;
     let bad = Robot::join(&yard, "rover-2").await;
     let drive = |theta: f64| {
@@ -154,7 +159,7 @@ async fn a_robot_that_is_withdrawn_leaves_the_map_as_if_it_had_never_come() {
             )
         })
     };
-    let as_of = format!("{CELLS}?as_of=2026-11-01T00:00:00Z");
+    let as_of = CELLS.to_owned();
     good.upload(drive(0.2).collect()).await.unwrap();
     let without: Value = yard.get(&as_of).await;
     bad.upload(drive(0.9).take(4).collect()).await.unwrap();
@@ -175,8 +180,12 @@ async fn a_robot_that_is_withdrawn_leaves_the_map_as_if_it_had_never_come() {
     let receipt = bad.upload(drive(0.9).collect()).await.unwrap();
     assert_eq!((receipt.committed, receipt.duplicates), (2, 4));
     assert_eq!(yard.get::<Value>(&as_of).await, without);
-    let yard = yard.restart().await;
-    assert_eq!(yard.get::<Value>(&as_of).await, without);
+    let again = said(&restarted(yard.server.app()).await).await;
+    assert_eq!(
+        serde_json::to_value(again).unwrap(),
+        without,
+        "after a restart"
+    );
     let listed: Page<Withdrawal> = yard.get("/v1/sites/yard/withdrawals").await;
     assert_eq!(listed.items.len(), 2);
     assert_eq!(listed.items[0].by, "tests");
@@ -193,4 +202,81 @@ async fn a_robot_that_is_withdrawn_leaves_the_map_as_if_it_had_never_come() {
         assert_eq!(said["field"], field, "{said}");
     }
     yard.server.stop().await.unwrap();
+}
+
+/// What a server has in memory that starts now on the same database.
+async fn restarted(app: &App) -> App {
+    let config = FrictionConfig::default();
+    let restarted = App::new(app.db().clone(), app.clock().clone(), config);
+    restarted.load_map().await.unwrap();
+    restarted
+}
+
+/// What the map says of all cells.
+async fn said(app: &App) -> Page<CellFriction> {
+    let cells = CellsAsked {
+        area: Area::new((None, None), (None, None)).unwrap(),
+        resolution_m: None,
+        cursor: None,
+        limit: 1_000,
+    };
+    let asked = Asked::default();
+    app.friction_of_cells(&site(), &asked, cells).await.unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn old_hours_are_merged_into_days_and_a_kill_on_the_way_changes_nothing_that_is_said() {
+    let writer = Writer::start().await;
+    let app = &writer.app;
+    // Thirty hours over two days, all before the clock's 1 November.
+    let drive = (0..30).map(|seq| {
+        let place = i32::try_from(seq % 3).unwrap();
+        let hour = i64::try_from(seq).unwrap();
+        measured(
+            seq,
+            segment((place, 0), 0.2 + 0.001 * f64::from(place), hour * 3_600),
+        )
+    });
+    upload_at(&writer, None, drive.collect()).await;
+    assert_eq!(writer.sums().await.len(), 30);
+    app.clock().advance(Duration::from_hours(10 * 24));
+    app.move_horizons().await.unwrap();
+    let expected = said(app).await;
+    assert_eq!(expected.items.len(), 3);
+    let mut rounds = 0;
+    loop {
+        // What a server would say that was killed here and started again.
+        let restarted = App::new(
+            app.db().clone(),
+            app.clock().clone(),
+            FrictionConfig::default(),
+        );
+        restarted.load_map().await.unwrap();
+        assert_eq!(said(&restarted).await, expected, "after {rounds} rounds");
+        if !app.merge_some(7).await.unwrap() {
+            break;
+        }
+        rounds += 1;
+    }
+    assert!(rounds > 3, "{rounds} rounds");
+    assert_eq!(said(app).await, expected);
+    let merged = writer.sums().await;
+    assert!(
+        merged.len() <= 9,
+        "three cells on at most three days: {}",
+        merged.len()
+    );
+    assert!(merged.iter().all(|row| row.key.epoch_h % 24 == 0));
+    let segments: u64 = merged.iter().map(|row| row.sums.segments).sum();
+    assert_eq!(segments, 30, "nothing lost, nothing twice");
+
+    // What comes late falls into its day.
+    upload_at(
+        &writer,
+        None,
+        vec![measured(30, segment((0, 0), 0.2, 1_800))],
+    )
+    .await;
+    let restarted = restarted(app).await;
+    assert_eq!(said(&restarted).await, said(app).await);
 }

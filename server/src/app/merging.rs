@@ -1,0 +1,98 @@
+//! Old hours of measuring are merged into days, so that the map does not grow for ever.
+//!
+//! First a site's horizon moves: hours before it are *read* as days from then on, in memory and
+//! after any restart. Then the rows follow, some at a time, each time in one transaction that
+//! removes hours and adds them to their day. Whenever this is killed, the map says the same.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use tokio_util::sync::CancellationToken;
+
+use super::{App, AppError};
+use crate::db;
+use crate::db::sums::SumKey;
+use crate::friction::sums::DAY_H;
+use crate::friction::{Sums, bucket_h, epoch_h};
+
+/// Hours that are kept by themselves before their day is merged.
+pub const HOURS_KEPT: i64 = 7 * DAY_H;
+/// How often the server looks for hours to merge.
+const MERGE_EVERY: Duration = Duration::from_mins(10);
+/// Rows that one transaction merges; others write in between.
+const ROWS_MERGED_MAX: u32 = 500;
+/// Sites of one look.
+const SITES_MAX: u32 = 1_000;
+
+/// Merges now and then until the stop.
+pub async fn run(app: App, stop: CancellationToken) {
+    loop {
+        if let Err(cause) = merge_all(&app, &stop).await {
+            tracing::error!("cannot merge old hours of the map: {cause:?}");
+        }
+        tokio::select! {
+            () = stop.cancelled() => break,
+            () = tokio::time::sleep(MERGE_EVERY) => {}
+        }
+    }
+}
+
+async fn merge_all(app: &App, stop: &CancellationToken) -> Result<(), AppError> {
+    app.move_horizons().await?;
+    while !stop.is_cancelled() && app.merge_some(ROWS_MERGED_MAX).await? {}
+    Ok(())
+}
+
+impl App {
+    /// Has every site read days that are older than [`HOURS_KEPT`] as one epoch each.
+    ///
+    /// # Errors
+    /// The database failed.
+    pub async fn move_horizons(&self) -> Result<(), AppError> {
+        let horizon_h = bucket_h(epoch_h(self.clock().now()) - HOURS_KEPT, i64::MAX);
+        let mut tx = self.db().read().await?;
+        let sites = db::sites::list(&mut tx, "", SITES_MAX).await?;
+        drop(tx);
+        for site in sites {
+            if site.merged_before_h >= horizon_h {
+                continue;
+            }
+            let _turn = self.maps().turn().await;
+            let mut tx = self.db().write().await?;
+            db::sites::merge_before(&mut tx, site.pk, horizon_h).await?;
+            tx.commit().await?;
+            self.maps().change(&site, |map| map.merge_before(horizon_h));
+        }
+        Ok(())
+    }
+
+    /// Merges some rows of hours before the horizon; whether there may be more.
+    ///
+    /// # Errors
+    /// The database failed.
+    pub async fn merge_some(&self, limit: u32) -> Result<bool, AppError> {
+        let mut tx = self.db().read().await?;
+        let row = db::sums::one_unmerged(&mut tx).await?;
+        drop(tx);
+        let Some((robot_pk, horizon_h)) = row else {
+            return Ok(false);
+        };
+        let _turn = self.maps().turn().await;
+        let mut tx = self.db().write().await?;
+        let rows = db::sums::unmerged(&mut tx, robot_pk, horizon_h, limit).await?;
+        let mut days: BTreeMap<SumKey, Sums> = BTreeMap::new();
+        for row in rows {
+            db::sums::remove(&mut tx, &row.key).await?;
+            let key = SumKey {
+                epoch_h: bucket_h(row.key.epoch_h, horizon_h),
+                ..row.key
+            };
+            days.entry(key)
+                .and_modify(|day| day.add(&row.sums))
+                .or_insert(row.sums);
+        }
+        db::sums::add(&mut tx, days.iter()).await?;
+        tx.commit().await?;
+        Ok(true)
+    }
+}
