@@ -347,6 +347,10 @@ impl Dispatcher {
                 return refused(OfferRefusal::NotReady, "the control loop is busy");
             }
         }
+        // The same tick takes both. Without room the server pauses it once it sees it driven.
+        if offer.held && !self.tell_loop(LoopCommand::Hold(mission, Hold::Pause)) {
+            warn!(mission.id = %mission, "{mission} was to be held, and the control loop is busy");
+        }
         info!(
             mission.id = %mission,
             length_m = plan.length_m,

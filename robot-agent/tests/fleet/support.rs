@@ -346,5 +346,6 @@ pub(crate) fn offer(number: u128, asked: &str) -> Offer {
         trajectory,
         start_within_ms: Some(10_000),
         link_policy: LinkPolicy::default(),
+        held: false,
     }
 }
