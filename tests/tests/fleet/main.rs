@@ -3,12 +3,14 @@
 mod bad_input;
 mod chaos;
 mod control;
+mod drivers;
 mod event_clients;
 mod impostors;
 
 mod messages;
 mod missions;
 mod outages;
+mod pages;
 mod safety;
 
 use std::path::Path;
