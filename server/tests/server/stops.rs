@@ -6,7 +6,7 @@ use std::time::Duration;
 use reqwest::StatusCode;
 use serde_json::{Value, json};
 use tokio::time::Instant;
-use tread_api::mission::MissionState;
+use tread_api::mission::{Mission, MissionState};
 use tread_api::page::Page;
 use tread_api::robot::{Alert, MissionProgress, PauseCause};
 use tread_api::stop::{FleetStop, Stop};
@@ -118,6 +118,45 @@ async fn a_stop_is_confirmed_shown_and_cleared_and_nothing_goes_on_by_itself() {
     yard.server.stop().await.unwrap();
 }
 
+/// A robot's report that it paused a mission of itself, weeks ago.
+fn safety_pause(mission: &Mission, paused_by: PauseCause) -> RecordContent {
+    let RecordContent::Mission(mut paused) = report(mission, MissionPhase::Paused) else {
+        panic!("a report on a mission");
+    };
+    paused.progress = Some(MissionProgress {
+        id: mission.id,
+        revision: mission.revision,
+        plan_hash: mission.plan_hash,
+        driven_m: 1.0,
+        length_m: 18.0,
+        cross_track_m: 0.0,
+        paused: true,
+        paused_by: Some(paused_by),
+    });
+    RecordContent::Mission(paused)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_pause_that_is_reported_after_a_person_resumed_the_mission_does_not_hold_it_again() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    for asked in ["pause", "resume"] {
+        let path = format!("/v1/missions/{}/{asked}", mission.id);
+        let (status, body) = yard.post(&path, &Value::Null).await;
+        assert!(status.is_success(), "{asked}: {body}");
+    }
+    let content = safety_pause(&mission, PauseCause::Stop);
+    robot
+        .upload(vec![Record { seq: 0, content }])
+        .await
+        .unwrap();
+    let detail = yard.mission(mission.id).await;
+    assert!(!detail.mission.pause_wanted, "{detail:?}");
+    yard.server.stop().await.unwrap();
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_pause_that_the_robot_reports_for_its_safety_is_what_is_wanted_from_then_on() {
     let yard = Yard::start().await;
@@ -125,21 +164,8 @@ async fn a_pause_that_the_robot_reports_for_its_safety_is_what_is_wanted_from_th
     for (seq, paused_by) in (0..).zip([PauseCause::Stop, PauseCause::Teleoperation]) {
         let mission = yard.create_mission(&robot.id).await;
         yard.mission_becomes(mission.id, MissionState::Active).await;
-        let RecordContent::Mission(mut paused) = report(&mission, MissionPhase::Paused) else {
-            panic!("a report on a mission");
-        };
-        paused.progress = Some(MissionProgress {
-            id: mission.id,
-            revision: mission.revision,
-            plan_hash: mission.plan_hash,
-            driven_m: 1.0,
-            length_m: 18.0,
-            cross_track_m: 0.0,
-            paused: true,
-            paused_by: Some(paused_by),
-        });
-        let content = RecordContent::Mission(paused);
         let seq = 2 * seq;
+        let content = safety_pause(&mission, paused_by);
         robot.upload(vec![Record { seq, content }]).await.unwrap();
         let held = yard.mission_becomes(mission.id, MissionState::Paused).await;
         assert!(held.mission.pause_wanted, "{paused_by:?}: {held:?}");

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use futures_util::{SinkExt as _, StreamExt as _};
 use tokio::net::TcpStream;
-use tokio::task::JoinHandle;
+use tokio::task::JoinSet;
 use tokio_tungstenite::tungstenite::{ClientRequestBuilder, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async};
 use tread_api::drive::{Drive, DriveRequest, DriveUpdate, DriverName};
@@ -38,8 +38,8 @@ fn say(request: &DriveRequest) -> Message {
     Message::text(serde_json::to_string(request).unwrap())
 }
 
-/// Acquires the lease and drives, on a circle, until the connection ends or the task is aborted.
-async fn drive(fleet: &Fleet, server: SocketAddr) -> JoinHandle<()> {
+/// Acquires the lease and drives, on a circle, until the connection ends or what is given is dropped.
+async fn drive(fleet: &Fleet, server: SocketAddr) -> JoinSet<()> {
     let mut socket = open(fleet, server).await;
     let driver = DriverName {
         name: "Ann".to_owned(),
@@ -67,7 +67,8 @@ async fn drive(fleet: &Fleet, server: SocketAddr) -> JoinHandle<()> {
         angular_rad_s: 0.3,
         for_ms: None,
     });
-    tokio::spawn(async move {
+    let mut driving = JoinSet::new();
+    driving.spawn(async move {
         let mut ticks = tokio::time::interval(PERIOD);
         loop {
             tokio::select! {
@@ -83,7 +84,8 @@ async fn drive(fleet: &Fleet, server: SocketAddr) -> JoinHandle<()> {
                 }
             }
         }
-    })
+    });
+    driving
 }
 
 async fn live(fleet: &Fleet, what: &str, is: impl Fn(&RobotLive) -> bool) {
@@ -115,7 +117,7 @@ async fn losing_the_driver_always_stops_the_robot_however_it_happens() {
     // The driver's program dies: its socket closes without a word.
     let driver = drive(&fleet, server).await;
     it_drives(&fleet).await;
-    driver.abort();
+    drop(driver);
     it_stands_and_is_free(&fleet).await;
 
     // The network resets the connection.
@@ -124,14 +126,14 @@ async fn losing_the_driver_always_stops_the_robot_however_it_happens() {
     it_drives(&fleet).await;
     relay.reset();
     it_stands_and_is_free(&fleet).await;
-    driver.abort();
+    drop(driver);
 
     // The network swallows everything, and no side is told.
     let driver = drive(&fleet, relay.address()).await;
     it_drives(&fleet).await;
     relay.cut();
     it_stands_and_is_free(&fleet).await;
-    driver.abort();
+    drop(driver);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -196,6 +198,6 @@ async fn losing_an_observer_never_stops_the_robot() {
         }
         drop(observer);
     }
-    driver.abort();
+    drop(driver);
     it_stands_and_is_free(&fleet).await;
 }

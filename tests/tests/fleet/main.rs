@@ -3,6 +3,7 @@
 mod bad_input;
 mod chaos;
 mod control;
+#[cfg(test)]
 mod drivers;
 mod event_clients;
 mod impostors;
@@ -10,6 +11,7 @@ mod impostors;
 mod messages;
 mod missions;
 mod outages;
+#[cfg(test)]
 mod pages;
 mod safety;
 

@@ -11,7 +11,7 @@ fn sources(folder: &Path, text: &mut String) {
             if name != "target" && !name.starts_with('.') && name != "node_modules" {
                 sources(&path, text);
             }
-        } else if name.ends_with(".rs") {
+        } else if path.extension().is_some_and(|kind| kind == "rs") {
             text.push_str(&std::fs::read_to_string(&path).unwrap());
         }
     }
