@@ -384,7 +384,7 @@ impl Online {
         match link.hello(&hello).await {
             Ok(welcome) => {
                 info!("the server welcomes `{}`", self.identity.robot);
-                self.dispatcher.take_site(welcome.site)
+                self.dispatcher.take_welcome(welcome.site)
             }
             Err(fleet::AskError::NoAnswer) => false,
             Err(cause) => {
