@@ -24,6 +24,7 @@
 mod along;
 mod block;
 mod change;
+mod curved;
 mod excitation;
 mod expectation;
 mod offsets;
@@ -57,8 +58,6 @@ pub const BLOCK_S: f64 = 0.2;
 const RIM_SPEED_MIN_M_S: f64 = 0.15;
 /// Largest combined slip that is taken for the linear range.
 const SLIP_LINEAR_MAX: f64 = 0.15;
-/// The same before θ is known.
-const SLIP_LINEAR_FIRST_MAX: f64 = 0.10;
 /// Relative deviation above which there is said to be no measurement.
 const RELATIVE_STD_DEV_MAX: f64 = 0.5;
 /// Fewest blocks of a measurement.
@@ -214,12 +213,8 @@ impl Estimator {
         let bound = SlipBound {
             theta_most: self.bound.theta_most,
             theta: self.bound.theta_weights,
-            slip_max: if self.bound.theta.is_some() {
-                SLIP_LINEAR_MAX
-            } else {
-                SLIP_LINEAR_FIRST_MAX
-            },
-            curvature: self.tyres.curvature,
+            radius_difference: self.estimate.radius_difference.value,
+            tyres: self.tyres,
         };
         let rows = self
             .along

@@ -60,7 +60,7 @@ const INFLATION_ROWS: f64 = 15.0;
 /// How large rolling resistance over load may be, one standard deviation.
 const ROLLING_SPREAD: f64 = 0.02;
 /// Share of the effect of curved tyres that the rows may miss: they hold it to second order.
-const BEND_SHARE: f64 = 0.1;
+const BEND_SHARE: f64 = 0.05;
 /// Least spread of a tyre's curvature, so that the matrix stays regular.
 const CURVATURE_SPREAD_MIN: f64 = 1.0e-3;
 
