@@ -306,6 +306,7 @@ impl AlongFilter {
             force_noise: force_noise * 2.0 / (2.0 - gain),
             bend: 0.0,
             common_noise: Parameters::zeros(),
+            ramp_noise: 0.0,
         }
     }
 }

@@ -120,7 +120,13 @@ impl Block {
             force_noise: force.difference_noise,
             bend: force.bend,
             common_noise,
+            ramp_noise: 0.0,
         })
+    }
+
+    /// The moment balance, where no torque is measured.
+    pub(super) fn turning_row(&self) -> Option<Row> {
+        self.turning.filter(|_| self.force.is_none())
     }
 
     /// Row of the sides' mean, on measured torques and body speed.
@@ -140,6 +146,7 @@ impl Block {
             force_noise: 0.25 * force.difference_noise,
             bend: force.bend,
             common_noise: Parameters::zeros(),
+            ramp_noise: 0.0,
         })
     }
 
@@ -432,16 +439,18 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
         -track_m * (model.effective_track_ratio() - 1.0) * model.effective_track_m() * gyro_noise
             / means.samples;
     common_noise[index::AHEAD_OFFSET] = -theta * difference_noise / GRAVITY_M_S2;
+    let ramp_noise = (inertia * means.harmonic_m_s / means.duration_s).powi(2) * 2.0 * gyro_noise
+        / means.ramp_samples;
     Row {
         regressors,
         response: means.slip_m_s,
         spread: (2.0 * rim_noise_m_s.powi(2) + model.effective_track_m().powi(2) * gyro_noise)
             / means.samples,
-        force_noise: (inertia * means.harmonic_m_s / means.duration_s).powi(2) * 2.0 * gyro_noise
-            / means.ramp_samples
+        force_noise: ramp_noise
             + (means.rim_difference_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2)
                 / means.samples,
         bend: bent(1.0, sides.mean, tyres.curvature),
         common_noise,
+        ramp_noise,
     }
 }

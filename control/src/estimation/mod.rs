@@ -43,7 +43,7 @@ use change::ChangeDetector;
 use excitation::Excitation;
 pub use expectation::{ExpectedAccuracy, expected_accuracy};
 use offsets::OffsetKnowledge;
-use regression::{Solution, SolveInput, solve};
+use regression::{Row, Solution, SolveInput, solve};
 pub use segment::SegmentStatistics;
 use segment::{Claims, SegmentTheta};
 use sums::Sums;
@@ -103,6 +103,8 @@ pub struct Estimator {
     estimate: Estimate,
     /// What all blocks of this ground give, where that is a measurement.
     measured: Option<Solution>,
+    /// The moment balance of the last block, where it was used.
+    turning_before: Option<Row>,
     last_wheels: Option<WheelSpeeds>,
     skipped_s: f64,
     leaps_in_a_row: u32,
@@ -137,6 +139,7 @@ impl Estimator {
             },
             estimate: Estimate::default(),
             measured: None,
+            turning_before: None,
             last_wheels: None,
             skipped_s: 0.0,
             leaps_in_a_row: 0,
@@ -163,6 +166,7 @@ impl Estimator {
         if dt_s > GAP_MAX_S {
             // Nothing is known of the time between: averages begin anew.
             self.block = BlockBuilder::default();
+            self.turning_before = None;
             self.along = AlongFilter::new();
             return UpdateOutcome::default();
         }
@@ -181,6 +185,9 @@ impl Estimator {
             theta: self.bound.theta_weights,
         };
         let block = builder.finish(context);
+        if block.is_none() {
+            self.turning_before = None;
+        }
         let (ground_changed, slips) = block.map_or((false, false), |block| self.take(block));
         self.excitation.end_block();
         self.refresh();
@@ -232,6 +239,11 @@ impl Estimator {
     fn take(&mut self, mut block: Block) -> (bool, bool) {
         block.is_linear &= block.slips_little(&self.bound);
         self.pending.add(&block);
+        let row = block.turning_row().filter(|_| block.is_linear);
+        if let (Some(row), Some(before)) = (row, self.turning_before) {
+            self.pending.note_neighbour(&row, &before);
+        }
+        self.turning_before = row;
         let innovation = self
             .measured
             .and_then(|solution| solution.innovation(&block));
@@ -243,6 +255,7 @@ impl Estimator {
         let changed = innovation.is_some_and(|value| self.change.update(value));
         if changed {
             // These blocks may be of either ground: they belong to neither.
+            self.turning_before = None;
             self.pending = Sums::default();
             self.change = ChangeDetector::default();
         } else if self.change.is_quiet() {
@@ -392,6 +405,7 @@ impl Estimator {
         self.segment = Sums::default();
         self.pending = Sums::default();
         self.change = ChangeDetector::default();
+        self.turning_before = None;
         self.block = BlockBuilder::default();
         self.along = AlongFilter::new();
         self.excitation = Excitation::default();
