@@ -60,6 +60,9 @@ pub(crate) enum ClientError {
     /// The server refused.
     #[error("{}", refusal(.problem))]
     Refused { problem: Box<ProblemBody> },
+    /// What answers opens no WebSocket.
+    #[error("what answers at {address} opens no connection to drive a robot: is there a proxy?")]
+    NoWebSocket { address: String },
     /// What answers does not speak this API.
     #[error("what answers at {address} is no Tread server of this version ({status})")]
     NotUnderstood {
@@ -173,7 +176,7 @@ impl Client {
         &self.address
     }
 
-    fn request(&self, method: Method, path: &str) -> RequestBuilder {
+    pub(crate) fn request(&self, method: Method, path: &str) -> RequestBuilder {
         let request = self.http.request(method, format!("{}{path}", self.address));
         match &self.token {
             Some(token) => request.bearer_auth(token),
@@ -215,16 +218,24 @@ impl Client {
         if status.is_success() {
             return Ok(());
         }
-        let body = response.bytes().await.map_err(unreachable)?;
-        let problem =
-            serde_json::from_slice(&body).map_err(|cause| ClientError::NotUnderstood {
-                address: self.address.clone(),
+        Err(self.refusal(response).await)
+    }
+
+    /// What an answer that is no success says.
+    pub(crate) async fn refusal(&self, response: Response) -> ClientError {
+        let (address, status) = (self.address.clone(), response.status());
+        let body = match response.bytes().await {
+            Ok(body) => body,
+            Err(cause) => return ClientError::Unreachable { address, cause },
+        };
+        match serde_json::from_slice(&body) {
+            Ok(problem) => ClientError::Refused { problem },
+            Err(cause) => ClientError::NotUnderstood {
+                address,
                 status,
                 cause,
-            })?;
-        Err(ClientError::Refused {
-            problem: Box::new(problem),
-        })
+            },
+        }
     }
 
     async fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {

@@ -10,6 +10,7 @@ mod commands;
 mod credentials;
 mod demo;
 mod output;
+mod socket;
 
 use std::process::ExitCode;
 

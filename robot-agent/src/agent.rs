@@ -37,7 +37,7 @@ use crate::knowledge::{Missions, SiteCell};
 use crate::missions::memory::{Memory, MemoryError};
 use crate::outbox::{Outbox, OutboxError};
 use crate::recorder::Recorder;
-use crate::reporter::{Reporter, every, log_losses};
+use crate::reporter::{Reporter, every, log_losses, publish_states};
 use crate::safety::{Safety, watchdog};
 use crate::supervisor::{PartEnded, Supervisor};
 
@@ -148,7 +148,8 @@ impl Agent {
             Arc::clone(&shared.safety),
             Arc::clone(&clock),
         );
-        let core = LoopCore::new(model, loop_ends);
+        let core =
+            LoopCore::new(model, loop_ends).with_blind_within_fence(config.blind_within_fence);
         let (loop_clock, period) = (Arc::clone(&clock), config.period());
         let no_thread = |part| move |source| StartError::Thread { part, source };
         let recording = supervisor
@@ -341,9 +342,7 @@ impl Online {
                 self.introduce(Arc::clone(&link), welcomed),
                 uploading,
                 answering,
-                every(self.config.state_rate_hz, Arc::clone(&link), |link| {
-                    link.publish_state(&reporter.state());
-                }),
+                publish_states(self.config.state_rate_hz, Arc::clone(&link), reporter),
                 every(self.config.friction_rate_hz, Arc::clone(&link), |link| {
                     link.publish_friction(&reporter.friction());
                 }),

@@ -22,6 +22,12 @@ use crate::knowledge::SiteCell;
 use crate::outbox::Outbox;
 use crate::safety::{Safety, microseconds};
 
+/// Longest wait for the loop before a change is published: two ticks of the slowest one.
+const TICK_WAIT_MAX: Duration = Duration::from_millis(100);
+/// Time between two looks at its ticks; at the same time the least time between two changes that
+/// are published.
+const TICK_LOOK_EVERY: Duration = Duration::from_millis(2);
+
 /// Who tells others how the robot is.
 #[derive(Debug)]
 pub(crate) struct Reporter {
@@ -145,6 +151,20 @@ impl Reporter {
         }
     }
 
+    /// Waits until the loop has looked at what changed a moment ago, so that its mode says so too.
+    async fn loop_has_seen(&self) {
+        let ticks = || self.shared.ticks.load(Ordering::Relaxed);
+        // A tick that has begun already may not have seen it.
+        let seen = ticks() + 2;
+        let ticking = async {
+            while ticks() < seen {
+                tokio::time::sleep(TICK_LOOK_EVERY).await;
+            }
+        };
+        // A loop that stands still is shown as it is.
+        let _ = tokio::time::timeout(TICK_WAIT_MAX, ticking).await;
+    }
+
     /// Both friction estimates now.
     pub(crate) fn friction(&self) -> FrictionReport {
         let snapshot = self.shared.snapshot();
@@ -197,6 +217,20 @@ pub(crate) async fn log_losses(shared: Arc<Shared>, stop: CancellationToken) {
             );
             blocks = unplaced;
         }
+    }
+}
+
+/// Publishes the state at a fixed rate, and at once when a stop or a lease has begun or ended, until
+/// the task is dropped.
+pub(crate) async fn publish_states(rate_hz: f64, link: Arc<FleetLink>, reporter: &Reporter) {
+    let mut ticks = tokio::time::interval(Duration::from_secs_f64(rate_hz.recip()));
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        tokio::select! {
+            _ = ticks.tick() => {}
+            () = reporter.safety.changed() => reporter.loop_has_seen().await,
+        }
+        link.publish_state(&reporter.state());
     }
 }
 

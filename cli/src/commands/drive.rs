@@ -12,12 +12,10 @@ use anyhow::{Context, bail};
 use crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 use crossterm::{cursor, execute, terminal};
 use futures_util::{SinkExt as _, StreamExt as _};
-use tokio::net::TcpStream;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior};
-use tokio_tungstenite::tungstenite::{ClientRequestBuilder, Error, Message};
-use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async};
+use tokio_tungstenite::tungstenite::{Error, Message};
 use tread_api::drive::{
     Drive, DriveRequest, DriveUpdate, DriveView, DriverName, Nothing, StopWords,
 };
@@ -26,6 +24,7 @@ use super::robots::{link_name, mode_name};
 use crate::args::DriveArguments;
 use crate::client::Client;
 use crate::output::{age, line};
+use crate::socket::{self, Socket};
 
 /// Time between two drive commands.
 const SEND_PERIOD: Duration = Duration::from_millis(50);
@@ -41,8 +40,6 @@ const KEY_POLL: Duration = Duration::from_millis(50);
 const CONNECT_MAX: Duration = Duration::from_secs(5);
 /// What the keys do.
 const HELP: &str = "arrows or WASD drive · space stands · x stops and latches · q quits";
-
-type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
 
 /// A terminal that gives keys at once; it is as before when this is dropped, also by a panic.
 struct RawTerminal;
@@ -200,27 +197,9 @@ async fn connect(arguments: &DriveArguments, client: &Client) -> anyhow::Result<
     let (site, robot) = (&arguments.connection.site, &arguments.robot);
     // Whether it is known is asked first, for a clear word.
     client.robot(site, robot).await?;
-    let address = client.address().replacen("http://", "ws://", 1);
-    let url = format!("{address}/v1/sites/{site}/robots/{robot}/drive");
-    if !url.starts_with("ws://") {
-        bail!(
-            "`tread drive` cannot speak TLS yet: run it on the server's machine, or through a tunnel \
-             to its loopback address"
-        );
-    }
-    let uri = url
-        .parse()
-        .with_context(|| format!("{url} is no address"))?;
-    let mut request = ClientRequestBuilder::new(uri);
-    if let Some(token) = client.token() {
-        request = request.with_header("authorization", format!("Bearer {token}"));
-    }
-    let connecting = tokio::time::timeout(CONNECT_MAX, connect_async(request));
-    let (socket, _) = connecting
-        .await
-        .with_context(|| format!("{url} does not answer"))?
-        .with_context(|| format!("cannot open {url}"))?;
-    Ok(socket)
+    let opening = tokio::time::timeout(CONNECT_MAX, socket::open(client, site, robot));
+    let opened = opening.await;
+    Ok(opened.with_context(|| format!("{} does not answer", client.address()))??)
 }
 
 async fn send(socket: &mut Socket, request: &DriveRequest) -> anyhow::Result<()> {

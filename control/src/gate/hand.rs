@@ -3,7 +3,12 @@
 //! Late commands slow the robot down: above [`AGE_FULL_S`] the share of its speed falls in a
 //! straight line to [`SHARE_LEAST`] at [`AGE_LEAST_S`]. [`AgeMeter`] keeps the worst age of late, so
 //! that one command that came quickly does not make up for many that did not.
+//!
+//! In the last [`STEADY_BEFORE_END_S`] of a command the robot gains no more speed, and wheels that
+//! slip ahead of it come back to its own speed: should the driver fall silent, it brakes from the
+//! speed that it had when the command ended.
 
+use super::SLIP_LEAST_M_S;
 use crate::geometry::Twist;
 use crate::robot::RobotModel;
 
@@ -13,6 +18,11 @@ pub const AGE_FULL_S: f64 = 0.15;
 pub const AGE_LEAST_S: f64 = 0.5;
 /// The least share of the speed.
 pub const SHARE_LEAST: f64 = 0.2;
+/// Fastest drive by hand of a robot that does not know where it is, metres per second.
+pub const BLIND_MAX_M_S: f64 = 0.3;
+/// Time before the end of a command from which on it speeds the robot up no more, seconds: twice
+/// the lag of a wheel servo, so that robot and wheels have come together when it ends.
+pub const STEADY_BEFORE_END_S: f64 = 0.1;
 /// Share of the worst age that is forgotten with each command that comes sooner.
 const FORGOTTEN_SHARE: f64 = 0.05;
 
@@ -98,6 +108,37 @@ pub fn approach(previous: Twist, target: Twist, model: &RobotModel, dt_s: f64) -
     }
 }
 
+/// A target that is no faster than what is driven already, and never the other way.
+///
+/// What is wanted near the end of a command: a robot that still gains speed when its driver is
+/// heard no more would first go faster.
+pub fn no_faster(previous: Twist, target: Twist) -> Twist {
+    let least = |previous: f64, target: f64| {
+        if previous * target > 0.0 {
+            target.abs().min(previous.abs()).copysign(target)
+        } else {
+            0.0
+        }
+    };
+    Twist {
+        linear_m_s: least(previous.linear_m_s, target.linear_m_s),
+        angular_rad_s: least(previous.angular_rad_s, target.angular_rad_s),
+    }
+}
+
+/// A twist that is not ahead of what the robot really does, bent the same way: wheels that slip
+/// to gain speed are taken back to the robot's.
+pub fn not_ahead(twist: Twist, real_m_s: f64) -> Twist {
+    if twist.linear_m_s.abs() < SLIP_LEAST_M_S || !real_m_s.is_finite() {
+        return twist;
+    }
+    let share = (real_m_s / twist.linear_m_s).clamp(0.0, 1.0);
+    Twist {
+        linear_m_s: share * twist.linear_m_s,
+        angular_rad_s: share * twist.angular_rad_s,
+    }
+}
+
 fn step(previous: f64, target: f64, rise: f64) -> f64 {
     let is_slowing = previous * target <= 0.0 || target.abs() < previous.abs();
     let most = if is_slowing { 2.0 * rise } else { rise };
@@ -148,6 +189,29 @@ mod tests {
             }
             prop_assert!((now.linear_m_s - to).abs() < 1.0e-9);
             prop_assert!((now.angular_rad_s + to).abs() < 1.0e-9);
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn near_the_end_of_a_command_nothing_gets_faster_or_turns_back(
+            linear_m_s in -1.0..1.0_f64, angular_rad_s in -2.0..2.0_f64,
+            wanted_m_s in -1.0..1.0_f64, wanted_rad_s in -2.0..2.0_f64,
+            real_m_s in -1.0..1.0_f64,
+        ) {
+            let previous = Twist { linear_m_s, angular_rad_s };
+            let target = Twist { linear_m_s: wanted_m_s, angular_rad_s: wanted_rad_s };
+            let steady = no_faster(previous, target);
+            prop_assert!(steady.linear_m_s.abs() <= linear_m_s.abs().min(wanted_m_s.abs()));
+            prop_assert!(steady.angular_rad_s.abs() <= angular_rad_s.abs().min(wanted_rad_s.abs()));
+            prop_assert!(steady.linear_m_s * linear_m_s >= 0.0);
+            let beside = not_ahead(steady, real_m_s);
+            prop_assert!(beside.linear_m_s.abs() <= steady.linear_m_s.abs());
+            prop_assert!(beside.linear_m_s.abs() <= real_m_s.abs().max(SLIP_LEAST_M_S) + 1.0e-12);
+            let cross = beside.linear_m_s * steady.angular_rad_s
+                - beside.angular_rad_s * steady.linear_m_s;
+            prop_assert!(cross.abs() < 1.0e-9);
+            prop_assert_eq!(not_ahead(steady, f64::NAN), steady);
         }
     }
 

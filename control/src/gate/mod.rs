@@ -100,6 +100,11 @@ pub struct Reasons {
     pub outside_max_m_s: Option<f64>,
     /// Fastest speed that the age of commands by hand allows, metres per second.
     pub command_age_max_m_s: Option<f64>,
+    /// Fastest speed of a robot that does not know where it is, metres per second.
+    pub blind_max_m_s: Option<f64>,
+    /// How fast the robot really goes along its path, metres per second, if that is known. On the
+    /// way to rest its wheels do not pull it on to a speed that it does not have yet.
+    pub real_m_s: Option<f64>,
 }
 
 impl Reasons {
@@ -120,8 +125,9 @@ impl Reasons {
         .find_map(|(is_so, cause)| is_so.then_some(cause))
     }
 
-    fn caps(&self) -> [(Option<f64>, GateCause); 3] {
+    fn caps(&self) -> [(Option<f64>, GateCause); 4] {
         [
+            (self.blind_max_m_s, GateCause::StalePosition),
             (self.command_age_max_m_s, GateCause::CommandAge),
             (self.outside_max_m_s, GateCause::ExternalLimit),
             (self.fence_max_m_s, GateCause::Fence),
@@ -149,6 +155,9 @@ pub struct GateLimits {
 
 /// Farthest that a robot may lean from level unless said otherwise, radians: 25 degrees.
 pub const TILT_MAX_RAD: f64 = 0.436;
+
+/// Speed below which a robot's slip says nothing, metres per second.
+const SLIP_LEAST_M_S: f64 = 0.01;
 
 impl GateLimits {
     /// Limits of a robot; it brakes no harder along the path than twice its planned braking, so
@@ -260,7 +269,12 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
     } else {
         0.0
     };
-    let wheel_speeds = ramped(previous, target, is_capped, limits, dt_s);
+    let step = Step {
+        dt_s,
+        is_capped,
+        real_m_s: reasons.real_m_s,
+    };
+    let wheel_speeds = ramped(previous, target, step, limits);
     let is_short = |got: f64, wanted: f64| (got - wanted).abs() > 1.0e-9;
     if is_short(wheel_speeds.left_rad_s, target.left_rad_s)
         || is_short(wheel_speeds.right_rad_s, target.right_rad_s)
@@ -291,6 +305,30 @@ fn rest_share(previous: WheelSpeeds, braking: f64, up: f64) -> f64 {
         .min(1.0)
 }
 
+/// The share of both sides' speeds by which the wheels are ahead of the robot, as far as they may
+/// change in a tick: a robot that still gains speed by slip would be pulled on while they brake.
+fn slip_share(previous: WheelSpeeds, real_m_s: Option<f64>, radius_m: f64, up: f64) -> f64 {
+    let centre_m_s = 0.5 * radius_m * (previous.left_rad_s + previous.right_rad_s);
+    let Some(real_m_s) = real_m_s.filter(|real_m_s| real_m_s.is_finite()) else {
+        return 0.0;
+    };
+    if centre_m_s.abs() < SLIP_LEAST_M_S {
+        return 0.0;
+    }
+    let ahead = 1.0 - (real_m_s / centre_m_s).max(0.0);
+    ahead
+        .min(up / previous.magnitude_max_rad_s())
+        .clamp(0.0, 1.0)
+}
+
+/// What a tick of the ramp depends on beside the speeds.
+#[derive(Debug, Clone, Copy)]
+struct Step {
+    dt_s: f64,
+    is_capped: bool,
+    real_m_s: Option<f64>,
+}
+
 fn scaled(speeds: WheelSpeeds, share: f64) -> WheelSpeeds {
     WheelSpeeds {
         left_rad_s: speeds.left_rad_s * share,
@@ -306,16 +344,17 @@ fn scaled(speeds: WheelSpeeds, share: f64) -> WheelSpeeds {
 fn ramped(
     previous: WheelSpeeds,
     target: WheelSpeeds,
-    is_capped: bool,
+    step: Step,
     limits: &GateLimits,
-    dt_s: f64,
 ) -> WheelSpeeds {
-    let up = limits.wheel_acceleration_max_rad_s2 * dt_s;
-    let braking = limits.wheel_braking_max_rad_s2 * dt_s;
+    let up = limits.wheel_acceleration_max_rad_s2 * step.dt_s;
+    let braking = limits.wheel_braking_max_rad_s2 * step.dt_s;
     if target == WheelSpeeds::default() {
-        return scaled(previous, 1.0 - rest_share(previous, braking, up));
+        let share = rest_share(previous, braking, up);
+        let slip = slip_share(previous, step.real_m_s, limits.wheel_radius_m, up);
+        return scaled(previous, 1.0 - share.max(slip));
     }
-    let down = if is_capped { braking } else { up };
+    let down = if step.is_capped { braking } else { up };
     WheelSpeeds {
         left_rad_s: ramp(previous.left_rad_s, target.left_rad_s, up, down),
         right_rad_s: ramp(previous.right_rad_s, target.right_rad_s, up, down),

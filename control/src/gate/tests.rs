@@ -11,8 +11,13 @@ fn maybe(most: f64) -> impl Strategy<Value = Option<f64>> {
 fn reasons() -> impl Strategy<Value = Reasons> {
     let rare = || prop::bool::weighted(0.1);
     let holds = (rare(), rare(), rare(), rare(), rare());
-    let caps = (maybe(0.9), maybe(1.5), maybe(1.5), maybe(1.5));
-    (holds, caps).prop_map(|(holds, caps)| Reasons {
+    let caps = (maybe(0.9), maybe(1.5), maybe(1.5), maybe(1.5), maybe(1.5));
+    let real = prop_oneof![
+        2 => Just(None),
+        4 => (-1.5..1.5_f64).prop_map(Some),
+        1 => Just(Some(f64::NAN)),
+    ];
+    (holds, caps, real).prop_map(|(holds, caps, real_m_s)| Reasons {
         is_stopped: holds.0,
         is_position_lost: holds.1,
         is_held_outside: holds.2,
@@ -22,6 +27,8 @@ fn reasons() -> impl Strategy<Value = Reasons> {
         fence_max_m_s: caps.1,
         outside_max_m_s: caps.2,
         command_age_max_m_s: caps.3,
+        blind_max_m_s: caps.4,
+        real_m_s,
     })
 }
 
@@ -121,6 +128,46 @@ proptest! {
         }
         prop_assert!(previous.magnitude_max_rad_s() <= 0.0);
     }
+}
+
+#[test]
+fn a_robot_slower_than_its_wheels_is_not_pulled_on_while_they_brake() {
+    let limits = GateLimits::of(&RobotModel::yi2007());
+    let wheels = WheelSpeeds {
+        left_rad_s: 6.0,
+        right_rad_s: 7.0,
+    };
+    let rest = |real_m_s: Option<f64>| {
+        let mut previous = wheels;
+        for _ in 0..10 {
+            let input = GateInput {
+                command: None,
+                previous,
+                stop: true,
+                feedback_age_s: 0.0,
+                dt_s: 0.01,
+            };
+            let reasons = Reasons {
+                real_m_s,
+                ..Reasons::default()
+            };
+            previous = gate_with(&input, &reasons, &limits).wheel_speeds;
+        }
+        centre_m_s(previous)
+    };
+    let ramp_m_s = rest(None);
+    assert!((0.30..0.40).contains(&ramp_m_s), "{ramp_m_s}");
+    // What is faster than its wheels, or not known, is braked on the ramp.
+    for real_m_s in [0.6, f64::NAN] {
+        assert!((rest(Some(real_m_s)) - ramp_m_s).abs() < 1.0e-12);
+    }
+    // Down to the robot's own speed at the wheels' rate, and from there on the ramp.
+    assert!(
+        (0.15..=0.2).contains(&rest(Some(0.2))),
+        "{}",
+        rest(Some(0.2))
+    );
+    assert!(rest(Some(-0.2)) < 0.1);
 }
 
 #[test]

@@ -29,8 +29,6 @@ pub const ZERO_WITHIN: Duration = Duration::from_millis(250);
 const SEND_EVERY_US: u64 = 50_000;
 /// Longest trial after the driver has fallen silent.
 const SETTLE_MAX: Duration = Duration::from_secs(6);
-/// Way that measuring and noise may add, metres.
-const MEASURING_M: f64 = 0.005;
 
 /// What the trials found.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -48,7 +46,7 @@ pub struct HandReport {
     /// Trials in which the robot took more way to rest than `v²/2a + v·0.25 s`, or did not rest;
     /// `a` is the braking ramp, or what the ground gives where that is less.
     pub overruns: u64,
-    /// The largest share of that way, with 5 mm for noise, that was used.
+    /// The largest share of that way that was used.
     pub worst_way_share: f64,
 }
 
@@ -176,7 +174,7 @@ impl Trial<'_> {
         // Way since the last end, and the speed then; begins anew with every end.
         let mut since: Option<(u64, f64, f64)> = None;
         while self.bench.now < until {
-            let before = self.bench.drive.truth().pose.point();
+            let before = *self.bench.drive.truth();
             let before_us = self.bench.now_us();
             self.tick();
             // Where locked wheels give less than the ramp asks for, that is the ground's matter.
@@ -184,17 +182,19 @@ impl Trial<'_> {
             let ground_m_s2 = ground.map_or(0.0, |curve| curve.mu(1.0) * GRAVITY_M_S2);
             braking_m_s2 = braking_m_s2.min(ground_m_s2);
             let truth = self.bench.drive.truth();
-            let step_m = before.distance_m(truth.pose.point());
-            let (now_us, speed_m_s) = (self.bench.now_us(), truth.twist().linear_m_s.abs());
+            let step_m = before.pose.point().distance_m(truth.pose.point());
+            let (now_us, after) = (self.bench.now_us(), *truth);
             match self.last_end {
                 Some((end_us, _)) if now_us >= end_us => match &mut since {
                     Some((known_us, _, way_m)) if *known_us == end_us => *way_m += step_m,
                     Some(_) | None => {
-                        // Of this tick's way only what came after the end.
-                        let after = Duration::from_micros(now_us - end_us.max(before_us));
+                        // Of this tick's way only what came after the end, and the speed then.
+                        let rest = Duration::from_micros(now_us - end_us.max(before_us));
                         let whole = Duration::from_micros(now_us - before_us);
-                        let share = after.as_secs_f64() / whole.as_secs_f64();
-                        since = Some((end_us, speed_m_s, share * step_m));
+                        let share = rest.as_secs_f64() / whole.as_secs_f64();
+                        let speed_m_s = share * before.twist().linear_m_s
+                            + (1.0 - share) * after.twist().linear_m_s;
+                        since = Some((end_us, speed_m_s.abs(), share * step_m));
                     }
                 },
                 Some(_) | None => {}
@@ -204,12 +204,10 @@ impl Trial<'_> {
                     let allowed_m = speed_m_s * speed_m_s / (2.0 * braking_m_s2) + speed_m_s * 0.25;
                     let report = &mut *self.report;
                     report.fastest_m_s = report.fastest_m_s.max(speed_m_s);
-                    if speed_m_s > 0.1 {
-                        report.worst_way_share = report
-                            .worst_way_share
-                            .max(way_m / (allowed_m + MEASURING_M));
+                    if way_m > 0.0 {
+                        report.worst_way_share = report.worst_way_share.max(way_m / allowed_m);
                     }
-                    report.overruns += u64::from(way_m > allowed_m + MEASURING_M);
+                    report.overruns += u64::from(way_m > allowed_m);
                 }
                 return;
             }
@@ -262,6 +260,7 @@ mod tests {
             "{report:?}"
         );
         assert!(report.worst_zero_ms <= 250.0, "{report:?}");
+        assert!(report.worst_way_share <= 1.0, "{report:?}");
     }
 
     #[test]

@@ -173,6 +173,26 @@ impl Drive for Nonsense {
     fn write(&mut self, _: WheelSpeeds) {}
 }
 
+/// A base that does not know where it is.
+struct Blind<'base>(&'base mut SimulatedDrive);
+
+impl Drive for Blind<'_> {
+    fn read(&mut self, now: Duration) -> Feedback {
+        let mut feedback = Feedback::default();
+        for &sample in self.0.read(now).samples() {
+            feedback.push(SensorSample {
+                position: None,
+                ..sample
+            });
+        }
+        feedback
+    }
+
+    fn write(&mut self, command: WheelSpeeds) {
+        self.0.write(command);
+    }
+}
+
 /// A base that says nothing.
 struct Silence;
 
@@ -353,6 +373,14 @@ impl Bench {
         self.pass_time(PERIOD);
         let now = self.moment();
         self.core.tick(now, false, &mut Nonsense);
+        self.collect();
+    }
+
+    /// One period in which nothing says where the robot is.
+    pub fn tick_without_position(&mut self) {
+        self.simulate();
+        let now = self.moment();
+        self.core.tick(now, false, &mut Blind(&mut self.drive));
         self.collect();
     }
 

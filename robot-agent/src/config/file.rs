@@ -20,6 +20,7 @@ pub(super) struct FileConfig {
     pub(super) state_rate_hz: Option<f64>,
     pub(super) friction_rate_hz: Option<f64>,
     pub(super) required_holders: Option<Vec<HolderId>>,
+    pub(super) blind_within_fence: Option<bool>,
     pub(super) model: Option<ModelFile>,
     pub(super) drive: Option<DriveFile>,
 }

@@ -172,6 +172,8 @@ pub struct AgentConfig {
     /// Holders of external limits whose silence holds the robot, at most
     /// [`LIMITS_MAX`].
     pub required_holders: Vec<HolderId>,
+    /// Whether the robot may be driven by hand, slowly, within a fence without knowing where it is.
+    pub blind_within_fence: bool,
     /// Bounds of the outbox.
     pub outbox: outbox::Limits,
 }
@@ -333,6 +335,7 @@ fn assemble(
         friction_rate_hz,
         model,
         required_holders,
+        blind_within_fence: file.blind_within_fence.unwrap_or(false),
         outbox: outbox::Limits::default(),
     })
 }

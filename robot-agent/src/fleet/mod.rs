@@ -5,6 +5,8 @@
 //! callbacks that never wait. Nothing here knows of loops, missions or disks: [`uploader`] alone
 //! knows the outbox.
 
+mod command;
+mod error;
 mod session;
 pub mod uploader;
 
@@ -18,17 +20,20 @@ use tracing::{debug, info, warn};
 use tread_api::ids::{BootId, HolderId, RobotId, SiteId};
 use tread_api::keys::{self, Key, Verb};
 use tread_api::safety::SMALL_PAYLOAD_MAX;
-use tread_api::wire::command::Answer;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::ingest::{Batch, Receipt};
 use tread_api::wire::state::{FrictionReport, RobotState};
-use tread_api::wire::{self, PAYLOAD_BYTES_MAX, Refusal, RefusalCode, WireError};
+use tread_api::wire::{self, PAYLOAD_BYTES_MAX, Refusal};
 use zenoh::Wait;
 use zenoh::handlers::FifoChannel;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::{ConsolidationMode, Querier, Query};
+
+pub use self::command::IncomingCommand;
+use self::error::zenoh_failed;
+pub use self::error::{AskError, LinkError, may_pass_later};
 
 /// Commands that may wait to be answered; more are dropped, and the server asks again.
 pub const COMMANDS_MAX: usize = 64;
@@ -90,99 +95,6 @@ pub struct Listeners {
 impl std::fmt::Debug for Listeners {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         formatter.write_str("Listeners")
-    }
-}
-
-/// Why the link could not be made.
-#[derive(Debug, thiserror::Error)]
-pub enum LinkError {
-    /// The server's endpoint is none.
-    #[error("`{endpoint}` is no zenoh endpoint: {problem}")]
-    Endpoint {
-        /// What was given.
-        endpoint: String,
-        /// What is wrong with it.
-        problem: String,
-    },
-    /// zenoh refused.
-    #[error("zenoh could not {action}: {problem}")]
-    Zenoh {
-        /// What was tried.
-        action: &'static str,
-        /// What zenoh said.
-        problem: String,
-    },
-}
-
-fn zenoh_failed(action: &'static str) -> impl FnOnce(zenoh::Error) -> LinkError {
-    move |problem| LinkError::Zenoh {
-        action,
-        problem: problem.to_string(),
-    }
-}
-
-/// Why a question to the server went without an answer.
-#[derive(Debug, thiserror::Error)]
-pub enum AskError {
-    /// Nobody answered: the server is not there, or too slow.
-    #[error("the server did not answer")]
-    NoAnswer,
-    /// The server refused the whole message.
-    #[error("the server refused: {0:?}")]
-    Refused(Refusal),
-    /// The answer cannot be read.
-    #[error("the server's answer cannot be read")]
-    Unreadable(#[source] WireError),
-    /// The question cannot be written.
-    #[error("the message cannot be written as JSON")]
-    Unwritable(#[source] serde_json::Error),
-    /// zenoh refused.
-    #[error(transparent)]
-    Link(#[from] LinkError),
-}
-
-/// A command that waits for its answer.
-#[derive(Debug)]
-pub struct IncomingCommand {
-    /// What is asked.
-    pub verb: Verb,
-    /// The payload as it came.
-    pub payload: Vec<u8>,
-    query: Query,
-}
-
-impl IncomingCommand {
-    /// Answers; a failure is logged, for the server asks again.
-    pub async fn answer(self, answer: &Answer) {
-        match wire::encode(answer) {
-            Ok(payload) => self.reply(payload, false).await,
-            Err(cause) => warn!(
-                error = &cause as &dyn std::error::Error,
-                "cannot write an answer"
-            ),
-        }
-    }
-
-    /// Refuses the message as a whole.
-    pub async fn refuse(self, refusal: &Refusal) {
-        if let Ok(payload) = wire::encode(refusal) {
-            self.reply(payload, true).await;
-        }
-    }
-
-    async fn reply(self, payload: Vec<u8>, is_error: bool) {
-        let replying = tokio::task::spawn_blocking(move || {
-            if is_error {
-                self.query.reply_err(payload).wait()
-            } else {
-                self.query
-                    .reply(self.query.key_expr().clone(), payload)
-                    .wait()
-            }
-        });
-        if let Ok(Err(cause)) = replying.await {
-            warn!("an answer could not be sent: {cause}");
-        }
     }
 }
 
@@ -503,16 +415,5 @@ enum Question {
 fn log_failed(sent: zenoh::Result<()>, what: &str) {
     if let Err(cause) = sent {
         debug!("`{what}` was not published: {cause}");
-    }
-}
-
-/// Whether sending the same again to the same server may help.
-pub fn may_pass_later(error: &AskError) -> bool {
-    match error {
-        AskError::Refused(refusal) => refusal.code != RefusalCode::Malformed,
-        AskError::NoAnswer
-        | AskError::Unreadable(_)
-        | AskError::Unwritable(_)
-        | AskError::Link(_) => true,
     }
 }

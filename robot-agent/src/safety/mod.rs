@@ -21,6 +21,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use tokio::sync::Notify;
 use tracing::{error, info, warn};
 use tread_api::ids::{BootId, HolderId, StopId};
 use tread_api::safety::{DriveStatus, Lease, LimitStatus, SMALL_PAYLOAD_MAX, StopLatch};
@@ -119,6 +120,8 @@ pub(crate) struct Safety {
     writing: tokio::sync::Mutex<()>,
     operator: Mutex<Operator>,
     limits: Mutex<ExternalLimits>,
+    /// Woken when a stop or a lease begins or ends.
+    changed: Notify,
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -156,6 +159,7 @@ impl Safety {
             writing: tokio::sync::Mutex::new(()),
             operator: Mutex::new(operator),
             limits: Mutex::new(limits),
+            changed: Notify::new(),
         })
     }
 
@@ -176,6 +180,7 @@ impl Safety {
             self.cell.stop.store(stops.number, Ordering::Release);
             let id = stop.stop;
             warn!(stop.id = %id, "stopped by {}: {}", stop.by, stop.reason);
+            self.changed.notify_one();
         }
         stops.number
     }
@@ -232,6 +237,7 @@ impl Safety {
             stops.state = next;
             self.cell.stop.store(0, Ordering::Release);
             info!(stop.id = %stop, "the stop was cleared by {by}");
+            self.changed.notify_one();
         }
         Ok(())
     }
@@ -244,7 +250,15 @@ impl Safety {
         let mut operator = lock(&self.operator);
         let answer = operator.lease(command, self.now_us());
         self.cell.publish(|view| view.hand = operator.view());
+        if answer.is_ok() {
+            self.changed.notify_one();
+        }
         answer
+    }
+
+    /// Waits until a stop or a lease has begun or ended since the last call; for one who waits.
+    pub(crate) async fn changed(&self) {
+        self.changed.notified().await;
     }
 
     /// Who drives by hand.

@@ -17,7 +17,7 @@ use tread_api::safety::{
     BY_LENGTH_MAX, DriveCounts, DriveStatus, Driver, LEASE_SILENCE_MAX_US, Lease,
 };
 use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
-use tread_control::gate::hand::{AgeMeter, within_limits};
+use tread_control::gate::hand::{AgeMeter, STEADY_BEFORE_END_S, within_limits};
 use tread_control::geometry::Twist;
 use tread_control::robot::RobotModel;
 use uuid::Uuid;
@@ -81,6 +81,13 @@ impl HandView {
     pub(crate) fn wanted_at(&self, now_us: u64) -> Option<Twist> {
         let (twist, until_us) = self.wanted?;
         (now_us < until_us && self.is_leased(now_us)).then_some(twist)
+    }
+
+    /// Whether what is wanted ends so soon that it speeds the robot up no more.
+    pub(crate) fn ends_soon(&self, now_us: u64) -> bool {
+        let left = |(_, until_us): (Twist, u64)| seconds_of(until_us.saturating_sub(now_us));
+        self.wanted
+            .is_none_or(|wanted| left(wanted) < STEADY_BEFORE_END_S)
     }
 }
 

@@ -12,12 +12,15 @@ use tread_api::wire::command::{OfferRefusal, Outcome};
 use tread_api::wire::ingest::MissionPhase;
 use tread_api::wire::safety::{DriveCommand, ExternalLimit, LeaseAction, LeaseCommand, Stop};
 use tread_control::fence::disc_radius_m;
+use tread_control::follower::FailureReason;
 use tread_control::gate::GateCause;
+use tread_control::gate::hand::BLIND_MAX_M_S;
 use tread_control::geometry::Pose;
 use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
 use crate::bench::{Bench, boot, site_of};
+use crate::control_loop::seam::EndReason;
 use crate::sim::scenario::Scenario;
 
 const START: Pose = Pose {
@@ -132,21 +135,38 @@ impl Hand {
     ) {
         let until = bench.now + time;
         while bench.now < until {
-            self.seq += 1;
-            let command = DriveCommand {
-                boot: boot(),
-                epoch: self.epoch,
-                seq: self.seq,
-                sent_us: bench.now_us() - age_us,
-                until_us: bench.now_us() + 300_000,
-                twist: WireTwist {
-                    linear_m_s,
-                    angular_rad_s,
-                },
-            };
-            assert!(bench.drive_by_hand(&wire::encode(&command).unwrap()));
+            self.say(bench, linear_m_s, angular_rad_s, age_us);
             bench.run_for(Duration::from_millis(50));
         }
+    }
+
+    /// One command.
+    fn say(&mut self, bench: &mut Bench, linear_m_s: f64, angular_rad_s: f64, age_us: u64) {
+        self.say_for(bench, linear_m_s, angular_rad_s, age_us, 300_000);
+    }
+
+    /// One command that lasts so long.
+    fn say_for(
+        &mut self,
+        bench: &mut Bench,
+        linear_m_s: f64,
+        angular_rad_s: f64,
+        age_us: u64,
+        for_us: u64,
+    ) {
+        self.seq += 1;
+        let command = DriveCommand {
+            boot: boot(),
+            epoch: self.epoch,
+            seq: self.seq,
+            sent_us: bench.now_us() - age_us,
+            until_us: bench.now_us() + for_us,
+            twist: WireTwist {
+                linear_m_s,
+                angular_rad_s,
+            },
+        };
+        assert!(bench.drive_by_hand(&wire::encode(&command).unwrap()));
     }
 }
 
@@ -359,6 +379,103 @@ fn a_hand_cannot_drive_through_a_fence() {
         );
         assert!(least_m < radius_m + 0.4, "it never came near: {least_m} m");
     }
+}
+
+/// Drives by hand for two seconds with nothing that says where the robot is; the fastest speed.
+fn driven_blind(bench: &mut Bench) -> f64 {
+    let mut hand = Hand::acquire(bench);
+    let mut fastest_m_s: f64 = 0.0;
+    for tick in 0..200 {
+        if tick % 5 == 0 {
+            hand.say(bench, 0.8, 0.0, 10_000);
+        }
+        bench.tick_without_position();
+        fastest_m_s = fastest_m_s.max(speed_m_s(bench));
+    }
+    fastest_m_s
+}
+
+fn lost_in(geofence: Geofence) -> Bench {
+    let mut bench = bench_in(geofence);
+    for _ in 0..400 {
+        bench.tick_without_position();
+    }
+    assert_eq!(mode(&bench), RobotMode::Fault);
+    bench
+}
+
+#[test]
+fn a_robot_without_a_position_is_driven_slowly_by_hand_and_within_a_fence_only_if_it_may() {
+    let mut bench = lost_in(Geofence::default());
+    let fastest_m_s = driven_blind(&mut bench);
+    assert!(
+        (0.2..BLIND_MAX_M_S + 0.02).contains(&fastest_m_s),
+        "{fastest_m_s}"
+    );
+    assert_eq!(cause(&bench), Some(GateCause::StalePosition));
+
+    let mut bench = lost_in(yard());
+    assert!(driven_blind(&mut bench) < 0.01);
+    assert_eq!(cause(&bench), Some(GateCause::StalePosition));
+
+    let mut bench = lost_in(yard());
+    bench.core = bench.core.with_blind_within_fence(true);
+    let fastest_m_s = driven_blind(&mut bench);
+    assert!(
+        (0.2..BLIND_MAX_M_S + 0.02).contains(&fastest_m_s),
+        "{fastest_m_s}"
+    );
+}
+
+#[test]
+fn a_robot_that_never_knew_where_it_is_is_driven_slowly_by_hand() {
+    let scenario = Scenario::built_in().unwrap();
+    let mut bench = Bench::new(&scenario, START, 5).unwrap();
+    for _ in 0..100 {
+        bench.tick_without_position();
+    }
+    let fastest_m_s = driven_blind(&mut bench);
+    assert!(
+        (0.2..BLIND_MAX_M_S + 0.02).contains(&fastest_m_s),
+        "{fastest_m_s}"
+    );
+}
+
+#[test]
+fn a_mission_stops_when_the_position_is_lost_for_three_seconds() {
+    let (mut bench, mission) = driving();
+    let mut ticks = 0;
+    while !bench.target_rests() {
+        bench.tick_without_position();
+        ticks += 1;
+        assert!(ticks <= 301, "it drives on without a position");
+    }
+    assert!(ticks > 250, "it stopped after {ticks} ticks");
+    assert_eq!(mode(&bench), RobotMode::Fault);
+    assert_eq!(
+        bench.ended,
+        [(mission, EndReason::Failed(FailureReason::PoseLost))]
+    );
+}
+
+#[test]
+fn a_command_that_is_about_to_end_does_not_speed_the_robot_up() {
+    let mut bench = bench_in(Geofence::default());
+    let mut hand = Hand::acquire(&bench);
+    for _ in 0..40 {
+        hand.say_for(&mut bench, 0.8, 0.0, 10_000, 90_000);
+        bench.run_for(Duration::from_millis(50));
+    }
+    assert!(bench.stands(), "{} m/s", speed_m_s(&bench));
+    // The same with commands that last longer.
+    hand.drive(&mut bench, 0.8, 0.0, SECOND);
+    assert!(speed_m_s(&bench) > 0.5);
+    // What drives already goes on as it is.
+    for _ in 0..20 {
+        hand.say_for(&mut bench, 0.8, 0.0, 10_000, 90_000);
+        bench.run_for(Duration::from_millis(50));
+    }
+    assert!(speed_m_s(&bench) > 0.4, "{} m/s", speed_m_s(&bench));
 }
 
 #[test]

@@ -1,14 +1,17 @@
 //! Missions and their histories.
 
+mod standing;
+
 use futures_util::StreamExt as _;
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
-use tread_api::ids::{BootId, MissionId, PlanHash, RobotId, SiteId};
+use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
 use tread_api::mission::{
-    Cause, DrivenPath, LinkPolicy, Mission, MissionQuality, MissionState, PlanSummary, Replacement,
+    Cause, DrivenPath, Mission, MissionQuality, MissionState, PlanSummary, Replacement,
 };
 use tread_api::robot::MissionProgress;
 
+pub use self::standing::{Standing, in_hand, next_in_queues, open_of_robot, overdue};
 use super::{DbError, corrupt, from_json, from_us, parse, to_json, to_us, unsigned};
 
 /// A mission with the key of its robot.
@@ -214,181 +217,6 @@ pub async fn list(
     Ok((rows, false))
 }
 
-/// Where an open mission stands, without what is to be driven, which may be long.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Standing {
-    /// The mission.
-    pub id: MissionId,
-    /// The robot's site.
-    pub site: SiteId,
-    /// The robot.
-    pub robot: RobotId,
-    /// Where it stands.
-    pub state: MissionState,
-    /// Why it stands there.
-    pub reason: Option<String>,
-    /// The run of the agent that took it.
-    pub boot: Option<BootId>,
-    /// Whether it is to be paused.
-    pub pause_wanted: bool,
-    /// The revision and hash that count now.
-    pub content: (u32, PlanHash),
-    /// The revision and hash that the robot does not hold whole yet.
-    pub replacement: Option<(u32, PlanHash)>,
-    /// Since when its robot has not been heard.
-    pub silent_since: Option<Timestamp>,
-    /// How long its robot may stay away, seconds, if that was said.
-    pub lost_after_s: Option<f64>,
-    /// What its robot does when it no longer hears the server.
-    pub link_policy: LinkPolicy,
-    /// The time that the robot planned for it, seconds.
-    pub duration_s: Option<f64>,
-}
-
-impl From<&Mission> for Standing {
-    fn from(mission: &Mission) -> Self {
-        Self {
-            id: mission.id,
-            site: mission.site.clone(),
-            robot: mission.robot.clone(),
-            state: mission.state,
-            reason: mission.reason.clone(),
-            boot: mission.boot,
-            pause_wanted: mission.pause_wanted,
-            content: (mission.revision, mission.plan_hash),
-            replacement: mission
-                .replacement
-                .as_ref()
-                .map(|replacement| (replacement.revision, replacement.plan_hash)),
-            silent_since: None,
-            lost_after_s: mission.lost_after_s,
-            link_policy: mission.link_policy,
-            duration_s: mission.plan.map(|plan| plan.duration_s),
-        }
-    }
-}
-
-struct RawStanding {
-    id: String,
-    site: String,
-    robot: String,
-    state: String,
-    reason: Option<String>,
-    boot: Option<String>,
-    pause_wanted: bool,
-    revision: i64,
-    plan_hash: String,
-    replacement_revision: Option<i64>,
-    replacement_hash: Option<String>,
-    silent_since_us: Option<i64>,
-    lost_after_s: Option<f64>,
-    link_policy: String,
-    duration_s: Option<f64>,
-}
-
-impl TryFrom<RawStanding> for Standing {
-    type Error = DbError;
-
-    fn try_from(raw: RawStanding) -> Result<Self, DbError> {
-        Ok(Self {
-            id: parse("mission", &raw.id)?,
-            site: parse("site", &raw.site)?,
-            robot: parse("robot", &raw.robot)?,
-            state: state(&raw.state)?,
-            reason: raw.reason,
-            boot: raw
-                .boot
-                .as_deref()
-                .map(|boot| parse("boot", boot))
-                .transpose()?,
-            pause_wanted: raw.pause_wanted,
-            content: (
-                unsigned("mission revision", raw.revision)?,
-                parse("plan hash", &raw.plan_hash)?,
-            ),
-            replacement: match (raw.replacement_revision, raw.replacement_hash) {
-                (Some(revision), Some(hash)) => Some((
-                    unsigned("mission revision", revision)?,
-                    parse("plan hash", &hash)?,
-                )),
-                (Some(_), None) | (None, _) => None,
-            },
-            silent_since: raw.silent_since_us.map(from_us).transpose()?,
-            lost_after_s: raw.lost_after_s,
-            link_policy: from_json("link policy", &raw.link_policy)?,
-            duration_s: raw.duration_s,
-        })
-    }
-}
-
-macro_rules! standings {
-    ($condition:tt $(, $argument:expr)* $(,)?) => {
-        sqlx::query_as!(
-            RawStanding,
-            r#"SELECT missions.id, sites.id AS site, robots.id AS robot, missions.state,
-                   missions.reason, missions.boot,
-                   missions.pause_wanted AS "pause_wanted: bool", missions.revision,
-                   missions.plan_hash,
-                   missions.replacement ->> 'revision' AS "replacement_revision: i64",
-                   missions.replacement ->> 'plan_hash' AS "replacement_hash: String",
-                   missions.silent_since_us, missions.lost_after_s, missions.link_policy,
-                   missions.plan ->> 'duration_s' AS "duration_s: f64"
-               FROM missions
-               JOIN robots ON robots.pk = missions.robot_pk
-               JOIN sites ON sites.pk = robots.site_pk "# + $condition
-            $(, $argument)*
-        )
-    };
-}
-
-fn standings(raw: Vec<RawStanding>) -> Result<Vec<Standing>, DbError> {
-    raw.into_iter().map(Standing::try_from).collect()
-}
-
-/// All missions that a robot has in hand, or that wait for its answer.
-pub async fn in_hand(db: &mut SqliteConnection) -> Result<Vec<Standing>, DbError> {
-    let raw = standings!("WHERE missions.state IN ('offered', 'active', 'paused', 'cancelling')")
-        .fetch_all(db)
-        .await?;
-    standings(raw)
-}
-
-/// The mission that is next in the queue of each robot that has nothing in hand; one that is held
-/// is passed over.
-pub async fn next_in_queues(db: &mut SqliteConnection) -> Result<Vec<Standing>, DbError> {
-    let raw = standings!(
-        "WHERE missions.id IN (
-             SELECT id FROM (
-                 SELECT id, ROW_NUMBER() OVER (PARTITION BY robot_pk ORDER BY priority DESC, id)
-                     AS place
-                 FROM missions WHERE state = 'queued' AND pause_wanted = 0)
-             WHERE place = 1)
-           AND NOT EXISTS (
-             SELECT 1 FROM missions AS other WHERE other.robot_pk = missions.robot_pk
-               AND other.state IN ('offered', 'active', 'paused', 'cancelling'))"
-    )
-    .fetch_all(db)
-    .await?;
-    standings(raw)
-}
-
-/// Queued missions whose latest start has passed.
-pub async fn overdue(
-    db: &mut SqliteConnection,
-    now: Timestamp,
-    limit: u32,
-) -> Result<Vec<Standing>, DbError> {
-    let now_us = to_us(now);
-    let raw = standings!(
-        "WHERE missions.state = 'queued' AND missions.latest_start_us < ? LIMIT ?",
-        now_us,
-        limit,
-    )
-    .fetch_all(db)
-    .await?;
-    standings(raw)
-}
-
 /// How many missions of a robot wait.
 pub async fn queued_count(db: &mut SqliteConnection, robot_pk: i64) -> Result<usize, DbError> {
     let count = sqlx::query_scalar!(
@@ -470,22 +298,6 @@ pub async fn add_facts(
     .execute(db)
     .await?;
     Ok(())
-}
-
-/// All missions of a robot that have not ended, the one in hand first, then as they are queued.
-pub async fn open_of_robot(
-    db: &mut SqliteConnection,
-    robot_pk: i64,
-) -> Result<Vec<Standing>, DbError> {
-    let raw = standings!(
-        "WHERE missions.robot_pk = ? AND missions.state IN
-             ('queued', 'offered', 'active', 'paused', 'cancelling')
-         ORDER BY missions.state = 'queued', missions.priority DESC, missions.id",
-        robot_pk,
-    )
-    .fetch_all(db)
-    .await?;
-    standings(raw)
 }
 
 /// Wants an open mission paused or not; `false` if it has ended.

@@ -1,17 +1,21 @@
 //! Who is on the network now, and what each robot said last. In memory; ages by our own clock.
 
+mod looks;
+mod news;
 mod rivals;
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use jiff::Timestamp;
 use tread_api::friction::LiveFriction;
 use tread_api::ids::{BootId, MissionId, RobotId, SiteId, StopId};
-use tread_api::robot::{Aged, AlertReport, LinkCause, LinkState, RobotLive, RobotMode};
+use tread_api::robot::{Aged, LinkCause, LinkState, RobotLive};
 use tread_api::wire::state::{FrictionReport, RobotState};
 
+pub use self::looks::Held;
+use self::news::Shown;
 use self::rivals::OtherRun;
 pub use self::rivals::Rival;
 
@@ -22,8 +26,6 @@ pub const OFFLINE_TIMEOUT: Duration = Duration::from_millis(1_400);
 /// A token that goes within this time of a heartbeat was taken away by its robot or by the end of
 /// its process; a network that is down makes the heartbeats stop long before.
 const SUDDEN: Duration = Duration::from_secs(1);
-/// Least time between two events on a robot whose state only moved on.
-const SHOW_PERIOD: Duration = Duration::from_secs(1);
 
 /// Most robots that are kept track of before they have said hello.
 const STRANGERS_MAX: usize = 20_000;
@@ -40,15 +42,6 @@ pub enum Heard {
     Stranger,
     /// It is of another run of the agent than the present one; nothing of it is shown.
     Other,
-}
-
-/// What a robot holds of its site.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Held {
-    /// The revision of its terrains.
-    pub terrains: Option<u64>,
-    /// The revision of its geofence; `None` also of a robot that knows no geofences.
-    pub fence: Option<u64>,
 }
 
 /// A robot's name with its site.
@@ -224,21 +217,6 @@ impl Presence {
     }
 }
 
-/// What of a robot was shown to event clients last.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Shown {
-    at: Duration,
-    link: LinkState,
-    cause: Option<LinkCause>,
-    mode: Option<RobotMode>,
-    mission: Option<(MissionId, u32, bool)>,
-    stop: Option<StopId>,
-    lease: Option<u64>,
-    seq: Option<u64>,
-}
-
-/// Robots that are shown afresh at a time.
-const NEWS_MAX: usize = 500;
 /// States of which the clock's offset is kept.
 const OFFSETS_MAX: usize = 16;
 
@@ -277,155 +255,6 @@ impl Presences {
                 *stop = None;
             }
         }
-    }
-
-    /// Every robot that has ever said hello.
-    pub fn known(&self) -> Vec<RobotKey> {
-        let robots = self.lock();
-        let known = robots.iter().filter(|(_, presence)| presence.welcomed);
-        known.map(|(key, _)| key.clone()).collect()
-    }
-
-    /// The stops that robots show to be in force.
-    pub fn shown_stops(&self) -> Vec<(RobotKey, StopId)> {
-        let robots = self.lock();
-        let shown = |(key, presence): (&RobotKey, &Presence)| {
-            Some((key.clone(), presence.state().and_then(stop_of)?))
-        };
-        robots.iter().filter_map(shown).collect()
-    }
-
-    /// The robots that are heard now, with the revisions of terrains and geofence that each holds.
-    pub fn online(&self, now: Duration) -> Vec<(RobotKey, Held)> {
-        let robots = self.lock();
-        let online = robots
-            .iter()
-            .filter(|(_, presence)| presence.link(now) == LinkState::Online);
-        let held = |presence: &Presence| {
-            let state = presence.state();
-            Held {
-                terrains: state.and_then(|state| state.terrain_revision),
-                fence: state.and_then(|state| state.safety.fence_revision),
-            }
-        };
-        online
-            .map(|(key, presence)| (key.clone(), held(presence)))
-            .collect()
-    }
-
-    /// The missions that robots which are heard now say they drive.
-    pub fn shown_missions(&self, now: Duration) -> Vec<(RobotKey, MissionId)> {
-        let robots = self.lock();
-        let heard = robots
-            .iter()
-            .filter(|(_, presence)| presence.link(now) != LinkState::Offline);
-        let shown = |presence: &Presence| presence.state()?.mission.map(|mission| mission.id);
-        heard
-            .filter_map(|(key, presence)| Some((key.clone(), shown(presence)?)))
-            .collect()
-    }
-
-    /// What robots say needs attention, of those that said something else before; each is given
-    /// once.
-    pub fn take_alert_changes(&self) -> Vec<(RobotKey, Vec<AlertReport>)> {
-        let mut robots = self.lock();
-        let changed = robots
-            .iter_mut()
-            .filter(|(_, presence)| presence.alerts_changed);
-        let taken = changed.filter_map(|(key, presence)| {
-            // Without a state of the present run nobody knows what the robot itself says.
-            let own = presence.state()?.alerts.clone();
-            let alerts = presence.rival_alert().into_iter().chain(own).collect();
-            presence.alerts_changed = false;
-            Some((key.clone(), alerts))
-        });
-        taken.collect()
-    }
-
-    /// Gives what could not be written down again.
-    pub fn return_alert_change(&self, key: &RobotKey) {
-        if let Some(presence) = self.lock().get_mut(key) {
-            presence.alerts_changed = true;
-        }
-    }
-
-    /// The robots of which event clients have not seen the present state: at once when link, mode
-    /// or mission changed, and once a second while only figures move on.
-    ///
-    /// At most [`NEWS_MAX`] at a time, so that no client is swamped; the rest comes next.
-    pub fn take_news(&self, now: Duration) -> Vec<RobotKey> {
-        let mut robots = self.lock();
-        let mut news = Vec::new();
-        for (key, presence) in robots.iter_mut() {
-            if !presence.welcomed {
-                continue;
-            }
-            let state = presence.state();
-            let shown = Shown {
-                at: now,
-                link: presence.link(now),
-                cause: presence.link_cause(now),
-                mode: state.map(|state| state.mode),
-                mission: state.and_then(content),
-                stop: state.and_then(stop_of),
-                lease: state.and_then(lease_of),
-                seq: state.map(|state| state.seq),
-            };
-            let is_new = presence.shown.is_none_or(|before| {
-                let elapsed = now.saturating_sub(before.at) >= SHOW_PERIOD;
-                let moved = before.seq != shown.seq && elapsed;
-                let same = Shown {
-                    at: before.at,
-                    seq: before.seq,
-                    ..shown
-                };
-                moved || before != same
-            });
-            if is_new {
-                presence.shown = Some(shown);
-                news.push(key.clone());
-            }
-            if news.len() >= NEWS_MAX {
-                break;
-            }
-        }
-        news
-    }
-
-    /// How many robots that are heard are slowed down, by the name of the strictest cause.
-    pub fn gate_causes(&self, now: Duration) -> BTreeMap<String, usize> {
-        let robots = self.lock();
-        let mut causes = BTreeMap::new();
-        for presence in robots.values() {
-            let state = presence
-                .state()
-                .filter(|_| presence.link(now) != LinkState::Offline);
-            let cause = state.and_then(|state| state.safety.gate.cause);
-            // A cause's name is that on the wire.
-            if let Some(serde_json::Value::String(name)) =
-                cause.and_then(|cause| serde_json::to_value(cause).ok())
-            {
-                *causes.entry(name).or_insert(0) += 1;
-            }
-        }
-        causes
-    }
-
-    /// How many robots have each link state.
-    pub fn link_counts(&self, now: Duration) -> [(LinkState, usize); 3] {
-        let robots = self.lock();
-        LinkState::ALL.map(|link| {
-            let has = |presence: &&Presence| presence.welcomed && presence.link(now) == link;
-            (link, robots.values().filter(has).count())
-        })
-    }
-
-    /// How many robots are on the network.
-    pub fn present_count(&self) -> usize {
-        self.lock()
-            .values()
-            .filter(|presence| presence.welcomed && !presence.tokens.is_empty())
-            .count()
     }
 
     /// A robot's token appeared.
@@ -565,165 +394,4 @@ fn content(state: &RobotState) -> Option<(MissionId, u32, bool)> {
 }
 
 #[cfg(test)]
-mod tests {
-    use tread_api::robot::{LoopStatus, OutboxStatus, RobotMode};
-    use tread_api::safety::SafetyStatus;
-    use uuid::Uuid;
-
-    use super::*;
-
-    pub(super) fn key() -> RobotKey {
-        ("yard".parse().unwrap(), "rover-1".parse().unwrap())
-    }
-
-    pub(super) fn boot(number: u128) -> BootId {
-        BootId::from_uuid(Uuid::from_u128(number))
-    }
-
-    pub(super) fn state(boot: BootId, seq: u64) -> RobotState {
-        RobotState {
-            robot: key().1,
-            boot,
-            seq,
-            robot_time: "2026-11-01T00:00:00Z".parse().unwrap(),
-            mode: RobotMode::Idle,
-            fault: None,
-            pose: None,
-            twist: None,
-            mission: None,
-            terrain_revision: None,
-            outbox: OutboxStatus::default(),
-            control_loop: LoopStatus {
-                ticks: seq,
-                ..LoopStatus::default()
-            },
-            battery: None,
-            alerts: Vec::new(),
-            monotonic_us: None,
-            safety: SafetyStatus::default(),
-        }
-    }
-
-    pub(super) fn wall() -> Timestamp {
-        "2026-11-01T00:00:00Z".parse().unwrap()
-    }
-
-    pub(super) const SECOND: Duration = Duration::from_secs(1);
-
-    #[test]
-    fn silence_is_stale_and_a_lost_token_is_offline() {
-        let presences = Presences::default();
-        let link = |now| presences.get(&key()).link(now);
-        assert_eq!(link(SECOND), LinkState::Offline);
-        presences.hello(key(), boot(1), SECOND);
-        assert_eq!(link(SECOND), LinkState::Offline);
-        presences.token_appeared(key(), boot(1), SECOND);
-        assert_eq!(
-            link(SECOND),
-            LinkState::Offline,
-            "present, but not heard yet"
-        );
-        let cause = |now| presences.get(&key()).link_cause(now);
-        assert_eq!(cause(SECOND), Some(LinkCause::Joining));
-        presences.state(&key(), state(boot(1), 0), SECOND, wall());
-        assert_eq!(link(SECOND + ONLINE_TIMEOUT), LinkState::Online);
-        assert_eq!(link(SECOND + OFFLINE_TIMEOUT), LinkState::Stale);
-        assert_eq!(
-            link(3 * SECOND),
-            LinkState::Offline,
-            "whatever its token says"
-        );
-        presences.token_gone(&key(), boot(1), 2 * SECOND);
-        assert_eq!(link(SECOND), LinkState::Offline);
-    }
-
-    #[test]
-    fn a_blip_of_the_token_is_no_restart_and_a_straggler_of_the_old_run_changes_nothing() {
-        let presences = Presences::default();
-        presences.token_appeared(key(), boot(1), SECOND);
-        presences.hello(key(), boot(1), SECOND);
-        presences.state(&key(), state(boot(1), 7), SECOND, wall());
-        presences.token_gone(&key(), boot(1), 2 * SECOND);
-        presences.token_appeared(key(), boot(1), 2 * SECOND);
-        assert_eq!(presences.get(&key()).state().unwrap().seq, 7);
-        presences.token_appeared(key(), boot(2), 3 * SECOND);
-        assert!(presences.get(&key()).state().is_none());
-        assert_eq!(
-            presences.state(&key(), state(boot(1), 8), 3 * SECOND, wall()),
-            Heard::Other
-        );
-        assert_eq!(presences.get(&key()).boot(), Some((boot(2), 3 * SECOND)));
-        assert!(presences.take_rivals(4 * SECOND).is_empty());
-    }
-
-    #[test]
-    fn ages_grow_until_the_robot_speaks_again() {
-        let presences = Presences::default();
-        presences.hello(key(), boot(1), SECOND);
-        presences.state(&key(), state(boot(1), 0), SECOND, wall());
-        let live = presences.get(&key()).live(4 * SECOND).unwrap();
-        assert_eq!(live.heard_age_ms, 3_000);
-    }
-
-    #[test]
-    fn of_a_robot_that_said_no_hello_nothing_is_kept() {
-        let presences = Presences::default();
-        let heard = presences.state(&key(), state(boot(1), 0), SECOND, wall());
-        assert_eq!(heard, Heard::Stranger);
-        presences.token_appeared(key(), boot(1), SECOND);
-        assert_eq!(presences.present_count(), 0);
-        assert_eq!(
-            presences.state(&key(), state(boot(1), 0), SECOND, wall()),
-            Heard::Stranger
-        );
-        presences.token_gone(&key(), boot(1), SECOND);
-        assert!(presences.lock().is_empty());
-    }
-
-    #[test]
-    fn robot_off_link_down_and_a_loop_that_stands_still_are_told_apart() {
-        let presences = Presences::default();
-        let cause = |now| presences.get(&key()).link_cause(now);
-        assert_eq!(cause(SECOND), Some(LinkCause::ServerRestarted));
-        presences.know(key());
-        presences.token_appeared(key(), boot(1), SECOND);
-        presences.state(&key(), state(boot(1), 1), SECOND, wall());
-        assert_eq!(cause(SECOND), None);
-        assert_eq!(cause(3 * SECOND), Some(LinkCause::LinkDown));
-        // The agent speaks on, and its loop's ticks do not.
-        let mut stuck = state(boot(1), 2);
-        stuck.control_loop.ticks = 1;
-        presences.state(&key(), stuck, 3 * SECOND, wall());
-        assert_eq!(presences.get(&key()).link(3 * SECOND), LinkState::Offline);
-        assert_eq!(cause(3 * SECOND), Some(LinkCause::LoopStopped));
-        presences.state(&key(), state(boot(1), 3), 4 * SECOND, wall());
-        presences.token_gone(&key(), boot(1), 4 * SECOND);
-        assert_eq!(cause(4 * SECOND), Some(LinkCause::RobotOff));
-        presences.token_appeared(key(), boot(1), 5 * SECOND);
-        presences.token_gone(&key(), boot(1), 9 * SECOND);
-        assert_eq!(cause(9 * SECOND), Some(LinkCause::LinkDown));
-    }
-
-    #[test]
-    fn the_clock_offset_is_that_of_the_state_with_the_shortest_way() {
-        let presences = Presences::default();
-        presences.know(key());
-        let said = |seq, late_ms: i64| {
-            let heard_at = wall() + jiff::SignedDuration::from_millis(late_ms - 3_000);
-            presences.state(&key(), state(boot(1), seq), SECOND, heard_at);
-        };
-        said(1, 40);
-        said(2, 2);
-        said(3, 900);
-        assert_eq!(presences.get(&key()).clock_offset_ms(), 2_998);
-    }
-
-    #[test]
-    fn an_older_state_that_comes_late_is_not_shown() {
-        let presences = Presences::default();
-        presences.know(key());
-        presences.state(&key(), state(boot(1), 5), SECOND, wall());
-        presences.state(&key(), state(boot(1), 4), SECOND, wall());
-        assert_eq!(presences.get(&key()).state().unwrap().seq, 5);
-    }
-}
+mod tests;

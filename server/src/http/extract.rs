@@ -3,6 +3,8 @@
 //! `Json` refuses unknown fields: a client that misspells one wants to know. (Payloads of robots
 //! ignore them, so that old and new versions work together; the types are the same.)
 
+use std::collections::BTreeMap;
+
 use axum::body::Body;
 use axum::extract::{FromRequest, FromRequestParts, Request};
 use axum::http::request::Parts;
@@ -11,6 +13,7 @@ use axum::response::{IntoResponse, Response};
 use futures_util::StreamExt as _;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use serde_json::value::RawValue;
 use tread_api::page::{PAGE_LIMIT_DEFAULT, PAGE_LIMIT_MAX};
 use tread_api::problem::ProblemType;
 
@@ -155,9 +158,8 @@ fn without_place(message: &str) -> &str {
 /// Refuses a list where an object belongs: the parser would take its entries for the fields in
 /// their order, past the check for unknown ones.
 fn refuse_lists_for_objects<T: Serialize>(parsed: &T, body: &[u8]) -> Result<(), Problem> {
-    let sent: serde_json::Value = serde_json::from_slice(body).unwrap_or_default();
-    let meant = serde_json::to_value(parsed).unwrap_or_default();
-    match list_for_object(&sent, &meant) {
+    let meant = serde_json::to_vec(parsed).unwrap_or_default();
+    match list_for_object(body, &meant) {
         None => Ok(()),
         Some(place) => {
             let problem = Problem::new(ProblemType::InvalidBody)
@@ -172,25 +174,33 @@ fn refuse_lists_for_objects<T: Serialize>(parsed: &T, body: &[u8]) -> Result<(),
 }
 
 /// The path of the first list that was read as an object.
-fn list_for_object(sent: &serde_json::Value, meant: &serde_json::Value) -> Option<String> {
-    use serde_json::Value;
+///
+/// Reads one level of both texts at a time, so that a path of many thousand points costs a pointer
+/// each and no tree.
+fn list_for_object(sent: &[u8], meant: &[u8]) -> Option<String> {
     let within = |name: &str, place: String| match place.as_str() {
         "" => name.to_owned(),
         _ => format!("{name}.{place}"),
     };
-    match (sent, meant) {
-        (Value::Array(_), Value::Object(_)) => Some(String::new()),
-        (Value::Array(sent), Value::Array(meant)) => {
-            sent.iter()
-                .zip(meant)
-                .enumerate()
-                .find_map(|(index, (sent, meant))| {
-                    list_for_object(sent, meant).map(|place| within(&index.to_string(), place))
-                })
+    match (sent.trim_ascii_start().first()?, meant.first()?) {
+        (b'[', b'{') => Some(String::new()),
+        (b'[', b'[') => {
+            let sent: Vec<&RawValue> = serde_json::from_slice(sent).ok()?;
+            let meant: Vec<&RawValue> = serde_json::from_slice(meant).ok()?;
+            let mut pairs = sent.iter().zip(meant).enumerate();
+            pairs.find_map(|(index, (sent, meant))| {
+                list_for_object(sent.get().as_bytes(), meant.get().as_bytes())
+                    .map(|place| within(&index.to_string(), place))
+            })
         }
-        (Value::Object(sent), Value::Object(meant)) => sent.iter().find_map(|(name, sent)| {
-            list_for_object(sent, meant.get(name)?).map(|place| within(name, place))
-        }),
+        (b'{', b'{') => {
+            let sent: BTreeMap<String, &RawValue> = serde_json::from_slice(sent).ok()?;
+            let meant: BTreeMap<String, &RawValue> = serde_json::from_slice(meant).ok()?;
+            sent.iter().find_map(|(name, sent)| {
+                let meant = meant.get(name)?.get().as_bytes();
+                list_for_object(sent.get().as_bytes(), meant).map(|place| within(name, place))
+            })
+        }
         _ => None,
     }
 }

@@ -14,6 +14,7 @@ pub mod health;
 mod identity;
 mod limits;
 mod missions;
+mod page;
 pub mod problem;
 mod robots;
 pub mod serve;
@@ -169,6 +170,7 @@ pub fn router(app: App, names: Names) -> Router {
     let names = Arc::new(names);
     let guard = Guard::new(app.clone(), Access::of(&openapi), Arc::clone(&names));
     let router = router
+        .merge(page::routes())
         .merge(
             SwaggerUi::new("/docs")
                 .url("/openapi.json", openapi)

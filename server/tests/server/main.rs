@@ -8,6 +8,10 @@ mod control;
 #[cfg(test)]
 mod drive;
 #[cfg(test)]
+mod dry_run;
+#[cfg(test)]
+mod events;
+#[cfg(test)]
 mod geofence;
 #[cfg(test)]
 mod harness;
@@ -24,11 +28,15 @@ mod network;
 #[cfg(test)]
 mod openapi;
 #[cfg(test)]
+mod page;
+#[cfg(test)]
 mod program;
 #[cfg(test)]
 mod resources;
 #[cfg(test)]
 mod robot;
+#[cfg(test)]
+mod robots;
 #[cfg(test)]
 mod slow_client;
 #[cfg(test)]

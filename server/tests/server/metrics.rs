@@ -77,3 +77,28 @@ async fn alert_rules_and_dashboard_name_only_metrics_that_exist() {
     }
     yard.server.stop().await.unwrap();
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn metrics_are_on_an_address_of_their_own_and_count_what_happens() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    let address = yard.server.metrics_address().unwrap();
+    let page = yard.client().get(format!("http://{address}/metrics"));
+    let text = page.send().await.unwrap().text().await.unwrap();
+    for line in [
+        "tread_missions{state=\"active\"} 1",
+        "tread_robots{link=\"online\"} 1",
+        "tread_offers_sent_total 1",
+        "tread_http_request_seconds_count{method=\"POST\",route=\"/v1/missions\",status=\"201\"} 1",
+    ] {
+        assert!(
+            text.lines().any(|said| said == line),
+            "{line} is not in {text}"
+        );
+    }
+    let (status, _) = yard.get_value("/metrics").await;
+    assert_eq!(status, StatusCode::NOT_FOUND, "not on the API's address");
+    yard.server.stop().await.unwrap();
+}

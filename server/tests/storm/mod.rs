@@ -6,21 +6,22 @@
 //! against the reference; at the end of a run the network heals, and every mission must end, with
 //! both sides of one mind.
 
+mod dice;
+mod network;
+mod reference;
 mod robot;
+mod samples;
 
-use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use tokio::sync::oneshot;
-use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
-use tread_api::keys::Verb;
+use tread_api::ids::{MissionId, SiteId};
 use tread_api::mission::{
     Cause, CreateMission, LinkPolicy, MissionState, ReplaceMission, StartPolicy,
 };
-use tread_api::robot::{Capabilities, RobotLimits, RobotModel};
-use tread_api::trajectory::{Circle, Direction, Trajectory, TrajectoryOptions};
+use tread_api::robot::Capabilities;
 use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::MissionPhase;
 use tread_api::wire::state::RobotState;
@@ -29,157 +30,22 @@ use tread_server::app::reconciler::Reconciler;
 use tread_server::app::{App, AppError};
 use tread_server::clock::Clock;
 use tread_server::config::FrictionConfig;
-use tread_server::db::{self, Db};
-use tread_server::fleet::commands::{Carrier, Carrying, Commands};
-use tread_server::fleet::presence::RobotKey;
+use tread_server::db::Db;
+use tread_server::fleet::commands::Commands;
 use tread_server::supervisor::Supervisor;
 
+use self::dice::Dice;
+use self::network::{LATE_MAX, Late, Network, Shared, World, with};
+use self::reference::Reference;
 use self::robot::Robot;
+use self::samples::{circle, model};
 
 /// Robots of one run.
 const ROBOTS: usize = 3;
 /// Missions of one run that requests may name.
 const NAMED_MAX: usize = 40;
-/// Messages that are late at once.
-const LATE_MAX: usize = 30;
 /// Steps within which everything must have ended after the network has healed.
 const HEAL_STEPS: usize = 600;
-
-/// Random numbers from a seed: xorshift64*.
-#[derive(Debug)]
-pub(crate) struct Dice(u64);
-
-impl Dice {
-    pub(crate) fn of(seed: u64) -> Self {
-        Self(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1)
-    }
-
-    fn roll(&mut self) -> u64 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        self.0.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 33
-    }
-
-    fn below(&mut self, end: usize) -> usize {
-        usize::try_from(self.roll()).unwrap_or(0) % end.max(1)
-    }
-
-    fn percent(&mut self, percent: u64) -> bool {
-        self.roll() % 100 < percent
-    }
-}
-
-/// A message that is still on its way.
-#[derive(Debug)]
-enum Late {
-    Command(usize, Option<BootId>, Verb, Vec<u8>),
-    State(Box<RobotState>),
-}
-
-/// The robots and the network between them and the server.
-#[derive(Debug)]
-struct World {
-    robots: Vec<Robot>,
-    late: Vec<Late>,
-    dice: Dice,
-    calm: bool,
-}
-
-type Shared = Arc<Mutex<World>>;
-
-fn with<T>(world: &Shared, act: impl FnOnce(&mut World) -> T) -> T {
-    act(&mut world.lock().unwrap_or_else(PoisonError::into_inner))
-}
-
-#[derive(Debug)]
-struct Network(Shared);
-
-impl Carrier for Network {
-    fn carry(
-        &self,
-        (_, robot): &RobotKey,
-        run: Option<BootId>,
-        verb: Verb,
-        payload: Vec<u8>,
-    ) -> Carrying {
-        let answer = with(&self.0, |world| {
-            let index = world.robots.iter().position(|here| here.id == *robot)?;
-            let there = &world.robots[index];
-            let reachable = there.on && there.linked && there.is_run(run);
-            let calm = world.calm;
-            let fate = if calm { 99 } else { world.dice.below(100) };
-            // Lost on the way, or late: the server hears nothing.
-            if !reachable || fate < 15 {
-                return None;
-            }
-            if fate < 25 && world.late.len() < LATE_MAX {
-                world.late.push(Late::Command(index, run, verb, payload));
-                return None;
-            }
-            if fate < 35 && world.late.len() < LATE_MAX {
-                world
-                    .late
-                    .push(Late::Command(index, run, verb, payload.clone()));
-            }
-            let impossible = !calm && world.dice.percent(3);
-            let answer = world.robots[index].answer(verb, &payload, impossible);
-            // Done, and the answer is lost.
-            (fate >= 45).then_some(answer)
-        });
-        Box::pin(std::future::ready(answer))
-    }
-}
-
-/// What the reference knows: where each mission stands, by the history alone.
-#[derive(Debug, Default)]
-struct Reference {
-    missions: BTreeMap<MissionId, (RobotId, MissionState, Cause)>,
-    last_step: i64,
-}
-
-impl Reference {
-    /// Reads what the server wrote, and checks it.
-    async fn follow(&mut self, db: &Db) -> Result<(), String> {
-        let mut tx = db.read().await.map_err(|error| error.to_string())?;
-        let steps = db::history::steps_after(&mut tx, self.last_step, 10_000).await;
-        drop(tx);
-        for (pk, step) in steps.map_err(|error| error.to_string())? {
-            self.last_step = pk;
-            let before = self.missions.get(&step.mission).map(|known| known.1);
-            if before != step.step.from {
-                return Err(format!("{step:?} does not follow {before:?}"));
-            }
-            let moved = before != Some(step.step.to);
-            if moved && before.is_some_and(MissionState::is_terminal) {
-                return Err(format!("revived: {step:?}"));
-            }
-            let cause = match self.missions.get(&step.mission) {
-                Some(&(_, _, cause)) if !moved => cause,
-                _ => step.step.cause,
-            };
-            let standing = (step.robot.clone(), step.step.to, cause);
-            self.missions.insert(step.mission, standing);
-            let mut in_hand: HashMap<&RobotId, usize> = HashMap::new();
-            for (robot, state, _) in self.missions.values() {
-                if !state.is_terminal() && *state != MissionState::Queued {
-                    *in_hand.entry(robot).or_default() += 1;
-                }
-            }
-            if let Some((robot, count)) = in_hand.into_iter().find(|(_, count)| *count > 1) {
-                return Err(format!(
-                    "robot {robot} has {count} missions in hand: {step:?}"
-                ));
-            }
-        }
-        Ok(())
-    }
-
-    fn open(&self) -> Vec<(MissionId, MissionState)> {
-        let standing = self.missions.iter().map(|(id, known)| (*id, known.1));
-        standing.filter(|(_, state)| !state.is_terminal()).collect()
-    }
-}
 
 /// One run.
 struct Storm {
@@ -580,38 +446,5 @@ fn allowed<T>(answer: Result<T, AppError>) -> Result<(), String> {
     match answer {
         Err(error @ AppError::Storage(_)) => Err(format!("{error:?}")),
         Ok(_) | Err(_) => Ok(()),
-    }
-}
-
-fn circle(radius_m: f64) -> Trajectory {
-    Trajectory::Circle(Circle {
-        center: tread_api::geometry::Point { x_m: 0.0, y_m: 0.0 },
-        radius_m,
-        speed_m_s: Some(0.5),
-        period_s: None,
-        direction: Direction::CounterClockwise,
-        turns: 1.0,
-        options: TrajectoryOptions::default(),
-    })
-}
-
-fn model() -> RobotModel {
-    RobotModel {
-        name: "storm".to_owned(),
-        tyres: "any".to_owned(),
-        mass_kg: 50.0,
-        track_width_m: 0.6,
-        wheelbase_m: 0.5,
-        wheel_radius_m: 0.15,
-        yaw_inertia_kg_m2: 3.0,
-        limits: RobotLimits {
-            linear_max_m_s: 2.0,
-            angular_max_rad_s: 1.5,
-            linear_acceleration_max_m_s2: 1.0,
-            lateral_acceleration_max_m_s2: 1.0,
-            linear_jerk_max_m_s3: 5.0,
-            wheel_speed_max_rad_s: 20.0,
-            wheel_acceleration_max_rad_s2: 50.0,
-        },
     }
 }

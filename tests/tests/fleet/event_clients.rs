@@ -16,8 +16,7 @@ use crate::fleet;
 /// Clients that read.
 const READERS: usize = 1_000;
 /// Memory that a thousand clients and one that never reads may cost the server, bytes.
-/// An unoptimised server was seen to take 201 MB.
-const MEMORY_MAX: u64 = 260_000_000;
+const MEMORY_MAX: u64 = 200_000_000;
 /// Events of robots that each reader must see after the deaf one has joined.
 const EVENTS_EACH: usize = 5;
 

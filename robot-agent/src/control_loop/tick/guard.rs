@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use tread_api::robot::PauseCause;
 use tread_control::fence::{FenceInput, MU_UNKNOWN};
-use tread_control::gate::hand::approach;
+use tread_control::gate::hand::{BLIND_MAX_M_S, approach, no_faster, not_ahead};
 use tread_control::gate::{GateCause, GateInput, GateOutput, Reasons, gate_with};
 use tread_control::geometry::Twist;
 use tread_control::measured::WheelSpeeds;
@@ -91,7 +91,12 @@ impl LoopCore {
     }
 
     /// What the wheels are to do: what the hand wants, or what the mission wants.
-    pub(super) fn choose(&self, by_mission: Option<WheelSpeeds>, dt_s: f64) -> Wanted {
+    pub(super) fn choose(
+        &self,
+        now: Duration,
+        by_mission: Option<WheelSpeeds>,
+        dt_s: f64,
+    ) -> Wanted {
         let hand = &self.guard.view.hand;
         // A mission that is still braking for the lease comes to rest first.
         let is_mission_at_rest = self.active.as_ref().is_none_or(Active::rests);
@@ -104,7 +109,15 @@ impl LoopCore {
         }
         let wanted = hand.wanted_at(self.guard.now_us);
         let previous = self.model.twist_from_wheel_speeds(self.command);
-        let twist = approach(previous, wanted.unwrap_or_default(), &self.model, dt_s);
+        let mut target = wanted.unwrap_or_default();
+        let ends_soon = hand.ends_soon(self.guard.now_us);
+        if ends_soon {
+            target = no_faster(previous, target);
+        }
+        let mut twist = approach(previous, target, &self.model, dt_s);
+        if ends_soon {
+            twist = not_ahead(twist, self.real_m_s(now));
+        }
         Wanted {
             wheels: self.model.wheel_speeds_from_twist(twist),
             is_by_hand: true,
@@ -112,13 +125,11 @@ impl LoopCore {
         }
     }
 
-    fn fence_max_m_s(&self, wanted: Twist) -> (Option<f64>, bool) {
-        let Some(site) = self.site.as_ref().filter(|site| !site.fence().is_empty()) else {
-            return (None, false);
-        };
-        let Some(pose) = self.localisation.pose() else {
-            return (None, true);
-        };
+    /// The fastest speed within the fence; none where there is no fence, or nobody knows where the
+    /// robot is.
+    fn fence_max_m_s(&self, wanted: Twist) -> Option<f64> {
+        let site = self.site.as_ref().filter(|site| !site.fence().is_empty())?;
+        let pose = self.localisation.pose()?;
         let seen = self.estimate.mu_peak_lower_bound;
         // Ground that has not slipped yet is taken for no worse than unknown ground.
         let mu_lower = if self.slips {
@@ -133,7 +144,28 @@ impl LoopCore {
             wanted,
             mu_lower,
         };
-        (site.fence().judge(&input, &self.model).speed_max_m_s, false)
+        site.fence().judge(&input, &self.model).speed_max_m_s
+    }
+
+    /// Whether the robot must stand for not knowing where it is, or else how fast it may be driven.
+    ///
+    /// A mission needs a position. By hand the driver sees where the robot is: it goes slowly, and
+    /// within a fence only if its configuration says so.
+    fn blindness(&self, fault: Option<Fault>, wanted: &Wanted) -> (bool, Option<f64>) {
+        let is_lost = fault == Some(Fault::PositionLost) || self.localisation.pose().is_none();
+        if !is_lost {
+            return (false, None);
+        }
+        let is_fenced = self
+            .site
+            .as_ref()
+            .is_some_and(|site| !site.fence().is_empty());
+        let must_stand = if wanted.is_by_hand {
+            is_fenced && !self.blind_within_fence
+        } else {
+            is_fenced || self.active.is_some()
+        };
+        (must_stand, wanted.is_by_hand.then_some(BLIND_MAX_M_S))
     }
 
     fn reasons(&self, now: Duration, fault: Option<Fault>, wanted: &Wanted) -> Reasons {
@@ -141,19 +173,23 @@ impl LoopCore {
         let rest = WheelSpeeds::default();
         let is_moving = wanted.wheels != rest || self.command != rest;
         let twist = self.model.twist_from_wheel_speeds(wanted.wheels);
-        let (fence_max_m_s, is_fence_blind) = if is_moving {
+        let fence_max_m_s = if is_moving {
             self.fence_max_m_s(twist)
         } else {
-            (None, false)
+            None
         };
-        let is_driving = self.active.is_some() || wanted.is_by_hand;
-        let is_position_lost = fault == Some(Fault::PositionLost) && is_driving;
+        let is_driving = is_moving || self.active.is_some() || wanted.is_by_hand;
+        let (is_position_lost, blind_max_m_s) = if is_driving {
+            self.blindness(fault, wanted)
+        } else {
+            (false, None)
+        };
         let share = guard.view.hand.speed_share;
         let linear_max_m_s = self.model.limits().linear_max_m_s;
         Reasons {
             is_stopped: guard.is_stopped(),
             tilt_rad: self.tilt_rad,
-            is_position_lost: is_position_lost || is_fence_blind,
+            is_position_lost,
             is_held_outside: guard.view.limits.holds(guard.now_us),
             is_link_silent: self.is_long_silent(now),
             is_driver_silent: wanted.is_driver_silent,
@@ -161,6 +197,8 @@ impl LoopCore {
             outside_max_m_s: guard.view.limits.linear_max_m_s(guard.now_us),
             command_age_max_m_s: (wanted.is_by_hand && share < 1.0)
                 .then_some(share * linear_max_m_s),
+            blind_max_m_s,
+            real_m_s: Some(self.real_m_s(now)),
         }
     }
 

@@ -53,9 +53,13 @@ pub(crate) struct LoopCore {
     last_tick: Option<Duration>,
     last_sample: Option<Duration>,
     last_fix: Option<Duration>,
+    /// How fast the robot went by a sensor of its own, m/s, and when.
+    body_speed: Option<(f64, Duration)>,
     /// How far the robot leans, if the base measures it.
     tilt_rad: Option<f64>,
     guard: Guard,
+    /// Whether the robot may be driven by hand within a fence without knowing where it is.
+    blind_within_fence: bool,
     /// Whether a wheel slips beyond the model.
     slips: bool,
     /// Until when the mission is held for its next revision.
@@ -84,12 +88,22 @@ impl LoopCore {
             last_tick: None,
             last_sample: None,
             last_fix: None,
+            body_speed: None,
             tilt_rad: None,
             guard: Guard::default(),
+            blind_within_fence: false,
             slips: false,
             replacement_until: None,
             ticks: 0,
         }
+    }
+
+    /// The same loop with the configuration's word on driving by hand within a fence without
+    /// knowing where the robot is.
+    #[must_use]
+    pub(crate) fn with_blind_within_fence(mut self, may: bool) -> Self {
+        self.blind_within_fence = may;
+        self
     }
 
     /// Whether the wheels are commanded to rest and do.
@@ -111,7 +125,7 @@ impl LoopCore {
         self.mind_bounds(now.monotonic);
         let fault = self.fault(now.monotonic);
         let by_mission = self.follow(now, fault, dt_s);
-        let wanted = self.choose(by_mission, dt_s);
+        let wanted = self.choose(now.monotonic, by_mission, dt_s);
         let gated = self.pass(now.monotonic, fault, wanted, stop, dt_s);
         self.command = gated.wheel_speeds;
         drive.write(self.command);

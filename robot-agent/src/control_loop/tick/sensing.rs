@@ -16,6 +16,8 @@ use crate::geometry::wire_point;
 
 /// Oldest word of the base with which it does not count as silent.
 const BASE_SILENT_AFTER: Duration = Duration::from_millis(200);
+/// Oldest word of a sensor of the robot's own speed that says how fast it is now.
+const BODY_SPEED_AGE_MAX: Duration = Duration::from_millis(150);
 /// Oldest position fix with which the position does not count as lost.
 const POSITION_LOST_AFTER: Duration = Duration::from_secs(3);
 
@@ -32,6 +34,9 @@ impl LoopCore {
         for sample in feedback.samples() {
             if sample.tilt_rad.is_some() {
                 self.tilt_rad = sample.tilt_rad;
+            }
+            if let Some(speed_m_s) = sample.body_speed_m_s.filter(|speed| speed.is_finite()) {
+                self.body_speed = Some((speed_m_s, sample.at));
             }
             let gyro_rad_s = sample.yaw_rate_rad_s.filter(|rate| rate.is_finite());
             let wheel_speeds = sample.wheel_speeds.filter(|speeds| speeds.is_finite());
@@ -81,6 +86,16 @@ impl LoopCore {
             self.estimate = self.estimator.estimate();
         }
         ground_changed
+    }
+
+    /// How fast the robot really goes along its path, as well as it is known: slip tells wheels and
+    /// robot apart, and position fixes tell of it only after a while.
+    pub(super) fn real_m_s(&self, now: Duration) -> f64 {
+        let is_new = |at: Duration| now.saturating_sub(at) <= BODY_SPEED_AGE_MAX;
+        match self.body_speed {
+            Some((speed_m_s, at)) if is_new(at) => speed_m_s,
+            Some(_) | None => self.localisation.twist().linear_m_s,
+        }
     }
 
     pub(super) fn knowledge(&self) -> Option<ThetaKnowledge> {

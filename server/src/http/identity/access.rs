@@ -9,9 +9,12 @@ use utoipa::openapi::OpenApi;
 use utoipa::openapi::security::{ApiKey, ApiKeyValue, HttpAuthScheme, HttpBuilder, SecurityScheme};
 
 use super::browser::COOKIE;
+use crate::http::page;
 
 /// What anybody may ask for: this list and nothing else.
-pub const PUBLIC: [(&str, &str); 7] = [
+pub const PUBLIC: [(&str, &str); 9] = [
+    ("GET", page::ROOT),
+    ("GET", page::FILES),
     ("GET", "/healthz"),
     ("GET", "/readyz"),
     ("POST", "/v1/session"),

@@ -244,6 +244,12 @@ async fn every_answer_says_what_browsers_may_do_with_it() {
         ),
         ("/healthz", "default-src 'none'", false),
         ("/docs/", "script-src 'self'", false),
+        ("/", "default-src 'none'; script-src 'self'", false),
+        (
+            "/page/app.js",
+            "default-src 'none'; script-src 'self'",
+            false,
+        ),
     ] {
         let answer = yard.client().get(yard.url(path)).send().await.unwrap();
         let headers = answer.headers();

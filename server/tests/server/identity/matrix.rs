@@ -13,7 +13,9 @@ use crate::harness::{Yard, client};
 
 /// What anybody may ask for. It stands here a second time, so that a change of the server's list
 /// is a change of this test.
-const OPEN: [(&str, &str); 7] = [
+const OPEN: [(&str, &str); 9] = [
+    ("GET", "/"),
+    ("GET", "/page/{file}"),
     ("GET", "/healthz"),
     ("GET", "/readyz"),
     ("POST", "/v1/session"),

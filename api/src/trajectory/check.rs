@@ -1,0 +1,122 @@
+//! What a trajectory would ask of a robot, told before anything moves.
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::Trajectory;
+use crate::geometry::{Point, Pose};
+use crate::ids::{RobotId, SiteId};
+
+/// The body of `POST /v1/trajectories/check`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct CheckTrajectory {
+    /// The robot's site.
+    pub site: SiteId,
+    /// The robot whose model and limits count.
+    pub robot: RobotId,
+    /// What would be driven.
+    pub trajectory: Trajectory,
+    /// From where; the robot's last known pose when absent, and the start of the path if there is
+    /// none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub start: Option<Pose>,
+    /// Assumed θ of the ground, for the accuracy to expect; what the robot measures now when
+    /// absent, and [`THETA_ASSUMED`] if it measures nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(exclusive_minimum = 0.0, example = 0.2)]
+    pub theta: Option<f64>,
+}
+
+/// θ that a check assumes where nothing is known: firm ground.
+pub const THETA_ASSUMED: f64 = 0.2;
+
+/// How well friction would be measured on a trajectory, by the robot's own estimator.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ExpectedMeasurement {
+    /// The θ of the ground that was assumed.
+    pub theta_assumed: f64,
+    /// Whether the base measures wheel torque.
+    pub wheel_torque: bool,
+    /// Standard deviation of θ at the end, as a share of θ; `null` where the trajectory excites
+    /// too little for a measurement.
+    pub relative_sd: Option<f64>,
+    /// Driving time until the first measurement, seconds.
+    pub first_after_s: Option<f64>,
+}
+
+/// What a trajectory would ask of a robot, planned by the robot's own planner.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct TrajectoryCheck {
+    /// From where it was planned.
+    pub start: Pose,
+    /// Length with the way to its start, metres.
+    pub length_m: f64,
+    /// Length of the way to its start, metres.
+    pub approach_length_m: f64,
+    /// Time from rest to rest when nothing slows the robot, seconds.
+    pub duration_s: f64,
+    /// Fastest speed, m/s.
+    pub speed_peak_m_s: f64,
+    /// Hardest acceleration or braking along the path, m/s².
+    pub linear_acceleration_peak_m_s2: f64,
+    /// Hardest acceleration across the path, m/s².
+    pub lateral_acceleration_peak_m_s2: f64,
+    /// Fastest turn, rad/s.
+    pub angular_peak_rad_s: f64,
+    /// Where a limit makes the robot slower than it was asked to be, in driving order; at most
+    /// [`BINDINGS_MAX`].
+    pub bindings: Vec<Binding>,
+    /// How deep the wiggle of the speed is that was asked for, as a share of the speed: less than
+    /// asked where the robot's limits leave less.
+    pub excitation_depth_ratio: Option<f64>,
+    /// How well friction would be measured.
+    pub measurement: ExpectedMeasurement,
+}
+
+/// Most stretches that a check names.
+pub const BINDINGS_MAX: usize = 1_000;
+
+/// A stretch of a path on which one limit decides how fast the robot goes.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Binding {
+    /// Which limit.
+    pub limit: BindingLimit,
+    /// Where it begins.
+    pub from: Place,
+    /// Where it ends.
+    pub to: Place,
+    /// Slowest speed of the stretch, m/s.
+    pub speed_min_m_s: f64,
+}
+
+/// A limit that slows a robot below what was asked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum BindingLimit {
+    /// Acceleration across the path.
+    LateralAcceleration,
+    /// Yaw rate.
+    AngularSpeed,
+    /// Wheel speed.
+    WheelSpeed,
+    /// Wheel acceleration where the bend changes.
+    WheelAcceleration,
+    /// Acceleration or braking along the path, up to the next slower place.
+    LinearAcceleration,
+    /// What the ground is known to give, along or across the path; on the way to the trajectory a
+    /// cautious guess where nothing is known.
+    Grip,
+}
+
+/// A place along a path.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Place {
+    /// Arc length from the start, metres, where it is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub arc_m: Option<f64>,
+    /// Index of the waypoint at or before it, from 0.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub waypoint: Option<usize>,
+    /// Where it is.
+    pub point: Point,
+}

@@ -1,0 +1,248 @@
+//! One polygon of a fence, prepared for looking at it in a tick.
+//!
+//! Its sides lie in groups of neighbours, each in a box: a group whose box is farther away than
+//! the nearest side so far, and that no ray to the right can meet, need not be looked at.
+
+use crate::geometry::Point;
+
+/// Sides in a group.
+const GROUP_SIDES: usize = 12;
+
+/// One side of a polygon, prepared.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Side {
+    from: Point,
+    to: Point,
+    inverse_length_1_m2: f64,
+}
+
+/// The least box along the axes that holds some points.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Bounds {
+    low: Point,
+    high: Point,
+}
+
+impl Bounds {
+    fn of(points: impl Iterator<Item = Point>) -> Self {
+        let nothing = Self {
+            low: Point {
+                x_m: f64::INFINITY,
+                y_m: f64::INFINITY,
+            },
+            high: Point {
+                x_m: f64::NEG_INFINITY,
+                y_m: f64::NEG_INFINITY,
+            },
+        };
+        points.fold(nothing, |bounds, point| Self {
+            low: Point {
+                x_m: bounds.low.x_m.min(point.x_m),
+                y_m: bounds.low.y_m.min(point.y_m),
+            },
+            high: Point {
+                x_m: bounds.high.x_m.max(point.x_m),
+                y_m: bounds.high.y_m.max(point.y_m),
+            },
+        })
+    }
+
+    /// How far a point is outside along each axis, metres; 0 within.
+    fn off(&self, point: Point) -> (f64, f64) {
+        let off = |value: f64, low: f64, high: f64| (low - value).max(value - high).max(0.0);
+        (
+            off(point.x_m, self.low.x_m, self.high.x_m),
+            off(point.y_m, self.low.y_m, self.high.y_m),
+        )
+    }
+
+    fn distance_m2(&self, point: Point) -> f64 {
+        let (x_m, y_m) = self.off(point);
+        x_m * x_m + y_m * y_m
+    }
+
+    /// Whether the ray from a point to the right can meet a side in it.
+    fn is_met_by_ray(&self, point: Point) -> bool {
+        (self.low.y_m..=self.high.y_m).contains(&point.y_m) && point.x_m <= self.high.x_m
+    }
+}
+
+#[derive(Debug, Clone, PartialEq)]
+struct Group {
+    bounds: Bounds,
+    sides: Vec<Side>,
+}
+
+/// What a look at the border finds.
+#[derive(Debug, Clone, Copy)]
+struct Nearest {
+    distance_m2: f64,
+    point: Point,
+}
+
+impl Group {
+    fn new(sides: &[Side]) -> Self {
+        let ends = sides.iter().flat_map(|side| [side.from, side.to]);
+        Self {
+            bounds: Bounds::of(ends),
+            sides: sides.to_vec(),
+        }
+    }
+
+    fn look_nearer(&self, point: Point, nearest: &mut Nearest) {
+        for side in &self.sides {
+            let (from, to) = (side.from, side.to);
+            let (side_x, side_y) = (to.x_m - from.x_m, to.y_m - from.y_m);
+            let (x_m, y_m) = (point.x_m - from.x_m, point.y_m - from.y_m);
+            let share = ((x_m * side_x + y_m * side_y) * side.inverse_length_1_m2).clamp(0.0, 1.0);
+            let (off_x, off_y) = (x_m - share * side_x, y_m - share * side_y);
+            let distance_m2 = off_x * off_x + off_y * off_y;
+            if distance_m2 < nearest.distance_m2 {
+                *nearest = Nearest {
+                    distance_m2,
+                    point: Point {
+                        x_m: from.x_m + share * side_x,
+                        y_m: from.y_m + share * side_y,
+                    },
+                };
+            }
+        }
+    }
+
+    /// Whether the ray from a point to the right crosses an odd number of its sides.
+    fn is_crossed(&self, point: Point) -> bool {
+        let mut is_crossed = false;
+        for side in &self.sides {
+            let (from, to) = (side.from, side.to);
+            let (side_x, side_y) = (to.x_m - from.x_m, to.y_m - from.y_m);
+            let (x_m, y_m) = (point.x_m - from.x_m, point.y_m - from.y_m);
+            // Without a division.
+            let is_upward = to.y_m > from.y_m;
+            let is_beside = (from.y_m > point.y_m) != (to.y_m > point.y_m);
+            is_crossed ^= is_beside && ((x_m * side_y < side_x * y_m) == is_upward);
+        }
+        is_crossed
+    }
+}
+
+/// A polygon.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Ring {
+    groups: Vec<Group>,
+    bounds: Bounds,
+}
+
+impl Ring {
+    pub(super) fn new(corners: &[Point]) -> Self {
+        let next = corners.iter().cycle().skip(1);
+        let side = |(&from, &to): (&Point, &Point)| Side {
+            from,
+            to,
+            inverse_length_1_m2: from.distance_m(to).powi(2).recip(),
+        };
+        let sides: Vec<Side> = corners.iter().zip(next).map(side).collect();
+        Self {
+            groups: sides.chunks(GROUP_SIDES).map(Group::new).collect(),
+            bounds: Bounds::of(corners.iter().copied()),
+        }
+    }
+
+    /// A lower bound of the distance from outside; 0 within the polygon's box.
+    pub(super) fn outside_at_least_m(&self, point: Point) -> f64 {
+        let (x_m, y_m) = self.bounds.off(point);
+        x_m.max(y_m)
+    }
+
+    /// Distance to the border, positive inside.
+    pub(super) fn depth_m(&self, point: Point) -> f64 {
+        let mut is_inside = false;
+        for group in &self.groups {
+            if group.bounds.is_met_by_ray(point) {
+                is_inside ^= group.is_crossed(point);
+            }
+        }
+        let distance_m = self.nearest(point).distance_m2.sqrt();
+        if is_inside { distance_m } else { -distance_m }
+    }
+
+    /// The point of the border that is nearest.
+    pub(super) fn border_near(&self, point: Point) -> Point {
+        self.nearest(point).point
+    }
+
+    fn nearest(&self, point: Point) -> Nearest {
+        let mut nearest = Nearest {
+            distance_m2: f64::INFINITY,
+            point,
+        };
+        // The group that is likely the nearest first, so that most others need no look.
+        let by_box = |group: &&Group| group.bounds.distance_m2(point);
+        let likely = self
+            .groups
+            .iter()
+            .min_by(|one, other| by_box(one).total_cmp(&by_box(other)));
+        if let Some(likely) = likely {
+            likely.look_nearer(point, &mut nearest);
+        }
+        for group in &self.groups {
+            if group.bounds.distance_m2(point) < nearest.distance_m2 {
+                group.look_nearer(point, &mut nearest);
+            }
+        }
+        nearest
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// The same without groups.
+    fn plain(corners: &[Point], point: Point) -> f64 {
+        let next = corners.iter().cycle().skip(1);
+        let side = |(&from, &to): (&Point, &Point)| Side {
+            from,
+            to,
+            inverse_length_1_m2: from.distance_m(to).powi(2).recip(),
+        };
+        let all = Group::new(&corners.iter().zip(next).map(side).collect::<Vec<_>>());
+        let mut nearest = Nearest {
+            distance_m2: f64::INFINITY,
+            point,
+        };
+        all.look_nearer(point, &mut nearest);
+        let distance_m = nearest.distance_m2.sqrt();
+        if all.is_crossed(point) {
+            distance_m
+        } else {
+            -distance_m
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn groups_change_nothing(
+            radii in prop::collection::vec(1.0..20.0_f64, 3..120),
+            x_m in -25.0..25.0_f64, y_m in -25.0..25.0_f64,
+            is_on_a_corner: bool,
+        ) {
+            let count = f64::from(u32::try_from(radii.len()).unwrap());
+            let corners: Vec<Point> = (0_u32..).zip(&radii).map(|(index, radius_m)| {
+                let angle_rad = std::f64::consts::TAU * f64::from(index) / count;
+                Point { x_m: radius_m * angle_rad.cos(), y_m: radius_m * angle_rad.sin() }
+            }).collect();
+            let ring = Ring::new(&corners);
+            // On the height of a corner, where a ray meets two sides at once.
+            let y_m = if is_on_a_corner { corners[0].y_m } else { y_m };
+            let point = Point { x_m, y_m };
+            let depth_m = ring.depth_m(point);
+            prop_assert!((depth_m - plain(&corners, point)).abs() < 1.0e-12);
+            let border = ring.border_near(point);
+            prop_assert!((border.distance_m(point) - depth_m.abs()).abs() < 1.0e-9);
+            prop_assert!(ring.depth_m(border).abs() < 1.0e-9);
+            prop_assert!(depth_m > 0.0 || ring.outside_at_least_m(point) <= -depth_m + 1.0e-9);
+        }
+    }
+}

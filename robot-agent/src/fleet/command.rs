@@ -1,0 +1,53 @@
+//! A command that came in, and its answer.
+
+use tracing::warn;
+use tread_api::keys::Verb;
+use tread_api::wire::command::Answer;
+use tread_api::wire::{self, Refusal};
+use zenoh::Wait;
+use zenoh::query::Query;
+
+/// A command that waits for its answer.
+#[derive(Debug)]
+pub struct IncomingCommand {
+    /// What is asked.
+    pub verb: Verb,
+    /// The payload as it came.
+    pub payload: Vec<u8>,
+    pub(super) query: Query,
+}
+
+impl IncomingCommand {
+    /// Answers; a failure is logged, for the server asks again.
+    pub async fn answer(self, answer: &Answer) {
+        match wire::encode(answer) {
+            Ok(payload) => self.reply(payload, false).await,
+            Err(cause) => warn!(
+                error = &cause as &dyn std::error::Error,
+                "cannot write an answer"
+            ),
+        }
+    }
+
+    /// Refuses the message as a whole.
+    pub async fn refuse(self, refusal: &Refusal) {
+        if let Ok(payload) = wire::encode(refusal) {
+            self.reply(payload, true).await;
+        }
+    }
+
+    async fn reply(self, payload: Vec<u8>, is_error: bool) {
+        let replying = tokio::task::spawn_blocking(move || {
+            if is_error {
+                self.query.reply_err(payload).wait()
+            } else {
+                self.query
+                    .reply(self.query.key_expr().clone(), payload)
+                    .wait()
+            }
+        });
+        if let Ok(Err(cause)) = replying.await {
+            warn!("an answer could not be sent: {cause}");
+        }
+    }
+}

@@ -1,0 +1,62 @@
+//! Why the link could not be made, and why a question went without an answer.
+
+use tread_api::wire::{Refusal, RefusalCode, WireError};
+
+/// Why the link could not be made.
+#[derive(Debug, thiserror::Error)]
+pub enum LinkError {
+    /// The server's endpoint is none.
+    #[error("`{endpoint}` is no zenoh endpoint: {problem}")]
+    Endpoint {
+        /// What was given.
+        endpoint: String,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// zenoh refused.
+    #[error("zenoh could not {action}: {problem}")]
+    Zenoh {
+        /// What was tried.
+        action: &'static str,
+        /// What zenoh said.
+        problem: String,
+    },
+}
+
+pub(super) fn zenoh_failed(action: &'static str) -> impl FnOnce(zenoh::Error) -> LinkError {
+    move |problem| LinkError::Zenoh {
+        action,
+        problem: problem.to_string(),
+    }
+}
+
+/// Why a question to the server went without an answer.
+#[derive(Debug, thiserror::Error)]
+pub enum AskError {
+    /// Nobody answered: the server is not there, or too slow.
+    #[error("the server did not answer")]
+    NoAnswer,
+    /// The server refused the whole message.
+    #[error("the server refused: {0:?}")]
+    Refused(Refusal),
+    /// The answer cannot be read.
+    #[error("the server's answer cannot be read")]
+    Unreadable(#[source] WireError),
+    /// The question cannot be written.
+    #[error("the message cannot be written as JSON")]
+    Unwritable(#[source] serde_json::Error),
+    /// zenoh refused.
+    #[error(transparent)]
+    Link(#[from] LinkError),
+}
+
+/// Whether sending the same again to the same server may help.
+pub fn may_pass_later(error: &AskError) -> bool {
+    match error {
+        AskError::Refused(refusal) => refusal.code != RefusalCode::Malformed,
+        AskError::NoAnswer
+        | AskError::Unreadable(_)
+        | AskError::Unwritable(_)
+        | AskError::Link(_) => true,
+    }
+}

@@ -1,0 +1,98 @@
+// Asks the server: one function, one kind of error.
+import type { ProblemBody } from './schema';
+import { words } from '../words';
+
+/** How long an answer may take, milliseconds; the server's own bound is 15 s. */
+const ANSWER_MAX_MS = 16_000;
+/** Entries of one page of a list, the most that the server gives. */
+const PAGE_ENTRIES = 1_000;
+
+/** What went wrong, in one plain sentence. */
+export class Problem extends Error {
+  constructor(
+    message: string,
+    /** 0 when the server did not answer at all. */
+    readonly status: number,
+    readonly body: ProblemBody | null = null,
+  ) {
+    super(message);
+  }
+
+  get isLost(): boolean {
+    return this.status === 0;
+  }
+}
+
+/** One sentence for people about whatever was thrown. */
+export function sentence(error: unknown): string {
+  return error instanceof Error ? error.message : String(error);
+}
+
+/** A sentence from a problem's parts. */
+export function tell(body: ProblemBody): string {
+  const detail = body.detail ? `${body.title}: ${body.detail}` : body.title;
+  return `${detail.charAt(0).toUpperCase()}${detail.slice(1)}.`;
+}
+
+export interface Asked {
+  method?: 'GET' | 'POST' | 'PUT' | 'PATCH' | 'DELETE';
+  body?: unknown;
+  headers?: Record<string, string>;
+  timeoutMs?: number;
+}
+
+/** Asks for `path`; throws a [`Problem`] unless the answer is a success. */
+export async function ask<T>(path: string, asked: Asked = {}): Promise<T> {
+  const headers: Record<string, string> = { ...asked.headers };
+  const init: RequestInit = {
+    method: asked.method ?? 'GET',
+    headers,
+    signal: AbortSignal.timeout(asked.timeoutMs ?? ANSWER_MAX_MS),
+  };
+  if (asked.body !== undefined) {
+    headers['content-type'] = 'application/json';
+    init.body = JSON.stringify(asked.body);
+  }
+  let response: Response;
+  try {
+    response = await fetch(path, init);
+  } catch {
+    throw new Problem(words.problem.lost, 0);
+  }
+  if (response.status === 204) return undefined as T;
+  let body: unknown;
+  try {
+    body = await response.json();
+  } catch {
+    if (response.ok) throw new Problem(words.problem.lost, 0);
+    throw new Problem(words.problem.unreadable(response.status), response.status);
+  }
+  if (response.ok) return body as T;
+  const problem = body as ProblemBody;
+  if (response.status === 401) {
+    for (const listener of ended) listener();
+  }
+  throw new Problem(tell(problem), response.status, problem);
+}
+
+const ended = new Set<() => void>();
+
+/** Calls when the server no longer knows who asks. */
+export function whenSignedOut(listener: () => void): void {
+  ended.add(listener);
+}
+
+/** Reads a list to its end, or to `most` entries. */
+export async function list<T>(path: string, most: number): Promise<{ items: T[]; isWhole: boolean }> {
+  const items: T[] = [];
+  let cursor: string | null = null;
+  do {
+    const query = new URLSearchParams({ limit: String(Math.min(PAGE_ENTRIES, most)) });
+    if (cursor) query.set('cursor', cursor);
+    const mark = path.includes('?') ? '&' : '?';
+    const page: { items: T[]; next_cursor?: string | null } = await ask(`${path}${mark}${query}`);
+    items.push(...page.items);
+    cursor = page.next_cursor ?? null;
+  } while (cursor && items.length < most);
+  return { items, isWhole: cursor === null };
+}

@@ -1,0 +1,56 @@
+// Numbers and times for people. What is not known is a dash.
+import { words } from './words';
+
+const cache = new Map<number, Intl.NumberFormat>();
+
+/** A number with a fixed count of digits after the point. */
+export function number(value: number | null | undefined, digits: number): string {
+  if (value === null || value === undefined || !Number.isFinite(value)) return words.unknown;
+  let format = cache.get(digits);
+  if (!format) {
+    format = new Intl.NumberFormat('en', {
+      minimumFractionDigits: digits,
+      maximumFractionDigits: digits,
+      useGrouping: false,
+    });
+    cache.set(digits, format);
+  }
+  // A small negative number is not "-0.00".
+  return format.format(Object.is(Math.round(value * 10 ** digits), -0) ? 0 : value);
+}
+
+/** A number with three significant digits. */
+export function short(value: number | null | undefined): string {
+  if (value === null || value === undefined || !Number.isFinite(value)) return words.unknown;
+  if (value === 0) return '0';
+  const digits = Math.max(0, 2 - Math.floor(Math.log10(Math.abs(value))));
+  return number(value, Math.min(digits, 6));
+}
+
+/** A value with its unit. */
+export function unit(value: number | null | undefined, digits: number, name: string): string {
+  const text = number(value, digits);
+  return text === words.unknown ? text : `${text} ${name}`;
+}
+
+/** A span, as short as it can be read. */
+export function span(seconds: number | null | undefined): string {
+  if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return words.unknown;
+  const { s, min, h, d } = words.unit;
+  const passed = Math.max(0, seconds);
+  if (passed < 10) return `${number(passed, 1)} ${s}`;
+  if (passed < 60) return `${number(passed, 0)} ${s}`;
+  if (passed < 3600) return `${Math.floor(passed / 60)} ${min} ${number(Math.floor(passed % 60), 0)} ${s}`;
+  if (passed < 86_400) return `${Math.floor(passed / 3600)} ${h} ${Math.floor((passed % 3600) / 60)} ${min}`;
+  return `${number(passed / 86_400, 1)} ${d}`;
+}
+
+/** Time of day of a wall time. */
+export function clock(at: string | number | Date): string {
+  return new Date(at).toLocaleTimeString('en-GB');
+}
+
+/** Day and time of a wall time. */
+export function moment(at: string): string {
+  return new Date(at).toLocaleString('en-GB', { dateStyle: 'short', timeStyle: 'medium' });
+}

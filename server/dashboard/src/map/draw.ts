@@ -1,0 +1,361 @@
+// Draws the map, layer by layer. Knows nothing of the page: what to draw comes in a scene.
+import type { Geofence, Mission, Terrain, Trajectory } from '../api/schema';
+import type { Tracked } from '../state/tracked';
+import type { Theme } from '../state/session.svelte';
+import { span } from '../format';
+import { words } from '../words';
+import { roundUp, type Camera, type PointM } from './camera';
+import type { Draft } from './draft';
+import { HATCHED_CELL_PX, drawFriction } from './draw_friction';
+import type { Layer } from './friction';
+import { PALETTES, groundFill, groundLine, type Palette } from './palette';
+
+export { HATCHED_CELL_PX };
+
+export interface Scene {
+  terrains: Terrain[];
+  fence: Geofence | null;
+  tracked: Iterable<Tracked>;
+  missions: Mission[];
+  /** Robots that a stop is on its way to without their confirmation. */
+  unconfirmed: ReadonlySet<string>;
+  friction: Layer | null;
+  draft: Draft | null;
+  driven: { asked: Trajectory; points: PointM[] } | null;
+  selected: string | null;
+  showTerrains: boolean;
+  showFence: boolean;
+  showTrails: boolean;
+  /** Marks the middle, for those who draw by keys. */
+  showCross: boolean;
+  theme: Theme;
+  /** Monotonic, milliseconds. */
+  now: number;
+}
+
+/** Least pixels between two lines of the grid. */
+const GRID_PX = 48;
+/** Width that the scale bar aims at, pixels. */
+const SCALE_BAR_PX = 90;
+/** Smallest a robot is drawn, pixels of its length. */
+const ROBOT_PX = 15;
+/** Most labels of robots: with more they would only cover each other. */
+const LABELS_MAX = 60;
+
+export function draw(context: CanvasRenderingContext2D, camera: Camera, scene: Scene): void {
+  const palette = PALETTES[scene.theme];
+  context.fillStyle = palette.ground;
+  context.fillRect(0, 0, camera.width, camera.height);
+  if (scene.showTerrains) drawTerrains(context, camera, scene, palette);
+  if (scene.friction) drawFriction(context, camera, scene.friction);
+  drawGrid(context, camera, palette);
+  if (scene.showFence && scene.fence) drawFence(context, camera, scene.fence, palette);
+  drawPaths(context, camera, scene, palette);
+  drawRobots(context, camera, scene, palette);
+  if (scene.draft) drawDraft(context, camera, scene.draft, palette);
+  if (scene.showCross) drawCross(context, camera, palette);
+  drawScale(context, camera, palette);
+}
+
+function trace(context: CanvasRenderingContext2D, camera: Camera, points: readonly PointM[]): void {
+  context.beginPath();
+  for (const point of points) {
+    const { x, y } = camera.toPx(point);
+    context.lineTo(x, y);
+  }
+}
+
+function label(
+  context: CanvasRenderingContext2D,
+  text: string,
+  x: number,
+  y: number,
+  colour: string,
+  palette: Palette,
+): void {
+  context.lineWidth = 3;
+  context.lineJoin = 'round';
+  context.strokeStyle = palette.halo;
+  context.strokeText(text, x, y);
+  context.fillStyle = colour;
+  context.fillText(text, x, y);
+}
+
+function drawTerrains(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): void {
+  context.font = '12px system-ui, sans-serif';
+  context.textAlign = 'center';
+  const terrains = [...scene.terrains].sort((a, b) => a.layer - b.layer);
+  for (const terrain of terrains) {
+    trace(context, camera, terrain.polygon);
+    context.closePath();
+    context.fillStyle = groundFill(terrain.class, scene.theme);
+    context.fill();
+    context.lineWidth = 1;
+    context.strokeStyle = groundLine(terrain.class, scene.theme);
+    context.stroke();
+  }
+  for (const terrain of terrains) {
+    const at = camera.toPx(labelPlace(terrain.polygon));
+    label(context, `${terrain.name} · ${words.terrains.classes[terrain.class]}`, at.x, at.y, palette.text, palette);
+  }
+}
+
+/** Just inside the upper edge of a polygon, in its middle. */
+function labelPlace(polygon: readonly PointM[]): PointM {
+  let [xMin, xMax, yMax, yMin] = [Infinity, -Infinity, -Infinity, Infinity];
+  for (const { x_m, y_m } of polygon) {
+    xMin = Math.min(xMin, x_m);
+    xMax = Math.max(xMax, x_m);
+    yMax = Math.max(yMax, y_m);
+    yMin = Math.min(yMin, y_m);
+  }
+  return { x_m: (xMin + xMax) / 2, y_m: yMax - (yMax - yMin) * 0.06 };
+}
+
+function drawGrid(context: CanvasRenderingContext2D, camera: Camera, palette: Palette): void {
+  const step = roundUp(GRID_PX / camera.scale);
+  const { xMin, yMin, xMax, yMax } = camera.bounds;
+  for (const isStrong of [false, true]) {
+    context.beginPath();
+    for (let index = Math.ceil(xMin / step); index * step <= xMax; index += 1) {
+      if ((index % 5 === 0) !== isStrong) continue;
+      const x = Math.round(camera.toPx({ x_m: index * step, y_m: 0 }).x) + 0.5;
+      context.moveTo(x, 0);
+      context.lineTo(x, camera.height);
+    }
+    for (let index = Math.ceil(yMin / step); index * step <= yMax; index += 1) {
+      if ((index % 5 === 0) !== isStrong) continue;
+      const y = Math.round(camera.toPx({ x_m: 0, y_m: index * step }).y) + 0.5;
+      context.moveTo(0, y);
+      context.lineTo(camera.width, y);
+    }
+    context.lineWidth = 1;
+    context.globalAlpha = 0.7;
+    context.strokeStyle = isStrong ? palette.gridStrong : palette.grid;
+    context.stroke();
+    context.globalAlpha = 1;
+  }
+}
+
+function drawFence(context: CanvasRenderingContext2D, camera: Camera, fence: Geofence, palette: Palette): void {
+  context.lineWidth = 2;
+  for (const polygon of fence.keep_in) {
+    trace(context, camera, polygon);
+    context.closePath();
+    context.setLineDash([10, 4]);
+    context.strokeStyle = palette.fence;
+    context.stroke();
+  }
+  for (const polygon of fence.keep_out) {
+    trace(context, camera, polygon);
+    context.closePath();
+    context.setLineDash([3, 3]);
+    context.strokeStyle = palette.fenceOut;
+    context.stroke();
+    context.globalAlpha = 0.12;
+    context.fillStyle = palette.fenceOut;
+    context.fill();
+    context.globalAlpha = 1;
+  }
+  context.setLineDash([]);
+}
+
+/** Traces what was asked for: a circle exactly, waypoints joined by straight lines. */
+export function traceTrajectory(context: CanvasRenderingContext2D, camera: Camera, asked: Trajectory): void {
+  if ('circle' in asked) {
+    const { center, radius_m } = asked.circle;
+    const { x, y } = camera.toPx(center);
+    context.beginPath();
+    context.arc(x, y, radius_m * camera.scale, 0, 2 * Math.PI);
+  } else {
+    trace(context, camera, asked.waypoints.points);
+  }
+}
+
+function drawPaths(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): void {
+  context.setLineDash([6, 5]);
+  for (const mission of scene.missions) {
+    const isWaiting = mission.state === 'queued';
+    if (isWaiting && mission.robot !== scene.selected) continue;
+    context.globalAlpha = isWaiting ? 0.4 : mission.robot === scene.selected ? 1 : 0.6;
+    context.lineWidth = mission.robot === scene.selected ? 2 : 1.25;
+    context.strokeStyle = palette.planned;
+    traceTrajectory(context, camera, mission.trajectory);
+    context.stroke();
+    if ('waypoints' in mission.trajectory && !isWaiting && mission.trajectory.waypoints.points.length <= 200) {
+      context.fillStyle = palette.planned;
+      for (const point of mission.trajectory.waypoints.points) {
+        const { x, y } = camera.toPx(point);
+        context.fillRect(x - 2, y - 2, 4, 4);
+      }
+    }
+  }
+  context.globalAlpha = 1;
+  if (scene.driven) {
+    context.lineWidth = 2;
+    context.strokeStyle = palette.planned;
+    traceTrajectory(context, camera, scene.driven.asked);
+    context.stroke();
+    context.setLineDash([]);
+    context.lineWidth = 2.5;
+    context.strokeStyle = palette.driven;
+    trace(context, camera, scene.driven.points);
+    context.stroke();
+  }
+  context.setLineDash([]);
+}
+
+function drawRobots(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): void {
+  const all = [...scene.tracked];
+  if (scene.showTrails) {
+    context.lineWidth = 1.5;
+    context.lineJoin = 'round';
+    context.strokeStyle = palette.trail;
+    context.globalAlpha = 0.55;
+    const { scale } = camera;
+    const left = camera.width / 2 - camera.center.x_m * scale;
+    const top = camera.height / 2 + camera.center.y_m * scale;
+    for (const { trail } of all) {
+      context.beginPath();
+      for (let index = 0; index < trail.length; index += 2) {
+        context.lineTo(left + (trail[index] ?? 0) * scale, top - (trail[index + 1] ?? 0) * scale);
+      }
+      context.stroke();
+    }
+    context.globalAlpha = 1;
+  }
+  context.font = '600 12px system-ui, sans-serif';
+  context.textAlign = 'left';
+  for (const tracked of all) drawRobot(context, camera, tracked, scene, palette, all.length <= LABELS_MAX);
+}
+
+function drawRobot(
+  context: CanvasRenderingContext2D,
+  camera: Camera,
+  tracked: Tracked,
+  scene: Scene,
+  palette: Palette,
+  withLabel: boolean,
+): void {
+  const { robot } = tracked;
+  const pose = robot.live?.pose?.value;
+  if (!pose) return;
+  const { x, y } = camera.toPx(pose);
+  const isSelected = robot.id === scene.selected;
+  const isLost = robot.link === 'offline';
+  const isStopped = robot.live?.safety.stop != null || scene.unconfirmed.has(robot.id);
+  const colour = isStopped
+    ? palette.stopped
+    : isLost
+      ? palette.robotLost
+      : robot.link === 'stale'
+        ? palette.robotLate
+        : palette.robot;
+  const length = Math.max(ROBOT_PX, (robot.model.wheelbase_m + 2 * robot.model.wheel_radius_m) * camera.scale);
+  const width = Math.max(ROBOT_PX * 0.8, robot.model.track_width_m * camera.scale);
+  context.save();
+  context.translate(x, y);
+  if (isSelected || scene.unconfirmed.has(robot.id)) {
+    context.beginPath();
+    context.arc(0, 0, Math.hypot(length, width) / 2 + 5, 0, 2 * Math.PI);
+    context.lineWidth = scene.unconfirmed.has(robot.id) ? 4 : 2;
+    context.strokeStyle = scene.unconfirmed.has(robot.id) ? palette.stopped : palette.selected;
+    context.stroke();
+  }
+  context.rotate(-pose.heading_rad);
+  context.beginPath();
+  context.roundRect(-length / 2, -width / 2, length, width, 3);
+  context.lineWidth = 2;
+  context.strokeStyle = colour;
+  if (isLost) {
+    // Its last known place: an empty, dashed outline.
+    context.setLineDash([3, 3]);
+    context.fillStyle = palette.halo;
+  } else {
+    context.fillStyle = colour;
+  }
+  context.fill();
+  context.stroke();
+  context.setLineDash([]);
+  context.beginPath();
+  context.moveTo(length * 0.36, 0);
+  context.lineTo(-length * 0.12, width * 0.3);
+  context.lineTo(-length * 0.12, -width * 0.3);
+  context.closePath();
+  context.fillStyle = isLost ? colour : palette.halo;
+  context.fill();
+  context.restore();
+  if (!withLabel && !isSelected) return;
+  const age = tracked.ageS(scene.now);
+  const note = isLost && age !== null ? ` · ${words.robots.lastKnown}, ${words.robots.age(span(age))}` : '';
+  const late = robot.link === 'stale' ? ` · ${words.link.stale}` : '';
+  label(context, `${robot.name}${late}${note}`, x + length / 2 + 7, y - 6, colour, palette);
+}
+
+function drawDraft(context: CanvasRenderingContext2D, camera: Camera, draft: Draft, palette: Palette): void {
+  context.strokeStyle = palette.draft;
+  context.fillStyle = palette.draftFill;
+  context.lineWidth = 2;
+  if (draft.kind === 'circle') {
+    if (!draft.center) return;
+    const { x, y } = camera.toPx(draft.center);
+    context.beginPath();
+    context.arc(x, y, draft.radius_m * camera.scale, 0, 2 * Math.PI);
+    context.fill();
+    context.stroke();
+    context.beginPath();
+    context.moveTo(x - 5, y);
+    context.lineTo(x + 5, y);
+    context.moveTo(x, y - 5);
+    context.lineTo(x, y + 5);
+    context.stroke();
+    return;
+  }
+  trace(context, camera, draft.points);
+  if (draft.kind === 'terrain') {
+    context.closePath();
+    context.fill();
+  }
+  context.stroke();
+  context.font = '11px system-ui, sans-serif';
+  context.textAlign = 'center';
+  draft.points.forEach((point, index) => {
+    const { x, y } = camera.toPx(point);
+    context.beginPath();
+    context.arc(x, y, 6, 0, 2 * Math.PI);
+    context.fillStyle = palette.draft;
+    context.fill();
+    label(context, String(index + 1), x, y - 10, palette.draft, palette);
+  });
+}
+
+function drawCross(context: CanvasRenderingContext2D, camera: Camera, palette: Palette): void {
+  const x = Math.round(camera.width / 2) + 0.5;
+  const y = Math.round(camera.height / 2) + 0.5;
+  context.beginPath();
+  context.moveTo(x - 12, y);
+  context.lineTo(x + 12, y);
+  context.moveTo(x, y - 12);
+  context.lineTo(x, y + 12);
+  context.lineWidth = 1;
+  context.strokeStyle = palette.text;
+  context.stroke();
+}
+
+function drawScale(context: CanvasRenderingContext2D, camera: Camera, palette: Palette): void {
+  const length = roundUp(SCALE_BAR_PX / camera.scale);
+  const width = length * camera.scale;
+  const [x, y] = [14, camera.height - 14];
+  context.beginPath();
+  context.moveTo(x, y - 6);
+  context.lineTo(x, y);
+  context.lineTo(x + width, y);
+  context.lineTo(x + width, y - 6);
+  context.lineWidth = 2;
+  context.strokeStyle = palette.text;
+  context.stroke();
+  context.font = '12px system-ui, sans-serif';
+  context.textAlign = 'center';
+  const text = length >= 1 ? `${length} m` : length >= 0.01 ? `${Math.round(length * 100)} cm` : `${length * 1000} mm`;
+  label(context, text, x + width / 2, y - 8, palette.text, palette);
+}

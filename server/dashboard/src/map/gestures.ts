@@ -1,0 +1,162 @@
+// Pointers on the map: one finger or the mouse draws or moves, two fingers zoom, the wheel zooms.
+import type { Camera, PointPx } from './camera';
+import type { Draft } from './draft';
+
+/** A press that moves less than this is a click, pixels. */
+const CLICK_PX = 5;
+/** How near a point must be to be taken, pixels; fingers are wider than this says. */
+const REACH_PX = 14;
+/** Factor of one step of the wheel, per pixel. */
+const WHEEL_FACTOR = 0.0015;
+
+export interface Hands {
+  draft(): Draft | null;
+  changed(): void;
+  /** The camera moved. */
+  moved(): void;
+  /** A click where nothing is drawn. */
+  clicked(at: PointPx): void;
+  /** The pointer is here; null when it left. */
+  over(at: PointPx | null): void;
+}
+
+type Grip =
+  | { what: 'press'; from: PointPx; at: PointPx }
+  | { what: 'pan'; at: PointPx }
+  | { what: 'point'; index: number }
+  | { what: 'circle'; from: PointPx };
+
+/** Lets hands work on a canvas; gives what ends it. */
+export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands): () => void {
+  const pointers = new Map<number, PointPx>();
+  let grip: Grip | null = null;
+
+  const place = (event: MouseEvent): PointPx => {
+    const box = canvas.getBoundingClientRect();
+    return { x: event.clientX - box.left, y: event.clientY - box.top };
+  };
+
+  const down = (event: PointerEvent) => {
+    if (event.button !== 0) return;
+    const at = place(event);
+    canvas.setPointerCapture(event.pointerId);
+    pointers.set(event.pointerId, at);
+    if (pointers.size > 1) {
+      grip = null;
+      return;
+    }
+    const draft = hands.draft();
+    const near = draft && draft.kind !== 'circle' ? draft.nearest(camera.toM(at), REACH_PX / camera.scale) : null;
+    if (draft && near !== null) {
+      draft.mark();
+      grip = { what: 'point', index: near };
+    } else if (draft?.kind === 'circle') {
+      grip = { what: 'circle', from: at };
+    } else {
+      grip = { what: 'press', from: at, at };
+    }
+  };
+
+  const move = (event: PointerEvent) => {
+    const at = place(event);
+    hands.over(at);
+    const before = pointers.get(event.pointerId);
+    if (!before) return;
+    pointers.set(event.pointerId, at);
+    if (pointers.size === 2) {
+      pinch(event.pointerId, before, at);
+      return;
+    }
+    const draft = hands.draft();
+    if (grip?.what === 'press' && distance(grip.from, at) > CLICK_PX) grip = { what: 'pan', at: grip.from };
+    if (grip?.what === 'pan') {
+      camera.pan(at.x - grip.at.x, at.y - grip.at.y);
+      grip.at = at;
+      hands.moved();
+    } else if (grip?.what === 'point' && draft) {
+      draft.move(grip.index, camera.toM(at));
+      hands.changed();
+    } else if (grip?.what === 'circle' && draft && distance(grip.from, at) > CLICK_PX) {
+      drawCircle(draft, grip.from, at);
+    }
+  };
+
+  let isDrawing = false;
+  const drawCircle = (draft: Draft, from: PointPx, to: PointPx) => {
+    if (!isDrawing) draft.mark();
+    isDrawing = true;
+    draft.setCircle(camera.toM(from), distance(from, to) / camera.scale);
+    hands.changed();
+  };
+
+  const pinch = (moved: number, before: PointPx, at: PointPx) => {
+    const other = [...pointers.entries()].find(([id]) => id !== moved)?.[1];
+    if (!other) return;
+    const was = distance(before, other);
+    const is = distance(at, other);
+    camera.pan((at.x - before.x) / 2, (at.y - before.y) / 2);
+    if (was > 1 && is > 1) camera.zoom(is / was, { x: (at.x + other.x) / 2, y: (at.y + other.y) / 2 });
+    hands.moved();
+  };
+
+  const up = (event: PointerEvent) => {
+    const held = grip;
+    pointers.delete(event.pointerId);
+    isDrawing = false;
+    grip = null;
+    if (held?.what !== 'press') return;
+    const draft = hands.draft();
+    if (draft && draft.kind !== 'circle') {
+      draft.add(camera.toM(held.from));
+      hands.changed();
+    } else {
+      hands.clicked(held.from);
+    }
+  };
+
+  const cancel = (event: PointerEvent) => {
+    pointers.delete(event.pointerId);
+    isDrawing = false;
+    grip = null;
+  };
+
+  const wheel = (event: WheelEvent) => {
+    event.preventDefault();
+    const lines = event.deltaMode === WheelEvent.DOM_DELTA_LINE ? 16 : 1;
+    camera.zoom(Math.exp(-event.deltaY * lines * WHEEL_FACTOR), place(event));
+    hands.moved();
+  };
+
+  const menu = (event: MouseEvent) => {
+    const draft = hands.draft();
+    if (!draft) return;
+    event.preventDefault();
+    const near = draft.nearest(camera.toM(place(event)), REACH_PX / camera.scale);
+    if (near === null || draft.kind === 'circle') return;
+    draft.remove(near);
+    hands.changed();
+  };
+
+  const leave = () => hands.over(null);
+
+  canvas.addEventListener('pointerdown', down);
+  canvas.addEventListener('pointermove', move);
+  canvas.addEventListener('pointerup', up);
+  canvas.addEventListener('pointercancel', cancel);
+  canvas.addEventListener('pointerleave', leave);
+  canvas.addEventListener('wheel', wheel, { passive: false });
+  canvas.addEventListener('contextmenu', menu);
+  return () => {
+    canvas.removeEventListener('pointerdown', down);
+    canvas.removeEventListener('pointermove', move);
+    canvas.removeEventListener('pointerup', up);
+    canvas.removeEventListener('pointercancel', cancel);
+    canvas.removeEventListener('pointerleave', leave);
+    canvas.removeEventListener('wheel', wheel);
+    canvas.removeEventListener('contextmenu', menu);
+  };
+}
+
+function distance(a: PointPx, b: PointPx): number {
+  return Math.hypot(a.x - b.x, a.y - b.y);
+}

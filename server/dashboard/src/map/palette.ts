@@ -1,0 +1,91 @@
+// Colours of the map, for light and dark.
+import type { TerrainClass } from '../api/schema';
+import type { Theme } from '../state/session.svelte';
+
+export interface Palette {
+  ground: string;
+  grid: string;
+  gridStrong: string;
+  text: string;
+  halo: string;
+  robot: string;
+  robotLate: string;
+  robotLost: string;
+  stopped: string;
+  selected: string;
+  trail: string;
+  planned: string;
+  driven: string;
+  fence: string;
+  fenceOut: string;
+  draft: string;
+  draftFill: string;
+}
+
+export const PALETTES: Record<Theme, Palette> = {
+  light: {
+    ground: '#f4f5f2',
+    grid: '#e2e4de',
+    gridStrong: '#c3c7bd',
+    text: '#1b2328',
+    halo: '#f4f5f2',
+    robot: '#0b5fa5',
+    robotLate: '#8a5a00',
+    robotLost: '#5d666b',
+    stopped: '#b3121d',
+    selected: '#111111',
+    trail: '#0b5fa5',
+    planned: '#7a2e9d',
+    driven: '#0b5fa5',
+    fence: '#1a7f37',
+    fenceOut: '#b3121d',
+    draft: '#c2410c',
+    draftFill: 'rgba(194, 65, 12, 0.12)',
+  },
+  dark: {
+    ground: '#14191d',
+    grid: '#1f262b',
+    gridStrong: '#344049',
+    text: '#e6ebee',
+    halo: '#14191d',
+    robot: '#6cb6f5',
+    robotLate: '#e0a93b',
+    robotLost: '#93a0a8',
+    stopped: '#ff6b6b',
+    selected: '#ffffff',
+    trail: '#6cb6f5',
+    planned: '#d59bf6',
+    driven: '#6cb6f5',
+    fence: '#56d37c',
+    fenceOut: '#ff6b6b',
+    draft: '#ff9d5c',
+    draftFill: 'rgba(255, 157, 92, 0.15)',
+  },
+};
+
+/** Hue and saturation of each kind of ground. */
+const GROUNDS: Record<TerrainClass, [number, number]> = {
+  asphalt: [220, 6],
+  concrete: [200, 10],
+  paving: [15, 18],
+  gravel: [35, 14],
+  soil: [25, 42],
+  grass: [105, 38],
+  sand: [48, 58],
+  mud: [20, 30],
+  snow: [200, 45],
+  ice: [188, 60],
+  wood: [30, 50],
+  metal: [215, 22],
+  other: [290, 12],
+};
+
+export function groundFill(kind: TerrainClass, theme: Theme): string {
+  const [hue, saturation] = GROUNDS[kind];
+  return theme === 'dark' ? `hsl(${hue} ${saturation}% 30% / 0.5)` : `hsl(${hue} ${saturation}% 62% / 0.45)`;
+}
+
+export function groundLine(kind: TerrainClass, theme: Theme): string {
+  const [hue, saturation] = GROUNDS[kind];
+  return theme === 'dark' ? `hsl(${hue} ${saturation}% 55%)` : `hsl(${hue} ${saturation}% 38%)`;
+}

@@ -1,0 +1,201 @@
+// What is drawn at the moment and for which purpose; kept whatever happens to server or sign-in.
+import type { CreateMission, Mission, Terrain, TerrainClass, Trajectory, TrajectoryCheck } from '../api/schema';
+import { ask, sentence } from '../api/client';
+import { Draft, type DraftKind } from '../map/draft';
+import type { Fleet } from './fleet.svelte';
+
+/** Wait after a change before the dry run is asked for, milliseconds. */
+const CHECK_WAIT_MS = 350;
+
+export type Purpose =
+  | { what: 'mission' }
+  | { what: 'replace'; mission: Mission }
+  | { what: 'terrain'; terrain: Terrain | null };
+
+export class Editor {
+  purpose = $state.raw<Purpose | null>(null);
+  draft = $state.raw<Draft | null>(null);
+  /** Grows with each change of the draft. */
+  version = $state(0);
+
+  robot = $state('');
+  speed_m_s = $state(0.5);
+  turns = $state(1);
+  clockwise = $state(false);
+  excite = $state(false);
+  priority = $state(0);
+  startPolicy = $state<'append' | 'replace' | 'refuse'>('append');
+  linkPolicy = $state<'continue' | 'stop_after'>('continue');
+
+  terrainId = $state('');
+  terrainName = $state('');
+  terrainClass = $state<TerrainClass>('grass');
+  terrainLayer = $state(0);
+
+  check = $state.raw<TrajectoryCheck | null>(null);
+  checkProblem = $state<string | null>(null);
+  isChecking = $state(false);
+  sendProblem = $state<string | null>(null);
+  isSending = $state(false);
+  /** Said after a success. */
+  said = $state<string | null>(null);
+
+  #due: ReturnType<typeof setTimeout> | undefined;
+  #asked = 0;
+  /** Names what is sent, so that sending it twice makes one mission. */
+  #key = '';
+
+  constructor(readonly fleet: Fleet) {}
+
+  beginMission(robot: string): void {
+    this.robot = robot;
+    this.#begin({ what: 'mission' }, new Draft('circle'));
+  }
+
+  beginReplace(mission: Mission): void {
+    this.robot = mission.robot;
+    this.#begin({ what: 'replace', mission }, new Draft('circle'));
+  }
+
+  beginTerrain(terrain: Terrain | null): void {
+    this.terrainId = terrain?.id ?? '';
+    this.terrainName = terrain?.name ?? '';
+    this.terrainClass = terrain?.class ?? 'grass';
+    this.terrainLayer = terrain?.layer ?? 0;
+    this.#begin({ what: 'terrain', terrain }, new Draft('terrain', terrain?.polygon));
+  }
+
+  #begin(purpose: Purpose, draft: Draft): void {
+    this.purpose = purpose;
+    this.draft = draft;
+    this.said = null;
+    this.sendProblem = null;
+    this.changed();
+  }
+
+  setKind(kind: DraftKind): void {
+    if (this.draft?.kind === kind) return;
+    this.draft = new Draft(kind);
+    this.changed();
+  }
+
+  /** Says that draft or form are no longer what they were. */
+  changed(): void {
+    this.version += 1;
+    this.fleet.isDirty = true;
+    this.#key = '';
+    this.check = null;
+    this.checkProblem = null;
+    this.#asked += 1;
+    this.isChecking = false;
+    clearTimeout(this.#due);
+    if (this.purpose && this.purpose.what !== 'terrain' && this.draft?.isWhole && this.robot) {
+      this.isChecking = true;
+      this.#due = setTimeout(() => void this.#dryRun(), CHECK_WAIT_MS);
+    }
+  }
+
+  putAway(): void {
+    clearTimeout(this.#due);
+    this.purpose = null;
+    this.draft = null;
+    this.check = null;
+    this.checkProblem = null;
+    this.sendProblem = null;
+    this.fleet.isDirty = true;
+  }
+
+  get trajectory(): Trajectory | null {
+    const { draft } = this;
+    if (!draft?.isWhole) return null;
+    const options = this.excite ? { options: { excitation: { depth_ratio: 0.5, period_s: 3 } } } : {};
+    if (draft.kind === 'circle' && draft.center) {
+      return {
+        circle: {
+          center: draft.center,
+          radius_m: draft.radius_m,
+          speed_m_s: this.speed_m_s,
+          direction: this.clockwise ? 'clockwise' : 'counter_clockwise',
+          turns: this.turns,
+          ...options,
+        },
+      } as Trajectory;
+    }
+    return { waypoints: { points: draft.points, speed_m_s: this.speed_m_s, ...options } } as Trajectory;
+  }
+
+  async #dryRun(): Promise<void> {
+    const { trajectory } = this;
+    const site = this.fleet.site;
+    if (!trajectory || !site) return;
+    const mine = (this.#asked += 1);
+    try {
+      const check = await ask<TrajectoryCheck>('/v1/trajectories/check', {
+        method: 'POST',
+        body: { site, robot: this.robot, trajectory },
+      });
+      if (mine === this.#asked) this.check = check;
+    } catch (error) {
+      if (mine === this.#asked) this.checkProblem = sentence(error);
+    }
+    if (mine === this.#asked) this.isChecking = false;
+  }
+
+  /** Sends a mission, or what replaces one; true when the server has it. */
+  async sendMission(): Promise<boolean> {
+    const { trajectory, purpose } = this;
+    const site = this.fleet.site;
+    if (!trajectory || !site || !purpose || purpose.what === 'terrain') return false;
+    if (purpose.what === 'replace') {
+      return this.#send(`/v1/missions/${purpose.mission.id}/replace`, 'POST', { trajectory });
+    }
+    const link = this.linkPolicy === 'continue' ? 'continue' : { stop_after: { silence_s: 5 } };
+    const body = {
+      site,
+      robot: this.robot,
+      trajectory,
+      priority: this.priority,
+      start_policy: this.startPolicy,
+      link_policy: link,
+    } as CreateMission;
+    this.#key ||= crypto.randomUUID();
+    return this.#send('/v1/missions', 'POST', body, { 'idempotency-key': this.#key });
+  }
+
+  async saveTerrain(): Promise<boolean> {
+    const { purpose, draft } = this;
+    const site = this.fleet.site;
+    if (purpose?.what !== 'terrain' || !draft || !site) return false;
+    const shape = {
+      class: this.terrainClass,
+      layer: this.terrainLayer,
+      name: this.terrainName || this.terrainId,
+      polygon: draft.points,
+    };
+    const at = `/v1/sites/${site}/terrains`;
+    const done = purpose.terrain
+      ? await this.#send(`${at}/${purpose.terrain.id}`, 'PUT', shape)
+      : await this.#send(at, 'POST', { id: this.terrainId, ...shape });
+    if (done) void this.fleet.readGround();
+    return done;
+  }
+
+  async #send(
+    path: string,
+    method: 'POST' | 'PUT',
+    body: unknown,
+    headers: Record<string, string> = {},
+  ): Promise<boolean> {
+    this.isSending = true;
+    this.sendProblem = null;
+    try {
+      await ask(path, { method, body, headers });
+      return true;
+    } catch (error) {
+      this.sendProblem = sentence(error);
+      return false;
+    } finally {
+      this.isSending = false;
+    }
+  }
+}

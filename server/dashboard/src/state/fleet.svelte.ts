@@ -1,0 +1,228 @@
+// Everything that the page knows of one site, kept by the stream of events.
+import { SvelteMap } from 'svelte/reactivity';
+import type { Alert, Geofence, Mission, MissionStep, Robot, Site, Terrain, TerrainFriction } from '../api/schema';
+import { ask, list, sentence } from '../api/client';
+import { Stream, type Listener } from '../api/stream';
+import { signedIn } from './session.svelte';
+import { Stops } from './stops.svelte';
+import { Tracked } from './tracked';
+
+/** Time between two changes of the lists on the page, milliseconds; the map does not wait. */
+const LISTS_MS = 200;
+/** Terrains and sites that are read at most. */
+const LIST_MAX = 5_000;
+/** Ended missions that are kept for the history. */
+const ENDED_MAX = 1_000;
+/** Time between two looks at terrains and fences, which no event tells of, milliseconds. */
+const GROUND_MS = 10_000;
+const SITE_KEY = 'tread-site';
+
+/** A robot as lists show it. */
+export interface RobotView {
+  id: string;
+  robot: Robot;
+  receivedAt: number;
+}
+
+const TERMINAL = new Set(['succeeded', 'failed', 'cancelled', 'rejected', 'expired']);
+
+export function hasEnded(mission: Mission): boolean {
+  return TERMINAL.has(mission.state);
+}
+
+export class Fleet implements Listener {
+  sites = $state.raw<Site[]>([]);
+  site = $state<string | null>(null);
+  isLive = $state(false);
+  /** When the stream was lost, wall time; null while it lives or was never there. */
+  lostAt = $state<number | null>(null);
+  problem = $state<string | null>(null);
+  /** A monotonic clock for ages, milliseconds, twice a second. */
+  now = $state(performance.now());
+  selected = $state<string | null>(null);
+
+  robots = $state.raw<RobotView[]>([]);
+  terrains = $state.raw<Terrain[]>([]);
+  terrainFriction = $state.raw<TerrainFriction[]>([]);
+  fence = $state.raw<Geofence | null>(null);
+  readonly missions = new SvelteMap<string, Mission>();
+  readonly alerts = new SvelteMap<string, Alert>();
+  readonly stops = new Stops(() => this.site);
+
+  /** For the map, which draws it afresh each time: not reactive. */
+  readonly tracked = new Map<string, Tracked>();
+  /** Set when something on the map may look different. */
+  isDirty = true;
+  /** Steps of missions, for whoever shows a history. */
+  lastStep = $state.raw<MissionStep | null>(null);
+
+  #stream: Stream | null = null;
+  #timers: ReturnType<typeof setInterval>[] = [];
+  #listsDue: ReturnType<typeof setTimeout> | undefined;
+  #seen: Set<string> | null = null;
+
+  readonly openMissions = $derived(
+    [...this.missions.values()]
+      .filter((mission) => !hasEnded(mission))
+      .sort((a, b) => rank(a) - rank(b) || b.priority - a.priority || (a.id < b.id ? -1 : 1)),
+  );
+  readonly endedMissions = $derived(
+    [...this.missions.values()].filter(hasEnded).sort((a, b) => ((a.ended_at ?? '') < (b.ended_at ?? '') ? 1 : -1)),
+  );
+  readonly standingAlerts = $derived(
+    [...this.alerts.values()].filter((alert) => !alert.cleared_at).sort((a, b) => (a.raised_at < b.raised_at ? 1 : -1)),
+  );
+
+  get selectedRobot(): Robot | null {
+    return this.robots.find((view) => view.id === this.selected)?.robot ?? null;
+  }
+
+  async start(): Promise<void> {
+    this.#timers.push(setInterval(() => (this.now = performance.now()), 500));
+    this.#timers.push(setInterval(() => void this.readGround(), GROUND_MS));
+    await this.readSites();
+  }
+
+  async readSites(): Promise<void> {
+    try {
+      this.sites = (await list<Site>('/v1/sites', LIST_MAX)).items;
+      this.problem = null;
+    } catch (error) {
+      this.problem = sentence(error);
+      return;
+    }
+    const kept = localStorage.getItem(SITE_KEY);
+    const first = this.sites.find((site) => site.id === kept) ?? this.sites[0];
+    if (first && !this.site) this.choose(first.id);
+  }
+
+  choose(site: string): void {
+    this.#stream?.close();
+    localStorage.setItem(SITE_KEY, site);
+    this.site = site;
+    this.selected = null;
+    this.tracked.clear();
+    this.missions.clear();
+    this.alerts.clear();
+    this.robots = [];
+    this.terrains = [];
+    this.terrainFriction = [];
+    this.fence = null;
+    this.stops.forget();
+    this.isDirty = true;
+    this.#stream = new Stream(site, this);
+    void this.readGround();
+    void this.stops.read();
+  }
+
+  end(): void {
+    this.#stream?.close();
+    this.#stream = null;
+    for (const timer of this.#timers) clearInterval(timer);
+    clearTimeout(this.#listsDue);
+    this.#timers = [];
+    this.stops.end();
+  }
+
+  /** Terrains, their friction and the geofence. */
+  async readGround(): Promise<void> {
+    const { site } = this;
+    if (!site || document.hidden) return;
+    const at = `/v1/sites/${site}`;
+    try {
+      const [terrains, friction, fence] = await Promise.all([
+        list<Terrain>(`${at}/terrains`, LIST_MAX),
+        list<TerrainFriction>(`${at}/friction/terrains`, LIST_MAX),
+        ask<Geofence>(`${at}/geofence`),
+      ]);
+      if (this.site !== site) return;
+      this.terrains = terrains.items;
+      this.terrainFriction = friction.items;
+      this.fence = fence;
+      this.isDirty = true;
+    } catch {
+      // The stream says already that the server is lost.
+    }
+  }
+
+  /** The site's square, metres. */
+  get cellM(): number {
+    return this.sites.find((site) => site.id === this.site)?.grid.cell_m ?? 1;
+  }
+
+  // The stream's part.
+
+  begin(): void {
+    this.#seen = new Set();
+  }
+
+  whole(): void {
+    const seen = this.#seen;
+    if (!seen) return;
+    for (const id of this.tracked.keys()) if (!seen.has(`r${id}`)) this.tracked.delete(id);
+    for (const id of this.missions.keys()) if (!seen.has(`m${id}`)) this.missions.delete(id);
+    for (const id of this.alerts.keys()) if (!seen.has(`a${id}`)) this.alerts.delete(id);
+    this.#seen = null;
+    this.#listsSoon();
+    void this.stops.read();
+    void this.readGround();
+  }
+
+  robot(robot: Robot): void {
+    this.#seen?.add(`r${robot.id}`);
+    const now = performance.now();
+    const known = this.tracked.get(robot.id);
+    if (robot.retired_at) this.tracked.delete(robot.id);
+    else if (known) known.update(robot, now);
+    else this.tracked.set(robot.id, new Tracked(robot, now));
+    this.stops.heard(robot);
+    this.isDirty = true;
+    this.#listsSoon();
+  }
+
+  mission(mission: Mission): void {
+    this.#seen?.add(`m${mission.id}`);
+    this.missions.set(mission.id, mission);
+    this.isDirty = true;
+    if (this.missions.size > ENDED_MAX * 2) {
+      for (const old of this.endedMissions.slice(ENDED_MAX)) this.missions.delete(old.id);
+    }
+  }
+
+  step(step: MissionStep): void {
+    this.lastStep = step;
+  }
+
+  alert(alert: Alert): void {
+    this.#seen?.add(`a${alert.id}`);
+    if (alert.cleared_at) this.alerts.delete(alert.id);
+    else this.alerts.set(alert.id, alert);
+    if (alert.code.startsWith('stop')) void this.stops.read();
+  }
+
+  link(isLive: boolean): void {
+    if (isLive === this.isLive) return;
+    this.isLive = isLive;
+    this.lostAt = isLive ? null : Date.now();
+    this.isDirty = true;
+    if (isLive && this.sites.length === 0) void this.readSites();
+  }
+
+  signedOut(): void {
+    signedIn.end();
+  }
+
+  #listsSoon(): void {
+    this.#listsDue ??= setTimeout(() => {
+      this.#listsDue = undefined;
+      this.robots = [...this.tracked.values()]
+        .map((tracked) => ({ id: tracked.robot.id, robot: tracked.robot, receivedAt: tracked.receivedAt }))
+        .sort((a, b) => a.id.localeCompare(b.id, 'en', { numeric: true }));
+    }, LISTS_MS);
+  }
+}
+
+/** Missions in hand before those that wait. */
+function rank(mission: Mission): number {
+  return mission.state === 'queued' ? 1 : 0;
+}

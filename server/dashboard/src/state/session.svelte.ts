@@ -1,0 +1,100 @@
+// Who is signed in, and how the page looks to them.
+import type { Role, Session } from '../api/schema';
+import { Problem, ask, sentence, whenSignedOut } from '../api/client';
+
+const ROLES: Role[] = ['viewer', 'operator', 'admin'];
+const THEME_KEY = 'tread-theme';
+/** Kept while this browser should have a session, so that others are not asked in vain. */
+const SESSION_KEY = 'tread-session';
+
+export type Theme = 'light' | 'dark';
+
+class SignedIn {
+  session = $state<Session | null>(null);
+  /** Whether the server was asked already. */
+  isKnown = $state(false);
+  /** Somebody was signed in on this page and no longer is. */
+  hasEnded = $state(false);
+  problem = $state<string | null>(null);
+
+  constructor() {
+    whenSignedOut(() => this.end());
+  }
+
+  may(role: Role): boolean {
+    return this.session !== null && ROLES.indexOf(this.session.role) >= ROLES.indexOf(role);
+  }
+
+  get name(): string {
+    return this.session?.name ?? '';
+  }
+
+  /** Asks whether this browser has a session. */
+  async look(): Promise<void> {
+    this.problem = null;
+    if (localStorage.getItem(SESSION_KEY)) {
+      try {
+        this.session = await ask<Session>('/v1/session');
+      } catch (error) {
+        if (error instanceof Problem && error.status === 401) this.hasEnded = true;
+        else this.problem = sentence(error);
+      }
+    }
+    this.isKnown = true;
+  }
+
+  async signIn(token: string): Promise<void> {
+    this.problem = null;
+    try {
+      this.session = await ask<Session>('/v1/session', { method: 'POST', body: { token } });
+      this.hasEnded = false;
+      localStorage.setItem(SESSION_KEY, 'yes');
+    } catch (error) {
+      this.problem = sentence(error);
+    }
+  }
+
+  async signOut(): Promise<void> {
+    try {
+      await ask('/v1/session', { method: 'DELETE' });
+      localStorage.removeItem(SESSION_KEY);
+      this.session = null;
+    } catch (error) {
+      this.problem = sentence(error);
+    }
+  }
+
+  end(): void {
+    if (this.session) this.hasEnded = true;
+    localStorage.removeItem(SESSION_KEY);
+    this.session = null;
+  }
+}
+
+class Look {
+  #system = matchMedia('(prefers-color-scheme: dark)');
+  #wanted = $state<Theme | null>(localStorage.getItem(THEME_KEY) as Theme | null);
+  #isDark = $state(this.#system.matches);
+
+  constructor() {
+    this.#system.addEventListener('change', (event) => (this.#isDark = event.matches));
+    this.#apply();
+  }
+
+  get theme(): Theme {
+    return this.#wanted ?? (this.#isDark ? 'dark' : 'light');
+  }
+
+  toggle(): void {
+    this.#wanted = this.theme === 'dark' ? 'light' : 'dark';
+    localStorage.setItem(THEME_KEY, this.#wanted);
+    this.#apply();
+  }
+
+  #apply(): void {
+    if (this.#wanted) document.documentElement.dataset['theme'] = this.#wanted;
+  }
+}
+
+export const signedIn = new SignedIn();
+export const look = new Look();

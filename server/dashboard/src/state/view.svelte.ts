@@ -1,0 +1,105 @@
+// What is shown: tabs, layers of the map, the mission that is looked at.
+import type { CellFriction, MissionDetail } from '../api/schema';
+import { ask, list, sentence } from '../api/client';
+import { Layer, type Quantity } from '../map/friction';
+import type { PointM } from '../map/camera';
+import type { Fleet } from './fleet.svelte';
+
+export type Tab = 'robots' | 'missions' | 'alerts' | 'terrains';
+
+/** Time between two looks at the friction map while it is shown, milliseconds. */
+const FRICTION_MS = 10_000;
+/** Entries of the friction map that the page reads; the API gives them in pages of 1000. */
+const CELLS_MAX = 20_000;
+
+export class View {
+  tab = $state<Tab>('robots');
+  showTerrains = $state(true);
+  showFence = $state(true);
+  showTrails = $state(true);
+  quantity = $state<Quantity | null>(null);
+  configuration = $state<string | null>(null);
+  /** Robot models that the friction map knows. */
+  configurations = $state.raw<string[]>([]);
+  layer = $state.raw<Layer | null>(null);
+  frictionProblem = $state<string | null>(null);
+  isReading = $state(false);
+  isWhole = $state(true);
+  detail = $state.raw<MissionDetail | null>(null);
+  detailProblem = $state<string | null>(null);
+  /** A wish to the map: to show this, counted so that the same can be wished again. */
+  wanted = $state.raw<{ points: PointM[] } | null>(null);
+
+  #cells: CellFriction[] = [];
+  #timer: ReturnType<typeof setInterval> | undefined;
+
+  constructor(readonly fleet: Fleet) {}
+
+  choose(quantity: Quantity | null): void {
+    this.quantity = quantity;
+    clearInterval(this.#timer);
+    if (quantity === null) {
+      this.layer = null;
+      this.fleet.isDirty = true;
+      return;
+    }
+    this.paint();
+    void this.readFriction();
+    this.#timer = setInterval(() => void this.readFriction(), FRICTION_MS);
+  }
+
+  async readFriction(): Promise<void> {
+    const { site } = this.fleet;
+    if (!site || this.isReading || document.hidden || this.quantity === null) return;
+    this.isReading = true;
+    try {
+      const read = await list<CellFriction>(`/v1/sites/${site}/friction/cells`, CELLS_MAX);
+      this.#cells = read.items;
+      this.isWhole = read.isWhole;
+      this.configurations = [...new Set(read.items.map((cell) => cell.configuration))].sort();
+      if (!this.configuration || !this.configurations.includes(this.configuration)) {
+        this.configuration = this.configurations[0] ?? null;
+      }
+      this.frictionProblem = null;
+      this.paint();
+    } catch (error) {
+      this.frictionProblem = sentence(error);
+    }
+    this.isReading = false;
+  }
+
+  paint(): void {
+    if (this.quantity === null) return;
+    this.layer = new Layer(this.#cells, this.configuration, this.fleet.cellM, this.quantity, Date.now());
+    this.fleet.isDirty = true;
+  }
+
+  /** The name of a robot model, from whichever robot has it. */
+  modelName(configuration: string): string {
+    const robot = this.fleet.robots.find((view) => view.robot.configuration === configuration)?.robot;
+    return robot ? `${robot.model.name}, ${robot.model.tyres}` : configuration.slice(0, 8);
+  }
+
+  async open(mission: string): Promise<void> {
+    try {
+      this.detail = await ask<MissionDetail>(`/v1/missions/${mission}`);
+      this.detailProblem = null;
+    } catch (error) {
+      this.detailProblem = sentence(error);
+    }
+    this.fleet.isDirty = true;
+  }
+
+  close(): void {
+    this.detail = null;
+    this.fleet.isDirty = true;
+  }
+
+  show(points: PointM[]): void {
+    this.wanted = { points };
+  }
+
+  end(): void {
+    clearInterval(this.#timer);
+  }
+}

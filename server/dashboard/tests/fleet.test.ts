@@ -1,0 +1,102 @@
+// What whoever comes first sees: signing in, motion, the friction map, and a viewer's page.
+import { expect, test } from 'vitest';
+import type { CellFriction, CreatedToken, Page as ApiPage } from './types';
+import { api, browser, eventually, map, select, server, shot, token, windowOf } from './harness';
+
+const { open } = browser();
+
+test('a stranger sees the sign-in and nothing else', async () => {
+  const page = await open({ as: null });
+  await page.getByLabel('Token').waitFor();
+  expect(await page.getByRole('button').allInnerTexts()).toEqual(['Sign in']);
+  await shot(page, 'sign-in');
+});
+
+test('a wrong token is refused in one sentence, and stays to be mended', async () => {
+  const page = await open({ as: null, expected: /401/ });
+  await page.getByLabel('Token').fill('tread_a_wrong');
+  await page.getByRole('button', { name: 'Sign in' }).click();
+  await page.getByRole('alert').waitFor();
+  expect(await page.getByLabel('Token').inputValue()).toBe('tread_a_wrong');
+});
+
+test('robots are seen moving', async () => {
+  const page = await open();
+  await select(page, 'rover-1');
+  const position = () => page.locator('dt:has-text("Position") + dd').innerText();
+  const before = await position();
+  const box = await map(page);
+  const look = () => page.screenshot({ clip: { x: box.x, y: box.y, width: box.width, height: box.height - 60 } });
+  const picture = await look();
+  await eventually('another position', async () => (await position()) !== before);
+  await eventually('another picture', async () => !(await look()).equals(picture));
+  await shot(page, 'robot');
+});
+
+test('the page is there again after a reload, without another sign-in', async () => {
+  const page = await open();
+  await page.reload();
+  await page.locator('button[data-robot]').first().waitFor();
+});
+
+test('the friction layer says what the API says, at three places', async () => {
+  const cells = await eventually('three measured cells', async () => {
+    const { items } = await api<ApiPage<CellFriction>>('/v1/sites/yard/friction/cells?limit=1000');
+    return items.length >= 3 && items;
+  });
+  const page = await open();
+  await page.getByRole('combobox', { name: 'Friction' }).selectOption('theta');
+  const place = await windowOf(page);
+  const box = await map(page);
+  let compared = 0;
+  for (const { cell } of cells) {
+    const { x, y } = place(cell.ix + 0.5, cell.iy + 0.5);
+    // What lies under the box of layers cannot be pointed at.
+    if (x > box.x + box.width - 260 || compared === 3) continue;
+    await eventually('the value of the API', async () => {
+      const { items } = await api<ApiPage<CellFriction>>('/v1/sites/yard/friction/cells?limit=1000');
+      const here = items.filter((other) => other.cell.ix === cell.ix && other.cell.iy === cell.iy);
+      const most = here.sort((a, b) => b.friction.segments - a.friction.segments)[0];
+      await page.mouse.move(x + 1, y);
+      await page.mouse.move(x, y);
+      const said = await page.locator('[data-test="value"]').innerText();
+      const found = /θ = 1\/K ([\d.]+) ± ([\d.]+), (\d+) robots, (\d+) measurements/.exec(said);
+      if (!most || !found) return false;
+      const near = (text: string | undefined, value: number) => Math.abs(Number(text) - value) <= 0.006 * value;
+      return (
+        near(found[1], most.friction.theta) &&
+        near(found[2], most.friction.std_dev) &&
+        Number(found[4]) === most.friction.segments
+      );
+    });
+    compared += 1;
+  }
+  expect(compared).toBe(3);
+  await shot(page, 'friction');
+});
+
+test('a viewer sees Stop and nothing else that changes something', async () => {
+  const made = await api<CreatedToken>('/v1/tokens', 'POST', { name: `viewer ${Date.now()}`, role: 'viewer' });
+  const page = await open({ as: made.secret });
+  const changes = /^(new|drive|pause|resume|cancel|replace|edit|delete|acknowledge|clear|save|send)/i;
+  for (const tab of ['Robots', 'Missions', 'Alerts', 'Terrains']) {
+    await page.getByRole('tab', { name: tab }).click();
+    const names = await page.getByRole('button').allInnerTexts();
+    expect(names.filter((name) => changes.test(name))).toEqual([]);
+    expect(names).toContain('Stop all');
+  }
+  await select(page, 'rover-2');
+  expect(await page.getByRole('button', { name: 'Stop rover-2' }).isEnabled()).toBe(true);
+  const names = await page.getByRole('button').allInnerTexts();
+  expect(names.filter((name) => changes.test(name))).toEqual([]);
+  await shot(page, 'viewer');
+});
+
+test('whoever signs out is out, also for the server', async () => {
+  const page = await open();
+  await page.getByRole('button', { name: 'Sign out' }).click();
+  await page.getByLabel('Token').waitFor();
+  const cookies = await page.context().cookies(server());
+  expect(cookies.filter((cookie) => cookie.name.includes('session'))).toEqual([]);
+  expect(token()).toMatch(/^tread_/);
+});

@@ -1,0 +1,201 @@
+// A browser on the page, the API beside it, and waiting for states with a bound.
+import { existsSync, mkdirSync, readFileSync } from 'node:fs';
+import { type Socket, connect, createServer } from 'node:net';
+import type { AddressInfo } from 'node:net';
+import { type Browser, type BrowserContext, type Page, chromium } from 'playwright-core';
+import { afterAll, beforeAll, expect, inject } from 'vitest';
+
+/** How long anything may take to come about, milliseconds. */
+const PATIENCE_MS = 25_000;
+const LOOK_AGAIN_MS = 50;
+/** Screenshots are kept here, to be looked at. */
+const SHOTS = new URL('../shots/', import.meta.url).pathname;
+
+export const server = (): string => inject('server');
+export const token = (): string => inject('token');
+
+/** Asks the API as admin, past the page. */
+export async function api<T>(path: string, method = 'GET', body?: unknown): Promise<T> {
+  const answer = await fetch(`${server()}${path}`, {
+    method,
+    headers: { authorization: `Bearer ${token()}`, 'content-type': 'application/json' },
+    ...(body === undefined ? {} : { body: JSON.stringify(body) }),
+  });
+  const text = await answer.text();
+  if (!answer.ok) throw new Error(`${method} ${path}: ${answer.status} ${text}`);
+  return (text ? JSON.parse(text) : undefined) as T;
+}
+
+/** Waits until a look gives something, and says what was seen last if it never does. */
+export async function eventually<T>(
+  what: string,
+  look: () => Promise<T | null | undefined | false>,
+  patienceMs = PATIENCE_MS,
+): Promise<T> {
+  const end = Date.now() + patienceMs;
+  let last: unknown;
+  while (Date.now() < end) {
+    try {
+      const found = await look();
+      if (found) return found;
+      last = found;
+    } catch (error) {
+      last = error;
+    }
+    await new Promise((resolve) => setTimeout(resolve, LOOK_AGAIN_MS));
+  }
+  throw new Error(`not within ${patienceMs} ms: ${what}; last seen: ${String(last)}`);
+}
+
+/** A browser for a file of tests; everything that its consoles say amiss fails the file. */
+export function browser(): { open(options?: Open): Promise<Page> } {
+  let running: Browser;
+  const contexts: BrowserContext[] = [];
+  const amiss: string[] = [];
+  beforeAll(async () => {
+    mkdirSync(SHOTS, { recursive: true });
+    running = await chromium.launch({
+      executablePath: inject('chromium'),
+      args: ['--no-sandbox', '--disable-gpu'],
+    });
+  });
+  afterAll(async () => {
+    await running.close();
+    expect(amiss).toEqual([]);
+  });
+  return {
+    async open(options: Open = {}): Promise<Page> {
+      const context = await running.newContext({
+        viewport: options.size ?? { width: 1360, height: 850 },
+        colorScheme: options.theme ?? 'light',
+        hasTouch: options.hasTouch ?? false,
+      });
+      contexts.push(context);
+      const page = await context.newPage();
+      page.setDefaultTimeout(PATIENCE_MS);
+      await page.addInitScript(() => {
+        document.addEventListener('securitypolicyviolation', (event) =>
+          console.error(`CSP: ${event.violatedDirective} ${event.blockedURI}`),
+        );
+      });
+      page.on('pageerror', (error) => amiss.push(error.message));
+      page.on('console', (message) => {
+        const text = message.text();
+        if (message.type() === 'error' && !options.expected?.test(text)) amiss.push(text);
+      });
+      if (process.env['TREAD_DIST']) await fromDisk(page, process.env['TREAD_DIST']);
+      if (options.prepare) await options.prepare(page);
+      await page.goto(options.address ?? server());
+      if (options.as !== null) await signIn(page, options.as ?? token());
+      return page;
+    },
+  };
+}
+
+/** Puts a page that was just built in the place of the embedded one, with its headers. */
+async function fromDisk(page: Page, folder: string): Promise<void> {
+  await page.route(/\/(page\/.*)?$/, async (route) => {
+    const name = new URL(route.request().url()).pathname.replace(/^\/(page\/)?/, '') || 'index.html';
+    const path = `${folder}/${name}`;
+    if (!existsSync(path)) return route.continue();
+    const response = await route.fetch();
+    return route.fulfill({ response, body: readFileSync(path) });
+  });
+}
+
+export interface Open {
+  /** The token to sign in with; null for nobody. */
+  as?: string | null;
+  address?: string;
+  size?: { width: number; height: number };
+  theme?: 'light' | 'dark';
+  hasTouch?: boolean;
+  /** What the console may say, since the test makes it happen. */
+  expected?: RegExp;
+  prepare?(page: Page): Promise<void>;
+}
+
+export async function signIn(page: Page, secret: string): Promise<void> {
+  await page.getByLabel('Token').fill(secret);
+  await page.getByRole('button', { name: 'Sign in' }).click();
+  await page.locator('button[data-robot]').first().waitFor();
+}
+
+export async function shot(page: Page, name: string): Promise<void> {
+  await page.screenshot({ path: `${SHOTS}${name}.png` });
+}
+
+export async function select(page: Page, robot: string): Promise<void> {
+  await page.getByRole('tab', { name: 'Robots' }).click();
+  const back = page.getByRole('button', { name: 'All robots' });
+  if (await back.isVisible()) await back.click();
+  await page.locator(`button[data-robot="${robot}"]`).click();
+}
+
+/** The map's canvas and where it lies. */
+export async function map(page: Page): Promise<{ x: number; y: number; width: number; height: number }> {
+  const box = await page.getByRole('application', { name: /^Map/ }).boundingBox();
+  if (!box) throw new Error('there is no map');
+  return box;
+}
+
+/** Metres under a place of the window, as the page reads them out. */
+export async function metresAt(page: Page, x: number, y: number): Promise<{ x_m: number; y_m: number }> {
+  await page.mouse.move(x, y);
+  const text = await page.locator('output.cursor').innerText();
+  const found = /x (-?[\d.]+) m, y (-?[\d.]+) m/.exec(text);
+  if (!found) throw new Error(`no place in \`${text}\``);
+  return { x_m: Number(found[1]), y_m: Number(found[2]) };
+}
+
+/** Where some metres lie in the window: the map is linear. */
+export async function windowOf(page: Page): Promise<(x_m: number, y_m: number) => { x: number; y: number }> {
+  const box = await map(page);
+  const [left, top] = [box.x + 150, box.y + 200];
+  const [right, bottom] = [box.x + box.width - 250, box.y + box.height - 100];
+  const a = await metresAt(page, left, top);
+  const b = await metresAt(page, right, bottom);
+  return (x_m, y_m) => ({
+    x: left + ((x_m - a.x_m) / (b.x_m - a.x_m)) * (right - left),
+    y: top + ((y_m - a.y_m) / (b.y_m - a.y_m)) * (bottom - top),
+  });
+}
+
+/** A line to the server that can be cut, and mended. */
+export async function line(): Promise<{ address: string; cut(): void; mend(): void; end(): void }> {
+  const to = new URL(server());
+  const sockets = new Set<Socket>();
+  let isCut = false;
+  const keep = (socket: Socket) => {
+    sockets.add(socket);
+    socket.on('error', () => socket.destroy());
+    socket.on('close', () => sockets.delete(socket));
+  };
+  const listener = createServer((near) => {
+    keep(near);
+    if (isCut) {
+      near.destroy();
+      return;
+    }
+    const far = connect(Number(to.port), to.hostname);
+    keep(far);
+    near.pipe(far).pipe(near);
+    near.on('close', () => far.destroy());
+    far.on('close', () => near.destroy());
+  });
+  await new Promise<void>((resolve) => listener.listen(0, '127.0.0.1', resolve));
+  return {
+    address: `http://127.0.0.1:${(listener.address() as AddressInfo).port}`,
+    cut() {
+      isCut = true;
+      for (const socket of sockets) socket.destroy();
+    },
+    mend() {
+      isCut = false;
+    },
+    end() {
+      for (const socket of sockets) socket.destroy();
+      listener.close();
+    },
+  };
+}

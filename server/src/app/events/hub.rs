@@ -1,0 +1,225 @@
+//! The clients of the feed with their bounded buffers, and the newest events.
+
+use std::collections::{HashMap, HashSet, VecDeque};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use jiff::Timestamp;
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+use tracing::info;
+use tread_api::event::{Event, Topic};
+use tread_api::ids::{RobotId, SiteId};
+use tread_api::robot::Alert;
+
+use crate::fleet::presence::RobotKey;
+
+/// Events that wait for one client.
+pub const CLIENT_BUFFER: usize = 4_096;
+/// Bytes of events that wait for one client; a single event may be larger.
+pub const CLIENT_BYTES_MAX: usize = 4 * 1024 * 1024;
+/// Newest events that are kept for clients that come back.
+pub const KEPT_EVENTS_MAX: usize = 8_192;
+/// Bytes of them.
+pub const KEPT_BYTES_MAX: usize = 32 * 1024 * 1024;
+/// How long a client that was dropped may take to read its end.
+const LINGER: Duration = Duration::from_secs(5);
+
+/// One event, ready to be sent.
+#[derive(Debug)]
+pub struct Sent {
+    /// What a client gives back as `Last-Event-ID`; `None` within a snapshot.
+    pub id: Option<String>,
+    /// Its name.
+    pub name: &'static str,
+    /// Its body, JSON on one line.
+    pub text: String,
+    pub(super) seq: u64,
+    pub(super) topic: Option<Topic>,
+    pub(super) robot: Option<RobotKey>,
+}
+
+/// What a client wants to hear of; what is empty lets everything through.
+#[derive(Debug, Clone, Default)]
+pub struct EventFilter {
+    /// Only these topics.
+    pub topics: HashSet<Topic>,
+    /// Only this site.
+    pub site: Option<SiteId>,
+    /// Only these robots.
+    pub robots: HashSet<RobotId>,
+}
+
+impl EventFilter {
+    pub(super) fn lets_through(&self, topic: Option<Topic>, robot: Option<&RobotKey>) -> bool {
+        let of_topic = topic.is_none_or(|topic| self.wants(topic));
+        of_topic && robot.is_none_or(|(site, robot)| self.wants_robot(site, robot))
+    }
+
+    pub(super) fn wants(&self, topic: Topic) -> bool {
+        self.topics.is_empty() || self.topics.contains(&topic)
+    }
+
+    pub(super) fn wants_robot(&self, site: &SiteId, robot: &RobotId) -> bool {
+        self.site.as_ref().is_none_or(|wanted| wanted == site)
+            && (self.robots.is_empty() || self.robots.contains(robot))
+    }
+}
+
+/// The clients, and the newest events.
+#[derive(Debug)]
+pub struct Hub {
+    /// Tells the events of one run of the server from those of another.
+    pub(super) run: String,
+    pub(super) state: Mutex<HubState>,
+}
+
+#[derive(Debug, Default)]
+pub(super) struct HubState {
+    pub(super) seq: u64,
+    pub(super) kept: VecDeque<Arc<Sent>>,
+    pub(super) kept_bytes: usize,
+    pub(super) clients: HashMap<u64, Client>,
+    pub(super) dropped: Vec<(Option<Duration>, CancellationToken)>,
+    pub(super) next_client: u64,
+    pub(super) dropped_count: u64,
+}
+
+#[derive(Debug)]
+pub(super) struct Client {
+    pub(super) filter: EventFilter,
+    pub(super) buffer: mpsc::Sender<Arc<Sent>>,
+    /// Bytes that wait in the buffer.
+    pub(super) waiting: Arc<AtomicUsize>,
+    pub(super) cut: CancellationToken,
+}
+
+impl Client {
+    /// Puts an event into the buffer; false if it is full.
+    fn take(&self, event: &Arc<Sent>) -> bool {
+        let bytes = event.text.len();
+        let before = self.waiting.fetch_add(bytes, Ordering::Relaxed);
+        (before == 0 || before + bytes <= CLIENT_BYTES_MAX)
+            && self.buffer.try_send(Arc::clone(event)).is_ok()
+    }
+}
+
+impl Hub {
+    /// No clients and no events yet.
+    pub(in crate::app) fn new(started_at: Timestamp) -> Self {
+        Self {
+            run: format!("{:x}", started_at.as_microsecond()),
+            state: Mutex::default(),
+        }
+    }
+
+    pub(super) fn lock(&self) -> MutexGuard<'_, HubState> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// How many clients there are.
+    pub fn client_count(&self) -> usize {
+        self.lock().clients.len()
+    }
+
+    /// How many clients were dropped because they read too slowly.
+    pub fn dropped_count(&self) -> u64 {
+        self.lock().dropped_count
+    }
+
+    /// The most events that wait for any client.
+    pub fn longest_buffer(&self) -> usize {
+        let state = self.lock();
+        let waiting = |client: &Client| CLIENT_BUFFER - client.buffer.capacity();
+        state.clients.values().map(waiting).max().unwrap_or(0)
+    }
+
+    pub(super) fn is_closed(&self) -> bool {
+        self.lock().next_client == u64::MAX
+    }
+
+    /// Ends all streams; no further client is taken.
+    pub(super) fn close(&self) {
+        let mut state = self.lock();
+        state.next_client = u64::MAX;
+        state.clients.clear();
+    }
+
+    pub(super) fn publish(&self, event: &Event, topic: Topic, robot: RobotKey) {
+        let mut state = self.lock();
+        state.seq += 1;
+        let seq = state.seq;
+        let sent = Arc::new(Sent {
+            id: Some(format!("{}-{seq}", self.run)),
+            seq,
+            ..unnumbered(event, Some(topic), Some(robot))
+        });
+        state.kept_bytes += sent.text.len();
+        state.kept.push_back(Arc::clone(&sent));
+        while state.kept.len() > KEPT_EVENTS_MAX || state.kept_bytes > KEPT_BYTES_MAX {
+            let Some(oldest) = state.kept.pop_front() else {
+                break;
+            };
+            state.kept_bytes -= oldest.text.len();
+        }
+        let mut slow = Vec::new();
+        for (&id, client) in &state.clients {
+            let wanted = client.filter.lets_through(sent.topic, sent.robot.as_ref());
+            if wanted && !client.take(&sent) {
+                slow.push(id);
+            }
+        }
+        for id in slow {
+            if let Some(client) = state.clients.remove(&id) {
+                info!("an event client reads too slowly and is dropped");
+                state.dropped.push((None, client.cut));
+                state.dropped_count += 1;
+            }
+        }
+    }
+
+    /// Publishes an alert as it is now.
+    pub(in crate::app) fn alert(&self, alert: &Alert) {
+        let robot = (alert.site.clone(), alert.robot.clone());
+        let event = Event::Alert(Box::new(alert.clone()));
+        self.publish(&event, Topic::Alerts, robot);
+    }
+
+    /// Cuts the connections of clients that did not even read their end.
+    pub(super) fn sweep(&self, now: Duration) {
+        self.lock().dropped.retain_mut(|(since, cut)| {
+            let since = *since.get_or_insert(now);
+            let over = now.saturating_sub(since) > LINGER;
+            if over {
+                cut.cancel();
+            }
+            !over
+        });
+    }
+
+    /// What a client missed since an event; `None` if that is out of reach.
+    pub(super) fn missed(&self, last: &str, filter: &EventFilter) -> Option<VecDeque<Arc<Sent>>> {
+        let (run, seq) = last.rsplit_once('-')?;
+        let seq: u64 = seq.parse().ok()?;
+        let state = self.lock();
+        let oldest = state.kept.front().map_or(state.seq + 1, |event| event.seq);
+        if run != self.run || seq + 1 < oldest || seq > state.seq {
+            return None;
+        }
+        let missed = state.kept.iter().filter(|event| event.seq > seq);
+        let wanted = missed.filter(|event| filter.lets_through(event.topic, event.robot.as_ref()));
+        Some(wanted.cloned().collect())
+    }
+}
+
+pub(super) fn unnumbered(event: &Event, topic: Option<Topic>, robot: Option<RobotKey>) -> Sent {
+    Sent {
+        id: None,
+        name: event.name(),
+        text: serde_json::to_string(event).unwrap_or_default(),
+        seq: 0,
+        topic,
+        robot,
+    }
+}

@@ -1,0 +1,165 @@
+//! The way of stops to their robots, and what becomes of them.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use tokio::sync::{mpsc, oneshot, watch};
+use tokio_util::sync::CancellationToken;
+use tracing::{error, warn};
+use tread_api::ids::StopId;
+use tread_api::keys::Verb;
+use tread_api::stop::Stop;
+use tread_api::wire::command::{Answer, Outcome};
+use tread_api::wire::safety::Stop as StopCommand;
+
+use super::super::{App, AppError, Links};
+use super::STOP_CONFIRM_MAX;
+use crate::fleet::commands::Commands;
+
+/// Tells a robot to stop; whether it has confirmed.
+pub(in crate::app) async fn tell(app: &App, commands: &Commands, stop: &Stop) -> bool {
+    let command = StopCommand {
+        stop: stop.id,
+        by: stop.by.clone(),
+        reason: stop.reason.clone(),
+        at: stop.wanted_at,
+    };
+    let key = (stop.site.clone(), stop.robot.clone());
+    app.counters().stops_sent.one();
+    // Whatever runs under the robot's name stops; only its present run can confirm.
+    let present = app.presences().get(&key).boot().map(|(boot, _since)| boot);
+    let answer = commands.send_to(&key, None, Verb::Stop, &command).await;
+    let confirms = |answer: &Answer| present.is_none_or(|boot| boot == answer.boot);
+    match answer.filter(confirms).map(|answer| answer.outcome) {
+        Some(Outcome::Refused { detail, .. }) => {
+            error!(robot.id = %stop.robot, "robot `{}` does not stop: {detail}", stop.robot);
+            false
+        }
+        Some(_) => true,
+        None => {
+            app.counters().commands_unanswered.one();
+            false
+        }
+    }
+}
+
+/// A stop on its way to its robot.
+pub(super) struct Outgoing {
+    pub(super) app: App,
+    pub(super) links: Links,
+    pub(super) stop: Stop,
+    pub(super) recorded: watch::Receiver<bool>,
+}
+
+impl Outgoing {
+    /// Sends until the robot has confirmed, or the database has the stop: then the reconciler goes
+    /// on.
+    pub(super) async fn deliver(self, tell_of: mpsc::Sender<(StopId, Timestamp)>) {
+        let ending = self.links.supervisor.stop_token();
+        loop {
+            if tell(&self.app, &self.links.commands, &self.stop).await {
+                // Nobody listens only when the server stops.
+                let _ = tell_of.send((self.stop.id, self.app.clock().now())).await;
+                return;
+            }
+            tokio::select! {
+                () = ending.cancelled() => return,
+                () = tokio::time::sleep(UNRECORDED_RETRY) => {}
+            }
+            if *self.recorded.borrow() {
+                return;
+            }
+        }
+    }
+}
+
+/// Stops that were sent: what becomes of them, and the database.
+pub(super) struct Settling {
+    pub(super) app: App,
+    pub(super) stops: Vec<Stop>,
+    pub(super) stop: CancellationToken,
+}
+
+impl Settling {
+    pub(super) async fn run(
+        self,
+        mut confirmations: mpsc::Receiver<(StopId, Timestamp)>,
+        shown: oneshot::Sender<Vec<(StopId, Timestamp)>>,
+        recorded: watch::Sender<bool>,
+    ) {
+        let recording = async {
+            while !self.record().await {
+                tokio::select! {
+                    () = self.stop.cancelled() => return,
+                    () = tokio::time::sleep(UNRECORDED_RETRY) => {}
+                }
+            }
+            recorded.send_replace(true);
+        };
+        let ((), confirmed) = tokio::join!(recording, self.collect(&mut confirmations, shown));
+        self.note(&confirmed).await;
+        let is_open = |stop: &&Stop| !confirmed.iter().any(|(id, _)| *id == stop.id);
+        let open: Vec<&Stop> = self.stops.iter().filter(is_open).collect();
+        if !open.is_empty() {
+            warn!("{} robots have not confirmed a stop", open.len());
+            self.app.counters().stops_unconfirmed.add(open.len() as u64);
+            if let Err(error) = self.app.note_unconfirmed(&open).await {
+                error!("cannot write down that stops are unconfirmed: {error:?}");
+            }
+        }
+        self.app.wake();
+        while let Some(late) = confirmations.recv().await {
+            self.note(&[late]).await;
+        }
+    }
+
+    async fn record(&self) -> bool {
+        let writing = async {
+            let mut tx = self.app.db().write().await?;
+            self.app.record_stops(&mut tx, &self.stops).await?;
+            tx.commit().await?;
+            Ok::<(), AppError>(())
+        };
+        match writing.await {
+            Ok(()) => true,
+            Err(error) => {
+                error!("cannot write down a stop; it is sent all the same: {error:?}");
+                false
+            }
+        }
+    }
+
+    /// Waits until all robots have confirmed or the bound has passed, and says which have.
+    async fn collect(
+        &self,
+        confirmations: &mut mpsc::Receiver<(StopId, Timestamp)>,
+        shown: oneshot::Sender<Vec<(StopId, Timestamp)>>,
+    ) -> Vec<(StopId, Timestamp)> {
+        let mut confirmed = Vec::with_capacity(self.stops.len());
+        let mut bound = std::pin::pin!(tokio::time::sleep(STOP_CONFIRM_MAX));
+        while confirmed.len() < self.stops.len() {
+            tokio::select! {
+                biased;
+                Some(confirmation) = confirmations.recv() => confirmed.push(confirmation),
+                () = bound.as_mut() => break,
+                else => break,
+            }
+        }
+        // Whoever asked may be gone.
+        let _ = shown.send(confirmed.clone());
+        confirmed
+    }
+
+    async fn note(&self, confirmed: &[(StopId, Timestamp)]) {
+        if confirmed.is_empty() {
+            return;
+        }
+        if let Err(error) = self.app.note_confirmed(&self.stops, confirmed).await {
+            // The reconciler asks the robot again, which says the same.
+            error!("cannot write down that stops are confirmed: {error:?}");
+        }
+    }
+}
+
+/// Wait between two tries of a stop that could not be written down, so that nobody else repeats it.
+const UNRECORDED_RETRY: Duration = Duration::from_millis(250);

@@ -1,0 +1,76 @@
+//! The network between robots and server: it loses, delays, doubles and reorders.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use tread_api::ids::BootId;
+use tread_api::keys::Verb;
+use tread_api::wire::state::RobotState;
+use tread_server::fleet::commands::{Carrier, Carrying};
+use tread_server::fleet::presence::RobotKey;
+
+use super::dice::Dice;
+use super::robot::Robot;
+
+/// A message that is still on its way.
+#[derive(Debug)]
+pub(super) enum Late {
+    Command(usize, Option<BootId>, Verb, Vec<u8>),
+    State(Box<RobotState>),
+}
+
+/// The robots and the network between them and the server.
+#[derive(Debug)]
+pub(super) struct World {
+    pub(super) robots: Vec<Robot>,
+    pub(super) late: Vec<Late>,
+    pub(super) dice: Dice,
+    pub(super) calm: bool,
+}
+
+pub(super) type Shared = Arc<Mutex<World>>;
+
+pub(super) fn with<T>(world: &Shared, act: impl FnOnce(&mut World) -> T) -> T {
+    act(&mut world.lock().unwrap_or_else(PoisonError::into_inner))
+}
+
+#[derive(Debug)]
+pub(super) struct Network(pub(super) Shared);
+
+impl Carrier for Network {
+    fn carry(
+        &self,
+        (_, robot): &RobotKey,
+        run: Option<BootId>,
+        verb: Verb,
+        payload: Vec<u8>,
+    ) -> Carrying {
+        let answer = with(&self.0, |world| {
+            let index = world.robots.iter().position(|here| here.id == *robot)?;
+            let there = &world.robots[index];
+            let reachable = there.on && there.linked && there.is_run(run);
+            let calm = world.calm;
+            let fate = if calm { 99 } else { world.dice.below(100) };
+            // Lost on the way, or late: the server hears nothing.
+            if !reachable || fate < 15 {
+                return None;
+            }
+            if fate < 25 && world.late.len() < LATE_MAX {
+                world.late.push(Late::Command(index, run, verb, payload));
+                return None;
+            }
+            if fate < 35 && world.late.len() < LATE_MAX {
+                world
+                    .late
+                    .push(Late::Command(index, run, verb, payload.clone()));
+            }
+            let impossible = !calm && world.dice.percent(3);
+            let answer = world.robots[index].answer(verb, &payload, impossible);
+            // Done, and the answer is lost.
+            (fate >= 45).then_some(answer)
+        });
+        Box::pin(std::future::ready(answer))
+    }
+}
+
+/// Messages that are late at once.
+pub(super) const LATE_MAX: usize = 30;

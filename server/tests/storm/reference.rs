@@ -1,0 +1,57 @@
+//! What must hold of missions, whatever happens: told from the history that the server wrote.
+
+use std::collections::{BTreeMap, HashMap};
+
+use tread_api::ids::{MissionId, RobotId};
+use tread_api::mission::{Cause, MissionState};
+use tread_server::db::{self, Db};
+
+/// What the reference knows: where each mission stands, by the history alone.
+#[derive(Debug, Default)]
+pub(super) struct Reference {
+    pub(super) missions: BTreeMap<MissionId, (RobotId, MissionState, Cause)>,
+    last_step: i64,
+}
+
+impl Reference {
+    /// Reads what the server wrote, and checks it.
+    pub(super) async fn follow(&mut self, db: &Db) -> Result<(), String> {
+        let mut tx = db.read().await.map_err(|error| error.to_string())?;
+        let steps = db::history::steps_after(&mut tx, self.last_step, 10_000).await;
+        drop(tx);
+        for (pk, step) in steps.map_err(|error| error.to_string())? {
+            self.last_step = pk;
+            let before = self.missions.get(&step.mission).map(|known| known.1);
+            if before != step.step.from {
+                return Err(format!("{step:?} does not follow {before:?}"));
+            }
+            let moved = before != Some(step.step.to);
+            if moved && before.is_some_and(MissionState::is_terminal) {
+                return Err(format!("revived: {step:?}"));
+            }
+            let cause = match self.missions.get(&step.mission) {
+                Some(&(_, _, cause)) if !moved => cause,
+                _ => step.step.cause,
+            };
+            let standing = (step.robot.clone(), step.step.to, cause);
+            self.missions.insert(step.mission, standing);
+            let mut in_hand: HashMap<&RobotId, usize> = HashMap::new();
+            for (robot, state, _) in self.missions.values() {
+                if !state.is_terminal() && *state != MissionState::Queued {
+                    *in_hand.entry(robot).or_default() += 1;
+                }
+            }
+            if let Some((robot, count)) = in_hand.into_iter().find(|(_, count)| *count > 1) {
+                return Err(format!(
+                    "robot {robot} has {count} missions in hand: {step:?}"
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    pub(super) fn open(&self) -> Vec<(MissionId, MissionState)> {
+        let standing = self.missions.iter().map(|(id, known)| (*id, known.1));
+        standing.filter(|(_, state)| !state.is_terminal()).collect()
+    }
+}
