@@ -4,8 +4,8 @@ use super::curved::{Bent, SLIP_MIN, SideSlips, Turn, bent, drift_bend, spread_ou
 use super::regression::{Parameters, Row, index};
 use super::window::{TurnMeans, TurnWindow};
 use super::{
-    BLOCK_S, RIM_SPEED_MIN_M_S, SLIP_LINEAR_MAX, SensorNoise, SensorSample, TyrePrior,
-    ValueWithDeviation,
+    BLOCK_S, RIM_SPEED_MIN_M_S, SLIP_LINEAR_FIRST_MAX, SLIP_LINEAR_MAX, SensorNoise, SensorSample,
+    TyrePrior, ValueWithDeviation,
 };
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
@@ -80,22 +80,23 @@ pub(super) struct Block {
 impl Block {
     /// Whether slip was in the linear range, combined from along and across. Across, and along the
     /// sides' difference, it is measured well, known θ or not; what the sides have in common is θμ.
-    /// Before θ is known that is the most it may be, or less where the body speed says so: turning
-    /// alone must not keep a long robot from ever beginning.
+    /// Before θ is known that is the most it may be, so that turning alone does not keep a long robot
+    /// from ever beginning. With torque it comes from the body speed, which is coarse: the bound is
+    /// tighter, or a robot that slides would begin with what sliding shows.
     pub(super) fn slips_little(&self, bound: &ThetaBound) -> bool {
         let turning = 0.5 * self.difference_m_s.abs() / self.slower_m_s;
-        let common = match (bound.theta, self.force) {
-            (Some(theta), Some(force)) => theta * force.mean_m_s.abs() / self.rim_mean_m_s.abs(),
-            (None, Some(force)) => {
-                let most = bound.theta_most * force.mean_m_s.abs() / self.rim_mean_m_s.abs();
-                let guessed = bound.theta_weights * force.mean_m_s.abs() / self.rim_mean_m_s.abs();
-                self.slip_m_s.map_or(guessed, |slip_m_s| {
-                    most.min(slip_m_s.abs() / self.slower_m_s)
-                })
-            }
-            (_, None) => bound.theta_most * self.ahead_mu,
+        let (common, limit) = match (bound.theta, self.force) {
+            (Some(theta), Some(force)) => (
+                theta * force.mean_m_s.abs() / self.rim_mean_m_s.abs(),
+                SLIP_LINEAR_MAX,
+            ),
+            (None, Some(_)) => (
+                self.slip_m_s.unwrap_or(0.0).abs() / self.slower_m_s,
+                SLIP_LINEAR_FIRST_MAX,
+            ),
+            (_, None) => (bound.theta_most * self.ahead_mu, SLIP_LINEAR_MAX),
         };
-        (turning + common).hypot(self.slip_lateral) < SLIP_LINEAR_MAX
+        (turning + common).hypot(self.slip_lateral) < limit
     }
 
     /// Row of the sides' difference: on measured torques, or else on measured accelerations.

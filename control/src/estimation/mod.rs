@@ -58,6 +58,8 @@ pub const BLOCK_S: f64 = 0.2;
 const RIM_SPEED_MIN_M_S: f64 = 0.15;
 /// Largest combined slip that is taken for the linear range.
 const SLIP_LINEAR_MAX: f64 = 0.15;
+/// The same before θ is known, where slip along is told by the body speed.
+const SLIP_LINEAR_FIRST_MAX: f64 = 0.10;
 /// Relative deviation above which there is said to be no measurement.
 const RELATIVE_STD_DEV_MAX: f64 = 0.5;
 /// Fewest blocks of a measurement.
