@@ -35,6 +35,10 @@ pub struct Offer {
     /// What the map knows along the way; absent when it knows nothing.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prior: Option<PathPrior>,
+    /// Whether it is to stand at its start until it is resumed: whoever paused it, or stopped the
+    /// robot before it was taken, has not let it go on. Counts only when the mission is taken.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub held: bool,
 }
 
 /// Most cells of a prior.

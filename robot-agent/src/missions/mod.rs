@@ -321,6 +321,7 @@ mod tests {
             start_within_ms: None,
             link_policy: LinkPolicy::default(),
             prior: None,
+            held: false,
         }
     }
 
