@@ -2,6 +2,7 @@
 
 pub mod alerts;
 pub mod check;
+pub mod enrolment;
 mod error;
 pub mod events;
 pub mod friction;
@@ -25,6 +26,7 @@ use std::time::Duration;
 use tokio::sync::{Notify, Semaphore, SemaphorePermit};
 use tread_api::ids::{RobotId, SiteId};
 
+use self::enrolment::Membership;
 pub use self::error::AppError;
 use self::events::Hub;
 use self::identity::Identity;
@@ -61,6 +63,7 @@ struct Inner {
     keys_in_flight: InFlight,
     checks: Semaphore,
     identity: Identity,
+    membership: Membership,
     requests: Requests,
     refusals: Refusals,
     queues: Queues,
@@ -100,6 +103,7 @@ impl App {
             keys_in_flight: InFlight::default(),
             checks: Semaphore::new(check::CHECKS_MAX),
             identity: Identity::default(),
+            membership: Membership::default(),
             requests: Requests::default(),
             refusals: Refusals::default(),
             queues: Queues::default(),
@@ -193,6 +197,10 @@ impl App {
 
     fn identity(&self) -> &Identity {
         &self.inner.identity
+    }
+
+    fn membership(&self) -> &Membership {
+        &self.inner.membership
     }
 
     fn keys_in_flight(&self) -> &InFlight {

@@ -5,7 +5,7 @@ mod chaos;
 mod control;
 mod event_clients;
 mod impostors;
-
+mod membership;
 mod messages;
 mod missions;
 mod outages;
