@@ -3,12 +3,10 @@
 
 use std::ops::ControlFlow;
 use std::sync::Arc;
-use std::time::Duration;
 
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 use tracing::{error, info, warn};
-use tread_api::ids::BootId;
 use tread_api::robot::Capabilities;
 use tread_api::wire::hello::Hello;
 
@@ -20,15 +18,6 @@ use crate::fleet::{self, COMMANDS_MAX, FleetLink, Identity, Listeners, Note, Not
 use crate::membership::Membership;
 use crate::outbox::Outbox;
 use crate::reporter::{Reporter, every, publish_states};
-
-/// Longest pause before an agent first looks for its server.
-const START_JITTER_MAX: Duration = Duration::from_millis(300);
-
-/// A pause of its own for each run, below [`START_JITTER_MAX`]: the boot is random already.
-fn start_jitter(boot: BootId) -> Duration {
-    let share = f64::from(boot.as_uuid().as_fields().0) / f64::from(u32::MAX);
-    START_JITTER_MAX.mul_f64(share)
-}
 
 /// Waits for the next certificate; for ever where there is none.
 async fn renewed(membership: &mut Option<watch::Receiver<Arc<Membership>>>) {
@@ -64,7 +53,7 @@ impl Online {
         });
         tokio::select! {
             // Robots that get power together do not come all at once.
-            () = tokio::time::sleep(start_jitter(self.identity.boot)) => {}
+            () = tokio::time::sleep(fleet::start_jitter(self.identity.boot)) => {}
             () = self.stop.cancelled() => return,
         }
         let (commands, commands_in) = mpsc::channel(COMMANDS_MAX);
@@ -181,7 +170,7 @@ impl Online {
         match link.hello(&hello).await {
             Ok(welcome) => {
                 info!("the server welcomes `{}`", self.identity.robot);
-                self.dispatcher.take_site(welcome.site)
+                self.dispatcher.take_welcome(welcome.site)
             }
             Err(fleet::AskError::NoAnswer) => false,
             Err(cause) => {

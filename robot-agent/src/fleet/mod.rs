@@ -13,7 +13,6 @@ pub mod uploader;
 use std::sync::Arc;
 use std::time::Duration;
 
-pub use session::session_config;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
@@ -34,6 +33,7 @@ use zenoh::query::{ConsolidationMode, Querier, Query};
 pub use self::command::IncomingCommand;
 use self::error::zenoh_failed;
 pub use self::error::{AskError, LinkError, may_pass_later};
+pub use self::session::{session_config, start_jitter};
 use crate::membership::Membership;
 
 /// Commands that may wait to be answered; more are dropped, and the server asks again.

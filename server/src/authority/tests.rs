@@ -116,8 +116,8 @@ fn the_authority_comes_back_from_its_folder_and_others_cannot_read_its_key() {
     let again = Authority::create(&folder, now());
     assert!(matches!(again, Err(AuthorityError::Exists(_))));
     let key = folder.join(KEY_FILE);
-    let mode = std::fs::metadata(&key).unwrap().permissions().mode();
-    assert_eq!(mode & 0o777, 0o600);
+    let rights = std::fs::metadata(&key).unwrap().permissions().mode();
+    assert_eq!(rights & 0o777, 0o600);
     let certificate = signed(&made, &KeyPair::generate().unwrap());
     let loaded = Authority::load(&folder).unwrap();
     assert!(loaded.read_robot(&certificate, now()).is_ok());

@@ -43,6 +43,9 @@ use crate::supervisor::Supervisor;
 
 /// Most robots that may be connected; zenoh's own default is 1000.
 const SESSIONS_MAX: u32 = 10_000;
+/// After this silence a robot takes the server for gone and connects anew, milliseconds. TCP sends
+/// what was lost again after ever longer pauses; a new connection is there sooner.
+const LEASE_MS: u32 = 3_000;
 /// Most connections that may be in the middle of their opening.
 const ACCEPT_PENDING_MAX: u32 = 1_000;
 /// What the system may keep of what is sent to one robot, bytes. Priorities act only above it: on

@@ -22,7 +22,8 @@ use super::presence::RobotKey;
 use super::router;
 use super::routers::Router;
 use super::{
-    ACCEPT_PENDING_MAX, BATCH_BYTES, FleetError, SEND_BUFFER_BYTES, SESSION_TIMEOUT, SESSIONS_MAX,
+    ACCEPT_PENDING_MAX, BATCH_BYTES, FleetError, LEASE_MS, SEND_BUFFER_BYTES, SESSION_TIMEOUT,
+    SESSIONS_MAX,
 };
 use crate::authority::Authority;
 use crate::clock::Clock;
@@ -215,6 +216,7 @@ fn config(
             format!("[\"{protocol}/{address}#so_sndbuf={SEND_BUFFER_BYTES}\"]"),
         ),
         ("transport/link/tx/batch_size", BATCH_BYTES.to_string()),
+        ("transport/link/tx/lease", LEASE_MS.to_string()),
         // Nothing is discovered and nothing is advertised.
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
@@ -261,4 +263,21 @@ pub(super) fn client_config(
         inside.connect(&mut config)?;
     }
     Ok(config)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_router_takes_more_robots_than_zenoh_does_by_itself() {
+        let sessions = |config: &Config| -> u32 {
+            let said = config.get_json("transport/unicast/max_sessions").unwrap();
+            said.parse().unwrap()
+        };
+        let address = SocketAddr::from((Ipv4Addr::LOCALHOST, 7447));
+        let ours = config(address, None, &[]).unwrap();
+        assert_eq!(sessions(&ours), SESSIONS_MAX);
+        assert!(sessions(&Config::default()) < sessions(&ours));
+    }
 }

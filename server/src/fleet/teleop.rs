@@ -67,8 +67,18 @@ impl Teleop {
         }
     }
 
+    /// Without a network: no line can be opened.
+    pub fn without_network(supervisor: Supervisor) -> Self {
+        Self {
+            routers: Arc::default(),
+            supervisor,
+        }
+    }
+
     /// Opens the line to a robot; `None` if the network refuses.
     pub async fn open(&self, (site, robot): &RobotKey) -> Option<Line> {
+        // Where the network is simulated, or a router is being opened again, there is no line.
+        self.routers.newest()?;
         let key = keys::teleop(site, robot);
         let (routers, of) = (Arc::clone(&self.routers), key.clone());
         // Declaring blocks its thread.

@@ -81,7 +81,7 @@ async fn a_join_token_counts_once_and_whatever_does_not_count_is_answered_alike(
     let named = join_token(&yard, json!({"site": "yard", "robot": "rover-2"})).await;
     let any = join_token(&yard, json!({"site": "yard"})).await;
     let late = join_token(&yard, json!({"site": "yard", "valid_minutes": 1})).await;
-    yard.server.app().clock().advance(Duration::from_secs(60));
+    yard.server.app().clock().advance(Duration::from_mins(1));
 
     let admin = yard.admin().to_owned();
     let cases = [

@@ -82,6 +82,10 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
     })
     .await;
     let most = |times: &[f64]| times.iter().copied().fold(0.0, f64::max);
+    let median = |times: &mut [f64]| {
+        times.sort_by(f64::total_cmp);
+        times[times.len() / 2]
+    };
     Ok(vec![
         Check::at_least(
             "garbage connections per second",
@@ -89,6 +93,16 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
             rate_hz,
         ),
         Check::at_least("garbage refused and counted", figure(sent), figure(refused)),
+        Check::at_most(
+            "median connect without garbage, ms",
+            CONNECT_MAX_MS,
+            median(&mut alone_ms),
+        ),
+        Check::at_most(
+            "median connect under garbage, ms",
+            CONNECT_MAX_MS,
+            median(&mut ms),
+        ),
         Check::at_most(
             "slowest connect without garbage, ms",
             CONNECT_MAX_MS,

@@ -84,12 +84,15 @@ pub(crate) async fn measure(
             MissionState::Expired,
         ];
         let ended = fleet.rest.mission_reaches(mission, &ends, 2 * DRIVE).await;
-        let passed: Vec<_> = ended.events.iter().map(|event| event.to).collect();
-        let active = passed
-            .iter()
-            .filter(|state| **state == MissionState::Active);
-        let straight = active.count() == 1;
-        disturbed += u64::from(!straight || ended.mission.state != MissionState::Succeeded);
+        let mut passed: Vec<_> = ended.events.iter().map(|event| event.to).collect();
+        passed.dedup();
+        let straight = [
+            MissionState::Queued,
+            MissionState::Offered,
+            MissionState::Active,
+            MissionState::Succeeded,
+        ];
+        disturbed += u64::from(passed != straight);
     }
     let again = u64::try_from(connections(fleet) - before)?;
     Ok(vec![
