@@ -122,6 +122,8 @@ export const words = {
     by: (name: string) => `by ${name}`,
     clear: (robot: string) => `Clear ${robot}`,
     everyRobot: 'the robots',
+    again: 'Stop again',
+    putAway: 'Put away',
   },
   tabs: {
     robots: 'Robots',
@@ -134,7 +136,6 @@ export const words = {
   gate,
   robots: {
     none: 'No robot has reported to this site yet.',
-    select: (robot: string) => `Select ${robot}`,
     back: 'All robots',
     notSeen: 'not heard since the server started',
     age: (age: string) => `${age} old`,
@@ -145,7 +146,6 @@ export const words = {
     battery: 'Battery',
     charging: 'charging',
     position: 'Position',
-    heading: 'Heading',
     speed: 'Speed',
     slowedBy: 'Slowed by',
     nothing: 'nothing',
@@ -160,7 +160,6 @@ export const words = {
     excited: 'enough to measure',
     unexcited: 'too little to measure',
     newMission: 'New mission',
-    follow: 'Keep in view',
     center: 'Show on map',
   },
   curves: {
@@ -168,13 +167,6 @@ export const words = {
     crossTrack: 'Cross-track error, mm',
     speed: 'Speed, m/s',
     theta: 'θ',
-    measured: 'θ measured',
-    low: '95 % low',
-    high: '95 % high',
-    loop: 'θ in the loop',
-    time: 'time',
-    empty: 'Nothing measured yet.',
-    excited: 'excited',
     legendTheta: 'Line: θ measured, with its 95 % band. Dashed: θ in the loop. Ticks below: excitation suffices.',
   },
   missions: {
@@ -353,9 +345,8 @@ export const words = {
     cursor: (x: string, y: string) => `x ${x} m, y ${y} m`,
     noValue: 'not measured here',
     plusMinus: (value: string, deviation: string) => `${value} ± ${deviation}`,
-    robotsSeen: (robots: number, segments: number) => `${robots} robots, ${segments} measurements`,
-    lowest: '≤',
-    highest: '≥',
+    robotsSeen: (robots: number, segments: number) =>
+      `${robots} ${robots === 1 ? 'robot' : 'robots'}, ${segments} ${segments === 1 ? 'measurement' : 'measurements'}`,
   },
   unit: { m: 'm', mm: 'mm', s: 's', mps: 'm/s', radps: 'rad/s', mps2: 'm/s²', percent: '%', ms: 'ms', deg: '°', h: 'h', d: 'd', min: 'min' },
   unknown: '–',
