@@ -21,6 +21,12 @@ pub struct Point {
     pub y_m: f64,
 }
 
+impl std::fmt::Display for Point {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(formatter, "({:.2} m, {:.2} m)", self.x_m, self.y_m)
+    }
+}
+
 impl Point {
     /// Whether both coordinates are finite and within [`COORDINATE_MAX_M`].
     pub fn is_on_the_map(&self) -> bool {
@@ -76,8 +82,20 @@ pub enum InvalidPolygon {
     #[error("corners {0} and {1} are the same point; leave out the closing corner")]
     DuplicateCorner(usize, usize),
     /// Two sides touch or cross.
-    #[error("the side from corner {0} crosses or touches the side from corner {1}")]
-    SelfCrossing(usize, usize),
+    #[error(
+        "the side from corner {first} at {from} crosses or touches the side from corner {second} \
+         at {onto}"
+    )]
+    SelfCrossing {
+        /// The corner where one side begins.
+        first: usize,
+        /// Where that is.
+        from: Point,
+        /// The corner where the other begins.
+        second: usize,
+        /// Where that is.
+        onto: Point,
+    },
     /// The area is below [`AREA_MIN_M2`].
     #[error("the polygon's area is below {AREA_MIN_M2} m²")]
     TooSmall,
@@ -117,7 +135,12 @@ impl Polygon {
                     touches(side(first), side(second))
                 };
                 if crossing {
-                    return Err(InvalidPolygon::SelfCrossing(first, second));
+                    return Err(InvalidPolygon::SelfCrossing {
+                        first,
+                        from: side(first).0,
+                        second,
+                        onto: side(second).0,
+                    });
                 }
             }
         }
@@ -233,19 +256,25 @@ mod tests {
     #[test]
     fn a_bow_tie_is_refused_with_the_sides_that_cross() {
         let bow_tie = polygon(&[(0.0, 0.0), (2.0, 2.0), (2.0, 0.0), (0.0, 2.0)]);
-        assert_eq!(bow_tie, Err(InvalidPolygon::SelfCrossing(0, 2)));
+        let refused = bow_tie.unwrap_err().to_string();
+        for part in [
+            "corner 0 at (0.00 m, 0.00 m)",
+            "corner 2 at (2.00 m, 0.00 m)",
+        ] {
+            assert!(refused.contains(part), "{refused}");
+        }
     }
 
     #[test]
     fn sides_that_touch_or_fold_back_are_refused() {
         let touching = polygon(&[(0.0, 0.0), (4.0, 0.0), (4.0, 2.0), (2.0, 0.0), (0.0, 2.0)]);
         assert!(
-            matches!(touching, Err(InvalidPolygon::SelfCrossing(..))),
+            matches!(touching, Err(InvalidPolygon::SelfCrossing { .. })),
             "{touching:?}"
         );
         let folded = polygon(&[(0.0, 0.0), (4.0, 0.0), (2.0, 0.0), (2.0, 2.0)]);
         assert!(
-            matches!(folded, Err(InvalidPolygon::SelfCrossing(..))),
+            matches!(folded, Err(InvalidPolygon::SelfCrossing { .. })),
             "{folded:?}"
         );
     }

@@ -22,6 +22,12 @@ fn tick(bencher: Bencher) {
 }
 
 #[divan::bench]
+fn tick_within_a_fence_of_1000_corners(bencher: Bencher) {
+    let mut robot = Robot::under_way(5.0).fenced();
+    bencher.bench_local(move || robot.tick());
+}
+
+#[divan::bench]
 fn estimator_step(bencher: Bencher) {
     let mut robot = Robot::under_way(5.0);
     bencher.bench_local(move || robot.estimate());

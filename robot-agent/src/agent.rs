@@ -43,8 +43,6 @@ use crate::supervisor::{PartEnded, Supervisor};
 
 /// Longest time that a stopping agent waits for the server to take its last records.
 const LAST_UPLOAD_MAX: Duration = Duration::from_secs(1);
-/// Longest pause before an agent first looks for its server.
-const START_JITTER_MAX: Duration = Duration::from_millis(300);
 /// Pause between two looks at what still waits.
 const LAST_UPLOAD_POLL: Duration = Duration::from_millis(10);
 
@@ -276,12 +274,6 @@ fn recall_missions(
     Ok(missions)
 }
 
-/// A pause of its own for each run, below [`START_JITTER_MAX`]: the boot is random already.
-fn start_jitter(boot: BootId) -> Duration {
-    let share = f64::from(boot.as_uuid().as_fields().0) / f64::from(u32::MAX);
-    START_JITTER_MAX.mul_f64(share)
-}
-
 /// Everything that needs the network.
 struct Online {
     config: AgentConfig,
@@ -303,7 +295,7 @@ impl Online {
         });
         tokio::select! {
             // Robots that get power together do not come all at once.
-            () = tokio::time::sleep(start_jitter(self.identity.boot)) => {}
+            () = tokio::time::sleep(fleet::start_jitter(self.identity.boot)) => {}
             () = self.stop.cancelled() => return,
         }
         let server = &self.config.server;
@@ -392,7 +384,7 @@ impl Online {
         match link.hello(&hello).await {
             Ok(welcome) => {
                 info!("the server welcomes `{}`", self.identity.robot);
-                self.dispatcher.take_site(welcome.site)
+                self.dispatcher.take_welcome(welcome.site)
             }
             Err(fleet::AskError::NoAnswer) => false,
             Err(cause) => {

@@ -16,7 +16,7 @@ use std::time::Duration;
 
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
-use tracing::{info, warn};
+use tracing::{error, info, warn};
 use tread_api::ids::{BootId, MissionId};
 use tread_api::keys::Verb;
 use tread_api::mission::{LinkPolicy, PlanSummary};
@@ -205,14 +205,33 @@ impl Dispatcher {
         })
     }
 
+    /// Takes the site of a server's welcome; false if the loop has no room for it now.
+    ///
+    /// A geofence that is larger than a tick can look at is no reason to drive without any: the
+    /// robot then finds no room anywhere until it is told of another.
+    pub(crate) fn take_welcome(&self, definition: SiteDefinition) -> bool {
+        match definition.geofence.validate() {
+            Ok(()) => self.take_site(definition),
+            Err(cause) => {
+                error!("the site's geofence cannot be kept, so the robot stays: {cause}");
+                self.take(SiteView::without_room(definition))
+            }
+        }
+    }
+
     /// Takes a definition of the site; false if the loop has no room for it now.
     pub(crate) fn take_site(&self, definition: SiteDefinition) -> bool {
+        self.take(SiteView::new(definition))
+    }
+
+    fn take(&self, view: SiteView) -> bool {
         let mut cell = self.site.lock();
+        let definition = view.definition().clone();
         if cell.as_ref().is_some_and(|(known, _)| *known == definition) {
             return true;
         }
         let revision = definition.terrain_revision;
-        let view = Arc::new(SiteView::new(definition.clone()));
+        let view = Arc::new(view);
         if self
             .to_loop
             .try_send(LoopCommand::Site(Arc::clone(&view)))
@@ -346,6 +365,10 @@ impl Dispatcher {
                 self.missions.holder().release(mission);
                 return refused(OfferRefusal::NotReady, "the control loop is busy");
             }
+        }
+        // The same tick takes both. Without room the server pauses it once it sees it driven.
+        if offer.held && !self.tell_loop(LoopCommand::Hold(mission, Hold::Pause)) {
+            warn!(mission.id = %mission, "{mission} was to be held, and the control loop is busy");
         }
         info!(
             mission.id = %mission,

@@ -93,6 +93,7 @@ impl Server {
             commands: fleet.commands(&app),
             teleop: fleet.teleop(),
             supervisor: supervisor.clone(),
+            stop_confirm_max: app::stops::STOP_CONFIRM_MAX,
         });
         let (uploads, uploads_in) = mpsc::channel(ingest::UPLOADS_WAITING_MAX);
         supervisor.spawn_vital("ingest", ingest::run(app.clone(), uploads_in, stop()));

@@ -30,6 +30,10 @@ pub struct Offer {
     /// What to do when the server is no longer heard.
     #[serde(default)]
     pub link_policy: LinkPolicy,
+    /// Whether it is to stand at its start until it is resumed: whoever paused it, or stopped the
+    /// robot before it was taken, has not let it go on. Counts only when the mission is taken.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub held: bool,
 }
 
 impl Offer {

@@ -19,6 +19,7 @@ use tokio_tungstenite::tungstenite::{Error, Message};
 use tread_api::drive::{
     Drive, DriveRequest, DriveUpdate, DriveView, DriverName, Nothing, StopWords,
 };
+use tread_api::safety::GateCause;
 
 use super::robots::{link_name, mode_name};
 use crate::args::DriveArguments;
@@ -354,17 +355,63 @@ fn status(view: &DriveView) -> String {
     let heard = view.heard_age_ms.map_or_else(|| "-".to_owned(), age);
     let driver = view.safety.lease.as_ref();
     let driver = driver.map_or("nobody", |lease| lease.driver.name.as_str());
+    // What a narrow terminal cuts off is at the end.
     let stop = view.safety.stop.as_ref();
-    let stop = stop.map_or(String::new(), |stop| format!(" · STOPPED by {}", stop.by));
+    let stop = stop.map_or(String::new(), |stop| format!("STOPPED by {} · ", stop.by));
+    let slowed = view.safety.gate.cause.and_then(slowed_by);
+    let slowed = slowed.map_or(String::new(), |cause| format!(" ({cause})"));
     format!(
-        "{} · {mode} · {speed} · latency {latency} · heard {heard} ago · driver {driver}{stop}",
+        "{stop}{} · {mode} · {speed}{slowed} · latency {latency} · heard {heard} ago · driver {driver}",
         link_name(view.link)
     )
+}
+
+/// What slows the robot down beyond its driver's word, if that is worth saying.
+fn slowed_by(cause: GateCause) -> Option<&'static str> {
+    match cause {
+        GateCause::CommandAge => Some("slow: the link is late"),
+        GateCause::ExternalLimit => Some("slow: another program limits it"),
+        GateCause::Fence => Some("slow: the geofence is near"),
+        GateCause::LinkPolicy => Some("held: the server was silent"),
+        GateCause::ExternalHold => Some("held by another program"),
+        GateCause::StalePosition => Some("slow or held: it does not know where it is"),
+        GateCause::Tilt => Some("held: it leans too far"),
+        GateCause::StaleFeedback => Some("held: its base is silent"),
+        GateCause::Acceleration
+        | GateCause::Speed
+        | GateCause::NotFinite
+        | GateCause::NoCommand
+        | GateCause::Lease
+        | GateCause::Stop
+        | GateCause::Other => None,
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_narrow_terminal_shows_first_that_the_robot_is_stopped_and_why_it_is_slow() {
+        let mut view: DriveView = serde_json::from_value(serde_json::json!({
+            "link": "online", "heard_age_ms": 20, "mode": "stopped", "pose": null, "twist": null,
+            "mission": null, "latency_ms": 12.0, "socket_ms": 1.0,
+            "safety": {
+                "stop": {"id": "00000000-0000-0000-0000-000000000001", "by": "Ann",
+                         "reason": "smoke", "since": "2026-11-01T00:00:00Z"},
+                "gate": {"cause": "stop", "reduced_ticks": 1, "counts": []},
+            },
+        }))
+        .unwrap();
+        assert!(status(&view).starts_with("STOPPED by Ann · online"));
+        view.safety.stop = None;
+        view.safety.gate.cause = Some(GateCause::Fence);
+        let shown = status(&view);
+        assert!(
+            shown.starts_with("online") && shown.contains("geofence"),
+            "{shown}"
+        );
+    }
 
     fn key(code: KeyCode) -> KeyEvent {
         KeyEvent::new(code, KeyModifiers::NONE)

@@ -2,9 +2,10 @@
 //! work.
 
 use tread_control::estimation::{Estimator, SensorNoise, SensorSample};
+use tread_control::fence::{Fence, FenceInput};
 use tread_control::follower::{Follower, FollowerConfig, FollowerOutput};
 use tread_control::friction::FrictionCurve;
-use tread_control::gate::{GateInput, GateLimits, gate};
+use tread_control::gate::{GateInput, GateLimits, Reasons, gate_with};
 use tread_control::geometry::{Point, Pose};
 use tread_control::localisation::{Localisation, LocalisationNoise, PositionFix};
 use tread_control::measured::{Measured, WheelSpeeds};
@@ -42,7 +43,19 @@ pub(crate) fn plan() -> Plan {
     Plan::new(&trajectory, start, &RobotModel::yi2007()).expect("a path that can be driven")
 }
 
-/// A robot with plant, estimator, localisation, law and gate.
+/// The corners of a regular polygon.
+fn ring(x_m: f64, y_m: f64, radius_m: f64, corners: u32) -> Vec<Point> {
+    let corner = |index: u32| {
+        let angle_rad = f64::from(index) / f64::from(corners) * std::f64::consts::TAU;
+        Point {
+            x_m: x_m + radius_m * angle_rad.cos(),
+            y_m: y_m + radius_m * angle_rad.sin(),
+        }
+    };
+    (0..corners).map(corner).collect()
+}
+
+/// A robot with plant, estimator, localisation, law, fence and gate.
 pub(crate) struct Robot {
     pub(crate) plant: Plant,
     pub(crate) ground: Ground,
@@ -51,6 +64,8 @@ pub(crate) struct Robot {
     estimator: Estimator,
     follower: Follower,
     limits: GateLimits,
+    model: RobotModel,
+    fence: Fence,
     samples: [SensorSample; SAMPLES as usize],
     ticks: u32,
 }
@@ -70,6 +85,8 @@ impl Robot {
             estimator: Estimator::new(model, SensorNoise::default()),
             follower: Follower::new(plan, model, FollowerConfig::default()).expect("valid gains"),
             limits: GateLimits::of(&model),
+            model,
+            fence: Fence::default(),
             samples: [SensorSample::default(); SAMPLES as usize],
             ticks: 0,
         };
@@ -78,6 +95,15 @@ impl Robot {
             robot.tick();
         }
         robot
+    }
+
+    /// The same robot within a fence of a thousand corners, the most that there may be, most of
+    /// them near its way.
+    pub(crate) fn fenced(mut self) -> Self {
+        let keep_out = [(2.7, 0.0), (-2.7, 0.0), (0.0, 2.6), (0.0, -2.6)];
+        let keep_out = keep_out.map(|(x_m, y_m)| ring(x_m, y_m, 0.25, 100));
+        self.fence = Fence::new(vec![ring(0.0, 0.0, 4.8, 600)], keep_out.to_vec());
+        self
     }
 
     /// Lets the plant run for a tick and reads its sensors; no part of the measured work.
@@ -133,7 +159,18 @@ impl Robot {
             feedback_age_s: 0.0,
             dt_s: LOOP_S,
         };
-        self.command = gate(&input, &self.limits).wheel_speeds;
+        let fence = FenceInput {
+            pose: measured.pose,
+            position_std_dev_m: self.localisation.position_std_dev_m(),
+            present: measured.twist,
+            wanted: self.model.twist_from_wheel_speeds(output.wheel_speeds),
+            mu_lower: None,
+        };
+        let reasons = Reasons {
+            fence_max_m_s: self.fence.judge(&fence, &self.model).speed_max_m_s,
+            ..Reasons::default()
+        };
+        self.command = gate_with(&input, &reasons, &self.limits).wheel_speeds;
         output
     }
 

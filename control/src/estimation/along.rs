@@ -14,9 +14,9 @@
 
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-use super::block::{SideSlips, bent};
+use super::curved::{SLIP_MIN, SideSlips, Turn, bent, drift_bend, spread_out, uneven};
 use super::regression::{Parameters, Row, index};
-use super::{SensorNoise, SensorSample, signed_rims};
+use super::{SLIP_LINEAR_MAX, SensorNoise, SensorSample, TyrePrior, signed_rims};
 
 /// Time over which samples are averaged, seconds.
 pub(super) const STEP_S: f64 = 0.05;
@@ -26,6 +26,8 @@ const UNKNOWN_M2_S2: f64 = 1.0;
 const STANDING_M_S: f64 = 3.0e-3;
 /// Deviation of a standing robot's speed, metres per second.
 const STANDING_NOISE_M_S: f64 = 1.0e-3;
+/// Turn rate below which a robot drives straight, radians per second.
+const TURNING_MIN_RAD_S: f64 = 1.0e-3;
 /// Steps the wheels must have stood before the body does too.
 const STANDING_STEPS: u32 = 3;
 
@@ -59,10 +61,19 @@ pub(super) struct SlipBound {
     pub(super) theta_most: f64,
     /// θ that weighs the rows.
     pub(super) theta: f64,
-    /// Largest combined slip.
-    pub(super) slip_max: f64,
-    /// Mean curvature of the tyres, per slip.
-    pub(super) curvature: f64,
+    /// `δ_d` as it is known.
+    pub(super) radius_difference: f64,
+    /// What is known of the tyres.
+    pub(super) tyres: TyrePrior,
+}
+
+/// What sideways drift is reckoned with.
+#[derive(Debug, Clone, Copy)]
+struct Sideways {
+    /// θ as it is known.
+    theta: f64,
+    /// [`drift_bend`].
+    bend: f64,
 }
 
 /// The filter.
@@ -75,6 +86,7 @@ pub(super) struct AlongFilter {
     /// Change of speed that the last step leaves to its successor.
     last_share_m_s: f64,
     last_duration_s: f64,
+    last_gyro_rad_s: f64,
     standing: u32,
     started: bool,
 }
@@ -91,6 +103,7 @@ impl AlongFilter {
             sensitivity: Parameters::zeros(),
             last_share_m_s: 0.0,
             last_duration_s: 0.0,
+            last_gyro_rad_s: 0.0,
             standing: 0,
             started: false,
         }
@@ -141,7 +154,11 @@ impl AlongFilter {
         let count = step.samples;
         let ahead_m_s2 = step.ahead_m_s2 / count;
         let gyro_rad_s = step.gyro_rad_s / count;
-        self.predict(&step, ahead_m_s2, gyro_rad_s, noise);
+        let sideways = Sideways {
+            theta: bound.theta,
+            bend: sideways_bend(&step, gyro_rad_s, model, bound.tyres.curvature),
+        };
+        self.predict(&step, ahead_m_s2, gyro_rad_s, noise, sideways);
         let mut rows: Rows = [None; 3];
         let is_standing = (step.rim_m_s / count).abs() < STANDING_M_S;
         self.standing = if is_standing { self.standing + 1 } else { 0 };
@@ -174,13 +191,21 @@ impl AlongFilter {
 
     /// From the mean of the last step to that of this one: the acceleration between, weighed by a
     /// triangle that rises over the last step and falls over this one.
-    fn predict(&mut self, step: &Step, ahead_m_s2: f64, gyro_rad_s: f64, noise: &SensorNoise) {
+    fn predict(
+        &mut self,
+        step: &Step,
+        ahead_m_s2: f64,
+        gyro_rad_s: f64,
+        noise: &SensorNoise,
+        sideways: Sideways,
+    ) {
         let late_m_s = step.ahead_late_m_s / step.samples;
         let early_m_s = ahead_m_s2 * step.duration_s - late_m_s;
         let span_s = 0.5 * (self.last_duration_s + step.duration_s);
         let gained_m_s = self.last_share_m_s + early_m_s;
         self.last_share_m_s = late_m_s;
         self.last_duration_s = step.duration_s;
+        let last_gyro_rad_s = std::mem::replace(&mut self.last_gyro_rad_s, gyro_rad_s);
         if !self.started {
             self.started = true;
             self.speed_m_s = step.rim_m_s / step.samples;
@@ -189,8 +214,17 @@ impl AlongFilter {
         self.speed_m_s += gained_m_s;
         self.sensitivity[index::AHEAD_OFFSET] -= span_s;
         self.sensitivity[index::AHEAD_SCALE] += gained_m_s;
-        self.sensitivity[index::THETA] -=
-            span_s * (self.speed_m_s * gyro_rad_s).powi(2) / GRAVITY_M_S2;
+        // Between the middles of two steps. Drift follows the acceleration across, which is less
+        // than vφ̇ while the drift itself grows.
+        let turn_rad_s = 0.5 * (gyro_rad_s + last_gyro_rad_s);
+        let turn_rad_s2 = (gyro_rad_s - last_gyro_rad_s) / span_s;
+        let ahead_m_s2 = gained_m_s / span_s;
+        let drift_s = sideways.theta * self.speed_m_s / GRAVITY_M_S2;
+        let across_m_s2 = self.speed_m_s * turn_rad_s
+            - drift_s * (self.speed_m_s * turn_rad_s2 + 2.0 * ahead_m_s2 * turn_rad_s);
+        let sideways_m_s = span_s * self.speed_m_s * turn_rad_s * across_m_s2 / GRAVITY_M_S2;
+        self.sensitivity[index::THETA] -= sideways_m_s;
+        self.sensitivity[index::CURVATURE] -= sideways_m_s * sideways.bend;
         self.variance = (self.variance
             + (span_s * noise.accelerometer_m_s2).powi(2) / step.samples)
             .min(UNKNOWN_M2_S2);
@@ -212,28 +246,40 @@ impl AlongFilter {
         let lateral = 0.5 * model.wheelbase_m() * gyro_rad_s.abs() / slower_m_s;
         let turning = 0.5 * (rim_difference_m_s - turn_m_s).abs() / slower_m_s;
         let driving = bound.theta_most * ahead_m_s2.abs() / GRAVITY_M_S2;
-        if lateral.hypot(turning + driving) > bound.slip_max {
+        if lateral.hypot(turning + driving) > SLIP_LINEAR_MAX {
             return None;
         }
         let harmonic_m_s = step.harmonic_m_s / count;
         let force_m_s = step.force_m_s / count;
         let slip = lateral.hypot(turning + bound.theta * ahead_m_s2.abs() / GRAVITY_M_S2);
         let mut regressors = Parameters::zeros();
-        regressors[index::THETA] = force_m_s;
+        regressors[index::THETA] = spread_out(force_m_s, slip, &bound.tyres);
         regressors[index::RADIUS_OFFSET] = harmonic_m_s;
         regressors[index::RADIUS_DIFFERENCE] = 0.25 * rim_difference_m_s;
         // On a curved tyre the side that slips more carries less: with equal and opposite slip of
         // the two sides in a turn, both together hold the robot back.
-        let sides = SideSlips::of(harmonic_m_s.abs(), rim_difference_m_s, gyro_rad_s, model);
-        regressors[index::CURVATURE] = bent(force_m_s, slip, bound.curvature)
-            - 0.25 * sides.unequal * sides.apart * harmonic_m_s / bound.theta;
+        let turn = Turn {
+            rim_m_s: harmonic_m_s.abs(),
+            rim_difference_m_s,
+            yaw_rate_rad_s: gyro_rad_s,
+            radius_difference: bound.radius_difference * harmonic_m_s.signum(),
+            apart_variance: 0.0,
+        };
+        let common = bound.theta * ahead_m_s2 / GRAVITY_M_S2 * harmonic_m_s.signum();
+        let sides = SideSlips::of(&turn, common, model);
+        let curvature = bound.tyres.curvature;
+        let uneven_gain = uneven(sides.mean, curvature);
+        regressors[index::CURVATURE] = bent(force_m_s, slip, curvature)
+            - 0.25 * uneven_gain * sides.unequal * sides.apart * harmonic_m_s / bound.theta;
         // The measured acceleration is averaged over the step, and so is its offset.
         let felt_noise = (harmonic_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2) / count;
         let rim_noise = 0.5 * (noise.wheel_speed_rad_s * model.wheel_radius_m()).powi(2) / count;
         regressors[index::AHEAD_OFFSET] = -bound.theta * harmonic_m_s.abs() / GRAVITY_M_S2;
         let spread = rim_noise + bound.theta.powi(2) * felt_noise;
         let mut row = self.observe(regressors, step.wheels_m_s / count, spread, felt_noise);
-        row.bend = bent(1.0, slip, bound.curvature);
+        // The force makes the sides' slip unequal too, with its noise.
+        row.bend = bent(1.0, slip, curvature)
+            + 0.25 * uneven_gain * sides.apart * sides.apart / sides.mean.max(SLIP_MIN);
         Some(row)
     }
 
@@ -260,6 +306,28 @@ impl AlongFilter {
             force_noise: force_noise * 2.0 / (2.0 - gain),
             bend: 0.0,
             common_noise: Parameters::zeros(),
+            ramp_noise: 0.0,
         }
     }
+}
+
+/// [`drift_bend`] of a step; zero on a straight.
+fn sideways_bend(step: &Step, gyro_rad_s: f64, model: &RobotModel, curvature: f64) -> f64 {
+    let rim_m_s = step.harmonic_m_s.abs() / step.samples;
+    if step.usable < step.samples || gyro_rad_s.abs() < TURNING_MIN_RAD_S {
+        return 0.0;
+    }
+    let turn = Turn {
+        rim_m_s,
+        rim_difference_m_s: step.rim_difference_m_s / step.samples,
+        yaw_rate_rad_s: gyro_rad_s,
+        radius_difference: 0.0,
+        apart_variance: 0.0,
+    };
+    let slip = SideSlips::of(&turn, 0.0, model).mean;
+    drift_bend(
+        slip,
+        0.5 * model.wheelbase_m() * gyro_rad_s / rim_m_s,
+        curvature,
+    )
 }

@@ -1,5 +1,6 @@
 //! Samples averaged over blocks, and the two differential rows that a block gives.
 
+use super::curved::{Bent, SLIP_MIN, SideSlips, Turn, bent, drift_bend, spread_out, uneven};
 use super::regression::{Parameters, Row, index};
 use super::window::{TurnMeans, TurnWindow};
 use super::{
@@ -23,6 +24,11 @@ pub(super) struct Force {
     mean_m_s: f64,
     /// Variance of the former; that of the latter is a quarter of it.
     difference_noise: f64,
+    /// What both add to θκ's regressor, and both to θ's, each side at its own slip.
+    difference_bent: Bent,
+    mean_bent: Bent,
+    /// θκ's regressor over the force, whose noise it has.
+    bend: f64,
 }
 
 /// What is known about θ when a block is judged.
@@ -44,10 +50,6 @@ pub(super) struct Block {
     pub(super) is_linear: bool,
     /// Geometric slip across of the slower side's wheels.
     slip_lateral: f64,
-    /// Combined slip by the sides' difference alone.
-    slip: f64,
-    /// Mean curvature of the tyres, per slip.
-    curvature: f64,
     /// Acceleration ahead over gravity, magnitude.
     ahead_mu: f64,
     /// Rim speed of the slower side, metres per second.
@@ -76,24 +78,25 @@ pub(super) struct Block {
 }
 
 impl Block {
-    /// Whether slip was in the linear range, combined from along and across. Along, the sides'
-    /// difference is measured well; what they have in common is θμ where θ is known. Before that it
-    /// comes from the body speed, which is coarse, so the bound is tighter.
+    /// Whether slip was in the linear range, combined from along and across. Across, and along the
+    /// sides' difference, it is measured well, known θ or not; what the sides have in common is θμ.
+    /// Before θ is known that is the most it may be, so that turning alone does not keep a long robot
+    /// from ever beginning. With torque it comes from the body speed, which is coarse: the bound is
+    /// tighter, or a robot that slides would begin with what sliding shows.
     pub(super) fn slips_little(&self, bound: &ThetaBound) -> bool {
         let turning = 0.5 * self.difference_m_s.abs() / self.slower_m_s;
-        let limit = if bound.theta.is_some() {
-            SLIP_LINEAR_MAX
-        } else {
-            SLIP_LINEAR_FIRST_MAX
+        let (common, limit) = match (bound.theta, self.force) {
+            (Some(theta), Some(force)) => (
+                theta * force.mean_m_s.abs() / self.rim_mean_m_s.abs(),
+                SLIP_LINEAR_MAX,
+            ),
+            (None, Some(_)) => (
+                self.slip_m_s.unwrap_or(0.0).abs() / self.slower_m_s,
+                SLIP_LINEAR_FIRST_MAX,
+            ),
+            (_, None) => (bound.theta_most * self.ahead_mu, SLIP_LINEAR_MAX),
         };
-        let along = match (bound.theta, self.force) {
-            (Some(theta), Some(force)) => {
-                turning + theta * force.mean_m_s.abs() / self.rim_mean_m_s.abs()
-            }
-            (None, Some(_)) => turning + self.slip_m_s.unwrap_or(0.0).abs() / self.slower_m_s,
-            (_, None) => turning + bound.theta_most * self.ahead_mu,
-        };
-        along.hypot(self.slip_lateral) < limit
+        (turning + common).hypot(self.slip_lateral) < limit
     }
 
     /// Row of the sides' difference: on measured torques, or else on measured accelerations.
@@ -102,11 +105,11 @@ impl Block {
             return self.turning;
         };
         let mut regressors = Parameters::zeros();
-        regressors[index::THETA] = force.difference_m_s;
+        regressors[index::THETA] = force.difference_bent.theta_m_s;
         regressors[index::RADIUS_OFFSET] = self.rim_difference_m_s;
         regressors[index::RADIUS_DIFFERENCE] = self.rim_mean_m_s;
         regressors[index::GYRO_OFFSET] = -self.track_width_m;
-        regressors[index::CURVATURE] = bent(force.difference_m_s, self.slip, self.curvature);
+        regressors[index::CURVATURE] = force.difference_bent.curvature_m_s;
         regressors[index::RESISTANCE] = -self.rim_difference_m_s;
         let mut common_noise = Parameters::zeros();
         common_noise[index::RADIUS_OFFSET] = self.rim_difference_noise;
@@ -116,10 +119,15 @@ impl Block {
             response: self.difference_m_s,
             spread: self.difference_noise,
             force_noise: force.difference_noise,
-            // Torque is measured so well that its noise does not matter there.
-            bend: 0.0,
+            bend: force.bend,
             common_noise,
+            ramp_noise: 0.0,
         })
+    }
+
+    /// The moment balance, where no torque is measured.
+    pub(super) fn turning_row(&self) -> Option<Row> {
+        self.turning.filter(|_| self.force.is_none())
     }
 
     /// Row of the sides' mean, on measured torques and body speed.
@@ -127,19 +135,19 @@ impl Block {
         let force = self.force?;
         let slip_m_s = self.slip_m_s.filter(|_| self.is_steady)?;
         let mut regressors = Parameters::zeros();
-        regressors[index::THETA] = force.mean_m_s;
+        regressors[index::THETA] = force.mean_bent.theta_m_s;
         regressors[index::RADIUS_OFFSET] = self.rim_mean_m_s;
         regressors[index::RADIUS_DIFFERENCE] = 0.25 * self.rim_difference_m_s;
-        regressors[index::CURVATURE] = bent(force.mean_m_s, self.slip, self.curvature);
+        regressors[index::CURVATURE] = force.mean_bent.curvature_m_s;
         regressors[index::RESISTANCE] = -self.rim_mean_m_s;
         Some(Row {
             regressors,
             response: slip_m_s,
             spread: self.slip_noise,
             force_noise: 0.25 * force.difference_noise,
-            // Torque is measured so well that its noise does not matter there.
-            bend: 0.0,
+            bend: force.bend,
             common_noise: Parameters::zeros(),
+            ramp_noise: 0.0,
         })
     }
 
@@ -149,43 +157,6 @@ impl Block {
             .map_or(2.0 * self.ahead_mu * self.rim_mean_m_s.abs(), |force| {
                 2.0 * force.mean_m_s.abs()
             })
-    }
-}
-
-/// Regressor of θκ: the force's slip grows with slip itself on a curved tyre.
-pub(super) fn bent(force_m_s: f64, slip: f64, curvature: f64) -> f64 {
-    force_m_s * slip * (1.0 + 2.0 / 3.0 * curvature * slip)
-}
-
-/// Slips of the two sides in a turn.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct SideSlips {
-    /// Mean combined slip.
-    pub(super) mean: f64,
-    /// Left minus right combined slip.
-    pub(super) unequal: f64,
-    /// Right minus left slip ahead.
-    pub(super) apart: f64,
-}
-
-impl SideSlips {
-    /// At a mean rim speed above zero, all of a robot that drives ahead.
-    pub(super) fn of(
-        rim_m_s: f64,
-        rim_difference_m_s: f64,
-        turn_rad_s: f64,
-        model: &RobotModel,
-    ) -> Self {
-        let apart = (rim_difference_m_s - model.track_width_m() * turn_rad_s) / rim_m_s;
-        let combined =
-            |side_m_s: f64| (0.5 * apart).hypot(0.5 * model.wheelbase_m() * turn_rad_s / side_m_s);
-        let left = combined(rim_m_s - 0.5 * rim_difference_m_s);
-        let right = combined(rim_m_s + 0.5 * rim_difference_m_s);
-        Self {
-            mean: 0.5 * (left + right),
-            unequal: left - right,
-            apart,
-        }
     }
 }
 
@@ -279,12 +250,7 @@ impl BlockBuilder {
 
     /// The block's means; none when the robot was too slow or turned on the spot.
     pub(super) fn finish(&self, context: BlockContext<'_>) -> Option<Block> {
-        let BlockContext {
-            model,
-            noise,
-            tyres,
-            ..
-        } = context;
+        let BlockContext { model, noise, .. } = context;
         if self.samples == 0 || self.usable < self.samples {
             return None;
         }
@@ -300,15 +266,9 @@ impl BlockBuilder {
         let difference_m_s = right_m_s - left_m_s - model.track_width_m() * gyro_rad_s;
         let slip = lateral.hypot(0.5 * difference_m_s.abs() / slower_m_s);
         let rim_noise_m_s = noise.wheel_speed_rad_s * model.wheel_radius_m();
-        let force = (self.with_torque == self.samples).then(|| Force {
-            difference_m_s: (self.right_force_m_s - self.left_force_m_s) / count,
-            mean_m_s: 0.5 * (self.right_force_m_s + self.left_force_m_s) / count,
-            difference_noise: noise.torque_mu.powi(2)
-                * (left_m_s * left_m_s + right_m_s * right_m_s)
-                / count,
-        });
         let has_acceleration = self.with_acceleration == self.samples;
         let ahead_mu = self.ahead_m_s2 / count / GRAVITY_M_S2;
+        let force = (self.with_torque == self.samples).then(|| self.force(&context));
         let turning = has_acceleration
             .then(|| self.window.means(self.duration_s))
             .flatten()
@@ -335,8 +295,6 @@ impl BlockBuilder {
             duration_s: self.duration_s,
             is_linear: slip < SLIP_LINEAR_MAX,
             slip_lateral: lateral,
-            slip,
-            curvature: tyres.curvature,
             ahead_mu: ahead_mu.abs(),
             slower_m_s,
             difference_m_s,
@@ -360,6 +318,56 @@ impl BlockBuilder {
             rolling_resistance: resistance,
         })
     }
+
+    /// Forces from torques; every sample has one.
+    fn force(&self, context: &BlockContext<'_>) -> Force {
+        let BlockContext {
+            model,
+            noise,
+            tyres,
+            radius_difference,
+            theta,
+        } = *context;
+        let count = f64::from(self.samples);
+        let (left_m_s, right_m_s) = (self.left_m_s / count, self.right_m_s / count);
+        let mean_m_s = 0.5 * (left_m_s + right_m_s);
+        let left_force_m_s = self.left_force_m_s / count;
+        let right_force_m_s = self.right_force_m_s / count;
+        let mean_force_m_s = 0.5 * (right_force_m_s + left_force_m_s);
+        let turn = Turn {
+            rim_m_s: mean_m_s.abs(),
+            rim_difference_m_s: right_m_s - left_m_s,
+            yaw_rate_rad_s: self.gyro_rad_s / count,
+            radius_difference: radius_difference * mean_m_s.signum(),
+            apart_variance: 0.0,
+        };
+        // The torque holds rolling resistance, which no contact carries.
+        let contact_m_s = if self.with_acceleration == self.samples {
+            self.ahead_m_s2 / count / GRAVITY_M_S2 * mean_m_s.abs()
+        } else {
+            mean_force_m_s
+        };
+        let rolling_m_s = mean_force_m_s - contact_m_s;
+        let sides = SideSlips::of(&turn, theta * contact_m_s / mean_m_s, model);
+        // In reverse the robot is looked at mirrored.
+        let (left_slip, right_slip) = if mean_m_s < 0.0 {
+            (sides.right, sides.left)
+        } else {
+            (sides.left, sides.right)
+        };
+        let left = Bent::of(left_force_m_s, rolling_m_s, left_slip, tyres);
+        let right = Bent::of(right_force_m_s, rolling_m_s, right_slip, tyres);
+        Force {
+            difference_m_s: right_force_m_s - left_force_m_s,
+            mean_m_s: mean_force_m_s,
+            difference_noise: noise.torque_mu.powi(2)
+                * (left_m_s * left_m_s + right_m_s * right_m_s)
+                / count,
+            difference_bent: Bent::sum(right, 1.0, left, -1.0),
+            mean_bent: Bent::sum(right, 0.5, left, 0.5),
+            bend: bent(1.0, sides.mean, tyres.curvature),
+        }
+    }
 }
 
 /// The moment balance as a row.
@@ -379,30 +387,52 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
         + means.ahead_force_m_s
         - radius_difference * means.rim_mean_m_s * means.ahead_mu;
     let mut regressors = Parameters::zeros();
-    regressors[index::THETA] = force_m_s;
     regressors[index::RADIUS_OFFSET] = means.rim_difference_m_s;
     regressors[index::RADIUS_DIFFERENCE] = means.rim_mean_m_s;
     regressors[index::TRACK] = track_m * (model.effective_track_ratio() - 1.0) * means.turn_rad_s;
     regressors[index::GYRO_OFFSET] = -model.effective_track_m();
     regressors[index::AHEAD_OFFSET] = -theta * means.rim_difference_m_s / GRAVITY_M_S2;
     // The side that slips more carries less; what that adds to the balance is odd in the turn.
-    let sides = SideSlips::of(
-        means.harmonic_m_s,
-        means.rim_difference_m_s,
-        means.turn_rad_s,
-        model,
-    );
-    let gap = means.rim_difference_m_s / means.harmonic_m_s.powi(2);
-    let lever_m = model.wheelbase_m().powi(2) / track_m;
-    let odd_m_s = means.harmonic_m_s
-        * sides.unequal
-        * (0.5 * sides.apart * gap * means.harmonic_m_s
-            + 0.5 * lever_m * means.turn_rad_s * gap
-            + 2.0 * theta * means.ahead_mu);
-    regressors[index::CURVATURE] =
-        bent(force_m_s, sides.mean, tyres.curvature) - 0.5 * odd_m_s / theta;
     let rim_noise_m_s = noise.wheel_speed_rad_s * model.wheel_radius_m();
     let gyro_noise = noise.gyro_rad_s.powi(2);
+    let turn = Turn {
+        rim_m_s: means.harmonic_m_s,
+        rim_difference_m_s: means.rim_difference_m_s,
+        yaw_rate_rad_s: means.turn_rad_s,
+        radius_difference: radius_difference * means.rim_mean_m_s.signum(),
+        // A loop on noisy poses swings the slip within a window; its noise is no slip.
+        apart_variance: means.apart_variance
+            - (2.0 * rim_noise_m_s.powi(2) + track_m * track_m * gyro_noise)
+                / means.harmonic_m_s.powi(2),
+    };
+    let sides = SideSlips::of(&turn, theta * means.ahead_mu, model);
+    regressors[index::THETA] = spread_out(force_m_s, sides.mean, tyres);
+    let gap = means.rim_difference_m_s / means.harmonic_m_s.powi(2);
+    let lever_m = model.wheelbase_m().powi(2) / track_m;
+    let uneven_gain = uneven(sides.mean, tyres.curvature);
+    let uneven = sides.unequal * uneven_gain;
+    // Slip that the sides have in common: of the force ahead, less what unequal sides hold back.
+    let common = bent(theta * means.ahead_mu, sides.mean, tyres.curvature) * tyres.curvature
+        + theta * means.ahead_mu
+        - 0.25 * sides.apart * tyres.curvature * uneven;
+    let odd_m_s = means.harmonic_m_s
+        * uneven
+        * (0.5 * sides.apart * gap * means.harmonic_m_s
+            + 0.5 * lever_m * means.turn_rad_s * gap
+            + 2.0 * common);
+    // Drift makes the axles slip unequally, so that their moments no longer cancel its force's.
+    let across = 0.5 * model.wheelbase_m() * means.turn_rad_s / means.harmonic_m_s;
+    let drift = theta * means.harmonic_m_s * means.turn_rad_s / GRAVITY_M_S2
+        * (1.0 + tyres.curvature * drift_bend(sides.mean, across, tyres.curvature));
+    let axles_m_s = 2.0 * model.wheelbase_m() / track_m
+        * means.harmonic_m_s
+        * uneven_gain
+        * across
+        * drift
+        * drift
+        / sides.mean.max(SLIP_MIN);
+    regressors[index::CURVATURE] =
+        bent(force_m_s, sides.mean, tyres.curvature) - (0.5 * odd_m_s + axles_m_s) / theta;
     let difference_noise = 2.0 * rim_noise_m_s.powi(2) / means.samples;
     let mut common_noise = Parameters::zeros();
     common_noise[index::RADIUS_OFFSET] = difference_noise;
@@ -410,16 +440,18 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
         -track_m * (model.effective_track_ratio() - 1.0) * model.effective_track_m() * gyro_noise
             / means.samples;
     common_noise[index::AHEAD_OFFSET] = -theta * difference_noise / GRAVITY_M_S2;
+    let ramp_noise = (inertia * means.harmonic_m_s / means.duration_s).powi(2) * 2.0 * gyro_noise
+        / means.ramp_samples;
     Row {
         regressors,
         response: means.slip_m_s,
         spread: (2.0 * rim_noise_m_s.powi(2) + model.effective_track_m().powi(2) * gyro_noise)
             / means.samples,
-        force_noise: (inertia * means.harmonic_m_s / means.duration_s).powi(2) * 2.0 * gyro_noise
-            / means.ramp_samples
+        force_noise: ramp_noise
             + (means.rim_difference_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2)
                 / means.samples,
         bend: bent(1.0, sides.mean, tyres.curvature),
         common_noise,
+        ramp_noise,
     }
 }

@@ -24,6 +24,7 @@
 mod along;
 mod block;
 mod change;
+mod curved;
 mod excitation;
 mod expectation;
 mod offsets;
@@ -42,7 +43,7 @@ use change::ChangeDetector;
 use excitation::Excitation;
 pub use expectation::{ExpectedAccuracy, expected_accuracy};
 use offsets::OffsetKnowledge;
-use regression::{Solution, SolveInput, solve};
+use regression::{Row, Solution, SolveInput, solve};
 pub use segment::SegmentStatistics;
 use segment::{Claims, SegmentTheta};
 use sums::Sums;
@@ -57,7 +58,7 @@ pub const BLOCK_S: f64 = 0.2;
 const RIM_SPEED_MIN_M_S: f64 = 0.15;
 /// Largest combined slip that is taken for the linear range.
 const SLIP_LINEAR_MAX: f64 = 0.15;
-/// The same before θ is known.
+/// The same before θ is known, where slip along is told by the body speed.
 const SLIP_LINEAR_FIRST_MAX: f64 = 0.10;
 /// Relative deviation above which there is said to be no measurement.
 const RELATIVE_STD_DEV_MAX: f64 = 0.5;
@@ -104,6 +105,8 @@ pub struct Estimator {
     estimate: Estimate,
     /// What all blocks of this ground give, where that is a measurement.
     measured: Option<Solution>,
+    /// The moment balance of the last block, where it was used.
+    turning_before: Option<Row>,
     last_wheels: Option<WheelSpeeds>,
     skipped_s: f64,
     leaps_in_a_row: u32,
@@ -138,6 +141,7 @@ impl Estimator {
             },
             estimate: Estimate::default(),
             measured: None,
+            turning_before: None,
             last_wheels: None,
             skipped_s: 0.0,
             leaps_in_a_row: 0,
@@ -164,6 +168,7 @@ impl Estimator {
         if dt_s > GAP_MAX_S {
             // Nothing is known of the time between: averages begin anew.
             self.block = BlockBuilder::default();
+            self.turning_before = None;
             self.along = AlongFilter::new();
             return UpdateOutcome::default();
         }
@@ -182,6 +187,9 @@ impl Estimator {
             theta: self.bound.theta_weights,
         };
         let block = builder.finish(context);
+        if block.is_none() {
+            self.turning_before = None;
+        }
         let (ground_changed, slips) = block.map_or((false, false), |block| self.take(block));
         self.excitation.end_block();
         self.refresh();
@@ -214,12 +222,8 @@ impl Estimator {
         let bound = SlipBound {
             theta_most: self.bound.theta_most,
             theta: self.bound.theta_weights,
-            slip_max: if self.bound.theta.is_some() {
-                SLIP_LINEAR_MAX
-            } else {
-                SLIP_LINEAR_FIRST_MAX
-            },
-            curvature: self.tyres.curvature,
+            radius_difference: self.estimate.radius_difference.value,
+            tyres: self.tyres,
         };
         let rows = self
             .along
@@ -237,6 +241,11 @@ impl Estimator {
     fn take(&mut self, mut block: Block) -> (bool, bool) {
         block.is_linear &= block.slips_little(&self.bound);
         self.pending.add(&block);
+        let row = block.turning_row().filter(|_| block.is_linear);
+        if let (Some(row), Some(before)) = (row, self.turning_before) {
+            self.pending.note_neighbour(&row, &before);
+        }
+        self.turning_before = row;
         let innovation = self
             .measured
             .and_then(|solution| solution.innovation(&block));
@@ -248,6 +257,7 @@ impl Estimator {
         let changed = innovation.is_some_and(|value| self.change.update(value));
         if changed {
             // These blocks may be of either ground: they belong to neither.
+            self.turning_before = None;
             self.pending = Sums::default();
             self.change = ChangeDetector::default();
         } else if self.change.is_quiet() {
@@ -397,6 +407,7 @@ impl Estimator {
         self.segment = Sums::default();
         self.pending = Sums::default();
         self.change = ChangeDetector::default();
+        self.turning_before = None;
         self.block = BlockBuilder::default();
         self.along = AlongFilter::new();
         self.excitation = Excitation::default();

@@ -60,7 +60,9 @@ const INFLATION_ROWS: f64 = 15.0;
 /// How large rolling resistance over load may be, one standard deviation.
 const ROLLING_SPREAD: f64 = 0.02;
 /// Share of the effect of curved tyres that the rows may miss: they hold it to second order.
-const BEND_SHARE: f64 = 0.1;
+const BEND_SHARE: f64 = 0.05;
+/// Most of a variance that neighbouring rows may take from it.
+const NEIGHBOURS_SHARE_MAX: f64 = 0.9;
 /// Least spread of a tyre's curvature, so that the matrix stays regular.
 const CURVATURE_SPREAD_MIN: f64 = 1.0e-3;
 
@@ -78,6 +80,9 @@ pub(super) struct Row {
     /// Covariance of the other regressors' noise with that of the response: rim speeds and turn
     /// rate stand on both sides.
     pub(super) common_noise: Parameters,
+    /// The part of the force's variance that is the gyro's over two ramps, each shared with a
+    /// neighbouring row with the other sign.
+    pub(super) ramp_noise: f64,
 }
 
 impl Row {
@@ -90,6 +95,7 @@ impl Row {
             force_noise: 0.0,
             bend: 0.0,
             common_noise: Parameters::zeros(),
+            ramp_noise: 0.0,
         }
     }
 }
@@ -106,6 +112,8 @@ pub(super) struct Channel {
     /// The same times the share in θκ's regressor, and times its square.
     bent_noise: [f64; 2],
     common_noise: Parameters,
+    /// `Σ (x xᵀ′ + x′ xᵀ) cov` over neighbouring rows x, x′ whose force noise has this covariance.
+    neighbours: ParameterMatrix,
     /// Sum of the response's variances.
     response_noise: f64,
 }
@@ -120,6 +128,7 @@ impl Default for Channel {
             force_noise: 0.0,
             bent_noise: [0.0; 2],
             common_noise: Parameters::zeros(),
+            neighbours: ParameterMatrix::zeros(),
             response_noise: 0.0,
         }
     }
@@ -139,6 +148,13 @@ impl Channel {
         self.response_noise += row.spread;
     }
 
+    /// Notes that a row that was added stands next to another one: they share a ramp.
+    pub(super) fn note_neighbour(&mut self, row: &Row, before: &Row) {
+        let covariance = -0.5 * (row.ramp_noise * before.ramp_noise).sqrt();
+        let product = row.regressors * before.regressors.transpose();
+        self.neighbours += (product + product.transpose()) * covariance;
+    }
+
     /// Adds a row in units of its own spread, which holds the force's noise at this θ.
     pub(super) fn add_standardised(&mut self, row: &Row, theta: f64) {
         let force_noise = row.force_noise / row.spread;
@@ -150,6 +166,7 @@ impl Channel {
             spread: (1.0 - theta * theta * force_noise).max(0.1),
             force_noise,
             bend: row.bend,
+            ramp_noise: 0.0,
         });
     }
 
@@ -165,6 +182,7 @@ impl Channel {
                 self.bent_noise[1] + other.bent_noise[1],
             ],
             common_noise: self.common_noise + other.common_noise,
+            neighbours: self.neighbours + other.neighbours,
             response_noise: self.response_noise + other.response_noise,
         }
     }
@@ -267,6 +285,19 @@ pub(super) fn inflation(channels: &[&Channel], parameters: &Parameters, theta: f
     }
 }
 
+/// What neighbouring rows add to the variance in the direction `M⁻¹v`; below zero where the force
+/// changes slowly, since what one row has too much of a ramp the next has too little.
+fn neighbours(channels: &[&Channel], direction: &Parameters, theta: f64) -> f64 {
+    let of_channel = |channel: &&Channel| {
+        if channel.count < 1.0 {
+            return 0.0;
+        }
+        let scale = theta / channel.spread(theta);
+        (channel.neighbours * direction).dot(direction) * scale * scale
+    };
+    channels.iter().map(of_channel).sum()
+}
+
 /// How large the regressor of θκ is beside that of θ.
 fn bend_ratio(channels: &[&Channel]) -> f64 {
     let sum = |parameter: usize| {
@@ -328,6 +359,9 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
             let mut of_theta = Parameters::zeros();
             of_theta[index::THETA] = 1.0;
             of_theta[index::RADIUS_OFFSET] = scale;
+            let direction = covariance * of_theta;
+            let neighbours =
+                neighbours(&channels, &direction, theta_weights).max(-NEIGHBOURS_SHARE_MAX * base);
             let missed = BEND_SHARE * parameters[index::CURVATURE] * bend_ratio(&channels);
             return Some(Solution {
                 theta,
@@ -335,7 +369,7 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
                 covariance: covariance * inflation,
                 inflation,
                 of_theta,
-                variance: (base + scaled) * inflation
+                variance: (base + scaled + neighbours) * inflation
                     + base * base * normal.excess
                     + missed * missed,
                 missed,

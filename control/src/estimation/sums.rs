@@ -78,6 +78,11 @@ impl Sums {
         }
     }
 
+    /// Notes that a block that was added follows another one without a gap.
+    pub(super) fn note_neighbour(&mut self, row: &Row, before: &Row) {
+        self.turning.note_neighbour(row, before);
+    }
+
     /// Adds an innovation of the speed ahead, weighed at this θ.
     pub(super) fn add_along(&mut self, row: &Row, theta: f64) {
         self.along.add_standardised(row, theta);

@@ -28,6 +28,8 @@ struct Part {
     turn: f64,
     rim_difference: f64,
     rim_mean: f64,
+    /// Right minus left slip ahead, and its square.
+    apart: [f64; 2],
     /// Gyro over the ramp, radians per second, and how much of the ramp there was.
     ramp: [f64; 2],
     ramp_share: [f64; 2],
@@ -51,6 +53,8 @@ pub(super) struct TurnMeans {
     pub(super) rim_difference_m_s: f64,
     /// `(u_R + u_L)/2`, metres per second, negative in reverse.
     pub(super) rim_mean_m_s: f64,
+    /// Variance of right minus left slip ahead within the window, with the sensors' noise.
+    pub(super) apart_variance: f64,
     pub(super) duration_s: f64,
     pub(super) samples: f64,
     pub(super) ramp_samples: f64,
@@ -115,6 +119,7 @@ impl TurnWindow {
             turn_acceleration_rad_s2: (rates[1] - rates[0]) / block_s,
             rim_difference_m_s: mean(part.rim_difference),
             rim_mean_m_s: mean(part.rim_mean),
+            apart_variance: mean(part.apart[1]) - mean(part.apart[0]).powi(2),
             duration_s: block_s,
             samples: part.samples,
             ramp_samples: part.ramp_samples.max(1.0),
@@ -145,6 +150,9 @@ impl Part {
         self.ahead_mu += weight_s * ahead_m_s2 / GRAVITY_M_S2;
         self.turn += weight_s * sample.gyro_rad_s;
         self.rim_difference += weight_s * (rims.right_m_s - rims.left_m_s);
+        let apart = (rims.right_m_s - rims.left_m_s - track_m * sample.gyro_rad_s) * half_sum;
+        self.apart[0] += weight_s * apart;
+        self.apart[1] += weight_s * apart * apart;
         self.rim_mean += weight_s * rims.sign * 0.5 * (rims.right_m_s + rims.left_m_s);
     }
 }

@@ -49,6 +49,17 @@ pub(crate) struct SimRobot {
 
 impl SimRobot {
     pub(crate) fn new(start: Pose, stiffness: f64, seed: u64, noisy: bool) -> Self {
+        Self::of(RobotModel::yi2007(), start, stiffness, seed, noisy)
+    }
+
+    /// The same of another model.
+    pub(crate) fn of(
+        model: RobotModel,
+        start: Pose,
+        stiffness: f64,
+        seed: u64,
+        noisy: bool,
+    ) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let sensors = SensorNoise::default();
         let mut spec = PlantSpec::default();
@@ -59,7 +70,6 @@ impl SimRobot {
             torque_gain = [0, 1].map(|_| 1.0 + sensors.torque_gain_ratio * normal(&mut rng));
             accelerometer_offset = sensors.accelerometer_offset_m_s2 * normal(&mut rng);
         }
-        let model = RobotModel::yi2007();
         let mut robot = Self {
             model,
             plant: Plant::new(model, spec, start).expect("a valid plant"),

@@ -190,7 +190,7 @@ fn a_revision_that_comes_at_the_very_end_is_driven_and_one_that_does_not_come_ho
 }
 
 #[test]
-fn a_silent_server_ends_a_mission_that_minds_after_its_time_and_no_other() {
+fn the_mission_link_watchdog_ends_a_mission_that_minds_silence_and_no_other() {
     for (silence_s, expected) in [
         (None, EndReason::Reached),
         (Some(2), EndReason::ServerSilent),

@@ -94,6 +94,19 @@ impl SiteView {
         }
     }
 
+    /// The same, but with no room for a robot anywhere: its geofence cannot be kept.
+    pub(crate) fn without_room(mut definition: SiteDefinition) -> Self {
+        let revision = std::mem::take(&mut definition.geofence).revision;
+        let mut view = Self::new(definition);
+        view.definition.geofence.revision = revision;
+        view.fence = Fence::without_room();
+        view
+    }
+
+    pub(crate) fn definition(&self) -> &SiteDefinition {
+        &self.definition
+    }
+
     pub(crate) fn grid(&self) -> Grid {
         self.definition.grid
     }

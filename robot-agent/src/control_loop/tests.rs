@@ -266,7 +266,7 @@ fn the_word_to_stop_brings_the_robot_to_rest_within_its_braking_time() {
 }
 
 #[test]
-fn a_silent_base_is_a_fault_and_ends_the_mission() {
+fn the_base_feedback_watchdog_is_a_fault_and_ends_the_mission() {
     let scenario = one_ground(2.0);
     let mut bench = bench_at(&scenario, ORIGIN, 10);
     bench.run_for(Duration::from_millis(500));

@@ -13,7 +13,6 @@ pub mod uploader;
 use std::sync::Arc;
 use std::time::Duration;
 
-use session::session_config;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
@@ -34,6 +33,8 @@ use zenoh::query::{ConsolidationMode, Querier, Query};
 pub use self::command::IncomingCommand;
 use self::error::zenoh_failed;
 pub use self::error::{AskError, LinkError, may_pass_later};
+use self::session::session_config;
+pub use self::session::start_jitter;
 
 /// Commands that may wait to be answered; more are dropped, and the server asks again.
 pub const COMMANDS_MAX: usize = 64;

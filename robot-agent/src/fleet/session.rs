@@ -1,13 +1,17 @@
 //! How the robot's session is opened: a client that connects for ever, with short queues below.
 
 use std::str::FromStr;
+use std::time::Duration;
+
+use tread_api::ids::BootId;
 
 use super::{LinkError, zenoh_failed};
 
 /// First pause before a lost connection is tried again, milliseconds.
 const RETRY_FIRST_MS: u32 = 100;
-/// Longest pause between tries, milliseconds.
-const RETRY_MAX_MS: u32 = 500;
+/// Longest pause between tries, milliseconds: with the longest try it is what a healed network
+/// waits for.
+const RETRY_MAX_MS: u32 = 300;
 /// Longest try to connect, milliseconds: a hanging one must not outlast the network's healing.
 const OPEN_TIMEOUT_MS: u32 = 1_000;
 /// After this silence the router takes a robot for gone, milliseconds.
@@ -16,6 +20,16 @@ const LEASE_MS: u32 = 3_000;
 const SEND_BUFFER_BYTES: u32 = 32_768;
 /// Largest batch that zenoh hands to the kernel at once, bytes.
 const BATCH_BYTES: u16 = 8_192;
+
+/// Longest pause before an agent first looks for its server.
+const START_JITTER_MAX: Duration = Duration::from_millis(300);
+
+/// The pause before an agent first looks for its server, one of its own for each run: the boot is
+/// random already.
+pub fn start_jitter(boot: BootId) -> Duration {
+    let share = f64::from(boot.as_uuid().as_fields().0) / f64::from(u32::MAX);
+    START_JITTER_MAX.mul_f64(share)
+}
 
 /// The endpoint with a small send buffer of the kernel, unless it names one: priorities act only
 /// above that buffer, so on a slow link a large one makes everything wait behind the bulk.
@@ -71,7 +85,23 @@ pub(super) fn session_config(server: &str) -> Result<zenoh::Config, LinkError> {
 
 #[cfg(test)]
 mod tests {
+    use uuid::Uuid;
+
     use super::*;
+
+    #[test]
+    fn agents_that_start_together_come_one_after_the_other() {
+        let boot = || BootId::from_uuid(Uuid::new_v4());
+        let mut pauses: Vec<Duration> = (0..1_000).map(|_| start_jitter(boot())).collect();
+        pauses.sort();
+        assert!(pauses[999] <= START_JITTER_MAX);
+        // Spread over the whole of it: a tenth of the time sees about a tenth of the agents.
+        for tenth in 0..10 {
+            let within = START_JITTER_MAX / 10 * tenth..START_JITTER_MAX / 10 * (tenth + 1);
+            let count = pauses.iter().filter(|pause| within.contains(pause)).count();
+            assert!((40..200).contains(&count), "{count} within {within:?}");
+        }
+    }
 
     #[test]
     fn a_stream_gets_a_small_send_buffer_unless_it_names_one() {

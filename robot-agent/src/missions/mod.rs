@@ -320,6 +320,7 @@ mod tests {
             trajectory,
             start_within_ms: None,
             link_policy: LinkPolicy::default(),
+            held: false,
         }
     }
 

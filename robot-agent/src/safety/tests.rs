@@ -21,6 +21,7 @@ use uuid::Uuid;
 
 use crate::bench::{Bench, boot, site_of};
 use crate::control_loop::seam::EndReason;
+use crate::drive::simulated::COMMAND_TIMEOUT;
 use crate::sim::scenario::Scenario;
 
 const START: Pose = Pose {
@@ -229,7 +230,7 @@ fn a_stop_counts_while_the_base_is_silent_and_is_still_there_afterwards() {
 }
 
 #[test]
-fn a_lease_pauses_the_mission_and_its_silence_stops_the_robot() {
+fn the_operator_watchdog_stops_a_robot_whose_driver_is_silent() {
     let (mut bench, mission) = driving();
     let mut hand = Hand::acquire(&bench);
     hand.drive(&mut bench, 0.0, 0.0, 3 * SECOND);
@@ -442,7 +443,7 @@ fn a_robot_that_never_knew_where_it_is_is_driven_slowly_by_hand() {
 }
 
 #[test]
-fn a_mission_stops_when_the_position_is_lost_for_three_seconds() {
+fn the_localisation_watchdog_stops_a_mission_without_a_position_for_three_seconds() {
     let (mut bench, mission) = driving();
     let mut ticks = 0;
     while !bench.target_rests() {
@@ -476,6 +477,18 @@ fn a_command_that_is_about_to_end_does_not_speed_the_robot_up() {
         bench.run_for(Duration::from_millis(50));
     }
     assert!(speed_m_s(&bench) > 0.4, "{} m/s", speed_m_s(&bench));
+}
+
+#[test]
+fn a_base_that_is_told_nothing_more_stops_its_wheels() {
+    let (mut bench, _) = driving();
+    // The agent is gone: nobody reads, nobody writes.
+    let gone_at = bench.now;
+    while speed_m_s(&bench) > 0.02 {
+        bench.simulate();
+        assert!(bench.now < gone_at + 2 * SECOND, "it rolls on");
+    }
+    assert!(bench.now > gone_at + COMMAND_TIMEOUT);
 }
 
 #[test]

@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn a_loop_that_stands_still_is_said_once_and_then_given_up() {
+    fn the_loop_watchdog_says_once_that_it_stands_still_and_then_gives_up() {
         let mut watch = TickWatch::new(Duration::ZERO);
         assert_eq!(look_until(&mut watch, 1, 100, 500), []);
         assert_eq!(look_until(&mut watch, 1, 600, 900), [Finding::StandsStill]);

@@ -84,6 +84,34 @@ async fn end_report(rig: &Rig, mission: MissionId) -> MissionReport {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_mission_that_is_taken_held_stands_at_its_start_until_it_is_resumed() {
+    let rig = Rig::new();
+    let server = rig.serve();
+    let agent = rig.agent();
+    rig.ready(agent.boot()).await;
+    let first = Offer {
+        held: true,
+        ..offer(1, LONG)
+    };
+    let mission = first.mission;
+    let answer = server.offer(&rig.robot, &first).await;
+    assert_eq!(refusal(&answer.outcome), None);
+    rig.sees("it says that it is paused", |memory| {
+        let paused = memory.phases(mission).contains(&MissionPhase::Paused);
+        paused.then_some(())
+    })
+    .await;
+    let stood_m = agent.state().mission.unwrap().driven_m;
+    assert!(stood_m < 0.05, "it drove {stood_m} m");
+    // The same offer again takes nothing back.
+    assert_eq!(resume(&server, &rig, mission, 1).await, Outcome::Done);
+    server.offer(&rig.robot, &first).await;
+    drives(&rig, mission, 0.3).await;
+    agent.stop().await;
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_mission_is_paused_resumed_and_replaced_and_tells_how_it_went() {
     let rig = Rig::new();
     let server = rig.serve();

@@ -7,7 +7,7 @@ use tread_api::geometry::{Point, Polygon, Twist};
 use tread_api::ids::{BootId, StopId};
 use tread_api::keys::{self, Verb};
 use tread_api::robot::{PauseCause, RobotMode};
-use tread_api::safety::{Driver, Geofence};
+use tread_api::safety::{Driver, FENCE_POLYGONS_MAX, GateCause, Geofence};
 use tread_api::wire;
 use tread_api::wire::command::{OfferRefusal, Outcome};
 use tread_api::wire::ingest::MissionPhase;
@@ -297,6 +297,155 @@ async fn a_mission_that_would_leave_the_fence_is_refused_with_the_place() {
     site.geofence.keep_out = vec![site.geofence.keep_in[0].clone(); 64];
     let too_large = send(&server, &rig, Verb::Site, &site).await;
     assert_eq!(self::code(&too_large), Some(OfferRefusal::Impossible));
+    agent.stop().await;
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_required_program_that_falls_silent_holds_the_robot_until_it_is_heard_again() {
+    let rig = Rig::new();
+    let server = rig.serve();
+    let mut config = rig.config();
+    config.required_holders = vec!["lidar".parse().unwrap()];
+    let agent = tread_agent::Agent::start(config).unwrap();
+    rig.ready(agent.boot()).await;
+    let site = "yard".parse().unwrap();
+    let key = keys::limit(&site, &rig.robot, &"lidar".parse().unwrap());
+    let speak = async |seq: u64, for_us: u64| {
+        let limit = ExternalLimit {
+            holder: "lidar".parse().unwrap(),
+            boot: agent.boot(),
+            until_us: agent.state().monotonic_us.unwrap() + for_us,
+            seq,
+            hold: false,
+            linear_max_m_s: None,
+        };
+        server.publish(&key, wire::encode(&limit).unwrap()).await;
+    };
+    speak(1, 60_000_000).await;
+    state_of(&rig, agent.boot(), "it is heard", |state| {
+        state.safety.limits.first().is_some_and(|limit| !limit.hold)
+    })
+    .await;
+    server.offer(&rig.robot, &offer(1, LONG)).await;
+    state_of(&rig, agent.boot(), "it drives", |state| {
+        state.mission.is_some_and(|mission| mission.driven_m > 0.3)
+    })
+    .await;
+    // Its last word ends in a moment, and nothing follows.
+    speak(2, 200_000).await;
+    let held = state_of(&rig, agent.boot(), "it stands for the silence", |state| {
+        let stands = state
+            .twist
+            .is_some_and(|twist| twist.value.linear_m_s.abs() < 0.02);
+        stands && state.safety.gate.cause == Some(GateCause::ExternalHold)
+    })
+    .await;
+    assert!(held.safety.limits[0].required && held.safety.limits[0].hold);
+    let driven_m = held.mission.unwrap().driven_m;
+    speak(3, 60_000_000).await;
+    state_of(&rig, agent.boot(), "it goes on", |state| {
+        state
+            .mission
+            .is_some_and(|mission| mission.driven_m > driven_m + 0.3)
+    })
+    .await;
+    agent.stop().await;
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_welcome_with_a_geofence_that_no_tick_can_look_at_leaves_the_robot_standing() {
+    let rig = Rig::new();
+    let corners = [(0.0, 0.0), (9.0, 0.0), (9.0, 9.0), (0.0, 9.0)];
+    let corners = corners.map(|(x_m, y_m)| Point { x_m, y_m });
+    let around = Polygon::new(corners.to_vec()).unwrap();
+    let mut site = site_of(&rig.scenario);
+    site.geofence = Geofence {
+        revision: 3,
+        keep_in: vec![around; FENCE_POLYGONS_MAX + 1],
+        keep_out: Vec::new(),
+    };
+    let server = FakeServer::start_with_site(rig.port, &rig.scenario, &rig.memory, site.clone());
+    let agent = rig.agent();
+    rig.ready(agent.boot()).await;
+    let refused = server.offer(&rig.robot, &offer(1, LONG)).await.outcome;
+    assert_eq!(
+        code(&refused),
+        Some(OfferRefusal::Impossible),
+        "{refused:?}"
+    );
+    let leased = lease(&server, &rig, 1, LeaseAction::Acquire, 1).await;
+    let Outcome::Leased { epoch } = leased else {
+        panic!("{leased:?}");
+    };
+    let key = keys::teleop(&"yard".parse().unwrap(), &rig.robot);
+    for seq in 1..=20 {
+        let now_us = agent.state().monotonic_us.unwrap();
+        let command = DriveCommand {
+            boot: agent.boot(),
+            epoch,
+            seq,
+            sent_us: now_us,
+            until_us: now_us + 300_000,
+            twist: Twist {
+                linear_m_s: 0.5,
+                angular_rad_s: 0.0,
+            },
+        };
+        server.publish(&key, wire::encode(&command).unwrap()).await;
+        tokio::time::sleep(Duration::from_millis(50)).await;
+        let twist = agent.state().twist.unwrap().value;
+        assert!(twist.linear_m_s.abs() < 0.02, "{twist:?}");
+    }
+    assert_eq!(agent.state().safety.gate.cause, Some(GateCause::Fence));
+    // One that it can keep is taken at once.
+    site.geofence.keep_in.truncate(1);
+    site.geofence.revision = 4;
+    assert_eq!(send(&server, &rig, Verb::Site, &site).await, Outcome::Done);
+    state_of(&rig, agent.boot(), "it knows the fence", |state| {
+        state.safety.fence_revision == Some(4)
+    })
+    .await;
+    agent.stop().await;
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_a_clear_and_a_lease_are_published_at_once() {
+    let rig = Rig::new();
+    let server = rig.serve();
+    let mut config = rig.config();
+    // The next periodic state is far away.
+    config.state_rate_hz = 0.1;
+    let agent = tread_agent::Agent::start(config).unwrap();
+    rig.sees("its first state", |memory| {
+        memory.states.first().map(|_| ())
+    })
+    .await;
+    let within = Duration::from_secs(5);
+    let began = tokio::time::Instant::now();
+    assert_eq!(stop(&server, &rig, 1).await, Outcome::Done);
+    state_of(&rig, agent.boot(), "the stop is shown", |state| {
+        state.safety.stop.is_some() && state.mode == RobotMode::Stopped
+    })
+    .await;
+    assert_eq!(clear(&server, &rig, 1).await, Outcome::Done);
+    state_of(&rig, agent.boot(), "the clear is shown", |state| {
+        state.safety.stop.is_none() && state.mode == RobotMode::Idle
+    })
+    .await;
+    lease(&server, &rig, 1, LeaseAction::Acquire, 1).await;
+    state_of(&rig, agent.boot(), "the lease is shown", |state| {
+        state.safety.lease.is_some() && state.mode == RobotMode::Teleoperated
+    })
+    .await;
+    lease(&server, &rig, 2, LeaseAction::Release, 1).await;
+    state_of(&rig, agent.boot(), "its end is shown", |state| {
+        state.safety.lease.is_none() && state.mode == RobotMode::Idle
+    })
+    .await;
+    assert!(began.elapsed() < within, "{:?}", began.elapsed());
     agent.stop().await;
     server.stop().await;
 }

@@ -125,6 +125,16 @@ pub(crate) fn site_of(scenario: &Scenario) -> SiteDefinition {
 
 impl FakeServer {
     pub(crate) fn start(port: u16, scenario: &Scenario, memory: &SharedMemory) -> Self {
+        Self::start_with_site(port, scenario, memory, site_of(scenario))
+    }
+
+    /// A server that welcomes robots with this definition of their site.
+    pub(crate) fn start_with_site(
+        port: u16,
+        scenario: &Scenario,
+        memory: &SharedMemory,
+        definition: SiteDefinition,
+    ) -> Self {
         let mut config = zenoh::Config::default();
         for (key, value) in [
             ("mode", "\"router\"".to_owned()),
@@ -143,14 +153,14 @@ impl FakeServer {
             receipts_to_lose,
             refuses_starts,
         };
-        server.declare(scenario, memory);
+        server.declare(definition, memory);
         server
     }
 
-    fn declare(&self, scenario: &Scenario, memory: &SharedMemory) {
+    fn declare(&self, definition: SiteDefinition, memory: &SharedMemory) {
         let session = &self.session;
         let welcome = Welcome {
-            site: site_of(scenario),
+            site: definition,
             server_time: jiff::Timestamp::UNIX_EPOCH,
         };
         let welcome = wire::encode(&welcome).unwrap();
@@ -346,5 +356,6 @@ pub(crate) fn offer(number: u128, asked: &str) -> Offer {
         trajectory,
         start_within_ms: Some(10_000),
         link_policy: LinkPolicy::default(),
+        held: false,
     }
 }

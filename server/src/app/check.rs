@@ -307,7 +307,7 @@ fn fenced(
 }
 
 /// A geofence as the planner sees it.
-fn control_fence(geofence: &Geofence) -> Fence {
+pub(super) fn control_fence(geofence: &Geofence) -> Fence {
     let rings = |polygons: &[Polygon]| {
         let ring = |polygon: &Polygon| {
             let corners = polygon.corners().iter();
@@ -377,7 +377,7 @@ fn place_of(error: PlanError, trajectory: &Trajectory) -> Option<Place> {
     }
 }
 
-fn control_model(model: &RobotModel) -> Result<robot::RobotModel, RobotModelError> {
+pub(super) fn control_model(model: &RobotModel) -> Result<robot::RobotModel, RobotModelError> {
     let limits = model.limits;
     robot::RobotModel::try_from(RobotModelSpec {
         mass_kg: model.mass_kg,

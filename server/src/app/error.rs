@@ -129,12 +129,23 @@ pub enum AppError {
         place: Place,
     },
     /// A geofence would leave a robot outside.
-    #[error("robot `{robot}` stands at x {:.2} m, y {:.2} m, outside this geofence", point.x_m, point.y_m)]
+    #[error(
+        "robot `{robot}` stands at {point} and reaches {reach_m:.2} m around it: {depth_m:.2} m \
+         beyond the border of {polygon} at {border}"
+    )]
     OutsideGeofence {
         /// The robot.
         robot: RobotId,
         /// Where it stands.
         point: Point,
+        /// Half the diagonal of its outline, metres.
+        reach_m: f64,
+        /// The polygon that forbids it, as in the request.
+        polygon: String,
+        /// The point of its border that is nearest.
+        border: Point,
+        /// How far the robot reaches over it, metres.
+        depth_m: f64,
     },
     /// Somebody else changed it first.
     #[error("the {what} is at revision {present} now, not {expected}")]

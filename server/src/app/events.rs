@@ -12,7 +12,7 @@ mod snapshot;
 
 use std::collections::{HashSet, VecDeque};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -24,6 +24,8 @@ pub use self::hub::{
     CLIENT_BUFFER, CLIENT_BYTES_MAX, EventFilter, Hub, KEPT_BYTES_MAX, KEPT_EVENTS_MAX, Sent,
 };
 use self::hub::{Client, unnumbered};
+use self::snapshot::Reading;
+pub use self::snapshot::SNAPSHOT_BYTES_MAX;
 use super::{App, AppError};
 use crate::db;
 use crate::db::robots::RobotRow;
@@ -40,21 +42,30 @@ pub struct Subscription {
     id: u64,
     events: mpsc::Receiver<Arc<Sent>>,
     waiting: Arc<AtomicUsize>,
-    /// What comes first: a snapshot, or what was missed.
+    /// What comes first of all, unless only little was missed.
+    snapshot: Option<Reading>,
+    /// What was missed, or has happened since the snapshot.
     first: VecDeque<Arc<Sent>>,
+    has_begun: Arc<AtomicBool>,
     covered: u64,
     ended: bool,
 }
 
 impl Drop for Subscription {
     fn drop(&mut self) {
-        self.app.hub().lock().clients.remove(&self.id);
+        self.app.hub().lock().remove(self.id);
     }
 }
 
 impl Subscription {
     /// The next event; `None` after the end.
     pub async fn next(&mut self) -> Option<Arc<Sent>> {
+        if let Some(event) = self.snapshot.as_mut().and_then(Reading::next) {
+            return Some(event);
+        }
+        // Let go as soon as it is read: others may want the room.
+        self.snapshot = None;
+        self.has_begun.store(true, Ordering::Relaxed);
         if let Some(first) = self.first.pop_front() {
             return Some(first);
         }
@@ -99,11 +110,14 @@ impl App {
     ) -> Result<Subscription, AppError> {
         let (buffer, events) = mpsc::channel(CLIENT_BUFFER);
         let waiting = Arc::new(AtomicUsize::new(0));
+        let has_begun = Arc::new(AtomicBool::new(false));
         let client = Client {
             filter: filter.clone(),
             buffer,
             waiting: Arc::clone(&waiting),
             cut,
+            since: self.clock().elapsed(),
+            has_begun: Arc::clone(&has_begun),
         };
         let (id, covered) = {
             let mut state = self.hub().lock();
@@ -123,20 +137,25 @@ impl App {
             id,
             events,
             waiting,
+            snapshot: None,
             first: VecDeque::new(),
+            has_begun,
             covered,
             ended: false,
         };
         let missed = last.and_then(|last| self.hub().missed(last, &filter));
-        if let Some(missed) = missed {
-            // Published between the subscription and now: in the buffer too.
-            let newest = missed.back().map_or(0, |event| event.seq);
-            subscription.covered = covered.max(newest);
-            subscription.first = missed;
+        subscription.first = if let Some(missed) = missed {
+            missed
         } else {
-            subscription.covered = self.hub().lock().seq;
-            subscription.first = self.snapshot(&filter, subscription.covered).await?;
-        }
+            let (snapshot, since) = self.snapshot_for(&filter).await?;
+            // The buffer may hold what is older than a snapshot that was built just now.
+            subscription.covered = snapshot.covered();
+            subscription.snapshot = Some(snapshot);
+            since
+        };
+        // Published between the subscription and now: in the buffer too.
+        let newest = subscription.first.back().map_or(0, |event| event.seq);
+        subscription.covered = subscription.covered.max(newest);
         Ok(subscription)
     }
 

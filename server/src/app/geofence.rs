@@ -1,10 +1,15 @@
 //! Geofences: where the robots of a site may be. A change reaches the robots by the reconciler.
 
+use tread_api::geometry::Point;
 use tread_api::ids::SiteId;
 use tread_api::safety::{Geofence, ReplaceGeofence};
+use tread_control::fence::{Fence, FencePolygon, disc_radius_m};
+use tread_control::geometry as control;
 
+use super::check::{control_fence, control_model};
 use super::{App, AppError, site_row};
 use crate::db;
+use crate::db::robots::RobotRow;
 
 /// Most robots whose place is looked at.
 const ROBOTS_MAX: u32 = 10_000;
@@ -48,22 +53,45 @@ impl App {
             field: "keep_in",
             detail: invalid.to_string(),
         })?;
+        let fence = control_fence(&geofence);
         for row in db::robots::list(&mut tx, site_pk, "", false, ROBOTS_MAX).await? {
             let presence = self.presences().get(&(site.clone(), row.id.clone()));
             let Some(pose) = presence.state().and_then(|state| state.pose) else {
                 continue;
             };
-            let point = pose.value.position();
-            let holds = |polygon: &tread_api::geometry::Polygon| polygon.contains(point);
-            let is_in = geofence.keep_in.is_empty() || geofence.keep_in.iter().any(holds);
-            if !is_in || geofence.keep_out.iter().any(holds) {
-                let robot = row.id;
-                return Err(AppError::OutsideGeofence { robot, point });
-            }
+            refuse_outside(&fence, row, pose.value.position())?;
         }
         db::geofences::insert(&mut tx, site_pk, &geofence, self.clock().now()).await?;
         tx.commit().await?;
         self.wake();
         Ok(geofence)
     }
+}
+
+/// Checks that the whole of a robot is where it may be, without the margin that it keeps on the
+/// move.
+fn refuse_outside(fence: &Fence, row: RobotRow, point: Point) -> Result<(), AppError> {
+    // A model that is none was never let in; its centre is looked at all the same.
+    let reach_m = control_model(&row.model).map_or(0.0, |model| disc_radius_m(&model));
+    let center = control::Point {
+        x_m: point.x_m,
+        y_m: point.y_m,
+    };
+    let Some(overlap) = fence.overlap(center, reach_m) else {
+        return Ok(());
+    };
+    Err(AppError::OutsideGeofence {
+        robot: row.id,
+        point,
+        reach_m,
+        polygon: match overlap.polygon {
+            FencePolygon::KeepIn(index) => format!("keep_in[{index}]"),
+            FencePolygon::KeepOut(index) => format!("keep_out[{index}]"),
+        },
+        border: Point {
+            x_m: overlap.border.x_m,
+            y_m: overlap.border.y_m,
+        },
+        depth_m: overlap.depth_m,
+    })
 }

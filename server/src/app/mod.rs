@@ -81,6 +81,9 @@ pub struct Links {
     pub teleop: Teleop,
     /// Starts what goes on after a request was answered.
     pub supervisor: Supervisor,
+    /// How long whoever asked for a stop waits for its confirmation: [`stops::STOP_CONFIRM_MAX`],
+    /// but where time is simulated.
+    pub stop_confirm_max: Duration,
 }
 
 impl App {

@@ -164,6 +164,7 @@ impl App {
             app: self.clone(),
             stops: stops.clone(),
             stop: links.supervisor.stop_token(),
+            confirm_max: links.stop_confirm_max,
         };
         let settling = settling.run(confirmations, shown, recorded);
         links.supervisor.spawn_passing("stops", settling);

@@ -29,6 +29,9 @@ use crate::supervisor::Supervisor;
 
 /// Most robots that may be connected; zenoh's own default is 1000.
 const SESSIONS_MAX: u32 = 10_000;
+/// After this silence a robot takes the server for gone and connects anew, milliseconds. TCP sends
+/// what was lost again after ever longer pauses; a new connection is there sooner.
+const LEASE_MS: u32 = 3_000;
 /// Most connections that may be in the middle of their opening.
 const ACCEPT_PENDING_MAX: u32 = 1_000;
 /// What the system may keep of what is sent to one robot, bytes. Priorities act only above it: on
@@ -211,6 +214,7 @@ fn config(address: SocketAddr) -> zenoh::Result<Config> {
             format!("[\"tcp/{address}#so_sndbuf={SEND_BUFFER_BYTES}\"]"),
         ),
         ("transport/link/tx/batch_size", BATCH_BYTES.to_string()),
+        ("transport/link/tx/lease", LEASE_MS.to_string()),
         // Nothing is discovered and nothing is advertised.
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
@@ -228,4 +232,22 @@ fn config(address: SocketAddr) -> zenoh::Result<Config> {
         config.insert_json5(key, &value)?;
     }
     Ok(config)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::Ipv4Addr;
+
+    use super::*;
+
+    #[test]
+    fn the_router_takes_more_robots_than_zenoh_does_by_itself() {
+        let sessions = |config: &Config| -> u32 {
+            let said = config.get_json("transport/unicast/max_sessions").unwrap();
+            said.parse().unwrap()
+        };
+        let ours = config(SocketAddr::from((Ipv4Addr::LOCALHOST, 7447))).unwrap();
+        assert_eq!(sessions(&ours), SESSIONS_MAX);
+        assert!(sessions(&Config::default()) < sessions(&ours));
+    }
 }

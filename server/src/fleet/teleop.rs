@@ -18,7 +18,8 @@ use crate::supervisor::Supervisor;
 /// Opens lines to robots; clones open them through the same network.
 #[derive(Debug, Clone)]
 pub struct Teleop {
-    session: Arc<Current>,
+    /// `None` where the network is simulated: it has no lines.
+    session: Option<Arc<Current>>,
     supervisor: Supervisor,
 }
 
@@ -31,14 +32,22 @@ pub struct Line {
 impl Teleop {
     pub(super) fn new(session: Arc<Current>, supervisor: Supervisor) -> Self {
         Self {
-            session,
+            session: Some(session),
+            supervisor,
+        }
+    }
+
+    /// Without a network: no line can be opened.
+    pub fn without_network(supervisor: Supervisor) -> Self {
+        Self {
+            session: None,
             supervisor,
         }
     }
 
     /// Opens the line to a robot; `None` if the network refuses.
     pub async fn open(&self, (site, robot): &RobotKey) -> Option<Line> {
-        let (session, key) = (self.session.get(), keys::teleop(site, robot));
+        let (session, key) = (self.session.as_ref()?.get(), keys::teleop(site, robot));
         // Declaring blocks its thread.
         let declared = self.supervisor.blocking(move || {
             session

@@ -120,7 +120,8 @@ async fn a_geofence_that_crosses_itself_or_leaves_a_robot_outside_is_refused_by_
     assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{body}");
     let detail = body["detail"].as_str().unwrap();
     assert!(
-        detail.contains("corner 0") && detail.contains("corner 2"),
+        detail.contains("corner 0 at (0.00 m, 0.00 m)")
+            && detail.contains("corner 2 at (4.00 m, 0.00 m)"),
         "{body}"
     );
     let around = corners(&[(28.0, 0.0), (32.0, 0.0), (32.0, 4.0), (28.0, 4.0)]);
@@ -136,6 +137,20 @@ async fn a_geofence_that_crosses_itself_or_leaves_a_robot_outside_is_refused_by_
             "{body}"
         );
         assert_eq!(body["place"]["point"]["x_m"], 30.0);
+    }
+    // The robot's centre is inside, and a part of its body is not: it reaches 0.47 m around it.
+    let tight = corners(&[(20.0, -10.0), (30.3, -10.0), (30.3, 10.0), (20.0, 10.0)]);
+    let beside = corners(&[(30.3, -1.0), (31.0, -1.0), (31.0, 3.0), (30.3, 3.0)]);
+    for (fence, polygon) in [
+        (json!({"keep_in": [tight]}), "keep_in[0]"),
+        (json!({"keep_out": [square(1.0), beside]}), "keep_out[1]"),
+    ] {
+        let (status, body) = yard.put(FENCE, &fence).await;
+        assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{body}");
+        let detail = body["detail"].as_str().unwrap();
+        for part in ["rover-1", "(30.00 m, 2.00 m)", polygon, "(30.30 m, 2.00 m)"] {
+            assert!(detail.contains(part), "`{part}` is missing: {detail}");
+        }
     }
     let many: Vec<Value> = (0..65).map(|_| square(50.0)).collect();
     let (status, body) = yard.put(FENCE, &json!({"keep_in": many})).await;

@@ -6,13 +6,14 @@ use std::time::Duration;
 use reqwest::StatusCode;
 use serde_json::{Value, json};
 use tokio::time::Instant;
-use tread_api::mission::MissionState;
+use tread_api::keys::Verb;
+use tread_api::mission::{Mission, MissionState};
 use tread_api::page::Page;
-use tread_api::robot::Alert;
+use tread_api::robot::{Alert, MissionProgress, PauseCause};
 use tread_api::stop::{FleetStop, Stop};
-use tread_api::wire::ingest::MissionPhase;
+use tread_api::wire::ingest::{MissionPhase, Record, RecordContent};
 
-use crate::harness::{Yard, eventually};
+use crate::harness::{Yard, eventually, report};
 use crate::robot::Robot;
 
 const STOP: &str = "/v1/sites/yard/robots/rover-1/stop";
@@ -115,6 +116,67 @@ async fn a_stop_is_confirmed_shown_and_cleared_and_nothing_goes_on_by_itself() {
     let (status, body) = yard.post(&resume, &Value::Null).await;
     assert_eq!(status, StatusCode::ACCEPTED, "{body}");
     yard.mission_becomes(waiting.id, MissionState::Active).await;
+    yard.server.stop().await.unwrap();
+}
+
+/// A robot's report that it paused a mission of itself, weeks ago.
+fn safety_pause(mission: &Mission, paused_by: PauseCause) -> RecordContent {
+    let RecordContent::Mission(mut paused) = report(mission, MissionPhase::Paused) else {
+        panic!("a report on a mission");
+    };
+    paused.progress = Some(MissionProgress {
+        id: mission.id,
+        revision: mission.revision,
+        plan_hash: mission.plan_hash,
+        driven_m: 1.0,
+        length_m: 18.0,
+        cross_track_m: 0.0,
+        paused: true,
+        paused_by: Some(paused_by),
+    });
+    RecordContent::Mission(paused)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_pause_that_is_reported_after_a_person_resumed_the_mission_does_not_hold_it_again() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    for asked in ["pause", "resume"] {
+        let path = format!("/v1/missions/{}/{asked}", mission.id);
+        let (status, body) = yard.post(&path, &Value::Null).await;
+        assert!(status.is_success(), "{asked}: {body}");
+    }
+    let content = safety_pause(&mission, PauseCause::Stop);
+    robot
+        .upload(vec![Record { seq: 0, content }])
+        .await
+        .unwrap();
+    let detail = yard.mission(mission.id).await;
+    assert!(!detail.mission.pause_wanted, "{detail:?}");
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_pause_that_the_robot_reports_for_its_safety_is_what_is_wanted_from_then_on() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    for (seq, paused_by) in (0..).zip([PauseCause::Stop, PauseCause::Teleoperation]) {
+        let mission = yard.create_mission(&robot.id).await;
+        yard.mission_becomes(mission.id, MissionState::Active).await;
+        let seq = 2 * seq;
+        let content = safety_pause(&mission, paused_by);
+        robot.upload(vec![Record { seq, content }]).await.unwrap();
+        let held = yard.mission_becomes(mission.id, MissionState::Paused).await;
+        assert!(held.mission.pause_wanted, "{paused_by:?}: {held:?}");
+        // The reconciler does not let it go on by itself.
+        tokio::time::sleep(Duration::from_millis(1_200)).await;
+        let holds = robot.holds();
+        assert!(!holds.contains(&Verb::Resume), "{paused_by:?}: {holds:?}");
+        robot.report(seq + 1, &mission, MissionPhase::Failed).await;
+        yard.mission_becomes(mission.id, MissionState::Failed).await;
+    }
     yard.server.stop().await.unwrap();
 }
 

@@ -4,14 +4,17 @@
 //! process, and so is the time. Messages are lost, delayed, doubled and reordered; robots, server
 //! and links go down at any moment. After every step the history that the server wrote is checked
 //! against the reference; at the end of a run the network heals, and every mission must end, with
-//! both sides of one mind.
+//! both sides of one mind. People stop robots, clear their stops and drive by hand meanwhile; what
+//! was held for that must not be told to go on before somebody says so.
 
 mod dice;
 mod network;
 mod reference;
 mod robot;
+mod safety;
 mod samples;
 
+use std::collections::HashSet;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -99,6 +102,8 @@ impl Storm {
             late: Vec::new(),
             dice: Dice::of(seed),
             calm: false,
+            held: HashSet::new(),
+            wrong: None,
         }));
         let supervisor = Supervisor::new();
         let app = app_on(&path, &clock, &site).await;
@@ -106,6 +111,7 @@ impl Storm {
             Arc::new(Network(Arc::clone(&world))),
             Arc::clone(app.presences()),
         );
+        safety::connect(&app, commands.clone(), &supervisor);
         let mut storm = Self {
             reconciler: Reconciler::new(app.clone(), commands, supervisor.clone()),
             writer: Writer::new(app.clone()),
@@ -157,6 +163,9 @@ impl Storm {
         for _ in 0..steps {
             self.step().await?;
             self.reference.follow(self.app.db()).await?;
+            if let Some(wrong) = with(&self.world, |world| world.wrong.take()) {
+                return Err(wrong);
+            }
         }
         self.heal().await?;
         let count = self.reference.missions.len();
@@ -168,8 +177,11 @@ impl Storm {
         let (what, index) = self.dice(|dice| (dice.below(100), dice.below(ROBOTS)));
         match what {
             0..8 => self.create(index).await?,
-            8..20 => self.want().await?,
-            20..38 => {
+            8..18 => self.want().await?,
+            18 => self.stop(index).await?,
+            19 => self.clear_or_release(index).await?,
+            20 => self.lease(index),
+            21..38 => {
                 let unlucky = self.dice(|dice| dice.percent(2));
                 with(&self.world, |world| world.robots[index].drive(2.5, unlucky));
             }
@@ -219,7 +231,13 @@ impl Storm {
             link_policy: LinkPolicy::Continue,
             lost_after_s: (bound == 0).then_some(5.0),
         };
-        allowed(self.app.create_mission(request).await)
+        let made = self.app.create_mission(request).await;
+        if let Ok(mission) = &made
+            && mission.pause_wanted
+        {
+            with(&self.world, |world| world.held.insert(mission.id));
+        }
+        allowed(made)
     }
 
     async fn want(&mut self) -> Result<(), String> {
@@ -232,7 +250,7 @@ impl Storm {
         match verb {
             0 => allowed(self.app.cancel_mission(id).await),
             1 => allowed(self.app.pause_mission(id).await),
-            2 | 3 => allowed(self.app.resume_mission(id).await),
+            2 | 3 => self.resume(id).await,
             _ => {
                 #[expect(clippy::cast_precision_loss, reason = "below 5")]
                 let trajectory = circle(2.0 + radius as f64);
@@ -353,6 +371,7 @@ impl Storm {
             Arc::new(Network(Arc::clone(&self.world))),
             Arc::clone(self.app.presences()),
         );
+        safety::connect(&self.app, commands.clone(), &self.supervisor);
         self.reconciler = Reconciler::new(self.app.clone(), commands, self.supervisor.clone());
         for index in 0..ROBOTS {
             if with(&self.world, |world| world.robots[index].linked) {
@@ -376,8 +395,9 @@ impl Storm {
             while with(&self.world, |world| !world.late.is_empty()) {
                 self.deliver_late();
             }
+            self.let_go().await?;
             for (id, _) in self.reference.open() {
-                allowed(self.app.resume_mission(id).await)?;
+                self.resume(id).await?;
             }
             for index in 0..ROBOTS {
                 with(&self.world, |world| world.robots[index].drive(2.5, false));
@@ -391,7 +411,10 @@ impl Storm {
                 let done = |robot: &Robot| robot.holds().is_none() && robot.batch(1).is_none();
                 world.robots.iter().all(done)
             });
-            if idle && self.reference.open().is_empty() {
+            let free = with(&self.world, |world| {
+                !world.robots.iter().any(Robot::is_in_hands)
+            });
+            if idle && free && self.reference.open().is_empty() && !self.is_any_stopped().await? {
                 return Ok(());
             }
         }

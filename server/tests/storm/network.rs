@@ -1,9 +1,12 @@
 //! The network between robots and server: it loses, delays, doubles and reorders.
 
+use std::collections::HashSet;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use tread_api::ids::BootId;
+use tread_api::ids::{BootId, MissionId};
 use tread_api::keys::Verb;
+use tread_api::wire;
+use tread_api::wire::command::{Offer, Pause};
 use tread_api::wire::state::RobotState;
 use tread_server::fleet::commands::{Carrier, Carrying};
 use tread_server::fleet::presence::RobotKey;
@@ -25,6 +28,35 @@ pub(super) struct World {
     pub(super) late: Vec<Late>,
     pub(super) dice: Dice,
     pub(super) calm: bool,
+    /// Missions that a stop or a driver has held, and that nobody has let go on since.
+    pub(super) held: HashSet<MissionId>,
+    /// What the server set in motion by itself, if it ever does.
+    pub(super) wrong: Option<String>,
+}
+
+impl World {
+    /// Nothing that was held may be told to go on.
+    fn check_sent(&mut self, verb: Verb, payload: &[u8]) {
+        let mission = match verb {
+            Verb::Offer => match wire::decode::<Offer>(payload) {
+                // It is to be taken and not to be driven.
+                Ok(offer) if offer.held => return,
+                offer => offer.map(|offer| offer.mission),
+            },
+            Verb::Resume => wire::decode::<Pause>(payload).map(|pause| pause.mission),
+            Verb::Cancel
+            | Verb::Pause
+            | Verb::Site
+            | Verb::Stop
+            | Verb::Clear
+            | Verb::Lease
+            | Verb::Limit => return,
+        };
+        let mission = mission.expect("the server writes what can be read");
+        if self.held.contains(&mission) {
+            self.wrong = Some(format!("{verb:?} of {mission}, which is held"));
+        }
+    }
 }
 
 pub(super) type Shared = Arc<Mutex<World>>;
@@ -45,6 +77,7 @@ impl Carrier for Network {
         payload: Vec<u8>,
     ) -> Carrying {
         let answer = with(&self.0, |world| {
+            world.check_sent(verb, &payload);
             let index = world.robots.iter().position(|here| here.id == *robot)?;
             let there = &world.robots[index];
             let reachable = there.on && there.linked && there.is_run(run);

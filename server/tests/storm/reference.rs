@@ -50,6 +50,13 @@ impl Reference {
         Ok(())
     }
 
+    /// A robot's missions that have not ended.
+    pub(super) fn open_of(&self, robot: &RobotId) -> Vec<MissionId> {
+        let of_robot = self.missions.iter().filter(|(_, known)| known.0 == *robot);
+        let open = of_robot.filter(|(_, known)| !known.1.is_terminal());
+        open.map(|(id, _)| *id).collect()
+    }
+
     pub(super) fn open(&self) -> Vec<(MissionId, MissionState)> {
         let standing = self.missions.iter().map(|(id, known)| (*id, known.1));
         standing.filter(|(_, state)| !state.is_terminal()).collect()

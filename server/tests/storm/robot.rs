@@ -1,13 +1,15 @@
 //! A robot of few lines: what any agent must do about missions, and nothing else.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, HashSet, VecDeque};
 
-use tread_api::ids::{BootId, MissionId, PlanHash, RobotId};
+use tread_api::ids::{BootId, MissionId, PlanHash, RobotId, StopId};
 use tread_api::keys::Verb;
-use tread_api::robot::{LoopStatus, MissionProgress, OutboxStatus, RobotMode};
+use tread_api::robot::{LoopStatus, MissionProgress, OutboxStatus, PauseCause, RobotMode};
+use tread_api::safety::{Lease, SafetyStatus, StopLatch};
 use tread_api::wire;
 use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome, Pause};
 use tread_api::wire::ingest::{Batch, MissionPhase, MissionReport, Record, RecordContent};
+use tread_api::wire::safety::{ClearStop, LeaseAction, LeaseCommand, Stop};
 use tread_api::wire::state::RobotState;
 use uuid::Uuid;
 
@@ -20,6 +22,7 @@ struct Held {
     /// Whether it is to be held; it stands after its next drive.
     to_stand: bool,
     paused: bool,
+    paused_by: PauseCause,
     driven_m: f64,
 }
 
@@ -32,6 +35,11 @@ pub(crate) struct Robot {
     pub(crate) linked: bool,
     held: Option<Held>,
     pub(crate) ended: BTreeMap<MissionId, MissionPhase>,
+    /// Survives restarts, as do the stops that were seen.
+    stop: Option<StopLatch>,
+    stops_seen: HashSet<StopId>,
+    lease: Option<Lease>,
+    leases: u64,
     outbox: VecDeque<(BootId, Record)>,
     next_record: u64,
     states: u64,
@@ -48,6 +56,10 @@ impl Robot {
             linked: true,
             held: None,
             ended: BTreeMap::new(),
+            stop: None,
+            stops_seen: HashSet::new(),
+            lease: None,
+            leases: 0,
             outbox: VecDeque::new(),
             next_record: 0,
             states: 0,
@@ -63,9 +75,25 @@ impl Robot {
         self.held.map(|held| held.mission)
     }
 
+    /// Whether a stop is in force, or a person drives.
+    pub(crate) fn is_in_hands(&self) -> bool {
+        self.stop.is_some() || self.lease.is_some()
+    }
+
+    /// The stop in force.
+    pub(crate) fn stopped_by(&self) -> Option<StopId> {
+        self.stop.as_ref().map(|latch| latch.id)
+    }
+
+    /// Whoever drove by hand is gone; what was paused for it stays paused.
+    pub(crate) fn end_lease(&mut self) {
+        self.lease = None;
+    }
+
     /// A new run of the agent; what was held is over, and told only if the robot still could.
     pub(crate) fn restart(&mut self, boot: u64, tells: bool) {
         self.boot = boot_id(boot);
+        (self.lease, self.leases) = (None, 0);
         self.next_record = 0;
         self.states = 0;
         if let Some(held) = self.held.take() {
@@ -136,14 +164,18 @@ impl Robot {
             length_m: LENGTH_M,
             cross_track_m: 0.0,
             paused: held.paused,
-            paused_by: None,
+            paused_by: held.paused.then_some(held.paused_by),
         };
         RobotState {
             robot: self.id.clone(),
             boot: self.boot,
             seq: self.states,
             robot_time: "2026-11-01T00:00:00Z".parse().expect("it is a time"),
-            mode: RobotMode::Idle,
+            mode: if self.stop.is_some() {
+                RobotMode::Stopped
+            } else {
+                RobotMode::Idle
+            },
             fault: None,
             pose: None,
             twist: None,
@@ -160,7 +192,11 @@ impl Robot {
             battery: None,
             alerts: Vec::new(),
             monotonic_us: None,
-            safety: tread_api::safety::SafetyStatus::default(),
+            safety: SafetyStatus {
+                stop: self.stop.clone(),
+                lease: self.lease.clone(),
+                ..SafetyStatus::default()
+            },
         }
     }
 
@@ -196,7 +232,10 @@ impl Robot {
                 self.hold(&pause, verb == Verb::Pause)
             }
             Verb::Site => Outcome::Done,
-            Verb::Stop | Verb::Clear | Verb::Lease | Verb::Limit => refused(OfferRefusal::Other),
+            Verb::Stop => self.latch(wire::decode(payload).expect("a stop")),
+            Verb::Clear => self.clear(&wire::decode(payload).expect("a clear")),
+            Verb::Lease => self.lend(wire::decode(payload).expect("a lease")),
+            Verb::Limit => refused(OfferRefusal::Other),
         };
         Answer {
             boot: self.boot,
@@ -213,11 +252,13 @@ impl Robot {
             mission: offer.mission,
             revision: offer.revision,
             plan_hash: offer.plan_hash,
-            to_stand: false,
+            to_stand: offer.held,
             paused: false,
+            paused_by: PauseCause::Request,
             driven_m: 0.0,
         };
         match self.held {
+            None if self.is_in_hands() => refused(OfferRefusal::NotReady),
             None if impossible => refused(OfferRefusal::Impossible),
             None => {
                 self.held = Some(new);
@@ -232,6 +273,7 @@ impl Robot {
                 let new = Held {
                     to_stand: held.to_stand,
                     paused: held.paused,
+                    paused_by: held.paused_by,
                     ..new
                 };
                 self.held = Some(new);
@@ -268,11 +310,72 @@ impl Robot {
                 OfferRefusal::Unknown
             });
         };
+        if !paused && self.stop.is_some() {
+            return refused(OfferRefusal::Stopped);
+        }
+        if !paused && self.lease.is_some() {
+            return refused(OfferRefusal::Leased);
+        }
         self.held = Some(Held {
             to_stand: paused,
+            paused_by: PauseCause::Request,
             ..held
         });
         Outcome::Done
+    }
+
+    /// Whatever is in hand stands, and goes on only when it is told to.
+    fn stand(&mut self, cause: PauseCause) {
+        if let Some(held) = &mut self.held {
+            (held.to_stand, held.paused_by) = (true, cause);
+        }
+    }
+
+    fn latch(&mut self, stop: Stop) -> Outcome {
+        // The same twice is one stop, also after it was cleared.
+        if self.stops_seen.insert(stop.stop) {
+            self.stop = Some(StopLatch {
+                id: stop.stop,
+                by: stop.by,
+                reason: stop.reason,
+                since: stop.at,
+            });
+            self.stand(PauseCause::Stop);
+        }
+        Outcome::Done
+    }
+
+    fn clear(&mut self, clear: &ClearStop) -> Outcome {
+        match self.stopped_by() {
+            Some(newest) if newest == clear.stop => {
+                self.stop = None;
+                Outcome::Done
+            }
+            Some(_) => refused(OfferRefusal::Conflict),
+            None if self.stops_seen.contains(&clear.stop) => Outcome::Done,
+            None => refused(OfferRefusal::Unknown),
+        }
+    }
+
+    fn lend(&mut self, asked: LeaseCommand) -> Outcome {
+        let other = self.lease.as_ref();
+        let is_others = other.is_some_and(|lease| lease.driver.client != asked.holder.client);
+        match asked.action {
+            LeaseAction::Acquire if is_others => refused(OfferRefusal::Leased),
+            LeaseAction::Acquire | LeaseAction::Take => {
+                self.leases += 1;
+                self.lease = Some(Lease {
+                    epoch: self.leases,
+                    driver: asked.holder,
+                });
+                self.stand(PauseCause::Teleoperation);
+                Outcome::Leased { epoch: self.leases }
+            }
+            LeaseAction::Release => {
+                self.lease = self.lease.take().filter(|_| is_others);
+                Outcome::Done
+            }
+        }
     }
 }
 

@@ -3,12 +3,16 @@
 mod bad_input;
 mod chaos;
 mod control;
+#[cfg(test)]
+mod drivers;
 mod event_clients;
 mod impostors;
 
 mod messages;
 mod missions;
 mod outages;
+#[cfg(test)]
+mod pages;
 mod safety;
 
 use std::path::Path;

@@ -1,7 +1,7 @@
 //! The clients of the feed with their bounded buffers, and the newest events.
 
 use std::collections::{HashMap, HashSet, VecDeque};
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -13,6 +13,7 @@ use tread_api::event::{Event, Topic};
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::robot::Alert;
 
+use super::snapshot::{SNAPSHOT_READ_MAX, Snapshots};
 use crate::fleet::presence::RobotKey;
 
 /// Events that wait for one client.
@@ -73,6 +74,7 @@ pub struct Hub {
     /// Tells the events of one run of the server from those of another.
     pub(super) run: String,
     pub(super) state: Mutex<HubState>,
+    pub(super) snapshots: Snapshots,
 }
 
 #[derive(Debug, Default)]
@@ -84,6 +86,27 @@ pub(super) struct HubState {
     pub(super) dropped: Vec<(Option<Duration>, CancellationToken)>,
     pub(super) next_client: u64,
     pub(super) dropped_count: u64,
+    /// Goes up whenever the last client leaves.
+    gathering: u64,
+}
+
+impl HubState {
+    pub(super) fn remove(&mut self, id: u64) -> Option<Client> {
+        let client = self.clients.remove(&id)?;
+        self.gathering += u64::from(self.clients.is_empty());
+        Some(client)
+    }
+
+    /// Drops clients that read too slowly: they get what waits for them, and an end.
+    fn drop_slow(&mut self, slow: Vec<u64>) {
+        for id in slow {
+            if let Some(client) = self.remove(id) {
+                info!("an event client reads too slowly and is dropped");
+                self.dropped.push((None, client.cut));
+                self.dropped_count += 1;
+            }
+        }
+    }
 }
 
 #[derive(Debug)]
@@ -93,6 +116,10 @@ pub(super) struct Client {
     /// Bytes that wait in the buffer.
     pub(super) waiting: Arc<AtomicUsize>,
     pub(super) cut: CancellationToken,
+    /// Since when it is subscribed.
+    pub(super) since: Duration,
+    /// Whether it has read its snapshot.
+    pub(super) has_begun: Arc<AtomicBool>,
 }
 
 impl Client {
@@ -111,6 +138,7 @@ impl Hub {
         Self {
             run: format!("{:x}", started_at.as_microsecond()),
             state: Mutex::default(),
+            snapshots: Snapshots::default(),
         }
     }
 
@@ -133,6 +161,16 @@ impl Hub {
         let state = self.lock();
         let waiting = |client: &Client| CLIENT_BUFFER - client.buffer.capacity();
         state.clients.values().map(waiting).max().unwrap_or(0)
+    }
+
+    /// The newest event.
+    pub(super) fn newest(&self) -> u64 {
+        self.lock().seq
+    }
+
+    /// A number of the present clients, which another one gets when all of them have left.
+    pub(super) fn gathering(&self) -> u64 {
+        self.lock().gathering
     }
 
     pub(super) fn is_closed(&self) -> bool {
@@ -170,13 +208,7 @@ impl Hub {
                 slow.push(id);
             }
         }
-        for id in slow {
-            if let Some(client) = state.clients.remove(&id) {
-                info!("an event client reads too slowly and is dropped");
-                state.dropped.push((None, client.cut));
-                state.dropped_count += 1;
-            }
-        }
+        state.drop_slow(slow);
     }
 
     /// Publishes an alert as it is now.
@@ -186,9 +218,17 @@ impl Hub {
         self.publish(&event, Topic::Alerts, robot);
     }
 
-    /// Cuts the connections of clients that did not even read their end.
+    /// Drops clients that do not read their snapshot in time, and cuts the connections of those
+    /// that did not even read their end.
     pub(super) fn sweep(&self, now: Duration) {
-        self.lock().dropped.retain_mut(|(since, cut)| {
+        let mut state = self.lock();
+        let late = state.clients.iter().filter(|(_, client)| {
+            let has_begun = client.has_begun.load(Ordering::Relaxed);
+            !has_begun && now.saturating_sub(client.since) > SNAPSHOT_READ_MAX
+        });
+        let late = late.map(|(&id, _)| id).collect();
+        state.drop_slow(late);
+        state.dropped.retain_mut(|(since, cut)| {
             let since = *since.get_or_insert(now);
             let over = now.saturating_sub(since) > LINGER;
             if over {
@@ -202,9 +242,17 @@ impl Hub {
     pub(super) fn missed(&self, last: &str, filter: &EventFilter) -> Option<VecDeque<Arc<Sent>>> {
         let (run, seq) = last.rsplit_once('-')?;
         let seq: u64 = seq.parse().ok()?;
+        if run != self.run {
+            return None;
+        }
+        self.since(seq, filter)
+    }
+
+    /// What a client wants of what was published since an event; `None` if that is out of reach.
+    pub(super) fn since(&self, seq: u64, filter: &EventFilter) -> Option<VecDeque<Arc<Sent>>> {
         let state = self.lock();
         let oldest = state.kept.front().map_or(state.seq + 1, |event| event.seq);
-        if run != self.run || seq + 1 < oldest || seq > state.seq {
+        if seq > state.seq || seq + 1 < oldest {
             return None;
         }
         let missed = state.kept.iter().filter(|event| event.seq > seq);

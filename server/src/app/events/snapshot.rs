@@ -1,60 +1,199 @@
 //! What a client gets first: everything as it stands now.
+//!
+//! Clients often come together, after a restart or a cut, so they share what was built within
+//! [`SHARED_FOR`]; what happened since is in the events that are kept. One that is still being read
+//! stays in memory: all of them together are bounded, and each must be read in time.
 
-use std::collections::{HashSet, VecDeque};
-use std::sync::Arc;
+use std::collections::{HashMap, HashSet, VecDeque};
+use std::sync::{Arc, Weak};
+use std::time::Duration;
 
 use tread_api::event::{Event, Topic};
-use tread_api::ids::MissionId;
+use tread_api::ids::{MissionId, SiteId};
 use tread_api::mission::Mission;
+use tread_api::robot::Alert;
 
 use super::super::{App, AppError};
 use super::ROBOTS_MAX;
 use super::hub::{EventFilter, Sent, unnumbered};
 use crate::db;
 use crate::db::missions::MissionFilter;
+use crate::fleet::presence::RobotKey;
 
+/// How old a snapshot may be that another client gets too.
+const SHARED_FOR: Duration = Duration::from_millis(100);
+/// Bytes of snapshots that are being read beyond which none is built.
+pub const SNAPSHOT_BYTES_MAX: usize = 128 * 1024 * 1024;
+/// How long a client may take to read its snapshot.
+pub(super) const SNAPSHOT_READ_MAX: Duration = Duration::from_mins(1);
 /// Missions in a snapshot: all that are open, and the newest.
 const MISSIONS_MAX: u32 = 1_000;
 /// Bytes of trajectories at which a snapshot stops naming ended missions.
 const MISSIONS_BYTES_MAX: usize = 4 * 1024 * 1024;
 
+/// Everything as it stood at one event, for all clients of the same topics and site.
+#[derive(Debug)]
+pub(super) struct Snapshot {
+    /// The newest event that it holds already.
+    covered: u64,
+    events: Vec<Arc<Sent>>,
+    bytes: usize,
+}
+
+/// A client's place in a snapshot.
+#[derive(Debug)]
+pub(super) struct Reading {
+    snapshot: Arc<Snapshot>,
+    filter: EventFilter,
+    next: usize,
+}
+
+impl Reading {
+    /// The newest event that the snapshot holds already.
+    pub(super) fn covered(&self) -> u64 {
+        self.snapshot.covered
+    }
+
+    /// The next event that the client wants; `None` after the last.
+    pub(super) fn next(&mut self) -> Option<Arc<Sent>> {
+        let rest = self.snapshot.events.get(self.next..)?;
+        let wanted =
+            |event: &Arc<Sent>| self.filter.lets_through(event.topic, event.robot.as_ref());
+        let skipped = rest.iter().position(wanted)?;
+        self.next += skipped + 1;
+        rest.get(skipped).cloned()
+    }
+}
+
+/// For whom a snapshot was built.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Scope {
+    topics: HashSet<Topic>,
+    site: Option<SiteId>,
+}
+
+/// A snapshot that somebody may be reading.
+#[derive(Debug)]
+struct Built {
+    scope: Scope,
+    at: Duration,
+    /// Of the clients: what happens while there is none is not published.
+    gathering: u64,
+    snapshot: Weak<Snapshot>,
+}
+
+/// The snapshots that are being read, oldest first; who builds one holds it.
+#[derive(Debug, Default)]
+pub(super) struct Snapshots(tokio::sync::Mutex<Vec<Built>>);
+
 impl App {
-    pub(super) async fn snapshot(
+    /// A snapshot for a client that is subscribed already, and what has happened since.
+    pub(super) async fn snapshot_for(
         &self,
         filter: &EventFilter,
-        covered: u64,
-    ) -> Result<VecDeque<Arc<Sent>>, AppError> {
-        let mut events = VecDeque::new();
-        let mut add = |event: &Event| events.push_back(Arc::new(unnumbered(event, None, None)));
-        add(&Event::SnapshotBegin);
+    ) -> Result<(Reading, VecDeque<Arc<Sent>>), AppError> {
+        let scope = Scope {
+            topics: filter.topics.clone(),
+            site: filter.site.clone(),
+        };
+        let mut all = self.hub().snapshots.0.lock().await;
+        all.retain(|built| built.snapshot.strong_count() > 0);
+        let alive = all.iter().filter_map(|built| built.snapshot.upgrade());
+        let is_full = alive.map(|snapshot| snapshot.bytes).sum::<usize>() >= SNAPSHOT_BYTES_MAX;
+        let (now, gathering) = (self.clock().elapsed(), self.hub().gathering());
+        // Where no further one may be built, an older one and what is kept do as well.
+        let usable = all.iter().rev().filter(|built| {
+            let young = now.saturating_sub(built.at) <= SHARED_FOR;
+            built.scope == scope && built.gathering == gathering && (young || is_full)
+        });
+        let mut shared = usable.filter_map(|built| built.snapshot.upgrade());
+        let found = shared.find_map(|snapshot| {
+            let since = self.hub().since(snapshot.covered, filter)?;
+            Some((snapshot, since))
+        });
+        let (snapshot, since) = match found {
+            Some(found) => found,
+            None if is_full => {
+                return Err(AppError::TooMany {
+                    what: "bytes of snapshots that event clients read",
+                    count: SNAPSHOT_BYTES_MAX,
+                });
+            }
+            None => {
+                let snapshot = Arc::new(self.build_snapshot(&scope).await?);
+                all.push(Built {
+                    scope,
+                    at: now,
+                    gathering,
+                    snapshot: Arc::downgrade(&snapshot),
+                });
+                // What was not kept since is in the client's own buffer.
+                let since = self.hub().since(snapshot.covered, filter);
+                (snapshot, since.unwrap_or_default())
+            }
+        };
+        let reading = Reading {
+            snapshot,
+            filter: filter.clone(),
+            next: 0,
+        };
+        Ok((reading, since))
+    }
+
+    async fn build_snapshot(&self, scope: &Scope) -> Result<Snapshot, AppError> {
+        let filter = EventFilter {
+            topics: scope.topics.clone(),
+            site: scope.site.clone(),
+            robots: HashSet::new(),
+        };
+        let covered = self.hub().newest();
+        let mut events = vec![unnumbered(&Event::SnapshotBegin, None, None)];
+        let mut add = |event: &Event, topic, robot: RobotKey| {
+            events.push(unnumbered(event, Some(topic), Some(robot)));
+        };
         let mut tx = self.db().read().await?;
+        let alerts = db::alerts::raised(&mut tx, ROBOTS_MAX).await?;
         if filter.wants(Topic::Robots) {
+            let mut of_robots: HashMap<RobotKey, Vec<Alert>> = HashMap::new();
+            for alert in &alerts {
+                let key = (alert.site.clone(), alert.robot.clone());
+                of_robots.entry(key).or_default().push(alert.clone());
+            }
             for row in db::robots::all(&mut tx, ROBOTS_MAX).await? {
                 if row.retired_at.is_none() && filter.wants_robot(&row.site, &row.id) {
-                    let alerts = db::alerts::raised_of(&mut tx, row.pk).await?;
-                    add(&Event::Robot(Box::new(self.with_live(row, alerts))));
+                    let key = (row.site.clone(), row.id.clone());
+                    let alerts = of_robots.remove(&key).unwrap_or_default();
+                    let robot = Event::Robot(Box::new(self.with_live(row, alerts)));
+                    add(&robot, Topic::Robots, key);
                 }
             }
         }
         if filter.wants(Topic::Missions) {
-            for mission in self.missions_to_show(&mut tx, filter).await? {
-                add(&Event::Mission(Box::new(mission)));
+            for mission in self.missions_to_show(&mut tx, &filter).await? {
+                let key = (mission.site.clone(), mission.robot.clone());
+                add(&Event::Mission(Box::new(mission)), Topic::Missions, key);
             }
         }
         if filter.wants(Topic::Alerts) {
-            for alert in db::alerts::raised(&mut tx, ROBOTS_MAX).await? {
-                if filter.wants_robot(&alert.site, &alert.robot) {
-                    add(&Event::Alert(Box::new(alert)));
+            for alert in alerts {
+                let key = (alert.site.clone(), alert.robot.clone());
+                if filter.wants_robot(&key.0, &key.1) {
+                    add(&Event::Alert(Box::new(alert)), Topic::Alerts, key);
                 }
             }
         }
         drop(tx);
-        let end = Sent {
+        events.push(Sent {
             id: Some(format!("{}-{covered}", self.hub().run)),
             ..unnumbered(&Event::SnapshotEnd, None, None)
-        };
-        events.push_back(Arc::new(end));
-        Ok(events)
+        });
+        let bytes = events.iter().map(|event| event.text.len()).sum();
+        let events = events.into_iter().map(Arc::new).collect();
+        Ok(Snapshot {
+            covered,
+            events,
+            bytes,
+        })
     }
 
     /// The newest missions, and older ones that have not ended; oldest first.

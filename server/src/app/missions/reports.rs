@@ -1,7 +1,7 @@
 //! What robots report of their missions, durably, and what the server makes of it.
 
 use jiff::Timestamp;
-use tread_api::ids::BootId;
+use tread_api::ids::{BootId, MissionId};
 use tread_api::mission::{Actor, Cause, DRIVEN_POINTS_MAX, Mission, THETA_SAMPLES_MAX};
 use tread_api::robot::MissionProgress;
 use tread_api::wire::ingest::{MissionPhase, MissionReport};
@@ -10,6 +10,9 @@ use super::transitions::Change;
 use super::{Step, note, take_step};
 use crate::db::missions::{Facts, MissionRow};
 use crate::db::{self, DbError, Tx};
+
+/// Most events of a mission that are looked through; of more, a pause is held to be wanted.
+const EVENTS_MAX: u32 = 1_000;
 
 /// Who reports, and when.
 #[derive(Debug, Clone, Copy)]
@@ -155,7 +158,9 @@ async fn take_phase(
         return Ok(());
     };
     let is_for_safety = |progress: &MissionProgress| progress.is_paused_for_safety();
-    if report.phase == MissionPhase::Paused && report.progress.as_ref().is_some_and(is_for_safety) {
+    let is_safety_pause =
+        report.phase == MissionPhase::Paused && report.progress.as_ref().is_some_and(is_for_safety);
+    if is_safety_pause && !was_resumed_since(tx, mission.id, reporting.at).await? {
         db::missions::want_pause(tx, mission.id, true).await?;
     }
     let reason = report.reason.as_deref();
@@ -185,6 +190,15 @@ async fn take_phase(
         .unwrap_or_default();
     let text = format!("the robot reported late that it {name}{reason}");
     note(tx, row, Actor::Robot, reporting.now, &text).await
+}
+
+/// Whether a person let a mission go on after this: then a pause from before, reported late, is not
+/// what is wanted any more. The robot itself refuses while it is stopped or driven by hand.
+async fn was_resumed_since(tx: &mut Tx, id: MissionId, at: Timestamp) -> Result<bool, DbError> {
+    let events = db::history::events(tx, id, EVENTS_MAX).await?;
+    let mut newest_first = events.iter().rev();
+    let resumed = newest_first.find(|event| event.cause == Cause::ResumeRequested);
+    Ok(resumed.is_some_and(|event| event.at > at))
 }
 
 fn next_is_reached(change: Change, mission: &Mission) -> bool {

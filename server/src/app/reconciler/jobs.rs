@@ -115,6 +115,7 @@ pub(super) async fn offer(
         trajectory: mission.trajectory,
         start_within_ms,
         link_policy: mission.link_policy,
+        held: mission.pause_wanted,
     };
     app.counters().offers_sent.one();
     let key = (mission.site, mission.robot);
@@ -203,6 +204,7 @@ pub(super) async fn replace(
         // It has begun, so its latest start is behind it.
         start_within_ms: None,
         link_policy: row.mission.link_policy,
+        held: row.mission.pause_wanted,
     };
     app.counters().offers_sent.one();
     let key = (row.mission.site.clone(), row.mission.robot.clone());

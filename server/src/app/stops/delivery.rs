@@ -13,7 +13,6 @@ use tread_api::wire::command::{Answer, Outcome};
 use tread_api::wire::safety::Stop as StopCommand;
 
 use super::super::{App, AppError, Links};
-use super::STOP_CONFIRM_MAX;
 use crate::fleet::commands::Commands;
 
 /// Tells a robot to stop; whether it has confirmed.
@@ -78,6 +77,7 @@ pub(super) struct Settling {
     pub(super) app: App,
     pub(super) stops: Vec<Stop>,
     pub(super) stop: CancellationToken,
+    pub(super) confirm_max: Duration,
 }
 
 impl Settling {
@@ -136,7 +136,7 @@ impl Settling {
         shown: oneshot::Sender<Vec<(StopId, Timestamp)>>,
     ) -> Vec<(StopId, Timestamp)> {
         let mut confirmed = Vec::with_capacity(self.stops.len());
-        let mut bound = std::pin::pin!(tokio::time::sleep(STOP_CONFIRM_MAX));
+        let mut bound = std::pin::pin!(tokio::time::sleep(self.confirm_max));
         while confirmed.len() < self.stops.len() {
             tokio::select! {
                 biased;

@@ -4,8 +4,14 @@
 //! `offline`, from the death of the agent's process to `offline`, and from the healing of the
 //! network to `online`, after cuts of several lengths, with and without a reset. What is timed is
 //! what a client of the REST API sees, so the poll is in the figures.
+//!
+//! The relay of those cuts keeps what it was given, as a bridge would. [`lossy`] repeats them where
+//! packets are really lost.
+
+mod lossy;
 
 use std::io::Write;
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -44,23 +50,26 @@ struct Arguments {
     /// Print one JSON object instead of a table
     #[arg(long)]
     json: bool,
+    /// Only the cuts that lose packets, here, in a network of this program's own; prints the times
+    #[arg(long, hide = true)]
+    lossy_here: bool,
 }
 
 #[derive(Debug, Serialize)]
 struct Check {
-    name: &'static str,
+    name: String,
     goal: String,
     value: f64,
     median: f64,
     holds: bool,
 }
 
-fn check(name: &'static str, most_s: f64, mut seen_s: Vec<f64>) -> Check {
+fn check(name: &str, most_s: f64, mut seen_s: Vec<f64>) -> Check {
     seen_s.sort_by(f64::total_cmp);
     let worst = seen_s.last().copied().unwrap_or(f64::INFINITY);
     let median = seen_s.get(seen_s.len() / 2).copied();
     Check {
-        name,
+        name: name.to_owned(),
         goal: format!("<= {most_s}"),
         value: worst,
         median: median.unwrap_or(f64::INFINITY),
@@ -70,7 +79,16 @@ fn check(name: &'static str, most_s: f64, mut seen_s: Vec<f64>) -> Check {
 
 /// Waits until the server shows a link state and says how long that took, seconds.
 async fn shown(fleet: &Fleet, robot: &RobotId, link: LinkState) -> anyhow::Result<f64> {
-    let began = Instant::now();
+    shown_since(fleet, robot, link, Instant::now()).await
+}
+
+/// The same, told from a moment that has passed.
+async fn shown_since(
+    fleet: &Fleet,
+    robot: &RobotId,
+    link: LinkState,
+    began: Instant,
+) -> anyhow::Result<f64> {
     loop {
         if fleet.rest.robot(robot).await.map(|robot| robot.link) == Some(link) {
             return Ok(began.elapsed().as_secs_f64());
@@ -111,16 +129,27 @@ async fn cuts(
     Ok((gone_s, back_s))
 }
 
-#[tokio::main]
-async fn main() -> anyhow::Result<ExitCode> {
-    let arguments = Arguments::parse();
-    // The executables of this package stand beside each other.
+/// The executable that is a server or an agent; those of this package stand beside each other.
+fn node() -> anyhow::Result<PathBuf> {
     let node = std::env::current_exe()?.with_file_name("node");
     anyhow::ensure!(
         node.exists(),
         "{} is missing: build it with `cargo build --release -p tread-tests --bins`",
         node.display()
     );
+    Ok(node)
+}
+
+#[tokio::main]
+async fn main() -> anyhow::Result<ExitCode> {
+    let arguments = Arguments::parse();
+    let node = node()?;
+    if arguments.lossy_here {
+        let times = lossy::measure_here(&node, arguments.trials, arguments.seed).await?;
+        let mut output = std::io::stdout().lock();
+        writeln!(output, "{}", serde_json::to_string(&times)?)?;
+        return Ok(ExitCode::SUCCESS);
+    }
     let mut fleet = Fleet::start_with(&node).await;
     let robot: RobotId = "rover-1".parse()?;
     let relay = fleet.start_agent_behind_relay(&robot, 0.0).await;
@@ -134,15 +163,27 @@ async fn main() -> anyhow::Result<ExitCode> {
         fleet.spawn_agent_behind(&robot, 0.0, &relay);
         shown(&fleet, &robot, LinkState::Online).await?;
     }
-    let checks = [
+    drop(fleet);
+    let mut checks = vec![
         check("silent partition to offline, s", SILENCE_MAX_S, gone_s),
         check("process death to offline, s", DEATH_MAX_S, died_s),
         check("healing to online, s", HEALING_MAX_S, back_s),
     ];
+    let not_measured = match lossy::measure(arguments.trials, arguments.seed).await? {
+        Some(times) => {
+            checks.extend(times.into_iter().flat_map(lossy::Times::checks));
+            None
+        }
+        None => Some(lossy::NOT_MEASURED),
+    };
     let holds = checks.iter().all(|check| check.holds);
     let mut output = std::io::stdout().lock();
     if arguments.json {
-        let report = serde_json::json!({"trials": arguments.trials, "checks": checks});
+        let report = serde_json::json!({
+            "trials": arguments.trials,
+            "checks": checks,
+            "not_measured": not_measured,
+        });
         writeln!(output, "{report}")?;
     } else {
         for Check {
@@ -156,9 +197,12 @@ async fn main() -> anyhow::Result<ExitCode> {
             let verdict = if *holds { "holds" } else { "DOES NOT HOLD" };
             writeln!(
                 output,
-                "{name:34} worst {value:>7.3}, median {median:>7.3}  {goal:>7}  {verdict}"
+                "{name:44} worst {value:>7.3}, median {median:>7.3}  {goal:>7}  {verdict}"
             )?;
         }
+    }
+    if let Some(what) = not_measured {
+        eprintln!("{what}");
     }
     Ok(if holds {
         ExitCode::SUCCESS

@@ -96,8 +96,14 @@ fn is_moving(agent: &RunningAgent) -> bool {
 }
 
 async fn all_drive(agents: &[RunningAgent]) {
-    let look = || async { agents.iter().filter(|agent| !is_moving(agent)).count() };
-    eventually("all robots drive", DRIVE, look, |standing| *standing == 0).await;
+    let standing = |agent: &&RunningAgent| !is_moving(agent);
+    let seen = |agent: &RunningAgent| {
+        let state = agent.state();
+        let (mission, gate) = (state.mission, state.safety.gate.cause);
+        (state.robot, state.mode, state.fault, mission, gate)
+    };
+    let look = || async { agents.iter().filter(standing).map(seen).collect::<Vec<_>>() };
+    eventually("all robots drive", DRIVE, look, Vec::is_empty).await;
 }
 
 /// Clears every stop and lets every mission go on.
