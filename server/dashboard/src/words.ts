@@ -112,6 +112,7 @@ export const words = {
     noRobot: 'Stop robot',
     choose: 'Select a robot on the map or in the list to stop it alone.',
     all: 'Stop all',
+    allOf: (site: string) => `Stop all of ${site}`,
     region: 'Stop',
     sending: (robot: string) => `${robot}: stop is being sent …`,
     unconfirmed: (robot: string) => `${robot} has NOT confirmed its stop. It is told again until it does.`,
