@@ -154,6 +154,10 @@ uuid_id! {
     TokenId
 }
 uuid_id! {
+    /// A token by which a robot joins the fleet: a version 7 UUID; no secret.
+    JoinTokenId
+}
+uuid_id! {
     /// A browser's session: a version 7 UUID; no secret.
     SessionId
 }

@@ -11,7 +11,9 @@
 //! right-handed, x east-like, y north-like; headings are counter-clockwise from x. A value that is
 //! not known is `null`, never a default. Integers stay below 2⁵³.
 
+pub mod access;
 pub mod drive;
+pub mod enrolment;
 pub mod event;
 pub mod friction;
 pub mod geometry;

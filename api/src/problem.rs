@@ -89,6 +89,8 @@ pub enum ProblemType {
     UnknownToken,
     #[serde(rename = "/problems/request-too-long")]
     RequestTooLong,
+    #[serde(rename = "/problems/robots-do-not-join")]
+    RobotsDoNotJoin,
     #[serde(rename = "/problems/too-many")]
     TooMany,
     #[serde(rename = "/problems/timeout")]
@@ -101,7 +103,7 @@ pub enum ProblemType {
 
 impl ProblemType {
     /// Every kind.
-    pub const ALL: [Self; 42] = [
+    pub const ALL: [Self; 43] = [
         Self::MalformedBody,
         Self::InvalidBody,
         Self::UnknownField,
@@ -140,6 +142,7 @@ impl ProblemType {
         Self::UnknownHost,
         Self::UnknownToken,
         Self::RequestTooLong,
+        Self::RobotsDoNotJoin,
         Self::TooMany,
         Self::Timeout,
         Self::Unavailable,
@@ -187,6 +190,7 @@ impl ProblemType {
             Self::UnknownHost => "This server does not go by that name",
             Self::UnknownToken => "The token is not known",
             Self::RequestTooLong => "The path or query is too long",
+            Self::RobotsDoNotJoin => "Robots do not join this server",
             Self::TooMany => "There are too many of these",
             Self::Timeout => "The answer took too long",
             Self::Unavailable => "The server cannot answer now",

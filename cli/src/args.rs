@@ -13,7 +13,10 @@ use tread_api::ids::{HolderId, MissionId, RobotId, SiteId, StopId, TerrainId};
 use tread_api::trajectory::Waypoint;
 
 use self::identity::Showing;
-pub(crate) use self::identity::{AuditArguments, PlainArguments, TokensAction, TokensArguments};
+pub(crate) use self::identity::{
+    AuditArguments, JoinTokenAction, JoinTokenArguments, PlainArguments, RobotsAction,
+    TokensAction, TokensArguments,
+};
 use self::values::{duration, finite, look_interval, point, positive};
 pub(crate) use self::values::{shield_negative_points, waypoint};
 
@@ -67,8 +70,8 @@ impl PassedOn {
 /// Commands that talk to a running server.
 #[derive(Debug, Subcommand)]
 pub(crate) enum RemoteCommand {
-    /// List the robots of a site, or show one
-    Robots(RobotsArguments),
+    /// List the robots of a site, show one, let one join, or put one out
+    Robots(Box<RobotsArguments>),
     /// Send a robot on a circle or through waypoints
     Send(SendArguments),
     /// List missions, show one with its history, pause, resume or cancel one
@@ -106,7 +109,7 @@ pub(crate) enum RemoteCommand {
 impl RemoteCommand {
     pub(crate) fn connection(&self) -> &Connection {
         match self {
-            Self::Robots(arguments) => &arguments.connection,
+            Self::Robots(arguments) => arguments.connection(),
             Self::Send(arguments) => match &arguments.trajectory {
                 SendTrajectory::Circle(circle) => &circle.order.connection,
                 SendTrajectory::Waypoints(waypoints) => &waypoints.order.connection,
@@ -147,11 +150,23 @@ pub(crate) struct Connection {
 }
 
 #[derive(Debug, Args)]
+#[command(args_conflicts_with_subcommands = true)]
 pub(crate) struct RobotsArguments {
+    #[command(subcommand)]
+    pub(crate) action: Option<RobotsAction>,
     /// Show only this one, with the age of every value
     pub(crate) robot: Option<RobotId>,
     #[command(flatten)]
     pub(crate) connection: Connection,
+}
+
+impl RobotsArguments {
+    fn connection(&self) -> &Connection {
+        match &self.action {
+            None => &self.connection,
+            Some(action) => action.connection(),
+        }
+    }
 }
 
 #[derive(Debug, Args)]

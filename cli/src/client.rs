@@ -8,9 +8,10 @@ use std::time::Duration;
 use reqwest::{Certificate, Method, RequestBuilder, Response, StatusCode, Url};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use tread_api::enrolment::{CreateJoinToken, CreatedJoinToken, Enrolment, JoinToken};
 use tread_api::friction::{CellFriction, TerrainFriction};
 use tread_api::identity::{AuditEntry, CreateToken, CreatedToken, Session, Token};
-use tread_api::ids::{HolderId, MissionId, RobotId, SiteId, TerrainId, TokenId};
+use tread_api::ids::{HolderId, JoinTokenId, MissionId, RobotId, SiteId, TerrainId, TokenId};
 use tread_api::mission::{CreateMission, Mission, MissionDetail, ReplaceMission};
 use tread_api::page::{PAGE_LIMIT_MAX, Page};
 use tread_api::problem::{ProblemBody, ProblemType};
@@ -276,6 +277,43 @@ impl Client {
 
     pub(crate) async fn tokens(&self) -> Result<Vec<Token>, ClientError> {
         self.all("/v1/tokens").await
+    }
+
+    /// Makes a token by which a robot may join.
+    pub(crate) async fn create_join_token(
+        &self,
+        request: &CreateJoinToken,
+    ) -> Result<CreatedJoinToken, ClientError> {
+        self.post("/v1/join-tokens", request).await
+    }
+
+    /// Join tokens, newest first.
+    pub(crate) async fn join_tokens(&self) -> Result<Vec<JoinToken>, ClientError> {
+        self.all("/v1/join-tokens").await
+    }
+
+    /// Revokes a join token.
+    pub(crate) async fn revoke_join_token(
+        &self,
+        id: JoinTokenId,
+    ) -> Result<JoinToken, ClientError> {
+        let path = format!("/v1/join-tokens/{id}");
+        self.send(self.request(Method::DELETE, &path)).await
+    }
+
+    /// How the robots of a site stand that have ever joined.
+    pub(crate) async fn enrolments(&self, site: &SiteId) -> Result<Vec<Enrolment>, ClientError> {
+        self.all(&format!("/v1/sites/{site}/enrolments")).await
+    }
+
+    /// Puts a robot out of the fleet.
+    pub(crate) async fn revoke_robot(
+        &self,
+        site: &SiteId,
+        robot: &RobotId,
+    ) -> Result<Enrolment, ClientError> {
+        let path = format!("/v1/sites/{site}/enrolments/{robot}");
+        self.send(self.request(Method::DELETE, &path)).await
     }
 
     pub(crate) async fn create_token(

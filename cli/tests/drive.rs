@@ -51,6 +51,7 @@ impl Yard {
                 certificate: at("cert.pem"),
                 key: at("key.pem"),
             }),
+            robots: None,
             web: WebConfig::default(),
         });
         let server = server.await.unwrap();

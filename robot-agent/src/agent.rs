@@ -13,11 +13,9 @@ use std::time::Duration;
 
 use jiff::SignedDuration;
 use tokio::sync::watch;
-use tokio_util::sync::CancellationToken;
-use tracing::{error, info, warn};
+use tracing::{error, info};
 use tread_api::ids::BootId;
-use tread_api::robot::{Capabilities, OutboxStatus};
-use tread_api::wire::hello::Hello;
+use tread_api::robot::OutboxStatus;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
 use tread_api::wire::state::{FrictionReport, RobotState};
 use tread_control::robot::{RobotModel, RobotModelError};
@@ -30,14 +28,15 @@ use crate::control_loop::tick::LoopCore;
 use crate::control_loop::{self, BRAKING_MAX};
 use crate::dispatcher::Dispatcher;
 use crate::drive::simulated::{SimMode, SimulatedDrive, SimulatedDriveError};
-use crate::fleet::uploader::{self, Backoff};
-use crate::fleet::{self, FleetLink, Identity, LinkError, Listeners, Note, Noted};
+use crate::fleet::{self, Identity, LinkError};
 use crate::geometry::control_model;
 use crate::knowledge::{Missions, SiteCell};
+use crate::membership::{Membership, Renewal};
 use crate::missions::memory::{Memory, MemoryError};
+use crate::online::Online;
 use crate::outbox::{Outbox, OutboxError};
 use crate::recorder::Recorder;
-use crate::reporter::{Reporter, every, log_losses, publish_states};
+use crate::reporter::{Reporter, log_losses};
 use crate::safety::{Safety, watchdog};
 use crate::supervisor::{PartEnded, Supervisor};
 
@@ -159,15 +158,9 @@ impl Agent {
             })
             .map_err(no_thread("control loop"))?;
         let watchdog = watch_loop(&supervisor, &shared, &clock).map_err(no_thread("watchdog"))?;
-        supervisor.spawn(
-            "outbox",
-            outbox.clone().keep_synced(supervisor.stop_token()),
-        );
-
-        supervisor.spawn(
-            "losses",
-            log_losses(Arc::clone(&shared), supervisor.stop_token()),
-        );
+        let stop = || supervisor.stop_token();
+        supervisor.spawn("outbox", outbox.clone().keep_synced(stop()));
+        supervisor.spawn("losses", log_losses(Arc::clone(&shared), stop()));
 
         let reporter = Arc::new(Reporter {
             identity: identity.clone(),
@@ -193,6 +186,7 @@ impl Agent {
             driving: Mutex::default(),
         });
         let (connected, is_connected) = watch::channel(false);
+        let membership = renew_membership(&supervisor, &config, &dispatcher.clock);
         let online = Online {
             config,
             identity: identity.clone(),
@@ -201,6 +195,7 @@ impl Agent {
             outbox: outbox.clone(),
             stop: supervisor.stop_token(),
             connected,
+            membership,
         };
         supervisor.spawn("fleet link", online.run());
         info!(robot.id = %identity.robot, %boot, "agent of `{}` runs", identity.robot);
@@ -214,6 +209,22 @@ impl Agent {
             threads: vec![looping, recording, watchdog],
         })
     }
+}
+
+/// Begins to renew the certificate, if there is one; it changes with each renewal.
+fn renew_membership(
+    supervisor: &Supervisor,
+    config: &AgentConfig,
+    clock: &SharedClock,
+) -> Option<watch::Receiver<Arc<Membership>>> {
+    let (present, membership) = watch::channel(Arc::new(config.membership.clone()?));
+    let renewal = Renewal {
+        folder: config.data_dir.clone(),
+        clock: Arc::clone(clock),
+        present,
+    };
+    supervisor.spawn("renewal", renewal.run(supervisor.stop_token()));
+    Some(membership)
 }
 
 fn simulated_drive(
@@ -272,130 +283,6 @@ fn recall_missions(
         missions.save();
     }
     Ok(missions)
-}
-
-/// Everything that needs the network.
-struct Online {
-    config: AgentConfig,
-    identity: Identity,
-    reporter: Arc<Reporter>,
-    dispatcher: Arc<Dispatcher>,
-    outbox: Outbox,
-    stop: CancellationToken,
-    connected: watch::Sender<bool>,
-}
-
-impl Online {
-    async fn run(self) {
-        let (shared, clock) = (&self.dispatcher.shared, &self.dispatcher.clock);
-        let (shared, clock) = (Arc::clone(shared), Arc::clone(clock));
-        let note: Note = Arc::new(move |noted| match noted {
-            Noted::ServerHeard => shared.note_server_heard(clock.monotonic()),
-            Noted::CommandLost => Shared::count(&shared.lost_commands),
-        });
-        tokio::select! {
-            // Robots that get power together do not come all at once.
-            () = tokio::time::sleep(fleet::start_jitter(self.identity.boot)) => {}
-            () = self.stop.cancelled() => return,
-        }
-        let server = &self.config.server;
-        let listeners = Listeners {
-            note,
-            urgent: {
-                let safety = Arc::clone(&self.dispatcher.safety);
-                Arc::new(move |urgent| safety.take_urgent(urgent))
-            },
-        };
-        let connecting = FleetLink::connect(server, self.identity.clone(), listeners, &self.stop);
-        let (link, commands) = match connecting.await {
-            Ok(Some((link, commands))) => (Arc::new(link), commands),
-            Ok(None) => return,
-            Err(cause) => {
-                error!(
-                    error = &cause as &dyn std::error::Error,
-                    "the fleet link failed"
-                );
-                return;
-            }
-        };
-        let (welcomed, is_welcome) = watch::channel(false);
-        let _ = self.connected.send(true);
-        let reporter = &self.reporter;
-        let uploading = uploader::run(
-            Arc::clone(&link),
-            self.outbox.clone(),
-            Arc::clone(&self.dispatcher.clock),
-            is_welcome,
-            self.stop.clone(),
-        );
-        let answering = Arc::clone(&self.dispatcher).run(commands, self.stop.clone());
-        let working = async {
-            tokio::join!(
-                self.introduce(Arc::clone(&link), welcomed),
-                uploading,
-                answering,
-                publish_states(self.config.state_rate_hz, Arc::clone(&link), reporter),
-                every(self.config.friction_rate_hz, Arc::clone(&link), |link| {
-                    link.publish_friction(&reporter.friction());
-                }),
-            );
-        };
-        tokio::select! {
-            () = working => {}
-            () = self.stop.cancelled() => {}
-        }
-        link.close().await;
-    }
-
-    /// Says hello on every new connection until it is answered.
-    async fn introduce(&self, link: Arc<FleetLink>, welcomed: watch::Sender<bool>) {
-        let mut server_seen = link.server_seen();
-        loop {
-            server_seen.mark_unchanged();
-            let mut backoff = Backoff::new();
-            while !self.introduce_once(&link).await {
-                tokio::time::sleep(backoff.grow()).await;
-            }
-            let _ = welcomed.send(true);
-            if server_seen.changed().await.is_err() {
-                return;
-            }
-        }
-    }
-
-    async fn introduce_once(&self, link: &Arc<FleetLink>) -> bool {
-        let hello = Hello {
-            robot: self.identity.robot.clone(),
-            boot: self.identity.boot,
-            agent_version: env!("CARGO_PKG_VERSION").to_owned(),
-            model: self.config.model.clone(),
-            robot_time: self.dispatcher.clock.wall(),
-            capabilities: Capabilities {
-                pause: true,
-                replace: true,
-                battery: true,
-                wheel_torque: true,
-                stop: true,
-                teleop: true,
-                rate_hz: Some(self.config.rate_hz),
-                base: Some("simulated".to_owned()),
-            },
-        };
-        match link.hello(&hello).await {
-            Ok(welcome) => {
-                info!("the server welcomes `{}`", self.identity.robot);
-                self.dispatcher.take_welcome(welcome.site)
-            }
-            Err(fleet::AskError::NoAnswer) => false,
-            Err(cause) => {
-                warn!(
-                    error = &cause as &dyn std::error::Error,
-                    "the server does not welcome us"
-                );
-                false
-            }
-        }
-    }
 }
 
 impl RunningAgent {

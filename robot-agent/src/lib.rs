@@ -8,6 +8,7 @@
 //! * The loop: `control_loop`, the base behind [`drive`], the simulated one in [`sim`].
 //! * Around it: [`missions`] (what is held), `dispatcher` (answers), `alerts`, `recorder` and [`outbox`]
 //!   (what must not be lost), `reporter` (what may), [`fleet`] (the only one that knows zenoh).
+//! * [`membership`]: the robot's certificate, how it gets it and the next one.
 //! * `safety`: what may only slow the robot down, and driving by hand.
 //! * [`mod@bench`] steps the loop by hand, for tests and figures.
 //! * Below all: [`clock`], `supervisor`, [`geometry`] (between wire and controller).
@@ -21,6 +22,7 @@ pub mod config;
 pub mod drive;
 pub mod fleet;
 pub mod geometry;
+pub mod membership;
 pub mod missions;
 pub mod outbox;
 pub mod program;
@@ -30,7 +32,9 @@ mod alerts;
 mod control_loop;
 mod dispatcher;
 mod durable;
+mod enroll;
 mod knowledge;
+mod online;
 mod recorder;
 mod reporter;
 mod safety;

@@ -5,12 +5,29 @@ use std::io::IsTerminal as _;
 use std::process::ExitCode;
 
 use anyhow::Context;
-use clap::Parser;
+use clap::{Parser, Subcommand};
 use tracing::{error, info};
 use tracing_subscriber::EnvFilter;
 
 use crate::agent::{Agent, RunningAgent};
 use crate::config::{AgentConfig, Flags, LogFormat};
+use crate::enroll::{self, EnrollArgs};
+
+/// Drives one robot and measures its ground.
+#[derive(Debug, Parser)]
+#[command(name = "tread-agent", version, args_conflicts_with_subcommands = true)]
+struct Words {
+    #[command(subcommand)]
+    action: Option<Action>,
+    #[command(flatten)]
+    flags: Flags,
+}
+
+#[derive(Debug, Subcommand)]
+enum Action {
+    /// Join the fleet by a join token: get a certificate, and keep it in the robot's folder
+    Enroll(EnrollArgs),
+}
 
 /// Runs an agent until it is told to stop by SIGTERM or ctrl-c; the first argument is the
 /// program's name. Sets up logging, so it is for whole processes.
@@ -18,16 +35,22 @@ use crate::config::{AgentConfig, Flags, LogFormat};
 /// The code is 0 after an orderly stop, 1 when the agent could not start or a part of it died,
 /// and 2 for wrong flags.
 pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
-    let flags = match Flags::try_parse_from(arguments) {
-        Ok(flags) => flags,
+    // The first call counts; all install the same.
+    let _first = rustls::crypto::ring::default_provider().install_default();
+    let words = match Words::try_parse_from(arguments) {
+        Ok(words) => words,
         Err(message) => {
             // Help and version come this way too; nobody is left to tell if this fails.
             let _ = message.print();
             return ExitCode::from(u8::try_from(message.exit_code()).unwrap_or(2));
         }
     };
-    init_logging(&flags);
-    match run(&flags) {
+    init_logging(&words.flags);
+    let ended = match words.action {
+        Some(Action::Enroll(args)) => run_enroll(args),
+        None => run(&words.flags),
+    };
+    match ended {
         Ok(()) => ExitCode::SUCCESS,
         Err(cause) => {
             error!("{cause:#}");
@@ -47,6 +70,14 @@ fn init_logging(flags: &Flags) {
         LogFormat::Human => subscriber.try_init(),
         LogFormat::Json => subscriber.json().try_init(),
     };
+}
+
+fn run_enroll(args: EnrollArgs) -> anyhow::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .context("no runtime")?;
+    runtime.block_on(enroll::run(args))
 }
 
 fn run(flags: &Flags) -> anyhow::Result<()> {

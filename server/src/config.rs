@@ -11,6 +11,7 @@ use clap::{Args, ValueEnum};
 use serde::Deserialize;
 use tread_api::ids::{ConfigurationId, SiteId};
 
+use crate::authority::is_port_name;
 use crate::friction::index::Normalisation;
 use crate::identity::origin::{Names, Origin};
 
@@ -69,7 +70,7 @@ pub struct Config {
     pub http: SocketAddr,
     /// Address of `/metrics`, on this machine, if there is to be one.
     pub metrics: Option<SocketAddr>,
-    /// Address of the zenoh router, on this machine.
+    /// Address that robots connect to; on this machine, unless they show certificates.
     pub zenoh: SocketAddr,
     /// The database file.
     pub database: PathBuf,
@@ -83,6 +84,32 @@ pub struct Config {
     pub tls: Option<TlsFiles>,
     /// What browsers may do.
     pub web: WebConfig,
+    /// How robots join and show who they are; without it they connect in the clear, on this
+    /// machine alone.
+    pub robots: Option<RobotsConfig>,
+}
+
+/// How robots join and show who they are.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RobotsConfig {
+    /// The folder of the fleet's authority, which `tread-server init` makes.
+    pub authority: PathBuf,
+    /// Names and addresses that robots know this server by, besides `localhost`.
+    #[serde(default)]
+    pub names: Vec<String>,
+    /// How long a robot's certificate is good for, seconds, within [`CERTIFICATE_S_RANGE`]. A
+    /// robot renews it when two thirds are over.
+    #[serde(default = "certificate_s")]
+    pub certificate_s: u32,
+}
+
+/// How long a robot's certificate may be good for, seconds: it must outlive an outage or two, and
+/// what was stolen must end some day.
+pub const CERTIFICATE_S_RANGE: std::ops::RangeInclusive<u32> = 5..=30 * 24 * 3_600;
+
+const fn certificate_s() -> u32 {
+    24 * 3_600
 }
 
 /// Certificate and key of the REST API, both PEM.
@@ -201,6 +228,7 @@ struct File {
     tls: Option<TlsFiles>,
     #[serde(default)]
     web: WebConfig,
+    robots: Option<RobotsConfig>,
 }
 
 /// Why the server cannot start with this configuration.
@@ -235,6 +263,9 @@ pub enum ConfigError {
         /// What was given.
         value: f64,
     },
+    /// A name of the robots' port is none.
+    #[error("`robots.names` has `{0}`, which is neither a host name nor an address")]
+    PortName(String),
     /// An address that others can reach.
     #[error("`{key}` is {address}, which other machines can reach without TLS: {cure}")]
     NotLoopback {
@@ -285,6 +316,7 @@ impl Config {
             normalisations: normalisations(file.normalisations)?,
             tls: file.tls,
             web: file.web,
+            robots: file.robots,
         };
         config.check()?;
         Ok(config)
@@ -303,15 +335,39 @@ impl Config {
         const HERE: &str = "use an address of this machine such as 127.0.0.1";
         const TLS: &str = "give `certificate` and `key` under `[tls]`, or use an address of this \
                            machine such as 127.0.0.1";
+        const ROBOTS: &str = "give `authority` under `[robots]` (`tread-server init` makes it), or \
+                              use an address of this machine such as 127.0.0.1";
         let metrics = self.metrics.map(|address| ("metrics", address, HERE));
         let http = self.tls.is_none().then_some(("http", self.http, TLS));
-        let zenoh = Some(("zenoh", self.zenoh, HERE));
+        let zenoh = self
+            .robots
+            .is_none()
+            .then_some(("zenoh", self.zenoh, ROBOTS));
         for (key, address, cure) in [http, zenoh, metrics].into_iter().flatten() {
             if !address.ip().is_loopback() {
                 return Err(ConfigError::NotLoopback { key, address, cure });
             }
         }
+        if let Some(robots) = &self.robots {
+            robots.check()?;
+        }
         self.friction.check()
+    }
+}
+
+impl RobotsConfig {
+    fn check(&self) -> Result<(), ConfigError> {
+        if let Some(name) = self.names.iter().find(|name| !is_port_name(name)) {
+            return Err(ConfigError::PortName(name.clone()));
+        }
+        if !CERTIFICATE_S_RANGE.contains(&self.certificate_s) {
+            return Err(ConfigError::OutOfRange {
+                key: "robots.certificate_s",
+                range: "5 to 2592000",
+                value: f64::from(self.certificate_s),
+            });
+        }
+        Ok(())
     }
 }
 
@@ -411,6 +467,12 @@ mod tests {
         let tls = "[tls]\ncertificate = \"c.pem\"\nkey = \"k.pem\"";
         let config = load(&format!("http = \"0.0.0.0:443\"\n{tls}")).unwrap();
         assert!(config.names().is_tls);
+        let robots = "[robots]\nauthority = \"ca\"\n";
+        assert!(load(&format!("zenoh = \"0.0.0.0:1\"\n{robots}")).is_ok());
+        for wrong in ["names = [\"a b\"]", "certificate_s = 4"] {
+            let error = load(&format!("{robots}{wrong}")).unwrap_err();
+            assert!(error.to_string().contains("robots."), "{error}");
+        }
         for key in ["zenoh", "metrics"] {
             let error = load(&format!("{key} = \"0.0.0.0:1\"\n{tls}")).unwrap_err();
             assert!(

@@ -64,6 +64,53 @@ counters! {
     /// States and friction reports of another run of the agent than the one that said hello last:
     /// stragglers, or a second agent under the robot's name.
     refused_other_run,
+    /// Messages of robots that were put out of the fleet.
+    refused_revoked_robot,
+    /// Messages of robots that have not joined, where only those that have may speak.
+    refused_unenrolled_robot,
+    /// Robots that joined, with those that joined again.
+    robots_enrolled,
+    /// Certificates renewed.
+    certificates_renewed,
+    /// Attempts to join with what cannot be a join token.
+    join_token_malformed,
+    /// Attempts to join with a join token that is not kept here.
+    join_token_unknown,
+    /// Attempts to join with a join token whose time is over.
+    join_token_expired,
+    /// Attempts to join with a join token that was used before.
+    join_token_used,
+    /// Attempts to join with a join token that was revoked.
+    join_token_revoked,
+    /// Attempts to join as a robot that the join token does not allow.
+    join_token_other_robot,
+    /// Renewals refused: no certificate of this fleet, over for too long, or without its key.
+    renewals_refused,
+    /// Renewals refused because the robot was put out of the fleet, or joined again.
+    renewals_revoked,
+    /// Connections to the robots' port.
+    gate_connections,
+    /// Connections to the robots' port that began with something else than TLS.
+    gate_garbage,
+    /// Connections to the robots' port on which nothing came in time.
+    gate_silent,
+    /// Connections to the robots' port whose TLS handshake failed, for want of a certificate of
+    /// the fleet's or otherwise.
+    gate_tls_failed,
+    /// Connections to the robots' port refused because too many of their address had failed.
+    gate_rate_limited,
+    /// Connections to the robots' port refused because too many were open.
+    gate_full,
+    /// Connections to the robots' port ended to make room for new ones before their handshake.
+    gate_displaced,
+    /// Connections of robots that were put out of the fleet, or have joined again since.
+    gate_revoked,
+    /// Connections of robots ended because their certificate was over.
+    gate_expired,
+    /// Connections of robots that the router did not take.
+    gate_router_failed,
+    /// Times that another router was opened beside the present ones, for robots that joined.
+    routers_opened,
     /// Messages to a site that is not known.
     refused_unknown_site,
     /// Messages on a key that is none of ours.

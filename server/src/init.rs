@@ -1,4 +1,5 @@
-//! `tread-server init`: the first admin's token of a server.
+//! `tread-server init`: the first admin's token of a server, and the fleet's authority if robots
+//! are to join.
 //!
 //! Whoever can write the database may make one; the server need not run, and may. The token is
 //! told once: on standard output, or into a file that only its owner can read.
@@ -11,8 +12,9 @@ use anyhow::Context as _;
 use clap::Args;
 use tread_api::identity::TOKEN_DAYS_MAX;
 
-use crate::app::App;
 use crate::app::identity::FirstAdmin;
+use crate::app::{App, AppError};
+use crate::authority::{Authority, AuthorityError};
 use crate::clock::Clock;
 use crate::config::{Config, ServerArgs};
 use crate::db::Db;
@@ -51,8 +53,13 @@ pub(crate) async fn run(args: InitArgs) -> anyhow::Result<()> {
         database: args.database,
         ..ServerArgs::default()
     })?;
+    let clock = Clock::system();
+    let made_authority = match &config.robots {
+        Some(robots) => make_authority(&robots.authority, &clock)?,
+        None => false,
+    };
     let db = Db::open(&config.database).await?;
-    let app = App::new(db, Clock::system(), config.friction);
+    let app = App::new(db, clock, config.friction);
     let first = FirstAdmin {
         name: args.name,
         valid_days: args.valid_days,
@@ -60,6 +67,10 @@ pub(crate) async fn run(args: InitArgs) -> anyhow::Result<()> {
     };
     let created = app.create_first_admin(first).await;
     app.db().close().await;
+    if let (true, Err(AppError::AlreadyExists { .. })) = (made_authority, &created) {
+        eprintln!("there is an admin already, so no token was made");
+        return Ok(());
+    }
     let created = created
         .context("cannot make the first admin's token (with --force another one is made)")?;
     match &args.token_file {
@@ -70,6 +81,22 @@ pub(crate) async fn run(args: InitArgs) -> anyhow::Result<()> {
     let (name, expires_at) = (&created.token.name, created.token.expires_at);
     eprintln!("admin's token `{name}`, valid until {expires_at}; it is told this once");
     Ok(())
+}
+
+/// Makes the fleet's authority unless it is there; robots trust the present one. Whether it did.
+fn make_authority(folder: &Path, clock: &Clock) -> anyhow::Result<bool> {
+    match Authority::create(folder, clock.now()) {
+        Ok(_made) => {
+            let folder = folder.display();
+            eprintln!("fleet's authority in {folder}; whoever has its key can pose as any robot");
+            Ok(true)
+        }
+        Err(AuthorityError::Exists(_)) => {
+            Authority::load(folder)?;
+            Ok(false)
+        }
+        Err(failed) => Err(failed.into()),
+    }
 }
 
 /// Writes a file that only its owner can read, whole or not at all.

@@ -7,8 +7,10 @@
 //!   the whole program, until a signal.
 
 pub mod app;
+pub mod authority;
 pub mod clock;
 pub mod config;
+pub mod connections;
 pub mod counters;
 pub mod db;
 pub mod fleet;
@@ -28,18 +30,22 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use clap::Parser as _;
+use jiff::SignedDuration;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 
+use self::app::enrolment::Office;
 use self::app::identity::audit;
 use self::app::{App, Links, events, ingest, merging, reconciler};
+use self::authority::Authority;
 use self::clock::Clock;
+use self::config::RobotsConfig;
 pub use self::config::{Config, ServerArgs};
 use self::db::Db;
-use self::fleet::Fleet;
+use self::fleet::{Fleet, Security};
 use self::http::serve::Serving;
 use self::http::tls::Tls;
 use self::supervisor::Supervisor;
@@ -75,6 +81,7 @@ impl Server {
     /// # Errors
     /// As [`Server::start`].
     pub async fn start_with_clock(config: Config, clock: Clock) -> anyhow::Result<RunningServer> {
+        let security = config.robots.as_ref().map(security).transpose()?;
         let names = config.names();
         let tls = config.tls.map(Tls::load).transpose()?.map(Arc::new);
         let db = Db::open(&config.database).await?;
@@ -83,6 +90,7 @@ impl Server {
         app.ensure_site(&config.site).await?;
         app.know_robots().await?;
         app.load_map().await?;
+        app.know_enrolments().await?;
         let listener = TcpListener::bind(config.http)
             .await
             .with_context(|| format!("cannot listen for HTTP on {}", config.http))?;
@@ -90,7 +98,19 @@ impl Server {
 
         let supervisor = Supervisor::new();
         let stop = || supervisor.stop_token();
-        let fleet = Fleet::open(config.zenoh, supervisor.clone()).await?;
+        let fleet = Fleet::open(
+            config.zenoh,
+            security.clone(),
+            app.clock().clone(),
+            supervisor.clone(),
+        )?;
+        if let (Some(security), Some(robots)) = (security, &config.robots) {
+            app.open_office(Office {
+                authority: security.authority,
+                lifetime: SignedDuration::from_secs(robots.certificate_s.into()),
+                port: fleet.address().port(),
+            });
+        }
         app.connect(Links {
             commands: fleet.commands(&app),
             teleop: fleet.teleop(),
@@ -152,6 +172,14 @@ impl Server {
     }
 }
 
+fn security(robots: &RobotsConfig) -> anyhow::Result<Security> {
+    let authority = Authority::load(&robots.authority)?;
+    Ok(Security {
+        authority: Arc::new(authority),
+        names: robots.names.clone(),
+    })
+}
+
 impl RunningServer {
     /// Where the REST API listens.
     pub fn http_address(&self) -> SocketAddr {
@@ -165,7 +193,7 @@ impl RunningServer {
 
     /// The endpoint that robots connect to, as zenoh writes it.
     pub fn zenoh_endpoint(&self) -> String {
-        format!("tcp/{}", self.fleet.address())
+        self.fleet.endpoint()
     }
 
     /// The use cases, for tests that look behind the API.

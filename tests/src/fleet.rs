@@ -8,6 +8,8 @@ use std::process::{Command, ExitStatus};
 use anyhow::Context;
 use serde_json::json;
 use tempfile::TempDir;
+use tread_agent::clock::{Clock as _, SystemClock};
+use tread_agent::membership::{self, Enrolment, Membership, Trust};
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::robot::LinkState;
 
@@ -40,6 +42,7 @@ pub struct Fleet {
     server: Option<Process>,
     agents: HashMap<RobotId, Process>,
     agent_flags: Vec<String>,
+    config: Option<PathBuf>,
 }
 
 impl Fleet {
@@ -49,9 +52,30 @@ impl Fleet {
     /// # Panics
     /// If the server does not get ready.
     pub async fn start_with(node: &Path) -> Self {
+        Self::start_configured(node, None).await
+    }
+
+    /// The same, but robots must join, and show certificates that are good for so many seconds.
+    ///
+    /// # Panics
+    /// If the server does not get ready.
+    pub async fn start_secure_with(node: &Path, certificate_s: u32) -> Self {
+        let text =
+            format!("[robots]\nauthority = \"authority\"\ncertificate_s = {certificate_s}\n");
+        Self::start_configured(node, Some(&text)).await
+    }
+
+    async fn start_configured(node: &Path, config: Option<&str>) -> Self {
         let (http, zenoh) = (free_address(), free_address());
         let folder = tempfile::tempdir().expect("a temporary folder");
-        let token = first_token(node, folder.path());
+        let config = config.map(|text| {
+            let path = folder.path().join("tread.toml");
+            let authority = folder.path().join("authority");
+            let text = text.replace("\"authority\"", &format!("\"{}\"", authority.display()));
+            std::fs::write(&path, text).expect("the temporary folder can be written");
+            path
+        });
+        let token = first_token(node, folder.path(), config.as_deref());
         let mut fleet = Self {
             rest: Rest::new(format!("http://{http}"), &token),
             token,
@@ -62,6 +86,7 @@ impl Fleet {
             server: None,
             agents: HashMap::new(),
             agent_flags: Vec::new(),
+            config,
         };
         fleet.start_server().await;
         let corner = |x: f64, y: f64| json!({"x_m": GROUND_HALF_M * x, "y_m": GROUND_HALF_M * y});
@@ -86,7 +111,85 @@ impl Fleet {
 
     /// Where the server's router listens.
     pub fn zenoh_endpoint(&self) -> String {
-        format!("tcp/{}", self.zenoh)
+        let protocol = if self.config.is_some() { "tls" } else { "tcp" };
+        format!("{protocol}/{}", self.zenoh)
+    }
+
+    /// Where robots connect.
+    pub fn zenoh_address(&self) -> SocketAddr {
+        self.zenoh
+    }
+
+    /// A new join token, for that robot or for any new one.
+    pub async fn join_token(&self, robot: Option<&RobotId>) -> String {
+        let request = json!({"site": SITE, "robot": robot});
+        let created = self.rest.post("/v1/join-tokens", &request).await;
+        let secret = created["secret"].as_str().expect("a secret is a text");
+        secret.to_owned()
+    }
+
+    /// Lets a robot join by a token, as one does on the robot: its words, and how it ended.
+    ///
+    /// # Panics
+    /// If the node cannot be started.
+    pub async fn enroll(&self, robot: &RobotId, token: &str) -> (ExitStatus, String) {
+        let mut command = Command::new(&self.node);
+        command
+            .args(["agent", "enroll"])
+            .arg(format!("--server=http://{}", self.http))
+            .arg(format!("--robot={robot}"))
+            .arg(format!("--data-dir={}", self.robot_folder(robot).display()))
+            .env("TREAD_JOIN_TOKEN", token);
+        let ended = tokio::task::spawn_blocking(move || command.output()).await;
+        let ended = ended.ok().and_then(Result::ok);
+        let ended = ended.expect("the node can be started");
+        let said = String::from_utf8_lossy(&ended.stderr).into_owned();
+        (ended.status, said)
+    }
+
+    /// Joins as a robot from within this process.
+    ///
+    /// # Panics
+    /// If it is not let in.
+    pub async fn membership(&self, robot: &RobotId) -> Membership {
+        let enrolment = Enrolment {
+            server: format!("http://{}", self.http),
+            trust: Trust::Machine,
+            token: self.join_token(Some(robot)).await,
+            robot: Some(robot.clone()),
+            endpoint: Some(self.zenoh_endpoint()),
+        };
+        let joined = membership::enrol(&enrolment, SystemClock::new().wall()).await;
+        joined.expect("the robot is let in")
+    }
+
+    /// Lets a robot join by a token of its own.
+    ///
+    /// # Panics
+    /// If it is not let in.
+    pub async fn join(&self, robot: &RobotId) {
+        let token = self.join_token(Some(robot)).await;
+        let (status, said) = self.enroll(robot, &token).await;
+        assert!(status.success(), "{robot} was not let in: {said}");
+    }
+
+    /// Puts a robot out of the fleet.
+    ///
+    /// # Panics
+    /// If the server refuses.
+    pub async fn revoke(&self, robot: &RobotId) {
+        let path = format!("/v1/sites/{SITE}/enrolments/{robot}");
+        let answer = self.rest.call(reqwest::Method::DELETE, &path, None).await;
+        let (status, answer) = answer.expect("the server answers");
+        assert!(status.is_success(), "{answer}");
+    }
+
+    /// The server's counters.
+    pub async fn counter(&self, name: &str) -> u64 {
+        let status: serde_json::Value = self.rest.get("/v1/server").await;
+        status["counters"][name]
+            .as_u64()
+            .unwrap_or_else(|| panic!("no counter {name}: {status}"))
     }
 
     /// Where the server answers HTTP.
@@ -114,13 +217,16 @@ impl Fleet {
     /// # Panics
     /// If it does not get ready.
     pub async fn start_server(&mut self) {
-        let arguments = [
+        let mut arguments = vec![
             "server".to_owned(),
             format!("--http={}", self.http),
             format!("--zenoh={}", self.zenoh),
             format!("--database={}", self.database().display()),
             format!("--site={SITE}"),
         ];
+        if let Some(config) = &self.config {
+            arguments.push(format!("--config={}", config.display()));
+        }
         self.server = Some(self.start_process("server", &arguments));
         let log = self.folder.path().join("server.log");
         let look = || async {
@@ -286,10 +392,11 @@ fn database(folder: &Path) -> PathBuf {
 }
 
 /// Makes the database with an admin's token in it, as one does before a server's first start.
-fn first_token(node: &Path, folder: &Path) -> String {
+fn first_token(node: &Path, folder: &Path, config: Option<&Path>) -> String {
     let made = Command::new(node)
         .args(["server", "init"])
         .arg(format!("--database={}", database(folder).display()))
+        .args(config.map(|config| format!("--config={}", config.display())))
         .output()
         .expect("the node can be started");
     let said = String::from_utf8_lossy(&made.stderr);

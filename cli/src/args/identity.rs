@@ -1,12 +1,13 @@
-//! The words of the commands about tokens.
+//! The words of the commands about tokens, and about who is of the fleet.
 
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
+use tread_api::enrolment::JOIN_MINUTES_MAX;
 use tread_api::identity::{Role, TOKEN_DAYS_DEFAULT, TOKEN_DAYS_MAX};
-use tread_api::ids::TokenId;
+use tread_api::ids::{JoinTokenId, RobotId, TokenId};
 
-use super::Connection;
+use super::{Connection, duration};
 
 /// How to show who asks, and whom to trust.
 #[derive(Debug, Clone, Default, Args)]
@@ -69,4 +70,69 @@ pub(crate) struct AuditArguments {
     pub(crate) limit: u32,
     #[command(flatten)]
     pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum RobotsAction {
+    /// Make a token by which one robot may join once; it is printed this once
+    JoinToken(JoinTokenArguments),
+    /// List how each robot of the site stands that has ever joined
+    Enrolments(PlainArguments),
+    /// Put a robot out of the fleet; it comes back only by a join token that names it
+    Revoke(RevokeArguments),
+}
+
+impl RobotsAction {
+    pub(crate) fn connection(&self) -> &Connection {
+        match self {
+            Self::JoinToken(arguments) => &arguments.connection,
+            Self::Enrolments(arguments) => &arguments.connection,
+            Self::Revoke(arguments) => &arguments.connection,
+        }
+    }
+}
+
+#[derive(Debug, Args)]
+#[command(args_conflicts_with_subcommands = true)]
+pub(crate) struct JoinTokenArguments {
+    #[command(subcommand)]
+    pub(crate) action: Option<JoinTokenAction>,
+    /// The robot that it is for; without it any may join that is new to the site
+    #[arg(long, value_name = "ROBOT")]
+    pub(crate) name: Option<RobotId>,
+    /// How long it may be used, such as `30m` or `1h`, at most a day
+    #[arg(long, value_name = "TIME", default_value = "1h", value_parser = join_time)]
+    pub(crate) expires: u32,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum JoinTokenAction {
+    /// List join tokens, newest first, dead ones too
+    List,
+    /// Revoke a join token
+    Revoke {
+        /// The join token's identifier, as `list` shows it
+        join_token: JoinTokenId,
+    },
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct RevokeArguments {
+    /// The robot
+    pub(crate) robot: RobotId,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+/// Whole minutes out of a time such as `1h`.
+fn join_time(text: &str) -> Result<u32, String> {
+    let time = duration(text)?;
+    let minutes = u32::try_from(time.as_secs().div_ceil(60)).unwrap_or(u32::MAX);
+    if (1..=JOIN_MINUTES_MAX).contains(&minutes) {
+        Ok(minutes)
+    } else {
+        Err("it must be a minute to a day".to_owned())
+    }
 }

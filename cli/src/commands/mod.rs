@@ -1,6 +1,7 @@
 //! The commands that talk to a running server, a file each.
 
 mod drive;
+mod enrolment;
 mod friction;
 mod geofence;
 mod identity;
@@ -38,7 +39,10 @@ pub(crate) async fn run(command: RemoteCommand) -> anyhow::Result<ExitCode> {
         RemoteCommand::Token(_) => identity::token(&client),
         RemoteCommand::Tokens(arguments) => identity::tokens(arguments, &client, output).await,
         RemoteCommand::Audit(arguments) => identity::audit(&arguments, &client, output).await,
-        RemoteCommand::Robots(arguments) => robots::run(&arguments, &client, output).await,
+        RemoteCommand::Robots(arguments) => match &arguments.action {
+            None => robots::run(&arguments, &client, output).await,
+            Some(action) => enrolment::run(action, &client, output).await,
+        },
         RemoteCommand::Send(arguments) => send::run(arguments, &client, output).await,
         RemoteCommand::Missions(arguments) => missions::run(&arguments, &client, output).await,
         RemoteCommand::Terrains(arguments) => terrains::run(&arguments, &client, output).await,

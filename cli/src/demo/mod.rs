@@ -118,7 +118,7 @@ fn choose_robots(scenario: &Scenario, count: u32) -> anyhow::Result<Vec<Scenario
 
 fn welcome(client: &Client, processes: &Processes, folder: &Path, missions: usize) -> String {
     format!(
-        "\n  REST API       {api}/v1\n  documentation  {api}/docs\n  zenoh router   {}\n  \
+        "\n  page           {api}/\n  REST API       {api}/v1\n  documentation  {api}/docs\n  zenoh router   {}\n  \
          data and logs  {}\n  admin's token  {}\n\n{missions} missions sent; try \
          `tread watch --server {api}` in another terminal: it finds the token.\n",
         processes.zenoh_endpoint(),

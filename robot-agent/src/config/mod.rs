@@ -3,6 +3,7 @@
 //! Everything is read and checked before anything is opened. A mistake names file, line and key.
 
 mod file;
+mod place;
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -14,9 +15,12 @@ use tread_api::safety::LIMITS_MAX;
 use tread_control::geometry::Pose;
 
 use file::{DriveFile, FileConfig};
+pub(crate) use place::place;
+use place::place_at;
 
 use crate::drive::simulated::Stall;
 use crate::geometry::{control_model, paper_robot};
+use crate::membership::{Membership, MembershipFileError};
 use crate::outbox;
 use crate::sim::scenario::{BUILT_IN_NAME, Scenario, ScenarioError};
 
@@ -63,6 +67,18 @@ pub enum ConfigError {
         /// What is wrong with it.
         problem: String,
     },
+    /// The robot's membership was refused.
+    #[error("the robot's place in the fleet is not known")]
+    Membership(#[from] MembershipFileError),
+    /// The robot has joined under another name.
+    #[error("the robot has joined the fleet as `{0}`: give that name, or join again")]
+    OtherRobot(String),
+    /// The endpoint wants a certificate, and there is none.
+    #[error("`{0}` wants a certificate: join the fleet with `tread-agent enroll`")]
+    NotEnrolled(String),
+    /// What is sent there could be read and changed by others.
+    #[error("`{0}` is another machine without TLS: join the fleet with `tread-agent enroll`")]
+    ClearText(String),
     /// The scenario was refused.
     #[error("the simulated drive has no ground")]
     Scenario(#[from] ScenarioError),
@@ -85,7 +101,7 @@ pub struct Flags {
     /// The robot's identifier within its site
     #[arg(long)]
     pub robot: Option<RobotId>,
-    /// The server's zenoh endpoint [default: tcp/127.0.0.1:7447]
+    /// The server's zenoh endpoint [default: what `enroll` was told, or tcp/127.0.0.1:7447]
     #[arg(long)]
     pub server: Option<String>,
     /// Where measurements wait for the server
@@ -157,6 +173,8 @@ pub struct AgentConfig {
     pub robot: RobotId,
     /// The server's zenoh endpoint.
     pub server: String,
+    /// The robot's certificate, for an endpoint that wants one.
+    pub membership: Option<Membership>,
     /// Where measurements and missions outlive the process.
     pub data_dir: PathBuf,
     /// Rate of the control loop, Hz, within [`RATE_HZ_RANGE`].
@@ -204,18 +222,7 @@ impl AgentConfig {
     /// # Errors
     /// [`ConfigError`] names file, line and key.
     pub fn load(flags: &Flags) -> Result<Self, ConfigError> {
-        let file = match &flags.config {
-            None => FileConfig::default(),
-            Some(path) => {
-                let file = path.display().to_string();
-                let text =
-                    std::fs::read_to_string(path).map_err(|source| ConfigError::Unreadable {
-                        file: file.clone(),
-                        source,
-                    })?;
-                file::parse(&file, &text)?
-            }
-        };
+        let file = read_file(flags)?;
         let from_file = file
             .drive
             .as_ref()
@@ -238,6 +245,18 @@ impl AgentConfig {
     pub fn period(&self) -> Duration {
         Duration::from_secs_f64(self.rate_hz.recip())
     }
+}
+
+fn read_file(flags: &Flags) -> Result<FileConfig, ConfigError> {
+    let Some(path) = &flags.config else {
+        return Ok(FileConfig::default());
+    };
+    let file = path.display().to_string();
+    let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Unreadable {
+        file: file.clone(),
+        source,
+    })?;
+    file::parse(&file, &text)
 }
 
 /// `x,y,heading` of the simulated base.
@@ -281,10 +300,17 @@ fn assemble(
     file: FileConfig,
     scenario: Scenario,
 ) -> Result<AgentConfig, ConfigError> {
+    let data_dir = flags.data_dir.clone().or(file.data_dir);
+    let membership = match &data_dir {
+        Some(folder) => Membership::load(folder)?,
+        None => None,
+    };
+    let joined = membership.as_ref();
     let site = flags
         .site
         .clone()
         .or(file.site)
+        .or(joined.map(|joined| joined.site.clone()))
         .ok_or(ConfigError::Missing {
             key: "site",
             flag: "site",
@@ -293,18 +319,15 @@ fn assemble(
         .robot
         .clone()
         .or(file.robot)
+        .or(joined.map(|joined| joined.robot.clone()))
         .ok_or(ConfigError::Missing {
             key: "robot",
             flag: "robot",
         })?;
-    let data_dir = flags
-        .data_dir
-        .clone()
-        .or(file.data_dir)
-        .ok_or(ConfigError::Missing {
-            key: "data_dir",
-            flag: "data-dir",
-        })?;
+    let data_dir = data_dir.ok_or(ConfigError::Missing {
+        key: "data_dir",
+        flag: "data-dir",
+    })?;
     let rate_hz = flags.rate_hz.or(file.rate_hz).unwrap_or(100.0);
     within("rate_hz", rate_hz, &RATE_HZ_RANGE)?;
     let state_rate_hz = file.state_rate_hz.unwrap_or(5.0);
@@ -316,7 +339,13 @@ fn assemble(
         key: "model",
         problem: refused.to_string(),
     })?;
-    let server = flags.server.clone().or(file.server);
+    let server = flags
+        .server
+        .clone()
+        .or(file.server)
+        .or(joined.map(|joined| joined.endpoint.clone()))
+        .unwrap_or_else(|| SERVER_DEFAULT.to_owned());
+    let membership = place_at(&server, &site, &robot, membership)?;
     let required_holders = file.required_holders.unwrap_or_default();
     if required_holders.len() > LIMITS_MAX {
         return Err(ConfigError::OutOfRange {
@@ -328,7 +357,8 @@ fn assemble(
         drive: simulated(flags, file.drive, scenario, &robot)?,
         site,
         robot,
-        server: server.unwrap_or_else(|| SERVER_DEFAULT.to_owned()),
+        server,
+        membership,
         data_dir,
         rate_hz,
         state_rate_hz,
@@ -495,6 +525,27 @@ mod tests {
         }
         let refused = load("site = \"yard\"\n", &[]).unwrap_err();
         assert!(refused.contains("--robot"), "{refused}");
+    }
+
+    #[test]
+    fn another_machine_is_spoken_to_by_tls_alone_and_that_only_after_joining() {
+        for good in [
+            "tcp/127.0.0.1:7447",
+            "tcp/[::1]:1",
+            "tcp/localhost:1#so_sndbuf=9000",
+        ] {
+            let config = load(GOOD, &["--server", good]).unwrap();
+            assert_eq!((config.server.as_str(), config.membership), (good, None));
+        }
+        for (bad, cure) in [
+            ("tcp/192.0.2.7:7447", "without TLS"),
+            ("udp/tread.example:7447", "without TLS"),
+            ("tcp/localhost.example:7447", "without TLS"),
+            ("tls/tread.example:7447", "tread-agent enroll"),
+        ] {
+            let refused = load(GOOD, &["--server", bad]).unwrap_err();
+            assert!(refused.contains(cure), "{refused}");
+        }
     }
 
     #[test]

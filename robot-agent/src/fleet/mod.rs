@@ -33,8 +33,8 @@ use zenoh::query::{ConsolidationMode, Querier, Query};
 pub use self::command::IncomingCommand;
 use self::error::zenoh_failed;
 pub use self::error::{AskError, LinkError, may_pass_later};
-use self::session::session_config;
-pub use self::session::start_jitter;
+pub use self::session::{session_config, start_jitter};
+use crate::membership::Membership;
 
 /// Commands that may wait to be answered; more are dropped, and the server asks again.
 pub const COMMANDS_MAX: usize = 64;
@@ -44,6 +44,8 @@ pub const HELLO_TIMEOUT: Duration = Duration::from_secs(2);
 pub const UPLOAD_TIMEOUT: Duration = Duration::from_secs(10);
 /// Longest wait for a session to close.
 pub const CLOSE_MAX: Duration = Duration::from_secs(3);
+/// Rest after a row of tries to connect.
+const OPEN_REST: Duration = Duration::from_millis(100);
 /// Replies to one query that may wait; there is one server.
 const REPLIES_MAX: usize = 4;
 
@@ -91,6 +93,8 @@ pub struct Listeners {
     pub note: Note,
     /// Takes what must not wait.
     pub urgent: TakeUrgent,
+    /// Takes commands; what finds no room is dropped, and the server asks again.
+    pub commands: mpsc::Sender<IncomingCommand>,
 }
 
 impl std::fmt::Debug for Listeners {
@@ -112,40 +116,58 @@ pub struct FleetLink {
     server_seen: watch::Receiver<u64>,
 }
 
-/// What comes in over a link.
+/// Commands that wait to be answered. They outlive a link: what came by one is answered though
+/// another has been opened meanwhile.
 pub type Commands = mpsc::Receiver<IncomingCommand>;
+
+/// Opens a session, however long that takes; `None` once it was given up. Blocks its thread.
+fn open(config: &zenoh::Config, given_up: &CancellationToken) -> Option<zenoh::Session> {
+    while !given_up.is_cancelled() {
+        match zenoh::open(config.clone()).wait() {
+            Ok(session) if given_up.is_cancelled() => {
+                let _ = session.close().wait();
+            }
+            Ok(session) => return Some(session),
+            Err(cause) => {
+                debug!("the server is not reached: {cause}");
+                std::thread::sleep(OPEN_REST);
+            }
+        }
+    }
+    None
+}
 
 /// Checks that a text is an endpoint that zenoh can connect to.
 ///
 /// # Errors
 /// [`LinkError::Endpoint`].
 pub fn check_endpoint(server: &str) -> Result<(), LinkError> {
-    session_config(server).map(|_| ())
+    session_config(server, None).map(|_| ())
 }
 
 impl FleetLink {
     /// Connects, however long that takes, and declares everything; `None` once told to stop.
+    /// Dropped before it is done, it leaves nothing behind for long.
     ///
     /// # Errors
     /// [`LinkError`] for an endpoint that is none, or when zenoh refuses a declaration.
     pub async fn connect(
         server: &str,
+        membership: Option<&Membership>,
         identity: Identity,
         listeners: Listeners,
         stop: &CancellationToken,
-    ) -> Result<Option<(Self, Commands)>, LinkError> {
-        let config = session_config(server)?;
+    ) -> Result<Option<Self>, LinkError> {
+        let config = session_config(server, membership)?;
         let (opened, opening) = oneshot::channel();
         // Opening blocks until the server is there. A thread of its own can be left behind.
-        let cancelled = stop.clone();
+        let given_up = stop.child_token();
+        let _give_up = given_up.clone().drop_guard();
         std::thread::Builder::new()
             .name("fleet-connect".to_owned())
             .spawn(move || {
-                let session = zenoh::open(config).wait();
-                if let (Ok(session), true) = (&session, cancelled.is_cancelled()) {
-                    let _ = session.close().wait();
-                }
-                // Nobody waits any more: the session closes by being dropped.
+                let session = open(&config, &given_up);
+                // Nobody may wait any more: the session closes by being dropped.
                 let _ = opened.send(session);
             })
             .map_err(|cause| LinkError::Zenoh {
@@ -156,12 +178,13 @@ impl FleetLink {
             () = stop.cancelled() => return Ok(None),
             session = opening => session,
         };
-        let session = session
-            .map_err(|_| LinkError::Zenoh {
-                action: "open a session",
-                problem: "its thread died".to_owned(),
-            })?
-            .map_err(zenoh_failed("open a session"))?;
+        let session = session.map_err(|_| LinkError::Zenoh {
+            action: "open a session",
+            problem: "its thread died".to_owned(),
+        })?;
+        let Some(session) = session else {
+            return Ok(None);
+        };
         info!(server, "connected to `{server}`");
         let declaring =
             tokio::task::spawn_blocking(move || Self::declare(session, identity, &listeners));
@@ -174,9 +197,9 @@ impl FleetLink {
         session: zenoh::Session,
         identity: Identity,
         listeners: &Listeners,
-    ) -> Result<(Self, Commands), LinkError> {
+    ) -> Result<Self, LinkError> {
         let (site, robot) = (&identity.site, &identity.robot);
-        let (command_sender, commands) = mpsc::channel(COMMANDS_MAX);
+        let command_sender = listeners.commands.clone();
         let (noted, urgent) = (Arc::clone(&listeners.note), Arc::clone(&listeners.urgent));
         let own_run = identity.boot.to_string();
         let take_query = move |query: Query| {
@@ -263,7 +286,7 @@ impl FleetLink {
             .declare_token(keys::alive(site, robot, identity.boot))
             .wait()
             .map_err(zenoh_failed("declare the liveliness token"))?;
-        let link = Self {
+        Ok(Self {
             identity,
             session,
             state,
@@ -272,8 +295,7 @@ impl FleetLink {
             ingest,
             _alive: alive,
             server_seen,
-        };
-        Ok((link, commands))
+        })
     }
 
     /// Drive commands and limits: the latest counts, so each is taken in its callback.

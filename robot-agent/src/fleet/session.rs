@@ -5,7 +5,11 @@ use std::time::Duration;
 
 use tread_api::ids::BootId;
 
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
+
 use super::{LinkError, zenoh_failed};
+use crate::membership::Membership;
 
 /// First pause before a lost connection is tried again, milliseconds.
 const RETRY_FIRST_MS: u32 = 100;
@@ -14,6 +18,8 @@ const RETRY_FIRST_MS: u32 = 100;
 const RETRY_MAX_MS: u32 = 300;
 /// Longest try to connect, milliseconds: a hanging one must not outlast the network's healing.
 const OPEN_TIMEOUT_MS: u32 = 1_000;
+/// Longest row of tries to connect before the configuration is looked at again, milliseconds.
+const CONNECT_TIMEOUT_MS: u32 = 5_000;
 /// After this silence the router takes a robot for gone, milliseconds.
 const LEASE_MS: u32 = 3_000;
 /// Send buffer of the kernel, bytes.
@@ -42,11 +48,14 @@ fn with_small_buffer(server: &str) -> String {
     format!("{server}{joint}so_sndbuf={SEND_BUFFER_BYTES}")
 }
 
-/// How the robot's session is opened.
+/// How the robot's session is opened; with a certificate where one is wanted.
 ///
 /// # Errors
 /// [`LinkError`] for an endpoint that is none.
-pub(super) fn session_config(server: &str) -> Result<zenoh::Config, LinkError> {
+pub fn session_config(
+    server: &str,
+    membership: Option<&Membership>,
+) -> Result<zenoh::Config, LinkError> {
     let endpoint_failed = |problem: String| LinkError::Endpoint {
         endpoint: server.to_owned(),
         problem,
@@ -62,7 +71,7 @@ pub(super) fn session_config(server: &str) -> Result<zenoh::Config, LinkError> {
     let settings = [
         ("mode", "\"client\"".to_owned()),
         ("connect/endpoints", endpoints),
-        ("connect/timeout_ms", "-1".to_owned()),
+        ("connect/timeout_ms", CONNECT_TIMEOUT_MS.to_string()),
         ("connect/retry", retry.to_string()),
         ("listen/endpoints", "[]".to_owned()),
         ("scouting/multicast/enabled", "false".to_owned()),
@@ -80,7 +89,28 @@ pub(super) fn session_config(server: &str) -> Result<zenoh::Config, LinkError> {
             .insert_json5(key, &value)
             .map_err(zenoh_failed("take its configuration"))?;
     }
+    if let Some(membership) = membership {
+        show_certificate(&mut config, membership)?;
+    }
     Ok(config)
+}
+
+/// TLS both ways: the robot shows its certificate, and takes only the fleet's server.
+fn show_certificate(config: &mut zenoh::Config, membership: &Membership) -> Result<(), LinkError> {
+    let text = |pem: &str| format!("\"{}\"", BASE64_STANDARD.encode(pem));
+    let settings = [
+        ("enable_mtls", "true".to_owned()),
+        ("verify_name_on_connect", "true".to_owned()),
+        ("root_ca_certificate_base64", text(&membership.authority)),
+        ("connect_certificate_base64", text(&membership.certificate)),
+        ("connect_private_key_base64", text(&membership.key)),
+    ];
+    for (key, value) in settings {
+        config
+            .insert_json5(&format!("transport/link/tls/{key}"), &value)
+            .map_err(zenoh_failed("take its certificate"))?;
+    }
+    Ok(())
 }
 
 #[cfg(test)]
@@ -98,7 +128,10 @@ mod tests {
         // Spread over the whole of it: a tenth of the time sees about a tenth of the agents.
         for tenth in 0..10 {
             let within = START_JITTER_MAX / 10 * tenth..START_JITTER_MAX / 10 * (tenth + 1);
-            let count = pauses.iter().filter(|pause| within.contains(pause)).count();
+            let count = pauses
+                .iter()
+                .filter(|pause| within.contains(*pause))
+                .count();
             assert!((40..200).contains(&count), "{count} within {within:?}");
         }
     }
@@ -113,7 +146,7 @@ mod tests {
         ] {
             assert_eq!(with_small_buffer(given), used);
         }
-        assert!(session_config("tcp/127.0.0.1:7447").is_ok());
-        assert!(session_config("nonsense").is_err());
+        assert!(session_config("tcp/127.0.0.1:7447", None).is_ok());
+        assert!(session_config("nonsense", None).is_err());
     }
 }

@@ -56,7 +56,10 @@ export function browser(): { open(options?: Open): Promise<Page> } {
     mkdirSync(SHOTS, { recursive: true });
     running = await chromium.launch({
       executablePath: inject('chromium'),
-      args: ['--no-sandbox', '--disable-gpu'],
+      // A page that was put in the place of the embedded one comes from nowhere, for Chromium.
+      args: ['--no-sandbox', '--disable-gpu'].concat(
+        process.env['TREAD_DIST'] ? ['--disable-features=LocalNetworkAccessChecks'] : [],
+      ),
     });
   });
   afterAll(async () => {

@@ -8,6 +8,7 @@ use tread_api::ids::{AlertCode, AlertId};
 use tread_api::page::Page;
 use tread_api::robot::{ALERT_TEXT_MAX, ALERTS_MAX, Alert, AlertReport, Severity};
 
+use super::enrolment::REVOKED_ALERT;
 use super::stops::UNCONFIRMED_ALERT;
 use super::{App, AppError, check_named, page};
 use crate::db;
@@ -67,7 +68,8 @@ impl App {
         let has = |alert: &Alert| said.iter().any(|report| report.code == alert.code);
         let is_new = |report: &&AlertReport| !raised.iter().any(|alert| alert.code == report.code);
         // What the server itself has raised is not for the robot to end.
-        let own = |alert: &&Alert| alert.code.as_str() == UNCONFIRMED_ALERT;
+        let own =
+            |alert: &&Alert| [UNCONFIRMED_ALERT, REVOKED_ALERT].contains(&alert.code.as_str());
         let gone = raised.iter().filter(|alert| !has(alert) && !own(alert));
         let gone: Vec<&Alert> = gone.collect();
         let new: Vec<&AlertReport> = said.iter().filter(is_new).collect();

@@ -1,7 +1,9 @@
 //! Why a use case did not do it, in the words of the domain.
 
 use tread_api::geometry::Point;
-use tread_api::ids::{AlertId, MissionId, RobotId, SiteId, StopId, TerrainId, TokenId};
+use tread_api::ids::{
+    AlertId, JoinTokenId, MissionId, RobotId, SiteId, StopId, TerrainId, TokenId,
+};
 use tread_api::mission::MissionState;
 use tread_api::trajectory::Place;
 
@@ -93,6 +95,12 @@ pub enum AppError {
     /// No token of that identifier.
     #[error("token `{0}` is not known")]
     UnknownToken(TokenId),
+    /// No join token of that identifier.
+    #[error("join token `{0}` is not known")]
+    UnknownJoinToken(JoinTokenId),
+    /// Robots do not join this server.
+    #[error("robots do not join this server: its configuration has no `[robots]`")]
+    NoAuthority,
     /// The operating system gives no random numbers.
     #[error("the operating system gives no random numbers: {0}")]
     NoRandomness(String),
@@ -241,6 +249,8 @@ impl AppError {
             | Self::Impossible { .. }
             | Self::UnknownAlert(_)
             | Self::UnknownToken(_)
+            | Self::UnknownJoinToken(_)
+            | Self::NoAuthority
             | Self::NoRandomness(_)
             | Self::UnknownStop(_)
             | Self::StopNotCleared { .. }

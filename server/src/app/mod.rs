@@ -2,6 +2,7 @@
 
 pub mod alerts;
 pub mod check;
+pub mod enrolment;
 mod error;
 pub mod events;
 pub mod friction;
@@ -28,6 +29,7 @@ use std::time::Duration;
 use tokio::sync::{Notify, Semaphore, SemaphorePermit};
 use tread_api::ids::{RobotId, SiteId};
 
+use self::enrolment::Membership;
 pub use self::error::AppError;
 use self::events::Hub;
 use self::identity::Identity;
@@ -67,6 +69,7 @@ struct Inner {
     checks: Semaphore,
     identity: Identity,
     maps: Maps,
+    membership: Membership,
     requests: Requests,
     refusals: Refusals,
     queues: Queues,
@@ -111,6 +114,7 @@ impl App {
             checks: Semaphore::new(check::CHECKS_MAX),
             identity: Identity::default(),
             maps: Maps::default(),
+            membership: Membership::default(),
             requests: Requests::default(),
             refusals: Refusals::default(),
             queues: Queues::default(),
@@ -218,6 +222,10 @@ impl App {
 
     fn identity(&self) -> &Identity {
         &self.inner.identity
+    }
+
+    fn membership(&self) -> &Membership {
+        &self.inner.membership
     }
 
     fn keys_in_flight(&self) -> &InFlight {

@@ -7,9 +7,11 @@
 pub mod alerts;
 pub mod aside;
 pub mod audit;
+pub mod enrolments;
 pub mod geofences;
 pub mod history;
 pub mod idempotency;
+pub mod join_tokens;
 pub mod missions;
 pub mod robots;
 pub mod segments;

@@ -1,7 +1,7 @@
 //! Commands to robots: zenoh queries with an application answer.
 
 use std::pin::Pin;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use serde::Serialize;
@@ -17,7 +17,7 @@ use zenoh::qos::Priority;
 use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 
 use super::presence::{Presences, RobotKey};
-use super::router::Current;
+use super::routers::Routers;
 use crate::supervisor::Supervisor;
 
 /// How long a robot may take to answer.
@@ -91,7 +91,7 @@ impl Commands {
 /// The fleet's network as a carrier.
 #[derive(Debug)]
 pub(super) struct Network {
-    pub(super) session: Arc<Current>,
+    pub(super) routers: Arc<Routers>,
     pub(super) supervisor: Supervisor,
 }
 
@@ -107,9 +107,13 @@ impl Carrier for Network {
         if let Some(boot) = run {
             key = keys::to_run(&key, boot);
         }
-        let (session, supervisor) = (self.session.get(), self.supervisor.clone());
+        // A robot is on one of them; the others know nobody of its name and say nothing.
+        let routers = self.routers.all();
+        let sessions = routers.iter().map(|router| router.session.clone());
+        let sessions: Vec<Session> = sessions.collect();
+        let supervisor = self.supervisor.clone();
         Box::pin(query(
-            session,
+            sessions,
             supervisor,
             key,
             (priority_of(verb), payload),
@@ -129,7 +133,7 @@ const fn priority_of(verb: Verb) -> Priority {
 }
 
 async fn query(
-    session: Session,
+    sessions: Vec<Session>,
     supervisor: Supervisor,
     key: String,
     (priority, payload): (Priority, Vec<u8>),
@@ -138,23 +142,28 @@ async fn query(
     let query_key = key.clone();
     // Sending blocks its thread when the robot's link is full.
     let sent = supervisor.blocking(move || {
-        let mut answer = Some(answer);
-        session
-            .get(query_key)
-            .payload(payload)
-            .priority(priority)
-            .express(priority == Priority::RealTime)
-            // A second agent under the same name must not swallow what is for the first.
-            .target(QueryTarget::All)
-            .consolidation(ConsolidationMode::None)
-            .timeout(COMMAND_TIMEOUT)
-            .callback_mut(move |reply| {
-                // Only the first reply counts: the robot's key belongs to one robot.
-                if let Some(answer) = answer.take() {
-                    let _ = answer.send(reply);
-                }
-            })
-            .wait()
+        let answer = Arc::new(Mutex::new(Some(answer)));
+        for session in sessions {
+            let answer = Arc::clone(&answer);
+            session
+                .get(&query_key)
+                .payload(payload.clone())
+                .priority(priority)
+                .express(priority == Priority::RealTime)
+                // A second agent under the same name must not swallow what is for the first.
+                .target(QueryTarget::All)
+                .consolidation(ConsolidationMode::None)
+                .timeout(COMMAND_TIMEOUT)
+                .callback(move |reply| {
+                    // Only the first reply counts: the robot's key belongs to one robot.
+                    let waiting = answer.lock().unwrap_or_else(PoisonError::into_inner).take();
+                    if let Some(waiting) = waiting {
+                        let _ = waiting.send(reply);
+                    }
+                })
+                .wait()?;
+        }
+        Ok::<(), zenoh::Error>(())
     });
     let exchange = async {
         sent.await?

@@ -12,7 +12,7 @@ use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait as _};
 
 use super::presence::{Heard, RobotKey};
-use super::requests;
+use super::{requests, tokens};
 use crate::app::App;
 use crate::app::ingest::Upload;
 use crate::counters::Counter;
@@ -38,9 +38,15 @@ pub(super) struct Channels {
 }
 
 #[derive(Debug)]
-struct TokenChange {
-    key: String,
-    appeared: bool,
+enum TokenChange {
+    /// A token appeared on a router, or went.
+    Token {
+        key: String,
+        router: u64,
+        appeared: bool,
+    },
+    /// A router was closed, and with it all that was on it.
+    RouterClosed(u64),
 }
 
 #[derive(Debug)]
@@ -86,6 +92,18 @@ impl Channels {
     }
 }
 
+impl Channels {
+    /// Tells that a router is gone.
+    pub(super) fn router_closed(&self, router: u64) {
+        let change = TokenChange::RouterClosed(router);
+        hand_over(
+            &self.presence,
+            change,
+            &self.app.counters().presence_dropped,
+        );
+    }
+}
+
 fn hand_over<T>(channel: &mpsc::Sender<T>, message: T, dropped: &Counter) {
     // A closed channel means that the server stops; nothing is lost that matters then.
     if let Err(TrySendError::Full(_)) = channel.try_send(message) {
@@ -94,7 +112,7 @@ fn hand_over<T>(channel: &mpsc::Sender<T>, message: T, dropped: &Counter) {
 }
 
 /// Declares everything that the server listens to. Blocks its thread.
-pub(super) fn declare(session: &Session, channels: &Channels) -> zenoh::Result<()> {
+pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> zenoh::Result<()> {
     let to = channels.clone();
     session
         .declare_queryable(keys::ALL_HELLOS)
@@ -131,8 +149,9 @@ pub(super) fn declare(session: &Session, channels: &Channels) -> zenoh::Result<(
         .declare_subscriber(keys::ALL_ALIVE)
         .history(true)
         .callback(move |sample| {
-            let change = TokenChange {
+            let change = TokenChange::Token {
                 key: sample.key_expr().as_str().to_owned(),
+                router,
                 appeared: sample.kind() == SampleKind::Put,
             };
             hand_over(&to.presence, change, &to.app.counters().presence_dropped);
@@ -146,20 +165,48 @@ async fn watch_presence(
     mut changes: mpsc::Receiver<TokenChange>,
     stop: CancellationToken,
 ) {
+    let mut tokens = tokens::Tokens::default();
     while let Some(change) = next(&mut changes, &stop).await {
-        let Some(Key::Alive(site, robot, boot)) = Key::parse(&change.key) else {
-            refuse_key(&app, &change.key);
-            continue;
-        };
-        let now = app.clock().elapsed();
-        if change.appeared {
-            info!(robot.id = %robot, "robot `{robot}` of site `{site}` is on the network");
-            app.presences().token_appeared((site, robot), boot, now);
-        } else {
-            info!(robot.id = %robot, "robot `{robot}` of site `{site}` is off the network");
-            app.presences().token_gone(&(site, robot), boot, now);
+        match change {
+            TokenChange::Token {
+                key,
+                router,
+                appeared: true,
+            } => appeared(&app, &mut tokens, &key, router).await,
+            TokenChange::Token { key, router, .. } => {
+                if tokens.gone(&key, router) {
+                    gone(&app, &key);
+                }
+            }
+            TokenChange::RouterClosed(router) => {
+                for key in tokens.router_closed(router) {
+                    gone(&app, &key);
+                }
+            }
         }
         app.wake();
+    }
+}
+
+async fn appeared(app: &App, tokens: &mut tokens::Tokens, token: &str, router: u64) {
+    let Some(Key::Alive(site, robot, boot)) = Key::parse(token) else {
+        return refuse_key(app, token);
+    };
+    let key = (site, robot);
+    if !app.admits(&key).await || !tokens.appeared(token, router) {
+        return;
+    }
+    let (site, robot) = &key;
+    info!(robot.id = %robot, "robot `{robot}` of site `{site}` is on the network");
+    let now = app.clock().elapsed();
+    app.presences().token_appeared(key, boot, now);
+}
+
+fn gone(app: &App, token: &str) {
+    if let Some(Key::Alive(site, robot, boot)) = Key::parse(token) {
+        info!(robot.id = %robot, "robot `{robot}` of site `{site}` is off the network");
+        let now = app.clock().elapsed();
+        app.presences().token_gone(&(site, robot), boot, now);
     }
 }
 
@@ -170,6 +217,9 @@ async fn read_states(app: App, mut published: mpsc::Receiver<Published>, stop: C
             Some(Key::State(site, robot)) => {
                 let named = |state: &RobotState| state.robot == robot;
                 let key: RobotKey = (site, robot.clone());
+                if !app.admits(&key).await {
+                    continue;
+                }
                 if let Some(state) = read(&app, &message, named) {
                     match app.presences().state(&key, state, now, app.clock().now()) {
                         Heard::News => app.wake(),
@@ -182,6 +232,9 @@ async fn read_states(app: App, mut published: mpsc::Receiver<Published>, stop: C
             Some(Key::Friction(site, robot)) => {
                 let named = |report: &FrictionReport| report.robot == robot;
                 let key: RobotKey = (site, robot.clone());
+                if !app.admits(&key).await {
+                    continue;
+                }
                 if let Some(report) = read(&app, &message, named) {
                     match app.presences().friction(&key, &report, now) {
                         Heard::News | Heard::Nothing => {}

@@ -1,30 +1,44 @@
 //! The fleet's network. The only module that calls zenoh.
 //!
-//! The server's session is itself the router that robots connect to. Callbacks run on zenoh's own
+//! The server's session is itself the router that robots connect to: in the clear on this machine
+//! alone, or through the [`gate`], which takes TLS with robots' certificates. Callbacks run on zenoh's own
 //! threads, where anything slow would stop the whole network: they only `try_send` into bounded
 //! channels, and what does not fit is counted and dropped. Robots send again what matters.
 
+mod access;
 pub mod commands;
+mod gate;
 mod inbox;
+mod keeper;
+#[cfg(test)]
+mod matrix;
+mod opening;
 pub mod presence;
 mod pulse;
 mod requests;
 mod router;
+mod routers;
 pub mod teleop;
+mod tokens;
 
 use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 use std::time::Duration;
 
-use tokio::sync::mpsc;
-use tracing::{info, warn};
-use zenoh::{Config, Session, Wait as _};
+use tokio::sync::{Mutex, mpsc};
+use tracing::info;
 
 use self::commands::{Commands, Network};
-use self::router::Current;
+use self::gate::Gate;
+use self::keeper::Keeper;
+use self::opening::{Inside, Opener, with_free_port};
+use self::routers::Routers;
 use self::teleop::Teleop;
 use crate::app::App;
 use crate::app::ingest::Upload;
+use crate::authority::Authority;
+use crate::clock::Clock;
 use crate::supervisor::Supervisor;
 
 /// Most robots that may be connected; zenoh's own default is 1000.
@@ -53,6 +67,12 @@ pub enum FleetError {
         /// What zenoh says.
         reason: String,
     },
+    /// There are no random numbers for keys.
+    #[error("cannot make the keys of the robots' port")]
+    Keys(#[source] rcgen::Error),
+    /// The certificates of the robots' port cannot be used.
+    #[error("cannot use the certificates of the robots' port")]
+    Certificates(#[source] anyhow::Error),
     /// Another program listens there.
     #[error("cannot listen for robots on {address}")]
     InUse {
@@ -73,30 +93,68 @@ pub enum FleetError {
     },
 }
 
+/// What the robots' port shows, and demands.
+#[derive(Debug, Clone)]
+pub struct Security {
+    /// Who must have signed a robot's certificate, and signs the port's.
+    pub authority: Arc<Authority>,
+    /// The names that robots know the port by.
+    pub names: Vec<String>,
+}
+
 /// The open network.
 #[derive(Debug)]
 pub struct Fleet {
-    session: Arc<Current>,
+    routers: Arc<Routers>,
+    opener: std::sync::Mutex<Option<Opener>>,
+    gate: std::sync::Mutex<Option<Gate>>,
     supervisor: Supervisor,
     address: SocketAddr,
+    is_tls: bool,
     probe_period: Duration,
 }
 
 impl Fleet {
-    /// Opens the router. Port 0 takes a free one.
+    /// Takes the address that robots connect to; port 0 takes a free one. Without security it is
+    /// in the clear, and everybody who reaches it may be any robot.
     ///
     /// # Errors
-    /// [`FleetError`]: the address is in use, or zenoh refuses it.
-    pub async fn open(address: SocketAddr, supervisor: Supervisor) -> Result<Self, FleetError> {
-        let address = with_free_port(address)?;
-        // Asked here because the operating system's own words are clearer than zenoh's.
-        drop(TcpListener::bind(address).map_err(|cause| FleetError::InUse { address, cause })?);
-        let session = open_session(address, &supervisor).await?;
-        info!("zenoh router listens on tcp/{address}");
+    /// [`FleetError`]: the address is in use, or the certificates cannot be used.
+    pub fn open(
+        address: SocketAddr,
+        security: Option<Security>,
+        clock: Clock,
+        supervisor: Supervisor,
+    ) -> Result<Self, FleetError> {
+        let routers = Arc::new(Routers::default());
+        let is_tls = security.is_some();
+        let (address, inside, gate) = match security {
+            None => {
+                let address = with_free_port(address)?;
+                // Asked here because the operating system's own words are clearer than zenoh's.
+                let in_use = |cause| FleetError::InUse { address, cause };
+                drop(TcpListener::bind(address).map_err(in_use)?);
+                (address, None, None)
+            }
+            Some(security) => {
+                let inside = Inside::new(clock.clone()).map_err(FleetError::Keys)?;
+                let inside = Arc::new(inside);
+                let gate = Gate::open(address, security, clock, Arc::clone(&inside))?;
+                (gate.address(), Some(inside), Some(gate))
+            }
+        };
         Ok(Self {
-            session: Arc::new(Current::new(session)),
+            opener: std::sync::Mutex::new(Some(Opener {
+                address,
+                inside,
+                supervisor: supervisor.clone(),
+                next: AtomicU64::new(0),
+            })),
+            gate: std::sync::Mutex::new(gate),
+            routers,
             supervisor,
             address,
+            is_tls,
             probe_period: router::PROBE_PERIOD,
         })
     }
@@ -106,10 +164,16 @@ impl Fleet {
         self.address
     }
 
+    /// Where robots connect, as zenoh writes it.
+    pub fn endpoint(&self) -> String {
+        let protocol = if self.is_tls { "tls" } else { "tcp" };
+        format!("{protocol}/{}", self.address)
+    }
+
     /// The way to command the robots that an app knows.
     pub fn commands(&self, app: &App) -> Commands {
         let network = Network {
-            session: Arc::clone(&self.session),
+            routers: Arc::clone(&self.routers),
             supervisor: self.supervisor.clone(),
         };
         Commands::new(Arc::new(network), Arc::clone(app.presences()))
@@ -117,137 +181,53 @@ impl Fleet {
 
     /// The way of drive commands.
     pub fn teleop(&self) -> Teleop {
-        Teleop::new(Arc::clone(&self.session), self.supervisor.clone())
+        Teleop::new(Arc::clone(&self.routers), self.supervisor.clone())
     }
 
-    /// Begins to listen to robots, to beat the pulse and to look after the router.
+    /// Opens the router and begins to listen to robots, to beat the pulse and to look after the
+    /// router. Only the first call does.
     ///
     /// # Errors
-    /// [`FleetError::Open`] if zenoh refuses a declaration.
+    /// [`FleetError::Open`] if zenoh refuses.
     pub async fn listen(&self, app: &App, uploads: mpsc::Sender<Upload>) -> Result<(), FleetError> {
-        let channels = inbox::Channels::new(&self.supervisor, app, uploads);
-        declare(
-            self.session.get(),
-            &channels,
-            self.address,
-            &self.supervisor,
-        )
-        .await?;
-        let stop = || self.supervisor.stop_token();
-        let pulse = pulse::run(app.clone(), Arc::clone(&self.session), stop());
-        self.supervisor.spawn_vital("pulse", pulse);
-        let watching = router::watch(router::Watch {
+        let opener = self.opener.lock().ok().and_then(|mut opener| opener.take());
+        let Some(opener) = opener else {
+            return Ok(());
+        };
+        let keeper = Arc::new(Keeper {
             app: app.clone(),
-            session: Arc::clone(&self.session),
-            channels,
+            routers: Arc::clone(&self.routers),
+            opener,
+            channels: inbox::Channels::new(&self.supervisor, app, uploads),
+            turn: Mutex::new(()),
+        });
+        keeper.open().await?;
+        let stop = || self.supervisor.stop_token();
+        let pulse = pulse::run(app.clone(), Arc::clone(&self.routers), stop());
+        self.supervisor.spawn_vital("pulse", pulse);
+        let gate = self.gate.lock().ok().and_then(|mut gate| gate.take());
+        if let Some(gate) = gate {
+            let keeping = Arc::clone(&keeper).run(stop());
+            self.supervisor.spawn_vital("routers", keeping);
+            let (routers, supervisor) = (Arc::clone(&self.routers), self.supervisor.clone());
+            let running = gate.run(app.clone(), routers, supervisor, stop());
+            self.supervisor.spawn_vital("gate", running);
+        }
+        let watching = router::watch(router::Watch {
+            keeper,
             supervisor: self.supervisor.clone(),
-            address: self.address,
             period: self.probe_period,
             stop: stop(),
         });
         self.supervisor.spawn_vital("router", watching);
+        info!("robots connect to {}", self.endpoint());
         Ok(())
     }
 
     /// Closes the network; robots keep trying to come back.
     pub async fn close(self) {
-        close(self.session.get()).await;
-    }
-}
-
-async fn open_session(address: SocketAddr, supervisor: &Supervisor) -> Result<Session, FleetError> {
-    let failed = |reason: String| FleetError::Open { address, reason };
-    let config = config(address).map_err(|error| failed(error.to_string()))?;
-    let opening = supervisor.blocking(move || zenoh::open(config).wait());
-    tokio::time::timeout(SESSION_TIMEOUT, opening)
-        .await
-        .map_err(|_elapsed| failed("it took too long".to_owned()))?
-        .ok_or_else(|| failed("it panicked".to_owned()))?
-        .map_err(|error| failed(error.to_string()))
-}
-
-async fn declare(
-    session: Session,
-    channels: &inbox::Channels,
-    address: SocketAddr,
-    supervisor: &Supervisor,
-) -> Result<(), FleetError> {
-    let channels = channels.clone();
-    let declaring = supervisor.blocking(move || {
-        inbox::declare(&session, &channels)?;
-        router::declare_probe(&session)
-    });
-    let reason = match declaring.await {
-        Some(Ok(())) => return Ok(()),
-        Some(Err(error)) => error.to_string(),
-        None => "it panicked".to_owned(),
-    };
-    Err(FleetError::Open { address, reason })
-}
-
-async fn close(session: Session) {
-    let closing = tokio::task::spawn_blocking(move || session.close().wait());
-    match tokio::time::timeout(SESSION_TIMEOUT, closing).await {
-        Ok(Ok(Ok(()))) => {}
-        Ok(Ok(Err(error))) => warn!("zenoh did not close cleanly: {error}"),
-        Ok(Err(_panic)) => warn!("zenoh panicked while closing"),
-        Err(_elapsed) => warn!("zenoh did not close in time"),
-    }
-}
-
-/// Zenoh does not say which port it took for 0, so a free one is looked for first.
-fn with_free_port(address: SocketAddr) -> Result<SocketAddr, FleetError> {
-    if address.port() != 0 {
-        return Ok(address);
-    }
-    TcpListener::bind(address)
-        .and_then(|listener| listener.local_addr())
-        .map_err(|cause| FleetError::NoPort { address, cause })
-}
-
-fn config(address: SocketAddr) -> zenoh::Result<Config> {
-    let mut config = Config::default();
-    let settings = [
-        ("mode", "\"router\"".to_owned()),
-        (
-            "listen/endpoints",
-            format!("[\"tcp/{address}#so_sndbuf={SEND_BUFFER_BYTES}\"]"),
-        ),
-        ("transport/link/tx/batch_size", BATCH_BYTES.to_string()),
-        ("transport/link/tx/lease", LEASE_MS.to_string()),
-        // Nothing is discovered and nothing is advertised.
-        ("scouting/multicast/enabled", "false".to_owned()),
-        ("scouting/gossip/enabled", "false".to_owned()),
-        (
-            "timestamping/enabled",
-            "{ router: true, peer: true, client: true }".to_owned(),
-        ),
-        ("transport/unicast/max_sessions", SESSIONS_MAX.to_string()),
-        (
-            "transport/unicast/accept_pending",
-            ACCEPT_PENDING_MAX.to_string(),
-        ),
-    ];
-    for (key, value) in settings {
-        config.insert_json5(key, &value)?;
-    }
-    Ok(config)
-}
-
-#[cfg(test)]
-mod tests {
-    use std::net::Ipv4Addr;
-
-    use super::*;
-
-    #[test]
-    fn the_router_takes_more_robots_than_zenoh_does_by_itself() {
-        let sessions = |config: &Config| -> u32 {
-            let said = config.get_json("transport/unicast/max_sessions").unwrap();
-            said.parse().unwrap()
-        };
-        let ours = config(SocketAddr::from((Ipv4Addr::LOCALHOST, 7447))).unwrap();
-        assert_eq!(sessions(&ours), SESSIONS_MAX);
-        assert!(sessions(&Config::default()) < sessions(&ours));
+        for router in self.routers.all() {
+            opening::close(router.session.clone()).await;
+        }
     }
 }

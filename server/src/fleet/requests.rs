@@ -60,8 +60,9 @@ impl Replies {
         });
     }
 
-    /// Reads a query's body, and checks that it names the robot of its key.
-    fn read<T: DeserializeOwned>(
+    /// Reads a query's body, and checks that it names the robot of its key, and that this one may
+    /// speak.
+    async fn read<T: DeserializeOwned>(
         &self,
         query: &Query,
         robot_of: impl Fn(&T) -> &RobotId,
@@ -71,6 +72,10 @@ impl Replies {
             refuse_key(&self.app, key);
             return None;
         };
+        // No reply is no delivery: a robot that joins again has lost nothing.
+        if !self.app.admits(&(site.clone(), robot.clone())).await {
+            return None;
+        }
         let payload = query
             .payload()
             .map(zenoh::bytes::ZBytes::to_bytes)
@@ -132,7 +137,7 @@ pub(super) async fn serve_hellos(
     stop: CancellationToken,
 ) {
     while let Some(query) = next(&mut queries, &stop).await {
-        let Some((site, hello)) = replies.read(&query, |hello: &Hello| &hello.robot) else {
+        let Some((site, hello)) = replies.read(&query, |hello: &Hello| &hello.robot).await else {
             continue;
         };
         let app = replies.app.clone();
@@ -152,7 +157,7 @@ pub(super) async fn serve_uploads(
     stop: CancellationToken,
 ) {
     while let Some(query) = next(&mut queries, &stop).await {
-        let Some((site, batch)) = replies.read(&query, |batch: &Batch| &batch.robot) else {
+        let Some((site, batch)) = replies.read(&query, |batch: &Batch| &batch.robot).await else {
             continue;
         };
         let outcome = batch.and_then(|batch| {

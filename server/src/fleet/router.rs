@@ -3,45 +3,26 @@
 //!
 //! A router may cease to accept connections without any error. Only a client can see that.
 
-use std::net::SocketAddr;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 use tracing::{error, warn};
-use zenoh::{Config, Session, Wait as _};
+use zenoh::{Session, Wait as _};
 
-use super::inbox::Channels;
-use crate::app::App;
+use super::keeper::Keeper;
+use super::opening::{Inside, client_config};
+use super::routers::Router;
 use crate::supervisor::Supervisor;
 
 /// The key that the router answers itself on.
-const PROBE_KEY: &str = "tread/self/probe";
+pub(super) const PROBE_KEY: &str = "tread/self/probe";
 /// Time between two looks.
 pub(super) const PROBE_PERIOD: Duration = Duration::from_secs(10);
 /// How long one look may take, connection and all.
 const PROBE_TIMEOUT: Duration = Duration::from_secs(3);
 /// Looks in a row without an answer after which the router is opened again.
 const FAILURES_MAX: u32 = 3;
-
-/// The session that is open now.
-#[derive(Debug)]
-pub(super) struct Current(Mutex<Session>);
-
-impl Current {
-    pub(super) fn new(session: Session) -> Self {
-        Self(Mutex::new(session))
-    }
-
-    pub(super) fn get(&self) -> Session {
-        let session = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        session.clone()
-    }
-
-    fn set(&self, session: Session) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = session;
-    }
-}
 
 /// Declares what the look asks. Blocks its thread.
 pub(super) fn declare_probe(session: &Session) -> zenoh::Result<()> {
@@ -58,75 +39,75 @@ pub(super) fn declare_probe(session: &Session) -> zenoh::Result<()> {
 
 /// What the watch works on.
 pub(super) struct Watch {
-    pub(super) app: App,
-    pub(super) session: Arc<Current>,
-    pub(super) channels: Channels,
+    pub(super) keeper: Arc<Keeper>,
     pub(super) supervisor: Supervisor,
-    pub(super) address: SocketAddr,
     /// Time between two looks.
     pub(super) period: Duration,
     pub(super) stop: CancellationToken,
 }
 
-/// Watches until the stop.
+/// Watches the router that new connections go to until the stop.
 pub(super) async fn watch(watch: Watch) {
     let mut failures = 0;
+    let mut seen = None;
     loop {
         tokio::select! {
             biased;
             () = watch.stop.cancelled() => return,
             () = tokio::time::sleep(watch.period) => {}
         }
-        let looking = watch.supervisor.blocking({
-            let address = watch.address;
-            move || probe(address)
-        });
-        let looked = tokio::time::timeout(2 * PROBE_TIMEOUT, looking).await;
-        if matches!(looked, Ok(Some(true))) {
+        let newest = watch.keeper.routers.newest();
+        let number = newest.as_ref().map(|router| router.number);
+        if number != seen {
+            (seen, failures) = (number, 0);
+        }
+        if looked_at(&watch, newest.as_ref()).await {
             failures = 0;
             continue;
         }
         failures += 1;
-        watch.app.counters().router_probes_failed.one();
+        let counters = watch.keeper.app.counters();
+        counters.router_probes_failed.one();
         warn!("the zenoh router did not answer, {failures} of {FAILURES_MAX} times");
         if failures >= FAILURES_MAX && !watch.stop.is_cancelled() {
             failures = 0;
-            reopen(&watch).await;
+            reopen(&watch.keeper, number).await;
         }
     }
 }
 
-async fn reopen(watch: &Watch) {
-    super::close(watch.session.get()).await;
-    let opened = super::open_session(watch.address, &watch.supervisor).await;
-    let session = match opened {
-        Ok(session) => session,
-        // It stays closed, so the next looks fail too and it is tried again.
-        Err(failed) => return error!("cannot open the zenoh router again: {failed}"),
+async fn looked_at(watch: &Watch, router: Option<&Arc<Router>>) -> bool {
+    let Some(router) = router.map(Arc::clone) else {
+        return false;
     };
-    watch.session.set(session.clone());
-    watch.app.counters().router_reopened.one();
-    let declared = super::declare(session, &watch.channels, watch.address, &watch.supervisor).await;
-    match declared {
-        Ok(()) => warn!("the zenoh router was opened again"),
-        Err(failed) => error!("cannot listen on the router that was opened again: {failed}"),
+    let inside = watch.keeper.opener.inside.clone();
+    let looking = watch
+        .supervisor
+        .blocking(move || probe(&router, inside.as_deref()));
+    let looked = tokio::time::timeout(2 * PROBE_TIMEOUT, looking).await;
+    matches!(looked, Ok(Some(true)))
+}
+
+async fn reopen(keeper: &Keeper, number: Option<u64>) {
+    let _turn = keeper.turn.lock().await;
+    // In the clear there is but one address, which must be given up first.
+    if let Some(number) = number {
+        keeper.close(number).await;
+    }
+    match keeper.open().await {
+        Ok(()) => {
+            keeper.app.counters().router_reopened.one();
+            warn!("the zenoh router was opened again");
+        }
+        // There is none now, so the next looks fail too and it is tried again.
+        Err(failed) => error!("cannot open the zenoh router again: {failed}"),
     }
 }
 
 /// Asks the router something over a connection of its own. Blocks its thread.
-fn probe(address: SocketAddr) -> bool {
+fn probe(router: &Router, inside: Option<&Inside>) -> bool {
     let asked = || -> zenoh::Result<bool> {
-        let mut config = Config::default();
-        let timeout_ms = PROBE_TIMEOUT.as_millis();
-        for (key, value) in [
-            ("mode", "\"client\"".to_owned()),
-            ("connect/endpoints", format!("[\"tcp/{address}\"]")),
-            ("connect/timeout_ms", timeout_ms.to_string()),
-            ("scouting/multicast/enabled", "false".to_owned()),
-            ("scouting/gossip/enabled", "false".to_owned()),
-        ] {
-            config.insert_json5(key, &value)?;
-        }
+        let config = client_config(router.address, inside, PROBE_TIMEOUT.as_millis())?;
         let session = zenoh::open(config).wait()?;
         let replies = session.get(PROBE_KEY).timeout(PROBE_TIMEOUT).wait()?;
         let answered = replies.recv().is_ok_and(|reply| reply.result().is_ok());
@@ -138,13 +119,14 @@ fn probe(address: SocketAddr) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use std::net::Ipv4Addr;
+    use std::net::{Ipv4Addr, SocketAddr};
 
     use tokio::sync::mpsc;
     use zenoh::Wait as _;
 
     use super::super::Fleet;
     use super::*;
+    use crate::app::App;
     use crate::clock::Clock;
     use crate::config::FrictionConfig;
     use crate::db::Db;
@@ -158,18 +140,21 @@ mod tests {
         let app = App::new(db, Clock::system(), FrictionConfig::default());
         let supervisor = Supervisor::new();
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
-        let mut fleet = Fleet::open(address, supervisor.clone()).await.unwrap();
+        let opening = Fleet::open(address, None, Clock::system(), supervisor.clone());
+        let mut fleet = opening.unwrap();
         fleet.probe_period = Duration::from_millis(50);
         let (uploads, _uploads_in) = mpsc::channel(1);
         fleet.listen(&app, uploads).await.unwrap();
         let answers = async |wanted: bool| {
-            let address = fleet.address();
             let looking = async {
-                while tokio::task::spawn_blocking(move || probe(address))
-                    .await
-                    .unwrap()
-                    != wanted
-                {
+                loop {
+                    let router = fleet.routers.newest();
+                    let looked = tokio::task::spawn_blocking(move || {
+                        router.is_some_and(|router| probe(&router, None))
+                    });
+                    if looked.await.unwrap() == wanted {
+                        return;
+                    }
                     tokio::time::sleep(Duration::from_millis(20)).await;
                 }
             };
@@ -177,7 +162,7 @@ mod tests {
         };
         answers(true).await;
         assert_eq!(app.counters().router_reopened.get(), 0);
-        let session = fleet.session.get();
+        let session = fleet.routers.newest().unwrap().session.clone();
         tokio::task::spawn_blocking(move || session.close().wait())
             .await
             .unwrap()

@@ -30,7 +30,6 @@ use tread_api::identity::Role;
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::problem::{ProblemBody, ProblemType};
 
-use super::connections::Slot;
 use super::extract::Path;
 use super::identity::guard::Subject;
 use super::problem::Problem;
@@ -38,6 +37,7 @@ use crate::app::App;
 use crate::app::identity::Credential;
 use crate::app::stops::StopWords;
 use crate::app::teleop::{Refused, Session};
+use crate::connections::Slot;
 
 /// Time between two pings.
 const PING_PERIOD: Duration = Duration::from_secs(1);

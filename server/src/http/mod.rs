@@ -4,7 +4,7 @@
 //! problems ([`problem`]); bodies, paths and queries are read by [`extract`] alone.
 
 mod alerts;
-pub mod connections;
+
 mod drive;
 mod etag;
 mod events;
@@ -49,7 +49,7 @@ use utoipa_swagger_ui::SwaggerUi;
 use self::extract::BodyLimit;
 pub use self::identity::access::{Access, Needed, PUBLIC};
 use self::identity::guard::{self, Guard};
-use self::identity::{audit, browser, session, tokens};
+use self::identity::{audit, browser, enrolment, session, tokens};
 use self::problem::{Problem, Refused};
 use crate::app::App;
 use crate::identity::origin::Names;
@@ -58,6 +58,8 @@ use crate::identity::origin::Names;
 pub const MISSION_BODY_MAX: usize = 16 * 1024 * 1024;
 /// Largest body of a sign-in, which anybody may send.
 pub const SIGN_IN_BODY_MAX: usize = 4 * 1024;
+/// Largest body of a robot that joins or renews, which anybody may send.
+pub const ENROLMENT_BODY_MAX: usize = 16 * 1024;
 /// Largest body of all other requests.
 pub const BODY_MAX: usize = 1024 * 1024;
 /// How long a request may take.
@@ -84,12 +86,20 @@ fn routes() -> OpenApiRouter<App> {
     let session = OpenApiRouter::new()
         .routes(routes!(session::create, session::get, session::end))
         .layer(Extension(BodyLimit(SIGN_IN_BODY_MAX)));
+    let joining = OpenApiRouter::new()
+        .routes(routes!(enrolment::enrol))
+        .routes(routes!(enrolment::renew))
+        .layer(Extension(BodyLimit(ENROLMENT_BODY_MAX)));
     OpenApiRouter::with_openapi(Description::openapi())
         .routes(routes!(health::healthz))
         .routes(routes!(health::readyz))
         .routes(routes!(health::status))
         .routes(routes!(tokens::list, tokens::create))
         .routes(routes!(tokens::revoke))
+        .routes(routes!(enrolment::list_tokens, enrolment::create_token))
+        .routes(routes!(enrolment::revoke_token))
+        .routes(routes!(enrolment::list))
+        .routes(routes!(enrolment::revoke))
         .routes(routes!(audit::list))
         .routes(routes!(sites::list, sites::create))
         .routes(routes!(sites::get))
@@ -127,6 +137,7 @@ fn routes() -> OpenApiRouter<App> {
         .layer(Extension(BodyLimit(BODY_MAX)))
         .merge(missions)
         .merge(session)
+        .merge(joining)
 }
 
 /// The description of the API.

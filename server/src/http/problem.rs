@@ -80,6 +80,7 @@ const fn status(kind: ProblemType) -> StatusCode {
         | ProblemType::RobotRefused
         | ProblemType::StopNotCleared
         | ProblemType::IdempotencyKeyInFlight
+        | ProblemType::RobotsDoNotJoin
         | ProblemType::TooMany => StatusCode::CONFLICT,
         ProblemType::Unauthenticated => StatusCode::UNAUTHORIZED,
         ProblemType::Forbidden | ProblemType::ForeignOrigin => StatusCode::FORBIDDEN,
@@ -110,7 +111,8 @@ impl From<AppError> for Problem {
             AppError::RobotRetired(_) => ProblemType::RobotRetired,
             AppError::RobotCannot { .. } => ProblemType::RobotCannot,
             AppError::UnknownAlert(_) => ProblemType::UnknownAlert,
-            AppError::UnknownToken(_) => ProblemType::UnknownToken,
+            AppError::UnknownToken(_) | AppError::UnknownJoinToken(_) => ProblemType::UnknownToken,
+            AppError::NoAuthority => ProblemType::RobotsDoNotJoin,
             AppError::UnknownStop(_) => ProblemType::UnknownStop,
             AppError::StopNotCleared { .. } => ProblemType::StopNotCleared,
             AppError::RobotUnreachable(_) => ProblemType::RobotUnreachable,

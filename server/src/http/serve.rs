@@ -1,5 +1,5 @@
 //! The accept loop. Ours, because half-sent headers must not hold a connection for ever, and
-//! because the number of connections has bounds (see [`super::connections`]).
+//! because the number of connections has bounds (see [`crate::connections`]).
 
 use std::net::SocketAddr;
 use std::pin::Pin;
@@ -20,11 +20,11 @@ use tokio_util::sync::CancellationToken;
 use tower::ServiceExt as _;
 use tracing::{debug, warn};
 
-use super::connections::{AtWork, BOUNDS, Connections, Slot};
 use super::events::Cut;
 use super::identity::guard::Peer;
 use super::tls::Tls;
 use crate::app::App;
+use crate::connections::{AtWork, BOUNDS, Connections, Slot};
 use crate::supervisor::Supervisor;
 
 /// How long the first byte of a connection may take to arrive.

@@ -1,7 +1,7 @@
-//! Secrets of tokens and sessions: 256 random bits, of which only the SHA-256 is kept.
+//! Secrets of tokens, sessions and joining robots: 256 random bits, of which only the SHA-256 is kept.
 //!
 //! A secret reads `tread_<kind>_<64 hex digits><8 hex digits>`. The kind is `v`, `o` or `a` for a
-//! token of that role and `s` for a session; the last eight digits are a checksum. So a scanner
+//! token of that role, `s` for a session and `j` for a join token; the last eight digits are a checksum. So a scanner
 //! for leaked secrets knows one when it sees it, and a slip of the pen is refused without asking
 //! the database. The kind tells people what they hold; what it may do is in the database.
 
@@ -31,14 +31,17 @@ pub enum Kind {
     Token(Role),
     /// A browser's session.
     Session,
+    /// The joining of a robot.
+    Join,
 }
 
 impl Kind {
-    const ALL: [Self; 4] = [
+    const ALL: [Self; 5] = [
         Self::Token(Role::Viewer),
         Self::Token(Role::Operator),
         Self::Token(Role::Admin),
         Self::Session,
+        Self::Join,
     ];
 
     const fn initial(self) -> char {
@@ -47,6 +50,7 @@ impl Kind {
             Self::Token(Role::Operator) => 'o',
             Self::Token(Role::Admin) => 'a',
             Self::Session => 's',
+            Self::Join => 'j',
         }
     }
 }

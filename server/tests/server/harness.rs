@@ -20,8 +20,9 @@ use tread_api::terrain::TerrainRef;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, Record, RecordContent};
 use tread_api::wire::{self, Refusal};
 use tread_server::app::identity::FirstAdmin;
+use tread_server::authority::Authority;
 use tread_server::clock::Clock;
-use tread_server::config::{FrictionConfig, TlsFiles, WebConfig};
+use tread_server::config::{FrictionConfig, RobotsConfig, TlsFiles, WebConfig};
 use tread_server::counters::CounterValues;
 use tread_server::{Config, RunningServer, Server};
 use zenoh::Wait as _;
@@ -89,6 +90,21 @@ impl Yard {
     pub(crate) async fn start_at(wall: Timestamp) -> Self {
         let folder = Arc::new(tempfile::tempdir().unwrap());
         let config = config(folder.path(), "127.0.0.1:0");
+        let server = Server::start_with_clock(config, Clock::manual(wall));
+        Self::of(folder, server.await.unwrap()).await
+    }
+
+    /// The same, and robots may join it.
+    pub(crate) async fn start_joining_at(wall: Timestamp) -> Self {
+        let folder = Arc::new(tempfile::tempdir().unwrap());
+        let authority = folder.path().join("authority");
+        Authority::create(&authority, wall).unwrap();
+        let mut config = config(folder.path(), "127.0.0.1:0");
+        config.robots = Some(RobotsConfig {
+            authority,
+            names: Vec::new(),
+            certificate_s: 3_600,
+        });
         let server = Server::start_with_clock(config, Clock::manual(wall));
         Self::of(folder, server.await.unwrap()).await
     }
@@ -221,6 +237,7 @@ fn config(folder: &Path, zenoh: &str) -> Config {
         friction: FrictionConfig::default(),
         normalisations: Vec::new(),
         tls: None,
+        robots: None,
         web: WebConfig {
             hosts: vec!["tread.test".to_owned()],
             allowed_origins: vec!["https://dash.test".parse().unwrap()],

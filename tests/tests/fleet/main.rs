@@ -7,7 +7,7 @@ mod control;
 mod drivers;
 mod event_clients;
 mod impostors;
-
+mod membership;
 mod messages;
 mod missions;
 mod outages;

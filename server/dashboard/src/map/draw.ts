@@ -39,6 +39,8 @@ const GRID_PX = 48;
 const SCALE_BAR_PX = 90;
 /** Smallest a robot is drawn, pixels of its length. */
 const ROBOT_PX = 15;
+/** Points of a trail that are nearer to each other than this are one, pixels. */
+const TRAIL_STEP_PX = 2;
 /** Most labels of robots: with more they would only cover each other. */
 const LABELS_MAX = 60;
 
@@ -208,21 +210,26 @@ function drawPaths(context: CanvasRenderingContext2D, camera: Camera, scene: Sce
 function drawRobots(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): void {
   const all = [...scene.tracked];
   if (scene.showTrails) {
-    context.lineWidth = 1.5;
-    context.lineJoin = 'round';
+    // Lines of one pixel are drawn several times as fast as wider ones.
+    context.lineWidth = 1;
+    context.lineJoin = 'bevel';
     context.strokeStyle = palette.trail;
-    context.globalAlpha = 0.55;
     const { scale } = camera;
     const left = camera.width / 2 - camera.center.x_m * scale;
     const top = camera.height / 2 + camera.center.y_m * scale;
     for (const { trail } of all) {
       context.beginPath();
+      let [xLast, yLast] = [Infinity, Infinity];
       for (let index = 0; index < trail.length; index += 2) {
-        context.lineTo(left + (trail[index] ?? 0) * scale, top - (trail[index + 1] ?? 0) * scale);
+        const x = left + (trail[index] ?? 0) * scale;
+        const y = top - (trail[index + 1] ?? 0) * scale;
+        const isLast = index + 2 >= trail.length;
+        if (!isLast && Math.abs(x - xLast) + Math.abs(y - yLast) < TRAIL_STEP_PX) continue;
+        context.lineTo(x, y);
+        [xLast, yLast] = [x, y];
       }
       context.stroke();
     }
-    context.globalAlpha = 1;
   }
   context.font = '600 12px system-ui, sans-serif';
   context.textAlign = 'left';
@@ -253,6 +260,8 @@ function drawRobot(
         : palette.robot;
   const length = Math.max(ROBOT_PX, (robot.model.wheelbase_m + 2 * robot.model.wheel_radius_m) * camera.scale);
   const width = Math.max(ROBOT_PX * 0.8, robot.model.track_width_m * camera.scale);
+  const isOut = x < -length || y < -length || x > camera.width + length || y > camera.height + length;
+  if (isOut) return;
   context.save();
   context.translate(x, y);
   if (isSelected || scene.unconfirmed.has(robot.id)) {
@@ -276,7 +285,7 @@ function drawRobot(
   }
   context.fill();
   context.stroke();
-  context.setLineDash([]);
+  if (isLost) context.setLineDash([]);
   context.beginPath();
   context.moveTo(length * 0.36, 0);
   context.lineTo(-length * 0.12, width * 0.3);

@@ -14,9 +14,7 @@ export function drawFriction(context: CanvasRenderingContext2D, camera: Camera, 
   const width = (bounds.xMax - bounds.xMin) * camera.scale;
   const height = (bounds.yMax - bounds.yMin) * camera.scale;
   context.imageSmoothingEnabled = false;
-  context.globalAlpha = 0.9;
   context.drawImage(image, corner.x, corner.y, width, height);
-  context.globalAlpha = 1;
   const side = layer.cellM * camera.scale;
   if (side < HATCHED_CELL_PX) return;
   const seen = camera.bounds;

@@ -71,6 +71,8 @@ const SURE = 0.05;
 const UNSURE = 0.5;
 /** Relative deviation from which a cell is hatched. */
 export const HATCHED = 0.25;
+/** More cells than any site has along one side; its square is still a whole number. */
+const KEY_SPAN = 2 ** 26;
 /** Most cells along one side of the image. */
 const SIDE_MAX = 2_048;
 
@@ -89,7 +91,7 @@ export function doubt(friction: FusedFriction): number {
 
 /** Cells of one robot model; where two terrains share one, the one that was measured more often. */
 export class Layer {
-  readonly cells = new Map<string, CellFriction>();
+  readonly cells = new Map<number, CellFriction>();
   image: HTMLCanvasElement | null = null;
   /** What the image covers, metres. */
   bounds: Bounds | null = null;
@@ -154,6 +156,7 @@ export class Layer {
   }
 }
 
-function keyOf(ix: number, iy: number): string {
-  return `${ix},${iy}`;
+/** Both in one number, which takes a fraction of the room and time of a text. */
+function keyOf(ix: number, iy: number): number {
+  return ix * KEY_SPAN + iy;
 }

@@ -93,6 +93,7 @@ export class Drive {
   /** The touch stick: where it is, or null when it is let go. */
   stick(wish: Wish | null): void {
     this.#stick = wish && clamped(wish);
+    if (wish) this.said = null;
     this.#command();
   }
 

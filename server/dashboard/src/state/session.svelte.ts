@@ -55,6 +55,7 @@ class SignedIn {
   }
 
   async signOut(): Promise<void> {
+    this.problem = null;
     try {
       await ask('/v1/session', { method: 'DELETE' });
       localStorage.removeItem(SESSION_KEY);
@@ -66,6 +67,7 @@ class SignedIn {
 
   end(): void {
     if (this.session) this.hasEnded = true;
+    this.problem = null;
     localStorage.removeItem(SESSION_KEY);
     this.session = null;
   }

@@ -48,12 +48,27 @@ export class View {
     this.#timer = setInterval(() => void this.readFriction(), FRICTION_MS);
   }
 
+  /** Another site has other ground and other missions. */
+  changeSite(): void {
+    this.#cells = [];
+    this.configurations = [];
+    this.configuration = null;
+    this.layer = null;
+    this.detail = null;
+    if (this.quantity !== null) void this.readFriction();
+  }
+
   async readFriction(): Promise<void> {
     const { site } = this.fleet;
     if (!site || this.isReading || document.hidden || this.quantity === null) return;
     this.isReading = true;
     try {
       const read = await list<CellFriction>(`/v1/sites/${site}/friction/cells`, CELLS_MAX);
+      // The site was changed meanwhile; the next look is for that one.
+      if (site !== this.fleet.site) {
+        this.isReading = false;
+        return void this.readFriction();
+      }
       this.#cells = read.items;
       this.isWhole = read.isWhole;
       this.configurations = [...new Set(read.items.map((cell) => cell.configuration))].sort();

@@ -251,6 +251,7 @@ impl App {
         let secret = Secret::read(text).filter(|secret| match secret.kind() {
             Kind::Token(_) => shown == Shown::Token,
             Kind::Session => shown == Shown::Session,
+            Kind::Join => false,
         });
         if let Some(secret) = &secret
             && let Some(credential) = self.known(secret).await?
@@ -310,6 +311,8 @@ impl App {
         let (token, session, expires_at) = match secret.kind() {
             Kind::Token(_) => token_of(&mut tx, &fingerprint).await?,
             Kind::Session => session_of(&mut tx, &fingerprint).await?,
+            // It lets robots join and opens nothing.
+            Kind::Join => return Err(SignInError::Unknown),
         };
         if token.revoked_at.is_some() {
             Err(SignInError::Revoked)
@@ -327,7 +330,7 @@ impl App {
         }
     }
 
-    fn locked_for(&self, sources: &[Source]) -> Option<Duration> {
+    pub(super) fn locked_for(&self, sources: &[Source]) -> Option<Duration> {
         let now = self.clock().elapsed();
         let attempts = &self.identity().attempts;
         let attempts = attempts.lock().unwrap_or_else(PoisonError::into_inner);
@@ -335,7 +338,7 @@ impl App {
         sources.iter().filter_map(locked).max()
     }
 
-    fn failed(&self, sources: Vec<Source>) {
+    pub(super) fn failed(&self, sources: Vec<Source>) {
         let now = self.clock().elapsed();
         let attempts = &self.identity().attempts;
         let mut attempts = attempts.lock().unwrap_or_else(PoisonError::into_inner);
@@ -446,7 +449,7 @@ async fn session_of(
 }
 
 /// A new secret of the operating system's random numbers: the only place that makes one.
-fn new_secret(kind: Kind) -> Result<Secret, AppError> {
+pub(super) fn new_secret(kind: Kind) -> Result<Secret, AppError> {
     let mut random = [0; RANDOM_BYTES];
     getrandom::fill(&mut random).map_err(|error| AppError::NoRandomness(error.to_string()))?;
     Ok(Secret::from_random(kind, &random))

@@ -12,12 +12,14 @@ use super::browser::COOKIE;
 use crate::http::page;
 
 /// What anybody may ask for: this list and nothing else.
-pub const PUBLIC: [(&str, &str); 9] = [
+pub const PUBLIC: [(&str, &str); 11] = [
     ("GET", page::ROOT),
     ("GET", page::FILES),
     ("GET", "/healthz"),
     ("GET", "/readyz"),
     ("POST", "/v1/session"),
+    ("POST", "/v1/enrolments"),
+    ("POST", "/v1/enrolments/renew"),
     ("GET", "/openapi.json"),
     ("GET", "/docs"),
     ("GET", "/docs/"),

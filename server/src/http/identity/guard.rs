@@ -67,6 +67,10 @@ impl AuditSlot {
 #[derive(Debug, Clone)]
 pub(super) struct SignedIn(pub(super) Arc<Credential>);
 
+/// What the audit log says of this request instead of its body, an extension of the answer.
+#[derive(Debug, Clone)]
+pub(super) struct Audited(pub(super) Value);
+
 /// What the guard knows.
 #[derive(Debug, Clone)]
 pub(in crate::http) struct Guard {
@@ -199,6 +203,9 @@ impl Guard {
         who: Option<&Arc<Credential>>,
         is_change: bool,
     ) {
+        let said = response.extensions().get::<Audited>();
+        let said = said.map(|Audited(what)| what.clone());
+        let left = asked.slot.0.get().cloned();
         let entry = AuditEntry {
             id: 0,
             at: self.app.clock().now(),
@@ -211,7 +218,7 @@ impl Guard {
             path: asked.path,
             status: response.status().as_u16(),
             request_id: asked.request_id,
-            what: asked.slot.0.get().cloned().filter(|what| !what.is_null()),
+            what: said.or(left).filter(|what| !what.is_null()),
         };
         self.app.audit(entry, is_change);
     }
@@ -278,8 +285,8 @@ pub(in crate::http) async fn stand(
     if is_change {
         let signed_in = response.extensions().get::<SignedIn>().cloned();
         let who = subject.clone().or(signed_in.map(|SignedIn(who)| who));
-        let by_nobody = who.is_none();
-        guard.note(asked, &response, who.as_ref(), !by_nobody);
+        let is_change = who.is_some() || response.status().is_success();
+        guard.note(asked, &response, who.as_ref(), is_change);
     }
     match subject {
         Some(subject) => end_with(&guard.app, subject, response),
@@ -353,14 +360,7 @@ pub(super) fn sign_in_problem(app: &App, error: &SignInError) -> Response {
         SignInError::Unknown => &counters.refused_token_unknown,
         SignInError::Expired => &counters.refused_token_expired,
         SignInError::Revoked => &counters.refused_token_revoked,
-        SignInError::Locked(left) => {
-            counters.refused_locked.one();
-            let problem = Problem::new(ProblemType::TooManyAttempts).detail(error.to_string());
-            let mut response = problem.into_response();
-            let seconds = HeaderValue::from(left.as_secs() + 1);
-            response.headers_mut().insert(header::RETRY_AFTER, seconds);
-            return response;
-        }
+        SignInError::Locked(left) => return locked(app, *left, error.to_string()),
         SignInError::Storage(cause) => {
             tracing::error!("cannot look up a token: {cause:?}");
             return Problem::new(ProblemType::Internal).into_response();
@@ -369,6 +369,16 @@ pub(super) fn sign_in_problem(app: &App, error: &SignInError) -> Response {
     counter.one();
     let mut response = unauthenticated().into_response();
     say_how(&mut response);
+    response
+}
+
+/// The answer after too many failures.
+pub(super) fn locked(app: &App, left: std::time::Duration, detail: String) -> Response {
+    app.counters().refused_locked.one();
+    let problem = Problem::new(ProblemType::TooManyAttempts).detail(detail);
+    let mut response = problem.into_response();
+    let seconds = HeaderValue::from(left.as_secs() + 1);
+    response.headers_mut().insert(header::RETRY_AFTER, seconds);
     response
 }
 

@@ -7,6 +7,7 @@
 pub(super) mod access;
 pub(super) mod audit;
 pub(super) mod browser;
+pub(super) mod enrolment;
 pub(super) mod guard;
 pub(super) mod session;
 pub(super) mod tokens;

@@ -5,7 +5,7 @@ use std::time::Duration;
 use reqwest::StatusCode;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
-use tread_server::http::connections::BOUNDS;
+use tread_server::connections::BOUNDS;
 
 use crate::harness::{PATIENCE, Yard};
 

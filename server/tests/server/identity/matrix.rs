@@ -13,22 +13,28 @@ use crate::harness::{Yard, client};
 
 /// What anybody may ask for. It stands here a second time, so that a change of the server's list
 /// is a change of this test.
-const OPEN: [(&str, &str); 9] = [
+const OPEN: [(&str, &str); 11] = [
     ("GET", "/"),
     ("GET", "/page/{file}"),
     ("GET", "/healthz"),
     ("GET", "/readyz"),
     ("POST", "/v1/session"),
+    ("POST", "/v1/enrolments"),
+    ("POST", "/v1/enrolments/renew"),
     ("GET", "/openapi.json"),
     ("GET", "/docs"),
     ("GET", "/docs/"),
     ("GET", "/docs/{*rest}"),
 ];
 /// What an operator may not ask for.
-const ADMINS_ONLY: [(&str, &str); 5] = [
+const ADMINS_ONLY: [(&str, &str); 9] = [
     ("GET", "/v1/tokens"),
     ("POST", "/v1/tokens"),
     ("DELETE", "/v1/tokens/{token}"),
+    ("GET", "/v1/join-tokens"),
+    ("POST", "/v1/join-tokens"),
+    ("DELETE", "/v1/join-tokens/{token}"),
+    ("DELETE", "/v1/sites/{site}/enrolments/{robot}"),
     ("GET", "/v1/audit"),
     ("POST", "/v1/sites"),
 ];

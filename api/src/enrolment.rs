@@ -1,0 +1,156 @@
+//! How robots join the fleet, stay in it, and are put out of it.
+//!
+//! A robot makes its key itself and never shows it. With a join token, which counts once, it asks
+//! for a certificate; with that certificate and key it asks for the next one.
+
+use std::fmt;
+
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use crate::ids::{JoinTokenId, RobotId, SiteId};
+
+/// Most minutes that a join token may be valid: a day.
+pub const JOIN_MINUTES_MAX: u32 = 24 * 60;
+/// Minutes that a join token is valid when nothing is said.
+pub const JOIN_MINUTES_DEFAULT: u32 = 60;
+/// What the proof of a renewal is about, before the request's own text: no signature that was
+/// made for another purpose counts as one.
+pub const RENEWAL_CONTEXT: &[u8] = b"tread: the next certificate for this request\n";
+
+/// What a robot signs with its present key to get its next certificate.
+pub fn renewal_message(certificate_request: &str) -> Vec<u8> {
+    [RENEWAL_CONTEXT, certificate_request.as_bytes()].concat()
+}
+
+/// A token by which one robot may join once, as it is listed.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct JoinToken {
+    /// Its identifier; no secret.
+    pub id: JoinTokenId,
+    /// The site that the robot joins.
+    pub site: SiteId,
+    /// The robot that it is for; `null` for any that is new.
+    pub robot: Option<RobotId>,
+    /// When it was made.
+    pub created_at: Timestamp,
+    /// Who made it.
+    pub created_by: String,
+    /// From when on it is refused.
+    pub expires_at: Timestamp,
+    /// When a robot joined by it.
+    pub used_at: Option<Timestamp>,
+    /// Which robot that was.
+    pub used_by: Option<RobotId>,
+    /// When it was revoked.
+    pub revoked_at: Option<Timestamp>,
+}
+
+/// Asks for a join token.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct CreateJoinToken {
+    /// The site that the robot joins.
+    pub site: SiteId,
+    /// The robot that it is for. Without it any robot may join that is new to the site; one that
+    /// is known there, or was revoked, must be named.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub robot: Option<RobotId>,
+    /// Minutes until it is refused, 1 to 1440; 60 when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub valid_minutes: Option<u32>,
+}
+
+/// A new join token with its secret, which is told this once.
+#[derive(Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct CreatedJoinToken {
+    /// The token.
+    pub join_token: JoinToken,
+    /// What the robot shows.
+    pub secret: String,
+}
+
+impl fmt::Debug for CreatedJoinToken {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter
+            .debug_struct("CreatedJoinToken")
+            .field("join_token", &self.join_token)
+            .finish_non_exhaustive()
+    }
+}
+
+/// A robot joins.
+#[derive(Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct EnrolRobot {
+    /// The secret of a join token.
+    pub token: String,
+    /// Who it is; may be left out if the token names it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub robot: Option<RobotId>,
+    /// A PKCS #10 request for its key, PEM. Only the key in it counts: names are the server's.
+    pub certificate_request: String,
+}
+
+impl fmt::Debug for EnrolRobot {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter
+            .debug_struct("EnrolRobot")
+            .field("robot", &self.robot)
+            .finish_non_exhaustive()
+    }
+}
+
+/// A robot asks for its next certificate.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct RenewCertificate {
+    /// Its present certificate, PEM.
+    pub certificate: String,
+    /// A PKCS #10 request for its next key, PEM, signed with that key.
+    pub certificate_request: String,
+    /// The ECDSA P-256 signature of [`renewal_message`] with the present key, ASN.1, base64.
+    pub proof: String,
+}
+
+/// What a robot gets when it joins, and with each renewal.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct RobotCertificate {
+    /// The site.
+    pub site: SiteId,
+    /// The robot.
+    pub robot: RobotId,
+    /// How often it has joined, from 1; a certificate of an earlier time is refused.
+    pub enrolment: u32,
+    /// Its certificate, PEM.
+    pub certificate: String,
+    /// The fleet's authority, PEM: who the robots' port must show to be signed by.
+    pub authority: String,
+    /// How long the certificate is good for, seconds from now. Renew it after two thirds of that.
+    pub lifetime_s: u64,
+    /// From when on it is refused.
+    pub expires_at: Timestamp,
+    /// The TCP port that robots connect to.
+    pub port: u16,
+}
+
+/// One time that a robot joined.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct Enrolment {
+    /// The site.
+    pub site: SiteId,
+    /// The robot.
+    pub robot: RobotId,
+    /// How often it has joined, from 1.
+    pub number: u32,
+    /// When it joined.
+    pub enrolled_at: Timestamp,
+    /// The join token that it came with.
+    pub join_token: JoinTokenId,
+    /// When it got its present certificate.
+    pub renewed_at: Timestamp,
+    /// From when on its present certificate is refused.
+    pub expires_at: Timestamp,
+    /// When it was put out of the fleet, or joined again.
+    pub revoked_at: Option<Timestamp>,
+    /// Who did that.
+    pub revoked_by: Option<String>,
+}

@@ -1,0 +1,109 @@
+//! `tread robots join-token`, `enrolments` and `revoke`: which robots are of the fleet.
+
+use std::process::ExitCode;
+
+use tread_api::enrolment::{CreateJoinToken, Enrolment, JoinToken};
+
+use crate::args::{JoinTokenAction, JoinTokenArguments, RobotsAction};
+use crate::client::Client;
+use crate::output::{Output, note, or_dash, render, table};
+
+pub(super) async fn run(
+    action: &RobotsAction,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    let site = &action.connection().site;
+    match action {
+        RobotsAction::JoinToken(arguments) => join_token(arguments, client, output).await?,
+        RobotsAction::Enrolments(_) => {
+            let enrolments = client.enrolments(site).await?;
+            output.show(&enrolments, |enrolments| list(enrolments))?;
+        }
+        RobotsAction::Revoke(arguments) => {
+            let revoked = client.revoke_robot(site, &arguments.robot).await?;
+            output.show(&revoked, |it| format!("`{}` is out of the fleet", it.robot))?;
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+async fn join_token(
+    arguments: &JoinTokenArguments,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<()> {
+    match &arguments.action {
+        None => {
+            let request = CreateJoinToken {
+                site: arguments.connection.site.clone(),
+                robot: arguments.name.clone(),
+                valid_minutes: Some(arguments.expires),
+            };
+            let created = client.create_join_token(&request).await?;
+            if !output.is_json() {
+                let token = &created.join_token;
+                let whom = token.robot.as_ref().map_or_else(
+                    || "a new robot".to_owned(),
+                    |robot| format!("robot `{robot}`"),
+                );
+                note(&format!(
+                    "for {whom} of site `{}`, until {}; it is told this once:",
+                    token.site, token.expires_at
+                ));
+            }
+            output.show(&created, |created| created.secret.clone())?;
+        }
+        Some(JoinTokenAction::List) => {
+            let tokens = client.join_tokens().await?;
+            output.show(&tokens, |tokens| listed(tokens))?;
+        }
+        Some(JoinTokenAction::Revoke { join_token }) => {
+            let revoked = client.revoke_join_token(*join_token).await?;
+            output.show(&revoked, |token| format!("`{}` is revoked", token.id))?;
+        }
+    }
+    Ok(())
+}
+
+fn listed(tokens: &[JoinToken]) -> String {
+    let mut table = table([
+        "JOIN TOKEN",
+        "SITE",
+        "FOR",
+        "MADE BY",
+        "EXPIRES",
+        "USED BY",
+        "REVOKED",
+    ]);
+    for token in tokens {
+        table.add_row([
+            token.id.to_string(),
+            token.site.to_string(),
+            or_dash(token.robot.as_ref()),
+            token.created_by.clone(),
+            format!("{:.0}", token.expires_at),
+            or_dash(token.used_by.as_ref()),
+            or_dash(token.revoked_at.map(|at| format!("{at:.0}"))),
+        ]);
+    }
+    render(&table)
+}
+
+fn list(enrolments: &[Enrolment]) -> String {
+    let mut table = table([
+        "ROBOT", "TIMES", "JOINED", "RENEWED", "EXPIRES", "PUT OUT", "BY",
+    ]);
+    for enrolment in enrolments {
+        table.add_row([
+            enrolment.robot.to_string(),
+            enrolment.number.to_string(),
+            format!("{:.0}", enrolment.enrolled_at),
+            format!("{:.0}", enrolment.renewed_at),
+            format!("{:.0}", enrolment.expires_at),
+            or_dash(enrolment.revoked_at.map(|at| format!("{at:.0}"))),
+            or_dash(enrolment.revoked_by.as_ref()),
+        ]);
+    }
+    render(&table)
+}

@@ -1,0 +1,247 @@
+//! Joins the fleet and renews the certificate over the server's REST API.
+//!
+//! A renewal is proved by a signature with the present key over the request for the next, which
+//! is itself signed with the next key. So it needs no TLS with certificates of clients, works
+//! through any proxy, and what is overheard is of no use: the answer fits a key that only the
+//! robot has.
+
+use std::net::IpAddr;
+use std::time::Duration;
+
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
+use jiff::Timestamp;
+use rcgen::{CertificateParams, DistinguishedName, KeyPair, SigningKey as _};
+use reqwest::{StatusCode, Url};
+use serde::Serialize;
+use tread_api::enrolment::{EnrolRobot, RenewCertificate, RobotCertificate, renewal_message};
+use tread_api::ids::RobotId;
+use tread_api::problem::ProblemBody;
+
+use super::{Membership, Trust};
+
+/// Longest wait for an answer.
+const ANSWER_WAIT_MAX: Duration = Duration::from_secs(15);
+/// Longest wait for a connection.
+const CONNECT_WAIT_MAX: Duration = Duration::from_secs(5);
+
+/// Why a robot got no certificate.
+#[derive(Debug, thiserror::Error)]
+pub enum MembershipError {
+    /// The address is not one.
+    #[error("`{0}` is not the address of a server: use one like https://tread.example:8420")]
+    Address(String),
+    /// Everybody could read and change what is sent.
+    #[error("`{0}` is another machine without TLS: use https")]
+    ClearText(String),
+    /// The authority to trust does not read.
+    #[error("the authority to trust cannot be used")]
+    Trust(#[source] rustls::Error),
+    /// No key could be made.
+    #[error("no key could be made, or it could not sign")]
+    Key(#[source] rcgen::Error),
+    /// Nothing answers there.
+    #[error("no server answers at `{server}`")]
+    Unreachable {
+        /// Where.
+        server: String,
+        /// Why.
+        #[source]
+        source: reqwest::Error,
+    },
+    /// The server refused.
+    #[error("the server refused ({status}): {detail}")]
+    Refused {
+        /// How.
+        status: StatusCode,
+        /// What it says.
+        detail: String,
+    },
+    /// The answer does not read.
+    #[error("the answer of `{0}` does not read: is it a Tread server?")]
+    NotUnderstood(String),
+}
+
+/// What a robot needs to join.
+#[derive(Clone)]
+pub struct Enrolment {
+    /// Where the REST API is.
+    pub server: String,
+    /// Whom it must show to be signed by.
+    pub trust: Trust,
+    /// The secret of a join token.
+    pub token: String,
+    /// Who the robot is; may be left out if the token names it.
+    pub robot: Option<RobotId>,
+    /// The robots' port, as zenoh writes it, if it is not on the server's own address.
+    pub endpoint: Option<String>,
+}
+
+impl std::fmt::Debug for Enrolment {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter
+            .debug_struct("Enrolment")
+            .field("server", &self.server)
+            .field("robot", &self.robot)
+            .finish_non_exhaustive()
+    }
+}
+
+/// Joins the fleet: makes a key, which stays here, and gets a certificate for it.
+///
+/// # Errors
+/// [`MembershipError`].
+pub async fn enrol(enrolment: &Enrolment, now: Timestamp) -> Result<Membership, MembershipError> {
+    let url = parse(&enrolment.server)?;
+    let (key, request) = new_key()?;
+    let body = EnrolRobot {
+        token: enrolment.token.trim().to_owned(),
+        robot: enrolment.robot.clone(),
+        certificate_request: request,
+    };
+    let got = post(&url, &enrolment.trust, "v1/enrolments", &body).await?;
+    let host = url.host_str().unwrap_or_default();
+    let own = || format!("tls/{host}:{}", got.port);
+    Ok(Membership {
+        endpoint: enrolment.endpoint.clone().unwrap_or_else(own),
+        site: got.site,
+        robot: got.robot,
+        enrolment: got.enrolment,
+        certificate: got.certificate,
+        key: key.serialize_pem(),
+        authority: got.authority,
+        server: enrolment.server.clone(),
+        trust: enrolment.trust.clone(),
+        issued_at: now,
+        lifetime_s: got.lifetime_s,
+    })
+}
+
+impl Membership {
+    /// Gets the next certificate, for a new key.
+    ///
+    /// # Errors
+    /// [`MembershipError`]; the present one stays good.
+    pub(super) async fn renewed(&self, now: Timestamp) -> Result<Self, MembershipError> {
+        let url = parse(&self.server)?;
+        let present = KeyPair::from_pem(&self.key).map_err(MembershipError::Key)?;
+        let (next, request) = new_key()?;
+        let proof = present
+            .sign(&renewal_message(&request))
+            .map_err(MembershipError::Key)?;
+        let body = RenewCertificate {
+            certificate: self.certificate.clone(),
+            certificate_request: request,
+            proof: BASE64_STANDARD.encode(proof),
+        };
+        let got = post(&url, &self.trust, "v1/enrolments/renew", &body).await?;
+        Ok(Self {
+            certificate: got.certificate,
+            key: next.serialize_pem(),
+            authority: got.authority,
+            issued_at: now,
+            lifetime_s: got.lifetime_s,
+            ..self.clone()
+        })
+    }
+}
+
+/// A new key, and a request for a certificate. Names in it would count for nothing.
+fn new_key() -> Result<(KeyPair, String), MembershipError> {
+    let key = KeyPair::generate().map_err(MembershipError::Key)?;
+    let mut params = CertificateParams::default();
+    params.distinguished_name = DistinguishedName::new();
+    let request = params
+        .serialize_request(&key)
+        .and_then(|request| request.pem())
+        .map_err(MembershipError::Key)?;
+    Ok((key, request))
+}
+
+fn parse(server: &str) -> Result<Url, MembershipError> {
+    let invalid = || MembershipError::Address(server.to_owned());
+    let mut url = Url::parse(server).map_err(|_| invalid())?;
+    let host = url.host_str().ok_or_else(invalid)?;
+    let bare = host.trim_start_matches('[').trim_end_matches(']');
+    let is_here = host == "localhost"
+        || bare
+            .parse()
+            .is_ok_and(|address: IpAddr| address.is_loopback());
+    match url.scheme() {
+        "https" => {}
+        "http" if is_here => {}
+        "http" => return Err(MembershipError::ClearText(server.to_owned())),
+        _ => return Err(invalid()),
+    }
+    if !url.path().ends_with('/') {
+        let path = format!("{}/", url.path());
+        url.set_path(&path);
+    }
+    Ok(url)
+}
+
+async fn post<B: Serialize + Sync>(
+    url: &Url,
+    trust: &Trust,
+    path: &str,
+    body: &B,
+) -> Result<RobotCertificate, MembershipError> {
+    let server = url.to_string();
+    let unreachable = |source| MembershipError::Unreachable {
+        server: server.clone(),
+        source,
+    };
+    let mut builder = reqwest::Client::builder()
+        .timeout(ANSWER_WAIT_MAX)
+        .connect_timeout(CONNECT_WAIT_MAX)
+        .user_agent(concat!("tread-agent/", env!("CARGO_PKG_VERSION")));
+    builder = match trust.client_config().map_err(MembershipError::Trust)? {
+        Some(config) => builder.tls_backend_preconfigured(config),
+        None if url.scheme() == "https" => builder,
+        // Nobody is trusted, so that no machine's certificates need be read.
+        None => builder.tls_certs_only([]),
+    };
+    let client = builder.build().map_err(unreachable)?;
+    let not_understood = || MembershipError::NotUnderstood(server.clone());
+    let address = url.join(path).map_err(|_| not_understood())?;
+    let response = client.post(address).json(body).send().await;
+    let response = response.map_err(unreachable)?;
+    let status = response.status();
+    let text = response.bytes().await.map_err(unreachable)?;
+    if status.is_success() {
+        return serde_json::from_slice(&text).map_err(|_| not_understood());
+    }
+    let problem = serde_json::from_slice::<ProblemBody>(&text).map_err(|_| not_understood())?;
+    Err(MembershipError::Refused {
+        status,
+        detail: problem.detail.unwrap_or(problem.title),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_token_goes_to_another_machine_by_tls_alone() {
+        for good in [
+            "https://tread.example:8420",
+            "http://127.0.0.1:8420",
+            "http://[::1]:1/",
+            "http://localhost/prefix",
+        ] {
+            assert!(
+                parse(good).is_ok_and(|url| url.path().ends_with('/')),
+                "{good}"
+            );
+        }
+        for bad in [
+            "http://192.0.2.7",
+            "ftp://localhost",
+            "nonsense",
+            "http://127.0.0.1.example",
+        ] {
+            assert!(parse(bad).is_err(), "{bad}");
+        }
+    }
+}

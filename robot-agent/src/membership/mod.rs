@@ -1,0 +1,205 @@
+//! A robot's place in the fleet: its certificate and key, and where it gets the next one.
+//!
+//! ```text
+//!  none ──enroll, with a join token──► member ──two thirds of the certificate's time──► renews
+//!                                         ▲                                               │
+//!                                         └───────────────────────────────────────────────┘
+//! ```
+//!
+//! All of it is one file that only its owner can read, replaced as a whole: there is no moment at
+//! which key and certificate do not belong together.
+
+mod client;
+mod renewal;
+mod trust;
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use jiff::{SignedDuration, Timestamp};
+use serde::{Deserialize, Serialize};
+use tread_api::ids::{RobotId, SiteId};
+
+pub use self::client::{Enrolment, MembershipError, enrol};
+pub(crate) use self::renewal::Renewal;
+pub use self::trust::{Fingerprint, InvalidFingerprint, Trust};
+use crate::durable;
+
+/// The file in the robot's folder.
+pub const FILE: &str = "membership.json";
+/// The share of a certificate's time after which it is renewed.
+const RENEW_AFTER: f64 = 2.0 / 3.0;
+
+/// A robot's place in the fleet.
+#[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Membership {
+    /// The site.
+    pub site: SiteId,
+    /// The robot.
+    pub robot: RobotId,
+    /// How often it has joined.
+    pub enrolment: u32,
+    /// Its certificate, PEM.
+    pub certificate: String,
+    /// Its key, PEM; it never leaves the robot.
+    pub(crate) key: String,
+    /// Who the robots' port must show to be signed by, PEM.
+    pub authority: String,
+    /// Where the REST API is, for renewals.
+    pub server: String,
+    /// Whom the REST API must show to be signed by.
+    pub trust: Trust,
+    /// The robots' port, as zenoh writes it.
+    pub endpoint: String,
+    /// When the certificate came, by the robot's own clock.
+    pub issued_at: Timestamp,
+    /// How long it is good for from then on, seconds.
+    pub lifetime_s: u64,
+}
+
+impl std::fmt::Debug for Membership {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter
+            .debug_struct("Membership")
+            .field("site", &self.site)
+            .field("robot", &self.robot)
+            .field("enrolment", &self.enrolment)
+            .field("endpoint", &self.endpoint)
+            .finish_non_exhaustive()
+    }
+}
+
+/// Why the file cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum MembershipFileError {
+    /// It cannot be read.
+    #[error("`{}` cannot be read", path.display())]
+    Unreadable {
+        /// Which file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: io::Error,
+    },
+    /// It does not say what it should.
+    #[error("`{}` does not read; join the fleet again", path.display())]
+    Malformed {
+        /// Which file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: serde_json::Error,
+    },
+    /// It cannot be written.
+    #[error("`{}` cannot be written", path.display())]
+    Unwritable {
+        /// Which file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: io::Error,
+    },
+}
+
+impl Membership {
+    /// Reads the file in a robot's folder; `None` if it has not joined. Blocks.
+    ///
+    /// # Errors
+    /// [`MembershipFileError`]: it cannot be read.
+    pub fn load(folder: &Path) -> Result<Option<Self>, MembershipFileError> {
+        let path = folder.join(FILE);
+        let text = match std::fs::read(&path) {
+            Ok(text) => text,
+            Err(cause) if cause.kind() == io::ErrorKind::NotFound => return Ok(None),
+            Err(source) => return Err(MembershipFileError::Unreadable { path, source }),
+        };
+        serde_json::from_slice(&text)
+            .map(Some)
+            .map_err(|source| MembershipFileError::Malformed { path, source })
+    }
+
+    /// Replaces the file in a robot's folder, which is made if it is missing. Blocks.
+    ///
+    /// # Errors
+    /// [`MembershipFileError::Unwritable`]; the former file stays then.
+    pub fn save(&self, folder: &Path) -> Result<(), MembershipFileError> {
+        let path = folder.join(FILE);
+        let written = serde_json::to_vec_pretty(self)
+            .map_err(io::Error::other)
+            .and_then(|text| {
+                std::fs::create_dir_all(folder)?;
+                durable::replace_private(folder, FILE, &text)
+            });
+        written.map_err(|source| MembershipFileError::Unwritable { path, source })
+    }
+
+    /// How long from now until the certificate is to be renewed, by the robot's own clock alone,
+    /// which may be wrong: it is asked how long ago the certificate came, nothing else.
+    pub(crate) fn renewal_due_in(&self, now: Timestamp) -> Duration {
+        let after = Duration::from_secs(self.lifetime_s).mul_f64(RENEW_AFTER);
+        let age = now.duration_since(self.issued_at);
+        if age < SignedDuration::ZERO {
+            // The clock was set back; nobody knows how old it is.
+            return Duration::ZERO;
+        }
+        after.saturating_sub(age.unsigned_abs())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt as _;
+
+    use super::*;
+
+    fn membership() -> Membership {
+        Membership {
+            site: "yard".parse().unwrap(),
+            robot: "rover-1".parse().unwrap(),
+            enrolment: 1,
+            certificate: "certificate".to_owned(),
+            key: "very secret".to_owned(),
+            authority: "authority".to_owned(),
+            server: "https://tread.example".to_owned(),
+            trust: Trust::Machine,
+            endpoint: "tls/tread.example:7447".to_owned(),
+            issued_at: "2026-11-02T10:00:00Z".parse().unwrap(),
+            lifetime_s: 90,
+        }
+    }
+
+    #[test]
+    fn it_comes_back_from_a_file_that_only_its_owner_can_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let folder = folder.path().join("robot");
+        assert_eq!(Membership::load(&folder).unwrap(), None);
+        for enrolment in [1, 2] {
+            let saved = Membership {
+                enrolment,
+                ..membership()
+            };
+            saved.save(&folder).unwrap();
+            assert_eq!(Membership::load(&folder).unwrap(), Some(saved));
+            let mode = std::fs::metadata(folder.join(FILE)).unwrap().permissions();
+            assert_eq!(mode.mode() & 0o777, 0o600);
+        }
+        std::fs::write(folder.join(FILE), "{}").unwrap();
+        assert!(Membership::load(&folder).is_err());
+    }
+
+    #[test]
+    fn the_key_is_not_shown_by_accident() {
+        assert!(!format!("{:?}", membership()).contains("secret"));
+    }
+
+    #[test]
+    fn it_renews_after_two_thirds_of_its_time_and_at_once_when_the_clock_was_set_back() {
+        let membership = membership();
+        let at = |seconds| membership.issued_at + SignedDuration::from_secs(seconds);
+        for (now_s, left_s) in [(0, 60), (20, 40), (60, 0), (1_000, 0), (-1, 0)] {
+            let left = membership.renewal_due_in(at(now_s));
+            assert_eq!(left, Duration::from_secs(left_s), "at {now_s} s");
+        }
+    }
+}

@@ -1,0 +1,185 @@
+//! The agent's life on the network: connects, introduces the robot, publishes, uploads, answers;
+//! and opens the link again when there is a new certificate.
+
+use std::ops::ControlFlow;
+use std::sync::Arc;
+
+use tokio::sync::{mpsc, watch};
+use tokio_util::sync::CancellationToken;
+use tracing::{error, info, warn};
+use tread_api::robot::Capabilities;
+use tread_api::wire::hello::Hello;
+
+use crate::config::AgentConfig;
+use crate::control_loop::seam::Shared;
+use crate::dispatcher::Dispatcher;
+use crate::fleet::uploader::{self, Backoff};
+use crate::fleet::{self, COMMANDS_MAX, FleetLink, Identity, Listeners, Note, Noted};
+use crate::membership::Membership;
+use crate::outbox::Outbox;
+use crate::reporter::{Reporter, every, publish_states};
+
+/// Waits for the next certificate; for ever where there is none.
+async fn renewed(membership: &mut Option<watch::Receiver<Arc<Membership>>>) {
+    if let Some(membership) = membership
+        && membership.changed().await.is_ok()
+    {
+        return;
+    }
+    std::future::pending::<()>().await;
+}
+
+/// Everything that needs the network.
+pub(crate) struct Online {
+    pub(crate) config: AgentConfig,
+    pub(crate) identity: Identity,
+    pub(crate) reporter: Arc<Reporter>,
+    pub(crate) dispatcher: Arc<Dispatcher>,
+    pub(crate) outbox: Outbox,
+    pub(crate) stop: CancellationToken,
+    pub(crate) connected: watch::Sender<bool>,
+    /// The certificate, which changes with each renewal; `None` where none is wanted.
+    pub(crate) membership: Option<watch::Receiver<Arc<Membership>>>,
+}
+
+impl Online {
+    /// Runs until the stop.
+    pub(crate) async fn run(mut self) {
+        let (shared, clock) = (&self.dispatcher.shared, &self.dispatcher.clock);
+        let (shared, clock) = (Arc::clone(shared), Arc::clone(clock));
+        let note: Note = Arc::new(move |noted| match noted {
+            Noted::ServerHeard => shared.note_server_heard(clock.monotonic()),
+            Noted::CommandLost => Shared::count(&shared.lost_commands),
+        });
+        tokio::select! {
+            // Robots that get power together do not come all at once.
+            () = tokio::time::sleep(fleet::start_jitter(self.identity.boot)) => {}
+            () = self.stop.cancelled() => return,
+        }
+        let (commands, commands_in) = mpsc::channel(COMMANDS_MAX);
+        let listeners = Listeners {
+            note,
+            urgent: {
+                let safety = Arc::clone(&self.dispatcher.safety);
+                Arc::new(move |urgent| safety.take_urgent(urgent))
+            },
+            commands,
+        };
+        let answering = Arc::clone(&self.dispatcher).run(commands_in, self.stop.clone());
+        let mut membership = self.membership.take();
+        let linking = async { while self.link(&mut membership, &listeners).await.is_continue() {} };
+        tokio::join!(answering, linking);
+    }
+
+    /// One link, until the stop or until it is to be opened again with another certificate. The
+    /// robot drives on in between, as in every outage.
+    async fn link(
+        &self,
+        membership: &mut Option<watch::Receiver<Arc<Membership>>>,
+        listeners: &Listeners,
+    ) -> ControlFlow<()> {
+        let shown = membership
+            .as_mut()
+            .map(|it| Arc::clone(&it.borrow_and_update()));
+        let connecting = FleetLink::connect(
+            &self.config.server,
+            shown.as_deref(),
+            self.identity.clone(),
+            listeners.clone(),
+            &self.stop,
+        );
+        let connected = tokio::select! {
+            connected = connecting => connected,
+            // The one that was shown may be the reason why nobody answers.
+            () = renewed(membership) => return ControlFlow::Continue(()),
+        };
+        let link = match connected {
+            Ok(Some(link)) => Arc::new(link),
+            Ok(None) => return ControlFlow::Break(()),
+            Err(cause) => {
+                error!(
+                    error = &cause as &dyn std::error::Error,
+                    "the fleet link failed"
+                );
+                return ControlFlow::Break(());
+            }
+        };
+        let (welcomed, is_welcome) = watch::channel(false);
+        let _ = self.connected.send(true);
+        let reporter = &self.reporter;
+        let uploading = uploader::run(
+            Arc::clone(&link),
+            self.outbox.clone(),
+            Arc::clone(&self.dispatcher.clock),
+            is_welcome,
+            self.stop.clone(),
+        );
+        let working = async {
+            tokio::join!(
+                self.introduce(Arc::clone(&link), welcomed),
+                uploading,
+                publish_states(self.config.state_rate_hz, Arc::clone(&link), reporter),
+                every(self.config.friction_rate_hz, Arc::clone(&link), |link| {
+                    link.publish_friction(&reporter.friction());
+                }),
+            );
+        };
+        let next = tokio::select! {
+            () = working => ControlFlow::Break(()),
+            () = self.stop.cancelled() => ControlFlow::Break(()),
+            () = renewed(membership) => ControlFlow::Continue(()),
+        };
+        link.close().await;
+        next
+    }
+
+    /// Says hello on every new connection until it is answered.
+    async fn introduce(&self, link: Arc<FleetLink>, welcomed: watch::Sender<bool>) {
+        let mut server_seen = link.server_seen();
+        loop {
+            server_seen.mark_unchanged();
+            let mut backoff = Backoff::new();
+            while !self.introduce_once(&link).await {
+                tokio::time::sleep(backoff.grow()).await;
+            }
+            let _ = welcomed.send(true);
+            if server_seen.changed().await.is_err() {
+                return;
+            }
+        }
+    }
+
+    async fn introduce_once(&self, link: &Arc<FleetLink>) -> bool {
+        let hello = Hello {
+            robot: self.identity.robot.clone(),
+            boot: self.identity.boot,
+            agent_version: env!("CARGO_PKG_VERSION").to_owned(),
+            model: self.config.model.clone(),
+            robot_time: self.dispatcher.clock.wall(),
+            capabilities: Capabilities {
+                pause: true,
+                replace: true,
+                battery: true,
+                wheel_torque: true,
+                stop: true,
+                teleop: true,
+                rate_hz: Some(self.config.rate_hz),
+                base: Some("simulated".to_owned()),
+            },
+        };
+        match link.hello(&hello).await {
+            Ok(welcome) => {
+                info!("the server welcomes `{}`", self.identity.robot);
+                self.dispatcher.take_welcome(welcome.site)
+            }
+            Err(fleet::AskError::NoAnswer) => false,
+            Err(cause) => {
+                warn!(
+                    error = &cause as &dyn std::error::Error,
+                    "the server does not welcome us"
+                );
+                false
+            }
+        }
+    }
+}

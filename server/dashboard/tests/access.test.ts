@@ -1,0 +1,129 @@
+// For everybody: axe-core on every part of the page, and a whole run by keys alone.
+import { readFileSync } from 'node:fs';
+import { createRequire } from 'node:module';
+import type { Page } from 'playwright-core';
+import { expect, test } from 'vitest';
+import type { Mission, Page as ApiPage } from './types';
+import { api, browser, eventually, select, shot, token } from './harness';
+
+const { open } = browser();
+const AXE = readFileSync(createRequire(import.meta.url).resolve('axe-core/axe.min.js'), 'utf8');
+
+interface Result {
+  violations: { id: string; nodes: { html: string; failureSummary: string }[] }[];
+}
+
+/** Says what breaks WCAG 2.2 A or AA or good practice. */
+async function violations(page: Page): Promise<string[]> {
+  // The page's policy lets no inline script run; the protocol's evaluation is not the page's.
+  await page.evaluate(AXE);
+  const result = await page.evaluate(
+    () =>
+      (globalThis as unknown as { axe: { run(): Promise<unknown> } }).axe.run() as Promise<unknown>,
+  );
+  return (result as Result).violations.flatMap((found) =>
+    found.nodes.map((node) => `${found.id}: ${node.html} ${node.failureSummary}`),
+  );
+}
+
+for (const theme of ['light', 'dark'] as const) {
+  for (const [name, size] of [
+    ['wide', { width: 1360, height: 850 }],
+    ['phone', { width: 390, height: 800 }],
+  ] as const) {
+    test(`no part of the page violates a rule of accessibility: ${theme}, ${name}`, async () => {
+      const stranger = await open({ as: null, theme, size });
+      await stranger.getByLabel('Token').waitFor();
+      expect(await violations(stranger)).toEqual([]);
+      await stranger.close();
+      const page = await open({ theme, size });
+      expect(await violations(page)).toEqual([]);
+      await page.locator('.layers details').evaluate((details: HTMLDetailsElement) => (details.open = true));
+      await page.getByRole('combobox', { name: 'Friction' }).selectOption('theta');
+      await page.locator('.layers figure').waitFor();
+      for (const tab of ['Missions', 'Alerts', 'Terrains']) {
+        await page.getByRole('tab', { name: tab }).click();
+        expect(await violations(page), tab).toEqual([]);
+      }
+      await select(page, 'rover-3');
+      expect(await violations(page), 'robot').toEqual([]);
+      await page.getByRole('button', { name: 'New mission' }).click();
+      await page.getByRole('radio', { name: 'Waypoints' }).check();
+      await page.getByRole('button', { name: 'Add point' }).click();
+      await page.getByText('Options').click();
+      expect(await violations(page), 'drawing').toEqual([]);
+      await page.getByRole('button', { name: 'Put away' }).click();
+      await page.getByRole('button', { name: 'Drive by hand' }).click();
+      await page.getByText('You have the lease.').waitFor();
+      await page.getByRole('button', { name: 'Stop rover-3' }).click();
+      const clear = page.getByRole('button', { name: 'Clear rover-3' });
+      await clear.waitFor();
+      expect(await violations(page), 'driving, stopped').toEqual([]);
+      await shot(page, `${theme}-${name}`);
+      await eventually('the clear', async () => {
+        if (await clear.isVisible()) await clear.click({ timeout: 2_000 });
+        return !(await clear.isVisible());
+      });
+      // With the page goes its lease.
+      await page.close();
+    });
+  }
+}
+
+/** Moves on by Tab until something of that name has the focus. */
+async function tabTo(page: Page, name: RegExp): Promise<void> {
+  const seen: string[] = [];
+  for (let step = 0; step < 80; step += 1) {
+    const now = await page.evaluate(() => {
+      const at = document.activeElement;
+      if (!(at instanceof HTMLElement)) return '';
+      const label = at instanceof HTMLInputElement || at instanceof HTMLSelectElement ? at.labels?.[0]?.innerText : '';
+      return at.getAttribute('aria-label') ?? (label || at.innerText);
+    });
+    if (name.test(now)) return;
+    seen.push(now.split('\n')[0] ?? '');
+    await page.keyboard.press('Tab');
+  }
+  throw new Error(`Tab never comes to ${name}: ${seen.join(' | ')}`);
+}
+
+test('a whole run by keys alone: sign in, select, draw, send, stop, clear', async () => {
+  const page = await open({ as: null });
+  await page.getByLabel('Token').waitFor();
+  await tabTo(page, /^Token/);
+  await page.keyboard.type(token());
+  await page.keyboard.press('Enter');
+  await page.locator('button[data-robot]').first().waitFor();
+  await tabTo(page, /^rover-3/);
+  await page.keyboard.press('Enter');
+  await tabTo(page, /^New mission/);
+  await page.keyboard.press('Enter');
+  await page.getByRole('radio', { name: 'Circle' }).waitFor();
+  // Back to the map, whose middle becomes the circle's.
+  await tabTo(page, /^Map/);
+  await page.keyboard.press('f');
+  await page.keyboard.press('ArrowLeft');
+  await page.keyboard.press('Enter');
+  await tabTo(page, /^Radius/);
+  await page.keyboard.press('ControlOrMeta+a');
+  await page.keyboard.type('1.2');
+  await page.keyboard.press('Tab');
+  await page.locator('[data-test="dry-run"]').waitFor();
+  await tabTo(page, /^Send/);
+  await page.keyboard.press('Enter');
+  await page.getByText('Sent to rover-3.').waitFor();
+  const { items } = await api<ApiPage<Mission>>('/v1/missions?site=yard&robot=rover-3&limit=1');
+  const sent = items[0];
+  if (!sent || !('circle' in sent.trajectory)) throw new Error('no circle was sent');
+  expect(sent.trajectory.circle.radius_m).toBe(1.2);
+  await page.keyboard.press('Alt+KeyX');
+  await page.locator('[data-robot="rover-3"].held').waitFor();
+  await eventually('rover-3 stands', async () => {
+    const robot = await api<{ live: { twist: { value: { linear_m_s: number } } } }>('/v1/sites/yard/robots/rover-3');
+    return Math.abs(robot.live.twist.value.linear_m_s) < 0.02;
+  });
+  await tabTo(page, /^Clear rover-3/);
+  await page.keyboard.press('Enter');
+  await page.locator('[data-robot="rover-3"].held').waitFor({ state: 'detached' });
+  await api(`/v1/missions/${sent.id}/cancel`, 'POST');
+});

@@ -1,0 +1,107 @@
+// Draws the page's own map with a large fleet and a large friction layer, and counts frames.
+import type { CellFriction, Robot } from '../../src/api/schema';
+import { Camera } from '../../src/map/camera';
+import { draw } from '../../src/map/draw';
+import { Layer } from '../../src/map/friction';
+import { TRAIL_POINTS, Tracked } from '../../src/state/tracked';
+
+const ROBOTS = 200;
+const SIDE = 1_024;
+const MEASURED_MS = 4_000;
+
+function robotAt(index: number): Tracked {
+  const heading_rad = index * 0.7;
+  const pose = { x_m: (index * 37) % SIDE, y_m: (index * 91) % SIDE, heading_rad };
+  const robot = {
+    id: `rover-${index}`,
+    name: `rover-${index}`,
+    link: index % 10 === 0 ? 'offline' : 'online',
+    model: { wheelbase_m: 0.28, track_width_m: 0.43, wheel_radius_m: 0.08 },
+    live: { heard_age_ms: 10, pose: { value: pose, age_ms: 10 }, safety: {} },
+  } as unknown as Robot;
+  const tracked = new Tracked(robot, performance.now());
+  tracked.trail = Array.from({ length: TRAIL_POINTS }, (_, point) => [
+    pose.x_m - point * Math.cos(heading_rad + point / 90),
+    pose.y_m - point * Math.sin(heading_rad + point / 60),
+  ]).flat();
+  return tracked;
+}
+
+function cells(): CellFriction[] {
+  const kinds = Array.from({ length: 256 }, (_, kind) => ({
+    theta: 0.05 + kind / 130,
+    stiffness: 1 / (0.05 + kind / 130),
+    std_dev: 0.002 * (kind % 50),
+    newest_at: '2026-01-01T00:00:00Z',
+    robots: 1,
+    segments: 1 + kind,
+  }));
+  const all: CellFriction[] = [];
+  for (let iy = 0; iy < SIDE; iy += 1) {
+    for (let ix = 0; ix < SIDE; ix += 1) {
+      const friction = kinds[(ix * 7 + iy * 13) % 256];
+      all.push({ cell: { ix, iy }, configuration: 'bench', friction } as unknown as CellFriction);
+    }
+  }
+  return all;
+}
+
+export interface Frames {
+  frames_s: number;
+  draw_p50_ms: number;
+  draw_p99_ms: number;
+  layer_ms: number;
+}
+
+async function measure(): Promise<Frames> {
+  const canvas = document.querySelector('canvas');
+  const context = canvas?.getContext('2d', { alpha: false });
+  if (!canvas || !context) throw new Error('there is no canvas');
+  const began = performance.now();
+  const friction = new Layer(cells(), null, 1, 'theta', Date.now());
+  const layer_ms = performance.now() - began;
+  const tracked = Array.from({ length: ROBOTS }, (_, index) => robotAt(index));
+  const camera = new Camera();
+  camera.width = canvas.width;
+  camera.height = canvas.height;
+  camera.fit({ xMin: 0, yMin: 0, xMax: SIDE, yMax: SIDE });
+  const spent: number[] = [];
+  const start = performance.now();
+  let now = start;
+  while (now - start < MEASURED_MS) {
+    now = await new Promise<number>((resolve) => requestAnimationFrame(resolve));
+    const before = performance.now();
+    // Nothing may be kept from the frame before.
+    camera.pan(Math.sin(now / 300), Math.cos(now / 300));
+    draw(context, camera, {
+      terrains: [],
+      fence: null,
+      tracked,
+      missions: [],
+      unconfirmed: new Set(),
+      friction,
+      draft: null,
+      driven: null,
+      selected: 'rover-1',
+      showTerrains: true,
+      showFence: true,
+      showTrails: true,
+      showCross: false,
+      theme: 'light',
+      now,
+    });
+    // Reading a pixel waits until everything is really drawn.
+    context.getImageData(0, 0, 1, 1);
+    spent.push(performance.now() - before);
+  }
+  const seconds = (now - start) / 1000;
+  spent.sort((a, b) => a - b);
+  return {
+    frames_s: spent.length / seconds,
+    draw_p50_ms: spent[Math.floor(spent.length * 0.5)] ?? NaN,
+    draw_p99_ms: spent[Math.floor(spent.length * 0.99)] ?? NaN,
+    layer_ms,
+  };
+}
+
+Object.assign(globalThis, { measure });

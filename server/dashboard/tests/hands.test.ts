@@ -1,0 +1,169 @@
+// Stop and driving by hand, with real robots at the other end.
+import { execFileSync } from 'node:child_process';
+import { readFileSync } from 'node:fs';
+import { expect, inject, test } from 'vitest';
+import type { Page } from 'playwright-core';
+import type { Page as ApiPage, Robot, Stop } from './types';
+import { api, browser, eventually, select, shot } from './harness';
+
+const { open } = browser();
+
+const robot = (id: string) => api<Robot>(`/v1/sites/yard/robots/${id}`);
+const speed = async (id: string) => (await robot(id)).live?.twist?.value.linear_m_s ?? 0;
+const stops = async (id: string) =>
+  (await api<ApiPage<Stop>>(`/v1/stops?site=yard&robot=${id}&in_force=true`)).items;
+
+/** The process of a robot's agent: one of the demo's children. */
+function agentOf(id: string): number {
+  const children = execFileSync('pgrep', ['-P', String(inject('demoPid'))], { encoding: 'utf8' });
+  for (const pid of children.trim().split('\n').map(Number)) {
+    const words = readFileSync(`/proc/${pid}/cmdline`, 'utf8').split('\0');
+    if (words.includes('agent') && words.some((word) => word.includes(id))) return pid;
+  }
+  throw new Error(`no agent of ${id} among ${children}`);
+}
+
+async function beginDriving(page: Page, id: string): Promise<void> {
+  await select(page, id);
+  await page.getByRole('button', { name: 'Drive by hand' }).click();
+  await page.getByText('You have the lease.').waitFor();
+}
+
+async function standsStill(id: string): Promise<void> {
+  await eventually(`${id} stands`, async () => Math.abs(await speed(id)) < 0.02);
+}
+
+test('a stop is shown confirmed and is cleared from the page', async () => {
+  const page = await open();
+  await select(page, 'rover-2');
+  await page.getByRole('button', { name: 'Stop rover-2' }).click();
+  const shown = page.locator('[data-robot="rover-2"].held');
+  await shown.waitFor();
+  expect((await stops('rover-2')).length).toBe(1);
+  await shot(page, 'stopped');
+  await standsStill('rover-2');
+  await page.getByRole('button', { name: 'Clear rover-2' }).click();
+  await shown.waitFor({ state: 'detached' });
+  expect(await stops('rover-2')).toEqual([]);
+});
+
+test('a stop that the robot has not confirmed stays red until it has', async () => {
+  const page = await open();
+  await select(page, 'rover-2');
+  const agent = agentOf('rover-2');
+  process.kill(agent, 'SIGSTOP');
+  try {
+    await page.keyboard.press('Alt+KeyX');
+    await page.getByText('rover-2 has NOT confirmed its stop').waitFor();
+    expect((await stops('rover-2'))[0]?.confirmed_at ?? null).toBeNull();
+    await shot(page, 'unconfirmed');
+  } finally {
+    process.kill(agent, 'SIGCONT');
+  }
+  await page.locator('[data-robot="rover-2"].held').waitFor();
+  await standsStill('rover-2');
+  await page.getByRole('button', { name: 'Clear rover-2' }).click();
+  await eventually('the clear', async () => (await stops('rover-2')).length === 0);
+});
+
+test('the shortcut stops all robots, also while somebody types', async () => {
+  const page = await open();
+  await select(page, 'rover-1');
+  await page.getByRole('button', { name: 'New mission' }).click();
+  await page.getByLabel('Radius, m').focus();
+  await page.keyboard.press('Alt+Shift+KeyX');
+  for (const id of ['rover-1', 'rover-2', 'rover-3']) {
+    await page.locator(`[data-robot="${id}"].held`).waitFor();
+  }
+  await shot(page, 'all-stopped');
+  for (const id of ['rover-1', 'rover-2', 'rover-3']) {
+    await standsStill(id);
+    await page.getByRole('button', { name: `Clear ${id}` }).click();
+    await eventually(`${id} is cleared`, async () => (await stops(id)).length === 0);
+  }
+});
+
+test('keys drive a robot, and a hidden tab makes it stand', async () => {
+  const page = await open();
+  await beginDriving(page, 'rover-2');
+  await page.keyboard.down('KeyW');
+  await eventually('rover-2 drives', async () => (await speed('rover-2')) > 0.2);
+  await page.locator('dt:has-text("Commands’ age") + dd').filter({ hasText: /\d+ ms/ }).waitFor();
+  await shot(page, 'driving');
+  await page.evaluate(() => {
+    Object.defineProperty(document, 'hidden', { value: true, configurable: true });
+    document.dispatchEvent(new Event('visibilitychange'));
+  });
+  await standsStill('rover-2');
+  await page.getByText('The tab was hidden: the robot stands.').waitFor();
+  await page.evaluate(() => {
+    Reflect.deleteProperty(document, 'hidden');
+    document.dispatchEvent(new Event('visibilitychange'));
+  });
+  await page.keyboard.up('KeyW');
+  await standsStill('rover-2');
+  await page.keyboard.down('ArrowDown');
+  await eventually('rover-2 drives backwards', async () => (await speed('rover-2')) < -0.1);
+  await page.keyboard.up('ArrowDown');
+  await standsStill('rover-2');
+  await page.getByRole('button', { name: 'Give back' }).click();
+  await eventually('nobody has the lease', async () => !(await robot('rover-2')).live?.safety.lease);
+});
+
+test('the stick drives, and letting go, leaving the window or closing the page makes the robot stand', async () => {
+  const page = await open();
+  await beginDriving(page, 'rover-2');
+  const stick = page.getByRole('application', { name: /stick/ });
+  const push = async () => {
+    await stick.scrollIntoViewIfNeeded();
+    const box = await stick.boundingBox();
+    if (!box) throw new Error('there is no stick');
+    const middle = { x: box.x + box.width / 2, y: box.y + box.height / 2 };
+    await page.mouse.move(middle.x, middle.y);
+    await page.mouse.down();
+    await page.mouse.move(middle.x, middle.y + box.height / 3, { steps: 3 });
+    await eventually('rover-2 drives', async () => Math.abs(await speed('rover-2')) > 0.1);
+  };
+  await push();
+  await page.mouse.up();
+  await standsStill('rover-2');
+  await push();
+  await page.evaluate(() => window.dispatchEvent(new Event('blur')));
+  await page.getByText('The window lost focus: the robot stands.').waitFor();
+  await standsStill('rover-2');
+  await page.mouse.up();
+  await push();
+  await page.close();
+  await standsStill('rover-2');
+});
+
+test('a lease is refused while another has it, taken by force, and the loss is said', async () => {
+  const first = await open();
+  const second = await open();
+  await beginDriving(first, 'rover-2');
+  await select(second, 'rover-2');
+  await second.getByRole('button', { name: 'Drive by hand' }).click();
+  const take = second.getByRole('button', { name: /^Take over from/ });
+  await take.waitFor();
+  await take.click();
+  await second.getByText('You have the lease.').waitFor();
+  await first.getByText(/^The lease is gone/).waitFor();
+  await second.getByRole('button', { name: 'Give back' }).click();
+});
+
+test('the touch stick of a phone drives too', async () => {
+  const page = await open({ size: { width: 390, height: 800 }, hasTouch: true });
+  await beginDriving(page, 'rover-2');
+  const stick = page.getByRole('application', { name: /stick/ });
+  await stick.evaluate((element) => element.scrollIntoView({ block: 'center' }));
+  const box = await stick.boundingBox();
+  if (!box) throw new Error('there is no stick');
+  const touch = await page.context().newCDPSession(page);
+  const at = (y: number) => [{ x: box.x + box.width / 2, y: box.y + y * box.height }];
+  await touch.send('Input.dispatchTouchEvent', { type: 'touchStart', touchPoints: at(0.5) });
+  await touch.send('Input.dispatchTouchEvent', { type: 'touchMove', touchPoints: at(0.15) });
+  await eventually('rover-2 drives', async () => (await speed('rover-2')) > 0.1);
+  await shot(page, 'phone-drive');
+  await touch.send('Input.dispatchTouchEvent', { type: 'touchEnd', touchPoints: [] });
+  await standsStill('rover-2');
+});

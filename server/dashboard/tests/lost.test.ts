@@ -1,0 +1,66 @@
+// A server that goes away and comes back.
+import { expect, test } from 'vitest';
+import { api, browser, eventually, line, select, shot } from './harness';
+
+const { open } = browser();
+/** What a browser says of a line that was cut. */
+const CUT = /ERR_|Failed to load|WebSocket|CSP: none/;
+
+test('a lost server is said, what was drawn is kept, and everything goes on when it is back', async () => {
+  const wire = await line();
+  const page = await open({ address: wire.address, expected: CUT });
+  await select(page, 'rover-1');
+  await page.getByRole('button', { name: 'New mission' }).click();
+  await page.getByLabel('Centre x, m').fill('7.5');
+  await page.getByLabel('Radius, m').fill('1.5');
+  await page.getByLabel('Radius, m').press('Tab');
+  await page.locator('[data-test="dry-run"]').waitFor();
+  wire.cut();
+  await page.getByText(/^The server has not answered since/).waitFor();
+  await page.getByRole('button', { name: 'Send', exact: true }).click();
+  await page.getByText('The server does not answer; what you entered is kept.').waitFor();
+  await page.getByRole('button', { name: 'Stop rover-1' }).click();
+  await page.getByText(/rover-1 may not have been told to stop/).waitFor();
+  await shot(page, 'lost');
+  expect(await page.getByLabel('Centre x, m').inputValue()).toBe('7.5');
+  wire.mend();
+  await page.getByText(/^The server has not answered since/).waitFor({ state: 'hidden' });
+  await page.getByText('live', { exact: true }).waitFor();
+  const age = () => page.locator('.head span').last().innerText();
+  await eventually('a fresh state', async () => /^online · 0\.\d s/.test(await age()));
+  expect(await page.getByLabel('Centre x, m').inputValue()).toBe('7.5');
+  wire.end();
+});
+
+test('a driver whose line is cut is told, and the robot stands', async () => {
+  const wire = await line();
+  const page = await open({ address: wire.address, expected: CUT });
+  await select(page, 'rover-3');
+  await page.getByRole('button', { name: 'Drive by hand' }).click();
+  await page.getByText('You have the lease.').waitFor();
+  wire.cut();
+  await page.getByText(/^The socket is lost/).waitFor();
+  await eventually('nobody has the lease', async () => {
+    const robot = await api<{ live: { safety: { lease?: unknown } } }>('/v1/sites/yard/robots/rover-3');
+    return !robot.live.safety.lease;
+  });
+  wire.end();
+});
+
+test('a token that is revoked leads back to the sign-in, and the drawing survives', async () => {
+  const made = await api<{ secret: string; token: { id: string } }>('/v1/tokens', 'POST', {
+    name: `short ${Date.now()}`,
+    role: 'operator',
+  });
+  const page = await open({ as: made.secret, expected: /401/ });
+  await select(page, 'rover-1');
+  await page.getByRole('button', { name: 'New mission' }).click();
+  await page.getByLabel('Centre x, m').fill('6.5');
+  await page.getByLabel('Centre x, m').press('Tab');
+  await api(`/v1/tokens/${made.token.id}`, 'DELETE');
+  await page.getByText(/^Your sign-in has ended/).waitFor();
+  const again = await api<{ secret: string }>('/v1/tokens', 'POST', { name: `again ${Date.now()}`, role: 'operator' });
+  await page.getByLabel('Token').fill(again.secret);
+  await page.getByRole('button', { name: 'Sign in' }).click();
+  expect(await page.getByLabel('Centre x, m').inputValue()).toBe('6.5');
+});

@@ -1,0 +1,469 @@
+//! Robots join the fleet, stay in it, and are put out of it.
+//!
+//! ```text
+//!  join token ──made──► valid ──used by one robot──► used
+//!                         └──revoked, or its time over──► dead
+//!
+//!  robot ──joins──► in force ──renews──► in force …
+//!                      ├──put out──────► revoked
+//!                      └──joins again──► revoked, and in force under the next number
+//! ```
+//!
+//! What fails is told alike, whatever the cause; the cause is for the audit log and the counters.
+
+mod outsiders;
+pub mod roll;
+
+use std::net::IpAddr;
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+
+use jiff::{SignedDuration, Timestamp};
+use tread_api::enrolment::{
+    CreateJoinToken, CreatedJoinToken, EnrolRobot, Enrolment, JOIN_MINUTES_DEFAULT,
+    JOIN_MINUTES_MAX, JoinToken, RenewCertificate, RobotCertificate,
+};
+use tread_api::ids::{JoinTokenId, RobotId, SiteId};
+use tread_api::page::Page;
+
+use self::outsiders::Outsiders;
+pub(super) use self::outsiders::REVOKED_ALERT;
+use self::roll::Roll;
+use super::identity::new_secret;
+use super::{App, AppError, page, site_row};
+use crate::authority::{Authority, CertificateError, RobotName, RobotRequest};
+use crate::db::{self, DbError};
+use crate::identity::attempts::Source;
+use crate::identity::secret::{Kind, Secret};
+
+/// Most join tokens that can be used at once.
+pub const JOIN_TOKENS_MAX: usize = 1_000;
+/// Most robots that may ever join.
+pub const ROBOTS_MAX: usize = 10_000;
+/// How long dead join tokens are listed.
+const DEAD_KEPT: SignedDuration = SignedDuration::from_hours(400 * 24);
+/// Dead join tokens that are forgotten with each new one.
+const FORGET_MAX: u32 = 10;
+
+/// What the server signs robots' certificates with.
+#[derive(Debug)]
+pub struct Office {
+    /// The fleet's authority.
+    pub authority: Arc<Authority>,
+    /// How long a robot's certificate is good for.
+    pub lifetime: SignedDuration,
+    /// The port that robots connect to.
+    pub port: u16,
+}
+
+/// What is known of robots that have joined.
+#[derive(Debug, Default)]
+pub(super) struct Membership {
+    pub(super) roll: Arc<Roll>,
+    office: OnceLock<Office>,
+    outsiders: Outsiders,
+}
+
+/// Why a robot gets no certificate. Who asks is told no more than that.
+#[derive(Debug, thiserror::Error)]
+pub enum EnrolError {
+    /// The request for a certificate is none, whoever sends it.
+    #[error(transparent)]
+    Request(CertificateError),
+    /// Neither the token nor the request names the robot.
+    #[error("nobody names the robot")]
+    Nameless(JoinTokenId),
+    /// The join token cannot be one.
+    #[error("malformed")]
+    Malformed,
+    /// Nothing is kept of the join token.
+    #[error("unknown")]
+    Unknown,
+    /// Its time is over.
+    #[error("expired")]
+    Expired(JoinTokenId),
+    /// A robot joined by it before.
+    #[error("used")]
+    Used(JoinTokenId),
+    /// It was revoked.
+    #[error("revoked")]
+    Revoked(JoinTokenId),
+    /// It is for another robot.
+    #[error("for another robot")]
+    OtherRobot(JoinTokenId),
+    /// The robot is known, and the join token does not name it.
+    #[error("the robot is known and the join token does not name it")]
+    KnownRobot(JoinTokenId),
+    /// The certificate, or the proof that its key is at hand, does not count.
+    #[error("bad certificate")]
+    Certificate(#[source] CertificateError),
+    /// The robot was put out of the fleet, or joined again.
+    #[error("the enrolment was revoked")]
+    Ended(RobotName),
+    /// There were too many failures; nothing was looked up.
+    #[error("there were too many failed attempts; try again in {} s", .0.as_secs() + 1)]
+    Locked(Duration),
+    /// Robots do not join this server.
+    #[error("robots do not join this server")]
+    Closed,
+    /// Something else failed.
+    #[error("the server failed")]
+    App(#[from] AppError),
+}
+
+impl From<DbError> for EnrolError {
+    fn from(cause: DbError) -> Self {
+        Self::App(cause.into())
+    }
+}
+
+impl From<sqlx::Error> for EnrolError {
+    fn from(cause: sqlx::Error) -> Self {
+        Self::App(cause.into())
+    }
+}
+
+impl EnrolError {
+    /// The join token that was shown, if it is one.
+    pub fn join_token(&self) -> Option<JoinTokenId> {
+        match self {
+            Self::Expired(id)
+            | Self::Used(id)
+            | Self::Revoked(id)
+            | Self::OtherRobot(id)
+            | Self::Nameless(id)
+            | Self::KnownRobot(id) => Some(*id),
+            Self::Request(_)
+            | Self::Malformed
+            | Self::Unknown
+            | Self::Certificate(_)
+            | Self::Ended(_)
+            | Self::Locked(_)
+            | Self::Closed
+            | Self::App(_) => None,
+        }
+    }
+}
+
+/// What became of a robot's request, for the audit log.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Enrolled {
+    /// What the robot gets.
+    pub certificate: RobotCertificate,
+    /// The join token that it came with.
+    pub join_token: JoinTokenId,
+}
+
+impl App {
+    /// Which robots are of the fleet.
+    pub fn roll(&self) -> &Arc<Roll> {
+        &self.membership().roll
+    }
+
+    /// From now on robots join by this authority, and only those that have joined may speak; the
+    /// first time counts.
+    pub fn open_office(&self, office: Office) {
+        let _ = self.membership().office.set(office);
+        self.roll().close();
+    }
+
+    fn office(&self) -> Option<&Office> {
+        self.membership().office.get()
+    }
+
+    /// Learns from the database who has joined.
+    ///
+    /// # Errors
+    /// The database failed.
+    pub async fn know_enrolments(&self) -> Result<(), AppError> {
+        let mut tx = self.db().read().await?;
+        for enrolment in db::enrolments::all_newest(&mut tx).await? {
+            self.roll().note(&enrolment);
+        }
+        Ok(())
+    }
+
+    /// Makes a join token.
+    ///
+    /// # Errors
+    /// Robots do not join this server, the site is not known, an impossible time, or too many.
+    pub async fn create_join_token(
+        &self,
+        request: CreateJoinToken,
+        created_by: &str,
+    ) -> Result<CreatedJoinToken, AppError> {
+        if self.office().is_none() {
+            return Err(AppError::NoAuthority);
+        }
+        let minutes = request.valid_minutes.unwrap_or(JOIN_MINUTES_DEFAULT);
+        if !(1..=JOIN_MINUTES_MAX).contains(&minutes) {
+            let detail = format!("valid_minutes must be 1 to {JOIN_MINUTES_MAX}, not {minutes}");
+            return Err(AppError::Invalid {
+                field: "valid_minutes",
+                detail,
+            });
+        }
+        let now = self.clock().now();
+        let span = SignedDuration::from_mins(i64::from(minutes));
+        let mut tx = self.db().write().await?;
+        site_row(&mut tx, &request.site).await?;
+        let valid_count = db::join_tokens::valid_count(&mut tx, now).await?;
+        if usize::try_from(valid_count).is_ok_and(|count| count >= JOIN_TOKENS_MAX) {
+            return Err(AppError::TooMany {
+                what: "valid join tokens",
+                count: JOIN_TOKENS_MAX,
+            });
+        }
+        let secret = new_secret(Kind::Join)?;
+        let join_token = JoinToken {
+            id: JoinTokenId::from_uuid(self.clock().mission_id().as_uuid()),
+            site: request.site,
+            robot: request.robot,
+            created_at: now,
+            created_by: created_by.to_owned(),
+            expires_at: now.checked_add(span).unwrap_or(Timestamp::MAX),
+            used_at: None,
+            used_by: None,
+            revoked_at: None,
+        };
+        db::join_tokens::insert(&mut tx, &join_token, &secret.fingerprint()).await?;
+        if let Ok(before) = now.checked_sub(DEAD_KEPT) {
+            db::join_tokens::forget_dead(&mut tx, before, FORGET_MAX).await?;
+        }
+        tx.commit().await?;
+        Ok(CreatedJoinToken {
+            join_token,
+            secret: secret.reveal().to_owned(),
+        })
+    }
+
+    /// Join tokens, newest first; dead ones too.
+    pub async fn join_tokens(
+        &self,
+        before: Option<JoinTokenId>,
+        limit: u32,
+    ) -> Result<Page<JoinToken>, AppError> {
+        let mut tx = self.db().read().await?;
+        let tokens = db::join_tokens::list(&mut tx, before, limit + 1).await?;
+        Ok(page(tokens, limit, |token| token.id.to_string()))
+    }
+
+    /// Revokes a join token.
+    ///
+    /// # Errors
+    /// [`AppError::UnknownJoinToken`].
+    pub async fn revoke_join_token(&self, id: JoinTokenId) -> Result<JoinToken, AppError> {
+        let mut tx = self.db().write().await?;
+        db::join_tokens::revoke(&mut tx, id, self.clock().now()).await?;
+        let found = db::join_tokens::find(&mut tx, id).await?;
+        let token = found.ok_or(AppError::UnknownJoinToken(id))?;
+        tx.commit().await?;
+        Ok(token)
+    }
+
+    /// The newest enrolment of each robot of a site, by name.
+    pub async fn enrolments(
+        &self,
+        site: &SiteId,
+        after: &str,
+        limit: u32,
+    ) -> Result<Page<Enrolment>, AppError> {
+        let mut tx = self.db().read().await?;
+        site_row(&mut tx, site).await?;
+        let found = db::enrolments::list(&mut tx, site, after, limit + 1).await?;
+        Ok(page(found, limit, |enrolment| enrolment.robot.to_string()))
+    }
+
+    /// Puts a robot out of the fleet: from now on nothing that it says counts, its link is cut,
+    /// and it gets no certificate until it joins again by a token that names it.
+    ///
+    /// # Errors
+    /// [`AppError::UnknownRobot`] if it has never joined.
+    pub async fn revoke_robot(
+        &self,
+        site: &SiteId,
+        robot: &RobotId,
+        revoked_by: &str,
+    ) -> Result<Enrolment, AppError> {
+        let mut tx = self.db().write().await?;
+        db::enrolments::revoke(&mut tx, (site, robot), revoked_by, self.clock().now()).await?;
+        let found = db::enrolments::newest(&mut tx, site, robot).await?;
+        let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
+        let enrolment = found.ok_or_else(unknown)?;
+        tx.commit().await?;
+        self.roll().note(&enrolment);
+        tracing::warn!(robot.id = %robot, "robot `{robot}` of site `{site}` was put out by {revoked_by}");
+        Ok(enrolment)
+    }
+
+    /// A robot joins: its join token is used up, and whatever it had before counts no more.
+    ///
+    /// # Errors
+    /// [`EnrolError`]; all but `Request`, `Locked`, `Closed` and `App` look the same from outside.
+    pub async fn enrol_robot(
+        &self,
+        address: IpAddr,
+        request: &EnrolRobot,
+    ) -> Result<Enrolled, EnrolError> {
+        let office = self.office().ok_or(EnrolError::Closed)?;
+        // Whether the request reads says nothing about the token, so it is looked at first.
+        let key = RobotRequest::read(&request.certificate_request).map_err(EnrolError::Request)?;
+        let secret = Secret::read(&request.token).filter(|secret| secret.kind() == Kind::Join);
+        let mut sources = vec![Source::of_address(address)];
+        if let Some(secret) = &secret {
+            sources.push(Source::Prefix(secret.prefix().to_owned()));
+        }
+        if let Some(left) = self.locked_for(&sources) {
+            return Err(EnrolError::Locked(left));
+        }
+        let enrolled = match &secret {
+            Some(secret) => {
+                self.enrol(office, secret, request.robot.as_ref(), &key)
+                    .await
+            }
+            None => Err(EnrolError::Malformed),
+        };
+        match &enrolled {
+            Ok(_) | Err(EnrolError::App(_)) => {}
+            Err(_refused) => self.failed(sources),
+        }
+        enrolled
+    }
+
+    async fn enrol(
+        &self,
+        office: &Office,
+        secret: &Secret,
+        robot: Option<&RobotId>,
+        key: &RobotRequest,
+    ) -> Result<Enrolled, EnrolError> {
+        let now = self.clock().now();
+        let mut tx = self.db().write().await?;
+        let fingerprint = secret.fingerprint();
+        let kept = db::join_tokens::by_lookup(&mut tx, &fingerprint).await?;
+        let kept = kept.filter(|kept| fingerprint.matches(&kept.hash));
+        let token = kept.ok_or(EnrolError::Unknown)?.token;
+        if token.revoked_at.is_some() {
+            return Err(EnrolError::Revoked(token.id));
+        }
+        if token.used_at.is_some() {
+            return Err(EnrolError::Used(token.id));
+        }
+        if token.expires_at <= now {
+            return Err(EnrolError::Expired(token.id));
+        }
+        let robot = match (&token.robot, robot) {
+            (Some(named), Some(asked)) if named != asked => {
+                return Err(EnrolError::OtherRobot(token.id));
+            }
+            (Some(named), _) => named.clone(),
+            (None, Some(asked)) => asked.clone(),
+            (None, None) => return Err(EnrolError::Nameless(token.id)),
+        };
+        let former = db::enrolments::newest(&mut tx, &token.site, &robot).await?;
+        let is_known =
+            former.is_some() || db::robots::is_known(&mut tx, Some(&token.site), &robot).await?;
+        if is_known && token.robot.is_none() {
+            return Err(EnrolError::KnownRobot(token.id));
+        }
+        let robot_count = db::enrolments::robot_count(&mut tx).await?;
+        if former.is_none() && usize::try_from(robot_count).is_ok_and(|count| count >= ROBOTS_MAX) {
+            return Err(EnrolError::App(AppError::TooMany {
+                what: "robots that have joined",
+                count: ROBOTS_MAX,
+            }));
+        }
+        let number = former.map_or(1, |former| former.number.saturating_add(1));
+        let name = RobotName {
+            site: token.site.clone(),
+            robot: robot.clone(),
+            enrolment: number,
+        };
+        let certificate = office.sign(key, &name, now)?;
+        if !db::join_tokens::use_up(&mut tx, token.id, &robot, now).await? {
+            return Err(EnrolError::Used(token.id));
+        }
+        db::enrolments::revoke(&mut tx, (&token.site, &robot), "a new enrolment", now).await?;
+        let enrolment = Enrolment {
+            site: token.site,
+            robot,
+            number,
+            enrolled_at: now,
+            join_token: token.id,
+            renewed_at: now,
+            expires_at: certificate.expires_at,
+            revoked_at: None,
+            revoked_by: None,
+        };
+        db::enrolments::insert(&mut tx, &enrolment).await?;
+        let ended = self.end_outsider(&mut tx, &enrolment).await?;
+        tx.commit().await?;
+        self.show_alerts(&ended);
+        self.roll().note(&enrolment);
+        self.counters().robots_enrolled.one();
+        let (site, robot) = (&enrolment.site, &enrolment.robot);
+        tracing::info!(robot.id = %robot, "robot `{robot}` joined site `{site}`");
+        Ok(Enrolled {
+            certificate,
+            join_token: token.id,
+        })
+    }
+
+    /// A robot of the fleet gets its next certificate.
+    ///
+    /// # Errors
+    /// [`EnrolError`]; all but `Request`, `Closed` and `App` look the same from outside.
+    pub async fn renew_certificate(
+        &self,
+        request: &RenewCertificate,
+        proof: &[u8],
+    ) -> Result<RobotCertificate, EnrolError> {
+        let office = self.office().ok_or(EnrolError::Closed)?;
+        let key = RobotRequest::read(&request.certificate_request).map_err(EnrolError::Request)?;
+        let now = self.clock().now();
+        let present = office
+            .authority
+            .read_robot(&request.certificate, now)
+            .map_err(EnrolError::Certificate)?;
+        let proven = present.check_proof(&request.certificate_request, proof);
+        proven.map_err(EnrolError::Certificate)?;
+        let name = present.name();
+        let certificate = office.sign(&key, name, now)?;
+        let mut tx = self.db().write().await?;
+        let enrolment = (&name.site, &name.robot, name.enrolment);
+        if !db::enrolments::renew(&mut tx, enrolment, now, certificate.expires_at).await? {
+            drop(tx);
+            let key = (name.site.clone(), name.robot.clone());
+            self.note_outsider(&key).await;
+            return Err(EnrolError::Ended(name.clone()));
+        }
+        tx.commit().await?;
+        self.counters().certificates_renewed.one();
+        Ok(certificate)
+    }
+}
+
+impl Office {
+    fn sign(
+        &self,
+        key: &RobotRequest,
+        name: &RobotName,
+        now: Timestamp,
+    ) -> Result<RobotCertificate, EnrolError> {
+        let signed = self.authority.sign(key, name, now, self.lifetime);
+        let signed = signed.map_err(|cause| {
+            tracing::error!("cannot sign a certificate: {cause:?}");
+            EnrolError::App(AppError::NoRandomness(cause.to_string()))
+        })?;
+        Ok(RobotCertificate {
+            site: name.site.clone(),
+            robot: name.robot.clone(),
+            enrolment: name.enrolment,
+            certificate: signed.certificate,
+            authority: self.authority.certificate_pem().to_owned(),
+            lifetime_s: u64::try_from(self.lifetime.as_secs()).unwrap_or_default(),
+            expires_at: signed.expires_at,
+            port: self.port,
+        })
+    }
+}

@@ -1,0 +1,109 @@
+//! Robots that were put out of the fleet and go on trying: people are told, not too often.
+
+use std::collections::HashMap;
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use tread_api::enrolment::Enrolment;
+use tread_api::robot::{Alert, Severity};
+
+use super::roll::Standing;
+use crate::app::{App, AppError};
+use crate::db::{self, Tx};
+use crate::fleet::presence::RobotKey;
+
+/// What is raised about a robot that was put out and is still there.
+pub(in crate::app) const REVOKED_ALERT: &str = "revoked-robot";
+/// How often one robot is looked at, at the most.
+const NOTED_EVERY: Duration = Duration::from_mins(1);
+
+/// When each was noted last; no more than robots have ever joined.
+#[derive(Debug, Default)]
+pub(super) struct Outsiders(Mutex<HashMap<RobotKey, Duration>>);
+
+impl Outsiders {
+    fn is_due(&self, key: &RobotKey, now: Duration) -> bool {
+        let mut noted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let last = noted.get(key);
+        let is_due = last.is_none_or(|&last| now.saturating_sub(last) >= NOTED_EVERY);
+        if is_due {
+            noted.insert(key.clone(), now);
+        }
+        is_due
+    }
+
+    fn forget(&self, key: &RobotKey) {
+        let mut noted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        noted.remove(key);
+    }
+}
+
+impl App {
+    /// Whether a message of a robot counts; counts and tells of it if not.
+    pub async fn admits(&self, key: &RobotKey) -> bool {
+        if self.roll().may_speak(key) {
+            return true;
+        }
+        match self.roll().standing(key) {
+            Some(_) => {
+                self.counters().refused_revoked_robot.one();
+                self.note_outsider(key).await;
+            }
+            None => self.counters().refused_unenrolled_robot.one(),
+        }
+        false
+    }
+
+    /// Tells of a robot that was put out and is still there.
+    pub async fn note_outsider(&self, key: &RobotKey) {
+        let is_out = matches!(self.roll().standing(key), Some(Standing::Revoked(_)));
+        if !is_out {
+            return;
+        }
+        let outsiders = &self.membership().outsiders;
+        if !outsiders.is_due(key, self.clock().elapsed()) {
+            return;
+        }
+        let (site, robot) = key;
+        tracing::warn!(robot.id = %robot, "robot `{robot}` of site `{site}` was put out and still tries");
+        if let Err(error) = self.raise_outsider(key).await {
+            tracing::error!("cannot raise an alert about robot `{robot}`: {error:?}");
+        }
+    }
+
+    async fn raise_outsider(&self, key: &RobotKey) -> Result<(), AppError> {
+        let mut tx = self.db().write().await?;
+        let Some(robot_pk) = robot_pk(&mut tx, key).await? else {
+            return Ok(());
+        };
+        let text = "it was put out of the fleet and still tries to connect".to_owned();
+        let alert = (REVOKED_ALERT, Severity::Warning, text);
+        let raised = self.begin_alert(&mut tx, robot_pk, alert).await?;
+        tx.commit().await?;
+        self.show_alerts(raised.as_slice());
+        Ok(())
+    }
+
+    /// Ends the alert of a robot that has joined again.
+    pub(super) async fn end_outsider(
+        &self,
+        tx: &mut Tx,
+        enrolment: &Enrolment,
+    ) -> Result<Vec<Alert>, AppError> {
+        let key = (enrolment.site.clone(), enrolment.robot.clone());
+        self.membership().outsiders.forget(&key);
+        let Some(robot_pk) = robot_pk(tx, &key).await? else {
+            return Ok(Vec::new());
+        };
+        let ended = self.end_alert(tx, robot_pk, REVOKED_ALERT).await?;
+        Ok(ended.into_iter().collect())
+    }
+}
+
+async fn robot_pk(tx: &mut Tx, (site, robot): &RobotKey) -> Result<Option<i64>, AppError> {
+    let Some(site) = db::sites::find(tx, site).await? else {
+        return Ok(None);
+    };
+    let row = db::robots::find(tx, site.pk, robot).await?;
+    Ok(row.map(|row| row.pk))
+}

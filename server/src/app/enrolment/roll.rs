@@ -1,0 +1,158 @@
+//! Which robots are of the fleet, in memory: asked for every message and every connection.
+
+use std::collections::HashMap;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{PoisonError, RwLock};
+
+use tokio::sync::watch;
+use tread_api::enrolment::Enrolment;
+
+use crate::fleet::presence::RobotKey;
+
+/// What a robot's newest enrolment says of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Standing {
+    /// It is of the fleet by this enrolment.
+    Enrolled(u32),
+    /// It was put out of the fleet; the number is that of the enrolment that ended.
+    Revoked(u32),
+}
+
+impl Standing {
+    fn number(self) -> u32 {
+        match self {
+            Self::Enrolled(number) | Self::Revoked(number) => number,
+        }
+    }
+}
+
+/// All robots that have ever joined.
+#[derive(Debug)]
+pub struct Roll {
+    robots: RwLock<HashMap<RobotKey, Standing>>,
+    /// Whether only robots that have joined may speak.
+    is_closed: AtomicBool,
+    changes: watch::Sender<u64>,
+}
+
+impl Default for Roll {
+    fn default() -> Self {
+        Self {
+            robots: RwLock::default(),
+            is_closed: AtomicBool::new(false),
+            changes: watch::Sender::new(0),
+        }
+    }
+}
+
+impl Roll {
+    /// From now on only robots that have joined may speak.
+    pub(super) fn close(&self) {
+        self.is_closed.store(true, Ordering::Relaxed);
+    }
+
+    /// Takes in what the database says of a robot. What an earlier enrolment says comes too late.
+    pub(crate) fn note(&self, enrolment: &Enrolment) {
+        let standing = match enrolment.revoked_at {
+            None => Standing::Enrolled(enrolment.number),
+            Some(_) => Standing::Revoked(enrolment.number),
+        };
+        let key = (enrolment.site.clone(), enrolment.robot.clone());
+        let mut robots = self.robots.write().unwrap_or_else(PoisonError::into_inner);
+        let present = robots.get(&key).copied();
+        let is_late = present.is_some_and(|present| {
+            let ended = present == Standing::Revoked(enrolment.number);
+            present.number() > enrolment.number || ended
+        });
+        if !is_late {
+            robots.insert(key, standing);
+            drop(robots);
+            self.changes.send_modify(|count| *count += 1);
+        }
+    }
+
+    /// How a robot stands; `None` if it has never joined.
+    pub fn standing(&self, key: &RobotKey) -> Option<Standing> {
+        let robots = self.robots.read().unwrap_or_else(PoisonError::into_inner);
+        robots.get(key).copied()
+    }
+
+    /// Whether a robot may speak, by whatever link.
+    pub fn may_speak(&self, key: &RobotKey) -> bool {
+        match self.standing(key) {
+            Some(Standing::Enrolled(_)) => true,
+            Some(Standing::Revoked(_)) => false,
+            None => !self.is_closed.load(Ordering::Relaxed),
+        }
+    }
+
+    /// Whether a certificate of that enrolment still counts.
+    pub fn is_in_force(&self, key: &RobotKey, enrolment: u32) -> bool {
+        self.standing(key) == Some(Standing::Enrolled(enrolment))
+    }
+
+    /// Every robot that has ever joined.
+    pub fn robots(&self) -> Vec<RobotKey> {
+        let robots = self.robots.read().unwrap_or_else(PoisonError::into_inner);
+        robots.keys().cloned().collect()
+    }
+
+    /// Changes whenever a robot joins or is put out.
+    pub fn changes(&self) -> watch::Receiver<u64> {
+        self.changes.subscribe()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+    use tread_api::ids::JoinTokenId;
+
+    use super::*;
+
+    fn enrolment(number: u32, is_revoked: bool) -> Enrolment {
+        Enrolment {
+            site: "yard".parse().unwrap(),
+            robot: "rover-1".parse().unwrap(),
+            number,
+            enrolled_at: Timestamp::UNIX_EPOCH,
+            join_token: JoinTokenId::from_uuid(uuid::Uuid::nil()),
+            renewed_at: Timestamp::UNIX_EPOCH,
+            expires_at: Timestamp::MAX,
+            revoked_at: is_revoked.then_some(Timestamp::UNIX_EPOCH),
+            revoked_by: is_revoked.then(|| "test".to_owned()),
+        }
+    }
+
+    #[test]
+    fn whatever_the_order_of_the_news_the_newest_enrolment_counts_and_an_end_is_final() {
+        let key: RobotKey = ("yard".parse().unwrap(), "rover-1".parse().unwrap());
+        let news = [(1, false), (1, true), (2, false), (2, true)];
+        for first in 0..news.len() {
+            for turn in 0..news.len() {
+                let roll = Roll::default();
+                let mut order = news.to_vec();
+                order.rotate_left(turn);
+                order.swap(0, first);
+                for (number, is_revoked) in order {
+                    roll.note(&enrolment(number, is_revoked));
+                }
+                assert_eq!(roll.standing(&key), Some(Standing::Revoked(2)));
+                assert!(!roll.may_speak(&key));
+            }
+        }
+    }
+
+    #[test]
+    fn a_stranger_may_speak_until_the_roll_is_closed() {
+        let roll = Roll::default();
+        let key: RobotKey = ("yard".parse().unwrap(), "rover-1".parse().unwrap());
+        assert!(roll.may_speak(&key) && !roll.is_in_force(&key, 1));
+        roll.close();
+        assert!(!roll.may_speak(&key));
+        let changes = roll.changes();
+        roll.note(&enrolment(1, false));
+        assert!(changes.has_changed().unwrap());
+        assert!(roll.may_speak(&key) && roll.is_in_force(&key, 1) && !roll.is_in_force(&key, 2));
+    }
+}

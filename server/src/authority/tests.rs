@@ -1,0 +1,159 @@
+use proptest::prelude::*;
+
+use super::*;
+
+const DAY: SignedDuration = SignedDuration::from_hours(24);
+
+fn now() -> Timestamp {
+    "2026-11-02T10:00:00Z".parse().unwrap()
+}
+
+fn name(enrolment: u32) -> RobotName {
+    RobotName {
+        site: "yard".parse().unwrap(),
+        robot: "rover-1".parse().unwrap(),
+        enrolment,
+    }
+}
+
+fn request(key: &KeyPair) -> String {
+    let params = CertificateParams::default();
+    params.serialize_request(key).unwrap().pem().unwrap()
+}
+
+fn signed(authority: &Authority, key: &KeyPair) -> String {
+    let request = RobotRequest::read(&request(key)).unwrap();
+    let signed = authority.sign(&request, &name(3), now(), DAY).unwrap();
+    assert_eq!(signed.expires_at, now() + DAY);
+    signed.certificate
+}
+
+#[test]
+fn a_certificate_names_its_robot_and_no_request_can_change_that() {
+    let authority = Authority::generate("fleet", now()).unwrap();
+    let key = KeyPair::generate().unwrap();
+    let mut params = CertificateParams::new(vec!["e1.other.yard".to_owned()]).unwrap();
+    params.distinguished_name = named("e1.other.yard");
+    params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+    let greedy = params.serialize_request(&key).unwrap().pem().unwrap();
+    let request = RobotRequest::read(&greedy).unwrap();
+    let signed = authority.sign(&request, &name(3), now(), DAY).unwrap();
+    let present = authority.read_robot(&signed.certificate, now()).unwrap();
+    assert_eq!(*present.name(), name(3));
+    let (_, parsed) = X509Certificate::from_der(&present.certificate).unwrap();
+    assert!(!parsed.is_ca());
+}
+
+#[test]
+fn a_renewal_needs_the_present_key_and_a_certificate_of_this_authority() {
+    let authority = Authority::generate("fleet", now()).unwrap();
+    let (old, new) = (KeyPair::generate().unwrap(), KeyPair::generate().unwrap());
+    let (certificate, next) = (signed(&authority, &old), request(&new));
+    let present = authority.read_robot(&certificate, now()).unwrap();
+    let sign = |key: &KeyPair, message: &[u8]| rcgen::SigningKey::sign(key, message).unwrap();
+    let message = renewal_message(&next);
+    assert!(present.check_proof(&next, &sign(&old, &message)).is_ok());
+    for wrong in [
+        sign(&new, &message),
+        sign(&old, next.as_bytes()),
+        sign(&old, &renewal_message(&request(&old))),
+        Vec::new(),
+    ] {
+        let checked = present.check_proof(&next, &wrong);
+        assert!(matches!(checked, Err(CertificateError::Proof)));
+    }
+    let stranger = Authority::generate("fleet", now()).unwrap();
+    let foreign = stranger.read_robot(&certificate, now());
+    assert!(matches!(foreign, Err(CertificateError::Foreign)));
+}
+
+#[test]
+fn a_certificate_renews_for_a_while_after_its_end_and_then_no_more() {
+    let authority = Authority::generate("fleet", now()).unwrap();
+    let certificate = signed(&authority, &KeyPair::generate().unwrap());
+    let end = now() + DAY;
+    assert!(
+        authority
+            .read_robot(&certificate, end + RENEWAL_GRACE)
+            .is_ok()
+    );
+    let late = end + RENEWAL_GRACE + SignedDuration::from_secs(1);
+    let over = authority.read_robot(&certificate, late);
+    assert!(matches!(over, Err(CertificateError::Over)));
+    let before = authority.read_robot(&certificate, now() - DAY);
+    assert!(matches!(before, Err(CertificateError::Foreign)));
+}
+
+#[test]
+fn the_ports_own_certificate_does_not_count_as_a_robots() {
+    let authority = Authority::generate("fleet", now()).unwrap();
+    let port = authority.port_identity(&[], now()).unwrap();
+    assert!(named_in(&port.chain[0]).is_err());
+}
+
+#[test]
+fn requests_that_are_none_are_refused() {
+    for text in ["", "-----BEGIN CERTIFICATE REQUEST-----", "nonsense"] {
+        assert!(RobotRequest::read(text).is_err(), "`{text}`");
+    }
+    let mut bytes = request(&KeyPair::generate().unwrap()).into_bytes();
+    // Within the base64 of the signature, which stands last.
+    let at = bytes.len() - 60;
+    bytes[at] = if bytes[at] == b'A' { b'B' } else { b'A' };
+    let broken = String::from_utf8(bytes).unwrap();
+    assert!(RobotRequest::read(&broken).is_err());
+    let other = KeyPair::generate_for(&rcgen::PKCS_ED25519).unwrap();
+    let refused = RobotRequest::read(&request(&other));
+    assert!(matches!(refused, Err(CertificateError::Algorithm)));
+}
+
+#[test]
+fn the_authority_comes_back_from_its_folder_and_others_cannot_read_its_key() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path().join("authority");
+    let made = Authority::create(&folder, now()).unwrap();
+    let again = Authority::create(&folder, now());
+    assert!(matches!(again, Err(AuthorityError::Exists(_))));
+    let key = folder.join(KEY_FILE);
+    let rights = std::fs::metadata(&key).unwrap().permissions().mode();
+    assert_eq!(rights & 0o777, 0o600);
+    let certificate = signed(&made, &KeyPair::generate().unwrap());
+    let loaded = Authority::load(&folder).unwrap();
+    assert!(loaded.read_robot(&certificate, now()).is_ok());
+    let next = signed(&loaded, &KeyPair::generate().unwrap());
+    assert!(made.read_robot(&next, now()).is_ok());
+    std::fs::set_permissions(&key, std::fs::Permissions::from_mode(0o640)).unwrap();
+    assert!(matches!(
+        Authority::load(&folder),
+        Err(AuthorityError::Open(_))
+    ));
+    std::fs::remove_file(&key).unwrap();
+    let missing = Authority::load(&folder);
+    assert!(matches!(missing, Err(AuthorityError::Unreadable { .. })));
+    let other = KeyPair::generate().unwrap().serialize_pem();
+    std::fs::write(&key, other).unwrap();
+    std::fs::set_permissions(&key, std::fs::Permissions::from_mode(0o600)).unwrap();
+    assert!(matches!(
+        Authority::load(&folder),
+        Err(AuthorityError::Unusable { .. })
+    ));
+}
+
+proptest! {
+    #[test]
+    fn a_name_reads_back_as_what_it_was_and_nothing_else_reads(
+        site in "[a-z0-9-]{1,63}", robot in "[a-z0-9-]{1,63}", enrolment in 1_u32..,
+        other in "[a-z0-9.+-]{0,20}",
+    ) {
+        let name = RobotName {
+            site: site.parse().unwrap(),
+            robot: robot.parse().unwrap(),
+            enrolment,
+        };
+        prop_assert_eq!(RobotName::read(&name.text()), Some(name));
+        if let Some(read) = RobotName::read(&other) {
+            prop_assert_eq!(read.text(), other);
+        }
+    }
+}

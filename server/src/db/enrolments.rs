@@ -1,0 +1,179 @@
+//! Which robots have joined, and how often.
+
+use jiff::Timestamp;
+use sqlx::SqliteConnection;
+use tread_api::enrolment::Enrolment;
+use tread_api::ids::{RobotId, SiteId};
+
+use super::{DbError, from_us, parse, to_us};
+
+struct Raw {
+    site: String,
+    robot: String,
+    number: i64,
+    enrolled_at_us: i64,
+    join_token: String,
+    renewed_at_us: i64,
+    expires_at_us: i64,
+    revoked_at_us: Option<i64>,
+    revoked_by: Option<String>,
+}
+
+impl TryFrom<Raw> for Enrolment {
+    type Error = DbError;
+
+    fn try_from(raw: Raw) -> Result<Self, DbError> {
+        Ok(Self {
+            site: parse("site", &raw.site)?,
+            robot: parse("robot", &raw.robot)?,
+            number: u32::try_from(raw.number).map_err(|_| DbError::DoesNotFit("number"))?,
+            enrolled_at: from_us(raw.enrolled_at_us)?,
+            join_token: parse("join token", &raw.join_token)?,
+            renewed_at: from_us(raw.renewed_at_us)?,
+            expires_at: from_us(raw.expires_at_us)?,
+            revoked_at: raw.revoked_at_us.map(from_us).transpose()?,
+            revoked_by: raw.revoked_by,
+        })
+    }
+}
+
+macro_rules! enrolments {
+    ($condition:tt $(, $argument:expr)* $(,)?) => {
+        sqlx::query_as!(
+            Raw,
+            r#"SELECT site, robot, number, enrolled_at_us, join_token, renewed_at_us,
+                   expires_at_us, revoked_at_us, revoked_by
+               FROM enrolments "# + $condition
+            $(, $argument)*
+        )
+    };
+}
+
+/// The newest enrolment of every robot of all sites.
+pub async fn all_newest(db: &mut SqliteConnection) -> Result<Vec<Enrolment>, DbError> {
+    let raw = enrolments!(
+        "AS present WHERE number = (SELECT MAX(number) FROM enrolments AS other
+             WHERE other.site = present.site AND other.robot = present.robot)
+         ORDER BY site, robot"
+    )
+    .fetch_all(db)
+    .await?;
+    raw.into_iter().map(Enrolment::try_from).collect()
+}
+
+/// The newest enrolments of a site after a robot, by its name.
+pub async fn list(
+    db: &mut SqliteConnection,
+    site: &SiteId,
+    after: &str,
+    limit: u32,
+) -> Result<Vec<Enrolment>, DbError> {
+    let site = site.as_str();
+    let raw = enrolments!(
+        "AS present WHERE site = ?1 AND robot > ?2
+             AND number = (SELECT MAX(number) FROM enrolments AS other
+                 WHERE other.site = present.site AND other.robot = present.robot)
+         ORDER BY robot LIMIT ?3",
+        site,
+        after,
+        limit
+    )
+    .fetch_all(db)
+    .await?;
+    raw.into_iter().map(Enrolment::try_from).collect()
+}
+
+/// A robot's newest enrolment.
+pub async fn newest(
+    db: &mut SqliteConnection,
+    site: &SiteId,
+    robot: &RobotId,
+) -> Result<Option<Enrolment>, DbError> {
+    let (site, robot) = (site.as_str(), robot.as_str());
+    let raw = enrolments!(
+        "WHERE site = ? AND robot = ? ORDER BY number DESC LIMIT 1",
+        site,
+        robot
+    )
+    .fetch_optional(db)
+    .await?;
+    raw.map(Enrolment::try_from).transpose()
+}
+
+/// How many robots have ever joined.
+pub async fn robot_count(db: &mut SqliteConnection) -> Result<i64, DbError> {
+    let row = sqlx::query!(
+        r#"SELECT COUNT(*) AS "count!: i64" FROM (SELECT DISTINCT site, robot FROM enrolments)"#
+    )
+    .fetch_one(db)
+    .await?;
+    Ok(row.count)
+}
+
+/// Writes an enrolment down.
+pub async fn insert(db: &mut SqliteConnection, enrolment: &Enrolment) -> Result<(), DbError> {
+    let (site, robot) = (enrolment.site.as_str(), enrolment.robot.as_str());
+    let join_token = enrolment.join_token.to_string();
+    let enrolled_at_us = to_us(enrolment.enrolled_at);
+    let renewed_at_us = to_us(enrolment.renewed_at);
+    let expires_at_us = to_us(enrolment.expires_at);
+    sqlx::query!(
+        "INSERT INTO enrolments (site, robot, number, enrolled_at_us, join_token, renewed_at_us,
+             expires_at_us)
+         VALUES (?, ?, ?, ?, ?, ?, ?)",
+        site,
+        robot,
+        enrolment.number,
+        enrolled_at_us,
+        join_token,
+        renewed_at_us,
+        expires_at_us,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Notes a renewal of an enrolment that is in force; false if it no longer is.
+pub async fn renew(
+    db: &mut SqliteConnection,
+    (site, robot, number): (&SiteId, &RobotId, u32),
+    at: Timestamp,
+    expires_at: Timestamp,
+) -> Result<bool, DbError> {
+    let (site, robot) = (site.as_str(), robot.as_str());
+    let (at_us, expires_at_us) = (to_us(at), to_us(expires_at));
+    let done = sqlx::query!(
+        "UPDATE enrolments SET renewed_at_us = ?, expires_at_us = ?
+         WHERE site = ? AND robot = ? AND number = ? AND revoked_at_us IS NULL",
+        at_us,
+        expires_at_us,
+        site,
+        robot,
+        number
+    )
+    .execute(db)
+    .await?;
+    Ok(done.rows_affected() == 1)
+}
+
+/// Ends the enrolment that is in force, if one is.
+pub async fn revoke(
+    db: &mut SqliteConnection,
+    (site, robot): (&SiteId, &RobotId),
+    by: &str,
+    at: Timestamp,
+) -> Result<(), DbError> {
+    let (site, robot, at_us) = (site.as_str(), robot.as_str(), to_us(at));
+    sqlx::query!(
+        "UPDATE enrolments SET revoked_at_us = ?, revoked_by = ?
+         WHERE site = ? AND robot = ? AND revoked_at_us IS NULL",
+        at_us,
+        by,
+        site,
+        robot
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}

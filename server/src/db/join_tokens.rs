@@ -1,0 +1,206 @@
+//! Tokens by which robots join. What is kept of a secret is its hash.
+
+use jiff::Timestamp;
+use sqlx::SqliteConnection;
+use tread_api::enrolment::JoinToken;
+use tread_api::ids::{JoinTokenId, RobotId};
+
+use super::{DbError, from_us, parse, to_us};
+use crate::identity::secret::Fingerprint;
+
+struct Raw {
+    id: String,
+    site: String,
+    robot: Option<String>,
+    created_at_us: i64,
+    created_by: String,
+    expires_at_us: i64,
+    used_at_us: Option<i64>,
+    used_by: Option<String>,
+    revoked_at_us: Option<i64>,
+}
+
+fn robot(name: Option<String>) -> Result<Option<RobotId>, DbError> {
+    name.map(|name| parse("robot", &name)).transpose()
+}
+
+impl TryFrom<Raw> for JoinToken {
+    type Error = DbError;
+
+    fn try_from(raw: Raw) -> Result<Self, DbError> {
+        Ok(Self {
+            id: parse("join token", &raw.id)?,
+            site: parse("site", &raw.site)?,
+            robot: robot(raw.robot)?,
+            created_at: from_us(raw.created_at_us)?,
+            created_by: raw.created_by,
+            expires_at: from_us(raw.expires_at_us)?,
+            used_at: raw.used_at_us.map(from_us).transpose()?,
+            used_by: robot(raw.used_by)?,
+            revoked_at: raw.revoked_at_us.map(from_us).transpose()?,
+        })
+    }
+}
+
+macro_rules! join_tokens {
+    ($condition:tt $(, $argument:expr)* $(,)?) => {
+        sqlx::query_as!(
+            Raw,
+            r#"SELECT id, site, robot, created_at_us, created_by, expires_at_us, used_at_us,
+                   used_by, revoked_at_us
+               FROM join_tokens "# + $condition
+            $(, $argument)*
+        )
+    };
+}
+
+/// Join tokens older than one, newest first; dead ones too.
+pub async fn list(
+    db: &mut SqliteConnection,
+    before: Option<JoinTokenId>,
+    limit: u32,
+) -> Result<Vec<JoinToken>, DbError> {
+    let before = before.map(|id| id.to_string());
+    let raw = join_tokens!(
+        "WHERE (?1 IS NULL OR id < ?1) ORDER BY id DESC LIMIT ?2",
+        before,
+        limit
+    )
+    .fetch_all(db)
+    .await?;
+    raw.into_iter().map(JoinToken::try_from).collect()
+}
+
+/// The join token of that identifier.
+pub async fn find(
+    db: &mut SqliteConnection,
+    id: JoinTokenId,
+) -> Result<Option<JoinToken>, DbError> {
+    let id = id.to_string();
+    let raw = join_tokens!("WHERE id = ?", id).fetch_optional(db).await?;
+    raw.map(JoinToken::try_from).transpose()
+}
+
+/// How many could be used at a time.
+pub async fn valid_count(db: &mut SqliteConnection, at: Timestamp) -> Result<i64, DbError> {
+    let at_us = to_us(at);
+    let row = sqlx::query!(
+        r#"SELECT COUNT(*) AS "count!: i64" FROM join_tokens
+           WHERE used_at_us IS NULL AND revoked_at_us IS NULL AND expires_at_us > ?"#,
+        at_us
+    )
+    .fetch_one(db)
+    .await?;
+    Ok(row.count)
+}
+
+/// Keeps a new join token.
+pub async fn insert(
+    db: &mut SqliteConnection,
+    token: &JoinToken,
+    fingerprint: &Fingerprint,
+) -> Result<(), DbError> {
+    let (id, site) = (token.id.to_string(), token.site.as_str());
+    let robot = token.robot.as_ref().map(RobotId::as_str);
+    let (lookup, hash) = (fingerprint.lookup(), fingerprint.as_bytes());
+    let (created_at_us, expires_at_us) = (to_us(token.created_at), to_us(token.expires_at));
+    sqlx::query!(
+        "INSERT INTO join_tokens (id, site, robot, lookup, hash, created_at_us, created_by,
+             expires_at_us)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+        id,
+        site,
+        robot,
+        lookup,
+        hash,
+        created_at_us,
+        token.created_by,
+        expires_at_us,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Uses a join token up; false if it was used before.
+pub async fn use_up(
+    db: &mut SqliteConnection,
+    id: JoinTokenId,
+    by: &RobotId,
+    at: Timestamp,
+) -> Result<bool, DbError> {
+    let (id, by, at_us) = (id.to_string(), by.as_str(), to_us(at));
+    let done = sqlx::query!(
+        "UPDATE join_tokens SET used_at_us = ?, used_by = ?
+         WHERE id = ? AND used_at_us IS NULL AND revoked_at_us IS NULL",
+        at_us,
+        by,
+        id
+    )
+    .execute(db)
+    .await?;
+    Ok(done.rows_affected() == 1)
+}
+
+/// Revokes a join token; a first time counts.
+pub async fn revoke(
+    db: &mut SqliteConnection,
+    id: JoinTokenId,
+    at: Timestamp,
+) -> Result<(), DbError> {
+    let (id, at_us) = (id.to_string(), to_us(at));
+    sqlx::query!(
+        "UPDATE join_tokens SET revoked_at_us = COALESCE(revoked_at_us, ?) WHERE id = ?",
+        at_us,
+        id
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Forgets join tokens that were over before a time, at most `limit`.
+pub async fn forget_dead(
+    db: &mut SqliteConnection,
+    before: Timestamp,
+    limit: u32,
+) -> Result<(), DbError> {
+    let before_us = to_us(before);
+    sqlx::query!(
+        "DELETE FROM join_tokens WHERE id IN (
+             SELECT id FROM join_tokens WHERE expires_at_us < ? ORDER BY id LIMIT ?)",
+        before_us,
+        limit
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// What is kept of a secret, with what it opens.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Kept {
+    /// The hash of the secret.
+    pub hash: Vec<u8>,
+    /// The join token.
+    pub token: JoinToken,
+}
+
+/// The join token whose hash begins like this one.
+pub async fn by_lookup(
+    db: &mut SqliteConnection,
+    fingerprint: &Fingerprint,
+) -> Result<Option<Kept>, DbError> {
+    let lookup = fingerprint.lookup();
+    let row = sqlx::query!("SELECT id, hash FROM join_tokens WHERE lookup = ?", lookup)
+        .fetch_optional(&mut *db)
+        .await?;
+    let Some(row) = row else {
+        return Ok(None);
+    };
+    let token = find(db, parse("join token", &row.id)?).await?;
+    Ok(token.map(|token| Kept {
+        hash: row.hash,
+        token,
+    }))
+}

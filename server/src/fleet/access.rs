@@ -1,0 +1,130 @@
+//! The access control of a router, made from the table of what robots do with which keys.
+//!
+//! A robot is who its certificate says. It may do with its own keys what the table says, hear
+//! what is for all robots of its site, and nothing else. Zenoh's rules match a message if their
+//! expression includes the message's key; so the server's own wildcards are let out to all, or
+//! else a robot would not know that somebody wants what it publishes, and would not send it.
+
+use serde_json::{Value, json};
+use tread_api::access::{Act, Owner, ROBOT_KEYS, RobotKeys};
+use tread_api::ids::{RobotId, SiteId};
+
+use super::presence::RobotKey;
+use super::router::PROBE_KEY;
+
+/// The name in the certificate of the server's own look at its router. No robot's has no dot.
+pub(super) const PROBE_NAME: &str = "tread-probe";
+
+/// The name of a robot in the certificate that the gate shows to the router.
+pub(super) fn name_of((site, robot): &RobotKey) -> String {
+    format!("{robot}.{site}")
+}
+
+/// What is let in from a robot and out to it for one act, by zenoh's names.
+const fn messages(act: Act) -> (&'static [&'static str], &'static [&'static str]) {
+    match act {
+        Act::Publish => (&["put"], &[]),
+        Act::Listen => (&["declare_subscriber"], &["put"]),
+        Act::Answer => (&["declare_queryable", "reply"], &["query"]),
+        Act::Ask => (&["query"], &["reply"]),
+        Act::Announce => (&["liveliness_token"], &[]),
+    }
+}
+
+/// What is let out to everybody: that the server listens, and answers.
+const fn announcements(act: Act) -> &'static [&'static str] {
+    match act {
+        Act::Publish => &["declare_subscriber"],
+        Act::Ask => &["declare_queryable"],
+        Act::Listen | Act::Answer | Act::Announce => &[],
+    }
+}
+
+/// Rules as they are collected.
+#[derive(Default)]
+struct Rules {
+    rules: Vec<Value>,
+    ids: Vec<String>,
+}
+
+impl Rules {
+    fn add(&mut self, flow: &str, messages: &[&str], keys: &[String]) {
+        if messages.is_empty() || keys.is_empty() {
+            return;
+        }
+        let id = format!("r{}", self.rules.len());
+        self.rules.push(json!({
+            "id": id, "permission": "allow", "flows": [flow],
+            "messages": messages, "key_exprs": keys,
+        }));
+        self.ids.push(id);
+    }
+
+    /// The rules of one act on several keys.
+    fn add_act(&mut self, act: Act, keys: &[String]) {
+        let (inward, outward) = messages(act);
+        self.add("ingress", inward, keys);
+        self.add("egress", outward, keys);
+    }
+
+    /// The rules since the last time.
+    fn take_ids(&mut self) -> Vec<String> {
+        std::mem::take(&mut self.ids)
+    }
+}
+
+/// The rules for these robots, as zenoh's configuration has them.
+pub(super) fn control(robots: &[RobotKey]) -> Value {
+    let mut rules = Rules::default();
+    let (mut subjects, mut policies) = (Vec::new(), Vec::new());
+    for act in Act::ALL {
+        let keys = |row: &RobotKeys| (row.act == act).then(|| row.of_all());
+        let keys: Vec<String> = ROBOT_KEYS.iter().filter_map(keys).collect();
+        rules.add("egress", announcements(act), &keys);
+    }
+    let for_all = rules.take_ids();
+    let mut sites: Vec<&SiteId> = robots.iter().map(|(site, _robot)| site).collect();
+    sites.sort();
+    sites.dedup();
+    for site in sites {
+        let keys = |act| own_keys(Owner::Site, act, site, None);
+        for act in Act::ALL {
+            rules.add_act(act, &keys(act));
+        }
+        let mut of_site = rules.take_ids();
+        of_site.extend(for_all.iter().cloned());
+        let mut members = Vec::new();
+        for key in robots.iter().filter(|(of, _robot)| of == site) {
+            let name = name_of(key);
+            for act in Act::ALL {
+                rules.add_act(act, &own_keys(Owner::Robot, act, site, Some(&key.1)));
+            }
+            subjects.push(json!({"id": name, "cert_common_names": [name]}));
+            policies.push(json!({"rules": rules.take_ids(), "subjects": [name]}));
+            members.push(name);
+        }
+        policies.push(json!({"rules": of_site, "subjects": members}));
+    }
+    let probe = [PROBE_KEY.to_owned()];
+    rules.add("ingress", &["query"], &probe);
+    rules.add("egress", &["reply", "declare_queryable"], &probe);
+    subjects.push(json!({"id": PROBE_NAME, "cert_common_names": [PROBE_NAME]}));
+    policies.push(json!({"rules": rules.take_ids(), "subjects": [PROBE_NAME]}));
+    json!({
+        "enabled": true,
+        "default_permission": "deny",
+        "rules": rules.rules,
+        "subjects": subjects,
+        "policies": policies,
+    })
+}
+
+fn own_keys(owner: Owner, act: Act, site: &SiteId, robot: Option<&RobotId>) -> Vec<String> {
+    let rows = ROBOT_KEYS.iter();
+    let rows = rows.filter(|row| row.owner == owner && row.act == act);
+    rows.map(|row| match robot {
+        Some(robot) => row.expression(site, robot),
+        None => format!("{}/{site}/{}", tread_api::keys::ROOT, row.pattern),
+    })
+    .collect()
+}

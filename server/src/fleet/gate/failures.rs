@@ -1,0 +1,121 @@
+//! How often connections from one address have failed, and when that is too often.
+//!
+//! Each address may fail some times at once and slowly for ever; above that its connections are
+//! refused before anything is read of them. Only failures count, so that a whole fleet behind one
+//! address may come back at once; and they must be many, so that a stranger behind the same
+//! address does not lock it out with little effort.
+
+use std::collections::HashMap;
+use std::net::IpAddr;
+use std::time::Duration;
+
+/// Failures that an address may have at once.
+const BURST: f64 = 200.0;
+/// Failures that an address may have per second over longer times.
+const RATE_HZ: f64 = 20.0;
+/// Addresses that are remembered.
+const ADDRESSES_MAX: usize = 4_096;
+
+#[derive(Debug, Clone, Copy)]
+struct Bucket {
+    /// Failures that count still.
+    count: f64,
+    counted_at: Duration,
+}
+
+impl Bucket {
+    fn at(self, now: Duration) -> f64 {
+        let passed_s = now.saturating_sub(self.counted_at).as_secs_f64();
+        (self.count - passed_s * RATE_HZ).max(0.0)
+    }
+}
+
+/// What is remembered of failures. Those from this machine do not count: whoever is on it has
+/// other means.
+#[derive(Debug, Default)]
+pub(super) struct Failures(HashMap<IpAddr, Bucket>);
+
+impl Failures {
+    /// Whether an address has failed too often.
+    pub(super) fn is_blocked(&self, address: IpAddr, now: Duration) -> bool {
+        let bucket = self.0.get(&address.to_canonical());
+        bucket.is_some_and(|bucket| bucket.at(now) + 1.0 > BURST)
+    }
+
+    /// A connection from an address has failed.
+    pub(super) fn failed(&mut self, address: IpAddr, now: Duration) {
+        let address = address.to_canonical();
+        if address.is_loopback() {
+            return;
+        }
+        if !self.0.contains_key(&address) && self.0.len() >= ADDRESSES_MAX {
+            self.0.retain(|_, bucket| bucket.at(now) > 0.0);
+            if self.0.len() >= ADDRESSES_MAX {
+                // So many at once are no neighbours with a bad cable; the bounds on open
+                // connections hold against them.
+                return;
+            }
+        }
+        let count = self.0.get(&address).map_or(0.0, |bucket| bucket.at(now));
+        let bucket = Bucket {
+            count: (count + 1.0).min(BURST),
+            counted_at: now,
+        };
+        self.0.insert(address, bucket);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn seconds(seconds: u64) -> Duration {
+        Duration::from_secs(seconds)
+    }
+
+    fn address(last: u8) -> IpAddr {
+        [192, 0, 2, last].into()
+    }
+
+    #[test]
+    fn who_fails_too_often_is_blocked_for_a_while_and_nobody_else() {
+        let mut failures = Failures::default();
+        for _ in 0..1_000 {
+            failures.failed(address(1), seconds(1));
+            failures.failed([127, 0, 0, 1].into(), seconds(1));
+        }
+        assert!(failures.is_blocked(address(1), seconds(1)));
+        assert!(!failures.is_blocked(address(1), seconds(2)));
+        assert!(!failures.is_blocked(address(2), seconds(1)));
+        assert!(!failures.is_blocked([127, 0, 0, 1].into(), seconds(1)));
+    }
+
+    #[test]
+    fn what_is_remembered_is_bounded() {
+        let mut failures = Failures::default();
+        for number in 0..20_000_u32 {
+            failures.failed(IpAddr::V4(number.into()), seconds(1));
+        }
+        assert_eq!(failures.0.len(), ADDRESSES_MAX);
+    }
+
+    proptest! {
+        #[test]
+        fn over_a_long_time_no_more_failures_pass_than_allowed(gaps_ms in prop::collection::vec(0_u64..40, 1..2_000)) {
+            let mut failures = Failures::default();
+            let (mut now_ms, mut passed) = (0, 0.0);
+            for gap_ms in gaps_ms {
+                now_ms += gap_ms;
+                let now = Duration::from_millis(now_ms);
+                if !failures.is_blocked(address(1), now) {
+                    failures.failed(address(1), now);
+                    passed += 1.0;
+                }
+            }
+            let allowed = BURST + RATE_HZ * Duration::from_millis(now_ms).as_secs_f64();
+            prop_assert!(passed <= allowed + 1e-6, "{passed} of {allowed}");
+        }
+    }
+}

@@ -1,0 +1,235 @@
+//! The gate: robots' TLS port.
+//!
+//! ```text
+//!  connection ─► its address failed too often? ─► refused
+//!     │ too many open? ─► displaces one without a handshake, or is refused
+//!     │ begins like TLS? ─no─► closed
+//!     │ handshake with a certificate of the fleet's authority, in time? ─no─► closed
+//!     │ the certificate's enrolment in force? ─no─► closed, and people are told
+//!     ▼
+//!  joined to the router, as the robot that the certificate names, until either side ends, the
+//!  certificate is over, or the robot is put out of the fleet
+//! ```
+//!
+//! zenoh's own TLS listener sleeps for 0.1 s after each failed handshake, during which it takes
+//! nobody: twenty garbage connections a second lock every robot out. It also does not tell who
+//! failed, reads its certificate once, and cannot end one robot's link. So TLS ends here, many
+//! handshakes at a time, and a router sees connections that have been checked.
+
+mod failures;
+mod link;
+
+use std::net::{IpAddr, SocketAddr};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use jiff::{SignedDuration, Timestamp};
+use rustls::server::WebPkiClientVerifier;
+use rustls::{RootCertStore, ServerConfig};
+use tokio::net::{TcpListener, TcpSocket};
+use tokio_rustls::TlsAcceptor;
+use tokio_util::sync::CancellationToken;
+use tracing::{error, warn};
+
+use self::failures::Failures;
+use self::link::Link;
+use super::opening::Inside;
+use super::routers::Routers;
+use super::{FleetError, SEND_BUFFER_BYTES, SESSIONS_MAX, Security};
+use crate::app::App;
+use crate::authority::PORT_LASTS;
+use crate::clock::Clock;
+use crate::connections::{Bounds, Connections};
+use crate::supervisor::Supervisor;
+
+/// The bounds of the robots' port. A robot that has shown its certificate counts as at work, and
+/// is never displaced.
+const BOUNDS: Bounds = Bounds {
+    all: SESSIONS_MAX as usize,
+    per_address: 4_096,
+    unproven: 1_024,
+    unproven_per_address: 256,
+};
+/// Connections that the system may keep until they are accepted.
+const BACKLOG: u32 = 1_024;
+/// Rest after the machine refused a connection, such as for want of file handles.
+const ACCEPT_REST: Duration = Duration::from_millis(100);
+
+/// The robots' port, open.
+#[derive(Debug)]
+pub(super) struct Gate {
+    listener: TcpListener,
+    address: SocketAddr,
+    door: Door,
+    inside: Arc<Inside>,
+}
+
+/// What the port shows.
+struct Door {
+    security: Security,
+    clock: Clock,
+    present: Mutex<Present>,
+}
+
+struct Present {
+    config: Arc<ServerConfig>,
+    made_at: Timestamp,
+}
+
+impl std::fmt::Debug for Door {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.debug_struct("Door").finish_non_exhaustive()
+    }
+}
+
+impl Door {
+    fn new(security: Security, clock: Clock) -> anyhow::Result<Self> {
+        let made_at = clock.now();
+        let config = Arc::new(server_config(&security, made_at)?);
+        Ok(Self {
+            security,
+            clock,
+            present: Mutex::new(Present { config, made_at }),
+        })
+    }
+
+    /// What makes TLS of a connection; the certificate is made anew in time.
+    fn acceptor(&self) -> TlsAcceptor {
+        let now = self.clock.now();
+        let mut present = self.present.lock().unwrap_or_else(PoisonError::into_inner);
+        let age = now.duration_since(present.made_at);
+        if age > PORT_LASTS / 3 || age < SignedDuration::ZERO {
+            match server_config(&self.security, now) {
+                Ok(config) => {
+                    *present = Present {
+                        config: Arc::new(config),
+                        made_at: now,
+                    };
+                }
+                Err(failed) => error!("the robots' port keeps its certificate: {failed:#}"),
+            }
+        }
+        TlsAcceptor::from(Arc::clone(&present.config))
+    }
+}
+
+fn server_config(security: &Security, now: Timestamp) -> anyhow::Result<ServerConfig> {
+    let identity = security.authority.port_identity(&security.names, now)?;
+    let mut roots = RootCertStore::empty();
+    roots.add(security.authority.certificate().clone())?;
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let verifier =
+        WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&provider))
+            .build()?;
+    let config = ServerConfig::builder_with_provider(provider)
+        .with_protocol_versions(&[&rustls::version::TLS13])?
+        .with_client_cert_verifier(verifier)
+        .with_single_cert(identity.chain, identity.key)?;
+    Ok(config)
+}
+
+impl Gate {
+    /// Takes the port.
+    ///
+    /// # Errors
+    /// It is in use, or the certificates cannot be used.
+    pub(super) fn open(
+        address: SocketAddr,
+        security: Security,
+        clock: Clock,
+        inside: Arc<Inside>,
+    ) -> Result<Self, FleetError> {
+        let door = Door::new(security, clock).map_err(FleetError::Certificates)?;
+        let listener = listen(address).map_err(|cause| FleetError::InUse { address, cause })?;
+        let address = listener
+            .local_addr()
+            .map_err(|cause| FleetError::InUse { address, cause })?;
+        Ok(Self {
+            listener,
+            address,
+            door,
+            inside,
+        })
+    }
+
+    /// Where it is.
+    pub(super) fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Lets robots in until the stop.
+    pub(super) async fn run(
+        self,
+        app: App,
+        routers: Arc<Routers>,
+        supervisor: Supervisor,
+        stop: CancellationToken,
+    ) {
+        let connections = Connections::new(BOUNDS);
+        let failures = Arc::new(Mutex::new(Failures::default()));
+        loop {
+            let accepted = tokio::select! {
+                biased;
+                () = stop.cancelled() => return,
+                accepted = self.listener.accept() => accepted,
+            };
+            let (stream, peer) = match accepted {
+                Ok(accepted) => accepted,
+                Err(error) => {
+                    warn!("cannot accept a robot's connection: {error}");
+                    tokio::time::sleep(ACCEPT_REST).await;
+                    continue;
+                }
+            };
+            let counters = app.counters();
+            counters.gate_connections.one();
+            if is_blocked(&failures, peer.ip(), app.clock().elapsed()) {
+                counters.gate_rate_limited.one();
+                continue;
+            }
+            let cut = CancellationToken::new();
+            let Some(admitted) = connections.admit(peer.ip(), cut.clone()) else {
+                counters.gate_full.one();
+                continue;
+            };
+            let displaced = u64::try_from(admitted.displaced).unwrap_or_default();
+            counters.gate_displaced.add(displaced);
+            let link = Link {
+                app: app.clone(),
+                peer,
+                slot: admitted.slot,
+                acceptor: self.door.acceptor(),
+                inside: Arc::clone(&self.inside),
+                routers: Arc::clone(&routers),
+                failures: Arc::clone(&failures),
+            };
+            let stop = stop.clone();
+            supervisor.spawn_passing("robot's link", async move {
+                tokio::select! {
+                    () = link.serve(stream) => {}
+                    () = cut.cancelled() => {}
+                    () = stop.cancelled() => {}
+                }
+            });
+        }
+    }
+}
+
+fn is_blocked(failures: &Mutex<Failures>, address: IpAddr, now: Duration) -> bool {
+    let failures = failures.lock().unwrap_or_else(PoisonError::into_inner);
+    failures.is_blocked(address, now)
+}
+
+/// Listens with a small send buffer: what stands in it has lost its priority.
+fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
+    let socket = if address.is_ipv4() {
+        TcpSocket::new_v4()?
+    } else {
+        TcpSocket::new_v6()?
+    };
+    // A server that starts again may find connections of its former self.
+    socket.set_reuseaddr(true)?;
+    socket.set_send_buffer_size(SEND_BUFFER_BYTES)?;
+    socket.bind(address)?;
+    socket.listen(BACKLOG)
+}

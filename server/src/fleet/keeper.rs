@@ -1,0 +1,129 @@
+//! Keeps a router open that knows every robot of the fleet, and closes those that nobody needs.
+//!
+//! ```text
+//!  a robot joins ─► a new router beside the others ─► robots come to it as they reconnect
+//!                                                      (each at the latest when it renews)
+//!  an older router without robots ─► closed
+//!  too many routers ─► the older one with the fewest robots is closed; they reconnect at once
+//! ```
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::Mutex;
+use tokio_util::sync::CancellationToken;
+use tracing::{error, info};
+use zenoh::Wait as _;
+
+use super::inbox::Channels;
+use super::opening::{self, Opener};
+use super::presence::RobotKey;
+use super::routers::{Router, Routers};
+use crate::app::App;
+
+/// Most routers at a time.
+const ROUTERS_MAX: usize = 4;
+/// Time between two looks for routers that nobody needs.
+const LOOK_EVERY: Duration = Duration::from_secs(5);
+
+/// What opening, replacing and closing routers works on.
+#[derive(Debug)]
+pub(super) struct Keeper {
+    pub(super) app: App,
+    pub(super) routers: Arc<Routers>,
+    pub(super) opener: Opener,
+    pub(super) channels: Channels,
+    /// One change at a time.
+    pub(super) turn: Mutex<()>,
+}
+
+impl Keeper {
+    /// Opens a router for all robots of the fleet, beside those that are open.
+    ///
+    /// # Errors
+    /// [`super::FleetError`].
+    pub(super) async fn open(&self) -> Result<(), super::FleetError> {
+        let robots = self.app.roll().robots();
+        let router = self.opener.open(robots).await?;
+        if let Err(failed) = self.opener.declare(&router, &self.channels).await {
+            opening::close(router.session.clone()).await;
+            return Err(failed);
+        }
+        self.routers.add(router);
+        Ok(())
+    }
+
+    /// Closes a router; its robots come back to another.
+    pub(super) async fn close(&self, number: u64) {
+        if let Some(router) = self.routers.remove(number) {
+            opening::close(router.session.clone()).await;
+            self.channels.router_closed(number);
+        }
+    }
+
+    /// Keeps the routers in order until the stop.
+    pub(super) async fn run(self: Arc<Self>, stop: CancellationToken) {
+        let mut joined = self.app.roll().changes();
+        loop {
+            joined.mark_unchanged();
+            {
+                let _turn = self.turn.lock().await;
+                self.let_everybody_in().await;
+                self.close_idle().await;
+            }
+            tokio::select! {
+                biased;
+                () = stop.cancelled() => return,
+                _ = joined.changed() => {}
+                () = tokio::time::sleep(LOOK_EVERY) => {}
+            }
+        }
+    }
+
+    async fn let_everybody_in(&self) {
+        let newest = self.routers.newest();
+        let knows = |robot: &RobotKey| {
+            let newest = newest.as_ref();
+            newest.is_some_and(|newest| newest.robots.contains(robot))
+        };
+        if self.app.roll().robots().iter().all(knows) {
+            return;
+        }
+        match self.open().await {
+            Ok(()) => {
+                self.app.counters().routers_opened.one();
+                info!("another zenoh router was opened, for the robots that joined");
+            }
+            // The next look tries again.
+            Err(failed) => error!("cannot open a router for the robots that joined: {failed}"),
+        }
+    }
+
+    async fn close_idle(&self) {
+        let all = self.routers.all();
+        let Some((_newest, older)) = all.split_last() else {
+            return;
+        };
+        let mut left = all.len();
+        let mut counted = Vec::new();
+        for router in older {
+            counted.push((robots_on(router).await, router.number));
+        }
+        counted.sort_unstable();
+        for (robot_count, number) in counted {
+            if robot_count > 0 && left <= ROUTERS_MAX {
+                break;
+            }
+            self.close(number).await;
+            left -= 1;
+            info!("an older zenoh router with {robot_count} robots was closed");
+        }
+    }
+}
+
+/// How many sessions a router has.
+async fn robots_on(router: &Arc<Router>) -> usize {
+    let session = router.session.clone();
+    let counting = tokio::task::spawn_blocking(move || session.info().transports().wait().count());
+    counting.await.unwrap_or(0)
+}

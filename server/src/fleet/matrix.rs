@@ -1,0 +1,462 @@
+//! Every key of robots × every certificate × everything that can be done with a key, over real
+//! zenoh through the gate. The keys come from the table in `tread_api::access`: a new one is in
+//! here without a word.
+//!
+//! What is not to arrive is never waited for: whoever did it says something afterwards, over the
+//! same link, that does arrive.
+
+use std::collections::BTreeMap;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
+use jiff::{SignedDuration, Timestamp};
+use rcgen::{CertificateParams, KeyPair};
+use tokio::sync::mpsc;
+use tread_api::access::{Act, Owner, ROBOT_KEYS, RobotKeys};
+use tread_api::enrolment::Enrolment;
+use tread_api::ids::{JoinTokenId, RobotId, SiteId};
+use tread_api::keys;
+use zenoh::qos::CongestionControl;
+use zenoh::query::{ConsolidationMode, QueryTarget};
+use zenoh::{Config, Session, Wait as _};
+
+use super::{Fleet, Security};
+use crate::app::App;
+use crate::app::enrolment::Office;
+use crate::authority::{Authority, RobotName, RobotRequest};
+use crate::clock::Clock;
+use crate::config::FrictionConfig;
+use crate::db::Db;
+use crate::supervisor::Supervisor;
+
+const PATIENCE: Duration = Duration::from_secs(20);
+const HOUR: SignedDuration = SignedDuration::from_hours(1);
+
+/// Who does something with the keys of `rover-1`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Who {
+    /// Its own certificate.
+    Own,
+    /// Another robot's of the same site.
+    Foreign,
+    /// Its own, of an enrolment that was followed by another.
+    Former,
+    /// A robot's that was put out.
+    Revoked,
+    /// One of the same name by another authority.
+    Stranger,
+    /// One whose time is over.
+    Expired,
+    /// None.
+    Nobody,
+}
+
+const REFUSED: [Who; 5] = [
+    Who::Former,
+    Who::Revoked,
+    Who::Stranger,
+    Who::Expired,
+    Who::Nobody,
+];
+
+/// What was done, by whom, and on which key.
+type Cell = (&'static str, Act, Who);
+
+fn site() -> SiteId {
+    "yard".parse().unwrap()
+}
+
+fn robot(name: &str) -> RobotId {
+    name.parse().unwrap()
+}
+
+fn enrolment(name: &str, number: u32, is_revoked: bool) -> Enrolment {
+    Enrolment {
+        site: site(),
+        robot: robot(name),
+        number,
+        enrolled_at: Timestamp::UNIX_EPOCH,
+        join_token: JoinTokenId::from_uuid(uuid::Uuid::nil()),
+        renewed_at: Timestamp::UNIX_EPOCH,
+        expires_at: Timestamp::MAX,
+        revoked_at: is_revoked.then_some(Timestamp::UNIX_EPOCH),
+        revoked_by: is_revoked.then(|| "test".to_owned()),
+    }
+}
+
+/// A fleet of two robots, one that was put out, and an authority that nobody knows.
+struct Rig {
+    app: App,
+    fleet: Fleet,
+    authority: Arc<Authority>,
+    stranger: Authority,
+    supervisor: Supervisor,
+    _folder: tempfile::TempDir,
+}
+
+impl Rig {
+    async fn start() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
+        let clock = Clock::system();
+        let app = App::new(db, clock.clone(), FrictionConfig::default());
+        app.ensure_site(&site()).await.unwrap();
+        let authority = Arc::new(Authority::generate("fleet", clock.now()).unwrap());
+        let security = Security {
+            authority: Arc::clone(&authority),
+            names: Vec::new(),
+        };
+        let supervisor = Supervisor::new();
+        let address = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
+        let opening = Fleet::open(address, Some(security), clock.clone(), supervisor.clone());
+        let fleet = opening.unwrap();
+        app.open_office(Office {
+            authority: Arc::clone(&authority),
+            lifetime: HOUR,
+            port: fleet.address().port(),
+        });
+        for (name, number, is_revoked) in [
+            ("rover-1", 2, false),
+            ("rover-2", 1, false),
+            ("rover-3", 1, true),
+        ] {
+            app.roll().note(&enrolment(name, number, is_revoked));
+        }
+        let (uploads, uploads_in) = mpsc::channel(1);
+        drop(uploads_in);
+        fleet.listen(&app, uploads).await.unwrap();
+        Self {
+            stranger: Authority::generate("fleet", clock.now()).unwrap(),
+            app,
+            fleet,
+            authority,
+            supervisor,
+            _folder: folder,
+        }
+    }
+
+    /// The router's own session, which sees everything.
+    fn witness(&self) -> Session {
+        self.fleet.routers.newest().unwrap().session.clone()
+    }
+
+    fn certificate(&self, who: Who) -> Option<(String, KeyPair)> {
+        let (authority, name, enrolment) = match who {
+            Who::Own | Who::Expired => (&*self.authority, "rover-1", 2),
+            Who::Foreign => (&*self.authority, "rover-2", 1),
+            Who::Former => (&*self.authority, "rover-1", 1),
+            Who::Revoked => (&*self.authority, "rover-3", 1),
+            Who::Stranger => (&self.stranger, "rover-1", 2),
+            Who::Nobody => return None,
+        };
+        let key = KeyPair::generate().unwrap();
+        let request = CertificateParams::default()
+            .serialize_request(&key)
+            .unwrap();
+        let request = RobotRequest::read(&request.pem().unwrap()).unwrap();
+        let name = RobotName {
+            site: site(),
+            robot: robot(name),
+            enrolment,
+        };
+        let mut now = self.app.clock().now();
+        if who == Who::Expired {
+            now -= HOUR + SignedDuration::from_secs(2);
+        }
+        let signed = authority.sign(&request, &name, now, HOUR).unwrap();
+        Some((signed.certificate, key))
+    }
+
+    /// Connects with a certificate, if the gate lets it.
+    async fn connect(&self, who: Who, wait_ms: u32) -> Option<Session> {
+        let text = |pem: &str| format!("\"{}\"", BASE64_STANDARD.encode(pem));
+        let mut settings = vec![
+            ("mode", "\"client\"".to_owned()),
+            (
+                "connect/endpoints",
+                format!("[\"{}\"]", self.fleet.endpoint()),
+            ),
+            ("connect/timeout_ms", wait_ms.to_string()),
+            ("scouting/multicast/enabled", "false".to_owned()),
+            ("scouting/gossip/enabled", "false".to_owned()),
+            (
+                "transport/link/tls/root_ca_certificate_base64",
+                text(self.authority.certificate_pem()),
+            ),
+        ];
+        if let Some((certificate, key)) = self.certificate(who) {
+            settings.push(("transport/link/tls/enable_mtls", "true".to_owned()));
+            settings.push((
+                "transport/link/tls/connect_certificate_base64",
+                text(&certificate),
+            ));
+            let key = text(&key.serialize_pem());
+            settings.push(("transport/link/tls/connect_private_key_base64", key));
+        }
+        let mut config = Config::default();
+        for (key, value) in settings {
+            config.insert_json5(key, &value).unwrap();
+        }
+        let opening = tokio::task::spawn_blocking(move || zenoh::open(config).wait());
+        opening.await.unwrap().ok()
+    }
+}
+
+/// Keys on which something came, in order.
+#[derive(Debug, Clone, Default)]
+struct Seen(Arc<Mutex<Vec<String>>>);
+
+impl Seen {
+    fn note(&self, key: &str) {
+        self.0
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .push(key.to_owned());
+    }
+
+    fn has(&self, key: &str) -> bool {
+        self.0
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .iter()
+            .any(|seen| seen == key)
+    }
+
+    async fn waits_for(&self, key: &str) {
+        let waiting = async {
+            while !self.has(key) {
+                tokio::time::sleep(Duration::from_millis(2)).await;
+            }
+        };
+        let waited = tokio::time::timeout(PATIENCE, waiting).await;
+        assert!(waited.is_ok(), "nothing came on {key}, only {:?}", self.0);
+    }
+}
+
+/// One key of an expression.
+fn one_of(expression: &str, act: Act) -> String {
+    expression.replace('*', &format!("{act:?}").to_lowercase())
+}
+
+/// What the router's own session sees.
+struct Witness {
+    session: Session,
+    published: Seen,
+    announced: Seen,
+    asked: Seen,
+    _kept: Kept,
+}
+
+/// What is declared as long as it is kept.
+type Kept = Vec<Box<dyn std::any::Any + Send>>;
+
+impl Witness {
+    fn of(session: Session) -> Self {
+        let (published, announced) = (Seen::default(), Seen::default());
+        let asked = Seen::default();
+        let to = published.clone();
+        let subscriber = session
+            .declare_subscriber("tread/**")
+            .callback(move |sample| {
+                to.note(&signed(
+                    sample.key_expr().as_str(),
+                    &sample.payload().to_bytes(),
+                ));
+            });
+        let subscriber = subscriber.wait().unwrap();
+        let to = announced.clone();
+        let live = session
+            .liveliness()
+            .declare_subscriber("tread/**")
+            .callback(move |sample| to.note(sample.key_expr().as_str()));
+        let live = live.wait().unwrap();
+        let to = asked.clone();
+        let queryable = session
+            .declare_queryable("tread/**")
+            .callback(move |query| {
+                to.note(query.key_expr().as_str());
+                let _ = query.reply(query.key_expr().clone(), "answer").wait();
+            });
+        let queryable = queryable.wait().unwrap();
+        Self {
+            _kept: vec![Box::new(subscriber), Box::new(live), Box::new(queryable)],
+            session,
+            published,
+            announced,
+            asked,
+        }
+    }
+
+    /// Whether a robot answers on a key. The witness answers its own question too; what the robot
+    /// says is another answer.
+    async fn is_answered_by_robot(&self, key: String) -> bool {
+        let asking = self.session.get(key).target(QueryTarget::All);
+        let asking = asking.consolidation(ConsolidationMode::None);
+        let replies = asking.timeout(PATIENCE).wait().unwrap();
+        let mut answered = false;
+        while let Ok(reply) = replies.recv_async().await {
+            let sample = reply.result();
+            answered |= sample.is_ok_and(|sample| *sample.payload().to_bytes() == *b"robot");
+        }
+        answered
+    }
+}
+
+fn signed(key: &str, payload: &[u8]) -> String {
+    format!("{key}={}", String::from_utf8_lossy(payload))
+}
+
+/// Publishes without ever dropping anything: what does not arrive was not let through.
+fn put(session: &Session, key: String, payload: String) {
+    let putting = session.put(key, payload);
+    let putting = putting.congestion_control(CongestionControl::Block);
+    putting.wait().unwrap();
+}
+
+/// The keys of `rover-1` in one row of the table.
+fn expression(row: &RobotKeys) -> String {
+    row.expression(&site(), &robot("rover-1"))
+}
+
+/// Does over a robot's link everything with every key of `rover-1`. What it hears goes to `heard`;
+/// whether its questions are answered is told.
+async fn do_all(
+    session: &Session,
+    who: Who,
+    heard: &Seen,
+    kept: &mut Kept,
+) -> Vec<(&'static str, bool)> {
+    let mut answers = Vec::new();
+    for row in ROBOT_KEYS {
+        let keys = expression(&row);
+        let to = heard.clone();
+        let hearing = session.declare_subscriber(&keys).callback(move |sample| {
+            to.note(&signed(
+                sample.key_expr().as_str(),
+                &sample.payload().to_bytes(),
+            ));
+        });
+        kept.push(Box::new(hearing.wait().unwrap()));
+        let answering = session.declare_queryable(&keys).callback(|query| {
+            let _ = query.reply(query.key_expr().clone(), "robot").wait();
+        });
+        kept.push(Box::new(answering.wait().unwrap()));
+        let token = session
+            .liveliness()
+            .declare_token(one_of(&keys, Act::Announce));
+        kept.push(Box::new(token.wait().unwrap()));
+        let key = one_of(&keys, Act::Publish);
+        put(session, key, format!("{who:?}"));
+        let asking = session.get(one_of(&keys, Act::Ask)).timeout(PATIENCE);
+        let asking = asking.consolidation(ConsolidationMode::None);
+        let replies = asking.target(QueryTarget::All).wait().unwrap();
+        let mut answered = false;
+        while let Ok(reply) = replies.recv_async().await {
+            let sample = reply.result();
+            answered |= sample.is_ok_and(|sample| *sample.payload().to_bytes() == *b"answer");
+        }
+        answers.push((row.pattern, answered));
+    }
+    answers
+}
+
+/// Does everything with every key of `rover-1` over a link, and says what came of it.
+async fn try_all(rig: &Rig, who: Who, session: &Session) -> BTreeMap<Cell, bool> {
+    let witness = Witness::of(rig.witness());
+    let own = robot(if who == Who::Own {
+        "rover-1"
+    } else {
+        "rover-2"
+    });
+    // What passes always: the robot's own state outwards, its drive commands inwards.
+    let (outward, inward) = (keys::state(&site(), &own), keys::teleop(&site(), &own));
+    let (heard, mut kept) = (Seen::default(), Kept::new());
+    let answers = do_all(session, who, &heard, &mut kept).await;
+    let to = heard.clone();
+    let last = session
+        .declare_subscriber(&inward)
+        .callback(move |sample| to.note(&format!("last {}", sample.key_expr())));
+    kept.push(Box::new(last.wait().unwrap()));
+    // Everything before this has reached the router when this has.
+    put(session, outward.clone(), "the end".to_owned());
+    witness
+        .published
+        .waits_for(&signed(&outward, b"the end"))
+        .await;
+    let mut came = BTreeMap::new();
+    for (row, (pattern, answered)) in ROBOT_KEYS.iter().zip(answers) {
+        let keys = expression(row);
+        let asked = witness.asked.has(&one_of(&keys, Act::Ask));
+        came.insert((pattern, Act::Ask, who), asked || answered);
+        let published = signed(&one_of(&keys, Act::Publish), format!("{who:?}").as_bytes());
+        let published = witness.published.has(&published);
+        came.insert((pattern, Act::Publish, who), published);
+        let announced = witness.announced.has(&one_of(&keys, Act::Announce));
+        came.insert((pattern, Act::Announce, who), announced);
+        let answered = witness
+            .is_answered_by_robot(one_of(&keys, Act::Answer))
+            .await;
+        came.insert((pattern, Act::Answer, who), answered);
+        let to_robot = one_of(&keys, Act::Listen);
+        put(&witness.session, to_robot, "hear this".to_owned());
+    }
+    put(&witness.session, inward.clone(), "the end".to_owned());
+    heard.waits_for(&format!("last {inward}")).await;
+    for row in ROBOT_KEYS {
+        // A robot hears itself too; this is what the server said.
+        let said = signed(&one_of(&expression(&row), Act::Listen), b"hear this");
+        let is_heard = heard.has(&said);
+        came.insert((row.pattern, Act::Listen, who), is_heard);
+    }
+    came
+}
+
+/// What may come of it, from the table alone.
+fn may(pattern: &str, act: Act, who: Who) -> bool {
+    let row = ROBOT_KEYS
+        .iter()
+        .find(|row| row.pattern == pattern)
+        .unwrap();
+    let is_ones_own = match row.owner {
+        Owner::Robot => who == Who::Own,
+        Owner::Site => who == Who::Own || who == Who::Foreign,
+    };
+    is_ones_own && row.act == act
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn every_key_with_every_certificate_allows_what_the_table_says_and_nothing_else() {
+    let rig = Rig::start().await;
+    let mut came = BTreeMap::new();
+    for who in [Who::Own, Who::Foreign] {
+        let session = rig.connect(who, 10_000).await.expect("the gate lets it in");
+        came.extend(try_all(&rig, who, &session).await);
+        tokio::task::spawn_blocking(move || session.close().wait())
+            .await
+            .unwrap()
+            .unwrap();
+    }
+    for who in REFUSED {
+        let counters = rig.app.counters();
+        let before = counters.gate_tls_failed.get() + counters.gate_revoked.get();
+        let connected = rig.connect(who, 300).await;
+        assert!(connected.is_none(), "{who:?} was let in");
+        let after = counters.gate_tls_failed.get() + counters.gate_revoked.get();
+        assert!(after > before, "{who:?} was not counted");
+        for row in ROBOT_KEYS {
+            came.extend(Act::ALL.map(|act| ((row.pattern, act, who), false)));
+        }
+    }
+    let whole = ROBOT_KEYS.len() * Act::ALL.len() * (2 + REFUSED.len());
+    assert_eq!(came.len(), whole, "the matrix is complete");
+    let surprises: Vec<_> = came
+        .iter()
+        .filter(|((pattern, act, who), came)| **came != may(pattern, *act, *who))
+        .collect();
+    assert!(surprises.is_empty(), "{surprises:#?}");
+    rig.supervisor.stop().await.unwrap();
+    rig.fleet.close().await;
+}

@@ -1,0 +1,200 @@
+//! `/v1/join-tokens`, `/v1/enrolments` and `/v1/sites/{site}/enrolments`: robots of the fleet.
+
+use axum::extract::{Extension, State};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
+use serde::Deserialize;
+use serde_json::{Value, json};
+use tread_api::enrolment::{
+    CreateJoinToken, CreatedJoinToken, EnrolRobot, Enrolment, JoinToken, RenewCertificate,
+    RobotCertificate,
+};
+use tread_api::ids::{JoinTokenId, RobotId, SiteId};
+use tread_api::page::Page;
+use tread_api::problem::{ProblemBody, ProblemType};
+use utoipa::IntoParams;
+
+use super::guard::{Audited, Peer, Subject, locked};
+use crate::app::enrolment::EnrolError;
+use crate::app::{App, AppError};
+use crate::http::extract::{Json, Path, Query, cursor, page_limit};
+use crate::http::problem::Problem;
+
+/// Which page of a list.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct PageQuery {
+    /// `next_cursor` of the page before.
+    cursor: Option<String>,
+    /// Most entries of the page, 1 to 1000; 100 when absent.
+    limit: Option<u32>,
+}
+
+/// Join tokens, newest first, dead ones too. Secrets are told once and never again.
+#[utoipa::path(get, path = "/v1/join-tokens", tag = "identity", operation_id = "list_join_tokens",
+    security(("token" = ["admin"])), params(PageQuery),
+    responses((status = 200, body = Page<JoinToken>), (status = 400, body = ProblemBody)))]
+pub(in crate::http) async fn list_tokens(
+    State(app): State<App>,
+    Query(query): Query<PageQuery>,
+) -> Result<Json<Page<JoinToken>>, Problem> {
+    let limit = page_limit(query.limit)?;
+    let before = cursor(query.cursor.as_deref())?;
+    Ok(Json(app.join_tokens(before, limit).await?))
+}
+
+/// Makes a token by which one robot may join once. Its secret is in this answer and nowhere else.
+#[utoipa::path(post, path = "/v1/join-tokens", tag = "identity",
+    operation_id = "create_join_token",
+    security(("token" = ["admin"])), request_body = CreateJoinToken,
+    responses((status = 201, body = CreatedJoinToken), (status = 404, body = ProblemBody),
+        (status = 409, body = ProblemBody), (status = 422, body = ProblemBody)))]
+pub(in crate::http) async fn create_token(
+    State(app): State<App>,
+    Subject(subject): Subject,
+    Json(request): Json<CreateJoinToken>,
+) -> Result<(StatusCode, Json<CreatedJoinToken>), Problem> {
+    let created = app.create_join_token(request, &subject.name).await?;
+    Ok((StatusCode::CREATED, Json(created)))
+}
+
+/// Revokes a join token: no robot joins by it any more.
+#[utoipa::path(delete, path = "/v1/join-tokens/{token}", tag = "identity",
+    operation_id = "revoke_join_token", security(("token" = ["admin"])),
+    params(("token" = JoinTokenId, Path)),
+    responses((status = 200, body = JoinToken), (status = 404, body = ProblemBody)))]
+pub(in crate::http) async fn revoke_token(
+    State(app): State<App>,
+    Path(token): Path<JoinTokenId>,
+) -> Result<Json<JoinToken>, Problem> {
+    Ok(Json(app.revoke_join_token(token).await?))
+}
+
+/// How each robot of a site stands that has ever joined: its newest enrolment.
+#[utoipa::path(get, path = "/v1/sites/{site}/enrolments", tag = "identity",
+    operation_id = "list_enrolments", security(("token" = ["viewer"])),
+    params(("site" = SiteId, Path), PageQuery),
+    responses((status = 200, body = Page<Enrolment>), (status = 404, body = ProblemBody)))]
+pub(in crate::http) async fn list(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+    Query(query): Query<PageQuery>,
+) -> Result<Json<Page<Enrolment>>, Problem> {
+    let limit = page_limit(query.limit)?;
+    let after = query.cursor.unwrap_or_default();
+    Ok(Json(app.enrolments(&site, &after, limit).await?))
+}
+
+/// Puts a robot out of the fleet: what it says counts no more, its link is cut, and it gets no
+/// certificate until it joins again by a token that names it.
+#[utoipa::path(delete, path = "/v1/sites/{site}/enrolments/{robot}", tag = "identity",
+    operation_id = "revoke_robot", security(("token" = ["admin"])),
+    params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
+    responses((status = 200, body = Enrolment), (status = 404, body = ProblemBody)))]
+pub(in crate::http) async fn revoke(
+    State(app): State<App>,
+    Subject(subject): Subject,
+    Path((site, robot)): Path<(SiteId, RobotId)>,
+) -> Result<Json<Enrolment>, Problem> {
+    Ok(Json(app.revoke_robot(&site, &robot, &subject.name).await?))
+}
+
+/// A robot joins, by a join token, which is used up. Anybody may ask; a token that is wrong, over,
+/// used, revoked or for another robot is answered with the same bytes.
+#[utoipa::path(post, path = "/v1/enrolments", tag = "identity", operation_id = "enrol_robot",
+    request_body = EnrolRobot,
+    responses((status = 201, body = RobotCertificate), (status = 401, body = ProblemBody),
+        (status = 409, body = ProblemBody), (status = 422, body = ProblemBody),
+        (status = 429, body = ProblemBody)))]
+pub(in crate::http) async fn enrol(
+    State(app): State<App>,
+    peer: Option<Extension<Peer>>,
+    Json(request): Json<EnrolRobot>,
+) -> Response {
+    let address = peer.map(|Extension(Peer(peer))| peer.ip());
+    let address = address.unwrap_or([0, 0, 0, 0].into()).to_canonical();
+    match app.enrol_robot(address, &request).await {
+        Ok(enrolled) => {
+            let certificate = enrolled.certificate;
+            let what = json!({
+                "join_token": enrolled.join_token, "site": certificate.site,
+                "robot": certificate.robot, "enrolment": certificate.enrolment,
+            });
+            let response = (StatusCode::CREATED, Json(certificate)).into_response();
+            audited(response, what)
+        }
+        Err(error) => {
+            let what = json!({
+                "join_token": error.join_token(), "robot": request.robot,
+                "refused": error.to_string(),
+            });
+            audited(refusal(&app, error), what)
+        }
+    }
+}
+
+/// A robot of the fleet gets its next certificate: it proves that it has the key of the present
+/// one, and its request that it has the next. Anybody may ask; whatever does not count is answered
+/// with the same bytes.
+#[utoipa::path(post, path = "/v1/enrolments/renew", tag = "identity",
+    operation_id = "renew_certificate", request_body = RenewCertificate,
+    responses((status = 200, body = RobotCertificate), (status = 401, body = ProblemBody),
+        (status = 409, body = ProblemBody), (status = 422, body = ProblemBody)))]
+pub(in crate::http) async fn renew(
+    State(app): State<App>,
+    Json(request): Json<RenewCertificate>,
+) -> Response {
+    // What is no base64 is no proof.
+    let proof = BASE64_STANDARD.decode(&request.proof).unwrap_or_default();
+    match app.renew_certificate(&request, &proof).await {
+        Ok(certificate) => {
+            let what = json!({"site": certificate.site, "robot": certificate.robot});
+            audited(Json(certificate).into_response(), what)
+        }
+        Err(error) => {
+            let mut what = json!({"refused": error.to_string()});
+            if let EnrolError::Ended(name) = &error {
+                what["site"] = json!(name.site);
+                what["robot"] = json!(name.robot);
+            }
+            audited(refusal(&app, error), what)
+        }
+    }
+}
+
+fn audited(mut response: Response, what: Value) -> Response {
+    response.extensions_mut().insert(Audited(what));
+    response
+}
+
+/// The answer to what gets no certificate; counts the cause.
+fn refusal(app: &App, error: EnrolError) -> Response {
+    let counters = app.counters();
+    let said = error.to_string();
+    let counter = match error {
+        EnrolError::Request(_) => {
+            let problem = Problem::new(ProblemType::InvalidBody).detail(said);
+            return problem.field("certificate_request").into_response();
+        }
+        EnrolError::Closed => return Problem::from(AppError::NoAuthority).into_response(),
+        EnrolError::App(error) => return Problem::from(error).into_response(),
+        EnrolError::Locked(left) => return locked(app, left, said),
+        EnrolError::Malformed => &counters.join_token_malformed,
+        EnrolError::Unknown => &counters.join_token_unknown,
+        EnrolError::Expired(_) => &counters.join_token_expired,
+        EnrolError::Used(_) => &counters.join_token_used,
+        EnrolError::Revoked(_) => &counters.join_token_revoked,
+        EnrolError::OtherRobot(_) | EnrolError::KnownRobot(_) | EnrolError::Nameless(_) => {
+            &counters.join_token_other_robot
+        }
+        EnrolError::Certificate(_) => &counters.renewals_refused,
+        EnrolError::Ended(_) => &counters.renewals_revoked,
+    };
+    counter.one();
+    Problem::new(ProblemType::Unauthenticated)
+        .detail("this lets no robot in: ask an administrator for a join token")
+        .into_response()
+}
