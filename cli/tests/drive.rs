@@ -47,6 +47,7 @@ impl Yard {
             database: at("tread.db"),
             site: "yard".parse().unwrap(),
             friction: FrictionConfig::default(),
+            normalisations: Vec::new(),
             tls: Some(TlsFiles {
                 certificate: at("cert.pem"),
                 key: at("key.pem"),
