@@ -1,7 +1,7 @@
 //! The map: what many robots measured at many times, as one estimate. Pure.
 //!
 //! What is stored are additive statistics ([`sums`]) in fixed point ([`fixed`]); what is said is
-//! made from them when somebody asks ([`fuse`]), with the age that they have then. So nothing
+//! made from them when somebody asks ([`fuse()`]), with the age that they have then. So nothing
 //! stored is ever rewritten because time passes, and the answer depends on what was measured, not
 //! on when or how often it arrived. [`index`] holds the sums in memory.
 
