@@ -84,7 +84,8 @@ export function browser(): { open(options?: Open): Promise<Page> } {
       page.on('pageerror', (error) => amiss.push(error.message));
       page.on('console', (message) => {
         const text = message.text();
-        if (message.type() === 'error' && !options.expected?.test(text)) amiss.push(text);
+        // What was asked for is not in the text of a refused request.
+        if (message.type() === 'error' && !options.expected?.test(text)) amiss.push(`${text} (${message.location().url})`);
       });
       if (process.env['TREAD_DIST']) await fromDisk(page, process.env['TREAD_DIST']);
       if (options.prepare) await options.prepare(page);

@@ -2,7 +2,9 @@
 //! does.
 
 use std::net::SocketAddr;
-use std::time::Duration;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
 
 use futures_util::{SinkExt as _, StreamExt as _};
 use tokio::net::TcpStream;
@@ -20,6 +22,10 @@ use crate::fleet;
 
 /// Time between two drive commands.
 const PERIOD: Duration = Duration::from_millis(50);
+/// A driver that is silent for longer makes the robot slow down: half of how long a command holds.
+const GAP_MAX: Duration = Duration::from_millis(125);
+/// How often a trial is done again because the machine kept the driver waiting.
+const TRIALS_MAX: usize = 8;
 
 type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
 
@@ -38,8 +44,21 @@ fn say(request: &DriveRequest) -> Message {
     Message::text(serde_json::to_string(request).unwrap())
 }
 
+/// Drives until it is dropped.
+struct Driver {
+    _driving: JoinSet<()>,
+    longest_gap_ms: Arc<AtomicU64>,
+}
+
+impl Driver {
+    /// The longest time between two commands since this was last asked.
+    fn longest_gap(&self) -> Duration {
+        Duration::from_millis(self.longest_gap_ms.swap(0, Ordering::Relaxed))
+    }
+}
+
 /// Acquires the lease and drives, on a circle, until the connection ends or what is given is dropped.
-async fn drive(fleet: &Fleet, server: SocketAddr) -> JoinSet<()> {
+async fn drive(fleet: &Fleet, server: SocketAddr) -> Driver {
     let mut socket = open(fleet, server).await;
     let driver = DriverName {
         name: "Ann".to_owned(),
@@ -67,15 +86,21 @@ async fn drive(fleet: &Fleet, server: SocketAddr) -> JoinSet<()> {
         angular_rad_s: 0.3,
         for_ms: None,
     });
+    let longest_gap_ms = Arc::new(AtomicU64::new(0));
+    let gap_ms = Arc::clone(&longest_gap_ms);
     let mut driving = JoinSet::new();
     driving.spawn(async move {
         let mut ticks = tokio::time::interval(PERIOD);
+        let mut said = Instant::now();
         loop {
             tokio::select! {
                 _ = ticks.tick() => {
                     if socket.send(say(&drive)).await.is_err() {
                         return;
                     }
+                    let gap = std::mem::replace(&mut said, Instant::now()).elapsed();
+                    let gap = u64::try_from(gap.as_millis()).unwrap_or(u64::MAX);
+                    gap_ms.fetch_max(gap, Ordering::Relaxed);
                 }
                 frame = socket.next() => {
                     if !matches!(frame, Some(Ok(_))) {
@@ -85,7 +110,10 @@ async fn drive(fleet: &Fleet, server: SocketAddr) -> JoinSet<()> {
             }
         }
     });
-    driving
+    Driver {
+        _driving: driving,
+        longest_gap_ms,
+    }
 }
 
 async fn live(fleet: &Fleet, what: &str, is: impl Fn(&RobotLive) -> bool) {
@@ -186,18 +214,36 @@ async fn losing_an_observer_never_stops_the_robot() {
     let driver = drive(&fleet, server).await;
     it_drives(&fleet).await;
     for way in [Relay::reset, Relay::cut] {
-        let mut observer = open(&fleet, relay.address()).await;
-        observer.next().await.unwrap().unwrap();
-        way(&relay);
-        // Longer than the server takes to notice that the observer says nothing.
-        for _ in 0..16 {
-            tokio::time::sleep(Duration::from_millis(250)).await;
-            let seen = fleet.rest.robot(&robot()).await.unwrap().live.unwrap();
-            assert!(speed_m_s(&seen) > 0.2, "{seen:?}");
-            assert!(seen.safety.lease.is_some());
+        let mut told_something = false;
+        for _ in 0..TRIALS_MAX {
+            it_drives(&fleet).await;
+            driver.longest_gap();
+            let slowest_m_s = lose_an_observer(&fleet, &relay, way).await;
+            // A driver that the machine kept waiting makes the robot stand too, as it must.
+            if driver.longest_gap() < GAP_MAX {
+                assert!(slowest_m_s > 0.2, "it slowed to {slowest_m_s} m/s");
+                told_something = true;
+                break;
+            }
         }
-        drop(observer);
+        assert!(told_something, "the machine is too busy for a driver");
     }
     drop(driver);
     it_stands_and_is_free(&fleet).await;
+}
+
+/// Loses one who looks on, and returns the lowest speed seen until the server has noticed.
+async fn lose_an_observer(fleet: &Fleet, relay: &Relay, way: fn(&Relay)) -> f64 {
+    let mut observer = open(fleet, relay.address()).await;
+    observer.next().await.unwrap().unwrap();
+    way(relay);
+    let mut slowest_m_s = f64::INFINITY;
+    // Longer than the server takes to notice that the observer says nothing.
+    for _ in 0..16 {
+        tokio::time::sleep(Duration::from_millis(250)).await;
+        let seen = fleet.rest.robot(&robot()).await.unwrap().live.unwrap();
+        slowest_m_s = slowest_m_s.min(speed_m_s(&seen));
+        assert!(seen.safety.lease.is_some(), "{seen:?}");
+    }
+    slowest_m_s
 }
