@@ -48,6 +48,7 @@ impl Yard {
             site: "yard".parse().unwrap(),
             friction: FrictionConfig::default(),
             normalisations: Vec::new(),
+            retention: tread_server::config::RetentionConfig::default(),
             tls: Some(TlsFiles {
                 certificate: at("cert.pem"),
                 key: at("key.pem"),

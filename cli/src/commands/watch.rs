@@ -148,7 +148,7 @@ impl Known {
                     self.missions.pop_first();
                 }
             }
-            Event::Step(_) | Event::Alert(_) => return Ok(false),
+            Event::Step(_) | Event::Alert(_) | Event::Map(_) => return Ok(false),
             Event::End(StreamEnd::TooSlow) => note("the server ended the stream: read too slowly"),
             Event::End(StreamEnd::Stopping) => note("the server stops"),
         }

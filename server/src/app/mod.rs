@@ -14,6 +14,7 @@ mod map;
 pub mod merging;
 pub mod missions;
 pub mod reconciler;
+pub mod retention;
 pub mod robots;
 pub mod segments;
 pub mod sites;
@@ -32,10 +33,11 @@ use tread_api::ids::{RobotId, SiteId};
 use self::enrolment::Membership;
 pub use self::error::AppError;
 use self::events::Hub;
-use self::friction::Pictures;
+use self::friction::{MapNews, Pictures};
 use self::identity::Identity;
 use self::map::Maps;
 use self::missions::idempotency::InFlight;
+use self::retention::Removed;
 use crate::clock::Clock;
 use crate::config::FrictionConfig;
 use crate::counters::Counters;
@@ -82,6 +84,8 @@ struct Inner {
     normalisations: OnceLock<Vec<Arc<Normalisation>>>,
     map_readers: Semaphore,
     pictures: Pictures,
+    news: MapNews,
+    removed: Removed,
     drive_slots: Arc<Semaphore>,
 }
 
@@ -128,6 +132,8 @@ impl App {
             normalisations: OnceLock::new(),
             map_readers: Semaphore::new(friction::READERS_MAX),
             pictures: Pictures::default(),
+            news: MapNews::default(),
+            removed: Removed::default(),
             drive_slots: Arc::new(Semaphore::new(teleop::SESSIONS_MAX)),
         };
         Self {
@@ -250,6 +256,14 @@ impl App {
 
     fn pictures(&self) -> &Pictures {
         &self.inner.pictures
+    }
+
+    fn news(&self) -> &MapNews {
+        &self.inner.news
+    }
+
+    fn removed(&self) -> &Removed {
+        &self.inner.removed
     }
 
     fn robots_changed(&self) {

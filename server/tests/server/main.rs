@@ -11,6 +11,7 @@ mod drive;
 mod dry_run;
 #[cfg(test)]
 mod events;
+mod exports;
 #[cfg(test)]
 mod friction;
 #[cfg(test)]
@@ -21,6 +22,7 @@ mod harness;
 mod identity;
 #[cfg(test)]
 mod ingest;
+mod live;
 #[cfg(test)]
 mod map;
 #[cfg(test)]
@@ -38,6 +40,7 @@ mod pictures;
 mod program;
 #[cfg(test)]
 mod resources;
+mod retention;
 #[cfg(test)]
 mod robot;
 #[cfg(test)]
