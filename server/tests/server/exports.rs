@@ -196,9 +196,11 @@ async fn many_measurements_come_in_pieces_and_none_twice() {
     );
     let seqs: Vec<i64> = rows
         .iter()
-        .map(|row| match field(row, "seq") {
-            Field::Long(seq) => seq,
-            other => panic!("{other:?}"),
+        .map(|row| {
+            let Field::Long(seq) = field(row, "seq") else {
+                panic!("a number of another kind: {row}");
+            };
+            seq
         })
         .collect();
     assert_eq!(seqs, (0..9_500).collect::<Vec<i64>>());

@@ -11,6 +11,7 @@ mod drive;
 mod dry_run;
 #[cfg(test)]
 mod events;
+#[cfg(test)]
 mod exports;
 #[cfg(test)]
 mod friction;
@@ -22,6 +23,7 @@ mod harness;
 mod identity;
 #[cfg(test)]
 mod ingest;
+#[cfg(test)]
 mod live;
 #[cfg(test)]
 mod map;
@@ -35,11 +37,13 @@ mod network;
 mod openapi;
 #[cfg(test)]
 mod page;
+#[cfg(test)]
 mod pictures;
 #[cfg(test)]
 mod program;
 #[cfg(test)]
 mod resources;
+#[cfg(test)]
 mod retention;
 #[cfg(test)]
 mod robot;
