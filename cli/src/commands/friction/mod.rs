@@ -1,0 +1,107 @@
+//! `tread friction`: how the ground grips, and how sure that is.
+
+mod tables;
+
+use std::process::ExitCode;
+
+use tread_api::friction::{AskPath, CreateWithdrawal};
+
+use super::points::read_corners;
+use crate::args::{FrictionAction, FrictionArguments};
+use crate::client::{Client, Reading};
+use crate::output::Output;
+
+pub(super) async fn run(
+    arguments: FrictionArguments,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    let site = &arguments.connection.site;
+    match arguments.action {
+        None => {
+            let read = client.terrain_friction(site, None, Reading::default());
+            output.show(&read.await?, |terrains| tables::terrains(terrains))?;
+        }
+        Some(FrictionAction::Terrains { terrain, reading }) => {
+            let read = client.terrain_friction(site, terrain.as_ref(), reading.reading());
+            output.show(&read.await?, |terrains| tables::terrains(terrains))?;
+        }
+        Some(FrictionAction::History {
+            terrain,
+            from,
+            to,
+            step,
+            models,
+        }) => {
+            let (step_s, reading) = (step.as_secs(), models.reading());
+            let read = client.terrain_history((site, &terrain), (from, to), step_s, reading);
+            output.show(&read.await?, tables::history)?;
+        }
+        Some(FrictionAction::Cells {
+            area,
+            resolution,
+            reading,
+        }) => {
+            let read = client.cell_friction(site, area.area, resolution, reading.reading());
+            output.show(&read.await?, |cells| tables::cells(cells))?;
+        }
+        Some(FrictionAction::Point { point, reading }) => {
+            let read = client.point_friction(site, point, reading.reading());
+            output.show(&read.await?, tables::point)?;
+        }
+        Some(FrictionAction::Path {
+            points,
+            file,
+            robot,
+            as_of,
+            normalisation,
+        }) => {
+            let request = AskPath {
+                points: read_corners(file.as_deref(), points)?,
+                robot,
+                as_of,
+                normalisation,
+            };
+            let read = client.path_friction(site, &request);
+            output.show(&read.await?, tables::path)?;
+        }
+        Some(FrictionAction::Difference {
+            from,
+            to,
+            area,
+            models,
+        }) => {
+            let read = client.friction_difference(site, (from, to), area.area, models.reading());
+            output.show(&read.await?, |cells| tables::differences(cells))?;
+        }
+        Some(FrictionAction::Visits {
+            area,
+            limit,
+            reading,
+        }) => {
+            let page = client.visits(site, area, limit, reading.reading()).await?;
+            output.show(&page.items, |visits| tables::visits(visits))?;
+        }
+        Some(FrictionAction::Robots) => {
+            let read = client.contributions(site);
+            output.show(&read.await?, |robots| tables::contributions(robots))?;
+        }
+        Some(FrictionAction::Withdrawals) => {
+            let read = client.withdrawals(site);
+            output.show(&read.await?, |done| tables::withdrawals(done))?;
+        }
+        Some(FrictionAction::Withdraw {
+            robot,
+            reason,
+            from,
+            to,
+        }) => {
+            let request = CreateWithdrawal { from, to, reason };
+            let done = client.withdraw(site, &robot, &request).await?;
+            output.show(&done, |done| {
+                tables::withdrawals(std::slice::from_ref(done))
+            })?;
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
