@@ -189,6 +189,14 @@ fn live_lines(live: &RobotLive) -> Vec<String> {
             age(friction.age_ms)
         )
     }));
+    let slip = live.friction.and_then(|friction| friction.value.slip);
+    lines.extend(slip.map(|slip| {
+        format!(
+            "wheel slip     {:.1} % left, {:.1} % right",
+            1e2 * slip.left_ratio,
+            1e2 * slip.right_ratio
+        )
+    }));
     lines.push(format!(
         "outbox         {} waiting, {} dropped, {} refused",
         live.outbox.pending, live.outbox.dropped, live.outbox.refused

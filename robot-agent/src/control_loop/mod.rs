@@ -10,6 +10,7 @@ pub(crate) mod prior;
 pub(crate) mod seam;
 pub(crate) mod segments;
 pub(crate) mod site_view;
+pub(crate) mod slip;
 pub(crate) mod tick;
 
 use std::time::Duration;

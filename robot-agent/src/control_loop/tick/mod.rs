@@ -25,6 +25,7 @@ use super::outgoing::Outgoing;
 use super::seam::{EndReason, LoopEnds, Shared};
 use super::segments::{Moment, SegmentCutter};
 use super::site_view::{Footing, SiteView};
+use super::slip::SlipMeter;
 use crate::drive::Drive;
 use guard::Guard;
 
@@ -62,6 +63,8 @@ pub(crate) struct LoopCore {
     blind_within_fence: bool,
     /// Whether a wheel slips beyond the model.
     slips: bool,
+    /// How much they slip.
+    slip: SlipMeter,
     /// Until when the mission is held for its next revision.
     replacement_until: Option<Duration>,
     ticks: u64,
@@ -93,6 +96,7 @@ impl LoopCore {
             guard: Guard::default(),
             blind_within_fence: false,
             slips: false,
+            slip: SlipMeter::default(),
             replacement_until: None,
             ticks: 0,
         }
@@ -119,6 +123,7 @@ impl LoopCore {
         let dt_s = self.time_step_s(now.monotonic);
         let feedback = drive.read(now.monotonic);
         let ground_changed = self.take_samples(&feedback);
+        self.measure_slip(now.monotonic, dt_s);
         self.take_commands(now, stop);
         self.cut_segments(now, ground_changed, dt_s);
         self.look_at_safety(now.monotonic);
