@@ -1,9 +1,12 @@
 // What is shown: tabs, layers of the map, the mission that is looked at.
-import type { CellFriction, MissionDetail } from '../api/schema';
+import type { CellFriction, MissionDetail, PlannedPath } from '../api/schema';
 import { ask, list, sentence } from '../api/client';
 import { Layer, type Quantity } from '../map/friction';
 import type { PointM } from '../map/camera';
-import type { Fleet } from './fleet.svelte';
+import { hasEnded, type Fleet } from './fleet.svelte';
+import { Compare } from './compare.svelte';
+import { Plans } from './plans';
+import { Replay } from './replay.svelte';
 
 export type Tab = 'robots' | 'missions' | 'alerts' | 'terrains';
 
@@ -27,13 +30,24 @@ export class View {
   isWhole = $state(true);
   detail = $state.raw<MissionDetail | null>(null);
   detailProblem = $state<string | null>(null);
+  /** The smooth way of the mission that is looked at, once it is known. */
+  plan = $state.raw<PlannedPath | null>(null);
+  /** Its time line, once it has ended. */
+  replay = $state.raw<Replay | null>(null);
   /** A wish to the map: to show this, counted so that the same can be wished again. */
   wanted = $state.raw<{ points: PointM[] } | null>(null);
 
   #cells: CellFriction[] = [];
   #timer: ReturnType<typeof setInterval> | undefined;
 
-  constructor(readonly fleet: Fleet) {}
+  readonly plans: Plans;
+  /** The change between two times, shown instead of a quantity. */
+  readonly compare: Compare;
+
+  constructor(readonly fleet: Fleet) {
+    this.plans = new Plans(() => (fleet.isDirty = true));
+    this.compare = new Compare(fleet);
+  }
 
   choose(quantity: Quantity | null): void {
     this.quantity = quantity;
@@ -54,7 +68,8 @@ export class View {
     this.configurations = [];
     this.configuration = null;
     this.layer = null;
-    this.detail = null;
+    this.close();
+    if (this.compare.isOn) void this.compare.read();
     if (this.quantity !== null) void this.readFriction();
   }
 
@@ -97,8 +112,18 @@ export class View {
 
   async open(mission: string): Promise<void> {
     try {
-      this.detail = await ask<MissionDetail>(`/v1/missions/${mission}`);
+      const detail = await ask<MissionDetail>(`/v1/missions/${mission}`);
+      // What a robot has refused may have no way at all.
+      const path = `/v1/missions/${mission}/path`;
+      const plan = detail.state === 'rejected' ? null : await ask<PlannedPath>(path).catch(() => null);
+      this.detail = detail;
+      this.plan = plan;
       this.detailProblem = null;
+      // A time line that somebody looks at stays where it is.
+      if (this.replay?.mission !== detail.id || !this.replay.track) {
+        this.replay?.pause();
+        this.replay = hasEnded(detail) ? new Replay(detail, plan, () => (this.fleet.isDirty = true)) : null;
+      }
     } catch (error) {
       this.detailProblem = sentence(error);
     }
@@ -107,6 +132,9 @@ export class View {
 
   close(): void {
     this.detail = null;
+    this.plan = null;
+    this.replay?.pause();
+    this.replay = null;
     this.fleet.isDirty = true;
   }
 
