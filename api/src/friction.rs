@@ -149,8 +149,8 @@ pub struct LiveFriction {
     pub theta_measured: Option<ThetaEstimate>,
     /// Whether the motion of late carried information on θ.
     pub excited: bool,
-    /// How much the wheels slip along their way; `null` while they hardly turn, and from an older
-    /// agent.
+    /// How much the wheels slip along their way; `null` while they hardly turn or change their
+    /// speed, and from an older agent.
     #[serde(default)]
     pub slip: Option<SideSlip>,
 }

@@ -8,7 +8,7 @@ export const CHANCE = 2;
 /** Change of θ at the ends of the colours, as a natural logarithm: half and twice. */
 const MOST = Math.LN2;
 /** What the legend names, percent. */
-export const CHANGE_TICKS = [-50, -25, 0, 40, 100];
+export const CHANGE_TICKS = [-50, 0, 100];
 /** Blue to white to red, told apart by all eyes: ends and middle. */
 const FALLEN = [33, 102, 172] as const;
 const SAME = [190, 190, 190] as const;
