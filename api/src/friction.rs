@@ -389,6 +389,9 @@ pub struct CellDifference {
     pub after: Option<FusedFriction>,
     /// Difference of θ in its own standard deviations; `null` unless both are known.
     pub deviations: Option<f64>,
+    /// The normalisation that was used, if any.
+    #[serde(default)]
+    pub normalisation: Option<String>,
 }
 
 /// Where a visit would teach most.
@@ -405,6 +408,9 @@ pub struct VisitSuggestion {
     pub gain: f64,
     /// Standard deviation of θ over θ now; `null` when nothing is known.
     pub relative_deviation: Option<f64>,
+    /// The normalisation that was used, if any.
+    #[serde(default)]
+    pub normalisation: Option<String>,
     /// Whether measurements contradict each other.
     pub disputed: bool,
 }
