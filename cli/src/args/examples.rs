@@ -117,6 +117,10 @@ const EXAMPLES: &[(&str, &str)] = &[
         "friction visits",
         "  tread friction visits --box 0,0,20,10 --limit 5",
     ),
+    (
+        "friction map",
+        "  tread friction map --png out.png --box 0,0,20,10",
+    ),
     ("friction robots", "  tread friction robots"),
     ("friction withdrawals", "  tread friction withdrawals"),
     (

@@ -236,6 +236,22 @@ pub(crate) enum FrictionAction {
         #[command(flatten)]
         reading: ReadingArguments,
     },
+    /// The map of one robot model as a picture with its legend
+    Map {
+        /// Write it to this file; `-` is standard output
+        #[arg(long, value_name = "FILE")]
+        png: PathBuf,
+        #[command(flatten)]
+        area: BoxArgument,
+        /// Put cells together to squares of this side, metres
+        #[arg(long, value_name = "M", value_parser = positive)]
+        resolution: Option<f64>,
+        /// Pixels of a square's side; as many as make a picture of usual size when absent
+        #[arg(long, value_parser = clap::value_parser!(u32).range(1..=32))]
+        scale: Option<u32>,
+        #[command(flatten)]
+        reading: ReadingArguments,
+    },
     /// What each robot has put in, and its bias as far as it shows
     Robots,
     /// What was taken off the map

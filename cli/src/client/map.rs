@@ -199,6 +199,27 @@ impl Client {
             .await
     }
 
+    /// The map of one robot model as a picture with its legend, PNG.
+    pub(crate) async fn friction_picture(
+        &self,
+        site: &SiteId,
+        area: Option<Area>,
+        resolution_m: Option<f64>,
+        scale: Option<u32>,
+        reading: Reading,
+    ) -> Result<Vec<u8>, ClientError> {
+        let mut query = reading.query();
+        query.push(("format", "png".to_owned()));
+        query.extend(area.map(Area::query).unwrap_or_default());
+        query.extend(resolution_m.map(|side_m| ("resolution_m", side_m.to_string())));
+        query.extend(scale.map(|pixels| ("scale", pixels.to_string())));
+        let path = format!("/v1/sites/{site}/friction/map");
+        let request = self.request(Method::GET, &path).query(&query);
+        let response = self.answered(request).await?;
+        let body = response.bytes().await.map_err(|cause| self.lost(cause))?;
+        Ok(body.to_vec())
+    }
+
     pub(crate) async fn contributions(
         &self,
         site: &SiteId,

@@ -65,6 +65,17 @@ async fn the_ground_is_drawn_changed_and_asked_about_by_commands() {
         assert!(!yard.table(words).await.trim().is_empty(), "{words:?}");
         yard.json(words).await;
     }
+    // A picture is drawn of any box, whether or not anybody has driven there.
+    let picture = yard.folder.path().join("map.png");
+    let map = ["friction", "map", "--png", picture.to_str().unwrap()];
+    let drawn = yard
+        .run(&[&map[..], &["--box", "0,0,8,6", "--scale", "4"]].concat())
+        .await;
+    assert_eq!(drawn.code, Some(0), "{}", drawn.errors);
+    let bytes = std::fs::read(&picture).unwrap();
+    assert!(bytes.starts_with(b"\x89PNG\r\n\x1a\n"));
+    let said = yard.json(&[&map[..], &["--box", "0,0,8,6"]].concat()).await;
+    assert_eq!(said["file"], picture.to_str().unwrap());
     let visits = yard.json(&["friction", "visits", "--box", "0,0,4,4"]).await;
     assert!(visits.as_array().is_some_and(|all| !all.is_empty()));
     yard.table(&["terrains", "delete", "sand-pit"]).await;

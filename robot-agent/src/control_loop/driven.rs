@@ -278,7 +278,7 @@ fn distance_from_line_m(point: Point, from: Point, to: Point) -> f64 {
 /// By how much more than its tolerance a point is lost when only the ends of its stretch are told:
 /// from the line through them, and from where even motion between them would have brought the
 /// robot at that time. Above 1 is too much.
-fn lost(passed: Passed, from: Passed, to: Passed) -> f64 {
+fn shortfall(passed: Passed, from: Passed, to: Passed) -> f64 {
     let off_line = distance_from_line_m(passed.at, from.at, to.at) / LINE_TOLERANCE_M;
     let lasted_s = to.time_s - from.time_s;
     let share = if lasted_s > 0.0 {
@@ -305,11 +305,11 @@ fn thinned(points: &[Passed]) -> Vec<Passed> {
     let mut stretches = vec![(0, last)];
     while let Some((from, to)) = stretches.pop() {
         let inner = (from + 1..to).map(|index| {
-            let lost = lost(points[index], points[from], points[to]);
-            (index, lost)
+            let missed = shortfall(points[index], points[from], points[to]);
+            (index, missed)
         });
-        if let Some((farthest, lost)) = inner.max_by(|a, b| a.1.total_cmp(&b.1))
-            && lost > 1.0
+        if let Some((farthest, missed)) = inner.max_by(|a, b| a.1.total_cmp(&b.1))
+            && missed > 1.0
         {
             keep[farthest] = true;
             stretches.push((from, farthest));

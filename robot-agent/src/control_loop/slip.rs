@@ -79,7 +79,7 @@ mod tests {
     }
 
     /// Both sides at a rim speed, the body at a share of it.
-    fn moving(rim_m_s: f64, share: f64) -> Option<(BodyVelocity, WheelSpeeds)> {
+    fn moving(rim_m_s: f64, share: f64) -> (BodyVelocity, WheelSpeeds) {
         let rad_s = rim_m_s / model().wheel_radius_m();
         let velocity = BodyVelocity {
             ahead_m_s: share * rim_m_s,
@@ -89,23 +89,23 @@ mod tests {
             left_rad_s: rad_s,
             right_rad_s: rad_s,
         };
-        Some((velocity, wheels))
+        (velocity, wheels)
     }
 
     #[test]
     fn wheels_that_turn_faster_than_the_ground_passes_slip_by_that_share_either_way() {
         for rim_m_s in [0.5, -0.5] {
             let mut meter = SlipMeter::default();
-            meter.step(moving(rim_m_s, 0.9), &model(), 0.01);
+            meter.step(Some(moving(rim_m_s, 0.9)), &model(), 0.01);
             assert_eq!(meter.slip(), None, "it has just begun to move");
             for _ in 0..200 {
-                meter.step(moving(rim_m_s, 0.9), &model(), 0.01);
+                meter.step(Some(moving(rim_m_s, 0.9)), &model(), 0.01);
             }
             let slip = meter.slip().expect("they turn");
             assert!((slip.left_ratio - 0.1).abs() < 1.0e-9, "{slip:?}");
             // Braking: the ground passes faster than the rim, and the meter comes there in time.
             for _ in 0..500 {
-                meter.step(moving(rim_m_s, 1.2), &model(), 0.01);
+                meter.step(Some(moving(rim_m_s, 1.2)), &model(), 0.01);
             }
             let slip = meter.slip().expect("they turn");
             assert!((slip.right_ratio + 0.2).abs() < 1.0e-3, "{slip:?}");
@@ -116,14 +116,14 @@ mod tests {
     fn at_rest_on_a_silent_base_or_with_nonsense_there_is_no_slip() {
         let mut meter = SlipMeter::default();
         for _ in 0..200 {
-            meter.step(moving(0.5, 0.9), &model(), 0.01);
+            meter.step(Some(moving(0.5, 0.9)), &model(), 0.01);
         }
         assert!(meter.slip().is_some());
         meter.step(None, &model(), 0.01);
         assert_eq!(meter.slip(), None);
-        meter.step(moving(0.01, 0.5), &model(), 0.01);
+        meter.step(Some(moving(0.01, 0.5)), &model(), 0.01);
         assert_eq!(meter.slip(), None);
-        meter.step(moving(0.5, f64::NAN), &model(), 0.01);
+        meter.step(Some(moving(0.5, f64::NAN)), &model(), 0.01);
         assert_eq!(meter.slip(), None);
     }
 }

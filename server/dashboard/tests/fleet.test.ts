@@ -83,6 +83,22 @@ test('the friction layer says what the API says, at three places', async () => {
   await shot(page, 'friction');
 });
 
+test('from far the friction layer is read in larger squares, and whole', async () => {
+  const page = await open();
+  await page.getByRole('combobox', { name: 'Friction' }).selectOption('visits');
+  const side = (url: string) => Number(new URL(url).searchParams.get('resolution_m'));
+  const coarse = page.waitForResponse((answer) => answer.url().includes('/friction/cells?') && side(answer.url()) >= 4);
+  for (let step = 0; step < 14; step += 1) await page.getByRole('button', { name: 'Zoom out' }).click();
+  const { items } = (await (await coarse).json()) as ApiPage<CellFriction>;
+  const finest = await api<ApiPage<CellFriction>>('/v1/sites/yard/friction/cells?limit=1000');
+  const count = (cells: CellFriction[]) => cells.reduce((sum, cell) => sum + cell.friction.segments, 0);
+  expect(items[0]?.size_m).toBeGreaterThanOrEqual(4);
+  // Robots may have measured meanwhile, and nothing is lost.
+  expect(count(finest.items)).toBeGreaterThanOrEqual(count(items));
+  expect(count(items)).toBeGreaterThan(0.9 * count(finest.items));
+  await shot(page, 'far');
+});
+
 test('two times of the friction map are compared', async () => {
   const from = new Date(Date.now() - 3_600_000).toISOString();
   const measured = await eventually('measured cells', async () => {

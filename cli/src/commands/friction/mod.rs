@@ -2,14 +2,33 @@
 
 mod tables;
 
+use std::io::Write as _;
+use std::path::Path;
 use std::process::ExitCode;
 
+use anyhow::Context as _;
+use serde_json::json;
 use tread_api::friction::{AskPath, CreateWithdrawal};
 
 use super::points::read_corners;
 use crate::args::{FrictionAction, FrictionArguments};
 use crate::client::{Client, Reading};
 use crate::output::Output;
+
+/// Writes a picture to a file, or to standard output for `-`.
+fn save(picture: &[u8], file: &Path, output: Output) -> anyhow::Result<()> {
+    if file.as_os_str() == "-" {
+        let mut out = std::io::stdout().lock();
+        out.write_all(picture).context("cannot print")?;
+        return out.flush().context("cannot print");
+    }
+    let name = file.display();
+    std::fs::write(file, picture).with_context(|| format!("cannot write {name}"))?;
+    let bytes = picture.len();
+    output.show(&json!({ "file": file, "bytes": bytes }), |_| {
+        format!("the map is in {name}, {bytes} bytes")
+    })
+}
 
 pub(super) async fn run(
     arguments: FrictionArguments,
@@ -82,6 +101,17 @@ pub(super) async fn run(
             let page = client.visits(site, area, limit, reading.reading()).await?;
             output.show(&page.items, |visits| tables::visits(visits))?;
         }
+        Some(FrictionAction::Map {
+            png,
+            area,
+            resolution,
+            scale,
+            reading,
+        }) => {
+            let reading = reading.reading();
+            let drawn = client.friction_picture(site, area.area, resolution, scale, reading);
+            save(&drawn.await?, &png, output)?;
+        }
         Some(FrictionAction::Robots) => {
             let read = client.contributions(site);
             output.show(&read.await?, |robots| tables::contributions(robots))?;
@@ -97,10 +127,8 @@ pub(super) async fn run(
             to,
         }) => {
             let request = CreateWithdrawal { from, to, reason };
-            let done = client.withdraw(site, &robot, &request).await?;
-            output.show(&done, |done| {
-                tables::withdrawals(std::slice::from_ref(done))
-            })?;
+            let done = [client.withdraw(site, &robot, &request).await?];
+            output.show(&done, |done| tables::withdrawals(done))?;
         }
     }
     Ok(ExitCode::SUCCESS)
