@@ -114,8 +114,21 @@ function drawTerrains(context: CanvasRenderingContext2D, camera: Camera, scene: 
   }
   for (const terrain of terrains) {
     const at = camera.toPx(labelPlace(terrain.polygon));
-    label(context, `${terrain.name} · ${words.terrains.classes[terrain.class]}`, at.x, at.y, palette.text, palette);
+    const text = `${terrain.name} · ${words.terrains.classes[terrain.class]}`;
+    // From far names would only cover each other.
+    if (context.measureText(text).width > widthM(terrain.polygon) * camera.scale) continue;
+    label(context, text, at.x, at.y, palette.text, palette);
   }
+}
+
+/** From the leftmost to the rightmost corner, metres. */
+function widthM(polygon: readonly PointM[]): number {
+  let [least, most] = [Infinity, -Infinity];
+  for (const { x_m } of polygon) {
+    least = Math.min(least, x_m);
+    most = Math.max(most, x_m);
+  }
+  return most - least;
 }
 
 /** Just inside the upper edge of a polygon, in its middle. */
