@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use serde::Serialize;
 use tread_api::ids::{RobotId, SiteId};
-use tread_api::robot::{LinkState, Robot, RobotLive, RobotMode};
+use tread_api::robot::{LinkState, MissionProgress, Robot, RobotLive, RobotMode};
 use tread_api::safety::{Driver, SafetyStatus};
 
 use crate::args::RobotsArguments;
@@ -241,6 +241,18 @@ fn safety_lines(safety: &SafetyStatus) -> Vec<String> {
 pub(super) fn theta(live: &RobotLive) -> Option<String> {
     let measured = live.friction?.value.theta_measured?;
     Some(format!("{:.4} ± {:.4}", measured.theta, measured.std_dev))
+}
+
+/// How many of `steps` a mission has come, 0 to all; none while its length is not known.
+pub(super) fn steps_come(progress: MissionProgress, steps: usize) -> Option<usize> {
+    let share = (progress.length_m > 0.0).then(|| progress.driven_m / progress.length_m)?;
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        clippy::cast_precision_loss,
+        reason = "0 to the steps of a bar"
+    )]
+    Some((share.clamp(0.0, 1.0) * steps as f64).round() as usize)
 }
 
 pub(super) fn percent(part: f64, whole: f64) -> String {

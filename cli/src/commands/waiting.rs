@@ -10,13 +10,14 @@ use tread_api::ids::MissionId;
 use tread_api::mission::{Mission, MissionState};
 
 use super::missions::{state, summary};
+use super::robots::steps_come;
 use crate::client::Client;
 use crate::output::{Output, TookTooLong, note};
 
 /// Time between two looks at the missions that are waited for.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
 /// Steps of a bar.
-const STEPS: u64 = 1_000;
+const STEPS: usize = 1_000;
 
 /// One mission that is waited for.
 struct Waited {
@@ -38,18 +39,14 @@ impl Waited {
             return;
         }
         self.bar.set_prefix(seen.robot.to_string());
-        let Some(progress) = seen.progress.filter(|progress| progress.length_m > 0.0) else {
+        let come = seen
+            .progress
+            .and_then(|it| Some((it, steps_come(it, STEPS)?)));
+        let Some((progress, come)) = come else {
             self.bar.set_message(state(seen));
             return;
         };
-        let share = (progress.driven_m / progress.length_m).clamp(0.0, 1.0);
-        #[expect(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            clippy::cast_precision_loss,
-            reason = "0 to 1000"
-        )]
-        self.bar.set_position((share * STEPS as f64) as u64);
+        self.bar.set_position(come as u64);
         self.bar.set_message(format!(
             "{:.1} of {:.1} m, {:.0} mm off, {}",
             progress.driven_m,
@@ -85,7 +82,9 @@ pub(super) async fn wait(
         .iter()
         .map(|id| Waited {
             id: *id,
-            bar: all.add(ProgressBar::new(STEPS)).with_style(style.clone()),
+            bar: all
+                .add(ProgressBar::new(STEPS as u64))
+                .with_style(style.clone()),
             said: None,
             ended: None,
         })

@@ -12,7 +12,7 @@ use tread_api::robot::{LinkState, MissionProgress, Robot, RobotMode, Severity};
 use super::known::Known;
 use super::screen::{Order, Section, Shown};
 use crate::commands::missions::{state, trajectory};
-use crate::commands::robots::{details, link_name, mode_name, theta};
+use crate::commands::robots::{details, link_name, mode_name, steps_come, theta};
 use crate::output::{age, or_dash};
 
 /// Cells for the longest name.
@@ -146,17 +146,10 @@ fn head(picture: &Picture<'_>) -> Vec<Line<'static>> {
 
 /// A bar for how far a mission has come.
 fn bar(progress: Option<MissionProgress>) -> String {
-    let Some(progress) = progress.filter(|progress| progress.length_m > 0.0) else {
+    let Some((progress, full)) = progress.and_then(|it| Some((it, steps_come(it, BAR)?))) else {
         return "-".to_owned();
     };
     let share = (progress.driven_m / progress.length_m).clamp(0.0, 1.0);
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        clippy::cast_precision_loss,
-        reason = "0 to 10"
-    )]
-    let full = (share * BAR as f64).round() as usize;
     let (full, rest) = ("█".repeat(full), "░".repeat(BAR - full));
     format!("{full}{rest} {:3.0} %", 1e2 * share)
 }
