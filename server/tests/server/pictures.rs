@@ -1,5 +1,10 @@
 //! The map in the formats of other programs, read back by other readers than what wrote it.
 
+#![expect(
+    clippy::unwrap_used,
+    reason = "what the helpers of a test cannot do fails the test"
+)]
+
 use jiff::SignedDuration;
 use reqwest::{StatusCode, header};
 use serde_json::json;
