@@ -29,6 +29,7 @@ pub mod program;
 pub mod sim;
 
 mod alerts;
+mod base;
 mod control_loop;
 mod dispatcher;
 mod durable;
