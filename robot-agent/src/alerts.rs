@@ -80,8 +80,9 @@ impl Alerts {
             alert(code, Severity::Critical, fault.text().to_owned())
         });
         let dropped = causes.base.and_then(|base| {
-            let text = format!("the base: {}", self.dropping.look(base)?);
-            alert("base-refused", Severity::Warning, text)
+            let (refusal, text) = self.dropping.look(base)?;
+            let code = format!("base-{}", refusal.code());
+            alert(&code, Severity::Warning, format!("the base: {text}"))
         });
         let long = self.outbox_long.then(|| {
             let text = "many measurements wait for the server".to_owned();

@@ -32,6 +32,7 @@ mod alerts;
 mod base;
 mod control_loop;
 mod dispatcher;
+mod doctor;
 mod durable;
 mod enroll;
 mod knowledge;

@@ -210,7 +210,7 @@ pub(crate) async fn log_losses(
             () = tokio::time::sleep(LOSSES_EVERY) => {}
             () = stop.cancelled() => return,
         }
-        if let Some(text) = base.as_deref().and_then(|base| dropping.look(base)) {
+        if let Some((_, text)) = base.as_deref().and_then(|base| dropping.look(base)) {
             warn!("{text}");
         }
         let lost = shared.lost_segments.load(Ordering::Relaxed);

@@ -20,10 +20,14 @@ import zenoh
 from rosbags.typesys import Stores, get_typestore
 
 STEP_S = 0.001
+# Commands act after so many steps at the latest, as on a base with a fast loop of its own.
+STEPS = 2
 SENSOR_S = 0.01
 SLIP_SPEED_M_S = 0.05
 GRAVITY = 9.81
 COMMAND_TIMEOUT_S = 0.5
+# What the base itself takes its wheels' radius for.
+BASE_RADIUS = 0.08
 
 store = get_typestore(Stores.ROS2_JAZZY)
 
@@ -44,7 +48,7 @@ class Plant:
     """A body on four wheels; forces oppose each contact's slip, isotropically."""
 
     def __init__(self, arguments, rng):
-        self.mass, self.track, self.base, self.radius, self.inertia = 5.0, 0.43, 0.28, 0.08, 0.45
+        self.mass, self.track, self.base, self.radius, self.inertia = 5.0, 0.43, 0.28, arguments.radius, 0.45
         self.stiffness, self.lag = arguments.stiffness, arguments.lag
         self.radius_ratio = [1 + 0.01 * rng.uniform(-1, 1) for _ in range(2)]
         # x, y, heading, speed ahead, speed to the left, turn rate, wheel speeds left and right
@@ -200,25 +204,34 @@ class Robot:
             return
         twist = store.deserialize_cdr(sample.payload.to_bytes(), "geometry_msgs/msg/Twist")
         half = self.plant.track / 2 * twist.angular.z
-        self.plant.command = [(twist.linear.x - half) / self.plant.radius, (twist.linear.x + half) / self.plant.radius]
+        self.plant.command = [(twist.linear.x - half) / BASE_RADIUS, (twist.linear.x + half) / BASE_RADIUS]
         self.commanded_at, self.commands = time.monotonic(), self.commands + 1
 
     def noisy(self, value, deviation):
         return value + self.rng.gauss(0.0, deviation)
 
-    def header(self, frame):
-        stamp = time.time_ns() + int(1e9 * self.faults.get("stamp", 0.0))
+    def averaged(self, value, deviation):
+        """A sensor that measures twice for each message, at 200 Hz as the simulated robot's do."""
+        return self.noisy(value, deviation / math.sqrt(2))
+
+    def header(self, frame, behind=0.0):
+        stamp = time.time_ns() + int(1e9 * (self.faults.get("stamp", 0.0) - behind))
         return message("std_msgs/msg/Header", message("builtin_interfaces/msg/Time", stamp // 10**9, stamp % 10**9), frame)
 
     def joints(self, means):
         left, right, _, _, _, *torques = means
-        speeds = [self.noisy(left, 0.02), self.noisy(right, 0.02)]
+        speeds = [self.averaged(left, 0.02), self.averaged(right, 0.02)]
         if self.is_on("nan"):
             speeds[0] = math.nan
         if self.is_on("stuck"):
             speeds = [0.0, 0.0]
+        if self.is_on("swapped"):
+            speeds.reverse()
+            torques.reverse()
+        if self.is_on("inverted"):
+            speeds[0], torques[0] = -speeds[0], -torques[0]
         noise = 0.01 * self.plant.mass * GRAVITY / 2 * self.plant.radius
-        pulls = [self.noisy(torque * self.torque_scale, noise) / 2 for torque in torques]
+        pulls = [self.averaged(torque * self.torque_scale, noise) / 2 for torque in torques]
         names = ["front_left_wheel", "front_right_wheel", "rear_left_wheel", "rear_right_wheel"]
         sides = [0, 1, 0, 1]
         effort = [] if self.is_on("effortless") else [pulls[side] for side in sides]
@@ -229,11 +242,11 @@ class Robot:
 
     def imu(self, means):
         _, _, turn, ahead, left, *_ = means
-        felt = vector(self.noisy(ahead + self.bias[0], 0.05), self.noisy(left + self.bias[1], 0.05), GRAVITY)
+        felt = vector(self.averaged(ahead + self.bias[0], 0.05), self.averaged(left + self.bias[1], 0.05), GRAVITY)
         small = np.diag([1e-4, 1e-4, 1e-4]).flatten()
         return message(
-            "sensor_msgs/msg/Imu", self.header("imu_link"), turned(self.plant.state[2]), small,
-            vector(0.0, 0.0, self.noisy(turn, 0.003)), np.diag([9e-6] * 3).flatten(),
+            "sensor_msgs/msg/Imu", self.header("camera" if self.is_on("frame") else "imu_link"), turned(self.plant.state[2]), small,
+            vector(0.0, 0.0, self.averaged(turn, 0.003)), np.diag([9e-6] * 3).flatten(),
             felt, np.diag([2.5e-3] * 3).flatten(),
         )
 
@@ -253,7 +266,7 @@ class Robot:
         twist = message("geometry_msgs/msg/Twist", vector(ahead, 0.0, 0.0), vector(0.0, 0.0, turn))
         covariance = np.diag([4e-4] * 6).flatten()
         twist = message("geometry_msgs/msg/TwistWithCovariance", twist, covariance)
-        return message("nav_msgs/msg/Odometry", self.header("odom"), "base_link", self.covariant_pose(), twist)
+        return message("nav_msgs/msg/Odometry", self.header("odom", self.faults.get("delay", 0.0)), "base_link", self.covariant_pose(), twist)
 
     def battery(self):
         none = np.zeros(0, dtype=np.float32)
@@ -285,7 +298,7 @@ class Robot:
         print(json.dumps(line), flush=True)
 
     def run(self):
-        began, tick = time.monotonic(), 0
+        began, tick, steps = time.monotonic(), 0, []
         self.report(event="ready")
         while not self.is_on("quit"):
             if "restart" in self.faults:
@@ -293,14 +306,17 @@ class Robot:
                 self.node.close()
                 time.sleep(pause)
                 self.plant.command = [0.0, 0.0]
-                self.node, began, tick = Node(self), time.monotonic(), 0
+                self.node, began, tick, steps = Node(self), time.monotonic(), 0, []
                 self.report(event="restarted")
             if time.monotonic() - self.commanded_at > COMMAND_TIMEOUT_S:
                 self.plant.command = [0.0, 0.0]
-            steps = [self.plant.step() for _ in range(round(SENSOR_S / STEP_S))]
-            self.say(tick, [sum(values) / len(steps) for values in zip(*steps)])
-            tick += 1
-            time.sleep(max(0.0, began + tick * SENSOR_S - time.monotonic()))
+            for _ in range(STEPS):
+                steps.append(self.plant.step())
+            if len(steps) * STEP_S >= SENSOR_S:
+                self.say(tick, [sum(values) / len(steps) for values in zip(*steps)])
+                tick, steps = tick + 1, []
+            due = began + tick * SENSOR_S + len(steps) * STEP_S
+            time.sleep(max(0.0, due - time.monotonic()))
         self.node.close()
 
     def listen(self):
@@ -321,6 +337,7 @@ def main():
     parser.add_argument("--domain", type=int, default=0)
     parser.add_argument("--namespace", default="/rover")
     parser.add_argument("--stiffness", type=float, default=2.5)
+    parser.add_argument("--radius", type=float, default=0.08)
     parser.add_argument("--lag", type=float, default=0.05)
     parser.add_argument("--x", type=float, default=0.0)
     parser.add_argument("--y", type=float, default=0.0)

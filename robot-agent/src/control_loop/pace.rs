@@ -12,7 +12,7 @@ use crate::clock::SharedClock;
 use crate::drive::Arrivals;
 
 /// Earliest tick after the one before, as a share of the period.
-const EARLY_SHARE: f64 = 0.75;
+const EARLY_SHARE: f64 = 0.5;
 /// Latest tick after the one before, as a share of the period.
 const LATE_SHARE: f64 = 1.5;
 /// Periods by which the loop may lag before it gives up the ticks that it missed.
@@ -115,7 +115,7 @@ mod tests {
         let began = clock.monotonic();
         arrivals.ring();
         pace.wait(&clock);
-        assert!(clock.monotonic().saturating_sub(began) >= PERIOD.mul_f64(0.7));
+        assert!(clock.monotonic().saturating_sub(began) >= PERIOD.mul_f64(0.45));
         // None at all: the loop goes on.
         pace.begin(clock.monotonic());
         let began = clock.monotonic();

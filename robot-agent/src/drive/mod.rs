@@ -152,6 +152,11 @@ pub trait Drive: Send {
         SILENT_AFTER_MAX
     }
 
+    /// Whether the base itself is told to rest, for it is not heard.
+    fn is_silent(&self) -> bool {
+        false
+    }
+
     /// What tells of new samples, if they are to set the loop's pace.
     fn arrivals(&self) -> Option<Arc<Arrivals>> {
         None

@@ -59,6 +59,8 @@ pub(crate) struct LoopCore {
     tilt_rad: Option<f64>,
     /// Oldest word of the base with which it does not count as silent.
     silent_after: Duration,
+    /// Whether the drive says that the base is silent.
+    is_base_silent: bool,
     /// When the base was last silent, if its mission is held for that.
     base_silent_at: Option<Duration>,
     /// What the base says of its sensors' noise.
@@ -97,6 +99,7 @@ impl LoopCore {
             body_speed: None,
             tilt_rad: None,
             silent_after: SILENT_AFTER_MAX,
+            is_base_silent: false,
             base_silent_at: None,
             stated_noise: StatedNoise::default(),
             guard: Guard::default(),
@@ -135,6 +138,7 @@ impl LoopCore {
         self.outgoing.flush();
         let dt_s = self.time_step_s(now.monotonic);
         let feedback = drive.read(now.monotonic);
+        self.is_base_silent = drive.is_silent();
         self.take_noise(drive.noise());
         let ground_changed = self.take_samples(&feedback);
         self.take_commands(now, stop);

@@ -202,7 +202,7 @@ impl LoopCore {
         let is_older = |at: Option<Duration>, most: Duration| {
             at.is_some_and(|at| now.saturating_sub(at) > most)
         };
-        if is_older(self.last_sample, self.silent_after) {
+        if self.is_base_silent || is_older(self.last_sample, self.silent_after) {
             Some(Fault::BaseSilent)
         } else if is_older(self.last_fix, POSITION_LOST_AFTER) {
             Some(Fault::PositionLost)

@@ -22,6 +22,19 @@ use crate::drive::Arrivals;
 /// Messages that may wait for the loop; at 20 Hz and 200 messages a second of each kind.
 pub const WAITING_MAX: usize = 128;
 
+/// Somebody who hears every message as it came, besides the loop; must not wait.
+pub trait Tap: std::fmt::Debug + Send + Sync {
+    /// A message came.
+    fn hear(
+        &self,
+        source: Source,
+        arrival: Arrival,
+        key: &str,
+        attachment: Option<&[u8]>,
+        payload: &[u8],
+    );
+}
+
 /// What is known of a topic between two messages.
 #[derive(Debug, Clone, Copy)]
 struct Watched {
@@ -41,6 +54,7 @@ pub struct Inlet {
     /// Whether its messages set the loop's pace.
     is_pace: bool,
     clock: SharedClock,
+    tap: Option<Arc<dyn Tap>>,
 }
 
 impl Inlet {
@@ -77,12 +91,20 @@ impl Inlet {
             arrivals: Arc::clone(arrivals),
             is_pace: source == pace,
             clock: Arc::clone(clock),
+            tap: None,
         };
         Source::ALL
             .into_iter()
             .filter(|source| topic_of(settings, *source).is_some())
             .map(inlet)
             .collect()
+    }
+
+    /// The same, with somebody else who hears its messages.
+    #[must_use]
+    pub fn with_tap(mut self, tap: Option<Arc<dyn Tap>>) -> Self {
+        self.tap = tap;
+        self
     }
 
     /// Which topic it is.
@@ -127,6 +149,9 @@ impl Inlet {
             monotonic: self.clock.monotonic(),
             wall_ns: self.clock.host_wall_ns(),
         };
+        if let Some(tap) = &self.tap {
+            tap.hear(self.source, arrival, key, attachment, payload);
+        }
         let writer = match self.settings.bus.scheme {
             Scheme::Ros2Dds => None,
             Scheme::RmwZenoh(generation) => {
@@ -135,7 +160,7 @@ impl Inlet {
                 Some(attachment.ok_or(Refusal::NoAttachment)?)
             }
         };
-        let Some((stamp, content)) = self.decode(payload)? else {
+        let Some((stamp, content)) = decoded(&self.settings, self.source, payload)? else {
             return Ok(None);
         };
         let mut watched = self.watched.lock().unwrap_or_else(PoisonError::into_inner);
@@ -150,30 +175,37 @@ impl Inlet {
         };
         Ok(Some(Arrived { at, content }))
     }
+}
 
-    fn decode(&self, payload: &[u8]) -> Result<Option<Reading>, Refusal> {
-        let settings = &self.settings;
-        match self.source {
-            Source::Odometry => {
-                let odometry = settings.odometry.as_ref();
-                odometry
-                    .map(|odometry| reading::odometry(payload, odometry))
-                    .transpose()
-            }
-            Source::Imu => {
-                let imu = settings.imu.as_ref();
-                imu.map(|imu| reading::imu(payload, imu)).transpose()
-            }
-            Source::Joints => match &settings.joints {
-                Some(joints) => reading::joints(payload, joints),
-                None => Ok(None),
-            },
-            Source::Pose => {
-                let pose = settings.pose.as_ref();
-                pose.map(|pose| reading::pose(payload, pose)).transpose()
-            }
-            Source::Battery => reading::battery(payload),
+/// What a message of a source says; none for one that is of no concern.
+///
+/// # Errors
+/// [`Refusal`].
+pub fn decoded(
+    settings: &Ros2Settings,
+    source: Source,
+    payload: &[u8],
+) -> Result<Option<Reading>, Refusal> {
+    match source {
+        Source::Odometry => {
+            let odometry = settings.odometry.as_ref();
+            odometry
+                .map(|odometry| reading::odometry(payload, odometry))
+                .transpose()
         }
+        Source::Imu => {
+            let imu = settings.imu.as_ref();
+            imu.map(|imu| reading::imu(payload, imu)).transpose()
+        }
+        Source::Joints => match &settings.joints {
+            Some(joints) => reading::joints(payload, joints),
+            None => Ok(None),
+        },
+        Source::Pose => {
+            let pose = settings.pose.as_ref();
+            pose.map(|pose| reading::pose(payload, pose)).transpose()
+        }
+        Source::Battery => reading::battery(payload),
     }
 }
 

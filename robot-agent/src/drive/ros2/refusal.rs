@@ -79,6 +79,28 @@ impl Refusal {
     }
 }
 
+impl Refusal {
+    /// For programs, as part of an alert's code.
+    pub fn code(self) -> &'static str {
+        match self {
+            Self::WrongType => "type",
+            Self::WrongHash => "definition",
+            Self::NoAttachment => "attachment",
+            Self::Malformed => "malformed",
+            Self::WrongFrame => "frame",
+            Self::Joints => "joints",
+            Self::Value => "value",
+            Self::Covariance => "covariance",
+            Self::Stamp => "stamp",
+            Self::Late => "late",
+            Self::OutOfOrder => "order",
+            Self::SecondWriter => "second-writer",
+            Self::Disobedient => "disobedient",
+            Self::Overflow => "overflow",
+        }
+    }
+}
+
 impl From<CdrError> for Refusal {
     fn from(_: CdrError) -> Self {
         Self::Malformed
@@ -182,7 +204,7 @@ pub struct Dropping {
 
 impl Dropping {
     /// Looks again: for people, what is dropped most; none while nothing is.
-    pub fn look(&mut self, counts: &Counts) -> Option<String> {
+    pub fn look(&mut self, counts: &Counts) -> Option<(Refusal, String)> {
         let mut most = 0;
         for (source, refusal, times) in counts.drops() {
             let before = &mut self.before[source as usize][refusal as usize];
@@ -198,7 +220,8 @@ impl Dropping {
         let (source, refusal) = self.worst?;
         let times = counts.dropped(source, refusal);
         let (text, section) = (refusal.text(), source.section());
-        Some(format!("{text} are dropped ({section}, {times} so far)"))
+        let text = format!("{text} are dropped ({section}, {times} so far)");
+        Some((refusal, text))
     }
 }
 
@@ -214,10 +237,10 @@ mod tests {
             counts.refuse(Source::Imu, Refusal::Late);
         }
         counts.refuse(Source::Odometry, Refusal::Value);
-        let text = dropping.look(&counts).unwrap();
+        let (_, text) = dropping.look(&counts).unwrap();
         assert_eq!(text, "messages that came late are dropped (imu, 3 so far)");
         counts.refuse(Source::Odometry, Refusal::Value);
-        let text = dropping.look(&counts).unwrap();
+        let (_, text) = dropping.look(&counts).unwrap();
         assert_eq!(
             text,
             "messages with impossible values are dropped (odometry, 2 so far)"

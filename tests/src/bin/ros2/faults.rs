@@ -112,11 +112,11 @@ async fn try_fault(
     let path = format!("{name}: it says so");
     let is_said = eventually(
         &path,
-        SHORT.min(LASTS),
+        SHORT,
         || fleet.rest.robot(robot),
         |seen| {
             seen.as_ref().is_some_and(|seen| says(seen, fault.said))
-                || switched_at.elapsed() > LASTS / 2
+                || switched_at.elapsed() > LASTS.mul_f64(0.9)
         },
     )
     .await

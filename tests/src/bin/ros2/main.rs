@@ -7,9 +7,11 @@
 //!    and what the fleet learned of the ground.
 //! 2. **bus**: from a sensor's message to the command that follows it; what the ROS graph shows; that
 //!    ROS keys stay on the robot.
-//! 3. **faults**: a dead, late, lying, restarting base; how soon the command is zero, what the agent says,
+//! 3. **doctor**: `tread-agent doctor` on a healthy robot, and on robots with one planted fault each.
+//! 4. **faults**: a dead, late, lying, restarting base; how soon the command is zero, what the agent says,
 //!    and that it goes on.
 
+mod doctor;
 mod faults;
 mod missions;
 mod observer;
@@ -80,13 +82,15 @@ async fn main() -> anyhow::Result<ExitCode> {
         node.display()
     );
     let mut fleet = Fleet::start_with(&node).await;
-    let mut base = PythonRobot::start(&arguments.python)?;
+    let mut base = PythonRobot::start(&arguments.python, &[])?;
     let observer = Observer::start(base.endpoint())?;
     let robot = missions::start_robot(&mut fleet, &base).await?;
     let mut checks = missions::measure(&mut fleet, &robot, &observer).await;
     checks.extend(observer.graph(python_robot::DOMAIN)?);
     checks.push(observer::stays_on_the_robot(&fleet).await?);
     checks.extend(faults::measure(&fleet, &robot, &mut base, &observer).await?);
+    drop(base);
+    checks.extend(doctor::measure(&arguments.python, &node).await?);
     print(&arguments, &checks)?;
     let all_hold = checks.iter().all(|check| check.holds);
     if !all_hold {

@@ -21,7 +21,7 @@ pub(crate) struct PythonRobot {
 
 impl PythonRobot {
     /// Starts a robot that is its own router, and waits until it speaks.
-    pub(crate) fn start(python: &Path) -> anyhow::Result<Self> {
+    pub(crate) fn start(python: &Path, flags: &[&str]) -> anyhow::Result<Self> {
         let port = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?
             .local_addr()?
             .port();
@@ -31,6 +31,7 @@ impl PythonRobot {
             .arg(&script)
             .args(["--router", "--endpoint", &endpoint])
             .arg(format!("--domain={DOMAIN}"))
+            .args(flags)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
