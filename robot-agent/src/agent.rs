@@ -28,7 +28,6 @@ use crate::control_loop::BRAKING_MAX;
 use crate::control_loop::seam::{AgentEnds, Shared, seam};
 use crate::control_loop::tick::LoopCore;
 use crate::dispatcher::Dispatcher;
-use crate::drive::ros2::bus::BusError;
 use crate::drive::simulated::SimulatedDriveError;
 use crate::fleet::{self, Identity, LinkError};
 use crate::geometry::control_model;
@@ -53,15 +52,12 @@ pub enum StartError {
     /// The robot's model is impossible.
     #[error("the robot's model is impossible")]
     Model(#[from] RobotModelError),
-    /// The server's endpoint is none.
+    /// The server's endpoint, or that of the robot's bus, is none.
     #[error(transparent)]
     Link(#[from] LinkError),
     /// The simulated base could not be made.
     #[error(transparent)]
     Drive(#[from] SimulatedDriveError),
-    /// The robot's bus is none.
-    #[error(transparent)]
-    Bus(#[from] BusError),
     /// The outbox could not be opened.
     #[error(transparent)]
     Outbox(#[from] OutboxError),

@@ -24,6 +24,7 @@ use super::inlet::{Inlet, Numbering};
 use super::outlet::{COMMAND_SILENCE_MAX, Outlet};
 use super::settings::{BusMode, BusSettings, Ros2Settings, Scheme};
 use crate::clock::SharedClock;
+use crate::fleet::{LinkError, zenoh_failed};
 
 /// Longest row of tries to connect before the thread looks whether it is to end, milliseconds.
 const CONNECT_TIMEOUT_MS: u32 = 1_000;
@@ -39,40 +40,12 @@ const PAYLOAD_BYTES_MAX: usize = tread_ros2::cdr::MESSAGE_BYTES_MAX;
 /// The agent's only node.
 const NODE_NUMBER: u32 = 0;
 
-/// Why the bus does not work.
-#[derive(Debug, thiserror::Error)]
-pub enum BusError {
-    /// The endpoint is none.
-    #[error("`{endpoint}` is no zenoh endpoint: {problem}")]
-    Endpoint {
-        /// What was given.
-        endpoint: String,
-        /// What is wrong with it.
-        problem: String,
-    },
-    /// zenoh refused.
-    #[error("zenoh could not {action}: {problem}")]
-    Zenoh {
-        /// What was tried.
-        action: &'static str,
-        /// What zenoh said.
-        problem: String,
-    },
-}
-
-fn zenoh_failed(action: &'static str) -> impl FnOnce(zenoh::Error) -> BusError {
-    move |problem| BusError::Zenoh {
-        action,
-        problem: problem.to_string(),
-    }
-}
-
 /// How the session on the bus is opened.
 ///
 /// # Errors
-/// [`BusError::Endpoint`].
-pub fn session_config(bus: &BusSettings) -> Result<zenoh::Config, BusError> {
-    zenoh::config::EndPoint::from_str(&bus.endpoint).map_err(|problem| BusError::Endpoint {
+/// [`LinkError::Endpoint`].
+pub fn session_config(bus: &BusSettings) -> Result<zenoh::Config, LinkError> {
+    zenoh::config::EndPoint::from_str(&bus.endpoint).map_err(|problem| LinkError::Endpoint {
         endpoint: bus.endpoint.clone(),
         problem: problem.to_string(),
     })?;
@@ -163,13 +136,13 @@ impl Bus {
     /// A bus that nobody speaks on yet.
     ///
     /// # Errors
-    /// [`BusError::Endpoint`].
+    /// [`LinkError::Endpoint`].
     pub fn new(
         settings: Arc<Ros2Settings>,
         inlets: Vec<Inlet>,
         outlet: Arc<Outlet>,
         clock: SharedClock,
-    ) -> Result<Self, BusError> {
+    ) -> Result<Self, LinkError> {
         Ok(Self {
             config: session_config(&settings.bus)?,
             settings,
@@ -221,7 +194,7 @@ impl Bus {
         }
     }
 
-    fn declare(&self, session: &zenoh::Session) -> Result<Declared, BusError> {
+    fn declare(&self, session: &zenoh::Session) -> Result<Declared, LinkError> {
         let bus = &self.settings.bus;
         let node = Node {
             domain: bus.domain,
@@ -311,7 +284,7 @@ impl Bus {
         session: &zenoh::Session,
         inlet: &Arc<Inlet>,
         topic: &Name,
-    ) -> Result<(), BusError> {
+    ) -> Result<(), LinkError> {
         let bus = &self.settings.bus;
         let key = match self.generation() {
             Some(_) => rmw::any_type_key(bus.domain, topic),
@@ -368,7 +341,7 @@ impl Bus {
     }
 }
 
-fn declare_token(session: &zenoh::Session, token: String) -> Result<LivelinessToken, BusError> {
+fn declare_token(session: &zenoh::Session, token: String) -> Result<LivelinessToken, LinkError> {
     let declaring = session.liveliness().declare_token(token);
     declaring.wait().map_err(zenoh_failed("announce the node"))
 }

@@ -27,7 +27,7 @@ use std::time::Duration;
 use tread_control::measured::WheelSpeeds;
 
 use self::assemble::{Arrived, Assembler};
-use self::bus::{Bus, BusError};
+use self::bus::Bus;
 use self::inlet::{Inlet, Tap, WAITING_MAX};
 use self::obedience::Obedience;
 use self::outlet::Outlet;
@@ -35,6 +35,7 @@ use self::refusal::{Counts, Refusal, Source};
 use self::settings::Ros2Settings;
 use super::{Arrivals, Battery, Drive, Feedback, StatedNoise};
 use crate::clock::SharedClock;
+use crate::fleet::LinkError;
 
 #[cfg(test)]
 mod tests;
@@ -62,8 +63,8 @@ impl Ros2Drive {
     /// A drive, and the bus to be run in a thread of its own.
     ///
     /// # Errors
-    /// [`BusError::Endpoint`].
-    pub fn new(settings: Ros2Settings, clock: &SharedClock) -> Result<(Self, Bus), BusError> {
+    /// [`LinkError::Endpoint`].
+    pub fn new(settings: Ros2Settings, clock: &SharedClock) -> Result<(Self, Bus), LinkError> {
         Self::with_tap(settings, clock, None)
     }
 
@@ -76,7 +77,7 @@ impl Ros2Drive {
         settings: Ros2Settings,
         clock: &SharedClock,
         tap: &Arc<dyn Tap>,
-    ) -> Result<(Self, Bus), BusError> {
+    ) -> Result<(Self, Bus), LinkError> {
         Self::with_tap(settings, clock, Some(tap))
     }
 
@@ -84,7 +85,7 @@ impl Ros2Drive {
         settings: Ros2Settings,
         clock: &SharedClock,
         tap: Option<&Arc<dyn Tap>>,
-    ) -> Result<(Self, Bus), BusError> {
+    ) -> Result<(Self, Bus), LinkError> {
         let settings = Arc::new(settings);
         let (counts, outlet) = (Arc::new(Counts::default()), Arc::new(Outlet::default()));
         let arrivals = Arc::new(Arrivals::default());
