@@ -203,16 +203,19 @@ pub(crate) async fn log_losses(
     base: Option<Arc<Counts>>,
     stop: CancellationToken,
 ) {
-    let mut dropping = Dropping::default();
+    let (mut dropping, mut said) = (Dropping::default(), None);
     let (mut segments, mut blocks) = (0, 0);
     loop {
         tokio::select! {
             () = tokio::time::sleep(LOSSES_EVERY) => {}
             () = stop.cancelled() => return,
         }
-        if let Some((_, text)) = base.as_deref().and_then(|base| dropping.look(base)) {
+        let dropped = base.as_deref().and_then(|base| dropping.look(base));
+        // The count in it grows as long as there is something new.
+        if let Some((_, text)) = dropped.as_ref().filter(|_| dropped != said) {
             warn!("{text}");
         }
+        said = dropped;
         let lost = shared.lost_segments.load(Ordering::Relaxed);
         if lost > segments {
             warn!(

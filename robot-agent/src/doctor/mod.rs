@@ -39,6 +39,8 @@ const RAMP: Duration = Duration::from_millis(500);
 const HOLD: Duration = Duration::from_secs(2);
 /// How long the robot stands between two motions.
 const REST: Duration = Duration::from_secs(1);
+/// How often a motion is tried of a base that falls silent in the middle of it.
+const TRIES_MAX: u32 = 5;
 /// Longest wait for the bus to be left.
 const CLOSE_MAX: Duration = Duration::from_secs(2);
 /// Speed of the wheels' rims, metres per second.
@@ -171,21 +173,25 @@ struct Hands {
 }
 
 impl Hands {
-    /// Commands this for so long.
-    fn hold(&mut self, command: WheelSpeeds, span: Duration) {
+    /// Commands this for so long; whether the base was heard all the while.
+    fn hold(&mut self, command: WheelSpeeds, span: Duration) -> bool {
         let until = self.clock.monotonic() + span;
+        let mut is_heard = true;
         while self.clock.monotonic() < until {
             let _ = self.drive.read(self.clock.monotonic());
             self.drive.write(command);
+            is_heard &= !self.drive.must_rest();
             std::thread::sleep(PERIOD);
         }
         self.said = command;
+        is_heard
     }
 
-    /// Goes from what was commanded to this, evenly.
-    fn ramp(&mut self, to: WheelSpeeds) {
+    /// Goes from what was commanded to this, evenly; whether the base was heard all the while.
+    fn ramp(&mut self, to: WheelSpeeds) -> bool {
         let from = self.said;
         let steps = u32::try_from(RAMP.as_millis() / PERIOD.as_millis()).unwrap_or(1);
+        let mut is_heard = true;
         for step in 1..=steps {
             let share = f64::from(step) / f64::from(steps);
             let between = |from: f64, to: f64| from + share * (to - from);
@@ -193,24 +199,32 @@ impl Hands {
                 left_rad_s: between(from.left_rad_s, to.left_rad_s),
                 right_rad_s: between(from.right_rad_s, to.right_rad_s),
             };
-            self.hold(command, PERIOD);
+            is_heard &= self.hold(command, PERIOD);
         }
+        is_heard
     }
 
-    /// Drives like this for a while, and says what was said meanwhile.
+    /// Drives like this for a while, and says what was said meanwhile. A base that falls silent is
+    /// at rest then, and the motion is tried again.
     fn drive_for(
         &mut self,
         command: WheelSpeeds,
         settings: &Ros2Settings,
         heard: &Heard,
     ) -> moving::Drove {
-        self.ramp(command);
-        self.hold(command, HOLD / 2);
-        heard.forget();
-        self.hold(command, HOLD / 2);
-        let drove = moving::drove(command, settings, &heard.taken());
-        self.ramp(WheelSpeeds::default());
-        self.hold(WheelSpeeds::default(), REST);
+        let mut drove = moving::Drove::default();
+        for _ in 0..TRIES_MAX {
+            let mut is_heard = self.ramp(command) && self.hold(command, HOLD / 2);
+            heard.forget();
+            is_heard = is_heard && self.hold(command, HOLD / 2);
+            drove = moving::drove(command, settings, &heard.taken());
+            drove.is_heard = is_heard;
+            self.ramp(WheelSpeeds::default());
+            self.hold(WheelSpeeds::default(), REST);
+            if is_heard {
+                break;
+            }
+        }
         drove
     }
 }

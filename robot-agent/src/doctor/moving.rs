@@ -30,6 +30,8 @@ pub(super) struct Drove {
     pub(super) turn_rad_s: Option<f64>,
     /// How fast it went over ground, metres per second.
     pub(super) ground_m_s: Option<f64>,
+    /// Whether the base was heard all the while.
+    pub(super) is_heard: bool,
 }
 
 /// A mean that grows.
@@ -97,6 +99,7 @@ pub(super) fn drove(told: WheelSpeeds, settings: &Ros2Settings, messages: &[Mess
             }),
         turn_rad_s: gyro.value().or(odometry_turn.value()),
         ground_m_s: speed_of(&places).or(speed.value()),
+        is_heard: true,
     }
 }
 
@@ -127,6 +130,14 @@ pub(super) fn findings(
     turned: &Drove,
     ahead: &Drove,
 ) -> Vec<Finding> {
+    if !(turned.is_heard && ahead.is_heard) {
+        return vec![Finding::wrong(
+            "wheels",
+            "drive.ros2.silent_after_ms",
+            "the base fell silent whenever it was moved: its messages come with gaps, or its machine \
+             is overloaded",
+        )];
+    }
     let (Some(turning), Some(going)) = (turned.wheels, ahead.wheels) else {
         return vec![Finding::wrong(
             "wheels",

@@ -118,6 +118,11 @@ impl Ros2Drive {
         Arc::clone(&self.counts)
     }
 
+    /// Whether the base is told to rest, whatever the loop commands.
+    pub fn must_rest(&self) -> bool {
+        self.must_rest
+    }
+
     fn pace_source(&self) -> Source {
         if self.settings.joints.is_some() {
             Source::Joints
