@@ -1,7 +1,7 @@
 //! `tread-agent doctor`: what is wrong with the installation on a ROS 2 robot, before it drives.
 //!
 //! It listens for a while ([`listening`]); with `--move` it turns the robot on the spot and drives
-//! it ahead for half a metre, slowly, and compares what was told with what was said ([`moving`]). Each finding names the
+//! it ahead for a metre, slowly, and compares what was told with what was said ([`moving`]). Each finding names the
 //! key of `robot.toml` to look at.
 
 mod heard;
@@ -36,7 +36,7 @@ const PERIOD: Duration = Duration::from_millis(10);
 /// How long it takes to the whole speed, and back to rest.
 const RAMP: Duration = Duration::from_millis(500);
 /// How long the whole speed is held; the second half of it counts.
-const HOLD: Duration = Duration::from_secs(2);
+const HOLD: Duration = Duration::from_secs(4);
 /// How long the robot stands between two motions.
 const REST: Duration = Duration::from_secs(1);
 /// How often a motion is tried of a base that falls silent in the middle of it.
@@ -52,7 +52,7 @@ pub(crate) struct DoctorArgs {
     /// The configuration file of the robot
     #[arg(long, env = "TREAD_AGENT_CONFIG")]
     config: PathBuf,
-    /// Move the robot: it turns on the spot and drives half a metre ahead, at 0.2 m/s
+    /// Move the robot: it turns on the spot and drives a metre ahead, at 0.2 m/s
     #[arg(long = "move")]
     moves: bool,
     /// Print one JSON object

@@ -16,6 +16,8 @@ use crate::drive::ros2::settings::{MotionOf, Ros2Settings};
 const STANDING_SHARE: f64 = 0.2;
 /// Turn rate below which a robot does not turn, radians per second.
 const TURNING_RAD_S: f64 = 0.05;
+/// Least spread of the places' times for a speed, seconds squared: ten over a second.
+const PLACES_SPREAD_MIN_S2: f64 = 0.8;
 /// Error of a radius that is borne, as a share.
 const RADIUS_SHARE: f64 = 0.06;
 
@@ -63,14 +65,14 @@ pub(super) fn drove(told: WheelSpeeds, settings: &Ros2Settings, messages: &[Mess
         .as_ref()
         .map(|odometry| odometry.motion_of);
     for message in messages {
-        let Ok(Some((_, content))) = decoded(settings, message.source, &message.payload) else {
+        let Ok(Some((stamp, content))) = decoded(settings, message.source, &message.payload) else {
             continue;
         };
         let mut add_wheels = |speeds: WheelSpeeds| {
             left.add(speeds.left_rad_s);
             right.add(speeds.right_rad_s);
         };
-        let at_s = message.arrival.monotonic.as_secs_f64();
+        let at_s = f64::from(stamp.sec) + 1.0e-9 * f64::from(stamp.nanosec);
         match content {
             Content::Wheels(wheels) => add_wheels(wheels.speeds),
             Content::Inertial(inertial) => gyro.add(inertial.yaw_rate_rad_s),
@@ -103,13 +105,29 @@ pub(super) fn drove(told: WheelSpeeds, settings: &Ros2Settings, messages: &[Mess
     }
 }
 
-/// How fast the places went ahead.
+/// How fast the places went ahead: the slope of the line through all of them.
 fn speed_of(places: &[(f64, Position)]) -> Option<f64> {
-    let ((from_s, from), (to_s, to)) = (places.first()?, places.last()?);
-    let span_s = to_s - from_s;
-    let (sin, cos) = from.pose.heading_rad.sin_cos();
-    let ahead_m = cos * (to.pose.x_m - from.pose.x_m) + sin * (to.pose.y_m - from.pose.y_m);
-    (span_s > 0.5).then(|| ahead_m / span_s)
+    let (first_s, first) = places.first()?;
+    let (sin, cos) = first.pose.heading_rad.sin_cos();
+    let (mut span, mut way) = (Mean::default(), Mean::default());
+    let points: Vec<(f64, f64)> = places
+        .iter()
+        .map(|(at_s, place)| {
+            let ahead_m = cos * place.pose.x_m + sin * place.pose.y_m;
+            (at_s - first_s, ahead_m)
+        })
+        .inspect(|(at_s, ahead_m)| {
+            span.add(*at_s);
+            way.add(*ahead_m);
+        })
+        .collect();
+    let (middle_s, middle_m) = (span.value()?, way.value()?);
+    let (mut squares, mut products) = (0.0, 0.0);
+    for (at_s, ahead_m) in points {
+        squares += (at_s - middle_s).powi(2);
+        products += (at_s - middle_s) * (ahead_m - middle_m);
+    }
+    (squares > PLACES_SPREAD_MIN_S2).then(|| products / squares)
 }
 
 /// 1, -1, or 0 for a wheel that stands.
@@ -302,6 +320,23 @@ mod tests {
             Some("drive.ros2.command.ahead_sign")
         );
         assert_eq!(key((0, 0), (0, 0), 0.0), Some("drive.ros2.command.topic"));
+    }
+
+    #[test]
+    fn a_speed_is_the_slope_of_all_places() {
+        let at = |index: u32| {
+            let at_s = 100.0 + 0.05 * f64::from(index);
+            // Every other place is a centimetre off.
+            let off_m = if index.is_multiple_of(2) { 0.01 } else { -0.01 };
+            let pose = tread_control::geometry::Pose {
+                x_m: 0.2 * at_s + off_m,
+                ..Default::default()
+            };
+            (at_s, Position { pose, noise: None })
+        };
+        let places: Vec<_> = (0..40).map(at).collect();
+        assert!((speed_of(&places).unwrap() - 0.2).abs() < 0.002);
+        assert_eq!(speed_of(&places[..3]), None);
     }
 
     #[test]
