@@ -149,6 +149,20 @@ pub struct LiveFriction {
     pub theta_measured: Option<ThetaEstimate>,
     /// Whether the motion of late carried information on θ.
     pub excited: bool,
+    /// How much the wheels slip along their way; `null` while they hardly turn or change their
+    /// speed, and from an older agent.
+    #[serde(default)]
+    pub slip: Option<SideSlip>,
+}
+
+/// Slip of the two sides' wheels along their way, equation (3) of the paper: what the rim goes
+/// faster than the ground below it passes, over the speed of the rim; −1 to 1, positive drives.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct SideSlip {
+    /// Left wheels.
+    pub left_ratio: f64,
+    /// Right wheels.
+    pub right_ratio: f64,
 }
 
 /// θ with its deviation.

@@ -31,6 +31,24 @@ pub struct PositionFix {
     pub pose: Pose,
     /// How long ago it was measured, seconds.
     pub age_s: f64,
+    /// How good it is; none for what [`LocalisationNoise`] says.
+    pub noise: Option<FixNoise>,
+}
+
+/// How good a fix is; one standard deviation each, above zero.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FixNoise {
+    /// Position, per axis, metres.
+    pub position_m: f64,
+    /// Heading, radians.
+    pub heading_rad: f64,
+}
+
+impl FixNoise {
+    fn is_possible(self) -> bool {
+        let is_possible = |deviation: f64| deviation.is_finite() && deviation > 0.0;
+        is_possible(self.position_m) && is_possible(self.heading_rad)
+    }
 }
 
 /// Noise of the sensors that localisation uses; one standard deviation each.
@@ -221,13 +239,18 @@ impl Localisation {
 
     /// Takes a position fix.
     pub fn correct(&mut self, fix: &PositionFix) -> FixOutcome {
-        if !(fix.pose.is_finite() && (0.0..=FIX_AGE_MAX_S).contains(&fix.age_s)) {
+        let fix_noise = fix.noise.unwrap_or(FixNoise {
+            position_m: self.noise.position_m,
+            heading_rad: self.noise.heading_rad,
+        });
+        let is_in_time = (0.0..=FIX_AGE_MAX_S).contains(&fix.age_s);
+        if !(fix.pose.is_finite() && is_in_time && fix_noise.is_possible()) {
             self.invalid += 1;
             return FixOutcome::Invalid;
         }
         let moved = self.carried(fix);
         if !self.started {
-            self.start(moved, fix.age_s);
+            self.start(moved, fix.age_s, fix_noise);
             return FixOutcome::Started;
         }
         let innovation = Vector3::new(
@@ -236,11 +259,11 @@ impl Localisation {
             wrap_angle_rad(moved.heading_rad - self.state[2]),
         );
         let observe = Matrix3x6::identity();
-        let position = self.noise.position_m.powi(2);
+        let position = fix_noise.position_m.powi(2);
         let noise = Matrix3::from_diagonal(&Vector3::new(
             position,
             position,
-            self.noise.heading_rad.powi(2),
+            fix_noise.heading_rad.powi(2),
         ));
         let spread: Matrix3<f64> = observe * self.covariance * observe.transpose() + noise;
         let Some(inverse) = spread.try_inverse() else {
@@ -254,7 +277,7 @@ impl Localisation {
                 return FixOutcome::Outlier;
             }
             self.restarts += 1;
-            self.start(moved, fix.age_s);
+            self.start(moved, fix.age_s, fix_noise);
             return FixOutcome::Restarted;
         }
         let gain = self.covariance * observe.transpose() * inverse;
@@ -281,7 +304,7 @@ impl Localisation {
         }
     }
 
-    fn start(&mut self, pose: Pose, age_s: f64) {
+    fn start(&mut self, pose: Pose, age_s: f64, fix_noise: FixNoise) {
         self.state = Vector6::new(
             pose.x_m,
             pose.y_m,
@@ -292,9 +315,9 @@ impl Localisation {
         );
         let noise = &self.noise;
         self.covariance = Matrix6::from_diagonal(&Vector6::new(
-            noise.position_m.powi(2),
-            noise.position_m.powi(2),
-            noise.heading_rad.powi(2),
+            fix_noise.position_m.powi(2),
+            fix_noise.position_m.powi(2),
+            fix_noise.heading_rad.powi(2),
             noise.speed_m_s.powi(2),
             noise.sideways_m_s.powi(2),
             0.01_f64.powi(2),
@@ -321,6 +344,7 @@ mod tests {
                 heading_rad: 0.0,
             },
             age_s: 0.0,
+            noise: None,
         }
     }
 
@@ -345,6 +369,29 @@ mod tests {
         filter.predict(0.0, WheelSpeeds::default(), 0.05);
         assert_eq!(filter.correct(&fix(50.0, 0.0)), FixOutcome::Restarted);
         assert!((filter.pose().unwrap().x_m - 50.0).abs() < 1.0e-9);
+    }
+
+    #[test]
+    fn a_fix_weighs_by_its_own_deviation() {
+        let moved_by = |position_m: f64| {
+            let mut filter = filter();
+            filter.correct(&fix(0.0, 0.0));
+            filter.predict(0.0, WheelSpeeds::default(), 0.05);
+            let noise = Some(FixNoise {
+                position_m,
+                heading_rad: 0.01,
+            });
+            let outcome = filter.correct(&PositionFix {
+                noise,
+                ..fix(0.02, 0.0)
+            });
+            (outcome, filter.pose().unwrap().x_m)
+        };
+        let (_, by_good) = moved_by(0.005);
+        let (_, by_poor) = moved_by(0.1);
+        assert!(by_good > 0.015 && by_poor < 0.001, "{by_good} {by_poor}");
+        assert_eq!(moved_by(f64::NAN).0, FixOutcome::Invalid);
+        assert_eq!(moved_by(0.0).0, FixOutcome::Invalid);
     }
 
     #[test]

@@ -18,16 +18,17 @@ use tread_api::ids::BootId;
 use tread_api::robot::OutboxStatus;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
 use tread_api::wire::state::{FrictionReport, RobotState};
-use tread_control::robot::{RobotModel, RobotModelError};
+use tread_control::robot::RobotModelError;
 use uuid::Uuid;
 
+use crate::base::Base;
 use crate::clock::{SharedClock, SystemClock};
-use crate::config::{AgentConfig, SimulatedConfig};
+use crate::config::AgentConfig;
+use crate::control_loop::BRAKING_MAX;
 use crate::control_loop::seam::{AgentEnds, Shared, seam};
 use crate::control_loop::tick::LoopCore;
-use crate::control_loop::{self, BRAKING_MAX};
 use crate::dispatcher::Dispatcher;
-use crate::drive::simulated::{SimMode, SimulatedDrive, SimulatedDriveError};
+use crate::drive::simulated::SimulatedDriveError;
 use crate::fleet::{self, Identity, LinkError};
 use crate::geometry::control_model;
 use crate::knowledge::{Missions, SiteCell};
@@ -37,7 +38,7 @@ use crate::online::Online;
 use crate::outbox::{Outbox, OutboxError};
 use crate::recorder::Recorder;
 use crate::reporter::{Reporter, log_losses};
-use crate::safety::{Safety, watchdog};
+use crate::safety::Safety;
 use crate::supervisor::{PartEnded, Supervisor};
 
 /// Longest time that a stopping agent waits for the server to take its last records.
@@ -51,7 +52,7 @@ pub enum StartError {
     /// The robot's model is impossible.
     #[error("the robot's model is impossible")]
     Model(#[from] RobotModelError),
-    /// The server's endpoint is none.
+    /// The server's endpoint, or that of the robot's bus, is none.
     #[error(transparent)]
     Link(#[from] LinkError),
     /// The simulated base could not be made.
@@ -97,7 +98,9 @@ impl Agent {
     /// # Errors
     /// [`StartError`]: nothing is left running then.
     pub fn start(config: AgentConfig) -> Result<RunningAgent, StartError> {
-        let ahead = SignedDuration::from_secs(config.drive.clock_ahead_s);
+        let simulated = config.drive.simulated();
+        let ahead = simulated.map_or(0, |simulated| simulated.clock_ahead_s);
+        let ahead = SignedDuration::from_secs(ahead);
         Self::start_with_clock(config, Arc::new(SystemClock::new().ahead_by(ahead)))
     }
 
@@ -111,7 +114,7 @@ impl Agent {
     ) -> Result<RunningAgent, StartError> {
         let model = control_model(&config.model)?;
         fleet::check_endpoint(&config.server)?;
-        let drive = simulated_drive(&config.drive, model)?;
+        let base = Base::new(&config.drive, model, &clock)?;
         let boot = BootId::from_uuid(Uuid::new_v4());
         let outbox_folder = config.data_dir.join("outbox");
         let outbox = Outbox::open(&outbox_folder, config.outbox, config.robot.clone(), boot)?;
@@ -145,22 +148,24 @@ impl Agent {
             Arc::clone(&shared.safety),
             Arc::clone(&clock),
         );
-        let core =
-            LoopCore::new(model, loop_ends).with_blind_within_fence(config.blind_within_fence);
-        let (loop_clock, period) = (Arc::clone(&clock), config.period());
+        let core = LoopCore::new(model, loop_ends)
+            .with_blind_within_fence(config.blind_within_fence)
+            .with_silent_after(base.silent_after());
         let no_thread = |part| move |source| StartError::Thread { part, source };
+        let counts = base.counts();
         let recording = supervisor
             .spawn_thread("recorder", move || recorder.run(&events))
             .map_err(no_thread("recorder"))?;
-        let looping = supervisor
-            .spawn_thread("control loop", move || {
-                control_loop::run(core, Box::new(drive), &loop_clock, period);
-            })
+        let mut threads = base
+            .spawn(core, config.period(), &supervisor, &shared, &clock)
             .map_err(no_thread("control loop"))?;
-        let watchdog = watch_loop(&supervisor, &shared, &clock).map_err(no_thread("watchdog"))?;
+        threads.push(recording);
         let stop = || supervisor.stop_token();
         supervisor.spawn("outbox", outbox.clone().keep_synced(stop()));
-        supervisor.spawn("losses", log_losses(Arc::clone(&shared), stop()));
+        supervisor.spawn(
+            "losses",
+            log_losses(Arc::clone(&shared), counts.clone(), stop()),
+        );
 
         let reporter = Arc::new(Reporter {
             identity: identity.clone(),
@@ -173,6 +178,7 @@ impl Agent {
             states: AtomicU64::new(0),
             frictions: AtomicU64::new(0),
             alerts: Mutex::default(),
+            base: counts,
         });
         let dispatcher = Arc::new(Dispatcher {
             boot,
@@ -206,7 +212,7 @@ impl Agent {
             outbox,
             reporter,
             is_connected,
-            threads: vec![looping, recording, watchdog],
+            threads,
         })
     }
 }
@@ -225,27 +231,6 @@ fn renew_membership(
     };
     supervisor.spawn("renewal", renewal.run(supervisor.stop_token()));
     Some(membership)
-}
-
-fn simulated_drive(
-    simulated: &SimulatedConfig,
-    model: RobotModel,
-) -> Result<SimulatedDrive, SimulatedDriveError> {
-    let (start, seed) = (simulated.start, simulated.seed);
-    let drive = SimulatedDrive::new(&simulated.scenario, model, start, seed, SimMode::Auto)?;
-    let drive = drive.with_charge(simulated.battery_charge_ratio);
-    Ok(drive.with_stall(simulated.stall))
-}
-
-fn watch_loop(
-    supervisor: &Supervisor,
-    shared: &Arc<Shared>,
-    clock: &SharedClock,
-) -> std::io::Result<JoinHandle<()>> {
-    let (shared, clock) = (Arc::clone(shared), Arc::clone(clock));
-    supervisor.spawn_thread("watchdog of the control loop", move || {
-        watchdog::run(&shared, &clock);
-    })
 }
 
 /// Reads the mission memory; what was in hand when the agent died is reported as failed.

@@ -8,6 +8,7 @@ use tread_api::robot::{AlertReport, OutboxStatus, Severity};
 
 use crate::control_loop::seam::Fault;
 use crate::drive::Battery;
+use crate::drive::ros2::refusal::{Counts, Dropping};
 
 /// Charge below which the battery is low, and above which it no longer is.
 const BATTERY_LOW: (f64, f64) = (0.20, 0.25);
@@ -17,20 +18,23 @@ const BATTERY_CRITICAL: (f64, f64) = (0.05, 0.08);
 const OUTBOX_LONG: (u64, u64) = (50_000, 25_000);
 
 /// What alerts are judged from.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(crate) struct Causes {
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Causes<'a> {
     pub(crate) battery: Option<Battery>,
     pub(crate) fault: Option<Fault>,
     pub(crate) is_stopped: bool,
     pub(crate) outbox: OutboxStatus,
+    /// What of the base's words was dropped.
+    pub(crate) base: Option<&'a Counts>,
 }
 
 /// Which wavering alerts stand.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Alerts {
     battery_low: bool,
     battery_critical: bool,
     outbox_long: bool,
+    dropping: Dropping,
 }
 
 /// Whether a figure counts as below, with the bound that holds in the present state.
@@ -49,7 +53,7 @@ fn alert(code: &str, severity: Severity, text: String) -> Option<AlertReport> {
 
 impl Alerts {
     /// The alerts that stand now.
-    pub(crate) fn judge(&mut self, causes: &Causes) -> Vec<AlertReport> {
+    pub(crate) fn judge(&mut self, causes: &Causes<'_>) -> Vec<AlertReport> {
         let charge = causes.battery.map(|battery| battery.charge_ratio);
         self.battery_low =
             charge.is_some_and(|charge| is_below(charge, self.battery_low, BATTERY_LOW));
@@ -75,6 +79,11 @@ impl Alerts {
             };
             alert(code, Severity::Critical, fault.text().to_owned())
         });
+        let dropped = causes.base.and_then(|base| {
+            let (refusal, text) = self.dropping.look(base)?;
+            let code = format!("base-{}", refusal.code());
+            alert(&code, Severity::Warning, format!("the base: {text}"))
+        });
         let long = self.outbox_long.then(|| {
             let text = "many measurements wait for the server".to_owned();
             alert("outbox-long", Severity::Warning, text)
@@ -90,6 +99,7 @@ impl Alerts {
         [
             battery,
             fault,
+            dropped,
             stopped.flatten(),
             long.flatten(),
             lost.flatten(),

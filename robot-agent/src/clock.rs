@@ -13,6 +13,11 @@ pub trait Clock: std::fmt::Debug + Send + Sync {
     fn monotonic(&self) -> Duration;
     /// The wall clock; it may jump.
     fn wall(&self) -> Timestamp;
+    /// The machine's own wall clock as it stands now, nanoseconds since 1970: other programs of the
+    /// machine stamp their messages by it, and it may be put right at any time.
+    fn host_wall_ns(&self) -> i64 {
+        i64::try_from(self.wall().as_nanosecond()).unwrap_or(i64::MAX)
+    }
 }
 
 /// A clock as it is handed around.
@@ -77,6 +82,18 @@ impl Clock for SystemClock {
         self.wall_origin
             .checked_add(self.monotonic())
             .unwrap_or(Timestamp::MAX)
+    }
+
+    fn host_wall_ns(&self) -> i64 {
+        #[expect(
+            clippy::disallowed_methods,
+            reason = "this is the clock that others inject"
+        )]
+        let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+        // Before 1970 nothing has a stamp.
+        since_1970.map_or(0, |since| {
+            i64::try_from(since.as_nanos()).unwrap_or(i64::MAX)
+        })
     }
 }
 

@@ -29,8 +29,10 @@ pub mod program;
 pub mod sim;
 
 mod alerts;
+mod base;
 mod control_loop;
 mod dispatcher;
+mod doctor;
 mod durable;
 mod enroll;
 mod knowledge;

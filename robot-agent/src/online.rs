@@ -159,12 +159,12 @@ impl Online {
             capabilities: Capabilities {
                 pause: true,
                 replace: true,
-                battery: true,
-                wheel_torque: true,
+                battery: self.config.drive.measures_battery(),
+                wheel_torque: self.config.drive.measures_torque(),
                 stop: true,
                 teleop: true,
                 rate_hz: Some(self.config.rate_hz),
-                base: Some("simulated".to_owned()),
+                base: Some(self.config.drive.kind().to_owned()),
             },
         };
         match link.hello(&hello).await {

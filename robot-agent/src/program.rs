@@ -12,6 +12,7 @@ use tread_api::startup::give_zenoh_threads;
 
 use crate::agent::{Agent, RunningAgent};
 use crate::config::{AgentConfig, Flags, LogFormat};
+use crate::doctor::{self, DoctorArgs};
 use crate::enroll::{self, EnrollArgs};
 
 /// Drives one robot and measures its ground.
@@ -28,6 +29,8 @@ struct Words {
 enum Action {
     /// Join the fleet by a join token: get a certificate, and keep it in the robot's folder
     Enroll(EnrollArgs),
+    /// Say what is wrong with the installation on a ROS 2 robot
+    Doctor(DoctorArgs),
 }
 
 /// Runs an agent until it is told to stop by SIGTERM or ctrl-c; the first argument is the
@@ -49,6 +52,12 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
     init_logging(&words.flags);
     let ended = match words.action {
         Some(Action::Enroll(args)) => run_enroll(args),
+        Some(Action::Doctor(args)) => match doctor::run(&args) {
+            Ok(true) => Ok(()),
+            // What is wrong has been said.
+            Ok(false) => return ExitCode::FAILURE,
+            Err(cause) => Err(cause),
+        },
         None => run(&words.flags),
     };
     match ended {

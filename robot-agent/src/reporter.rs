@@ -16,6 +16,7 @@ use tread_control::gate::GateCause;
 use crate::alerts::{Alerts, Causes};
 use crate::clock::SharedClock;
 use crate::control_loop::seam::{Shared, Snapshot};
+use crate::drive::ros2::refusal::{Counts, Dropping};
 use crate::fleet::{FleetLink, Identity};
 use crate::geometry::{wire_pose, wire_twist};
 use crate::knowledge::SiteCell;
@@ -41,6 +42,8 @@ pub(crate) struct Reporter {
     pub(crate) states: AtomicU64,
     pub(crate) frictions: AtomicU64,
     pub(crate) alerts: Mutex<Alerts>,
+    /// What of the base's words was dropped, where that is counted.
+    pub(crate) base: Option<Arc<Counts>>,
 }
 
 /// A cause for the wire.
@@ -82,6 +85,7 @@ impl Reporter {
             fault: snapshot.fault,
             is_stopped: self.shared.safety.stop() != 0,
             outbox,
+            base: self.base.as_deref(),
         };
         let counted = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         RobotState {
@@ -185,6 +189,7 @@ impl Reporter {
                 theta_loop: snapshot.theta_loop,
                 theta_measured: snapshot.theta_measured,
                 excited: snapshot.excited,
+                slip: snapshot.slip,
             },
         }
     }
@@ -194,13 +199,24 @@ impl Reporter {
 const LOSSES_EVERY: Duration = Duration::from_secs(10);
 
 /// Logs what the loop had to give up, when there is more of it, until told to stop.
-pub(crate) async fn log_losses(shared: Arc<Shared>, stop: CancellationToken) {
+pub(crate) async fn log_losses(
+    shared: Arc<Shared>,
+    base: Option<Arc<Counts>>,
+    stop: CancellationToken,
+) {
+    let (mut dropping, mut said) = (Dropping::default(), None);
     let (mut segments, mut blocks) = (0, 0);
     loop {
         tokio::select! {
             () = tokio::time::sleep(LOSSES_EVERY) => {}
             () = stop.cancelled() => return,
         }
+        let dropped = base.as_deref().and_then(|base| dropping.look(base));
+        // The count in it grows as long as there is something new.
+        if let Some((_, text)) = dropped.as_ref().filter(|_| dropped != said) {
+            warn!("{text}");
+        }
+        said = dropped;
         let lost = shared.lost_segments.load(Ordering::Relaxed);
         if lost > segments {
             warn!(

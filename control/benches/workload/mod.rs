@@ -138,7 +138,11 @@ impl Robot {
         }
         if self.ticks.is_multiple_of(5) {
             let pose = self.plant.state().pose;
-            self.localisation.correct(&PositionFix { pose, age_s: 0.0 });
+            self.localisation.correct(&PositionFix {
+                pose,
+                age_s: 0.0,
+                noise: None,
+            });
         }
         self.ticks += 1;
         let knowledge = self.estimator.estimate().theta.map(|found| ThetaKnowledge {

@@ -136,7 +136,11 @@ impl SeededRobot {
             y_m: pose.y_m + self.gauss(FIX_NOISE.0),
             heading_rad: pose.heading_rad + self.gauss(FIX_NOISE.1),
         };
-        self.localisation.correct(&PositionFix { pose, age_s: 0.0 });
+        self.localisation.correct(&PositionFix {
+            pose,
+            age_s: 0.0,
+            noise: None,
+        });
     }
 
     /// What the robot's law may look at.

@@ -151,6 +151,11 @@ impl Estimator {
         estimator
     }
 
+    /// The noise of the sensors is this from now on.
+    pub fn set_noise(&mut self, noise: SensorNoise) {
+        self.noise = noise;
+    }
+
     /// Takes one sample, `dt_s` after the one before. One that is not finite, out of order or
     /// impossible is dropped and counted.
     pub fn update(&mut self, sample: &SensorSample, dt_s: f64) -> UpdateOutcome {

@@ -105,7 +105,11 @@ impl SimRobot {
             y_m: pose.y_m + self.gauss(0.01),
             heading_rad: pose.heading_rad + self.gauss(0.005),
         };
-        self.localisation.correct(&PositionFix { pose, age_s: 0.0 });
+        self.localisation.correct(&PositionFix {
+            pose,
+            age_s: 0.0,
+            noise: None,
+        });
     }
 
     /// What the loop sees now.

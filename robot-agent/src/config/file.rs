@@ -7,6 +7,7 @@ use tread_api::ids::{HolderId, RobotId, SiteId};
 use tread_api::robot::RobotModel;
 
 use super::ConfigError;
+use super::ros2::Ros2File;
 
 /// `robot.toml`.
 #[derive(Debug, Clone, Default, Deserialize)]
@@ -80,14 +81,14 @@ impl From<ModelFile> for RobotModel {
 #[serde(rename_all = "snake_case")]
 pub(super) enum DriveKind {
     Simulated,
+    Ros2,
 }
 
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct DriveFile {
-    /// There is one kind so far; it is asked for all the same, so that files stay valid.
-    #[serde(rename = "kind")]
-    _kind: DriveKind,
+    pub(super) kind: DriveKind,
+    pub(super) ros2: Option<Ros2File>,
     pub(super) scenario: Option<PathBuf>,
     pub(super) x_m: Option<f64>,
     pub(super) y_m: Option<f64>,

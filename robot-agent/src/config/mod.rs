@@ -4,6 +4,7 @@
 
 mod file;
 mod place;
+mod ros2;
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -14,10 +15,11 @@ use tread_api::robot::RobotModel;
 use tread_api::safety::LIMITS_MAX;
 use tread_control::geometry::Pose;
 
-use file::{DriveFile, FileConfig};
+use file::{DriveFile, DriveKind, FileConfig};
 pub(crate) use place::place;
 use place::place_at;
 
+use crate::drive::ros2::settings::{Effort, Ros2Settings};
 use crate::drive::simulated::Stall;
 use crate::geometry::{control_model, paper_robot};
 use crate::membership::{Membership, MembershipFileError};
@@ -164,6 +166,60 @@ pub struct SimulatedConfig {
     pub stall: Option<Stall>,
 }
 
+/// The base.
+#[derive(Debug, Clone, PartialEq)]
+pub enum DriveConfig {
+    /// A simulated one.
+    Simulated(SimulatedConfig),
+    /// A ROS 2 robot.
+    Ros2(Box<Ros2Settings>),
+}
+
+impl DriveConfig {
+    /// The simulated base, if it is one.
+    pub fn simulated(&self) -> Option<&SimulatedConfig> {
+        match self {
+            Self::Simulated(simulated) => Some(simulated),
+            Self::Ros2(_) => None,
+        }
+    }
+
+    /// Its kind, as in the file.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Simulated(_) => "simulated",
+            Self::Ros2(_) => "ros2",
+        }
+    }
+
+    /// Whether it says how full its battery is.
+    pub fn measures_battery(&self) -> bool {
+        match self {
+            Self::Simulated(_) => true,
+            Self::Ros2(settings) => settings.battery.is_some(),
+        }
+    }
+
+    /// Whether it says how its wheels pull.
+    pub fn measures_torque(&self) -> bool {
+        match self {
+            Self::Simulated(_) => true,
+            Self::Ros2(settings) => settings
+                .joints
+                .as_ref()
+                .is_some_and(|joints| joints.effort != Effort::None),
+        }
+    }
+
+    /// The same, to be changed.
+    pub fn simulated_mut(&mut self) -> Option<&mut SimulatedConfig> {
+        match self {
+            Self::Simulated(simulated) => Some(simulated),
+            Self::Ros2(_) => None,
+        }
+    }
+}
+
 /// A checked configuration.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AgentConfig {
@@ -186,7 +242,7 @@ pub struct AgentConfig {
     /// Model and tyres, as declared to the server.
     pub model: RobotModel,
     /// The base.
-    pub drive: SimulatedConfig,
+    pub drive: DriveConfig,
     /// Holders of external limits whose silence holds the robot, at most
     /// [`LIMITS_MAX`].
     pub required_holders: Vec<HolderId>,
@@ -214,7 +270,7 @@ impl AgentConfig {
             data_dir: Some(data_dir),
             ..Flags::default()
         };
-        assemble(&flags, FileConfig::default(), scenario)
+        assemble(&flags, FileConfig::default(), || Ok(scenario))
     }
 
     /// Reads the file that the flags name, if any, and lets the flags go before it.
@@ -223,19 +279,16 @@ impl AgentConfig {
     /// [`ConfigError`] names file, line and key.
     pub fn load(flags: &Flags) -> Result<Self, ConfigError> {
         let file = read_file(flags)?;
-        let from_file = file
-            .drive
-            .as_ref()
-            .and_then(|drive| drive.scenario.as_ref());
-        let scenario = match flags.scenario.as_ref().or(from_file) {
-            None => Scenario::built_in()?,
-            Some(name) if name == Path::new(BUILT_IN_NAME) => Scenario::built_in()?,
+        let from_file = file.drive.as_ref().and_then(|drive| drive.scenario.clone());
+        let scenario = || match flags.scenario.as_ref().or(from_file.as_ref()) {
+            None => Scenario::built_in(),
+            Some(name) if name == Path::new(BUILT_IN_NAME) => Scenario::built_in(),
             Some(path) => {
                 // Paths in a configuration are meant from where the file is.
                 let folder = flags.config.as_deref().and_then(Path::parent);
                 let is_from_flag = flags.scenario.is_some();
                 let folder = folder.filter(|_| !is_from_flag).unwrap_or(Path::new(""));
-                Scenario::load(&folder.join(path))?
+                Scenario::load(&folder.join(path))
             }
         };
         assemble(flags, file, scenario)
@@ -298,7 +351,7 @@ fn parse_stall(text: &str) -> Result<Stall, String> {
 fn assemble(
     flags: &Flags,
     file: FileConfig,
-    scenario: Scenario,
+    scenario: impl FnOnce() -> Result<Scenario, ScenarioError>,
 ) -> Result<AgentConfig, ConfigError> {
     let data_dir = flags.data_dir.clone().or(file.data_dir);
     let membership = match &data_dir {
@@ -353,8 +406,12 @@ fn assemble(
             problem: format!("at most {LIMITS_MAX} programs may limit a robot"),
         });
     }
+    let drive = match file.drive {
+        Some(drive) if drive.kind == DriveKind::Ros2 => ros2_drive(drive, &model)?,
+        drive => DriveConfig::Simulated(simulated(flags, drive, scenario()?, &robot)?),
+    };
     Ok(AgentConfig {
-        drive: simulated(flags, file.drive, scenario, &robot)?,
+        drive,
         site,
         robot,
         server,
@@ -368,6 +425,25 @@ fn assemble(
         blind_within_fence: file.blind_within_fence.unwrap_or(false),
         outbox: outbox::Limits::default(),
     })
+}
+
+fn ros2_drive(file: DriveFile, model: &RobotModel) -> Result<DriveConfig, ConfigError> {
+    let refused = |problem: &str| ConfigError::OutOfRange {
+        key: "drive",
+        problem: problem.to_owned(),
+    };
+    let is_simulated = file.scenario.is_some()
+        || file.x_m.or(file.y_m).or(file.heading_rad).is_some()
+        || file.battery_charge_ratio.is_some()
+        || file.seed.is_some()
+        || file.clock_ahead_s.is_some();
+    if is_simulated {
+        return Err(refused("a ROS 2 robot has no keys of a simulated one"));
+    }
+    let settings = file
+        .ros2
+        .ok_or_else(|| refused("`kind = \"ros2\"` needs [drive.ros2]"))?;
+    Ok(DriveConfig::Ros2(Box::new(settings.checked(model)?)))
 }
 
 fn simulated(
@@ -467,7 +543,8 @@ mod tests {
         assert_eq!(config.server, SERVER_DEFAULT);
         assert_eq!(config.period(), Duration::from_millis(10));
         assert_eq!(config.model, paper_robot());
-        assert_eq!(config.drive.seed, 11, "the scenario's robot of that name");
+        let drive = config.drive.simulated().unwrap();
+        assert_eq!(drive.seed, 11, "the scenario's robot of that name");
     }
 
     #[test]
@@ -491,7 +568,7 @@ mod tests {
         assert_eq!(config.robot.as_str(), "other");
         assert_eq!(config.period(), Duration::from_millis(20));
         assert_eq!(
-            config.drive.start,
+            config.drive.simulated().unwrap().start,
             Pose {
                 x_m: -1.0,
                 y_m: 2.5,

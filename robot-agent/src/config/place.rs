@@ -58,7 +58,7 @@ pub(super) fn place_at(
 
 /// Whether an endpoint in the clear is on this machine. What is no endpoint at all is for zenoh
 /// to refuse.
-fn is_here(endpoint: &str) -> bool {
+pub(super) fn is_here(endpoint: &str) -> bool {
     let Some((_protocol, rest)) = endpoint.split_once('/') else {
         return true;
     };

@@ -56,14 +56,21 @@ pub(crate) enum Hold {
     Replacement,
     /// Somebody outside holds the robot; it goes on by itself when that ends.
     Outside,
+    /// The base is silent, or is heard again for too short a time; it goes on by itself.
+    Base,
 }
 
 /// What holds a mission now.
 #[derive(Debug, Clone, Copy, Default)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "each says whether one independent hold is on"
+)]
 struct Holds {
     pause: bool,
     replacement: bool,
     outside: bool,
+    base: bool,
 }
 
 /// The mission in hand.
@@ -159,6 +166,7 @@ impl Active {
             }
             Hold::Replacement => &mut self.holds.replacement,
             Hold::Outside => &mut self.holds.outside,
+            Hold::Base => &mut self.holds.base,
         };
         if std::mem::replace(present, is_wanted) == is_wanted {
             return;
@@ -172,7 +180,7 @@ impl Active {
 
     /// Whether it is held, braking or standing.
     pub(super) fn is_held(&self) -> bool {
-        self.holds.pause || self.holds.replacement || self.holds.outside
+        self.holds.pause || self.holds.replacement || self.holds.outside || self.holds.base
     }
 
     /// Whether it leaves the wheels to others: it stands held, or is over but for a revision.

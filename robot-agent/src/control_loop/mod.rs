@@ -6,10 +6,12 @@
 pub(crate) mod active;
 pub(crate) mod driven;
 mod outgoing;
+mod pace;
 pub(crate) mod prior;
 pub(crate) mod seam;
 pub(crate) mod segments;
 pub(crate) mod site_view;
+pub(crate) mod slip;
 pub(crate) mod tick;
 
 use std::time::Duration;
@@ -18,13 +20,12 @@ use tracing::{info, warn};
 
 use crate::clock::SharedClock;
 use crate::drive::Drive;
+use pace::Pace;
 use segments::Moment;
 use tick::LoopCore;
 
 /// Longest time from the word to stop until the loop ends, standing or not.
 pub(crate) const BRAKING_MAX: Duration = Duration::from_secs(5);
-/// Periods by which the loop may lag before it gives up the ticks that it missed.
-const LAG_PERIODS_MAX: u32 = 10;
 /// Standing ticks in a row that count as having stopped.
 const STANDING_TICKS: u32 = 5;
 
@@ -39,12 +40,12 @@ pub(crate) fn run(
         period_us = u64::try_from(period.as_micros()).unwrap_or(0),
         "control loop runs"
     );
-    let mut deadline = clock.monotonic();
+    let mut pace = Pace::new(period, drive.arrivals(), clock.monotonic());
     let mut told_to_stop_at = None;
     let mut standing_ticks = 0;
     loop {
         let began = clock.monotonic();
-        if began > deadline + period {
+        if pace.begin(began) {
             core.note_overrun();
         }
         let stop = core.is_told_to_stop();
@@ -72,12 +73,7 @@ pub(crate) fn run(
                 return;
             }
         }
-        deadline += period;
-        if ended > deadline + LAG_PERIODS_MAX * period {
-            // The process slept or starved: what was missed is not made up for.
-            deadline = ended;
-        }
-        std::thread::sleep(deadline.saturating_sub(clock.monotonic()));
+        pace.wait(clock);
     }
 }
 

@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use jiff::Timestamp;
-use tread_api::friction::ThetaEstimate;
+use tread_api::friction::{SideSlip, ThetaEstimate};
 use tread_api::ids::{MissionId, PlanHash};
 use tread_api::robot::{MissionProgress, RobotMode};
 use tread_api::site::Cell;
@@ -226,6 +226,8 @@ pub(crate) struct Snapshot {
     pub theta_measured: Option<ThetaEstimate>,
     /// Whether the motion of late carried information on θ.
     pub excited: bool,
+    /// How much the wheels slip along their way, while they turn.
+    pub slip: Option<SideSlip>,
     /// The cell that the robot is in.
     pub cell: Option<Cell>,
     /// The terrain that it is on, by its place in the site's definition.
@@ -255,6 +257,7 @@ impl Default for Snapshot {
             theta_loop: None,
             theta_measured: None,
             excited: false,
+            slip: None,
             cell: None,
             terrain: None,
             terrain_revision: None,

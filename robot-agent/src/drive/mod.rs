@@ -3,15 +3,23 @@
 //! A drive hands over every sensor sample since the last tick (up to [`SAMPLES_MAX`]), so that the
 //! estimator sees all of a 200 Hz sensor in a 100 Hz loop. Neither call may block or allocate.
 
+pub mod ros2;
 pub mod simulated;
 
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
+use std::thread::Thread;
 use std::time::Duration;
 
 use tread_control::geometry::Pose;
+use tread_control::localisation::FixNoise;
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 
 /// Most samples of one tick: a 20 Hz loop with 200 Hz sensors, with room for jitter.
 pub const SAMPLES_MAX: usize = 16;
+
+/// Longest silence of any base with which it does not count as silent.
+pub const SILENT_AFTER_MAX: Duration = Duration::from_millis(200);
 
 /// What the base's sensors said at one moment; absent where a sensor said nothing then.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -32,6 +40,47 @@ pub struct SensorSample {
     pub tilt_rad: Option<f64>,
     /// A position fix in the site's frame.
     pub position: Option<Pose>,
+    /// How good that fix is, where the base says so.
+    pub position_noise: Option<FixNoise>,
+}
+
+/// How good the base says that its sensors are: one standard deviation each, where it says so.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct StatedNoise {
+    /// Gyro, radians per second.
+    pub gyro_rad_s: Option<f64>,
+    /// Accelerometer, metres per second squared.
+    pub accelerometer_m_s2: Option<f64>,
+    /// Speed of the body over ground, metres per second.
+    pub body_speed_m_s: Option<f64>,
+}
+
+/// Word of new samples, for a loop that waits for them.
+#[derive(Debug, Default)]
+pub struct Arrivals {
+    count: AtomicU64,
+    waiting: OnceLock<Thread>,
+}
+
+impl Arrivals {
+    /// From now on the calling thread is woken.
+    pub fn attend(&self) {
+        // A second thread would be a mistake of the program's; the first goes on.
+        let _ = self.waiting.set(std::thread::current());
+    }
+
+    /// A sample has come.
+    pub fn ring(&self) {
+        self.count.fetch_add(1, Ordering::Release);
+        if let Some(waiting) = self.waiting.get() {
+            waiting.unpark();
+        }
+    }
+
+    /// How many have come.
+    pub fn count(&self) -> u64 {
+        self.count.load(Ordering::Acquire)
+    }
 }
 
 /// Everything that the base said since the last tick, oldest first.
@@ -59,6 +108,11 @@ impl Feedback {
         &self.samples[..self.count]
     }
 
+    /// Takes the newest back.
+    pub fn pop(&mut self) {
+        self.count = self.count.saturating_sub(1);
+    }
+
     /// Samples that gave way.
     pub fn lost(&self) -> u32 {
         self.lost
@@ -84,6 +138,27 @@ pub trait Drive: Send {
 
     /// The battery; none if the base does not measure it.
     fn battery(&self) -> Option<Battery> {
+        None
+    }
+
+    /// How good the sensors are, as far as the base says so.
+    fn noise(&self) -> StatedNoise {
+        StatedNoise::default()
+    }
+
+    /// Oldest word of the base with which it does not count as silent, at most
+    /// [`SILENT_AFTER_MAX`].
+    fn silent_after(&self) -> Duration {
+        SILENT_AFTER_MAX
+    }
+
+    /// Whether the base itself is told to rest, for it is not heard.
+    fn is_silent(&self) -> bool {
+        false
+    }
+
+    /// What tells of new samples, if they are to set the loop's pace.
+    fn arrivals(&self) -> Option<Arc<Arrivals>> {
         None
     }
 }

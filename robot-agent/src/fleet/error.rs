@@ -5,7 +5,7 @@ use tread_api::wire::{Refusal, RefusalCode, WireError};
 /// Why the link could not be made.
 #[derive(Debug, thiserror::Error)]
 pub enum LinkError {
-    /// The server's endpoint is none.
+    /// An endpoint is none.
     #[error("`{endpoint}` is no zenoh endpoint: {problem}")]
     Endpoint {
         /// What was given.
@@ -23,7 +23,7 @@ pub enum LinkError {
     },
 }
 
-pub(super) fn zenoh_failed(action: &'static str) -> impl FnOnce(zenoh::Error) -> LinkError {
+pub(crate) fn zenoh_failed(action: &'static str) -> impl FnOnce(zenoh::Error) -> LinkError {
     move |problem| LinkError::Zenoh {
         action,
         problem: problem.to_string(),

@@ -31,7 +31,7 @@ use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::{ConsolidationMode, Querier, Query};
 
 pub use self::command::IncomingCommand;
-use self::error::zenoh_failed;
+pub(crate) use self::error::zenoh_failed;
 pub use self::error::{AskError, LinkError, may_pass_later};
 pub use self::session::{session_config, start_jitter};
 use crate::membership::Membership;

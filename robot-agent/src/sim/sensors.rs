@@ -157,6 +157,7 @@ impl Sensors {
             body_speed_m_s,
             tilt_rad: None,
             position,
+            position_noise: None,
         }
     }
 }

@@ -255,7 +255,7 @@ async fn a_robot_whose_clock_is_wrong_by_years_starts_in_time_and_names_its_cloc
     let rig = Rig::new();
     let server = rig.serve();
     let mut config = rig.config();
-    config.drive.battery_charge_ratio = 0.1;
+    config.drive.simulated_mut().unwrap().battery_charge_ratio = 0.1;
     let ahead = jiff::SignedDuration::from_hours(-24 * 365 * 20);
     let clock = Arc::new(SystemClock::new().ahead_by(ahead));
     let agent = Agent::start_with_clock(config, clock).unwrap();

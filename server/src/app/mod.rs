@@ -13,6 +13,7 @@ pub mod limits;
 mod map;
 pub mod merging;
 pub mod missions;
+mod planned_path;
 pub mod reconciler;
 pub mod retention;
 pub mod robots;

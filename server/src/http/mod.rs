@@ -113,6 +113,7 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(alerts::acknowledge))
         .routes(routes!(events::stream))
         .routes(routes!(missions::get))
+        .routes(routes!(missions::path))
         .routes(routes!(missions::cancel))
         .routes(routes!(missions::pause))
         .routes(routes!(missions::resume))

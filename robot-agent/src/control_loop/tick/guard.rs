@@ -225,7 +225,11 @@ impl LoopCore {
                 command: Some(wanted.wheels),
                 previous: self.command,
                 stop,
-                feedback_age_s: age_s(now, self.last_sample),
+                feedback_age_s: if self.is_base_silent {
+                    f64::INFINITY
+                } else {
+                    age_s(now, self.last_sample)
+                },
                 dt_s,
             },
             &reasons,

@@ -25,7 +25,8 @@ use super::outgoing::Outgoing;
 use super::seam::{EndReason, LoopEnds, Shared};
 use super::segments::{Moment, SegmentCutter};
 use super::site_view::{Footing, SiteView};
-use crate::drive::Drive;
+use super::slip::SlipMeter;
+use crate::drive::{Drive, SILENT_AFTER_MAX, StatedNoise};
 use guard::Guard;
 
 /// Longest time that one tick is taken to have lasted, seconds; a loop that slept does not leap.
@@ -57,11 +58,21 @@ pub(crate) struct LoopCore {
     body_speed: Option<(f64, Duration)>,
     /// How far the robot leans, if the base measures it.
     tilt_rad: Option<f64>,
+    /// Oldest word of the base with which it does not count as silent.
+    silent_after: Duration,
+    /// Whether the drive says that the base is silent.
+    is_base_silent: bool,
+    /// When the base was last silent, if its mission is held for that.
+    base_silent_at: Option<Duration>,
+    /// What the base says of its sensors' noise.
+    stated_noise: StatedNoise,
     guard: Guard,
     /// Whether the robot may be driven by hand within a fence without knowing where it is.
     blind_within_fence: bool,
     /// Whether a wheel slips beyond the model.
     slips: bool,
+    /// How much they slip.
+    slip: SlipMeter,
     /// Until when the mission is held for its next revision.
     replacement_until: Option<Duration>,
     ticks: u64,
@@ -90,9 +101,14 @@ impl LoopCore {
             last_fix: None,
             body_speed: None,
             tilt_rad: None,
+            silent_after: SILENT_AFTER_MAX,
+            is_base_silent: false,
+            base_silent_at: None,
+            stated_noise: StatedNoise::default(),
             guard: Guard::default(),
             blind_within_fence: false,
             slips: false,
+            slip: SlipMeter::default(),
             replacement_until: None,
             ticks: 0,
         }
@@ -103,6 +119,14 @@ impl LoopCore {
     #[must_use]
     pub(crate) fn with_blind_within_fence(mut self, may: bool) -> Self {
         self.blind_within_fence = may;
+        self
+    }
+
+    /// The same loop with a base that counts as silent earlier.
+    #[must_use]
+    pub(crate) fn with_silent_after(mut self, silent_after: Duration) -> Self {
+        self.silent_after = silent_after.min(SILENT_AFTER_MAX);
+        self.limits.feedback_age_max_s = self.silent_after.as_secs_f64();
         self
     }
 
@@ -118,12 +142,16 @@ impl LoopCore {
         self.outgoing.flush();
         let dt_s = self.time_step_s(now.monotonic);
         let feedback = drive.read(now.monotonic);
+        self.is_base_silent = drive.is_silent();
+        self.take_noise(drive.noise());
         let ground_changed = self.take_samples(&feedback);
+        self.measure_slip(now.monotonic, dt_s);
         self.take_commands(now, stop);
         self.cut_segments(now, ground_changed, dt_s);
         self.look_at_safety(now.monotonic);
         self.mind_bounds(now.monotonic);
         let fault = self.fault(now.monotonic);
+        self.hold_for_base(now.monotonic, fault);
         let by_mission = self.follow(now, fault, dt_s);
         let wanted = self.choose(now.monotonic, by_mission, dt_s);
         let gated = self.pass(now.monotonic, fault, wanted, stop, dt_s);

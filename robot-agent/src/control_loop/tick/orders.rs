@@ -139,8 +139,10 @@ impl LoopCore {
             self.end_mission(now, reason);
             return None;
         }
-        // The gate would brake anyway; a follower that hears of it does not wind up meanwhile.
-        fault.is_none().then_some(step.wanted)
+        // The gate would brake anyway; a follower that hears of it does not wind up meanwhile. A base
+        // that is heard again after a silence comes to rest first.
+        let is_heard = fault.is_none() && self.base_silent_at.is_none();
+        is_heard.then_some(step.wanted)
     }
 
     pub(super) fn end_mission(&mut self, now: Moment, reason: EndReason) {

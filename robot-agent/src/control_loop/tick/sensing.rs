@@ -3,20 +3,24 @@
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use tread_control::estimation::SensorSample;
+use tread_control::estimation::{SensorNoise, SensorSample};
 use tread_control::localisation::{FixOutcome, PositionFix};
+use tread_control::paper::BodyVelocity;
 use tread_control::tracking::ThetaKnowledge;
 
-use super::{LoopCore, TICK_MAX_S};
+use super::{LoopCore, TICK_MAX_S, age_s};
+use crate::control_loop::active::Hold;
 use crate::control_loop::prior::{Prior, told};
 use crate::control_loop::seam::{Fault, LoopEvent, Shared};
 use crate::control_loop::segments::{CutInput, Moment, Place};
 use crate::control_loop::site_view::Footing;
-use crate::drive::Feedback;
+use crate::drive::{Feedback, StatedNoise};
 use crate::geometry::wire_point;
 
-/// Oldest word of the base with which it does not count as silent.
-const BASE_SILENT_AFTER: Duration = Duration::from_millis(200);
+/// How long a base that was silent must be heard before its mission goes on.
+const HEARD_AGAIN_FOR: Duration = Duration::from_millis(500);
+/// Range within which a base's own word on its noise is believed, as a multiple of the default.
+const NOISE_RANGE: std::ops::RangeInclusive<f64> = 0.1..=30.0;
 /// Oldest word of a sensor of the robot's own speed that says how fast it is now.
 const BODY_SPEED_AGE_MAX: Duration = Duration::from_millis(150);
 /// Oldest position fix with which the position does not count as lost.
@@ -74,7 +78,14 @@ impl LoopCore {
                 }
             }
             if let Some(pose) = sample.position {
-                let fix = PositionFix { pose, age_s: 0.0 };
+                // A position takes longer to be found than the motion since.
+                let fix = PositionFix {
+                    pose,
+                    age_s: self
+                        .last_sample
+                        .map_or(0.0, |last| last.saturating_sub(sample.at).as_secs_f64()),
+                    noise: sample.position_noise,
+                };
                 match self.localisation.correct(&fix) {
                     FixOutcome::Started | FixOutcome::Fused | FixOutcome::Restarted => {
                         self.last_fix = Some(sample.at);
@@ -97,6 +108,18 @@ impl LoopCore {
             Some((speed_m_s, at)) if is_new(at) => speed_m_s,
             Some(_) | None => self.localisation.twist().linear_m_s,
         }
+    }
+
+    /// How much the wheels slip; nothing is known of a base that is silent.
+    pub(super) fn measure_slip(&mut self, now: Duration, dt_s: f64) {
+        let is_silent = age_s(now, self.last_sample) > self.silent_after.as_secs_f64();
+        let velocity = BodyVelocity {
+            ahead_m_s: self.real_m_s(now),
+            left_m_s: 0.0,
+            yaw_rate_rad_s: self.localisation.twist().angular_rad_s,
+        };
+        let heard = (!is_silent).then_some((velocity, self.measured_wheels));
+        self.slip.step(heard, &self.model, dt_s);
     }
 
     /// What the law is told about the ground: what was measured, and what the map knows of the
@@ -152,11 +175,47 @@ impl LoopCore {
         }
     }
 
+    /// Holds the mission of a base that is silent, and lets it go on when that is heard again for a
+    /// while.
+    pub(super) fn hold_for_base(&mut self, now: Duration, fault: Option<Fault>) {
+        if fault == Some(Fault::BaseSilent) {
+            self.base_silent_at = Some(now);
+        }
+        let is_held = self
+            .base_silent_at
+            .is_some_and(|silent_at| now.saturating_sub(silent_at) < HEARD_AGAIN_FOR);
+        if !is_held {
+            self.base_silent_at = None;
+        }
+        if let Some(active) = &mut self.active {
+            active.hold(Hold::Base, is_held);
+        }
+    }
+
+    /// Weighs samples by what the base says of its sensors, as far as that can be.
+    pub(super) fn take_noise(&mut self, stated: StatedNoise) {
+        if self.stated_noise == stated {
+            return;
+        }
+        self.stated_noise = stated;
+        let default = SensorNoise::default();
+        let within = |stated: Option<f64>, default: f64| {
+            let (least, most) = (NOISE_RANGE.start() * default, NOISE_RANGE.end() * default);
+            stated.map_or(default, |stated| stated.clamp(least, most))
+        };
+        self.estimator.set_noise(SensorNoise {
+            gyro_rad_s: within(stated.gyro_rad_s, default.gyro_rad_s),
+            accelerometer_m_s2: within(stated.accelerometer_m_s2, default.accelerometer_m_s2),
+            body_speed_m_s: within(stated.body_speed_m_s, default.body_speed_m_s),
+            ..default
+        });
+    }
+
     pub(super) fn fault(&self, now: Duration) -> Option<Fault> {
         let is_older = |at: Option<Duration>, most: Duration| {
             at.is_some_and(|at| now.saturating_sub(at) > most)
         };
-        if is_older(self.last_sample, BASE_SILENT_AFTER) {
+        if self.is_base_silent || is_older(self.last_sample, self.silent_after) {
             Some(Fault::BaseSilent)
         } else if is_older(self.last_fix, POSITION_LOST_AFTER) {
             Some(Fault::PositionLost)

@@ -88,6 +88,7 @@ impl LoopCore {
             theta_measured: measured
                 .filter(|theta| theta.theta.is_finite() && theta.std_dev.is_finite()),
             excited: !self.estimate.no_new_information,
+            slip: self.slip.slip(),
             cell: self.cutter.cell(),
             terrain,
             terrain_revision: self.site.as_ref().map(|site| site.terrain_revision()),

@@ -1,0 +1,472 @@
+//! `[drive.ros2]` in `robot.toml`: what makes it a [`Ros2Settings`].
+
+mod file;
+
+use std::time::Duration;
+
+use tread_api::robot::RobotModel;
+use tread_control::geometry::Pose;
+use tread_ros2::names::{Name, NameError};
+use tread_ros2::rmw::Generation;
+
+pub(super) use file::Ros2File;
+use file::{
+    CommandFile, CommandFileKind, DistributionFile, EffortFile, ImuFile, JointsFile, ModeFile,
+    MotionFile, OdometryFile, PoseFile, SchemeFile, StampsFile,
+};
+
+use super::place::is_here;
+use super::{ConfigError, within};
+use crate::drive::SILENT_AFTER_MAX;
+use crate::drive::ros2::settings::{
+    BusMode, BusSettings, CommandKind, CommandSettings, Effort, ImuSettings, JOINTS_MAX,
+    JointSettings, MotionOf, OdometrySettings, PoseSettings, Ros2Settings, Scheme, SideJoints,
+    StampClock, Timing,
+};
+
+/// Where a robot's own router listens unless said otherwise.
+const ENDPOINT_DEFAULT: &str = "tcp/127.0.0.1:7447";
+/// Highest domain of ROS 2.
+const DOMAIN_MAX: u32 = 232;
+/// Least silence of a base that counts, milliseconds.
+const SILENT_AFTER_MIN_MS: f64 = 30.0;
+/// Latest pose that is used, milliseconds: localisation carries none on for longer.
+const POSE_LATE_AFTER_MAX_MS: f64 = 1_000.0;
+/// Range of gears and constants.
+const RATIO_RANGE: std::ops::RangeInclusive<f64> = 1.0e-3..=1.0e4;
+/// Range of a base's own radius and track, metres.
+const LENGTH_RANGE_M: std::ops::RangeInclusive<f64> = 1.0e-3..=100.0;
+
+fn refused(key: &'static str, problem: impl Into<String>) -> ConfigError {
+    ConfigError::OutOfRange {
+        key,
+        problem: problem.into(),
+    }
+}
+
+fn named(key: &'static str) -> impl FnOnce(NameError) -> ConfigError {
+    move |problem| refused(key, problem.to_string())
+}
+
+fn sign(key: &'static str, sign: Option<f64>) -> Result<f64, ConfigError> {
+    let sign = sign.unwrap_or(1.0);
+    if (sign.abs() - 1.0).abs() < f64::EPSILON {
+        Ok(sign)
+    } else {
+        Err(refused(key, "it is 1 or -1"))
+    }
+}
+
+fn milliseconds(
+    key: &'static str,
+    given: Option<f64>,
+    default: f64,
+    most: f64,
+) -> Result<Duration, ConfigError> {
+    let span = given.unwrap_or(default);
+    within(key, span, &(SILENT_AFTER_MIN_MS..=most))?;
+    Ok(Duration::from_secs_f64(span * 1.0e-3))
+}
+
+fn place(key: &'static str, [x_m, y_m, heading_rad]: [f64; 3]) -> Result<Pose, ConfigError> {
+    let pose = Pose {
+        x_m,
+        y_m,
+        heading_rad,
+    };
+    if pose.is_finite() {
+        Ok(pose)
+    } else {
+        Err(refused(key, "a place is finite numbers"))
+    }
+}
+
+/// Makes the names of topics; the key is for errors.
+struct Topics {
+    namespace: Name,
+}
+
+impl Topics {
+    fn name(
+        &self,
+        key: &'static str,
+        given: Option<&str>,
+        default: &str,
+    ) -> Result<Name, ConfigError> {
+        Name::topic(given.unwrap_or(default), &self.namespace).map_err(named(key))
+    }
+}
+
+fn text(given: Option<&str>, default: &str) -> String {
+    given.unwrap_or(default).to_owned()
+}
+
+impl Ros2File {
+    /// Checks everything.
+    ///
+    /// # Errors
+    /// [`ConfigError::OutOfRange`] names the key.
+    pub(in crate::config) fn checked(
+        &self,
+        model: &RobotModel,
+    ) -> Result<Ros2Settings, ConfigError> {
+        let bus = self.bus()?;
+        let topics = Topics {
+            // The bridge's namespace is before every topic; a node's is before relative ones.
+            namespace: match bus.scheme {
+                Scheme::RmwZenoh(_) => bus.namespace.clone(),
+                Scheme::Ros2Dds => Name::default(),
+            },
+        };
+        let joints = self.joints.as_ref();
+        let joints = joints.map(|joints| joints.checked(&topics)).transpose()?;
+        let battery = self.battery.as_ref().map(|file| {
+            let given = file.topic.as_deref();
+            topics.name("drive.ros2.battery.topic", given, "battery_state")
+        });
+        let settings = Ros2Settings {
+            timing: self.timing()?,
+            odometry: self
+                .odometry
+                .as_ref()
+                .map(|file| file.checked(&topics))
+                .transpose()?,
+            imu: self
+                .imu
+                .as_ref()
+                .map(|file| file.checked(&topics))
+                .transpose()?,
+            pose: self
+                .pose
+                .as_ref()
+                .map(|file| file.checked(&topics))
+                .transpose()?,
+            battery: battery.transpose()?,
+            command: self.command.checked(&topics, joints.as_ref(), model)?,
+            joints,
+            bus,
+        };
+        check_whole(&settings)?;
+        Ok(settings)
+    }
+
+    fn bus(&self) -> Result<BusSettings, ConfigError> {
+        let endpoint = text(self.endpoint.as_deref(), ENDPOINT_DEFAULT);
+        if !is_here(&endpoint) {
+            let problem =
+                format!("`{endpoint}` is another machine: ROS keys never leave the robot");
+            return Err(refused("drive.ros2.endpoint", problem));
+        }
+        if self.domain > DOMAIN_MAX {
+            return Err(refused(
+                "drive.ros2.domain",
+                format!("it is at most {DOMAIN_MAX}"),
+            ));
+        }
+        let generation = match self.distribution {
+            DistributionFile::Humble => Generation::Humble,
+            DistributionFile::Iron
+            | DistributionFile::Jazzy
+            | DistributionFile::Kilted
+            | DistributionFile::Lyrical
+            | DistributionFile::Rolling => Generation::Hashed,
+        };
+        Ok(BusSettings {
+            scheme: match self.bus {
+                SchemeFile::RmwZenoh => Scheme::RmwZenoh(generation),
+                SchemeFile::Ros2dds => Scheme::Ros2Dds,
+            },
+            mode: match self.mode {
+                ModeFile::Client => BusMode::Client,
+                ModeFile::Router => BusMode::Router,
+            },
+            endpoint,
+            domain: self.domain,
+            namespace: Name::namespace(&self.namespace).map_err(named("drive.ros2.namespace"))?,
+            node: Name::node(self.node.as_deref().unwrap_or("tread_agent"))
+                .map_err(named("drive.ros2.node"))?,
+        })
+    }
+
+    fn timing(&self) -> Result<Timing, ConfigError> {
+        let silent_max_ms = SILENT_AFTER_MAX.as_secs_f64() * 1.0e3;
+        let (silent_key, late_key) = ("drive.ros2.silent_after_ms", "drive.ros2.late_after_ms");
+        let pose_key = "drive.ros2.pose_late_after_ms";
+        let pose_ms = self.pose_late_after_ms;
+        Ok(Timing {
+            stamps: match self.stamps {
+                StampsFile::Host => StampClock::Host,
+                StampsFile::Base => StampClock::Base,
+            },
+            silent_after: milliseconds(silent_key, self.silent_after_ms, 100.0, silent_max_ms)?,
+            late_after: milliseconds(late_key, self.late_after_ms, 100.0, silent_max_ms)?,
+            pose_late_after: milliseconds(pose_key, pose_ms, 300.0, POSE_LATE_AFTER_MAX_MS)?,
+        })
+    }
+}
+
+/// What no section can say for itself.
+fn check_whole(settings: &Ros2Settings) -> Result<(), ConfigError> {
+    let odometry = settings.odometry.as_ref();
+    let is_of_wheels = odometry.is_some_and(|odometry| odometry.motion_of == MotionOf::Wheels);
+    if settings.joints.is_none() && !is_of_wheels {
+        return Err(refused(
+            "drive.ros2",
+            "the wheels' speeds come from nowhere: give [drive.ros2.joints], or \
+             [drive.ros2.odometry] with motion_of = \"wheels\"",
+        ));
+    }
+    if settings.imu.is_none() && odometry.is_none() {
+        return Err(refused(
+            "drive.ros2",
+            "the turn rate comes from nowhere: give [drive.ros2.imu] or [drive.ros2.odometry]",
+        ));
+    }
+    let gives_position = odometry.is_some_and(|odometry| odometry.site_from_odom.is_some());
+    if settings.pose.is_some() && gives_position {
+        let problem = "[drive.ros2.pose] gives the position: two would quarrel";
+        return Err(refused("drive.ros2.odometry.gives_position", problem));
+    }
+    Ok(())
+}
+
+impl OdometryFile {
+    fn checked(&self, topics: &Topics) -> Result<OdometrySettings, ConfigError> {
+        let site = [self.site_x_m, self.site_y_m, self.site_heading_rad];
+        let site = place("drive.ros2.odometry.site_x_m", site)?;
+        Ok(OdometrySettings {
+            topic: topics.name("drive.ros2.odometry.topic", self.topic.as_deref(), "odom")?,
+            frame: text(self.frame.as_deref(), "odom"),
+            child_frame: text(self.child_frame.as_deref(), "base_link"),
+            motion_of: match self.motion_of {
+                MotionFile::Wheels => MotionOf::Wheels,
+                MotionFile::Ground => MotionOf::Ground,
+            },
+            site_from_odom: self.gives_position.then_some(site),
+        })
+    }
+}
+
+impl ImuFile {
+    fn checked(&self, topics: &Topics) -> Result<ImuSettings, ConfigError> {
+        if !self.yaw_rad.is_finite() {
+            return Err(refused("drive.ros2.imu.yaw_rad", "it must be finite"));
+        }
+        Ok(ImuSettings {
+            topic: topics.name("drive.ros2.imu.topic", self.topic.as_deref(), "imu/data")?,
+            frame: text(self.frame.as_deref(), "imu_link"),
+            yaw_rad: self.yaw_rad,
+            is_upside_down: self.upside_down,
+        })
+    }
+}
+
+impl PoseFile {
+    fn checked(&self, topics: &Topics) -> Result<PoseSettings, ConfigError> {
+        let site = [self.site_x_m, self.site_y_m, self.site_heading_rad];
+        Ok(PoseSettings {
+            topic: topics.name("drive.ros2.pose.topic", self.topic.as_deref(), "pose")?,
+            frame: text(self.frame.as_deref(), "map"),
+            site_from_map: place("drive.ros2.pose.site_x_m", site)?,
+        })
+    }
+}
+
+impl JointsFile {
+    fn checked(&self, topics: &Topics) -> Result<JointSettings, ConfigError> {
+        let gear_ratio = self.gear_ratio.unwrap_or(1.0);
+        within("drive.ros2.joints.gear_ratio", gear_ratio, &RATIO_RANGE)?;
+        let constant = self.torque_constant_n_m_a;
+        let key = "drive.ros2.joints.torque_constant_n_m_a";
+        if let Some(constant) = constant {
+            within(key, constant, &RATIO_RANGE)?;
+        }
+        let effort = match (self.effort, constant) {
+            (EffortFile::None, _) => Effort::None,
+            (EffortFile::Torque, None) => Effort::Times(1.0),
+            (EffortFile::Torque, Some(_)) => {
+                return Err(refused(key, "it is for effort = \"current\""));
+            }
+            (EffortFile::Current, Some(constant)) => Effort::Times(constant),
+            (EffortFile::Current, None) => {
+                return Err(refused(key, "effort = \"current\" needs it"));
+            }
+        };
+        let side = |key, names: &[String], sign_key, given| {
+            if names.is_empty() || names.len() > JOINTS_MAX {
+                return Err(refused(key, format!("1 to {JOINTS_MAX} joints are needed")));
+            }
+            let sign = sign(sign_key, given)?;
+            Ok(SideJoints {
+                names: names.to_vec(),
+                sign,
+            })
+        };
+        if self.left.iter().any(|name| self.right.contains(name)) {
+            return Err(refused(
+                "drive.ros2.joints.right",
+                "a joint is on both sides",
+            ));
+        }
+        Ok(JointSettings {
+            topic: topics.name(
+                "drive.ros2.joints.topic",
+                self.topic.as_deref(),
+                "joint_states",
+            )?,
+            left: side(
+                "drive.ros2.joints.left",
+                &self.left,
+                "drive.ros2.joints.left_sign",
+                self.left_sign,
+            )?,
+            right: side(
+                "drive.ros2.joints.right",
+                &self.right,
+                "drive.ros2.joints.right_sign",
+                self.right_sign,
+            )?,
+            gear_ratio,
+            effort,
+        })
+    }
+}
+
+impl CommandFile {
+    fn checked(
+        &self,
+        topics: &Topics,
+        joints: Option<&JointSettings>,
+        model: &RobotModel,
+    ) -> Result<CommandSettings, ConfigError> {
+        let kind = match self.kind {
+            CommandFileKind::Twist => CommandKind::Twist,
+            CommandFileKind::TwistStamped => CommandKind::TwistStamped,
+            CommandFileKind::JointSpeeds => CommandKind::JointSpeeds,
+        };
+        if kind == CommandKind::JointSpeeds && joints.is_none() {
+            let problem = "\"joint_speeds\" needs [drive.ros2.joints]";
+            return Err(refused("drive.ros2.command.kind", problem));
+        }
+        let base_radius_m = self.wheel_radius_m.unwrap_or(model.wheel_radius_m);
+        within(
+            "drive.ros2.command.wheel_radius_m",
+            base_radius_m,
+            &LENGTH_RANGE_M,
+        )?;
+        let base_track_m = self.track_width_m.unwrap_or(model.track_width_m);
+        within(
+            "drive.ros2.command.track_width_m",
+            base_track_m,
+            &LENGTH_RANGE_M,
+        )?;
+        // Without joints there is one of each side, and nothing is written to them.
+        let ratio = |side: &SideJoints, gear_ratio: f64| gear_ratio * side.sign;
+        let (joints, joint_ratios) = joints.map_or(([1, 1], [1.0, 1.0]), |joints| {
+            let (left, right, gear_ratio) = (&joints.left, &joints.right, joints.gear_ratio);
+            (
+                [left.names.len(), right.names.len()],
+                [ratio(left, gear_ratio), ratio(right, gear_ratio)],
+            )
+        });
+        Ok(CommandSettings {
+            topic: topics.name("drive.ros2.command.topic", self.topic.as_deref(), "cmd_vel")?,
+            kind,
+            frame: self.frame.clone().unwrap_or_else(|| "base_link".to_owned()),
+            base_radius_m,
+            base_track_m,
+            turn_sign: sign("drive.ros2.command.turn_sign", self.turn_sign)?,
+            ahead_sign: sign("drive.ros2.command.ahead_sign", self.ahead_sign)?,
+            joints,
+            joint_ratios,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::paper_robot;
+
+    fn checked(text: &str) -> Result<Ros2Settings, String> {
+        let file: Ros2File = toml::from_str(text).map_err(|refused| refused.to_string())?;
+        file.checked(&paper_robot())
+            .map_err(|refused| refused.to_string())
+    }
+
+    #[test]
+    fn a_short_file_is_a_robot_by_its_odometry_alone() {
+        let settings = checked("[odometry]\ngives_position = true\n").unwrap();
+        assert_eq!(settings.bus.scheme, Scheme::RmwZenoh(Generation::Hashed));
+        assert_eq!(settings.bus.endpoint, ENDPOINT_DEFAULT);
+        assert_eq!(settings.command.topic.to_string(), "/cmd_vel");
+        assert_eq!(settings.timing.silent_after, Duration::from_millis(100));
+        assert!(settings.odometry.unwrap().site_from_odom.is_some());
+    }
+
+    #[test]
+    fn names_are_within_the_namespace_but_for_the_bridge() {
+        let text = "namespace = \"/robot7\"\n[odometry]\n[command]\ntopic = \"/cmd\"\n";
+        let settings = checked(text).unwrap();
+        assert_eq!(settings.odometry.unwrap().topic.to_string(), "/robot7/odom");
+        assert_eq!(settings.command.topic.to_string(), "/cmd");
+        let settings = checked(&format!("bus = \"ros2dds\"\n{text}")).unwrap();
+        assert_eq!(settings.odometry.unwrap().topic.to_string(), "/odom");
+    }
+
+    #[test]
+    fn what_cannot_be_is_named_by_its_key() {
+        let joints = "[joints]\nleft = [\"l\"]\nright = [\"r\"]\n";
+        for (text, key) in [
+            (String::new(), "wheels' speeds"),
+            ("[imu]\n".to_owned(), "wheels' speeds"),
+            (joints.to_owned(), "turn rate"),
+            (
+                "[odometry]\nmotion_of = \"ground\"\n".to_owned(),
+                "wheels' speeds",
+            ),
+            (
+                "endpoint = \"tcp/192.0.2.1:7447\"\n[odometry]\n".to_owned(),
+                "endpoint",
+            ),
+            (
+                "silent_after_ms = 500\n[odometry]\n".to_owned(),
+                "silent_after_ms",
+            ),
+            ("domain = 233\n[odometry]\n".to_owned(), "domain"),
+            ("[odometry]\ntopic = \"a b\"\n".to_owned(), "odometry.topic"),
+            (
+                "[odometry]\n[command]\nkind = \"joint_speeds\"\n".to_owned(),
+                "command.kind",
+            ),
+            (
+                "[odometry]\n[command]\nturn_sign = 2\n".to_owned(),
+                "turn_sign",
+            ),
+            (
+                "[odometry]\ngives_position = true\n[pose]\n".to_owned(),
+                "gives_position",
+            ),
+            (
+                "[odometry]\n[pose]\nsite_x_m = nan\n".to_owned(),
+                "pose.site_x_m",
+            ),
+            (
+                format!("[odometry]\n{joints}effort = \"current\"\n"),
+                "torque_constant",
+            ),
+            (
+                format!("[odometry]\n{joints}gear_ratio = 0.0\n"),
+                "gear_ratio",
+            ),
+            (
+                "[odometry]\n[joints]\nleft = [\"l\"]\nright = [\"l\"]\n".to_owned(),
+                "both sides",
+            ),
+            ("[odometry]\nspeed = 1\n".to_owned(), "speed"),
+        ] {
+            let refused = checked(&text).map(|_| ()).unwrap_err();
+            assert!(refused.contains(key), "`{key}` is missing in: {refused}");
+        }
+    }
+}

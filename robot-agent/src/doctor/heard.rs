@@ -1,0 +1,67 @@
+//! Every message as it came, for a while.
+
+use std::sync::{Mutex, PoisonError};
+
+use crate::drive::ros2::inlet::Tap;
+use crate::drive::ros2::refusal::Source;
+use crate::drive::ros2::stamps::Arrival;
+
+/// Most messages that are kept; five topics of 200 Hz for ten seconds.
+const MESSAGES_MAX: usize = 10_000;
+
+/// A message as it came.
+#[derive(Debug, Clone)]
+pub(super) struct Message {
+    pub(super) source: Source,
+    pub(super) arrival: Arrival,
+    pub(super) key: String,
+    pub(super) has_attachment: bool,
+    pub(super) payload: Vec<u8>,
+}
+
+/// What was heard.
+#[derive(Debug, Default)]
+pub(super) struct Heard(Mutex<Vec<Message>>);
+
+impl Heard {
+    fn messages(&self) -> std::sync::MutexGuard<'_, Vec<Message>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Whether nothing was heard yet.
+    pub(super) fn is_empty(&self) -> bool {
+        self.messages().is_empty()
+    }
+
+    /// Begins afresh.
+    pub(super) fn forget(&self) {
+        self.messages().clear();
+    }
+
+    /// All that was heard since; begins afresh.
+    pub(super) fn taken(&self) -> Vec<Message> {
+        std::mem::take(&mut self.messages())
+    }
+}
+
+impl Tap for Heard {
+    fn hear(
+        &self,
+        source: Source,
+        arrival: Arrival,
+        key: &str,
+        attachment: Option<&[u8]>,
+        payload: &[u8],
+    ) {
+        let mut messages = self.messages();
+        if messages.len() < MESSAGES_MAX {
+            messages.push(Message {
+                source,
+                arrival,
+                key: key.to_owned(),
+                has_attachment: attachment.is_some_and(|bytes| !bytes.is_empty()),
+                payload: payload.to_vec(),
+            });
+        }
+    }
+}

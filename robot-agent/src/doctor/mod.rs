@@ -1,0 +1,230 @@
+//! `tread-agent doctor`: what is wrong with the installation on a ROS 2 robot, before it drives.
+//!
+//! It listens for a while ([`listening`]); with `--move` it turns the robot on the spot and drives
+//! it ahead for a metre, slowly, and compares what was told with what was said ([`moving`]). Each finding names the
+//! key of `robot.toml` to look at.
+
+mod heard;
+mod listening;
+mod moving;
+
+use std::io::Write as _;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context as _, bail};
+use clap::Args;
+use serde::Serialize;
+use tread_control::measured::WheelSpeeds;
+
+use self::heard::Heard;
+use crate::clock::{SharedClock, SystemClock};
+use crate::config::{AgentConfig, DriveConfig, Flags};
+use crate::drive::Drive as _;
+use crate::drive::ros2::Ros2Drive;
+use crate::drive::ros2::inlet::Tap;
+use crate::drive::ros2::settings::Ros2Settings;
+use crate::geometry::control_model;
+
+/// How long it listens to the standing robot.
+const LISTEN_FOR: Duration = Duration::from_secs(3);
+/// Longest wait for the first message.
+const FIRST_WORD_MAX: Duration = Duration::from_secs(5);
+/// Time between two commands.
+const PERIOD: Duration = Duration::from_millis(10);
+/// How long it takes to the whole speed, and back to rest.
+const RAMP: Duration = Duration::from_millis(500);
+/// How long the whole speed is held; the second half of it counts.
+const HOLD: Duration = Duration::from_secs(4);
+/// How long the robot stands between two motions.
+const REST: Duration = Duration::from_secs(1);
+/// How often a motion is tried of a base that falls silent in the middle of it.
+const TRIES_MAX: u32 = 5;
+/// Longest wait for the bus to be left.
+const CLOSE_MAX: Duration = Duration::from_secs(2);
+/// Speed of the wheels' rims, metres per second.
+const RIM_M_S: f64 = 0.2;
+
+/// Arguments of `tread-agent doctor`.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct DoctorArgs {
+    /// The configuration file of the robot
+    #[arg(long, env = "TREAD_AGENT_CONFIG")]
+    config: PathBuf,
+    /// Move the robot: it turns on the spot and drives a metre ahead, at 0.2 m/s
+    #[arg(long = "move")]
+    moves: bool,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// What was found on one question.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct Finding {
+    /// The question.
+    pub(crate) name: &'static str,
+    /// Whether all is well.
+    pub(crate) holds: bool,
+    /// The key of `robot.toml` to look at, where all is not.
+    pub(crate) key: Option<&'static str>,
+    /// In words.
+    pub(crate) text: String,
+}
+
+impl Finding {
+    fn well(name: &'static str, text: impl Into<String>) -> Self {
+        Self {
+            name,
+            holds: true,
+            key: None,
+            text: text.into(),
+        }
+    }
+
+    fn wrong(name: &'static str, key: &'static str, text: impl Into<String>) -> Self {
+        Self {
+            name,
+            holds: false,
+            key: Some(key),
+            text: text.into(),
+        }
+    }
+}
+
+/// Examines the robot and says what was found; whether all is well.
+///
+/// # Errors
+/// The configuration is refused, it is of no ROS 2 robot, or nothing can be written.
+pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<bool> {
+    let findings = examine(args)?;
+    let mut out = std::io::stdout().lock();
+    if args.json {
+        serde_json::to_writer(&mut out, &serde_json::json!({ "checks": findings }))?;
+        writeln!(out)?;
+    } else {
+        for finding in &findings {
+            let mark = if finding.holds { "ok   " } else { "WRONG" };
+            writeln!(out, "{mark} {}: {}", finding.name, finding.text)?;
+            if let Some(key) = finding.key {
+                writeln!(out, "      look at `{key}` in robot.toml")?;
+            }
+        }
+    }
+    Ok(findings.iter().all(|finding| finding.holds))
+}
+
+fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
+    let config = AgentConfig::load(&Flags {
+        config: Some(args.config.clone()),
+        ..Flags::default()
+    })?;
+    let DriveConfig::Ros2(settings) = &config.drive else {
+        bail!("the robot of this configuration is simulated: nothing is to be examined");
+    };
+    let model = control_model(&config.model)?;
+    let clock = SystemClock::shared();
+    let heard = Arc::new(Heard::default());
+    let tap: Arc<dyn Tap> = Arc::<Heard>::clone(&heard);
+    let (drive, bus) = Ros2Drive::examined((**settings).clone(), &clock, &tap)?;
+    let speaking = std::thread::Builder::new()
+        .name("robot's bus".to_owned())
+        .spawn(move || bus.run())
+        .context("no thread")?;
+    let mut hands = Hands {
+        drive,
+        clock,
+        said: WheelSpeeds::default(),
+    };
+    let until = hands.clock.monotonic() + FIRST_WORD_MAX;
+    while heard.is_empty() && hands.clock.monotonic() < until {
+        hands.hold(WheelSpeeds::default(), PERIOD);
+    }
+    heard.forget();
+    hands.hold(WheelSpeeds::default(), LISTEN_FOR);
+    let mut findings = listening::findings(settings, &heard.taken(), LISTEN_FOR);
+    if args.moves {
+        let rim_rad_s = RIM_M_S / model.wheel_radius_m();
+        let speeds = |left: f64, right: f64| WheelSpeeds {
+            left_rad_s: left * rim_rad_s,
+            right_rad_s: right * rim_rad_s,
+        };
+        heard.forget();
+        let turned = hands.drive_for(speeds(-1.0, 1.0), settings, &heard);
+        let ahead = hands.drive_for(speeds(1.0, 1.0), settings, &heard);
+        findings.extend(moving::findings(settings, &model, &turned, &ahead));
+    }
+    let until = hands.clock.monotonic() + CLOSE_MAX;
+    let clock = Arc::clone(&hands.clock);
+    drop(hands);
+    // A session that does not close is left to the end of the process.
+    while !speaking.is_finished() && clock.monotonic() < until {
+        std::thread::sleep(PERIOD);
+    }
+    Ok(findings)
+}
+
+/// What moves the robot.
+struct Hands {
+    drive: Ros2Drive,
+    clock: SharedClock,
+    said: WheelSpeeds,
+}
+
+impl Hands {
+    /// Commands this for so long; whether the base was heard all the while.
+    fn hold(&mut self, command: WheelSpeeds, span: Duration) -> bool {
+        let until = self.clock.monotonic() + span;
+        let mut is_heard = true;
+        while self.clock.monotonic() < until {
+            let _ = self.drive.read(self.clock.monotonic());
+            self.drive.write(command);
+            is_heard &= !self.drive.must_rest();
+            std::thread::sleep(PERIOD);
+        }
+        self.said = command;
+        is_heard
+    }
+
+    /// Goes from what was commanded to this, evenly; whether the base was heard all the while.
+    fn ramp(&mut self, to: WheelSpeeds) -> bool {
+        let from = self.said;
+        let steps = u32::try_from(RAMP.as_millis() / PERIOD.as_millis()).unwrap_or(1);
+        let mut is_heard = true;
+        for step in 1..=steps {
+            let share = f64::from(step) / f64::from(steps);
+            let between = |from: f64, to: f64| from + share * (to - from);
+            let command = WheelSpeeds {
+                left_rad_s: between(from.left_rad_s, to.left_rad_s),
+                right_rad_s: between(from.right_rad_s, to.right_rad_s),
+            };
+            is_heard &= self.hold(command, PERIOD);
+        }
+        is_heard
+    }
+
+    /// Drives like this for a while, and says what was said meanwhile. A base that falls silent is
+    /// at rest then, and the motion is tried again.
+    fn drive_for(
+        &mut self,
+        command: WheelSpeeds,
+        settings: &Ros2Settings,
+        heard: &Heard,
+    ) -> moving::Drove {
+        let mut drove = moving::Drove::default();
+        for _ in 0..TRIES_MAX {
+            let mut is_heard = self.ramp(command) && self.hold(command, HOLD / 2);
+            heard.forget();
+            is_heard = is_heard && self.hold(command, HOLD / 2);
+            drove = moving::drove(command, settings, &heard.taken());
+            drove.is_heard = is_heard;
+            self.ramp(WheelSpeeds::default());
+            self.hold(WheelSpeeds::default(), REST);
+            if is_heard {
+                break;
+            }
+        }
+        drove
+    }
+}

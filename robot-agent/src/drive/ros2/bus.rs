@@ -1,0 +1,356 @@
+//! The robot's own bus: a second zenoh session, on this machine alone.
+//!
+//! The fleet's session and this one never meet: what is said on the bus stays on the robot. One
+//! thread opens the session, however long that takes, announces the agent's node in the ROS graph,
+//! listens, and writes the loop's commands.
+
+use std::str::FromStr as _;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tracing::{debug, info, warn};
+use tread_control::measured::WheelSpeeds;
+use tread_ros2::bridge;
+use tread_ros2::messages::MessageType;
+use tread_ros2::names::Name;
+use tread_ros2::rmw::{self, Attachment, Endpoint, Generation, Node, Quality, Role};
+use zenoh::Wait as _;
+use zenoh::liveliness::LivelinessToken;
+use zenoh::pubsub::Publisher;
+use zenoh::qos::{CongestionControl, Priority};
+
+use super::command;
+use super::inlet::{Inlet, Numbering};
+use super::outlet::{COMMAND_SILENCE_MAX, Outlet};
+use super::settings::{BusMode, BusSettings, Ros2Settings, Scheme};
+use crate::clock::SharedClock;
+use crate::fleet::{LinkError, zenoh_failed};
+
+/// Longest row of tries to connect before the thread looks whether it is to end, milliseconds.
+const CONNECT_TIMEOUT_MS: u32 = 1_000;
+/// First and longest pause between tries, milliseconds: a router that is started again is found at
+/// once.
+const RETRY_MS: (u32, u32) = (50, 200);
+/// Rest after a row of tries.
+const OPEN_REST: Duration = Duration::from_millis(100);
+/// After this silence a router takes the agent for gone, milliseconds.
+const LEASE_MS: u32 = 3_000;
+/// Largest payload that is looked at, bytes.
+const PAYLOAD_BYTES_MAX: usize = tread_ros2::cdr::MESSAGE_BYTES_MAX;
+/// The agent's only node.
+const NODE_NUMBER: u32 = 0;
+
+/// How the session on the bus is opened.
+///
+/// # Errors
+/// [`LinkError::Endpoint`].
+pub fn session_config(bus: &BusSettings) -> Result<zenoh::Config, LinkError> {
+    zenoh::config::EndPoint::from_str(&bus.endpoint).map_err(|problem| LinkError::Endpoint {
+        endpoint: bus.endpoint.clone(),
+        problem: problem.to_string(),
+    })?;
+    let endpoints = serde_json::json!([bus.endpoint]).to_string();
+    let none = || "[]".to_owned();
+    let (mode, connect, listen) = match bus.mode {
+        BusMode::Client => ("\"client\"", endpoints, none()),
+        BusMode::Router => ("\"router\"", none(), endpoints),
+    };
+    let (first_ms, longest_ms) = RETRY_MS;
+    let retry = serde_json::json!({
+        "period_init_ms": first_ms,
+        "period_max_ms": longest_ms,
+        "period_increase_factor": 2.0,
+    });
+    let settings = [
+        ("mode", mode.to_owned()),
+        ("connect/endpoints", connect),
+        ("connect/timeout_ms", CONNECT_TIMEOUT_MS.to_string()),
+        ("connect/retry", retry.to_string()),
+        ("listen/endpoints", listen),
+        ("scouting/multicast/enabled", "false".to_owned()),
+        ("scouting/gossip/enabled", "false".to_owned()),
+        ("transport/link/tx/lease", LEASE_MS.to_string()),
+    ];
+    let mut config = zenoh::Config::default();
+    for (key, value) in settings {
+        config
+            .insert_json5(key, &value)
+            .map_err(zenoh_failed("take its configuration"))?;
+    }
+    Ok(config)
+}
+
+/// What the bus's thread works with.
+#[derive(Debug)]
+pub struct Bus {
+    config: zenoh::Config,
+    settings: Arc<Ros2Settings>,
+    pub(super) inlets: Vec<Arc<Inlet>>,
+    outlet: Arc<Outlet>,
+    clock: SharedClock,
+}
+
+/// Everything that lives as long as the session.
+#[derive(Debug)]
+struct Declared {
+    commands: Writer,
+    _tokens: Vec<LivelinessToken>,
+}
+
+/// One topic that is written.
+#[derive(Debug)]
+struct Writer {
+    publisher: Publisher<'static>,
+    /// The writer's name in its attachments; none where messages have no attachment.
+    gid: Option<[u8; rmw::GID_BYTES]>,
+    numbering: Numbering,
+}
+
+impl Writer {
+    fn put(&self, bytes: &[u8], wall_ns: i64) -> zenoh::Result<()> {
+        let put = self.publisher.put(bytes);
+        match self.gid {
+            None => put.wait(),
+            Some(gid) => {
+                let attachment = Attachment {
+                    sequence: self.numbering.next(),
+                    source_time_ns: wall_ns,
+                    gid,
+                };
+                put.attachment(attachment.to_bytes().as_slice()).wait()
+            }
+        }
+    }
+}
+
+/// A topic as the agent reads or writes it.
+struct Topic<'a> {
+    role: Role,
+    number: u32,
+    name: &'a Name,
+    message_type: &'a MessageType,
+    quality: Quality,
+}
+
+impl Bus {
+    /// A bus that nobody speaks on yet.
+    ///
+    /// # Errors
+    /// [`LinkError::Endpoint`].
+    pub fn new(
+        settings: Arc<Ros2Settings>,
+        inlets: Vec<Inlet>,
+        outlet: Arc<Outlet>,
+        clock: SharedClock,
+    ) -> Result<Self, LinkError> {
+        Ok(Self {
+            config: session_config(&settings.bus)?,
+            settings,
+            inlets: inlets.into_iter().map(Arc::new).collect(),
+            outlet,
+            clock,
+        })
+    }
+
+    /// Speaks on the bus until the loop's end of the outlet is closed. For a thread of its own.
+    pub fn run(self) {
+        self.outlet.attend();
+        let endpoint = &self.settings.bus.endpoint;
+        while let Some(session) = self.open() {
+            info!(endpoint, "on the robot's bus at `{endpoint}`");
+            match self.declare(&session) {
+                Ok(declared) => self.write_commands(&declared.commands),
+                Err(cause) => {
+                    let cause = &cause as &dyn std::error::Error;
+                    warn!(error = cause, "the robot's bus cannot be used");
+                    std::thread::sleep(OPEN_REST);
+                }
+            }
+            let _ = session.close().wait();
+        }
+    }
+
+    fn open(&self) -> Option<zenoh::Session> {
+        let mut is_told = false;
+        while !self.outlet.is_closed() {
+            match zenoh::open(self.config.clone()).wait() {
+                Ok(session) => return Some(session),
+                Err(cause) if is_told => debug!("the robot's bus is not reached: {cause}"),
+                Err(cause) => {
+                    let endpoint = &self.settings.bus.endpoint;
+                    warn!("the robot's bus at `{endpoint}` is not reached yet: {cause}");
+                    is_told = true;
+                }
+            }
+            std::thread::sleep(OPEN_REST);
+        }
+        None
+    }
+
+    fn generation(&self) -> Option<Generation> {
+        match self.settings.bus.scheme {
+            Scheme::RmwZenoh(generation) => Some(generation),
+            Scheme::Ros2Dds => None,
+        }
+    }
+
+    fn declare(&self, session: &zenoh::Session) -> Result<Declared, LinkError> {
+        let bus = &self.settings.bus;
+        let node = Node {
+            domain: bus.domain,
+            session: session.zid().to_string(),
+            number: NODE_NUMBER,
+            namespace: bus.namespace.clone(),
+            name: bus.node.clone(),
+        };
+        let mut tokens = Vec::new();
+        if self.generation().is_some() {
+            tokens.push(declare_token(session, node.token())?);
+        }
+        let mut number = NODE_NUMBER;
+        for inlet in &self.inlets {
+            let Some(name) = inlet.topic() else {
+                continue;
+            };
+            number += 1;
+            let message_type = inlet.message_type();
+            let topic = Topic {
+                role: Role::Subscriber,
+                number,
+                name,
+                message_type: &message_type,
+                quality: Quality {
+                    is_reliable: false,
+                    depth: 5,
+                },
+            };
+            if let Some(token) = self.token(&node, &topic) {
+                tokens.push(declare_token(session, token)?);
+            }
+            self.listen(session, inlet, name)?;
+        }
+        let command = &self.settings.command;
+        let message_type = command::message_type(command.kind);
+        let topic = Topic {
+            role: Role::Publisher,
+            number: number + 1,
+            name: &command.topic,
+            message_type: &message_type,
+            quality: Quality {
+                is_reliable: true,
+                depth: 1,
+            },
+        };
+        let token = self.token(&node, &topic);
+        let key = match self.generation() {
+            Some(generation) => rmw::topic_key(bus.domain, topic.name, &message_type, generation),
+            None => bridge::topic_key(&bus.namespace, topic.name),
+        };
+        let publisher = session
+            .declare_publisher(key)
+            .congestion_control(CongestionControl::Drop)
+            .priority(Priority::RealTime)
+            .express(true)
+            .wait()
+            .map_err(zenoh_failed("declare the commands"))?;
+        let gid = token.as_deref().map(rmw::gid);
+        if let Some(token) = token {
+            tokens.push(declare_token(session, token)?);
+        }
+        Ok(Declared {
+            commands: Writer {
+                publisher,
+                gid,
+                numbering: Numbering::default(),
+            },
+            _tokens: tokens,
+        })
+    }
+
+    fn token(&self, node: &Node, topic: &Topic<'_>) -> Option<String> {
+        let endpoint = Endpoint {
+            role: topic.role,
+            number: topic.number,
+            topic: topic.name,
+            message_type: topic.message_type,
+            generation: self.generation()?,
+            quality: topic.quality,
+        };
+        Some(node.endpoint_token(&endpoint))
+    }
+
+    fn listen(
+        &self,
+        session: &zenoh::Session,
+        inlet: &Arc<Inlet>,
+        topic: &Name,
+    ) -> Result<(), LinkError> {
+        let bus = &self.settings.bus;
+        let key = match self.generation() {
+            Some(_) => rmw::any_type_key(bus.domain, topic),
+            None => bridge::topic_key(&bus.namespace, topic),
+        };
+        let inlet = Arc::clone(inlet);
+        session
+            .declare_subscriber(key)
+            .callback(move |sample| {
+                let attachment = sample.attachment().map(small);
+                let payload = sample.payload();
+                // What is too large is not even put together.
+                let bytes = if payload.len() > PAYLOAD_BYTES_MAX {
+                    std::borrow::Cow::Borrowed(&[] as &[u8])
+                } else {
+                    payload.to_bytes()
+                };
+                inlet.take(sample.key_expr().as_str(), attachment.as_deref(), &bytes);
+            })
+            .background()
+            .wait()
+            .map_err(zenoh_failed("listen to a topic"))
+    }
+
+    /// Writes each command once, and rest when there is none for too long.
+    fn write_commands(&self, writer: &Writer) {
+        let (mut number, mut written_at) = (0, self.clock.monotonic());
+        let mut bytes = Vec::new();
+        loop {
+            let is_closed = self.outlet.is_closed();
+            let now = self.clock.monotonic();
+            let newer = self.outlet.newer_than(number);
+            let is_silent = now.saturating_sub(written_at) >= COMMAND_SILENCE_MAX;
+            if is_closed || newer.is_some() || is_silent {
+                let command = match newer {
+                    Some((newest, command)) if !is_closed => {
+                        number = newest;
+                        command
+                    }
+                    _ => WheelSpeeds::default(),
+                };
+                written_at = now;
+                let wall_ns = self.clock.host_wall_ns();
+                command::write(command, wall_ns, &self.settings.command, &mut bytes);
+                if let Err(cause) = writer.put(&bytes, wall_ns) {
+                    debug!("a command was not written: {cause}");
+                }
+            }
+            if is_closed {
+                return;
+            }
+            std::thread::park_timeout(COMMAND_SILENCE_MAX);
+        }
+    }
+}
+
+fn declare_token(session: &zenoh::Session, token: String) -> Result<LivelinessToken, LinkError> {
+    let declaring = session.liveliness().declare_token(token);
+    declaring.wait().map_err(zenoh_failed("announce the node"))
+}
+
+/// An attachment, if it is no larger than one of ROS.
+fn small(attachment: &zenoh::bytes::ZBytes) -> std::borrow::Cow<'_, [u8]> {
+    if attachment.len() == rmw::ATTACHMENT_BYTES {
+        attachment.to_bytes()
+    } else {
+        std::borrow::Cow::Borrowed(&[])
+    }
+}

@@ -1,0 +1,244 @@
+//! What comes in on one topic: looked at in zenoh's callback, which never waits, and handed over.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::SyncSender;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use tread_ros2::messages::{
+    BatteryState, Imu, JointState, Message, MessageType, Odometry, PoseWithCovarianceStamped,
+};
+use tread_ros2::names::Name;
+use tread_ros2::rmw::{Attachment, check_key};
+
+use super::assemble::Arrived;
+use super::reading::{self, Content, Reading};
+use super::refusal::{Counts, Refusal, Source};
+use super::settings::{Ros2Settings, Scheme};
+use super::stamps::{Arrival, Stamps};
+use super::writer_watch::WriterWatch;
+use crate::clock::SharedClock;
+use crate::drive::Arrivals;
+
+/// Messages that may wait for the loop; at 20 Hz and 200 messages a second of each kind.
+pub const WAITING_MAX: usize = 128;
+
+/// Somebody who hears every message as it came, besides the loop; must not wait.
+pub trait Tap: std::fmt::Debug + Send + Sync {
+    /// A message came.
+    fn hear(
+        &self,
+        source: Source,
+        arrival: Arrival,
+        key: &str,
+        attachment: Option<&[u8]>,
+        payload: &[u8],
+    );
+}
+
+/// What is known of a topic between two messages.
+#[derive(Debug, Clone, Copy)]
+struct Watched {
+    writer: WriterWatch,
+    stamps: Stamps,
+}
+
+/// The receiving end of one topic.
+#[derive(Debug)]
+pub struct Inlet {
+    source: Source,
+    settings: Arc<Ros2Settings>,
+    watched: Mutex<Watched>,
+    counts: Arc<Counts>,
+    to_loop: SyncSender<Arrived>,
+    arrivals: Arc<Arrivals>,
+    /// Whether its messages set the loop's pace.
+    is_pace: bool,
+    clock: SharedClock,
+    tap: Option<Arc<dyn Tap>>,
+}
+
+impl Inlet {
+    /// The receiving ends of all topics that the settings name.
+    pub fn all(
+        settings: &Arc<Ros2Settings>,
+        counts: &Arc<Counts>,
+        to_loop: &SyncSender<Arrived>,
+        arrivals: &Arc<Arrivals>,
+        clock: &SharedClock,
+    ) -> Vec<Self> {
+        let timing = settings.timing;
+        let pace = settings
+            .joints
+            .as_ref()
+            .map_or(Source::Odometry, |_| Source::Joints);
+        let inlet = |source| Self {
+            source,
+            settings: Arc::clone(settings),
+            watched: Mutex::new(Watched {
+                writer: WriterWatch::default(),
+                stamps: Stamps::new(
+                    timing.stamps,
+                    match source {
+                        Source::Pose => timing.pose_late_after,
+                        Source::Odometry | Source::Imu | Source::Joints | Source::Battery => {
+                            timing.late_after
+                        }
+                    },
+                ),
+            }),
+            counts: Arc::clone(counts),
+            to_loop: to_loop.clone(),
+            arrivals: Arc::clone(arrivals),
+            is_pace: source == pace,
+            clock: Arc::clone(clock),
+            tap: None,
+        };
+        Source::ALL
+            .into_iter()
+            .filter(|source| topic_of(settings, *source).is_some())
+            .map(inlet)
+            .collect()
+    }
+
+    /// The same, with somebody else who hears its messages.
+    #[must_use]
+    pub fn with_tap(mut self, tap: Option<Arc<dyn Tap>>) -> Self {
+        self.tap = tap;
+        self
+    }
+
+    /// Which topic it is.
+    pub fn source(&self) -> Source {
+        self.source
+    }
+
+    /// The topic's name.
+    pub fn topic(&self) -> Option<&Name> {
+        topic_of(&self.settings, self.source)
+    }
+
+    /// The type of its messages.
+    pub fn message_type(&self) -> MessageType {
+        type_of(self.source)
+    }
+
+    /// Takes a message, or counts why not.
+    pub fn take(&self, key: &str, attachment: Option<&[u8]>, payload: &[u8]) {
+        match self.read(key, attachment, payload) {
+            Ok(None) => {}
+            Ok(Some(arrived)) => {
+                // The count goes first: whoever sees what the loop made of it sees it counted.
+                self.counts.take(self.source);
+                if self.to_loop.try_send(arrived).is_err() {
+                    self.counts.refuse(self.source, Refusal::Overflow);
+                } else if self.is_pace {
+                    self.arrivals.ring();
+                }
+            }
+            Err(refusal) => self.counts.refuse(self.source, refusal),
+        }
+    }
+
+    fn read(
+        &self,
+        key: &str,
+        attachment: Option<&[u8]>,
+        payload: &[u8],
+    ) -> Result<Option<Arrived>, Refusal> {
+        let arrival = Arrival {
+            monotonic: self.clock.monotonic(),
+            wall_ns: self.clock.host_wall_ns(),
+        };
+        if let Some(tap) = &self.tap {
+            tap.hear(self.source, arrival, key, attachment, payload);
+        }
+        let writer = match self.settings.bus.scheme {
+            Scheme::Ros2Dds => None,
+            Scheme::RmwZenoh(generation) => {
+                check_key(key, &self.message_type(), generation)?;
+                let attachment = attachment.and_then(Attachment::from_bytes);
+                Some(attachment.ok_or(Refusal::NoAttachment)?)
+            }
+        };
+        let Some((stamp, content)) = decoded(&self.settings, self.source, payload)? else {
+            return Ok(None);
+        };
+        let mut watched = self.watched.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(attachment) = &writer {
+            watched.writer.check(attachment, arrival.monotonic)?;
+        }
+        let at = if matches!(content, Content::Battery(_)) {
+            arrival.monotonic
+        } else {
+            let stamp_ns = stamp.nanoseconds().ok_or(Refusal::Stamp)?;
+            watched.stamps.place(stamp_ns, arrival)?
+        };
+        Ok(Some(Arrived { at, content }))
+    }
+}
+
+/// What a message of a source says; none for one that is of no concern.
+///
+/// # Errors
+/// [`Refusal`].
+pub fn decoded(
+    settings: &Ros2Settings,
+    source: Source,
+    payload: &[u8],
+) -> Result<Option<Reading>, Refusal> {
+    match source {
+        Source::Odometry => {
+            let odometry = settings.odometry.as_ref();
+            odometry
+                .map(|odometry| reading::odometry(payload, odometry))
+                .transpose()
+        }
+        Source::Imu => {
+            let imu = settings.imu.as_ref();
+            imu.map(|imu| reading::imu(payload, imu)).transpose()
+        }
+        Source::Joints => match &settings.joints {
+            Some(joints) => reading::joints(payload, joints),
+            None => Ok(None),
+        },
+        Source::Pose => {
+            let pose = settings.pose.as_ref();
+            pose.map(|pose| reading::pose(payload, pose)).transpose()
+        }
+        Source::Battery => reading::battery(payload),
+    }
+}
+
+/// The topic of a source, if it is read.
+pub fn topic_of(settings: &Ros2Settings, source: Source) -> Option<&Name> {
+    match source {
+        Source::Odometry => settings.odometry.as_ref().map(|odometry| &odometry.topic),
+        Source::Imu => settings.imu.as_ref().map(|imu| &imu.topic),
+        Source::Joints => settings.joints.as_ref().map(|joints| &joints.topic),
+        Source::Pose => settings.pose.as_ref().map(|pose| &pose.topic),
+        Source::Battery => settings.battery.as_ref(),
+    }
+}
+
+/// The type of a source's messages.
+pub fn type_of(source: Source) -> MessageType {
+    match source {
+        Source::Odometry => Odometry::TYPE,
+        Source::Imu => Imu::TYPE,
+        Source::Joints => JointState::TYPE,
+        Source::Pose => PoseWithCovarianceStamped::TYPE,
+        Source::Battery => BatteryState::TYPE,
+    }
+}
+
+/// Numbers the messages of one writer.
+#[derive(Debug, Default)]
+pub struct Numbering(AtomicU64);
+
+impl Numbering {
+    /// The next number, from one on.
+    pub fn next(&self) -> i64 {
+        let number = self.0.fetch_add(1, Ordering::Relaxed).saturating_add(1);
+        i64::try_from(number).unwrap_or(i64::MAX)
+    }
+}

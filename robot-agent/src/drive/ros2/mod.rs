@@ -1,0 +1,201 @@
+//! A ROS 2 robot behind the drive's seam: read and commanded over zenoh, with no ROS on this side.
+//!
+//! ```text
+//! bus ─callback─► inlet (key, attachment, CDR, values, stamp) ─channel─► assemble ─► loop
+//! bus ◄─thread─── command ◄──────────── outlet ◄──────────────────────────────────── loop
+//! ```
+//! A message that is not wholly good is dropped and counted by its reason. A base that is not
+//! heard for [`Timing::silent_after`](settings::Timing) is told to rest at once; it hears nothing
+//! else until the loop itself has come to rest, so that no command leaps.
+
+pub mod assemble;
+pub mod bus;
+mod command;
+pub mod inlet;
+pub mod obedience;
+pub mod outlet;
+pub mod reading;
+pub mod refusal;
+pub mod settings;
+pub mod stamps;
+pub mod writer_watch;
+
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, sync_channel};
+use std::time::Duration;
+
+use tread_control::measured::WheelSpeeds;
+
+use self::assemble::{Arrived, Assembler};
+use self::bus::Bus;
+use self::inlet::{Inlet, Tap, WAITING_MAX};
+use self::obedience::Obedience;
+use self::outlet::Outlet;
+use self::refusal::{Counts, Refusal, Source};
+use self::settings::Ros2Settings;
+use super::{Arrivals, Battery, Drive, Feedback, StatedNoise};
+use crate::clock::SharedClock;
+use crate::fleet::LinkError;
+
+#[cfg(test)]
+mod tests;
+
+/// A ROS 2 base, seen from the loop.
+#[derive(Debug)]
+pub struct Ros2Drive {
+    settings: Arc<Ros2Settings>,
+    arrived: Receiver<Arrived>,
+    arrivals: Arc<Arrivals>,
+    assembler: Assembler,
+    obedience: Obedience,
+    counts: Arc<Counts>,
+    outlet: Arc<Outlet>,
+    now: Duration,
+    /// When the last whole sample was measured.
+    heard_at: Option<Duration>,
+    /// The base was silent, and the loop has not come to rest since.
+    must_rest: bool,
+    /// Whether wheels are believed whatever they do.
+    is_examined: bool,
+}
+
+impl Ros2Drive {
+    /// A drive, and the bus to be run in a thread of its own.
+    ///
+    /// # Errors
+    /// [`LinkError::Endpoint`].
+    pub fn new(settings: Ros2Settings, clock: &SharedClock) -> Result<(Self, Bus), LinkError> {
+        Self::with_tap(settings, clock, None)
+    }
+
+    /// A drive of a base that is being examined: somebody else hears every message, and wheels that
+    /// do not do what they are told are believed all the same.
+    ///
+    /// # Errors
+    /// As [`Ros2Drive::new`].
+    pub fn examined(
+        settings: Ros2Settings,
+        clock: &SharedClock,
+        tap: &Arc<dyn Tap>,
+    ) -> Result<(Self, Bus), LinkError> {
+        Self::with_tap(settings, clock, Some(tap))
+    }
+
+    fn with_tap(
+        settings: Ros2Settings,
+        clock: &SharedClock,
+        tap: Option<&Arc<dyn Tap>>,
+    ) -> Result<(Self, Bus), LinkError> {
+        let settings = Arc::new(settings);
+        let (counts, outlet) = (Arc::new(Counts::default()), Arc::new(Outlet::default()));
+        let arrivals = Arc::new(Arrivals::default());
+        let (to_loop, arrived) = sync_channel(WAITING_MAX);
+        let inlets = Inlet::all(&settings, &counts, &to_loop, &arrivals, clock);
+        let is_examined = tap.is_some();
+        let inlets = inlets
+            .into_iter()
+            .map(|inlet| inlet.with_tap(tap.cloned()))
+            .collect();
+        let drive = Self {
+            is_examined,
+            assembler: Assembler::new(&settings),
+            obedience: Obedience::default(),
+            arrived,
+            arrivals,
+            counts,
+            outlet: Arc::clone(&outlet),
+            now: Duration::ZERO,
+            heard_at: None,
+            must_rest: false,
+            settings: Arc::clone(&settings),
+        };
+        let bus = Bus::new(settings, inlets, outlet, Arc::clone(clock))?;
+        Ok((drive, bus))
+    }
+
+    /// How many messages came and were dropped.
+    pub fn counts(&self) -> Arc<Counts> {
+        Arc::clone(&self.counts)
+    }
+
+    /// Whether the base is told to rest, whatever the loop commands.
+    pub fn must_rest(&self) -> bool {
+        self.must_rest
+    }
+
+    fn pace_source(&self) -> Source {
+        if self.settings.joints.is_some() {
+            Source::Joints
+        } else {
+            Source::Odometry
+        }
+    }
+}
+
+impl Drive for Ros2Drive {
+    fn read(&mut self, now: Duration) -> Feedback {
+        self.now = now;
+        let mut feedback = Feedback::default();
+        // Bounded by the channel's room.
+        for _ in 0..WAITING_MAX {
+            let Ok(arrived) = self.arrived.try_recv() else {
+                break;
+            };
+            let Some(measured) = self.assembler.take(&arrived, &mut feedback) else {
+                continue;
+            };
+            if !self.obedience.judge(now, measured) && !self.is_examined {
+                self.counts.refuse(self.pace_source(), Refusal::Disobedient);
+                feedback.pop();
+                continue;
+            }
+            let is_whole = feedback
+                .samples()
+                .last()
+                .is_some_and(|sample| sample.yaw_rate_rad_s.is_some());
+            if is_whole {
+                // The base is as old as the older half of its word.
+                let turned_at = self.assembler.turned_at().unwrap_or(arrived.at);
+                self.heard_at = Some(arrived.at.min(turned_at));
+            }
+        }
+        feedback
+    }
+
+    fn write(&mut self, command: WheelSpeeds) {
+        let rest = WheelSpeeds::default();
+        self.must_rest = self.is_silent() || (self.must_rest && command != rest);
+        let written = if self.must_rest { rest } else { command };
+        self.obedience.command(self.now, written);
+        self.outlet.leave(written);
+    }
+
+    fn battery(&self) -> Option<Battery> {
+        self.assembler.battery()
+    }
+
+    fn noise(&self) -> StatedNoise {
+        self.assembler.noise()
+    }
+
+    fn is_silent(&self) -> bool {
+        let silent_after = self.settings.timing.silent_after;
+        self.heard_at
+            .is_none_or(|heard_at| self.now.saturating_sub(heard_at) > silent_after)
+    }
+
+    fn silent_after(&self) -> Duration {
+        self.settings.timing.silent_after
+    }
+
+    fn arrivals(&self) -> Option<Arc<Arrivals>> {
+        Some(Arc::clone(&self.arrivals))
+    }
+}
+
+impl Drop for Ros2Drive {
+    /// The bus's thread tells the base to rest, and ends.
+    fn drop(&mut self) {
+        self.outlet.close();
+    }
+}

@@ -1,0 +1,104 @@
+//! The newest command, on its way from the loop to the thread that speaks zenoh.
+//!
+//! The loop leaves it here and never waits; the thread writes each once. A loop that leaves none
+//! for [`COMMAND_SILENCE_MAX`] is taken for stuck: the thread writes rest then, and no command is
+//! ever repeated.
+
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread::Thread;
+use std::time::Duration;
+
+use tread_control::measured::WheelSpeeds;
+
+/// Longest time without a new command after which the base is told to rest.
+pub const COMMAND_SILENCE_MAX: Duration = Duration::from_millis(100);
+
+/// The place where the newest command lies.
+#[derive(Debug, Default)]
+pub struct Outlet {
+    /// Both speeds as single-precision numbers, so that they are read as they were written.
+    speeds: AtomicU64,
+    number: AtomicU64,
+    is_closed: AtomicBool,
+    thread: OnceLock<Thread>,
+}
+
+impl Outlet {
+    /// From now on the calling thread is woken by each command.
+    pub fn attend(&self) {
+        // A second thread would be a mistake of the program's; the first goes on.
+        let _ = self.thread.set(std::thread::current());
+    }
+
+    /// Leaves a command.
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "a wheel's speed needs no more than seven digits"
+    )]
+    pub fn leave(&self, command: WheelSpeeds) {
+        let left = u64::from((command.left_rad_s as f32).to_bits());
+        let right = u64::from((command.right_rad_s as f32).to_bits());
+        self.speeds.store(left << 32 | right, Ordering::Relaxed);
+        self.number.fetch_add(1, Ordering::Release);
+        self.wake();
+    }
+
+    /// There will be no more commands.
+    pub fn close(&self) {
+        self.is_closed.store(true, Ordering::Release);
+        self.wake();
+    }
+
+    fn wake(&self) {
+        if let Some(thread) = self.thread.get() {
+            thread.unpark();
+        }
+    }
+
+    /// Whether there will be no more.
+    pub fn is_closed(&self) -> bool {
+        self.is_closed.load(Ordering::Acquire)
+    }
+
+    /// The newest command, if it is not the one of that number; with its own number.
+    pub fn newer_than(&self, number: u64) -> Option<(u64, WheelSpeeds)> {
+        let newest = self.number.load(Ordering::Acquire);
+        if newest == number {
+            return None;
+        }
+        let speeds = self.speeds.load(Ordering::Relaxed);
+        let half = |bits: u64| f64::from(f32::from_bits(u32::try_from(bits).unwrap_or_default()));
+        let command = WheelSpeeds {
+            left_rad_s: half(speeds >> 32),
+            right_rad_s: half(speeds & u64::from(u32::MAX)),
+        };
+        Some((newest, command))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_newest_command_is_found_once() {
+        let outlet = Outlet::default();
+        assert!(outlet.newer_than(0).is_none());
+        for speed in [1.0, -2.5] {
+            outlet.leave(WheelSpeeds {
+                left_rad_s: speed,
+                right_rad_s: 0.5,
+            });
+        }
+        let (number, command) = outlet.newer_than(0).unwrap();
+        assert_eq!(
+            (number, command.left_rad_s, command.right_rad_s),
+            (2, -2.5, 0.5)
+        );
+        assert!(outlet.newer_than(number).is_none());
+        assert!(!outlet.is_closed());
+        outlet.close();
+        assert!(outlet.is_closed());
+    }
+}

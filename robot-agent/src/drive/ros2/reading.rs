@@ -1,0 +1,357 @@
+//! What a message says in the agent's own terms: decoded, checked, turned into the base's frame.
+//!
+//! Pure. A message that is not wholly usable is refused whole, with the reason.
+
+use tread_control::geometry::{Pose, wrap_angle_rad};
+use tread_control::localisation::FixNoise;
+use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
+use tread_ros2::cdr::decode;
+use tread_ros2::messages::{
+    self, BatteryState, Imu, JointState, Odometry, PoseWithCovarianceStamped, Time,
+};
+
+use super::refusal::Refusal;
+use super::settings::{
+    CommandSettings, Effort, ImuSettings, JointSettings, MotionOf, OdometrySettings, PoseSettings,
+    SideJoints,
+};
+use crate::drive::Battery;
+
+/// Standard gravity, metres per second squared.
+const GRAVITY_M_S2: f64 = 9.806_65;
+/// Fastest motion that is believed, metres or radians per second.
+const RATE_MAX: f64 = 100.0;
+/// Largest acceleration that is believed, metres per second squared.
+const ACCELERATION_MAX_M_S2: f64 = 200.0;
+/// Largest torque that is believed, newton metres.
+const TORQUE_MAX_N_M: f64 = 1.0e5;
+/// Farthest place that is believed, metres.
+const PLACE_MAX_M: f64 = 1.0e6;
+/// Largest deviations that a covariance may state: metres (or metres per second), radians.
+const DEVIATION_MAX: f64 = 10.0;
+/// Smallest deviations of a fix that are believed, metres and radians.
+const FIX_DEVIATION_MIN: (f64, f64) = (0.002, 0.001);
+
+/// What a message said.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Content {
+    /// The wheels.
+    Wheels(Wheels),
+    /// The inertial unit.
+    Inertial(Inertial),
+    /// Odometry.
+    Motion(Motion),
+    /// A position.
+    Position(Position),
+    /// The battery.
+    Battery(Battery),
+}
+
+/// The wheels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Wheels {
+    /// How they turn.
+    pub speeds: WheelSpeeds,
+    /// How they pull, if that is known.
+    pub torques: Option<WheelTorques>,
+}
+
+/// The inertial unit.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Inertial {
+    /// Turn rate, radians per second.
+    pub yaw_rate_rad_s: f64,
+    /// Its deviation, if it is stated.
+    pub yaw_rate_std_dev: Option<f64>,
+    /// Acceleration without gravity, if it is measured.
+    pub acceleration: Option<BodyAcceleration>,
+    /// Its deviation, if it is stated.
+    pub acceleration_std_dev: Option<f64>,
+    /// How far the robot leans, radians, if that is known.
+    pub tilt_rad: Option<f64>,
+}
+
+/// Odometry.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Motion {
+    /// Speed ahead, metres per second.
+    pub ahead_m_s: f64,
+    /// Its deviation, if it is stated.
+    pub ahead_std_dev: Option<f64>,
+    /// Turn rate, radians per second.
+    pub yaw_rate_rad_s: f64,
+    /// Where the robot is, if the odometry may say so.
+    pub position: Option<Position>,
+}
+
+/// A position in the site's frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Position {
+    /// Where.
+    pub pose: Pose,
+    /// How good it is, if that is stated.
+    pub noise: Option<FixNoise>,
+}
+
+/// A message, and when it was measured by its own word; none for the rare kinds whose age does not
+/// matter.
+pub type Reading = (Time, Content);
+
+/// A number within a bound.
+fn bounded(value: f64, most: f64) -> Result<f64, Refusal> {
+    // What is no number is within no bound.
+    if value.abs() <= most {
+        Ok(value)
+    } else {
+        Err(Refusal::Value)
+    }
+}
+
+/// The deviation of a variance; none for zero, by which ROS says that it is not known.
+fn deviation(variance: f64) -> Result<Option<f64>, Refusal> {
+    if variance == 0.0 {
+        return Ok(None);
+    }
+    let is_stated = variance > 0.0 && variance.sqrt() <= DEVIATION_MAX;
+    is_stated
+        .then(|| Some(variance.sqrt()))
+        .ok_or(Refusal::Covariance)
+}
+
+/// Whether a three-by-three covariance says that its value is not measured.
+fn is_unmeasured(covariance: &[f64; 9]) -> bool {
+    (covariance[0] + 1.0).abs() < f64::EPSILON
+}
+
+fn check_frame(frame: &str, expected: &str) -> Result<(), Refusal> {
+    // tf1 wrote a slash before a frame's name.
+    if frame.strip_prefix('/').unwrap_or(frame) == expected {
+        Ok(())
+    } else {
+        Err(Refusal::WrongFrame)
+    }
+}
+
+/// A pose of ROS in the plane.
+fn flat(pose: &messages::Pose) -> Result<Pose, Refusal> {
+    Ok(Pose {
+        x_m: bounded(pose.position.x, PLACE_MAX_M)?,
+        y_m: bounded(pose.position.y, PLACE_MAX_M)?,
+        heading_rad: pose.orientation.yaw_rad().ok_or(Refusal::Value)?,
+    })
+}
+
+/// A pose in an inner frame as seen from the outer one.
+fn within(outer_from_inner: Pose, pose: Pose) -> Pose {
+    let (sin, cos) = outer_from_inner.heading_rad.sin_cos();
+    Pose {
+        x_m: outer_from_inner.x_m + cos * pose.x_m - sin * pose.y_m,
+        y_m: outer_from_inner.y_m + sin * pose.x_m + cos * pose.y_m,
+        heading_rad: wrap_angle_rad(outer_from_inner.heading_rad + pose.heading_rad),
+    }
+}
+
+fn position(
+    site_from_frame: Pose,
+    pose: &messages::PoseWithCovariance,
+) -> Result<Position, Refusal> {
+    let covariance = &pose.covariance;
+    if !covariance
+        .as_flattened()
+        .iter()
+        .all(|value| value.is_finite())
+    {
+        return Err(Refusal::Covariance);
+    }
+    // Of x, y and the turn about z: their places on the diagonal.
+    let [x_m, y_m, heading_rad] = [0, 1, 5].map(|at: usize| deviation(covariance[at][at]));
+    let (place_min_m, heading_min_rad) = FIX_DEVIATION_MIN;
+    let noise = match (x_m?, y_m?, heading_rad?) {
+        (Some(x_m), Some(y_m), Some(heading_rad)) => Some(FixNoise {
+            position_m: x_m.max(y_m).max(place_min_m),
+            heading_rad: heading_rad.max(heading_min_rad),
+        }),
+        _ => None,
+    };
+    Ok(Position {
+        pose: within(site_from_frame, flat(&pose.pose)?),
+        noise,
+    })
+}
+
+/// Reads `sensor_msgs/JointState`; none where it is of other joints.
+///
+/// # Errors
+/// [`Refusal`].
+pub fn joints(bytes: &[u8], settings: &JointSettings) -> Result<Option<Reading>, Refusal> {
+    let message: JointState<'_> = decode(bytes)?;
+    let count = message.name.len();
+    let is_known = |name: &str| {
+        let sides = [&settings.left, &settings.right];
+        sides
+            .iter()
+            .any(|side| side.names.iter().any(|known| known == name))
+    };
+    if !message.name.iter().any(is_known) {
+        return Ok(None);
+    }
+    if message.velocity.len() != count {
+        return Err(Refusal::Joints);
+    }
+    let has_effort = message.effort.len() == count;
+    let side = |joints: &SideJoints| -> Result<(f64, Option<f64>), Refusal> {
+        let (mut speed_rad_s, mut torque_n_m) = (0.0, Some(0.0));
+        for known in &joints.names {
+            let index = message.name.iter().position(|name| name == known);
+            let index = index.ok_or(Refusal::Joints)?;
+            let turned = message.velocity.get(index).ok_or(Refusal::Joints)?;
+            speed_rad_s += bounded(turned / settings.gear_ratio, RATE_MAX)?;
+            torque_n_m = match settings.effort {
+                Effort::Times(constant) if has_effort => {
+                    let effort = message.effort.get(index).unwrap_or(f64::NAN);
+                    let pulled = effort * constant * settings.gear_ratio;
+                    // Some bases write no number for an effort that they do not measure.
+                    torque_n_m
+                        .filter(|_| pulled.abs() <= TORQUE_MAX_N_M)
+                        .map(|sum| sum + pulled)
+                }
+                Effort::Times(_) | Effort::None => None,
+            };
+        }
+        let wheels = f64::from(u32::try_from(joints.names.len()).unwrap_or(u32::MAX));
+        Ok((
+            joints.sign * speed_rad_s / wheels,
+            torque_n_m.map(|torque_n_m| joints.sign * torque_n_m),
+        ))
+    };
+    let ((left_rad_s, left_n_m), (right_rad_s, right_n_m)) =
+        (side(&settings.left)?, side(&settings.right)?);
+    let wheels = Wheels {
+        speeds: WheelSpeeds {
+            left_rad_s,
+            right_rad_s,
+        },
+        torques: left_n_m
+            .zip(right_n_m)
+            .map(|(left_n_m, right_n_m)| WheelTorques {
+                left_n_m,
+                right_n_m,
+            }),
+    };
+    Ok(Some((message.header.stamp, Content::Wheels(wheels))))
+}
+
+/// Reads `sensor_msgs/Imu`.
+///
+/// # Errors
+/// [`Refusal`].
+pub fn imu(bytes: &[u8], settings: &ImuSettings) -> Result<Reading, Refusal> {
+    let message: Imu<'_> = decode(bytes)?;
+    check_frame(message.header.frame_id, &settings.frame)?;
+    if is_unmeasured(&message.angular_velocity_covariance) {
+        return Err(Refusal::Value);
+    }
+    // Upside down, turned about x: y and z change their signs.
+    let flip = if settings.is_upside_down { -1.0 } else { 1.0 };
+    let up = if is_unmeasured(&message.orientation_covariance) {
+        None
+    } else {
+        message.orientation.up()
+    };
+    let tilt_rad = up.map(|up| (flip * up.z).clamp(-1.0, 1.0).acos());
+    let acceleration = if is_unmeasured(&message.linear_acceleration_covariance) {
+        None
+    } else {
+        let felt = message.linear_acceleration;
+        let most = ACCELERATION_MAX_M_S2;
+        // Without a word on how it stands it is taken for level.
+        let up = up.unwrap_or_default();
+        let x = bounded(felt.x, most)? - GRAVITY_M_S2 * up.x;
+        let y = flip * (bounded(felt.y, most)? - GRAVITY_M_S2 * up.y);
+        let (sin, cos) = settings.yaw_rad.sin_cos();
+        Some(BodyAcceleration {
+            ahead_m_s2: cos * x - sin * y,
+            left_m_s2: sin * x + cos * y,
+        })
+    };
+    let acceleration_std_dev = match acceleration {
+        Some(_) => deviation(message.linear_acceleration_covariance[0])?,
+        None => None,
+    };
+    let inertial = Inertial {
+        yaw_rate_rad_s: flip * bounded(message.angular_velocity.z, RATE_MAX)?,
+        yaw_rate_std_dev: deviation(message.angular_velocity_covariance[8])?,
+        acceleration,
+        acceleration_std_dev,
+        tilt_rad,
+    };
+    Ok((message.header.stamp, Content::Inertial(inertial)))
+}
+
+/// Reads `nav_msgs/Odometry`.
+///
+/// # Errors
+/// [`Refusal`].
+pub fn odometry(bytes: &[u8], settings: &OdometrySettings) -> Result<Reading, Refusal> {
+    let message: Odometry<'_> = decode(bytes)?;
+    check_frame(message.header.frame_id, &settings.frame)?;
+    check_frame(message.child_frame_id, &settings.child_frame)?;
+    let (twist, covariance) = (&message.twist.twist, &message.twist.covariance);
+    let position = match settings.site_from_odom {
+        Some(site_from_odom) => Some(position(site_from_odom, &message.pose)?),
+        None => None,
+    };
+    let motion = Motion {
+        ahead_m_s: bounded(twist.linear.x, RATE_MAX)?,
+        ahead_std_dev: deviation(covariance[0][0])?,
+        yaw_rate_rad_s: bounded(twist.angular.z, RATE_MAX)?,
+        position,
+    };
+    Ok((message.header.stamp, Content::Motion(motion)))
+}
+
+/// Reads `geometry_msgs/PoseWithCovarianceStamped`.
+///
+/// # Errors
+/// [`Refusal`].
+pub fn pose(bytes: &[u8], settings: &PoseSettings) -> Result<Reading, Refusal> {
+    let message: PoseWithCovarianceStamped<'_> = decode(bytes)?;
+    check_frame(message.header.frame_id, &settings.frame)?;
+    let position = position(settings.site_from_map, &message.pose)?;
+    Ok((message.header.stamp, Content::Position(position)))
+}
+
+/// Reads `sensor_msgs/BatteryState`; none where there is none.
+///
+/// # Errors
+/// [`Refusal`].
+pub fn battery(bytes: &[u8]) -> Result<Option<Reading>, Refusal> {
+    let message: BatteryState<'_> = decode(bytes)?;
+    if !message.present {
+        return Ok(None);
+    }
+    let charge_ratio = f64::from(message.percentage);
+    let voltage_v = f64::from(message.voltage);
+    if !(0.0..=1.0).contains(&charge_ratio) || !(0.0..=RATE_MAX * 10.0).contains(&voltage_v) {
+        return Err(Refusal::Value);
+    }
+    let battery = Battery {
+        charge_ratio,
+        voltage_v,
+    };
+    Ok(Some((message.header.stamp, Content::Battery(battery))))
+}
+
+/// The wheels' speeds behind a motion that the base reckoned from them.
+pub fn wheels_of(motion: &Motion, command: &CommandSettings) -> WheelSpeeds {
+    let turn_m_s = 0.5 * command.base_track_m * motion.yaw_rate_rad_s;
+    WheelSpeeds {
+        left_rad_s: (motion.ahead_m_s - turn_m_s) / command.base_radius_m,
+        right_rad_s: (motion.ahead_m_s + turn_m_s) / command.base_radius_m,
+    }
+}
+
+/// Whether odometry's speed is the body's.
+pub fn is_of_ground(settings: &OdometrySettings) -> bool {
+    settings.motion_of == MotionOf::Ground
+}

@@ -1,0 +1,254 @@
+//! Why messages of the base were dropped, how often, and of late.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use tread_ros2::cdr::CdrError;
+use tread_ros2::rmw::KeyMismatch;
+
+/// Why a message was dropped. What is dropped is no word of the base: one that says nothing else is
+/// silent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refusal {
+    /// A message of another type on the topic.
+    WrongType,
+    /// The same type by name, defined otherwise.
+    WrongHash,
+    /// No attachment, or none of the right form.
+    NoAttachment,
+    /// Too short, too long, or not what its type says.
+    Malformed,
+    /// Another frame than the configuration says.
+    WrongFrame,
+    /// None of the joints, not all of them, or lists of unequal lengths.
+    Joints,
+    /// What is no number, no rotation, or beyond what any robot does.
+    Value,
+    /// A covariance that is none.
+    Covariance,
+    /// A stamp that is none, or leapt.
+    Stamp,
+    /// Older than what is used.
+    Late,
+    /// Not newer than the one before.
+    OutOfOrder,
+    /// Another writer on a topic whose writer is heard.
+    SecondWriter,
+    /// The wheels do not do what they are told.
+    Disobedient,
+    /// More messages than the loop takes.
+    Overflow,
+}
+
+impl Refusal {
+    /// Every reason.
+    pub const ALL: [Self; 14] = [
+        Self::WrongType,
+        Self::WrongHash,
+        Self::NoAttachment,
+        Self::Malformed,
+        Self::WrongFrame,
+        Self::Joints,
+        Self::Value,
+        Self::Covariance,
+        Self::Stamp,
+        Self::Late,
+        Self::OutOfOrder,
+        Self::SecondWriter,
+        Self::Disobedient,
+        Self::Overflow,
+    ];
+
+    /// For people.
+    pub fn text(self) -> &'static str {
+        match self {
+            Self::WrongType => "messages of another type",
+            Self::WrongHash => "messages of another definition of the type",
+            Self::NoAttachment => "messages without attachment",
+            Self::Malformed => "messages that are not what their type says",
+            Self::WrongFrame => "messages of another frame",
+            Self::Joints => "messages without the robot's joints",
+            Self::Value => "messages with impossible values",
+            Self::Covariance => "messages with an impossible covariance",
+            Self::Stamp => "messages whose time stamp leapt",
+            Self::Late => "messages that came late",
+            Self::OutOfOrder => "messages that came twice or out of order",
+            Self::SecondWriter => "messages of a second writer",
+            Self::Disobedient => "messages of wheels that do not do what they are told",
+            Self::Overflow => "more messages than could be taken",
+        }
+    }
+}
+
+impl Refusal {
+    /// For programs, as part of an alert's code.
+    pub fn code(self) -> &'static str {
+        match self {
+            Self::WrongType => "type",
+            Self::WrongHash => "definition",
+            Self::NoAttachment => "attachment",
+            Self::Malformed => "malformed",
+            Self::WrongFrame => "frame",
+            Self::Joints => "joints",
+            Self::Value => "value",
+            Self::Covariance => "covariance",
+            Self::Stamp => "stamp",
+            Self::Late => "late",
+            Self::OutOfOrder => "order",
+            Self::SecondWriter => "second-writer",
+            Self::Disobedient => "disobedient",
+            Self::Overflow => "overflow",
+        }
+    }
+}
+
+impl From<CdrError> for Refusal {
+    fn from(_: CdrError) -> Self {
+        Self::Malformed
+    }
+}
+
+impl From<KeyMismatch> for Refusal {
+    fn from(mismatch: KeyMismatch) -> Self {
+        match mismatch {
+            KeyMismatch::Type => Self::WrongType,
+            KeyMismatch::Hash => Self::WrongHash,
+        }
+    }
+}
+
+/// The topics that are read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Source {
+    /// Odometry.
+    Odometry,
+    /// The inertial unit.
+    Imu,
+    /// The joints.
+    Joints,
+    /// The pose.
+    Pose,
+    /// The battery.
+    Battery,
+}
+
+impl Source {
+    /// Each.
+    pub const ALL: [Self; 5] = [
+        Self::Odometry,
+        Self::Imu,
+        Self::Joints,
+        Self::Pose,
+        Self::Battery,
+    ];
+
+    /// The name of its section in `robot.toml`.
+    pub fn section(self) -> &'static str {
+        match self {
+            Self::Odometry => "odometry",
+            Self::Imu => "imu",
+            Self::Joints => "joints",
+            Self::Pose => "pose",
+            Self::Battery => "battery",
+        }
+    }
+}
+
+/// How many messages came, and were dropped for which reason, by topic.
+#[derive(Debug, Default)]
+pub struct Counts {
+    taken: [AtomicU64; Source::ALL.len()],
+    dropped: [[AtomicU64; Refusal::ALL.len()]; Source::ALL.len()],
+}
+
+impl Counts {
+    /// One message was used.
+    pub fn take(&self, source: Source) {
+        self.taken[source as usize].fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// One message was dropped.
+    pub fn refuse(&self, source: Source, refusal: Refusal) {
+        self.dropped[source as usize][refusal as usize].fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Messages of a topic that were used.
+    pub fn taken(&self, source: Source) -> u64 {
+        self.taken[source as usize].load(Ordering::Relaxed)
+    }
+
+    /// Messages of a topic that were dropped for a reason.
+    pub fn dropped(&self, source: Source, refusal: Refusal) -> u64 {
+        self.dropped[source as usize][refusal as usize].load(Ordering::Relaxed)
+    }
+
+    /// Every topic and reason for which messages were dropped, with how many.
+    pub fn drops(&self) -> impl Iterator<Item = (Source, Refusal, u64)> + '_ {
+        Source::ALL
+            .into_iter()
+            .flat_map(|source| Refusal::ALL.map(|refusal| (source, refusal)))
+            .map(|(source, refusal)| (source, refusal, self.dropped(source, refusal)))
+            .filter(|(_, _, times)| *times > 0)
+    }
+}
+
+/// Looks without a new drop after which dropping is over.
+const QUIET_LOOKS: u32 = 10;
+
+/// What was dropped of late, for whoever looks at the counts from time to time.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Dropping {
+    before: [[u64; Refusal::ALL.len()]; Source::ALL.len()],
+    worst: Option<(Source, Refusal)>,
+    quiet_looks: u32,
+}
+
+impl Dropping {
+    /// Looks again: for people, what is dropped most; none while nothing is.
+    pub fn look(&mut self, counts: &Counts) -> Option<(Refusal, String)> {
+        let mut most = 0;
+        for (source, refusal, times) in counts.drops() {
+            let before = &mut self.before[source as usize][refusal as usize];
+            let new = times - std::mem::replace(before, times).min(times);
+            if new > most {
+                (most, self.worst) = (new, Some((source, refusal)));
+            }
+        }
+        self.quiet_looks = if most > 0 { 0 } else { self.quiet_looks + 1 };
+        if self.quiet_looks > QUIET_LOOKS {
+            self.worst = None;
+        }
+        let (source, refusal) = self.worst?;
+        let times = counts.dropped(source, refusal);
+        let (text, section) = (refusal.text(), source.section());
+        let text = format!("{text} are dropped ({section}, {times} so far)");
+        Some((refusal, text))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_dropped_most_of_late_is_said_until_it_is_over() {
+        let (counts, mut dropping) = (Counts::default(), Dropping::default());
+        assert_eq!(dropping.look(&counts), None);
+        for _ in 0..3 {
+            counts.refuse(Source::Imu, Refusal::Late);
+        }
+        counts.refuse(Source::Odometry, Refusal::Value);
+        let (_, text) = dropping.look(&counts).unwrap();
+        assert_eq!(text, "messages that came late are dropped (imu, 3 so far)");
+        counts.refuse(Source::Odometry, Refusal::Value);
+        let (_, text) = dropping.look(&counts).unwrap();
+        assert_eq!(
+            text,
+            "messages with impossible values are dropped (odometry, 2 so far)"
+        );
+        for _ in 0..QUIET_LOOKS {
+            assert!(dropping.look(&counts).is_some());
+        }
+        assert_eq!(dropping.look(&counts), None);
+        assert_eq!(counts.drops().count(), 2);
+    }
+}

@@ -1,0 +1,401 @@
+//! The drive from a message's bytes to the loop and back, with everything but zenoh.
+
+use jiff::Timestamp;
+use tread_ros2::cdr::{Sequence, encode};
+use tread_ros2::messages::{Header, Imu, JointState, Quaternion, Time, Vector3};
+use tread_ros2::names::Name;
+use tread_ros2::rmw::{Attachment, Generation, topic_key};
+
+use super::settings::*;
+use super::*;
+use crate::clock::{Clock as _, ManualClock};
+
+const NAMES: [&str; 2] = ["left", "right"];
+const STEP: Duration = Duration::from_millis(10);
+const TOLD: WheelSpeeds = WheelSpeeds {
+    left_rad_s: 4.0,
+    right_rad_s: 5.0,
+};
+
+fn topic(text: &str) -> Name {
+    Name::topic(text, &Name::default()).unwrap()
+}
+
+fn settings() -> Ros2Settings {
+    let side = |name: &str| SideJoints {
+        names: vec![name.to_owned()],
+        sign: 1.0,
+    };
+    Ros2Settings {
+        bus: BusSettings {
+            scheme: Scheme::RmwZenoh(Generation::Hashed),
+            mode: BusMode::Client,
+            endpoint: "tcp/127.0.0.1:7447".to_owned(),
+            domain: 0,
+            namespace: Name::default(),
+            node: Name::node("tread_agent").unwrap(),
+        },
+        timing: Timing {
+            stamps: StampClock::Host,
+            silent_after: Duration::from_millis(100),
+            late_after: Duration::from_millis(100),
+            pose_late_after: Duration::from_millis(300),
+        },
+        odometry: None,
+        imu: Some(ImuSettings {
+            topic: topic("imu"),
+            frame: "imu_link".to_owned(),
+            yaw_rad: 0.0,
+            is_upside_down: false,
+        }),
+        joints: Some(JointSettings {
+            topic: topic("joint_states"),
+            left: side("left"),
+            right: side("right"),
+            gear_ratio: 2.0,
+            effort: Effort::Times(0.5),
+        }),
+        pose: None,
+        battery: None,
+        command: CommandSettings {
+            topic: topic("cmd_vel"),
+            kind: CommandKind::Twist,
+            frame: "base_link".to_owned(),
+            base_radius_m: 0.1,
+            base_track_m: 0.5,
+            turn_sign: 1.0,
+            ahead_sign: 1.0,
+            joints: [1, 1],
+            joint_ratios: [1.0, 1.0],
+        },
+    }
+}
+
+/// A drive and a base that speaks to it without a network.
+struct Talk {
+    clock: Arc<ManualClock>,
+    drive: Ros2Drive,
+    bus: Bus,
+    sequence: i64,
+    number: u64,
+}
+
+/// What a base says, each field as a good one has it.
+#[derive(Clone, Copy)]
+struct Said {
+    joints: [f64; 2],
+    frame: &'static str,
+    stamp_behind_ns: i64,
+    gid: [u8; 16],
+    has_attachment: bool,
+    is_hashed: bool,
+    cut: usize,
+    covariance: f64,
+}
+
+const GOOD: Said = Said {
+    joints: [8.0, 10.0],
+    frame: "imu_link",
+    stamp_behind_ns: 2_000_000,
+    gid: [1; 16],
+    has_attachment: true,
+    is_hashed: true,
+    cut: 0,
+    covariance: 1.0e-4,
+};
+
+impl Talk {
+    fn new() -> Self {
+        let clock = Arc::new(ManualClock::new(Timestamp::UNIX_EPOCH));
+        clock.advance(Duration::from_secs(100));
+        let shared: SharedClock = Arc::<ManualClock>::clone(&clock);
+        let (drive, bus) = Ros2Drive::new(settings(), &shared).unwrap();
+        Self {
+            clock,
+            drive,
+            bus,
+            sequence: 0,
+            number: 0,
+        }
+    }
+
+    fn put(&mut self, source: Source, said: &Said, bytes: &[u8]) {
+        self.sequence += 1;
+        let attachment = Attachment {
+            sequence: self.sequence,
+            source_time_ns: 0,
+            gid: said.gid,
+        };
+        let attachment = attachment.to_bytes();
+        let inlet = self
+            .bus
+            .inlets
+            .iter()
+            .find(|inlet| inlet.source() == source);
+        let inlet = inlet.unwrap();
+        let generation = if said.is_hashed {
+            Generation::Hashed
+        } else {
+            Generation::Humble
+        };
+        let key = topic_key(0, inlet.topic().unwrap(), &inlet.message_type(), generation);
+        let attachment = said.has_attachment.then_some(attachment.as_slice());
+        inlet.take(&key, attachment, &bytes[..bytes.len() - said.cut]);
+    }
+
+    /// Lets a period pass, in which the base says this.
+    fn say(&mut self, said: &Said) -> Feedback {
+        self.clock.advance(STEP);
+        let stamp_ns = self.clock.host_wall_ns() - said.stamp_behind_ns;
+        let header = |frame_id| Header {
+            stamp: Time::from_nanoseconds(stamp_ns),
+            frame_id,
+        };
+        let mut bytes = Vec::new();
+        let turn = Vector3 {
+            z: 0.2,
+            ..Vector3::default()
+        };
+        let imu = Imu {
+            header: header(said.frame),
+            orientation: Quaternion::yaw(0.3),
+            angular_velocity: turn,
+            angular_velocity_covariance: [said.covariance; 9],
+            linear_acceleration: Vector3 {
+                x: 0.5,
+                y: 0.0,
+                z: 9.806_65,
+            },
+            ..Imu::default()
+        };
+        encode(&imu, &mut bytes);
+        self.put(Source::Imu, said, &bytes);
+        let joints = JointState {
+            header: header(""),
+            name: Sequence::from(&NAMES),
+            position: Sequence::default(),
+            velocity: Sequence::from(&said.joints),
+            effort: Sequence::from(&[1.0, 2.0]),
+        };
+        encode(&joints, &mut bytes);
+        self.put(Source::Joints, said, &bytes);
+        self.drive.read(self.clock.monotonic())
+    }
+
+    /// Lets a period pass in silence.
+    fn pass(&mut self) {
+        self.clock.advance(STEP);
+        self.drive.read(self.clock.monotonic());
+    }
+
+    /// Commands the base; what it is told.
+    fn tell(&mut self, command: WheelSpeeds) -> WheelSpeeds {
+        self.drive.write(command);
+        let (number, told) = self.drive.outlet.newer_than(self.number).unwrap();
+        self.number = number;
+        told
+    }
+}
+
+#[test]
+fn a_good_message_is_a_whole_sample_by_its_stamp() {
+    let mut talk = Talk::new();
+    let feedback = talk.say(&GOOD);
+    let [sample] = feedback.samples() else {
+        panic!("{feedback:?}");
+    };
+    let age = talk.clock.monotonic().abs_diff(sample.at);
+    assert!(
+        age.abs_diff(Duration::from_millis(2)) < Duration::from_micros(1),
+        "{age:?}"
+    );
+    let wheels = sample.wheel_speeds.unwrap();
+    assert!(
+        (wheels.left_rad_s - 4.0).abs() < 1.0e-12 && (wheels.right_rad_s - 5.0).abs() < 1.0e-12
+    );
+    let torques = sample.wheel_torques.unwrap();
+    assert!((torques.left_n_m - 1.0).abs() < 1.0e-12 && (torques.right_n_m - 2.0).abs() < 1.0e-12);
+    let felt = sample.acceleration.unwrap();
+    assert!((felt.ahead_m_s2 - 0.5).abs() < 1.0e-9 && felt.left_m_s2.abs() < 1.0e-9);
+    assert!((sample.yaw_rate_rad_s.unwrap() - 0.2).abs() < 1.0e-12);
+    assert!(sample.tilt_rad.unwrap() < 1.0e-6);
+    assert_eq!(talk.drive.noise().gyro_rad_s, Some(0.01));
+}
+
+#[test]
+fn every_bad_message_is_counted_by_its_reason_and_is_no_word_of_the_base() {
+    let cases = [
+        (
+            Refusal::WrongHash,
+            Said {
+                is_hashed: false,
+                ..GOOD
+            },
+        ),
+        (
+            Refusal::NoAttachment,
+            Said {
+                has_attachment: false,
+                ..GOOD
+            },
+        ),
+        (Refusal::Malformed, Said { cut: 9, ..GOOD }),
+        (
+            Refusal::WrongFrame,
+            Said {
+                frame: "camera",
+                ..GOOD
+            },
+        ),
+        (
+            Refusal::Value,
+            Said {
+                joints: [f64::NAN, 1.0],
+                ..GOOD
+            },
+        ),
+        (
+            Refusal::Value,
+            Said {
+                joints: [1.0e6, 1.0],
+                ..GOOD
+            },
+        ),
+        (
+            Refusal::Covariance,
+            Said {
+                covariance: -0.5,
+                ..GOOD
+            },
+        ),
+        (
+            Refusal::Covariance,
+            Said {
+                covariance: f64::NAN,
+                ..GOOD
+            },
+        ),
+        (
+            Refusal::Covariance,
+            Said {
+                covariance: 1.0e9,
+                ..GOOD
+            },
+        ),
+        (
+            Refusal::Late,
+            Said {
+                stamp_behind_ns: 500_000_000,
+                ..GOOD
+            },
+        ),
+        (
+            Refusal::Stamp,
+            Said {
+                stamp_behind_ns: -60_000_000_000,
+                ..GOOD
+            },
+        ),
+        (
+            Refusal::SecondWriter,
+            Said {
+                gid: [2; 16],
+                ..GOOD
+            },
+        ),
+    ];
+    for (refusal, bad) in cases {
+        let mut talk = Talk::new();
+        for _ in 0..5 {
+            talk.say(&GOOD);
+            assert_eq!(talk.tell(TOLD), TOLD);
+        }
+        let counts = talk.drive.counts();
+        for _ in 0..12 {
+            talk.say(&bad);
+            talk.tell(TOLD);
+        }
+        let count = |source| counts.dropped(source, refusal);
+        assert!(
+            count(Source::Imu) + count(Source::Joints) >= 12,
+            "{refusal:?}"
+        );
+        assert_eq!(talk.tell(TOLD), WheelSpeeds::default(), "{refusal:?}");
+    }
+}
+
+#[test]
+fn a_silent_base_rests_in_time_and_hears_nothing_until_the_loop_has_come_to_rest() {
+    let mut talk = Talk::new();
+    assert_eq!(
+        talk.tell(TOLD),
+        WheelSpeeds::default(),
+        "it has not been heard yet"
+    );
+    talk.say(&GOOD);
+    talk.tell(WheelSpeeds::default());
+    assert_eq!(talk.tell(TOLD), TOLD);
+    let heard_at = talk.clock.monotonic();
+    while talk.tell(TOLD) == TOLD {
+        talk.pass();
+    }
+    let silence = talk.clock.monotonic().saturating_sub(heard_at);
+    assert!(silence <= Duration::from_millis(110), "{silence:?}");
+    talk.say(&GOOD);
+    assert_eq!(
+        talk.tell(TOLD),
+        WheelSpeeds::default(),
+        "the command must not leap"
+    );
+    talk.tell(WheelSpeeds::default());
+    assert_eq!(talk.tell(TOLD), TOLD);
+}
+
+#[test]
+fn wheels_that_do_not_do_what_they_are_told_are_not_believed() {
+    let mut talk = Talk::new();
+    let stuck = Said {
+        joints: [0.0, 0.0],
+        ..GOOD
+    };
+    talk.say(&GOOD);
+    let began = talk.clock.monotonic();
+    while talk.tell(TOLD) == TOLD {
+        talk.say(&stuck);
+        assert!(talk.clock.monotonic() < began + Duration::from_secs(2));
+    }
+    assert!(
+        talk.drive
+            .counts()
+            .dropped(Source::Joints, Refusal::Disobedient)
+            > 0
+    );
+}
+
+#[test]
+fn more_than_the_loop_takes_is_counted_and_the_newest_is_not_waited_for() {
+    let mut talk = Talk::new();
+    let joints = JointState {
+        name: Sequence::from(&NAMES),
+        velocity: Sequence::from(&[1.0, 1.0]),
+        ..JointState::default()
+    };
+    for _ in 0..2 * WAITING_MAX {
+        talk.clock.advance(Duration::from_millis(1));
+        let stamp = Time::from_nanoseconds(talk.clock.host_wall_ns());
+        let header = Header {
+            stamp,
+            frame_id: "",
+        };
+        let mut bytes = Vec::new();
+        encode(&JointState { header, ..joints }, &mut bytes);
+        talk.put(Source::Joints, &GOOD, &bytes);
+    }
+    let overflow = talk
+        .drive
+        .counts()
+        .dropped(Source::Joints, Refusal::Overflow);
+    assert_eq!(overflow, u64::try_from(WAITING_MAX).unwrap());
+    let feedback = talk.drive.read(talk.clock.monotonic());
+    assert!(feedback.lost() > 0);
+}

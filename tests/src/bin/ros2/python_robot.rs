@@ -1,0 +1,96 @@
+//! The process of `tests/ros2/robot.py`.
+
+use std::fmt::Write as _;
+use std::io::{BufRead as _, BufReader, Write as _};
+use std::net::{Ipv4Addr, TcpListener};
+use std::path::Path;
+use std::process::{Child, ChildStdin, Command, Stdio};
+
+use anyhow::Context;
+
+/// The robot's domain.
+pub(crate) const DOMAIN: u32 = 7;
+
+/// A running robot; it ends when it is dropped.
+#[derive(Debug)]
+pub(crate) struct PythonRobot {
+    child: Child,
+    input: ChildStdin,
+    endpoint: String,
+}
+
+impl PythonRobot {
+    /// Starts a robot that is its own router, and waits until it speaks.
+    pub(crate) fn start(python: &Path, flags: &[&str]) -> anyhow::Result<Self> {
+        let port = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?
+            .local_addr()?
+            .port();
+        let endpoint = format!("tcp/127.0.0.1:{port}");
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("ros2/robot.py");
+        let mut child = Command::new(python)
+            .arg(&script)
+            .args(["--router", "--endpoint", &endpoint])
+            .arg(format!("--domain={DOMAIN}"))
+            .args(flags)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .with_context(|| format!("cannot start {}", python.display()))?;
+        let input = child.stdin.take().context("it has an input")?;
+        let output = child.stdout.take().context("it has an output")?;
+        let mut lines = BufReader::new(output).lines();
+        let first = lines.next().context(
+            "the robot ended at once: `pip install -r tests/ros2/requirements.txt` for the Python \
+             that `--python` names",
+        )??;
+        anyhow::ensure!(first.contains("ready"), "the robot says `{first}`");
+        // What it says further on is for people; a full pipe would stop it.
+        std::thread::spawn(move || lines.for_each(drop));
+        Ok(Self {
+            child,
+            input,
+            endpoint,
+        })
+    }
+
+    /// Where its bus is.
+    pub(crate) fn endpoint(&self) -> &str {
+        &self.endpoint
+    }
+
+    /// Switches a fault: `on`, `off`, or a figure.
+    pub(crate) fn switch(&mut self, fault: &str, value: &str) -> anyhow::Result<()> {
+        writeln!(self.input, "{fault} {value}")?;
+        Ok(self.input.flush()?)
+    }
+
+    /// The `robot.toml` of an agent that drives it.
+    pub(crate) fn configuration(&self) -> String {
+        let mut text = String::from("[drive]\nkind = \"ros2\"\n[drive.ros2]\n");
+        // Writing to a string cannot fail.
+        let _ = write!(
+            text,
+            "endpoint = \"{}\"\ndomain = {DOMAIN}\n",
+            self.endpoint
+        );
+        text.push_str(
+            "namespace = \"/rover\"\n\
+             [drive.ros2.joints]\n\
+             left = [\"front_left_wheel\", \"rear_left_wheel\"]\n\
+             right = [\"front_right_wheel\", \"rear_right_wheel\"]\n\
+             [drive.ros2.imu]\n\
+             [drive.ros2.odometry]\ntopic = \"vio/odom\"\nmotion_of = \"ground\"\n\
+             [drive.ros2.pose]\n\
+             [drive.ros2.battery]\n",
+        );
+        text
+    }
+}
+
+impl Drop for PythonRobot {
+    fn drop(&mut self) {
+        // Both fail only if it has ended already.
+        _ = self.child.kill();
+        _ = self.child.wait();
+    }
+}
