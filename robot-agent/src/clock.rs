@@ -13,6 +13,11 @@ pub trait Clock: std::fmt::Debug + Send + Sync {
     fn monotonic(&self) -> Duration;
     /// The wall clock; it may jump.
     fn wall(&self) -> Timestamp;
+
+    /// Blocks a loop until that monotonic time.
+    fn sleep_until(&self, deadline: Duration) {
+        std::thread::sleep(deadline.saturating_sub(self.monotonic()));
+    }
 }
 
 /// A clock as it is handed around.

@@ -160,7 +160,7 @@ impl Online {
                 pause: true,
                 replace: true,
                 battery: true,
-                wheel_torque: true,
+                wheel_torque: self.config.drive.individual.has_torque,
                 stop: true,
                 teleop: true,
                 rate_hz: Some(self.config.rate_hz),

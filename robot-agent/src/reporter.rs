@@ -82,6 +82,8 @@ impl Reporter {
             fault: snapshot.fault,
             is_stopped: self.shared.safety.stop() != 0,
             outbox,
+            surface_change: snapshot.surface_change,
+            dug_in_at: snapshot.dug_in_at,
         };
         let counted = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         RobotState {

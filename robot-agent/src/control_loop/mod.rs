@@ -5,11 +5,14 @@
 
 pub(crate) mod active;
 pub(crate) mod driven;
+mod gain;
 mod outgoing;
 pub(crate) mod prior;
+mod progress;
 pub(crate) mod seam;
 pub(crate) mod segments;
 pub(crate) mod site_view;
+pub(crate) mod surface;
 pub(crate) mod tick;
 
 use std::time::Duration;
@@ -77,7 +80,7 @@ pub(crate) fn run(
             // The process slept or starved: what was missed is not made up for.
             deadline = ended;
         }
-        std::thread::sleep(deadline.saturating_sub(clock.monotonic()));
+        clock.sleep_until(deadline);
     }
 }
 
@@ -87,3 +90,5 @@ mod hold_tests;
 mod prior_tests;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod watch_tests;

@@ -21,10 +21,13 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 
 use super::active::Active;
+use super::gain::GroundRecord;
 use super::outgoing::Outgoing;
+use super::progress::ProgressWatch;
 use super::seam::{EndReason, LoopEnds, Shared};
 use super::segments::{Moment, SegmentCutter};
 use super::site_view::{Footing, SiteView};
+use super::surface::SurfaceWatch;
 use crate::drive::Drive;
 use guard::Guard;
 
@@ -62,6 +65,10 @@ pub(crate) struct LoopCore {
     blind_within_fence: bool,
     /// Whether a wheel slips beyond the model.
     slips: bool,
+    /// What was known of the ground in this tick of a mission.
+    known: GroundRecord,
+    surface: SurfaceWatch,
+    progress: ProgressWatch,
     /// Until when the mission is held for its next revision.
     replacement_until: Option<Duration>,
     ticks: u64,
@@ -93,6 +100,9 @@ impl LoopCore {
             guard: Guard::default(),
             blind_within_fence: false,
             slips: false,
+            known: GroundRecord::default(),
+            surface: SurfaceWatch::default(),
+            progress: ProgressWatch::default(),
             replacement_until: None,
             ticks: 0,
         }
