@@ -1,6 +1,6 @@
 //! Every word that crosses the network: REST bodies, zenoh payloads, key expressions, identifiers.
 //!
-//! This crate does no I/O and knows no other part of Tread. Both sides of every wire build on it,
+//! This crate does no I/O, [`startup`] aside, and knows no other part of Tread. Both sides of every wire build on it,
 //! so a change here is a change of the protocol.
 //!
 //! * REST shapes: [`site`], [`terrain`], [`robot`], [`trajectory`], [`mission`], [`friction`],
@@ -26,6 +26,7 @@ pub mod problem;
 pub mod robot;
 pub mod safety;
 pub mod site;
+pub mod startup;
 pub mod stop;
 pub mod terrain;
 pub mod trajectory;

@@ -271,6 +271,7 @@ fn recall_missions(
             plan_hash: held.plan_hash,
             at: clock.wall(),
             phase,
+            since: None,
             reason: Some(reason.to_owned()),
             progress: None,
             quality: None,

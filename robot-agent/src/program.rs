@@ -6,8 +6,9 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::{Parser, Subcommand};
-use tracing::{error, info};
+use tracing::{error, info, warn};
 use tracing_subscriber::EnvFilter;
+use tread_api::startup::give_zenoh_threads;
 
 use crate::agent::{Agent, RunningAgent};
 use crate::config::{AgentConfig, Flags, LogFormat};
@@ -81,6 +82,9 @@ fn run_enroll(args: EnrollArgs) -> anyhow::Result<()> {
 }
 
 fn run(flags: &Flags) -> anyhow::Result<()> {
+    if let Err(cause) = give_zenoh_threads() {
+        warn!("zenoh has few threads, the robot may be mute for seconds after a cut: {cause}");
+    }
     let config = AgentConfig::load(flags)?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)

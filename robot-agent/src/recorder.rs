@@ -61,8 +61,13 @@ impl Recorder {
                 let report = report_of(&progress, at, MissionPhase::Started);
                 unsaved.push_back(RecordContent::Mission(report));
             }
-            LoopEvent::Paused { at, progress } => {
-                let report = report_of(&progress, at, MissionPhase::Paused);
+            LoopEvent::Paused {
+                at,
+                since,
+                progress,
+            } => {
+                let mut report = report_of(&progress, at, MissionPhase::Paused);
+                report.since = since;
                 unsaved.push_back(RecordContent::Mission(report));
             }
             LoopEvent::Resumed { at, progress } => {
@@ -143,6 +148,7 @@ fn report_of(
         plan_hash: progress.plan_hash,
         at,
         phase,
+        since: None,
         reason: None,
         progress: Some(*progress),
         quality: None,

@@ -36,6 +36,7 @@ use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
+use tread_api::startup::give_zenoh_threads;
 
 use self::app::enrolment::Office;
 use self::app::identity::audit;
@@ -282,7 +283,11 @@ fn run_init(args: init::InitArgs) -> anyhow::Result<()> {
 /// # Errors
 /// What keeps the server from starting, or what stopped it.
 pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
+    let threads = give_zenoh_threads();
     logging::start(args)?;
+    if let Err(cause) = threads {
+        warn!("zenoh has few threads, robots may be mute for seconds after a cut: {cause}");
+    }
     let config = Config::load(args)?;
     raise_file_limit();
     let runtime = tokio::runtime::Builder::new_multi_thread()

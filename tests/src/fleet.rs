@@ -212,6 +212,11 @@ impl Fleet {
         self.server.as_ref()?.usage()
     }
 
+    /// The server's process and those of agents.
+    pub fn processes(&self) -> impl Iterator<Item = &Process> {
+        self.server.iter().chain(self.agents.values())
+    }
+
     /// Starts the server on the same ports and database as before, and waits until it is ready.
     ///
     /// # Panics

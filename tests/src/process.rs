@@ -88,6 +88,16 @@ impl Process {
     pub fn usage(&self) -> Option<Usage> {
         usage_of(self.child.id())
     }
+
+    /// How many of its threads have a name that begins so.
+    pub fn threads(&self, beginning: &str) -> usize {
+        let tasks = std::fs::read_dir(format!("/proc/{}/task", self.child.id()));
+        let named_so = |task: std::io::Result<std::fs::DirEntry>| {
+            let name = std::fs::read_to_string(task.ok()?.path().join("comm")).ok()?;
+            name.starts_with(beginning).then_some(())
+        };
+        tasks.map_or(0, |tasks| tasks.filter_map(named_so).count())
+    }
 }
 
 impl Drop for Process {

@@ -61,6 +61,9 @@ pub struct MissionReport {
     pub at: Timestamp,
     /// What happened.
     pub phase: MissionPhase,
+    /// When a stop or a lease began that paused it, by the robot's clock: it stood only later.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub since: Option<Timestamp>,
     /// Why, for people.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reason: Option<String>,

@@ -89,6 +89,8 @@ pub struct Bench {
     pub(crate) ended: Vec<(MissionId, EndReason)>,
     /// Pauses, resumptions and new revisions, as they were reported.
     pub(crate) news: Vec<MissionPhase>,
+    /// How long before it stood the last pause for safety had begun.
+    pub(crate) paused_for: Option<jiff::SignedDuration>,
     /// Longest silence of the server that missions bear from now on.
     pub(crate) silence_max: Option<Duration>,
     /// What a map knows along the way of missions from now on.
@@ -245,6 +247,7 @@ impl Bench {
             starts: Vec::new(),
             ended: Vec::new(),
             news: Vec::new(),
+            paused_for: None,
             silence_max: None,
             prior: Prior::default(),
             last_driven: None,
@@ -416,7 +419,10 @@ impl Bench {
                     self.cross_track_m = progress.cross_track_m;
                 }
                 LoopEvent::Segment(segment) => self.segments.push(segment),
-                LoopEvent::Paused { .. } => self.news.push(MissionPhase::Paused),
+                LoopEvent::Paused { at, since, .. } => {
+                    self.news.push(MissionPhase::Paused);
+                    self.paused_for = since.map(|since| at.duration_since(since));
+                }
                 LoopEvent::Resumed { .. } => self.news.push(MissionPhase::Resumed),
                 LoopEvent::Replaced { .. } => self.news.push(MissionPhase::Replaced),
                 LoopEvent::CameTooLate(_) | LoopEvent::Retired(_) => {}

@@ -74,6 +74,8 @@ pub(super) struct Active {
     pub(super) progress: MissionProgress,
     pub(super) has_started: bool,
     holds: Holds,
+    /// When the cause that is reported began to pause it, by the monotonic clock.
+    paused_from: Option<Duration>,
     standing_ticks: u32,
     /// Whether the server was told that it stands paused.
     is_told_paused: bool,
@@ -104,6 +106,7 @@ impl Active {
             job,
             has_started: false,
             holds: Holds::default(),
+            paused_from: None,
             standing_ticks: 0,
             is_told_paused: false,
             stopped_because: EndReason::Cancelled,
@@ -121,7 +124,7 @@ impl Active {
     }
 
     /// Pauses the mission until somebody resumes it; the strictest cause is the one reported.
-    pub(super) fn pause(&mut self, cause: PauseCause) {
+    pub(super) fn pause(&mut self, cause: PauseCause, now: Duration) {
         let rank = |cause: PauseCause| match cause {
             PauseCause::Other => 0,
             PauseCause::Request => 1,
@@ -132,7 +135,16 @@ impl Active {
         if self.progress.paused_by.is_none_or(is_stricter) {
             self.hold(Hold::Pause, true);
             self.progress.paused_by = Some(cause);
+            self.paused_from = Some(now);
         }
+    }
+
+    /// How long what pauses it of itself has done so; none for a request.
+    pub(super) fn paused_for(&self, now: Duration) -> Option<Duration> {
+        let is_held = self.progress.is_paused_for_safety();
+        self.paused_from
+            .filter(|_| is_held)
+            .map(|from| now.saturating_sub(from))
     }
 
     /// Holds the mission, or lets it go on.

@@ -128,9 +128,10 @@ pub(crate) enum LoopEvent {
         at: Timestamp,
         progress: MissionProgress,
     },
-    /// The mission stands paused.
+    /// The mission stands paused, by the robot itself since then.
     Paused {
         at: Timestamp,
+        since: Option<Timestamp>,
         progress: MissionProgress,
     },
     /// The mission goes on after a pause.

@@ -13,11 +13,12 @@ use crate::membership::Membership;
 
 /// First pause before a lost connection is tried again, milliseconds.
 const RETRY_FIRST_MS: u32 = 100;
-/// Longest pause between tries, milliseconds: with the longest try it is what a healed network
-/// waits for.
+/// Longest pause between tries, milliseconds.
 const RETRY_MAX_MS: u32 = 300;
-/// Longest try to connect, milliseconds: a hanging one must not outlast the network's healing.
-const OPEN_TIMEOUT_MS: u32 = 1_000;
+/// Longest try to connect, milliseconds. The kernel repeats its first packet every second, so a
+/// healed network is found within that, and this lies between two repetitions. It is also the time
+/// that a far and narrow link has for all the round trips of TCP, TLS and zenoh.
+const OPEN_TIMEOUT_MS: u32 = 2_500;
 /// Longest row of tries to connect before the configuration is looked at again, milliseconds.
 const CONNECT_TIMEOUT_MS: u32 = 5_000;
 /// After this silence the router takes a robot for gone, milliseconds.

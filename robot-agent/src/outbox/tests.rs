@@ -230,6 +230,7 @@ fn report(number: u128) -> RecordContent {
         plan_hash: tread_api::ids::PlanHash::from_uuid(Uuid::from_u128(number)),
         at: jiff::Timestamp::UNIX_EPOCH,
         phase: MissionPhase::Succeeded,
+        since: None,
         reason: None,
         progress: None,
         quality: None,

@@ -201,6 +201,10 @@ fn a_stop_zeroes_the_target_in_the_next_tick_and_nothing_starts_by_itself_after_
     bench.run_for(SECOND);
     assert_eq!(paused_by(&bench), Some(PauseCause::Stop));
     assert_eq!(bench.news, [MissionPhase::Paused]);
+    // It had to brake first; the stop's own time is what is told.
+    let paused_for = bench.paused_for.unwrap();
+    assert!(paused_for.as_millis() >= 100, "{paused_for:?}");
+    assert!(paused_for.as_secs() < 5, "{paused_for:?}");
     // Asking for it to go on changes nothing while the stop is in force.
     bench.pause(mission, false).unwrap();
     bench.run_for(SECOND);

@@ -12,7 +12,7 @@ use std::collections::hash_map::Entry;
 use std::collections::{HashMap, HashSet};
 use std::time::Duration;
 
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 use serde_json::value::RawValue;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, timeout_at};
@@ -204,6 +204,17 @@ impl Writer {
         Ok(outcomes)
     }
 
+    /// A time of a robot's clock by ours, to a few milliseconds, from the run that is heard now.
+    fn heard_of(&self, upload: &Upload, at: Timestamp) -> Option<Timestamp> {
+        let key = (upload.site.clone(), upload.batch.robot.clone());
+        let presence = self.app.presences().get(&key);
+        let (boot, _since) = presence.boot()?;
+        let ahead = SignedDuration::from_millis(presence.clock_offset_ms());
+        (boot == upload.batch.boot)
+            .then(|| at.checked_sub(ahead).ok())
+            .flatten()
+    }
+
     async fn commit_once(&mut self, group: &[Upload]) -> Result<(Vec<Outcome>, Tally), DbError> {
         let mut outcomes: Vec<Outcome> = Vec::with_capacity(group.len());
         let mut candidates = Vec::new();
@@ -278,11 +289,14 @@ impl Writer {
                         Err(reason) => refuse(reason),
                     },
                     RecordContent::Mission(report) => {
+                        let at = skew.put_right(report.at);
+                        let since = report.since.and_then(|since| self.heard_of(upload, since));
                         let of = Reporting {
                             robot_pk,
                             boot: batch.boot,
                             now,
-                            at: skew.put_right(report.at),
+                            at,
+                            since: since.unwrap_or(at),
                         };
                         let taken = take_new_report(&mut tx, of, keys, report).await?;
                         tally.note_report(taken, seq, &mut receipt);

@@ -317,6 +317,7 @@ pub(crate) fn report(mission: &Mission, phase: MissionPhase) -> RecordContent {
         plan_hash: mission.plan_hash,
         at: time("2026-11-01T00:00:01Z"),
         phase,
+        since: None,
         reason: None,
         progress: None,
         quality: None,

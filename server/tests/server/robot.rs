@@ -177,6 +177,8 @@ impl Robot {
                 let payload = {
                     let mut state = said.lock().unwrap();
                     state.seq += 1;
+                    // Its clock goes, and is weeks behind.
+                    state.robot_time = time("2026-11-01T00:00:00Z") + clock.elapsed();
                     state.monotonic_us = Some(u64::try_from(clock.elapsed().as_micros()).unwrap());
                     state.control_loop.ticks += u64::from(beats.load(Ordering::Relaxed));
                     wire::encode(&*state).unwrap()

@@ -3,6 +3,7 @@
 
 use std::time::Duration;
 
+use jiff::Timestamp;
 use reqwest::StatusCode;
 use serde_json::{Value, json};
 use tokio::time::Instant;
@@ -155,6 +156,57 @@ async fn a_pause_that_is_reported_after_a_person_resumed_the_mission_does_not_ho
         .unwrap();
     let detail = yard.mission(mission.id).await;
     assert!(!detail.mission.pause_wanted, "{detail:?}");
+    yard.server.stop().await.unwrap();
+}
+
+/// What a robot reports of a stop that came in force then, by its clock, and of standing now.
+fn stopped_since(robot: &Robot, mission: &Mission, since: Timestamp) -> RecordContent {
+    let RecordContent::Mission(mut paused) = safety_pause(mission, PauseCause::Stop) else {
+        panic!("a report on a mission");
+    };
+    (paused.at, paused.since) = (robot.state().robot_time, Some(since));
+    RecordContent::Mission(paused)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn when_the_stop_began_decides_whether_a_person_resumed_the_mission_since() {
+    let yard = Yard::start().await;
+    // Its clock is weeks behind.
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    let before = robot.state().robot_time;
+    for asked in ["pause", "resume"] {
+        let path = format!("/v1/missions/{}/{asked}", mission.id);
+        let (status, body) = yard.post(&path, &Value::Null).await;
+        assert!(status.is_success(), "{asked}: {body}");
+    }
+    let later = eventually("some time has passed", async || {
+        let now = robot.state().robot_time;
+        let passed = now.duration_since(before);
+        if passed > jiff::SignedDuration::from_secs(2) {
+            Ok(now)
+        } else {
+            Err(passed)
+        }
+    })
+    .await;
+    // It stood long after the person had let it go on, for what had begun before that.
+    let content = stopped_since(&robot, &mission, before);
+    robot
+        .upload(vec![Record { seq: 0, content }])
+        .await
+        .unwrap();
+    let detail = yard.mission(mission.id).await;
+    assert!(!detail.mission.pause_wanted, "{detail:?}");
+    // A stop that began afterwards is another one.
+    let content = stopped_since(&robot, &mission, later);
+    robot
+        .upload(vec![Record { seq: 1, content }])
+        .await
+        .unwrap();
+    let detail = yard.mission(mission.id).await;
+    assert!(detail.mission.pause_wanted, "{detail:?}");
     yard.server.stop().await.unwrap();
 }
 

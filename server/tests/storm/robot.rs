@@ -111,6 +111,7 @@ impl Robot {
             plan_hash: held.plan_hash,
             at: "2026-11-01T00:00:00Z".parse().expect("it is a time"),
             phase,
+            since: None,
             reason: None,
             progress: None,
             quality: None,

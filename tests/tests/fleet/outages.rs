@@ -23,6 +23,27 @@ async fn everything_is_uploaded(fleet: &Fleet, robot: &RobotId) {
     .await;
 }
 
+/// The thread that closes a dead link stands still for up to ten seconds; others have to send.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_link_that_is_dead_does_not_hold_up_the_next_one() {
+    let mut fleet = fleet().await;
+    let robot: RobotId = "rover-1".parse().unwrap();
+    fleet.start_agent(&robot, 0.0).await;
+    let senders = || async {
+        fleet
+            .processes()
+            .map(|process| process.threads("tx-"))
+            .collect()
+    };
+    eventually(
+        "both sides have threads to send with",
+        SHORT,
+        senders,
+        |counts: &Vec<usize>| counts.len() == 2 && counts.iter().all(|&count| count >= 4),
+    )
+    .await;
+}
+
 /// Every segment once, and none missing: the numbers of each boot have no gap but those that
 /// mission reports took.
 async fn each_record_is_stored_once(fleet: &Fleet, mission_reports: usize) -> usize {

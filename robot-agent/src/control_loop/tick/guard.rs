@@ -79,9 +79,9 @@ impl LoopCore {
             return;
         };
         if guard.is_stopped() {
-            active.pause(PauseCause::Stop);
+            active.pause(PauseCause::Stop, now);
         } else if guard.is_leased() {
-            active.pause(PauseCause::Teleoperation);
+            active.pause(PauseCause::Teleoperation, now);
         }
         let limits = &guard.view.limits;
         let most_m_s = limits.linear_max_m_s(guard.now_us);

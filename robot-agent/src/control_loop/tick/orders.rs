@@ -126,7 +126,15 @@ impl LoopCore {
         }
         let (at, progress) = (now.wall, active.progress);
         match step.news {
-            Some(News::Paused) => self.outgoing.send(LoopEvent::Paused { at, progress }),
+            Some(News::Paused) => {
+                let paused_for = active.paused_for(now.monotonic);
+                let since = paused_for.and_then(|lasting| at.checked_sub(lasting).ok());
+                self.outgoing.send(LoopEvent::Paused {
+                    at,
+                    since,
+                    progress,
+                });
+            }
             Some(News::Resumed) => self.outgoing.send(LoopEvent::Resumed { at, progress }),
             None => {}
         }

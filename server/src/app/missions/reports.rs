@@ -25,6 +25,8 @@ pub(crate) struct Reporting {
     pub(crate) now: Timestamp,
     /// When it happened, put right by the offset of the robot's clock.
     pub(crate) at: Timestamp,
+    /// When what paused the mission began, by the server's clock; `at` if that is not known.
+    pub(crate) since: Timestamp,
 }
 
 /// Why a report can never be taken.
@@ -160,7 +162,7 @@ async fn take_phase(
     let is_for_safety = |progress: &MissionProgress| progress.is_paused_for_safety();
     let is_safety_pause =
         report.phase == MissionPhase::Paused && report.progress.as_ref().is_some_and(is_for_safety);
-    if is_safety_pause && !was_resumed_since(tx, mission.id, reporting.at).await? {
+    if is_safety_pause && !was_resumed_since(tx, mission.id, reporting.since).await? {
         db::missions::want_pause(tx, mission.id, true).await?;
     }
     let reason = report.reason.as_deref();
@@ -193,7 +195,9 @@ async fn take_phase(
 }
 
 /// Whether a person let a mission go on after this: then a pause from before, reported late, is not
-/// what is wanted any more. The robot itself refuses while it is stopped or driven by hand.
+/// what is wanted any more. A stop or a lease has to end before anybody can resume, so the time when
+/// it began tells the two orders apart, by far more than clocks are off; the time when the robot
+/// stood does not.
 async fn was_resumed_since(tx: &mut Tx, id: MissionId, at: Timestamp) -> Result<bool, DbError> {
     let events = db::history::events(tx, id, EVENTS_MAX).await?;
     let mut newest_first = events.iter().rev();

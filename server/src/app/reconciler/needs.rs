@@ -77,13 +77,25 @@ pub(super) fn driven(mission: &Standing, presence: &Presence) -> Option<MissionP
     said.filter(|driven| driven.id == mission.id)
 }
 
-/// Whether a robot is there without a mission that it took, and with nothing left to report.
+/// Whether a robot is there without a mission that it took, and with nothing left to report. While
+/// it thinks about an offer, however long, it has not taken it.
 pub(super) fn is_absent(mission: &Standing, presence: &Presence, now: Duration) -> bool {
+    let is_taken = match mission.state {
+        MissionState::Active | MissionState::Paused | MissionState::Cancelling => true,
+        MissionState::Queued
+        | MissionState::Offered
+        | MissionState::Succeeded
+        | MissionState::Failed
+        | MissionState::Cancelled
+        | MissionState::Rejected
+        | MissionState::Expired => false,
+    };
     let nothing_left = |state: &tread_api::wire::state::RobotState| {
         // A mission that only the robot's state showed as taken has no run yet.
         mission.boot.is_none_or(|boot| boot == state.boot) && state.outbox.pending == 0
     };
-    is_heard(presence, now)
+    is_taken
+        && is_heard(presence, now)
         && driven(mission, presence).is_none()
         && presence.state().is_some_and(nothing_left)
 }

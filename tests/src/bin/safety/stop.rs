@@ -9,7 +9,7 @@ use reqwest::Method;
 use serde_json::{Value, json};
 use tokio::time::Instant;
 use tread_agent::RunningAgent;
-use tread_api::ids::RobotId;
+use tread_api::ids::{MissionId, RobotId};
 use tread_api::robot::RobotMode;
 use tread_api::stop::{FleetStop, Stop};
 use tread_tests::fleet::{Fleet, SITE};
@@ -49,7 +49,7 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
     let (mut unconfirmed, mut not_zero) = (0, 0);
     let mut moving = 0;
     for _ in 0..arguments.rounds {
-        all_drive(&agents).await;
+        all_drive(fleet, &agents, &missions).await;
         for (number, agent) in (0..).zip(&agents) {
             moving += u64::from(is_moving(agent));
             let path = format!("/v1/sites/{SITE}/robots/{}/stop", name(number)?);
@@ -60,7 +60,7 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
             not_zero += u64::from(agent.state().mode != RobotMode::Stopped);
         }
         go_on(fleet, &agents, &missions).await?;
-        all_drive(&agents).await;
+        all_drive(fleet, &agents, &missions).await;
         let called_at = Instant::now();
         let answer = fleet.rest.post("/v1/stop", &json!({"site": SITE})).await;
         fleet_ms.push(called_at.elapsed().as_secs_f64() * 1e3);
@@ -95,14 +95,20 @@ fn is_moving(agent: &RunningAgent) -> bool {
     twist.is_some_and(|twist| twist.value.linear_m_s > 0.1)
 }
 
-async fn all_drive(agents: &[RunningAgent]) {
-    let standing = |agent: &&RunningAgent| !is_moving(agent);
-    let seen = |agent: &RunningAgent| {
-        let state = agent.state();
-        let (mission, gate) = (state.mission, state.safety.gate.cause);
-        (state.robot, state.mode, state.fault, mission, gate)
+/// Waits until all drive; names the robots that do not, with what they and the server say.
+async fn all_drive(fleet: &Fleet, agents: &[RunningAgent], missions: &[MissionId]) {
+    let look = || async {
+        let mut standing = Vec::new();
+        for (agent, mission) in agents.iter().zip(missions) {
+            if !is_moving(agent) {
+                let state = agent.state();
+                let robot = (state.robot, state.mode, state.fault, state.mission);
+                let sent = fleet.rest.mission(*mission).await;
+                standing.push((robot, state.safety.gate.cause, sent));
+            }
+        }
+        standing
     };
-    let look = || async { agents.iter().filter(standing).map(seen).collect::<Vec<_>>() };
     eventually("all robots drive", DRIVE, look, Vec::is_empty).await;
 }
 
@@ -110,7 +116,7 @@ async fn all_drive(agents: &[RunningAgent]) {
 async fn go_on(
     fleet: &Fleet,
     agents: &[RunningAgent],
-    missions: &[tread_api::ids::MissionId],
+    missions: &[MissionId],
 ) -> anyhow::Result<()> {
     for (number, (agent, mission)) in (0..).zip(agents.iter().zip(missions)) {
         let robot = name(number)?;

@@ -343,6 +343,9 @@ fn a_robot_that_is_there_without_its_mission_has_forgotten_it_after_a_while() {
     assert!(is_absent(&taken_unseen, &idle, ELAPSED));
     let reporting = presence(&Said { pending: 1, ..IDLE });
     assert!(!is_absent(&active, &reporting, ELAPSED));
+    // An offer that is answered after a long time was not forgotten meanwhile.
+    let offered = mission(MissionState::Offered, None);
+    assert!(!is_absent(&offered, &idle, ELAPSED));
     let since = |absent_since| Memory {
         absent_since: Some(absent_since),
         ..Memory::default()
