@@ -44,7 +44,7 @@ pub struct GroundLine {
     pub cells: u32,
     /// Of these, those whose 95 % interval holds the truth.
     pub held: u32,
-    /// Mean half width of the cells' intervals over the truth.
+    /// Median half width of the cells' intervals over the truth.
     pub half_width_ratio: f64,
     /// Root mean square of the cells' errors over the truth.
     pub error_rms_ratio: f64,
@@ -120,10 +120,13 @@ pub fn map_figures(
         for known in &known {
             line.cells += 1;
             line.held += u32::from(holds(known, truth));
-            line.half_width_ratio += 0.5 * (known.theta_high_95 - known.theta_low_95) / truth;
             line.error_rms_ratio += (known.theta / truth - 1.0).powi(2);
         }
-        line.half_width_ratio /= f64::from(line.cells);
+        let widths = known.iter();
+        let widths = widths.map(|known| 0.5 * (known.theta_high_95 - known.theta_low_95) / truth);
+        let mut widths: Vec<f64> = widths.collect();
+        widths.sort_by(f64::total_cmp);
+        line.half_width_ratio = widths.get(widths.len() / 2).copied().unwrap_or(f64::NAN);
         line.error_rms_ratio = (line.error_rms_ratio / f64::from(line.cells)).sqrt();
         let whole = wholes
             .iter()
