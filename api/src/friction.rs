@@ -149,6 +149,20 @@ pub struct LiveFriction {
     pub theta_measured: Option<ThetaEstimate>,
     /// Whether the motion of late carried information on θ.
     pub excited: bool,
+    /// How much the wheels slip along their way; `null` while they hardly turn or change their
+    /// speed, and from an older agent.
+    #[serde(default)]
+    pub slip: Option<SideSlip>,
+}
+
+/// Slip of the two sides' wheels along their way, equation (3) of the paper: what the rim goes
+/// faster than the ground below it passes, over the speed of the rim; −1 to 1, positive drives.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct SideSlip {
+    /// Left wheels.
+    pub left_ratio: f64,
+    /// Right wheels.
+    pub right_ratio: f64,
 }
 
 /// θ with its deviation.
@@ -375,6 +389,9 @@ pub struct CellDifference {
     pub after: Option<FusedFriction>,
     /// Difference of θ in its own standard deviations; `null` unless both are known.
     pub deviations: Option<f64>,
+    /// The normalisation that was used, if any.
+    #[serde(default)]
+    pub normalisation: Option<String>,
 }
 
 /// Where a visit would teach most.
@@ -391,6 +408,9 @@ pub struct VisitSuggestion {
     pub gain: f64,
     /// Standard deviation of θ over θ now; `null` when nothing is known.
     pub relative_deviation: Option<f64>,
+    /// The normalisation that was used, if any.
+    #[serde(default)]
+    pub normalisation: Option<String>,
     /// Whether measurements contradict each other.
     pub disputed: bool,
 }

@@ -5,6 +5,7 @@
 //!
 //! * REST shapes: [`site`], [`terrain`], [`robot`], [`trajectory`], [`mission`], [`friction`],
 //!   [`safety`], [`stop`], [`drive`], [`event`], [`identity`], [`page`], [`problem`].
+//! * The friction map as compact binary: [`tile`].
 //! * zenoh shapes: [`wire`], with the key expressions in [`keys`].
 //!
 //! Units are SI and stand last in a name (`_m`, `_m_s`, `_rad`). A site's frame is metric and
@@ -29,5 +30,6 @@ pub mod site;
 pub mod startup;
 pub mod stop;
 pub mod terrain;
+pub mod tile;
 pub mod trajectory;
 pub mod wire;

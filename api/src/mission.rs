@@ -332,6 +332,20 @@ pub struct DrivenPath {
     pub tolerance_m: f64,
     /// The points in their order, at most [`DRIVEN_POINTS_MAX`].
     pub points: Vec<Point>,
+    /// When the robot was at each point, seconds since its first wheel command, pauses included;
+    /// between two points it went about evenly. Empty from an older agent.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub times_s: Vec<f64>,
+}
+
+impl DrivenPath {
+    /// Whether its times are those of its points, in order.
+    pub fn has_possible_times(&self) -> bool {
+        self.times_s.is_empty()
+            || (self.times_s.len() == self.points.len()
+                && self.times_s.iter().all(|time_s| time_s.is_finite())
+                && self.times_s.is_sorted())
+    }
 }
 
 /// What a robot planned for a mission.

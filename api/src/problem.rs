@@ -23,6 +23,8 @@ pub enum ProblemType {
     BodyTooLarge,
     #[serde(rename = "/problems/unsupported-media-type")]
     UnsupportedMediaType,
+    #[serde(rename = "/problems/not-acceptable")]
+    NotAcceptable,
     #[serde(rename = "/problems/invalid-path")]
     InvalidPath,
     #[serde(rename = "/problems/invalid-query")]
@@ -103,12 +105,13 @@ pub enum ProblemType {
 
 impl ProblemType {
     /// Every kind.
-    pub const ALL: [Self; 43] = [
+    pub const ALL: [Self; 44] = [
         Self::MalformedBody,
         Self::InvalidBody,
         Self::UnknownField,
         Self::BodyTooLarge,
         Self::UnsupportedMediaType,
+        Self::NotAcceptable,
         Self::InvalidPath,
         Self::InvalidQuery,
         Self::NotFound,
@@ -157,6 +160,7 @@ impl ProblemType {
             Self::UnknownField => "The body has a field that is not known",
             Self::BodyTooLarge => "The body is too large",
             Self::UnsupportedMediaType => "The body must be application/json",
+            Self::NotAcceptable => "There is no answer in a format that is accepted",
             Self::InvalidPath => "The path has a part that is not an identifier",
             Self::InvalidQuery => "The query does not say something possible",
             Self::NotFound => "There is nothing here",

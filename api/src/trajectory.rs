@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 pub use self::check::{
-    BINDINGS_MAX, Binding, BindingLimit, CheckTrajectory, ExpectedMeasurement, Place,
-    THETA_ASSUMED, TrajectoryCheck,
+    BINDINGS_MAX, Binding, BindingLimit, CheckTrajectory, ExpectedMeasurement, PLANNED_POINTS_MAX,
+    Place, PlannedPath, THETA_ASSUMED, TrajectoryCheck,
 };
 pub use self::rules::InvalidTrajectory;
 use self::rules::{CircleFields, WaypointsFields, is_speed};

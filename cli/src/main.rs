@@ -9,20 +9,21 @@ mod client;
 mod commands;
 mod credentials;
 mod demo;
+mod exit;
+mod manual;
 mod output;
 mod socket;
 
 use std::process::ExitCode;
 
-use clap::Parser;
-
 use crate::args::{Arguments, Command};
+use crate::output::Output;
 
 fn main() -> ExitCode {
     // The first call counts, and there is no other.
     let _first = rustls::crypto::ring::default_provider().install_default();
     let words = std::env::args_os().map(args::shield_negative_points);
-    match Arguments::parse_from(words).command {
+    match Arguments::read(words).command {
         Command::Server(arguments) => {
             die_with_the_demo();
             tread_server::run_from_args(arguments.for_program("tread-server"))
@@ -31,8 +32,16 @@ fn main() -> ExitCode {
             die_with_the_demo();
             tread_agent::run_from_args(arguments.for_program("tread-agent"))
         }
-        Command::Demo(arguments) => finish(demo::run(arguments)),
-        Command::Remote(command) => finish(commands::run(command)),
+        Command::Demo(arguments) => {
+            let output = Output::new(arguments.json);
+            finish(output, demo::run(arguments))
+        }
+        Command::Remote(command) => {
+            let output = Output::new(command.connection().json);
+            finish(output, commands::run(command, output))
+        }
+        Command::Completions { shell } => ended(Output::new(false), manual::completions(shell)),
+        Command::Man { dir } => ended(Output::new(false), manual::man_pages(&dir)),
     }
 }
 
@@ -44,7 +53,7 @@ fn die_with_the_demo() {
 }
 
 /// Runs a command to its end and turns what went wrong into a sentence and an exit code.
-fn finish(command: impl Future<Output = anyhow::Result<ExitCode>>) -> ExitCode {
+fn finish(output: Output, command: impl Future<Output = anyhow::Result<ExitCode>>) -> ExitCode {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build();
@@ -52,5 +61,9 @@ fn finish(command: impl Future<Output = anyhow::Result<ExitCode>>) -> ExitCode {
         Ok(runtime) => runtime.block_on(command),
         Err(error) => Err(error.into()),
     };
-    outcome.unwrap_or_else(|error| output::report(&error))
+    ended(output, outcome)
+}
+
+fn ended(output: Output, outcome: anyhow::Result<ExitCode>) -> ExitCode {
+    outcome.unwrap_or_else(|error| output.report(&error))
 }

@@ -7,12 +7,10 @@ use anyhow::Context;
 use comfy_table::{ContentArrangement, Table, presets};
 use serde::Serialize;
 
-use crate::client::ClientError;
+use serde_json::json;
 
-/// The server could not be reached.
-const EXIT_UNREACHABLE: u8 = 3;
-/// The server refused.
-const EXIT_REFUSED: u8 = 4;
+use crate::client::ClientError;
+use crate::exit::Exit;
 
 /// Where answers go: standard output, as tables or as JSON.
 #[derive(Debug, Clone, Copy)]
@@ -41,7 +39,46 @@ impl Output {
             line(&human(value))
         }
     }
+
+    /// Says what went wrong, its causes and what to do next, and chooses the exit code. Programs
+    /// get one JSON object on standard error.
+    pub(crate) fn report(self, error: &anyhow::Error) -> ExitCode {
+        let closed_pipe = |cause: &(dyn std::error::Error + 'static)| {
+            let io_error = cause.downcast_ref::<io::Error>();
+            io_error.is_some_and(|error| error.kind() == io::ErrorKind::BrokenPipe)
+        };
+        if error.chain().any(closed_pipe) {
+            return ExitCode::SUCCESS;
+        }
+        let client_error = error.downcast_ref::<ClientError>();
+        let exit = match (client_error, error.downcast_ref::<TookTooLong>()) {
+            (Some(client_error), _) => client_error.exit(),
+            (None, Some(_)) => Exit::TimedOut,
+            (None, None) => Exit::WentWrong,
+        };
+        let next_step = client_error.and_then(ClientError::next_step);
+        if self.json {
+            let said = json!({
+                "error": format!("{error:#}"),
+                "exit_code": exit as u8,
+                "next_step": next_step,
+                "problem": client_error.and_then(ClientError::problem),
+            });
+            note(&said.to_string());
+        } else {
+            note(&format!("tread: {error:#}"));
+            if let Some(next_step) = next_step {
+                note(&format!("next: {next_step}"));
+            }
+        }
+        exit.into()
+    }
 }
+
+/// Something was waited for and has not come.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(crate) struct TookTooLong(pub(crate) String);
 
 /// Prints a value as one line of JSON.
 pub(crate) fn json_line<T: Serialize>(value: &T) -> anyhow::Result<()> {
@@ -57,23 +94,6 @@ pub(crate) fn line(text: &str) -> anyhow::Result<()> {
 pub(crate) fn note(text: &str) {
     // Nobody is left to be told when standard error is closed.
     _ = writeln!(io::stderr().lock(), "{text}");
-}
-
-/// Prints what went wrong with its causes, and chooses the exit code.
-pub(crate) fn report(error: &anyhow::Error) -> ExitCode {
-    let closed_pipe = |cause: &(dyn std::error::Error + 'static)| {
-        let io_error = cause.downcast_ref::<io::Error>();
-        io_error.is_some_and(|error| error.kind() == io::ErrorKind::BrokenPipe)
-    };
-    if error.chain().any(closed_pipe) {
-        return ExitCode::SUCCESS;
-    }
-    note(&format!("tread: {error:#}"));
-    match error.downcast_ref::<ClientError>() {
-        Some(ClientError::Unreachable { .. }) => ExitCode::from(EXIT_UNREACHABLE),
-        Some(ClientError::Refused { .. }) => ExitCode::from(EXIT_REFUSED),
-        _ => ExitCode::FAILURE,
-    }
 }
 
 /// A table without lines, as command lines print them.

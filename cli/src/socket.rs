@@ -25,10 +25,7 @@ pub(crate) async fn open(
     site: &SiteId,
     robot: &RobotId,
 ) -> Result<Socket, ClientError> {
-    let unreachable = |cause| ClientError::Unreachable {
-        address: client.address().to_owned(),
-        cause,
-    };
+    let lost = |cause| client.lost(cause);
     let path = format!("/v1/sites/{site}/robots/{robot}/drive");
     let key = generate_key();
     let request = client
@@ -37,7 +34,7 @@ pub(crate) async fn open(
         .header(header::UPGRADE, "websocket")
         .header(header::SEC_WEBSOCKET_VERSION, "13")
         .header(header::SEC_WEBSOCKET_KEY, &key);
-    let response = request.send().await.map_err(unreachable)?;
+    let response = request.send().await.map_err(lost)?;
     if response.status() != StatusCode::SWITCHING_PROTOCOLS {
         return Err(client.refusal(response).await);
     }
@@ -47,7 +44,7 @@ pub(crate) async fn open(
             address: client.address().to_owned(),
         });
     }
-    let stream = response.upgrade().await.map_err(unreachable)?;
+    let stream = response.upgrade().await.map_err(lost)?;
     let config = WebSocketConfig::default()
         .max_message_size(Some(FRAME_MAX))
         .max_frame_size(Some(FRAME_MAX));

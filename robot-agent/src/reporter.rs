@@ -187,6 +187,7 @@ impl Reporter {
                 theta_loop: snapshot.theta_loop,
                 theta_measured: snapshot.theta_measured,
                 excited: snapshot.excited,
+                slip: snapshot.slip,
             },
         }
     }

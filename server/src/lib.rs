@@ -14,6 +14,7 @@ pub mod connections;
 pub mod counters;
 pub mod db;
 pub mod fleet;
+pub mod formats;
 pub mod friction;
 pub mod http;
 pub mod identity;

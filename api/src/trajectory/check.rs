@@ -71,6 +71,21 @@ pub struct TrajectoryCheck {
     pub excitation_depth_ratio: Option<f64>,
     /// How well friction would be measured.
     pub measurement: ExpectedMeasurement,
+    /// Where it would be driven, the way to its start with it.
+    pub path: PlannedPath,
+}
+
+/// Most points of a planned path.
+pub const PLANNED_POINTS_MAX: usize = 1_000;
+
+/// The smooth way that the planner lays.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
+pub struct PlannedPath {
+    /// Way from each point to the next, metres, along the path.
+    pub step_m: f64,
+    /// Points in driving order, at most [`PLANNED_POINTS_MAX`]. Further turns of a circle go where
+    /// the first one went and are left out.
+    pub points: Vec<Point>,
 }
 
 /// Most stretches that a check names.

@@ -78,8 +78,14 @@ pub(crate) enum RobotsAction {
     JoinToken(JoinTokenArguments),
     /// List how each robot of the site stands that has ever joined
     Enrolments(PlainArguments),
+    /// Give a robot another name for people
+    Rename(RenameArguments),
+    /// Retire a robot: its missions are cancelled, it gets no more and is not listed
+    Retire(RobotArguments),
+    /// Take a retired robot back
+    Restore(RobotArguments),
     /// Put a robot out of the fleet; it comes back only by a join token that names it
-    Revoke(RevokeArguments),
+    Revoke(RobotArguments),
 }
 
 impl RobotsAction {
@@ -87,7 +93,10 @@ impl RobotsAction {
         match self {
             Self::JoinToken(arguments) => &arguments.connection,
             Self::Enrolments(arguments) => &arguments.connection,
-            Self::Revoke(arguments) => &arguments.connection,
+            Self::Rename(arguments) => &arguments.connection,
+            Self::Retire(arguments) | Self::Restore(arguments) | Self::Revoke(arguments) => {
+                &arguments.connection
+            }
         }
     }
 }
@@ -119,7 +128,17 @@ pub(crate) enum JoinTokenAction {
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct RevokeArguments {
+pub(crate) struct RenameArguments {
+    /// The robot; its identifier stays
+    pub(crate) robot: RobotId,
+    /// Its name
+    pub(crate) name: String,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct RobotArguments {
     /// The robot
     pub(crate) robot: RobotId,
     #[command(flatten)]

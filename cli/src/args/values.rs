@@ -3,8 +3,14 @@
 use std::ffi::OsString;
 use std::time::Duration;
 
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+use jiff::{SignedDuration, Timestamp};
 use tread_api::geometry::Point;
+use tread_api::mission::MissionState;
+use tread_api::terrain::TerrainClass;
 use tread_api::trajectory::Waypoint;
+
+use crate::client::Area;
 
 /// Least and most time between two looks of `tread watch`.
 const LOOK_EVERY_MIN: Duration = Duration::from_millis(100);
@@ -59,8 +65,10 @@ pub(super) fn positive(text: &str) -> Result<f64, String> {
 
 /// Marks arguments like `-4,2.5` as values: with a space in front they are no options.
 pub(crate) fn shield_negative_points(argument: OsString) -> OsString {
-    let is_point = |text: &&str| text.starts_with('-') && coordinates(text).is_ok();
-    match argument.to_str().filter(is_point) {
+    let is_number = |part: &str| part.trim().parse::<f64>().is_ok();
+    let are_numbers =
+        |text: &&str| text.starts_with('-') && text.contains(',') && text.split(',').all(is_number);
+    match argument.to_str().filter(are_numbers) {
         Some(point) => format!(" {point}").into(),
         None => argument,
     }
@@ -76,6 +84,56 @@ fn coordinates(text: &str) -> Result<(f64, f64), String> {
             .map_err(|_| format!("`{part}` is not a number"))
     };
     Ok((number(x)?, number(y)?))
+}
+
+/// Reads a box, `x0,y0,x1,y1` in metres, whichever corners are given first.
+pub(super) fn area(text: &str) -> Result<Area, String> {
+    let numbers: Vec<f64> = text
+        .split(',')
+        .map(|part| finite(part.trim()))
+        .collect::<Result<_, _>>()?;
+    let [x0, y0, x1, y1] = numbers[..] else {
+        return Err("give four numbers with commas: -5,-5,10,10".to_owned());
+    };
+    let corner = |x_m, y_m| Point { x_m, y_m };
+    Ok(Area {
+        lowest: corner(x0.min(x1), y0.min(y1)),
+        highest: corner(x0.max(x1), y0.max(y1)),
+    })
+}
+
+/// Reads a time: RFC 3339, or how long before now it was.
+#[expect(
+    clippy::disallowed_methods,
+    reason = "a person's `2h` counts back from now"
+)]
+pub(super) fn moment(text: &str) -> Result<Timestamp, String> {
+    if let Ok(at) = text.parse::<Timestamp>() {
+        return Ok(at);
+    }
+    let wrong = || format!("`{text}` is no time: give 2026-11-21T08:00:00Z, or 2h for 2 hours ago");
+    let ago = duration(text).map_err(|_| wrong())?;
+    let ago = SignedDuration::try_from(ago).map_err(|_| wrong())?;
+    Timestamp::now().checked_sub(ago).map_err(|_| wrong())
+}
+
+/// Reads the name of a mission's state.
+pub(super) fn mission_state() -> impl TypedValueParser<Value = MissionState> {
+    let names = MissionState::ALL.map(MissionState::as_str);
+    PossibleValuesParser::new(names)
+        .try_map(|name| MissionState::from_name(&name).ok_or("is no state"))
+}
+
+/// Kinds of ground as the API names them.
+const TERRAIN_CLASSES: [&str; 13] = [
+    "asphalt", "concrete", "paving", "gravel", "soil", "grass", "sand", "mud", "snow", "ice",
+    "wood", "metal", "other",
+];
+
+/// Reads a kind of ground.
+pub(super) fn terrain_class() -> impl TypedValueParser<Value = TerrainClass> {
+    PossibleValuesParser::new(TERRAIN_CLASSES)
+        .try_map(|name| serde_json::from_value::<TerrainClass>(name.into()))
 }
 
 pub(super) fn point(text: &str) -> Result<Point, String> {
@@ -96,6 +154,40 @@ pub(crate) fn waypoint(text: &str) -> Result<Waypoint, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn every_kind_of_ground_that_is_offered_is_one() {
+        for name in TERRAIN_CLASSES {
+            let class = serde_json::from_value::<TerrainClass>(name.into());
+            assert!(class.is_ok(), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_box_is_read_whichever_corner_comes_first() {
+        let read = area("4,-1, -2.5,3").unwrap();
+        let wanted = (
+            Point {
+                x_m: -2.5,
+                y_m: -1.0,
+            },
+            Point { x_m: 4.0, y_m: 3.0 },
+        );
+        assert_eq!((read.lowest, read.highest), wanted);
+        for wrong in ["", "1,2,3", "1,2,3,x", "1,2,3,nan"] {
+            assert!(area(wrong).is_err(), "`{wrong}` was taken");
+        }
+    }
+
+    #[test]
+    fn a_moment_is_a_time_or_lies_so_far_back() {
+        let exact = moment("2026-11-21T08:00:00Z").unwrap();
+        assert_eq!(exact.to_string(), "2026-11-21T08:00:00Z");
+        let (day, hour) = (moment("24h").unwrap(), moment("1h").unwrap());
+        let apart = hour.duration_since(day).as_secs();
+        assert!((82_799..=82_801).contains(&apart), "{apart}");
+        assert!(moment("yesterday").is_err());
+    }
 
     #[test]
     fn times_are_read_with_their_units() {

@@ -9,7 +9,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
+use crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 use crossterm::{cursor, execute, terminal};
 use futures_util::{SinkExt as _, StreamExt as _};
 use tokio::signal::unix::{SignalKind, signal};
@@ -21,6 +21,7 @@ use tread_api::drive::{
 };
 use tread_api::safety::GateCause;
 
+use super::keys::Keyboard;
 use super::robots::{link_name, mode_name};
 use crate::args::DriveArguments;
 use crate::client::Client;
@@ -33,10 +34,6 @@ const SEND_PERIOD: Duration = Duration::from_millis(50);
 const FOR_MS: u64 = 200;
 /// How long a key drives after it was seen last: longer than the pause before keys repeat.
 const KEY_HOLDS: Duration = Duration::from_millis(550);
-/// Keys that may wait.
-const KEYS_MAX: usize = 64;
-/// How often the keyboard is looked at, so that its thread ends soon after the rest.
-const KEY_POLL: Duration = Duration::from_millis(50);
 /// Longest wait for the server.
 const CONNECT_MAX: Duration = Duration::from_secs(5);
 /// What the keys do.
@@ -142,22 +139,6 @@ impl Keys {
     }
 }
 
-/// Reads keys on a thread of its own until nobody takes them.
-fn read_keys(keys: &mpsc::Sender<KeyEvent>) {
-    while !keys.is_closed() {
-        match event::poll(KEY_POLL) {
-            Ok(false) => {}
-            Ok(true) => match event::read() {
-                // What does not fit is one key more of those that are held.
-                Ok(Event::Key(key)) => _ = keys.try_send(key),
-                Ok(_) => {}
-                Err(_) => return,
-            },
-            Err(_) => return,
-        }
-    }
-}
-
 pub(super) async fn run(arguments: &DriveArguments, client: &Client) -> anyhow::Result<ExitCode> {
     if !io::stdin().is_terminal() || !io::stdout().is_terminal() {
         bail!("driving needs a terminal; programs use the WebSocket");
@@ -173,9 +154,8 @@ pub(super) async fn run(arguments: &DriveArguments, client: &Client) -> anyhow::
     };
     send(&mut socket, &wanted).await?;
     line(HELP)?;
-    let (keys, mut pressed) = mpsc::channel(KEYS_MAX);
     let terminal = RawTerminal::enter()?;
-    let reading = std::thread::spawn(move || read_keys(&keys));
+    let (keyboard, mut pressed) = Keyboard::read();
     let ended = Driving {
         terminal: &terminal,
         arguments,
@@ -186,11 +166,10 @@ pub(super) async fn run(arguments: &DriveArguments, client: &Client) -> anyhow::
     .run(&mut socket, &mut pressed)
     .await;
     drop(terminal);
-    drop(pressed);
     // The server lets the robot stand when the socket closes, whether or not this arrives.
     let _ = send(&mut socket, &DriveRequest::Release(Nothing {})).await;
     let _ = tokio::time::timeout(CONNECT_MAX, socket.close(None)).await;
-    let _ = tokio::task::spawn_blocking(move || reading.join()).await;
+    keyboard.end(pressed).await;
     ended
 }
 

@@ -1,11 +1,12 @@
-//! `tread robots join-token`, `enrolments` and `revoke`: which robots are of the fleet.
+//! `tread robots join-token`, `rename`, `revoke` and the like: which robots are of the fleet.
 
 use std::process::ExitCode;
 
 use tread_api::enrolment::{CreateJoinToken, Enrolment, JoinToken};
+use tread_api::robot::{ChangeRobot, Robot};
 
-use crate::args::{JoinTokenAction, JoinTokenArguments, RobotsAction};
-use crate::client::Client;
+use crate::args::{JoinTokenAction, JoinTokenArguments, RobotArguments, RobotsAction};
+use crate::client::{Client, ClientError};
 use crate::output::{Output, note, or_dash, render, table};
 
 pub(super) async fn run(
@@ -20,12 +21,45 @@ pub(super) async fn run(
             let enrolments = client.enrolments(site).await?;
             output.show(&enrolments, |enrolments| list(enrolments))?;
         }
+        RobotsAction::Rename(arguments) => {
+            let change = ChangeRobot {
+                name: Some(arguments.name.clone()),
+                retired: None,
+            };
+            let robot = client.change_robot(site, &arguments.robot, &change).await?;
+            output.show(&robot, |it| {
+                format!("`{}` is called {} now", it.id, it.name)
+            })?;
+        }
+        RobotsAction::Retire(arguments) => {
+            let retired = set_retired(client, arguments, true).await?;
+            output.show(&retired, |it| {
+                format!("`{}` is retired; what it measured stays", it.id)
+            })?;
+        }
+        RobotsAction::Restore(arguments) => {
+            let back = set_retired(client, arguments, false).await?;
+            output.show(&back, |it| format!("`{}` is back", it.id))?;
+        }
         RobotsAction::Revoke(arguments) => {
             let revoked = client.revoke_robot(site, &arguments.robot).await?;
             output.show(&revoked, |it| format!("`{}` is out of the fleet", it.robot))?;
         }
     }
     Ok(ExitCode::SUCCESS)
+}
+
+async fn set_retired(
+    client: &Client,
+    arguments: &RobotArguments,
+    is_retired: bool,
+) -> Result<Robot, ClientError> {
+    let change = ChangeRobot {
+        name: None,
+        retired: Some(is_retired),
+    };
+    let site = &arguments.connection.site;
+    client.change_robot(site, &arguments.robot, &change).await
 }
 
 async fn join_token(

@@ -19,8 +19,12 @@ pub(super) async fn run(
     let geofence = match &arguments.set {
         None => client.geofence(site).await?,
         Some(file) => {
-            let text = std::fs::read_to_string(file)
-                .with_context(|| format!("cannot read {}", file.display()))?;
+            let read = if file.as_os_str() == "-" {
+                std::io::read_to_string(std::io::stdin())
+            } else {
+                std::fs::read_to_string(file)
+            };
+            let text = read.with_context(|| format!("cannot read {}", file.display()))?;
             let geofence: ReplaceGeofence = serde_json::from_str(&text)
                 .with_context(|| format!("{} is no geofence", file.display()))?;
             client

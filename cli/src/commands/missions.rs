@@ -6,6 +6,7 @@ use tread_api::mission::{Mission, MissionDetail, MissionState};
 use tread_api::trajectory::{Direction, Trajectory};
 
 use super::robots::percent;
+use super::waiting::{have_succeeded, wait};
 use crate::args::{MissionsAction, MissionsArguments};
 use crate::client::Client;
 use crate::output::{Output, or_dash, render, table};
@@ -19,13 +20,25 @@ pub(super) async fn run(
         None => {
             let site = &arguments.connection.site;
             let page = client
-                .missions(site, arguments.robot.as_ref(), arguments.limit)
+                .missions(
+                    site,
+                    arguments.robot.as_ref(),
+                    arguments.state,
+                    arguments.limit,
+                )
                 .await?;
             output.show(&page.items, |missions| list(missions))?;
         }
         Some(MissionsAction::Show { mission }) => {
             let detail = client.mission(*mission).await?;
             output.show(&detail, history)?;
+        }
+        Some(MissionsAction::Wait { missions, timeout }) => {
+            let ended = wait(client, missions, *timeout, output).await?;
+            output.show(&ended, |ended| list(ended))?;
+            if !have_succeeded(&ended) {
+                return Ok(ExitCode::FAILURE);
+            }
         }
         Some(MissionsAction::Pause { mission }) => {
             output.show(&client.act(*mission, "pause").await?, summary)?;
@@ -73,7 +86,7 @@ pub(super) fn list(missions: &[Mission]) -> String {
 }
 
 /// One line on a mission.
-pub(crate) fn summary(mission: &Mission) -> String {
+pub(super) fn summary(mission: &Mission) -> String {
     let reason = mission
         .reason
         .as_ref()
@@ -89,7 +102,7 @@ pub(crate) fn summary(mission: &Mission) -> String {
 }
 
 /// A mission's state, with what is under way.
-fn state(mission: &Mission) -> String {
+pub(super) fn state(mission: &Mission) -> String {
     let word = mission.state.as_str();
     if mission.state.is_terminal() {
         return word.to_owned();
@@ -143,7 +156,7 @@ fn history(detail: &MissionDetail) -> String {
 }
 
 /// A trajectory in a few words.
-fn trajectory(trajectory: &Trajectory) -> String {
+pub(super) fn trajectory(trajectory: &Trajectory) -> String {
     match trajectory {
         Trajectory::Circle(circle) => {
             let way = match circle.direction {

@@ -1,16 +1,21 @@
 //! The commands that talk to a running server, a file each.
 
+mod alerts;
 mod drive;
 mod enrolment;
 mod friction;
 mod geofence;
 mod identity;
+mod keys;
 mod limits;
 mod missions;
+mod points;
 mod robots;
 mod send;
+mod sites;
 mod stops;
 mod terrains;
+mod waiting;
 mod watch;
 
 use std::process::ExitCode;
@@ -21,9 +26,8 @@ use crate::credentials;
 use crate::output::Output;
 
 /// Runs one command.
-pub(crate) async fn run(command: RemoteCommand) -> anyhow::Result<ExitCode> {
+pub(crate) async fn run(command: RemoteCommand, output: Output) -> anyhow::Result<ExitCode> {
     let connection = command.connection().clone();
-    let output = Output::new(connection.json);
     if let RemoteCommand::Login(_) = command {
         return identity::login(&connection, output).await;
     }
@@ -31,6 +35,7 @@ pub(crate) async fn run(command: RemoteCommand) -> anyhow::Result<ExitCode> {
     let address = address_of(&connection.server);
     let token = credentials::find(address, showing.token_file.as_deref())?;
     let client = Client::new(address, token.as_deref(), showing.ca.as_deref())?;
+    let site = &connection.site;
     match command {
         RemoteCommand::Login(_) | RemoteCommand::Whoami(_) => {
             identity::whoami(&client, output).await
@@ -39,17 +44,22 @@ pub(crate) async fn run(command: RemoteCommand) -> anyhow::Result<ExitCode> {
         RemoteCommand::Token(_) => identity::token(&client),
         RemoteCommand::Tokens(arguments) => identity::tokens(arguments, &client, output).await,
         RemoteCommand::Audit(arguments) => identity::audit(&arguments, &client, output).await,
+        RemoteCommand::Status(_) => sites::status(&client, output).await,
+        RemoteCommand::Sites(arguments) => sites::run(arguments, &client, output).await,
         RemoteCommand::Robots(arguments) => match &arguments.action {
             None => robots::run(&arguments, &client, output).await,
             Some(action) => enrolment::run(action, &client, output).await,
         },
-        RemoteCommand::Send(arguments) => send::run(arguments, &client, output).await,
+        RemoteCommand::Send(arguments) => send::run(*arguments, &client, output).await,
         RemoteCommand::Missions(arguments) => missions::run(&arguments, &client, output).await,
-        RemoteCommand::Terrains(arguments) => terrains::run(&arguments, &client, output).await,
-        RemoteCommand::Friction(arguments) => friction::run(&arguments, &client, output).await,
+        RemoteCommand::Terrains(arguments) => terrains::run(arguments, &client, output).await,
+        RemoteCommand::Friction(arguments) => friction::run(*arguments, &client, output).await,
         RemoteCommand::Stop(arguments) => stops::stop(arguments, &client, output).await,
+        RemoteCommand::Stops(arguments) => stops::history(&arguments, &client, output).await,
         RemoteCommand::Clear(arguments) => stops::clear(arguments, &client, output).await,
+        RemoteCommand::Alerts(arguments) => alerts::run(arguments, &client, output).await,
         RemoteCommand::Drive(arguments) => drive::run(&arguments, &client).await,
+        RemoteCommand::Leases(_) => robots::leases(site, &client, output).await,
         RemoteCommand::Limits(arguments) => limits::run(arguments, &client, output).await,
         RemoteCommand::Geofence(arguments) => geofence::run(&arguments, &client, output).await,
         RemoteCommand::Watch(arguments) => watch::run(&arguments, &client, output).await,

@@ -2,7 +2,10 @@
 
 use std::process::ExitCode;
 
-use tread_api::robot::{LinkState, Robot, RobotLive, RobotMode};
+use serde::Serialize;
+use tread_api::ids::{RobotId, SiteId};
+use tread_api::robot::{LinkState, MissionProgress, Robot, RobotLive, RobotMode};
+use tread_api::safety::{Driver, SafetyStatus};
 
 use crate::args::RobotsArguments;
 use crate::client::Client;
@@ -18,9 +21,53 @@ pub(super) async fn run(
         let robot = client.robot(site, robot).await?;
         output.show(&robot, details)?;
     } else {
-        let robots = client.robots(site).await?;
+        let robots = client.robots(site, arguments.retired).await?;
         output.show(&robots, |robots| list(robots))?;
     }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Who drives a robot by hand.
+#[derive(Serialize)]
+struct Leased<'robot> {
+    robot: &'robot RobotId,
+    epoch: u64,
+    driver: &'robot Driver,
+}
+
+impl<'robot> Leased<'robot> {
+    fn of(robot: &'robot Robot) -> Option<Self> {
+        let lease = robot.live.as_ref()?.safety.lease.as_ref()?;
+        Some(Self {
+            robot: &robot.id,
+            epoch: lease.epoch,
+            driver: &lease.driver,
+        })
+    }
+}
+
+pub(super) async fn leases(
+    site: &SiteId,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    let robots = client.robots(site, false).await?;
+    let leases: Vec<Leased<'_>> = robots.iter().filter_map(Leased::of).collect();
+    output.show(&leases, |leases| {
+        if leases.is_empty() {
+            return "nobody drives a robot by hand".to_owned();
+        }
+        let mut table = table(["ROBOT", "DRIVER", "LEASE", "CONNECTION"]);
+        for lease in leases {
+            table.add_row([
+                lease.robot.to_string(),
+                lease.driver.name.clone(),
+                lease.epoch.to_string(),
+                lease.driver.client.to_string(),
+            ]);
+        }
+        render(&table)
+    })?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -62,9 +109,10 @@ pub(super) fn list(robots: &[Robot]) -> String {
     render(&table)
 }
 
-fn details(robot: &Robot) -> String {
+pub(super) fn details(robot: &Robot) -> String {
     let mut lines = vec![
         format!("robot          {} of site {}", robot.id, robot.site),
+        format!("name           {}", robot.name),
         format!(
             "model          {}, tyres {}",
             robot.model.name, robot.model.tyres
@@ -79,6 +127,15 @@ fn details(robot: &Robot) -> String {
         Some(live) => lines.extend(live_lines(live)),
         None => lines.push("it has said nothing since the server started".to_owned()),
     }
+    lines.extend(
+        robot
+            .retired_at
+            .map(|at| format!("retired        since {at:.0}")),
+    );
+    lines.extend(robot.alerts.iter().map(|alert| {
+        let severity = alert.severity.as_str();
+        format!("alert          {severity}: {}", alert.text)
+    }));
     lines.join("\n")
 }
 
@@ -93,6 +150,12 @@ fn live_lines(live: &RobotLive) -> Vec<String> {
             .as_ref()
             .map(|fault| format!("fault          {fault}")),
     );
+    lines.extend(safety_lines(&live.safety));
+    lines.extend(live.battery.map(|battery| {
+        let charging = if battery.charging { ", charging" } else { "" };
+        let charge = 1e2 * battery.charge_ratio;
+        format!("battery        {charge:.0} %{charging}")
+    }));
     lines.extend(live.pose.map(|pose| {
         let (value, age) = (pose.value, age(pose.age_ms));
         format!(
@@ -126,6 +189,14 @@ fn live_lines(live: &RobotLive) -> Vec<String> {
             age(friction.age_ms)
         )
     }));
+    let slip = live.friction.and_then(|friction| friction.value.slip);
+    lines.extend(slip.map(|slip| {
+        format!(
+            "wheel slip     {:.1} % left, {:.1} % right",
+            1e2 * slip.left_ratio,
+            1e2 * slip.right_ratio
+        )
+    }));
     lines.push(format!(
         "outbox         {} waiting, {} dropped, {} refused",
         live.outbox.pending, live.outbox.dropped, live.outbox.refused
@@ -140,10 +211,48 @@ fn live_lines(live: &RobotLive) -> Vec<String> {
     lines
 }
 
+/// What keeps a robot from driving as it would.
+fn safety_lines(safety: &SafetyStatus) -> Vec<String> {
+    let mut lines = Vec::new();
+    lines.extend(
+        safety
+            .stop
+            .as_ref()
+            .map(|stop| format!("STOPPED        by {}: {}", stop.by, stop.reason)),
+    );
+    lines.extend(
+        safety
+            .lease
+            .as_ref()
+            .map(|lease| format!("driven by      {}", lease.driver.name)),
+    );
+    lines.extend(safety.limits.iter().map(|limit| {
+        let speed = limit.linear_max_m_s;
+        let how = match speed.filter(|_| !limit.hold) {
+            Some(speed_m_s) => format!("slows it to {speed_m_s} m/s"),
+            None => "holds it".to_owned(),
+        };
+        format!("limited        {} {how}", limit.holder)
+    }));
+    lines
+}
+
 /// The measured θ with its deviation.
 pub(super) fn theta(live: &RobotLive) -> Option<String> {
     let measured = live.friction?.value.theta_measured?;
     Some(format!("{:.4} ± {:.4}", measured.theta, measured.std_dev))
+}
+
+/// How many of `steps` a mission has come, 0 to all; none while its length is not known.
+pub(super) fn steps_come(progress: MissionProgress, steps: usize) -> Option<usize> {
+    let share = (progress.length_m > 0.0).then(|| progress.driven_m / progress.length_m)?;
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        clippy::cast_precision_loss,
+        reason = "0 to the steps of a bar"
+    )]
+    Some((share.clamp(0.0, 1.0) * steps as f64).round() as usize)
 }
 
 pub(super) fn percent(part: f64, whole: f64) -> String {

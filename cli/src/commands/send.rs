@@ -1,29 +1,22 @@
 //! `tread send`: a circle or waypoints for a robot.
 
-use std::io::IsTerminal;
-use std::path::Path;
 use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::Context;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use jiff::Timestamp;
-use tread_api::ids::MissionId;
-use tread_api::mission::{
-    CreateMission, LinkPolicy, Mission, MissionState, ReplaceMission, StartPolicy,
-};
+use tread_api::mission::{CreateMission, ReplaceMission};
 use tread_api::trajectory::{
     CheckTrajectory, Circle, Direction, Excitation, Trajectory, TrajectoryCheck, TrajectoryOptions,
-    Waypoint, Waypoints,
+    Waypoints,
 };
 
 use super::missions::summary;
-use crate::args::{Order, SendArguments, SendCircle, SendTrajectory, SendWaypoints, waypoint};
+use super::points::read_waypoints;
+use super::waiting::{have_succeeded, wait};
+use crate::args::{Order, SendArguments, SendCircle, SendTrajectory, SendWaypoints};
 use crate::client::Client;
 use crate::output::Output;
-
-/// Time between two looks at a mission that is waited for.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
 
 pub(super) async fn run(
     arguments: SendArguments,
@@ -49,20 +42,23 @@ pub(super) async fn run(
         trajectory,
         latest_start: order.start_within.map(latest_start).transpose()?,
         priority: order.priority,
-        start_policy: StartPolicy::default(),
-        link_policy: LinkPolicy::default(),
-        lost_after_s: None,
+        start_policy: order.start_policy(),
+        link_policy: order.link_policy(),
+        lost_after_s: order.lost_after.map(|away| away.as_secs_f64()),
     };
-    let mut mission = client.create_mission(&request).await?;
-    if order.wait {
-        mission = wait(client, mission.id, output).await?;
+    let mission = client.create_mission(&request).await?;
+    if !order.wait {
+        output.show(&mission, summary)?;
+        return Ok(ExitCode::SUCCESS);
     }
-    output.show(&mission, summary)?;
-    let went_wrong = order.wait && mission.state != MissionState::Succeeded;
-    Ok(if went_wrong {
-        ExitCode::FAILURE
-    } else {
+    let ended = wait(client, &[mission.id], order.timeout, output).await?;
+    for mission in &ended {
+        output.show(mission, summary)?;
+    }
+    Ok(if have_succeeded(&ended) {
         ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
     })
 }
 
@@ -156,7 +152,7 @@ fn circle(send: SendCircle) -> (Trajectory, Order) {
 
 fn waypoints(send: SendWaypoints) -> anyhow::Result<(Trajectory, Order)> {
     let points = match &send.file {
-        Some(file) => read_points(file)?,
+        Some(file) => read_waypoints(file)?,
         None => send.points,
     };
     Ok((
@@ -169,23 +165,6 @@ fn waypoints(send: SendWaypoints) -> anyhow::Result<(Trajectory, Order)> {
     ))
 }
 
-/// Reads points from a file of lines `x,y`, or of a JSON list.
-fn read_points(file: &Path) -> anyhow::Result<Vec<Waypoint>> {
-    let name = file.display();
-    let text = std::fs::read_to_string(file).with_context(|| format!("cannot read {name}"))?;
-    if text.trim_start().starts_with('[') {
-        return serde_json::from_str(&text).with_context(|| format!("{name} is no list of points"));
-    }
-    let is_point = |line: &str| !line.trim().is_empty() && !line.trim_start().starts_with('#');
-    text.lines()
-        .enumerate()
-        .filter(|(_, line)| is_point(line))
-        .map(|(index, line)| {
-            waypoint(line).map_err(|error| anyhow::anyhow!("{name}, line {}: {error}", index + 1))
-        })
-        .collect()
-}
-
 #[expect(
     clippy::disallowed_methods,
     reason = "a person's `within 5m` counts from now"
@@ -194,59 +173,4 @@ fn latest_start(within: Duration) -> anyhow::Result<Timestamp> {
     Timestamp::now()
         .checked_add(within)
         .context("--start-within is too far in the future")
-}
-
-/// Follows a mission to its end.
-async fn wait(client: &Client, mission: MissionId, output: Output) -> anyhow::Result<Mission> {
-    let bar = ProgressBar::with_draw_target(Some(100), ProgressDrawTarget::hidden());
-    if !output.is_json() && std::io::stderr().is_terminal() {
-        bar.set_draw_target(ProgressDrawTarget::stderr());
-    }
-    bar.set_style(ProgressStyle::with_template(
-        "{msg:10} {bar:40} {pos:>3} %",
-    )?);
-    loop {
-        let seen = client.mission(mission).await?.mission;
-        bar.set_message(seen.state.as_str());
-        if let Some(progress) = seen.progress.filter(|progress| progress.length_m > 0.0) {
-            let percent = (100.0 * progress.driven_m / progress.length_m).clamp(0.0, 100.0);
-            #[expect(
-                clippy::cast_possible_truncation,
-                clippy::cast_sign_loss,
-                reason = "0 to 100"
-            )]
-            bar.set_position(percent as u64);
-        }
-        if seen.state.is_terminal() {
-            bar.finish_and_clear();
-            return Ok(seen);
-        }
-        tokio::time::sleep(LOOK_EVERY).await;
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::io::Write;
-
-    use super::*;
-
-    fn points_of(text: &str) -> anyhow::Result<Vec<Waypoint>> {
-        let mut file = tempfile::NamedTempFile::new().unwrap();
-        file.write_all(text.as_bytes()).unwrap();
-        read_points(file.path())
-    }
-
-    #[test]
-    fn points_are_read_from_lines_and_from_json() {
-        let lines = points_of("# a path\n0,0\n\n 1.5 , -2\n").unwrap();
-        let json = points_of(r#"[{"x_m":0,"y_m":0},{"x_m":1.5,"y_m":-2}]"#).unwrap();
-        assert_eq!(lines, json);
-    }
-
-    #[test]
-    fn a_wrong_line_is_named() {
-        let error = points_of("0,0\n1;2\n").unwrap_err();
-        assert!(error.to_string().contains("line 2"), "{error}");
-    }
 }

@@ -4,9 +4,9 @@ use std::process::ExitCode;
 
 use tread_api::stop::{ClearStop, FleetStop, Stop, StopFleet, StopRobot};
 
-use crate::args::{ClearArguments, StopArguments};
+use crate::args::{ClearArguments, StopArguments, StopsArguments};
 use crate::client::Client;
-use crate::output::{Output, line, render, table};
+use crate::output::{Output, line, or_dash, render, table};
 
 pub(super) async fn stop(
     arguments: StopArguments,
@@ -74,6 +74,56 @@ fn list(stops: &[Stop]) -> String {
             stop.site.to_string(),
             confirmed.to_owned(),
             stop.id.to_string(),
+        ]);
+    }
+    render(&table)
+}
+
+/// Stops with what became of them.
+pub(super) async fn history(
+    arguments: &StopsArguments,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    let StopsArguments {
+        robot,
+        in_force,
+        limit,
+        connection,
+    } = arguments;
+    let page = client
+        .stops(&connection.site, robot.as_ref(), *in_force, *limit)
+        .await?;
+    output.show(&page.items, |stops| past(stops))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn past(stops: &[Stop]) -> String {
+    if stops.is_empty() {
+        return "there is no such stop".to_owned();
+    }
+    let mut table = table([
+        "STOP",
+        "ROBOT",
+        "WANTED",
+        "CONFIRMED",
+        "CLEARED",
+        "BY",
+        "REASON",
+    ]);
+    for stop in stops {
+        let after = stop.confirmed_at.map(|at| {
+            let after = at.duration_since(stop.wanted_at);
+            format!("after {} ms", after.as_millis())
+        });
+        table.add_row([
+            stop.id.to_string(),
+            stop.robot.to_string(),
+            format!("{:.0}", stop.wanted_at),
+            after.unwrap_or_else(|| "NOT YET".to_owned()),
+            or_dash(stop.cleared_at.map(|at| format!("{at:.0}"))),
+            stop.by.clone(),
+            stop.reason.clone(),
         ]);
     }
     render(&table)

@@ -2,25 +2,82 @@
 
 use std::process::ExitCode;
 
-use tread_api::terrain::{Terrain, TerrainClass};
+use anyhow::Context as _;
+use serde_json::json;
+use tread_api::geometry::{Point, Polygon};
+use tread_api::terrain::{CreateTerrain, ReplaceTerrain, Terrain, TerrainClass};
 
-use crate::args::TerrainsArguments;
+use super::points::read_corners;
+use crate::args::{TerrainsAction, TerrainsArguments};
 use crate::client::Client;
 use crate::output::{Output, render, table};
 
 pub(super) async fn run(
-    arguments: &TerrainsArguments,
+    arguments: TerrainsArguments,
     client: &Client,
     output: Output,
 ) -> anyhow::Result<ExitCode> {
-    let terrains = client.terrains(&arguments.connection.site).await?;
-    output.show(&terrains, |terrains| list(terrains))?;
+    let site = &arguments.connection.site;
+    match arguments.action {
+        None => {
+            let terrains = client.terrains(site).await?;
+            output.show(&terrains, |terrains| list(terrains))?;
+        }
+        Some(TerrainsAction::Show { terrain }) => {
+            output.show(&client.terrain(site, &terrain).await?, details)?;
+        }
+        Some(TerrainsAction::Create {
+            terrain,
+            class,
+            drawing,
+        }) => {
+            let request = CreateTerrain {
+                id: terrain,
+                name: drawing.name,
+                class,
+                polygon: polygon(read_corners(drawing.file.as_deref(), drawing.corners)?)?,
+                layer: drawing.layer.unwrap_or_default(),
+            };
+            output.show(&client.create_terrain(site, &request).await?, details)?;
+        }
+        Some(TerrainsAction::Change {
+            terrain,
+            class,
+            drawing,
+        }) => {
+            let present = client.terrain(site, &terrain).await?;
+            let corners = read_corners(drawing.file.as_deref(), drawing.corners)?;
+            let request = ReplaceTerrain {
+                name: Some(drawing.name.unwrap_or(present.name)),
+                class: class.unwrap_or(present.class),
+                polygon: if corners.is_empty() {
+                    present.polygon
+                } else {
+                    polygon(corners)?
+                },
+                layer: drawing.layer.unwrap_or(present.layer),
+            };
+            let changed = client.replace_terrain(site, &terrain, &request).await?;
+            output.show(&changed, details)?;
+        }
+        Some(TerrainsAction::Delete { terrain }) => {
+            client.delete_terrain(site, &terrain).await?;
+            output.show(&json!({ "deleted": terrain }), |_| {
+                format!("{terrain} is removed; what was measured on it stays")
+            })?;
+        }
+    }
     Ok(ExitCode::SUCCESS)
+}
+
+fn polygon(corners: Vec<Point>) -> anyhow::Result<Polygon> {
+    Polygon::new(corners).context("these corners make no terrain")
 }
 
 fn list(terrains: &[Terrain]) -> String {
     if terrains.is_empty() {
-        return "no terrain is drawn on this site yet".to_owned();
+        return "no terrain is drawn on this site yet: draw one with `tread terrains create`"
+            .to_owned();
     }
     let mut table = table([
         "TERRAIN", "NAME", "CLASS", "LAYER", "AREA M2", "CORNERS", "REVISION",
@@ -37,6 +94,18 @@ fn list(terrains: &[Terrain]) -> String {
         ]);
     }
     render(&table)
+}
+
+fn details(terrain: &Terrain) -> String {
+    let mut corners = table(["X M", "Y M"]);
+    for corner in terrain.polygon.corners() {
+        corners.add_row([format!("{:.2}", corner.x_m), format!("{:.2}", corner.y_m)]);
+    }
+    format!(
+        "{}\n\n{}",
+        list(std::slice::from_ref(terrain)),
+        render(&corners)
+    )
 }
 
 /// The class as the API names it.

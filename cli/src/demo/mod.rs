@@ -27,7 +27,7 @@ use self::processes::Processes;
 use self::progress::Progress;
 use self::report::Report;
 use crate::args::DemoArguments;
-use crate::client::{Client, ClientError};
+use crate::client::{Client, ClientError, Reading};
 use crate::credentials::{self, Store};
 use crate::output::{json_line, line, note};
 
@@ -235,7 +235,7 @@ impl Demo<'_> {
     }
 
     async fn present_robots(&self) -> Result<Vec<Robot>, ClientError> {
-        self.client.robots(&self.scenario.site).await
+        self.client.robots(&self.scenario.site, false).await
     }
 
     async fn wait_for_robots(&self, processes: &mut Processes) -> anyhow::Result<()> {
@@ -357,7 +357,11 @@ impl<'demo> Watch<'demo> {
     async fn look(&mut self) -> anyhow::Result<Vec<Robot>> {
         let robots = self.demo.present_robots().await?;
         let site = &self.demo.scenario.site;
-        let page = self.demo.client.missions(site, None, MISSIONS_MAX).await?;
+        let page = self
+            .demo
+            .client
+            .missions(site, None, None, MISSIONS_MAX)
+            .await?;
         let is_ours = |mission: &Mission| self.missions.contains(&mission.id);
         self.seen = page.items.into_iter().filter(is_ours).collect();
         for live in robots.iter().filter_map(|robot| robot.live.as_ref()) {
@@ -373,7 +377,11 @@ impl<'demo> Watch<'demo> {
 
     async fn report(&self) -> anyhow::Result<Report> {
         let site = &self.demo.scenario.site;
-        let measured = self.demo.client.terrain_friction(site, None).await?;
+        let measured = self
+            .demo
+            .client
+            .terrain_friction(site, None, Reading::default())
+            .await?;
         Ok(Report::new(
             self.demo.scenario,
             &self.seen,

@@ -23,6 +23,18 @@ const THETA_SPACING_M: f64 = 0.25;
 const LINE_TOLERANCE_M: f64 = 0.01;
 /// Coordinates are reported to this, metres.
 const RESOLUTION_M: f64 = 1.0e-4;
+/// How far the report may bring the robot from where it was at that time, metres, by saying even
+/// motion by its ends.
+const MOTION_TOLERANCE_M: f64 = 0.1;
+/// Times are reported to this, seconds.
+const RESOLUTION_S: f64 = 1.0e-2;
+
+/// Where the robot was, and when, seconds since the begin.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Passed {
+    at: Point,
+    time_s: f64,
+}
 
 /// What one tick adds.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,11 +65,11 @@ pub(crate) struct TickRecord {
 /// The record of one mission.
 #[derive(Debug, Clone)]
 pub(crate) struct Driven {
-    points: Vec<Point>,
+    points: Vec<Passed>,
     spacing_m: f64,
     /// Farthest that the way so far is from the line through the points, metres.
     tolerance_m: f64,
-    last: Option<Point>,
+    last: Option<Passed>,
     since_point_m: f64,
     theta: Vec<ThetaSample>,
     theta_spacing_m: f64,
@@ -139,7 +151,8 @@ impl Driven {
             self.distance_m += tick.driven_m.max(0.0);
         }
         if let Some(at) = tick.at.filter(|at| at.is_finite()) {
-            self.add_point(at);
+            let time_s = self.duration_s;
+            self.add_point(Passed { at, time_s });
         }
         self.add_theta(tick);
         let driven_m = if tick.driven_m.is_finite() {
@@ -151,12 +164,12 @@ impl Driven {
             .add(&tick.ground, (tick.dt_s, driven_m), self.duration_s);
     }
 
-    fn add_point(&mut self, at: Point) {
-        let Some(last) = self.last.replace(at) else {
-            self.points.push(at);
+    fn add_point(&mut self, passed: Passed) {
+        let Some(last) = self.last.replace(passed) else {
+            self.points.push(passed);
             return;
         };
-        self.since_point_m += last.distance_m(at);
+        self.since_point_m += last.at.distance_m(passed.at);
         if self.since_point_m < self.spacing_m {
             return;
         }
@@ -166,7 +179,7 @@ impl Driven {
         if self.points.len() >= DRIVEN_POINTS_MAX - 1 {
             self.drop_every_other_point();
         }
-        self.points.push(at);
+        self.points.push(passed);
     }
 
     fn drop_every_other_point(&mut self) {
@@ -177,7 +190,8 @@ impl Driven {
                 && let Some(&after) = self.points.get(index + 1)
             {
                 // Kept places move up only to where they were already read.
-                let off_m = distance_from_line_m(self.points[index], self.points[kept - 1], after);
+                let (before, at) = (self.points[kept - 1].at, self.points[index].at);
+                let off_m = distance_from_line_m(at, before, after.at);
                 farthest_m = farthest_m.max(off_m);
                 continue;
             }
@@ -249,16 +263,18 @@ impl Driven {
         if let Some(last) = self.last.filter(|last| whole.last() != Some(last)) {
             whole.push(last);
         }
-        let points = thinned(&whole, LINE_TOLERANCE_M);
-        let wire = |point: &Point| WirePoint {
-            x_m: (point.x_m / RESOLUTION_M).round() * RESOLUTION_M,
-            y_m: (point.y_m / RESOLUTION_M).round() * RESOLUTION_M,
+        let passed = thinned(&whole);
+        let wire = |passed: &Passed| WirePoint {
+            x_m: (passed.at.x_m / RESOLUTION_M).round() * RESOLUTION_M,
+            y_m: (passed.at.y_m / RESOLUTION_M).round() * RESOLUTION_M,
         };
+        let time_s = |passed: &Passed| (passed.time_s / RESOLUTION_S).round() * RESOLUTION_S;
         DrivenPath {
             tolerance_m: self.tolerance_m.max(0.5 * self.since_point_m)
                 + LINE_TOLERANCE_M
                 + RESOLUTION_M,
-            points: points.iter().map(wire).collect(),
+            points: passed.iter().map(wire).collect(),
+            times_s: passed.iter().map(time_s).collect(),
         }
     }
 }
@@ -279,9 +295,27 @@ fn distance_from_line_m(point: Point, from: Point, to: Point) -> f64 {
     })
 }
 
-/// The points without those that lie within a tolerance of the line through the others: the
-/// farthest from each stretch's chord is kept, and the stretch split there.
-fn thinned(points: &[Point], tolerance_m: f64) -> Vec<Point> {
+/// By how much more than its tolerance a point is lost when only the ends of its stretch are told:
+/// from the line through them, and from where even motion between them would have brought the
+/// robot at that time. Above 1 is too much.
+fn shortfall(passed: Passed, from: Passed, to: Passed) -> f64 {
+    let off_line = distance_from_line_m(passed.at, from.at, to.at) / LINE_TOLERANCE_M;
+    let lasted_s = to.time_s - from.time_s;
+    let share = if lasted_s > 0.0 {
+        (passed.time_s - from.time_s) / lasted_s
+    } else {
+        0.0
+    };
+    let evenly = Point {
+        x_m: from.at.x_m + share * (to.at.x_m - from.at.x_m),
+        y_m: from.at.y_m + share * (to.at.y_m - from.at.y_m),
+    };
+    off_line.max(passed.at.distance_m(evenly) / MOTION_TOLERANCE_M)
+}
+
+/// The points without those that the others tell well enough: the one that is lost most of each
+/// stretch is kept, and the stretch split there.
+fn thinned(points: &[Passed]) -> Vec<Passed> {
     let Some(last) = points.len().checked_sub(1) else {
         return Vec::new();
     };
@@ -291,11 +325,11 @@ fn thinned(points: &[Point], tolerance_m: f64) -> Vec<Point> {
     let mut stretches = vec![(0, last)];
     while let Some((from, to)) = stretches.pop() {
         let inner = (from + 1..to).map(|index| {
-            let off_m = distance_from_line_m(points[index], points[from], points[to]);
-            (index, off_m)
+            let missed = shortfall(points[index], points[from], points[to]);
+            (index, missed)
         });
-        if let Some((farthest, off_m)) = inner.max_by(|a, b| a.1.total_cmp(&b.1))
-            && off_m > tolerance_m
+        if let Some((farthest, missed)) = inner.max_by(|a, b| a.1.total_cmp(&b.1))
+            && missed > 1.0
         {
             keep[farthest] = true;
             stretches.push((from, farthest));
@@ -303,7 +337,7 @@ fn thinned(points: &[Point], tolerance_m: f64) -> Vec<Point> {
         }
     }
     let kept = points.iter().zip(keep).filter(|(_, keep)| *keep);
-    kept.map(|(point, _)| *point).collect()
+    kept.map(|(passed, _)| *passed).collect()
 }
 
 #[cfg(test)]
@@ -359,6 +393,7 @@ mod tests {
             }
             let path = driven.path();
             prop_assert!((1..=DRIVEN_POINTS_MAX).contains(&path.points.len()));
+            prop_assert!(path.has_possible_times() && !path.times_s.is_empty());
             prop_assert!(driven.quality().theta.len() <= THETA_SAMPLES_MAX);
             if path.points.len() > 1 {
                 for point in way.iter().step_by(1 + way.len() / 200) {
@@ -385,6 +420,41 @@ mod tests {
         assert!((32..=THETA_SAMPLES_MAX).contains(&quality.theta.len()));
         let far = quality.theta.last().unwrap().driven_m;
         assert!(far > 900.0, "θ was traced to {far} m only");
+    }
+
+    #[test]
+    fn a_pause_is_seen_in_the_times_and_motion_between_two_points_is_even() {
+        let mut driven = Driven::new();
+        let mut at = Point::default();
+        let mut way = Vec::new();
+        for step in 0..3_000_u32 {
+            // Ten seconds ahead, ten standing, ten ahead at half the speed.
+            let step_m = match step {
+                0..1_000 => 0.01,
+                1_000..2_000 => 0.0,
+                _ => 0.005,
+            };
+            at.x_m += step_m;
+            driven.add(&tick(at, step_m, 0.0));
+            way.push((0.01 * f64::from(step + 1), at));
+        }
+        let path = driven.path();
+        assert!(path.has_possible_times());
+        assert!((3..=8).contains(&path.points.len()), "{path:?}");
+        for (time_s, at) in way {
+            let after = path.times_s.partition_point(|known| *known < time_s);
+            let after = after.clamp(1, path.times_s.len() - 1);
+            let (from_s, to_s) = (path.times_s[after - 1], path.times_s[after]);
+            let share = ((time_s - from_s) / (to_s - from_s)).clamp(0.0, 1.0);
+            let (from, to) = (path.points[after - 1], path.points[after]);
+            let x_m = from.x_m + share * (to.x_m - from.x_m);
+            // What lies between two points of the record is not known finer than they stand apart.
+            let allowed_m = MOTION_TOLERANCE_M + 2.0 * POINT_SPACING_M;
+            assert!(
+                (x_m - at.x_m).abs() < allowed_m,
+                "{time_s} s: {x_m} m, {at:?}"
+            );
+        }
     }
 
     #[test]

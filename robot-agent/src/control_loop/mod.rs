@@ -12,6 +12,7 @@ mod progress;
 pub(crate) mod seam;
 pub(crate) mod segments;
 pub(crate) mod site_view;
+pub(crate) mod slip;
 pub(crate) mod surface;
 pub(crate) mod tick;
 

@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use jiff::Timestamp;
-use tread_api::friction::ThetaEstimate;
+use tread_api::friction::{SideSlip, ThetaEstimate};
 use tread_api::ids::{MissionId, PlanHash};
 use tread_api::robot::{MissionProgress, RobotMode};
 use tread_api::site::Cell;
@@ -231,6 +231,8 @@ pub(crate) struct Snapshot {
     pub(crate) surface_change: Option<Comparison>,
     /// Where the wheels turn without progress.
     pub dug_in_at: Option<Point>,
+    /// How much the wheels slip along their way, while they turn.
+    pub slip: Option<SideSlip>,
     /// The cell that the robot is in.
     pub cell: Option<Cell>,
     /// The terrain that it is on, by its place in the site's definition.
@@ -262,6 +264,7 @@ impl Default for Snapshot {
             excited: false,
             surface_change: None,
             dug_in_at: None,
+            slip: None,
             cell: None,
             terrain: None,
             terrain_revision: None,

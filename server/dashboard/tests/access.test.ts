@@ -45,6 +45,18 @@ for (const theme of ['light', 'dark'] as const) {
         await page.getByRole('tab', { name: tab }).click();
         expect(await violations(page), tab).toEqual([]);
       }
+      await page.getByRole('button', { name: 'Area to stay in' }).click();
+      await page.getByRole('button', { name: 'Add point' }).click();
+      await page.getByRole('combobox', { name: 'Friction' }).selectOption('change');
+      await page.getByLabel('Before').waitFor();
+      expect(await violations(page), 'geofence and comparison').toEqual([]);
+      await page.getByRole('button', { name: 'Put away' }).click();
+      await page.getByRole('combobox', { name: 'Friction' }).selectOption('theta');
+      const past = page.locator('.ended button', { hasText: 'succeeded' }).first();
+      await page.getByRole('tab', { name: 'Missions' }).click();
+      await past.click();
+      await page.locator('[data-test="replay"]').waitFor();
+      expect(await violations(page), 'replay').toEqual([]);
       await select(page, 'rover-3');
       expect(await violations(page), 'robot').toEqual([]);
       await page.getByRole('button', { name: 'New mission' }).click();

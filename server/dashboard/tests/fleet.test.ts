@@ -1,6 +1,6 @@
 // What whoever comes first sees: signing in, motion, the friction map, and a viewer's page.
 import { expect, test } from 'vitest';
-import type { CellFriction, CreatedToken, Mission, Page as ApiPage } from './types';
+import type { CellDifference, CellFriction, CreatedToken, Mission, Page as ApiPage, Robot } from './types';
 import { api, browser, eventually, map, select, server, shot, token, windowOf } from './harness';
 
 const { open } = browser();
@@ -83,10 +83,85 @@ test('the friction layer says what the API says, at three places', async () => {
   await shot(page, 'friction');
 });
 
+test('from far the friction layer is read in larger squares, and whole', async () => {
+  const fine = await eventually('measured cells', async () => {
+    const { items } = await api<ApiPage<CellFriction>>('/v1/sites/yard/friction/cells?limit=1000');
+    return items.length >= 3 && items;
+  });
+  const page = await open();
+  await page.getByRole('combobox', { name: 'Friction' }).selectOption('visits');
+  const side = (url: string) => Number(new URL(url).searchParams.get('resolution_m'));
+  const coarse = page.waitForResponse((answer) => answer.url().includes('/friction/cells?') && side(answer.url()) >= 4);
+  for (let step = 0; step < 14; step += 1) await page.getByRole('button', { name: 'Zoom out' }).click();
+  const { items } = (await (await coarse).json()) as ApiPage<CellFriction>;
+  expect(items[0]?.size_m).toBeGreaterThanOrEqual(4);
+  // Each cell that somebody has measured lies in one of the squares that are read.
+  const key = ({ cell, terrain }: CellFriction, factor: number) =>
+    `${Math.floor(cell.ix * factor)} ${Math.floor(cell.iy * factor)} ${terrain?.id}`;
+  const squares = new Set(items.map((square) => key(square, 1)));
+  const lost = fine.filter((cell) => !squares.has(key(cell, cell.size_m / (items[0]?.size_m ?? 1))));
+  expect(lost).toEqual([]);
+  await shot(page, 'far');
+});
+
+test('two times of the friction map are compared', async () => {
+  const from = new Date(Date.now() - 3_600_000).toISOString();
+  const measured = await eventually('measured cells', async () => {
+    const { items } = await api<ApiPage<CellDifference>>(`/v1/sites/yard/friction/difference?from=${from}&limit=1000`);
+    return items.length >= 3 && items;
+  });
+  const page = await open();
+  await page.getByRole('combobox', { name: 'Friction' }).selectOption('change of θ between two times');
+  await page.getByLabel('Before').waitFor();
+  await page.locator('.layers figure').getByText('grey: within two standard deviations').waitFor();
+  const place = await windowOf(page);
+  const box = await map(page);
+  const seen = measured.find(({ cell }) => place(cell.ix + 0.5, 0).x < box.x + box.width - 280);
+  if (!seen) throw new Error('no cell can be pointed at');
+  const { x, y } = place(seen.cell.ix + 0.5, seen.cell.iy + 0.5);
+  await eventually('what the API says', async () => {
+    await page.mouse.move(x + 1, y);
+    await page.mouse.move(x, y);
+    return (await page.locator('[data-test="value"]').innerText()) === 'measured for the first time';
+  });
+  await shot(page, 'compare');
+  // Between two times of long ago nothing was measured.
+  await page.getByLabel('Before').fill('2020-01-01T00:00');
+  await page.getByLabel('After').fill('2020-02-01T00:00');
+  await page.getByText('Nothing was measured between these times.').waitFor();
+  await page.getByRole('combobox', { name: 'Friction' }).selectOption('θ = 1/K');
+  await page.getByLabel('Before').waitFor({ state: 'detached' });
+});
+
+test('the slip of the wheels is shown while they turn', async () => {
+  const page = await open();
+  await select(page, 'rover-2');
+  const center = { x_m: 8, y_m: 14 };
+  const sent = await api<Mission>('/v1/missions', 'POST', {
+    site: 'yard',
+    robot: 'rover-2',
+    start_policy: 'replace',
+    trajectory: { circle: { center, radius_m: 2, speed_m_s: 0.6, direction: 'clockwise', turns: 5 } },
+  });
+  const slip = page.locator('dt', { hasText: 'Wheel slip' }).locator('+ dd');
+  await eventually('a slip within reason', async () => {
+    const found = /^(-?[\d.]+), (-?[\d.]+) %$/.exec((await slip.innerText()).trim());
+    const both = found && [Number(found[1]), Number(found[2])];
+    return both && both.every((percent) => Math.abs(percent) < 60) && both.some((percent) => percent !== 0);
+  });
+  await page.locator('.u-title', { hasText: 'Wheel slip' }).waitFor();
+  await page.waitForTimeout(4_000);
+  await page.locator('.u-title', { hasText: 'Wheel slip' }).scrollIntoViewIfNeeded();
+  await shot(page, 'slip');
+  await api(`/v1/missions/${sent.id}/cancel`, 'POST');
+  const robot = await api<Robot>('/v1/sites/yard/robots/rover-2');
+  expect(robot.live?.friction?.value.slip).toBeTruthy();
+});
+
 test('a viewer sees Stop and nothing else that changes something', async () => {
   const made = await api<CreatedToken>('/v1/tokens', 'POST', { name: `viewer ${Date.now()}`, role: 'viewer' });
   const page = await open({ as: made.secret });
-  const changes = /^(new|drive|pause|resume|cancel|replace|edit|delete|acknowledge|clear|save|send)/i;
+  const changes = /^(new|area|drive|pause|resume|cancel|replace|edit|delete|acknowledge|clear|save|send)/i;
   for (const tab of ['Robots', 'Missions', 'Alerts', 'Terrains']) {
     await page.getByRole('tab', { name: tab }).click();
     const names = await page.getByRole('button').allInnerTexts();

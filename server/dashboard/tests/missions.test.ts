@@ -1,6 +1,7 @@
 // Missions drawn with the mouse: dry run, sending, progress, history.
+import type { Page } from 'playwright-core';
 import { expect, test } from 'vitest';
-import type { Mission, MissionDetail, Page as ApiPage, Terrain } from './types';
+import type { Geofence, Mission, MissionDetail, Page as ApiPage, PlannedPath, Terrain } from './types';
 import { api, browser, eventually, metresAt, select, shot, windowOf } from './harness';
 
 const { open } = browser();
@@ -66,7 +67,42 @@ test('a circle is drawn with the mouse, tried, sent, driven, and shown with what
   const rms = (ended.quality?.cross_track_rms_m ?? NaN) * 1000;
   await page.locator('[data-test="detail"]').getByText(`${rms.toFixed(1)} mm`).first().waitFor();
   await shot(page, 'history');
+  await replayed(page, ended);
 });
+
+/** Goes along the time line of an ended mission, by keys and by itself. */
+async function replayed(page: Page, mission: MissionDetail): Promise<void> {
+  const replay = page.locator('[data-test="replay"]');
+  const said = async () => {
+    const text = await replay.locator('output').innerText();
+    const found = /^([\d.]+) \/ ([\d.]+) s · (\d+) mm off$/.exec(text);
+    if (!found) throw new Error(`no moment in \`${text}\``);
+    return { time_s: Number(found[1]), lasts_s: Number(found[2]), off_mm: Number(found[3]) };
+  };
+  const times = mission.driven?.times_s ?? [];
+  expect(times.length).toBe(mission.driven?.points.length);
+  const lasts_s = (times.at(-1) ?? 0) - (times[0] ?? 0);
+  expect(Math.abs((await said()).lasts_s - lasts_s)).toBeLessThan(0.11);
+  expect((await said()).time_s).toBe((await said()).lasts_s);
+  const slider = page.getByLabel('Moment of the mission');
+  await slider.focus();
+  await slider.press('Home');
+  expect((await said()).time_s).toBe(0);
+  await slider.press('PageUp');
+  expect((await said()).time_s).toBeGreaterThan(0);
+  await slider.press('Home');
+  await replay.getByRole('button', { name: 'Play' }).click();
+  await eventually('the time line runs', async () => {
+    const { time_s } = await said();
+    return time_s > 1 && time_s < lasts_s;
+  });
+  await replay.getByRole('button', { name: 'Hold' }).click();
+  const { off_mm } = await said();
+  // The robot's own figure is measured against its reference, this one against the whole path.
+  const worst_mm = (mission.quality?.cross_track_max_m ?? NaN) * 1000;
+  expect(off_mm).toBeLessThanOrEqual(worst_mm + (mission.driven?.tolerance_m ?? 0) * 1000 + 5);
+  await shot(page, 'replay');
+}
 
 test('waypoints are clicked, moved, deleted and taken back; paused, resumed, replaced and cancelled', async () => {
   await cancelAll('rover-3');
@@ -101,7 +137,9 @@ test('waypoints are clicked, moved, deleted and taken back; paused, resumed, rep
   expect(await inputs.count()).toBe(4);
   await page.getByLabel('Speed, m/s').fill('0.3');
   await page.locator('[data-test="dry-run"]').waitFor();
+  await page.getByText('The dry run is under way').waitFor({ state: 'hidden' });
   await shot(page, 'draw-waypoints');
+  const planned = page.waitForResponse(/\/v1\/missions\/[^/]+\/path$/);
   await page.getByRole('button', { name: 'Send', exact: true }).click();
   const sent = await eventually('the mission at the server', async () => {
     const mission = await newest('rover-3');
@@ -109,6 +147,8 @@ test('waypoints are clicked, moved, deleted and taken back; paused, resumed, rep
   });
   if (!('waypoints' in sent.trajectory)) throw new Error('no waypoints were sent');
   expect(sent.trajectory.waypoints.points.length).toBe(4);
+  const path = (await (await planned).json()) as PlannedPath;
+  expect(path.points.length).toBeGreaterThan(50);
   const card = page.locator(`[data-mission="${sent.id}"]`);
   await card.getByText('driving').waitFor();
   await card.getByRole('button', { name: 'Pause' }).click();
@@ -189,4 +229,64 @@ test('a terrain is drawn, classified, changed and deleted', async () => {
   await card.getByRole('button', { name: 'Delete' }).click();
   await card.getByRole('button', { name: 'Delete for good' }).click();
   await card.waitFor({ state: 'detached' });
+});
+
+test('an area of the geofence is drawn, changed after a conflict, and deleted', async () => {
+  const fence = () => api<Geofence>('/v1/sites/yard/geofence');
+  const before = await fence();
+  expect(before.keep_out).toEqual([]);
+  // A refusal and a conflict are made on purpose.
+  const page = await open({ expected: /412|422/ });
+  await page.getByRole('tab', { name: 'Terrains' }).click();
+  await page.getByRole('button', { name: 'Area to stay out of' }).click();
+  const corners = [
+    [-9, -9],
+    [-5, -9],
+    [-5, -5],
+    [-9, -5],
+  ] as const;
+  const set = async (label: string, value: number) => {
+    await page.getByLabel(label).fill(String(value));
+    await page.getByLabel(label).press('Tab');
+  };
+  for (const [index, [x_m, y_m]] of corners.entries()) {
+    await page.getByRole('button', { name: 'Add point' }).click();
+    // First one that crosses itself: it is refused where it is drawn, and kept.
+    await set(`Point ${index + 1}, x in m`, index === 2 ? -9 : x_m);
+    await set(`Point ${index + 1}, y in m`, index === 2 ? -7 : y_m);
+  }
+  await set('Point 4, x in m', -4);
+  await set('Point 4, y in m', -8);
+  await page.getByRole('button', { name: 'Save' }).click();
+  await page.locator('form .problem').waitFor();
+  await shot(page, 'fence-refused');
+  for (const [index, [x_m, y_m]] of corners.entries()) {
+    await set(`Point ${index + 1}, x in m`, x_m);
+    await set(`Point ${index + 1}, y in m`, y_m);
+  }
+  await page.getByRole('button', { name: 'Save' }).click();
+  const areas = page.locator('[data-test="fence"]');
+  await areas.getByText('Stay out, area 1').waitFor();
+  await areas.getByText('16.0 m², 4 corners').waitFor();
+  const made = await fence();
+  expect(made.keep_out[0]?.[0]).toEqual({ x_m: -9, y_m: -9 });
+  await areas.getByRole('button', { name: 'Edit' }).click();
+  await set('Point 1, x in m', -10);
+  // Somebody else is faster.
+  await api('/v1/sites/yard/geofence', 'PUT', { keep_in: made.keep_in, keep_out: made.keep_out });
+  await page.getByRole('button', { name: 'Save' }).click();
+  await page.getByText('Somebody changed the geofence meanwhile').waitFor();
+  await page.getByRole('button', { name: 'Save' }).click();
+  const changed = await eventually('the changed geofence', async () => {
+    const now = await fence();
+    return now.revision > made.revision + 1 && now;
+  });
+  expect(changed.keep_out).toHaveLength(1);
+  expect(changed.keep_out[0]?.[0]).toEqual({ x_m: -10, y_m: -9 });
+  await areas.getByRole('button', { name: 'Show on map' }).click();
+  await shot(page, 'fence');
+  await areas.getByRole('button', { name: 'Delete' }).click();
+  await areas.getByRole('button', { name: 'Delete for good' }).click();
+  await areas.getByText('Stay out, area 1').waitFor({ state: 'detached' });
+  expect((await fence()).keep_out).toEqual([]);
 });

@@ -18,6 +18,7 @@ use tread_control::plan::{Plan, PlanError, PlanOptions, Slowed, SlowedBy};
 use tread_control::robot::{self, RobotModelError, RobotModelSpec};
 use tread_control::trajectory as planned;
 
+use super::planned_path::way;
 use super::{App, AppError, site_row};
 use crate::db;
 
@@ -126,7 +127,7 @@ impl App {
 }
 
 /// The begin of the path, in its direction.
-fn begin_of(trajectory: &Trajectory) -> Pose {
+pub(super) fn begin_of(trajectory: &Trajectory) -> Pose {
     match trajectory {
         Trajectory::Circle(circle) => Pose {
             x_m: circle.center.x_m + circle.radius_m,
@@ -164,7 +165,7 @@ struct AssumedGround {
 }
 
 /// Why a trajectory cannot be driven, and where.
-struct Refused {
+pub(super) struct Refused {
     detail: String,
     place: Option<Place>,
     /// Whether it leaves the geofence.
@@ -172,7 +173,7 @@ struct Refused {
 }
 
 impl Refused {
-    fn of(self, robot: RobotId) -> AppError {
+    pub(super) fn of(self, robot: RobotId) -> AppError {
         let Self {
             detail,
             place,
@@ -194,12 +195,16 @@ impl Refused {
 }
 
 /// A plan with the model that it was made for.
-struct Planned {
+pub(super) struct Planned {
     model: robot::RobotModel,
-    plan: Plan,
+    pub(super) plan: Plan,
 }
 
-fn planned(model: &RobotModel, trajectory: &Trajectory, start: Pose) -> Result<Planned, Refused> {
+pub(super) fn planned(
+    model: &RobotModel,
+    trajectory: &Trajectory,
+    start: Pose,
+) -> Result<Planned, Refused> {
     let model = control_model(model).map_err(|error| Refused {
         detail: error.to_string(),
         place: None,
@@ -251,7 +256,19 @@ fn check(
             relative_sd: expected.relative_std_dev,
             first_after_s: expected.first_after_s,
         },
+        path: way(plan, trajectory),
     })
+}
+
+/// Length of a way without what goes where it went before: further turns of a circle, metres.
+pub(super) fn once_m(plan: &Plan, trajectory: &Trajectory) -> f64 {
+    match trajectory {
+        Trajectory::Circle(circle) => {
+            let once_m = plan.approach_length_m() + std::f64::consts::TAU * circle.radius_m;
+            plan.length_m().min(once_m)
+        }
+        Trajectory::Waypoints(_) => plan.length_m(),
+    }
 }
 
 /// Walks the path in steps of the clearance that is left, so that no crossing is stepped over.
@@ -264,14 +281,7 @@ fn fenced(
         return Ok(());
     }
     let keep_m = disc_radius_m(model) + MARGIN_M;
-    // Further turns of a circle go where the first one went.
-    let length_m = match trajectory {
-        Trajectory::Circle(circle) => {
-            let once_m = plan.approach_length_m() + std::f64::consts::TAU * circle.radius_m;
-            plan.length_m().min(once_m)
-        }
-        Trajectory::Waypoints(_) => plan.length_m(),
-    };
+    let length_m = once_m(plan, trajectory);
     let step_min_m = (length_m / FENCE_STEPS_MAX).max(FENCE_STEP_M);
     let mut arc_m = 0.0;
     while arc_m <= length_m {

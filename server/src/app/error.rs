@@ -195,6 +195,9 @@ pub enum AppError {
         /// What is wrong.
         detail: String,
     },
+    /// An answer cannot be written in its format.
+    #[error("the answer cannot be written: {0}")]
+    Unwritable(String),
     /// The database failed.
     #[error("the database failed")]
     Storage(#[from] DbError),
@@ -262,6 +265,7 @@ impl AppError {
             | Self::KeyInFlight
             | Self::KeyReused
             | Self::TooMany { .. }
+            | Self::Unwritable(_)
             | Self::Storage(_) => None,
         }
     }

@@ -13,6 +13,7 @@ pub mod limits;
 mod map;
 pub mod merging;
 pub mod missions;
+mod planned_path;
 pub mod reconciler;
 pub mod robots;
 pub mod segments;
@@ -32,6 +33,7 @@ use tread_api::ids::{RobotId, SiteId};
 use self::enrolment::Membership;
 pub use self::error::AppError;
 use self::events::Hub;
+use self::friction::Pictures;
 use self::identity::Identity;
 use self::map::Maps;
 use self::missions::idempotency::InFlight;
@@ -78,7 +80,9 @@ struct Inner {
     robots_generation: AtomicU64,
     started_at: Duration,
     links: OnceLock<Links>,
-    normalisations: OnceLock<Vec<Normalisation>>,
+    normalisations: OnceLock<Vec<Arc<Normalisation>>>,
+    map_readers: Semaphore,
+    pictures: Pictures,
     drive_slots: Arc<Semaphore>,
 }
 
@@ -123,6 +127,8 @@ impl App {
             started_at,
             links: OnceLock::new(),
             normalisations: OnceLock::new(),
+            map_readers: Semaphore::new(friction::READERS_MAX),
+            pictures: Pictures::default(),
             drive_slots: Arc::new(Semaphore::new(teleop::SESSIONS_MAX)),
         };
         Self {
@@ -137,10 +143,11 @@ impl App {
 
     /// Declares how robot models may be joined; the first time counts.
     pub fn declare(&self, normalisations: Vec<Normalisation>) {
+        let normalisations = normalisations.into_iter().map(Arc::new).collect();
         let _ = self.inner.normalisations.set(normalisations);
     }
 
-    fn normalisations(&self) -> &[Normalisation] {
+    fn normalisations(&self) -> &[Arc<Normalisation>] {
         self.inner.normalisations.get().map_or(&[], Vec::as_slice)
     }
 
@@ -235,6 +242,15 @@ impl App {
     /// Waits for a turn to plan; `None` never comes, since nobody closes the semaphore.
     async fn check_turn(&self) -> Option<SemaphorePermit<'_>> {
         self.inner.checks.acquire().await.ok()
+    }
+
+    /// Waits for a turn to read the map; `None` never comes, since nobody closes the semaphore.
+    async fn map_turn(&self) -> Option<SemaphorePermit<'_>> {
+        self.inner.map_readers.acquire().await.ok()
+    }
+
+    fn pictures(&self) -> &Pictures {
+        &self.inner.pictures
     }
 
     fn robots_changed(&self) {

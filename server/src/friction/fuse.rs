@@ -182,21 +182,87 @@ pub fn fuse<R: Ord + Copy>(
     config: &FrictionConfig,
     now_us: i64,
 ) -> Option<Fused> {
-    seen.sort_unstable_by_key(|one| {
-        (
-            std::cmp::Reverse(one.newest_at_us),
-            one.robot,
-            std::cmp::Reverse(one.epoch_h),
-        )
+    Fuser::default().fuse(seen, ground, config, now_us)
+}
+
+/// Fuses one piece of ground after another in the same room.
+#[derive(Debug)]
+pub struct Fuser<R> {
+    before: Vec<Seen<R>>,
+    robots: Vec<Word>,
+}
+
+impl<R> Default for Fuser<R> {
+    fn default() -> Self {
+        Self {
+            before: Vec::new(),
+            robots: Vec::new(),
+        }
+    }
+}
+
+impl<R: Ord + Copy> Fuser<R> {
+    /// The same as [`fuse()`].
+    pub fn fuse(
+        &mut self,
+        seen: &mut Vec<Seen<R>>,
+        ground: Ground,
+        config: &FrictionConfig,
+        now_us: i64,
+    ) -> Option<Fused> {
+        fuse_in(self, seen, ground, config, now_us)
+    }
+}
+
+/// What one robot says, with the variance that its own measurements leave.
+#[derive(Debug, Clone, Copy)]
+struct Word {
+    variance: f64,
+    value: f64,
+}
+
+/// Two revisions of a terrain that are one ground may both have a sum of one robot and epoch.
+fn by_content<R>(left: &Seen<R>, right: &Seen<R>) -> std::cmp::Ordering {
+    let information = left.theta.information.total_cmp(&right.theta.information);
+    information.then_with(|| left.theta.value.total_cmp(&right.theta.value))
+}
+
+fn fuse_in<R: Ord + Copy>(
+    room: &mut Fuser<R>,
+    seen: &mut Vec<Seen<R>>,
+    ground: Ground,
+    config: &FrictionConfig,
+    now_us: i64,
+) -> Option<Fused> {
+    seen.sort_unstable_by(|left, right| {
+        right
+            .newest_at_us
+            .cmp(&left.newest_at_us)
+            .then_with(|| left.robot.cmp(&right.robot))
+            .then_with(|| right.epoch_h.cmp(&left.epoch_h))
+            .then_with(|| by_content(left, right))
     });
     let passes = seen.iter().map(|one| one.passes).sum();
     let newest_at_us = seen.first()?.newest_at_us;
     let present = match ground {
-        Ground::Cell => Present::of(seen, config),
+        Ground::Cell => Present::of(seen, &mut room.before, config),
         Ground::Area => Present::default(),
     };
-    seen.sort_unstable_by_key(|one| (one.robot, one.epoch_h));
-    let (theta, spread) = joined(seen, |one| Some(one.theta), config, now_us, true)?;
+    seen.sort_unstable_by(|left, right| {
+        let by_robot = left.robot.cmp(&right.robot);
+        by_robot
+            .then_with(|| left.epoch_h.cmp(&right.epoch_h))
+            .then_with(|| by_content(left, right))
+    });
+    let drift = config.drift_variance_per_s;
+    let words = &mut room.robots;
+    let (theta, spread) = joined(seen, words, |one| Some(one.theta), config, (now_us, drift))?;
+    let mut layer = |value_of: fn(&Seen<R>) -> Option<Known>| {
+        let is_known = seen.iter().any(|one| value_of(one).is_some());
+        let joined = is_known.then(|| joined(seen, words, value_of, config, (now_us, 0.0)));
+        joined.flatten().map(|joined| joined.0)
+    };
+    let (track, rolling) = (layer(|one| one.track), layer(|one| one.rolling));
     let recent = |one: &&Seen<R>| age_s(one, now_us) <= config.mu_peak_age_max_s;
     Some(Fused {
         theta: Estimate {
@@ -208,8 +274,8 @@ pub fn fuse<R: Ord + Copy>(
             .filter(recent)
             .filter_map(|one| one.mu_peak)
             .reduce(f64::max),
-        track: joined(seen, |one| one.track, config, now_us, false).map(|joined| joined.0),
-        rolling: joined(seen, |one| one.rolling, config, now_us, false).map(|joined| joined.0),
+        track,
+        rolling,
         passes,
         robots: spread.robots,
         newest_at_us,
@@ -227,8 +293,13 @@ struct Present {
 
 impl Present {
     /// Keeps, of what is sorted from the newest back, what is of the ground as it is.
-    fn of<R: Ord + Copy>(seen: &mut Vec<Seen<R>>, config: &FrictionConfig) -> Self {
-        let before = seen.clone();
+    fn of<R: Ord + Copy>(
+        seen: &mut Vec<Seen<R>>,
+        older: &mut Vec<Seen<R>>,
+        config: &FrictionConfig,
+    ) -> Self {
+        older.clear();
+        older.extend_from_slice(seen);
         let (kept, changed_at_us) = keep_present(seen, config);
         seen.truncate(kept);
         let Some(changed_at_us) = changed_at_us else {
@@ -243,7 +314,6 @@ impl Present {
         }
         // One pass against all before it. Without it, what was there stands as it stood.
         let now = seen.first().map(|one| one.theta.value);
-        let mut older = before;
         if let Some(first) = older.first_mut() {
             match first.contradicted() {
                 Some((_newest, rest)) => *first = first.without_newest(rest),
@@ -252,7 +322,7 @@ impl Present {
                 }
             }
         }
-        let (kept, earlier_us) = keep_present(&mut older, config);
+        let (kept, earlier_us) = keep_present(older, config);
         older.truncate(kept);
         let was = older.first().map(|one| one.theta.value);
         let is_bad_news = was.zip(now).is_none_or(|(was, now)| now > was);
@@ -262,7 +332,8 @@ impl Present {
                 changed_at_us: Some(changed_at_us),
             };
         }
-        *seen = older;
+        seen.clear();
+        seen.extend_from_slice(older);
         Self {
             is_unconfirmed: true,
             changed_at_us: earlier_us,
@@ -379,20 +450,16 @@ fn age_s<R>(one: &Seen<R>, now_us: i64) -> f64 {
     seconds(now_us - one.newest_at_us).max(0.0)
 }
 
-/// One value out of the epochs of robots, which are sorted by robot.
+/// One value out of the epochs of robots, which are sorted by robot; `drift` is the growth of a
+/// measurement's variance with its age.
 fn joined<R: Ord + Copy>(
     seen: &[Seen<R>],
+    robots: &mut Vec<Word>,
     value_of: impl Fn(&Seen<R>) -> Option<Known>,
     config: &FrictionConfig,
-    now_us: i64,
-    drifts: bool,
+    (now_us, drift): (i64, f64),
 ) -> Option<(Estimate, Spread)> {
-    let drift = if drifts {
-        config.drift_variance_per_s
-    } else {
-        0.0
-    };
-    let mut robots: Vec<Known> = Vec::with_capacity(seen.len());
+    robots.clear();
     let mut spread = Spread::default();
     for epochs in seen.chunk_by(|left, right| left.robot == right.robot) {
         let (mut information, mut weighted, mut square) = (0.0, 0.0, 0.0);
@@ -410,13 +477,14 @@ fn joined<R: Ord + Copy>(
             let value = weighted / information;
             spread.within += (square - weighted * value).max(0.0);
             spread.within_freedom -= 1;
-            robots.push(Known { information, value });
+            let variance = f64::recip(information);
+            robots.push(Word { variance, value });
         }
     }
-    let (mut value, mut information) = weighed(&robots, 0.0)?;
+    let (mut value, mut information) = weighed(robots, 0.0)?;
     for _ in 0..ROUNDS_MAX {
         let bias_variance = (config.robot_bias_ratio * value).powi(2);
-        let (next, sum) = weighed(&robots, bias_variance)?;
+        let (next, sum) = weighed(robots, bias_variance)?;
         let change = (next - value).abs();
         (value, information) = (next, sum);
         if change <= SETTLED_RATIO * value.abs() {
@@ -424,8 +492,8 @@ fn joined<R: Ord + Copy>(
         }
     }
     let bias_variance = (config.robot_bias_ratio * value).powi(2);
-    for robot in &robots {
-        let weight = (bias_variance + robot.information.recip()).recip();
+    for robot in robots.iter() {
+        let weight = (bias_variance + robot.variance).recip();
         spread.between += weight * (robot.value - value).powi(2);
     }
     spread.robots = u32::try_from(robots.len()).unwrap_or(u32::MAX);
@@ -434,10 +502,10 @@ fn joined<R: Ord + Copy>(
 }
 
 /// The mean of robots with this variance of their bias, and its information.
-fn weighed(robots: &[Known], bias_variance: f64) -> Option<(f64, f64)> {
+fn weighed(robots: &[Word], bias_variance: f64) -> Option<(f64, f64)> {
     let (mut sum, mut weighted) = (0.0, 0.0);
     for robot in robots {
-        let weight = (bias_variance + robot.information.recip()).recip();
+        let weight = (bias_variance + robot.variance).recip();
         sum += weight;
         weighted += weight * robot.value;
     }

@@ -7,13 +7,16 @@
 
 pub mod fixed;
 pub mod fuse;
+pub mod grip;
 pub mod index;
+pub mod raster;
 pub mod sums;
 
 use jiff::Timestamp;
 use tread_api::friction::{FrictionBounds, FusedFriction, NORMAL_90, ValueEstimate};
 
-pub use self::fuse::{Estimate, Fused, Ground, Seen, fuse};
+pub use self::fuse::{Estimate, Fused, Fuser, Ground, Seen, fuse};
+pub use self::raster::Raster;
 pub use self::sums::{Sums, bucket_h, epoch_h};
 
 impl Fused {

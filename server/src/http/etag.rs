@@ -2,6 +2,7 @@
 
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 
+use axum::body::Bytes;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
@@ -12,7 +13,7 @@ use super::problem::Problem;
 /// JSON with an `ETag` of its content; 304 without a body to who has it already.
 pub(super) fn json<T: Serialize>(headers: &HeaderMap, answer: &T) -> Response {
     match serde_json::to_vec(answer) {
-        Ok(text) => bytes(headers, "application/json", text),
+        Ok(text) => bytes(headers, "application/json", text.into()),
         Err(error) => {
             tracing::error!("cannot write an answer: {error}");
             Problem::new(ProblemType::Internal).into_response()
@@ -21,7 +22,7 @@ pub(super) fn json<T: Serialize>(headers: &HeaderMap, answer: &T) -> Response {
 }
 
 /// A body of any kind, likewise.
-pub(super) fn bytes(headers: &HeaderMap, media_type: &'static str, body: Vec<u8>) -> Response {
+pub(super) fn bytes(headers: &HeaderMap, media_type: &'static str, body: Bytes) -> Response {
     let mut hasher = DefaultHasher::new();
     media_type.hash(&mut hasher);
     body.hash(&mut hasher);

@@ -7,7 +7,7 @@ use tread_api::ids::{MissionId, RobotId, SiteId};
 use tread_api::mission::{CreateMission, Mission, MissionDetail, MissionState, ReplaceMission};
 use tread_api::page::Page;
 use tread_api::problem::{ProblemBody, ProblemType};
-use tread_api::trajectory::{CheckTrajectory, TrajectoryCheck};
+use tread_api::trajectory::{CheckTrajectory, PlannedPath, TrajectoryCheck};
 use utoipa::IntoParams;
 
 use super::extract::{Json, Path, Query, cursor, page_limit};
@@ -103,6 +103,20 @@ pub(super) async fn get(
     Path(mission): Path<MissionId>,
 ) -> Result<Json<MissionDetail>, Problem> {
     Ok(Json(app.mission(mission).await?))
+}
+
+/// Where the planner lays a mission: from where its robot began once it has ended, and from the
+/// begin of its trajectory before.
+#[utoipa::path(get, path = "/v1/missions/{mission}/path", tag = "missions",
+    security(("token" = ["viewer"])),
+    operation_id = "get_planned_path", params(("mission" = MissionId, Path)),
+    responses((status = 200, body = PlannedPath), (status = 404, body = ProblemBody),
+        (status = 422, body = ProblemBody)))]
+pub(super) async fn path(
+    State(app): State<App>,
+    Path(mission): Path<MissionId>,
+) -> Result<Json<PlannedPath>, Problem> {
+    Ok(Json(app.planned_path(mission).await?))
 }
 
 /// Wants a mission to end. One that waits ends at once, one in hand when its robot has answered.

@@ -15,6 +15,7 @@ pub mod health;
 mod identity;
 mod limits;
 mod missions;
+mod negotiate;
 mod page;
 pub mod problem;
 mod robots;
@@ -111,6 +112,7 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(alerts::acknowledge))
         .routes(routes!(events::stream))
         .routes(routes!(missions::get))
+        .routes(routes!(missions::path))
         .routes(routes!(missions::cancel))
         .routes(routes!(missions::pause))
         .routes(routes!(missions::resume))
@@ -131,6 +133,7 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(friction::places::path))
         .routes(routes!(friction::places::difference))
         .routes(routes!(friction::places::visits))
+        .routes(routes!(friction::map::map))
         .routes(routes!(friction::segments))
         .routes(routes!(withdrawals::create))
         .routes(routes!(withdrawals::list))

@@ -62,6 +62,7 @@ const fn status(kind: ProblemType) -> StatusCode {
         | ProblemType::IdempotencyKeyReused => StatusCode::UNPROCESSABLE_ENTITY,
         ProblemType::BodyTooLarge => StatusCode::PAYLOAD_TOO_LARGE,
         ProblemType::UnsupportedMediaType => StatusCode::UNSUPPORTED_MEDIA_TYPE,
+        ProblemType::NotAcceptable => StatusCode::NOT_ACCEPTABLE,
         ProblemType::NotFound
         | ProblemType::UnknownSite
         | ProblemType::UnknownRobot
@@ -125,7 +126,7 @@ impl From<AppError> for Problem {
             AppError::TooMany { .. } => ProblemType::TooMany,
             AppError::Invalid { .. } => ProblemType::InvalidBody,
             AppError::InvalidQuery { .. } => ProblemType::InvalidQuery,
-            AppError::NoRandomness(_) => {
+            AppError::NoRandomness(_) | AppError::Unwritable(_) => {
                 error!("a request failed: {app_error}");
                 ProblemType::Internal
             }

@@ -40,6 +40,69 @@ async fn a_dry_run_tells_duration_and_limits_and_refuses_the_impossible_with_its
     yard.server.stop().await.unwrap();
 }
 
+/// The points of a planned path, and how far each is from the one before at the most.
+fn points(path: &Value) -> Vec<(f64, f64)> {
+    let number = |point: &Value, name: &str| point[name].as_f64().unwrap();
+    let points = path["points"].as_array().unwrap().iter();
+    let points: Vec<(f64, f64)> = points
+        .map(|point| (number(point, "x_m"), number(point, "y_m")))
+        .collect();
+    let step_m = path["step_m"].as_f64().unwrap();
+    for pair in points.windows(2) {
+        let apart_m = (pair[1].0 - pair[0].0).hypot(pair[1].1 - pair[0].1);
+        assert!(
+            apart_m <= step_m + 1e-9,
+            "{apart_m} m in a step of {step_m} m"
+        );
+    }
+    assert!((2..=1_000).contains(&points.len()));
+    points
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_planned_path_is_told_by_a_dry_run_and_of_a_mission_and_is_bounded() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mut body = circle(&robot.id);
+    body["trajectory"]["circle"]["turns"] = json!(900.0);
+    let (_, checked) = yard.post("/v1/trajectories/check", &body).await;
+    let round = points(&checked["path"]);
+    let centre = &body["trajectory"]["circle"]["center"];
+    let centre = (
+        centre["x_m"].as_f64().unwrap(),
+        centre["y_m"].as_f64().unwrap(),
+    );
+    let radius_m = body["trajectory"]["circle"]["radius_m"].as_f64().unwrap();
+    let last = round.last().unwrap();
+    let off_m = (last.0 - centre.0).hypot(last.1 - centre.1) - radius_m;
+    assert!(off_m.abs() < 1e-6, "{off_m}");
+    // Waypoints are passed on a smooth way, not on the straight lines between them.
+    let corners =
+        json!([{"x_m": 0.0, "y_m": 0.0}, {"x_m": 6.0, "y_m": 0.0}, {"x_m": 6.0, "y_m": 6.0}]);
+    body["trajectory"] = json!({"waypoints": {"points": corners, "speed_m_s": 0.5}});
+    let (status, mission) = yard.post("/v1/missions", &body).await;
+    assert_eq!(status, StatusCode::CREATED, "{mission}");
+    let id = mission["id"].as_str().unwrap();
+    let (status, path) = yard.get_value(&format!("/v1/missions/{id}/path")).await;
+    assert_eq!(status, StatusCode::OK, "{path}");
+    let smooth = points(&path);
+    assert_eq!(smooth[0], (0.0, 0.0));
+    let end = smooth.last().unwrap();
+    assert!((end.0 - 6.0).hypot(end.1 - 6.0) < 1e-6, "{end:?}");
+    let near = |x_m: f64, y_m: f64| {
+        let distances = smooth
+            .iter()
+            .map(|point| (point.0 - x_m).hypot(point.1 - y_m));
+        distances.fold(f64::INFINITY, f64::min)
+    };
+    assert!(near(6.0, 0.0) < 0.1, "it passes the corner");
+    assert!(near(3.0, 0.0) > 0.1, "it swings out before");
+    let nobody = "0192f0c1-2b3c-7d4e-8f50-617283940a1b";
+    let (status, _) = yard.get_value(&format!("/v1/missions/{nobody}/path")).await;
+    assert_eq!(status, StatusCode::NOT_FOUND);
+    yard.server.stop().await.unwrap();
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_dry_run_tells_how_well_friction_would_be_measured() {
     let yard = Yard::start().await;

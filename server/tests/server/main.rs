@@ -33,6 +33,7 @@ mod network;
 mod openapi;
 #[cfg(test)]
 mod page;
+mod pictures;
 #[cfg(test)]
 mod program;
 #[cfg(test)]

@@ -27,6 +27,7 @@ use super::progress::ProgressWatch;
 use super::seam::{EndReason, LoopEnds, Shared};
 use super::segments::{Moment, SegmentCutter};
 use super::site_view::{Footing, SiteView};
+use super::slip::SlipMeter;
 use super::surface::SurfaceWatch;
 use crate::drive::Drive;
 use guard::Guard;
@@ -69,6 +70,8 @@ pub(crate) struct LoopCore {
     known: GroundRecord,
     surface: SurfaceWatch,
     progress: ProgressWatch,
+    /// How much they slip.
+    slip: SlipMeter,
     /// Until when the mission is held for its next revision.
     replacement_until: Option<Duration>,
     ticks: u64,
@@ -103,6 +106,7 @@ impl LoopCore {
             known: GroundRecord::default(),
             surface: SurfaceWatch::default(),
             progress: ProgressWatch::default(),
+            slip: SlipMeter::default(),
             replacement_until: None,
             ticks: 0,
         }
@@ -129,6 +133,7 @@ impl LoopCore {
         let dt_s = self.time_step_s(now.monotonic);
         let feedback = drive.read(now.monotonic);
         let ground_changed = self.take_samples(&feedback);
+        self.measure_slip(now.monotonic, dt_s);
         self.take_commands(now, stop);
         self.cut_segments(now, ground_changed, dt_s);
         self.look_at_safety(now.monotonic);

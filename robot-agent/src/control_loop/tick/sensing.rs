@@ -5,9 +5,10 @@ use std::time::Duration;
 
 use tread_control::estimation::SensorSample;
 use tread_control::localisation::{FixOutcome, PositionFix};
+use tread_control::paper::BodyVelocity;
 use tread_control::tracking::ThetaKnowledge;
 
-use super::{LoopCore, TICK_MAX_S};
+use super::{LoopCore, TICK_MAX_S, age_s};
 use crate::control_loop::gain::GroundRecord;
 use crate::control_loop::prior::{Prior, told};
 use crate::control_loop::seam::{ClosedSegment, Fault, LoopEvent, Shared};
@@ -102,6 +103,18 @@ impl LoopCore {
             Some((speed_m_s, at)) if is_new(at) => speed_m_s,
             Some(_) | None => self.localisation.twist().linear_m_s,
         }
+    }
+
+    /// How much the wheels slip; nothing is known of a base that is silent.
+    pub(super) fn measure_slip(&mut self, now: Duration, dt_s: f64) {
+        let is_silent = age_s(now, self.last_sample) > BASE_SILENT_AFTER.as_secs_f64();
+        let velocity = BodyVelocity {
+            ahead_m_s: self.real_m_s(now),
+            left_m_s: 0.0,
+            yaw_rate_rad_s: self.localisation.twist().angular_rad_s,
+        };
+        let heard = (!is_silent).then_some((velocity, self.measured_wheels));
+        self.slip.step(heard, &self.model, dt_s);
     }
 
     /// What is known of the ground: what was measured, and what the map knows of the cell. The

@@ -1,5 +1,5 @@
 // Draws the map, layer by layer. Knows nothing of the page: what to draw comes in a scene.
-import type { Geofence, Mission, Terrain, Trajectory } from '../api/schema';
+import type { Cell, Geofence, Mission, Terrain, Trajectory } from '../api/schema';
 import type { Tracked } from '../state/tracked';
 import type { Theme } from '../state/session.svelte';
 import { span } from '../format';
@@ -7,7 +7,8 @@ import { words } from '../words';
 import { roundUp, type Camera, type PointM } from './camera';
 import type { Draft } from './draft';
 import { HATCHED_CELL_PX, drawFriction } from './draw_friction';
-import type { Layer } from './friction';
+import type { Raster } from './raster';
+import type { Moment } from './replay';
 import { PALETTES, groundFill, groundLine, type Palette } from './palette';
 
 export { HATCHED_CELL_PX };
@@ -19,9 +20,14 @@ export interface Scene {
   missions: Mission[];
   /** Robots that a stop is on its way to without their confirmation. */
   unconfirmed: ReadonlySet<string>;
-  friction: Layer | null;
+  friction: Raster<{ cell: Cell }> | null;
   draft: Draft | null;
-  driven: { asked: Trajectory; points: PointM[] } | null;
+  /** The mission that is looked at: its way as it was planned, as far as that is known, and driven. */
+  driven: { asked: Trajectory; planned: PointM[]; points: PointM[]; moment: Moment | null } | null;
+  /** The smooth way of what is drawn, by its dry run. */
+  dryRun: PointM[];
+  /** The smooth way of a mission, once it is known. */
+  wayOf(mission: Mission): PointM[] | null;
   selected: string | null;
   showTerrains: boolean;
   showFence: boolean;
@@ -41,6 +47,8 @@ const SCALE_BAR_PX = 90;
 const ROBOT_PX = 15;
 /** Points of a trail that are nearer to each other than this are one, pixels. */
 const TRAIL_STEP_PX = 2;
+/** Length of the arrow of a moment, pixels from its middle. */
+const MOMENT_PX = 11;
 /** Most labels of robots: with more they would only cover each other. */
 const LABELS_MAX = 60;
 
@@ -54,7 +62,15 @@ export function draw(context: CanvasRenderingContext2D, camera: Camera, scene: S
   if (scene.showFence && scene.fence) drawFence(context, camera, scene.fence, palette);
   drawPaths(context, camera, scene, palette);
   drawRobots(context, camera, scene, palette);
-  if (scene.draft) drawDraft(context, camera, scene.draft, palette);
+  if (scene.draft) {
+    drawDraft(context, camera, scene.draft, palette);
+    context.setLineDash([6, 5]);
+    context.lineWidth = 2;
+    context.strokeStyle = palette.planned;
+    trace(context, camera, scene.dryRun);
+    context.stroke();
+    context.setLineDash([]);
+  }
   if (scene.showCross) drawCross(context, camera, palette);
   drawScale(context, camera, palette);
 }
@@ -98,8 +114,21 @@ function drawTerrains(context: CanvasRenderingContext2D, camera: Camera, scene: 
   }
   for (const terrain of terrains) {
     const at = camera.toPx(labelPlace(terrain.polygon));
-    label(context, `${terrain.name} · ${words.terrains.classes[terrain.class]}`, at.x, at.y, palette.text, palette);
+    const text = `${terrain.name} · ${words.terrains.classes[terrain.class]}`;
+    // From far names would only cover each other.
+    if (context.measureText(text).width > widthM(terrain.polygon) * camera.scale) continue;
+    label(context, text, at.x, at.y, palette.text, palette);
   }
+}
+
+/** From the leftmost to the rightmost corner, metres. */
+function widthM(polygon: readonly PointM[]): number {
+  let [least, most] = [Infinity, -Infinity];
+  for (const { x_m } of polygon) {
+    least = Math.min(least, x_m);
+    most = Math.max(most, x_m);
+  }
+  return most - least;
 }
 
 /** Just inside the upper edge of a polygon, in its middle. */
@@ -182,7 +211,9 @@ function drawPaths(context: CanvasRenderingContext2D, camera: Camera, scene: Sce
     context.globalAlpha = isWaiting ? 0.4 : mission.robot === scene.selected ? 1 : 0.6;
     context.lineWidth = mission.robot === scene.selected ? 2 : 1.25;
     context.strokeStyle = palette.planned;
-    traceTrajectory(context, camera, mission.trajectory);
+    const way = scene.wayOf(mission);
+    if (way) trace(context, camera, way);
+    else traceTrajectory(context, camera, mission.trajectory);
     context.stroke();
     if ('waypoints' in mission.trajectory && !isWaiting && mission.trajectory.waypoints.points.length <= 200) {
       context.fillStyle = palette.planned;
@@ -196,15 +227,48 @@ function drawPaths(context: CanvasRenderingContext2D, camera: Camera, scene: Sce
   if (scene.driven) {
     context.lineWidth = 2;
     context.strokeStyle = palette.planned;
-    traceTrajectory(context, camera, scene.driven.asked);
+    const { asked, planned, points, moment } = scene.driven;
+    if (planned.length > 0) trace(context, camera, planned);
+    else traceTrajectory(context, camera, asked);
     context.stroke();
     context.setLineDash([]);
     context.lineWidth = 2.5;
     context.strokeStyle = palette.driven;
-    trace(context, camera, scene.driven.points);
-    context.stroke();
+    if (moment) {
+      // What came after the moment is faint.
+      context.globalAlpha = 0.35;
+      trace(context, camera, points);
+      context.stroke();
+      context.globalAlpha = 1;
+      trace(context, camera, [...points.slice(0, moment.index + 1), moment.at]);
+      context.stroke();
+      drawMoment(context, camera, moment, palette);
+    } else {
+      trace(context, camera, points);
+      context.stroke();
+    }
   }
   context.setLineDash([]);
+}
+
+/** Where the robot was: an arrow, not to be taken for the robot itself. */
+function drawMoment(context: CanvasRenderingContext2D, camera: Camera, moment: Moment, palette: Palette): void {
+  const { x, y } = camera.toPx(moment.at);
+  context.save();
+  context.translate(x, y);
+  context.rotate(-moment.heading_rad);
+  context.beginPath();
+  context.moveTo(MOMENT_PX, 0);
+  context.lineTo(-MOMENT_PX * 0.8, MOMENT_PX * 0.7);
+  context.lineTo(-MOMENT_PX * 0.4, 0);
+  context.lineTo(-MOMENT_PX * 0.8, -MOMENT_PX * 0.7);
+  context.closePath();
+  context.fillStyle = palette.halo;
+  context.fill();
+  context.lineWidth = 2;
+  context.strokeStyle = palette.driven;
+  context.stroke();
+  context.restore();
 }
 
 function drawRobots(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): void {

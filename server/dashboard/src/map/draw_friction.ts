@@ -1,13 +1,14 @@
-// Draws the friction layer: its image, and hatching over cells that are unsure.
+// Draws a layer of cells: its image, and hatching over those that are unsure.
 import type { Camera } from './camera';
-import type { Layer } from './friction';
+import type { Cell } from '../api/schema';
+import type { Raster } from './raster';
 
 /** Least pixels of a cell's side for hatching to be read. */
 export const HATCHED_CELL_PX = 8;
 /** Distance of the lines of the hatching, pixels. */
 const LINE_PX = 5;
 
-export function drawFriction(context: CanvasRenderingContext2D, camera: Camera, layer: Layer): void {
+export function drawFriction(context: CanvasRenderingContext2D, camera: Camera, layer: Raster<{ cell: Cell }>): void {
   const { image, bounds } = layer;
   if (!image || !bounds) return;
   const corner = camera.toPx({ x_m: bounds.xMin, y_m: bounds.yMax });
@@ -19,7 +20,7 @@ export function drawFriction(context: CanvasRenderingContext2D, camera: Camera, 
   if (side < HATCHED_CELL_PX) return;
   const seen = camera.bounds;
   context.beginPath();
-  for (const { cell } of layer.unsure) {
+  for (const { cell } of layer.hatched) {
     const x_m = cell.ix * layer.cellM;
     const y_m = (cell.iy + 1) * layer.cellM;
     if (x_m > seen.xMax || x_m + layer.cellM < seen.xMin) continue;

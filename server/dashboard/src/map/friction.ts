@@ -2,7 +2,7 @@
 import type { CellFriction, FusedFriction } from '../api/schema';
 import { words } from '../words';
 import { colour } from './cividis';
-import type { Bounds, PointM } from './camera';
+import { Raster } from './raster';
 
 export type Quantity = 'theta' | 'stiffness' | 'grip' | 'age' | 'visits';
 
@@ -71,11 +71,6 @@ const SURE = 0.05;
 const UNSURE = 0.5;
 /** Relative deviation from which a cell is hatched. */
 export const HATCHED = 0.25;
-/** More cells than any site has along one side; its square is still a whole number. */
-const KEY_SPAN = 2 ** 26;
-/** Most cells along one side of the image. */
-const SIDE_MAX = 2_048;
-
 /** Where a value stands in its range, 0 to 1. */
 export function share(range: Range, value: number): number {
   const of = (number: number) => (range.isLog ? Math.log(Math.max(number, 1e-12)) : number);
@@ -90,73 +85,24 @@ export function doubt(friction: FusedFriction): number {
 }
 
 /** Cells of one robot model; where two terrains share one, the one that was measured more often. */
-export class Layer {
-  readonly cells = new Map<number, CellFriction>();
-  image: HTMLCanvasElement | null = null;
-  /** What the image covers, metres. */
-  bounds: Bounds | null = null;
-  readonly unsure: CellFriction[] = [];
-
+export class Layer extends Raster<CellFriction> {
   constructor(
     cells: CellFriction[],
     readonly configuration: string | null,
-    readonly cellM: number,
+    cellM: number,
     readonly quantity: Quantity,
     nowMs: number,
   ) {
-    for (const cell of cells) {
-      if (configuration && cell.configuration !== configuration) continue;
-      const key = keyOf(cell.cell.ix, cell.cell.iy);
-      const known = this.cells.get(key);
-      if (!known || known.friction.segments < cell.friction.segments) this.cells.set(key, cell);
-    }
-    this.#paint(nowMs);
-  }
-
-  at(point: PointM): CellFriction | null {
-    const key = keyOf(Math.floor(point.x_m / this.cellM), Math.floor(point.y_m / this.cellM));
-    return this.cells.get(key) ?? null;
-  }
-
-  #paint(nowMs: number): void {
-    const cells = [...this.cells.values()];
-    if (cells.length === 0) return;
-    let [xMin, yMin, xMax, yMax] = [Infinity, Infinity, -Infinity, -Infinity];
-    for (const { cell } of cells) {
-      xMin = Math.min(xMin, cell.ix);
-      yMin = Math.min(yMin, cell.iy);
-      xMax = Math.max(xMax, cell.ix);
-      yMax = Math.max(yMax, cell.iy);
-    }
-    const width = Math.min(SIDE_MAX, xMax - xMin + 1);
-    const height = Math.min(SIDE_MAX, yMax - yMin + 1);
-    const canvas = document.createElement('canvas');
-    canvas.width = width;
-    canvas.height = height;
-    const context = canvas.getContext('2d');
-    if (!context) return;
-    const pixels = context.createImageData(width, height);
-    const range = RANGES[this.quantity];
-    for (const cell of cells) {
+    const mine = cells.filter((cell) => !configuration || cell.configuration === configuration);
+    super(mine, cellM, (known, other) => known.friction.segments < other.friction.segments);
+    const range = RANGES[quantity];
+    this.paint((cell) => {
       const value = range.value(cell.friction, nowMs);
-      const [column, row] = [cell.cell.ix - xMin, yMin + height - 1 - cell.cell.iy];
-      if (value === null || column >= width || row < 0) continue;
-      const [red, green, blue] = colour(share(range, value), doubt(cell.friction));
-      pixels.data.set([red, green, blue, 255], (row * width + column) * 4);
-      if (cell.friction.std_dev > HATCHED * cell.friction.theta) this.unsure.push(cell);
-    }
-    context.putImageData(pixels, 0, 0);
-    this.image = canvas;
-    this.bounds = {
-      xMin: xMin * this.cellM,
-      yMin: yMin * this.cellM,
-      xMax: (xMin + width) * this.cellM,
-      yMax: (yMin + height) * this.cellM,
-    };
+      if (value === null) return null;
+      return {
+        colour: colour(share(range, value), doubt(cell.friction)),
+        isHatched: cell.friction.std_dev > HATCHED * cell.friction.theta,
+      };
+    });
   }
-}
-
-/** Both in one number, which takes a fraction of the room and time of a text. */
-function keyOf(ix: number, iy: number): number {
-  return ix * KEY_SPAN + iy;
 }

@@ -1,7 +1,9 @@
 // What is drawn at the moment and for which purpose; kept whatever happens to server or sign-in.
-import type { CreateMission, Mission, Terrain, TerrainClass, Trajectory, TrajectoryCheck } from '../api/schema';
-import { ask, sentence } from '../api/client';
+import type { CreateMission, Geofence, Mission, ReplaceGeofence, Terrain, TerrainClass, Trajectory, TrajectoryCheck } from '../api/schema';
+import { Problem, ask, sentence } from '../api/client';
 import { Draft, type DraftKind } from '../map/draft';
+import type { PointM } from '../map/camera';
+import { words } from '../words';
 import type { Fleet } from './fleet.svelte';
 
 /** Wait after a change before the dry run is asked for, milliseconds. */
@@ -10,7 +12,11 @@ const CHECK_WAIT_MS = 350;
 export type Purpose =
   | { what: 'mission' }
   | { what: 'replace'; mission: Mission }
-  | { what: 'terrain'; terrain: Terrain | null };
+  | { what: 'terrain'; terrain: Terrain | null }
+  /** An area of the geofence; the one that it replaces, or none for a new one. */
+  | { what: 'fence'; side: FenceSide; old: PointM[] | null };
+
+export type FenceSide = 'keep_in' | 'keep_out';
 
 export class Editor {
   purpose = $state.raw<Purpose | null>(null);
@@ -65,6 +71,10 @@ export class Editor {
     this.#begin({ what: 'terrain', terrain }, new Draft('terrain', terrain?.polygon));
   }
 
+  beginFence(side: FenceSide, old: PointM[] | null): void {
+    this.#begin({ what: 'fence', side, old }, new Draft('terrain', old ?? []));
+  }
+
   #begin(purpose: Purpose, draft: Draft): void {
     this.purpose = purpose;
     this.draft = draft;
@@ -89,7 +99,8 @@ export class Editor {
     this.#asked += 1;
     this.isChecking = false;
     clearTimeout(this.#due);
-    if (this.purpose && this.purpose.what !== 'terrain' && this.draft?.isWhole && this.robot) {
+    const isMission = this.purpose?.what === 'mission' || this.purpose?.what === 'replace';
+    if (isMission && this.draft?.isWhole && this.robot) {
       this.isChecking = true;
       this.#due = setTimeout(() => void this.#dryRun(), CHECK_WAIT_MS);
     }
@@ -145,7 +156,8 @@ export class Editor {
   async sendMission(): Promise<boolean> {
     const { trajectory, purpose } = this;
     const site = this.fleet.site;
-    if (!trajectory || !site || !purpose || purpose.what === 'terrain') return false;
+    if (!trajectory || !site || !purpose) return false;
+    if (purpose.what !== 'mission' && purpose.what !== 'replace') return false;
     if (purpose.what === 'replace') {
       return this.#send(`/v1/missions/${purpose.mission.id}/replace`, 'POST', { trajectory });
     }
@@ -178,6 +190,42 @@ export class Editor {
       : await this.#send(at, 'POST', { id: this.terrainId, ...shape });
     if (done) void this.fleet.readGround();
     return done;
+  }
+
+  /** Saves the area that is drawn, in the place of the one that it changes. */
+  async saveFence(): Promise<boolean> {
+    const { purpose, draft } = this;
+    if (purpose?.what !== 'fence' || !draft) return false;
+    this.isSending = true;
+    this.sendProblem = await this.#putFence(purpose.side, purpose.old, draft.points);
+    this.isSending = false;
+    return this.sendProblem === null;
+  }
+
+  /** Deletes an area; why not, if it was not. */
+  removeFence(side: FenceSide, old: PointM[]): Promise<string | null> {
+    return this.#putFence(side, old, null);
+  }
+
+  /** Replaces one area of the geofence, unless somebody changed it meanwhile. */
+  async #putFence(side: FenceSide, old: PointM[] | null, area: PointM[] | null): Promise<string | null> {
+    const { fence, site } = this.fleet;
+    if (!fence || !site) return words.problem.lost;
+    const gone = JSON.stringify(old);
+    const others = fence[side].filter((known) => JSON.stringify(known) !== gone);
+    const body: ReplaceGeofence = { keep_in: fence.keep_in, keep_out: fence.keep_out };
+    body[side] = area ? [...others, area] : others;
+    const headers = { 'if-match': `"${fence.revision}"` };
+    try {
+      const answer = await ask<Geofence>(`/v1/sites/${site}/geofence`, { method: 'PUT', body, headers });
+      this.fleet.fence = answer;
+      this.fleet.isDirty = true;
+      return null;
+    } catch (error) {
+      if (!(error instanceof Problem) || error.status !== 412) return sentence(error);
+      await this.fleet.readGround();
+      return words.fence.changed;
+    }
   }
 
   async #send(

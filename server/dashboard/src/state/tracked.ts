@@ -19,6 +19,9 @@ export interface Sample {
   theta: number | null;
   thetaSd: number | null;
   thetaLoop: number | null;
+  /** Shares of the rim's speed. */
+  slipLeft: number | null;
+  slipRight: number | null;
   isExcited: boolean;
 }
 
@@ -70,6 +73,8 @@ export class Tracked {
       theta: friction?.theta_measured?.theta ?? null,
       thetaSd: friction?.theta_measured?.std_dev ?? null,
       thetaLoop: friction?.theta_loop ?? null,
+      slipLeft: friction?.slip?.left_ratio ?? null,
+      slipRight: friction?.slip?.right_ratio ?? null,
       isExcited: friction?.excited ?? false,
     });
     const old = this.samples.findIndex((sample) => sample.at_s > at_s - CURVE_SPAN_S);

@@ -1,9 +1,13 @@
 // What is shown: tabs, layers of the map, the mission that is looked at.
-import type { CellFriction, MissionDetail } from '../api/schema';
+import type { CellFriction, MissionDetail, PlannedPath } from '../api/schema';
 import { ask, list, sentence } from '../api/client';
 import { Layer, type Quantity } from '../map/friction';
-import type { PointM } from '../map/camera';
-import type { Fleet } from './fleet.svelte';
+import type { Bounds, PointM } from '../map/camera';
+import { serves, windowOn, type Window } from '../map/window';
+import { hasEnded, type Fleet } from './fleet.svelte';
+import { Compare } from './compare.svelte';
+import { Plans } from './plans';
+import { Replay } from './replay.svelte';
 
 export type Tab = 'robots' | 'missions' | 'alerts' | 'terrains';
 
@@ -11,6 +15,10 @@ export type Tab = 'robots' | 'missions' | 'alerts' | 'terrains';
 const FRICTION_MS = 10_000;
 /** Entries of the friction map that the page reads; the API gives them in pages of 1000. */
 const CELLS_MAX = 20_000;
+/** Squares of the part that is read; one that several terrains or models share has several entries. */
+const SQUARES_MAX = 16_000;
+/** Wait after the map was moved before another part is read, milliseconds. */
+const MOVED_MS = 300;
 
 export class View {
   tab = $state<Tab>('robots');
@@ -27,13 +35,28 @@ export class View {
   isWhole = $state(true);
   detail = $state.raw<MissionDetail | null>(null);
   detailProblem = $state<string | null>(null);
+  /** The smooth way of the mission that is looked at, once it is known. */
+  plan = $state.raw<PlannedPath | null>(null);
+  /** Its time line, once it has ended. */
+  replay = $state.raw<Replay | null>(null);
   /** A wish to the map: to show this, counted so that the same can be wished again. */
   wanted = $state.raw<{ points: PointM[] } | null>(null);
 
   #cells: CellFriction[] = [];
+  /** What of the map can be seen, and what of it was read. */
+  #seen: Bounds | null = null;
+  #window: Window | null = null;
+  #due: ReturnType<typeof setTimeout> | undefined;
   #timer: ReturnType<typeof setInterval> | undefined;
 
-  constructor(readonly fleet: Fleet) {}
+  readonly plans: Plans;
+  /** The change between two times, shown instead of a quantity. */
+  readonly compare: Compare;
+
+  constructor(readonly fleet: Fleet) {
+    this.plans = new Plans(() => (fleet.isDirty = true));
+    this.compare = new Compare(fleet);
+  }
 
   choose(quantity: Quantity | null): void {
     this.quantity = quantity;
@@ -51,11 +74,22 @@ export class View {
   /** Another site has other ground and other missions. */
   changeSite(): void {
     this.#cells = [];
+    this.#window = null;
     this.configurations = [];
     this.configuration = null;
     this.layer = null;
-    this.detail = null;
+    this.close();
+    if (this.compare.isOn) void this.compare.read();
     if (this.quantity !== null) void this.readFriction();
+  }
+
+  /** The map shows this now: what is not read of it yet is read. */
+  lookAt(seen: Bounds): void {
+    this.#seen = seen;
+    if (this.quantity === null || !this.#window) return;
+    if (serves(this.#window, seen, this.fleet.cellM, SQUARES_MAX)) return;
+    clearTimeout(this.#due);
+    this.#due = setTimeout(() => void this.readFriction(), MOVED_MS);
   }
 
   async readFriction(): Promise<void> {
@@ -63,15 +97,20 @@ export class View {
     if (!site || this.isReading || document.hidden || this.quantity === null) return;
     this.isReading = true;
     try {
-      const read = await list<CellFriction>(`/v1/sites/${site}/friction/cells`, CELLS_MAX);
+      const part = this.#seen && windowOn(this.#seen, this.fleet.cellM, SQUARES_MAX);
+      const path = `/v1/sites/${site}/friction/cells${part ? `?${queryOf(part)}` : ''}`;
+      const read = await list<CellFriction>(path, CELLS_MAX);
       // The site was changed meanwhile; the next look is for that one.
       if (site !== this.fleet.site) {
         this.isReading = false;
         return void this.readFriction();
       }
       this.#cells = read.items;
+      this.#window = part;
       this.isWhole = read.isWhole;
-      this.configurations = [...new Set(read.items.map((cell) => cell.configuration))].sort();
+      // What lies beside may have been measured by other models.
+      const found = read.items.map((cell) => cell.configuration);
+      this.configurations = [...new Set([...this.configurations, ...found])].sort();
       if (!this.configuration || !this.configurations.includes(this.configuration)) {
         this.configuration = this.configurations[0] ?? null;
       }
@@ -85,7 +124,8 @@ export class View {
 
   paint(): void {
     if (this.quantity === null) return;
-    this.layer = new Layer(this.#cells, this.configuration, this.fleet.cellM, this.quantity, Date.now());
+    const squareM = this.#window?.squareM ?? this.fleet.cellM;
+    this.layer = new Layer(this.#cells, this.configuration, squareM, this.quantity, Date.now());
     this.fleet.isDirty = true;
   }
 
@@ -97,8 +137,18 @@ export class View {
 
   async open(mission: string): Promise<void> {
     try {
-      this.detail = await ask<MissionDetail>(`/v1/missions/${mission}`);
+      const detail = await ask<MissionDetail>(`/v1/missions/${mission}`);
+      // What a robot has refused may have no way at all.
+      const path = `/v1/missions/${mission}/path`;
+      const plan = detail.state === 'rejected' ? null : await ask<PlannedPath>(path).catch(() => null);
+      this.detail = detail;
+      this.plan = plan;
       this.detailProblem = null;
+      // A time line that somebody looks at stays where it is.
+      if (this.replay?.mission !== detail.id || !this.replay.track) {
+        this.replay?.pause();
+        this.replay = hasEnded(detail) ? new Replay(detail, plan, () => (this.fleet.isDirty = true)) : null;
+      }
     } catch (error) {
       this.detailProblem = sentence(error);
     }
@@ -107,6 +157,9 @@ export class View {
 
   close(): void {
     this.detail = null;
+    this.plan = null;
+    this.replay?.pause();
+    this.replay = null;
     this.fleet.isDirty = true;
   }
 
@@ -115,6 +168,17 @@ export class View {
   }
 
   end(): void {
+    clearTimeout(this.#due);
     clearInterval(this.#timer);
   }
+}
+
+function queryOf({ bounds, squareM }: Window): URLSearchParams {
+  return new URLSearchParams({
+    x_min_m: String(bounds.xMin),
+    y_min_m: String(bounds.yMin),
+    x_max_m: String(bounds.xMax),
+    y_max_m: String(bounds.yMax),
+    resolution_m: String(squareM),
+  });
 }

@@ -82,6 +82,8 @@ async function measure(): Promise<Frames> {
       friction,
       draft: null,
       driven: null,
+      dryRun: [],
+      wayOf: () => null,
       selected: 'rover-1',
       showTerrains: true,
       showFence: true,

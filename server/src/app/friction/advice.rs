@@ -12,7 +12,7 @@ use tread_api::site::Cell;
 use super::cells::{Area, Drawn};
 use super::{App, AppError, Asked, Reading, SiteView, page, terrain_ref};
 use crate::friction::Ground;
-use crate::friction::index::SiteMap;
+use crate::friction::index::{Contribution, SiteMap};
 
 /// Most cells that one question about visits looks at.
 const LOOKED_AT_MAX: f64 = 262_144.0;
@@ -43,16 +43,19 @@ impl App {
             });
         }
         let (min, max) = area.cells(&grid)?;
-        let drawn = Drawn::new(&view.terrains);
-        let mut found = self.maps().look(&view.row, |map| {
-            let cells =
-                (min.iy..=max.iy).flat_map(|iy| (min.ix..=max.ix).map(move |ix| Cell { ix, iy }));
-            let suggestion = |cell: Cell| {
-                let center = grid.center_of(cell);
-                suggested(map, &drawn, &reading, cell, center)
-            };
-            cells.filter_map(suggestion).collect::<Vec<_>>()
-        });
+        let looking = move |app: &Self| {
+            let drawn = Drawn::new(&view.terrains);
+            app.maps().look(&view.row, |map| {
+                let rows = min.iy..=max.iy;
+                let cells = rows.flat_map(|iy| (min.ix..=max.ix).map(move |ix| Cell { ix, iy }));
+                let suggestion = |cell: Cell| {
+                    let center = grid.center_of(cell);
+                    suggested(map, &drawn, &reading, cell, center)
+                };
+                cells.filter_map(suggestion).collect::<Vec<_>>()
+            })
+        };
+        let mut found = self.off_thread(looking).await;
         found.sort_by(|left, right| {
             let by_gain = right.gain.total_cmp(&left.gain);
             by_gain.then_with(|| (left.cell.iy, left.cell.ix).cmp(&(right.cell.iy, right.cell.ix)))
@@ -73,12 +76,17 @@ impl App {
     ) -> Result<Page<RobotContribution>, AppError> {
         let reading = Reading::new(self, &Asked::default())?;
         let view = SiteView::read(&mut self.db().read().await?, site).await?;
-        let found = self.maps().look(&view.row, |map| {
-            let biases = biases(map, &view, &reading);
-            let contributions = map.contributions().into_iter();
-            let listed = contributions
-                .filter(|found| cursor.is_none_or(|after| found.robot.as_str() > after));
+        let after = cursor.map(str::to_owned);
+        let looking = move |app: &Self| {
+            let (biases, contributions) = app.maps().look(&view.row, |map| {
+                (biases(map, &view, &reading), map.contributions())
+            });
+            let is_wanted = |found: &Contribution| {
+                let after = after.as_deref();
+                after.is_none_or(|after| found.robot.as_str() > after)
+            };
             let time = |at: Result<Timestamp, _>| at.unwrap_or(Timestamp::MAX);
+            let listed = contributions.into_iter().filter(is_wanted);
             let shown = listed.map(|found| RobotContribution {
                 bias_ratio: biases.get(&found.robot).copied(),
                 robot: found.robot,
@@ -88,7 +96,8 @@ impl App {
                 newest_at: time(Timestamp::from_microsecond(found.newest_at_us)),
             });
             shown.collect()
-        });
+        };
+        let found = self.off_thread(looking).await;
         Ok(page(found, limit, |found: &RobotContribution| {
             found.robot.to_string()
         }))
@@ -98,7 +107,7 @@ impl App {
 fn suggested(
     map: &SiteMap,
     drawn: &Drawn<'_>,
-    reading: &Reading<'_>,
+    reading: &Reading,
     cell: Cell,
     center: Point,
 ) -> Option<VisitSuggestion> {
@@ -123,12 +132,13 @@ fn suggested(
         terrain: terrain.map(terrain_ref),
         gain,
         relative_deviation: relative,
+        normalisation: reading.normalisation(),
         disputed: known.is_some_and(|known| known.disputed),
     })
 }
 
 /// Each robot's θ over the one of all robots of its model, the median over terrains.
-fn biases(map: &SiteMap, view: &SiteView, reading: &Reading<'_>) -> BTreeMap<RobotId, f64> {
+fn biases(map: &SiteMap, view: &SiteView, reading: &Reading) -> BTreeMap<RobotId, f64> {
     let mut ratios: BTreeMap<RobotId, Vec<f64>> = BTreeMap::new();
     for terrain in &view.terrains {
         let groups = map.terrain(

@@ -114,7 +114,8 @@ impl App {
         let after = cursor.map(read_cursor).transpose()?;
         let row = site_row(&mut self.db().read().await?, site).await?;
         let grid = row.site.grid;
-        let factor = factor(&grid, resolution_m, &area)?;
+        let factor = factor(&grid, resolution_m)?;
+        check_count(&area, resolution_m)?;
         let size_m = grid.cell_m * f64::from(factor);
         let bounds = area.cells(&Grid {
             cell_m: size_m,
@@ -123,34 +124,19 @@ impl App {
         let wanted = usize::try_from(limit)
             .unwrap_or(usize::MAX)
             .saturating_add(1);
-        Ok(self.maps().look(&row, |map| {
-            let found = squares(map, factor, bounds, after, wanted);
-            let cells = page(found, limit, |(cell, _)| format!("{},{}", cell.ix, cell.iy));
-            let mut items = Vec::new();
-            for (cell, parts) in cells.items {
-                let (groups, ground) = match parts {
-                    None => (map.cell(cell, reading.choice()), Ground::Cell),
-                    Some(parts) => (map.area(&parts, reading.choice()), Ground::Area),
-                };
-                for group in groups {
-                    let (terrain, configuration) = (group.terrain.cloned(), group.configuration);
-                    if let Some(friction) = reading.fused(group, ground) {
-                        items.push(CellFriction {
-                            cell,
-                            size_m,
-                            terrain,
-                            configuration,
-                            friction,
-                            normalisation: reading.normalisation(),
-                        });
-                    }
+        let looking = move |app: &Self| {
+            app.maps().look(&row, |map| {
+                let found = squares(map, factor, bounds, after, wanted);
+                let cells = page(found, limit, |(cell, _)| format!("{},{}", cell.ix, cell.iy));
+                let squares = cells.items.into_iter();
+                let items = squares.flat_map(|square| of_square(map, &reading, square, size_m));
+                Page {
+                    items: items.collect(),
+                    next_cursor: cells.next_cursor,
                 }
-            }
-            Page {
-                items,
-                next_cursor: cells.next_cursor,
-            }
-        }))
+            })
+        };
+        Ok(self.off_thread(looking).await)
     }
 
     /// What is known of the ground at a point: only what was measured on the terrain under it.
@@ -167,11 +153,21 @@ impl App {
             detail: format!("a point lies on the map, within {COORDINATE_MAX_M} m of the origin"),
         };
         let cell = view.row.site.grid.cell_at(point).ok_or_else(off_the_map)?;
+        let looking = move |app: &Self| app.known_at_point(&view, &reading, (cell, point));
+        Ok(self.off_thread(looking).await)
+    }
+
+    fn known_at_point(
+        &self,
+        view: &SiteView,
+        reading: &Reading,
+        (cell, point): (Cell, Point),
+    ) -> PointFriction {
         let drawn = Drawn::new(&view.terrains);
         let terrain = drawn.at(point);
         let measured = self.maps().look(&view.row, |map| {
             let groups = map.cell(cell, reading.choice()).into_iter();
-            let here = groups.filter(|group| is_here(&view, group.terrain, terrain));
+            let here = groups.filter(|group| is_here(view, group.terrain, terrain));
             let models = same_ground(here).into_iter().map(|group| ModelFriction {
                 configuration: group.configuration,
                 model: view.model(group.configuration),
@@ -184,8 +180,8 @@ impl App {
         // What the class is like elsewhere is asked only where nothing was measured.
         let models = match terrain {
             Some(terrain) if measured.is_empty() => {
-                let classes = self.classes(&view, &reading);
-                let models = classes.models(&view, &reading, terrain).into_iter();
+                let classes = self.classes(view, reading);
+                let models = classes.models(view, reading, terrain).into_iter();
                 let expected = models.map(|model| ModelFriction {
                     prior: classes.prior(terrain, model.configuration),
                     friction: None,
@@ -195,11 +191,11 @@ impl App {
             }
             _ => measured,
         };
-        Ok(PointFriction {
+        PointFriction {
             cell,
             terrain: terrain.map(terrain_ref),
             models,
-        })
+        }
     }
 
     /// How cells that were measured between two times differ from before to after.
@@ -226,33 +222,55 @@ impl App {
         let row = site_row(&mut self.db().read().await?, site).await?;
         let (min, max) = cells.area.cells(&row.site.grid)?;
         let wanted = usize::try_from(cells.limit).unwrap_or(usize::MAX);
-        Ok(self.maps().look(&row, |map| {
-            let measured = map.cells_in(min, max, after).filter(|&cell| {
-                let newest = map.newest_at_us(cell, late.choice());
-                newest.is_some_and(|newest_us| newest_us > from.as_microsecond())
-            });
-            let found: Vec<Cell> = measured.take(wanted.saturating_add(1)).collect();
-            let cells = page(found, cells.limit, |cell| {
-                format!("{},{}", cell.ix, cell.iy)
-            });
-            let items = cells
-                .items
-                .into_iter()
-                .flat_map(|cell| differences(map, cell, &early, &late));
-            Page {
-                items: items.collect(),
-                next_cursor: cells.next_cursor,
-            }
-        }))
+        let limit = cells.limit;
+        let looking = move |app: &Self| {
+            app.maps().look(&row, |map| {
+                let measured = map.cells_in(min, max, after).filter(|&cell| {
+                    let newest = map.newest_at_us(cell, late.choice());
+                    newest.is_some_and(|newest_us| newest_us > from.as_microsecond())
+                });
+                let found: Vec<Cell> = measured.take(wanted.saturating_add(1)).collect();
+                let cells = page(found, limit, |cell| format!("{},{}", cell.ix, cell.iy));
+                let items = cells
+                    .items
+                    .into_iter()
+                    .flat_map(|cell| differences(map, cell, &early, &late));
+                Page {
+                    items: items.collect(),
+                    next_cursor: cells.next_cursor,
+                }
+            })
+        };
+        Ok(self.off_thread(looking).await)
     }
 }
 
-fn differences(
+/// What is known of a square, per terrain and configuration.
+fn of_square(
     map: &SiteMap,
-    cell: Cell,
-    early: &Reading<'_>,
-    late: &Reading<'_>,
-) -> Vec<CellDifference> {
+    reading: &Reading,
+    (cell, parts): Square,
+    size_m: f64,
+) -> Vec<CellFriction> {
+    let (groups, ground) = match parts {
+        None => (map.cell(cell, reading.choice()), Ground::Cell),
+        Some(parts) => (map.area(&parts, reading.choice()), Ground::Area),
+    };
+    let entry = |group: Group<'_>| {
+        let (terrain, configuration) = (group.terrain.cloned(), group.configuration);
+        Some(CellFriction {
+            cell,
+            size_m,
+            terrain,
+            configuration,
+            friction: reading.fused(group, ground)?,
+            normalisation: reading.normalisation(),
+        })
+    };
+    groups.into_iter().filter_map(entry).collect()
+}
+
+fn differences(map: &SiteMap, cell: Cell, early: &Reading, late: &Reading) -> Vec<CellDifference> {
     type Key = (Option<TerrainRef>, ConfigurationId);
     let key = |group: &Group<'_>| -> Key { (group.terrain.cloned(), group.configuration) };
     let mut before: BTreeMap<Key, _> = map
@@ -275,6 +293,7 @@ fn differences(
             before,
             after,
             deviations,
+            normalisation: late.normalisation(),
         }
     });
     both.collect()
@@ -310,7 +329,7 @@ pub(super) fn same_ground<'map>(groups: impl Iterator<Item = Group<'map>>) -> Ve
 
 /// The terrains as they are drawn, to find the one under a point.
 pub(super) struct Drawn<'view> {
-    terrains: &'view [Terrain],
+    pub(super) terrains: &'view [Terrain],
     shapes: Vec<TerrainShape>,
 }
 
@@ -336,33 +355,38 @@ impl<'view> Drawn<'view> {
 }
 
 /// Cells of the grid along a side of a square of this resolution.
-fn factor(grid: &Grid, resolution_m: Option<f64>, area: &Area) -> Result<i32, AppError> {
+pub(super) fn factor(grid: &Grid, resolution_m: Option<f64>) -> Result<i32, AppError> {
     let Some(resolution_m) = resolution_m else {
         return Ok(1);
-    };
-    let invalid = |detail| AppError::InvalidQuery {
-        parameter: "resolution_m",
-        detail,
     };
     let ratio = resolution_m / grid.cell_m;
     if !(grid.cell_m..=CELL_MAX_M * 100.0).contains(&resolution_m)
         || (ratio - ratio.round()).abs() > 1.0e-9 * ratio
     {
-        return Err(invalid(format!(
-            "resolution_m must be a whole multiple of the grid's {} m up to {} m",
-            grid.cell_m,
-            CELL_MAX_M * 100.0
-        )));
-    }
-    let count = area.count(resolution_m);
-    if count > CELLS_MAX {
-        return Err(invalid(format!(
-            "this would be {count} cells; a box may have {CELLS_MAX}"
-        )));
+        return Err(AppError::InvalidQuery {
+            parameter: "resolution_m",
+            detail: format!(
+                "resolution_m must be a whole multiple of the grid's {} m up to {} m",
+                grid.cell_m,
+                CELL_MAX_M * 100.0
+            ),
+        });
     }
     #[expect(clippy::cast_possible_truncation, reason = "at most 100 000")]
     let factor = ratio.round() as i32;
     Ok(factor)
+}
+
+/// Refuses a resolution with which a box would have too many squares.
+fn check_count(area: &Area, resolution_m: Option<f64>) -> Result<(), AppError> {
+    let count = resolution_m.map_or(0.0, |resolution_m| area.count(resolution_m));
+    if count > CELLS_MAX {
+        return Err(AppError::InvalidQuery {
+            parameter: "resolution_m",
+            detail: format!("this would be {count} cells; a box may have {CELLS_MAX}"),
+        });
+    }
+    Ok(())
 }
 
 /// A square and the cells of the grid in it that hold anything; none where it is a cell itself.

@@ -3,7 +3,9 @@
 mod advice;
 mod cells;
 mod path;
+mod pictures;
 mod prior;
+mod raster;
 mod reading;
 
 use std::collections::HashMap;
@@ -15,7 +17,10 @@ use tread_api::page::Page;
 use tread_api::terrain::{Terrain, TerrainRef};
 
 pub use self::cells::{Area, CELLS_MAX, CellsAsked};
+pub use self::pictures::Picture;
+pub(super) use self::pictures::Pictures;
 use self::prior::Classes;
+pub use self::raster::{PictureAsked, SQUARES_MAX};
 pub use self::reading::Asked;
 pub(super) use self::reading::Reading;
 use super::{App, AppError, page, site_row};
@@ -27,6 +32,8 @@ use crate::friction::Ground;
 const UNKNOWN_MODEL: &str = "not declared";
 /// Most times of one history.
 const TIMES_MAX: i64 = 1_000;
+/// Questions about the map that are worked on at once; further ones wait for their turn.
+pub(in crate::app) const READERS_MAX: usize = 4;
 
 /// Everything that answers about a site's terrains need from the database.
 pub(super) struct SiteView {
@@ -72,6 +79,24 @@ impl SiteView {
 }
 
 impl App {
+    /// Works on the map on a thread that may be kept busy: a lock that is held while something is
+    /// reckoned keeps no other request waiting for its thread.
+    pub(in crate::app) async fn off_thread<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&Self) -> T + Send + 'static,
+    ) -> T {
+        let _turn = self.map_turn().await;
+        let app = self.clone();
+        match tokio::task::spawn_blocking(move || work(&app)).await {
+            Ok(done) => done,
+            Err(broken) => match broken.try_into_panic() {
+                Ok(panic) => std::panic::resume_unwind(panic),
+                // The runtime is ending, and this task with it.
+                Err(_cancelled) => std::future::pending().await,
+            },
+        }
+    }
+
     /// The friction of every terrain of a site, after a cursor.
     pub async fn friction_of_terrains(
         &self,
@@ -82,17 +107,25 @@ impl App {
     ) -> Result<Page<TerrainFriction>, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = SiteView::read(&mut self.db().read().await?, site).await?;
-        let classes = self.classes(&view, &reading);
-        let wanted = |terrain: &&Terrain| cursor.is_none_or(|after| terrain.id.as_str() > after);
-        let listed: Vec<&Terrain> = view.terrains.iter().filter(wanted).collect();
-        let Page { items, next_cursor } = page(listed, limit, |terrain| terrain.id.to_string());
-        let items = items
-            .into_iter()
-            .map(|terrain| terrain_friction(terrain, classes.models(&view, &reading, terrain)));
-        Ok(Page {
-            items: items.collect(),
-            next_cursor,
-        })
+        let cursor = cursor.map(str::to_owned);
+        let listing = move |app: &Self| {
+            let classes = app.classes(&view, &reading);
+            let wanted = |terrain: &&Terrain| {
+                cursor
+                    .as_deref()
+                    .is_none_or(|after| terrain.id.as_str() > after)
+            };
+            let listed: Vec<&Terrain> = view.terrains.iter().filter(wanted).collect();
+            let Page { items, next_cursor } = page(listed, limit, |terrain| terrain.id.to_string());
+            let items = items
+                .into_iter()
+                .map(|terrain| terrain_friction(terrain, classes.models(&view, &reading, terrain)));
+            Page {
+                items: items.collect(),
+                next_cursor,
+            }
+        };
+        Ok(self.off_thread(listing).await)
     }
 
     /// The friction of one terrain.
@@ -104,10 +137,14 @@ impl App {
     ) -> Result<TerrainFriction, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = SiteView::read(&mut self.db().read().await?, site).await?;
-        let terrain = view.find(site, id)?;
-        let classes = self.classes(&view, &reading);
-        let models = classes.models(&view, &reading, terrain);
-        Ok(terrain_friction(terrain, models))
+        let terrain = view.find(site, id)?.clone();
+        let looking = move |app: &Self| {
+            let models = app
+                .classes(&view, &reading)
+                .models(&view, &reading, &terrain);
+            terrain_friction(&terrain, models)
+        };
+        Ok(self.off_thread(looking).await)
     }
 
     /// The friction of one terrain as it was known at equally spaced times, the last of them `to`.
@@ -140,25 +177,28 @@ impl App {
             },
         )?;
         let view = SiteView::read(&mut self.db().read().await?, site).await?;
-        let terrain = view.find(site, id)?;
-        let mut items = Vec::new();
-        for index in 0..=steps {
-            let back = step.saturating_mul(i32::try_from(steps - index).unwrap_or(i32::MAX));
-            let at = to.checked_sub(back).unwrap_or(from);
-            let models = self.measured_models(&view, &reading.at(at), terrain);
-            items.push(TerrainAt { at, models });
-        }
-        Ok(TerrainHistory {
-            terrain: terrain_ref(terrain),
-            items,
-        })
+        let terrain = view.find(site, id)?.clone();
+        let looking = move |app: &Self| {
+            let back =
+                |index| step.saturating_mul(i32::try_from(steps - index).unwrap_or(i32::MAX));
+            let times = (0..=steps).map(|index| to.checked_sub(back(index)).unwrap_or(from));
+            let known = |at| TerrainAt {
+                at,
+                models: app.measured_models(&view, &reading.at(at), &terrain),
+            };
+            TerrainHistory {
+                terrain: terrain_ref(&terrain),
+                items: times.map(known).collect(),
+            }
+        };
+        Ok(self.off_thread(looking).await)
     }
 
     /// What was measured of a terrain, per robot model.
     fn measured_models(
         &self,
         view: &SiteView,
-        reading: &Reading<'_>,
+        reading: &Reading,
         terrain: &Terrain,
     ) -> Vec<ModelFriction> {
         let is_wanted = |found: &TerrainRef| found.id == terrain.id && view.is_present(found);
@@ -175,7 +215,7 @@ impl App {
         })
     }
 
-    fn classes(&self, view: &SiteView, reading: &Reading<'_>) -> Classes {
+    fn classes(&self, view: &SiteView, reading: &Reading) -> Classes {
         let measured = view.terrains.iter().map(|terrain| {
             let models = self.measured_models(view, reading, terrain);
             (terrain.id.clone(), terrain.class, models)

@@ -18,8 +18,8 @@ use tread_control::robot::RobotModel as PlannedModel;
 use super::cells::{Drawn, is_here, same_ground};
 use super::{App, AppError, Asked, Reading, SiteView};
 use crate::db;
-use crate::friction::Ground;
 use crate::friction::index::SiteMap;
+use crate::friction::{Ground, grip};
 
 /// Longest path, metres.
 const LENGTH_MAX_M: f64 = 10_000.0;
@@ -27,8 +27,6 @@ const LENGTH_MAX_M: f64 = 10_000.0;
 const POINTS: std::ops::RangeInclusive<usize> = 2..=10_000;
 /// Most pieces, however small the cells are.
 const PIECES_MAX: usize = 100_000;
-/// Friction coefficient that is reckoned with where nothing better is known; the planner's own.
-const GRIP_CAUTIOUS_MU: f64 = 0.14;
 /// Corners that a circle is looked at with.
 const CIRCLE_CORNERS: u32 = 256;
 /// Relative standard deviation of θ above which a place counts as unknown; the estimator's own.
@@ -37,8 +35,6 @@ const DEVIATION_RATIO_MAX: f64 = 0.5;
 const NEAR_CELLS: i32 = 2;
 /// Most cells near a way that are looked at.
 const NEAR_MAX: usize = 20_000;
-/// Slip up to which friction grows in proportion to it.
-const SLIP_LINEAR: f64 = 0.2;
 
 impl App {
     /// What is known along a path, for a robot.
@@ -69,28 +65,31 @@ impl App {
         let reading = Reading::new(self, &asked).map_err(in_body)?;
         let length_m = checked_length(&points)?;
         let cut = cut(&points, &view.row.site.grid)?;
-        let drawn = Drawn::new(&view.terrains);
-        let mut pieces: Vec<PathPiece> = self.maps().look(&view.row, |map| {
-            let piece = |cut: &Cut| {
-                let known = known_at(map, &view, &drawn, &reading, cut);
-                described(cut, known.as_ref())
-            };
-            cut.iter().map(piece).collect()
-        });
-        set_speeds(&mut pieces, &cut, length_m, &found.model);
-        let known_m: f64 = pieces
-            .iter()
-            .zip(&cut)
-            .filter(|(piece, _)| piece.theta.is_some())
-            .map(|(_, cut)| cut.length_m)
-            .sum();
-        Ok(PathFriction {
-            length_m,
-            configuration: found.configuration,
-            normalisation: reading.normalisation(),
-            known_ratio: (known_m / length_m).min(1.0),
-            pieces,
-        })
+        let looking = move |app: &Self| {
+            let drawn = Drawn::new(&view.terrains);
+            let mut pieces: Vec<PathPiece> = app.maps().look(&view.row, |map| {
+                let piece = |cut: &Cut| {
+                    let known = known_at(map, &view, &drawn, &reading, cut);
+                    described(cut, known.as_ref())
+                };
+                cut.iter().map(piece).collect()
+            });
+            set_speeds(&mut pieces, &cut, length_m, &found.model);
+            let known_m: f64 = pieces
+                .iter()
+                .zip(&cut)
+                .filter(|(piece, _)| piece.theta.is_some())
+                .map(|(_, cut)| cut.length_m)
+                .sum();
+            PathFriction {
+                length_m,
+                configuration: found.configuration,
+                normalisation: reading.normalisation(),
+                known_ratio: (known_m / length_m).min(1.0),
+                pieces,
+            }
+        };
+        Ok(self.off_thread(looking).await)
     }
 }
 
@@ -121,12 +120,17 @@ impl App {
         else {
             return Ok(None);
         };
+        let looking = move |app: &Self| app.prior_of(&view, &reading, &cut);
+        Ok(self.off_thread(looking).await)
+    }
+
+    fn prior_of(&self, view: &SiteView, reading: &Reading, cut: &[Cut]) -> Option<PathPrior> {
         let drawn = Drawn::new(&view.terrains);
         let mut cells: BTreeMap<(i32, i32), CellPrior> = BTreeMap::new();
         let mut grips: BTreeMap<(i32, i32), CellGrip> = BTreeMap::new();
-        let near = near(&cut, &view.row.site.grid);
+        let near = near(cut, &view.row.site.grid);
         self.maps().look(&view.row, |map| {
-            let known = |cut: &Cut| known_at(map, &view, &drawn, &reading, cut);
+            let known = |cut: &Cut| known_at(map, view, &drawn, reading, cut);
             let mut grounds: BTreeMap<Option<&TerrainId>, f64> = BTreeMap::new();
             for place in cut.iter().chain(&near) {
                 let Some(known) = known(place).filter(is_measured) else {
@@ -137,7 +141,7 @@ impl App {
                 let least = grounds.entry(ground).or_insert(mu);
                 *least = least.min(mu);
             }
-            for cut in &cut {
+            for cut in cut {
                 let (cell, known) = (cut.cell, known(cut));
                 let ground = drawn.at(cut.middle).map(|terrain| &terrain.id);
                 let least_mu = grounds.get(&ground).copied().unwrap_or(f64::INFINITY);
@@ -176,7 +180,7 @@ impl App {
             cells,
             grips,
         };
-        Ok(Some(prior).filter(|prior| !prior.cells.is_empty() && prior.is_possible()))
+        Some(prior).filter(|prior| !prior.cells.is_empty() && prior.is_possible())
     }
 }
 
@@ -205,16 +209,14 @@ fn is_measured(known: &FusedFriction) -> bool {
     known.std_dev <= DEVIATION_RATIO_MAX * known.theta
 }
 
-/// The planner's friction coefficient: the larger of what was shown of late and a cautious value,
-/// within what needs no more than linear slip.
+/// The planner's friction coefficient.
 pub(in crate::app) fn grip_mu(known: Option<&FusedFriction>) -> f64 {
-    let shown = known.and_then(|known| known.mu_peak_lower_bound);
-    let grip = shown.unwrap_or(0.0).max(GRIP_CAUTIOUS_MU);
-    known
-        .filter(|known| is_measured(known))
-        .map_or(grip, |known| {
-            grip.min(SLIP_LINEAR * known.bounds.stiffness_lower_5)
-        })
+    grip::grip_mu(
+        known.and_then(|known| known.mu_peak_lower_bound),
+        known
+            .filter(|known| is_measured(known))
+            .map(|known| known.bounds.theta_upper_95),
+    )
 }
 
 fn in_body(error: AppError) -> AppError {
@@ -373,7 +375,7 @@ fn known_at(
     map: &SiteMap,
     view: &SiteView,
     drawn: &Drawn<'_>,
-    reading: &Reading<'_>,
+    reading: &Reading,
     cut: &Cut,
 ) -> Option<FusedFriction> {
     let groups = map.cell(cut.cell, reading.choice());

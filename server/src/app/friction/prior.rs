@@ -30,7 +30,7 @@ impl Classes {
     pub(super) fn models(
         &self,
         view: &SiteView,
-        reading: &Reading<'_>,
+        reading: &Reading,
         terrain: &Terrain,
     ) -> Vec<ModelFriction> {
         let mut own: BTreeMap<ConfigurationId, ModelFriction> = self

@@ -1,12 +1,14 @@
 //! What a question about the map asks for besides the place: whose measurements, as of when.
 
+use std::sync::Arc;
+
 use jiff::Timestamp;
 use tread_api::friction::FusedFriction;
 use tread_api::ids::ConfigurationId;
 
 use crate::app::{App, AppError};
 use crate::config::FrictionConfig;
-use crate::friction::index::{Choice, Group, Normalisation};
+use crate::friction::index::{At, Choice, Group, Normalisation};
 use crate::friction::{Ground, fuse};
 
 /// Microseconds of a minute.
@@ -25,18 +27,18 @@ pub struct Asked {
 
 /// The same, checked.
 #[derive(Debug, Clone)]
-pub(in crate::app) struct Reading<'app> {
+pub(in crate::app) struct Reading {
     pub(in crate::app) as_of: Option<Timestamp>,
     configuration: Option<ConfigurationId>,
-    normalisation: Option<&'app Normalisation>,
-    config: &'app FrictionConfig,
+    normalisation: Option<Arc<Normalisation>>,
+    config: FrictionConfig,
     /// The time at which ages are counted, microseconds since 1970. Now is told in whole minutes,
     /// so that an answer stays the same for as long as its parts do.
     pub(in crate::app) now_us: i64,
 }
 
-impl<'app> Reading<'app> {
-    pub(in crate::app) fn new(app: &'app App, asked: &Asked) -> Result<Self, AppError> {
+impl Reading {
+    pub(in crate::app) fn new(app: &App, asked: &Asked) -> Result<Self, AppError> {
         let now = app.clock().now();
         if let Some(as_of) = asked.as_of.filter(|&as_of| as_of > now) {
             return Err(AppError::InvalidQuery {
@@ -47,7 +49,7 @@ impl<'app> Reading<'app> {
         let normalisation = asked.normalisation.as_ref().map(|name| {
             let known = app.normalisations().iter();
             let mut known = known.filter(|normalisation| normalisation.name == *name);
-            known.next().ok_or_else(|| AppError::InvalidQuery {
+            known.next().cloned().ok_or_else(|| AppError::InvalidQuery {
                 parameter: "normalisation",
                 detail: format!("no normalisation `{name}` is declared here"),
             })
@@ -57,7 +59,7 @@ impl<'app> Reading<'app> {
             as_of: asked.as_of,
             configuration: asked.configuration,
             normalisation: normalisation.transpose()?,
-            config: app.friction_config(),
+            config: *app.friction_config(),
             now_us: asked.as_of.map_or(minute_us, Timestamp::as_microsecond),
         })
     }
@@ -71,18 +73,33 @@ impl<'app> Reading<'app> {
         }
     }
 
-    pub(in crate::app) fn choice(&self) -> Choice<'app> {
+    pub(in crate::app) fn choice(&self) -> Choice<'_> {
         Choice {
             as_of: self.as_of,
             configuration: self.configuration,
             robot: None,
-            normalisation: self.normalisation,
+            normalisation: self.normalisation.as_deref(),
         }
     }
 
     pub(in crate::app) fn normalisation(&self) -> Option<String> {
-        self.normalisation
-            .map(|normalisation| normalisation.name.clone())
+        let normalisation = self.normalisation.as_ref();
+        normalisation.map(|normalisation| normalisation.name.clone())
+    }
+
+    /// The configuration in whose θ the answer is, if it is one.
+    pub(in crate::app) fn reference(&self) -> Option<ConfigurationId> {
+        let normalisation = self.normalisation.as_ref();
+        let reference = normalisation.map(|normalisation| normalisation.reference);
+        self.configuration.or(reference)
+    }
+
+    /// How measurements are weighed, and the time of it.
+    pub(in crate::app) fn fused_at(&self) -> At<'_> {
+        At {
+            config: &self.config,
+            now_us: self.now_us,
+        }
     }
 
     /// What a group says together.
@@ -91,7 +108,7 @@ impl<'app> Reading<'app> {
         mut group: Group<'_>,
         ground: Ground,
     ) -> Option<FusedFriction> {
-        let fused = fuse(&mut group.seen, ground, self.config, self.now_us);
+        let fused = fuse(&mut group.seen, ground, &self.config, self.now_us);
         fused.map(|fused| fused.to_api(self.now_us))
     }
 }

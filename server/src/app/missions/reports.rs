@@ -126,6 +126,12 @@ fn impossible(report: &MissionReport) -> Option<String> {
         Some(format!(
             "a driven path has at most {DRIVEN_POINTS_MAX} points"
         ))
+    } else if report
+        .driven
+        .as_ref()
+        .is_some_and(|said| !said.has_possible_times())
+    {
+        Some("a driven path has a time for each of its points, in order, or none".to_owned())
     } else {
         None
     }

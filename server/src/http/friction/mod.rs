@@ -3,6 +3,7 @@
 //! Every answer about the map has an `ETag` and takes `as_of`: the map as it was known then, in
 //! whole epochs (those that had begun), with the ages of then.
 
+pub(super) mod map;
 pub(super) mod places;
 
 use axum::extract::State;

@@ -125,7 +125,7 @@ pub(in crate::http) async fn point(
 
 /// Friction along a path, how sure it is, and the speed that follows for a robot.
 #[utoipa::path(post, path = "/v1/sites/{site}/friction/path", tag = "friction",
-    security(("token" = ["operator"])),
+    security(("token" = ["viewer"])),
     operation_id = "ask_path_friction", params(("site" = SiteId, Path)),
     request_body = AskPath,
     responses((status = 200, body = PathFriction), (status = 304),

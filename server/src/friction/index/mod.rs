@@ -4,179 +4,28 @@
 //! lie row by row, so that a box is some runs of neighbours and a path some lookups. What is kept
 //! of a (cell, terrain, robot, configuration, epoch) takes 136 bytes besides its place.
 
+mod changes;
+mod names;
+mod part;
+mod squares;
+
 use std::collections::BTreeMap;
 use std::ops::Bound;
 
 use jiff::Timestamp;
-use tread_api::friction::Information;
 use tread_api::ids::{ConfigurationId, RobotId};
 use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
 
-use super::fixed::Fixed;
-use super::sums::{Pair, Pass, bucket_h};
+pub use self::changes::{BLOCK_CELLS, Block, Changes};
+use self::names::{Names, Number};
+use self::part::{Part, PartKey};
+pub use self::squares::{At, BLOCK_SQUARES, GROUND_NONE, Lens, Room, Square, SquareKnown};
+use super::sums::bucket_h;
 use super::{Seen, Sums};
 
-/// Side of the squares of cells whose changes are counted together.
-const BLOCK_CELLS: i32 = 64;
 /// Seconds of an hour.
 const HOUR_S: i64 = 3_600;
-/// Steps per unit in which a friction coefficient is kept.
-const MU_STEPS: f64 = 1.0e6;
-
-/// A robot, configuration or terrain by its place in [`Names`].
-type Number = u32;
-
-/// Names of what sums are about, each once.
-#[derive(Debug, Default)]
-pub struct Names {
-    robots: Interned<RobotId>,
-    configurations: Interned<ConfigurationId>,
-    terrains: Interned<Option<TerrainRef>>,
-}
-
-#[derive(Debug)]
-struct Interned<T> {
-    numbers: BTreeMap<T, Number>,
-    names: Vec<T>,
-    /// Place of each number in the order of the names, which does not depend on who came first.
-    ranks: Vec<u32>,
-}
-
-impl<T> Default for Interned<T> {
-    fn default() -> Self {
-        Self {
-            numbers: BTreeMap::new(),
-            names: Vec::new(),
-            ranks: Vec::new(),
-        }
-    }
-}
-
-impl<T: Ord + Clone> Interned<T> {
-    fn number(&mut self, name: &T) -> Number {
-        if let Some(&number) = self.numbers.get(name) {
-            return number;
-        }
-        let number = Number::try_from(self.names.len()).unwrap_or(Number::MAX);
-        self.names.push(name.clone());
-        self.numbers.insert(name.clone(), number);
-        self.ranks.resize(self.names.len(), 0);
-        for (&number, rank) in self.numbers.values().zip(0..) {
-            self.ranks[number as usize] = rank;
-        }
-        number
-    }
-
-    fn name(&self, number: Number) -> &T {
-        &self.names[number as usize]
-    }
-
-    fn rank(&self, number: Number) -> u32 {
-        self.ranks[number as usize]
-    }
-}
-
-/// What a sum is about, within a cell.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-struct PartKey {
-    terrain: Number,
-    configuration: Number,
-    robot: Number,
-    epoch_h: i32,
-}
-
-/// Sums as they are kept in memory: the same numbers in less room.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Part {
-    hi: [i64; 7],
-    lo: [u32; 7],
-    key: PartKey,
-    segments: u32,
-    /// A friction coefficient in steps, plus one; 0 for none.
-    mu_peak: u32,
-    newest_mu: u32,
-    newest_at_us: i64,
-    /// Information of the newest pass; 0, which no pass has, when it is not known.
-    newest_information: f64,
-    newest_weighted: f64,
-}
-
-fn pack_mu(mu: Option<f64>) -> u32 {
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        reason = "0 to 10 units"
-    )]
-    mu.map_or(0, |mu| (mu * MU_STEPS + 1.0e-6).floor() as u32 + 1)
-}
-
-fn unpack_mu(steps: u32) -> Option<f64> {
-    (steps > 0).then(|| f64::from(steps - 1) / MU_STEPS)
-}
-
-impl Part {
-    fn new(key: PartKey, sums: &Sums) -> Self {
-        let mut part = Self {
-            hi: [0; 7],
-            lo: [0; 7],
-            key,
-            segments: u32::try_from(sums.segments).unwrap_or(u32::MAX),
-            mu_peak: pack_mu(sums.mu_peak),
-            newest_mu: pack_mu(sums.newest.mu_peak),
-            newest_at_us: sums.newest.ended_at_us,
-            newest_information: sums.newest.theta.map_or(0.0, |theta| theta.information),
-            newest_weighted: sums.newest.theta.map_or(0.0, |theta| theta.weighted),
-        };
-        let fixed = [
-            sums.theta.information,
-            sums.theta.weighted,
-            sums.theta_square,
-            sums.track.information,
-            sums.track.weighted,
-            sums.rolling.information,
-            sums.rolling.weighted,
-        ];
-        for (index, fixed) in fixed.into_iter().enumerate() {
-            // Beyond this the database has refused the sum.
-            let (hi, lo) = fixed.halves().unwrap_or((i64::MAX, 0));
-            part.hi[index] = hi;
-            part.lo[index] = u32::try_from(lo).unwrap_or_default();
-        }
-        part
-    }
-
-    fn sums(&self) -> Sums {
-        let fixed = |index: usize| Fixed::from_halves(self.hi[index], i64::from(self.lo[index]));
-        let pair = |index| Pair {
-            information: fixed(index),
-            weighted: fixed(index + 1),
-        };
-        Sums {
-            theta: pair(0),
-            theta_square: fixed(2),
-            track: pair(3),
-            rolling: pair(5),
-            segments: u64::from(self.segments),
-            samples: 0,
-            mu_peak: unpack_mu(self.mu_peak),
-            newest: Pass {
-                ended_at_us: self.newest_at_us,
-                theta: (self.newest_information > 0.0).then_some(Information {
-                    information: self.newest_information,
-                    weighted: self.newest_weighted,
-                }),
-                mu_peak: unpack_mu(self.newest_mu),
-            },
-        }
-    }
-
-    fn add(&mut self, sums: &Sums) {
-        let mut whole = self.sums();
-        whole.add(sums);
-        *self = Self::new(self.key, &whole);
-    }
-}
 
 /// A sum with the names of what it is about.
 #[derive(Debug, Clone, Copy)]
@@ -205,9 +54,7 @@ pub struct SiteMap {
     cells: BTreeMap<u64, Box<[Part]>>,
     /// The same summed over cells, for terrains.
     totals: BTreeMap<PartKey, Sums>,
-    /// Changes of each square of cells.
-    blocks: BTreeMap<(i32, i32), u64>,
-    generation: u64,
+    changes: Changes,
 }
 
 fn place(cell: Cell) -> u64 {
@@ -309,12 +156,7 @@ impl SiteMap {
                 samples: 0,
                 ..*sums
             });
-        self.note(labelled.cell);
-    }
-
-    fn note(&mut self, cell: Cell) {
-        self.generation += 1;
-        self.blocks.insert(block_of(cell), self.generation);
+        self.changes.note(labelled.cell);
     }
 
     /// Forgets what a robot measured from one hour to another, both included.
@@ -335,7 +177,7 @@ impl SiteMap {
         self.cells.retain(|_place, parts| !parts.is_empty());
         self.totals.retain(|key, _sums| !goes(key));
         for cell in changed {
-            self.note(cell);
+            self.changes.note(cell);
         }
     }
 
@@ -358,7 +200,7 @@ impl SiteMap {
                 let key = bucket(part.key);
                 match merged.last_mut().filter(|last| last.key == key) {
                     Some(last) => last.add(&part.sums()),
-                    None => merged.push(Part { key, ..*part }),
+                    None => merged.push(part.moved(key)),
                 }
             }
             *parts = merged.into_boxed_slice();
@@ -369,10 +211,7 @@ impl SiteMap {
             total.and_modify(|total| total.add(sums)).or_insert(*sums);
         }
         self.totals = totals;
-        self.generation += 1;
-        for block in self.blocks.values_mut() {
-            *block = self.generation;
-        }
+        self.changes.note_all();
     }
 
     /// Hours before this one are read as days.
@@ -380,17 +219,9 @@ impl SiteMap {
         self.merged_before_h
     }
 
-    /// Counts all changes.
-    pub fn generation(&self) -> u64 {
-        self.generation
-    }
-
-    /// Something that changes when a cell of the box does.
-    pub fn generation_in(&self, min: Cell, max: Cell) -> u64 {
-        let (min, max) = (block_of(min), block_of(max));
-        let rows = self.blocks.range(min..=max);
-        let within = rows.filter(|((_row, column), _)| (min.1..=max.1).contains(column));
-        within.fold(0, |newest, (_block, &generation)| newest.max(generation))
+    /// What has changed, and when.
+    pub fn changes(&self) -> &Changes {
+        &self.changes
     }
 
     /// Cells that hold anything.
@@ -553,10 +384,10 @@ impl SiteMap {
                 terrain,
                 configuration,
                 robot,
-                epoch_h,
+                ..
             } = part.key;
             let rank = self.names.robots.rank(robot);
-            let Some(seen) = Seen::of(rank, i64::from(epoch_h), &part.sums()) else {
+            let Some(seen) = part.seen(rank) else {
                 continue;
             };
             let configuration = *self.names.configurations.name(configuration);
@@ -626,13 +457,6 @@ pub struct Contribution {
     pub first_epoch_h: i64,
     /// End of its newest segment, microseconds since 1970.
     pub newest_at_us: i64,
-}
-
-fn block_of(cell: Cell) -> (i32, i32) {
-    (
-        cell.iy.div_euclid(BLOCK_CELLS),
-        cell.ix.div_euclid(BLOCK_CELLS),
-    )
 }
 
 /// A configuration's word in the θ of the one that it is brought to, if it is.

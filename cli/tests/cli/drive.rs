@@ -1,105 +1,16 @@
-//! `tread drive` in a terminal, against a real server over TLS and a real agent.
-
-#![expect(
-    clippy::unwrap_used,
-    reason = "what the helpers of a test cannot do fails the test"
-)]
-
-mod terminal;
+//! `tread drive` in a terminal, over TLS.
 
 use std::time::Duration;
 
 use rcgen::{CertifiedKey, generate_simple_self_signed};
-use tempfile::TempDir;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
-use tread_agent::sim::scenario::Scenario;
-use tread_agent::{Agent, AgentConfig, RunningAgent};
 use tread_api::safety::StopLatch;
-use tread_server::app::identity::FirstAdmin;
-use tread_server::config::{FrictionConfig, TlsFiles, WebConfig};
-use tread_server::{Config, RunningServer, Server};
 
 use crate::terminal::{Terminal, eventually};
-
-const ROBOT: &str = "rover-1";
-
-/// A server over TLS with one robot, in a folder of their own.
-struct Yard {
-    folder: TempDir,
-    server: RunningServer,
-    agent: RunningAgent,
-}
+use crate::yard::{ROBOT, Yard};
 
 impl Yard {
-    async fn start() -> Self {
-        let _first = rustls::crypto::ring::default_provider().install_default();
-        let folder = tempfile::tempdir().unwrap();
-        let at = |name: &str| folder.path().join(name);
-        let names = vec!["localhost".to_owned()];
-        let CertifiedKey { cert, signing_key } = generate_simple_self_signed(names).unwrap();
-        std::fs::write(at("cert.pem"), cert.pem()).unwrap();
-        std::fs::write(at("key.pem"), signing_key.serialize_pem()).unwrap();
-        let server = Server::start(Config {
-            http: "127.0.0.1:0".parse().unwrap(),
-            metrics: None,
-            zenoh: "127.0.0.1:0".parse().unwrap(),
-            database: at("tread.db"),
-            site: "yard".parse().unwrap(),
-            friction: FrictionConfig::default(),
-            normalisations: Vec::new(),
-            tls: Some(TlsFiles {
-                certificate: at("cert.pem"),
-                key: at("key.pem"),
-            }),
-            robots: None,
-            web: WebConfig::default(),
-        });
-        let server = server.await.unwrap();
-        let admin = server.app().create_first_admin(FirstAdmin {
-            name: "tests".to_owned(),
-            valid_days: 1,
-            force: true,
-        });
-        std::fs::write(at("token"), admin.await.unwrap().secret).unwrap();
-        let config = AgentConfig::simulated(
-            Scenario::built_in().unwrap(),
-            ROBOT.parse().unwrap(),
-            server.zenoh_endpoint(),
-            at("robot"),
-        );
-        let agent = Agent::start(config.unwrap()).unwrap();
-        let yard = Self {
-            folder,
-            server,
-            agent,
-        };
-        eventually("the robot is there", || yard.agent.has_connected()).await;
-        yard
-    }
-
-    /// The command line on `tread`, for the server at this port.
-    fn tread(&self, port: u16, words: &[&str]) -> Terminal {
-        let at = |name: &str| self.folder.path().join(name).display().to_string();
-        let (server, ca, token) = (
-            format!("https://localhost:{port}"),
-            at("cert.pem"),
-            at("token"),
-        );
-        let mut all = words.to_vec();
-        all.extend([
-            "--server",
-            &server,
-            "--ca",
-            &ca,
-            "--token-file",
-            &token,
-            "--site",
-            "yard",
-        ]);
-        Terminal::run(env!("CARGO_BIN_EXE_tread"), &all)
-    }
-
     /// `tread drive` once it has the lease.
     async fn drive(&self, port: u16) -> Terminal {
         // The server may not have heard of the robot yet.
@@ -111,10 +22,6 @@ impl Yard {
             tokio::time::sleep(Duration::from_millis(200)).await;
         }
         panic!("no lease");
-    }
-
-    fn port(&self) -> u16 {
-        self.server.http_address().port()
     }
 
     fn speed_m_s(&self) -> f64 {
@@ -188,8 +95,7 @@ async fn keys_drive_the_robot_over_tls_stop_it_and_every_way_out_restores_the_te
     let mut clearing = yard.tread(yard.port(), &["clear", ROBOT, &id]);
     assert_eq!(clearing.ended().await, Some(0), "{}", clearing.screen());
     assert!(yard.stop().is_none());
-    yard.agent.stop().await;
-    yard.server.stop().await.unwrap();
+    yard.end().await;
 }
 
 /// Carries bytes to a port until it is dropped; then every connection breaks.
@@ -259,6 +165,5 @@ async fn a_server_whose_certificate_is_not_trusted_is_not_driven_through() {
     assert_eq!(terminal.ended().await, Some(3), "{}", terminal.screen());
     assert!(!terminal.is_raw());
     assert!(yard.agent.state().safety.lease.is_none());
-    yard.agent.stop().await;
-    yard.server.stop().await.unwrap();
+    yard.end().await;
 }

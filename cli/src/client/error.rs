@@ -1,0 +1,258 @@
+//! Why a request got no answer that can be used, and what to do about it.
+
+use reqwest::StatusCode;
+use tread_api::problem::{ProblemBody, ProblemType};
+
+use crate::exit::Exit;
+
+/// Why a request got no answer that can be used.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum ClientError {
+    /// The address is not one.
+    #[error("`{address}` is not the address of a server: use one like http://127.0.0.1:8420")]
+    Address { address: String },
+    /// A token would go over the network for everybody to read.
+    #[error(
+        "a token is not sent to {address} without TLS: use https, or an address of this machine"
+    )]
+    ClearText { address: String },
+    /// The certificate to trust is none.
+    #[error("cannot trust the certificate in `{file}`")]
+    Authority {
+        file: String,
+        #[source]
+        cause: std::io::Error,
+    },
+    /// Nothing answers there.
+    #[error("no server answers at {address}")]
+    Unreachable {
+        address: String,
+        #[source]
+        cause: reqwest::Error,
+    },
+    /// The server has the request and says nothing.
+    #[error("{address} took too long to answer")]
+    Silent {
+        address: String,
+        #[source]
+        cause: reqwest::Error,
+    },
+    /// The server refused.
+    #[error("{}", refusal(.problem))]
+    Refused { problem: Box<ProblemBody> },
+    /// What answers opens no WebSocket.
+    #[error("what answers at {address} opens no connection to drive a robot: is there a proxy?")]
+    NoWebSocket { address: String },
+    /// What answers does not speak this API.
+    #[error("what answers at {address} is no Tread server of this version ({status})")]
+    NotUnderstood {
+        address: String,
+        status: StatusCode,
+        #[source]
+        cause: serde_json::Error,
+    },
+}
+
+fn refusal(problem: &ProblemBody) -> String {
+    let mut text = problem.title.clone();
+    if let Some(field) = &problem.field {
+        text = format!("{text}, at `{field}`");
+    }
+    match &problem.detail {
+        Some(detail) => format!("{text}: {detail}"),
+        None => text,
+    }
+}
+
+/// What helps against a refusal; what is absent here says it in its detail.
+const NEXT_STEPS: &[(ProblemType, &str)] = &[
+    (
+        ProblemType::Unauthenticated,
+        "sign in with `tread login`, or give a token with --token-file or TREAD_TOKEN",
+    ),
+    (
+        ProblemType::Forbidden,
+        "`tread whoami` shows your role; an admin makes tokens with `tread tokens create`",
+    ),
+    (
+        ProblemType::TooManyAttempts,
+        "wait as long as it says, then sign in again with `tread login`",
+    ),
+    (
+        ProblemType::UnknownHost,
+        "use a name that the server goes by, or add this one to its configuration",
+    ),
+    (
+        ProblemType::UnknownSite,
+        "`tread sites` lists the sites; name one with --site or TREAD_SITE",
+    ),
+    (
+        ProblemType::UnknownRobot,
+        "`tread robots` lists the robots of the site; name another site with --site",
+    ),
+    (
+        ProblemType::UnknownTerrain,
+        "`tread terrains` lists the terrains of the site",
+    ),
+    (
+        ProblemType::UnknownMission,
+        "`tread missions` lists the newest missions of the site",
+    ),
+    (
+        ProblemType::UnknownAlert,
+        "`tread alerts --all` lists alerts, cleared ones too",
+    ),
+    (ProblemType::UnknownStop, "`tread stops` lists the stops"),
+    (
+        ProblemType::UnknownToken,
+        "`tread tokens` and `tread robots join-token list` list tokens",
+    ),
+    (
+        ProblemType::StopNotCleared,
+        "wait until the robot stands, and give its newest stop: `tread clear ROBOT` shows it",
+    ),
+    (
+        ProblemType::RobotUnreachable,
+        "`tread robots ROBOT` shows when it was heard last",
+    ),
+    (
+        ProblemType::RobotBusy,
+        "`tread missions --robot ROBOT` lists what it has; cancel that, or use --start append",
+    ),
+    (
+        ProblemType::RobotRetired,
+        "`tread robots restore ROBOT` takes it back",
+    ),
+    (
+        ProblemType::RobotCannot,
+        "`tread robots ROBOT --json` shows its capabilities",
+    ),
+    (
+        ProblemType::BeyondLimits,
+        "change the trajectory; the same command with --check shows what it would ask",
+    ),
+    (
+        ProblemType::CrossesGeofence,
+        "`tread geofence` shows where robots may be",
+    ),
+    (
+        ProblemType::RobotOutsideGeofence,
+        "move the robot first, or draw the geofence around it",
+    ),
+    (
+        ProblemType::MissionEnded,
+        "`tread missions show MISSION` tells how; send another with `tread send`",
+    ),
+    (
+        ProblemType::MissionState,
+        "`tread missions show MISSION` tells where it stands",
+    ),
+    (
+        ProblemType::AlreadyExists,
+        "choose another identifier, or change the one that is there",
+    ),
+    (
+        ProblemType::ChangedMeanwhile,
+        "look at it again, and give the new revision with --revision",
+    ),
+    (
+        ProblemType::Internal,
+        "the server's log names the cause; `tread status` shows whether it works",
+    ),
+];
+
+impl ClientError {
+    /// The exit code that says it.
+    pub(crate) fn exit(&self) -> Exit {
+        match self {
+            Self::Address { .. } => Exit::Usage,
+            Self::Unreachable { .. } | Self::NoWebSocket { .. } => Exit::Unreachable,
+            Self::Silent { .. } => Exit::TimedOut,
+            Self::Refused { problem } => exit_of(problem),
+            Self::ClearText { .. } => Exit::Refused,
+            Self::Authority { .. } | Self::NotUnderstood { .. } => Exit::WentWrong,
+        }
+    }
+
+    /// What to do next, where the error itself does not say it.
+    pub(crate) fn next_step(&self) -> Option<&'static str> {
+        match self {
+            Self::Unreachable { .. } => Some(
+                "start one with `tread demo` or `tread-server`, or name another with --server or \
+                 TREAD_SERVER",
+            ),
+            Self::Silent { .. } => {
+                Some("try again; what was asked for may have been done: look before you repeat it")
+            }
+            Self::NotUnderstood { .. } => Some("compare `tread --version` with `tread status`"),
+            Self::Refused { problem } => NEXT_STEPS
+                .iter()
+                .find(|(kind, _)| *kind == problem.kind)
+                .map(|(_, step)| *step),
+            Self::Address { .. }
+            | Self::ClearText { .. }
+            | Self::Authority { .. }
+            | Self::NoWebSocket { .. } => None,
+        }
+    }
+
+    /// What the server said, if it is the one that refused.
+    pub(crate) fn problem(&self) -> Option<&ProblemBody> {
+        match self {
+            Self::Refused { problem } => Some(problem),
+            Self::Address { .. }
+            | Self::ClearText { .. }
+            | Self::Authority { .. }
+            | Self::Unreachable { .. }
+            | Self::Silent { .. }
+            | Self::NoWebSocket { .. }
+            | Self::NotUnderstood { .. } => None,
+        }
+    }
+}
+
+fn exit_of(problem: &ProblemBody) -> Exit {
+    match problem.status {
+        404 => Exit::NotFound,
+        409 | 412 => Exit::Conflict,
+        408 | 504 => Exit::TimedOut,
+        502 | 503 => Exit::Unreachable,
+        _ => Exit::Refused,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn refused(kind: ProblemType, status: u16) -> ClientError {
+        ClientError::Refused {
+            problem: Box::new(ProblemBody {
+                kind,
+                title: kind.title().to_owned(),
+                status,
+                detail: None,
+                field: None,
+                state: None,
+                place: None,
+            }),
+        }
+    }
+
+    #[test]
+    fn each_kind_of_refusal_has_its_exit_code_and_its_next_step() {
+        for (kind, status, exit) in [
+            (ProblemType::Unauthenticated, 401, Exit::Refused),
+            (ProblemType::Forbidden, 403, Exit::Refused),
+            (ProblemType::UnknownRobot, 404, Exit::NotFound),
+            (ProblemType::RobotBusy, 409, Exit::Conflict),
+            (ProblemType::ChangedMeanwhile, 412, Exit::Conflict),
+            (ProblemType::BeyondLimits, 422, Exit::Refused),
+            (ProblemType::RobotUnreachable, 503, Exit::Unreachable),
+        ] {
+            let error = refused(kind, status);
+            assert_eq!(error.exit(), exit, "{kind:?}");
+            assert!(error.next_step().is_some(), "{kind:?}");
+        }
+    }
+}

@@ -1,0 +1,70 @@
+//! The server, its sites, their robots, and what changes.
+
+use reqwest::{Method, Response};
+use tread_api::ids::{RobotId, SiteId};
+use tread_api::robot::{ChangeRobot, Robot};
+use tread_api::site::{CreateSite, Site};
+
+use super::{Client, ClientError, STREAM_WAIT_MAX};
+
+impl Client {
+    /// What the server says of itself.
+    pub(crate) async fn status(&self) -> Result<serde_json::Value, ClientError> {
+        self.get("/v1/server").await
+    }
+
+    pub(crate) async fn sites(&self) -> Result<Vec<Site>, ClientError> {
+        self.all("/v1/sites").await
+    }
+
+    pub(crate) async fn create_site(&self, site: &CreateSite) -> Result<Site, ClientError> {
+        self.post("/v1/sites", site).await
+    }
+
+    /// The robots of a site, those that are retired too if wanted.
+    pub(crate) async fn robots(
+        &self,
+        site: &SiteId,
+        retired: bool,
+    ) -> Result<Vec<Robot>, ClientError> {
+        let query = vec![("retired", retired.to_string())];
+        self.all_with(&format!("/v1/sites/{site}/robots"), &query)
+            .await
+    }
+
+    pub(crate) async fn robot(&self, site: &SiteId, robot: &RobotId) -> Result<Robot, ClientError> {
+        self.get(&format!("/v1/sites/{site}/robots/{robot}")).await
+    }
+
+    /// Renames a robot, retires it or takes it back.
+    pub(crate) async fn change_robot(
+        &self,
+        site: &SiteId,
+        robot: &RobotId,
+        change: &ChangeRobot,
+    ) -> Result<Robot, ClientError> {
+        let path = format!("/v1/sites/{site}/robots/{robot}");
+        self.send(self.request(Method::PATCH, &path).json(change))
+            .await
+    }
+
+    /// Opens the stream of events of a site, from where `last` points.
+    pub(crate) async fn events(
+        &self,
+        site: &SiteId,
+        robot: Option<&RobotId>,
+        last: Option<&str>,
+    ) -> Result<Response, ClientError> {
+        let mut query = vec![("site", site.to_string())];
+        query.extend(robot.map(|robot| ("robots", robot.to_string())));
+        // The stream has no end of its own.
+        let mut request = self
+            .request(Method::GET, "/v1/events")
+            .query(&query)
+            .timeout(STREAM_WAIT_MAX);
+        if let Some(last) = last {
+            request = request.header("last-event-id", last);
+        }
+        self.answered(request).await
+    }
+}

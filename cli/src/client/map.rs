@@ -1,0 +1,247 @@
+//! The ground: terrains, and what is known of their friction.
+
+use jiff::Timestamp;
+use reqwest::Method;
+use tread_api::friction::{
+    AskPath, CellDifference, CellFriction, CreateWithdrawal, PathFriction, PointFriction,
+    RobotContribution, TerrainFriction, TerrainHistory, VisitSuggestion, Withdrawal,
+};
+use tread_api::geometry::Point;
+use tread_api::ids::{ConfigurationId, RobotId, SiteId, TerrainId};
+use tread_api::page::Page;
+use tread_api::terrain::{CreateTerrain, ReplaceTerrain, Terrain};
+
+use super::{Client, ClientError, Query};
+
+/// As of when, and whose measurements.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Reading {
+    pub(crate) as_of: Option<Timestamp>,
+    pub(crate) configuration: Option<ConfigurationId>,
+    pub(crate) normalisation: Option<String>,
+}
+
+impl Reading {
+    fn query(self) -> Query {
+        let mut query = Query::new();
+        query.extend(self.as_of.map(|at| ("as_of", at.to_string())));
+        query.extend(
+            self.configuration
+                .map(|id| ("configuration", id.to_string())),
+        );
+        query.extend(self.normalisation.map(|name| ("normalisation", name)));
+        query
+    }
+}
+
+/// A box of the map, metres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Area {
+    pub(crate) lowest: Point,
+    pub(crate) highest: Point,
+}
+
+impl Area {
+    fn query(self) -> Query {
+        vec![
+            ("x_min_m", self.lowest.x_m.to_string()),
+            ("y_min_m", self.lowest.y_m.to_string()),
+            ("x_max_m", self.highest.x_m.to_string()),
+            ("y_max_m", self.highest.y_m.to_string()),
+        ]
+    }
+}
+
+impl Client {
+    pub(crate) async fn terrains(&self, site: &SiteId) -> Result<Vec<Terrain>, ClientError> {
+        self.all(&format!("/v1/sites/{site}/terrains")).await
+    }
+
+    pub(crate) async fn terrain(
+        &self,
+        site: &SiteId,
+        terrain: &TerrainId,
+    ) -> Result<Terrain, ClientError> {
+        self.get(&format!("/v1/sites/{site}/terrains/{terrain}"))
+            .await
+    }
+
+    pub(crate) async fn create_terrain(
+        &self,
+        site: &SiteId,
+        terrain: &CreateTerrain,
+    ) -> Result<Terrain, ClientError> {
+        self.post(&format!("/v1/sites/{site}/terrains"), terrain)
+            .await
+    }
+
+    pub(crate) async fn replace_terrain(
+        &self,
+        site: &SiteId,
+        terrain: &TerrainId,
+        replacement: &ReplaceTerrain,
+    ) -> Result<Terrain, ClientError> {
+        let path = format!("/v1/sites/{site}/terrains/{terrain}");
+        self.send(self.request(Method::PUT, &path).json(replacement))
+            .await
+    }
+
+    pub(crate) async fn delete_terrain(
+        &self,
+        site: &SiteId,
+        terrain: &TerrainId,
+    ) -> Result<(), ClientError> {
+        let path = format!("/v1/sites/{site}/terrains/{terrain}");
+        let request = self.request(Method::DELETE, &path);
+        self.answered(request).await.map(|_done| ())
+    }
+
+    pub(crate) async fn terrain_friction(
+        &self,
+        site: &SiteId,
+        terrain: Option<&TerrainId>,
+        reading: Reading,
+    ) -> Result<Vec<TerrainFriction>, ClientError> {
+        let (path, query) = (
+            format!("/v1/sites/{site}/friction/terrains"),
+            reading.query(),
+        );
+        match terrain {
+            Some(terrain) => {
+                let one = self.get_with(&format!("{path}/{terrain}"), &query).await?;
+                Ok(vec![one])
+            }
+            None => self.all_with(&path, &query).await,
+        }
+    }
+
+    /// A terrain from the oldest to the newest time, in steps of `step_s` seconds.
+    pub(crate) async fn terrain_history(
+        &self,
+        (site, terrain): (&SiteId, &TerrainId),
+        (from, to): (Timestamp, Option<Timestamp>),
+        step_s: u64,
+        reading: Reading,
+    ) -> Result<TerrainHistory, ClientError> {
+        let mut query = reading.query();
+        query.push(("from", from.to_string()));
+        query.extend(to.map(|to| ("to", to.to_string())));
+        query.push(("step_s", step_s.to_string()));
+        let path = format!("/v1/sites/{site}/friction/terrains/{terrain}/history");
+        self.get_with(&path, &query).await
+    }
+
+    /// Cells of a box, or of the whole map, in squares of a side.
+    pub(crate) async fn cell_friction(
+        &self,
+        site: &SiteId,
+        area: Option<Area>,
+        resolution_m: Option<f64>,
+        reading: Reading,
+    ) -> Result<Vec<CellFriction>, ClientError> {
+        let mut query = reading.query();
+        query.extend(area.map(Area::query).unwrap_or_default());
+        query.extend(resolution_m.map(|side_m| ("resolution_m", side_m.to_string())));
+        self.all_with(&format!("/v1/sites/{site}/friction/cells"), &query)
+            .await
+    }
+
+    pub(crate) async fn point_friction(
+        &self,
+        site: &SiteId,
+        point: Point,
+        reading: Reading,
+    ) -> Result<PointFriction, ClientError> {
+        let mut query = reading.query();
+        query.push(("x_m", point.x_m.to_string()));
+        query.push(("y_m", point.y_m.to_string()));
+        self.get_with(&format!("/v1/sites/{site}/friction/point"), &query)
+            .await
+    }
+
+    pub(crate) async fn path_friction(
+        &self,
+        site: &SiteId,
+        path: &AskPath,
+    ) -> Result<PathFriction, ClientError> {
+        self.post(&format!("/v1/sites/{site}/friction/path"), path)
+            .await
+    }
+
+    /// Cells that were measured between two times.
+    pub(crate) async fn friction_difference(
+        &self,
+        site: &SiteId,
+        (from, to): (Timestamp, Option<Timestamp>),
+        area: Option<Area>,
+        reading: Reading,
+    ) -> Result<Vec<CellDifference>, ClientError> {
+        let mut query = reading.query();
+        query.push(("from", from.to_string()));
+        query.extend(to.map(|to| ("to", to.to_string())));
+        query.extend(area.map(Area::query).unwrap_or_default());
+        self.all_with(&format!("/v1/sites/{site}/friction/difference"), &query)
+            .await
+    }
+
+    /// Where a visit would teach most, the best first.
+    pub(crate) async fn visits(
+        &self,
+        site: &SiteId,
+        area: Area,
+        limit: u32,
+        reading: Reading,
+    ) -> Result<Page<VisitSuggestion>, ClientError> {
+        let mut query = reading.query();
+        query.extend(area.query());
+        query.push(("limit", limit.to_string()));
+        self.get_with(&format!("/v1/sites/{site}/friction/visits"), &query)
+            .await
+    }
+
+    /// The map of one robot model as a picture with its legend, PNG.
+    pub(crate) async fn friction_picture(
+        &self,
+        site: &SiteId,
+        area: Option<Area>,
+        resolution_m: Option<f64>,
+        scale: Option<u32>,
+        reading: Reading,
+    ) -> Result<Vec<u8>, ClientError> {
+        let mut query = reading.query();
+        query.push(("format", "png".to_owned()));
+        query.extend(area.map(Area::query).unwrap_or_default());
+        query.extend(resolution_m.map(|side_m| ("resolution_m", side_m.to_string())));
+        query.extend(scale.map(|pixels| ("scale", pixels.to_string())));
+        let path = format!("/v1/sites/{site}/friction/map");
+        let request = self.request(Method::GET, &path).query(&query);
+        let response = self.answered(request).await?;
+        let body = response.bytes().await.map_err(|cause| self.lost(cause))?;
+        Ok(body.to_vec())
+    }
+
+    pub(crate) async fn contributions(
+        &self,
+        site: &SiteId,
+    ) -> Result<Vec<RobotContribution>, ClientError> {
+        self.all(&format!("/v1/sites/{site}/friction/robots")).await
+    }
+
+    pub(crate) async fn withdrawals(&self, site: &SiteId) -> Result<Vec<Withdrawal>, ClientError> {
+        self.all(&format!("/v1/sites/{site}/withdrawals")).await
+    }
+
+    /// Takes what a robot measured in some hours off the map, for good.
+    pub(crate) async fn withdraw(
+        &self,
+        site: &SiteId,
+        robot: &RobotId,
+        withdrawal: &CreateWithdrawal,
+    ) -> Result<Withdrawal, ClientError> {
+        self.post(
+            &format!("/v1/sites/{site}/robots/{robot}/withdrawals"),
+            withdrawal,
+        )
+        .await
+    }
+}

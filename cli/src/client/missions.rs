@@ -1,0 +1,60 @@
+//! Missions and dry runs.
+
+use reqwest::Method;
+use tread_api::ids::{MissionId, RobotId, SiteId};
+use tread_api::mission::{CreateMission, Mission, MissionDetail, MissionState, ReplaceMission};
+use tread_api::page::Page;
+use tread_api::trajectory::{CheckTrajectory, TrajectoryCheck};
+
+use super::{Client, ClientError};
+
+impl Client {
+    pub(crate) async fn create_mission(
+        &self,
+        mission: &CreateMission,
+    ) -> Result<Mission, ClientError> {
+        self.post("/v1/missions", mission).await
+    }
+
+    /// The newest missions of a site, at most `limit`.
+    pub(crate) async fn missions(
+        &self,
+        site: &SiteId,
+        robot: Option<&RobotId>,
+        state: Option<MissionState>,
+        limit: u32,
+    ) -> Result<Page<Mission>, ClientError> {
+        let mut query = vec![("site", site.to_string()), ("limit", limit.to_string())];
+        query.extend(robot.map(|robot| ("robot", robot.to_string())));
+        query.extend(state.map(|state| ("state", state.as_str().to_owned())));
+        self.get_with("/v1/missions", &query).await
+    }
+
+    pub(crate) async fn mission(&self, mission: MissionId) -> Result<MissionDetail, ClientError> {
+        self.get(&format!("/v1/missions/{mission}")).await
+    }
+
+    /// Wants a mission paused, resumed or cancelled.
+    pub(crate) async fn act(&self, mission: MissionId, verb: &str) -> Result<Mission, ClientError> {
+        let path = format!("/v1/missions/{mission}/{verb}");
+        self.send(self.request(Method::POST, &path)).await
+    }
+
+    /// Wants a mission to be another trajectory.
+    pub(crate) async fn replace_mission(
+        &self,
+        mission: MissionId,
+        replacement: &ReplaceMission,
+    ) -> Result<Mission, ClientError> {
+        self.post(&format!("/v1/missions/{mission}/replace"), replacement)
+            .await
+    }
+
+    /// What a trajectory would ask of its robot.
+    pub(crate) async fn check_trajectory(
+        &self,
+        check: &CheckTrajectory,
+    ) -> Result<TrajectoryCheck, ClientError> {
+        self.post("/v1/trajectories/check", check).await
+    }
+}

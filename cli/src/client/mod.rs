@@ -1,0 +1,268 @@
+//! A client of the REST API: how requests are sent and answers read. What can be asked for is in
+//! the modules below, by subject.
+
+mod error;
+mod fleet;
+mod identity;
+mod map;
+mod missions;
+mod safety;
+
+use std::io;
+use std::net::IpAddr;
+use std::path::Path;
+use std::time::Duration;
+
+use reqwest::{Certificate, Method, RequestBuilder, Response, Url};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use tread_api::page::{PAGE_LIMIT_MAX, Page};
+
+pub(crate) use self::error::ClientError;
+pub(crate) use self::map::{Area, Reading};
+
+/// Longest wait for an answer; planning the longest path takes a while.
+const ANSWER_WAIT_MAX: Duration = Duration::from_secs(30);
+/// Longest life of one stream of events; then it is opened again where it ended.
+const STREAM_WAIT_MAX: Duration = Duration::from_hours(24);
+/// Longest wait for a connection.
+const CONNECT_WAIT_MAX: Duration = Duration::from_secs(3);
+/// Most pages of one list that are followed.
+const PAGES_MAX: usize = 100;
+
+/// The query of a request.
+type Query = Vec<(&'static str, String)>;
+
+/// An address as it is written everywhere.
+pub(crate) fn address_of(address: &str) -> &str {
+    address.trim_end_matches('/')
+}
+
+/// Whether only this machine reads what is sent to a host.
+fn is_here(url: &Url) -> bool {
+    match url.host_str() {
+        Some("localhost") => true,
+        Some(host) => {
+            let address = host.trim_start_matches('[').trim_end_matches(']');
+            address
+                .parse()
+                .is_ok_and(|address: IpAddr| address.is_loopback())
+        }
+        None => false,
+    }
+}
+
+/// A connection to one server.
+#[derive(Debug, Clone)]
+pub(crate) struct Client {
+    address: String,
+    token: Option<String>,
+    http: reqwest::Client,
+}
+
+fn certificates(file: &Path) -> Result<Vec<Certificate>, ClientError> {
+    let unusable = |cause| ClientError::Authority {
+        file: file.display().to_string(),
+        cause,
+    };
+    let text = std::fs::read(file).map_err(unusable)?;
+    let found = Certificate::from_pem_bundle(&text);
+    found.map_err(|error| unusable(io::Error::new(io::ErrorKind::InvalidData, error)))
+}
+
+impl Client {
+    /// A client that shows this token, and trusts this authority instead of the machine's.
+    pub(crate) fn new(
+        address: &str,
+        token: Option<&str>,
+        authority: Option<&Path>,
+    ) -> Result<Self, ClientError> {
+        let invalid = || ClientError::Address {
+            address: address.to_owned(),
+        };
+        let url = Url::parse(address).map_err(|_| invalid())?;
+        if !matches!(url.scheme(), "http" | "https") || url.host().is_none() {
+            return Err(invalid());
+        }
+        let is_tls = url.scheme() == "https";
+        let address = address_of(address).to_owned();
+        if token.is_some() && !is_tls && !is_here(&url) {
+            return Err(ClientError::ClearText { address });
+        }
+        let mut builder = reqwest::Client::builder()
+            .timeout(ANSWER_WAIT_MAX)
+            .connect_timeout(CONNECT_WAIT_MAX)
+            .user_agent(concat!("tread/", env!("CARGO_PKG_VERSION")));
+        builder = match authority {
+            Some(file) => builder.tls_certs_only(certificates(file)?),
+            None if is_tls => builder,
+            // Nobody is trusted, so that no machine's certificates need be read.
+            None => builder.tls_certs_only([]),
+        };
+        let http = builder.build().map_err(|cause| ClientError::Unreachable {
+            address: address.clone(),
+            cause,
+        })?;
+        let token = token.map(str::to_owned);
+        Ok(Self {
+            address,
+            token,
+            http,
+        })
+    }
+
+    /// The token that is shown.
+    pub(crate) fn token(&self) -> Option<&str> {
+        self.token.as_deref()
+    }
+
+    pub(crate) fn address(&self) -> &str {
+        &self.address
+    }
+
+    pub(crate) fn request(&self, method: Method, path: &str) -> RequestBuilder {
+        let request = self.http.request(method, format!("{}{path}", self.address));
+        match &self.token {
+            Some(token) => request.bearer_auth(token),
+            None => request,
+        }
+    }
+
+    /// Why a request or an answer did not come through.
+    pub(crate) fn lost(&self, cause: reqwest::Error) -> ClientError {
+        let address = self.address.clone();
+        if cause.is_timeout() && !cause.is_connect() {
+            ClientError::Silent { address, cause }
+        } else {
+            ClientError::Unreachable { address, cause }
+        }
+    }
+
+    /// Sends a request; an answer that is no success is an error.
+    async fn answered(&self, request: RequestBuilder) -> Result<Response, ClientError> {
+        let response = request.send().await.map_err(|cause| self.lost(cause))?;
+        if response.status().is_success() {
+            return Ok(response);
+        }
+        Err(self.refusal(response).await)
+    }
+
+    async fn send<T: DeserializeOwned>(&self, request: RequestBuilder) -> Result<T, ClientError> {
+        let response = self.answered(request).await?;
+        let status = response.status();
+        let body = response.bytes().await.map_err(|cause| self.lost(cause))?;
+        serde_json::from_slice(&body).map_err(|cause| ClientError::NotUnderstood {
+            address: self.address.clone(),
+            status,
+            cause,
+        })
+    }
+
+    /// What an answer that is no success says.
+    pub(crate) async fn refusal(&self, response: Response) -> ClientError {
+        let (address, status) = (self.address.clone(), response.status());
+        let body = match response.bytes().await {
+            Ok(body) => body,
+            Err(cause) => return self.lost(cause),
+        };
+        match serde_json::from_slice(&body) {
+            Ok(problem) => ClientError::Refused { problem },
+            Err(cause) => ClientError::NotUnderstood {
+                address,
+                status,
+                cause,
+            },
+        }
+    }
+
+    async fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
+        self.send(self.request(Method::GET, path)).await
+    }
+
+    async fn get_with<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        query: &Query,
+    ) -> Result<T, ClientError> {
+        self.send(self.request(Method::GET, path).query(query))
+            .await
+    }
+
+    async fn post<B: Serialize + Sync, T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: &B,
+    ) -> Result<T, ClientError> {
+        self.send(self.request(Method::POST, path).json(body)).await
+    }
+
+    async fn delete<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
+        self.send(self.request(Method::DELETE, path)).await
+    }
+
+    /// Follows a list to its end, at most [`PAGES_MAX`] pages.
+    async fn all<T: DeserializeOwned>(&self, path: &str) -> Result<Vec<T>, ClientError> {
+        self.all_with(path, &Vec::new()).await
+    }
+
+    /// Follows a list with a query to its end, at most [`PAGES_MAX`] pages.
+    async fn all_with<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        query: &Query,
+    ) -> Result<Vec<T>, ClientError> {
+        let mut items = Vec::new();
+        let mut cursor: Option<String> = None;
+        for _ in 0..PAGES_MAX {
+            let mut query = query.clone();
+            query.push(("limit", PAGE_LIMIT_MAX.to_string()));
+            query.extend(cursor.map(|cursor| ("cursor", cursor)));
+            let page: Page<T> = self.get_with(path, &query).await?;
+            items.extend(page.items);
+            cursor = page.next_cursor;
+            if cursor.is_none() {
+                break;
+            }
+        }
+        Ok(items)
+    }
+
+    /// Whether the server is ready to work.
+    pub(crate) async fn is_ready(&self) -> bool {
+        let answer = self.request(Method::GET, "/readyz").send().await;
+        answer.is_ok_and(|response| response.status().is_success())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_token_goes_over_the_network_only_by_tls() {
+        let _first = rustls::crypto::ring::default_provider().install_default();
+        let to = |address| Client::new(address, Some("t"), None).map(|_| ());
+        for here in [
+            "http://127.0.0.1:8420/",
+            "http://[::1]:8420",
+            "http://localhost:1",
+        ] {
+            assert!(to(here).is_ok(), "{here}");
+        }
+        for away in [
+            "http://192.0.2.1:8420",
+            "http://tread.example",
+            "http://localhost.example",
+        ] {
+            assert!(
+                matches!(to(away), Err(ClientError::ClearText { .. })),
+                "{away}"
+            );
+            assert!(Client::new(away, None, None).is_ok());
+        }
+        assert!(matches!(
+            to("ftp://127.0.0.1"),
+            Err(ClientError::Address { .. })
+        ));
+    }
+}

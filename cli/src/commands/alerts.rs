@@ -1,0 +1,53 @@
+//! `tread alerts`: what needs a person.
+
+use std::process::ExitCode;
+
+use tread_api::robot::Alert;
+
+use crate::args::{AlertsAction, AlertsArguments};
+use crate::client::Client;
+use crate::output::{Output, or_dash, render, table};
+
+pub(super) async fn run(
+    arguments: AlertsArguments,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    if let Some(AlertsAction::Acknowledge { alert }) = arguments.action {
+        let alert = client.acknowledge(alert).await?;
+        output.show(&alert, |alert| {
+            format!(
+                "`{}` of {} is noted as seen; it stands until its cause is gone",
+                alert.code, alert.robot
+            )
+        })?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    let site = &arguments.connection.site;
+    let (robot, raised) = (arguments.robot.as_ref(), !arguments.all);
+    let page = client.alerts(site, robot, raised, arguments.limit).await?;
+    output.show(&page.items, |alerts| list(alerts))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn list(alerts: &[Alert]) -> String {
+    if alerts.is_empty() {
+        return "no alert stands".to_owned();
+    }
+    let mut table = table([
+        "ALERT", "ROBOT", "SEVERITY", "CODE", "RAISED", "SEEN", "CLEARED", "TEXT",
+    ]);
+    for alert in alerts {
+        table.add_row([
+            alert.id.to_string(),
+            alert.robot.to_string(),
+            alert.severity.as_str().to_owned(),
+            alert.code.to_string(),
+            format!("{:.0}", alert.raised_at),
+            or_dash(alert.acknowledged_at.map(|at| format!("{at:.0}"))),
+            or_dash(alert.cleared_at.map(|at| format!("{at:.0}"))),
+            alert.text.clone(),
+        ]);
+    }
+    render(&table)
+}

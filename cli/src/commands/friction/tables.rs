@@ -1,0 +1,295 @@
+//! Answers of the friction map as tables.
+
+use comfy_table::Table;
+use tread_api::friction::{
+    CellDifference, CellFriction, FusedFriction, ModelFriction, PathFriction, PointFriction,
+    RobotContribution, TerrainFriction, TerrainHistory, VisitSuggestion, Withdrawal,
+};
+use tread_api::site::Cell;
+use tread_api::terrain::TerrainRef;
+
+use crate::commands::terrains::class_name;
+use crate::output::{age, or_dash, render, table};
+
+/// Columns that say what is known of a piece of ground.
+const FRICTION_COLUMNS: [&str; 7] = [
+    "THETA",
+    "95 % INTERVAL",
+    "K",
+    "MU PEAK >=",
+    "MEASURED",
+    "ROBOTS",
+    "AGE",
+];
+
+/// A table with these columns, and what is known behind them.
+fn friction_table(first: &[&str]) -> Table {
+    let mut all = table::<0>([]);
+    all.set_header(first.iter().chain(&FRICTION_COLUMNS));
+    all
+}
+
+fn number(value: Option<f64>, digits: usize) -> String {
+    or_dash(value.map(|value| format!("{value:.digits$}")))
+}
+
+fn seconds(age_s: Option<f64>) -> String {
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "an age is not negative, and one beyond any clock is cut"
+    )]
+    or_dash(age_s.map(|age_s| age((age_s * 1e3) as u64)))
+}
+
+fn columns(friction: Option<&FusedFriction>) -> [String; 7] {
+    let disputed = friction.is_some_and(|friction| friction.disputed);
+    let theta = number(friction.map(|friction| friction.theta), 4);
+    [
+        if disputed {
+            format!("{theta} (disputed)")
+        } else {
+            theta
+        },
+        or_dash(friction.map(|friction| {
+            format!(
+                "{:.4} to {:.4}",
+                friction.theta_low_95, friction.theta_high_95
+            )
+        })),
+        number(friction.map(|friction| friction.stiffness), 2),
+        number(
+            friction.and_then(|friction| friction.mu_peak_lower_bound),
+            2,
+        ),
+        or_dash(friction.map(|friction| friction.segments)),
+        or_dash(friction.map(|friction| friction.robots)),
+        seconds(friction.map(|friction| friction.age_s)),
+    ]
+}
+
+/// A model's row; what is only expected is said as such.
+fn model_row(model: &ModelFriction) -> Vec<String> {
+    let mut row = vec![model.model.clone()];
+    row.extend(columns(model.friction.as_ref()));
+    if let (None, Some(prior)) = (&model.friction, &model.prior) {
+        row[1] = format!("{:.4} expected", prior.theta);
+    }
+    row
+}
+
+fn terrain_name(terrain: Option<&TerrainRef>) -> String {
+    or_dash(terrain.map(|terrain| &terrain.id))
+}
+
+fn place(cell: Cell) -> [String; 2] {
+    [cell.ix.to_string(), cell.iy.to_string()]
+}
+
+pub(super) fn terrains(terrains: &[TerrainFriction]) -> String {
+    if terrains.is_empty() {
+        return "no terrain is drawn on this site yet: draw one with `tread terrains create`"
+            .to_owned();
+    }
+    let mut table = friction_table(&["TERRAIN", "CLASS", "MODEL"]);
+    for terrain in terrains {
+        let first = [terrain.terrain.id.to_string(), class_name(terrain.class)];
+        if terrain.models.is_empty() {
+            let nothing = columns(None);
+            let row = first.iter().cloned();
+            table.add_row(row.chain(["not driven yet".to_owned()]).chain(nothing));
+        }
+        for model in &terrain.models {
+            table.add_row(first.iter().cloned().chain(model_row(model)));
+        }
+    }
+    render(&table)
+}
+
+pub(super) fn history(history: &TerrainHistory) -> String {
+    let mut table = friction_table(&["AT", "MODEL"]);
+    for item in &history.items {
+        let at = format!("{:.0}", item.at);
+        if item.models.is_empty() {
+            let row = [at.clone(), "-".to_owned()].into_iter();
+            table.add_row(row.chain(columns(None)));
+        }
+        for model in &item.models {
+            table.add_row([at.clone()].into_iter().chain(model_row(model)));
+        }
+    }
+    format!(
+        "terrain {}, revision {}\n{}",
+        history.terrain.id,
+        history.terrain.revision,
+        render(&table)
+    )
+}
+
+pub(super) fn cells(cells: &[CellFriction]) -> String {
+    if cells.is_empty() {
+        return "no cell has been measured there yet".to_owned();
+    }
+    let mut table = friction_table(&["IX", "IY", "SIDE M", "TERRAIN"]);
+    for cell in cells {
+        let first = [cell.size_m.to_string(), terrain_name(cell.terrain.as_ref())];
+        let row = place(cell.cell).into_iter().chain(first);
+        table.add_row(row.chain(columns(Some(&cell.friction))));
+    }
+    render(&table)
+}
+
+pub(super) fn point(point: &PointFriction) -> String {
+    let Cell { ix, iy } = point.cell;
+    let ground = match &point.terrain {
+        Some(terrain) => format!("terrain {}, revision {}", terrain.id, terrain.revision),
+        None => "no terrain is drawn there".to_owned(),
+    };
+    let head = format!("cell {ix}, {iy}; {ground}");
+    if point.models.is_empty() {
+        return format!("{head}\nno robot has measured anything on this site yet");
+    }
+    let mut table = friction_table(&["MODEL"]);
+    for model in &point.models {
+        table.add_row(model_row(model));
+    }
+    format!("{head}\n{}", render(&table))
+}
+
+pub(super) fn path(path: &PathFriction) -> String {
+    let mut table = table([
+        "FROM M",
+        "IX",
+        "IY",
+        "THETA",
+        "± SD",
+        "95 % BELOW",
+        "AGE",
+        "GRIP MU",
+        "SPEED M/S",
+    ]);
+    for piece in &path.pieces {
+        let disputed = if piece.disputed { " (disputed)" } else { "" };
+        let [ix, iy] = place(piece.cell);
+        table.add_row([
+            format!("{:.2}", piece.from_m),
+            ix,
+            iy,
+            format!("{}{disputed}", number(piece.theta, 4)),
+            number(piece.std_dev, 4),
+            number(piece.theta_upper_95, 4),
+            seconds(piece.age_s),
+            format!("{:.2}", piece.grip_mu),
+            format!("{:.2}", piece.speed_m_s),
+        ]);
+    }
+    format!(
+        "{:.1} m, {:.0} % of it measured\n{}",
+        path.length_m,
+        1e2 * path.known_ratio,
+        render(&table)
+    )
+}
+
+pub(super) fn differences(cells: &[CellDifference]) -> String {
+    if cells.is_empty() {
+        return "nothing was measured there between these times".to_owned();
+    }
+    let mut table = table([
+        "IX",
+        "IY",
+        "TERRAIN",
+        "THETA BEFORE",
+        "THETA AFTER",
+        "CHANGE",
+        "IN DEVIATIONS",
+    ]);
+    let theta = |friction: &Option<FusedFriction>| {
+        let friction = friction.as_ref();
+        or_dash(friction.map(|known| format!("{:.4} ± {:.4}", known.theta, known.std_dev)))
+    };
+    for cell in cells {
+        let change = match (&cell.before, &cell.after) {
+            (Some(before), Some(after)) => {
+                format!("{:+.1} %", 1e2 * (after.theta / before.theta - 1.0))
+            }
+            (None, Some(_)) => "new".to_owned(),
+            (Some(_), None) => "gone".to_owned(),
+            (None, None) => "-".to_owned(),
+        };
+        let [ix, iy] = place(cell.cell);
+        table.add_row([
+            ix,
+            iy,
+            terrain_name(cell.terrain.as_ref()),
+            theta(&cell.before),
+            theta(&cell.after),
+            change,
+            or_dash(cell.deviations.map(|many| format!("{many:+.1}"))),
+        ]);
+    }
+    render(&table)
+}
+
+pub(super) fn visits(visits: &[VisitSuggestion]) -> String {
+    if visits.is_empty() {
+        return "no cell of this box would teach anything".to_owned();
+    }
+    let mut table = table([
+        "X M",
+        "Y M",
+        "TERRAIN",
+        "KNOWN TO",
+        "SHRINKS BY",
+        "DISPUTED",
+    ]);
+    for visit in visits {
+        let known = visit.relative_deviation;
+        table.add_row([
+            format!("{:.2}", visit.center.x_m),
+            format!("{:.2}", visit.center.y_m),
+            terrain_name(visit.terrain.as_ref()),
+            or_dash(known.map(|share| format!("{:.1} %", 1e2 * share))),
+            format!("{:.2} times", visit.gain.exp()),
+            if visit.disputed { "yes" } else { "no" }.to_owned(),
+        ]);
+    }
+    render(&table)
+}
+
+pub(super) fn contributions(robots: &[RobotContribution]) -> String {
+    if robots.is_empty() {
+        return "no robot has measured anything on this site yet".to_owned();
+    }
+    let mut table = table(["ROBOT", "CELLS", "SEGMENTS", "FIRST", "NEWEST", "BIAS"]);
+    for robot in robots {
+        let bias = robot.bias_ratio;
+        table.add_row([
+            robot.robot.to_string(),
+            robot.cells.to_string(),
+            robot.segments.to_string(),
+            format!("{:.0}", robot.first_at),
+            format!("{:.0}", robot.newest_at),
+            or_dash(bias.map(|ratio| format!("{:+.1} %", 1e2 * (ratio - 1.0)))),
+        ]);
+    }
+    render(&table)
+}
+
+pub(super) fn withdrawals(withdrawals: &[Withdrawal]) -> String {
+    if withdrawals.is_empty() {
+        return "nothing was taken off the map".to_owned();
+    }
+    let mut table = table(["ROBOT", "FROM", "BEFORE", "BY", "AT", "REASON"]);
+    for withdrawal in withdrawals {
+        table.add_row([
+            withdrawal.robot.to_string(),
+            format!("{:.0}", withdrawal.from),
+            format!("{:.0}", withdrawal.before),
+            withdrawal.by.clone(),
+            format!("{:.0}", withdrawal.at),
+            withdrawal.reason.clone(),
+        ]);
+    }
+    render(&table)
+}

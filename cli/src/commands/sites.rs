@@ -1,0 +1,101 @@
+//! `tread status` and `tread sites`: the server, and where its robots are.
+
+use std::process::ExitCode;
+
+use serde_json::Value;
+use tread_api::site::{CreateSite, Site};
+
+use crate::args::{SitesAction, SitesArguments};
+use crate::client::Client;
+use crate::output::{Output, age, render, table};
+
+pub(super) async fn status(client: &Client, output: Output) -> anyhow::Result<ExitCode> {
+    output.show(&client.status().await?, |status| {
+        describe(status, client.address())
+    })?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The fields of a server of any version: what is new is shown, what is gone is not missed.
+fn describe(status: &Value, address: &str) -> String {
+    let mut lines = vec![format!("server          {address}")];
+    let mut add = |name: &str, value: Option<String>| {
+        lines.extend(value.map(|value| format!("{name:15} {value}")));
+    };
+    let text = |name: &str| status[name].as_str().map(str::to_owned);
+    add("version", text("version"));
+    add("up for", status["uptime_ms"].as_u64().map(age));
+    add("sqlite", text("sqlite_version"));
+    let present = status["robots_present"].as_u64();
+    add("robots present", present.map(|count| count.to_string()));
+    let counters = status["counters"].as_object();
+    let counted: Vec<(&String, u64)> = counters
+        .into_iter()
+        .flatten()
+        .filter_map(|(name, value)| Some((name, value.as_u64()?)))
+        .filter(|(_, count)| *count > 0)
+        .collect();
+    if counted.is_empty() {
+        return lines.join("\n");
+    }
+    let mut counters = table(["COUNTED SINCE THE START", "TIMES"]);
+    for (name, count) in counted {
+        counters.add_row([name.replace('_', " "), count.to_string()]);
+    }
+    format!("{}\n\n{}", lines.join("\n"), render(&counters))
+}
+
+pub(super) async fn run(
+    arguments: SitesArguments,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    match arguments.action {
+        None => output.show(&client.sites().await?, |sites| list(sites))?,
+        Some(SitesAction::Create { id, name, cell }) => {
+            let request = CreateSite {
+                id,
+                name,
+                cell_m: cell,
+            };
+            let site = client.create_site(&request).await?;
+            output.show(&site, |site| list(std::slice::from_ref(site)))?;
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn list(sites: &[Site]) -> String {
+    if sites.is_empty() {
+        return "there is no site yet: an admin makes one with `tread sites create`".to_owned();
+    }
+    let mut table = table(["SITE", "NAME", "CELL M", "TERRAINS", "GEOFENCE", "CREATED"]);
+    for site in sites {
+        table.add_row([
+            site.id.to_string(),
+            site.name.clone(),
+            site.grid.cell_m.to_string(),
+            format!("revision {}", site.terrain_revision),
+            format!("revision {}", site.geofence_revision),
+            format!("{:.0}", site.created_at),
+        ]);
+    }
+    render(&table)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_status_is_shown_with_what_was_counted_and_without_what_never_happened() {
+        let status = serde_json::json!({
+            "version": "0.1.0", "uptime_ms": 90_000, "robots_present": 3,
+            "counters": {"requests_refused": 2, "messages_dropped": 0},
+        });
+        let text = describe(&status, "http://here");
+        assert!(text.contains("up for          90.0 s"), "{text}");
+        assert!(text.contains("requests refused"), "{text}");
+        assert!(!text.contains("messages dropped"), "{text}");
+    }
+}

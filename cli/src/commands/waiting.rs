@@ -1,0 +1,138 @@
+//! Waiting for missions to end: a bar for each in a terminal, a line for each change elsewhere.
+
+use std::io::IsTerminal as _;
+use std::time::Duration;
+
+use futures_util::future::try_join_all;
+use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use tokio::time::Instant;
+use tread_api::ids::MissionId;
+use tread_api::mission::{Mission, MissionState};
+
+use super::missions::{state, summary};
+use super::robots::steps_come;
+use crate::client::Client;
+use crate::output::{Output, TookTooLong, note};
+
+/// Time between two looks at the missions that are waited for.
+const LOOK_EVERY: Duration = Duration::from_millis(250);
+/// Steps of a bar.
+const STEPS: usize = 1_000;
+
+/// One mission that is waited for.
+struct Waited {
+    id: MissionId,
+    bar: ProgressBar,
+    /// What was said of it last, where there are no bars.
+    said: Option<String>,
+    ended: Option<Mission>,
+}
+
+impl Waited {
+    fn show(&mut self, seen: &Mission, lines: bool) {
+        if lines {
+            let state = state(seen);
+            if self.said.as_ref() != Some(&state) {
+                note(&summary(seen));
+                self.said = Some(state);
+            }
+            return;
+        }
+        self.bar.set_prefix(seen.robot.to_string());
+        let come = seen
+            .progress
+            .and_then(|it| Some((it, steps_come(it, STEPS)?)));
+        let Some((progress, come)) = come else {
+            self.bar.set_message(state(seen));
+            return;
+        };
+        self.bar.set_position(come as u64);
+        self.bar.set_message(format!(
+            "{:.1} of {:.1} m, {:.0} mm off, {}",
+            progress.driven_m,
+            progress.length_m,
+            1e3 * progress.cross_track_m.abs(),
+            state(seen)
+        ));
+    }
+}
+
+/// Follows missions to their ends, in the order in which they were named.
+///
+/// # Errors
+/// [`TookTooLong`] past the time that was allowed; the missions go on.
+pub(super) async fn wait(
+    client: &Client,
+    missions: &[MissionId],
+    allowed: Option<Duration>,
+    output: Output,
+) -> anyhow::Result<Vec<Mission>> {
+    let in_terminal = std::io::stderr().is_terminal();
+    let (bars, lines) = (
+        in_terminal && !output.is_json(),
+        !in_terminal && !output.is_json(),
+    );
+    let all = MultiProgress::with_draw_target(if bars {
+        ProgressDrawTarget::stderr()
+    } else {
+        ProgressDrawTarget::hidden()
+    });
+    let style = ProgressStyle::with_template("{prefix:12} {bar:32} {msg}")?;
+    let mut waited: Vec<Waited> = missions
+        .iter()
+        .map(|id| Waited {
+            id: *id,
+            bar: all
+                .add(ProgressBar::new(STEPS as u64))
+                .with_style(style.clone()),
+            said: None,
+            ended: None,
+        })
+        .collect();
+    let begin = Instant::now();
+    loop {
+        let open: Vec<MissionId> = waited
+            .iter()
+            .filter(|waited| waited.ended.is_none())
+            .map(|waited| waited.id)
+            .collect();
+        let looks = open.iter().map(|id| client.mission(*id));
+        for detail in try_join_all(looks).await? {
+            let seen = detail.mission;
+            let known = waited.iter_mut().find(|waited| waited.id == seen.id);
+            if let Some(known) = known {
+                known.show(&seen, lines);
+                known.ended = seen.state.is_terminal().then_some(seen);
+            }
+        }
+        if waited.iter().all(|waited| waited.ended.is_some()) {
+            for waited in &waited {
+                waited.bar.finish_and_clear();
+            }
+            return Ok(waited
+                .into_iter()
+                .filter_map(|waited| waited.ended)
+                .collect());
+        }
+        if let Some(allowed) = allowed.filter(|allowed| begin.elapsed() >= *allowed) {
+            let left = waited.iter().filter(|waited| waited.ended.is_none());
+            let left = left.count();
+            for waited in &waited {
+                waited.bar.abandon();
+            }
+            let text = format!(
+                "{left} of {} missions have not ended within {allowed:?}; they go on: look with `tread missions`",
+                waited.len()
+            );
+            return Err(TookTooLong(text).into());
+        }
+        tokio::time::sleep(LOOK_EVERY).await;
+    }
+}
+
+/// Whether all of them came to a good end.
+pub(super) fn have_succeeded(missions: &[Mission]) -> bool {
+    missions
+        .iter()
+        .all(|mission| mission.state == MissionState::Succeeded)
+}

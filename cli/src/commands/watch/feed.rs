@@ -1,0 +1,133 @@
+//! The server's stream of events, opened again where it broke off.
+
+use std::time::Duration;
+
+use anyhow::Context as _;
+use tokio::sync::mpsc;
+use tokio::time::timeout;
+use tread_api::event::Event;
+use tread_api::ids::{RobotId, SiteId};
+
+use crate::client::{Client, ClientError};
+
+/// News that may wait to be shown; while they do, the stream is not read.
+pub(super) const NEWS_MAX: usize = 256;
+/// Rest before the stream is opened again.
+const REOPEN_REST: Duration = Duration::from_secs(1);
+/// Longest silence of a stream; the server says something every 15 s.
+const SILENCE_MAX: Duration = Duration::from_secs(45);
+/// Longest line of a stream, bytes: a mission of the most waypoints.
+const LINE_MAX: usize = 32 * 1024 * 1024;
+
+/// What comes of watching.
+#[derive(Debug)]
+pub(super) enum News {
+    /// The stream is open.
+    Opened,
+    /// Something has happened.
+    Event(Box<Event>),
+    /// The stream broke off, and why; it is opened again.
+    Lost(String),
+}
+
+/// The stream of one site.
+pub(super) struct Feed<'client> {
+    client: &'client Client,
+    site: &'client SiteId,
+    robot: Option<&'client RobotId>,
+    /// Where the stream ended, as the server calls it.
+    last: Option<String>,
+    was_open: bool,
+}
+
+impl<'client> Feed<'client> {
+    pub(super) fn new(
+        client: &'client Client,
+        site: &'client SiteId,
+        robot: Option<&'client RobotId>,
+    ) -> Self {
+        Self {
+            client,
+            site,
+            robot,
+            last: None,
+            was_open: false,
+        }
+    }
+
+    /// Watches until nobody wants to know.
+    ///
+    /// # Errors
+    /// Nobody was there from the start, or the server refuses.
+    pub(super) async fn run(mut self, to: mpsc::Sender<News>) -> anyhow::Result<()> {
+        while !to.is_closed() {
+            match self.follow(&to).await {
+                Ok(()) => {}
+                Err(error) => {
+                    let refused = error.downcast_ref::<ClientError>();
+                    let is_refused = refused.is_some_and(|error| error.problem().is_some());
+                    if !self.was_open || is_refused {
+                        return Err(error);
+                    }
+                    // Whoever shows it may have ended meanwhile.
+                    _ = to.send(News::Lost(format!("{error:#}"))).await;
+                }
+            }
+            tokio::time::sleep(REOPEN_REST).await;
+        }
+        Ok(())
+    }
+
+    /// Follows one stream until it breaks off.
+    async fn follow(&mut self, to: &mpsc::Sender<News>) -> anyhow::Result<()> {
+        let last = self.last.clone();
+        let opening = self.client.events(self.site, self.robot, last.as_deref());
+        let mut stream = opening.await?;
+        self.was_open = true;
+        _ = to.send(News::Opened).await;
+        let mut text = Vec::new();
+        loop {
+            let chunk = timeout(SILENCE_MAX, stream.chunk()).await;
+            let chunk = chunk.with_context(|| format!("{} is silent", self.client.address()))?;
+            match chunk {
+                Ok(Some(chunk)) => text.extend_from_slice(&chunk),
+                Ok(None) => anyhow::bail!("{} has closed the stream", self.client.address()),
+                Err(cause) => return Err(self.client.lost(cause).into()),
+            }
+            anyhow::ensure!(text.len() <= LINE_MAX, "an event is too long");
+            while let Some(end) = text.windows(2).position(|pair| pair == b"\n\n") {
+                let block: Vec<u8> = text.drain(..end + 2).collect();
+                let (id, event) = read(&String::from_utf8_lossy(&block));
+                if id.is_some() {
+                    self.last = id;
+                }
+                if let Some(event) = event {
+                    _ = to.send(News::Event(event)).await;
+                }
+            }
+        }
+    }
+}
+
+/// The id and the event of a block of lines; events of a newer server that are not known here are
+/// passed over.
+fn read(block: &str) -> (Option<String>, Option<Box<Event>>) {
+    let field = |name: &str| block.lines().find_map(|line| line.strip_prefix(name));
+    let event = field("data: ").and_then(|text| serde_json::from_str(text).ok());
+    (field("id: ").map(str::to_owned), event.map(Box::new))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_event_is_read_with_its_id_and_what_is_not_known_is_passed_over() {
+        let end = "event: snapshot_end\ndata: \"snapshot_end\"\nid: 5-7\n\n";
+        let (id, event) = read(end);
+        assert_eq!(id.as_deref(), Some("5-7"));
+        assert_eq!(event.as_deref(), Some(&Event::SnapshotEnd));
+        assert_eq!(read(": keep-alive\n\n"), (None, None));
+        assert_eq!(read("data: {\"weather\":{}}\n\n"), (None, None));
+    }
+}

@@ -1,0 +1,122 @@
+//! What is known of a site by the events so far.
+
+use std::collections::BTreeMap;
+
+use tread_api::event::Event;
+use tread_api::ids::{MissionId, RobotId};
+use tread_api::mission::{Mission, MissionState};
+use tread_api::robot::{Alert, LinkState, Robot};
+
+/// Missions kept.
+const MISSIONS_KEPT: usize = 1_000;
+
+/// A site by the events so far.
+#[derive(Debug, Default)]
+pub(super) struct Known {
+    robots: BTreeMap<RobotId, Robot>,
+    missions: BTreeMap<MissionId, Mission>,
+    is_whole: bool,
+}
+
+/// How many of each.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Counts {
+    pub(super) online: usize,
+    pub(super) stale: usize,
+    pub(super) offline: usize,
+    pub(super) stopped: usize,
+    pub(super) in_hand: usize,
+    pub(super) queued: usize,
+    pub(super) alerts: usize,
+}
+
+impl Known {
+    pub(super) fn take(&mut self, event: Event) {
+        match event {
+            Event::SnapshotBegin => *self = Self::default(),
+            Event::SnapshotEnd => self.is_whole = true,
+            Event::Robot(robot) => {
+                self.robots.insert(robot.id.clone(), *robot);
+            }
+            Event::Mission(mission) => {
+                self.missions.insert(mission.id, *mission);
+                if self.missions.len() > MISSIONS_KEPT {
+                    self.missions.pop_first();
+                }
+            }
+            // A robot's alerts come with the robot, its steps with the mission.
+            Event::Alert(_) | Event::Step(_) | Event::End(_) => {}
+        }
+    }
+
+    /// Whether the snapshot has come whole.
+    pub(super) fn is_whole(&self) -> bool {
+        self.is_whole
+    }
+
+    /// The robots that are not retired, by name.
+    pub(super) fn robots(&self) -> impl Iterator<Item = &Robot> {
+        self.robots
+            .values()
+            .filter(|robot| robot.retired_at.is_none())
+    }
+
+    /// Missions in hand, then those that wait, then what has ended, each the newest first.
+    pub(super) fn missions(&self) -> Vec<Mission> {
+        let mut missions: Vec<Mission> = self
+            .missions
+            .values()
+            .rev()
+            .map(|mission| self.fresh(mission))
+            .collect();
+        missions.sort_by_key(|mission| {
+            let (state, is_ended) = (mission.state, mission.state.is_terminal());
+            (is_ended, state == MissionState::Queued)
+        });
+        missions
+    }
+
+    /// A mission with the progress that its robot said last; missions are sent when they step.
+    fn fresh(&self, mission: &Mission) -> Mission {
+        let live = self.robots.get(&mission.robot);
+        let said = live.and_then(|robot| robot.live.as_ref()?.mission);
+        let progress = said.filter(|said| said.id == mission.id && !mission.state.is_terminal());
+        Mission {
+            progress: progress.or(mission.progress),
+            ..mission.clone()
+        }
+    }
+
+    /// Alerts that stand: those that nobody has seen first, then the newest.
+    pub(super) fn alerts(&self) -> Vec<&Alert> {
+        let mut alerts: Vec<&Alert> = self.robots().flat_map(|robot| &robot.alerts).collect();
+        alerts.sort_by_key(|alert| {
+            let newest = std::cmp::Reverse(alert.raised_at);
+            (alert.acknowledged_at.is_some(), newest)
+        });
+        alerts
+    }
+
+    pub(super) fn counts(&self) -> Counts {
+        let linked = |link: LinkState| self.robots().filter(|robot| robot.link == link).count();
+        let is_stopped = |robot: &&Robot| {
+            let live = robot.live.as_ref();
+            live.is_some_and(|live| live.safety.stop.is_some())
+        };
+        let open = || {
+            let all = self.missions.values();
+            all.filter(|mission| !mission.state.is_terminal())
+        };
+        let queued = open().filter(|mission| mission.state == MissionState::Queued);
+        let queued = queued.count();
+        Counts {
+            online: linked(LinkState::Online),
+            stale: linked(LinkState::Stale),
+            offline: linked(LinkState::Offline),
+            stopped: self.robots().filter(is_stopped).count(),
+            in_hand: open().count() - queued,
+            queued,
+            alerts: self.alerts().len(),
+        }
+    }
+}

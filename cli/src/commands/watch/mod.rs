@@ -1,0 +1,81 @@
+//! `tread watch`: robots, missions and alerts as they change, by the server's stream of events.
+//!
+//! In a terminal it is a picture of the whole site; elsewhere, or with `--lines`, a line for each
+//! change; with `--json` the events themselves. A stream that breaks off is opened again where it
+//! ended, so nothing is missed; while no server answers, that is said.
+
+mod feed;
+mod known;
+mod lines;
+mod picture;
+mod screen;
+
+use std::io::{self, IsTerminal as _};
+use std::process::ExitCode;
+
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::mpsc;
+use tread_api::event::{Event, StreamEnd};
+
+use self::feed::{Feed, NEWS_MAX, News};
+use self::lines::Lines;
+use self::screen::Screen;
+use crate::args::WatchArguments;
+use crate::client::Client;
+use crate::output::{Output, json_line, line, note};
+
+pub(super) async fn run(
+    arguments: &WatchArguments,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    let site = &arguments.connection.site;
+    let feed = Feed::new(client, site, arguments.robot.as_ref());
+    let (to, news) = mpsc::channel(NEWS_MAX);
+    let in_terminal = io::stdout().is_terminal() && io::stdin().is_terminal();
+    let mut terminate = signal(SignalKind::terminate())?;
+    let shown = async {
+        if output.is_json() || arguments.lines || !in_terminal {
+            print(news, output).await
+        } else {
+            Screen::new(arguments, client).run(news).await
+        }
+    };
+    tokio::select! {
+        ended = feed.run(to) => ended,
+        ended = shown => ended,
+        _ = tokio::signal::ctrl_c() => Ok(()),
+        _ = terminate.recv() => Ok(()),
+    }?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Prints what comes, until nothing does.
+async fn print(mut news: mpsc::Receiver<News>, output: Output) -> anyhow::Result<()> {
+    let mut lines = Lines::default();
+    while let Some(news) = news.recv().await {
+        match news {
+            News::Opened => {}
+            News::Lost(why) => note(&format!("{why}; trying again")),
+            News::Event(event) => {
+                if let Event::End(end) = &*event {
+                    note(ended(*end));
+                }
+                if output.is_json() {
+                    json_line(&event)?;
+                } else if let Some(text) = lines.take(&event) {
+                    line(&text)?;
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Why the server ends a stream, for people.
+fn ended(end: StreamEnd) -> &'static str {
+    match end {
+        StreamEnd::TooSlow => "the server ended the stream: read too slowly",
+        StreamEnd::Stopping => "the server stops",
+    }
+}

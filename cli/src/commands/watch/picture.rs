@@ -1,0 +1,440 @@
+//! The picture itself: a heading, the robots, their missions, what stands, what keys do.
+
+use ratatui::Frame;
+use ratatui::layout::{Constraint, Layout, Rect};
+use ratatui::style::{Color, Modifier, Style};
+use ratatui::text::{Line, Span};
+use ratatui::widgets::{Block, Borders, Paragraph, Row, Table, TableState, Wrap};
+use tread_api::ids::SiteId;
+use tread_api::mission::{Mission, MissionState};
+use tread_api::robot::{LinkState, MissionProgress, Robot, RobotMode, Severity};
+
+use super::known::Known;
+use super::screen::{Order, Section, Shown};
+use crate::commands::missions::{state, trajectory};
+use crate::commands::robots::{details, link_name, mode_name, steps_come, theta};
+use crate::output::{age, or_dash};
+
+/// Cells for the longest name.
+const NAME_MOST: usize = 24;
+/// Cells of a bar.
+const BAR: usize = 10;
+/// Width from which identifiers are shown whole and more is told of each robot.
+const WIDE: u16 = 130;
+/// Most rows for missions beside the robots.
+const MISSION_ROWS: u16 = 40;
+/// Rows that missions have at least, with their heading, where the screen has any to give.
+const MISSION_ROWS_LEAST: u16 = 7;
+/// Rows for all of one robot.
+const DETAIL_ROWS: u16 = 24;
+/// Most rows for alerts.
+const ALERT_ROWS: u16 = 5;
+
+const KEYS: &str =
+    " q quit · ↑↓ select · Tab table · Enter details · o order · X STOP robot · a alert seen";
+
+/// What is drawn.
+pub(super) struct Picture<'screen> {
+    pub(super) site: &'screen SiteId,
+    pub(super) address: &'screen str,
+    pub(super) known: &'screen Known,
+    pub(super) shown: &'screen Shown,
+}
+
+/// Rows for a list of so many, with its heading and its border.
+fn rows(count: usize, most: u16) -> u16 {
+    let rows = u16::try_from(count).unwrap_or(most).min(most);
+    // A border with the title, and the heading.
+    rows + 2
+}
+
+pub(super) fn draw(frame: &mut Frame<'_>, picture: &Picture<'_>) {
+    let (known, shown) = (picture.known, picture.shown);
+    let (missions, alerts) = (known.missions(), known.alerts());
+    let alert_rows = if alerts.is_empty() {
+        0
+    } else {
+        rows(alerts.len(), ALERT_ROWS)
+    };
+    let above = if shown.details {
+        // All of one robot, and as much of the missions as is left.
+        Constraint::Length(DETAIL_ROWS)
+    } else {
+        let most = frame
+            .area()
+            .height
+            .saturating_sub(MISSION_ROWS_LEAST + alert_rows + 4);
+        Constraint::Length(rows(known.robots().count(), most.max(3) - 2))
+    };
+    let below = rows(missions.len(), MISSION_ROWS).min(MISSION_ROWS_LEAST);
+    let [heading, robots_area, missions_area, alerts_area, said, keys] = Layout::vertical([
+        Constraint::Length(2),
+        above,
+        Constraint::Min(below),
+        Constraint::Length(alert_rows),
+        Constraint::Length(1),
+        Constraint::Length(1),
+    ])
+    .areas(frame.area());
+    frame.render_widget(Paragraph::new(head(picture)), heading);
+    match shown.robot(known).filter(|_| shown.details) {
+        Some(robot) => {
+            let block = framed(format!(" {} ", robot.id), true);
+            let text = Paragraph::new(details(robot)).wrap(Wrap { trim: false });
+            frame.render_widget(text.block(block), robots_area);
+        }
+        None => draw_robots(frame, robots_area, picture),
+    }
+    draw_missions(frame, missions_area, picture, &missions);
+    if alert_rows > 0 {
+        draw_alerts(frame, alerts_area, picture);
+    }
+    let text = shown.said.as_deref().unwrap_or_default();
+    frame.render_widget(Paragraph::new(text).style(bold(Color::Yellow)), said);
+    let dim = Style::new().add_modifier(Modifier::DIM);
+    frame.render_widget(Paragraph::new(KEYS).style(dim), keys);
+}
+
+fn bold(color: Color) -> Style {
+    Style::new().fg(color).add_modifier(Modifier::BOLD)
+}
+
+fn framed(title: String, is_chosen: bool) -> Block<'static> {
+    let style = if is_chosen {
+        Style::new().add_modifier(Modifier::BOLD)
+    } else {
+        Style::new().add_modifier(Modifier::DIM)
+    };
+    Block::new()
+        .borders(Borders::TOP)
+        .border_style(style)
+        .title(title)
+}
+
+fn head(picture: &Picture<'_>) -> Vec<Line<'static>> {
+    let mut first = vec![
+        Span::styled(
+            format!("tread · {}", picture.site),
+            Style::new().add_modifier(Modifier::BOLD),
+        ),
+        Span::raw(format!(" · {} · ", picture.address)),
+    ];
+    first.push(match (&picture.shown.lost, picture.known.is_whole()) {
+        (Some(why), _) => Span::styled(
+            format!("NOT LIVE, what is shown is old: {why}"),
+            bold(Color::Red),
+        ),
+        (None, true) => Span::styled("live", bold(Color::Green)),
+        (None, false) => Span::styled("reading …", bold(Color::Yellow)),
+    });
+    let counts = picture.known.counts();
+    let counted = |count: usize, name: &str, color: Color| {
+        let style = if count > 0 { bold(color) } else { Style::new() };
+        Span::styled(format!("{count} {name}   "), style)
+    };
+    let second = vec![
+        counted(counts.online, "online", Color::Green),
+        counted(counts.stale, "stale", Color::Yellow),
+        counted(counts.offline, "offline", Color::Red),
+        counted(counts.stopped, "stopped", Color::Red),
+        counted(counts.in_hand, "missions in hand", Color::Cyan),
+        counted(counts.queued, "queued", Color::Reset),
+        counted(counts.alerts, "alerts", Color::Yellow),
+    ];
+    vec![Line::from(first), Line::from(second)]
+}
+
+/// A bar for how far a mission has come.
+fn bar(progress: Option<MissionProgress>) -> String {
+    let Some((progress, full)) = progress.and_then(|it| Some((it, steps_come(it, BAR)?))) else {
+        return "-".to_owned();
+    };
+    let share = (progress.driven_m / progress.length_m).clamp(0.0, 1.0);
+    let (full, rest) = ("█".repeat(full), "░".repeat(BAR - full));
+    format!("{full}{rest} {:3.0} %", 1e2 * share)
+}
+
+fn robot_style(robot: &Robot) -> Style {
+    let live = robot.live.as_ref();
+    let is_down = live.is_some_and(|live| {
+        live.safety.stop.is_some() || matches!(live.mode, RobotMode::Fault | RobotMode::Stopped)
+    });
+    match (is_down, robot.link) {
+        (true, _) => bold(Color::Red),
+        (false, LinkState::Offline) => Style::new().fg(Color::Red),
+        (false, LinkState::Stale) => Style::new().fg(Color::Yellow),
+        (false, LinkState::Online) => Style::new(),
+    }
+}
+
+fn robot_row(robot: &Robot, is_wide: bool) -> Row<'static> {
+    let live = robot.live.as_ref();
+    let twist = live.and_then(|live| live.twist);
+    let mission = live.and_then(|live| live.mission);
+    // Adding nothing makes a plain zero of a negative one.
+    let off = mission.map(|mission| format!("{:.0}", (1e3 * mission.cross_track_m).round() + 0.0));
+    let mut cells = vec![
+        robot.id.to_string(),
+        link_name(robot.link).to_owned(),
+        or_dash(live.map(|live| mode_name(live.mode))),
+        bar(mission),
+        or_dash(twist.map(|twist| format!("{:.2}", twist.value.linear_m_s))),
+        or_dash(off),
+        or_dash(live.and_then(theta)),
+        or_dash(live.map(|live| age(live.heard_age_ms))),
+    ];
+    if is_wide {
+        let pose = live.and_then(|live| live.pose).map(|pose| pose.value);
+        let battery = live.and_then(|live| live.battery);
+        let gate = live.and_then(|live| live.safety.gate.cause);
+        let gate = gate.and_then(|cause| serde_json::to_value(cause).ok());
+        let gate = gate.as_ref().and_then(serde_json::Value::as_str);
+        cells.extend([
+            or_dash(pose.map(|pose| format!("{:.2}, {:.2}", pose.x_m, pose.y_m))),
+            or_dash(battery.map(|battery| format!("{:.0} %", 1e2 * battery.charge_ratio))),
+            or_dash(gate.map(|cause| cause.replace('_', " "))),
+        ]);
+    }
+    Row::new(cells).style(robot_style(robot))
+}
+
+fn draw_robots(frame: &mut Frame<'_>, area: Rect, picture: &Picture<'_>) {
+    let shown = picture.shown;
+    let is_wide = area.width >= WIDE;
+    let robots = shown.robots(picture.known);
+    let order = match shown.order {
+        Order::Name => "by name",
+        Order::Trouble => "trouble first",
+    };
+    let title = format!(" robots, {order} ");
+    if robots.is_empty() && picture.known.is_whole() {
+        let text = "no robot has said hello on this site yet";
+        let block = framed(title, true);
+        frame.render_widget(Paragraph::new(text).block(block), area);
+        return;
+    }
+    let mut header = vec![
+        "ROBOT", "LINK", "MODE", "DONE", "M/S", "OFF MM", "THETA", "HEARD",
+    ];
+    let names = robots.iter().map(|robot| robot.id.as_str().len());
+    let longest = names.max().unwrap_or_default().clamp(8, NAME_MOST);
+    let mut widths = vec![
+        Constraint::Length(u16::try_from(longest).unwrap_or_default()),
+        Constraint::Length(7),
+        Constraint::Length(12),
+        Constraint::Length(16),
+        Constraint::Length(5),
+        Constraint::Length(6),
+        Constraint::Length(15),
+        Constraint::Length(7),
+    ];
+    if is_wide {
+        header.extend(["X, Y M", "BATTERY", "SLOWED BY"]);
+        widths.extend([
+            Constraint::Length(16),
+            Constraint::Length(7),
+            Constraint::Length(16),
+        ]);
+    }
+    let rows = robots.iter().map(|robot| robot_row(robot, is_wide));
+    draw_table(
+        frame,
+        area,
+        picture,
+        Section::Robots,
+        (title, &header),
+        rows,
+        widths,
+    );
+}
+
+fn mission_style(mission: &Mission) -> Style {
+    match mission.state {
+        MissionState::Failed | MissionState::Rejected => Style::new().fg(Color::Red),
+        MissionState::Active => Style::new().fg(Color::Cyan),
+        MissionState::Paused | MissionState::Cancelling => Style::new().fg(Color::Yellow),
+        MissionState::Queued | MissionState::Offered => Style::new(),
+        MissionState::Succeeded | MissionState::Cancelled | MissionState::Expired => {
+            Style::new().add_modifier(Modifier::DIM)
+        }
+    }
+}
+
+fn draw_missions(frame: &mut Frame<'_>, area: Rect, picture: &Picture<'_>, missions: &[Mission]) {
+    let is_wide = area.width >= WIDE;
+    let row = |mission: &Mission| {
+        let id = mission.id.to_string();
+        let id = if is_wide {
+            id
+        } else {
+            format!("…{}", &id[id.len() - 12..])
+        };
+        // While it is driven as it should be, the state says all.
+        let is_plain = matches!(
+            mission.state,
+            MissionState::Active | MissionState::Succeeded
+        );
+        let reason = mission.reason.clone().filter(|_| !is_plain);
+        Row::new([
+            id,
+            mission.robot.to_string(),
+            state(mission),
+            bar(mission.progress),
+            trajectory(&mission.trajectory),
+            reason.unwrap_or_default(),
+        ])
+        .style(mission_style(mission))
+    };
+    let widths = vec![
+        Constraint::Length(if is_wide { 36 } else { 13 }),
+        Constraint::Length(12),
+        Constraint::Length(10),
+        Constraint::Length(16),
+        Constraint::Fill(1),
+        Constraint::Fill(1),
+    ];
+    let header = ["MISSION", "ROBOT", "STATE", "DONE", "TRAJECTORY", "REASON"];
+    let rows = missions.iter().map(row);
+    let title = (" missions ".to_owned(), &header[..]);
+    draw_table(frame, area, picture, Section::Missions, title, rows, widths);
+}
+
+fn draw_alerts(frame: &mut Frame<'_>, area: Rect, picture: &Picture<'_>) {
+    let alerts = picture.known.alerts();
+    let rows = alerts.iter().map(|alert| {
+        let style = match (alert.acknowledged_at, alert.severity) {
+            (Some(_), _) => Style::new().add_modifier(Modifier::DIM),
+            (None, Severity::Critical) => bold(Color::Red),
+            (None, Severity::Warning) => Style::new().fg(Color::Yellow),
+        };
+        Row::new([
+            alert.robot.to_string(),
+            alert.severity.as_str().to_owned(),
+            format!("{:.0}", alert.raised_at),
+            alert.text.clone(),
+        ])
+        .style(style)
+    });
+    let widths = vec![
+        Constraint::Length(12),
+        Constraint::Length(8),
+        Constraint::Length(20),
+        Constraint::Fill(1),
+    ];
+    let header = ["ROBOT", "ALERT", "SINCE", "WHAT"];
+    let title = (" alerts ".to_owned(), &header[..]);
+    draw_table(frame, area, picture, Section::Alerts, title, rows, widths);
+}
+
+fn draw_table<'row>(
+    frame: &mut Frame<'_>,
+    area: Rect,
+    picture: &Picture<'_>,
+    section: Section,
+    (title, header): (String, &[&'row str]),
+    rows: impl Iterator<Item = Row<'row>>,
+    widths: Vec<Constraint>,
+) {
+    let is_chosen = picture.shown.section == section;
+    let header = Row::new(header.to_vec()).style(Style::new().add_modifier(Modifier::DIM));
+    let marked = if is_chosen {
+        Style::new().add_modifier(Modifier::REVERSED)
+    } else {
+        Style::new()
+    };
+    let table = Table::new(rows, widths)
+        .header(header)
+        .block(framed(title, is_chosen))
+        .row_highlight_style(marked);
+    let row = picture.shown.row(picture.known, section);
+    let mut state = TableState::new().with_selected(Some(row));
+    frame.render_stateful_widget(table, area, &mut state);
+}
+
+#[cfg(test)]
+mod tests {
+    use ratatui::Terminal;
+    use ratatui::backend::TestBackend;
+    use serde_json::json;
+    use tread_api::event::Event;
+
+    use super::*;
+
+    /// A robot as an older or newer server might tell of it.
+    fn robot(id: &str, link: &str) -> Event {
+        let at = "2026-11-21T08:00:00Z";
+        let limits = json!({
+            "linear_max_m_s": 1.0, "angular_max_rad_s": 1.0, "linear_acceleration_max_m_s2": 1.0,
+            "lateral_acceleration_max_m_s2": 1.0, "linear_jerk_max_m_s3": 1.0,
+            "wheel_speed_max_rad_s": 1.0, "wheel_acceleration_max_rad_s2": 1.0,
+        });
+        let robot = json!({"robot": {
+            "id": id, "name": id, "retired_at": null, "site": "yard",
+            "model": {
+                "name": "model", "tyres": "tyres", "mass_kg": 1.0, "track_width_m": 1.0,
+                "wheelbase_m": 1.0, "wheel_radius_m": 1.0, "yaw_inertia_kg_m2": 1.0,
+                "limits": limits,
+            },
+            "configuration": "0192f0c1-2b3c-7d4e-8f50-617283940a1b",
+            "capabilities": {"wheel_torque": false, "yaw_rate": false, "teleop": false},
+            "agent_version": "1", "first_seen_at": at, "last_hello_at": at,
+            "measurements": {"refused": 0, "refused_why": null, "aside": 0},
+            "link": link, "link_cause": null, "alerts": [], "live": null,
+        }});
+        serde_json::from_value(robot).expect("a robot")
+    }
+
+    fn picture(known: &Known, width: u16, height: u16) -> String {
+        let mut terminal = Terminal::new(TestBackend::new(width, height)).expect("a screen");
+        let site = "yard".parse().expect("a site");
+        let picture = Picture {
+            site: &site,
+            address: "http://here",
+            known,
+            shown: &Shown::default(),
+        };
+        terminal
+            .draw(|frame| draw(frame, &picture))
+            .expect("it is drawn");
+        terminal.backend().to_string()
+    }
+
+    #[test]
+    fn every_robot_is_shown_on_any_screen_and_a_tiny_one_breaks_nothing() {
+        let mut known = Known::default();
+        known.take(robot("rover-1", "online"));
+        known.take(robot("rover-2", "offline"));
+        assert!(picture(&known, 100, 20).contains("reading"));
+        known.take(Event::SnapshotEnd);
+        for (width, height) in [(80, 24), (160, 50), (90, 16)] {
+            let text = picture(&known, width, height);
+            for word in ["rover-1", "rover-2", "1 online", "1 offline", "live"] {
+                assert!(text.contains(word), "{word} at {width}x{height}:\n{text}");
+            }
+        }
+        for (width, height) in [(1, 1), (5, 3), (30, 6)] {
+            picture(&known, width, height);
+        }
+    }
+
+    #[test]
+    fn a_bar_is_as_full_as_the_mission_has_come() {
+        let progress = |driven_m: f64| MissionProgress {
+            id: "0192f0c1-2b3c-7d4e-8f50-617283940a1b"
+                .parse()
+                .expect("an id"),
+            revision: 1,
+            plan_hash: "0192f0c1-2b3c-7d4e-8f50-617283940a1b"
+                .parse()
+                .expect("an id"),
+            driven_m,
+            length_m: 10.0,
+            cross_track_m: 0.0,
+            paused: false,
+            paused_by: None,
+        };
+        assert_eq!(bar(Some(progress(5.0))), "█████░░░░░  50 %");
+        assert_eq!(bar(Some(progress(12.0))), "██████████ 100 %");
+        assert_eq!(bar(None), "-");
+    }
+}

@@ -1,0 +1,13 @@
+//! The real command line against a real server and a real agent with a simulated base.
+
+#![expect(
+    clippy::unwrap_used,
+    reason = "what the helpers of a test cannot do fails the test"
+)]
+
+mod drive;
+mod manual;
+mod operator;
+mod terminal;
+mod watch;
+mod yard;

@@ -1,0 +1,43 @@
+// The smooth ways of missions in hand, which the server plans on request and which never change
+// while mission and revision stay the same. Not reactive: the map draws them.
+import type { Mission, PlannedPath } from '../api/schema';
+import { ask } from '../api/client';
+import type { PointM } from '../map/camera';
+
+/** Ways that are kept; planning costs the server time, and a map with more is read by nobody. */
+const WAYS_MAX = 20;
+
+export class Plans {
+  readonly #ways = new Map<string, PointM[] | null>();
+
+  constructor(readonly changed: () => void) {}
+
+  /** The way of a mission, as soon as it is known. */
+  of(mission: Mission): PointM[] | null {
+    // A circle is drawn exactly by what was asked for, and its begin is only known to the robot.
+    if ('circle' in mission.trajectory) return null;
+    const key = keyOf(mission);
+    const known = this.#ways.get(key);
+    if (known !== undefined || this.#ways.size >= WAYS_MAX) return known ?? null;
+    this.#ways.set(key, null);
+    void ask<PlannedPath>(`/v1/missions/${mission.id}/path`).then(
+      (path) => {
+        this.#ways.set(key, path.points);
+        this.changed();
+      },
+      // The straight lines between its points stay.
+      () => undefined,
+    );
+    return null;
+  }
+
+  /** Forgets the ways of all other missions. */
+  keep(missions: Mission[]): void {
+    const kept = new Set(missions.map(keyOf));
+    for (const key of this.#ways.keys()) if (!kept.has(key)) this.#ways.delete(key);
+  }
+}
+
+function keyOf(mission: Mission): string {
+  return `${mission.id}/${mission.revision}`;
+}

@@ -1,0 +1,145 @@
+//! Pictures of the map, written in one of the formats and kept for as long as they are right.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use tread_api::ids::SiteId;
+
+use super::raster::{Blocks, PictureAsked};
+use super::{App, AppError, Reading, SiteView};
+use crate::friction::Raster;
+use crate::friction::index::Block;
+
+/// Bytes of pictures that are kept.
+const KEPT_BYTES_MAX: usize = 64 * 1024 * 1024;
+/// Pictures that are kept.
+const KEPT_MAX: usize = 1_024;
+
+/// A picture in one of the formats, with what it shows.
+#[derive(Debug, Clone)]
+pub struct Picture {
+    /// The picture itself.
+    pub bytes: Arc<[u8]>,
+    /// What it was made from, without the squares.
+    pub of: Arc<Raster>,
+}
+
+/// What makes a picture another one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct State {
+    /// Newest change of the cells that it shows.
+    change: u64,
+    terrain_revision: u64,
+    now_us: i64,
+}
+
+#[derive(Debug, Clone)]
+struct Kept {
+    state: State,
+    picture: Picture,
+    used: u64,
+}
+
+#[derive(Debug, Default)]
+struct Shelf {
+    clock: u64,
+    bytes: usize,
+    kept: HashMap<String, Kept>,
+}
+
+/// Pictures and parts of pictures that are kept.
+#[derive(Debug, Default)]
+pub(in crate::app) struct Pictures {
+    pub(super) blocks: Blocks,
+    shelf: Mutex<Shelf>,
+}
+
+impl Pictures {
+    fn find(&self, key: &str, state: State) -> Option<Picture> {
+        let mut held = self.shelf.lock().unwrap_or_else(PoisonError::into_inner);
+        held.clock += 1;
+        let now = held.clock;
+        let found = held.kept.get_mut(key)?;
+        found.used = now;
+        (found.state == state).then(|| found.picture.clone())
+    }
+
+    fn keep(&self, key: String, state: State, picture: Picture) {
+        let size = picture.bytes.len();
+        if size > KEPT_BYTES_MAX / 4 {
+            return;
+        }
+        let mut held = self.shelf.lock().unwrap_or_else(PoisonError::into_inner);
+        let used = held.clock;
+        let kept = Kept {
+            state,
+            picture,
+            used,
+        };
+        if let Some(before) = held.kept.insert(key, kept) {
+            held.bytes -= before.picture.bytes.len();
+        }
+        held.bytes += size;
+        while held.bytes > KEPT_BYTES_MAX || held.kept.len() > KEPT_MAX {
+            let oldest = held.kept.iter().min_by_key(|(_, kept)| kept.used);
+            let Some(oldest) = oldest.map(|(key, _)| key.clone()) else {
+                break;
+            };
+            if let Some(gone) = held.kept.remove(&oldest) {
+                held.bytes -= gone.picture.bytes.len();
+            }
+        }
+    }
+}
+
+impl App {
+    /// A picture of a site's map. `format` names how `write` writes it, with all that `write`
+    /// depends on besides the map.
+    ///
+    /// # Errors
+    /// The site is not known, or the question is none.
+    pub async fn picture(
+        &self,
+        site: &SiteId,
+        asked: PictureAsked,
+        format: String,
+        write: impl FnOnce(&Raster) -> Result<Vec<u8>, AppError> + Send + 'static,
+    ) -> Result<Picture, AppError> {
+        let reading = Reading::new(self, &asked.asked)?;
+        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let drawing = move |app: &Self| {
+            let key = format!("{}/{format}/{asked:?}", view.row.pk);
+            // Looked at before the squares are made: what changes meanwhile makes it stale.
+            let state = app.state_of(&view, &reading, &asked);
+            if let Some(picture) = app.pictures().find(&key, state) {
+                return Ok(picture);
+            }
+            let mut raster = app.raster(&view, &reading, &asked)?;
+            let bytes: Arc<[u8]> = write(&raster)?.into();
+            raster.squares = Vec::new();
+            let of = Arc::new(raster);
+            let picture = Picture { bytes, of };
+            app.pictures().keep(key, state, picture.clone());
+            Ok(picture)
+        };
+        self.off_thread(drawing).await
+    }
+
+    fn state_of(&self, view: &SiteView, reading: &Reading, asked: &PictureAsked) -> State {
+        let grid = view.row.site.grid;
+        let bounds = asked.area.and_then(|area| area.cells(&grid).ok());
+        let bounds = bounds.map(|(min, max)| (Block::of(min), Block::of(max)));
+        let change = self.maps().look(&view.row, |map| match bounds {
+            // Which model most have driven, for who asks for none, is of the whole map.
+            Some((low, high)) if reading.reference().is_some() => {
+                map.changes().newest_in(low, high)
+            }
+            Some(_) | None => map.changes().newest(),
+        });
+        State {
+            change,
+            terrain_revision: view.row.site.terrain_revision,
+            now_us: reading.now_us,
+        }
+    }
+}

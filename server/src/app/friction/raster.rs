@@ -1,0 +1,372 @@
+//! The map as squares, row by row, one robot model, for pictures of any kind.
+//!
+//! Blocks of cells are fused once and kept: those that changed since are fused again, cell by cell,
+//! and all of them when the minute in which ages are counted is over. The lock of the map is held
+//! for one block at a time, so that what robots upload never waits for long.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use tread_api::geometry::{COORDINATE_MAX_M, Point};
+use tread_api::ids::ConfigurationId;
+use tread_api::site::{Cell, Grid};
+use tread_api::terrain::{Terrain, TerrainRef};
+
+use super::cells::{Area, Drawn, factor};
+use super::{App, AppError, Asked, Reading, SiteView};
+use crate::friction::Raster;
+use crate::friction::index::{BLOCK_SQUARES, Block, GROUND_NONE, Lens, Room, SiteMap, Square};
+
+/// Most squares of one picture.
+pub const SQUARES_MAX: u64 = 1 << 20;
+/// Blocks that are kept fused, of all sites and models: 72 KiB each.
+const BLOCKS_MAX: usize = 1_024;
+
+/// What a picture of the map is to show.
+#[derive(Debug, Clone, Default)]
+pub struct PictureAsked {
+    /// Whose measurements, as of when.
+    pub asked: Asked,
+    /// Where; everywhere that anybody has driven when absent.
+    pub area: Option<Area>,
+    /// Side of the squares, metres; the grid's own when absent.
+    pub resolution_m: Option<f64>,
+}
+
+/// Of which squares: everything that says so but the time.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct BlockKey {
+    site_pk: i64,
+    block: Block,
+    configuration: ConfigurationId,
+    normalisation: Option<String>,
+}
+
+/// A block as it was fused.
+#[derive(Debug, Clone)]
+struct Kept {
+    change: u64,
+    terrain_revision: u64,
+    now_us: i64,
+    grounds: Arc<[u16]>,
+    squares: Arc<Vec<Square>>,
+    used: u64,
+}
+
+/// Blocks that are kept fused.
+#[derive(Debug, Default)]
+pub(in crate::app) struct Blocks {
+    inner: Mutex<(u64, HashMap<BlockKey, Kept>)>,
+}
+
+impl Blocks {
+    fn find(&self, key: &BlockKey) -> Option<Kept> {
+        let mut inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
+        inner.0 += 1;
+        let now = inner.0;
+        let found = inner.1.get_mut(key)?;
+        found.used = now;
+        Some(found.clone())
+    }
+
+    fn keep(&self, key: BlockKey, kept: Kept) {
+        let mut inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
+        let (_, blocks) = &mut *inner;
+        if blocks.len() >= BLOCKS_MAX && !blocks.contains_key(&key) {
+            // The half that was looked at longest ago goes at once, so that this is rare.
+            let mut used: Vec<u64> = blocks.values().map(|kept| kept.used).collect();
+            let middle = used.len() / 2;
+            let (_, &mut bound, _) = used.select_nth_unstable(middle);
+            blocks.retain(|_, kept| kept.used > bound);
+        }
+        blocks.insert(key, kept);
+    }
+}
+
+/// Everything that squares of one picture have in common.
+pub(super) struct Frame<'view> {
+    view: &'view SiteView,
+    reading: &'view Reading,
+    drawn: Drawn<'view>,
+    configuration: ConfigurationId,
+}
+
+impl Frame<'_> {
+    fn lens(&self, map: &SiteMap) -> Lens {
+        let choice = crate::friction::index::Choice {
+            configuration: Some(self.configuration),
+            ..self.reading.choice()
+        };
+        map.lens(choice, |found| self.ground_of(found))
+    }
+
+    /// The number of a ground that measurements name; `None` where it is drawn no more.
+    fn ground_of(&self, found: Option<&TerrainRef>) -> Option<u16> {
+        let Some(found) = found else {
+            return Some(GROUND_NONE);
+        };
+        let place = self.drawn.place(&found.id)?;
+        self.view.is_present(found).then_some(place)
+    }
+
+    fn grounds(&self, block: Block) -> Arc<[u16]> {
+        let grid = self.view.row.site.grid;
+        let (low, high) = (grid.center_of(block.first()), grid.center_of(block.last()));
+        let near = self.drawn.near(low, high);
+        let places = 0..u16::try_from(BLOCK_SQUARES).unwrap_or(u16::MAX);
+        places
+            .map(|place| near.ground_at(grid.center_of(block.cell(place))))
+            .collect()
+    }
+
+    fn block(&self, app: &App, block: Block) -> Arc<Vec<Square>> {
+        let (row, reading) = (&self.view.row, self.reading);
+        // What is asked of another time is made for this once.
+        let key = reading.as_of.is_none().then(|| BlockKey {
+            site_pk: row.pk,
+            block,
+            configuration: self.configuration,
+            normalisation: reading.normalisation(),
+        });
+        let found = key.as_ref().and_then(|key| app.pictures().blocks.find(key));
+        let terrain_revision = row.site.terrain_revision;
+        let found = found.filter(|kept| kept.terrain_revision == terrain_revision);
+        let grounds = match &found {
+            Some(kept) => Arc::clone(&kept.grounds),
+            None => self.grounds(block),
+        };
+        let of_now = found.filter(|kept| kept.now_us == reading.now_us);
+        let (change, squares) = app.maps().look(row, |map| {
+            let newest = map.changes().newest_of(block);
+            let (mut squares, places) = match of_now {
+                Some(kept) if kept.change == newest => return (newest, kept.squares),
+                Some(kept) => {
+                    let places = map.changes().since(block, kept.change);
+                    (kept.squares, places)
+                }
+                None => (Arc::new(vec![Square::default(); BLOCK_SQUARES]), None),
+            };
+            if newest > 0 {
+                let lens = self.lens(map);
+                let kept = Arc::make_mut(&mut squares);
+                let which = (block, places.as_deref());
+                map.fuse_block(which, &grounds, &lens, reading.fused_at(), kept);
+            }
+            (newest, squares)
+        });
+        if let Some(key) = key {
+            let kept = Kept {
+                change,
+                terrain_revision,
+                now_us: reading.now_us,
+                grounds,
+                squares: Arc::clone(&squares),
+                used: 0,
+            };
+            app.pictures().blocks.keep(key, kept);
+        }
+        squares
+    }
+
+    /// The squares of a box of cells, row by row.
+    fn cells(&self, app: &App, (min, max): (Cell, Cell)) -> Vec<Square> {
+        let columns = usize::try_from(max.ix - min.ix + 1).unwrap_or_default();
+        let rows = usize::try_from(max.iy - min.iy + 1).unwrap_or_default();
+        let mut squares = vec![Square::default(); columns * rows];
+        let (low, high) = (Block::of(min), Block::of(max));
+        for row in low.row..=high.row {
+            for column in low.column..=high.column {
+                let block = Block { row, column };
+                let kept = self.block(app, block);
+                let (first, last) = (block.first(), block.last());
+                let (from_ix, to_ix) = (first.ix.max(min.ix), last.ix.min(max.ix));
+                for iy in first.iy.max(min.iy)..=last.iy.min(max.iy) {
+                    let from = usize::from(Block::place(Cell { ix: from_ix, iy }));
+                    let to = usize::from(Block::place(Cell { ix: to_ix, iy }));
+                    let place = usize::try_from(iy - min.iy).unwrap_or_default() * columns
+                        + usize::try_from(from_ix - min.ix).unwrap_or_default();
+                    squares[place..=place + to - from].copy_from_slice(&kept[from..=to]);
+                }
+            }
+        }
+        squares
+    }
+
+    /// The same of squares of several cells, which are made for this once.
+    fn merged(&self, app: &App, (min, max): (Cell, Cell), factor: i32) -> Vec<Square> {
+        let grid = self.view.row.site.grid;
+        let coarse = Grid {
+            cell_m: grid.cell_m * f64::from(factor),
+            ..grid
+        };
+        let near = self
+            .drawn
+            .near(coarse.center_of(min), coarse.center_of(max));
+        let mut room = Room::default();
+        let mut squares = Vec::new();
+        for iy in min.iy..=max.iy {
+            // The lock is let go after each row.
+            app.maps().look(&self.view.row, |map| {
+                let lens = self.lens(map);
+                for ix in min.ix..=max.ix {
+                    let ground = near.ground_at(coarse.center_of(Cell { ix, iy }));
+                    let low = Cell {
+                        ix: ix.saturating_mul(factor),
+                        iy: iy.saturating_mul(factor),
+                    };
+                    let high = Cell {
+                        ix: low.ix.saturating_add(factor - 1),
+                        iy: low.iy.saturating_add(factor - 1),
+                    };
+                    let which = (ground, &lens);
+                    let at = self.reading.fused_at();
+                    squares.push(map.fuse_square((low, high), which, at, &mut room));
+                }
+            });
+        }
+        squares
+    }
+}
+
+impl App {
+    /// The map of a site as squares, on the thread that asks.
+    pub(super) fn raster(
+        &self,
+        view: &SiteView,
+        reading: &Reading,
+        picture: &PictureAsked,
+    ) -> Result<Raster, AppError> {
+        let grid = view.row.site.grid;
+        let reference = reading.reference();
+        let (extent, configuration) = self.maps().look(&view.row, |map| {
+            let first = || map.configurations().first().copied();
+            (map.extent(), reference.or_else(first))
+        });
+        let whole = Area {
+            min: Point {
+                x_m: -COORDINATE_MAX_M,
+                y_m: -COORDINATE_MAX_M,
+            },
+            max: Point {
+                x_m: COORDINATE_MAX_M,
+                y_m: COORDINATE_MAX_M,
+            },
+        };
+        let factor = factor(&grid, picture.resolution_m)?;
+        let size_m = grid.cell_m * f64::from(factor);
+        let bounds = match (picture.area, extent) {
+            (Some(area), _) => Some(area.cells(&Grid {
+                cell_m: size_m,
+                ..grid
+            })?),
+            (None, Some((min, max))) => {
+                let (lowest, highest) = whole.cells(&grid)?;
+                let square = |ix: i32, iy: i32| Cell {
+                    ix: ix.div_euclid(factor),
+                    iy: iy.div_euclid(factor),
+                };
+                let min = square(min.ix.max(lowest.ix), min.iy.max(lowest.iy));
+                let max = square(max.ix.min(highest.ix), max.iy.min(highest.iy));
+                Some((min, max))
+            }
+            (None, None) => None,
+        };
+        let mut raster = Raster {
+            site: view.row.site.clone(),
+            configuration,
+            model: configuration.map_or_else(String::new, |found| view.model(found)),
+            normalisation: reading.normalisation(),
+            as_of_us: reading.now_us,
+            first: Cell { ix: 0, iy: 0 },
+            columns: 0,
+            rows: 0,
+            size_m,
+            squares: Vec::new(),
+        };
+        let Some((min, max)) = bounds else {
+            return Ok(raster);
+        };
+        let length = |low: i32, high: i32| (i64::from(high) - i64::from(low) + 1).unsigned_abs();
+        let (columns, rows) = (length(min.ix, max.ix), length(min.iy, max.iy));
+        let count = columns.saturating_mul(rows);
+        if count > SQUARES_MAX {
+            return Err(AppError::InvalidQuery {
+                parameter: "resolution_m",
+                detail: format!(
+                    "this would be {count} squares; a picture may have {SQUARES_MAX}: take a \
+                     smaller box or a larger `resolution_m`"
+                ),
+            });
+        }
+        raster.first = min;
+        raster.columns = usize::try_from(columns).unwrap_or_default();
+        raster.rows = usize::try_from(rows).unwrap_or_default();
+        raster.squares = match configuration {
+            None => vec![Square::default(); raster.columns * raster.rows],
+            Some(configuration) => {
+                let frame = Frame {
+                    view,
+                    reading,
+                    drawn: Drawn::new(&view.terrains),
+                    configuration,
+                };
+                if factor == 1 {
+                    frame.cells(self, (min, max))
+                } else {
+                    frame.merged(self, (min, max), factor)
+                }
+            }
+        };
+        Ok(if picture.area.is_none() {
+            raster.trimmed()
+        } else {
+            raster
+        })
+    }
+}
+
+/// Terrains that a box touches, in the order in which they count.
+pub(super) struct Near<'view> {
+    found: Vec<(u16, &'view Terrain)>,
+}
+
+impl Near<'_> {
+    /// The number of the ground at a point.
+    fn ground_at(&self, point: Point) -> u16 {
+        let mut here = self.found.iter();
+        here.find(|(_, terrain)| terrain.polygon.contains(point))
+            .map_or(GROUND_NONE, |&(number, _)| number)
+    }
+}
+
+impl<'view> Drawn<'view> {
+    /// The number of a terrain, from 1.
+    fn place(&self, id: &tread_api::ids::TerrainId) -> Option<u16> {
+        let place = self.terrains.iter().position(|terrain| terrain.id == *id)?;
+        u16::try_from(place + 1).ok()
+    }
+
+    /// Terrains whose outlines come near a box.
+    fn near(&self, low: Point, high: Point) -> Near<'view> {
+        let touches = |terrain: &Terrain| {
+            let corners = terrain.polygon.corners();
+            let span = |of: fn(&Point) -> f64| {
+                let values = corners.iter().map(of);
+                let least = values.clone().fold(f64::INFINITY, f64::min);
+                (least, values.fold(f64::NEG_INFINITY, f64::max))
+            };
+            let (x, y) = (span(|corner| corner.x_m), span(|corner| corner.y_m));
+            x.0 <= high.x_m && x.1 >= low.x_m && y.0 <= high.y_m && y.1 >= low.y_m
+        };
+        let mut found: Vec<(u16, &'view Terrain)> = (1..)
+            .zip(self.terrains)
+            .filter(|(_, terrain)| touches(terrain))
+            .collect();
+        // As `terrain_at` has it: the higher layer counts, of equal ones the smaller identifier.
+        found.sort_by(|(_, left), (_, right)| {
+            let by_layer = right.layer.cmp(&left.layer);
+            by_layer.then_with(|| left.id.cmp(&right.id))
+        });
+        Near { found }
+    }
+}

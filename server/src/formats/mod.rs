@@ -1,0 +1,7 @@
+//! The friction map in the formats of other programs. Pure: what is known goes in, bytes come out.
+
+pub mod font;
+pub mod nav2;
+pub mod palette;
+pub mod png;
+pub mod tile;

@@ -1,0 +1,75 @@
+//! Colours of the map: the colour map cividis over a fixed range of θ, so that a colour means the
+//! same from day to day, drawn towards grey where a value is unsure. The page has the same.
+
+/// Lowest θ that has a colour of its own.
+pub const THETA_LOW: f64 = 0.05;
+/// Highest θ that has a colour of its own.
+pub const THETA_HIGH: f64 = 2.0;
+/// Relative deviation up to which a value keeps its colour.
+pub const SURE: f64 = 0.05;
+/// Relative deviation from which a value is grey.
+pub const UNSURE: f64 = 0.5;
+/// Relative deviation from which a value is hatched as well.
+pub const HATCHED: f64 = 0.25;
+
+/// Red, green, blue.
+pub type Rgb = [u8; 3];
+
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "clamped to a byte"
+)]
+fn byte(value: f64) -> u8 {
+    value.round().clamp(0.0, 255.0) as u8
+}
+
+/// The colour of a share from 0 to 1, by polynomials that were fitted to the published table
+/// (d3-scale-chromatic, ISC).
+pub fn cividis(share: f64) -> Rgb {
+    let t = share.clamp(0.0, 1.0);
+    let polynomial =
+        |terms: [f64; 6]| byte(terms.iter().rev().fold(0.0, |sum, term| sum * t + term));
+    [
+        polynomial([-4.54, -35.34, 2_381.73, -6_402.7, 7_024.72, -2_710.57]),
+        polynomial([32.49, 170.73, 52.82, -131.46, 176.58, -67.37]),
+        polynomial([81.24, 442.36, -2_482.43, 6_167.24, -6_614.94, 2_475.67]),
+    ]
+}
+
+/// Where θ stands in its range, 0 to 1.
+pub fn share(theta: f64) -> f64 {
+    ((theta / THETA_LOW).ln() / (THETA_HIGH / THETA_LOW).ln()).clamp(0.0, 1.0)
+}
+
+/// How unsure a value is, 0 to 1.
+pub fn doubt(relative_deviation: f64) -> f64 {
+    ((relative_deviation - SURE) / (UNSURE - SURE)).clamp(0.0, 1.0)
+}
+
+/// The colour of a share from 0 to 1, drawn towards grey by `doubt` from 0 to 1.
+pub fn colour(share: f64, doubt: f64) -> Rgb {
+    let pure = cividis(share).map(f64::from);
+    let grey = 0.299 * pure[0] + 0.587 * pure[1] + 0.114 * pure[2];
+    pure.map(|channel| byte(grey + (channel - grey) * (1.0 - doubt.clamp(0.0, 1.0))))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_colour_map_goes_from_dark_blue_to_yellow() {
+        assert_eq!(cividis(0.0), [0, 32, 81]);
+        assert_eq!(cividis(1.0), [253, 234, 69]);
+        let grey = colour(0.5, 1.0);
+        assert!(grey[0] == grey[1] && grey[1] == grey[2], "{grey:?}");
+    }
+
+    #[test]
+    fn the_range_is_fixed() {
+        assert!(share(THETA_LOW).abs() < 1e-12 && (share(THETA_HIGH) - 1.0).abs() < 1e-12);
+        assert!((share(1e-9)).abs() < 1e-12 && (share(1e9) - 1.0).abs() < 1e-12);
+        assert!(doubt(0.05).abs() < 1e-12 && (doubt(0.5) - 1.0).abs() < 1e-12);
+    }
+}

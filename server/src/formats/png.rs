@@ -1,0 +1,225 @@
+//! The map as a picture for people: θ in colours, grey and hatched where it is unsure, clear where
+//! nothing is known, with a legend below. North-like is up.
+
+use std::collections::BTreeMap;
+
+use super::font;
+use super::palette::{HATCHED, Rgb, THETA_HIGH, THETA_LOW, UNSURE, cividis, colour, doubt, share};
+use crate::friction::Raster;
+use crate::friction::index::SquareKnown;
+
+/// The media type.
+pub const MEDIA_TYPE: &str = "image/png";
+/// Pixels that the longer side gets when nothing is said, at least.
+const SIDE_PX: usize = 768;
+/// Most pixels of a square's side.
+pub const SCALE_MAX: usize = 32;
+/// Most pixels of a picture without its legend.
+const PIXELS_MAX: usize = 1 << 24;
+/// Least pixels of a square's side for hatching to be seen.
+const HATCHED_SIDE_PX: usize = 4;
+/// Distance of the lines of the hatching, pixels.
+const HATCH_PX: usize = 4;
+/// Pixels of a dot of a letter.
+const DOT_PX: usize = 2;
+/// Pixels of a margin in the legend.
+const MARGIN_PX: usize = 8;
+/// Pixels of the height of a bar of the legend.
+const BAR_PX: usize = 12;
+/// Least width of the legend, pixels.
+const LEGEND_WIDTH_PX: usize = 280;
+const WHITE: Rgb = [255; 3];
+const INK: Rgb = [32; 3];
+/// What the legend names of θ.
+const TICKS: [&str; 6] = ["0.05", "0.1", "0.2", "0.5", "1", "2"];
+
+/// Why there is no picture.
+#[derive(Debug, thiserror::Error)]
+pub enum PngError {
+    /// The picture would be too large.
+    #[error("with {0} pixels to a square this would be more than {PIXELS_MAX} pixels")]
+    TooLarge(usize),
+    /// It cannot be written.
+    #[error("the picture cannot be written")]
+    Encode(#[from] ::png::EncodingError),
+}
+
+/// Pixels with a channel for what is clear.
+struct Canvas {
+    width: usize,
+    height: usize,
+    pixels: Vec<u8>,
+}
+
+impl Canvas {
+    fn put(&mut self, x: usize, y: usize, [red, green, blue]: Rgb) {
+        if x < self.width && y < self.height {
+            let at = 4 * (y * self.width + x);
+            self.pixels[at..at + 4].copy_from_slice(&[red, green, blue, 255]);
+        }
+    }
+
+    fn fill(&mut self, (x, y): (usize, usize), (width, height): (usize, usize), ink: Rgb) {
+        for row in y..y + height {
+            for column in x..x + width {
+                self.put(column, row, ink);
+            }
+        }
+    }
+
+    fn write(&mut self, (x, y): (usize, usize), text: &str) {
+        for (place, letter) in text.chars().enumerate() {
+            let left = x + place * (font::COLUMNS + 1) * DOT_PX;
+            for (row, dots) in font::letter(letter).into_iter().enumerate() {
+                for column in 0..font::COLUMNS {
+                    if dots >> (font::COLUMNS - 1 - column) & 1 == 1 {
+                        let at = (left + column * DOT_PX, y + row * DOT_PX);
+                        self.fill(at, (DOT_PX, DOT_PX), INK);
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn text_width_px(text: &str) -> usize {
+    (text.chars().count() * (font::COLUMNS + 1)).saturating_sub(1) * DOT_PX
+}
+
+/// Pixels of a square's side when nobody says how many.
+fn scale_of(raster: &Raster) -> usize {
+    let side = raster.columns.max(raster.rows).max(1);
+    SIDE_PX.div_ceil(side).clamp(1, SCALE_MAX)
+}
+
+/// The picture as a PNG file, with `scale` pixels to a square's side.
+///
+/// # Errors
+/// [`PngError`]: it would be too large.
+pub fn encode(raster: &Raster, scale: Option<usize>) -> Result<Vec<u8>, PngError> {
+    let scale = scale
+        .unwrap_or_else(|| scale_of(raster))
+        .clamp(1, SCALE_MAX);
+    let (width, height) = (raster.columns * scale, raster.rows * scale);
+    if width.saturating_mul(height) > PIXELS_MAX {
+        return Err(PngError::TooLarge(scale));
+    }
+    let letters = font::ROWS * DOT_PX;
+    let legend = 5 * MARGIN_PX + 2 * (BAR_PX + letters + 2);
+    let mut canvas = Canvas {
+        width: width.max(LEGEND_WIDTH_PX),
+        height: height + legend,
+        pixels: Vec::new(),
+    };
+    canvas.pixels = vec![0; 4 * canvas.width * canvas.height];
+    for (row, squares) in raster.rows().rev().enumerate() {
+        for (column, square) in squares.iter().enumerate() {
+            if let Some(known) = square.known() {
+                draw(&mut canvas, (column * scale, row * scale), scale, &known);
+            }
+        }
+    }
+    draw_legend(&mut canvas, height, legend);
+    write(&canvas, raster)
+}
+
+fn draw(canvas: &mut Canvas, (x, y): (usize, usize), scale: usize, known: &SquareKnown) {
+    let relative = known.std_dev / known.theta;
+    let ink = colour(share(known.theta), doubt(relative));
+    canvas.fill((x, y), (scale, scale), ink);
+    if scale >= HATCHED_SIDE_PX && relative >= HATCHED {
+        for row in y..y + scale {
+            for column in (x..x + scale).filter(|column| (column + row).is_multiple_of(HATCH_PX)) {
+                canvas.put(column, row, WHITE);
+            }
+        }
+    }
+}
+
+/// A bar of colours for θ and one from sure to unsure.
+#[expect(
+    clippy::cast_precision_loss,
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "pixels"
+)]
+fn draw_legend(canvas: &mut Canvas, top: usize, height: usize) {
+    let letters = font::ROWS * DOT_PX;
+    let width = canvas.width;
+    canvas.fill((0, top), (width, height), WHITE);
+    let title = text_width_px("θ") + MARGIN_PX;
+    let left = MARGIN_PX + title.max(text_width_px("σ/θ") + MARGIN_PX);
+    let bar = width - left - 2 * MARGIN_PX;
+    let at = |share: f64| left + (share * bar as f64).round() as usize;
+    let mut y = top + MARGIN_PX;
+    canvas.write((MARGIN_PX, y + 1), "θ");
+    for column in 0..bar {
+        let ink = cividis(column as f64 / bar as f64);
+        canvas.fill((left + column, y), (1, BAR_PX), ink);
+    }
+    y += BAR_PX;
+    for tick in TICKS {
+        let value = tick.parse().unwrap_or(THETA_LOW);
+        let x = at((value / THETA_LOW).ln() / (THETA_HIGH / THETA_LOW).ln());
+        canvas.fill((x, y), (1, 3), INK);
+        let text_left = x
+            .saturating_sub(text_width_px(tick) / 2)
+            .min(width - text_width_px(tick) - 1);
+        canvas.write((text_left, y + 4), tick);
+    }
+    y += letters + 2 + 2 * MARGIN_PX;
+    canvas.write((MARGIN_PX, y + 1), "σ/θ");
+    for column in 0..bar {
+        let relative = column as f64 / bar as f64 * UNSURE;
+        let ink = colour(0.75, doubt(relative));
+        for row in y..y + BAR_PX {
+            let is_hatched = relative >= HATCHED && (left + column + row).is_multiple_of(HATCH_PX);
+            canvas.put(left + column, row, if is_hatched { WHITE } else { ink });
+        }
+    }
+    y += BAR_PX;
+    for (tick, share) in [("0%", 0.0), ("25%", 0.5), ("50%", 1.0)] {
+        let x = at(share);
+        canvas.fill((x, y), (1, 3), INK);
+        let text_left = x
+            .saturating_sub(text_width_px(tick) / 2)
+            .min(width - text_width_px(tick) - 1);
+        canvas.write((text_left, y + 4), tick);
+    }
+}
+
+fn write(canvas: &Canvas, raster: &Raster) -> Result<Vec<u8>, PngError> {
+    let side = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
+    let mut bytes = Vec::new();
+    let mut encoder = ::png::Encoder::new(&mut bytes, side(canvas.width), side(canvas.height));
+    encoder.set_color(::png::ColorType::Rgba);
+    encoder.set_depth(::png::BitDepth::Eight);
+    encoder.set_compression(::png::Compression::Fast);
+    for (keyword, text) in said(raster) {
+        encoder.add_itxt_chunk(keyword.to_owned(), text)?;
+    }
+    let mut writer = encoder.write_header()?;
+    writer.write_image_data(&canvas.pixels)?;
+    writer.finish()?;
+    Ok(bytes)
+}
+
+/// What the file says of itself.
+fn said(raster: &Raster) -> BTreeMap<&'static str, String> {
+    let corner = raster.corner();
+    let mut said = BTreeMap::from([
+        ("tread:site", raster.site.id.to_string()),
+        ("tread:model", raster.model.clone()),
+        ("tread:first", format!("{} {}", corner.x_m, corner.y_m)),
+        ("tread:size_m", raster.size_m.to_string()),
+        ("tread:columns", raster.columns.to_string()),
+        ("tread:rows", raster.rows.to_string()),
+    ]);
+    if let Some(configuration) = raster.configuration {
+        said.insert("tread:configuration", configuration.to_string());
+    }
+    if let Some(normalisation) = &raster.normalisation {
+        said.insert("tread:normalisation", normalisation.clone());
+    }
+    said
+}

@@ -1,0 +1,59 @@
+//! Names of what sums are about, each once, by numbers that are short.
+
+use std::collections::BTreeMap;
+
+use tread_api::ids::{ConfigurationId, RobotId};
+use tread_api::terrain::TerrainRef;
+
+/// A robot, configuration or terrain by its place in [`Names`].
+pub(super) type Number = u32;
+
+/// Names of what sums are about, each once.
+#[derive(Debug, Default)]
+pub(super) struct Names {
+    pub(super) robots: Interned<RobotId>,
+    pub(super) configurations: Interned<ConfigurationId>,
+    pub(super) terrains: Interned<Option<TerrainRef>>,
+}
+
+#[derive(Debug)]
+pub(super) struct Interned<T> {
+    pub(super) numbers: BTreeMap<T, Number>,
+    pub(super) names: Vec<T>,
+    /// Place of each number in the order of the names, which does not depend on who came first.
+    ranks: Vec<u32>,
+}
+
+impl<T> Default for Interned<T> {
+    fn default() -> Self {
+        Self {
+            numbers: BTreeMap::new(),
+            names: Vec::new(),
+            ranks: Vec::new(),
+        }
+    }
+}
+
+impl<T: Ord + Clone> Interned<T> {
+    pub(super) fn number(&mut self, name: &T) -> Number {
+        if let Some(&number) = self.numbers.get(name) {
+            return number;
+        }
+        let number = Number::try_from(self.names.len()).unwrap_or(Number::MAX);
+        self.names.push(name.clone());
+        self.numbers.insert(name.clone(), number);
+        self.ranks.resize(self.names.len(), 0);
+        for (&number, rank) in self.numbers.values().zip(0..) {
+            self.ranks[number as usize] = rank;
+        }
+        number
+    }
+
+    pub(super) fn name(&self, number: Number) -> &T {
+        &self.names[number as usize]
+    }
+
+    pub(super) fn rank(&self, number: Number) -> u32 {
+        self.ranks[number as usize]
+    }
+}

@@ -1,0 +1,197 @@
+//! Sums of one (terrain, configuration, robot, epoch) of a cell, in as little room as they need.
+
+use tread_api::friction::Information;
+
+use super::names::Number;
+use crate::friction::fixed::Fixed;
+use crate::friction::sums::{Known, Pair, Pass};
+use crate::friction::{Seen, Sums};
+
+/// Steps per unit in which a friction coefficient is kept.
+const MU_STEPS: f64 = 1.0e6;
+/// Steps per unit of the lower half of a fixed point number.
+const STEPS: f64 = 4_294_967_296.0;
+
+/// What a sum is about, within a cell.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct PartKey {
+    pub(super) terrain: Number,
+    pub(super) configuration: Number,
+    pub(super) robot: Number,
+    pub(super) epoch_h: i32,
+}
+
+/// Sums as they are kept in memory: the same numbers in less room.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Part {
+    hi: [i64; 7],
+    lo: [u32; 7],
+    pub(super) key: PartKey,
+    segments: u32,
+    /// A friction coefficient in steps, plus one; 0 for none.
+    mu_peak: u32,
+    newest_mu: u32,
+    pub(super) newest_at_us: i64,
+    /// Information of the newest pass; 0, which no pass has, when it is not known.
+    newest_information: f64,
+    newest_weighted: f64,
+}
+
+fn pack_mu(mu: Option<f64>) -> u32 {
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "0 to 10 units"
+    )]
+    mu.map_or(0, |mu| (mu * MU_STEPS + 1.0e-6).floor() as u32 + 1)
+}
+
+fn unpack_mu(steps: u32) -> Option<f64> {
+    (steps > 0).then(|| f64::from(steps - 1) / MU_STEPS)
+}
+
+impl Part {
+    pub(super) fn new(key: PartKey, sums: &Sums) -> Self {
+        let mut part = Self {
+            hi: [0; 7],
+            lo: [0; 7],
+            key,
+            segments: u32::try_from(sums.segments).unwrap_or(u32::MAX),
+            mu_peak: pack_mu(sums.mu_peak),
+            newest_mu: pack_mu(sums.newest.mu_peak),
+            newest_at_us: sums.newest.ended_at_us,
+            newest_information: sums.newest.theta.map_or(0.0, |theta| theta.information),
+            newest_weighted: sums.newest.theta.map_or(0.0, |theta| theta.weighted),
+        };
+        let fixed = [
+            sums.theta.information,
+            sums.theta.weighted,
+            sums.theta_square,
+            sums.track.information,
+            sums.track.weighted,
+            sums.rolling.information,
+            sums.rolling.weighted,
+        ];
+        for (index, fixed) in fixed.into_iter().enumerate() {
+            // Beyond this the database has refused the sum.
+            let (hi, lo) = fixed.halves().unwrap_or((i64::MAX, 0));
+            part.hi[index] = hi;
+            part.lo[index] = u32::try_from(lo).unwrap_or_default();
+        }
+        part
+    }
+
+    pub(super) fn sums(&self) -> Sums {
+        let fixed = |index: usize| Fixed::from_halves(self.hi[index], i64::from(self.lo[index]));
+        let pair = |index| Pair {
+            information: fixed(index),
+            weighted: fixed(index + 1),
+        };
+        Sums {
+            theta: pair(0),
+            theta_square: fixed(2),
+            track: pair(3),
+            rolling: pair(5),
+            segments: u64::from(self.segments),
+            samples: 0,
+            mu_peak: unpack_mu(self.mu_peak),
+            newest: Pass {
+                ended_at_us: self.newest_at_us,
+                theta: (self.newest_information > 0.0).then_some(Information {
+                    information: self.newest_information,
+                    weighted: self.newest_weighted,
+                }),
+                mu_peak: unpack_mu(self.newest_mu),
+            },
+        }
+    }
+
+    /// The same as [`Seen::of`] of [`Self::sums`], to the bit, without the detour.
+    pub(super) fn seen<R>(&self, robot: R) -> Option<Seen<R>> {
+        let number = |index: usize| {
+            let (hi, lo) = (self.hi[index], self.lo[index]);
+            // Both halves are exact, so that adding them rounds once, as the whole would.
+            #[expect(clippy::cast_precision_loss, reason = "below 2^52")]
+            if hi.unsigned_abs() < 1 << 52 {
+                hi as f64 + f64::from(lo) / STEPS
+            } else {
+                Fixed::from_halves(hi, i64::from(lo)).to_f64()
+            }
+        };
+        let known = |index: usize| {
+            let information = number(index);
+            (information > 0.0).then(|| Known {
+                information,
+                value: number(index + 1) / information,
+            })
+        };
+        let theta = known(0)?;
+        let scatter = number(2) - theta.information * theta.value * theta.value;
+        let newest = (self.newest_information > 0.0).then(|| Known {
+            information: self.newest_information,
+            value: self.newest_weighted / self.newest_information,
+        });
+        Some(Seen {
+            robot,
+            epoch_h: i64::from(self.key.epoch_h),
+            theta,
+            scatter: scatter.max(0.0),
+            passes: u64::from(self.segments),
+            newest_at_us: self.newest_at_us,
+            newest,
+            newest_mu: unpack_mu(self.newest_mu),
+            mu_peak: unpack_mu(self.mu_peak),
+            track: known(3),
+            rolling: known(5),
+        })
+    }
+
+    /// The same under another key.
+    pub(super) fn moved(&self, key: PartKey) -> Self {
+        Self { key, ..*self }
+    }
+
+    pub(super) fn add(&mut self, sums: &Sums) {
+        let mut whole = self.sums();
+        whole.add(sums);
+        *self = Self::new(self.key, &whole);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn fixed() -> impl Strategy<Value = Fixed> {
+        (any::<bool>(), 0_i64..1 << 60, 0_i64..1 << 32, 0_u32..60).prop_map(
+            |(minus, hi, lo, less)| {
+                let hi = hi >> less;
+                Fixed::from_halves(if minus { -hi } else { hi }, lo)
+            },
+        )
+    }
+
+    proptest! {
+        #[test]
+        fn what_a_part_has_seen_is_what_its_sums_have_seen_to_the_bit(
+            numbers in prop::array::uniform7(fixed()), segments in 1_u64..9, mu in prop::option::of(0.0_f64..3.0),
+        ) {
+            let pair = |index: usize| Pair { information: numbers[index], weighted: numbers[index + 1] };
+            let sums = Sums {
+                theta: pair(0),
+                theta_square: numbers[2],
+                track: pair(3),
+                rolling: pair(5),
+                segments,
+                samples: 0,
+                mu_peak: mu,
+                newest: Pass { ended_at_us: 7, theta: None, mu_peak: mu },
+            };
+            let key = PartKey { terrain: 0, configuration: 0, robot: 3, epoch_h: 11 };
+            let part = Part::new(key, &sums);
+            prop_assert_eq!(part.seen(3), Seen::of(3, 11, &part.sums()));
+        }
+    }
+}

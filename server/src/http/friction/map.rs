@@ -1,0 +1,242 @@
+//! `GET …/friction/map`: the map in the formats of other programs.
+
+use axum::body::Bytes;
+use axum::extract::State;
+use axum::http::{HeaderMap, HeaderName, HeaderValue};
+use axum::response::Response;
+use jiff::Timestamp;
+use serde::Deserialize;
+use tread_api::ids::{ConfigurationId, SiteId};
+use tread_api::problem::{ProblemBody, ProblemType};
+use utoipa::IntoParams;
+
+use crate::app::friction::{Area, Asked, Picture, PictureAsked};
+use crate::app::{App, AppError};
+use crate::formats::nav2::{self, SpeedScale};
+use crate::formats::png::{self, PngError};
+use crate::formats::tile;
+use crate::friction::Raster;
+use crate::http::etag;
+use crate::http::extract::{Path, Query};
+use crate::http::negotiate::{Offered, choose};
+use crate::http::problem::Problem;
+
+/// The robot model whose θ an answer has.
+const CONFIGURATION: HeaderName = HeaderName::from_static("tread-configuration");
+/// The normalisation that was used.
+const NORMALISATION: HeaderName = HeaderName::from_static("tread-normalisation");
+/// The time at which ages are counted.
+const AS_OF: HeaderName = HeaderName::from_static("tread-as-of");
+/// Speed of a hundred in a speed mask when nothing is said, metres per second.
+const SPEED_MAX_DEFAULT_M_S: f64 = 2.0;
+/// Distance to stop within when nothing is said, metres.
+const STOPPING_DEFAULT_M: f64 = 1.0;
+
+/// What a format shows one of each square.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Format {
+    Png,
+    Tile,
+    Nav2,
+    Pgm,
+}
+
+const OFFERED: [Offered<Format>; 4] = [
+    Offered {
+        name: "png",
+        media_type: png::MEDIA_TYPE,
+        format: Format::Png,
+    },
+    Offered {
+        name: "tile",
+        media_type: tread_api::tile::MEDIA_TYPE,
+        format: Format::Tile,
+    },
+    Offered {
+        name: "nav2",
+        media_type: nav2::YAML_MEDIA_TYPE,
+        format: Format::Nav2,
+    },
+    Offered {
+        name: "pgm",
+        media_type: nav2::PGM_MEDIA_TYPE,
+        format: Format::Pgm,
+    },
+];
+
+/// What of the map, and in which format.
+#[derive(Debug, Clone, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct MapQuery {
+    /// `png`, `tile` (compact binary), `nav2` (YAML of a speed mask), `pgm` (its picture); what
+    /// `Accept` asks for when absent.
+    format: Option<String>,
+    /// Lowest x of the area, metres; everywhere that anybody has driven when no bound is given.
+    x_min_m: Option<f64>,
+    /// Lowest y of the area, metres.
+    y_min_m: Option<f64>,
+    /// Highest x of the area, metres.
+    x_max_m: Option<f64>,
+    /// Highest y of the area, metres.
+    y_max_m: Option<f64>,
+    /// Side of the squares, metres, a multiple of the grid's; the grid's own when absent. There
+    /// may be 1 048 576 squares.
+    resolution_m: Option<f64>,
+    /// As of when; now when absent.
+    as_of: Option<Timestamp>,
+    /// The robot model and tyres whose θ it is; the one with most measurements when absent.
+    #[param(value_type = Option<String>)]
+    configuration: Option<ConfigurationId>,
+    /// A declared normalisation that joins robot models.
+    normalisation: Option<String>,
+    /// Pixels of a square's side in a PNG, 1 to 32; as many as make a picture of 768 when absent.
+    scale: Option<usize>,
+    /// Highest speed of a speed mask, metres per second, 0.01 to 50; 2 when absent.
+    speed_max_m_s: Option<f64>,
+    /// Distance within which a robot must be able to stop, metres, 0.01 to 1000; 1 when absent.
+    stopping_m: Option<f64>,
+}
+
+fn within(
+    parameter: &'static str,
+    value: f64,
+    range: std::ops::RangeInclusive<f64>,
+) -> Result<f64, Problem> {
+    if range.contains(&value) {
+        return Ok(value);
+    }
+    let detail = format!(
+        "{parameter} must be {} to {}, not {value}",
+        range.start(),
+        range.end()
+    );
+    Err(Problem::new(ProblemType::InvalidQuery)
+        .detail(detail)
+        .field(parameter))
+}
+
+impl MapQuery {
+    fn asked(&self) -> Result<PictureAsked, Problem> {
+        let bounds = ((self.x_min_m, self.y_min_m), (self.x_max_m, self.y_max_m));
+        let area = if bounds == ((None, None), (None, None)) {
+            None
+        } else {
+            Some(Area::new(bounds.0, bounds.1)?)
+        };
+        Ok(PictureAsked {
+            asked: Asked {
+                as_of: self.as_of,
+                configuration: self.configuration,
+                normalisation: self.normalisation.clone(),
+            },
+            area,
+            resolution_m: self.resolution_m,
+        })
+    }
+
+    fn speeds(&self) -> Result<SpeedScale, Problem> {
+        let speed = self.speed_max_m_s.unwrap_or(SPEED_MAX_DEFAULT_M_S);
+        let stopping = self.stopping_m.unwrap_or(STOPPING_DEFAULT_M);
+        Ok(SpeedScale {
+            speed_max_m_s: within("speed_max_m_s", speed, 0.01..=50.0)?,
+            stopping_m: within("stopping_m", stopping, 0.01..=1_000.0)?,
+        })
+    }
+
+    fn scale(&self) -> Result<Option<usize>, Problem> {
+        if self
+            .scale
+            .is_none_or(|scale| (1..=png::SCALE_MAX).contains(&scale))
+        {
+            return Ok(self.scale);
+        }
+        let detail = format!("scale must be 1 to {}", png::SCALE_MAX);
+        Err(Problem::new(ProblemType::InvalidQuery)
+            .detail(detail)
+            .field("scale"))
+    }
+}
+
+/// Writes a raster in a format.
+type Write = Box<dyn FnOnce(&Raster) -> Result<Vec<u8>, AppError> + Send>;
+
+fn writer(format: Format, query: &MapQuery) -> Result<(String, &'static str, Write), Problem> {
+    let (scale, speeds) = (query.scale()?, query.speeds()?);
+    Ok(match format {
+        Format::Png => (
+            format!("png {scale:?}"),
+            png::MEDIA_TYPE,
+            Box::new(move |raster| png::encode(raster, scale).map_err(refused)),
+        ),
+        Format::Tile => (
+            "tile".to_owned(),
+            tread_api::tile::MEDIA_TYPE,
+            Box::new(|raster| Ok(tile::encode(raster))),
+        ),
+        Format::Nav2 => (
+            format!("nav2 {speeds:?}"),
+            nav2::YAML_MEDIA_TYPE,
+            Box::new(move |raster| Ok(nav2::yaml(raster, speeds))),
+        ),
+        Format::Pgm => (
+            format!("pgm {speeds:?}"),
+            nav2::PGM_MEDIA_TYPE,
+            Box::new(move |raster| Ok(nav2::pgm(raster, speeds))),
+        ),
+    })
+}
+
+fn refused(error: PngError) -> AppError {
+    match error {
+        PngError::TooLarge(_) => AppError::InvalidQuery {
+            parameter: "scale",
+            detail: error.to_string(),
+        },
+        PngError::Encode(cause) => AppError::Unwritable(cause.to_string()),
+    }
+}
+
+/// The map of one robot model, as a picture with a legend, a compact binary tile or a speed mask
+/// for Nav2. Headers say whose θ it is (`tread-configuration`), by which normalisation
+/// (`tread-normalisation`) and as of when (`tread-as-of`).
+#[utoipa::path(get, path = "/v1/sites/{site}/friction/map", tag = "friction",
+    security(("token" = ["viewer"])),
+    operation_id = "get_friction_map", params(("site" = SiteId, Path), MapQuery),
+    responses((status = 200, description = "The map in that format", content(
+            (Vec<u8> = "image/png"), (Vec<u8> = "application/vnd.tread.friction-tile"),
+            (String = "application/yaml"), (Vec<u8> = "image/x-portable-graymap"))),
+        (status = 304), (status = 400, body = ProblemBody), (status = 404, body = ProblemBody),
+        (status = 406, body = ProblemBody)))]
+pub(in crate::http) async fn map(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+    Query(query): Query<MapQuery>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let format = choose(&OFFERED, query.format.as_deref(), &headers)?;
+    let (name, media_type, write) = writer(format, &query)?;
+    let picture = app.picture(&site, query.asked()?, name, write).await?;
+    Ok(answer(&headers, media_type, picture))
+}
+
+fn answer(headers: &HeaderMap, media_type: &'static str, picture: Picture) -> Response {
+    let of = picture.of;
+    let mut response = etag::bytes(headers, media_type, Bytes::from_owner(picture.bytes));
+    let said = response.headers_mut();
+    // So that a cache between does not give one format for another.
+    said.insert(axum::http::header::VARY, HeaderValue::from_static("accept"));
+    let as_of = Timestamp::from_microsecond(of.as_of_us).unwrap_or(Timestamp::MAX);
+    let mut say = |name: HeaderName, value: Option<String>| {
+        if let Some(value) = value.and_then(|value| HeaderValue::try_from(value).ok()) {
+            said.insert(name, value);
+        }
+    };
+    say(AS_OF, Some(as_of.to_string()));
+    say(
+        CONFIGURATION,
+        of.configuration.map(|found| found.to_string()),
+    );
+    say(NORMALISATION, of.normalisation.clone());
+    response
+}
