@@ -278,7 +278,39 @@ pub struct MissionQuality {
     pub gate_stops: u32,
     /// θ along the way, at most [`THETA_SAMPLES_MAX`].
     pub theta: Vec<ThetaSample>,
+    /// What the map's word was worth; absent when the map knew nothing along the way.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub prior: Option<PriorGain>,
 }
+
+/// What the map's word was worth on a mission: how much of the way the robot knew its ground for
+/// it, and how true it was.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
+pub struct PriorGain {
+    /// Friction coefficient that the plan was made with.
+    pub grip_mu: f64,
+    /// Share of the way driven over cells of which the map knew θ, 0 to 1.
+    pub known_ratio: f64,
+    /// Time in which θ was known to [`THETA_SURE_RATIO`], seconds.
+    pub sure_s: f64,
+    /// The same if the robot had had only its own measurements, seconds.
+    pub sure_alone_s: f64,
+    /// Time from the start until the robot's own measurement was as sure, seconds; `null` if it
+    /// never was.
+    pub first_sure_alone_s: Option<f64>,
+    /// Cells in which the robot has measured what the map had a word on.
+    pub cells_compared: u32,
+    /// Of these, cells that contradicted the map.
+    pub cells_contradicted: u32,
+    /// Mean of measured over expected θ, less one; `null` without any cell.
+    pub difference_ratio: Option<f64>,
+    /// Root mean square of the differences over their standard deviations: about 1 where map and
+    /// robot are as sure as they say; `null` without any cell.
+    pub difference_rms: Option<f64>,
+}
+
+/// Relative standard deviation below which θ counts as known.
+pub const THETA_SURE_RATIO: f64 = 0.15;
 
 /// Friction at one place of a mission.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]

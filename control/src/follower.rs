@@ -435,7 +435,8 @@ impl Follower {
             wheel_speeds: WheelSpeeds::default(),
             twist: Twist::default(),
             status: self.status,
-            progress_m: reference.arc_m,
+            // Rounding may take the reference back by a last digit.
+            progress_m: reference.arc_m.max(self.best_arc_m),
             length_m: self.plan.length_m(),
             remaining_s: (self.plan.duration_s() - self.governor.clock_s()).max(0.0),
             errors: self.last_errors,

@@ -6,7 +6,7 @@ use tread_control::excitation::ExcitationSpec;
 use tread_control::follower::{Follower, FollowerConfig};
 use tread_control::geometry::{Point, Pose};
 use tread_control::measured::Measured;
-use tread_control::plan::{Plan, PlanError, PlanOptions};
+use tread_control::plan::{GripMap, GripSquare, Plan, PlanError, PlanOptions, SlowedBy};
 use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 use tread_control::trajectory::{CircleSpec, Direction, Trajectory, Waypoint, WaypointsSpec};
 
@@ -30,7 +30,7 @@ fn circle() -> Trajectory {
     })
 }
 
-fn planned(trajectory: &Trajectory, start: Pose, options: &PlanOptions) -> Plan {
+fn planned(trajectory: &Trajectory, start: Pose, options: &PlanOptions<'_>) -> Plan {
     let model = RobotModel::yi2007();
     Plan::with_options(trajectory, start, &model, options).expect("a path that can be driven")
 }
@@ -128,6 +128,66 @@ fn accelerations_stay_within_what_the_ground_can_give() {
 }
 
 #[test]
+fn a_plan_is_slow_only_where_the_ice_is_and_brakes_before_it() {
+    const ICE_MU: f64 = 0.03;
+    const GRIP_MU: f64 = 0.6;
+    let squares = (-3..9_i32).flat_map(|ix| (-3..9_i32).map(move |iy| (ix, iy)));
+    let squares = squares.map(|(ix, iy)| GripSquare {
+        ix,
+        iy,
+        mu: if ix >= 5 { ICE_MU } else { GRIP_MU },
+    });
+    let map = GripMap::new(1.0, squares.collect(), 0.14).unwrap();
+    let along = PlanOptions {
+        grip: Some(&map),
+        ..PlanOptions::default()
+    };
+    let plan = planned(&bends(), Pose::default(), &along);
+    let everywhere = |grip_mu| {
+        let options = PlanOptions {
+            grip_mu: Some(grip_mu),
+            ..PlanOptions::default()
+        };
+        planned(&bends(), Pose::default(), &options)
+    };
+    let (ice, grip) = (everywhere(ICE_MU), everywhere(GRIP_MU));
+    assert!(
+        plan.duration_s() < 0.8 * ice.duration_s(),
+        "{}",
+        plan.duration_s()
+    );
+    assert!(
+        plan.duration_s() > 1.0 + grip.duration_s(),
+        "{}",
+        plan.duration_s()
+    );
+    let mut fastest_m_s: f64 = 0.0;
+    let mut time_s = 0.0;
+    while time_s < plan.duration_s() {
+        let now = plan.sample(time_s);
+        let mu = map.at(now.path.pose.point());
+        let across_m_s2 = now.speed_m_s.powi(2) * now.path.curvature_1_m.abs();
+        let most_m_s2 = 0.71 * mu * GRAVITY_M_S2;
+        let together_m_s2 = now.acceleration_m_s2.hypot(across_m_s2);
+        assert!(
+            together_m_s2 <= most_m_s2 + 1.0e-6,
+            "{together_m_s2} m/s² at {:?}, where μ is {mu}",
+            now.path.pose
+        );
+        if mu > 0.5 {
+            fastest_m_s = fastest_m_s.max(now.speed_m_s);
+        }
+        time_s += 0.01;
+    }
+    assert!(fastest_m_s > 0.6, "{fastest_m_s} m/s where there is grip");
+    assert!(
+        plan.slowed()
+            .iter()
+            .any(|slowed| slowed.by == SlowedBy::Grip)
+    );
+}
+
+#[test]
 fn the_way_to_the_trajectory_may_be_quicker_than_the_trajectory() {
     let start = Pose {
         x_m: 0.5,
@@ -155,7 +215,7 @@ fn the_way_to_the_trajectory_may_be_quicker_than_the_trajectory() {
 #[test]
 fn options_that_are_no_numbers_are_refused() {
     let model = RobotModel::yi2007();
-    let refused = |options: PlanOptions| {
+    let refused = |options: PlanOptions<'_>| {
         Plan::with_options(&circle(), Pose::default(), &model, &options).unwrap_err()
     };
     for bad in [0.0, -1.0, f64::NAN, f64::INFINITY] {

@@ -5,8 +5,10 @@
 
 use tread_api::ids::AlertCode;
 use tread_api::robot::{AlertReport, OutboxStatus, Severity};
+use tread_control::geometry::Point;
 
 use crate::control_loop::seam::Fault;
+use crate::control_loop::surface::Comparison;
 use crate::drive::Battery;
 use crate::drive::ros2::refusal::{Counts, Dropping};
 
@@ -26,6 +28,10 @@ pub(crate) struct Causes<'a> {
     pub(crate) outbox: OutboxStatus,
     /// What of the base's words was dropped.
     pub(crate) base: Option<&'a Counts>,
+    /// Where the ground is not as the map says.
+    pub(crate) surface_change: Option<Comparison>,
+    /// Where the wheels turn without progress.
+    pub(crate) dug_in_at: Option<Point>,
 }
 
 /// Which wavering alerts stand.
@@ -49,6 +55,25 @@ fn alert(code: &str, severity: Severity, text: String) -> Option<AlertReport> {
         severity,
         text,
     })
+}
+
+fn surface_change(found: &Comparison) -> Option<AlertReport> {
+    let (measured, expected) = (found.measured, found.expected);
+    let how = if measured.theta > expected.theta {
+        "slips more"
+    } else {
+        "grips better"
+    };
+    let text = format!(
+        "the ground in cell ({}, {}) {how} than the map says: θ {:.2} ± {:.2}, not {:.2} ± {:.2}",
+        found.cell.ix,
+        found.cell.iy,
+        measured.theta,
+        measured.std_dev,
+        expected.theta,
+        expected.std_dev,
+    );
+    alert("surface-change", Severity::Warning, text)
 }
 
 impl Alerts {
@@ -96,11 +121,18 @@ impl Alerts {
             let text = "the robot is stopped until an operator clears it".to_owned();
             alert("stopped", Severity::Critical, text)
         });
+        let dug_in = causes.dug_in_at.and_then(|at| {
+            let Point { x_m, y_m } = at;
+            let text = format!("the wheels turn and the robot stays at ({x_m:.1} m, {y_m:.1} m)");
+            alert("dug-in", Severity::Critical, text)
+        });
         [
             battery,
             fault,
             dropped,
             stopped.flatten(),
+            dug_in,
+            causes.surface_change.as_ref().and_then(surface_change),
             long.flatten(),
             lost.flatten(),
         ]
@@ -112,6 +144,9 @@ impl Alerts {
 
 #[cfg(test)]
 mod tests {
+    use tread_api::site::Cell;
+    use tread_control::tracking::ThetaKnowledge;
+
     use super::*;
 
     fn codes(alerts: &[AlertReport]) -> Vec<&str> {
@@ -161,5 +196,33 @@ mod tests {
         assert!(codes(&alerts.judge(&causes)).contains(&"outbox-long"));
         causes.outbox.pending = 20_000;
         assert!(!codes(&alerts.judge(&causes)).contains(&"outbox-long"));
+    }
+
+    #[test]
+    fn other_ground_and_wheels_that_dig_are_alerts_with_their_words() {
+        let known = |theta, std_dev| ThetaKnowledge { theta, std_dev };
+        let causes = Causes {
+            surface_change: Some(Comparison {
+                cell: Cell { ix: -3, iy: 12 },
+                measured: known(1.43, 0.05),
+                expected: known(0.2, 0.02),
+                robot_bias_ratio: 0.08,
+            }),
+            dug_in_at: Some(Point {
+                x_m: 3.04,
+                y_m: -1.0,
+            }),
+            ..Causes::default()
+        };
+        let said = Alerts::default().judge(&causes);
+        assert_eq!(codes(&said), ["dug-in", "surface-change"]);
+        assert_eq!(
+            said[0].text,
+            "the wheels turn and the robot stays at (3.0 m, -1.0 m)"
+        );
+        assert_eq!(
+            said[1].text,
+            "the ground in cell (-3, 12) slips more than the map says: θ 1.43 ± 0.05, not 0.20 ± 0.02"
+        );
     }
 }

@@ -101,8 +101,9 @@ fn simulated_drive(
     simulated: &SimulatedConfig,
     model: RobotModel,
 ) -> Result<SimulatedDrive, SimulatedDriveError> {
-    let (start, seed) = (simulated.start, simulated.seed);
-    let drive = SimulatedDrive::new(&simulated.scenario, model, start, seed, SimMode::Auto)?;
+    let (scenario, start) = (&simulated.scenario, simulated.start);
+    let drive = SimulatedDrive::new(scenario, model, start, simulated.individual, SimMode::Auto)?;
     let drive = drive.with_charge(simulated.battery_charge_ratio);
-    Ok(drive.with_stall(simulated.stall))
+    let drive = drive.with_stall(simulated.stall);
+    Ok(drive.with_trace(simulated.trace.clone()))
 }

@@ -18,6 +18,11 @@ pub trait Clock: std::fmt::Debug + Send + Sync {
     fn host_wall_ns(&self) -> i64 {
         i64::try_from(self.wall().as_nanosecond()).unwrap_or(i64::MAX)
     }
+
+    /// Blocks a loop until that monotonic time.
+    fn sleep_until(&self, deadline: Duration) {
+        std::thread::sleep(deadline.saturating_sub(self.monotonic()));
+    }
 }
 
 /// A clock as it is handed around.

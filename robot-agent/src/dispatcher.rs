@@ -446,8 +446,10 @@ impl Dispatcher {
         let planning = tokio::task::spawn_blocking(move || {
             let trajectory = control_trajectory(&offer.trajectory);
             let prior = Prior::new(offer.prior.as_ref());
+            let grip = view.as_ref().and_then(|view| prior.grip_map(view.grid()));
             let options = PlanOptions {
                 grip_mu: prior.grip_mu(),
+                grip: grip.as_ref(),
                 ..plan_options(&offer.trajectory)
             };
             let plan = Plan::with_options(&trajectory, start, &model, &options)

@@ -134,7 +134,7 @@ pub fn control_trajectory(asked: &trajectory::Trajectory) -> planned::Trajectory
 }
 
 /// What a user allows beside the trajectory, in the controller's words.
-pub fn plan_options(asked: &trajectory::Trajectory) -> PlanOptions {
+pub fn plan_options(asked: &trajectory::Trajectory) -> PlanOptions<'static> {
     let options = asked.options();
     PlanOptions {
         approach_speed_m_s: options.approach_speed_m_s,
@@ -143,5 +143,6 @@ pub fn plan_options(asked: &trajectory::Trajectory) -> PlanOptions {
             period_s: wiggle.period_s,
         }),
         grip_mu: None,
+        grip: None,
     }
 }

@@ -86,6 +86,8 @@ impl Reporter {
             is_stopped: self.shared.safety.stop() != 0,
             outbox,
             base: self.base.as_deref(),
+            surface_change: snapshot.surface_change,
+            dug_in_at: snapshot.dug_in_at,
         };
         let counted = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         RobotState {

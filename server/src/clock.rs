@@ -1,5 +1,6 @@
 //! Time and identifiers that grow with it, injected: nothing else here asks the machine.
 
+use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -7,17 +8,31 @@ use jiff::{SignedDuration, Timestamp};
 use tread_api::ids::MissionId;
 use uuid::{ContextV7, Uuid};
 
-/// A clock: the machine's, or one that a test moves by hand.
+/// A clock: the machine's, that of a simulated site, or one that a test moves by hand.
 #[derive(Debug, Clone)]
 pub struct Clock {
     source: Source,
     context: Arc<Mutex<ContextV7>>,
 }
 
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 enum Source {
     System { origin: Instant },
+    Site { origin: Instant, wall: SiteWall },
     Manual(Arc<Mutex<ManualTime>>),
+}
+
+/// Tells the wall time of a simulated site.
+type SiteWall = Arc<dyn Fn() -> Timestamp + Send + Sync>;
+
+impl fmt::Debug for Source {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(match self {
+            Self::System { .. } => "System",
+            Self::Site { .. } => "Site",
+            Self::Manual(_) => "Manual",
+        })
+    }
 }
 
 #[derive(Debug)]
@@ -35,6 +50,17 @@ impl Clock {
     pub fn system() -> Self {
         let origin = Instant::now();
         Self::of(Source::System { origin })
+    }
+
+    /// The wall clock of a simulated site, whose time may go faster than the machine's. What is
+    /// reckoned with beside it, as the silence of robots, goes by the machine's.
+    #[expect(
+        clippy::disallowed_methods,
+        reason = "this is where the time comes from"
+    )]
+    pub fn of_site(wall: impl Fn() -> Timestamp + Send + Sync + 'static) -> Self {
+        let (origin, wall) = (Instant::now(), Arc::new(wall) as SiteWall);
+        Self::of(Source::Site { origin, wall })
     }
 
     /// A clock that stands still until [`Clock::advance`].
@@ -59,6 +85,7 @@ impl Clock {
     pub fn now(&self) -> Timestamp {
         let wall = match &self.source {
             Source::System { .. } => Timestamp::now(),
+            Source::Site { wall, .. } => wall(),
             Source::Manual(time) => lock(time).wall,
         };
         Timestamp::from_microsecond(wall.as_microsecond()).unwrap_or(wall)
@@ -67,12 +94,12 @@ impl Clock {
     /// Time since an arbitrary origin; it never jumps. For ages and bounds.
     pub fn elapsed(&self) -> Duration {
         match &self.source {
-            Source::System { origin } => origin.elapsed(),
+            Source::System { origin } | Source::Site { origin, .. } => origin.elapsed(),
             Source::Manual(time) => lock(time).elapsed,
         }
     }
 
-    /// Moves a manual clock forward; the machine's clock moves by itself.
+    /// Moves a manual clock forward; the others move by themselves.
     pub fn advance(&self, span: Duration) {
         if let Source::Manual(time) = &self.source {
             let mut time = lock(time);
@@ -111,6 +138,16 @@ mod tests {
             SignedDuration::from_millis(1_500)
         );
         assert_eq!(clock.elapsed(), elapsed + Duration::from_millis(1_500));
+    }
+
+    #[test]
+    fn a_sites_clock_has_the_sites_wall_time_and_the_machines_ages() {
+        let wall: Timestamp = "2031-05-01T00:00:00Z".parse().unwrap();
+        let clock = Clock::of_site(move || wall);
+        assert_eq!(clock.now(), wall);
+        let before = clock.elapsed();
+        std::thread::sleep(Duration::from_millis(2));
+        assert!(clock.elapsed() > before && clock.now() == wall);
     }
 
     #[test]

@@ -6,6 +6,7 @@
 //! * [`relay`]: a network between robot and server that can be cut.
 //! * [`wait`]: waits for a state with a bound, and says what was seen last.
 //! * [`chaos`]: runs in which things fail at random, from a seed of [`random`].
+//! * [`scenario`]: fleets in a simulated time, from which figures are read.
 //! * [`light_robot`]: robots without physics, for load.
 
 pub mod chaos;
@@ -15,4 +16,5 @@ pub mod process;
 pub mod random;
 pub mod relay;
 pub mod rest;
+pub mod scenario;
 pub mod wait;

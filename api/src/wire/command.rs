@@ -52,8 +52,29 @@ pub struct PathPrior {
     pub grid_revision: u32,
     /// Friction coefficient to plan with: the lowest along the way, above zero.
     pub grip_mu: f64,
+    /// Standard deviation of one robot's own θ around that of all robots as a share of it, 0 to 1.
+    #[serde(default = "robot_bias_ratio")]
+    pub robot_bias_ratio: f64,
     /// Cells of one ground of which θ is known, at most [`PRIOR_CELLS_MAX`].
     pub cells: Vec<CellPrior>,
+    /// Friction coefficient to plan with by place, for cells along the way, at most
+    /// [`PRIOR_CELLS_MAX`]; `grip_mu` holds away from them, and everywhere where there are none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub grips: Vec<CellGrip>,
+}
+
+/// How a cell grips, for a plan.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct CellGrip {
+    /// The cell.
+    pub cell: Cell,
+    /// Friction coefficient, above zero: a lower bound of the peak.
+    pub mu: f64,
+}
+
+/// What servers reckon with unless they are told otherwise.
+const fn robot_bias_ratio() -> f64 {
+    0.08
 }
 
 /// What the map knows of a cell.
@@ -75,8 +96,11 @@ impl PathPrior {
             is_positive(cell.theta) && cell.theta <= THETA_MAX && is_positive(cell.std_dev)
         };
         is_positive(self.grip_mu)
+            && (0.0..=1.0).contains(&self.robot_bias_ratio)
             && self.cells.len() <= PRIOR_CELLS_MAX
             && self.cells.iter().all(is_known)
+            && self.grips.len() <= PRIOR_CELLS_MAX
+            && self.grips.iter().all(|grip| is_positive(grip.mu))
     }
 }
 

@@ -75,6 +75,8 @@ impl Blame {
 pub(super) struct NodeBounds {
     pub(super) limits: NodeLimits,
     pub(super) by: Option<SlowedBy>,
+    /// What bounds the acceleration along the path.
+    pub(super) along: SlowedBy,
 }
 
 impl NodeBounds {
@@ -87,17 +89,22 @@ impl NodeBounds {
             } else {
                 self.by
             },
+            along: if other.limits.acceleration_m_s2 < self.limits.acceleration_m_s2 {
+                other.along
+            } else {
+                self.along
+            },
         }
     }
 }
 
-/// What the robot may do where the path bends like this. `lateral` names what bounds its
-/// acceleration across the path.
+/// What the robot may do where the path bends like this. `blame` names what bounds its
+/// accelerations.
 pub(super) fn node_limits(
     path: &PathSample,
     asked_m_s: f64,
     model: &RobotModel,
-    lateral: SlowedBy,
+    blame: Blame,
 ) -> NodeBounds {
     let limits = model.limits();
     let bend = path.curvature_1_m.abs();
@@ -111,7 +118,7 @@ pub(super) fn node_limits(
     let floor = f64::MIN_POSITIVE;
     let bounds_m_s = [
         (
-            lateral,
+            blame.across,
             (limits.lateral_acceleration_max_m_s2 / bend.max(floor)).sqrt(),
         ),
         (
@@ -140,5 +147,6 @@ pub(super) fn node_limits(
                 .min(0.5 * rim_max_m_s2 / outer),
         },
         by: slowed_by,
+        along: blame.along,
     }
 }

@@ -7,6 +7,7 @@
 //! direction than the robot points, [`Plan::start_heading_rad`] tells where to turn on the spot.
 
 mod error;
+mod grip;
 mod limits;
 mod slowed;
 
@@ -21,6 +22,7 @@ use crate::robot::RobotModel;
 use crate::trajectory::{CircleSpec, Trajectory, WaypointsSpec};
 
 pub use error::PlanError;
+pub use grip::{GripMap, GripSquare};
 pub use slowed::{SLOWED_MAX, Slowed, SlowedBy};
 
 use limits::{Blame, NodeBounds, WHEEL_SHARE, node_limits, wiggled};
@@ -52,7 +54,7 @@ const GRID_MIN: usize = 16;
 
 /// What a plan may do beside its trajectory; nothing by default.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct PlanOptions {
+pub struct PlanOptions<'map> {
     /// Speed on the way to the trajectory, metres per second; the trajectory's own when absent.
     pub approach_speed_m_s: Option<f64>,
     /// A wiggle of the speed, so that θ can be measured without torque.
@@ -60,6 +62,16 @@ pub struct PlanOptions {
     /// Lower bound of the ground's peak friction coefficient, above zero: accelerations stay within
     /// what it can give. Without it only the robot's own limits hold.
     pub grip_mu: Option<f64>,
+    /// The same by place. The geometry keeps to the lowest of it, the timing to what holds at each
+    /// place; `grip_mu` counts no more then.
+    pub grip: Option<&'map GripMap>,
+}
+
+impl PlanOptions<'_> {
+    /// Peak friction coefficient that the geometry reckons with, if the ground is known.
+    fn least_grip_mu(&self) -> Option<f64> {
+        self.grip.map(GripMap::least).or(self.grip_mu)
+    }
 }
 
 /// The plan at one time or place.
@@ -116,12 +128,12 @@ impl Plan {
         trajectory: &Trajectory,
         start: Pose,
         model: &RobotModel,
-        options: &PlanOptions,
+        options: &PlanOptions<'_>,
     ) -> Result<Self, PlanError> {
         if let Some(speed_m_s) = options.approach_speed_m_s {
             check_speed(speed_m_s, 0, model)?;
         }
-        let gripped = match options.grip_mu {
+        let gripped = match options.least_grip_mu() {
             Some(mu) if !(mu.is_finite() && mu > 0.0) => {
                 return Err(PlanError::NotFinite {
                     what: "the grip",
@@ -132,6 +144,7 @@ impl Plan {
             Some(mu) => model.within_grip(mu),
             None => *model,
         };
+        let ungripped = model;
         let model = &gripped;
         if !start.is_finite() || start.x_m.abs().max(start.y_m.abs()) > COORDINATE_MAX_M {
             return Err(PlanError::NotFinite {
@@ -141,16 +154,18 @@ impl Plan {
             });
         }
         match trajectory {
-            Trajectory::Circle(circle) => Self::circle(circle, start, model, options),
-            Trajectory::Waypoints(waypoints) => Self::waypoints(waypoints, start, model, options),
+            Trajectory::Circle(circle) => Self::circle(circle, start, (model, ungripped), options),
+            Trajectory::Waypoints(waypoints) => {
+                Self::waypoints(waypoints, start, (model, ungripped), options)
+            }
         }
     }
 
     fn circle(
         circle: &CircleSpec,
         start: Pose,
-        model: &RobotModel,
-        options: &PlanOptions,
+        (model, ungripped): (&RobotModel, &RobotModel),
+        options: &PlanOptions<'_>,
     ) -> Result<Self, PlanError> {
         check_coordinate("the centre", 0, circle.center)?;
         if !(circle.radius_m >= RADIUS_MIN_M && circle.radius_m <= COORDINATE_MAX_M) {
@@ -197,14 +212,14 @@ impl Plan {
                 speed_m_s: circle.speed_m_s,
             },
         ];
-        Self::timed(path, &speeds, approach_pieces, model, options)
+        Self::timed(path, &speeds, approach_pieces, (model, ungripped), options)
     }
 
     fn waypoints(
         spec: &WaypointsSpec,
         start: Pose,
-        model: &RobotModel,
-        options: &PlanOptions,
+        (model, ungripped): (&RobotModel, &RobotModel),
+        options: &PlanOptions<'_>,
     ) -> Result<Self, PlanError> {
         let points = &spec.points;
         if points.len() < 2 {
@@ -290,7 +305,7 @@ impl Plan {
                 speed_m_s: asked.unwrap_or(spec.speed_m_s),
             });
         }
-        Self::timed(path, &speeds, approach_pieces, model, options)
+        Self::timed(path, &speeds, approach_pieces, (model, ungripped), options)
     }
 
     #[expect(
@@ -303,8 +318,8 @@ impl Plan {
         path: Path,
         speeds: &[SpeedFrom],
         approach_pieces: usize,
-        model: &RobotModel,
-        options: &PlanOptions,
+        (model, ungripped): (&RobotModel, &RobotModel),
+        options: &PlanOptions<'_>,
     ) -> Result<Self, PlanError> {
         let length_m = path.length_m();
         if length_m > LENGTH_MAX_M {
@@ -330,13 +345,18 @@ impl Plan {
                 asked += 1;
             }
             let speed_m_s = speeds[asked].speed_m_s;
-            let (model, across) = if arc_m < approach_end_m {
-                (&careful, careful_blame.across)
-            } else {
-                (model, blame.across)
-            };
             let here = path.sample(arc_m);
-            let mut node = node_limits(&here, speed_m_s, model, across);
+            let placed;
+            let (model, blame) = if let Some(grip) = options.grip {
+                let mu = grip.at(here.pose.point());
+                placed = ungripped.within_grip(mu);
+                (&placed, Blame::of(&placed, Some(mu)))
+            } else if arc_m < approach_end_m {
+                (&careful, careful_blame)
+            } else {
+                (model, blame)
+            };
+            let mut node = node_limits(&here, speed_m_s, model, blame);
             let bend_1_m = here.curvature_1_m.abs();
             // A sharp bend may have its peak between two nodes: both keep to what is in between.
             if bend_1_m.max(bend_before_1_m) > BEND_LOOKED_INTO_1_M
@@ -345,7 +365,7 @@ impl Plan {
                 for part in 1..PARTS_LOOKED_INTO {
                     let back_m = cell_m * f64::from(part) / f64::from(PARTS_LOOKED_INTO);
                     let between = path.sample(arc_m - back_m);
-                    let between = node_limits(&between, speed_m_s, model, across);
+                    let between = node_limits(&between, speed_m_s, model, blame);
                     *before = before.stricter(&between);
                     node = node.stricter(&between);
                 }
@@ -391,13 +411,8 @@ impl Plan {
                 left_m_s: nodes[node].speed_m_s,
                 by: bounds[node].by,
             };
-            let along = if timing.arc_m < approach_end_m {
-                careful_blame.along
-            } else {
-                blame.along
-            };
             plan.stretches
-                .note(timing.arc_m, timing.speed_m_s, &cell, along);
+                .note(timing.arc_m, timing.speed_m_s, &cell, bounds[node].along);
         }
         Ok(plan)
     }
@@ -495,8 +510,8 @@ fn check_coordinate(what: &'static str, place: usize, point: Point) -> Result<()
 }
 
 /// What the robot may do on its way to the trajectory.
-fn on_approach(model: &RobotModel, options: &PlanOptions) -> RobotModel {
-    match options.grip_mu {
+fn on_approach(model: &RobotModel, options: &PlanOptions<'_>) -> RobotModel {
+    match options.least_grip_mu() {
         // The model has been bounded already.
         Some(_) => *model,
         None => model.within_grip(GRIP_UNKNOWN_MU),

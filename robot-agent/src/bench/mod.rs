@@ -38,7 +38,7 @@ use crate::control_loop::seam::{
 use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;
 use crate::control_loop::tick::LoopCore;
-use crate::drive::simulated::{SimMode, SimulatedDrive, SimulatedDriveError};
+use crate::drive::simulated::{Individual, SimMode, SimulatedDrive, SimulatedDriveError};
 use crate::drive::{Drive, Feedback, SensorSample};
 use crate::geometry::{control_trajectory, plan_options};
 use crate::safety::{Safety, answers, microseconds};
@@ -234,7 +234,8 @@ impl Bench {
             Arc::clone(&ends.shared.safety),
             Arc::clone(&clock) as SharedClock,
         );
-        let drive = SimulatedDrive::new(scenario, model, start, seed, SimMode::Explicit)?;
+        let individual = Individual::of_seed(seed);
+        let drive = SimulatedDrive::new(scenario, model, start, individual, SimMode::Explicit)?;
         Ok(Self {
             core: LoopCore::new(model, loop_ends),
             drive,

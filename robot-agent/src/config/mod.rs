@@ -20,11 +20,12 @@ pub(crate) use place::place;
 use place::place_at;
 
 use crate::drive::ros2::settings::{Effort, Ros2Settings};
-use crate::drive::simulated::Stall;
+use crate::drive::simulated::{Individual, Stall};
 use crate::geometry::{control_model, paper_robot};
 use crate::membership::{Membership, MembershipFileError};
 use crate::outbox;
 use crate::sim::scenario::{BUILT_IN_NAME, Scenario, ScenarioError};
+use crate::sim::trace::Trace;
 
 /// Where the server listens unless said otherwise.
 pub const SERVER_DEFAULT: &str = "tcp/127.0.0.1:7447";
@@ -156,14 +157,16 @@ pub struct SimulatedConfig {
     pub scenario: Scenario,
     /// Where the robot stands at first.
     pub start: Pose,
-    /// What makes its sensors and wheels its own.
-    pub seed: u64,
+    /// What makes its sensors, wheels and tyres its own.
+    pub individual: Individual,
     /// Charge of its battery at the start, 0 to 1.
     pub battery_charge_ratio: f64,
     /// How far its wall clock is ahead, seconds.
     pub clock_ahead_s: i64,
     /// Its fault, if it is to have one.
     pub stall: Option<Stall>,
+    /// Where it leaves word of what it truly does.
+    pub trace: Option<Trace>,
 }
 
 /// The base.
@@ -203,7 +206,7 @@ impl DriveConfig {
     /// Whether it says how its wheels pull.
     pub fn measures_torque(&self) -> bool {
         match self {
-            Self::Simulated(_) => true,
+            Self::Simulated(simulated) => simulated.individual.has_torque,
             Self::Ros2(settings) => settings
                 .joints
                 .as_ref()
@@ -499,13 +502,20 @@ fn simulated(
         .or(file.and_then(|drive| drive.seed))
         .or(listed.map(|listed| listed.seed))
         .unwrap_or(1);
+    let usual = Individual::of_seed(seed);
+    let individual = listed.map_or(usual, |listed| Individual {
+        seed,
+        grip_ratio: listed.grip_ratio,
+        has_torque: listed.wheel_torque,
+    });
     Ok(SimulatedConfig {
         scenario,
         start,
-        seed,
+        individual,
         battery_charge_ratio,
         clock_ahead_s,
         stall: flags.stall_s,
+        trace: None,
     })
 }
 
@@ -544,7 +554,8 @@ mod tests {
         assert_eq!(config.period(), Duration::from_millis(10));
         assert_eq!(config.model, paper_robot());
         let drive = config.drive.simulated().unwrap();
-        assert_eq!(drive.seed, 11, "the scenario's robot of that name");
+        let seed = drive.individual.seed;
+        assert_eq!(seed, 11, "the scenario's robot of that name");
     }
 
     #[test]

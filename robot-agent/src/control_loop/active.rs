@@ -21,6 +21,7 @@ use tread_control::tracking::ThetaKnowledge;
 use super::driven::TickRecord;
 use super::prior::Prior;
 use super::seam::{EndReason, Job};
+use super::surface::Comparison;
 
 /// Speeds below which a held robot counts as standing, m/s and rad/s.
 const STANDING: f64 = 0.04;
@@ -337,6 +338,11 @@ impl Active {
                 .filter(|cause| !self.is_held() || *cause > GateCause::Speed),
             ..tick
         });
+    }
+
+    /// Notes what a cell has shown beside what the map says of it.
+    pub(super) fn compare(&mut self, comparison: &Comparison) {
+        self.job.driven.compare(comparison);
     }
 
     /// Whether the server has been silent for longer than the mission allows.

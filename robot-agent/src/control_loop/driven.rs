@@ -12,6 +12,9 @@ use tread_api::mission::{
 use tread_control::gate::GateCause;
 use tread_control::geometry::Point;
 
+use super::gain::{Gain, GroundRecord};
+use super::surface::Comparison;
+
 /// First distance between two points, metres.
 const POINT_SPACING_M: f64 = 0.05;
 /// First distance between two samples of θ, metres.
@@ -55,6 +58,8 @@ pub(crate) struct TickRecord {
     pub(crate) theta_loop: Option<f64>,
     /// Measured θ and its standard deviation.
     pub(crate) theta_measured: Option<(f64, f64)>,
+    /// What was known of the ground.
+    pub(crate) ground: GroundRecord,
 }
 
 /// The record of one mission.
@@ -82,6 +87,7 @@ pub(crate) struct Driven {
     gate_stops: u32,
     was_slipping: bool,
     was_held_by_gate: bool,
+    gain: Gain,
 }
 
 impl Driven {
@@ -109,7 +115,13 @@ impl Driven {
             gate_stops: 0,
             was_slipping: false,
             was_held_by_gate: false,
+            gain: Gain::default(),
         }
+    }
+
+    /// Notes what a cell has shown beside what the map says of it.
+    pub(crate) fn compare(&mut self, comparison: &Comparison) {
+        self.gain.compare(comparison);
     }
 
     /// Adds a tick. Does not allocate.
@@ -143,6 +155,13 @@ impl Driven {
             self.add_point(Passed { at, time_s });
         }
         self.add_theta(tick);
+        let driven_m = if tick.driven_m.is_finite() {
+            tick.driven_m.max(0.0)
+        } else {
+            0.0
+        };
+        self.gain
+            .add(&tick.ground, (tick.dt_s, driven_m), self.duration_s);
     }
 
     fn add_point(&mut self, passed: Passed) {
@@ -234,6 +253,7 @@ impl Driven {
             gate_reduced_ratio: share(self.reduced_ticks),
             gate_stops: self.gate_stops,
             theta: self.theta.clone(),
+            prior: self.gain.report(self.distance_m),
         }
     }
 
@@ -338,6 +358,7 @@ mod tests {
             gate: None,
             theta_loop: Some(0.4),
             theta_measured: None,
+            ground: GroundRecord::default(),
         }
     }
 

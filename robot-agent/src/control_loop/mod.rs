@@ -5,13 +5,16 @@
 
 pub(crate) mod active;
 pub(crate) mod driven;
+mod gain;
 mod outgoing;
 mod pace;
 pub(crate) mod prior;
+mod progress;
 pub(crate) mod seam;
 pub(crate) mod segments;
 pub(crate) mod site_view;
 pub(crate) mod slip;
+pub(crate) mod surface;
 pub(crate) mod tick;
 
 use std::time::Duration;
@@ -83,3 +86,5 @@ mod hold_tests;
 mod prior_tests;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod watch_tests;

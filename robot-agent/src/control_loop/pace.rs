@@ -63,7 +63,7 @@ impl Pace {
                 // The process slept or starved: what was missed is not made up for.
                 self.deadline = now;
             }
-            std::thread::sleep(self.deadline.saturating_sub(clock.monotonic()));
+            clock.sleep_until(self.deadline);
             return;
         };
         let earliest = self.deadline + self.period.mul_f64(EARLY_SHARE);

@@ -3,8 +3,9 @@
 //! It stands beside what the robot measures and never goes into it: segments come from the
 //! estimator alone, which does not know this module.
 
-use tread_api::site::Cell;
-use tread_api::wire::command::PathPrior;
+use tread_api::site::{Cell, Grid};
+use tread_api::wire::command::{CellGrip, PathPrior};
+use tread_control::plan::{GripMap, GripSquare};
 use tread_control::tracking::ThetaKnowledge;
 
 /// Standard deviations from which the robot's own measurement is believed alone: the ground is not
@@ -16,8 +17,10 @@ const CONTRADICTION_DEVIATIONS: f64 = 4.0;
 pub(crate) struct Prior {
     grid_revision: u32,
     grip_mu: Option<f64>,
+    robot_bias_ratio: f64,
     /// By row and column.
     cells: Box<[(Cell, ThetaKnowledge)]>,
+    grips: Box<[CellGrip]>,
 }
 
 impl Prior {
@@ -41,13 +44,34 @@ impl Prior {
         Self {
             grid_revision: prior.grid_revision,
             grip_mu: Some(prior.grip_mu),
+            robot_bias_ratio: prior.robot_bias_ratio,
             cells: cells.into_boxed_slice(),
+            grips: prior.grips.clone().into_boxed_slice(),
         }
     }
 
     /// Friction coefficient to plan with.
     pub(crate) fn grip_mu(&self) -> Option<f64> {
         self.grip_mu
+    }
+
+    /// The same by place, if it is known for this grid.
+    pub(crate) fn grip_map(&self, grid: Grid) -> Option<GripMap> {
+        let elsewhere_mu = self.grip_mu?;
+        if grid.revision != self.grid_revision || self.grips.is_empty() {
+            return None;
+        }
+        let squares = self.grips.iter().map(|grip| GripSquare {
+            ix: grip.cell.ix,
+            iy: grip.cell.iy,
+            mu: grip.mu,
+        });
+        GripMap::new(grid.cell_m, squares.collect(), elsewhere_mu)
+    }
+
+    /// Standard deviation of one robot's own θ around the map's, as a share of it.
+    pub(crate) fn robot_bias_ratio(&self) -> f64 {
+        self.robot_bias_ratio
     }
 
     /// What is known of a cell of that grid. Does not allocate.
@@ -96,7 +120,9 @@ mod tests {
         PathPrior {
             grid_revision: 1,
             grip_mu: 0.3,
+            robot_bias_ratio: 0.08,
             cells,
+            grips: Vec::new(),
         }
     }
 
@@ -121,12 +147,46 @@ mod tests {
     }
 
     #[test]
+    fn grip_by_place_counts_in_its_grid_alone() {
+        let grid = |revision| Grid {
+            revision,
+            cell_m: 2.0,
+        };
+        let at = |x_m, y_m| tread_control::geometry::Point { x_m, y_m };
+        let square = |mu| CellGrip {
+            cell: Cell { ix: 3, iy: -1 },
+            mu,
+        };
+        let offered = PathPrior {
+            grips: vec![square(0.5)],
+            ..prior(Vec::new())
+        };
+        let kept = Prior::new(Some(&offered));
+        let map = kept.grip_map(grid(1)).unwrap();
+        assert_eq!((map.at(at(7.0, -1.0)), map.at(at(0.0, 0.0))), (0.5, 0.3));
+        assert_eq!(kept.grip_map(grid(2)), None);
+        assert_eq!(Prior::new(Some(&prior(Vec::new()))).grip_map(grid(1)), None);
+        let offered = PathPrior {
+            grips: vec![square(-0.5)],
+            ..offered
+        };
+        assert_eq!(Prior::new(Some(&offered)), Prior::default());
+    }
+
+    #[test]
     fn a_prior_with_an_impossible_number_is_none() {
         for bad in [0.0, -1.0, f64::NAN, f64::INFINITY] {
             let offered = prior(vec![cell(0, 0, 0.2), cell(1, 0, bad)]);
             assert_eq!(Prior::new(Some(&offered)), Prior::default());
             let offered = PathPrior {
                 grip_mu: bad,
+                ..prior(Vec::new())
+            };
+            assert_eq!(Prior::new(Some(&offered)), Prior::default());
+        }
+        for bad in [-0.1, 1.1, f64::NAN] {
+            let offered = PathPrior {
+                robot_bias_ratio: bad,
                 ..prior(Vec::new())
             };
             assert_eq!(Prior::new(Some(&offered)), Prior::default());

@@ -10,7 +10,7 @@ use super::tests::{CIRCLE, LINE, ORIGIN, bench_at, one_ground, site_of};
 use crate::bench::Bench;
 
 /// The same word on every cell around the test's ways.
-fn everywhere(theta: f64, std_dev: f64, grip_mu: f64) -> PathPrior {
+pub(super) fn everywhere(theta: f64, std_dev: f64, grip_mu: f64) -> PathPrior {
     let cell = |ix, iy| CellPrior {
         cell: Cell { ix, iy },
         theta,
@@ -19,9 +19,11 @@ fn everywhere(theta: f64, std_dev: f64, grip_mu: f64) -> PathPrior {
     PathPrior {
         grid_revision: 1,
         grip_mu,
+        robot_bias_ratio: 0.08,
         cells: (-5..20)
             .flat_map(|iy| (-5..20).map(move |ix| cell(ix, iy)))
             .collect(),
+        grips: Vec::new(),
     }
 }
 

@@ -17,13 +17,14 @@ use tread_api::wire::ingest::MissionPhase;
 use tread_control::estimation::SegmentStatistics;
 use tread_control::follower::{FailureReason, Follower};
 use tread_control::gate::GateCause;
-use tread_control::geometry::{Pose, Twist};
+use tread_control::geometry::{Point, Pose, Twist};
 use tread_control::reference::Governor;
 
 use super::active::Hold;
 use super::driven::Driven;
 use super::prior::Prior;
 use super::site_view::SiteView;
+use super::surface::Comparison;
 use crate::drive::Battery;
 use crate::safety::SafetyCell;
 
@@ -226,6 +227,10 @@ pub(crate) struct Snapshot {
     pub theta_measured: Option<ThetaEstimate>,
     /// Whether the motion of late carried information on θ.
     pub excited: bool,
+    /// Where the ground is not as the map says.
+    pub(crate) surface_change: Option<Comparison>,
+    /// Where the wheels turn without progress.
+    pub dug_in_at: Option<Point>,
     /// How much the wheels slip along their way, while they turn.
     pub slip: Option<SideSlip>,
     /// The cell that the robot is in.
@@ -257,6 +262,8 @@ impl Default for Snapshot {
             theta_loop: None,
             theta_measured: None,
             excited: false,
+            surface_change: None,
+            dug_in_at: None,
             slip: None,
             cell: None,
             terrain: None,

@@ -15,6 +15,7 @@ use crate::sim::battery::SimulatedBattery;
 use crate::sim::ground::GroundMap;
 use crate::sim::scenario::{GroundSpec, Scenario, ScenarioError};
 use crate::sim::sensors::{SAMPLE_PERIOD, SensorSpec, Sensors};
+use crate::sim::trace::{Trace, TruthSample};
 
 /// Most simulated time of one call; a process that slept longer finds its robot paused.
 const CATCH_UP_MAX: Duration = Duration::from_secs(1);
@@ -71,6 +72,30 @@ pub struct SimulatedDrive {
     simulated_to: Option<Duration>,
     stall: Option<Stall>,
     first_read_at: Option<Duration>,
+    has_torque: bool,
+    trace: Option<Trace>,
+}
+
+/// What makes one base differ from others of its model.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Individual {
+    /// What makes its noise, offsets and rolling radii its own.
+    pub seed: u64,
+    /// How much stiffer any ground is on its tyres than the scenario says.
+    pub grip_ratio: f64,
+    /// Whether it measures wheel torque.
+    pub has_torque: bool,
+}
+
+impl Individual {
+    /// One with usual tyres and a torque sensor.
+    pub fn of_seed(seed: u64) -> Self {
+        Self {
+            seed,
+            grip_ratio: 1.0,
+            has_torque: true,
+        }
+    }
 }
 
 impl SimulatedDrive {
@@ -82,9 +107,14 @@ impl SimulatedDrive {
         scenario: &Scenario,
         model: RobotModel,
         start: Pose,
-        seed: u64,
+        individual: Individual,
         mode: SimMode,
     ) -> Result<Self, SimulatedDriveError> {
+        let Individual {
+            seed,
+            grip_ratio,
+            has_torque,
+        } = individual;
         let sensors = Sensors::new(SensorSpec::default(), &model, seed);
         let (left_radius_ratio, right_radius_ratio) = sensors.radius_ratios();
         let spec = PlantSpec {
@@ -95,7 +125,7 @@ impl SimulatedDrive {
         Ok(Self {
             mode,
             plant: Plant::new(model, spec, start)?,
-            ground: GroundMap::new(scenario)?,
+            ground: GroundMap::new(scenario, grip_ratio)?,
             sensors,
             track_width_m: model.track_width_m(),
             battery: SimulatedBattery::new(1.0),
@@ -106,6 +136,8 @@ impl SimulatedDrive {
             simulated_to: None,
             stall: None,
             first_read_at: None,
+            has_torque,
+            trace: None,
         })
     }
 
@@ -123,6 +155,13 @@ impl SimulatedDrive {
         self
     }
 
+    /// The same base, which leaves word of what it truly does.
+    #[must_use]
+    pub fn with_trace(mut self, trace: Option<Trace>) -> Self {
+        self.trace = trace;
+        self
+    }
+
     /// Leans the base from level, radians; a simulated fault.
     pub fn lean(&mut self, tilt_rad: f64) {
         self.tilt_rad = tilt_rad;
@@ -135,7 +174,8 @@ impl SimulatedDrive {
 
     /// The true ground under the robot's left side.
     pub fn ground_truth(&self) -> GroundSpec {
-        let curve = self.ground.under(self.plant.state().pose, 0.0).left;
+        let at = self.simulated_to.unwrap_or_default();
+        let curve = self.ground.under(self.plant.state().pose, 0.0, at).left;
         GroundSpec {
             stiffness: curve.stiffness(),
             peak_slip: curve.peak_slip(),
@@ -154,9 +194,8 @@ impl SimulatedDrive {
             if at.saturating_sub(self.commanded_at) > COMMAND_TIMEOUT {
                 self.command = WheelSpeeds::default();
             }
-            let ground = self
-                .ground
-                .under(self.plant.state().pose, self.track_width_m);
+            let pose = self.plant.state().pose;
+            let ground = self.ground.under(pose, self.track_width_m, at);
             self.plant
                 .step(self.command, &ground, SAMPLE_PERIOD.as_secs_f64());
             let (wheels, torques) = (self.plant.state().wheel_speeds, self.plant.wheel_torques());
@@ -166,8 +205,18 @@ impl SimulatedDrive {
             let sample = self.sensors.sample(&self.plant, at);
             self.waiting.push(SensorSample {
                 tilt_rad: Some(self.tilt_rad),
+                wheel_torques: sample.wheel_torques.filter(|_| self.has_torque),
                 ..sample
             });
+            if let Some(trace) = self.trace.as_ref().filter(|trace| trace.is_due(at)) {
+                let state = *self.plant.state();
+                trace.add(TruthSample {
+                    at,
+                    state,
+                    command: self.command,
+                    theta: self.ground.under(state.pose, 0.0, at).left.theta(),
+                });
+            }
         }
         self.simulated_to = Some(at);
     }

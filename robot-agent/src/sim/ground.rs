@@ -1,16 +1,28 @@
-//! The true ground under a simulated robot: each side stands on the terrain under it.
+//! The true ground under a simulated robot: each side stands on the terrain under it, as it is then.
+
+use std::time::Duration;
 
 use tread_api::geometry::{Point, Polygon};
 use tread_control::friction::FrictionCurve;
 use tread_control::geometry::Pose;
 use tread_control::plant::Ground;
 
-use super::scenario::{Scenario, ScenarioError};
+use super::scenario::{GroundSpec, Scenario, ScenarioError};
 
 #[derive(Debug, Clone)]
 struct Patch {
     outline: Polygon,
     curve: FrictionCurve,
+    /// From when on it is another one, in the order of time.
+    then: Vec<(Duration, FrictionCurve)>,
+}
+
+impl Patch {
+    fn curve(&self, at: Duration) -> FrictionCurve {
+        let begun = self.then.partition_point(|(from, _)| *from <= at);
+        let last = begun.checked_sub(1).and_then(|last| self.then.get(last));
+        last.map_or(self.curve, |(_, curve)| *curve)
+    }
 }
 
 /// The friction everywhere on a site.
@@ -22,11 +34,11 @@ pub struct GroundMap {
 }
 
 impl GroundMap {
-    /// The true ground of a scenario.
+    /// The true ground of a scenario for a robot on whose tyres it is stiffer by `grip_ratio`.
     ///
     /// # Errors
     /// [`ScenarioError`] for figures that a parsed scenario cannot have.
-    pub fn new(scenario: &Scenario) -> Result<Self, ScenarioError> {
+    pub fn new(scenario: &Scenario, grip_ratio: f64) -> Result<Self, ScenarioError> {
         let malformed = |problem: String| ScenarioError::Malformed {
             file: scenario.site.to_string(),
             problem,
@@ -41,29 +53,51 @@ impl GroundMap {
         let mut patches = Vec::with_capacity(terrains.len());
         for terrain in terrains {
             let outline = terrain.outline().map_err(malformed)?;
-            let curve = terrain.ground().curve().map_err(malformed)?;
-            patches.push(Patch { outline, curve });
+            let curve = |ground: GroundSpec| {
+                let felt = GroundSpec {
+                    stiffness: ground.stiffness * grip_ratio,
+                    ..ground
+                };
+                felt.curve().map_err(malformed)
+            };
+            let mut then = Vec::with_capacity(terrain.then.len());
+            for change in &terrain.then {
+                then.push((
+                    Duration::from_secs_f64(change.after_s),
+                    curve(change.ground())?,
+                ));
+            }
+            patches.push(Patch {
+                outline,
+                curve: curve(terrain.ground())?,
+                then,
+            });
         }
-        let elsewhere = scenario.ground.curve().map_err(malformed)?;
+        let elsewhere = GroundSpec {
+            stiffness: scenario.ground.stiffness * grip_ratio,
+            ..scenario.ground
+        };
+        let elsewhere = elsewhere.curve().map_err(malformed)?;
         Ok(Self { patches, elsewhere })
     }
 
-    fn at(&self, x_m: f64, y_m: f64) -> FrictionCurve {
+    fn curve(&self, (x_m, y_m): (f64, f64), at: Duration) -> FrictionCurve {
         let point = Point { x_m, y_m };
         let hit = self
             .patches
             .iter()
             .find(|patch| patch.outline.contains(point));
-        hit.map_or(self.elsewhere, |patch| patch.curve)
+        hit.map_or(self.elsewhere, |patch| patch.curve(at))
     }
 
-    /// The ground under both sides of a robot, taken half a track width left and right of it.
-    pub fn under(&self, pose: Pose, track_width_m: f64) -> Ground {
+    /// The ground under both sides of a robot at a time of its clock, taken half a track width left
+    /// and right of it.
+    pub fn under(&self, pose: Pose, track_width_m: f64, at: Duration) -> Ground {
         let (sin, cos) = pose.heading_rad.sin_cos();
         let half_m = 0.5 * track_width_m;
         Ground {
-            left: self.at(pose.x_m - half_m * sin, pose.y_m + half_m * cos),
-            right: self.at(pose.x_m + half_m * sin, pose.y_m - half_m * cos),
+            left: self.curve((pose.x_m - half_m * sin, pose.y_m + half_m * cos), at),
+            right: self.curve((pose.x_m + half_m * sin, pose.y_m - half_m * cos), at),
         }
     }
 }
@@ -73,7 +107,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_robot_on_a_border_stands_on_two_grounds() {
+    fn each_side_stands_on_its_own_ground_as_it_is_then() {
         let text = r#"
 site = "s"
 cell_m = 1.0
@@ -91,9 +125,11 @@ class = "ice"
 polygon = [[4.0, 4.0], [6.0, 4.0], [6.0, 6.0], [4.0, 6.0]]
 layer = 1
 stiffness = 0.5
+then = [{ after_s = 10.0, stiffness = 0.1 }, { after_s = 20.0, stiffness = 3.0 }]
 "#;
-        let map = GroundMap::new(&Scenario::parse("t", text).unwrap()).unwrap();
-        let stiffness = |x_m: f64, y_m: f64| {
+        let scenario = Scenario::parse("t", text).unwrap();
+        let map = GroundMap::new(&scenario, 1.0).unwrap();
+        let stiffness_at = |x_m: f64, y_m: f64, at_s: u64| {
             let ground = map.under(
                 Pose {
                     x_m,
@@ -101,12 +137,23 @@ stiffness = 0.5
                     heading_rad: 0.0,
                 },
                 0.4,
+                Duration::from_secs(at_s),
             );
             (ground.left.stiffness(), ground.right.stiffness())
         };
+        let stiffness = |x_m, y_m| stiffness_at(x_m, y_m, 0);
         assert_eq!(stiffness(5.0, 5.0), (0.5, 0.5));
         assert_eq!(stiffness(2.0, 2.0), (1.0, 1.0));
         assert_eq!(stiffness(2.0, 0.1), (1.0, 2.0));
         assert_eq!(stiffness(-1.0, -1.0), (2.0, 2.0));
+        for (at_s, then) in [(9, 0.5), (10, 0.1), (19, 0.1), (20, 3.0), (999, 3.0)] {
+            assert_eq!(stiffness_at(5.0, 5.0, at_s), (then, then), "{at_s} s");
+        }
+        let map = GroundMap::new(&scenario, 2.0).unwrap();
+        let ground = map.under(Pose::default(), 0.0, Duration::ZERO);
+        assert!(
+            (ground.left.stiffness() - 2.0).abs() < 1.0e-12,
+            "{ground:?}"
+        );
     }
 }

@@ -17,6 +17,10 @@ use tread_control::friction::{FrictionCurve, FrictionSpec};
 pub const BUILT_IN: &str = include_str!("../../scenarios/yard.toml");
 /// What [`BUILT_IN`] is called in error messages and on the command line.
 pub const BUILT_IN_NAME: &str = "yard";
+/// How much tyres may differ from what the scenario says of the ground.
+pub const GRIP_RATIO_RANGE: std::ops::RangeInclusive<f64> = 0.2..=5.0;
+/// Latest change of the ground, seconds.
+const CHANGE_AFTER_MAX_S: f64 = 1.0e6;
 /// Largest scenario file, bytes.
 pub const SCENARIO_BYTES_MAX: u64 = 4 * 1024 * 1024;
 
@@ -138,6 +142,36 @@ pub struct ScenarioTerrain {
     /// Share of the peak friction that is left at full sliding, α.
     #[serde(default = "default_sliding_ratio")]
     pub sliding_ratio: f64,
+    /// What becomes of it, in the order of time.
+    #[serde(default)]
+    pub then: Vec<GroundChange>,
+}
+
+/// Ground that is another one from some time on.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct GroundChange {
+    /// From when on, seconds of the robot's clock: since its agent was started.
+    pub after_s: f64,
+    /// Friction stiffness K = 1/θ from then on.
+    pub stiffness: f64,
+    /// Slip at the peak of friction, `λ_m`.
+    #[serde(default = "default_peak_slip")]
+    pub peak_slip: f64,
+    /// Share of the peak friction that is left at full sliding, α.
+    #[serde(default = "default_sliding_ratio")]
+    pub sliding_ratio: f64,
+}
+
+impl GroundChange {
+    /// The friction from then on, not yet checked.
+    pub fn ground(&self) -> GroundSpec {
+        GroundSpec {
+            stiffness: self.stiffness,
+            peak_slip: self.peak_slip,
+            sliding_ratio: self.sliding_ratio,
+        }
+    }
 }
 
 impl ScenarioTerrain {
@@ -178,6 +212,21 @@ pub struct ScenarioRobot {
     pub heading_rad: f64,
     /// What makes its noise, offsets and rolling radii its own.
     pub seed: u64,
+    /// How much stiffer any ground is on its tyres than the scenario says, within
+    /// [`GRIP_RATIO_RANGE`].
+    #[serde(default = "default_grip_ratio")]
+    pub grip_ratio: f64,
+    /// Whether its base measures wheel torque.
+    #[serde(default = "default_wheel_torque")]
+    pub wheel_torque: bool,
+}
+
+fn default_grip_ratio() -> f64 {
+    1.0
+}
+
+fn default_wheel_torque() -> bool {
+    true
 }
 
 /// A mission of the scenario.
@@ -263,6 +312,18 @@ impl Scenario {
                 .outline()
                 .map_err(|problem| refused(format!("polygon: {problem}")))?;
             terrain.ground().curve().map_err(refused)?;
+            let mut last_s = 0.0;
+            for change in &terrain.then {
+                change.ground().curve().map_err(refused)?;
+                if !(last_s..=CHANGE_AFTER_MAX_S).contains(&change.after_s) {
+                    let problem = format!(
+                        "then: after_s must be {last_s} to {CHANGE_AFTER_MAX_S}, not {}",
+                        change.after_s
+                    );
+                    return Err(refused(problem));
+                }
+                last_s = change.after_s;
+            }
             if !terrains.insert(&terrain.id) {
                 return Err(refused(format!("id: `{}` is there twice", terrain.id)));
             }
@@ -276,6 +337,14 @@ impl Scenario {
             };
             if !(start.is_on_the_map() && robot.heading_rad.is_finite()) {
                 return Err(refused("x_m, y_m or heading_rad is no place".to_owned()));
+            }
+            if !GRIP_RATIO_RANGE.contains(&robot.grip_ratio) {
+                return Err(refused(format!(
+                    "grip_ratio must be {} to {}, not {}",
+                    GRIP_RATIO_RANGE.start(),
+                    GRIP_RATIO_RANGE.end(),
+                    robot.grip_ratio
+                )));
             }
             if !robots.insert(&robot.id) {
                 return Err(refused(format!("id: `{}` is there twice", robot.id)));
@@ -377,6 +446,18 @@ speed_m_s = 0.5
             ("radius_m = 2.0", "radius_m = 0.0", "line 20", "radius_m"),
             ("site = \"yard\"", "site = \"Yard!\"", "line 2", "Yard!"),
             ("cell_m = 1.0", "cell_m = 0.0", "cell_m", "0"),
+            (
+                "seed = 1",
+                "seed = 1\ngrip_ratio = nan",
+                "line 11",
+                "grip_ratio",
+            ),
+            (
+                "stiffness = 8.0",
+                "stiffness = 8.0\nthen = [{ after_s = -1.0, stiffness = 1.0 }]",
+                "line 5",
+                "after_s",
+            ),
         ];
         for (from, to, place, key) in cases {
             let refused = refusal(from, to);

@@ -438,7 +438,7 @@ fn control_trajectory(asked: &Trajectory) -> planned::Trajectory {
 }
 
 /// What a user allows beside the trajectory, in the controller's words.
-fn plan_options(asked: &Trajectory) -> PlanOptions {
+fn plan_options(asked: &Trajectory) -> PlanOptions<'static> {
     let options = asked.options();
     PlanOptions {
         approach_speed_m_s: options.approach_speed_m_s,
@@ -447,5 +447,6 @@ fn plan_options(asked: &Trajectory) -> PlanOptions {
             period_s: wiggle.period_s,
         }),
         grip_mu: None,
+        grip: None,
     }
 }

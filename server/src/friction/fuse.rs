@@ -361,7 +361,11 @@ fn keep_present<R: Ord + Copy>(
             let bias = if only == Some(one.robot) {
                 0.0
             } else {
-                2.0 * (config.robot_bias_ratio * mean.max(word.value)).powi(2)
+                // If nothing has changed, robots differ by a share of the θ that they have in
+                // common, which is nearest to what is known best, not of the larger one.
+                let common =
+                    (weighted + word.information * word.value) / (information + word.information);
+                2.0 * (config.robot_bias_ratio * common).powi(2)
             };
             let apart_s = seconds(newest_kept_us - one.newest_at_us);
             let variance = information.recip()

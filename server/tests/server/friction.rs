@@ -382,15 +382,48 @@ async fn a_dispatch_tells_the_robot_what_the_map_knows_along_its_way() {
     let cells: Vec<i32> = prior.cells.iter().map(|known| known.cell.ix).collect();
     assert_eq!(
         cells,
-        [5, 6, 7, 8, 9, 11, 12],
-        "the border cell has two grounds"
+        [3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14],
+        "the way and two cells around it; the border cell has two grounds"
     );
-    assert!((prior.cells[0].theta - 0.2).abs() < 0.01, "{prior:?}");
-    assert!((prior.cells[6].theta - 0.05).abs() < 0.01, "{prior:?}");
+    assert!((prior.cells[2].theta - 0.2).abs() < 0.01, "{prior:?}");
+    assert!((prior.cells[8].theta - 0.05).abs() < 0.01, "{prior:?}");
     assert!(
         close(prior.grip_mu, 0.14),
         "nothing was shown there of late"
     );
+    assert!(close(prior.robot_bias_ratio, 0.08));
+    let grips: Vec<(i32, f64)> = prior
+        .grips
+        .iter()
+        .map(|grip| (grip.cell.ix, grip.mu))
+        .collect();
+    let columns: Vec<i32> = grips.iter().map(|(ix, _)| *ix).collect();
+    assert_eq!(
+        columns,
+        [5, 6, 7, 8, 9, 10, 11, 12],
+        "every cell of the way"
+    );
+    for &(ix, mu) in &grips {
+        let shown = if ix < 10 { 0.14 } else { 0.4 };
+        assert!(close(mu, shown), "as each terrain has shown: {grips:?}");
+    }
+    // Ice two cells farther on the road: the road may be frozen here too, the lawn is not.
+    let ice = (0..2).map(|number| {
+        let mut iced = on("road", (14, 0), 1.5, 9);
+        iced.ended_at += SignedDuration::from_secs(number);
+        iced
+    });
+    robot.upload(numbered(ice)).await.unwrap();
+    let prior = offered(5.5, 0.5).await.unwrap();
+    for grip in &prior.grips {
+        let is_road = grip.cell.ix > 10;
+        // In the border cell lies some of both.
+        assert!(
+            grip.cell.ix == 10 || (grip.mu < 0.139) == is_road,
+            "{grip:?}"
+        );
+    }
+    assert!(prior.grip_mu < 0.139, "{prior:?}");
     yard.server.stop().await.unwrap();
 }
 

@@ -14,6 +14,8 @@ mod outages;
 #[cfg(test)]
 mod pages;
 mod safety;
+#[cfg(test)]
+mod scenario;
 
 use std::path::Path;
 

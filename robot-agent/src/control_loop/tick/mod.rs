@@ -21,11 +21,14 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 
 use super::active::Active;
+use super::gain::GroundRecord;
 use super::outgoing::Outgoing;
+use super::progress::ProgressWatch;
 use super::seam::{EndReason, LoopEnds, Shared};
 use super::segments::{Moment, SegmentCutter};
 use super::site_view::{Footing, SiteView};
 use super::slip::SlipMeter;
+use super::surface::SurfaceWatch;
 use crate::drive::{Drive, SILENT_AFTER_MAX, StatedNoise};
 use guard::Guard;
 
@@ -71,6 +74,10 @@ pub(crate) struct LoopCore {
     blind_within_fence: bool,
     /// Whether a wheel slips beyond the model.
     slips: bool,
+    /// What was known of the ground in this tick of a mission.
+    known: GroundRecord,
+    surface: SurfaceWatch,
+    progress: ProgressWatch,
     /// How much they slip.
     slip: SlipMeter,
     /// Until when the mission is held for its next revision.
@@ -108,6 +115,9 @@ impl LoopCore {
             guard: Guard::default(),
             blind_within_fence: false,
             slips: false,
+            known: GroundRecord::default(),
+            surface: SurfaceWatch::default(),
+            progress: ProgressWatch::default(),
             slip: SlipMeter::default(),
             replacement_until: None,
             ticks: 0,

@@ -91,7 +91,8 @@ impl LoopCore {
             });
             return;
         }
-        if let Some(knowledge) = self.knowledge(&job.prior) {
+        self.surface.begin_mission();
+        if let Some(knowledge) = self.ground(&job.prior).told {
             job.follower.warm_start(knowledge);
         }
         self.active = Some(Active::new(job));
@@ -105,8 +106,10 @@ impl LoopCore {
         dt_s: f64,
     ) -> Option<WheelSpeeds> {
         let active = self.active.as_ref()?;
-        let knowledge = self.knowledge(active.prior());
+        let ground = self.ground(active.prior());
+        let knowledge = ground.told;
         let measured = self.measured(now.monotonic);
+        self.known = ground;
         let active = self.active.as_mut()?;
         if active.is_at_rest_for_replacement() {
             let old = active.replace(knowledge);
@@ -199,6 +202,7 @@ impl LoopCore {
             gate,
             theta_loop: self.theta_loop,
             theta_measured: measured.map(|theta| (theta.theta, theta.std_dev)),
+            ground: self.known,
         });
     }
 }

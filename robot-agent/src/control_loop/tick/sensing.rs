@@ -10,10 +10,12 @@ use tread_control::tracking::ThetaKnowledge;
 
 use super::{LoopCore, TICK_MAX_S, age_s};
 use crate::control_loop::active::Hold;
+use crate::control_loop::gain::GroundRecord;
 use crate::control_loop::prior::{Prior, told};
-use crate::control_loop::seam::{Fault, LoopEvent, Shared};
+use crate::control_loop::seam::{ClosedSegment, Fault, LoopEvent, Shared};
 use crate::control_loop::segments::{CutInput, Moment, Place};
 use crate::control_loop::site_view::Footing;
+use crate::control_loop::surface::Comparison;
 use crate::drive::{Feedback, StatedNoise};
 use crate::geometry::wire_point;
 
@@ -55,6 +57,8 @@ impl LoopCore {
                 self.last_sample = Some(sample.at);
                 self.measured_wheels = wheel_speeds;
                 if dt_s > 0.0 {
+                    let ahead = self.model.twist_from_wheel_speeds(wheel_speeds).linear_m_s;
+                    self.progress.note_wheels(ahead * dt_s);
                     self.localisation.predict(gyro_rad_s, wheel_speeds, dt_s);
                     // With wheels on two grounds there is no one θ to learn.
                     if self.footing != Some(Footing::Mixed) {
@@ -78,6 +82,7 @@ impl LoopCore {
                 }
             }
             if let Some(pose) = sample.position {
+                self.progress.note_fix(pose.point());
                 // A position takes longer to be found than the motion since.
                 let fix = PositionFix {
                     pose,
@@ -112,7 +117,8 @@ impl LoopCore {
 
     /// How much the wheels slip; nothing is known of a base that is silent.
     pub(super) fn measure_slip(&mut self, now: Duration, dt_s: f64) {
-        let is_silent = age_s(now, self.last_sample) > self.silent_after.as_secs_f64();
+        let is_silent =
+            self.is_base_silent || age_s(now, self.last_sample) > self.silent_after.as_secs_f64();
         let velocity = BodyVelocity {
             ahead_m_s: self.real_m_s(now),
             left_m_s: 0.0,
@@ -122,20 +128,50 @@ impl LoopCore {
         self.slip.step(heard, &self.model, dt_s);
     }
 
-    /// What the law is told about the ground: what was measured, and what the map knows of the
-    /// cell. The estimator itself never hears of the map.
-    pub(super) fn knowledge(&self, prior: &Prior) -> Option<ThetaKnowledge> {
+    /// What is known of the ground: what was measured, and what the map knows of the cell. The
+    /// estimator itself never hears of the map.
+    pub(super) fn ground(&self, prior: &Prior) -> GroundRecord {
         let measured = self.estimate.theta.map(|measured| ThetaKnowledge {
             theta: measured.theta,
             std_dev: measured.std_dev,
         });
         let site = self.site.as_ref();
-        let cell = site.zip(self.localisation.pose()).and_then(|(site, pose)| {
+        let mapped = site.zip(self.localisation.pose()).and_then(|(site, pose)| {
             let grid = site.grid();
             let cell = grid.cell_at(wire_point(pose))?;
             prior.at(grid.revision, cell)
         });
-        told(measured, cell)
+        GroundRecord {
+            grip_mu: prior.grip_mu(),
+            is_on_the_map: mapped.is_some(),
+            told: told(measured, mapped),
+            measured,
+        }
+    }
+
+    /// Holds what a closed segment says against what the map says of its cell.
+    fn compare(&mut self, segment: &ClosedSegment) {
+        let active = self.active.as_mut();
+        let Some(active) = active.filter(|active| segment.mission == Some(active.job.mission))
+        else {
+            return;
+        };
+        let (prior, statistics) = (&active.job.prior, &segment.statistics);
+        let expected = prior.at(segment.site.grid().revision, segment.cell);
+        let Some((expected, theta)) = expected.zip(statistics.theta()) else {
+            return;
+        };
+        let comparison = Comparison {
+            cell: segment.cell,
+            measured: ThetaKnowledge {
+                theta,
+                std_dev: statistics.theta_information.sqrt().recip(),
+            },
+            expected,
+            robot_bias_ratio: prior.robot_bias_ratio(),
+        };
+        active.compare(&comparison);
+        self.surface.note(comparison);
     }
 
     pub(super) fn cut_segments(&mut self, now: Moment, ground_changed: bool, dt_s: f64) {
@@ -171,6 +207,7 @@ impl LoopCore {
             self.estimate = self.estimator.estimate();
         }
         if let Some(segment) = cut.segment {
+            self.compare(&segment);
             self.outgoing.send(LoopEvent::Segment(segment));
         }
     }

@@ -88,6 +88,8 @@ impl LoopCore {
             theta_measured: measured
                 .filter(|theta| theta.theta.is_finite() && theta.std_dev.is_finite()),
             excited: !self.estimate.no_new_information,
+            surface_change: self.surface.raised(),
+            dug_in_at: self.progress.dug_in_at(),
             slip: self.slip.slip(),
             cell: self.cutter.cell(),
             terrain,

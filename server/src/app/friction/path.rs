@@ -4,15 +4,15 @@
 //! be as slow as each later piece asks: `v² ≤ v_next² + 2·a_along·Δs`. Both accelerations come from
 //! the grip of the piece, a lower bound, through the shares that the robot's own planner uses.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use tread_api::friction::{AskPath, FusedFriction, PathFriction, PathPiece};
 use tread_api::geometry::Point;
-use tread_api::ids::{RobotId, SiteId};
+use tread_api::ids::{RobotId, SiteId, TerrainId};
 use tread_api::robot::RobotModel;
 use tread_api::site::{Cell, Grid};
 use tread_api::trajectory::{Trajectory, Waypoint};
-use tread_api::wire::command::{CellPrior, PRIOR_CELLS_MAX, PathPrior};
+use tread_api::wire::command::{CellGrip, CellPrior, PRIOR_CELLS_MAX, PathPrior};
 use tread_control::robot::RobotModel as PlannedModel;
 
 use super::cells::{Drawn, is_here, same_ground};
@@ -29,6 +29,12 @@ const POINTS: std::ops::RangeInclusive<usize> = 2..=10_000;
 const PIECES_MAX: usize = 100_000;
 /// Corners that a circle is looked at with.
 const CIRCLE_CORNERS: u32 = 256;
+/// Relative standard deviation of θ above which a place counts as unknown; the estimator's own.
+const DEVIATION_RATIO_MAX: f64 = 0.5;
+/// Cells to either side of a way that say something of the ground under it.
+const NEAR_CELLS: i32 = 2;
+/// Most cells near a way that are looked at.
+const NEAR_MAX: usize = 20_000;
 
 impl App {
     /// What is known along a path, for a robot.
@@ -90,7 +96,9 @@ impl App {
 impl App {
     /// What a robot is told of the ground along a trajectory; `None` when nothing is known of it.
     ///
-    /// Cells with several grounds are left out: the robot could not tell them apart.
+    /// Cells with several grounds are left out: the robot could not tell them apart. A terrain grips
+    /// no better on the way than where it is known to grip worst, there or near it: ground that has
+    /// frozen in one cell may have in the next, where nobody has been since.
     pub(in crate::app) async fn prior_along(
         &self,
         (site, robot): (&SiteId, &RobotId),
@@ -118,28 +126,59 @@ impl App {
 
     fn prior_of(&self, view: &SiteView, reading: &Reading, cut: &[Cut]) -> Option<PathPrior> {
         let drawn = Drawn::new(&view.terrains);
-        let mut grip_least_mu = f64::INFINITY;
         let mut cells: BTreeMap<(i32, i32), CellPrior> = BTreeMap::new();
+        let mut grips: BTreeMap<(i32, i32), CellGrip> = BTreeMap::new();
+        let near = near(cut, &view.row.site.grid);
         self.maps().look(&view.row, |map| {
+            let known = |cut: &Cut| known_at(map, view, &drawn, reading, cut);
+            let mut grounds: BTreeMap<Option<&TerrainId>, f64> = BTreeMap::new();
+            for place in cut.iter().chain(&near) {
+                let Some(known) = known(place).filter(is_measured) else {
+                    continue;
+                };
+                let ground = drawn.at(place.middle).map(|terrain| &terrain.id);
+                let mu = grip_mu(Some(&known));
+                let least = grounds.entry(ground).or_insert(mu);
+                *least = least.min(mu);
+            }
             for cut in cut {
-                let known = known_at(map, view, &drawn, reading, cut);
-                grip_least_mu = grip_least_mu.min(grip_mu(known.as_ref()));
-                let has_one_ground = map.cell(cut.cell, reading.choice()).len() == 1;
-                if let Some(known) = known.filter(|_| has_one_ground) {
+                let (cell, known) = (cut.cell, known(cut));
+                let ground = drawn.at(cut.middle).map(|terrain| &terrain.id);
+                let least_mu = grounds.get(&ground).copied().unwrap_or(f64::INFINITY);
+                let mu = grip_mu(known.as_ref()).min(least_mu);
+                let key = (cell.iy, cell.ix);
+                let grip = grips.entry(key).or_insert(CellGrip { cell, mu });
+                grip.mu = grip.mu.min(mu);
+            }
+            // A robot drives smoothly from corner to corner, so a little beside the way, too.
+            for place in cut.iter().chain(&near) {
+                let cell = place.cell;
+                let key = (cell.iy, cell.ix);
+                if cells.len() >= PRIOR_CELLS_MAX || cells.contains_key(&key) {
+                    continue;
+                }
+                let has_one_ground = map.cell(cell, reading.choice()).len() == 1;
+                let told = known(place).filter(|known| has_one_ground && is_measured(known));
+                if let Some(known) = told {
                     let prior = CellPrior {
-                        cell: cut.cell,
+                        cell,
                         theta: known.theta,
                         std_dev: known.std_dev,
                     };
-                    cells.insert((cut.cell.iy, cut.cell.ix), prior);
+                    cells.insert(key, prior);
                 }
             }
         });
-        let cells: Vec<CellPrior> = cells.into_values().take(PRIOR_CELLS_MAX).collect();
+        let grip_least_mu = grips.values().map(|grip| grip.mu);
+        let grip_least_mu = grip_least_mu.fold(f64::INFINITY, f64::min);
+        let grips: Vec<CellGrip> = grips.into_values().take(PRIOR_CELLS_MAX).collect();
+        let cells: Vec<CellPrior> = cells.into_values().collect();
         let prior = PathPrior {
             grid_revision: view.row.site.grid.revision,
             grip_mu: grip_least_mu,
+            robot_bias_ratio: self.friction_config().robot_bias_ratio,
             cells,
+            grips,
         };
         Some(prior).filter(|prior| !prior.cells.is_empty() && prior.is_possible())
     }
@@ -164,11 +203,19 @@ fn corners(trajectory: &Trajectory) -> Vec<Point> {
     }
 }
 
+/// Whether a place is known well enough to say something of its grip: the upper bound of a θ that
+/// is hardly known is no reason to creep.
+fn is_measured(known: &FusedFriction) -> bool {
+    known.std_dev <= DEVIATION_RATIO_MAX * known.theta
+}
+
 /// The planner's friction coefficient.
 pub(in crate::app) fn grip_mu(known: Option<&FusedFriction>) -> f64 {
     grip::grip_mu(
         known.and_then(|known| known.mu_peak_lower_bound),
-        known.map(|known| known.bounds.theta_upper_95),
+        known
+            .filter(|known| is_measured(known))
+            .map(|known| known.bounds.theta_upper_95),
     )
 }
 
@@ -269,6 +316,29 @@ fn cut(points: &[Point], grid: &Grid) -> Result<Vec<Cut>, AppError> {
         from_m += side_m;
     }
     Ok(pieces)
+}
+
+/// Places around a path whose ground may be like that of the path: middles of cells, each once.
+fn near(cut: &[Cut], grid: &Grid) -> Vec<Cut> {
+    let around = |index: i32| index.saturating_sub(NEAR_CELLS)..=index.saturating_add(NEAR_CELLS);
+    let mut cells: BTreeSet<(i32, i32)> = BTreeSet::new();
+    for cut in cut {
+        for iy in around(cut.cell.iy) {
+            cells.extend(around(cut.cell.ix).map(|ix| (iy, ix)));
+        }
+        if cells.len() > NEAR_MAX {
+            // Of a way as long as this, its own cells say enough.
+            return Vec::new();
+        }
+    }
+    let place = |(iy, ix)| Cut {
+        from_m: 0.0,
+        length_m: 0.0,
+        cell: Cell { ix, iy },
+        middle: grid.center_of(Cell { ix, iy }),
+        curvature_1_m: 0.0,
+    };
+    cells.into_iter().map(place).collect()
 }
 
 /// Shares of a side at which one coordinate passes a border between cells.

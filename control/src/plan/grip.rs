@@ -1,0 +1,114 @@
+//! How the ground grips along a way, by place.
+
+use crate::geometry::Point;
+
+/// A square of a grid with its peak friction coefficient.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GripSquare {
+    /// Which square ahead of the origin along x: floor of the coordinate over the side.
+    pub ix: i32,
+    /// The same along y.
+    pub iy: i32,
+    /// Lower bound of the peak friction coefficient, above zero.
+    pub mu: f64,
+}
+
+/// Lower bounds of the peak friction coefficient by place.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GripMap {
+    square_m: f64,
+    /// By row and column.
+    squares: Box<[GripSquare]>,
+    elsewhere_mu: f64,
+}
+
+impl GripMap {
+    /// Squares of this side, and what holds where none is near; `None` for a number that is not
+    /// above zero or not finite.
+    pub fn new(square_m: f64, mut squares: Vec<GripSquare>, elsewhere_mu: f64) -> Option<Self> {
+        let is_possible = |value: f64| value.is_finite() && value > 0.0;
+        let all = is_possible(square_m)
+            && is_possible(elsewhere_mu)
+            && squares.iter().all(|square| is_possible(square.mu));
+        squares.sort_by_key(|square| (square.iy, square.ix));
+        all.then(|| Self {
+            square_m,
+            squares: squares.into_boxed_slice(),
+            elsewhere_mu,
+        })
+    }
+
+    /// The lowest of the square at a place and of its eight neighbours, so that a robot is slow
+    /// before any of its wheels is on ice; the value for elsewhere where none of them is known.
+    pub fn at(&self, point: Point) -> f64 {
+        #[expect(
+            clippy::cast_possible_truncation,
+            reason = "saturates, and no plan is as far away"
+        )]
+        let index = |coordinate_m: f64| (coordinate_m / self.square_m).floor() as i32;
+        let (ix, iy) = (index(point.x_m), index(point.y_m));
+        let mut least = f64::INFINITY;
+        for row in iy.saturating_sub(1)..=iy.saturating_add(1) {
+            let from = (row, ix.saturating_sub(1));
+            let first = self
+                .squares
+                .partition_point(|square| (square.iy, square.ix) < from);
+            let near = self.squares[first..]
+                .iter()
+                .take_while(|square| square.iy == row && square.ix <= ix.saturating_add(1));
+            least = near.fold(least, |least, square| least.min(square.mu));
+        }
+        if least.is_finite() {
+            least
+        } else {
+            self.elsewhere_mu
+        }
+    }
+
+    /// The lowest of all.
+    pub fn least(&self) -> f64 {
+        let squares = self.squares.iter().map(|square| square.mu);
+        squares.fold(self.elsewhere_mu, f64::min)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn a_place_has_the_lowest_grip_of_all_squares_that_touch_its_own(
+            squares in prop::collection::btree_map((-6..6_i32, -6..6_i32), 0.01..1.0_f64, 0..40),
+            x_m in -8.0..8.0_f64, y_m in -8.0..8.0_f64, square_m in 0.5..2.0_f64,
+        ) {
+            let list = squares.iter().map(|(&(ix, iy), &mu)| GripSquare { ix, iy, mu });
+            let map = GripMap::new(square_m, list.collect(), 0.14).unwrap();
+            let (ix, iy) = ((x_m / square_m).floor(), (y_m / square_m).floor());
+            let near = squares.iter().filter(|((column, row), _)| {
+                (f64::from(*column) - ix).abs() < 1.5 && (f64::from(*row) - iy).abs() < 1.5
+            });
+            let least = near.map(|(_, &mu)| mu).fold(f64::INFINITY, f64::min);
+            let expected = if least.is_finite() { least } else { 0.14 };
+            let found = map.at(Point { x_m, y_m });
+            prop_assert!((found - expected).abs() < 1.0e-12);
+            prop_assert!(map.least() <= expected);
+        }
+    }
+
+    #[test]
+    fn what_is_no_grip_makes_no_map() {
+        for bad in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+            let square = GripSquare {
+                ix: 0,
+                iy: 0,
+                mu: bad,
+            };
+            assert_eq!(GripMap::new(1.0, vec![square], 0.14), None);
+            assert_eq!(GripMap::new(bad, Vec::new(), 0.14), None);
+            assert_eq!(GripMap::new(1.0, Vec::new(), bad), None);
+        }
+    }
+}

@@ -1,0 +1,92 @@
+//! What the map's word was worth on a mission: how long θ was known for it, and how true it was.
+
+use tread_api::mission::{PriorGain, THETA_SURE_RATIO};
+use tread_control::tracking::ThetaKnowledge;
+
+use super::surface::Comparison;
+
+/// What was known of the ground in a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(crate) struct GroundRecord {
+    /// Friction coefficient that the plan was made with; none where the map knew nothing.
+    pub(crate) grip_mu: Option<f64>,
+    /// Whether the map knew this cell.
+    pub(crate) is_on_the_map: bool,
+    /// What the law was told.
+    pub(crate) told: Option<ThetaKnowledge>,
+    /// What the robot has measured by itself.
+    pub(crate) measured: Option<ThetaKnowledge>,
+}
+
+fn is_sure(known: Option<ThetaKnowledge>) -> bool {
+    known.is_some_and(|known| known.std_dev <= THETA_SURE_RATIO * known.theta)
+}
+
+/// The sums behind a [`PriorGain`].
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Gain {
+    grip_mu: Option<f64>,
+    known_m: f64,
+    sure_s: f64,
+    sure_alone_s: f64,
+    first_sure_alone_s: Option<f64>,
+    compared: u32,
+    contradicted: u32,
+    difference_sum: f64,
+    square_sum: f64,
+}
+
+impl Gain {
+    /// Adds a tick of so many seconds and metres, at a time since the start.
+    pub(super) fn add(
+        &mut self,
+        ground: &GroundRecord,
+        (dt_s, driven_m): (f64, f64),
+        since_start_s: f64,
+    ) {
+        self.grip_mu = ground.grip_mu.or(self.grip_mu);
+        if ground.is_on_the_map {
+            self.known_m += driven_m;
+        }
+        if is_sure(ground.told) {
+            self.sure_s += dt_s;
+        }
+        if is_sure(ground.measured) {
+            self.sure_alone_s += dt_s;
+            self.first_sure_alone_s.get_or_insert(since_start_s);
+        }
+    }
+
+    /// Adds a cell in which the map's word could be held against a measurement.
+    pub(super) fn compare(&mut self, comparison: &Comparison) {
+        let apart = comparison.deviations();
+        if !apart.is_finite() {
+            return;
+        }
+        self.compared = self.compared.saturating_add(1);
+        self.contradicted += u32::from(comparison.contradicts());
+        self.difference_sum += comparison.difference_ratio();
+        self.square_sum += apart * apart;
+    }
+
+    /// The report on a way of so many metres; none where the map knew nothing.
+    pub(super) fn report(&self, distance_m: f64) -> Option<PriorGain> {
+        let grip_mu = self.grip_mu?;
+        let mean = |sum: f64| (self.compared > 0).then(|| sum / f64::from(self.compared));
+        Some(PriorGain {
+            grip_mu,
+            known_ratio: if distance_m > 0.0 {
+                (self.known_m / distance_m).min(1.0)
+            } else {
+                0.0
+            },
+            sure_s: self.sure_s,
+            sure_alone_s: self.sure_alone_s,
+            first_sure_alone_s: self.first_sure_alone_s,
+            cells_compared: self.compared,
+            cells_contradicted: self.contradicted,
+            difference_ratio: mean(self.difference_sum),
+            difference_rms: mean(self.square_sum).map(f64::sqrt),
+        })
+    }
+}

@@ -1,0 +1,89 @@
+//! `scenario`: what a whole fleet comes to, in a simulated time of its own.
+//!
+//! Each scenario has a name: `scenario map` is [`tread_tests::scenario::map`].
+
+use std::io::Write;
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use tread_tests::scenario::map;
+use tread_tests::scenario::report::{Report, Size};
+
+mod print;
+
+/// Runs a fleet in a simulated time and holds what comes of it against what it should be.
+#[derive(Debug, Parser)]
+#[command(name = "scenario")]
+struct Arguments {
+    /// Which
+    #[command(subcommand)]
+    scenario: Scenario,
+}
+
+#[derive(Debug, Subcommand)]
+enum Scenario {
+    /// What a friction map is worth: ten robots of two models make it, a ford freezes, robots arrive
+    Map {
+        /// What differs between robots is drawn from this
+        #[arg(long, default_value_t = 1)]
+        seed: u64,
+        /// Robots of each of the two models
+        #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(2..=9))]
+        robots: u32,
+        /// Terrains that each of them visits
+        #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=5))]
+        visits: u32,
+        /// Robots of each model that arrive when the ford is frozen
+        #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=3))]
+        arrivals: u32,
+        /// Print one JSON object instead of tables
+        #[arg(long)]
+        json: bool,
+        /// What to log on standard error, such as `info`
+        #[arg(long, default_value = "error")]
+        log: String,
+    },
+}
+
+fn main() -> anyhow::Result<ExitCode> {
+    let Scenario::Map {
+        seed,
+        robots,
+        visits,
+        arrivals,
+        json,
+        log,
+    } = Arguments::parse().scenario;
+    tracing_subscriber::fmt()
+        .with_env_filter(log)
+        .with_writer(std::io::stderr)
+        .init();
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()?;
+    let report = runtime.block_on(map::run(Size {
+        seed,
+        robots_per_model: robots,
+        visits,
+        arrivals_per_model: arrivals,
+    }))?;
+    tell(&report, json)
+}
+
+fn tell(report: &Report, json: bool) -> anyhow::Result<ExitCode> {
+    let checks = report.checks();
+    let mut out = std::io::stdout().lock();
+    if json {
+        let told = serde_json::json!({ "report": report, "checks": checks });
+        serde_json::to_writer(&mut out, &told)?;
+        writeln!(out)?;
+    } else {
+        print::tables(&mut out, report)?;
+        print::checks(&mut out, &checks)?;
+    }
+    Ok(if checks.iter().all(|check| check.holds) {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    })
+}
