@@ -74,7 +74,7 @@ impl RobotKeys {
 }
 
 /// Everything that robots do on the network.
-pub const ROBOT_KEYS: [RobotKeys; 9] = [
+pub const ROBOT_KEYS: [RobotKeys; 10] = [
     RobotKeys::of_robot("robots/{robot}/alive/*", Act::Announce),
     RobotKeys::of_robot("robots/{robot}/state", Act::Publish),
     RobotKeys::of_robot("robots/{robot}/friction", Act::Publish),
@@ -85,6 +85,12 @@ pub const ROBOT_KEYS: [RobotKeys; 9] = [
     RobotKeys::of_robot("server/ingest/{robot}", Act::Ask),
     RobotKeys {
         pattern: "server/pulse",
+        owner: Owner::Site,
+        act: Act::Listen,
+    },
+    // Only the server writes it: a robot tells what it has measured by `server/ingest` alone.
+    RobotKeys {
+        pattern: "server/map",
         owner: Owner::Site,
         act: Act::Listen,
     },
@@ -122,6 +128,7 @@ mod tests {
             keys::teleop(site, robot),
             keys::limit(site, robot, &holder),
             keys::pulse(site),
+            keys::map(site),
             keys::hello(site, robot),
             keys::ingest(site, robot),
         ];
@@ -134,6 +141,7 @@ mod tests {
                 | Key::Teleop(..)
                 | Key::Limit(..)
                 | Key::Pulse(..)
+                | Key::Map(..)
                 | Key::Hello(..)
                 | Key::Ingest(..) => {}
             }

@@ -9,6 +9,7 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use crate::friction::MapChange;
 use crate::ids::{MissionId, RobotId, SiteId};
 use crate::mission::{Mission, MissionEvent};
 use crate::robot::{Alert, Robot};
@@ -23,11 +24,13 @@ pub enum Topic {
     Robots,
     /// Alerts.
     Alerts,
+    /// Where the friction map changes.
+    Map,
 }
 
 impl Topic {
     /// Every topic.
-    pub const ALL: [Self; 3] = [Self::Missions, Self::Robots, Self::Alerts];
+    pub const ALL: [Self; 4] = [Self::Missions, Self::Robots, Self::Alerts, Self::Map];
 
     /// The topic's name on the wire.
     pub const fn as_str(self) -> &'static str {
@@ -35,6 +38,7 @@ impl Topic {
             Self::Missions => "missions",
             Self::Robots => "robots",
             Self::Alerts => "alerts",
+            Self::Map => "map",
         }
     }
 
@@ -60,6 +64,8 @@ pub enum Event {
     Robot(Box<Robot>),
     /// An alert as it is now.
     Alert(Box<Alert>),
+    /// Where the friction map has changed.
+    Map(Box<MapChange>),
     /// The server ends the stream.
     End(StreamEnd),
 }
@@ -74,6 +80,7 @@ impl Event {
             Self::Step(_) => "step",
             Self::Robot(_) => "robot",
             Self::Alert(_) => "alert",
+            Self::Map(_) => "map",
             Self::End(_) => "end",
         }
     }

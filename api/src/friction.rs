@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use crate::geometry::Point;
-use crate::ids::{ConfigurationId, MissionId, RobotId};
+use crate::ids::{ConfigurationId, MissionId, RobotId, SiteId};
 use crate::site::Cell;
 use crate::terrain::{TerrainClass, TerrainRef};
 
@@ -498,4 +498,34 @@ pub struct Withdrawal {
     pub by: String,
     /// When.
     pub at: Timestamp,
+}
+
+/// Where the map of a site has changed: in these boxes of cells, since the word before.
+///
+/// Changes are told at most once a second and put together to squares of cells, so that what is in
+/// a box may be as it was. Ask for what you need of it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct MapChange {
+    /// The site.
+    pub site: SiteId,
+    /// When this was told.
+    pub at: Timestamp,
+    /// Revision of the grid that the cells are of.
+    pub grid_revision: u32,
+    /// Counts changes of the site's terrains; another one than before changes what is said of any
+    /// cell.
+    pub terrain_revision: u64,
+    /// Whether anything of the map may have changed; there are no boxes then.
+    pub everything: bool,
+    /// Where, at most 256 boxes.
+    pub boxes: Vec<CellBox>,
+}
+
+/// A box of cells, both ends included.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct CellBox {
+    /// The cell with the lowest coordinates.
+    pub min: Cell,
+    /// The cell with the highest coordinates.
+    pub max: Cell,
 }

@@ -9,6 +9,7 @@
 //! | `robots/{robot}/teleop` | published | server → robot |
 //! | `robots/{robot}/limit/{holder}` | published | any program → robot |
 //! | `server/pulse` | published | server → all robots |
+//! | `server/map` | published | server → all robots and programs |
 //! | `server/hello/{robot}` | query | robot → server |
 //! | `server/ingest/{robot}` | query | robot → server |
 
@@ -133,6 +134,11 @@ pub fn pulse(site: &SiteId) -> String {
     format!("{ROOT}/{site}/server/pulse")
 }
 
+/// Where the server publishes where the friction map changes.
+pub fn map(site: &SiteId) -> String {
+    format!("{ROOT}/{site}/server/map")
+}
+
 /// Where a robot introduces itself.
 pub fn hello(site: &SiteId, robot: &RobotId) -> String {
     format!("{ROOT}/{site}/server/hello/{robot}")
@@ -171,6 +177,8 @@ pub enum Key {
     Limit(SiteId, RobotId, HolderId),
     /// The server's pulse.
     Pulse(SiteId),
+    /// Where the friction map changes.
+    Map(SiteId),
     /// An introduction.
     Hello(SiteId, RobotId),
     /// An upload.
@@ -200,6 +208,7 @@ impl Key {
                 Self::Limit(site, robot.parse().ok()?, holder.parse().ok()?)
             }
             ["server", "pulse"] => Self::Pulse(site),
+            ["server", "map"] => Self::Map(site),
             ["server", "hello", robot] => Self::Hello(site, robot.parse().ok()?),
             ["server", "ingest", robot] => Self::Ingest(site, robot.parse().ok()?),
             _ => return None,
@@ -237,6 +246,7 @@ mod tests {
                 Key::Limit(pair().0, pair().1, holder.clone()),
             ),
             (pulse(&site), Key::Pulse(site.clone())),
+            (map(&site), Key::Map(site.clone())),
             (hello(&site, &robot), Key::Hello(pair().0, pair().1)),
             (ingest(&site, &robot), Key::Ingest(pair().0, pair().1)),
         ];

@@ -85,6 +85,65 @@ pub struct Cell {
     pub iy: i32,
 }
 
+/// Where on the earth a site's origin lies, and how the site is turned.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(try_from = "GeoOriginFields")]
+pub struct GeoOrigin {
+    /// Latitude of the origin in WGS 84, degrees north.
+    #[schema(minimum = -90.0, maximum = 90.0)]
+    pub latitude_deg: f64,
+    /// Longitude of the origin in WGS 84, degrees east.
+    #[schema(minimum = -180.0, maximum = 180.0)]
+    pub longitude_deg: f64,
+    /// Angle from east to the site's x axis, counter-clockwise, degrees; 0 when absent.
+    #[schema(minimum = -360.0, maximum = 360.0)]
+    pub x_axis_deg: f64,
+}
+
+#[derive(Deserialize)]
+#[expect(clippy::struct_field_names, reason = "units stand last in names")]
+struct GeoOriginFields {
+    latitude_deg: f64,
+    longitude_deg: f64,
+    #[serde(default)]
+    x_axis_deg: f64,
+}
+
+/// Why something is no place on the earth.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[error("{field} must be -{most} to {most}, not {value}")]
+pub struct InvalidGeoOrigin {
+    field: &'static str,
+    most: f64,
+    value: f64,
+}
+
+impl TryFrom<GeoOriginFields> for GeoOrigin {
+    type Error = InvalidGeoOrigin;
+
+    fn try_from(fields: GeoOriginFields) -> Result<Self, InvalidGeoOrigin> {
+        let GeoOriginFields {
+            latitude_deg,
+            longitude_deg,
+            x_axis_deg,
+        } = fields;
+        for (field, value, most) in [
+            ("latitude_deg", latitude_deg, 90.0),
+            ("longitude_deg", longitude_deg, 180.0),
+            ("x_axis_deg", x_axis_deg, 360.0),
+        ] {
+            if !(-most..=most).contains(&value) {
+                return Err(InvalidGeoOrigin { field, most, value });
+            }
+        }
+        Ok(Self {
+            latitude_deg,
+            longitude_deg,
+            x_axis_deg,
+        })
+    }
+}
+
 /// A site as the server keeps it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Site {
@@ -99,6 +158,9 @@ pub struct Site {
     /// Counts changes of the site's geofence.
     #[serde(default)]
     pub geofence_revision: u64,
+    /// Where on the earth the site lies, if somebody has said so.
+    #[serde(default)]
+    pub origin: Option<GeoOrigin>,
     /// When the site was made.
     pub created_at: Timestamp,
 }
@@ -115,6 +177,9 @@ pub struct CreateSite {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0.1, maximum = 100.0)]
     pub cell_m: Option<f64>,
+    /// Where on the earth the site lies; it may be said later.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub origin: Option<GeoOrigin>,
 }
 
 #[cfg(test)]
@@ -138,6 +203,24 @@ mod tests {
             let text = format!(r#"{{"revision":1,"cell_m":{cell_m}}}"#);
             let error = serde_json::from_str::<Grid>(&text).unwrap_err();
             assert!(error.to_string().contains("cell_m"), "{error}");
+        }
+    }
+
+    #[test]
+    fn an_origin_beyond_the_earth_is_refused_while_parsing() {
+        for (text, named) in [
+            (r#"{"latitude_deg":91,"longitude_deg":0}"#, "latitude_deg"),
+            (
+                r#"{"latitude_deg":0,"longitude_deg":-181}"#,
+                "longitude_deg",
+            ),
+            (
+                r#"{"latitude_deg":0,"longitude_deg":0,"x_axis_deg":1e3}"#,
+                "x_axis_deg",
+            ),
+        ] {
+            let error = serde_json::from_str::<GeoOrigin>(text).unwrap_err();
+            assert!(error.to_string().contains(named), "{error}");
         }
     }
 

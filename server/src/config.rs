@@ -80,6 +80,8 @@ pub struct Config {
     pub friction: FrictionConfig,
     /// How the θ of robot models is brought to that of others, where an answer asks for it.
     pub normalisations: Vec<Normalisation>,
+    /// How long raw measurements are kept.
+    pub retention: RetentionConfig,
     /// The REST API's certificate; without one it listens on this machine alone.
     pub tls: Option<TlsFiles>,
     /// What browsers may do.
@@ -132,6 +134,51 @@ pub struct WebConfig {
     pub allowed_origins: Vec<Origin>,
     /// A proxy before this server ends TLS: browsers come by `https`.
     pub behind_https: bool,
+}
+
+/// How long raw measurements are kept; what they say stays on the map for ever.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RetentionConfig {
+    /// Days after which a raw measurement is removed, within [`SEGMENTS_DAYS_RANGE`].
+    pub segments_days: u32,
+    /// Most raw measurements; the oldest go first. Within [`SEGMENTS_MAX_RANGE`].
+    pub segments_max: i64,
+}
+
+/// How long raw measurements may be kept, days.
+pub const SEGMENTS_DAYS_RANGE: std::ops::RangeInclusive<u32> = 1..=36_500;
+/// How many raw measurements may be kept.
+pub const SEGMENTS_MAX_RANGE: std::ops::RangeInclusive<i64> = 1_000..=1_000_000_000_000;
+
+impl Default for RetentionConfig {
+    fn default() -> Self {
+        Self {
+            segments_days: 90,
+            segments_max: 20_000_000,
+        }
+    }
+}
+
+impl RetentionConfig {
+    #[expect(clippy::cast_precision_loss, reason = "for a message")]
+    fn check(self) -> Result<(), ConfigError> {
+        if !SEGMENTS_DAYS_RANGE.contains(&self.segments_days) {
+            return Err(ConfigError::OutOfRange {
+                key: "retention.segments_days",
+                range: "1 to 36500",
+                value: self.segments_days.into(),
+            });
+        }
+        if !SEGMENTS_MAX_RANGE.contains(&self.segments_max) {
+            return Err(ConfigError::OutOfRange {
+                key: "retention.segments_max",
+                range: "1000 to 1e12",
+                value: self.segments_max as f64,
+            });
+        }
+        Ok(())
+    }
 }
 
 /// How measurements of several robots and times are weighed.
@@ -225,6 +272,8 @@ struct File {
     friction: FrictionConfig,
     #[serde(default)]
     normalisations: BTreeMap<String, NormalisationFields>,
+    #[serde(default)]
+    retention: RetentionConfig,
     tls: Option<TlsFiles>,
     #[serde(default)]
     web: WebConfig,
@@ -314,6 +363,7 @@ impl Config {
                 .unwrap_or_else(|| SITE_DEFAULT.parse().expect(builtin)),
             friction: file.friction,
             normalisations: normalisations(file.normalisations)?,
+            retention: file.retention,
             tls: file.tls,
             web: file.web,
             robots: file.robots,
@@ -351,6 +401,7 @@ impl Config {
         if let Some(robots) = &self.robots {
             robots.check()?;
         }
+        self.retention.check()?;
         self.friction.check()
     }
 }
@@ -431,6 +482,21 @@ mod tests {
             .unwrap_err()
             .to_string();
         assert!(nan.contains("friction.robot_bias_ratio"), "{nan}");
+    }
+
+    #[test]
+    fn how_long_measurements_are_kept_is_bounded() {
+        let kept = load("[retention]\nsegments_days = 7").unwrap().retention;
+        assert_eq!(kept.segments_days, 7);
+        assert_eq!(kept.segments_max, RetentionConfig::default().segments_max);
+        for wrong in [
+            "segments_days = 0",
+            "segments_max = 10",
+            "segments_hours = 1",
+        ] {
+            let error = load(&format!("[retention]\n{wrong}")).unwrap_err();
+            assert!(error.to_string().contains("segments_"), "{error}");
+        }
     }
 
     #[test]

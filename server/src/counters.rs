@@ -37,6 +37,8 @@ counters! {
     records_refused,
     /// Segments from a time that had not come, put aside until their run's clock is known.
     segments_aside,
+    /// Raw segments removed after their time; what they said stays on the map.
+    segments_removed,
     /// Mission reports taken.
     mission_reports_committed,
     /// Batches answered.

@@ -41,7 +41,7 @@ use tread_api::startup::give_zenoh_threads;
 
 use self::app::enrolment::Office;
 use self::app::identity::audit;
-use self::app::{App, Links, events, ingest, merging, reconciler};
+use self::app::{App, Links, events, ingest, merging, reconciler, retention};
 use self::authority::Authority;
 use self::clock::Clock;
 use self::config::RobotsConfig;
@@ -131,6 +131,10 @@ impl Server {
         supervisor.spawn_vital("reconciler", reconciling);
         supervisor.spawn_vital("events", events::run(app.clone(), stop()));
         supervisor.spawn_vital("merging", merging::run(app.clone(), stop()));
+        let telling = app::friction::live::run(app.clone(), stop());
+        supervisor.spawn_vital("map", telling);
+        let removing = retention::run(app.clone(), config.retention, stop());
+        supervisor.spawn_vital("retention", removing);
         supervisor.spawn_vital("audit", audit::run(app.clone(), stop()));
         let router = http::router(app.clone(), names);
         if let Some(tls) = &tls {

@@ -15,6 +15,7 @@ use tokio::sync::mpsc;
 use tread_api::mission::Mission;
 use tread_api::problem::ProblemType;
 
+use crate::app::friction::KnownGround;
 use crate::app::{App, AppError};
 use crate::db;
 
@@ -22,6 +23,8 @@ use crate::db;
 const BOUNDS_S: [f64; 10] = [0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.5, 1.0, 5.0];
 /// Most routes, methods and statuses that are told apart.
 const SERIES_MAX: usize = 1_000;
+/// Most terrains and robot models that have series of their own.
+pub const TERRAIN_SERIES_MAX: usize = 500;
 
 /// Upper bounds of the buckets of missions, seconds.
 const MISSION_BOUNDS_S: [f64; 10] = [
@@ -160,6 +163,9 @@ impl MissionDurations {
     }
 }
 
+/// One number of what is known of a terrain.
+type NumberOf = fn(&KnownGround) -> f64;
+
 type Depth = Box<dyn Fn() -> usize + Send + Sync>;
 
 /// The server's queues, looked at when somebody asks.
@@ -228,6 +234,7 @@ impl App {
     pub async fn metrics(&self) -> Result<String, AppError> {
         let mut text = String::new();
         self.write_fleet(&mut text).await?;
+        self.write_ground(&mut text).await?;
         self.write_clients(&mut text);
         let name = "tread_uptime_seconds";
         head(&mut text, name, "gauge", "Time since the start.");
@@ -287,6 +294,48 @@ impl App {
             head(text, name, "gauge", help);
             line(text, &format!("{name} {value}"));
         }
+        Ok(())
+    }
+
+    /// What is known of terrains.
+    async fn write_ground(&self, text: &mut String) -> Result<(), AppError> {
+        let (known, left_out) = self.known_of_terrains(TERRAIN_SERIES_MAX).await?;
+        let gauges: [(&str, NumberOf, &str); 3] = [
+            (
+                "tread_terrain_theta",
+                |known| known.theta,
+                "Slip per friction coefficient of each terrain that was measured, by robot model.",
+            ),
+            (
+                "tread_terrain_theta_std_dev",
+                |known| known.std_dev,
+                "Its standard deviation.",
+            ),
+            (
+                "tread_terrain_age_seconds",
+                |known| known.age_s,
+                "Age of its newest measurement.",
+            ),
+        ];
+        for (name, value_of, help) in gauges {
+            head(text, name, "gauge", help);
+            for known in &known {
+                let KnownGround {
+                    site,
+                    terrain,
+                    configuration,
+                    ..
+                } = known;
+                let labels = format!(
+                    "site=\"{site}\",terrain=\"{terrain}\",configuration=\"{configuration}\""
+                );
+                line(text, &format!("{name}{{{labels}}} {}", value_of(known)));
+            }
+        }
+        let name = "tread_terrain_series_left_out";
+        let help = "Terrains and robot models beyond those that have series of their own.";
+        head(text, name, "gauge", help);
+        line(text, &format!("{name} {left_out}"));
         Ok(())
     }
 

@@ -57,6 +57,7 @@ pub(super) async fn run(
                 id,
                 name,
                 cell_m: cell,
+                origin: None,
             };
             let site = client.create_site(&request).await?;
             output.show(&site, |site| list(std::slice::from_ref(site)))?;

@@ -314,6 +314,32 @@ impl Writer {
         Ok((outcomes, tally))
     }
 
+    /// Which of these were stored once and removed after their time. Only runs of which anything
+    /// was removed are asked for, so this costs nothing for all others.
+    async fn removed_before(
+        &self,
+        tx: &mut Tx,
+        candidates: &[Candidate<'_>],
+    ) -> Result<HashSet<(i64, i64)>, DbError> {
+        let mut spans: HashMap<i64, (i64, i64)> = HashMap::new();
+        for &(boot_pk, seq) in candidates.iter().map(|candidate| &candidate.keys) {
+            if self.app.removed().has(boot_pk) {
+                let span = spans.entry(boot_pk).or_insert((seq, seq));
+                *span = (span.0.min(seq), span.1.max(seq));
+            }
+        }
+        let mut removed = HashSet::new();
+        for (boot_pk, span) in spans {
+            let ranges = db::removed::within(tx, boot_pk, span).await?;
+            let keys = candidates.iter().map(|candidate| candidate.keys);
+            removed.extend(keys.filter(|&(of, seq)| {
+                let holds = |&(from, to): &(i64, i64)| (from..=to).contains(&seq);
+                of == boot_pk && ranges.iter().any(holds)
+            }));
+        }
+        Ok(removed)
+    }
+
     /// Stores segments and folds those that are new and not withdrawn.
     async fn insert(
         &mut self,
@@ -323,8 +349,10 @@ impl Writer {
         outcomes: &mut [Outcome],
         tally: &mut Tally,
     ) -> Result<Vec<Folded>, DbError> {
+        let removed = self.removed_before(tx, candidates).await?;
+        let rows = rows(candidates, &removed);
         let mut new: Option<HashSet<(i64, i64)>> =
-            match db::segments::insert_new(tx, &rows(candidates), now).await? {
+            match db::segments::insert_new(tx, &rows, now).await? {
                 Inserted::All => None,
                 Inserted::Only(keys) => Some(keys.into_iter().collect()),
             };
@@ -332,7 +360,8 @@ impl Writer {
         let mut folded: HashMap<SumKey, Folded> = HashMap::new();
         for candidate in candidates {
             // One that stands twice in this very group is new once.
-            let is_new = new.as_mut().is_none_or(|new| new.remove(&candidate.keys));
+            let is_new = !removed.contains(&candidate.keys)
+                && new.as_mut().is_none_or(|new| new.remove(&candidate.keys));
             let upload = candidate.upload.and_then(|upload| outcomes.get_mut(upload));
             if let Some(Ok(receipt)) = upload {
                 if is_new {
@@ -382,7 +411,10 @@ impl Writer {
     }
 }
 
-fn rows<'group>(candidates: &'group [Candidate<'_>]) -> Vec<NewSegment<'group>> {
+fn rows<'group>(
+    candidates: &'group [Candidate<'_>],
+    removed: &HashSet<(i64, i64)>,
+) -> Vec<NewSegment<'group>> {
     let row = |candidate: &'group Candidate<'_>| {
         let terrain = candidate.ready.segment.terrain.as_ref();
         let terrain = terrain.map_or("", |terrain| terrain.id.as_str());
@@ -391,7 +423,10 @@ fn rows<'group>(candidates: &'group [Candidate<'_>]) -> Vec<NewSegment<'group>> 
         let measurement = &*candidate.ready.measurement;
         NewSegment(boot_pk, seq, robot_pk, site_pk, terrain, measurement)
     };
-    candidates.iter().map(row).collect()
+    let kept = candidates
+        .iter()
+        .filter(|candidate| !removed.contains(&candidate.keys));
+    kept.map(row).collect()
 }
 
 fn is_withdrawn(row: &WithdrawalRow, key: &SumKey) -> bool {

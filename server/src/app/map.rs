@@ -92,7 +92,8 @@ impl Maps {
 }
 
 impl App {
-    /// Reads all sums into memory; once, before anything is taken in.
+    /// Reads all sums into memory, and of which runs raw measurements were removed; once, before
+    /// anything is taken in.
     ///
     /// # Errors
     /// The database failed.
@@ -103,6 +104,7 @@ impl App {
     }
 
     async fn fill(&self, tx: &mut Tx) -> Result<(), AppError> {
+        self.removed().extend(db::removed::boots(tx).await?);
         let mut after = String::new();
         loop {
             let rows = db::sites::list(tx, &after, 100).await?;

@@ -15,6 +15,7 @@ pub mod merging;
 pub mod missions;
 mod planned_path;
 pub mod reconciler;
+pub mod retention;
 pub mod robots;
 pub mod segments;
 pub mod sites;
@@ -33,10 +34,11 @@ use tread_api::ids::{RobotId, SiteId};
 use self::enrolment::Membership;
 pub use self::error::AppError;
 use self::events::Hub;
-use self::friction::Pictures;
+use self::friction::{MapNews, Pictures};
 use self::identity::Identity;
 use self::map::Maps;
 use self::missions::idempotency::InFlight;
+use self::retention::Removed;
 use crate::clock::Clock;
 use crate::config::FrictionConfig;
 use crate::counters::Counters;
@@ -83,6 +85,8 @@ struct Inner {
     normalisations: OnceLock<Vec<Arc<Normalisation>>>,
     map_readers: Semaphore,
     pictures: Pictures,
+    news: MapNews,
+    removed: Removed,
     drive_slots: Arc<Semaphore>,
 }
 
@@ -129,6 +133,8 @@ impl App {
             normalisations: OnceLock::new(),
             map_readers: Semaphore::new(friction::READERS_MAX),
             pictures: Pictures::default(),
+            news: MapNews::default(),
+            removed: Removed::default(),
             drive_slots: Arc::new(Semaphore::new(teleop::SESSIONS_MAX)),
         };
         Self {
@@ -251,6 +257,14 @@ impl App {
 
     fn pictures(&self) -> &Pictures {
         &self.inner.pictures
+    }
+
+    fn news(&self) -> &MapNews {
+        &self.inner.news
+    }
+
+    fn removed(&self) -> &Removed {
+        &self.inner.removed
     }
 
     fn robots_changed(&self) {

@@ -2,7 +2,7 @@
 
 use tread_api::ids::SiteId;
 use tread_api::page::Page;
-use tread_api::site::{CELL_MAX_M, CELL_MIN_M, CreateSite, Grid, Site};
+use tread_api::site::{CELL_MAX_M, CELL_MIN_M, CreateSite, GeoOrigin, Grid, Site};
 
 use super::{App, AppError, name_or, page, site_row};
 use crate::db;
@@ -36,7 +36,12 @@ impl App {
 
     /// Makes a site.
     pub async fn create_site(&self, request: CreateSite) -> Result<Site, AppError> {
-        let CreateSite { id, name, cell_m } = request;
+        let CreateSite {
+            id,
+            name,
+            cell_m,
+            origin,
+        } = request;
         let cell_m = cell_m.unwrap_or(CELL_DEFAULT_M);
         if !(CELL_MIN_M..=CELL_MAX_M).contains(&cell_m) {
             let detail = format!("cell_m must be {CELL_MIN_M} to {CELL_MAX_M}, not {cell_m}");
@@ -54,6 +59,7 @@ impl App {
             },
             terrain_revision: 0,
             geofence_revision: 0,
+            origin,
             created_at: self.clock().now(),
         };
         let mut tx = self.db().write().await?;
@@ -74,12 +80,22 @@ impl App {
         Ok(site)
     }
 
+    /// Says where on the earth a site lies, or that nobody knows.
+    pub async fn tie_site(&self, id: &SiteId, origin: Option<GeoOrigin>) -> Result<Site, AppError> {
+        let mut tx = self.db().write().await?;
+        let row = site_row(&mut tx, id).await?;
+        db::sites::set_origin(&mut tx, row.pk, origin).await?;
+        tx.commit().await?;
+        Ok(Site { origin, ..row.site })
+    }
+
     /// Makes a site unless it exists.
     pub async fn ensure_site(&self, id: &SiteId) -> Result<(), AppError> {
         let request = CreateSite {
             id: id.clone(),
             name: None,
             cell_m: None,
+            origin: None,
         };
         match self.create_site(request).await {
             Ok(_) | Err(AppError::AlreadyExists { .. }) => Ok(()),

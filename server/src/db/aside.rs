@@ -47,6 +47,8 @@ pub async fn put(
              (boot_pk, seq, site_pk, robot_pk, ended_at_us, received_at_us, measurement)
          SELECT ?1, ?2, ?3, ?4, ?5, ?6, ?7
          WHERE NOT EXISTS (SELECT 1 FROM segments WHERE boot_pk = ?1 AND seq = ?2)
+             AND NOT EXISTS (SELECT 1 FROM segments_removed
+                 WHERE boot_pk = ?1 AND ?2 BETWEEN from_seq AND to_seq)
          ON CONFLICT DO NOTHING",
         boot_pk,
         seq,

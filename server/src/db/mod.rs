@@ -13,6 +13,7 @@ pub mod history;
 pub mod idempotency;
 pub mod join_tokens;
 pub mod missions;
+pub mod removed;
 pub mod robots;
 pub mod segments;
 pub mod sessions;

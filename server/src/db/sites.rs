@@ -2,9 +2,9 @@
 
 use sqlx::SqliteConnection;
 use tread_api::ids::SiteId;
-use tread_api::site::{Grid, Site};
+use tread_api::site::{GeoOrigin, Grid, Site};
 
-use super::{DbError, from_us, parse, to_us, unsigned};
+use super::{DbError, from_json, from_us, parse, to_json, to_us, unsigned};
 
 /// A site with its key in the database.
 #[derive(Debug, Clone)]
@@ -27,6 +27,7 @@ struct Raw {
     geofence_revision: i64,
     created_at_us: i64,
     merged_before_h: i64,
+    origin: Option<String>,
 }
 
 impl TryFrom<Raw> for SiteRow {
@@ -37,12 +38,14 @@ impl TryFrom<Raw> for SiteRow {
             revision: unsigned("grid revision", raw.grid_revision)?,
             cell_m: raw.cell_m,
         };
+        let origin = raw.origin.map(|text| from_json("origin", &text));
         let site = Site {
             id: parse("site", &raw.id)?,
             name: raw.name,
             grid,
             terrain_revision: unsigned("terrain revision", raw.terrain_revision)?,
             geofence_revision: unsigned("geofence revision", raw.geofence_revision)?,
+            origin: origin.transpose()?,
             created_at: from_us(raw.created_at_us)?,
         };
         Ok(Self {
@@ -57,18 +60,37 @@ impl TryFrom<Raw> for SiteRow {
 pub async fn insert(db: &mut SqliteConnection, site: &Site) -> Result<bool, DbError> {
     let (id, created_at_us) = (site.id.as_str(), to_us(site.created_at));
     let grid_revision = i64::from(site.grid.revision);
+    let origin = origin_text(site.origin)?;
     let result = sqlx::query!(
-        "INSERT INTO sites (id, name, grid_revision, cell_m, created_at_us)
-         VALUES (?, ?, ?, ?, ?) ON CONFLICT (id) DO NOTHING",
+        "INSERT INTO sites (id, name, grid_revision, cell_m, created_at_us, origin)
+         VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (id) DO NOTHING",
         id,
         site.name,
         grid_revision,
         site.grid.cell_m,
         created_at_us,
+        origin,
     )
     .execute(db)
     .await?;
     Ok(result.rows_affected() == 1)
+}
+
+fn origin_text(origin: Option<GeoOrigin>) -> Result<Option<String>, DbError> {
+    origin.map(|origin| to_json("origin", &origin)).transpose()
+}
+
+/// Says where on the earth a site lies.
+pub async fn set_origin(
+    db: &mut SqliteConnection,
+    pk: i64,
+    origin: Option<GeoOrigin>,
+) -> Result<(), DbError> {
+    let origin = origin_text(origin)?;
+    sqlx::query!("UPDATE sites SET origin = ?2 WHERE pk = ?1", pk, origin)
+        .execute(db)
+        .await?;
+    Ok(())
 }
 
 /// The site of that name.
@@ -77,7 +99,7 @@ pub async fn find(db: &mut SqliteConnection, id: &SiteId) -> Result<Option<SiteR
     let raw = sqlx::query_as!(
         Raw,
         r#"SELECT pk AS "pk!", id, name, grid_revision, cell_m, terrain_revision, created_at_us,
-               merged_before_h,
+               merged_before_h, origin,
                COALESCE((SELECT MAX(revision) FROM geofences WHERE site_pk = sites.pk), 0)
                    AS "geofence_revision!: i64"
            FROM sites WHERE id = ?"#,
@@ -97,7 +119,7 @@ pub async fn list(
     let rows = sqlx::query_as!(
         Raw,
         r#"SELECT pk AS "pk!", id, name, grid_revision, cell_m, terrain_revision, created_at_us,
-               merged_before_h,
+               merged_before_h, origin,
                COALESCE((SELECT MAX(revision) FROM geofences WHERE site_pk = sites.pk), 0)
                    AS "geofence_revision!: i64"
            FROM sites WHERE id > ? ORDER BY id LIMIT ?"#,

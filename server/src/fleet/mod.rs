@@ -6,6 +6,7 @@
 //! channels, and what does not fit is counted and dropped. Robots send again what matters.
 
 mod access;
+mod changes;
 pub mod commands;
 mod gate;
 mod inbox;
@@ -14,6 +15,7 @@ mod keeper;
 mod matrix;
 mod opening;
 pub mod presence;
+mod publishers;
 mod pulse;
 mod requests;
 mod router;
@@ -205,6 +207,8 @@ impl Fleet {
         let stop = || self.supervisor.stop_token();
         let pulse = pulse::run(app.clone(), Arc::clone(&self.routers), stop());
         self.supervisor.spawn_vital("pulse", pulse);
+        let changes = changes::run(app.clone(), Arc::clone(&self.routers), stop());
+        self.supervisor.spawn_vital("changes", changes);
         let gate = self.gate.lock().ok().and_then(|mut gate| gate.take());
         if let Some(gate) = gate {
             let keeping = Arc::clone(&keeper).run(stop());

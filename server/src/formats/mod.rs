@@ -1,7 +1,10 @@
 //! The friction map in the formats of other programs. Pure: what is known goes in, bytes come out.
 
 pub mod font;
+pub mod geodesy;
+pub mod json;
 pub mod nav2;
 pub mod palette;
 pub mod png;
+pub mod table;
 pub mod tile;

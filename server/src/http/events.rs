@@ -31,7 +31,7 @@ pub(super) struct Cut(pub(super) CancellationToken);
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct EventQuery {
-    /// Only these topics, with commas between them: `missions`, `robots`, `alerts`.
+    /// Only these topics, with commas between them: `missions`, `robots`, `alerts`, `map`.
     topics: Option<String>,
     /// Only this site.
     #[param(value_type = Option<String>)]

@@ -104,6 +104,7 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(audit::list))
         .routes(routes!(sites::list, sites::create))
         .routes(routes!(sites::get))
+        .routes(routes!(sites::tie, sites::untie))
         .routes(routes!(terrains::list, terrains::create))
         .routes(routes!(terrains::get, terrains::replace, terrains::delete))
         .routes(routes!(robots::list))

@@ -16,6 +16,19 @@ pub(super) struct Offered<T> {
     pub(super) format: T,
 }
 
+/// A format with its name in `format=` and its media type.
+pub(super) const fn offered<T: Copy>(
+    name: &'static str,
+    media_type: &'static str,
+    format: T,
+) -> Offered<T> {
+    Offered {
+        name,
+        media_type,
+        format,
+    }
+}
+
 /// The format that is asked for; the first one when nothing is said.
 pub(super) fn choose<T: Copy>(
     offered: &[Offered<T>],
@@ -90,21 +103,9 @@ mod tests {
     use super::*;
 
     const OFFERED: [Offered<char>; 3] = [
-        Offered {
-            name: "json",
-            media_type: "application/json",
-            format: 'j',
-        },
-        Offered {
-            name: "png",
-            media_type: "image/png",
-            format: 'p',
-        },
-        Offered {
-            name: "csv",
-            media_type: "text/csv",
-            format: 'c',
-        },
+        offered("json", "application/json", 'j'),
+        offered("png", "image/png", 'p'),
+        offered("csv", "text/csv", 'c'),
     ];
 
     fn chosen(format: Option<&str>, accept: Option<&str>) -> Result<char, Problem> {

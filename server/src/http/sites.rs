@@ -6,7 +6,7 @@ use serde::Deserialize;
 use tread_api::ids::SiteId;
 use tread_api::page::Page;
 use tread_api::problem::ProblemBody;
-use tread_api::site::{CreateSite, Site};
+use tread_api::site::{CreateSite, GeoOrigin, Site};
 use utoipa::IntoParams;
 
 use super::extract::{Json, Path, Query, page_limit};
@@ -60,4 +60,30 @@ pub(super) async fn create(
     Json(request): Json<CreateSite>,
 ) -> Result<(StatusCode, Json<Site>), Problem> {
     Ok((StatusCode::CREATED, Json(app.create_site(request).await?)))
+}
+
+/// Says where on the earth a site's origin lies, so that its map can be given in WGS 84.
+#[utoipa::path(put, path = "/v1/sites/{site}/origin", tag = "sites", operation_id = "tie_site",
+    security(("token" = ["operator"])),
+    params(("site" = SiteId, Path)), request_body = GeoOrigin,
+    responses((status = 200, body = Site), (status = 404, body = ProblemBody),
+        (status = 422, body = ProblemBody)))]
+pub(super) async fn tie(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+    Json(origin): Json<GeoOrigin>,
+) -> Result<Json<Site>, Problem> {
+    Ok(Json(app.tie_site(&site, Some(origin)).await?))
+}
+
+/// Takes back where on the earth a site lies.
+#[utoipa::path(delete, path = "/v1/sites/{site}/origin", tag = "sites",
+    operation_id = "untie_site", security(("token" = ["operator"])),
+    params(("site" = SiteId, Path)),
+    responses((status = 200, body = Site), (status = 404, body = ProblemBody)))]
+pub(super) async fn untie(
+    State(app): State<App>,
+    Path(site): Path<SiteId>,
+) -> Result<Json<Site>, Problem> {
+    Ok(Json(app.tie_site(&site, None).await?))
 }

@@ -1,5 +1,7 @@
 //! Questions about the map, and what a bad question gets.
 
+use std::collections::BTreeMap;
+
 use jiff::{SignedDuration, Timestamp};
 use reqwest::{StatusCode, header};
 use serde_json::{Value, json};
@@ -7,10 +9,14 @@ use tread_api::friction::{
     CellDifference, CellFriction, PathFriction, PointFriction, RobotContribution, Segment,
     TerrainFriction, TerrainHistory, VisitSuggestion,
 };
+use tread_api::ids::ConfigurationId;
 use tread_api::page::Page;
+use tread_api::tile::Tile;
 use tread_api::wire::ingest::Record;
+use tread_server::friction::index::Normalisation;
+use uuid::Uuid;
 
-use crate::harness::{Yard, eventually, measured, segment};
+use crate::harness::{Yard, eventually, measured, model, segment};
 use crate::robot::Robot;
 
 const BASE: &str = "/v1/sites/yard/friction";
@@ -259,6 +265,93 @@ async fn a_path_tells_what_is_known_and_how_fast_it_may_be_driven() {
     let body = json!({"robot": "nobody", "points": []});
     let (status, _) = yard.post(&format!("{BASE}/path"), &body).await;
     assert_eq!(status, StatusCode::NOT_FOUND);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_path_that_nobody_has_driven_says_so() {
+    let yard = measured_yard().await;
+    let body = json!({"robot": "rover-1", "points": [
+        {"x_m": 50.5, "y_m": 0.5}, {"x_m": 54.5, "y_m": 0.5}]});
+    let (status, said) = yard.post(&format!("{BASE}/path"), &body).await;
+    assert_eq!(status, StatusCode::OK, "{said}");
+    assert_eq!(said["known_ratio"], json!(0.0));
+    for piece in said["pieces"].as_array().unwrap() {
+        for layer in ["theta", "std_dev", "theta_upper_95", "age_s"] {
+            assert_eq!(piece[layer], Value::Null, "unknown stays null: {piece}");
+        }
+        assert_eq!(piece["grip_mu"], json!(0.14), "the cautious one: {piece}");
+    }
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_answer_says_which_normalisation_it_used() {
+    let reference = model().configuration();
+    let other = ConfigurationId::from_uuid(Uuid::from_u128(77));
+    let yard = Yard::start_with(after_h(10), |config| {
+        config.normalisations = vec![Normalisation {
+            name: "to-lugged".to_owned(),
+            reference,
+            ratios: BTreeMap::from([(other, 2.0)]),
+        }];
+    })
+    .await;
+    draw(&yard, "lawn", "grass", (0.0, 10.5)).await;
+    let one = Robot::join(&yard, "rover-1").await;
+    let own = on("lawn", (1, 0), 0.2, 0);
+    one.upload(numbered([own])).await.unwrap();
+    let two = Robot::join(&yard, "rover-2").await;
+    let mut foreign = on("lawn", (1, 0), 0.4, 1);
+    foreign.configuration = other;
+    two.upload(numbered([foreign])).await.unwrap();
+
+    let apart: Page<CellFriction> = yard.get(&format!("{BASE}/cells")).await;
+    assert_eq!(apart.items.len(), 2, "models are kept apart");
+    let from = after_h(-1);
+    for (path, places) in [
+        ("cells?", "/items/0/normalisation"),
+        ("point?x_m=1.5&y_m=0.5&", "/models/0/normalisation"),
+        ("terrains?", "/items/0/models/0/normalisation"),
+        ("terrains/lawn?", "/models/0/normalisation"),
+        (
+            "visits?x_min_m=1&y_min_m=0&x_max_m=1.5&y_max_m=0.5&",
+            "/items/0/normalisation",
+        ),
+        (
+            &format!("difference?from={from}&"),
+            "/items/0/normalisation",
+        ),
+    ] {
+        let plain: Value = yard.get(&format!("{BASE}/{path}")).await;
+        assert_eq!(plain.pointer(places), Some(&Value::Null), "{path}: {plain}");
+        let joined: Value = yard
+            .get(&format!("{BASE}/{path}normalisation=to-lugged"))
+            .await;
+        assert_eq!(
+            joined.pointer(places),
+            Some(&json!("to-lugged")),
+            "{path}: {joined}"
+        );
+    }
+    let joined: Page<CellFriction> = yard
+        .get(&format!("{BASE}/cells?normalisation=to-lugged"))
+        .await;
+    let [cell] = joined.items.as_slice() else {
+        panic!("one model: {joined:?}");
+    };
+    assert_eq!((cell.configuration, cell.friction.robots), (reference, 2));
+    assert!((cell.friction.theta - 0.2).abs() < 1e-6, "{cell:?}");
+    let body = json!({"robot": "rover-1", "normalisation": "to-lugged", "points": [
+        {"x_m": 1.1, "y_m": 0.5}, {"x_m": 1.9, "y_m": 0.5}]});
+    let (_, path) = yard.post(&format!("{BASE}/path"), &body).await;
+    assert_eq!(path["normalisation"], json!("to-lugged"));
+    let map = format!("{BASE}/map?format=tile&normalisation=to-lugged");
+    let answer = yard.client().get(yard.url(&map)).send().await.unwrap();
+    assert_eq!(answer.headers()["tread-normalisation"], "to-lugged");
+    let tile = Tile::decode(&answer.bytes().await.unwrap()).unwrap();
+    assert_eq!(tile.normalisation.as_deref(), Some("to-lugged"));
+    assert_eq!(tile.squares[0].unwrap().segments, 2);
     yard.server.stop().await.unwrap();
 }
 

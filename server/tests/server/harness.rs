@@ -88,8 +88,14 @@ impl Yard {
 
     /// A server whose clock stands until it is moved.
     pub(crate) async fn start_at(wall: Timestamp) -> Self {
+        Self::start_with(wall, |_config| {}).await
+    }
+
+    /// The same, with a configuration of one's own.
+    pub(crate) async fn start_with(wall: Timestamp, change: impl FnOnce(&mut Config)) -> Self {
         let folder = Arc::new(tempfile::tempdir().unwrap());
-        let config = config(folder.path(), "127.0.0.1:0");
+        let mut config = config(folder.path(), "127.0.0.1:0");
+        change(&mut config);
         let server = Server::start_with_clock(config, Clock::manual(wall));
         Self::of(folder, server.await.unwrap()).await
     }
@@ -236,6 +242,7 @@ fn config(folder: &Path, zenoh: &str) -> Config {
         site: site(),
         friction: FrictionConfig::default(),
         normalisations: Vec::new(),
+        retention: tread_server::config::RetentionConfig::default(),
         tls: None,
         robots: None,
         web: WebConfig {

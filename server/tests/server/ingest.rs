@@ -86,6 +86,11 @@ impl Writer {
         answered
     }
 
+    /// Uploads, and waits for the answer.
+    pub(crate) async fn upload_as(&self, robot: &str, records: Vec<Record>) -> Receipt {
+        self.upload(robot, records).await.await.unwrap().unwrap()
+    }
+
     pub(crate) async fn sums(&self) -> Vec<SumRow> {
         let mut tx = self.app.db().read().await.unwrap();
         let mut rows = Vec::new();

@@ -12,6 +12,8 @@ mod dry_run;
 #[cfg(test)]
 mod events;
 #[cfg(test)]
+mod exports;
+#[cfg(test)]
 mod friction;
 #[cfg(test)]
 mod geofence;
@@ -21,6 +23,8 @@ mod harness;
 mod identity;
 #[cfg(test)]
 mod ingest;
+#[cfg(test)]
+mod live;
 #[cfg(test)]
 mod map;
 #[cfg(test)]
@@ -33,11 +37,14 @@ mod network;
 mod openapi;
 #[cfg(test)]
 mod page;
+#[cfg(test)]
 mod pictures;
 #[cfg(test)]
 mod program;
 #[cfg(test)]
 mod resources;
+#[cfg(test)]
+mod retention;
 #[cfg(test)]
 mod robot;
 #[cfg(test)]

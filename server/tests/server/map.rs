@@ -205,7 +205,7 @@ async fn a_robot_that_is_withdrawn_leaves_the_map_as_if_it_had_never_come() {
 }
 
 /// What a server has in memory that starts now on the same database.
-async fn restarted(app: &App) -> App {
+pub(crate) async fn restarted(app: &App) -> App {
     let config = FrictionConfig::default();
     let restarted = App::new(app.db().clone(), app.clock().clone(), config);
     restarted.load_map().await.unwrap();
@@ -213,7 +213,7 @@ async fn restarted(app: &App) -> App {
 }
 
 /// What the map says of all cells.
-async fn said(app: &App) -> Page<CellFriction> {
+pub(crate) async fn said(app: &App) -> Page<CellFriction> {
     let cells = CellsAsked {
         area: Area::new((None, None), (None, None)).unwrap(),
         resolution_m: None,

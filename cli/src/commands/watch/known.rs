@@ -45,7 +45,7 @@ impl Known {
                 }
             }
             // A robot's alerts come with the robot, its steps with the mission.
-            Event::Alert(_) | Event::Step(_) | Event::End(_) => {}
+            Event::Alert(_) | Event::Step(_) | Event::Map(_) | Event::End(_) => {}
         }
     }
 

@@ -47,7 +47,11 @@ impl Lines {
                     format!("{} {how}: {}", alert.robot, alert.text),
                 )
             }
-            Event::SnapshotBegin | Event::SnapshotEnd | Event::Step(_) | Event::End(_) => {
+            Event::SnapshotBegin
+            | Event::SnapshotEnd
+            | Event::Step(_)
+            | Event::Map(_)
+            | Event::End(_) => {
                 return None;
             }
         };

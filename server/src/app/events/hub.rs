@@ -10,6 +10,7 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tracing::info;
 use tread_api::event::{Event, Topic};
+use tread_api::friction::MapChange;
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::robot::Alert;
 
@@ -38,8 +39,11 @@ pub struct Sent {
     pub text: String,
     pub(super) seq: u64,
     pub(super) topic: Option<Topic>,
-    pub(super) robot: Option<RobotKey>,
+    pub(super) about: Option<About>,
 }
+
+/// What an event is about: a robot of a site, or the site as a whole.
+pub(super) type About = (SiteId, Option<RobotId>);
 
 /// What a client wants to hear of; what is empty lets everything through.
 #[derive(Debug, Clone, Default)]
@@ -53,9 +57,14 @@ pub struct EventFilter {
 }
 
 impl EventFilter {
-    pub(super) fn lets_through(&self, topic: Option<Topic>, robot: Option<&RobotKey>) -> bool {
+    pub(super) fn lets_through(&self, topic: Option<Topic>, about: Option<&About>) -> bool {
         let of_topic = topic.is_none_or(|topic| self.wants(topic));
-        of_topic && robot.is_none_or(|(site, robot)| self.wants_robot(site, robot))
+        let is_about = |about: &About| match about {
+            (site, Some(robot)) => self.wants_robot(site, robot),
+            // What is no robot's is of whoever asks for its topic or for everything.
+            (site, None) => self.site.as_ref().is_none_or(|wanted| wanted == site),
+        };
+        of_topic && about.is_none_or(is_about)
     }
 
     pub(super) fn wants(&self, topic: Topic) -> bool {
@@ -184,14 +193,18 @@ impl Hub {
         state.clients.clear();
     }
 
-    pub(super) fn publish(&self, event: &Event, topic: Topic, robot: RobotKey) {
+    pub(super) fn publish(&self, event: &Event, topic: Topic, (site, robot): RobotKey) {
+        self.publish_about(event, topic, (site, Some(robot)));
+    }
+
+    fn publish_about(&self, event: &Event, topic: Topic, about: About) {
         let mut state = self.lock();
         state.seq += 1;
         let seq = state.seq;
         let sent = Arc::new(Sent {
             id: Some(format!("{}-{seq}", self.run)),
             seq,
-            ..unnumbered(event, Some(topic), Some(robot))
+            ..unnumbered(event, Some(topic), Some(about))
         });
         state.kept_bytes += sent.text.len();
         state.kept.push_back(Arc::clone(&sent));
@@ -203,12 +216,19 @@ impl Hub {
         }
         let mut slow = Vec::new();
         for (&id, client) in &state.clients {
-            let wanted = client.filter.lets_through(sent.topic, sent.robot.as_ref());
+            let wanted = client.filter.lets_through(sent.topic, sent.about.as_ref());
             if wanted && !client.take(&sent) {
                 slow.push(id);
             }
         }
         state.drop_slow(slow);
+    }
+
+    /// Publishes where the map of a site has changed.
+    pub(in crate::app) fn map(&self, change: &MapChange) {
+        let about = (change.site.clone(), None);
+        let event = Event::Map(Box::new(change.clone()));
+        self.publish_about(&event, Topic::Map, about);
     }
 
     /// Publishes an alert as it is now.
@@ -256,18 +276,18 @@ impl Hub {
             return None;
         }
         let missed = state.kept.iter().filter(|event| event.seq > seq);
-        let wanted = missed.filter(|event| filter.lets_through(event.topic, event.robot.as_ref()));
+        let wanted = missed.filter(|event| filter.lets_through(event.topic, event.about.as_ref()));
         Some(wanted.cloned().collect())
     }
 }
 
-pub(super) fn unnumbered(event: &Event, topic: Option<Topic>, robot: Option<RobotKey>) -> Sent {
+pub(super) fn unnumbered(event: &Event, topic: Option<Topic>, about: Option<About>) -> Sent {
     Sent {
         id: None,
         name: event.name(),
         text: serde_json::to_string(event).unwrap_or_default(),
         seq: 0,
         topic,
-        robot,
+        about,
     }
 }

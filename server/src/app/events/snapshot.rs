@@ -58,7 +58,7 @@ impl Reading {
     pub(super) fn next(&mut self) -> Option<Arc<Sent>> {
         let rest = self.snapshot.events.get(self.next..)?;
         let wanted =
-            |event: &Arc<Sent>| self.filter.lets_through(event.topic, event.robot.as_ref());
+            |event: &Arc<Sent>| self.filter.lets_through(event.topic, event.about.as_ref());
         let skipped = rest.iter().position(wanted)?;
         self.next += skipped + 1;
         rest.get(skipped).cloned()
@@ -148,8 +148,9 @@ impl App {
         };
         let covered = self.hub().newest();
         let mut events = vec![unnumbered(&Event::SnapshotBegin, None, None)];
-        let mut add = |event: &Event, topic, robot: RobotKey| {
-            events.push(unnumbered(event, Some(topic), Some(robot)));
+        let mut add = |event: &Event, topic, (site, robot): RobotKey| {
+            let about = (site, Some(robot));
+            events.push(unnumbered(event, Some(topic), Some(about)));
         };
         let mut tx = self.db().read().await?;
         let alerts = db::alerts::raised(&mut tx, ROBOTS_MAX).await?;

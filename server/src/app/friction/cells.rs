@@ -246,7 +246,7 @@ impl App {
 }
 
 /// What is known of a square, per terrain and configuration.
-fn of_square(
+pub(super) fn of_square(
     map: &SiteMap,
     reading: &Reading,
     (cell, parts): Square,
@@ -390,10 +390,10 @@ fn check_count(area: &Area, resolution_m: Option<f64>) -> Result<(), AppError> {
 }
 
 /// A square and the cells of the grid in it that hold anything; none where it is a cell itself.
-type Square = (Cell, Option<Vec<Cell>>);
+pub(super) type Square = (Cell, Option<Vec<Cell>>);
 
 /// Squares that hold anything, row by row.
-fn squares(
+pub(super) fn squares(
     map: &SiteMap,
     factor: i32,
     (min, max): (Cell, Cell),

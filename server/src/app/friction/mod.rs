@@ -2,6 +2,8 @@
 
 mod advice;
 mod cells;
+mod export;
+pub mod live;
 mod path;
 mod pictures;
 mod prior;
@@ -17,6 +19,8 @@ use tread_api::page::Page;
 use tread_api::terrain::{Terrain, TerrainRef};
 
 pub use self::cells::{Area, CELLS_MAX, CellsAsked};
+pub use self::export::{CellExport, SegmentExport};
+pub(super) use self::live::MapNews;
 pub use self::pictures::Picture;
 pub(super) use self::pictures::Pictures;
 use self::prior::Classes;
@@ -221,6 +225,64 @@ impl App {
             (terrain.id.clone(), terrain.class, models)
         });
         Classes::new(measured.collect())
+    }
+}
+
+/// What is known of a terrain for one robot model, in numbers for a gauge.
+#[derive(Debug, Clone, PartialEq)]
+pub struct KnownGround {
+    /// The site.
+    pub site: SiteId,
+    /// The terrain.
+    pub terrain: TerrainId,
+    /// The robot model and tyres.
+    pub configuration: ConfigurationId,
+    /// θ.
+    pub theta: f64,
+    /// Its standard deviation.
+    pub std_dev: f64,
+    /// Age of the newest measurement, seconds.
+    pub age_s: f64,
+}
+
+impl App {
+    /// What was measured of all terrains, at most `limit`, and how many more there are.
+    ///
+    /// # Errors
+    /// The database failed.
+    pub async fn known_of_terrains(
+        &self,
+        limit: usize,
+    ) -> Result<(Vec<KnownGround>, usize), AppError> {
+        let reading = Reading::new(self, &Asked::default())?;
+        let (mut found, mut left_out) = (Vec::new(), 0);
+        for site in self.all_sites().await? {
+            let view = SiteView::read(&mut self.db().read().await?, &site).await?;
+            let reading = reading.clone();
+            let looking = move |app: &Self| {
+                let mut known = Vec::new();
+                for terrain in &view.terrains {
+                    let models = app.measured_models(&view, &reading, terrain).into_iter();
+                    known.extend(models.filter_map(|model| {
+                        let friction = model.friction?;
+                        Some(KnownGround {
+                            site: site.clone(),
+                            terrain: terrain.id.clone(),
+                            configuration: model.configuration,
+                            theta: friction.theta,
+                            std_dev: friction.std_dev,
+                            age_s: friction.age_s,
+                        })
+                    }));
+                }
+                known
+            };
+            let known = self.off_thread(looking).await;
+            let room = limit - found.len();
+            left_out += known.len().saturating_sub(room);
+            found.extend(known.into_iter().take(room));
+        }
+        Ok((found, left_out))
     }
 }
 

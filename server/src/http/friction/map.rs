@@ -6,19 +6,24 @@ use axum::http::{HeaderMap, HeaderName, HeaderValue};
 use axum::response::Response;
 use jiff::Timestamp;
 use serde::Deserialize;
+use tread_api::friction::CellFriction;
 use tread_api::ids::{ConfigurationId, SiteId};
+use tread_api::page::Page;
 use tread_api::problem::{ProblemBody, ProblemType};
+use tread_api::site::Site;
 use utoipa::IntoParams;
 
-use crate::app::friction::{Area, Asked, Picture, PictureAsked};
+use super::streamed::{CSV_MEDIA_TYPE, JSON_MEDIA_TYPE, PARQUET_MEDIA_TYPE, streamed};
+use crate::app::friction::{Area, Asked, CellExport, Picture, PictureAsked};
 use crate::app::{App, AppError};
 use crate::formats::nav2::{self, SpeedScale};
 use crate::formats::png::{self, PngError};
-use crate::formats::tile;
+use crate::formats::table::{self, TableError, Writer, cells};
+use crate::formats::{json, tile};
 use crate::friction::Raster;
 use crate::http::etag;
 use crate::http::extract::{Path, Query};
-use crate::http::negotiate::{Offered, choose};
+use crate::http::negotiate::{Offered, choose, offered};
 use crate::http::problem::Problem;
 
 /// The robot model whose θ an answer has.
@@ -32,36 +37,61 @@ const SPEED_MAX_DEFAULT_M_S: f64 = 2.0;
 /// Distance to stop within when nothing is said, metres.
 const STOPPING_DEFAULT_M: f64 = 1.0;
 
-/// What a format shows one of each square.
+/// What the map can be given as.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Format {
+    Picture(PictureFormat),
+    List(ListFormat),
+}
+
+/// What shows one value of each square.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum PictureFormat {
     Png,
     Tile,
     Nav2,
     Pgm,
 }
 
-const OFFERED: [Offered<Format>; 4] = [
-    Offered {
-        name: "png",
-        media_type: png::MEDIA_TYPE,
-        format: Format::Png,
-    },
-    Offered {
-        name: "tile",
-        media_type: tread_api::tile::MEDIA_TYPE,
-        format: Format::Tile,
-    },
-    Offered {
-        name: "nav2",
-        media_type: nav2::YAML_MEDIA_TYPE,
-        format: Format::Nav2,
-    },
-    Offered {
-        name: "pgm",
-        media_type: nav2::PGM_MEDIA_TYPE,
-        format: Format::Pgm,
-    },
+/// What has everything that is known of each square.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum ListFormat {
+    Json,
+    GeoJson,
+    Csv,
+    Parquet,
+}
+
+/// PNG first, so that a browser which accepts everything shows it.
+const OFFERED: [Offered<Format>; 8] = [
+    offered("png", png::MEDIA_TYPE, Format::Picture(PictureFormat::Png)),
+    offered("json", JSON_MEDIA_TYPE, Format::List(ListFormat::Json)),
+    offered(
+        "tile",
+        tread_api::tile::MEDIA_TYPE,
+        Format::Picture(PictureFormat::Tile),
+    ),
+    offered(
+        "geojson",
+        json::GEOJSON_MEDIA_TYPE,
+        Format::List(ListFormat::GeoJson),
+    ),
+    offered(
+        "nav2",
+        nav2::YAML_MEDIA_TYPE,
+        Format::Picture(PictureFormat::Nav2),
+    ),
+    offered(
+        "pgm",
+        nav2::PGM_MEDIA_TYPE,
+        Format::Picture(PictureFormat::Pgm),
+    ),
+    offered("csv", CSV_MEDIA_TYPE, Format::List(ListFormat::Csv)),
+    offered(
+        "parquet",
+        PARQUET_MEDIA_TYPE,
+        Format::List(ListFormat::Parquet),
+    ),
 ];
 
 /// What of the map, and in which format.
@@ -69,8 +99,9 @@ const OFFERED: [Offered<Format>; 4] = [
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct MapQuery {
-    /// `png`, `tile` (compact binary), `nav2` (YAML of a speed mask), `pgm` (its picture); what
-    /// `Accept` asks for when absent.
+    /// `png`, `tile` (compact binary), `nav2` (YAML of a speed mask), `pgm` (its picture), or with
+    /// all that is known of every cell: `json`, `geojson`, `csv`, `parquet`. What `Accept` asks
+    /// for when absent.
     format: Option<String>,
     /// Lowest x of the area, metres; everywhere that anybody has driven when no bound is given.
     x_min_m: Option<f64>,
@@ -161,25 +192,28 @@ impl MapQuery {
 /// Writes a raster in a format.
 type Write = Box<dyn FnOnce(&Raster) -> Result<Vec<u8>, AppError> + Send>;
 
-fn writer(format: Format, query: &MapQuery) -> Result<(String, &'static str, Write), Problem> {
+fn writer(
+    format: PictureFormat,
+    query: &MapQuery,
+) -> Result<(String, &'static str, Write), Problem> {
     let (scale, speeds) = (query.scale()?, query.speeds()?);
     Ok(match format {
-        Format::Png => (
+        PictureFormat::Png => (
             format!("png {scale:?}"),
             png::MEDIA_TYPE,
             Box::new(move |raster| png::encode(raster, scale).map_err(refused)),
         ),
-        Format::Tile => (
+        PictureFormat::Tile => (
             "tile".to_owned(),
             tread_api::tile::MEDIA_TYPE,
             Box::new(|raster| Ok(tile::encode(raster))),
         ),
-        Format::Nav2 => (
+        PictureFormat::Nav2 => (
             format!("nav2 {speeds:?}"),
             nav2::YAML_MEDIA_TYPE,
             Box::new(move |raster| Ok(nav2::yaml(raster, speeds))),
         ),
-        Format::Pgm => (
+        PictureFormat::Pgm => (
             format!("pgm {speeds:?}"),
             nav2::PGM_MEDIA_TYPE,
             Box::new(move |raster| Ok(nav2::pgm(raster, speeds))),
@@ -198,14 +232,17 @@ fn refused(error: PngError) -> AppError {
 }
 
 /// The map of one robot model, as a picture with a legend, a compact binary tile or a speed mask
-/// for Nav2. Headers say whose θ it is (`tread-configuration`), by which normalisation
+/// for Nav2; or all that is known of every cell, per ground and robot model, as a list without
+/// pages that is sent while it is made. Headers of pictures say whose θ it is (`tread-configuration`), by which normalisation
 /// (`tread-normalisation`) and as of when (`tread-as-of`).
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/map", tag = "friction",
     security(("token" = ["viewer"])),
     operation_id = "get_friction_map", params(("site" = SiteId, Path), MapQuery),
     responses((status = 200, description = "The map in that format", content(
-            (Vec<u8> = "image/png"), (Vec<u8> = "application/vnd.tread.friction-tile"),
-            (String = "application/yaml"), (Vec<u8> = "image/x-portable-graymap"))),
+            (Vec<u8> = "image/png"), (Page<CellFriction> = "application/json"),
+            (Vec<u8> = "application/vnd.tread.friction-tile"), (Value = "application/geo+json"),
+            (String = "application/yaml"), (Vec<u8> = "image/x-portable-graymap"),
+            (String = "text/csv"), (Vec<u8> = "application/vnd.apache.parquet"))),
         (status = 304), (status = 400, body = ProblemBody), (status = 404, body = ProblemBody),
         (status = 406, body = ProblemBody)))]
 pub(in crate::http) async fn map(
@@ -214,10 +251,49 @@ pub(in crate::http) async fn map(
     Query(query): Query<MapQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let format = choose(&OFFERED, query.format.as_deref(), &headers)?;
-    let (name, media_type, write) = writer(format, &query)?;
-    let picture = app.picture(&site, query.asked()?, name, write).await?;
-    Ok(answer(&headers, media_type, picture))
+    match choose(&OFFERED, query.format.as_deref(), &headers)? {
+        Format::Picture(format) => {
+            let (name, media_type, write) = writer(format, &query)?;
+            let picture = app.picture(&site, query.asked()?, name, write).await?;
+            Ok(answer(&headers, media_type, picture))
+        }
+        Format::List(format) => {
+            let (asked, media_type) = (query.asked()?, media_type_of(format));
+            let writer_of = |site: &Site| list_writer(format, site, &asked.asked);
+            let export = app.export_cells(&site, &asked, writer_of).await?;
+            Ok(streamed(media_type, export, CellExport::next))
+        }
+    }
+}
+
+fn media_type_of(format: ListFormat) -> &'static str {
+    match format {
+        ListFormat::Json => JSON_MEDIA_TYPE,
+        ListFormat::GeoJson => json::GEOJSON_MEDIA_TYPE,
+        ListFormat::Csv => CSV_MEDIA_TYPE,
+        ListFormat::Parquet => PARQUET_MEDIA_TYPE,
+    }
+}
+
+fn list_writer(
+    format: ListFormat,
+    site: &Site,
+    asked: &Asked,
+) -> Result<Box<dyn Writer<CellFriction>>, TableError> {
+    Ok(match format {
+        ListFormat::Json => json::page(),
+        ListFormat::GeoJson => json::features(site),
+        ListFormat::Csv => table::comma(cells::COLUMNS, cells::row),
+        ListFormat::Parquet => {
+            let mut said = vec![
+                ("tread:site".to_owned(), site.id.to_string()),
+                ("tread:cell_m".to_owned(), site.grid.cell_m.to_string()),
+            ];
+            let normalisation = asked.normalisation.clone();
+            said.extend(normalisation.map(|name| ("tread:normalisation".to_owned(), name)));
+            table::parquet(cells::COLUMNS, cells::row, said)?
+        }
+    })
 }
 
 fn answer(headers: &HeaderMap, media_type: &'static str, picture: Picture) -> Response {

@@ -5,10 +5,11 @@
 
 pub(super) mod map;
 pub(super) mod places;
+mod streamed;
 
 use axum::extract::State;
 use axum::http::HeaderMap;
-use axum::response::Response;
+use axum::response::{IntoResponse as _, Response};
 use jiff::{SignedDuration, Timestamp};
 use serde::Deserialize;
 use tread_api::friction::{RobotContribution, StoredSegment, TerrainFriction, TerrainHistory};
@@ -17,13 +18,16 @@ use tread_api::page::Page;
 use tread_api::problem::{ProblemBody, ProblemType};
 use utoipa::IntoParams;
 
+use self::streamed::{CSV_MEDIA_TYPE, JSON_MEDIA_TYPE, PARQUET_MEDIA_TYPE, streamed};
 use super::etag;
 use super::extract::{Json, Path, Query, cursor, page_limit};
+use super::negotiate::{Offered, choose, offered};
 use super::problem::Problem;
 use super::sites::PageQuery;
-use crate::app::App;
-use crate::app::friction::Asked;
+use crate::app::friction::{Asked, SegmentExport};
+use crate::app::{App, AppError};
 use crate::db::segments::SegmentFilter;
+use crate::formats::table::{self, segments};
 
 /// Longest step of a history, seconds: a year.
 const STEP_MAX_S: i64 = 366 * 86_400;
@@ -46,13 +50,19 @@ pub(super) struct ReadingQuery {
     limit: Option<u32>,
 }
 
-impl ReadingQuery {
-    fn asked(&self) -> Asked {
-        Asked {
-            as_of: self.as_of,
-            configuration: self.configuration,
-            normalisation: self.normalisation.clone(),
-        }
+/// What a question asks for besides the place.
+///
+/// Each query has these fields of its own: they cannot be flattened into one, since numbers do not
+/// survive that.
+fn asked(
+    as_of: Option<Timestamp>,
+    configuration: Option<ConfigurationId>,
+    normalisation: Option<String>,
+) -> Asked {
+    Asked {
+        as_of,
+        configuration,
+        normalisation,
     }
 }
 
@@ -69,7 +79,8 @@ pub(super) async fn terrains(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let limit = page_limit(query.limit)?;
-    let (asked, cursor) = (query.asked(), query.cursor.as_deref());
+    let asked = asked(query.as_of, query.configuration, query.normalisation);
+    let cursor = query.cursor.as_deref();
     let found = app.friction_of_terrains(&site, &asked, cursor, limit);
     Ok(etag::json(&headers, &found.await?))
 }
@@ -101,11 +112,7 @@ pub(super) async fn terrain(
     Query(query): Query<OneQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let asked = Asked {
-        as_of: query.as_of,
-        configuration: query.configuration,
-        normalisation: query.normalisation,
-    };
+    let asked = asked(query.as_of, query.configuration, query.normalisation);
     let found = app.friction_of_terrain(&site, &terrain, &asked).await?;
     Ok(etag::json(&headers, &found))
 }
@@ -148,11 +155,7 @@ pub(super) async fn history(
             .detail(detail)
             .field("step_s"));
     }
-    let asked = Asked {
-        as_of: None,
-        configuration: query.configuration,
-        normalisation: query.normalisation,
-    };
+    let asked = asked(None, query.configuration, query.normalisation);
     let (times, step) = ((query.from, query.to), SignedDuration::from_secs(step_s));
     let found = app.history_of_terrain((&site, &terrain), &asked, times, step);
     Ok(etag::json(&headers, &found.await?))
@@ -188,21 +191,43 @@ pub(super) struct SegmentQuery {
     terrain: Option<TerrainId>,
     /// `next_cursor` of the page before.
     cursor: Option<String>,
-    /// Most entries of the page, 1 to 1000; 100 when absent.
+    /// Most entries of the page, 1 to 1000; 100 when absent. CSV and Parquet have no pages.
     limit: Option<u32>,
+    /// `json`, or everything after the cursor as `csv` or `parquet`; what `Accept` asks for when
+    /// absent.
+    format: Option<String>,
 }
+
+/// What measurements can be given as.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum SegmentFormat {
+    Json,
+    Csv,
+    Parquet,
+}
+
+const SEGMENT_FORMATS: [Offered<SegmentFormat>; 3] = [
+    offered("json", JSON_MEDIA_TYPE, SegmentFormat::Json),
+    offered("csv", CSV_MEDIA_TYPE, SegmentFormat::Csv),
+    offered("parquet", PARQUET_MEDIA_TYPE, SegmentFormat::Parquet),
+];
 
 /// Raw measurements in the order of their commits.
 #[utoipa::path(get, path = "/v1/sites/{site}/segments", tag = "friction",
     security(("token" = ["viewer"])),
     operation_id = "list_segments", params(("site" = SiteId, Path), SegmentQuery),
-    responses((status = 200, body = Page<StoredSegment>), (status = 400, body = ProblemBody),
-        (status = 404, body = ProblemBody)))]
+    responses((status = 200, description = "The measurements", content(
+            (Page<StoredSegment> = "application/json"), (String = "text/csv"),
+            (Vec<u8> = "application/vnd.apache.parquet"))),
+        (status = 400, body = ProblemBody), (status = 404, body = ProblemBody),
+        (status = 406, body = ProblemBody)))]
 pub(super) async fn segments(
     State(app): State<App>,
     Path(site): Path<SiteId>,
     Query(query): Query<SegmentQuery>,
-) -> Result<Json<Page<StoredSegment>>, Problem> {
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let format = choose(&SEGMENT_FORMATS, query.format.as_deref(), &headers)?;
     let limit = page_limit(query.limit)?;
     let after = cursor(query.cursor.as_deref())?.unwrap_or(0);
     let SegmentQuery { robot, terrain, .. } = query;
@@ -211,5 +236,20 @@ pub(super) async fn segments(
         terrain,
         after,
     };
-    Ok(Json(app.segments(&site, &filter, limit).await?))
+    let (media_type, writer) = match format {
+        SegmentFormat::Json => {
+            return Ok(Json(app.segments(&site, &filter, limit).await?).into_response());
+        }
+        SegmentFormat::Csv => (
+            CSV_MEDIA_TYPE,
+            table::comma(segments::COLUMNS, segments::row),
+        ),
+        SegmentFormat::Parquet => {
+            let said = vec![("tread:site".to_owned(), site.to_string())];
+            let writer = table::parquet(segments::COLUMNS, segments::row, said);
+            (PARQUET_MEDIA_TYPE, writer.map_err(AppError::from)?)
+        }
+    };
+    let export = app.export_segments(&site, filter, writer).await?;
+    Ok(streamed(media_type, export, SegmentExport::next))
 }

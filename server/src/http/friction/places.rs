@@ -14,8 +14,9 @@ use tread_api::page::Page;
 use tread_api::problem::ProblemBody;
 use utoipa::IntoParams;
 
+use super::asked;
 use crate::app::App;
-use crate::app::friction::{Area, Asked, CellsAsked};
+use crate::app::friction::{Area, CellsAsked};
 use crate::http::etag;
 use crate::http::extract::{Json, Path, Query, page_limit};
 use crate::http::problem::Problem;
@@ -62,11 +63,7 @@ pub(in crate::http) async fn cells(
     Query(query): Query<CellQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let asked = Asked {
-        as_of: query.as_of,
-        configuration: query.configuration,
-        normalisation: query.normalisation,
-    };
+    let asked = asked(query.as_of, query.configuration, query.normalisation);
     let cells = CellsAsked {
         area: Area::new(
             (query.x_min_m, query.y_min_m),
@@ -110,11 +107,7 @@ pub(in crate::http) async fn point(
     Query(query): Query<PointQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let asked = Asked {
-        as_of: query.as_of,
-        configuration: query.configuration,
-        normalisation: query.normalisation,
-    };
+    let asked = asked(query.as_of, query.configuration, query.normalisation);
     let point = Point {
         x_m: query.x_m,
         y_m: query.y_m,
@@ -181,11 +174,7 @@ pub(in crate::http) async fn difference(
     Query(query): Query<DifferenceQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let asked = Asked {
-        as_of: None,
-        configuration: query.configuration,
-        normalisation: query.normalisation,
-    };
+    let asked = asked(None, query.configuration, query.normalisation);
     let cells = CellsAsked {
         area: Area::new(
             (query.x_min_m, query.y_min_m),
@@ -236,11 +225,7 @@ pub(in crate::http) async fn visits(
     Query(query): Query<VisitQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let asked = Asked {
-        as_of: query.as_of,
-        configuration: query.configuration,
-        normalisation: query.normalisation,
-    };
+    let asked = asked(query.as_of, query.configuration, query.normalisation);
     let area = Area::new(
         (Some(query.x_min_m), Some(query.y_min_m)),
         (Some(query.x_max_m), Some(query.y_max_m)),

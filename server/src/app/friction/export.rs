@@ -1,0 +1,191 @@
+//! Everything that is known, or was measured, piece by piece: only one piece is ever held.
+
+use tread_api::friction::{CellFriction, StoredSegment};
+use tread_api::ids::SiteId;
+use tread_api::site::{Cell, Grid, Site};
+
+use super::cells::{Area, factor, of_square, squares};
+use super::raster::PictureAsked;
+use super::{App, AppError, Reading};
+use crate::app::site_row;
+use crate::db;
+use crate::db::segments::SegmentFilter;
+use crate::db::sites::SiteRow;
+use crate::formats::table::{TableError, Writer};
+
+/// Cells of one piece.
+const CELLS_PIECE: usize = 4_096;
+/// Measurements of one piece; a group of rows of a Parquet file.
+const SEGMENTS_PIECE: u32 = 4_096;
+
+impl From<TableError> for AppError {
+    fn from(error: TableError) -> Self {
+        Self::Unwritable(format!("{error}: {:?}", std::error::Error::source(&error)))
+    }
+}
+
+/// Where an export stands.
+enum Stage {
+    Begin,
+    Entries,
+    End,
+    Over,
+}
+
+/// All cells of a box, in some format.
+pub struct CellExport {
+    app: App,
+    row: SiteRow,
+    reading: Reading,
+    factor: i32,
+    bounds: (Cell, Cell),
+    after: Option<Cell>,
+    stage: Stage,
+    writer: Box<dyn Writer<CellFriction>>,
+}
+
+impl App {
+    /// Begins an export of the cells of a site that know anything, row by row. Each piece is what
+    /// is known when it is made, with the ages of the beginning.
+    ///
+    /// # Errors
+    /// The site is not known, or the question is none.
+    pub async fn export_cells(
+        &self,
+        site: &SiteId,
+        asked: &PictureAsked,
+        writer_of: impl FnOnce(&Site) -> Result<Box<dyn Writer<CellFriction>>, TableError>,
+    ) -> Result<CellExport, AppError> {
+        let reading = Reading::new(self, &asked.asked)?;
+        let row = site_row(&mut self.db().read().await?, site).await?;
+        let grid = row.site.grid;
+        let factor = factor(&grid, asked.resolution_m)?;
+        let area = match asked.area {
+            Some(area) => area,
+            None => Area::new((None, None), (None, None))?,
+        };
+        let coarse = Grid {
+            cell_m: grid.cell_m * f64::from(factor),
+            ..grid
+        };
+        Ok(CellExport {
+            app: self.clone(),
+            reading,
+            factor,
+            bounds: area.cells(&coarse)?,
+            after: None,
+            stage: Stage::Begin,
+            writer: writer_of(&row.site)?,
+            row,
+        })
+    }
+
+    /// Begins an export of the measurements of a site, in the order of their commits.
+    ///
+    /// # Errors
+    /// The site is not known.
+    pub async fn export_segments(
+        &self,
+        site: &SiteId,
+        filter: SegmentFilter,
+        writer: Box<dyn Writer<StoredSegment>>,
+    ) -> Result<SegmentExport, AppError> {
+        let row = site_row(&mut self.db().read().await?, site).await?;
+        Ok(SegmentExport {
+            app: self.clone(),
+            site_pk: row.pk,
+            filter,
+            stage: Stage::Begin,
+            writer,
+        })
+    }
+}
+
+impl CellExport {
+    /// The next piece, and what comes after it; `None` at the end.
+    ///
+    /// # Errors
+    /// A piece cannot be written.
+    pub async fn next(self) -> Result<Option<(Vec<u8>, Self)>, AppError> {
+        let app = self.app.clone();
+        app.off_thread(move |app| self.step(app)).await
+    }
+
+    fn step(mut self, app: &App) -> Result<Option<(Vec<u8>, Self)>, AppError> {
+        let bytes = match self.stage {
+            Stage::Begin => {
+                self.stage = Stage::Entries;
+                self.writer.begin()?
+            }
+            Stage::Entries => {
+                let size_m = self.row.site.grid.cell_m * f64::from(self.factor);
+                let reading = &self.reading;
+                let (entries, last) = app.maps().look(&self.row, |map| {
+                    let found = squares(map, self.factor, self.bounds, self.after, CELLS_PIECE);
+                    let last = found.last().map(|(cell, _)| *cell);
+                    let found = found.into_iter();
+                    let entries = found.flat_map(|square| of_square(map, reading, square, size_m));
+                    (entries.collect::<Vec<_>>(), last)
+                });
+                match last {
+                    Some(_) => self.after = last,
+                    None => self.stage = Stage::End,
+                }
+                self.writer.piece(&entries)?
+            }
+            Stage::End => {
+                self.stage = Stage::Over;
+                self.writer.end()?
+            }
+            Stage::Over => return Ok(None),
+        };
+        Ok(Some((bytes, self)))
+    }
+}
+
+/// All measurements of a site, in some format.
+pub struct SegmentExport {
+    app: App,
+    site_pk: i64,
+    filter: SegmentFilter,
+    stage: Stage,
+    writer: Box<dyn Writer<StoredSegment>>,
+}
+
+impl SegmentExport {
+    /// The next piece, and what comes after it; `None` at the end.
+    ///
+    /// # Errors
+    /// The database failed, or a piece cannot be written.
+    pub async fn next(self) -> Result<Option<(Vec<u8>, Self)>, AppError> {
+        let mut found = Vec::new();
+        if matches!(self.stage, Stage::Entries) {
+            let mut tx = self.app.db().read().await?;
+            found = db::segments::list(&mut tx, self.site_pk, &self.filter, SEGMENTS_PIECE).await?;
+        }
+        let app = self.app.clone();
+        app.off_thread(move |_app| self.step(&found)).await
+    }
+
+    fn step(mut self, found: &[StoredSegment]) -> Result<Option<(Vec<u8>, Self)>, AppError> {
+        let bytes = match self.stage {
+            Stage::Begin => {
+                self.stage = Stage::Entries;
+                self.writer.begin()?
+            }
+            Stage::Entries => {
+                match found.last() {
+                    Some(last) => self.filter.after = last.id,
+                    None => self.stage = Stage::End,
+                }
+                self.writer.piece(found)?
+            }
+            Stage::End => {
+                self.stage = Stage::Over;
+                self.writer.end()?
+            }
+            Stage::Over => return Ok(None),
+        };
+        Ok(Some((bytes, self)))
+    }
+}

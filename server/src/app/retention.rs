@@ -1,0 +1,107 @@
+//! Raw measurements are kept for a time and up to a number; their sums, and with them the map, for
+//! ever.
+//!
+//! The oldest go first, some at a time, each time in one transaction that removes them and notes
+//! their names (`boot`, `seq`), so that one that is sent again after years is still known and
+//! counted once. Whenever this is killed, the map says the same.
+
+use std::collections::HashSet;
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use jiff::SignedDuration;
+use tokio_util::sync::CancellationToken;
+
+use super::{App, AppError};
+use crate::config::RetentionConfig;
+use crate::db;
+
+/// How often the server looks for what is over its time.
+const LOOK_EVERY: Duration = Duration::from_mins(10);
+/// Measurements that one transaction removes; others write in between.
+const REMOVED_MAX: u32 = 2_000;
+/// Hours of a day.
+const DAY_H: i64 = 24;
+
+/// Runs of agents of which anything was removed: only their uploads are held against the names.
+#[derive(Debug, Default)]
+pub(super) struct Removed {
+    boots: Mutex<HashSet<i64>>,
+}
+
+impl Removed {
+    pub(super) fn has(&self, boot_pk: i64) -> bool {
+        let boots = self.boots.lock().unwrap_or_else(PoisonError::into_inner);
+        boots.contains(&boot_pk)
+    }
+
+    pub(super) fn extend(&self, found: impl IntoIterator<Item = i64>) {
+        let mut boots = self.boots.lock().unwrap_or_else(PoisonError::into_inner);
+        boots.extend(found);
+    }
+}
+
+/// Removes now and then until the stop.
+pub async fn run(app: App, config: RetentionConfig, stop: CancellationToken) {
+    loop {
+        if let Err(cause) = remove_all(&app, &config, &stop).await {
+            tracing::error!("cannot remove old measurements: {cause:?}");
+        }
+        tokio::select! {
+            () = stop.cancelled() => break,
+            () = tokio::time::sleep(LOOK_EVERY) => {}
+        }
+    }
+}
+
+async fn remove_all(
+    app: &App,
+    config: &RetentionConfig,
+    stop: &CancellationToken,
+) -> Result<(), AppError> {
+    let mut removed = 0;
+    while !stop.is_cancelled() {
+        let some = app.remove_some(config, REMOVED_MAX).await?;
+        removed += some;
+        if some == 0 {
+            break;
+        }
+    }
+    if removed > 0 {
+        tracing::info!("{removed} raw measurements were removed after their time");
+    }
+    Ok(())
+}
+
+impl App {
+    /// Removes some raw measurements that are over their time or too many; how many.
+    ///
+    /// # Errors
+    /// The database failed; nothing is removed then.
+    pub async fn remove_some(&self, config: &RetentionConfig, limit: u32) -> Result<u64, AppError> {
+        let now = self.clock().now();
+        let kept = SignedDuration::from_hours(i64::from(config.segments_days) * DAY_H);
+        let before = now.checked_sub(kept).unwrap_or(jiff::Timestamp::MIN);
+        let mut tx = self.db().read().await?;
+        let Some(last) = db::removed::last_key(&mut tx).await? else {
+            return Ok(0);
+        };
+        // Keys leave no gaps, since only the first ones are ever removed.
+        let before_pk = last.saturating_sub(config.segments_max) + 1;
+        let mut rows = db::removed::oldest(&mut tx, before, before_pk, limit).await?;
+        // The last one stays, so that keys, which are cursors of lists, never begin anew.
+        rows.retain(|row| row.pk < last);
+        drop(tx);
+        if rows.is_empty() {
+            return Ok(0);
+        }
+        // Uploads wait their turn: none is between its look at the names and its commit.
+        let _turn = self.maps().turn().await;
+        let mut tx = self.db().write().await?;
+        db::removed::remove(&mut tx, &rows).await?;
+        tx.commit().await?;
+        self.removed().extend(rows.iter().map(|row| row.boot_pk));
+        self.counters().segments_removed.add(rows.len() as u64);
+        Ok(rows.len() as u64)
+    }
+}

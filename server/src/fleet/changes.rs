@@ -1,0 +1,61 @@
+//! Publishes where friction maps change, for programs that listen on the network.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use tokio::sync::broadcast::error::RecvError;
+use tokio_util::sync::CancellationToken;
+use tracing::debug;
+use tread_api::friction::MapChange;
+use tread_api::ids::SiteId;
+use tread_api::{keys, wire};
+use zenoh::Wait as _;
+
+use super::publishers::Publishers;
+use super::routers::Routers;
+use crate::app::App;
+
+/// Publishes until the stop.
+pub(super) async fn run(app: App, routers: Arc<Routers>, stop: CancellationToken) {
+    let mut news = app.map_news();
+    let mut publishers = Publishers::new(keys::map);
+    // Words that were missed, and how many of them each site has been told of.
+    let mut missed: u64 = 0;
+    let mut told: HashMap<SiteId, u64> = HashMap::new();
+    loop {
+        let heard = tokio::select! {
+            biased;
+            () = stop.cancelled() => return,
+            heard = news.recv() => heard,
+        };
+        let mut change = match heard {
+            Ok(change) => change,
+            Err(RecvError::Lagged(words)) => {
+                missed += words;
+                continue;
+            }
+            Err(RecvError::Closed) => {
+                stop.cancelled().await;
+                return;
+            }
+        };
+        if told.insert(change.site.clone(), missed).unwrap_or(0) < missed {
+            change.everything = true;
+            change.boxes.clear();
+        }
+        publishers.look_again(&routers);
+        publish(&change, &routers, &mut publishers);
+    }
+}
+
+fn publish(change: &MapChange, routers: &Routers, publishers: &mut Publishers) {
+    let Ok(payload) = wire::encode(change) else {
+        return;
+    };
+    publishers.declare(routers, std::slice::from_ref(&change.site));
+    for publisher in publishers.of(&change.site) {
+        if let Err(error) = publisher.put(payload.clone()).wait() {
+            debug!("a change of the map did not go out: {error}");
+        }
+    }
+}

@@ -1,0 +1,108 @@
+//! Entries as JSON: a list as the API has it, or features of GeoJSON, written piece by piece.
+//!
+//! GeoJSON (RFC 7946) knows WGS 84 alone. Where a site is tied to it, each cell is a polygon of
+//! longitudes and latitudes. Where it is not, nobody may take metres for degrees: `geometry` is
+//! `null` and the polygon stands in `place`, with `coordRefSys` beside it, in the manner of OGC
+//! JSON-FG.
+
+use serde::Serialize;
+use serde_json::{Value, json};
+use tread_api::friction::CellFriction;
+use tread_api::geometry::Point;
+use tread_api::site::Site;
+
+use super::geodesy::to_wgs84;
+use super::table::{TableError, Writer};
+
+/// The media type of GeoJSON.
+pub const GEOJSON_MEDIA_TYPE: &str = "application/geo+json";
+
+/// How an entry is written.
+type Write<T> = Box<dyn Fn(&T) -> Result<Value, serde_json::Error> + Send>;
+
+/// Entries of a list, with what stands before and behind them.
+struct List<T> {
+    before: String,
+    after: &'static str,
+    entry: Write<T>,
+    is_first: bool,
+}
+
+impl<T> Writer<T> for List<T> {
+    fn begin(&mut self) -> Result<Vec<u8>, TableError> {
+        Ok(self.before.clone().into_bytes())
+    }
+
+    fn piece(&mut self, entries: &[T]) -> Result<Vec<u8>, TableError> {
+        let mut bytes = Vec::new();
+        for entry in entries {
+            if !std::mem::take(&mut self.is_first) {
+                bytes.push(b',');
+            }
+            bytes.push(b'\n');
+            serde_json::to_writer(&mut bytes, &(self.entry)(entry)?)?;
+        }
+        Ok(bytes)
+    }
+
+    fn end(&mut self) -> Result<Vec<u8>, TableError> {
+        Ok(self.after.as_bytes().to_vec())
+    }
+}
+
+/// Everything on one page, as the API's lists are.
+pub fn page<T: Serialize + 'static>() -> Box<dyn Writer<T>> {
+    Box::new(List {
+        before: "{\"items\":[".to_owned(),
+        after: "],\"next_cursor\":null}\n",
+        entry: Box::new(|entry: &T| serde_json::to_value(entry)),
+        is_first: true,
+    })
+}
+
+/// Cells of a site as features.
+pub fn features(site: &Site) -> Box<dyn Writer<CellFriction>> {
+    let origin = site.origin;
+    let head = match origin {
+        Some(_) => json!({
+            "type": "FeatureCollection",
+            "tread:frame": "WGS 84, longitude and latitude in degrees",
+        }),
+        None => json!({
+            "type": "FeatureCollection",
+            "conformsTo": ["http://www.opengis.net/spec/json-fg-1/1.0/conf/core"],
+            "coordRefSys": format!("urn:tread:site:{}", site.id),
+            "tread:frame": "metres in the site's own frame, which is not tied to WGS 84",
+        }),
+    };
+    let mut before = head.to_string();
+    // The list comes last in the object.
+    before.pop();
+    before.push_str(",\"features\":[");
+    Box::new(List {
+        before,
+        after: "]}\n",
+        entry: Box::new(move |entry: &CellFriction| {
+            let (x, y) = (f64::from(entry.cell.ix), f64::from(entry.cell.iy));
+            let corners = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (0.0, 0.0)];
+            let corners = corners.map(|(right, up)| Point {
+                x_m: (x + right) * entry.size_m,
+                y_m: (y + up) * entry.size_m,
+            });
+            let ring = corners.map(|corner| match origin {
+                Some(origin) => to_wgs84(origin, corner),
+                None => [corner.x_m, corner.y_m],
+            });
+            let polygon = json!({"type": "Polygon", "coordinates": [ring]});
+            let properties = serde_json::to_value(entry)?;
+            Ok(match origin {
+                Some(_) => {
+                    json!({"type": "Feature", "geometry": polygon, "properties": properties})
+                }
+                None => json!({"type": "Feature", "geometry": null, "place": polygon,
+                               "properties": properties}),
+            })
+        }),
+        is_first: true,
+    })
+}
