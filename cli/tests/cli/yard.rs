@@ -8,7 +8,7 @@ use tempfile::TempDir;
 use tread_agent::sim::scenario::Scenario;
 use tread_agent::{Agent, AgentConfig, RunningAgent};
 use tread_server::app::identity::FirstAdmin;
-use tread_server::config::{FrictionConfig, TlsFiles, WebConfig};
+use tread_server::config::{FrictionConfig, RetentionConfig, TlsFiles, WebConfig};
 use tread_server::{Config, RunningServer, Server};
 
 use crate::terminal::{Terminal, eventually};
@@ -39,6 +39,7 @@ impl Yard {
             database: at("tread.db"),
             site: "yard".parse().unwrap(),
             friction: FrictionConfig::default(),
+            retention: RetentionConfig::default(),
             normalisations: Vec::new(),
             retention: tread_server::config::RetentionConfig::default(),
             tls: Some(TlsFiles {

@@ -175,7 +175,8 @@ impl World {
                 AgentConfig::simulated(scenario.clone(), robot.clone(), endpoint, data_dir)?;
             config.model = model.clone();
             let trace = Trace::new(TRACE_EVERY, TRACE_MAX);
-            config.drive.trace = Some(trace.clone());
+            let drive = config.drive.simulated_mut();
+            drive.context("a simulated base")?.trace = Some(trace.clone());
             let clock = Arc::new(self.time.clock());
             let agent = Agent::start_with_clock(config, clock)
                 .with_context(|| format!("the agent of {robot}"))?;
