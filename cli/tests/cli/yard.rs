@@ -41,7 +41,6 @@ impl Yard {
             friction: FrictionConfig::default(),
             retention: RetentionConfig::default(),
             normalisations: Vec::new(),
-            retention: tread_server::config::RetentionConfig::default(),
             tls: Some(TlsFiles {
                 certificate: at("cert.pem"),
                 key: at("key.pem"),

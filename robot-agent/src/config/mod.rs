@@ -173,7 +173,7 @@ pub struct SimulatedConfig {
 #[derive(Debug, Clone, PartialEq)]
 pub enum DriveConfig {
     /// A simulated one.
-    Simulated(SimulatedConfig),
+    Simulated(Box<SimulatedConfig>),
     /// A ROS 2 robot.
     Ros2(Box<Ros2Settings>),
 }
@@ -411,7 +411,10 @@ fn assemble(
     }
     let drive = match file.drive {
         Some(drive) if drive.kind == DriveKind::Ros2 => ros2_drive(drive, &model)?,
-        drive => DriveConfig::Simulated(simulated(flags, drive, scenario()?, &robot)?),
+        drive => {
+            let simulated = simulated(flags, drive, scenario()?, &robot)?;
+            DriveConfig::Simulated(Box::new(simulated))
+        }
     };
     Ok(AgentConfig {
         drive,
