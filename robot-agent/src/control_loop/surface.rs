@@ -14,7 +14,7 @@ use tread_api::site::Cell;
 use tread_control::tracking::ThetaKnowledge;
 
 /// Standard deviations from which a cell's ground is another one than the map's. By chance, one
-/// cell in 147 000 is as far off ([`FALSE_ALARM_PROBABILITY`]), and two in a row at the most as often:
+/// cell in 147 000 is as far off, and two in a row at the most as often:
 /// a robot that drives 2 000 cells an hour gives at most one false alarm in 73 hours of driving over
 /// ground that the map knows. The second cell is asked for since a single wrong word, of the map or
 /// of a robot without torque, is likelier than chance has it.
