@@ -8,6 +8,7 @@
 //! * [`chaos`]: runs in which things fail at random, from a seed of [`random`].
 //! * [`scenario`]: fleets in a simulated time, from which figures are read.
 //! * [`light_robot`]: robots without physics, for load.
+//! * [`report`]: figures against their goals, as every report program prints them.
 
 pub mod chaos;
 pub mod fleet;
@@ -15,6 +16,7 @@ pub mod light_robot;
 pub mod process;
 pub mod random;
 pub mod relay;
+pub mod report;
 pub mod rest;
 pub mod scenario;
 pub mod wait;

@@ -1,7 +1,7 @@
 //! One process of the fleet: started, stopped politely, killed without a word, and measured.
 
 use std::fs::File;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::Duration;
 
@@ -16,6 +16,20 @@ const STOP_WAIT_MAX: Duration = Duration::from_secs(15);
 const LOOK_EVERY: Duration = Duration::from_millis(10);
 /// Ticks per second of the kernel's CPU accounting, the same on every Linux of today.
 const CLOCK_TICKS_PER_SECOND: f64 = 100.0;
+
+/// The executable that is a server or an agent; those of this package stand beside each other.
+///
+/// # Errors
+/// It was not built.
+pub fn node() -> anyhow::Result<PathBuf> {
+    let node = std::env::current_exe()?.with_file_name("node");
+    anyhow::ensure!(
+        node.exists(),
+        "{} is missing: build it with `cargo build --release -p tread-tests --bins`",
+        node.display()
+    );
+    Ok(node)
+}
 
 /// A child process; it is killed when it is dropped.
 #[derive(Debug)]

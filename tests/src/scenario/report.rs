@@ -6,6 +6,7 @@ use tread_api::mission::{MissionState, PriorGain};
 
 use super::judge::{BAND_M, MapFigures, Stopping, Tracking};
 use super::yard::FORD;
+use crate::report::Check;
 
 /// How large a run is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -79,44 +80,6 @@ pub struct Report {
     pub learned: Vec<Learned>,
     /// Robots that arrived.
     pub arrivals: Vec<Arrival>,
-}
-
-/// A figure with what it must be.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Check {
-    /// What it is.
-    pub name: &'static str,
-    /// What it must be.
-    pub goal: String,
-    /// What it is in this run.
-    pub value: f64,
-    /// Whether it is that.
-    pub holds: bool,
-}
-
-impl Check {
-    fn at_least(name: &'static str, least: f64, value: f64) -> Self {
-        Self {
-            name,
-            goal: format!(">= {least}"),
-            value,
-            holds: value >= least,
-        }
-    }
-
-    fn at_most(name: &'static str, most: f64, value: f64) -> Self {
-        Self {
-            name,
-            goal: format!("<= {most}"),
-            value,
-            holds: value <= most,
-        }
-    }
-}
-
-#[expect(clippy::cast_precision_loss, reason = "a count far below 2^53")]
-fn count(things: usize) -> f64 {
-    things as f64
 }
 
 /// Least share of the cells of a frozen patch, driven twice since, by which it is visible.
@@ -193,18 +156,6 @@ impl Report {
     }
 }
 
-impl Check {
-    /// A figure that is shown beside others and need not be anything.
-    fn shown(name: &'static str, value: f64) -> Self {
-        Self {
-            name,
-            goal: "shown".to_owned(),
-            value,
-            holds: value.is_finite(),
-        }
-    }
-}
-
 impl Learned {
     /// What must hold of one fleet's map.
     pub fn checks(&self) -> Vec<Check> {
@@ -221,7 +172,7 @@ impl Learned {
         };
         let mut checks = vec![
             Check::at_least(cells, HELD_RATIO_MIN, self.before.held_ratio()),
-            Check::at_most(alarms, 0.0, count(self.false_alarms.len())),
+            Check::exactly(alarms, 0, self.false_alarms.len() as u64),
         ];
         if self.frozen.cells > 0 {
             // What was known of the ford before it froze is of another ground.

@@ -6,6 +6,7 @@
 //! process, and cuts of the network, silent or with a reset. A seed that fails is printed with all
 //! that is known, and `--seed` runs it alone.
 
+use std::collections::BTreeMap;
 use std::io::Write;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -15,6 +16,8 @@ use serde::Serialize;
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 use tread_tests::chaos::{RunReport, run};
+use tread_tests::process::node;
+use tread_tests::report::{self, Check};
 
 /// Breaks things at random and looks whether every mission ends.
 #[derive(Debug, Parser)]
@@ -35,36 +38,21 @@ struct Arguments {
 }
 
 #[derive(Debug, Serialize)]
-struct Check {
-    name: &'static str,
-    goal: String,
-    value: u64,
-    holds: bool,
-}
-
-#[derive(Debug, Serialize)]
-struct Report {
+struct Details {
     runs: u64,
     missions: u64,
     server_kills: u64,
     agent_kills: u64,
     cuts: u64,
     requests: u64,
-    ends: std::collections::BTreeMap<String, u64>,
+    ends: BTreeMap<String, u64>,
     failures: Vec<RunReport>,
-    checks: Vec<Check>,
 }
 
 #[tokio::main]
 async fn main() -> anyhow::Result<ExitCode> {
     let arguments = Arguments::parse();
-    // The executables of this package stand beside each other.
-    let node = Arc::new(std::env::current_exe()?.with_file_name("node"));
-    anyhow::ensure!(
-        node.exists(),
-        "{} is missing: build it with `cargo build --release -p tread-tests --bins`",
-        node.display()
-    );
+    let node = Arc::new(node()?);
     let room = Arc::new(Semaphore::new(arguments.at_once as usize));
     let mut runs = JoinSet::new();
     for seed in arguments.seed..arguments.seed + arguments.runs {
@@ -90,90 +78,55 @@ async fn main() -> anyhow::Result<ExitCode> {
             }
         }
     }
-    let report = summed(&arguments, reports, broken);
-    let holds = report.checks.iter().all(|check| check.holds);
-    let mut output = std::io::stdout().lock();
-    if arguments.json {
-        writeln!(output, "{}", serde_json::to_string(&report)?)?;
-    } else {
-        for check in &report.checks {
-            let verdict = if check.holds {
-                "holds"
-            } else {
-                "DOES NOT HOLD"
-            };
-            let Check {
-                name, goal, value, ..
-            } = check;
-            writeln!(output, "{name:40} {value:>6}  {goal:>8}  {verdict}")?;
-        }
-        writeln!(
-            output,
-            "{} missions, {} server kills, {} agent kills, {} cuts, {} requests; ends: {:?}",
-            report.missions,
-            report.server_kills,
-            report.agent_kills,
-            report.cuts,
-            report.requests,
-            report.ends
-        )?;
-    }
-    Ok(if holds {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    })
+    tell(&arguments, reports, broken)
 }
 
-fn summed(arguments: &Arguments, reports: Vec<RunReport>, broken: u64) -> Report {
-    let none = |name, value| Check {
-        name,
-        goal: "= 0".to_owned(),
-        value,
-        holds: value == 0,
-    };
+fn tell(arguments: &Arguments, reports: Vec<RunReport>, broken: u64) -> anyhow::Result<ExitCode> {
     let total = |pick: fn(&RunReport) -> u64| reports.iter().map(pick).sum::<u64>();
-    let ends = reports.iter().flat_map(|report| report.ends.iter());
-    let mut counted = std::collections::BTreeMap::new();
-    for end in ends {
-        *counted.entry(end.clone()).or_insert(0) += 1;
+    let mut ends = BTreeMap::new();
+    for end in reports.iter().flat_map(|report| &report.ends) {
+        *ends.entry(end.clone()).or_insert(0) += 1;
     }
-    let violated = |kind: &str| {
-        let of_kind = |report: &&RunReport| {
-            report
-                .violations
-                .iter()
-                .any(|violation| violation.kind == kind)
-        };
-        u64::try_from(reports.iter().filter(of_kind).count()).unwrap_or(u64::MAX)
+    let without = |what: &str, kind: &str| {
+        let of_kind = |report: &&RunReport| report.violations.iter().any(|it| it.kind == kind);
+        let count = reports.iter().filter(of_kind).count() as u64;
+        Check::exactly(what, 0, count)
     };
-    let done = u64::try_from(reports.len()).unwrap_or(u64::MAX);
-    let checks = vec![
-        Check {
-            name: "runs that came to their end",
-            goal: format!("= {}", arguments.runs),
-            value: done,
-            holds: done == arguments.runs && broken == 0,
-        },
-        none("runs with a mission that did not end", violated("stuck")),
-        none("runs with a revived mission", violated("revived")),
-        none("runs with two missions at once", violated("two_at_once")),
-        none("runs with an end against its policy", violated("policy")),
-        none("runs in which the sides disagree", violated("disagree")),
-        none("runs with a record lost or doubled", violated("records")),
+    let checks = [
+        Check::exactly(
+            "runs that came to their end",
+            arguments.runs,
+            reports.len() as u64,
+        ),
+        Check::exactly("runs that broke", 0, broken),
+        without("runs with a mission that did not end", "stuck"),
+        without("runs with a revived mission", "revived"),
+        without("runs with two missions at once", "two_at_once"),
+        without("runs with an end against its policy", "policy"),
+        without("runs in which the sides disagree", "disagree"),
+        without("runs with a record lost or doubled", "records"),
     ];
-    Report {
+    let details = Details {
         runs: arguments.runs,
-        missions: total(|report| u64::try_from(report.ends.len()).unwrap_or(0)),
+        missions: total(|report| report.ends.len() as u64),
         server_kills: total(|report| report.server_kills),
         agent_kills: total(|report| report.agent_kills),
         cuts: total(|report| report.cuts),
         requests: total(|report| report.requests),
-        ends: counted,
+        ends,
         failures: reports
             .into_iter()
             .filter(|report| !report.violations.is_empty())
             .collect(),
-        checks,
-    }
+    };
+    let words = format!(
+        "{} missions, {} server kills, {} agent kills, {} cuts, {} requests; ends: {:?}\n",
+        details.missions,
+        details.server_kills,
+        details.agent_kills,
+        details.cuts,
+        details.requests,
+        details.ends
+    );
+    report::tell_with(arguments.json, &details, words, &checks)
 }

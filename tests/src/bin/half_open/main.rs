@@ -6,7 +6,6 @@
 //! tools for this attack do. Both are done several times in turn, so that whatever else the
 //! machine does falls on both.
 
-use std::io::Write as _;
 use std::net::SocketAddr;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -24,6 +23,8 @@ use tokio::runtime::Handle;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior};
 use tread_tests::fleet::Fleet;
+use tread_tests::process::node;
+use tread_tests::report::{self, Check};
 
 /// How much longer 99 % of the answers may take, at the most.
 const SLOWER_MAX: f64 = 2.0;
@@ -82,21 +83,12 @@ impl Answers {
 }
 
 #[derive(Debug, Serialize)]
-struct Check {
-    name: &'static str,
-    goal: String,
-    value: f64,
-    holds: bool,
-}
-
-#[derive(Debug, Serialize)]
-struct Report {
+struct Details {
     connections: u32,
     reopened: u64,
     requests: u64,
     kept_p99_ms: [f64; 2],
     new_p99_ms: [f64; 2],
-    checks: Vec<Check>,
 }
 
 /// Which connection a request takes.
@@ -226,13 +218,7 @@ async fn measure(arguments: Arguments, attacker: &Handle) -> anyhow::Result<Exit
         most >= u64::from(arguments.connections) + OTHER_FILES,
         "only {most} files may be open: raise `ulimit -n`, or take fewer --connections"
     );
-    // The executables of this package stand beside each other.
-    let node = std::env::current_exe()?.with_file_name("node");
-    anyhow::ensure!(
-        node.exists(),
-        "{} is missing: build it with `cargo build --release -p tread-tests --bins`",
-        node.display()
-    );
+    let node = node()?;
     let fleet = Fleet::start_with(&node).await;
     let address = fleet.http_address();
     let request = format!(
@@ -263,74 +249,39 @@ async fn measure(arguments: Arguments, attacker: &Handle) -> anyhow::Result<Exit
             drop(open);
         }
     }
-    let report = report(&arguments, reopened.load(Ordering::Relaxed), &kept, &new);
-    print(&report, arguments.json)?;
-    Ok(if report.checks.iter().all(|check| check.holds) {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    })
+    tell(&arguments, reopened.load(Ordering::Relaxed), &kept, &new)
 }
 
-fn report(arguments: &Arguments, reopened: u64, kept: &[Answers; 2], new: &[Answers; 2]) -> Report {
+fn tell(
+    arguments: &Arguments,
+    reopened: u64,
+    kept: &[Answers; 2],
+    new: &[Answers; 2],
+) -> anyhow::Result<ExitCode> {
     let slower = |name, [normal, disturbed]: &[Answers; 2]| {
-        let value = disturbed.p99_ms() / normal.p99_ms();
-        Check {
-            name,
-            goal: format!("< {SLOWER_MAX}"),
-            value,
-            holds: value < SLOWER_MAX,
-        }
+        Check::below(name, SLOWER_MAX, disturbed.p99_ms() / normal.p99_ms())
     };
     let all = || kept.iter().chain(new);
-    let failed: u64 = all().map(|answers| answers.failed).sum();
-    #[expect(clippy::cast_precision_loss, reason = "a small count")]
-    let failed_check = Check {
-        name: "requests without an answer",
-        goal: "= 0".to_owned(),
-        value: failed as f64,
-        holds: failed == 0,
-    };
-    Report {
+    let failed = all().map(|answers| answers.failed).sum();
+    let details = Details {
         connections: arguments.connections,
         reopened,
         requests: all().map(|answers| answers.took_us.len()).sum(),
         kept_p99_ms: [kept[0].p99_ms(), kept[1].p99_ms()],
         new_p99_ms: [new[0].p99_ms(), new[1].p99_ms()],
-        checks: vec![
-            slower("p99 on kept connections, times normal", kept),
-            slower("p99 on new connections, times normal", new),
-            failed_check,
-        ],
-    }
-}
-
-fn print(report: &Report, json: bool) -> anyhow::Result<()> {
-    let mut output = std::io::stdout().lock();
-    if json {
-        writeln!(output, "{}", serde_json::to_string(report)?)?;
-        return Ok(());
-    }
-    let [normal, disturbed] = report.kept_p99_ms;
-    let [new_normal, new_disturbed] = report.new_p99_ms;
-    writeln!(
-        output,
+    };
+    let checks = [
+        slower("p99 on kept connections, times normal", kept),
+        slower("p99 on new connections, times normal", new),
+        Check::exactly("requests without an answer", 0, failed),
+    ];
+    let [normal, disturbed] = details.kept_p99_ms;
+    let [new_normal, new_disturbed] = details.new_p99_ms;
+    let words = format!(
         "{} half-open connections, {} times ended and opened again; {} requests; p99 on kept \
          connections {normal:.2} and {disturbed:.2} ms, on new ones {new_normal:.2} and \
-         {new_disturbed:.2} ms",
-        report.connections, report.reopened, report.requests
-    )?;
-    for check in &report.checks {
-        let verdict = if check.holds {
-            "holds"
-        } else {
-            "DOES NOT HOLD"
-        };
-        writeln!(
-            output,
-            "{:40} {:>8.2}  {:>6}  {verdict}",
-            check.name, check.value, check.goal
-        )?;
-    }
-    Ok(())
+         {new_disturbed:.2} ms\n",
+        details.connections, details.reopened, details.requests
+    );
+    report::tell_with(arguments.json, &details, words, &checks)
 }

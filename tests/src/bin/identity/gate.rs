@@ -14,10 +14,11 @@ use tread_agent::fleet::session_config;
 use tread_agent::membership::Membership;
 use tread_api::ids::RobotId;
 use tread_tests::fleet::Fleet;
+use tread_tests::report::{Check, figure};
 use tread_tests::wait::{SHORT, eventually};
 use zenoh::Wait as _;
 
-use crate::{Arguments, Check, figure};
+use crate::Arguments;
 
 /// Longest time that a good robot may take.
 const CONNECT_MAX_MS: f64 = 100.0;

@@ -7,9 +7,10 @@ use tread_api::ids::RobotId;
 use tread_api::mission::MissionState;
 use tread_api::robot::LinkState;
 use tread_tests::fleet::Fleet;
+use tread_tests::report::{Check, figure};
 use tread_tests::wait::{DRIVE, SHORT};
 
-use crate::{Arguments, Check, figure};
+use crate::Arguments;
 
 /// Longest time until the server hears a robot that joins, seconds.
 const JOIN_MAX_S: f64 = 5.0;

@@ -17,8 +17,9 @@ use tread_api::ids::RobotId;
 use tread_api::robot::LinkState;
 use tread_tests::fleet::Fleet;
 use tread_tests::random::Random;
+use tread_tests::report::Check;
 
-use super::{Check, HEALING_MAX_S, SILENCE_MAX_S, check, settle, shown_since};
+use super::{HEALING_MAX_S, SILENCE_MAX_S, settle, shown_since, worst_and_median};
 
 /// How long cuts last, about, seconds.
 const CUTS_S: [f64; 3] = [1.0, 4.0, 10.0];
@@ -39,12 +40,12 @@ pub(crate) struct Times {
 impl Times {
     pub(crate) fn checks(self) -> Vec<Check> {
         let cut_s = self.cut_s;
-        let back = format!("healing to online, {cut_s} s of lost packets, s");
-        let mut checks = vec![check(&back, HEALING_MAX_S, self.back_s)];
+        let back = format!("healing to online, {cut_s} s of lost packets");
+        let mut checks = worst_and_median(&back, HEALING_MAX_S, self.back_s).to_vec();
         // After the shortest cut the robot may be heard again before it is shown offline.
         if !self.gone_s.is_empty() {
-            let gone = format!("lost packets to offline, cut of {cut_s} s, s");
-            checks.push(check(&gone, SILENCE_MAX_S, self.gone_s));
+            let gone = format!("lost packets to offline, cut of {cut_s} s");
+            checks.extend(worst_and_median(&gone, SILENCE_MAX_S, self.gone_s));
         }
         checks
     }

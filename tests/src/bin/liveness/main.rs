@@ -11,7 +11,6 @@
 mod lossy;
 
 use std::io::Write;
-use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -21,8 +20,10 @@ use tokio::time::Instant;
 use tread_api::ids::RobotId;
 use tread_api::robot::LinkState;
 use tread_tests::fleet::Fleet;
+use tread_tests::process::node;
 use tread_tests::random::Random;
 use tread_tests::relay::Relay;
+use tread_tests::report::{self, Check, quantile};
 
 /// Silent cut to `offline`, at the most.
 const SILENCE_MAX_S: f64 = 1.5;
@@ -56,25 +57,17 @@ struct Arguments {
 }
 
 #[derive(Debug, Serialize)]
-struct Check {
-    name: String,
-    goal: String,
-    value: f64,
-    median: f64,
-    holds: bool,
+struct Details {
+    trials: u32,
+    not_measured: Option<&'static str>,
 }
 
-fn check(name: &str, most_s: f64, mut seen_s: Vec<f64>) -> Check {
-    seen_s.sort_by(f64::total_cmp);
-    let worst = seen_s.last().copied().unwrap_or(f64::INFINITY);
-    let median = seen_s.get(seen_s.len() / 2).copied();
-    Check {
-        name: name.to_owned(),
-        goal: format!("<= {most_s}"),
-        value: worst,
-        median: median.unwrap_or(f64::INFINITY),
-        holds: worst <= most_s,
-    }
+/// The slowest and, beside it, the median.
+fn worst_and_median(name: &str, most_s: f64, mut seen_s: Vec<f64>) -> [Check; 2] {
+    [
+        Check::at_most(format!("{name}, s"), most_s, quantile(&mut seen_s, 1.0)),
+        Check::shown(format!("{name}, median, s"), quantile(&mut seen_s, 0.5)),
+    ]
 }
 
 /// Waits until the server shows a link state and says how long that took, seconds.
@@ -129,17 +122,6 @@ async fn cuts(
     Ok((gone_s, back_s))
 }
 
-/// The executable that is a server or an agent; those of this package stand beside each other.
-fn node() -> anyhow::Result<PathBuf> {
-    let node = std::env::current_exe()?.with_file_name("node");
-    anyhow::ensure!(
-        node.exists(),
-        "{} is missing: build it with `cargo build --release -p tread-tests --bins`",
-        node.display()
-    );
-    Ok(node)
-}
-
 #[tokio::main]
 async fn main() -> anyhow::Result<ExitCode> {
     let arguments = Arguments::parse();
@@ -164,11 +146,14 @@ async fn main() -> anyhow::Result<ExitCode> {
         shown(&fleet, &robot, LinkState::Online).await?;
     }
     drop(fleet);
-    let mut checks = vec![
-        check("silent partition to offline, s", SILENCE_MAX_S, gone_s),
-        check("process death to offline, s", DEATH_MAX_S, died_s),
-        check("healing to online, s", HEALING_MAX_S, back_s),
-    ];
+    let mut checks = Vec::new();
+    for (name, most_s, seen_s) in [
+        ("silent partition to offline", SILENCE_MAX_S, gone_s),
+        ("process death to offline", DEATH_MAX_S, died_s),
+        ("healing to online", HEALING_MAX_S, back_s),
+    ] {
+        checks.extend(worst_and_median(name, most_s, seen_s));
+    }
     let not_measured = match lossy::measure(arguments.trials, arguments.seed).await? {
         Some(times) => {
             checks.extend(times.into_iter().flat_map(lossy::Times::checks));
@@ -176,37 +161,12 @@ async fn main() -> anyhow::Result<ExitCode> {
         }
         None => Some(lossy::NOT_MEASURED),
     };
-    let holds = checks.iter().all(|check| check.holds);
-    let mut output = std::io::stdout().lock();
-    if arguments.json {
-        let report = serde_json::json!({
-            "trials": arguments.trials,
-            "checks": checks,
-            "not_measured": not_measured,
-        });
-        writeln!(output, "{report}")?;
-    } else {
-        for Check {
-            name,
-            goal,
-            value,
-            median,
-            holds,
-        } in &checks
-        {
-            let verdict = if *holds { "holds" } else { "DOES NOT HOLD" };
-            writeln!(
-                output,
-                "{name:44} worst {value:>7.3}, median {median:>7.3}  {goal:>7}  {verdict}"
-            )?;
-        }
-    }
     if let Some(what) = not_measured {
         eprintln!("{what}");
     }
-    Ok(if holds {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    })
+    let details = Details {
+        trials: arguments.trials,
+        not_measured,
+    };
+    report::tell_with(arguments.json, &details, "", &checks)
 }

@@ -28,8 +28,8 @@ pub(crate) struct Ingest {
     pub(crate) uploads_failed: u64,
     pub(crate) states_published_per_second: f64,
     pub(crate) server_cpu_us_per_segment: f64,
-    pub(crate) acknowledged_but_lost: i64,
-    pub(crate) counted_twice: i64,
+    pub(crate) acknowledged_but_lost: u64,
+    pub(crate) counted_twice: u64,
     pub(crate) server: Usage,
     pub(crate) generator: Usage,
 }
@@ -101,8 +101,9 @@ pub(crate) async fn measure(
             / committed_f64.max(1.0),
         // An upload without receipt may or may not be stored, so more may be there than was
         // acknowledged, never less; the sums must hold each stored one once.
-        acknowledged_but_lost: (committed - stored.segments).max(0),
-        counted_twice: (stored.in_sums - stored.segments).abs() + stored.doubles,
+        acknowledged_but_lost: (committed - stored.segments).max(0).cast_unsigned(),
+        counted_twice: (stored.in_sums - stored.segments).unsigned_abs()
+            + stored.doubles.cast_unsigned(),
         server,
         generator,
     })

@@ -19,8 +19,9 @@ use std::time::Duration;
 use clap::Parser;
 use tread_tests::fleet::Fleet;
 use tread_tests::light_robot::LightRobot;
+use tread_tests::process::node;
 
-use crate::report::Report;
+use crate::report::Details;
 
 /// Measures what one server carries.
 #[derive(Debug, Parser)]
@@ -55,24 +56,17 @@ pub(crate) struct Arguments {
 #[tokio::main]
 async fn main() -> anyhow::Result<ExitCode> {
     let arguments = Arguments::parse();
-    // The executables of this package stand beside each other.
-    let node = std::env::current_exe()?.with_file_name("node");
-    anyhow::ensure!(
-        node.exists(),
-        "{} is missing: build it with `cargo build --release -p tread-tests --bins`",
-        node.display()
-    );
+    let node = node()?;
     let mut fleet = Fleet::start_with(&node).await;
     let robots = start_light_robots(&fleet, arguments.robots).await?;
     let ingest = ingest::measure(&arguments, &mut fleet, robots).await?;
     let dispatch = dispatch::measure(&arguments, &mut fleet).await?;
-    let report = Report::new(&arguments, ingest, dispatch);
-    report.print(arguments.json)?;
-    Ok(if report.holds() {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    })
+    let details = Details {
+        robots: arguments.robots,
+        ingest,
+        dispatch,
+    };
+    details.tell(arguments.json)
 }
 
 /// Connects the light robots, a few at a time as a fleet does after a power cut with jitter.

@@ -1,10 +1,10 @@
 //! The figures, the goals, and whether they hold.
 
-use std::io::Write;
+use std::process::ExitCode;
 
 use serde::Serialize;
+use tread_tests::report::{self, Check};
 
-use crate::Arguments;
 use crate::dispatch::Dispatch;
 use crate::ingest::Ingest;
 
@@ -19,124 +19,62 @@ const DISPATCH_P50_MAX_MS: f64 = 15.0;
 /// 99 % of the missions move the wheels within this, milliseconds.
 const DISPATCH_P99_MAX_MS: f64 = 40.0;
 
-/// One figure against its goal.
-#[derive(Debug, Serialize)]
-struct Check {
-    name: &'static str,
-    goal: String,
-    value: f64,
-    holds: bool,
-}
-
-fn at_least(name: &'static str, goal: f64, value: f64) -> Check {
-    Check {
-        name,
-        goal: format!(">= {goal}"),
-        value,
-        holds: value >= goal,
-    }
-}
-
-fn at_most(name: &'static str, goal: f64, value: f64) -> Check {
-    Check {
-        name,
-        goal: format!("<= {goal}"),
-        value,
-        holds: value <= goal,
-    }
-}
-
 /// Everything that was measured.
 #[derive(Debug, Serialize)]
-pub(crate) struct Report {
-    robots: u32,
-    ingest: Ingest,
-    dispatch: Dispatch,
-    checks: Vec<Check>,
+pub(crate) struct Details {
+    pub(crate) robots: u32,
+    pub(crate) ingest: Ingest,
+    pub(crate) dispatch: Dispatch,
 }
 
-impl Report {
-    pub(crate) fn new(arguments: &Arguments, ingest: Ingest, dispatch: Dispatch) -> Self {
-        #[expect(clippy::cast_precision_loss, reason = "small counts")]
-        let checks = vec![
-            at_least(
+impl Details {
+    pub(crate) fn tell(&self, json: bool) -> anyhow::Result<ExitCode> {
+        report::tell_with(json, self, self.words(), &self.checks())
+    }
+
+    fn checks(&self) -> [Check; 8] {
+        let Self {
+            ingest, dispatch, ..
+        } = self;
+        [
+            Check::at_least(
                 "segments committed per second",
                 SEGMENTS_PER_SECOND_MIN,
                 ingest.segments_per_second,
             ),
-            at_most(
+            Check::at_most(
                 "server CPU per segment, us",
                 SERVER_CPU_US_PER_SEGMENT_MAX,
                 ingest.server_cpu_us_per_segment,
             ),
-            at_most("ack p99, ms", ACK_P99_MAX_MS, ingest.ack_p99_ms),
-            at_most(
-                "uploads without a receipt",
-                0.0,
-                ingest.uploads_failed as f64,
-            ),
-            at_most(
-                "acknowledged but lost",
-                0.0,
-                ingest.acknowledged_but_lost as f64,
-            ),
-            at_most("counted twice", 0.0, ingest.counted_twice as f64),
-            at_most("dispatch p50, ms", DISPATCH_P50_MAX_MS, dispatch.p50_ms),
-            at_most("dispatch p99, ms", DISPATCH_P99_MAX_MS, dispatch.p99_ms),
-        ];
-        Self {
-            robots: arguments.robots,
-            ingest,
-            dispatch,
-            checks,
-        }
+            Check::at_most("ack p99, ms", ACK_P99_MAX_MS, ingest.ack_p99_ms),
+            Check::exactly("uploads without a receipt", 0, ingest.uploads_failed),
+            Check::exactly("acknowledged but lost", 0, ingest.acknowledged_but_lost),
+            Check::exactly("counted twice", 0, ingest.counted_twice),
+            Check::at_most("dispatch p50, ms", DISPATCH_P50_MAX_MS, dispatch.p50_ms),
+            Check::at_most("dispatch p99, ms", DISPATCH_P99_MAX_MS, dispatch.p99_ms),
+        ]
     }
 
-    pub(crate) fn holds(&self) -> bool {
-        self.checks.iter().all(|check| check.holds)
-    }
-
-    pub(crate) fn print(&self, json: bool) -> anyhow::Result<()> {
-        let mut output = std::io::stdout().lock();
-        if json {
-            writeln!(output, "{}", serde_json::to_string(self)?)?;
-            return Ok(());
-        }
+    fn words(&self) -> String {
         let memory_mb = |bytes: u64| bytes / 1_000_000;
         let Ingest {
             server, generator, ..
         } = &self.ingest;
-        writeln!(
-            output,
+        format!(
             "{} light robots, {:.0} states/s; server {:.1} s CPU, {} MB at most; generator {:.1} s \
-             CPU, {} MB at most",
+             CPU, {} MB at most\nack p50 {:.1} ms, max {:.1} ms; dispatch max {:.1} ms over {} \
+             missions\n",
             self.robots,
             self.ingest.states_published_per_second,
             server.cpu_s,
             memory_mb(server.memory_peak_bytes),
             generator.cpu_s,
             memory_mb(generator.memory_peak_bytes),
-        )?;
-        writeln!(
-            output,
-            "ack p50 {:.1} ms, max {:.1} ms; dispatch max {:.1} ms over {} missions",
             self.ingest.ack_p50_ms,
             self.ingest.ack_max_ms,
             self.dispatch.max_ms,
             self.dispatch.missions
-        )?;
-        for check in &self.checks {
-            let verdict = if check.holds {
-                "holds"
-            } else {
-                "DOES NOT HOLD"
-            };
-            writeln!(
-                output,
-                "{:32} {:>10.2}  {:>9}  {verdict}",
-                check.name, check.value, check.goal
-            )?;
-        }
-        Ok(())
+        )
     }
 }

@@ -6,8 +6,8 @@ use std::process::Command;
 use anyhow::Context;
 use serde_json::Value;
 
-use crate::Check;
 use crate::python_robot::PythonRobot;
+use tread_tests::report::Check;
 
 /// A planted fault, and the key of `robot.toml` by which it must be named.
 struct Planted {

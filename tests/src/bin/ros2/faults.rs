@@ -10,9 +10,9 @@ use tread_api::robot::Robot;
 use tread_tests::fleet::Fleet;
 use tread_tests::wait::{SHORT, eventually};
 
-use crate::Check;
 use crate::observer::Observer;
 use crate::python_robot::PythonRobot;
+use tread_tests::report::Check;
 
 /// Longest from the last good word of the base to a zero command.
 const ZERO_MAX_MS: f64 = 150.0;

@@ -17,13 +17,13 @@ mod missions;
 mod observer;
 mod python_robot;
 
-use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
-use serde::Serialize;
 use tread_tests::fleet::Fleet;
+use tread_tests::process::node;
+use tread_tests::report;
 
 use self::observer::Observer;
 use self::python_robot::PythonRobot;
@@ -40,47 +40,10 @@ struct Arguments {
     json: bool,
 }
 
-/// A figure with what it must be.
-#[derive(Debug, Serialize)]
-struct Check {
-    name: String,
-    goal: String,
-    value: f64,
-    holds: bool,
-}
-
-impl Check {
-    /// A figure that must be at most `most`.
-    fn at_most(name: impl Into<String>, most: f64, value: f64) -> Self {
-        Self {
-            name: name.into(),
-            goal: format!("<= {most}"),
-            value,
-            holds: value <= most,
-        }
-    }
-
-    /// Something that must be so.
-    fn so(name: impl Into<String>, holds: bool) -> Self {
-        Self {
-            name: name.into(),
-            goal: "1".to_owned(),
-            value: f64::from(u8::from(holds)),
-            holds,
-        }
-    }
-}
-
 #[tokio::main]
 async fn main() -> anyhow::Result<ExitCode> {
     let arguments = Arguments::parse();
-    // The executables of this package stand beside each other.
-    let node = std::env::current_exe()?.with_file_name("node");
-    anyhow::ensure!(
-        node.exists(),
-        "{} is missing: build it with `cargo build --release -p tread-tests --bins`",
-        node.display()
-    );
+    let node = node()?;
     let mut fleet = Fleet::start_with(&node).await;
     let mut base = PythonRobot::start(&arguments.python, &[])?;
     let observer = Observer::start(base.endpoint())?;
@@ -91,34 +54,10 @@ async fn main() -> anyhow::Result<ExitCode> {
     checks.extend(faults::measure(&fleet, &robot, &mut base, &observer).await?);
     drop(base);
     checks.extend(doctor::measure(&arguments.python, &node).await?);
-    print(&arguments, &checks)?;
-    let all_hold = checks.iter().all(|check| check.holds);
-    if !all_hold {
+    if !checks.iter().all(|check| check.holds) {
         for line in fleet.log_tail(robot.as_str()) {
             eprintln!("{line}");
         }
     }
-    Ok(if all_hold {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    })
-}
-
-fn print(arguments: &Arguments, checks: &[Check]) -> anyhow::Result<()> {
-    let mut out = std::io::stdout().lock();
-    if arguments.json {
-        serde_json::to_writer(&mut out, &serde_json::json!({ "checks": checks }))?;
-        writeln!(out)?;
-        return Ok(());
-    }
-    for check in checks {
-        let verdict = if check.holds { "ok" } else { "FAILED" };
-        writeln!(
-            out,
-            "{verdict:<7}{:<56}{:>12.4}   goal {}",
-            check.name, check.value, check.goal
-        )?;
-    }
-    Ok(())
+    report::tell(arguments.json, &checks)
 }

@@ -11,9 +11,9 @@ use tread_api::mission::{MissionQuality, MissionState};
 use tread_tests::fleet::{Fleet, GROUND, GROUND_THETA, SITE};
 use tread_tests::wait::{SHORT, eventually};
 
-use crate::Check;
 use crate::observer::Observer;
 use crate::python_robot::PythonRobot;
+use tread_tests::report::Check;
 
 /// Longest that a mission may take.
 const MISSION_MAX: Duration = Duration::from_mins(2);

@@ -11,7 +11,7 @@ use tread_ros2::messages::Twist;
 use tread_tests::fleet::Fleet;
 use zenoh::Wait as _;
 
-use crate::Check;
+use tread_tests::report::Check;
 
 /// How long everything on the fleet's router is listened to.
 const LISTEN_FOR: Duration = Duration::from_secs(2);

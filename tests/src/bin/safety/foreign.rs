@@ -15,12 +15,13 @@ use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
 use tread_tests::fleet::Fleet;
 use tread_tests::light_robot::{ask, open_session};
 use tread_tests::random::Random;
+use tread_tests::report::{Check, figure};
 use uuid::Uuid;
 use zenoh::Session;
 use zenoh::qos::CongestionControl;
 
+use crate::Arguments;
 use crate::robots::{name, start};
-use crate::{Arguments, Check, figure};
 
 /// The robot's number, apart from all others.
 const NUMBER: u32 = 900;

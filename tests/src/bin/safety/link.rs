@@ -16,10 +16,11 @@ use tread_api::keys;
 use tread_tests::fleet::{Fleet, SITE};
 use tread_tests::light_robot::open_session;
 use tread_tests::relay::Relay;
+use tread_tests::report::{Check, figure, quantile};
 use zenoh::qos::CongestionControl;
 
+use crate::Arguments;
 use crate::robots::{name, start};
-use crate::{Arguments, Check, figure, quantile};
 
 /// The robot's number, apart from all others.
 const NUMBER: u32 = 901;

@@ -16,13 +16,13 @@ mod link;
 mod robots;
 mod stop;
 
-use std::io::Write;
 use std::process::ExitCode;
 
 use clap::Parser;
-use serde::Serialize;
 use tread_agent::bench::{hand_trials, lease_model};
 use tread_tests::fleet::Fleet;
+use tread_tests::process::node;
+use tread_tests::report::{self, Check, figure};
 
 /// Measures whether stopping depends on luck.
 #[derive(Debug, Parser)]
@@ -54,67 +54,10 @@ pub(crate) struct Arguments {
     json: bool,
 }
 
-/// A figure with what it must be.
-#[derive(Debug, Serialize)]
-pub(crate) struct Check {
-    pub(crate) name: &'static str,
-    pub(crate) goal: String,
-    pub(crate) value: f64,
-    pub(crate) holds: bool,
-}
-
-impl Check {
-    /// A figure that must be at most `most`.
-    pub(crate) fn at_most(name: &'static str, most: f64, value: f64) -> Self {
-        Self {
-            name,
-            goal: format!("<= {most}"),
-            value,
-            holds: value <= most,
-        }
-    }
-
-    /// A figure that must be at least `least`.
-    pub(crate) fn at_least(name: &'static str, least: f64, value: f64) -> Self {
-        Self {
-            name,
-            goal: format!(">= {least}"),
-            value,
-            holds: value >= least,
-        }
-    }
-}
-
-/// A count as a figure.
-#[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
-pub(crate) fn figure(count: u64) -> f64 {
-    count as f64
-}
-
-/// The value below which that share of the figures lies; infinite without any.
-pub(crate) fn quantile(figures: &mut [f64], share: f64) -> f64 {
-    figures.sort_by(f64::total_cmp);
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_precision_loss,
-        clippy::cast_sign_loss,
-        reason = "an index into a list in memory"
-    )]
-    let index = (figures.len() as f64 * share).ceil() as usize;
-    let found = figures.get(index.saturating_sub(1));
-    found.copied().unwrap_or(f64::INFINITY)
-}
-
 #[tokio::main]
 async fn main() -> anyhow::Result<ExitCode> {
     let arguments = Arguments::parse();
-    // The executables of this package stand beside each other.
-    let node = std::env::current_exe()?.with_file_name("node");
-    anyhow::ensure!(
-        node.exists(),
-        "{} is missing: build it with `cargo build --release -p tread-tests --bins`",
-        node.display()
-    );
+    let node = node()?;
     let (trials, steps, seed) = (arguments.trials, arguments.steps, arguments.seed);
     let mut checks =
         tokio::task::spawn_blocking(move || on_the_bench(trials, steps, seed)).await??;
@@ -124,12 +67,7 @@ async fn main() -> anyhow::Result<ExitCode> {
     let fleet = Fleet::start_with(&node).await;
     checks.extend(foreign::measure(&arguments, &fleet).await?);
     checks.extend(link::measure(&arguments, &fleet).await?);
-    print(&arguments, &checks)?;
-    Ok(if checks.iter().all(|check| check.holds) {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    })
+    report::tell(arguments.json, &checks)
 }
 
 fn on_the_bench(trials: u64, steps: u64, seed: u64) -> anyhow::Result<Vec<Check>> {
@@ -167,22 +105,4 @@ fn on_the_bench(trials: u64, steps: u64, seed: u64) -> anyhow::Result<Vec<Check>
         Check::at_least("lease: commands accepted", 1.0, figure(counts.accepted)),
         Check::at_least("lease: commands refused", 1.0, figure(refused)),
     ])
-}
-
-fn print(arguments: &Arguments, checks: &[Check]) -> anyhow::Result<()> {
-    let mut out = std::io::stdout().lock();
-    if arguments.json {
-        serde_json::to_writer(&mut out, &serde_json::json!({ "checks": checks }))?;
-        writeln!(out)?;
-        return Ok(());
-    }
-    for check in checks {
-        let verdict = if check.holds { "ok" } else { "FAILED" };
-        writeln!(
-            out,
-            "{verdict:<7}{:<48}{:>14.3}   goal {}",
-            check.name, check.value, check.goal
-        )?;
-    }
-    Ok(())
 }

@@ -13,10 +13,11 @@ use tread_api::ids::{MissionId, RobotId};
 use tread_api::robot::RobotMode;
 use tread_api::stop::{FleetStop, Stop};
 use tread_tests::fleet::{Fleet, SITE};
+use tread_tests::report::{Check, figure, quantile};
 use tread_tests::wait::{DRIVE, SHORT, eventually};
 
+use crate::Arguments;
 use crate::robots::{APART_M, name, start};
-use crate::{Arguments, Check, figure, quantile};
 
 /// From the call to a target of zero, 99 % of them, at the most.
 const STOP_MAX_MS: f64 = 50.0;

@@ -2,14 +2,17 @@
 //!
 //! Each scenario has a name: `scenario map` is [`tread_tests::scenario::map`].
 
-use std::io::Write;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+use serde::Serialize;
+use tread_tests::report;
 use tread_tests::scenario::map;
 use tread_tests::scenario::report::{Report, Size};
 
 mod print;
+
+use self::print::Tables;
 
 /// Runs a fleet in a simulated time and holds what comes of it against what it should be.
 #[derive(Debug, Parser)]
@@ -67,23 +70,11 @@ fn main() -> anyhow::Result<ExitCode> {
         visits,
         arrivals_per_model: arrivals,
     }))?;
-    tell(&report, json)
+    let details = Details { report: &report };
+    report::tell_with(json, &details, Tables(&report), &report.checks())
 }
 
-fn tell(report: &Report, json: bool) -> anyhow::Result<ExitCode> {
-    let checks = report.checks();
-    let mut out = std::io::stdout().lock();
-    if json {
-        let told = serde_json::json!({ "report": report, "checks": checks });
-        serde_json::to_writer(&mut out, &told)?;
-        writeln!(out)?;
-    } else {
-        print::tables(&mut out, report)?;
-        print::checks(&mut out, &checks)?;
-    }
-    Ok(if checks.iter().all(|check| check.holds) {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    })
+#[derive(Debug, Serialize)]
+struct Details<'a> {
+    report: &'a Report,
 }

@@ -1,11 +1,19 @@
 //! A run for people.
 
-use std::io::{self, Write};
+use std::fmt::{self, Display, Formatter, Write};
 
-use tread_tests::scenario::report::{Arrival, Check, Learned, Report};
+use tread_tests::scenario::report::{Arrival, Learned, Report};
 
 /// All tables of a run.
-pub(super) fn tables(out: &mut impl Write, report: &Report) -> io::Result<()> {
+pub(super) struct Tables<'a>(pub(super) &'a Report);
+
+impl Display for Tables<'_> {
+    fn fmt(&self, out: &mut Formatter<'_>) -> fmt::Result {
+        tables(out, self.0)
+    }
+}
+
+fn tables(out: &mut impl Write, report: &Report) -> fmt::Result {
     for learned in &report.learned {
         grounds(out, learned)?;
     }
@@ -44,10 +52,10 @@ pub(super) fn tables(out: &mut impl Write, report: &Report) -> io::Result<()> {
             )?;
         }
     }
-    Ok(())
+    writeln!(out)
 }
 
-fn grounds(out: &mut impl Write, learned: &Learned) -> io::Result<()> {
+fn grounds(out: &mut impl Write, learned: &Learned) -> fmt::Result {
     let how = if learned.torque { "with" } else { "without" };
     writeln!(
         out,
@@ -94,20 +102,6 @@ fn grounds(out: &mut impl Write, learned: &Learned) -> io::Result<()> {
                 pass.model, pass.shown, pass.cells, pass.disputed, pass.alert
             )?;
         }
-    }
-    Ok(())
-}
-
-/// What must hold.
-pub(super) fn checks(out: &mut impl Write, checks: &[Check]) -> io::Result<()> {
-    writeln!(out)?;
-    for check in checks {
-        let verdict = if check.holds { "ok" } else { "FAILED" };
-        writeln!(
-            out,
-            "{verdict:<7}{:<66}{:>9.3}   goal {}",
-            check.name, check.value, check.goal
-        )?;
     }
     Ok(())
 }
