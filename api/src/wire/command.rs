@@ -181,7 +181,7 @@ pub enum OfferRefusal {
     Busy,
     /// The same mission and revision were offered with other content.
     Conflict,
-    /// The mission has ended here before.
+    /// The mission, the lease or the stop has ended here before.
     Ended,
     /// The trajectory cannot be driven by this robot.
     Impossible,

@@ -26,6 +26,12 @@ fn refused(code: OfferRefusal, detail: impl Into<String>) -> Outcome {
 /// Stops, and says so once the target is zero and the disk has the latch.
 pub(crate) async fn stop(safety: &Arc<Safety>, stop: &Stop) -> Outcome {
     match safety.confirm_stop(stop).await {
+        // Stops may come in another order than they were asked for in, and the clear of the one
+        // that came last ends all that came before.
+        Ok(()) if safety.latch().is_none() => refused(
+            OfferRefusal::Ended,
+            "this stop was in force, and was cleared",
+        ),
         Ok(()) => Outcome::Done,
         Err(cause) => refused(OfferRefusal::NotReady, cause.to_string()),
     }

@@ -140,7 +140,10 @@ async fn a_stop_is_confirmed_survives_a_restart_and_is_cleared_only_by_its_newes
     assert_eq!(code(&refused.outcome), Some(OfferRefusal::NotReady));
     assert_eq!(clear(&server, &rig, 2).await, Outcome::Done);
     assert_eq!(clear(&server, &rig, 2).await, Outcome::Done, "doubled");
-    assert_eq!(stop(&server, &rig, 2).await, Outcome::Done, "come late");
+    for number in [1, 2] {
+        let late = stop(&server, &rig, number).await;
+        assert_eq!(code(&late), Some(OfferRefusal::Ended), "{late:?}");
+    }
     assert_eq!(
         agent.state().safety.stop,
         None,

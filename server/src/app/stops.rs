@@ -7,8 +7,9 @@
 //! clear ──► the database ─► the robot ─► cleared, or refused: a newer stop, or it still moves
 //! ```
 //!
-//! The robot is the truth of what is in force. A robot that does not show a stop which it had
-//! confirmed and which nobody asked to clear is told again. Everything that a stopped robot had in
+//! The robot is the truth of what is in force, in the order in which stops came to it: the clear of
+//! the last one ends those before. A robot that does not show a stop which it had confirmed and
+//! which nobody asked to clear is told again, and may answer that it was cleared. Everything that a stopped robot had in
 //! hand or in its queue is held, and goes on only when a person says so.
 
 mod delivery;
@@ -27,8 +28,8 @@ use tread_api::stop::{FleetStop, STOP_CONFIRM_MAX_MS, STOP_TEXT_MAX, Stop};
 use tread_api::wire::command::Outcome;
 use tread_api::wire::safety::ClearStop;
 
-pub(super) use self::delivery::tell;
 use self::delivery::{Outgoing, Settling};
+pub(super) use self::delivery::{Told, tell};
 use super::missions::control::hold_all;
 use super::{App, AppError, page, site_row};
 use crate::db::stops::StopFilter;
@@ -311,6 +312,21 @@ impl App {
         }
         tx.commit().await?;
         self.show_alerts(&alerts);
+        Ok(())
+    }
+
+    /// Writes down that a stop was in force on its robot and has been cleared there, with one that
+    /// came later there.
+    pub(super) async fn note_over(&self, stop: &Stop) -> Result<(), AppError> {
+        let mut tx = self.db().write().await?;
+        db::stops::end(&mut tx, stop.id, self.clock().now()).await?;
+        let mut alerts = Vec::new();
+        if let Some(robot_pk) = db::robots::pk_of(&mut tx, &stop.site, &stop.robot).await? {
+            alerts.extend(self.end_alert(&mut tx, robot_pk, UNCONFIRMED_ALERT).await?);
+        }
+        tx.commit().await?;
+        self.show_alerts(&alerts);
+        self.wake();
         Ok(())
     }
 

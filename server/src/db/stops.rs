@@ -200,7 +200,8 @@ pub async fn unconfirm(db: &mut SqliteConnection, id: StopId) -> Result<(), DbEr
     Ok(())
 }
 
-/// Notes that somebody asks to clear a robot's stops up to this one.
+/// Notes that somebody asks to clear a robot's stops up to this one, in the order in which they
+/// were asked for or came to the robot: what it has confirmed came before what is cleared now.
 pub async fn ask_clear(
     db: &mut SqliteConnection,
     id: StopId,
@@ -211,7 +212,8 @@ pub async fn ask_clear(
     sqlx::query!(
         "UPDATE stops SET clear_asked_by = ?1, clear_asked_at_us = ?2
          WHERE robot_pk = (SELECT robot_pk FROM stops WHERE id = ?3)
-           AND wanted_at_us <= (SELECT wanted_at_us FROM stops WHERE id = ?3)
+           AND (wanted_at_us <= (SELECT wanted_at_us FROM stops WHERE id = ?3)
+               OR confirmed_at_us <= ?2)
            AND cleared_at_us IS NULL",
         by,
         at_us,
@@ -228,7 +230,7 @@ pub async fn refuse_clear(db: &mut SqliteConnection, id: StopId) -> Result<(), D
     sqlx::query!(
         "UPDATE stops SET clear_asked_by = NULL, clear_asked_at_us = NULL
          WHERE robot_pk = (SELECT robot_pk FROM stops WHERE id = ?1)
-           AND wanted_at_us <= (SELECT wanted_at_us FROM stops WHERE id = ?1)
+           AND clear_asked_at_us = (SELECT clear_asked_at_us FROM stops WHERE id = ?1)
            AND cleared_at_us IS NULL",
         id,
     )
@@ -237,14 +239,29 @@ pub async fn refuse_clear(db: &mut SqliteConnection, id: StopId) -> Result<(), D
     Ok(())
 }
 
-/// Notes that a robot has cleared its stops up to this one.
+/// Notes that a robot has cleared this stop and all that were to be cleared with it.
 pub async fn clear(db: &mut SqliteConnection, id: StopId, at: Timestamp) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
         "UPDATE stops SET cleared_at_us = ?1
          WHERE robot_pk = (SELECT robot_pk FROM stops WHERE id = ?2)
-           AND wanted_at_us <= (SELECT wanted_at_us FROM stops WHERE id = ?2)
+           AND (id = ?2
+               OR clear_asked_at_us = (SELECT clear_asked_at_us FROM stops WHERE id = ?2))
            AND cleared_at_us IS NULL",
+        at_us,
+        id,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Notes that a stop was in force and has ended, whoever cleared it.
+pub async fn end(db: &mut SqliteConnection, id: StopId, at: Timestamp) -> Result<(), DbError> {
+    let (id, at_us) = (id.to_string(), to_us(at));
+    sqlx::query!(
+        "UPDATE stops SET confirmed_at_us = COALESCE(confirmed_at_us, ?1), cleared_at_us = ?1
+         WHERE id = ?2 AND cleared_at_us IS NULL",
         at_us,
         id,
     )

@@ -48,6 +48,7 @@ struct Heard {
     limits: Vec<ExternalLimit>,
     drives: Vec<DriveCommand>,
     deaf_to_stops: bool,
+    stops_are_over: bool,
     epoch: u64,
 }
 
@@ -116,6 +117,7 @@ impl Robot {
             limits: Vec::new(),
             drives: Vec::new(),
             deaf_to_stops: false,
+            stops_are_over: false,
             epoch: 0,
         }));
         let state = Arc::new(Mutex::new(RobotState {
@@ -266,6 +268,11 @@ impl Robot {
     /// Lets it hear no stop, or hear them again.
     pub(crate) fn be_deaf_to_stops(&self, deaf: bool) {
         self.heard.lock().unwrap().deaf_to_stops = deaf;
+    }
+
+    /// Lets it say of every stop that it was in force and has been cleared.
+    pub(crate) fn call_stops_over(&self) {
+        self.heard.lock().unwrap().stops_are_over = true;
     }
 
     pub(crate) fn stops(&self) -> Vec<Stop> {

@@ -321,6 +321,32 @@ async fn a_stop_that_the_robot_forgot_is_sent_again_and_one_of_its_own_is_adopte
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_that_ended_on_its_robot_with_a_later_one_is_listed_as_cleared() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    // Its answer to the stop is lost, as is the clear of whatever came after.
+    robot.be_deaf_to_stops(true);
+    let stop = yard.stop_robot(&json!({})).await;
+    assert!(stop.unconfirmed, "{stop:?}");
+    robot.call_stops_over();
+    robot.be_deaf_to_stops(false);
+    let over = yard
+        .stop_becomes("it is over", |stop| stop.cleared_at.is_some())
+        .await;
+    assert_eq!(over.id, stop.id);
+    assert!(over.confirmed_at.is_some() && !over.unconfirmed, "{over:?}");
+    eventually("its alert is over too", async || {
+        let raised = yard.raised().await;
+        let has = raised.iter().any(|code| code == "stop-unconfirmed");
+        if has { Err(raised) } else { Ok(()) }
+    })
+    .await;
+    let page: Page<Stop> = yard.get("/v1/stops?in_force=true").await;
+    assert!(page.items.is_empty(), "{:?}", page.items);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_clear_names_the_newest_stop_and_reaches_the_robot_or_nothing_is_cleared() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;

@@ -16,4 +16,10 @@ mod tests {
         }
         assert!(missions > 100, "only {missions} missions were asked for");
     }
+
+    /// Stops that came to a robot in another order than they were asked for in.
+    #[tokio::test]
+    async fn a_stop_that_was_cleared_with_a_later_one_does_not_hold_missions_for_ever() {
+        storm::run(7, 1_000).await.unwrap();
+    }
 }

@@ -418,16 +418,22 @@ impl Storm {
                 return Ok(());
             }
         }
-        let held = with(&self.world, |world| {
-            let held = world
-                .robots
-                .iter()
-                .map(|robot| (robot.id.clone(), robot.holds()));
-            held.collect::<Vec<_>>()
+        let hands = with(&self.world, |world| {
+            let hand = |robot: &Robot| {
+                let stopped_by = robot.stopped_by();
+                (
+                    robot.id.clone(),
+                    robot.holds(),
+                    stopped_by,
+                    robot.is_in_hands(),
+                )
+            };
+            world.robots.iter().map(hand).collect::<Vec<_>>()
         });
-        let open = self.reference.open();
+        let (open, stops) = (self.reference.open(), self.stops_in_force().await?);
         Err(format!(
-            "stuck: open at the server {open:?}, in robots' hands {held:?}"
+            "stuck: open at the server {open:?}, stops in force {stops:?}, robots with mission, stop and whether they \
+             are in somebody's hands {hands:?}"
         ))
     }
 

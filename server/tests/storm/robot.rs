@@ -343,6 +343,9 @@ impl Robot {
             });
             self.stand(PauseCause::Stop);
         }
+        if self.stop.is_none() {
+            return refused(OfferRefusal::Ended);
+        }
         Outcome::Done
     }
 

@@ -78,7 +78,7 @@ impl Storm {
         Err(format!("{stop:?} was not written down"))
     }
 
-    async fn stops_in_force(&self) -> Result<Vec<Stop>, String> {
+    pub(super) async fn stops_in_force(&self) -> Result<Vec<Stop>, String> {
         let filter = StopFilter {
             in_force: true,
             ..StopFilter::default()

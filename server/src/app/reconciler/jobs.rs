@@ -10,7 +10,7 @@ use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome, Pau
 use crate::app::missions::reports::adopt;
 use crate::app::missions::transitions::Change;
 use crate::app::missions::{Step, add_note, take_step};
-use crate::app::stops::tell;
+use crate::app::stops::{Told, tell};
 use crate::app::terrains::site_definition;
 use crate::app::{App, AppError};
 use crate::db;
@@ -425,12 +425,17 @@ pub(super) async fn stop_again(
     commands: Commands,
     stop: Stop,
 ) -> Result<Finished, AppError> {
-    if !tell(&app, &commands, &stop).await {
-        app.note_unconfirmed(&[&stop]).await?;
-        return Ok(Finished::Again);
+    match tell(&app, &commands, &stop).await {
+        Told::Confirmed => {
+            let confirmed = (stop.id, app.clock().now());
+            app.note_confirmed(&[stop], &[confirmed]).await?;
+        }
+        Told::Over => app.note_over(&stop).await?,
+        Told::Unconfirmed => {
+            app.note_unconfirmed(&[&stop]).await?;
+            return Ok(Finished::Again);
+        }
     }
-    let confirmed = (stop.id, app.clock().now());
-    app.note_confirmed(&[stop], &[confirmed]).await?;
     Ok(Finished::Settled)
 }
 

@@ -9,14 +9,25 @@ use tracing::{error, warn};
 use tread_api::ids::StopId;
 use tread_api::keys::Verb;
 use tread_api::stop::Stop;
-use tread_api::wire::command::{Answer, Outcome};
+use tread_api::wire::command::{Answer, OfferRefusal, Outcome};
 use tread_api::wire::safety::Stop as StopCommand;
 
 use super::super::{App, AppError, Links};
 use crate::fleet::commands::Commands;
 
-/// Tells a robot to stop; whether it has confirmed.
-pub(in crate::app) async fn tell(app: &App, commands: &Commands, stop: &Stop) -> bool {
+/// What a robot has said to a stop.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::app) enum Told {
+    /// It is in force, or was replaced by one that came later.
+    Confirmed,
+    /// It was in force and has been cleared since, perhaps with one that came later.
+    Over,
+    /// Nothing, or not what was hoped for.
+    Unconfirmed,
+}
+
+/// Tells a robot to stop.
+pub(in crate::app) async fn tell(app: &App, commands: &Commands, stop: &Stop) -> Told {
     let command = StopCommand {
         stop: stop.id,
         by: stop.by.clone(),
@@ -30,14 +41,18 @@ pub(in crate::app) async fn tell(app: &App, commands: &Commands, stop: &Stop) ->
     let answer = commands.send_to(&key, None, Verb::Stop, &command).await;
     let confirms = |answer: &Answer| present.is_none_or(|boot| boot == answer.boot);
     match answer.filter(confirms).map(|answer| answer.outcome) {
+        Some(Outcome::Refused {
+            code: OfferRefusal::Ended,
+            ..
+        }) => Told::Over,
         Some(Outcome::Refused { detail, .. }) => {
             error!(robot.id = %stop.robot, "robot `{}` does not stop: {detail}", stop.robot);
-            false
+            Told::Unconfirmed
         }
-        Some(_) => true,
+        Some(_) => Told::Confirmed,
         None => {
             app.counters().commands_unanswered.one();
-            false
+            Told::Unconfirmed
         }
     }
 }
@@ -56,8 +71,10 @@ impl Outgoing {
     pub(super) async fn deliver(self, tell_of: mpsc::Sender<(StopId, Timestamp)>) {
         let ending = self.links.supervisor.stop_token();
         loop {
-            if tell(&self.app, &self.links.commands, &self.stop).await {
-                // Nobody listens only when the server stops.
+            let told = tell(&self.app, &self.links.commands, &self.stop).await;
+            if told != Told::Unconfirmed {
+                // What is over was in force; the reconciler hears that it is over. Nobody listens
+                // only when the server stops.
                 let _ = tell_of.send((self.stop.id, self.app.clock().now())).await;
                 return;
             }

@@ -113,6 +113,13 @@ fn in_safety(
                 return None;
             }
             let stop: Stop = wire::decode(payload).unwrap();
+            if heard.stops_are_over {
+                heard.stops.push(stop);
+                return Some(Outcome::Refused {
+                    code: OfferRefusal::Ended,
+                    detail: "this stop was in force, and was cleared".to_owned(),
+                });
+            }
             state.mode = RobotMode::Stopped;
             if let Some(mission) = &mut state.mission {
                 mission.paused = true;
