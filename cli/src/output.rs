@@ -57,16 +57,21 @@ impl Output {
             (None, None) => Exit::WentWrong,
         };
         let next_step = client_error.and_then(ClientError::next_step);
+        let told = match client_error {
+            // What lies between only says again that it could not be asked.
+            Some(ClientError::Unreachable { .. }) => format!("{error}: {}", error.root_cause()),
+            _ => format!("{error:#}"),
+        };
         if self.json {
             let said = json!({
-                "error": format!("{error:#}"),
+                "error": told,
                 "exit_code": exit as u8,
                 "next_step": next_step,
                 "problem": client_error.and_then(ClientError::problem),
             });
             note(&said.to_string());
         } else {
-            note(&format!("tread: {error:#}"));
+            note(&format!("tread: {told}"));
             if let Some(next_step) = next_step {
                 note(&format!("next: {next_step}"));
             }
@@ -119,6 +124,15 @@ pub(crate) fn or_dash<T: ToString>(value: Option<T>) -> String {
     value.map_or_else(|| "-".to_owned(), |value| value.to_string())
 }
 
+/// A number with so many decimals; what rounds to zero has no sign.
+pub(crate) fn fixed(value: f64, digits: usize) -> String {
+    let text = format!("{value:.digits$}");
+    match text.strip_prefix('-') {
+        Some(zero) if !zero.contains(|digit: char| ('1'..='9').contains(&digit)) => zero.to_owned(),
+        _ => text,
+    }
+}
+
 /// An age for people.
 pub(crate) fn age(age_ms: u64) -> String {
     match age_ms {
@@ -126,5 +140,18 @@ pub(crate) fn age(age_ms: u64) -> String {
         1_000..120_000 => format!("{}.{} s", age_ms / 1_000, age_ms % 1_000 / 100),
         120_000..7_200_000 => format!("{} min", age_ms / 60_000),
         _ => format!("{} h", age_ms / 3_600_000),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_number_that_rounds_to_zero_has_no_sign() {
+        assert_eq!(fixed(-0.004, 2), "0.00");
+        assert_eq!(fixed(-0.0, 0), "0");
+        assert_eq!(fixed(-0.006, 2), "-0.01");
+        assert_eq!(fixed(-10.0, 1), "-10.0");
     }
 }

@@ -21,8 +21,13 @@ const EXAMPLES: &[(&str, &str)] = &[
     ("sites", "  tread sites"),
     (
         "sites create",
-        "  tread sites create north-yard --name \"North yard\" --cell 0.5",
+        "  tread sites create north-yard --name \"North yard\" --cell 0.5\n  tread sites create quay --origin 53.5413,9.9841 --x-axis 30",
     ),
+    (
+        "sites tie",
+        "  tread sites tie north-yard 48.1374,11.5755 --x-axis -12.5",
+    ),
+    ("sites untie", "  tread sites untie north-yard"),
     ("robots", "  tread robots\n  tread robots rover-1"),
     (
         "robots join-token",

@@ -7,10 +7,11 @@ use clap::{Args, Subcommand};
 use jiff::Timestamp;
 use tread_api::geometry::Point;
 use tread_api::ids::{ConfigurationId, RobotId, SiteId, TerrainId};
+use tread_api::site::GeoOrigin;
 use tread_api::terrain::TerrainClass;
 
 use super::Connection;
-use super::values::{area, duration, moment, point, positive, terrain_class};
+use super::values::{area, duration, earth, finite, moment, point, positive, terrain_class};
 use crate::client::{Area, Reading};
 
 #[derive(Debug, Args)]
@@ -33,6 +34,30 @@ pub(crate) enum SitesAction {
         /// Side of the squares in which friction is kept, metres; it never changes
         #[arg(long, value_name = "M", value_parser = positive)]
         cell: Option<f64>,
+        /// Where on the earth its origin lies, WGS 84 degrees north and east; it may be said later
+        #[arg(long, value_name = "LAT,LON", value_parser = earth)]
+        origin: Option<GeoOrigin>,
+        /// Angle from east to its x axis, counter-clockwise, degrees
+        #[arg(long, value_name = "DEG", value_parser = finite, allow_hyphen_values = true)]
+        #[arg(default_value_t = 0.0, requires = "origin")]
+        x_axis: f64,
+    },
+    /// Say where on the earth a site lies, so that its map can be given in WGS 84
+    Tie {
+        /// The site
+        id: SiteId,
+        /// Where its origin lies, degrees north and east
+        #[arg(value_name = "LAT,LON", value_parser = earth)]
+        origin: GeoOrigin,
+        /// Angle from east to its x axis, counter-clockwise, degrees
+        #[arg(long, value_name = "DEG", value_parser = finite, allow_hyphen_values = true)]
+        #[arg(default_value_t = 0.0)]
+        x_axis: f64,
+    },
+    /// Take back where on the earth a site lies
+    Untie {
+        /// The site
+        id: SiteId,
     },
 }
 

@@ -10,7 +10,7 @@ use tread_api::mission::{LinkPolicy, MissionState, StartPolicy};
 use tread_api::trajectory::Waypoint;
 
 use super::Connection;
-use super::values::{duration, finite, mission_state, point, waypoint};
+use super::values::{duration, finite, mission, mission_state, point, waypoint};
 
 #[derive(Debug, Args)]
 pub(crate) struct SendArguments {
@@ -63,7 +63,7 @@ pub(crate) struct Order {
     #[arg(long)]
     pub(crate) excite: bool,
     /// Swap this mission for the new trajectory instead of queueing another
-    #[arg(long, value_name = "MISSION")]
+    #[arg(long, value_name = "MISSION", value_parser = mission)]
     pub(crate) replaces: Option<MissionId>,
     /// Only tell what it would ask of the robot; nothing moves
     #[arg(long, conflicts_with_all = ["replaces", "wait"])]
@@ -170,13 +170,14 @@ pub(crate) enum MissionsAction {
     /// Show a mission with its history
     Show {
         /// The mission
+        #[arg(value_parser = mission)]
         mission: MissionId,
     },
     /// Wait until missions have ended, showing their progress; exits with 1 if one did not succeed
     #[command(visible_alias = "follow")]
     Wait {
         /// The missions
-        #[arg(required = true)]
+        #[arg(required = true, value_parser = mission)]
         missions: Vec<MissionId>,
         /// Wait at most so long; the missions go on
         #[arg(long, value_name = "TIME", value_parser = duration)]
@@ -185,16 +186,19 @@ pub(crate) enum MissionsAction {
     /// Hold a mission: its robot brakes along the path and stands
     Pause {
         /// The mission
+        #[arg(value_parser = mission)]
         mission: MissionId,
     },
     /// Let a paused mission go on
     Resume {
         /// The mission
+        #[arg(value_parser = mission)]
         mission: MissionId,
     },
     /// Cancel a mission: its robot brakes along the path
     Cancel {
         /// The mission
+        #[arg(value_parser = mission)]
         mission: MissionId,
     },
 }

@@ -6,7 +6,9 @@ use std::time::Duration;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use jiff::{SignedDuration, Timestamp};
 use tread_api::geometry::Point;
+use tread_api::ids::MissionId;
 use tread_api::mission::MissionState;
+use tread_api::site::GeoOrigin;
 use tread_api::terrain::TerrainClass;
 use tread_api::trajectory::Waypoint;
 
@@ -80,8 +82,7 @@ fn coordinates(text: &str) -> Result<(f64, f64), String> {
         .ok_or("give two numbers with a comma: 1.5,-2")?;
     let number = |part: &str| {
         let part = part.trim();
-        part.parse::<f64>()
-            .map_err(|_| format!("`{part}` is not a number"))
+        finite(part).map_err(|_| format!("`{part}` is not a number"))
     };
     Ok((number(x)?, number(y)?))
 }
@@ -136,6 +137,26 @@ pub(super) fn terrain_class() -> impl TypedValueParser<Value = TerrainClass> {
         .try_map(|name| serde_json::from_value::<TerrainClass>(name.into()))
 }
 
+/// Reads a place on the earth, degrees north and east; the x axis of what lies there points east.
+pub(super) fn earth(text: &str) -> Result<GeoOrigin, String> {
+    let (latitude_deg, longitude_deg) = coordinates(text)
+        .map_err(|error| format!("{error}; degrees north and east: 48.14,11.57"))?;
+    let place = serde_json::json!({
+        "latitude_deg": latitude_deg, "longitude_deg": longitude_deg,
+    });
+    // Read as the API reads it, so that what is no place is said here.
+    serde_json::from_value(place).map_err(|error| error.to_string())
+}
+
+/// Reads the identifier of a mission.
+pub(super) fn mission(text: &str) -> Result<MissionId, String> {
+    text.parse().map_err(|_| {
+        "give the whole identifier, as `tread missions` prints it: \
+         0192f0c1-2b3c-7d4e-8f50-617283940a1b"
+            .to_owned()
+    })
+}
+
 pub(super) fn point(text: &str) -> Result<Point, String> {
     coordinates(text).map(|(x_m, y_m)| Point { x_m, y_m })
 }
@@ -177,6 +198,27 @@ mod tests {
         for wrong in ["", "1,2,3", "1,2,3,x", "1,2,3,nan"] {
             assert!(area(wrong).is_err(), "`{wrong}` was taken");
         }
+    }
+
+    #[test]
+    fn a_place_on_the_earth_is_read_and_what_is_none_is_said() {
+        let read = earth("-33.86, 151.21").unwrap();
+        assert_eq!((read.latitude_deg, read.longitude_deg), (-33.86, 151.21));
+        for (wrong, said) in [
+            ("91,0", "latitude_deg must be -90 to 90"),
+            ("0,181", "longitude_deg must be -180 to 180"),
+            ("48.14", "48.14,11.57"),
+            ("nan,0", "`nan` is not a number"),
+        ] {
+            let error = earth(wrong).unwrap_err();
+            assert!(error.contains(said), "`{wrong}`: {error}");
+        }
+    }
+
+    #[test]
+    fn a_mission_that_is_none_is_told_where_to_find_one() {
+        assert!(mission("123").unwrap_err().contains("tread missions"));
+        assert!(mission("0192f0c1-2b3c-7d4e-8f50-617283940a1b").is_ok());
     }
 
     #[test]

@@ -67,6 +67,14 @@ fn refusal(problem: &ProblemBody) -> String {
 /// What helps against a refusal; what is absent here says it in its detail.
 const NEXT_STEPS: &[(ProblemType, &str)] = &[
     (
+        ProblemType::InvalidBody,
+        "the same command with --help says what it takes",
+    ),
+    (
+        ProblemType::InvalidQuery,
+        "the same command with --help says what it takes",
+    ),
+    (
         ProblemType::Unauthenticated,
         "sign in with `tread login`, or give a token with --token-file or TREAD_TOKEN",
     ),

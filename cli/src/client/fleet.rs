@@ -3,7 +3,7 @@
 use reqwest::{Method, Response};
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::robot::{ChangeRobot, Robot};
-use tread_api::site::{CreateSite, Site};
+use tread_api::site::{CreateSite, GeoOrigin, Site};
 
 use super::{Client, ClientError, STREAM_WAIT_MAX};
 
@@ -19,6 +19,22 @@ impl Client {
 
     pub(crate) async fn create_site(&self, site: &CreateSite) -> Result<Site, ClientError> {
         self.post("/v1/sites", site).await
+    }
+
+    /// Says where on the earth a site lies.
+    pub(crate) async fn tie_site(
+        &self,
+        site: &SiteId,
+        origin: &GeoOrigin,
+    ) -> Result<Site, ClientError> {
+        let path = format!("/v1/sites/{site}/origin");
+        self.send(self.request(Method::PUT, &path).json(origin))
+            .await
+    }
+
+    /// Takes back where on the earth a site lies.
+    pub(crate) async fn untie_site(&self, site: &SiteId) -> Result<Site, ClientError> {
+        self.delete(&format!("/v1/sites/{site}/origin")).await
     }
 
     /// The robots of a site, those that are retired too if wanted.

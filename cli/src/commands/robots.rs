@@ -9,7 +9,7 @@ use tread_api::safety::{Driver, SafetyStatus};
 
 use crate::args::RobotsArguments;
 use crate::client::Client;
-use crate::output::{Output, age, or_dash, render, table};
+use crate::output::{Output, age, fixed, or_dash, render, table};
 
 pub(super) async fn run(
     arguments: &RobotsArguments,
@@ -97,9 +97,9 @@ pub(super) fn list(robots: &[Robot]) -> String {
             robot.id.to_string(),
             link_name(robot.link).to_owned(),
             or_dash(live.map(|live| mode_name(live.mode))),
-            or_dash(pose.map(|pose| format!("{:.2}", pose.value.x_m))),
-            or_dash(pose.map(|pose| format!("{:.2}", pose.value.y_m))),
-            or_dash(twist.map(|twist| format!("{:.2}", twist.value.linear_m_s))),
+            or_dash(pose.map(|pose| fixed(pose.value.x_m, 2))),
+            or_dash(pose.map(|pose| fixed(pose.value.y_m, 2))),
+            or_dash(twist.map(|twist| fixed(twist.value.linear_m_s, 2))),
             or_dash(mission.map(|mission| mission.id)),
             or_dash(mission.map(|mission| percent(mission.driven_m, mission.length_m))),
             or_dash(live.and_then(theta)),
@@ -166,8 +166,9 @@ fn live_lines(live: &RobotLive) -> Vec<String> {
     lines.extend(live.twist.map(|twist| {
         let (value, age) = (twist.value, age(twist.age_ms));
         format!(
-            "speed          {:.3} m/s, {:.3} rad/s, {age} old",
-            value.linear_m_s, value.angular_rad_s
+            "speed          {} m/s, {} rad/s, {age} old",
+            fixed(value.linear_m_s, 3),
+            fixed(value.angular_rad_s, 3)
         )
     }));
     lines.extend(live.mission.map(|mission| {

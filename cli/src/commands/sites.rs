@@ -3,11 +3,11 @@
 use std::process::ExitCode;
 
 use serde_json::Value;
-use tread_api::site::{CreateSite, Site};
+use tread_api::site::{CreateSite, GeoOrigin, Site};
 
 use crate::args::{SitesAction, SitesArguments};
-use crate::client::Client;
-use crate::output::{Output, age, render, table};
+use crate::client::{Client, ClientError};
+use crate::output::{Output, age, or_dash, render, table};
 
 pub(super) async fn status(client: &Client, output: Output) -> anyhow::Result<ExitCode> {
     output.show(&client.status().await?, |status| {
@@ -52,25 +52,62 @@ pub(super) async fn run(
 ) -> anyhow::Result<ExitCode> {
     match arguments.action {
         None => output.show(&client.sites().await?, |sites| list(sites))?,
-        Some(SitesAction::Create { id, name, cell }) => {
-            let request = CreateSite {
-                id,
-                name,
-                cell_m: cell,
-                origin: None,
-            };
-            let site = client.create_site(&request).await?;
+        Some(action) => {
+            let site = change(action, client).await?;
             output.show(&site, |site| list(std::slice::from_ref(site)))?;
         }
     }
     Ok(ExitCode::SUCCESS)
 }
 
+async fn change(action: SitesAction, client: &Client) -> Result<Site, ClientError> {
+    match action {
+        SitesAction::Create {
+            id,
+            name,
+            cell,
+            origin,
+            x_axis,
+        } => {
+            let request = CreateSite {
+                id,
+                name,
+                cell_m: cell,
+                origin: origin.map(|place| turned(place, x_axis)),
+            };
+            client.create_site(&request).await
+        }
+        SitesAction::Tie { id, origin, x_axis } => {
+            client.tie_site(&id, &turned(origin, x_axis)).await
+        }
+        SitesAction::Untie { id } => client.untie_site(&id).await,
+    }
+}
+
+fn turned(place: GeoOrigin, x_axis_deg: f64) -> GeoOrigin {
+    GeoOrigin {
+        x_axis_deg,
+        ..place
+    }
+}
+
+/// A place on the earth to about a decimetre, and how the site is turned there.
+fn on_earth(origin: GeoOrigin) -> String {
+    let GeoOrigin {
+        latitude_deg,
+        longitude_deg,
+        x_axis_deg,
+    } = origin;
+    format!("{latitude_deg:.6},{longitude_deg:.6} x axis {x_axis_deg}°")
+}
+
 fn list(sites: &[Site]) -> String {
     if sites.is_empty() {
         return "there is no site yet: an admin makes one with `tread sites create`".to_owned();
     }
-    let mut table = table(["SITE", "NAME", "CELL M", "TERRAINS", "GEOFENCE", "CREATED"]);
+    let mut table = table([
+        "SITE", "NAME", "CELL M", "TERRAINS", "GEOFENCE", "ORIGIN", "CREATED",
+    ]);
     for site in sites {
         table.add_row([
             site.id.to_string(),
@@ -78,6 +115,7 @@ fn list(sites: &[Site]) -> String {
             site.grid.cell_m.to_string(),
             format!("revision {}", site.terrain_revision),
             format!("revision {}", site.geofence_revision),
+            or_dash(site.origin.map(on_earth)),
             format!("{:.0}", site.created_at),
         ]);
     }

@@ -147,7 +147,9 @@ pub(super) fn point(point: &PointFriction) -> String {
     };
     let head = format!("cell {ix}, {iy}; {ground}");
     if point.models.is_empty() {
-        return format!("{head}\nno robot has measured anything on this site yet");
+        return format!(
+            "{head}\nno robot has measured this place yet: `tread friction` shows its terrain"
+        );
     }
     let mut table = friction_table(&["MODEL"]);
     for model in &point.models {

@@ -13,7 +13,7 @@ use super::known::Known;
 use super::screen::{Order, Section, Shown};
 use crate::commands::missions::{state, trajectory};
 use crate::commands::robots::{details, link_name, mode_name, steps_come, theta};
-use crate::output::{age, or_dash};
+use crate::output::{age, fixed, or_dash};
 
 /// Cells for the longest name.
 const NAME_MOST: usize = 24;
@@ -178,7 +178,7 @@ fn robot_row(robot: &Robot, is_wide: bool) -> Row<'static> {
         link_name(robot.link).to_owned(),
         or_dash(live.map(|live| mode_name(live.mode))),
         bar(mission),
-        or_dash(twist.map(|twist| format!("{:.2}", twist.value.linear_m_s))),
+        or_dash(twist.map(|twist| fixed(twist.value.linear_m_s, 2))),
         or_dash(off),
         or_dash(live.and_then(theta)),
         or_dash(live.map(|live| age(live.heard_age_ms))),
@@ -190,7 +190,7 @@ fn robot_row(robot: &Robot, is_wide: bool) -> Row<'static> {
         let gate = gate.and_then(|cause| serde_json::to_value(cause).ok());
         let gate = gate.as_ref().and_then(serde_json::Value::as_str);
         cells.extend([
-            or_dash(pose.map(|pose| format!("{:.2}, {:.2}", pose.x_m, pose.y_m))),
+            or_dash(pose.map(|pose| format!("{}, {}", fixed(pose.x_m, 2), fixed(pose.y_m, 2)))),
             or_dash(battery.map(|battery| format!("{:.0} %", 1e2 * battery.charge_ratio))),
             or_dash(gate.map(|cause| cause.replace('_', " "))),
         ]);
