@@ -1,9 +1,28 @@
 // What whoever comes first sees: signing in, motion, the friction map, and a viewer's page.
+import type { Locator } from 'playwright-core';
 import { expect, test } from 'vitest';
 import type { CellDifference, CellFriction, CreatedToken, Mission, Page as ApiPage, Robot } from './types';
+import { changeColour, shareOfChange } from '../src/map/compare';
 import { api, browser, eventually, map, select, server, shot, token, windowOf } from './harness';
 
 const { open } = browser();
+/** So many pixels of its ink are a curve, and no single point. */
+const CURVE_PIXELS = 40;
+
+/** Pixels of a canvas that have just this colour. */
+function inked(canvas: Locator, [red, green, blue]: readonly number[]): Promise<number> {
+  return canvas.evaluate(
+    (drawn: HTMLCanvasElement, ink) => {
+      const { data } = drawn.getContext('2d')!.getImageData(0, 0, drawn.width, drawn.height);
+      let count = 0;
+      for (let at = 0; at < data.length; at += 4) {
+        if (data[at] === ink[0] && data[at + 1] === ink[1] && data[at + 2] === ink[2]) count += 1;
+      }
+      return count;
+    },
+    [red, green, blue],
+  );
+}
 
 test('a stranger sees the sign-in and nothing else', async () => {
   const page = await open({ as: null });
@@ -133,6 +152,58 @@ test('two times of the friction map are compared', async () => {
   await page.getByLabel('Before').waitFor({ state: 'detached' });
 });
 
+test('ground that has changed is red where θ rose, blue where it fell, and grey within chance', async () => {
+  const from = new Date(Date.now() - 3_600_000).toISOString();
+  await eventually('measured cells', async () => {
+    const { items } = await api<ApiPage<CellDifference>>(`/v1/sites/yard/friction/difference?from=${from}&limit=1000`);
+    return items.length >= 3;
+  });
+  // What the server says of ground that was measured, as if it had been another before: the demo's
+  // does not change. Every third cell has risen, fallen, or stayed.
+  const before = [1 / 1.5, 2, 1] as const;
+  const cells: CellDifference[] = [];
+  const page = await open({
+    async prepare(page) {
+      await page.route(/\/friction\/difference\?/, async (route) => {
+        const response = await route.fetch();
+        const answer = (await response.json()) as ApiPage<CellDifference>;
+        cells.length = 0;
+        answer.items = answer.items.map((cell, index) => {
+          const factor = before[index % 3] ?? 1;
+          const was = cell.after ? { ...cell.after, theta: cell.after.theta * factor } : null;
+          return { ...cell, before: was, deviations: factor === 1 ? 0.3 : factor < 1 ? 6 : -6 };
+        });
+        cells.push(...answer.items);
+        await route.fulfill({ response, json: answer });
+      });
+    },
+  });
+  await page.getByText('Layers', { exact: true }).click();
+  await page.getByRole('checkbox', { name: 'Trails' }).uncheck();
+  await page.getByRole('combobox', { name: 'Friction' }).selectOption('change of θ between two times');
+  await page.getByText('loading …').waitFor({ state: 'detached' });
+  const place = await windowOf(page);
+  const box = await map(page);
+  const canvas = page.getByRole('application', { name: /^Map/ });
+  const isSeen = ({ cell }: CellDifference) => place(cell.ix + 1, 0).x < box.x + box.width - 280;
+  for (const [rest, said, colour] of [
+    [0, '50.0 %, 6.0 deviations', changeColour(shareOfChange(1.5))],
+    [1, '-50.0 %, -6.0 deviations', changeColour(-1)],
+    [2, '0.0 %, 0.3 deviations', changeColour(0)],
+  ] as const) {
+    const shown = cells.find((cell, index) => index % 3 === rest && cell.after && isSeen(cell));
+    if (!shown) throw new Error(`no cell of kind ${rest} can be pointed at`);
+    const { x, y } = place(shown.cell.ix + 0.5, shown.cell.iy + 0.5);
+    await eventually(`it says ${said}`, async () => {
+      await page.mouse.move(x + 1, y);
+      await page.mouse.move(x, y);
+      return (await page.locator('[data-test="value"]').innerText()) === said;
+    });
+    expect(await inked(canvas, colour), said).toBeGreaterThan(CURVE_PIXELS);
+  }
+  await shot(page, 'changed');
+});
+
 test('the slip of the wheels is shown while they turn', async () => {
   const page = await open();
   await select(page, 'rover-2');
@@ -149,9 +220,9 @@ test('the slip of the wheels is shown while they turn', async () => {
     const both = found && [Number(found[1]), Number(found[2])];
     return both && both.every((percent) => Math.abs(percent) < 60) && both.some((percent) => percent !== 0);
   });
-  await page.locator('.u-title', { hasText: 'Wheel slip' }).waitFor();
-  await page.waitForTimeout(4_000);
-  await page.locator('.u-title', { hasText: 'Wheel slip' }).scrollIntoViewIfNeeded();
+  const curve = page.locator('.uplot', { has: page.locator('.u-title', { hasText: 'Wheel slip' }) });
+  await eventually('a curve of the slip', async () => (await inked(curve.locator('canvas'), [11, 95, 165])) > CURVE_PIXELS);
+  await curve.scrollIntoViewIfNeeded();
   await shot(page, 'slip');
   // Before it brakes: while wheels change their speed nobody knows their slip.
   await eventually('the API says a slip too', async () => {

@@ -149,6 +149,10 @@ test('a lease is refused while another has it, taken by force, and the loss is s
   await second.getByText('You have the lease.').waitFor();
   await first.getByText(/^The lease is gone/).waitFor();
   await second.getByRole('button', { name: 'Give back' }).click();
+  await first.getByText('Nobody drives.').waitFor();
+  await first.getByRole('button', { name: 'Take the lease' }).click();
+  await first.getByText('You have the lease.').waitFor();
+  await first.getByRole('button', { name: 'Give back' }).click();
 });
 
 test('the touch stick of a phone drives too', async () => {

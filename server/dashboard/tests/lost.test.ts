@@ -3,6 +3,10 @@ import { expect, test } from 'vitest';
 import { api, browser, eventually, line, select, shot } from './harness';
 
 const { open } = browser();
+/** How long the page may take to be half a minute without the server, milliseconds. */
+const LONG_MS = 45_000;
+/** How soon it is to go on when the server is back, milliseconds. */
+const BACK_MAX_MS = 5_000;
 /** What a browser says of a line that was cut. */
 const CUT = /ERR_|Failed to load|WebSocket|CSP: none/;
 
@@ -21,6 +25,8 @@ test('a lost server is said, what was drawn is kept, and everything goes on when
   await page.getByText('The server does not answer; what you entered is kept.').waitFor();
   await page.getByRole('button', { name: 'Stop rover-1' }).click();
   await page.getByText(/rover-1 may not have been told to stop/).waitFor();
+  // Nothing that was so is shown as if it were.
+  await page.locator('.head .warn', { hasText: /^last known · / }).waitFor();
   await shot(page, 'lost');
   expect(await page.getByLabel('Centre x, m').inputValue()).toBe('7.5');
   wire.mend();
@@ -29,6 +35,26 @@ test('a lost server is said, what was drawn is kept, and everything goes on when
   const age = () => page.locator('.head span').last().innerText();
   await eventually('a fresh state', async () => /^online · 0\.\d s/.test(await age()));
   expect(await page.getByLabel('Centre x, m').inputValue()).toBe('7.5');
+  wire.end();
+});
+
+test('after a long time without the server the page goes on by itself, and the same once more', async () => {
+  const wire = await line();
+  const page = await open({ address: wire.address, expected: CUT });
+  const ages = page.locator('button[data-robot] .faint span').last();
+  // First for long, then for a moment: waits that grow while it tries would be seen.
+  for (const old of [/(^|· )[3-5]\d s$/, /(^|· )\d+(\.\d)? s$/]) {
+    wire.cut();
+    await page.getByText(/^The server has not answered since/).waitFor();
+    await eventually('old states', async () => old.test((await ages.innerText()).trim()), LONG_MS);
+    await page.locator('button[data-robot] .badge', { hasText: 'last known' }).first().waitFor();
+    wire.mend();
+    const mended = Date.now();
+    await page.getByText('live', { exact: true }).waitFor();
+    await page.locator('button[data-robot] .badge', { hasText: 'online' }).first().waitFor();
+    await eventually('fresh states', async () => /(^|· )[01]\.\d s$/.test((await ages.innerText()).trim()));
+    expect(Date.now() - mended).toBeLessThan(BACK_MAX_MS);
+  }
   wire.end();
 });
 

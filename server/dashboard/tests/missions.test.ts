@@ -156,6 +156,10 @@ test('waypoints are clicked, moved, deleted and taken back; paused, resumed, rep
   await card.getByRole('button', { name: 'Resume' }).click();
   await card.getByText('driving').waitFor();
   await card.getByRole('button', { name: 'Replace' }).click();
+  // It begins with what is driven, and with its speed.
+  expect(await inputs.count()).toBe(4);
+  expect(await page.getByLabel('Speed, m/s').inputValue()).toBe('0.3');
+  await page.getByRole('radio', { name: 'Circle' }).check();
   await page.getByLabel('Centre x, m').fill('21');
   await page.getByLabel('Centre y, m').fill('6');
   await page.getByLabel('Radius, m').fill('1.5');
@@ -187,6 +191,73 @@ test('a path that cannot be driven is refused where it is drawn, and kept', asyn
   expect(await page.getByRole('button', { name: 'Send', exact: true }).isEnabled()).toBe(false);
   expect(await page.getByLabel('Centre x, m').inputValue()).toBe('8');
   await shot(page, 'refused');
+});
+
+test('what is no number, and a path too tight, are said in a sentence each, and kept', async () => {
+  const page = await open({ expected: /422/ });
+  await select(page, 'rover-1');
+  await page.getByRole('button', { name: 'New mission' }).click();
+  const problem = page.locator('form .problem');
+  const type = async (label: string, value: string) => {
+    await page.getByLabel(label).fill(value);
+    await page.getByLabel(label).press('Tab');
+  };
+  await type('Centre x, m', '8');
+  await type('Centre y, m', '6');
+  await page.locator('[data-test="dry-run"]').waitFor();
+  for (const [label, wrong, right, said] of [
+    ['Radius, m', '-3', '2', 'The radius has to be a number of metres, at least 0.05.'],
+    ['Speed, m/s', '', '0.5', 'The speed has to be a number of metres per second above 0.'],
+    ['Speed, m/s', '40', '0.5', 'That is too fast: rover-1 drives at most 1 m/s.'],
+    ['Turns', '0', '1', 'The turns have to be a number above 0.'],
+    ['Centre x, m', '', '8', 'The centre needs two numbers, x and y.'],
+  ] as const) {
+    await type(label, wrong);
+    await problem.getByText(said, { exact: true }).waitFor();
+    expect(await page.getByLabel(label).inputValue()).toBe(wrong);
+    expect(await page.getByRole('button', { name: 'Send', exact: true }).isEnabled()).toBe(false);
+    await type(label, right);
+    await page.locator('[data-test="dry-run"]').waitFor();
+  }
+  // This one only the server can tell.
+  await type('Radius, m', '0.05');
+  await problem.waitFor();
+  expect(await problem.innerText()).toMatch(/^The robot cannot do this: .*\.$/);
+  expect(await page.getByLabel('Radius, m').inputValue()).toBe('0.05');
+  // What was drawn of one kind is still there after a look at the other.
+  await page.getByRole('radio', { name: 'Waypoints' }).check();
+  await page.getByRole('button', { name: 'Add point' }).click();
+  await type('Point 1, y in m', '');
+  await problem.getByText('Point 1 needs two numbers, x and y.').waitFor();
+  await page.getByRole('radio', { name: 'Circle' }).check();
+  expect(await page.getByLabel('Centre y, m').inputValue()).toBe('6');
+});
+
+test('a path outside of where robots may be is refused in one sentence, and kept', async () => {
+  const before = await api<Geofence>('/v1/sites/yard/geofence');
+  const yard = [
+    { x_m: -2, y_m: -2 },
+    { x_m: 34, y_m: -2 },
+    { x_m: 34, y_m: 26 },
+    { x_m: -2, y_m: 26 },
+  ];
+  await api('/v1/sites/yard/geofence', 'PUT', { keep_in: [yard], keep_out: [] });
+  try {
+    const page = await open({ expected: /422/ });
+    await select(page, 'rover-2');
+    await page.getByRole('button', { name: 'New mission' }).click();
+    await page.getByLabel('Centre x, m').fill('60');
+    await page.getByLabel('Centre y, m').fill('6');
+    await page.getByLabel('Centre y, m').press('Tab');
+    const problem = page.locator('form .problem');
+    await problem.waitFor();
+    expect(await problem.innerText()).toMatch(/^The way leaves where robots may be: [^.]*(\d\.\d+[^.]*)*\.$/);
+    expect(await page.getByLabel('Centre x, m').inputValue()).toBe('60');
+    expect(await page.getByRole('button', { name: 'Send', exact: true }).isEnabled()).toBe(false);
+    await shot(page, 'outside');
+  } finally {
+    await api('/v1/sites/yard/geofence', 'PUT', { keep_in: before.keep_in, keep_out: before.keep_out });
+  }
 });
 
 test('a terrain is drawn, classified, changed and deleted', async () => {

@@ -1,7 +1,7 @@
 // How cells differ between two times, as a layer: blue where θ fell, red where it rose, grey where
 // the difference is within chance, hatched where only one of the times knows anything.
 import type { CellDifference } from '../api/schema';
-import { Raster } from './raster';
+import { Raster, type Look } from './raster';
 
 /** Deviations within which a difference is chance. */
 export const CHANCE = 2;
@@ -31,16 +31,19 @@ export function changePercent(cell: CellDifference): number | null {
   return cell.before && cell.after ? (cell.after.theta / cell.before.theta - 1) * 100 : null;
 }
 
+/** How a cell looks: coloured as far as it really changed, hatched where one time knows nothing. */
+export function lookOf(cell: CellDifference): Look {
+  const percent = changePercent(cell);
+  const isChance = Math.abs(cell.deviations ?? 0) < CHANCE;
+  const share = percent === null || isChance ? 0 : shareOfChange(1 + percent / 100);
+  return { colour: changeColour(share), isHatched: percent === null };
+}
+
 /** Where two terrains or models share a cell, the one that changed most. */
 export class Comparison extends Raster<CellDifference> {
   constructor(cells: CellDifference[], cellM: number) {
     const strength = (cell: CellDifference) => Math.abs(cell.deviations ?? 0);
     super(cells, cellM, (known, other) => strength(other) > strength(known));
-    this.paint((cell) => {
-      const percent = changePercent(cell);
-      const isChance = Math.abs(cell.deviations ?? 0) < CHANCE;
-      const share = percent === null || isChance ? 0 : shareOfChange(1 + percent / 100);
-      return { colour: changeColour(share), isHatched: percent === null };
-    });
+    this.paint(lookOf);
   }
 }

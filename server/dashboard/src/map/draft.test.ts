@@ -48,6 +48,21 @@ test('a draft is whole when it is enough for its kind', () => {
   expect(circle.isWhole).toBe(true);
 });
 
+test('what was typed and is no path is kept, and named', () => {
+  const circle = new Draft('circle');
+  circle.typeCircle({ x_m: 1, y_m: 1 }, -3);
+  expect([circle.radius_m, circle.flaw, circle.isWhole]).toEqual([-3, 'radius', false]);
+  circle.typeCircle({ x_m: NaN, y_m: 1 }, 2);
+  expect([circle.flaw, circle.isWhole]).toEqual(['center', false]);
+  circle.typeCircle({ x_m: 1, y_m: 1 }, 2);
+  expect([circle.flaw, circle.isWhole]).toEqual([null, true]);
+  const path = new Draft('waypoints', [
+    { x_m: 0, y_m: 0 },
+    { x_m: 1, y_m: NaN },
+  ]);
+  expect([path.flaw, path.isWhole]).toEqual([2, false]);
+});
+
 test('the nearest point is taken only within reach', () => {
   const draft = new Draft('waypoints', [
     { x_m: 0, y_m: 0 },

@@ -36,8 +36,19 @@ export class Draft implements Shape {
 
   /** Enough to be a path or an outline. */
   get isWhole(): boolean {
-    if (this.kind === 'circle') return this.center !== null && this.radius_m >= RADIUS_MIN_M;
+    if (this.flaw) return false;
+    if (this.kind === 'circle') return this.center !== null;
     return this.points.length >= (this.kind === 'terrain' ? 3 : 2);
+  }
+
+  /** What was typed and is nothing to draw; the number of a point, from 1. */
+  get flaw(): 'center' | 'radius' | number | null {
+    if (this.kind === 'circle') {
+      if (this.center && !isPlace(this.center)) return 'center';
+      return this.radius_m >= RADIUS_MIN_M ? null : 'radius';
+    }
+    const wrong = this.points.findIndex((point) => !isPlace(point));
+    return wrong < 0 ? null : wrong + 1;
   }
 
   /** Keeps the present shape, so that what follows can be taken back in one step. */
@@ -62,9 +73,15 @@ export class Draft implements Shape {
     this.points.splice(index, 1);
   }
 
+  /** A circle out of numbers, also of such as are none: what was typed is kept, and said to be wrong. */
+  typeCircle(center: PointM, radius_m: number): void {
+    this.center = rounded(center);
+    this.radius_m = radius_m;
+  }
+
   setCircle(center: PointM, radius_m: number): void {
     this.center = rounded(center);
-    this.radius_m = Math.max(RADIUS_MIN_M, Math.round(radius_m * 100) / 100);
+    this.radius_m = Math.max(RADIUS_MIN_M, Math.round(radius_m * 100) / 100 || RADIUS_MIN_M);
   }
 
   clear(): void {
@@ -103,6 +120,10 @@ export class Draft implements Shape {
       points: this.points.map((point) => ({ ...point })),
     };
   }
+}
+
+function isPlace({ x_m, y_m }: PointM): boolean {
+  return Number.isFinite(x_m) && Number.isFinite(y_m);
 }
 
 /** To the centimetre: nobody points finer. */

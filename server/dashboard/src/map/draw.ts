@@ -34,6 +34,8 @@ export interface Scene {
   showTrails: boolean;
   /** Marks the middle, for those who draw by keys. */
   showCross: boolean;
+  /** The server is lost: what is shown was so when it was heard last. */
+  isOld: boolean;
   theme: Theme;
   /** Monotonic, milliseconds. */
   now: number;
@@ -256,7 +258,7 @@ function drawMoment(context: CanvasRenderingContext2D, camera: Camera, moment: M
   const { x, y } = camera.toPx(moment.at);
   context.save();
   context.translate(x, y);
-  context.rotate(-moment.heading_rad);
+  context.rotate(-moment.course_rad);
   context.beginPath();
   context.moveTo(MOMENT_PX, 0);
   context.lineTo(-MOMENT_PX * 0.8, MOMENT_PX * 0.7);
@@ -319,7 +321,7 @@ function drawRobot(
     ? palette.stopped
     : isLost
       ? palette.robotLost
-      : robot.link === 'stale'
+      : robot.link === 'stale' || scene.isOld
         ? palette.robotLate
         : palette.robot;
   const length = Math.max(ROBOT_PX, (robot.model.wheelbase_m + 2 * robot.model.wheel_radius_m) * camera.scale);
@@ -360,8 +362,8 @@ function drawRobot(
   context.restore();
   if (!withLabel && !isSelected) return;
   const age = tracked.ageS(scene.now);
-  const note = isLost && age !== null ? ` · ${words.robots.lastKnown}, ${words.robots.age(span(age))}` : '';
-  const late = robot.link === 'stale' ? ` · ${words.link.stale}` : '';
+  const note = (isLost || scene.isOld) && age !== null ? ` · ${words.robots.lastKnown}, ${words.robots.age(span(age))}` : '';
+  const late = robot.link === 'stale' && !scene.isOld ? ` · ${words.link.stale}` : '';
   label(context, `${robot.name}${late}${note}`, x + length / 2 + 7, y - 6, colour, palette);
 }
 
@@ -370,7 +372,7 @@ function drawDraft(context: CanvasRenderingContext2D, camera: Camera, draft: Dra
   context.fillStyle = palette.draftFill;
   context.lineWidth = 2;
   if (draft.kind === 'circle') {
-    if (!draft.center) return;
+    if (!draft.center || draft.flaw) return;
     const { x, y } = camera.toPx(draft.center);
     context.beginPath();
     context.arc(x, y, draft.radius_m * camera.scale, 0, 2 * Math.PI);

@@ -11,8 +11,9 @@ test('a robot is between its points by time, stands in a pause, and is nowhere b
   const track = new Track([...line.slice(0, 2), { x_m: 4, y_m: 0 }, line[2]!], [0, 4, 9, 11], line);
   expect(track.at(1).at).toEqual({ x_m: 1, y_m: 0 });
   expect(track.at(6).at).toEqual({ x_m: 4, y_m: 0 });
+  expect(track.at(6).course_rad).toBeCloseTo(0);
   expect(track.at(10).at).toEqual({ x_m: 4, y_m: 1 });
-  expect(track.at(10).heading_rad).toBeCloseTo(Math.PI / 2);
+  expect(track.at(10).course_rad).toBeCloseTo(Math.PI / 2);
   expect(track.at(-5).at).toEqual(line[0]);
   expect(track.at(99).at).toEqual(line[2]);
   expect([track.from_s, track.to_s]).toEqual([0, 11]);

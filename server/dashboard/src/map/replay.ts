@@ -6,7 +6,8 @@ const SAMPLES = 240;
 
 export interface Moment {
   at: PointM;
-  heading_rad: number;
+  /** Which way it went, counter-clockwise from the x axis; not which way it looked. */
+  course_rad: number;
   /** The driven point at or before it. */
   index: number;
 }
@@ -57,9 +58,27 @@ export class Track {
     const share = end > begin ? Math.min(1, Math.max(0, (time_s - begin) / (end - begin))) : 0;
     return {
       at: { x_m: here.x_m + share * (next.x_m - here.x_m), y_m: here.y_m + share * (next.y_m - here.y_m) },
-      heading_rad: Math.atan2(next.y_m - here.y_m, next.x_m - here.x_m),
+      course_rad: this.#courseAt(index),
       index,
     };
+  }
+
+  /** Which way it went from a point; while it stood, the way that it came, or else the way it goes on. */
+  #courseAt(index: number): number {
+    const leaves = (at: number) => {
+      const [here, next] = [this.points[at], this.points[at + 1]];
+      const [dx, dy] = here && next ? [next.x_m - here.x_m, next.y_m - here.y_m] : [0, 0];
+      return dx === 0 && dy === 0 ? null : Math.atan2(dy, dx);
+    };
+    for (let at = index; at >= 0; at -= 1) {
+      const course = leaves(at);
+      if (course !== null) return course;
+    }
+    for (let at = index + 1; at < this.points.length; at += 1) {
+      const course = leaves(at);
+      if (course !== null) return course;
+    }
+    return 0;
   }
 
   /** Distance from the planned path at a moment, metres; null where no path is known. */

@@ -1,7 +1,7 @@
 // What is drawn at the moment and for which purpose; kept whatever happens to server or sign-in.
 import type { CreateMission, Geofence, Mission, ReplaceGeofence, Terrain, TerrainClass, Trajectory, TrajectoryCheck } from '../api/schema';
 import { Problem, ask, sentence } from '../api/client';
-import { Draft, type DraftKind } from '../map/draft';
+import { Draft, RADIUS_MIN_M, type DraftKind } from '../map/draft';
 import type { PointM } from '../map/camera';
 import { words } from '../words';
 import type { Fleet } from './fleet.svelte';
@@ -46,6 +46,8 @@ export class Editor {
   /** Said after a success. */
   said = $state<string | null>(null);
 
+  /** What was drawn of the other kind, in case that is wanted after all. */
+  #other: Draft | null = null;
   #due: ReturnType<typeof setTimeout> | undefined;
   #asked = 0;
   /** Names what is sent, so that sending it twice makes one mission. */
@@ -60,7 +62,22 @@ export class Editor {
 
   beginReplace(mission: Mission): void {
     this.robot = mission.robot;
-    this.#begin({ what: 'replace', mission }, new Draft('circle'));
+    this.#begin({ what: 'replace', mission }, this.#asIn(mission.trajectory));
+  }
+
+  /** What a mission was asked for, to be changed; its speed, turns and direction come with it. */
+  #asIn(trajectory: Trajectory): Draft {
+    if ('waypoints' in trajectory) {
+      this.speed_m_s = trajectory.waypoints.speed_m_s ?? this.speed_m_s;
+      return new Draft('waypoints', trajectory.waypoints.points);
+    }
+    const { center, radius_m, speed_m_s, turns, direction } = trajectory.circle;
+    const draft = new Draft('circle');
+    draft.setCircle(center, radius_m);
+    this.speed_m_s = speed_m_s ?? this.speed_m_s;
+    this.turns = turns ?? 1;
+    this.clockwise = direction === 'clockwise';
+    return draft;
   }
 
   beginTerrain(terrain: Terrain | null): void {
@@ -78,15 +95,33 @@ export class Editor {
   #begin(purpose: Purpose, draft: Draft): void {
     this.purpose = purpose;
     this.draft = draft;
+    this.#other = null;
     this.said = null;
     this.sendProblem = null;
     this.changed();
   }
 
   setKind(kind: DraftKind): void {
-    if (this.draft?.kind === kind) return;
-    this.draft = new Draft(kind);
+    if (!this.draft || this.draft.kind === kind) return;
+    const other = this.#other ?? new Draft(kind);
+    this.#other = this.draft;
+    this.draft = other;
     this.changed();
+  }
+
+  /** Why what was typed can be no mission, in one sentence; null when it can. */
+  get flaw(): string | null {
+    const wrong = this.draft?.flaw ?? null;
+    if (wrong === 'center') return words.draw.flaw.center;
+    if (wrong === 'radius') return words.draw.flaw.radius(RADIUS_MIN_M);
+    if (wrong !== null) return words.draw.flaw.point(wrong);
+    if (this.draft?.kind === 'terrain') return null;
+    if (!(this.speed_m_s > 0)) return words.draw.flaw.speed;
+    const model = this.fleet.robots.find((view) => view.id === this.robot)?.robot.model;
+    const top = model?.limits.linear_max_m_s ?? Infinity;
+    if (this.speed_m_s > top) return words.draw.flaw.fast(this.robot, String(Number(top.toFixed(2))));
+    if (this.draft?.kind === 'circle' && !(this.turns > 0)) return words.draw.flaw.turns;
+    return Number.isInteger(this.priority) ? null : words.draw.flaw.priority;
   }
 
   /** Says that draft or form are no longer what they were. */
@@ -95,12 +130,12 @@ export class Editor {
     this.fleet.isDirty = true;
     this.#key = '';
     this.check = null;
-    this.checkProblem = null;
+    this.checkProblem = this.draft?.isEmpty ? null : this.flaw;
     this.#asked += 1;
     this.isChecking = false;
     clearTimeout(this.#due);
     const isMission = this.purpose?.what === 'mission' || this.purpose?.what === 'replace';
-    if (isMission && this.draft?.isWhole && this.robot) {
+    if (isMission && this.draft?.isWhole && this.robot && !this.flaw) {
       this.isChecking = true;
       this.#due = setTimeout(() => void this.#dryRun(), CHECK_WAIT_MS);
     }

@@ -4,6 +4,7 @@ import type { Alert, Geofence, Mission, MissionStep, Robot, Site, Terrain, Terra
 import { ask, list, sentence } from '../api/client';
 import { Stream, type Listener } from '../api/stream';
 import { signedIn } from './session.svelte';
+import { words } from '../words';
 import { Stops } from './stops.svelte';
 import { Tracked } from './tracked';
 
@@ -75,6 +76,13 @@ export class Fleet implements Listener {
 
   get selectedRobot(): Robot | null {
     return this.robots.find((view) => view.id === this.selected)?.robot ?? null;
+  }
+
+  /** How a robot is heard, as far as it is known: a lost server says nothing more of it. */
+  linkOf(robot: Robot): { text: string; look: 'good' | 'warn' | 'bad' } {
+    if (robot.link === 'offline') return { text: words.link.offline, look: 'bad' };
+    if (this.lostAt !== null) return { text: words.robots.lastKnown, look: 'warn' };
+    return { text: words.link[robot.link], look: robot.link === 'online' ? 'good' : 'warn' };
   }
 
   async start(): Promise<void> {

@@ -89,6 +89,7 @@ async function measure(): Promise<Frames> {
       showFence: true,
       showTrails: true,
       showCross: false,
+      isOld: false,
       theme: 'light',
       now,
     });
