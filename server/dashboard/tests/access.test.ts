@@ -106,6 +106,11 @@ test('a whole run by keys alone: sign in, select, draw, send, stop, clear', asyn
   await page.keyboard.type(token());
   await page.keyboard.press('Enter');
   await page.locator('button[data-robot]').first().waitFor();
+  await tabTo(page, /^Keys/);
+  await page.keyboard.press('Enter');
+  await page.getByText('stop all robots').waitFor();
+  await page.keyboard.press('Enter');
+  await page.getByText('stop all robots').waitFor({ state: 'hidden' });
   await tabTo(page, /^rover-3/);
   await page.keyboard.press('Enter');
   await tabTo(page, /^New mission/);

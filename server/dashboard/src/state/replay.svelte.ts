@@ -8,6 +8,8 @@ export const SPEEDS = [1, 4, 16] as const;
 export class Replay {
   readonly mission: string;
   readonly track: Track | null;
+  /** How far the robot may have been from the line that it reported, metres. */
+  readonly tolerance_m: number;
   time_s = $state(0);
   isRunning = $state(false);
   speed = $state<number>(4);
@@ -22,6 +24,7 @@ export class Replay {
   ) {
     this.mission = detail.id;
     const { points, times_s } = detail.driven ?? { points: [], times_s: undefined };
+    this.tolerance_m = detail.driven?.tolerance_m ?? 0;
     this.track = Track.isTimed(points, times_s) ? new Track(points, times_s, plan?.points ?? []) : null;
     // The whole way is shown first.
     this.time_s = this.track?.to_s ?? 0;
