@@ -34,6 +34,8 @@ pub(crate) use self::safety::{
 };
 use self::values::duration;
 pub(crate) use self::values::{shield_negative_points, waypoint};
+use crate::exit::Exit;
+use crate::output::{failure, note};
 
 /// Where a server answers, unless told otherwise.
 pub(crate) const SERVER_DEFAULT: &str = "http://127.0.0.1:8420";
@@ -58,9 +60,34 @@ impl Arguments {
 
     /// Reads the words; says what is wrong with them and ends the process otherwise.
     pub(crate) fn read(words: impl Iterator<Item = OsString>) -> Self {
-        let matches: ArgMatches = Self::whole().get_matches_from(words);
-        Self::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
+        let words: Vec<OsString> = words.collect();
+        let is_for_programs = words.iter().any(|word| word == "--json");
+        let read = Self::whole()
+            .try_get_matches_from(words)
+            .and_then(|matches: ArgMatches| Self::from_arg_matches(&matches));
+        read.unwrap_or_else(|error| {
+            // Help and version are no errors, and go where they always go.
+            if is_for_programs && error.use_stderr() {
+                refuse_for_programs(&error);
+            }
+            error.exit()
+        })
     }
+}
+
+/// Says what is wrong with the words as one JSON object, as is done with all else that goes wrong.
+fn refuse_for_programs(error: &clap::Error) -> ! {
+    let text = error.to_string();
+    // Tips and usage come after an empty line.
+    let first = text
+        .lines()
+        .map(str::trim)
+        .take_while(|line| !line.is_empty());
+    let said = first.collect::<Vec<_>>().join(" ");
+    let said = said.strip_prefix("error: ").unwrap_or(&said);
+    let next_step = "the same command with --help says what it takes";
+    note(&failure(said, Exit::Usage, Some(next_step), None).to_string());
+    std::process::exit(error.exit_code())
 }
 
 #[derive(Debug, Subcommand)]

@@ -8,6 +8,7 @@ use comfy_table::{ContentArrangement, Table, presets};
 use serde::Serialize;
 
 use serde_json::json;
+use tread_api::problem::ProblemBody;
 
 use crate::client::ClientError;
 use crate::exit::Exit;
@@ -63,13 +64,8 @@ impl Output {
             _ => format!("{error:#}"),
         };
         if self.json {
-            let said = json!({
-                "error": told,
-                "exit_code": exit as u8,
-                "next_step": next_step,
-                "problem": client_error.and_then(ClientError::problem),
-            });
-            note(&said.to_string());
+            let problem = client_error.and_then(ClientError::problem);
+            note(&failure(&told, exit, next_step, problem).to_string());
         } else {
             note(&format!("tread: {told}"));
             if let Some(next_step) = next_step {
@@ -78,6 +74,18 @@ impl Output {
         }
         exit.into()
     }
+}
+
+/// What programs get when there is no success.
+pub(crate) fn failure(
+    told: &str,
+    exit: Exit,
+    next_step: Option<&str>,
+    problem: Option<&ProblemBody>,
+) -> serde_json::Value {
+    json!({
+        "error": told, "exit_code": exit as u8, "next_step": next_step, "problem": problem,
+    })
 }
 
 /// Something was waited for and has not come.

@@ -7,8 +7,8 @@ use anyhow::Context;
 use jiff::Timestamp;
 use tread_api::mission::{CreateMission, ReplaceMission};
 use tread_api::trajectory::{
-    CheckTrajectory, Circle, Direction, Excitation, Trajectory, TrajectoryCheck, TrajectoryOptions,
-    Waypoints,
+    BindingLimit, CheckTrajectory, Circle, Direction, Excitation, Trajectory, TrajectoryCheck,
+    TrajectoryOptions, Waypoints,
 };
 
 use super::missions::summary;
@@ -97,11 +97,11 @@ fn demands(checked: &TrajectoryCheck) -> String {
     ];
     lines.extend(checked.bindings.iter().map(|binding| {
         format!(
-            "slower than asked, down to {:.2} m/s, from {:.2} to {:.2} m: {:?}",
+            "slower than asked, down to {:.2} m/s, from {:.2} to {:.2} m: {}",
             binding.speed_min_m_s,
             binding.from.arc_m.unwrap_or_default(),
             binding.to.arc_m.unwrap_or_default(),
-            binding.limit
+            limit_name(binding.limit)
         )
     }));
     if let Some(depth_ratio) = checked.excitation_depth_ratio {
@@ -173,4 +173,16 @@ fn latest_start(within: Duration) -> anyhow::Result<Timestamp> {
     Timestamp::now()
         .checked_add(within)
         .context("--start-within is too far in the future")
+}
+
+/// What keeps a robot slower than asked, in words.
+fn limit_name(limit: BindingLimit) -> &'static str {
+    match limit {
+        BindingLimit::LateralAcceleration => "acceleration across the path",
+        BindingLimit::AngularSpeed => "turning speed",
+        BindingLimit::WheelSpeed => "wheel speed",
+        BindingLimit::WheelAcceleration => "wheel acceleration in a bend",
+        BindingLimit::LinearAcceleration => "acceleration or braking",
+        BindingLimit::Grip => "grip of the ground",
+    }
 }

@@ -97,6 +97,8 @@ async fn the_ground_is_drawn_changed_and_asked_about_by_commands() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_mission_is_checked_sent_held_followed_and_ended_by_commands() {
     let yard = Yard::start().await;
+    let told = yard.table(&[&LONG_CIRCLE[..], &["--check"]].concat()).await;
+    assert!(told.contains(" m: acceleration or braking"), "{told}");
     let checked = yard.json(&[&LONG_CIRCLE[..], &["--check"]].concat()).await;
     assert!(
         checked["duration_s"]
@@ -222,6 +224,14 @@ async fn what_went_wrong_has_its_own_exit_code_and_says_what_to_do_next() {
     let said: Value = serde_json::from_str(&unknown.errors).unwrap();
     assert_eq!(said["exit_code"], 5);
     assert_eq!(said["problem"]["type"], "/problems/unknown-robot");
+    let wordless = yard.run(&["send", "circle", "--json"]).await;
+    assert_eq!(wordless.code, Some(2));
+    let said: Value = serde_json::from_str(&wordless.errors).unwrap();
+    assert_eq!(said["exit_code"], 2);
+    let error = said["error"].as_str().unwrap();
+    assert!(error.contains("not provided: --center <X,Y>"), "{error}");
+    let help = yard.run(&["send", "circle", "--json", "--help"]).await;
+    assert_eq!((help.code, help.errors.as_str()), (Some(0), ""));
     std::fs::write(yard.folder.path().join("token"), "tread_v_nobody").unwrap();
     let stranger = yard.run(&["robots"]).await;
     assert_eq!(stranger.code, Some(4));

@@ -193,6 +193,11 @@ pub(super) fn path(path: &PathFriction) -> String {
     )
 }
 
+/// Whether a value says more than that somebody was there.
+fn is_sure(friction: &FusedFriction) -> bool {
+    friction.std_dev < friction.theta
+}
+
 pub(super) fn differences(cells: &[CellDifference]) -> String {
     if cells.is_empty() {
         return "nothing was measured there between these times".to_owned();
@@ -206,12 +211,16 @@ pub(super) fn differences(cells: &[CellDifference]) -> String {
         "CHANGE",
         "IN DEVIATIONS",
     ]);
-    let theta = |friction: &Option<FusedFriction>| {
-        let friction = friction.as_ref();
-        or_dash(friction.map(|known| format!("{:.4} ± {:.4}", known.theta, known.std_dev)))
+    let theta = |friction: &Option<FusedFriction>| match friction {
+        Some(known) if is_sure(known) => format!("{:.4} ± {:.4}", known.theta, known.std_dev),
+        Some(_) => "unsure".to_owned(),
+        None => "-".to_owned(),
     };
     for cell in cells {
         let change = match (&cell.before, &cell.after) {
+            (Some(before), Some(after)) if !(is_sure(before) && is_sure(after)) => {
+                "unsure".to_owned()
+            }
             (Some(before), Some(after)) => {
                 format!("{:+.1} %", 1e2 * (after.theta / before.theta - 1.0))
             }
@@ -294,4 +303,43 @@ pub(super) fn withdrawals(withdrawals: &[Withdrawal]) -> String {
         ]);
     }
     render(&table)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::{Value, json};
+
+    use super::*;
+
+    fn known(theta: f64, std_dev: f64) -> Value {
+        json!({
+            "theta": theta, "std_dev": std_dev, "theta_low_95": 0.0, "theta_high_95": 9.0,
+            "stiffness": 1.0, "segments": 1, "robots": 1, "age_s": 1.0, "disputed": false,
+            "newest_at": "2026-11-21T08:00:00Z",
+            "bounds": {"theta_lower_5": 0.0, "theta_upper_95": 9.0, "stiffness_lower_5": 0.1},
+        })
+    }
+
+    fn row(before: &Value, after: &Value) -> String {
+        let cell: CellDifference = serde_json::from_value(json!({
+            "cell": {"ix": 4, "iy": 2}, "terrain": null, "before": before, "after": after,
+            "configuration": "8c8722f3-7240-59d0-bde2-495b2d9205b8", "deviations": null,
+        }))
+        .unwrap();
+        differences(&[cell]).lines().last().unwrap().to_owned()
+    }
+
+    #[test]
+    fn a_change_is_said_in_percent_only_where_both_times_are_sure() {
+        let sure = row(&known(0.2, 0.01), &known(0.3, 0.01));
+        assert!(sure.contains("0.3000 ± 0.0100"), "{sure}");
+        assert!(sure.contains("+50.0 %"), "{sure}");
+        for before in [known(0.0, 46_340.95), known(0.1, 0.2)] {
+            let unsure = row(&before, &known(0.3, 0.01));
+            assert_eq!(unsure.matches("unsure").count(), 2, "{unsure}");
+            assert!(!unsure.contains('%'), "{unsure}");
+        }
+        let new = row(&Value::Null, &known(0.3, 0.01));
+        assert!(new.contains("new"), "{new}");
+    }
 }
