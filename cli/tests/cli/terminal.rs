@@ -11,7 +11,7 @@ use nix::pty::{Winsize, openpty};
 use nix::sys::termios::{LocalFlags, tcgetattr};
 
 /// Longest wait for anything.
-const PATIENCE: Duration = Duration::from_secs(20);
+pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 /// What holds of a lock that nobody breaks.
 const WHOLE: &str = "nobody panics with it";
 const LOOK_AGAIN: Duration = Duration::from_millis(20);

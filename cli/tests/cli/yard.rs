@@ -11,7 +11,7 @@ use tread_server::app::identity::FirstAdmin;
 use tread_server::config::{FrictionConfig, RetentionConfig, TlsFiles, WebConfig};
 use tread_server::{Config, RunningServer, Server};
 
-use crate::terminal::{Terminal, eventually};
+use crate::terminal::{PATIENCE, Terminal, eventually};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_tread");
 pub(crate) const ROBOT: &str = "rover-1";
@@ -109,6 +109,20 @@ impl Yard {
         let ran = self.run(words).await;
         assert_eq!(ran.code, Some(0), "{words:?}: {}", ran.errors);
         ran.text
+    }
+
+    /// The table once it says this.
+    pub(crate) async fn table_that_says(&self, words: &[&str], said: &str) -> String {
+        let looking = async {
+            loop {
+                let table = self.table(words).await;
+                if table.contains(said) {
+                    break table;
+                }
+            }
+        };
+        let shown = tokio::time::timeout(PATIENCE, looking).await;
+        shown.unwrap_or_else(|_| panic!("{words:?} never says `{said}`"))
     }
 
     pub(crate) async fn end(self) {
