@@ -34,7 +34,7 @@ pub struct SumKey {
 }
 
 /// Numbers of a row.
-const COLUMNS: usize = 30;
+const COLUMNS: usize = 31;
 
 static ADD: LazyLock<RowsStatement> = LazyLock::new(|| {
     RowsStatement::new(
@@ -43,14 +43,15 @@ static ADD: LazyLock<RowsStatement> = LazyLock::new(|| {
              weighted_lo, square_hi, square_lo, track_information_hi, track_information_lo,
              track_weighted_hi, track_weighted_lo, rolling_information_hi, rolling_information_lo,
              rolling_weighted_hi, rolling_weighted_lo, segments, samples, mu_peak, newest_at_us,
-             newest_information, newest_weighted, newest_mu)",
+             newest_information, newest_weighted, newest_mu, pass_at_us)",
         COLUMNS,
         ADDED,
     )
 });
 
-/// Of two newest passes the later counts, of equally late ones the one with larger numbers; NULL is
-/// smaller than any number, and nothing is smaller than -1 here.
+/// Of two passes the one that tells something counts (`TELLING_DEVIATIONS` squared is 20.25), of two
+/// such the later, of equally late ones the one with larger numbers; NULL is smaller than any number,
+/// and nothing is smaller than -1 here.
 const ADDED: &str = "
 ON CONFLICT DO UPDATE SET
     information_hi = information_hi + excluded.information_hi
@@ -80,21 +81,38 @@ ON CONFLICT DO UPDATE SET
     segments = segments + excluded.segments,
     samples = samples + excluded.samples,
     mu_peak = COALESCE(MAX(mu_peak, excluded.mu_peak), mu_peak, excluded.mu_peak),
-    newest_information = CASE WHEN (excluded.newest_at_us, COALESCE(excluded.newest_information, -1),
-            COALESCE(excluded.newest_weighted, -1), COALESCE(excluded.newest_mu, -1))
-            > (newest_at_us, COALESCE(newest_information, -1),
-            COALESCE(newest_weighted, -1), COALESCE(newest_mu, -1))
+    newest_information = CASE WHEN (COALESCE(excluded.newest_weighted * excluded.newest_weighted
+                >= 20.25 * excluded.newest_information, 0), excluded.pass_at_us,
+            COALESCE(excluded.newest_information, -1), COALESCE(excluded.newest_weighted, -1),
+            COALESCE(excluded.newest_mu, -1))
+        > (COALESCE(newest_weighted * newest_weighted >= 20.25 * newest_information, 0),
+            pass_at_us, COALESCE(newest_information, -1), COALESCE(newest_weighted, -1),
+            COALESCE(newest_mu, -1))
         THEN excluded.newest_information ELSE newest_information END,
-    newest_weighted = CASE WHEN (excluded.newest_at_us, COALESCE(excluded.newest_information, -1),
-            COALESCE(excluded.newest_weighted, -1), COALESCE(excluded.newest_mu, -1))
-            > (newest_at_us, COALESCE(newest_information, -1),
-            COALESCE(newest_weighted, -1), COALESCE(newest_mu, -1))
+    newest_weighted = CASE WHEN (COALESCE(excluded.newest_weighted * excluded.newest_weighted
+                >= 20.25 * excluded.newest_information, 0), excluded.pass_at_us,
+            COALESCE(excluded.newest_information, -1), COALESCE(excluded.newest_weighted, -1),
+            COALESCE(excluded.newest_mu, -1))
+        > (COALESCE(newest_weighted * newest_weighted >= 20.25 * newest_information, 0),
+            pass_at_us, COALESCE(newest_information, -1), COALESCE(newest_weighted, -1),
+            COALESCE(newest_mu, -1))
         THEN excluded.newest_weighted ELSE newest_weighted END,
-    newest_mu = CASE WHEN (excluded.newest_at_us, COALESCE(excluded.newest_information, -1),
-            COALESCE(excluded.newest_weighted, -1), COALESCE(excluded.newest_mu, -1))
-            > (newest_at_us, COALESCE(newest_information, -1),
-            COALESCE(newest_weighted, -1), COALESCE(newest_mu, -1))
+    newest_mu = CASE WHEN (COALESCE(excluded.newest_weighted * excluded.newest_weighted
+                >= 20.25 * excluded.newest_information, 0), excluded.pass_at_us,
+            COALESCE(excluded.newest_information, -1), COALESCE(excluded.newest_weighted, -1),
+            COALESCE(excluded.newest_mu, -1))
+        > (COALESCE(newest_weighted * newest_weighted >= 20.25 * newest_information, 0),
+            pass_at_us, COALESCE(newest_information, -1), COALESCE(newest_weighted, -1),
+            COALESCE(newest_mu, -1))
         THEN excluded.newest_mu ELSE newest_mu END,
+    pass_at_us = CASE WHEN (COALESCE(excluded.newest_weighted * excluded.newest_weighted
+                >= 20.25 * excluded.newest_information, 0), excluded.pass_at_us,
+            COALESCE(excluded.newest_information, -1), COALESCE(excluded.newest_weighted, -1),
+            COALESCE(excluded.newest_mu, -1))
+        > (COALESCE(newest_weighted * newest_weighted >= 20.25 * newest_information, 0),
+            pass_at_us, COALESCE(newest_information, -1), COALESCE(newest_weighted, -1),
+            COALESCE(newest_mu, -1))
+        THEN excluded.pass_at_us ELSE pass_at_us END,
     newest_at_us = MAX(newest_at_us, excluded.newest_at_us)";
 
 fn count(number: u64) -> Result<i64, DbError> {
@@ -128,10 +146,11 @@ fn bind(row: &mut Row<'_>, (key, sums): &(&SumKey, &Sums)) -> Result<(), DbError
     row.add(count(sums.segments)?)?
         .add(count(sums.samples)?)?
         .add(sums.mu_peak)?
-        .add(newest.ended_at_us)?
+        .add(sums.newest_at_us)?
         .add(newest.theta.map(|theta| theta.information))?
         .add(newest.theta.map(|theta| theta.weighted))?
-        .add(newest.mu_peak)?;
+        .add(newest.mu_peak)?
+        .add(newest.ended_at_us)?;
     Ok(())
 }
 
@@ -185,6 +204,7 @@ struct Raw {
     newest_information: Option<f64>,
     newest_weighted: Option<f64>,
     newest_mu: Option<f64>,
+    pass_at_us: i64,
 }
 
 impl TryFrom<Raw> for SumRow {
@@ -231,8 +251,9 @@ impl TryFrom<Raw> for SumRow {
             segments: unsigned("count", raw.segments)?,
             samples: unsigned("count", raw.samples)?,
             mu_peak: raw.mu_peak,
+            newest_at_us: raw.newest_at_us,
             newest: Pass {
-                ended_at_us: raw.newest_at_us,
+                ended_at_us: raw.pass_at_us,
                 theta: newest_theta.map(|(information, weighted)| Information {
                     information,
                     weighted,
@@ -253,7 +274,8 @@ pub async fn each(db: &mut SqliteConnection, mut take: impl FnMut(SumRow)) -> Re
                square_hi, square_lo, track_information_hi, track_information_lo,
                track_weighted_hi, track_weighted_lo, rolling_information_hi,
                rolling_information_lo, rolling_weighted_hi, rolling_weighted_lo, segments,
-               samples, mu_peak, newest_at_us, newest_information, newest_weighted, newest_mu
+               samples, mu_peak, newest_at_us, newest_information, newest_weighted, newest_mu,
+               pass_at_us
            FROM cell_sums"#,
     )
     .fetch(db);
@@ -291,7 +313,8 @@ pub async fn unmerged(
                square_hi, square_lo, track_information_hi, track_information_lo,
                track_weighted_hi, track_weighted_lo, rolling_information_hi,
                rolling_information_lo, rolling_weighted_hi, rolling_weighted_lo, segments,
-               samples, mu_peak, newest_at_us, newest_information, newest_weighted, newest_mu
+               samples, mu_peak, newest_at_us, newest_information, newest_weighted, newest_mu,
+               pass_at_us
            FROM cell_sums WHERE robot_pk = ?1 AND epoch_h < ?2 AND epoch_h % 24 <> 0
            LIMIT ?3"#,
         robot_pk,

@@ -443,7 +443,7 @@ impl SiteMap {
             if let Some(sums) = sums {
                 entry.segments += sums.segments;
                 entry.first_epoch_h = entry.first_epoch_h.min(i64::from(key.epoch_h));
-                entry.newest_at_us = entry.newest_at_us.max(sums.newest.ended_at_us);
+                entry.newest_at_us = entry.newest_at_us.max(sums.newest_at_us);
             }
         };
         for (key, sums) in &self.totals {
@@ -484,7 +484,7 @@ mod tests {
 
     #[test]
     fn a_part_takes_no_more_room_than_was_promised() {
-        assert_eq!(size_of::<Part>(), 136);
+        assert_eq!(size_of::<Part>(), 144);
     }
 
     #[test]
