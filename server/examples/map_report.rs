@@ -150,10 +150,10 @@ async fn fill(db: &Db, epoch_h: i64) -> anyhow::Result<()> {
          INSERT INTO cell_sums (site_pk, iy, ix, grid_revision, terrain, terrain_revision,
              robot_pk, configuration_pk, epoch_h, information_hi, information_lo, weighted_hi,
              weighted_lo, segments, samples, mu_peak, newest_at_us, square_hi, square_lo,
-             newest_information, newest_weighted, newest_mu)
+             newest_information, newest_weighted, newest_mu, pass_at_us)
          SELECT site_pk, iy, ix, 1, '', 0, robot_pk, configuration_pk, ?2, 2500, 0, q / 4,
              (q % 4) << 30, 1, 100, 0.3, ?2 * 3600000000, q * q / 40000,
-             ((q * q % 40000) << 32) / 40000, 2500.0, q / 4.0, 0.3
+             ((q * q % 40000) << 32) / 40000, 2500.0, q / 4.0, 0.3, ?2 * 3600000000
          FROM numbers ORDER BY robot_pk, iy, ix",
     )
     .bind(SIDE_CELLS)

@@ -15,6 +15,7 @@ pub mod join_tokens;
 pub mod missions;
 pub mod removed;
 pub mod robots;
+mod rows;
 pub mod segments;
 pub mod sessions;
 pub mod sites;
@@ -33,8 +34,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use serde::Serialize;
 use serde::de::DeserializeOwned;
-use serde::{Serialize, Serializer as _};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{Sqlite, SqliteConnection, SqlitePool, Transaction};
 use tokio::time::Instant;
@@ -322,17 +323,6 @@ fn parse<T: FromStr>(what: &'static str, text: &str) -> Result<T, DbError> {
 
 fn to_json<T: Serialize>(what: &'static str, value: &T) -> Result<String, DbError> {
     serde_json::to_string(value).map_err(|_error| DbError::DoesNotFit(what))
-}
-
-/// One JSON object of pairs, in their order; a key may repeat.
-fn object_json<V: Serialize>(
-    what: &'static str,
-    pairs: Vec<(String, V)>,
-) -> Result<String, DbError> {
-    let mut text = Vec::new();
-    let written = serde_json::Serializer::new(&mut text).collect_map(pairs);
-    written.map_err(|_error| DbError::DoesNotFit(what))?;
-    String::from_utf8(text).map_err(|_error| DbError::DoesNotFit(what))
 }
 
 fn from_json<T: DeserializeOwned>(what: &'static str, text: &str) -> Result<T, DbError> {

@@ -1,14 +1,17 @@
 //! Raw measurements, in the order of their commits.
 
+use std::sync::LazyLock;
+
 use jiff::Timestamp;
 use serde_json::value::RawValue;
 use sqlx::SqliteConnection;
 use tread_api::friction::StoredSegment;
 use tread_api::ids::{RobotId, TerrainId};
 
-use super::{DbError, from_json, from_us, object_json, parse, to_json, to_us, unsigned};
+use super::rows::{Row, RowsStatement};
+use super::{DbError, from_json, from_us, parse, to_us, unsigned};
 
-/// A measurement on its way into the database, in the order of the statement that reads it.
+/// A measurement on its way into the database.
 #[derive(Debug)]
 pub struct NewSegment<'segment>(
     /// Key of the run of the agent.
@@ -25,17 +28,17 @@ pub struct NewSegment<'segment>(
     pub &'segment RawValue,
 );
 
-/// One JSON object with what identifies a measurement as its key, the measurement as its value.
-///
-/// SQLite writes `value` anew for every mention of it, so the long part is mentioned only once.
-fn keyed(segments: &[NewSegment<'_>]) -> Result<String, DbError> {
-    let mut pairs = Vec::with_capacity(segments.len());
-    for NewSegment(boot_pk, seq, robot_pk, site_pk, terrain, measurement) in segments {
-        let key = to_json("segment", &(boot_pk, seq, robot_pk, site_pk, terrain))?;
-        pairs.push((key, *measurement));
-    }
-    object_json("segment", pairs)
-}
+/// Columns of a measurement.
+const COLUMNS: usize = 7;
+
+static INSERT: LazyLock<RowsStatement> = LazyLock::new(|| {
+    RowsStatement::new(
+        "INSERT INTO segments
+             (boot_pk, seq, robot_pk, site_pk, terrain, received_at_us, measurement)",
+        COLUMNS,
+        "ON CONFLICT (boot_pk, seq) DO NOTHING",
+    )
+});
 
 /// Which of the offered measurements were new.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -46,7 +49,7 @@ pub enum Inserted {
     Only(Vec<(i64, i64)>),
 }
 
-/// Stores those measurements that are not there yet, in one statement.
+/// Stores those measurements that are not there yet.
 pub async fn insert_new(
     db: &mut SqliteConnection,
     segments: &[NewSegment<'_>],
@@ -58,20 +61,20 @@ pub async fn insert_new(
     let last = sqlx::query_scalar!(r#"SELECT COALESCE(MAX(pk), 0) AS "last!: i64" FROM segments"#)
         .fetch_one(&mut *db)
         .await?;
-    let (rows, received_at_us) = (keyed(segments)?, to_us(received_at));
-    // `WHERE true` tells the parser that ON belongs to the conflict.
-    let result = sqlx::query!(
-        "INSERT INTO segments
-             (boot_pk, seq, robot_pk, site_pk, terrain, received_at_us, measurement)
-         SELECT key ->> 0, key ->> 1, key ->> 2, key ->> 3, key ->> 4, ?2, value
-         FROM json_each(?1) WHERE true
-         ON CONFLICT (boot_pk, seq) DO NOTHING",
-        rows,
-        received_at_us,
-    )
-    .execute(&mut *db)
-    .await?;
-    if usize::try_from(result.rows_affected()) == Ok(segments.len()) {
+    let received_at_us = to_us(received_at);
+    let bind = |row: &mut Row<'_>, segment: &NewSegment<'_>| {
+        let NewSegment(boot_pk, seq, robot_pk, site_pk, terrain, measurement) = *segment;
+        row.add(boot_pk)?
+            .add(seq)?
+            .add(robot_pk)?
+            .add(site_pk)?
+            .add(terrain)?
+            .add(received_at_us)?
+            .add(measurement.get())?;
+        Ok(())
+    };
+    let inserted = INSERT.execute(&mut *db, segments, bind).await?;
+    if usize::try_from(inserted) == Ok(segments.len()) {
         return Ok(Inserted::All);
     }
     // The one writer gives rising keys, so what was added now lies behind what was there.

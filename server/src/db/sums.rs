@@ -1,12 +1,15 @@
 //! Sums of measurements per cell, ground, robot, configuration and hour of measuring.
 
+use std::sync::LazyLock;
+
 use futures_util::TryStreamExt as _;
 use sqlx::SqliteConnection;
 use tread_api::friction::Information;
 use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
 
-use super::{DbError, corrupt, object_json, parse, to_json, unsigned};
+use super::rows::{Row, RowsStatement};
+use super::{DbError, corrupt, parse, unsigned};
 use crate::friction::Sums;
 use crate::friction::fixed::Fixed;
 use crate::friction::sums::{Pair, Pass};
@@ -30,120 +33,134 @@ pub struct SumKey {
     pub configuration_pk: i64,
 }
 
-/// The numbers of a sum, in the order of the statement that reads them.
-fn numbers(key: &SumKey, sums: &Sums) -> Result<String, DbError> {
-    let terrain = key.terrain.as_ref();
-    let halves = |fixed: Fixed| fixed.halves().ok_or(DbError::DoesNotFit("sum"));
-    let (cell, newest) = (key.cell, sums.newest);
-    to_json(
-        "sum",
-        &(
-            (key.site_pk, cell.iy, cell.ix, key.grid_revision),
-            terrain.map_or(0, |terrain| terrain.revision),
-            (key.robot_pk, key.configuration_pk, key.epoch_h),
-            (
-                halves(sums.theta.information)?,
-                halves(sums.theta.weighted)?,
-                halves(sums.theta_square)?,
-                halves(sums.track.information)?,
-                halves(sums.track.weighted)?,
-                halves(sums.rolling.information)?,
-                halves(sums.rolling.weighted)?,
-            ),
-            (sums.segments, sums.samples, sums.mu_peak),
-            (
-                newest.ended_at_us,
-                newest.theta.map(|theta| theta.information),
-                newest.theta.map(|theta| theta.weighted),
-                newest.mu_peak,
-            ),
-        ),
-    )
-}
+/// Numbers of a row.
+const COLUMNS: usize = 31;
 
-/// Adds sums to those that are there, in one statement.
-pub async fn add<'sums>(
-    db: &mut SqliteConnection,
-    sums: impl Iterator<Item = (&'sums SumKey, &'sums Sums)>,
-) -> Result<(), DbError> {
-    let mut rows = Vec::new();
-    for (key, sums) in sums {
-        let terrain = key.terrain.as_ref();
-        let terrain = terrain.map_or("", |terrain| terrain.id.as_str());
-        rows.push((numbers(key, sums)?, terrain));
-    }
-    if rows.is_empty() {
-        return Ok(());
-    }
-    // The numbers are the key and the terrain is the value, which is the cheapest to take apart.
-    let rows = object_json("sum", rows)?;
-    // Of two newest passes the later counts, of equally late ones the one with larger numbers; NULL
-    // is smaller than any number, and nothing is smaller than -1 here.
-    sqlx::query!(
+static ADD: LazyLock<RowsStatement> = LazyLock::new(|| {
+    RowsStatement::new(
         "INSERT INTO cell_sums (site_pk, iy, ix, grid_revision, terrain, terrain_revision,
              robot_pk, configuration_pk, epoch_h, information_hi, information_lo, weighted_hi,
              weighted_lo, square_hi, square_lo, track_information_hi, track_information_lo,
              track_weighted_hi, track_weighted_lo, rolling_information_hi, rolling_information_lo,
              rolling_weighted_hi, rolling_weighted_lo, segments, samples, mu_peak, newest_at_us,
-             newest_information, newest_weighted, newest_mu)
-         SELECT key ->> '$[0][0]', key ->> '$[0][1]', key ->> '$[0][2]', key ->> '$[0][3]',
-             value, key ->> 1, key ->> '$[2][0]', key ->> '$[2][1]', key ->> '$[2][2]',
-             key ->> '$[3][0][0]', key ->> '$[3][0][1]', key ->> '$[3][1][0]',
-             key ->> '$[3][1][1]', key ->> '$[3][2][0]', key ->> '$[3][2][1]',
-             key ->> '$[3][3][0]', key ->> '$[3][3][1]', key ->> '$[3][4][0]',
-             key ->> '$[3][4][1]', key ->> '$[3][5][0]', key ->> '$[3][5][1]',
-             key ->> '$[3][6][0]', key ->> '$[3][6][1]', key ->> '$[4][0]', key ->> '$[4][1]',
-             key ->> '$[4][2]', key ->> '$[5][0]', key ->> '$[5][1]', key ->> '$[5][2]',
-             key ->> '$[5][3]'
-         FROM json_each(?) WHERE true
-         ON CONFLICT DO UPDATE SET
-             information_hi = information_hi + excluded.information_hi
-                 + ((information_lo + excluded.information_lo) >> 32),
-             information_lo = (information_lo + excluded.information_lo) & 4294967295,
-             weighted_hi = weighted_hi + excluded.weighted_hi
-                 + ((weighted_lo + excluded.weighted_lo) >> 32),
-             weighted_lo = (weighted_lo + excluded.weighted_lo) & 4294967295,
-             square_hi = square_hi + excluded.square_hi
-                 + ((square_lo + excluded.square_lo) >> 32),
-             square_lo = (square_lo + excluded.square_lo) & 4294967295,
-             track_information_hi = track_information_hi + excluded.track_information_hi
-                 + ((track_information_lo + excluded.track_information_lo) >> 32),
-             track_information_lo =
-                 (track_information_lo + excluded.track_information_lo) & 4294967295,
-             track_weighted_hi = track_weighted_hi + excluded.track_weighted_hi
-                 + ((track_weighted_lo + excluded.track_weighted_lo) >> 32),
-             track_weighted_lo = (track_weighted_lo + excluded.track_weighted_lo) & 4294967295,
-             rolling_information_hi = rolling_information_hi + excluded.rolling_information_hi
-                 + ((rolling_information_lo + excluded.rolling_information_lo) >> 32),
-             rolling_information_lo =
-                 (rolling_information_lo + excluded.rolling_information_lo) & 4294967295,
-             rolling_weighted_hi = rolling_weighted_hi + excluded.rolling_weighted_hi
-                 + ((rolling_weighted_lo + excluded.rolling_weighted_lo) >> 32),
-             rolling_weighted_lo =
-                 (rolling_weighted_lo + excluded.rolling_weighted_lo) & 4294967295,
-             segments = segments + excluded.segments,
-             samples = samples + excluded.samples,
-             mu_peak = COALESCE(MAX(mu_peak, excluded.mu_peak), mu_peak, excluded.mu_peak),
-             newest_information = CASE WHEN (excluded.newest_at_us, COALESCE(excluded.newest_information, -1),
-                     COALESCE(excluded.newest_weighted, -1), COALESCE(excluded.newest_mu, -1))
-                     > (newest_at_us, COALESCE(newest_information, -1),
-                     COALESCE(newest_weighted, -1), COALESCE(newest_mu, -1))
-                 THEN excluded.newest_information ELSE newest_information END,
-             newest_weighted = CASE WHEN (excluded.newest_at_us, COALESCE(excluded.newest_information, -1),
-                     COALESCE(excluded.newest_weighted, -1), COALESCE(excluded.newest_mu, -1))
-                     > (newest_at_us, COALESCE(newest_information, -1),
-                     COALESCE(newest_weighted, -1), COALESCE(newest_mu, -1))
-                 THEN excluded.newest_weighted ELSE newest_weighted END,
-             newest_mu = CASE WHEN (excluded.newest_at_us, COALESCE(excluded.newest_information, -1),
-                     COALESCE(excluded.newest_weighted, -1), COALESCE(excluded.newest_mu, -1))
-                     > (newest_at_us, COALESCE(newest_information, -1),
-                     COALESCE(newest_weighted, -1), COALESCE(newest_mu, -1))
-                 THEN excluded.newest_mu ELSE newest_mu END,
-             newest_at_us = MAX(newest_at_us, excluded.newest_at_us)",
-        rows,
+             newest_information, newest_weighted, newest_mu, pass_at_us)",
+        COLUMNS,
+        ADDED,
     )
-    .execute(db)
-    .await?;
+});
+
+/// Of two passes the one that tells something counts (`TELLING_DEVIATIONS` squared is 20.25), of two
+/// such the later, of equally late ones the one with larger numbers; NULL is smaller than any number,
+/// and nothing is smaller than -1 here.
+const ADDED: &str = "
+ON CONFLICT DO UPDATE SET
+    information_hi = information_hi + excluded.information_hi
+        + ((information_lo + excluded.information_lo) >> 32),
+    information_lo = (information_lo + excluded.information_lo) & 4294967295,
+    weighted_hi = weighted_hi + excluded.weighted_hi
+        + ((weighted_lo + excluded.weighted_lo) >> 32),
+    weighted_lo = (weighted_lo + excluded.weighted_lo) & 4294967295,
+    square_hi = square_hi + excluded.square_hi
+        + ((square_lo + excluded.square_lo) >> 32),
+    square_lo = (square_lo + excluded.square_lo) & 4294967295,
+    track_information_hi = track_information_hi + excluded.track_information_hi
+        + ((track_information_lo + excluded.track_information_lo) >> 32),
+    track_information_lo =
+        (track_information_lo + excluded.track_information_lo) & 4294967295,
+    track_weighted_hi = track_weighted_hi + excluded.track_weighted_hi
+        + ((track_weighted_lo + excluded.track_weighted_lo) >> 32),
+    track_weighted_lo = (track_weighted_lo + excluded.track_weighted_lo) & 4294967295,
+    rolling_information_hi = rolling_information_hi + excluded.rolling_information_hi
+        + ((rolling_information_lo + excluded.rolling_information_lo) >> 32),
+    rolling_information_lo =
+        (rolling_information_lo + excluded.rolling_information_lo) & 4294967295,
+    rolling_weighted_hi = rolling_weighted_hi + excluded.rolling_weighted_hi
+        + ((rolling_weighted_lo + excluded.rolling_weighted_lo) >> 32),
+    rolling_weighted_lo =
+        (rolling_weighted_lo + excluded.rolling_weighted_lo) & 4294967295,
+    segments = segments + excluded.segments,
+    samples = samples + excluded.samples,
+    mu_peak = COALESCE(MAX(mu_peak, excluded.mu_peak), mu_peak, excluded.mu_peak),
+    newest_information = CASE WHEN (COALESCE(excluded.newest_weighted * excluded.newest_weighted
+                >= 20.25 * excluded.newest_information, 0), excluded.pass_at_us,
+            COALESCE(excluded.newest_information, -1), COALESCE(excluded.newest_weighted, -1),
+            COALESCE(excluded.newest_mu, -1))
+        > (COALESCE(newest_weighted * newest_weighted >= 20.25 * newest_information, 0),
+            pass_at_us, COALESCE(newest_information, -1), COALESCE(newest_weighted, -1),
+            COALESCE(newest_mu, -1))
+        THEN excluded.newest_information ELSE newest_information END,
+    newest_weighted = CASE WHEN (COALESCE(excluded.newest_weighted * excluded.newest_weighted
+                >= 20.25 * excluded.newest_information, 0), excluded.pass_at_us,
+            COALESCE(excluded.newest_information, -1), COALESCE(excluded.newest_weighted, -1),
+            COALESCE(excluded.newest_mu, -1))
+        > (COALESCE(newest_weighted * newest_weighted >= 20.25 * newest_information, 0),
+            pass_at_us, COALESCE(newest_information, -1), COALESCE(newest_weighted, -1),
+            COALESCE(newest_mu, -1))
+        THEN excluded.newest_weighted ELSE newest_weighted END,
+    newest_mu = CASE WHEN (COALESCE(excluded.newest_weighted * excluded.newest_weighted
+                >= 20.25 * excluded.newest_information, 0), excluded.pass_at_us,
+            COALESCE(excluded.newest_information, -1), COALESCE(excluded.newest_weighted, -1),
+            COALESCE(excluded.newest_mu, -1))
+        > (COALESCE(newest_weighted * newest_weighted >= 20.25 * newest_information, 0),
+            pass_at_us, COALESCE(newest_information, -1), COALESCE(newest_weighted, -1),
+            COALESCE(newest_mu, -1))
+        THEN excluded.newest_mu ELSE newest_mu END,
+    pass_at_us = CASE WHEN (COALESCE(excluded.newest_weighted * excluded.newest_weighted
+                >= 20.25 * excluded.newest_information, 0), excluded.pass_at_us,
+            COALESCE(excluded.newest_information, -1), COALESCE(excluded.newest_weighted, -1),
+            COALESCE(excluded.newest_mu, -1))
+        > (COALESCE(newest_weighted * newest_weighted >= 20.25 * newest_information, 0),
+            pass_at_us, COALESCE(newest_information, -1), COALESCE(newest_weighted, -1),
+            COALESCE(newest_mu, -1))
+        THEN excluded.pass_at_us ELSE pass_at_us END,
+    newest_at_us = MAX(newest_at_us, excluded.newest_at_us)";
+
+fn count(number: u64) -> Result<i64, DbError> {
+    i64::try_from(number).map_err(|_range| DbError::DoesNotFit("count"))
+}
+
+fn bind(row: &mut Row<'_>, (key, sums): &(&SumKey, &Sums)) -> Result<(), DbError> {
+    let terrain = key.terrain.as_ref();
+    row.add(key.site_pk)?
+        .add(key.cell.iy)?
+        .add(key.cell.ix)?
+        .add(key.grid_revision)?
+        .add(terrain.map_or("", |terrain| terrain.id.as_str()))?
+        .add(terrain.map_or(0, |terrain| terrain.revision))?
+        .add(key.robot_pk)?
+        .add(key.configuration_pk)?
+        .add(key.epoch_h)?;
+    for fixed in [
+        sums.theta.information,
+        sums.theta.weighted,
+        sums.theta_square,
+        sums.track.information,
+        sums.track.weighted,
+        sums.rolling.information,
+        sums.rolling.weighted,
+    ] {
+        let (hi, lo) = fixed.halves().ok_or(DbError::DoesNotFit("sum"))?;
+        row.add(hi)?.add(lo)?;
+    }
+    let newest = sums.newest;
+    row.add(count(sums.segments)?)?
+        .add(count(sums.samples)?)?
+        .add(sums.mu_peak)?
+        .add(sums.newest_at_us)?
+        .add(newest.theta.map(|theta| theta.information))?
+        .add(newest.theta.map(|theta| theta.weighted))?
+        .add(newest.mu_peak)?
+        .add(newest.ended_at_us)?;
+    Ok(())
+}
+
+/// Adds sums to those that are there.
+pub async fn add<'sums>(
+    db: &mut SqliteConnection,
+    sums: impl Iterator<Item = (&'sums SumKey, &'sums Sums)>,
+) -> Result<(), DbError> {
+    let rows: Vec<_> = sums.collect();
+    ADD.execute(db, &rows, bind).await?;
     Ok(())
 }
 
@@ -187,6 +204,7 @@ struct Raw {
     newest_information: Option<f64>,
     newest_weighted: Option<f64>,
     newest_mu: Option<f64>,
+    pass_at_us: i64,
 }
 
 impl TryFrom<Raw> for SumRow {
@@ -233,8 +251,9 @@ impl TryFrom<Raw> for SumRow {
             segments: unsigned("count", raw.segments)?,
             samples: unsigned("count", raw.samples)?,
             mu_peak: raw.mu_peak,
+            newest_at_us: raw.newest_at_us,
             newest: Pass {
-                ended_at_us: raw.newest_at_us,
+                ended_at_us: raw.pass_at_us,
                 theta: newest_theta.map(|(information, weighted)| Information {
                     information,
                     weighted,
@@ -255,7 +274,8 @@ pub async fn each(db: &mut SqliteConnection, mut take: impl FnMut(SumRow)) -> Re
                square_hi, square_lo, track_information_hi, track_information_lo,
                track_weighted_hi, track_weighted_lo, rolling_information_hi,
                rolling_information_lo, rolling_weighted_hi, rolling_weighted_lo, segments,
-               samples, mu_peak, newest_at_us, newest_information, newest_weighted, newest_mu
+               samples, mu_peak, newest_at_us, newest_information, newest_weighted, newest_mu,
+               pass_at_us
            FROM cell_sums"#,
     )
     .fetch(db);
@@ -293,7 +313,8 @@ pub async fn unmerged(
                square_hi, square_lo, track_information_hi, track_information_lo,
                track_weighted_hi, track_weighted_lo, rolling_information_hi,
                rolling_information_lo, rolling_weighted_hi, rolling_weighted_lo, segments,
-               samples, mu_peak, newest_at_us, newest_information, newest_weighted, newest_mu
+               samples, mu_peak, newest_at_us, newest_information, newest_weighted, newest_mu,
+               pass_at_us
            FROM cell_sums WHERE robot_pk = ?1 AND epoch_h < ?2 AND epoch_h % 24 <> 0
            LIMIT ?3"#,
         robot_pk,

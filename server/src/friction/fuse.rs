@@ -7,7 +7,7 @@
 //!
 //! The ground changes. For a cell, the epochs are gone through from the newest back, and where one
 //! contradicts what is newer by more than [`CHANGE_DEVIATIONS`], it and all older ones are left
-//! out. An epoch whose newest pass contradicts its other ones counts with that pass alone. Bad news
+//! out. An epoch whose newest telling pass contradicts its other ones counts with that pass alone. Bad news
 //! (more slip) is believed from the first pass, good news when a second one confirms it; until
 //! then the estimate is disputed.
 
@@ -45,9 +45,9 @@ pub struct Seen<R> {
     pub passes: u64,
     /// End of the newest pass, microseconds since 1970.
     pub newest_at_us: i64,
-    /// θ of the newest pass, if it is known by itself.
+    /// θ of the newest pass that tells something, if it is known by itself.
     pub newest: Option<Known>,
-    /// Friction seen by the newest pass.
+    /// Friction seen by that pass.
     pub newest_mu: Option<f64>,
     /// Largest friction coefficient seen.
     pub mu_peak: Option<f64>,
@@ -68,7 +68,7 @@ impl<R> Seen<R> {
             theta,
             scatter: scatter.max(0.0),
             passes: sums.segments,
-            newest_at_us: sums.newest.ended_at_us,
+            newest_at_us: sums.newest_at_us,
             newest: sums.newest.theta.as_ref().and_then(known),
             newest_mu: sums.newest.mu_peak,
             mu_peak: sums.mu_peak,

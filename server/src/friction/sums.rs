@@ -57,7 +57,13 @@ pub struct Known {
     pub value: f64,
 }
 
-/// The newest of some measurements by itself, so that a change of the ground shows within an epoch.
+/// How many of its own standard deviations θ of a pass must be for the pass to tell of a change.
+///
+/// One that says less contradicts nothing, and would hide one before it that does.
+pub const TELLING_DEVIATIONS: f64 = 4.5;
+
+/// The newest measurement that tells something, by itself, so that a change of the ground shows
+/// within an epoch; the newest of all if none does.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pass {
     /// When it ended, microseconds since 1970.
@@ -69,13 +75,26 @@ pub struct Pass {
 }
 
 impl Pass {
+    /// Whether θ is known by it at all: `θ/σ = Λθ/√Λ`. The database reckons the same.
+    fn is_telling(&self) -> bool {
+        self.theta.is_some_and(|theta| {
+            let least = TELLING_DEVIATIONS * TELLING_DEVIATIONS * theta.information;
+            theta.information > 0.0 && theta.weighted * theta.weighted >= least
+        })
+    }
+
     /// A total order, so that the newest is the same whoever comes first.
     fn newer(&self, other: &Self) -> Ordering {
         let bits = |pass: &Self| {
             let theta = pass
                 .theta
                 .map(|theta| (ordered(theta.information), ordered(theta.weighted)));
-            (pass.ended_at_us, theta, pass.mu_peak.map(ordered))
+            (
+                pass.is_telling(),
+                pass.ended_at_us,
+                theta,
+                pass.mu_peak.map(ordered),
+            )
         };
         bits(self).cmp(&bits(other))
     }
@@ -104,7 +123,9 @@ pub struct Sums {
     pub samples: u64,
     /// Largest friction coefficient seen.
     pub mu_peak: Option<f64>,
-    /// The newest of them.
+    /// End of the newest of them, microseconds since 1970.
+    pub newest_at_us: i64,
+    /// The newest of them that tells something.
     pub newest: Pass,
 }
 
@@ -129,6 +150,7 @@ impl Sums {
             segments: 1,
             samples: u64::from(segment.samples),
             mu_peak: segment.mu_peak_lower_bound,
+            newest_at_us: segment.ended_at.as_microsecond(),
             newest: Pass {
                 ended_at_us: segment.ended_at.as_microsecond(),
                 theta: Some(theta),
@@ -149,6 +171,7 @@ impl Sums {
             (Some(left), Some(right)) => Some(left.max(right)),
             (left, right) => left.or(right),
         };
+        self.newest_at_us = self.newest_at_us.max(other.newest_at_us);
         if other.newest.newer(&self.newest) == Ordering::Greater {
             self.newest = other.newest;
         }
@@ -156,7 +179,7 @@ impl Sums {
 
     /// End of the newest.
     pub fn newest_at(&self) -> Timestamp {
-        Timestamp::from_microsecond(self.newest.ended_at_us).unwrap_or(Timestamp::MAX)
+        Timestamp::from_microsecond(self.newest_at_us).unwrap_or(Timestamp::MAX)
     }
 }
 

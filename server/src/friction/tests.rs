@@ -35,6 +35,7 @@ pub(super) fn measured(theta: f64, std_dev: f64, age_s: i64) -> Sums {
         segments: 1,
         samples: 10,
         mu_peak: None,
+        newest_at_us: at_us(age_s),
         newest: Pass {
             ended_at_us: at_us(age_s),
             theta: Some(Information {
@@ -239,6 +240,18 @@ fn ice_shows_at_the_first_pass_and_is_certain_at_the_second_within_the_same_hour
     assert!((second.theta - 1.43).abs() < 0.2, "{second:?}");
     assert!(!second.disputed, "{second:?}");
     assert_eq!(second.changed_at.unwrap().as_microsecond(), at_us(60));
+}
+
+#[test]
+fn a_pass_that_says_next_to_nothing_does_not_hide_the_ice_before_it() {
+    let config = FrictionConfig::default();
+    let mut parts = iced(&[(0, 60)]);
+    let seen = fused(parts.clone(), &config).unwrap();
+    // Of the same robot in the same hour, and known to a quarter.
+    parts.push((0, measured(0.8, 0.2, 30)));
+    let vague = fused(parts, &config).unwrap();
+    assert!(close(vague.theta, seen.theta), "{seen:?}, then {vague:?}");
+    assert!(vague.changed_at.is_some() && vague.age_s < seen.age_s);
 }
 
 #[test]

@@ -342,6 +342,14 @@ async fn an_answer_says_which_normalisation_it_used() {
     };
     assert_eq!((cell.configuration, cell.friction.robots), (reference, 2));
     assert!((cell.friction.theta - 0.2).abs() < 1e-6, "{cell:?}");
+    // Whose θ is asked for is whose it is, also if that is not the reference.
+    let of_other = format!("configuration={other}&normalisation=to-lugged");
+    let joined: Page<CellFriction> = yard.get(&format!("{BASE}/cells?{of_other}")).await;
+    let [cell] = joined.items.as_slice() else {
+        panic!("one model: {joined:?}");
+    };
+    assert_eq!((cell.configuration, cell.friction.robots), (other, 2));
+    assert!((cell.friction.theta - 0.4).abs() < 1e-6, "{cell:?}");
     let body = json!({"robot": "rover-1", "normalisation": "to-lugged", "points": [
         {"x_m": 1.1, "y_m": 0.5}, {"x_m": 1.9, "y_m": 0.5}]});
     let (_, path) = yard.post(&format!("{BASE}/path"), &body).await;
@@ -351,7 +359,16 @@ async fn an_answer_says_which_normalisation_it_used() {
     assert_eq!(answer.headers()["tread-normalisation"], "to-lugged");
     let tile = Tile::decode(&answer.bytes().await.unwrap()).unwrap();
     assert_eq!(tile.normalisation.as_deref(), Some("to-lugged"));
-    assert_eq!(tile.squares[0].unwrap().segments, 2);
+    let of_reference = tile.squares[0].unwrap();
+    assert_eq!(of_reference.segments, 2);
+    let map = format!("{BASE}/map?format=tile&{of_other}");
+    let answer = yard.client().get(yard.url(&map)).send().await.unwrap();
+    let tile = Tile::decode(&answer.bytes().await.unwrap()).unwrap();
+    let of_other = tile.squares[0].unwrap();
+    assert!(
+        (of_other.theta / of_reference.theta - 2.0).abs() < 0.01,
+        "{of_reference:?}, {of_other:?}"
+    );
     yard.server.stop().await.unwrap();
 }
 

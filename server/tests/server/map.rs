@@ -6,7 +6,7 @@ use jiff::SignedDuration;
 use reqwest::StatusCode;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
-use tread_api::friction::{CellFriction, Segment, Withdrawal};
+use tread_api::friction::{CellFriction, Information, Segment, Withdrawal};
 use tread_api::page::Page;
 use tread_api::robot::Robot as ShownRobot;
 use tread_api::wire::ingest::{Batch, Receipt, Record};
@@ -140,6 +140,40 @@ async fn a_restart_reads_the_same_map() {
     }
     let before = said(yard.server.app()).await;
     assert_eq!(before.items.len(), 7);
+    assert_eq!(said(&restarted(yard.server.app()).await).await, before);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_pass_that_is_kept_by_itself_is_the_same_in_memory_and_on_the_disk() {
+    let begin = segment((0, 0), 0.2, 0).ended_at;
+    let yard = Yard::start_at(begin + SignedDuration::from_hours(12)).await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    // Each pass comes by itself, so that the database adds them up; cells have them in two orders.
+    let pass = |seq: u64, ix: i32, theta: f64, std_dev_ratio: f64, second: i64| {
+        let mut pass = segment((ix, 0), theta, second);
+        let information = (std_dev_ratio * theta).powi(-2);
+        pass.theta = Information {
+            information,
+            weighted: information * theta,
+        };
+        measured(seq, pass)
+    };
+    let old = |seq, ix| pass(seq, ix, 0.2, 0.05, 0);
+    let ice = |seq, ix| pass(seq, ix, 1.4, 0.05, 60);
+    let vague = |seq, ix| pass(seq, ix, 0.7, 0.3, 120);
+    let passes = [old(0, 0), ice(1, 0), vague(2, 0)];
+    let reversed = [vague(3, 1), ice(4, 1), old(5, 1)];
+    for one in passes.into_iter().chain(reversed) {
+        let receipt = robot.upload(vec![one]).await.unwrap();
+        assert_eq!(receipt.committed, 1, "{receipt:?}");
+    }
+    let before = said(yard.server.app()).await;
+    let [first, second] = before.items.as_slice() else {
+        panic!("two cells: {before:?}");
+    };
+    assert!((first.friction.theta - 1.4).abs() < 0.1, "{first:?}");
+    assert_eq!(first.friction, second.friction);
     assert_eq!(said(&restarted(yard.server.app()).await).await, before);
     yard.server.stop().await.unwrap();
 }

@@ -9,7 +9,8 @@ use tread_api::ids::{RobotId, SiteId};
 use tread_api::page::Page;
 use tread_api::site::Cell;
 
-use super::cells::{Area, Drawn};
+use super::cells::Area;
+use super::drawn::Drawn;
 use super::{App, AppError, Asked, Reading, SiteView, page, terrain_ref};
 use crate::friction::Ground;
 use crate::friction::index::{Contribution, SiteMap};

@@ -8,8 +8,9 @@ use tread_api::geometry::{COORDINATE_MAX_M, Point};
 use tread_api::ids::{ConfigurationId, SiteId};
 use tread_api::page::Page;
 use tread_api::site::{CELL_MAX_M, Cell, Grid};
-use tread_api::terrain::{Terrain, TerrainRef, TerrainShape, terrain_at};
+use tread_api::terrain::TerrainRef;
 
+use super::drawn::{Drawn, is_here};
 use super::{App, AppError, Asked, Reading, SiteView, page, site_row, terrain_ref};
 use crate::friction::Ground;
 use crate::friction::index::{Group, SiteMap};
@@ -299,19 +300,6 @@ fn differences(map: &SiteMap, cell: Cell, early: &Reading, late: &Reading) -> Ve
     both.collect()
 }
 
-/// Whether what was measured on a ground counts where this terrain is drawn now.
-pub(super) fn is_here(
-    view: &SiteView,
-    measured_on: Option<&TerrainRef>,
-    drawn: Option<&Terrain>,
-) -> bool {
-    match (measured_on, drawn) {
-        (None, None) => true,
-        (Some(found), Some(terrain)) => found.id == terrain.id && view.is_present(found),
-        (None, Some(_)) | (Some(_), None) => false,
-    }
-}
-
 /// Revisions that are the same ground, together.
 pub(super) fn same_ground<'map>(groups: impl Iterator<Item = Group<'map>>) -> Vec<Group<'map>> {
     let mut joined: Vec<Group<'map>> = Vec::new();
@@ -325,33 +313,6 @@ pub(super) fn same_ground<'map>(groups: impl Iterator<Item = Group<'map>>) -> Ve
         }
     }
     joined
-}
-
-/// The terrains as they are drawn, to find the one under a point.
-pub(super) struct Drawn<'view> {
-    pub(super) terrains: &'view [Terrain],
-    shapes: Vec<TerrainShape>,
-}
-
-impl<'view> Drawn<'view> {
-    pub(super) fn new(terrains: &'view [Terrain]) -> Self {
-        let shape = |terrain: &Terrain| TerrainShape {
-            terrain: terrain_ref(terrain),
-            polygon: terrain.polygon.clone(),
-            layer: terrain.layer,
-        };
-        Self {
-            terrains,
-            shapes: terrains.iter().map(shape).collect(),
-        }
-    }
-
-    pub(super) fn at(&self, point: Point) -> Option<&'view Terrain> {
-        let shape = terrain_at(&self.shapes, point)?;
-        self.terrains
-            .iter()
-            .find(|terrain| terrain.id == shape.terrain.id)
-    }
 }
 
 /// Cells of the grid along a side of a square of this resolution.

@@ -2,6 +2,7 @@
 
 mod advice;
 mod cells;
+mod drawn;
 mod export;
 pub mod live;
 mod path;

@@ -8,18 +8,18 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use tread_api::friction::{AskPath, FusedFriction, PathFriction, PathPiece};
 use tread_api::geometry::Point;
-use tread_api::ids::{RobotId, SiteId, TerrainId};
+use tread_api::ids::{RobotId, SiteId};
 use tread_api::robot::RobotModel;
 use tread_api::site::{Cell, Grid};
 use tread_api::trajectory::{Trajectory, Waypoint};
 use tread_api::wire::command::{CellGrip, CellPrior, PRIOR_CELLS_MAX, PathPrior};
 use tread_control::robot::RobotModel as PlannedModel;
 
-use super::cells::{Drawn, is_here, same_ground};
+use super::drawn::{Drawn, Near};
 use super::{App, AppError, Asked, Reading, SiteView};
 use crate::db;
-use crate::friction::index::SiteMap;
-use crate::friction::{Ground, grip};
+use crate::friction::grip;
+use crate::friction::index::{Lens, Room, SiteMap};
 
 /// Longest path, metres.
 const LENGTH_MAX_M: f64 = 10_000.0;
@@ -67,11 +67,10 @@ impl App {
         let cut = cut(&points, &view.row.site.grid)?;
         let looking = move |app: &Self| {
             let drawn = Drawn::new(&view.terrains);
+            let near = drawn_near(&drawn, &cut);
             let mut pieces: Vec<PathPiece> = app.maps().look(&view.row, |map| {
-                let piece = |cut: &Cut| {
-                    let known = known_at(map, &view, &drawn, &reading, cut);
-                    described(cut, known.as_ref())
-                };
+                let mut eye = Eye::new(map, (&view, &drawn, &near), &reading);
+                let piece = |cut: &Cut| described(cut, eye.known_at(cut).as_ref());
                 cut.iter().map(piece).collect()
             });
             set_speeds(&mut pieces, &cut, length_m, &found.model);
@@ -129,21 +128,21 @@ impl App {
         let mut cells: BTreeMap<(i32, i32), CellPrior> = BTreeMap::new();
         let mut grips: BTreeMap<(i32, i32), CellGrip> = BTreeMap::new();
         let near = near(cut, &view.row.site.grid);
+        let around = drawn_near(&drawn, cut.iter().chain(&near));
         self.maps().look(&view.row, |map| {
-            let known = |cut: &Cut| known_at(map, view, &drawn, reading, cut);
-            let mut grounds: BTreeMap<Option<&TerrainId>, f64> = BTreeMap::new();
+            let mut eye = Eye::new(map, (view, &drawn, &around), reading);
+            let mut grounds: BTreeMap<u16, f64> = BTreeMap::new();
             for place in cut.iter().chain(&near) {
-                let Some(known) = known(place).filter(is_measured) else {
+                let Some(known) = eye.known_at(place).filter(is_measured) else {
                     continue;
                 };
-                let ground = drawn.at(place.middle).map(|terrain| &terrain.id);
                 let mu = grip_mu(Some(&known));
-                let least = grounds.entry(ground).or_insert(mu);
+                let least = grounds.entry(around.ground_at(place.middle)).or_insert(mu);
                 *least = least.min(mu);
             }
             for cut in cut {
-                let (cell, known) = (cut.cell, known(cut));
-                let ground = drawn.at(cut.middle).map(|terrain| &terrain.id);
+                let (cell, known) = (cut.cell, eye.known_at(cut));
+                let ground = around.ground_at(cut.middle);
                 let least_mu = grounds.get(&ground).copied().unwrap_or(f64::INFINITY);
                 let mu = grip_mu(known.as_ref()).min(least_mu);
                 let key = (cell.iy, cell.ix);
@@ -158,7 +157,9 @@ impl App {
                     continue;
                 }
                 let has_one_ground = map.cell(cell, reading.choice()).len() == 1;
-                let told = known(place).filter(|known| has_one_ground && is_measured(known));
+                let told = eye
+                    .known_at(place)
+                    .filter(|known| has_one_ground && is_measured(known));
                 if let Some(known) = told {
                     let prior = CellPrior {
                         cell,
@@ -371,23 +372,60 @@ fn curvature(a: Point, b: Point, c: Point) -> f64 {
     }
 }
 
-fn known_at(
-    map: &SiteMap,
-    view: &SiteView,
-    drawn: &Drawn<'_>,
-    reading: &Reading,
-    cut: &Cut,
-) -> Option<FusedFriction> {
-    let groups = map.cell(cut.cell, reading.choice());
-    if groups.is_empty() {
-        return None;
+/// The terrains that come near places.
+fn drawn_near<'view, 'cut>(
+    drawn: &Drawn<'view>,
+    places: impl IntoIterator<Item = &'cut Cut>,
+) -> Near<'view> {
+    let (mut low, mut high) = (
+        Point {
+            x_m: f64::INFINITY,
+            y_m: f64::INFINITY,
+        },
+        Point {
+            x_m: f64::NEG_INFINITY,
+            y_m: f64::NEG_INFINITY,
+        },
+    );
+    for Cut { middle, .. } in places {
+        (low.x_m, low.y_m) = (low.x_m.min(middle.x_m), low.y_m.min(middle.y_m));
+        (high.x_m, high.y_m) = (high.x_m.max(middle.x_m), high.y_m.max(middle.y_m));
     }
-    let terrain = drawn.at(cut.middle);
-    let here = groups
-        .into_iter()
-        .filter(|group| is_here(view, group.terrain, terrain));
-    let group = same_ground(here).into_iter().next()?;
-    reading.fused(group, Ground::Cell)
+    drawn.near(low, high)
+}
+
+/// Looks at one place of the map after another.
+struct Eye<'map> {
+    map: &'map SiteMap,
+    near: &'map Near<'map>,
+    lens: Lens,
+    reading: &'map Reading,
+    room: Room,
+}
+
+impl<'map> Eye<'map> {
+    fn new(
+        map: &'map SiteMap,
+        (view, drawn, near): (&'map SiteView, &Drawn<'_>, &'map Near<'map>),
+        reading: &'map Reading,
+    ) -> Self {
+        let lens = map.lens(reading.choice(), |found| drawn.ground_of(view, found));
+        Self {
+            map,
+            near,
+            lens,
+            reading,
+            room: Room::default(),
+        }
+    }
+
+    /// What is known of the ground that is drawn at the middle of a place.
+    fn known_at(&mut self, place: &Cut) -> Option<FusedFriction> {
+        let ground = self.near.ground_at(place.middle);
+        let (which, at) = ((ground, &self.lens), self.reading.fused_at());
+        let fused = self.map.fuse_cell(place.cell, which, at, &mut self.room);
+        fused.map(|fused| fused.to_api(self.reading.now_us))
+    }
 }
 
 fn described(cut: &Cut, known: Option<&FusedFriction>) -> PathPiece {

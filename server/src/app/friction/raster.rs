@@ -10,12 +10,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 use tread_api::geometry::{COORDINATE_MAX_M, Point};
 use tread_api::ids::ConfigurationId;
 use tread_api::site::{Cell, Grid};
-use tread_api::terrain::{Terrain, TerrainRef};
 
-use super::cells::{Area, Drawn, factor};
+use super::cells::{Area, factor};
+use super::drawn::Drawn;
 use super::{App, AppError, Asked, Reading, SiteView};
 use crate::friction::Raster;
-use crate::friction::index::{BLOCK_SQUARES, Block, GROUND_NONE, Lens, Room, SiteMap, Square};
+use crate::friction::index::{BLOCK_SQUARES, Block, Lens, Room, SiteMap, Square};
 
 /// Most squares of one picture.
 pub const SQUARES_MAX: u64 = 1 << 20;
@@ -97,16 +97,7 @@ impl Frame<'_> {
             configuration: Some(self.configuration),
             ..self.reading.choice()
         };
-        map.lens(choice, |found| self.ground_of(found))
-    }
-
-    /// The number of a ground that measurements name; `None` where it is drawn no more.
-    fn ground_of(&self, found: Option<&TerrainRef>) -> Option<u16> {
-        let Some(found) = found else {
-            return Some(GROUND_NONE);
-        };
-        let place = self.drawn.place(&found.id)?;
-        self.view.is_present(found).then_some(place)
+        map.lens(choice, |found| self.drawn.ground_of(self.view, found))
     }
 
     fn grounds(&self, block: Block) -> Arc<[u16]> {
@@ -322,51 +313,5 @@ impl App {
         } else {
             raster
         })
-    }
-}
-
-/// Terrains that a box touches, in the order in which they count.
-pub(super) struct Near<'view> {
-    found: Vec<(u16, &'view Terrain)>,
-}
-
-impl Near<'_> {
-    /// The number of the ground at a point.
-    fn ground_at(&self, point: Point) -> u16 {
-        let mut here = self.found.iter();
-        here.find(|(_, terrain)| terrain.polygon.contains(point))
-            .map_or(GROUND_NONE, |&(number, _)| number)
-    }
-}
-
-impl<'view> Drawn<'view> {
-    /// The number of a terrain, from 1.
-    fn place(&self, id: &tread_api::ids::TerrainId) -> Option<u16> {
-        let place = self.terrains.iter().position(|terrain| terrain.id == *id)?;
-        u16::try_from(place + 1).ok()
-    }
-
-    /// Terrains whose outlines come near a box.
-    fn near(&self, low: Point, high: Point) -> Near<'view> {
-        let touches = |terrain: &Terrain| {
-            let corners = terrain.polygon.corners();
-            let span = |of: fn(&Point) -> f64| {
-                let values = corners.iter().map(of);
-                let least = values.clone().fold(f64::INFINITY, f64::min);
-                (least, values.fold(f64::NEG_INFINITY, f64::max))
-            };
-            let (x, y) = (span(|corner| corner.x_m), span(|corner| corner.y_m));
-            x.0 <= high.x_m && x.1 >= low.x_m && y.0 <= high.y_m && y.1 >= low.y_m
-        };
-        let mut found: Vec<(u16, &'view Terrain)> = (1..)
-            .zip(self.terrains)
-            .filter(|(_, terrain)| touches(terrain))
-            .collect();
-        // As `terrain_at` has it: the higher layer counts, of equal ones the smaller identifier.
-        found.sort_by(|(_, left), (_, right)| {
-            let by_layer = right.layer.cmp(&left.layer);
-            by_layer.then_with(|| left.id.cmp(&right.id))
-        });
-        Near { found }
     }
 }

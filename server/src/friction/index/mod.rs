@@ -83,6 +83,24 @@ pub struct Choice<'choice> {
     pub normalisation: Option<&'choice Normalisation>,
 }
 
+impl Choice<'_> {
+    /// In whose θ a configuration's measurements count, and what they are divided by for that;
+    /// `None` if they do not count. Those that a normalisation joins count in the θ of the one that
+    /// is asked for, of its reference if none is.
+    fn brought_to(&self, found: ConfigurationId) -> Option<(ConfigurationId, f64)> {
+        let ratio = |of: ConfigurationId| self.normalisation.and_then(|joined| joined.ratio(of));
+        let reference = self.normalisation.map(|joined| joined.reference);
+        match (self.configuration, reference) {
+            (Some(asked), _) if asked == found => Some((found, 1.0)),
+            (Some(asked), _) => Some((asked, ratio(found)? / ratio(asked)?)),
+            (None, Some(reference)) => {
+                Some(ratio(found).map_or((found, 1.0), |ratio| (reference, ratio)))
+            }
+            (None, None) => Some((found, 1.0)),
+        }
+    }
+}
+
 /// Factors that bring the θ of several configurations to that of one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Normalisation {
@@ -347,7 +365,10 @@ impl SiteMap {
             let Some(seen) = Seen::of(rank, i64::from(epoch_h), &sums) else {
                 continue;
             };
-            let (configuration, seen) = normalised(configuration, seen, choice.normalisation);
+            let Some((configuration, ratio)) = choice.brought_to(configuration) else {
+                continue;
+            };
+            let seen = seen.scaled(ratio);
             let group = groups.entry(configuration).or_insert_with(|| Group {
                 terrain: None,
                 configuration,
@@ -366,14 +387,9 @@ impl SiteMap {
             && choice
                 .robot
                 .is_none_or(|robot| names.robots.name(key.robot) == robot)
-            && choice.configuration.is_none_or(|configuration| {
-                let this = *names.configurations.name(key.configuration);
-                this == configuration
-                    || choice.normalisation.is_some_and(|normalisation| {
-                        normalisation.reference == configuration
-                            && normalisation.ratio(this).is_some()
-                    })
-            })
+            && choice
+                .brought_to(*names.configurations.name(key.configuration))
+                .is_some()
     }
 
     /// Parts of one cell, which are sorted by key, as groups in the order of their names.
@@ -392,7 +408,10 @@ impl SiteMap {
             };
             let configuration = *self.names.configurations.name(configuration);
             let terrain = self.names.terrains.name(terrain).as_ref();
-            let (configuration, seen) = normalised(configuration, seen, choice.normalisation);
+            let Some((configuration, ratio)) = choice.brought_to(configuration) else {
+                continue;
+            };
+            let seen = seen.scaled(ratio);
             let group = groups
                 .iter_mut()
                 .find(|group| group.configuration == configuration && group.terrain == terrain);
@@ -424,7 +443,7 @@ impl SiteMap {
             if let Some(sums) = sums {
                 entry.segments += sums.segments;
                 entry.first_epoch_h = entry.first_epoch_h.min(i64::from(key.epoch_h));
-                entry.newest_at_us = entry.newest_at_us.max(sums.newest.ended_at_us);
+                entry.newest_at_us = entry.newest_at_us.max(sums.newest_at_us);
             }
         };
         for (key, sums) in &self.totals {
@@ -459,27 +478,13 @@ pub struct Contribution {
     pub newest_at_us: i64,
 }
 
-/// A configuration's word in the θ of the one that it is brought to, if it is.
-fn normalised(
-    configuration: ConfigurationId,
-    seen: Seen<u32>,
-    normalisation: Option<&Normalisation>,
-) -> (ConfigurationId, Seen<u32>) {
-    let Some((normalisation, ratio)) = normalisation
-        .and_then(|normalisation| Some((normalisation, normalisation.ratio(configuration)?)))
-    else {
-        return (configuration, seen);
-    };
-    (normalisation.reference, seen.scaled(ratio))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn a_part_takes_no_more_room_than_was_promised() {
-        assert_eq!(size_of::<Part>(), 136);
+        assert_eq!(size_of::<Part>(), 144);
     }
 
     #[test]

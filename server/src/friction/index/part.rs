@@ -32,7 +32,9 @@ pub(super) struct Part {
     mu_peak: u32,
     newest_mu: u32,
     pub(super) newest_at_us: i64,
-    /// Information of the newest pass; 0, which no pass has, when it is not known.
+    /// End of the pass that is kept by itself.
+    pass_at_us: i64,
+    /// Its information; 0, which no pass has, when it is not known.
     newest_information: f64,
     newest_weighted: f64,
 }
@@ -59,7 +61,8 @@ impl Part {
             segments: u32::try_from(sums.segments).unwrap_or(u32::MAX),
             mu_peak: pack_mu(sums.mu_peak),
             newest_mu: pack_mu(sums.newest.mu_peak),
-            newest_at_us: sums.newest.ended_at_us,
+            newest_at_us: sums.newest_at_us,
+            pass_at_us: sums.newest.ended_at_us,
             newest_information: sums.newest.theta.map_or(0.0, |theta| theta.information),
             newest_weighted: sums.newest.theta.map_or(0.0, |theta| theta.weighted),
         };
@@ -95,8 +98,9 @@ impl Part {
             segments: u64::from(self.segments),
             samples: 0,
             mu_peak: unpack_mu(self.mu_peak),
+            newest_at_us: self.newest_at_us,
             newest: Pass {
-                ended_at_us: self.newest_at_us,
+                ended_at_us: self.pass_at_us,
                 theta: (self.newest_information > 0.0).then_some(Information {
                     information: self.newest_information,
                     weighted: self.newest_weighted,
@@ -187,6 +191,7 @@ mod tests {
                 segments,
                 samples: 0,
                 mu_peak: mu,
+                newest_at_us: 9,
                 newest: Pass { ended_at_us: 7, theta: None, mu_peak: mu },
             };
             let key = PartKey { terrain: 0, configuration: 0, robot: 3, epoch_h: 11 };

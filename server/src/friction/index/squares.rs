@@ -113,8 +113,8 @@ pub struct Room {
 }
 
 impl SiteMap {
-    /// Which measurements count: those of the chosen configuration, or, by a normalisation, of all
-    /// that it joins, on the grounds that `ground_of` numbers.
+    /// Which measurements count: those of the chosen configuration and, by a normalisation, of all
+    /// that it joins with it, on the grounds that `ground_of` numbers. None without a configuration.
     pub fn lens(
         &self,
         choice: Choice<'_>,
@@ -127,9 +127,9 @@ impl SiteMap {
                 .map(|terrain| ground_of(terrain.as_ref()).unwrap_or(GROUND_LOST))
                 .collect(),
             ratios: configurations
-                .map(|&found| match choice.normalisation {
-                    Some(normalisation) => normalisation.ratio(found),
-                    None => (choice.configuration == Some(found)).then_some(1.0),
+                .map(|&found| {
+                    let (reference, ratio) = choice.brought_to(found)?;
+                    (Some(reference) == choice.configuration).then_some(ratio)
                 })
                 .collect(),
             as_of_h: choice
@@ -203,11 +203,31 @@ impl SiteMap {
         fused.map_or_else(Square::default, |fused| Square::of(&fused))
     }
 
-    fn square(&self, parts: &[Part], which: (u16, &Lens), at: At<'_>, room: &mut Room) -> Square {
+    /// What a cell says of the ground with that number.
+    pub fn fuse_cell(
+        &self,
+        cell: Cell,
+        which: (u16, &Lens),
+        at: At<'_>,
+        room: &mut Room,
+    ) -> Option<Fused> {
+        self.fuse_parts(self.cells.get(&place(cell))?, which, at, room)
+    }
+
+    fn fuse_parts(
+        &self,
+        parts: &[Part],
+        which: (u16, &Lens),
+        at: At<'_>,
+        room: &mut Room,
+    ) -> Option<Fused> {
         self.gather(parts, which, room);
-        let fused = room
-            .fuser
-            .fuse(&mut room.seen, Ground::Cell, at.config, at.now_us);
+        let (fuser, seen) = (&mut room.fuser, &mut room.seen);
+        fuser.fuse(seen, Ground::Cell, at.config, at.now_us)
+    }
+
+    fn square(&self, parts: &[Part], which: (u16, &Lens), at: At<'_>, room: &mut Room) -> Square {
+        let fused = self.fuse_parts(parts, which, at, room);
         fused.map_or_else(Square::default, |fused| Square::of(&fused))
     }
 
