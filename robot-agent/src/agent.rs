@@ -18,14 +18,14 @@ use tread_api::ids::BootId;
 use tread_api::robot::OutboxStatus;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
 use tread_api::wire::state::{FrictionReport, RobotState};
-use tread_control::robot::RobotModelError;
+use tread_control::robot::{RobotModel, RobotModelError};
 use uuid::Uuid;
 
 use crate::base::Base;
 use crate::clock::{SharedClock, SystemClock};
 use crate::config::AgentConfig;
 use crate::control_loop::BRAKING_MAX;
-use crate::control_loop::seam::{AgentEnds, Shared, seam};
+use crate::control_loop::seam::{AgentEnds, LoopEnds, Shared, seam};
 use crate::control_loop::tick::LoopCore;
 use crate::dispatcher::Dispatcher;
 use crate::drive::simulated::SimulatedDriveError;
@@ -37,6 +37,8 @@ use crate::missions::memory::{Memory, MemoryError};
 use crate::online::Online;
 use crate::outbox::{Outbox, OutboxError};
 use crate::recorder::Recorder;
+use crate::recording::frame::notes;
+use crate::recording::{RecordWriter, RunHead};
 use crate::reporter::{Reporter, log_losses};
 use crate::safety::Safety;
 use crate::supervisor::{PartEnded, Supervisor};
@@ -148,18 +150,18 @@ impl Agent {
             Arc::clone(&shared.safety),
             Arc::clone(&clock),
         );
-        let core = LoopCore::new(model, loop_ends)
-            .with_blind_within_fence(config.blind_within_fence)
-            .with_silent_after(base.silent_after());
         let no_thread = |part| move |source| StartError::Thread { part, source };
+        let (core, writing) =
+            loop_core(&config, boot, &base, model, loop_ends, &supervisor, &clock)?;
         let counts = base.counts();
-        let recording = supervisor
+        let saving = supervisor
             .spawn_thread("recorder", move || recorder.run(&events))
             .map_err(no_thread("recorder"))?;
         let mut threads = base
             .spawn(core, config.period(), &supervisor, &shared, &clock)
             .map_err(no_thread("control loop"))?;
-        threads.push(recording);
+        threads.push(saving);
+        threads.extend(writing);
         let stop = || supervisor.stop_token();
         supervisor.spawn("outbox", outbox.clone().keep_synced(stop()));
         supervisor.spawn(
@@ -215,6 +217,31 @@ impl Agent {
             threads,
         })
     }
+}
+
+/// The loop as it is configured, and the thread that records it, if that is wanted.
+fn loop_core(
+    config: &AgentConfig,
+    boot: BootId,
+    base: &Base,
+    model: RobotModel,
+    ends: LoopEnds,
+    supervisor: &Supervisor,
+    clock: &SharedClock,
+) -> Result<(LoopCore, Option<JoinHandle<()>>), StartError> {
+    let mut core = LoopCore::new(model, ends)
+        .with_blind_within_fence(config.blind_within_fence)
+        .with_silent_after(base.silent_after());
+    let part = "record of the loop";
+    let Some((to, head)) = RunHead::of(config, boot, base.silent_after()) else {
+        return Ok((core, None));
+    };
+    let writer = RecordWriter::new(to, head, model, Arc::clone(clock));
+    let (taker, notes) = notes();
+    let writing = supervisor.spawn_thread(part, move || writer.run(&notes));
+    let writing = writing.map_err(|source| StartError::Thread { part, source })?;
+    core.note_to(Some(taker));
+    Ok((core, Some(writing)))
 }
 
 /// Begins to renew the certificate, if there is one; it changes with each renewal.

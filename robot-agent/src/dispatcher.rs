@@ -24,19 +24,16 @@ use tread_api::robot::RobotMode;
 use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome, Pause, Resume};
 use tread_api::wire::hello::SiteDefinition;
 use tread_api::wire::{self, Refusal, WireError};
-use tread_control::follower::{Follower, FollowerConfig};
 use tread_control::geometry::Pose;
-use tread_control::plan::{Plan, PlanOptions};
+use tread_control::plan::Plan;
 use tread_control::robot::RobotModel;
 
 use crate::clock::SharedClock;
 use crate::control_loop::active::Hold;
-use crate::control_loop::driven::Driven;
-use crate::control_loop::prior::Prior;
+use crate::control_loop::origin::JobOrigin;
 use crate::control_loop::seam::{Job, LoopCommand, Shared};
 use crate::control_loop::site_view::SiteView;
 use crate::fleet::{Commands, IncomingCommand};
-use crate::geometry::{control_trajectory, plan_options};
 use crate::knowledge::{Missions, SiteCell};
 use crate::missions::{CancelDecision, Held, OfferDecision};
 use crate::safety::{Safety, answers};
@@ -444,16 +441,18 @@ impl Dispatcher {
         let view = self.site.view();
         let offer = offer.clone();
         let planning = tokio::task::spawn_blocking(move || {
-            let trajectory = control_trajectory(&offer.trajectory);
-            let prior = Prior::new(offer.prior.as_ref());
-            let grip = view.as_ref().and_then(|view| prior.grip_map(view.grid()));
-            let options = PlanOptions {
-                grip_mu: prior.grip_mu(),
-                grip: grip.as_ref(),
-                ..plan_options(&offer.trajectory)
+            let origin = JobOrigin {
+                mission: offer.mission,
+                revision: offer.revision,
+                plan_hash: offer.plan_hash,
+                trajectory: offer.trajectory,
+                start,
+                prior: offer.prior,
+                grid: view.as_ref().map(|view| view.grid()),
+                start_by,
+                silence_max: silence_max(offer.link_policy)?,
             };
-            let plan = Plan::with_options(&trajectory, start, &model, &options)
-                .map_err(|cause| cause.to_string())?;
+            let plan = origin.plan(&model)?;
             if let Some(breach) = view.and_then(|view| view.fence().plan_breach(&plan, &model)) {
                 return Err(format!(
                     "the way leaves the geofence at ({:.1} m, {:.1} m), {:.1} m along it",
@@ -466,18 +465,7 @@ impl Dispatcher {
                 speed_peak_m_s: plan.peak_speed_m_s(),
             };
             let kept = Arc::new(plan.clone());
-            let follower = Follower::new(plan, model, FollowerConfig::default())
-                .map_err(|cause| cause.to_string())?;
-            let job = Box::new(Job {
-                mission: offer.mission,
-                revision: offer.revision,
-                plan_hash: offer.plan_hash,
-                follower,
-                prior,
-                start_by,
-                silence_max: silence_max(offer.link_policy)?,
-                driven: Driven::new(),
-            });
+            let job = origin.job(plan, model)?;
             Ok(Planned {
                 summary,
                 plan: kept,

@@ -10,6 +10,7 @@
 //!   (what must not be lost), `reporter` (what may), [`fleet`] (the only one that knows zenoh).
 //! * [`membership`]: the robot's certificate, how it gets it and the next one.
 //! * `safety`: what may only slow the robot down, and driving by hand.
+//! * `recording`: what the loop took and gave, in files, and running such files again.
 //! * [`mod@bench`] steps the loop by hand, for tests and figures.
 //! * Below all: [`clock`], `supervisor`, [`geometry`] (between wire and controller).
 //!
@@ -38,6 +39,7 @@ mod enroll;
 mod knowledge;
 mod online;
 mod recorder;
+mod recording;
 mod reporter;
 mod safety;
 mod supervisor;
@@ -46,4 +48,5 @@ pub use agent::{Agent, RunningAgent};
 pub use config::AgentConfig;
 pub use control_loop::seam::Fault;
 pub use program::run_from_args;
+pub use recording::{FILE_MIB_RANGE, FILES_RANGE, RecordingConfig};
 pub use supervisor::PartEnded;

@@ -14,6 +14,7 @@ use crate::agent::{Agent, RunningAgent};
 use crate::config::{AgentConfig, Flags, LogFormat};
 use crate::doctor::{self, DoctorArgs};
 use crate::enroll::{self, EnrollArgs};
+use crate::recording::told::{self, ReplayArgs};
 
 /// Drives one robot and measures its ground.
 #[derive(Debug, Parser)]
@@ -31,6 +32,8 @@ enum Action {
     Enroll(EnrollArgs),
     /// Say what is wrong with the installation on a ROS 2 robot
     Doctor(DoctorArgs),
+    /// Run controller and estimator on a record again, and say where they differ from it
+    Replay(ReplayArgs),
 }
 
 /// Runs an agent until it is told to stop by SIGTERM or ctrl-c; the first argument is the
@@ -55,6 +58,11 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
         Some(Action::Doctor(args)) => match doctor::run(&args) {
             Ok(true) => Ok(()),
             // What is wrong has been said.
+            Ok(false) => return ExitCode::FAILURE,
+            Err(cause) => Err(cause),
+        },
+        Some(Action::Replay(args)) => match told::run(&args) {
+            Ok(true) => Ok(()),
             Ok(false) => return ExitCode::FAILURE,
             Err(cause) => Err(cause),
         },

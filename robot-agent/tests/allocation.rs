@@ -4,6 +4,8 @@ use std::alloc::System;
 use std::time::Duration;
 
 use stats_alloc::{INSTRUMENTED_SYSTEM, Region, Stats, StatsAlloc};
+use tempfile::TempDir;
+use tread_agent::RecordingConfig;
 use tread_agent::bench::{Bench, boot, site_of};
 use tread_agent::sim::scenario::Scenario;
 use tread_api::geometry::{Point, Polygon, Twist};
@@ -22,7 +24,7 @@ static ALLOCATOR: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
 const TICKS_MAX: u32 = 10_000;
 
 #[test]
-fn no_tick_of_a_mission_across_cells_and_terrains_allocates() {
+fn no_tick_of_a_recorded_mission_across_cells_and_terrains_allocates() {
     let scenario = Scenario::built_in().unwrap();
     let start = Pose {
         x_m: 4.0,
@@ -30,6 +32,14 @@ fn no_tick_of_a_mission_across_cells_and_terrains_allocates() {
         heading_rad: 0.5,
     };
     let mut bench = Bench::new(&scenario, start, 3).unwrap();
+    let folder = TempDir::new().unwrap();
+    let recording = RecordingConfig {
+        folder: folder.path().to_owned(),
+        file_bytes: 1 << 20,
+        files: 2,
+    };
+    let robot = scenario.robots[0].id.clone();
+    bench.record(recording, scenario.site.clone(), robot);
     bench.know_site(site_of(&scenario).unwrap()).unwrap();
     bench.run_for(Duration::from_secs(1));
     let mission = bench
@@ -43,6 +53,7 @@ fn no_tick_of_a_mission_across_cells_and_terrains_allocates() {
         bench.collect();
         if let Some(phase) = bench.end_of(mission) {
             assert_eq!(phase, MissionPhase::Succeeded);
+            assert_eq!(bench.end_record(), 0, "notes were lost");
             assert!(
                 bench.segment_count() > 10,
                 "{} segments",

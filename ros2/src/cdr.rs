@@ -176,7 +176,7 @@ macro_rules! numbers {
         }
     )*};
 }
-numbers!(u8, i32, u32, f32, f64);
+numbers!(u8, i32, u32, i64, u64, f32, f64);
 
 impl<'a> Field<'a> for bool {
     const BYTES_MIN: usize = 1;

@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 
 use serde::Deserialize;
 use tread_ros2::cdr::{Sequence, decode, encode};
+use tread_ros2::definitions::schema;
 use tread_ros2::messages::{
     BatteryState, DiagnosticArray, DiagnosticStatus, Float64MultiArray, Header, Imu, JointState,
     KeyValue, Message, MultiArrayDimension, MultiArrayLayout, Odometry, Path, Point, Pose,
@@ -17,6 +18,7 @@ use tread_ros2::rmw::{Attachment, gid};
 struct Golden {
     messages: BTreeMap<String, String>,
     hashes: BTreeMap<String, String>,
+    definitions: BTreeMap<String, String>,
     token: String,
     attachment: String,
 }
@@ -272,6 +274,20 @@ fn hashes_of_all_types_are_those_of_rosbags() {
     check(Twist::TYPE);
     check(TwistStamped::TYPE);
     assert!(left.is_empty(), "{left:?}");
+}
+
+#[test]
+fn definitions_in_recordings_are_those_of_rosbags() {
+    let golden = golden();
+    assert!(golden.definitions.len() > 7);
+    for (kind, text) in &golden.definitions {
+        let (package, name) = kind.split_once("/msg/").expect("package/msg/name");
+        assert_eq!(
+            schema(package, name).as_deref(),
+            Some(text.as_str()),
+            "{kind}"
+        );
+    }
 }
 
 #[test]

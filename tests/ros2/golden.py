@@ -129,6 +129,9 @@ messages = {
     "empty_diagnostics": diagnostics(0),
 }
 
+# What recordings carry the definition of.
+DEFINED = sorted({message.__msgtype__ for message in messages.values()} - {"sensor_msgs/msg/BatteryState"})
+
 TOKEN = "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/10/MS/%/%/listener/%chatter/std_msgs::msg::dds_::String_/::,10:,:,:,,"
 gid = xxhash.xxh3_128_intdigest(TOKEN.encode()).to_bytes(16, "little")
 attachment = zenoh.ext.z_serialize((zenoh.ext.Int64(41), zenoh.ext.Int64(1_700_000_000_123_456_789), gid))
@@ -136,6 +139,7 @@ attachment = zenoh.ext.z_serialize((zenoh.ext.Int64(41), zenoh.ext.Int64(1_700_0
 golden = {
     "messages": {name: bytes(store.serialize_cdr(message, message.__msgtype__)).hex() for name, message in messages.items()},
     "hashes": {kind: store.hash_rihs01(kind) for kind in sorted({message.__msgtype__ for message in messages.values()})},
+    "definitions": {kind: store.generate_msgdef(kind, ros_version=2)[0] for kind in DEFINED},
     "token": TOKEN,
     "attachment": bytes(attachment).hex(),
 }

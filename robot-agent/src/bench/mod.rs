@@ -8,11 +8,12 @@ pub mod lease_model;
 
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::sync::mpsc::SendError;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use tread_api::ids::{BootId, MissionId, PlanHash};
+use tread_api::ids::{BootId, MissionId, PlanHash, RobotId, SiteId};
 use tread_api::safety::Geofence;
 use tread_api::site::Grid;
 use tread_api::terrain::{TerrainRef, TerrainShape};
@@ -21,17 +22,16 @@ use tread_api::wire::command::{Outcome, PathPrior};
 use tread_api::wire::hello::SiteDefinition;
 use tread_api::wire::ingest::MissionPhase;
 use tread_api::wire::safety::LeaseCommand;
-use tread_control::follower::{Follower, FollowerConfig};
 use tread_control::geometry::Pose;
 use tread_control::measured::WheelSpeeds;
-use tread_control::plan::{Plan, PlanOptions};
+use tread_control::plan::Plan;
 use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
 use crate::clock::{ManualClock, SharedClock};
 use crate::control_loop::active::Hold;
 use crate::control_loop::driven::Driven;
-use crate::control_loop::prior::Prior;
+use crate::control_loop::origin::JobOrigin;
 use crate::control_loop::seam::{
     AgentEnds, ClosedSegment, EndReason, Job, LoopCommand, LoopEvent, seam,
 };
@@ -39,8 +39,10 @@ use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;
 use crate::control_loop::tick::LoopCore;
 use crate::drive::simulated::{Individual, SimMode, SimulatedDrive, SimulatedDriveError};
-use crate::drive::{Drive, Feedback, SensorSample};
-use crate::geometry::{control_trajectory, plan_options};
+use crate::drive::{Drive, Feedback, SILENT_AFTER_MAX, SensorSample};
+use crate::geometry::paper_robot;
+use crate::recording::frame::{Notes, notes};
+use crate::recording::{FORMAT, RecordWriter, RecordingConfig, RunHead, VERSION};
 use crate::safety::{Safety, answers, microseconds};
 use crate::sim::scenario::Scenario;
 
@@ -94,11 +96,13 @@ pub struct Bench {
     /// Longest silence of the server that missions bear from now on.
     pub(crate) silence_max: Option<Duration>,
     /// What a map knows along the way of missions from now on.
-    prior: Prior,
+    prior: Option<PathPrior>,
     /// The record of the last mission that ended.
     pub(crate) last_driven: Option<Driven>,
     /// Distance from the path when the last mission ended.
     pub(crate) cross_track_m: f64,
+    /// Who records, if anybody does, and what waits for him.
+    record: Option<(RecordWriter, Notes)>,
 }
 
 /// The site of a scenario as a server would define it.
@@ -131,36 +135,6 @@ pub fn site_of(scenario: &Scenario) -> Result<SiteDefinition, String> {
 
 fn mission_of(number: u128) -> MissionId {
     MissionId::from_uuid(Uuid::from_u128(number))
-}
-
-fn planned(
-    number: u128,
-    revision: u32,
-    trajectory: &Trajectory,
-    start: Pose,
-    prior: &Prior,
-) -> Result<Box<Job>, BenchError> {
-    let impossible = |problem: String| BenchError::Impossible(problem);
-    let model = RobotModel::yi2007();
-    let asked = control_trajectory(trajectory);
-    let options = PlanOptions {
-        grip_mu: prior.grip_mu(),
-        ..plan_options(trajectory)
-    };
-    let plan = Plan::with_options(&asked, start, &model, &options)
-        .map_err(|refused| impossible(refused.to_string()))?;
-    let follower = Follower::new(plan, model, FollowerConfig::default())
-        .map_err(|refused| impossible(refused.to_string()))?;
-    Ok(Box::new(Job {
-        prior: prior.clone(),
-        mission: mission_of(number),
-        revision,
-        plan_hash: PlanHash::from_uuid(Uuid::from_u128(number)),
-        follower,
-        start_by: None,
-        silence_max: None,
-        driven: Driven::new(),
-    }))
 }
 
 /// A base whose sensors say what is no number.
@@ -249,10 +223,50 @@ impl Bench {
             news: Vec::new(),
             paused_for: None,
             silence_max: None,
-            prior: Prior::default(),
+            prior: None,
             last_driven: None,
             cross_track_m: f64::NAN,
+            record: None,
         })
+    }
+
+    /// Records from now on, before the first tick.
+    pub fn record(&mut self, config: RecordingConfig, site: SiteId, robot: RobotId) {
+        let head = RunHead {
+            format: FORMAT,
+            version: VERSION.to_owned(),
+            boot: boot(),
+            site,
+            robot,
+            part: 0,
+            model: paper_robot(),
+            blind_within_fence: false,
+            silent_after: SILENT_AFTER_MAX,
+            rate_hz: PERIOD.as_secs_f64().recip(),
+        };
+        let (taker, notes) = notes();
+        self.core.note_to(Some(taker));
+        let clock = Arc::clone(&self.clock) as SharedClock;
+        let writer = RecordWriter::new(config, head, RobotModel::yi2007(), clock);
+        self.record = Some((writer, notes));
+    }
+
+    /// Writes what was noted, if it is to be recorded.
+    fn write_record(&mut self) {
+        if let Some((writer, notes)) = &mut self.record {
+            writer.drain(notes);
+        }
+    }
+
+    /// Ends the record; notes that found no room.
+    pub fn end_record(&mut self) -> u64 {
+        self.write_record();
+        self.core.note_to(None);
+        let Some((mut writer, notes)) = self.record.take() else {
+            return 0;
+        };
+        writer.close();
+        notes.lost.load(Ordering::Relaxed)
     }
 
     /// Tells the loop of its site.
@@ -266,7 +280,31 @@ impl Bench {
 
     /// Tells the robot what a map knows, from its next mission on.
     pub fn tell(&mut self, prior: &PathPrior) {
-        self.prior = Prior::new(Some(prior));
+        self.prior = Some(prior.clone());
+    }
+
+    fn planned(
+        &self,
+        number: u128,
+        revision: u32,
+        trajectory: &Trajectory,
+        start: Pose,
+        start_by: Option<Duration>,
+    ) -> Result<Box<Job>, BenchError> {
+        let model = RobotModel::yi2007();
+        let origin = JobOrigin {
+            mission: mission_of(number),
+            revision,
+            plan_hash: PlanHash::from_uuid(Uuid::from_u128(number)),
+            trajectory: trajectory.clone(),
+            start,
+            prior: self.prior.clone(),
+            grid: None,
+            start_by,
+            silence_max: self.silence_max,
+        };
+        let plan = origin.plan(&model).map_err(BenchError::Impossible)?;
+        origin.job(plan, model).map_err(BenchError::Impossible)
     }
 
     /// Plans a trajectory from where the robot stands and hands it to the loop.
@@ -280,9 +318,7 @@ impl Bench {
         start_by: Option<Duration>,
     ) -> Result<MissionId, BenchError> {
         let (pose, _) = self.ends.shared.snapshot().pose.ok_or(BenchError::NoPose)?;
-        let mut job = planned(number, 1, trajectory, pose, &self.prior)?;
-        job.start_by = start_by;
-        job.silence_max = self.silence_max;
+        let job = self.planned(number, 1, trajectory, pose, start_by)?;
         let mission = job.mission;
         self.ends.commands.send(LoopCommand::Start(job))?;
         Ok(mission)
@@ -306,7 +342,7 @@ impl Bench {
         self.tick();
         let governor = self.ends.shared.snapshot().governor;
         let rest = governor.ok_or(BenchError::Gone)?.rest(driving);
-        let job = planned(number, revision, trajectory, rest, &self.prior)?;
+        let job = self.planned(number, revision, trajectory, rest, None)?;
         Ok(self.ends.commands.send(LoopCommand::Replace(job))?)
     }
 
@@ -405,6 +441,7 @@ impl Bench {
 
     /// Takes what the loop has reported.
     pub fn collect(&mut self) {
+        self.write_record();
         for event in self.ends.events.try_iter() {
             match event {
                 LoopEvent::Started { progress, .. } => self.starts.push(progress.id),

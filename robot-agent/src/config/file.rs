@@ -24,6 +24,17 @@ pub(super) struct FileConfig {
     pub(super) blind_within_fence: Option<bool>,
     pub(super) model: Option<ModelFile>,
     pub(super) drive: Option<DriveFile>,
+    pub(super) recording: Option<RecordingFile>,
+}
+
+/// `[recording]` in `robot.toml`.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RecordingFile {
+    pub(super) enabled: Option<bool>,
+    pub(super) folder: Option<PathBuf>,
+    pub(super) file_mib: Option<u64>,
+    pub(super) files: Option<usize>,
 }
 
 /// `[model]` in `robot.toml`; the same words as on the wire, but strict.

@@ -4,6 +4,7 @@
 
 mod file;
 mod place;
+mod recording;
 mod ros2;
 
 use std::path::{Path, PathBuf};
@@ -24,6 +25,7 @@ use crate::drive::simulated::{Individual, Stall};
 use crate::geometry::{control_model, paper_robot};
 use crate::membership::{Membership, MembershipFileError};
 use crate::outbox;
+use crate::recording::RecordingConfig;
 use crate::sim::scenario::{BUILT_IN_NAME, Scenario, ScenarioError};
 use crate::sim::trace::Trace;
 
@@ -253,6 +255,8 @@ pub struct AgentConfig {
     pub blind_within_fence: bool,
     /// Bounds of the outbox.
     pub outbox: outbox::Limits,
+    /// Where what the loop takes and gives is recorded; absent: nowhere.
+    pub recording: Option<RecordingConfig>,
 }
 
 impl AgentConfig {
@@ -416,7 +420,9 @@ fn assemble(
             DriveConfig::Simulated(Box::new(simulated))
         }
     };
+    let recording = recording::checked(file.recording.unwrap_or_default(), &data_dir)?;
     Ok(AgentConfig {
+        recording,
         drive,
         site,
         robot,

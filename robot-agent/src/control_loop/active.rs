@@ -11,6 +11,7 @@
 
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
 use tread_api::robot::{MissionProgress, PauseCause};
 use tread_control::follower::FollowerStatus;
 use tread_control::gate::GateCause;
@@ -49,7 +50,8 @@ pub(super) enum News {
 }
 
 /// Why a mission is held.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub(crate) enum Hold {
     /// An operator paused it.
     Pause,

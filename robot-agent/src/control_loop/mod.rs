@@ -6,6 +6,7 @@
 pub(crate) mod active;
 pub(crate) mod driven;
 mod gain;
+pub(crate) mod origin;
 mod outgoing;
 mod pace;
 pub(crate) mod prior;

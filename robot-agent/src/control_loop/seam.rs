@@ -22,6 +22,7 @@ use tread_control::reference::Governor;
 
 use super::active::Hold;
 use super::driven::Driven;
+use super::origin::JobOrigin;
 use super::prior::Prior;
 use super::site_view::SiteView;
 use super::surface::Comparison;
@@ -48,6 +49,8 @@ pub(crate) struct Job {
     pub(crate) silence_max: Option<Duration>,
     /// What it turns out to be.
     pub(crate) driven: Driven,
+    /// What it was made from.
+    pub(crate) origin: Arc<JobOrigin>,
 }
 
 /// To the loop.
@@ -322,6 +325,15 @@ impl Shared {
     pub(crate) fn note_server_heard(&self, now: Duration) {
         let now_us = u64::try_from(now.as_micros()).unwrap_or(u64::MAX);
         self.server_heard_us.fetch_max(now_us, Ordering::Relaxed);
+    }
+
+    /// Makes the server as silent as a record says that it was.
+    pub(crate) fn show_server_silence(&self, now: Duration, silence: Duration) {
+        // Rounded up: what is kept in whole microseconds is met, and a server heard later than the
+        // tick began stays silent for no time.
+        let heard_us = now.saturating_sub(silence).as_nanos().div_ceil(1_000);
+        let heard_us = u64::try_from(heard_us).unwrap_or(u64::MAX);
+        self.server_heard_us.store(heard_us, Ordering::Relaxed);
     }
 
     /// How long the server has been silent.

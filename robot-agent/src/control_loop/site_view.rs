@@ -68,6 +68,8 @@ pub(crate) struct SiteView {
     bounds: Vec<Bounds>,
     /// Places in the definition, the one that counts first.
     order: Vec<usize>,
+    /// Whether the fence leaves no room anywhere, whatever the definition says.
+    is_without_room: bool,
 }
 
 impl SiteView {
@@ -91,6 +93,7 @@ impl SiteView {
             fence,
             bounds,
             order,
+            is_without_room: false,
         }
     }
 
@@ -100,7 +103,13 @@ impl SiteView {
         let mut view = Self::new(definition);
         view.definition.geofence.revision = revision;
         view.fence = Fence::without_room();
+        view.is_without_room = true;
         view
+    }
+
+    /// Whether it was made by [`SiteView::without_room`].
+    pub(crate) fn is_without_room(&self) -> bool {
+        self.is_without_room
     }
 
     pub(crate) fn definition(&self) -> &SiteDefinition {

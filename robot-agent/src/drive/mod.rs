@@ -103,6 +103,13 @@ impl Feedback {
         self.count += 1;
     }
 
+    /// The same with so many more samples that gave way.
+    #[must_use]
+    pub fn with_lost(mut self, lost: u32) -> Self {
+        self.lost = self.lost.saturating_add(lost);
+        self
+    }
+
     /// The samples, oldest first.
     pub fn samples(&self) -> &[SensorSample] {
         &self.samples[..self.count]

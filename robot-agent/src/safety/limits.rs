@@ -3,6 +3,7 @@
 //! The newest limit of a holder counts until its end. A holder that the configuration calls
 //! required holds the robot while it is silent; of any other an ended limit has no effect.
 
+use serde::{Deserialize, Serialize};
 use tread_api::ids::{BootId, HolderId};
 use tread_api::safety::{LIMITS_MAX, LimitStatus};
 use tread_api::wire::safety::ExternalLimit;
@@ -23,7 +24,7 @@ pub(crate) enum LimitRefusal {
 }
 
 /// One holder's limit as the loop sees it.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct Entry {
     is_required: bool,
     until_us: u64,
@@ -46,10 +47,30 @@ impl Entry {
 }
 
 /// All limits, to be looked at in a tick.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(from = "Vec<Entry>", into = "Vec<Entry>")]
 pub(crate) struct LimitsView {
     entries: [Entry; LIMITS_MAX],
     count: usize,
+}
+
+/// In a record.
+impl From<LimitsView> for Vec<Entry> {
+    fn from(view: LimitsView) -> Self {
+        view.present().to_vec()
+    }
+}
+
+/// From a record; more than there can be are left out.
+impl From<Vec<Entry>> for LimitsView {
+    fn from(entries: Vec<Entry>) -> Self {
+        let mut view = Self::default();
+        for (place, entry) in view.entries.iter_mut().zip(entries) {
+            *place = entry;
+            view.count += 1;
+        }
+        view
+    }
 }
 
 impl LimitsView {

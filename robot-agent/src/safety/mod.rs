@@ -21,6 +21,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
 use tokio::sync::Notify;
 use tracing::{error, info, warn};
 use tread_api::ids::{BootId, HolderId, StopId};
@@ -65,7 +66,7 @@ pub(crate) enum NotCleared {
 }
 
 /// What the loop looks at in a tick.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct LoopView {
     pub(crate) hand: HandView,
     pub(crate) limits: LimitsView,
@@ -95,6 +96,12 @@ impl SafetyCell {
     /// The loop has set its target to zero under this stop.
     pub(crate) fn note_zeroed(&self, stop: u64) {
         self.zeroed.fetch_max(stop, Ordering::Release);
+    }
+
+    /// Shows the loop what a record says that it saw.
+    pub(crate) fn show(&self, stop: u64, view: &LoopView) {
+        self.stop.store(stop, Ordering::Release);
+        self.publish(|shown| *shown = *view);
     }
 
     fn publish(&self, change: impl FnOnce(&mut LoopView)) {

@@ -12,6 +12,7 @@
 
 use std::collections::VecDeque;
 
+use serde::{Deserialize, Serialize};
 use tread_api::ids::BootId;
 use tread_api::safety::{
     BY_LENGTH_MAX, DriveCounts, DriveStatus, Driver, LEASE_SILENCE_MAX_US, Lease,
@@ -61,7 +62,7 @@ struct Held {
 }
 
 /// What the loop needs to know of it.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct HandView {
     /// The lease in force, and until when without another command.
     pub(crate) lease: Option<(u64, u64)>,

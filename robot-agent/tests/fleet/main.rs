@@ -7,6 +7,7 @@
 )]
 
 mod control;
+mod recording;
 mod rig;
 mod safety;
 mod support;

@@ -8,6 +8,7 @@ mod diagnostic;
 mod geometry;
 mod nav;
 mod sensor;
+pub mod tread;
 
 pub use common::{Float64MultiArray, Header, MultiArrayDimension, MultiArrayLayout, Time};
 pub use diagnostic::{DiagnosticArray, DiagnosticStatus, KeyValue, Level};

@@ -25,6 +25,8 @@ pub(super) struct Guard {
     now_us: u64,
     /// The number of the stop in force; 0 for none.
     stop: u64,
+    /// How long the server has been silent.
+    server_silence: Duration,
     gate: GateSnapshot,
     last_cause: Option<GateCause>,
 }
@@ -45,6 +47,12 @@ impl Guard {
         self.gate
     }
 
+    /// What it looked at in this tick: the number of the stop in force, how long the server had been
+    /// silent, and the rest.
+    pub(super) fn looked_at(&self) -> (u64, Duration, LoopView) {
+        (self.stop, self.server_silence, self.view)
+    }
+
     fn count(&mut self, gated: &GateOutput) {
         let cause = gated.cause;
         self.gate.cause = cause;
@@ -60,7 +68,7 @@ impl Guard {
 /// What drives in this tick.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Wanted {
-    wheels: WheelSpeeds,
+    pub(super) wheels: WheelSpeeds,
     is_by_hand: bool,
     is_driver_silent: bool,
 }
@@ -71,6 +79,7 @@ impl LoopCore {
         let shared = &self.ends.shared;
         self.guard.now_us = microseconds(now);
         self.guard.stop = shared.safety.stop();
+        self.guard.server_silence = shared.server_silence(now);
         if let Some(view) = shared.safety.try_view() {
             self.guard.view = view;
         }
@@ -191,7 +200,7 @@ impl LoopCore {
             tilt_rad: self.tilt_rad,
             is_position_lost,
             is_held_outside: guard.view.limits.holds(guard.now_us),
-            is_link_silent: self.is_long_silent(now),
+            is_link_silent: self.is_long_silent(),
             is_driver_silent: wanted.is_driver_silent,
             fence_max_m_s,
             outside_max_m_s: guard.view.limits.linear_max_m_s(guard.now_us),
@@ -203,8 +212,8 @@ impl LoopCore {
     }
 
     /// Whether the mission should long have ended for the server's silence.
-    fn is_long_silent(&self, now: Duration) -> bool {
-        let silence = self.ends.shared.server_silence(now);
+    fn is_long_silent(&self) -> bool {
+        let silence = self.guard.server_silence;
         let active = self.active.as_ref();
         active.is_some_and(|active| active.minds_silence(silence.saturating_sub(BRAKING_MAX)))
     }
@@ -214,11 +223,11 @@ impl LoopCore {
         &mut self,
         now: Duration,
         fault: Option<Fault>,
-        wanted: Wanted,
+        wanted: &Wanted,
         stop: bool,
         dt_s: f64,
     ) -> GateOutput {
-        let reasons = self.reasons(now, fault, &wanted);
+        let reasons = self.reasons(now, fault, wanted);
         let gated = gate_with(
             &GateInput {
                 // A robot without a mission holds still: that is a command, not the lack of one.
@@ -252,7 +261,7 @@ impl LoopCore {
             self.replacement_until = None;
             return;
         };
-        if active.minds_silence(self.ends.shared.server_silence(now)) {
+        if active.minds_silence(self.guard.server_silence) {
             active.stop(EndReason::ServerSilent);
         }
         if self.replacement_until.is_some_and(|until| now > until) {

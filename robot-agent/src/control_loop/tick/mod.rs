@@ -3,9 +3,10 @@
 //! Pure but for the drive and the channels' ends; nothing here waits, allocates or looks at a
 //! clock. What has to be freed goes out with an event, to be freed by somebody else. [`sensing`] is
 //! what comes from the base, [`orders`] what comes from the rest of the agent, [`guard`] what may only
-//! slow the robot down, [`snapshot`] what goes out.
+//! slow the robot down, [`snapshot`] what goes out, [`noting`] what a record holds of a tick.
 
 mod guard;
+mod noting;
 mod orders;
 mod sensing;
 mod snapshot;
@@ -30,6 +31,7 @@ use super::site_view::{Footing, SiteView};
 use super::slip::SlipMeter;
 use super::surface::SurfaceWatch;
 use crate::drive::{Drive, SILENT_AFTER_MAX, StatedNoise};
+use crate::recording::frame::NoteTaker;
 use guard::Guard;
 
 /// Longest time that one tick is taken to have lasted, seconds; a loop that slept does not leap.
@@ -83,6 +85,10 @@ pub(crate) struct LoopCore {
     /// Until when the mission is held for its next revision.
     replacement_until: Option<Duration>,
     ticks: u64,
+    /// Sums on θ of the segment that this tick closed.
+    closed: Option<(f64, f64)>,
+    /// Where ticks are noted, if they are recorded.
+    notes: Option<NoteTaker>,
 }
 
 impl LoopCore {
@@ -121,6 +127,8 @@ impl LoopCore {
             slip: SlipMeter::default(),
             replacement_until: None,
             ticks: 0,
+            closed: None,
+            notes: None,
         }
     }
 
@@ -140,6 +148,11 @@ impl LoopCore {
         self
     }
 
+    /// From now on it notes what it takes and gives, or no longer.
+    pub(crate) fn note_to(&mut self, notes: Option<NoteTaker>) {
+        self.notes = notes;
+    }
+
     /// Whether the wheels are commanded to rest and do.
     pub(crate) fn stands(&self) -> bool {
         let radius_m = self.model.wheel_radius_m();
@@ -150,6 +163,7 @@ impl LoopCore {
     /// One tick. With `stop`, the robot brakes and its mission ends.
     pub(crate) fn tick(&mut self, now: Moment, stop: bool, drive: &mut dyn Drive) {
         self.outgoing.flush();
+        self.closed = None;
         let dt_s = self.time_step_s(now.monotonic);
         let feedback = drive.read(now.monotonic);
         self.is_base_silent = drive.is_silent();
@@ -164,7 +178,7 @@ impl LoopCore {
         self.hold_for_base(now.monotonic, fault);
         let by_mission = self.follow(now, fault, dt_s);
         let wanted = self.choose(now.monotonic, by_mission, dt_s);
-        let gated = self.pass(now.monotonic, fault, wanted, stop, dt_s);
+        let gated = self.pass(now.monotonic, fault, &wanted, stop, dt_s);
         self.command = gated.wheel_speeds;
         drive.write(self.command);
         self.note_written();
@@ -175,9 +189,9 @@ impl LoopCore {
         self.report_start(now);
         self.ticks += 1;
         self.ends.shared.ticks.store(self.ticks, Ordering::Relaxed);
-        self.ends
-            .shared
-            .publish(&self.snapshot(now.monotonic, fault, drive.battery()));
+        let snapshot = self.snapshot(now.monotonic, fault, drive.battery());
+        self.ends.shared.publish(&snapshot);
+        self.note(now, stop, &feedback, &wanted, &snapshot);
     }
 
     fn time_step_s(&mut self, now: Duration) -> f64 {

@@ -23,6 +23,9 @@ impl LoopCore {
             let Ok(command) = self.ends.commands.try_recv() else {
                 return;
             };
+            if let Some(notes) = &mut self.notes {
+                notes.command(self.ticks + 1, &command);
+            }
             match command {
                 LoopCommand::Start(job) => self.begin(now, job, stop),
                 LoopCommand::Cancel(mission) => {

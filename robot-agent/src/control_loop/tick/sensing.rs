@@ -207,6 +207,8 @@ impl LoopCore {
             self.estimate = self.estimator.estimate();
         }
         if let Some(segment) = cut.segment {
+            let statistics = &segment.statistics;
+            self.closed = Some((statistics.theta_information, statistics.theta_weighted));
             self.compare(&segment);
             self.outgoing.send(LoopEvent::Segment(segment));
         }

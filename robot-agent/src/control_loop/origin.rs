@@ -1,0 +1,77 @@
+//! What a job is made from: enough to plan the same again, to the bit.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+use tread_api::ids::{MissionId, PlanHash};
+use tread_api::site::Grid;
+use tread_api::trajectory::Trajectory;
+use tread_api::wire::command::PathPrior;
+use tread_control::follower::{Follower, FollowerConfig};
+use tread_control::geometry::Pose;
+use tread_control::plan::{Plan, PlanOptions};
+use tread_control::robot::RobotModel;
+
+use super::driven::Driven;
+use super::prior::Prior;
+use super::seam::Job;
+use crate::geometry::{control_trajectory, plan_options};
+
+/// What was asked for, where the robot stood, and what was known then.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct JobOrigin {
+    pub(crate) mission: MissionId,
+    pub(crate) revision: u32,
+    pub(crate) plan_hash: PlanHash,
+    pub(crate) trajectory: Trajectory,
+    /// Where the plan begins.
+    pub(crate) start: Pose,
+    /// What the map knows along the way.
+    pub(crate) prior: Option<PathPrior>,
+    /// The grid of the site for which it was planned.
+    pub(crate) grid: Option<Grid>,
+    /// Past this monotonic time it must not start.
+    pub(crate) start_by: Option<Duration>,
+    /// Longest silence of the server with which it goes on; for ever when absent.
+    pub(crate) silence_max: Option<Duration>,
+}
+
+impl JobOrigin {
+    /// Plans it for a robot.
+    ///
+    /// # Errors
+    /// A sentence on why it cannot be driven.
+    pub(crate) fn plan(&self, model: &RobotModel) -> Result<Plan, String> {
+        let prior = Prior::new(self.prior.as_ref());
+        let grip = self.grid.and_then(|grid| prior.grip_map(grid));
+        let options = PlanOptions {
+            grip_mu: prior.grip_mu(),
+            grip: grip.as_ref(),
+            ..plan_options(&self.trajectory)
+        };
+        let trajectory = control_trajectory(&self.trajectory);
+        Plan::with_options(&trajectory, self.start, model, &options)
+            .map_err(|refused| refused.to_string())
+    }
+
+    /// The job of that plan.
+    ///
+    /// # Errors
+    /// A sentence on what the tracking law refuses.
+    pub(crate) fn job(self, plan: Plan, model: RobotModel) -> Result<Box<Job>, String> {
+        let follower = Follower::new(plan, model, FollowerConfig::default())
+            .map_err(|refused| refused.to_string())?;
+        Ok(Box::new(Job {
+            mission: self.mission,
+            revision: self.revision,
+            plan_hash: self.plan_hash,
+            follower,
+            prior: Prior::new(self.prior.as_ref()),
+            start_by: self.start_by,
+            silence_max: self.silence_max,
+            driven: Driven::new(),
+            origin: Arc::new(self),
+        }))
+    }
+}

@@ -1,0 +1,310 @@
+//! Runs controller and estimator on a record again, and says where they differ from it.
+//!
+//! The loop's own core is fed through the loop's own seams: commands through its channel, what the
+//! base said through a drive that reads the record, stops, leases and limits through their cell. What
+//! it notes of itself then is held against what is in the record, to the bit.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::mpsc::TryRecvError;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use tread_control::measured::WheelSpeeds;
+use tread_control::robot::{RobotModel, RobotModelError};
+use tread_ros2::cdr::{decode, encode};
+use tread_ros2::messages::tread::{LoopSample, LoopTick, tick_bits};
+
+use super::frame::{Note, Notes, TickFrame, notes};
+use super::read::{Entry, ReadError, Run};
+use super::{CommandMessage, CommandRecord, RunHead, VERSION, words};
+use crate::control_loop::origin::JobOrigin;
+use crate::control_loop::seam::{AgentEnds, COMMANDS_MAX, Job, LoopCommand, seam};
+use crate::control_loop::segments::Moment;
+use crate::control_loop::site_view::SiteView;
+use crate::control_loop::tick::LoopCore;
+use crate::drive::{Battery, Drive, Feedback, StatedNoise};
+use crate::geometry::control_model;
+use crate::safety::LoopView;
+
+/// Differing ticks that are told one by one.
+pub(crate) const TOLD_MAX: usize = 10;
+
+/// Why a record could not be run again to its end.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum ReplayError {
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    #[error("the robot's model in the record is impossible")]
+    Model(#[from] RobotModelError),
+    #[error("tick {tick} of the record is none: {problem}")]
+    Malformed { tick: u64, problem: String },
+}
+
+/// A figure that is not as it was recorded.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Difference {
+    pub(crate) name: &'static str,
+    pub(crate) recorded: f64,
+    pub(crate) replayed: f64,
+}
+
+/// A tick that went otherwise.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct DifferingTick {
+    pub(crate) tick: u64,
+    /// Since the first tick, seconds.
+    pub(crate) after_s: f64,
+    pub(crate) differences: Vec<Difference>,
+}
+
+/// What a replay found.
+#[derive(Debug)]
+pub(crate) struct Replayed {
+    pub(crate) head: RunHead,
+    /// Ticks that were run again.
+    pub(crate) ticks: u64,
+    /// Time between the first and the last of them.
+    pub(crate) lasting: Duration,
+    /// Ticks of them in which something was commanded.
+    pub(crate) driving_ticks: u64,
+    /// Ticks of them that went otherwise.
+    pub(crate) differing: u64,
+    /// The first of those.
+    pub(crate) told: Vec<DifferingTick>,
+    /// What is missing from the record, so that nothing behind it could be run again.
+    pub(crate) gap: Option<String>,
+    /// Where the record is torn; nothing is missing before.
+    pub(crate) torn: Option<String>,
+}
+
+impl Replayed {
+    /// Whether the record is of another version of the agent.
+    pub(crate) fn is_of_another_version(&self) -> bool {
+        self.head.version != VERSION
+    }
+}
+
+/// A base that says what a record holds.
+#[derive(Default)]
+struct RecordedBase {
+    feedback: Feedback,
+    is_silent: bool,
+    noise: StatedNoise,
+    battery: Option<Battery>,
+}
+
+impl Drive for RecordedBase {
+    fn read(&mut self, _: Duration) -> Feedback {
+        std::mem::take(&mut self.feedback)
+    }
+
+    fn write(&mut self, _: WheelSpeeds) {}
+
+    fn battery(&self) -> Option<Battery> {
+        self.battery
+    }
+
+    fn noise(&self) -> StatedNoise {
+        self.noise
+    }
+
+    fn is_silent(&self) -> bool {
+        self.is_silent
+    }
+}
+
+/// A loop that lives through a record.
+struct Player {
+    model: RobotModel,
+    core: LoopCore,
+    ends: AgentEnds,
+    notes: Notes,
+    view: LoopView,
+    waiting: Vec<CommandMessage>,
+    last_tick: u64,
+    began: Option<Duration>,
+    samples: Vec<LoopSample>,
+    bytes: Vec<u8>,
+    found: Replayed,
+}
+
+/// Runs the files of one run again, given in any order.
+///
+/// # Errors
+/// [`ReplayError`] when there is nothing that could be run.
+pub(crate) fn replay(files: &[PathBuf]) -> Result<Replayed, ReplayError> {
+    let mut run = Run::open(files)?;
+    let mut player = Player::new(run.head.clone())?;
+    while player.found.gap.is_none() {
+        match run.next()? {
+            None => break,
+            Some(Entry::Command(command)) => player.waiting.push(*command),
+            Some(Entry::Safety(message)) => player.view = message.view,
+            Some(Entry::Tick(bytes)) => player.tick(&bytes)?,
+        }
+    }
+    player.found.torn = run.torn;
+    Ok(player.found)
+}
+
+impl Player {
+    fn new(head: RunHead) -> Result<Self, ReplayError> {
+        let model = control_model(&head.model)?;
+        let (loop_ends, ends) = seam();
+        let (taker, notes) = notes();
+        let mut core = LoopCore::new(model, loop_ends)
+            .with_blind_within_fence(head.blind_within_fence)
+            .with_silent_after(head.silent_after);
+        core.note_to(Some(taker));
+        Ok(Self {
+            model,
+            core,
+            ends,
+            notes,
+            view: LoopView::default(),
+            waiting: Vec::with_capacity(COMMANDS_MAX),
+            last_tick: 0,
+            began: None,
+            samples: Vec::new(),
+            bytes: Vec::new(),
+            found: Replayed {
+                head,
+                ticks: 0,
+                lasting: Duration::ZERO,
+                driving_ticks: 0,
+                differing: 0,
+                told: Vec::new(),
+                gap: None,
+                torn: None,
+            },
+        })
+    }
+
+    fn tick(&mut self, recorded_bytes: &[u8]) -> Result<(), ReplayError> {
+        let tick = self.last_tick + 1;
+        let malformed = |problem: String| ReplayError::Malformed { tick, problem };
+        let recorded: LoopTick<'_> =
+            decode(recorded_bytes).map_err(|refused| malformed(refused.to_string()))?;
+        if recorded.number != tick {
+            let (from, to) = (tick, recorded.number);
+            self.found.gap = Some(format!(
+                "ticks {from} to {to} are not in the record one after the other; nothing behind them can be run again"
+            ));
+            return Ok(());
+        }
+        self.last_tick = tick;
+        if let Err(problem) = self.command(&recorded) {
+            self.found.gap = Some(problem);
+            return Ok(());
+        }
+        let wall = Timestamp::from_nanosecond(i128::from(recorded.wall_ns))
+            .map_err(|refused| malformed(refused.to_string()))?;
+        let now = Moment {
+            monotonic: Duration::from_nanos(recorded.monotonic_ns),
+            wall,
+        };
+        let has = |bit: u32| recorded.present & bit != 0;
+        let mut base = RecordedBase {
+            feedback: words::feedback_of(&recorded)
+                .ok_or_else(|| malformed("it has too many samples".to_owned()))?,
+            is_silent: has(tick_bits::BASE_SILENT),
+            noise: words::noise_of(&recorded),
+            battery: words::battery_of(&recorded),
+        };
+        let shared = &self.ends.shared;
+        shared.safety.show(recorded.stop, &self.view);
+        let silence = Duration::from_nanos(recorded.server_silence_ns);
+        shared.show_server_silence(now.monotonic, silence);
+        self.core.tick(now, has(tick_bits::TOLD_TO_STOP), &mut base);
+        // What the loop hands back is freed.
+        self.ends.events.try_iter().for_each(drop);
+        if let Some(frame) = self.noted() {
+            self.compare(&recorded, recorded_bytes, &frame);
+        }
+        self.count(&recorded, now.monotonic);
+        Ok(())
+    }
+
+    /// Hands the loop what it took in that tick.
+    fn command(&mut self, recorded: &LoopTick<'_>) -> Result<(), String> {
+        let tick = recorded.number;
+        let noted = self.waiting.len();
+        if usize::try_from(recorded.commands) != Ok(noted)
+            || self.waiting.iter().any(|command| command.tick != tick)
+        {
+            return Err(format!(
+                "tick {tick} took {} commands, of which {noted} are in the record",
+                recorded.commands
+            ));
+        }
+        for message in self.waiting.drain(..) {
+            let command = loop_command(message.command, self.model).map_err(|problem| {
+                format!("tick {tick} took a mission that is refused now: {problem}")
+            })?;
+            let sent = self.ends.commands.try_send(command);
+            sent.map_err(|_| format!("tick {tick} took more commands than a loop takes"))?;
+        }
+        Ok(())
+    }
+
+    /// What the loop noted of its tick.
+    fn noted(&mut self) -> Option<TickFrame> {
+        loop {
+            match self.notes.notes.try_recv() {
+                Ok(Note::Tick(frame)) => return Some(frame),
+                Ok(Note::Command(..)) => {}
+                Err(TryRecvError::Empty | TryRecvError::Disconnected) => return None,
+            }
+        }
+    }
+
+    fn compare(&mut self, recorded: &LoopTick<'_>, recorded_bytes: &[u8], frame: &TickFrame) {
+        let replayed = words::tick_message(frame, &mut self.samples);
+        encode(&replayed, &mut self.bytes);
+        if self.bytes == recorded_bytes {
+            return;
+        }
+        self.found.differing += 1;
+        if self.found.told.len() < TOLD_MAX {
+            let since = Duration::from_nanos(recorded.monotonic_ns);
+            let after = since.saturating_sub(self.began.unwrap_or(since));
+            self.found.told.push(DifferingTick {
+                tick: recorded.number,
+                after_s: after.as_secs_f64(),
+                differences: words::differences(recorded, &replayed),
+            });
+        }
+    }
+
+    fn count(&mut self, recorded: &LoopTick<'_>, now: Duration) {
+        let began = *self.began.get_or_insert(now);
+        self.found.ticks += 1;
+        self.found.lasting = now.saturating_sub(began);
+        let speed = recorded.command_left_rad_s.abs() + recorded.command_right_rad_s.abs();
+        self.found.driving_ticks += u64::from(speed > 0.0);
+    }
+}
+
+fn job(origin: JobOrigin, model: RobotModel) -> Result<Box<Job>, String> {
+    let plan = origin.plan(&model)?;
+    origin.job(plan, model)
+}
+
+fn loop_command(record: CommandRecord, model: RobotModel) -> Result<LoopCommand, String> {
+    Ok(match record {
+        CommandRecord::Start(origin) => LoopCommand::Start(job(origin, model)?),
+        CommandRecord::Replace(origin) => LoopCommand::Replace(job(origin, model)?),
+        CommandRecord::Cancel { mission } => LoopCommand::Cancel(mission),
+        CommandRecord::Hold { mission, hold } => LoopCommand::Hold(mission, hold),
+        CommandRecord::Release { mission, hold } => LoopCommand::Release(mission, hold),
+        CommandRecord::Site {
+            definition,
+            is_without_room,
+        } => LoopCommand::Site(Arc::new(if is_without_room {
+            SiteView::without_room(definition)
+        } else {
+            SiteView::new(definition)
+        })),
+    })
+}

@@ -1,0 +1,135 @@
+//! `tread-agent replay`: what a replay found, for people and for programs.
+
+use std::io::Write;
+use std::path::PathBuf;
+
+use clap::Args;
+use serde_json::{Value, json};
+
+use super::VERSION;
+use super::replay::{DifferingTick, Replayed, replay};
+
+/// Arguments of `tread-agent replay`.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ReplayArgs {
+    /// The files of one run, all from its first part on
+    #[arg(required = true)]
+    files: Vec<PathBuf>,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs a record again and says where it differs; whether it does not.
+///
+/// # Errors
+/// The record cannot be read at all, or nothing can be written.
+pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<bool> {
+    let found = replay(&args.files)?;
+    let mut out = std::io::stdout().lock();
+    if args.json {
+        serde_json::to_writer(&mut out, &object(&found))?;
+        writeln!(out)?;
+    } else {
+        write!(out, "{}", text(&found))?;
+    }
+    Ok(holds(&found))
+}
+
+fn checks(found: &Replayed) -> [(&'static str, &'static str, Value, bool); 3] {
+    let gaps = u32::from(found.gap.is_some());
+    [
+        (
+            "ticks run again",
+            ">= 1",
+            json!(found.ticks),
+            found.ticks > 0,
+        ),
+        (
+            "ticks that differ from the record",
+            "0",
+            json!(found.differing),
+            found.differing == 0,
+        ),
+        ("gaps in the record", "0", json!(gaps), gaps == 0),
+    ]
+}
+
+/// Whether all was run again as it was recorded; a torn end is no difference.
+pub(crate) fn holds(found: &Replayed) -> bool {
+    checks(found).iter().all(|(_, _, _, holds)| *holds)
+}
+
+fn told(tick: &DifferingTick) -> Value {
+    let differences: Vec<Value> = tick
+        .differences
+        .iter()
+        .map(|it| json!({ "name": it.name, "recorded": it.recorded, "replayed": it.replayed }))
+        .collect();
+    json!({ "tick": tick.tick, "after_s": tick.after_s, "differences": differences })
+}
+
+/// For programs.
+pub(crate) fn object(found: &Replayed) -> Value {
+    let checks: Vec<Value> = checks(found)
+        .into_iter()
+        .map(|(name, goal, value, holds)| {
+            json!({ "name": name, "goal": goal, "value": value, "holds": holds })
+        })
+        .collect();
+    json!({
+        "robot": found.head.robot,
+        "boot": found.head.boot,
+        "recorded_by": found.head.version,
+        "replayed_by": VERSION,
+        "lasting_s": found.lasting.as_secs_f64(),
+        "driving_ticks": found.driving_ticks,
+        "torn": found.torn,
+        "gap": found.gap,
+        "differing": found.told.iter().map(told).collect::<Vec<_>>(),
+        "checks": checks,
+    })
+}
+
+/// For people.
+pub(crate) fn text(found: &Replayed) -> String {
+    let mut lines = vec![format!(
+        "{} of `{}`: {} ticks over {:.1} s, {} of them driving",
+        found.head.boot,
+        found.head.robot,
+        found.ticks,
+        found.lasting.as_secs_f64(),
+        found.driving_ticks,
+    )];
+    if found.is_of_another_version() {
+        lines.push(format!(
+            "recorded by tread-agent {}, and this is {VERSION}: differences may be what was changed between them",
+            found.head.version,
+        ));
+    }
+    if let Some(torn) = &found.torn {
+        lines.push(format!(
+            "the record is torn, and was read up to there: {torn}"
+        ));
+    }
+    lines.extend(found.gap.clone());
+    for tick in &found.told {
+        lines.push(format!(
+            "tick {} after {:.3} s differs:",
+            tick.tick, tick.after_s
+        ));
+        for it in &tick.differences {
+            lines.push(format!(
+                "    {}: {:?}, now {:?}",
+                it.name, it.recorded, it.replayed
+            ));
+        }
+    }
+    lines.push(match found.differing {
+        0 if found.ticks == 0 => "nothing was run again".to_owned(),
+        0 => "no tick differs from the record".to_owned(),
+        number => format!("{number} ticks differ from the record"),
+    });
+    lines.push(String::new());
+    lines.join("\n")
+}

@@ -1,0 +1,254 @@
+//! What was recorded, once more in messages of ROS, for programs that know no others.
+//!
+//! Nothing here is read again: what the loop took and gave to the bit is in `words`.
+
+use std::time::Duration;
+
+use tread_api::robot::RobotMode;
+use tread_control::geometry::Pose as PlanePose;
+use tread_control::geometry::Twist as PlaneTwist;
+use tread_control::plan::Plan;
+use tread_ros2::cdr::{Sequence, encode};
+use tread_ros2::messages::{
+    DiagnosticArray, DiagnosticStatus, Header, Imu, JointState, KeyValue, Level, Odometry, Path,
+    Point, Pose, PoseStamped, PoseWithCovariance, PoseWithCovarianceStamped, Quaternion, Time,
+    Twist, TwistStamped, TwistWithCovariance, Vector3,
+};
+
+use super::frame::TickFrame;
+use crate::drive::SensorSample;
+
+/// The frame of everything that has a place.
+pub(crate) const SITE_FRAME: &str = "site";
+/// The robot's own frame.
+pub(crate) const BASE_FRAME: &str = "base_link";
+/// The wheels of both sides, as joints.
+const JOINTS: [&str; 2] = ["left_wheels", "right_wheels"];
+/// Most points of a path.
+pub(crate) const PATH_POINTS_MAX: u32 = 500;
+/// Distance between two points of a path, unless there would be too many.
+const PATH_SPACING_M: f64 = 0.1;
+
+/// A pose on the plane.
+pub(crate) fn pose_message(pose: PlanePose) -> Pose {
+    let (sin, cos) = (0.5 * pose.heading_rad).sin_cos();
+    Pose {
+        position: Point {
+            x: pose.x_m,
+            y: pose.y_m,
+            z: 0.0,
+        },
+        orientation: Quaternion {
+            x: 0.0,
+            y: 0.0,
+            z: sin,
+            w: cos,
+        },
+    }
+}
+
+fn twist_message(twist: PlaneTwist) -> Twist {
+    Twist {
+        linear: Vector3 {
+            x: twist.linear_m_s,
+            ..Vector3::default()
+        },
+        angular: Vector3 {
+            z: twist.angular_rad_s,
+            ..Vector3::default()
+        },
+    }
+}
+
+/// The head of a message of that moment.
+pub(crate) fn header(wall_ns: i64, frame_id: &str) -> Header<'_> {
+    Header {
+        stamp: Time::from_nanoseconds(wall_ns),
+        frame_id,
+    }
+}
+
+/// When a sample was measured, by the wall clock of the tick that took it.
+pub(super) fn sample_wall_ns(frame: &TickFrame, wall_ns: i64, sample: &SensorSample) -> i64 {
+    let age = frame.inputs.now.monotonic.saturating_sub(sample.at);
+    wall_ns.saturating_sub(i64::try_from(age.as_nanos()).unwrap_or(i64::MAX))
+}
+
+/// Where the robot is believed to be; false if that is not known.
+pub(super) fn odometry(frame: &TickFrame, wall_ns: i64, into: &mut Vec<u8>) -> bool {
+    let Some(pose) = frame.outputs.pose else {
+        return false;
+    };
+    let message = Odometry {
+        header: header(wall_ns, SITE_FRAME),
+        child_frame_id: BASE_FRAME,
+        pose: PoseWithCovariance {
+            pose: pose_message(pose),
+            ..PoseWithCovariance::default()
+        },
+        twist: TwistWithCovariance {
+            twist: twist_message(frame.outputs.twist),
+            ..TwistWithCovariance::default()
+        },
+    };
+    encode(&message, into);
+    true
+}
+
+/// What the wheels were commanded, as a motion without slip.
+pub(super) fn commanded(twist: PlaneTwist, wall_ns: i64, into: &mut Vec<u8>) {
+    let message = TwistStamped {
+        header: header(wall_ns, BASE_FRAME),
+        twist: twist_message(twist),
+    };
+    encode(&message, into);
+}
+
+/// What the inertial unit said; false if it said nothing.
+pub(super) fn imu(sample: &SensorSample, wall_ns: i64, into: &mut Vec<u8>) -> bool {
+    if sample.yaw_rate_rad_s.is_none() && sample.acceleration.is_none() {
+        return false;
+    }
+    let unmeasured = |is_unmeasured: bool| {
+        let mut covariance = [0.0; 9];
+        covariance[0] = if is_unmeasured { -1.0 } else { 0.0 };
+        covariance
+    };
+    let acceleration = sample.acceleration.unwrap_or_default();
+    let message = Imu {
+        header: header(wall_ns, BASE_FRAME),
+        orientation_covariance: unmeasured(true),
+        angular_velocity: Vector3 {
+            z: sample.yaw_rate_rad_s.unwrap_or_default(),
+            ..Vector3::default()
+        },
+        angular_velocity_covariance: unmeasured(sample.yaw_rate_rad_s.is_none()),
+        linear_acceleration: Vector3 {
+            x: acceleration.ahead_m_s2,
+            y: acceleration.left_m_s2,
+            z: 0.0,
+        },
+        linear_acceleration_covariance: unmeasured(sample.acceleration.is_none()),
+        ..Imu::default()
+    };
+    encode(&message, into);
+    true
+}
+
+/// What the wheels said; false if they said nothing.
+pub(super) fn joints(sample: &SensorSample, wall_ns: i64, into: &mut Vec<u8>) -> bool {
+    let velocity = sample
+        .wheel_speeds
+        .map(|wheels| [wheels.left_rad_s, wheels.right_rad_s]);
+    let effort = sample
+        .wheel_torques
+        .map(|torques| [torques.left_n_m, torques.right_n_m]);
+    if velocity.is_none() && effort.is_none() {
+        return false;
+    }
+    let message = JointState {
+        header: header(wall_ns, BASE_FRAME),
+        name: Sequence::from(&JOINTS),
+        velocity: velocity.as_ref().map(Sequence::from).unwrap_or_default(),
+        effort: effort.as_ref().map(Sequence::from).unwrap_or_default(),
+        ..JointState::default()
+    };
+    encode(&message, into);
+    true
+}
+
+/// A position fix; false if there is none.
+pub(super) fn fix(sample: &SensorSample, wall_ns: i64, into: &mut Vec<u8>) -> bool {
+    let Some(pose) = sample.position else {
+        return false;
+    };
+    let mut message = PoseWithCovarianceStamped {
+        header: header(wall_ns, SITE_FRAME),
+        pose: PoseWithCovariance {
+            pose: pose_message(pose),
+            ..PoseWithCovariance::default()
+        },
+    };
+    if let Some(noise) = sample.position_noise {
+        let covariance = &mut message.pose.covariance;
+        covariance[0][0] = noise.position_m * noise.position_m;
+        covariance[1][1] = covariance[0][0];
+        covariance[5][5] = noise.heading_rad * noise.heading_rad;
+    }
+    encode(&message, into);
+    true
+}
+
+/// A way, at most [`PATH_POINTS_MAX`] points of it.
+pub(crate) fn path(poses: &[PlanePose], wall_ns: i64, into: &mut Vec<u8>) {
+    let head = header(wall_ns, SITE_FRAME);
+    let poses: Vec<PoseStamped<'_>> = poses
+        .iter()
+        .take(PATH_POINTS_MAX as usize)
+        .map(|pose| PoseStamped {
+            header: head,
+            pose: pose_message(*pose),
+        })
+        .collect();
+    let message = Path {
+        header: head,
+        poses: Sequence::from(poses.as_slice()),
+    };
+    encode(&message, into);
+}
+
+/// Points along a plan, close enough to draw it.
+pub(crate) fn poses_of(plan: &Plan) -> Vec<PlanePose> {
+    let length_m = plan.length_m();
+    let spacing_m = PATH_SPACING_M.max(length_m / f64::from(PATH_POINTS_MAX - 1));
+    // The last one is the plan's own end.
+    let inner = (0..PATH_POINTS_MAX - 1).map(|step| f64::from(step) * spacing_m);
+    inner
+        .take_while(|arc_m| *arc_m < length_m)
+        .chain([length_m])
+        .map(|arc_m| plan.path().sample(arc_m).pose)
+        .collect()
+}
+
+/// A figure in words.
+fn value<'text>(key: &'text str, value: &'text str) -> KeyValue<'text> {
+    KeyValue { key, value }
+}
+
+/// How the loop is, of a tick.
+pub(super) fn diagnostics(frame: &TickFrame, robot: &str, lost: u64, into: &mut Vec<u8>) {
+    let outputs = &frame.outputs;
+    let (level, text) = match (outputs.mode, outputs.fault) {
+        (_, Some(fault)) => (Level::Error, fault.text()),
+        (RobotMode::Stopped, _) => (Level::Warn, "stopped"),
+        (RobotMode::Teleoperated, _) => (Level::Ok, "driven by hand"),
+        (RobotMode::Tracking, _) => (Level::Ok, "on a mission"),
+        (RobotMode::Idle | RobotMode::Fault, _) => (Level::Ok, "idle"),
+    };
+    let wall_ns = i64::try_from(frame.inputs.now.wall.as_nanosecond()).unwrap_or(i64::MAX);
+    let gate = outputs.gate.map(|cause| format!("{cause:?}"));
+    let silence_s = seconds(frame.inputs.server_silence);
+    let (number, lost) = (frame.number.to_string(), lost.to_string());
+    let values = [
+        value("tick", &number),
+        value("gate", gate.as_deref().unwrap_or("open")),
+        value("server silent for, s", &silence_s),
+        value("notes lost", &lost),
+    ];
+    let status = [DiagnosticStatus {
+        level: level as u8,
+        name: "tread_agent: control loop",
+        message: text,
+        hardware_id: robot,
+        values: Sequence::from(&values),
+    }];
+    let message = DiagnosticArray {
+        header: header(wall_ns, ""),
+        status: Sequence::from(&status),
+    };
+    encode(&message, into);
+}
+
+fn seconds(time: Duration) -> String {
+    format!("{:.3}", time.as_secs_f64())
+}

@@ -1,0 +1,477 @@
+//! The thread that writes records: files of bounded size, and not too many of them.
+//!
+//! Each second what is under way is closed and handed to the operating system, so that a file that
+//! is torn by a crash is good up to there. A disk that refuses costs the record: it is said once,
+//! and a new file is tried after a while.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::RecvTimeoutError;
+use std::time::Duration;
+
+use mcap::records::MessageHeader;
+use mcap::write::NoSeek;
+use mcap::{Compression, McapError, WriteOptions, Writer};
+use serde::Serialize;
+use tracing::{error, info, warn};
+use tread_control::robot::RobotModel;
+use tread_ros2::cdr::encode;
+use tread_ros2::definitions::schema;
+use tread_ros2::messages::tread::{self, LoopSample};
+use tread_ros2::messages::{
+    DiagnosticArray, Imu, JointState, Message, Odometry, Path as PathMessage,
+    PoseWithCovarianceStamped, TwistStamped,
+};
+
+use super::frame::{Note, NotedCommand, Notes, TickFrame};
+use super::{
+    CommandMessage, CommandRecord, RecordingConfig, RunHead, SafetyMessage, topics, views, words,
+};
+use crate::clock::SharedClock;
+use crate::control_loop::origin::JobOrigin;
+use crate::safety::LoopView;
+
+/// Time after which what was written is handed to the operating system.
+const FLUSH_EVERY: Duration = Duration::from_secs(1);
+/// Time between two tries on a disk that refuses.
+const RETRY_EVERY: Duration = Duration::from_secs(10);
+/// Time between two words on how the agent is.
+const DIAGNOSTICS_EVERY: Duration = Duration::from_secs(1);
+/// How names of records begin and end.
+const NAME: (&str, &str) = ("tread-", ".mcap");
+
+/// A file that knows how much was written to it.
+#[derive(Debug)]
+struct Counted {
+    file: BufWriter<File>,
+    bytes: Arc<AtomicU64>,
+}
+
+impl Write for Counted {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let written = self.file.write(bytes)?;
+        self.bytes.fetch_add(written as u64, Ordering::Relaxed);
+        Ok(written)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+}
+
+/// A record that is being written.
+struct OpenRecord {
+    writer: Writer<NoSeek<Counted>>,
+    channels: BTreeMap<&'static str, (u16, u32)>,
+    bytes: Arc<AtomicU64>,
+    flushed: Duration,
+}
+
+fn ros_channel(
+    writer: &mut Writer<NoSeek<Counted>>,
+    topic: &str,
+    (package, name): (&str, &str),
+) -> Result<u16, McapError> {
+    let text = schema(package, name).unwrap_or_default();
+    let full = format!("{package}/msg/{name}");
+    let schema = writer.add_schema(&full, "ros2msg", text.as_bytes())?;
+    writer.add_channel(schema, topic, "cdr", &BTreeMap::new())
+}
+
+fn json_channel(
+    writer: &mut Writer<NoSeek<Counted>>,
+    topic: &str,
+    title: &str,
+    required: &[&str],
+) -> Result<u16, McapError> {
+    let schema = serde_json::json!({ "title": title, "type": "object", "required": required });
+    let schema = writer.add_schema(title, "jsonschema", schema.to_string().as_bytes())?;
+    writer.add_channel(schema, topic, "json", &BTreeMap::new())
+}
+
+fn ros_type<'a, T: Message<'a>>() -> (&'static str, &'static str) {
+    (T::TYPE.package, T::TYPE.name)
+}
+
+impl OpenRecord {
+    fn create(path: &Path, now: Duration) -> Result<Self, McapError> {
+        let bytes = Arc::new(AtomicU64::new(0));
+        let counted = Counted {
+            file: BufWriter::new(File::create_new(path)?),
+            bytes: Arc::clone(&bytes),
+        };
+        let mut writer = WriteOptions::new()
+            .library(concat!("tread-agent ", env!("CARGO_PKG_VERSION")))
+            .compression(Some(Compression::Zstd))
+            .compression_threads(0)
+            .disable_seeking(true)
+            .create(NoSeek::new(counted))?;
+        let mut channels = BTreeMap::new();
+        for (topic, title, required) in [
+            (
+                topics::RUN,
+                "tread.Run",
+                &["format", "version", "boot", "part"][..],
+            ),
+            (topics::COMMAND, "tread.Command", &["tick", "command"]),
+            (topics::SAFETY, "tread.Safety", &["tick", "view"]),
+        ] {
+            let channel = json_channel(&mut writer, topic, title, required)?;
+            channels.insert(topic, (channel, 0));
+        }
+        for (topic, kind) in [
+            (topics::TICK, (tread::PACKAGE, tread::LOOP_TICK)),
+            (topics::ODOMETRY, ros_type::<Odometry<'_>>()),
+            (topics::COMMANDED, ros_type::<TwistStamped<'_>>()),
+            (topics::IMU, ros_type::<Imu<'_>>()),
+            (topics::JOINTS, ros_type::<JointState<'_>>()),
+            (topics::POSE, ros_type::<PoseWithCovarianceStamped<'_>>()),
+            (topics::PLAN, ros_type::<PathMessage<'_>>()),
+            (topics::DIAGNOSTICS, ros_type::<DiagnosticArray<'_>>()),
+        ] {
+            let channel = ros_channel(&mut writer, topic, kind)?;
+            channels.insert(topic, (channel, 0));
+        }
+        Ok(Self {
+            writer,
+            channels,
+            bytes,
+            flushed: now,
+        })
+    }
+
+    fn write(&mut self, topic: &str, wall_ns: i64, message: &[u8]) -> Result<(), McapError> {
+        let Some((channel, sequence)) = self.channels.get_mut(topic) else {
+            return Ok(());
+        };
+        let time = u64::try_from(wall_ns).unwrap_or_default();
+        let header = MessageHeader {
+            channel_id: *channel,
+            sequence: *sequence,
+            log_time: time,
+            publish_time: time,
+        };
+        *sequence = sequence.wrapping_add(1);
+        self.writer.write_to_known_channel(&header, message)
+    }
+
+    fn write_json(
+        &mut self,
+        topic: &str,
+        wall_ns: i64,
+        message: &impl Serialize,
+    ) -> Result<(), McapError> {
+        let bytes = serde_json::to_vec(message).map_err(io::Error::from)?;
+        self.write(topic, wall_ns, &bytes)
+    }
+}
+
+/// Who writes.
+pub(crate) struct RecordWriter {
+    config: RecordingConfig,
+    head: RunHead,
+    model: RobotModel,
+    clock: SharedClock,
+    open: Option<OpenRecord>,
+    /// Before then no file is tried again.
+    retry_at: Duration,
+    view: Option<LoopView>,
+    /// The newest tick's time, for what has none of its own.
+    wall_ns: i64,
+    diagnosed: Option<Duration>,
+    /// Notes that were lost when it was last said, and when that was.
+    lost: u64,
+    said_lost_at: Option<Duration>,
+    bytes: Vec<u8>,
+    samples: Vec<LoopSample>,
+}
+
+impl fmt::Debug for RecordWriter {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter
+            .debug_struct("RecordWriter")
+            .field("config", &self.config)
+            .field("head", &self.head)
+            .finish_non_exhaustive()
+    }
+}
+
+impl RecordWriter {
+    /// Nothing is written yet; `model` is the head's, checked.
+    pub(crate) fn new(
+        config: RecordingConfig,
+        head: RunHead,
+        model: RobotModel,
+        clock: SharedClock,
+    ) -> Self {
+        Self {
+            config,
+            head,
+            model,
+            clock,
+            open: None,
+            retry_at: Duration::ZERO,
+            view: None,
+            wall_ns: 0,
+            diagnosed: None,
+            lost: 0,
+            said_lost_at: None,
+            bytes: Vec::new(),
+            samples: Vec::new(),
+        }
+    }
+
+    /// Writes until the loop has ended.
+    pub(crate) fn run(mut self, notes: &Notes) {
+        loop {
+            match notes.notes.recv_timeout(FLUSH_EVERY) {
+                Ok(note) => self.note(notes, &note),
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+            self.flush_when_due();
+        }
+        self.close();
+    }
+
+    /// Writes what waits.
+    pub(crate) fn drain(&mut self, notes: &Notes) {
+        for note in notes.notes.try_iter() {
+            self.note(notes, &note);
+        }
+        self.flush_when_due();
+    }
+
+    fn note(&mut self, notes: &Notes, note: &Note) {
+        let lost = notes.lost.load(Ordering::Relaxed);
+        if lost > self.lost
+            && self
+                .said_lost_at
+                .is_none_or(|at| self.is_over(at, RETRY_EVERY))
+        {
+            warn!(
+                lost,
+                "{lost} notes of the loop are not in the record: the disk is slow"
+            );
+            self.said_lost_at = Some(self.clock.monotonic());
+            self.lost = lost;
+        }
+        self.guarded(|writer, open| writer.take(open, note, lost));
+        self.turn_over();
+    }
+
+    fn is_over(&self, since: Duration, time: Duration) -> bool {
+        self.clock.monotonic().saturating_sub(since) >= time
+    }
+
+    /// Does something with the open record, which is opened before and given up after an error.
+    fn guarded(&mut self, work: impl FnOnce(&mut Self, &mut OpenRecord) -> Result<(), McapError>) {
+        let now = self.clock.monotonic();
+        let mut open = match self.open.take() {
+            Some(open) => open,
+            None if now < self.retry_at => return,
+            None => match self.begin(now) {
+                Ok(open) => open,
+                Err(cause) => return self.give_up(now, &cause),
+            },
+        };
+        match work(self, &mut open) {
+            Ok(()) => self.open = Some(open),
+            Err(cause) => self.give_up(now, &cause),
+        }
+    }
+
+    fn give_up(&mut self, now: Duration, cause: &McapError) {
+        let folder = self.config.folder.display();
+        error!("nothing is recorded for a while, `{folder}` refuses: {cause}");
+        self.retry_at = now.saturating_add(RETRY_EVERY);
+        self.head.part += 1;
+    }
+
+    /// Makes room and begins the next file.
+    fn begin(&mut self, now: Duration) -> Result<OpenRecord, McapError> {
+        let folder = &self.config.folder;
+        fs::create_dir_all(folder)?;
+        make_room(folder, self.config.files.saturating_sub(1))?;
+        let (wall, head) = (self.clock.wall(), &self.head);
+        let (begin, end) = NAME;
+        let boot = head.boot.to_string();
+        let name = format!(
+            "{begin}{}-{}-{}-{:04}{end}",
+            head.robot,
+            wall.strftime("%Y%m%dT%H%M%SZ"),
+            boot.get(..8).unwrap_or(&boot),
+            head.part,
+        );
+        let path = folder.join(name);
+        let mut open = OpenRecord::create(&path, now)?;
+        if self.wall_ns == 0 {
+            self.wall_ns = i64::try_from(wall.as_nanosecond()).unwrap_or_default();
+        }
+        open.write_json(topics::RUN, self.wall_ns, head)?;
+        // Each file says by itself what was allowed when it began.
+        self.view = None;
+        info!("recording to `{}`", path.display());
+        Ok(open)
+    }
+
+    fn take(&mut self, open: &mut OpenRecord, note: &Note, lost: u64) -> Result<(), McapError> {
+        match note {
+            Note::Command(tick, command) => self.take_command(open, *tick, command),
+            Note::Tick(frame) => self.take_tick(open, frame, lost),
+        }
+    }
+
+    fn take_command(
+        &mut self,
+        open: &mut OpenRecord,
+        tick: u64,
+        noted: &NotedCommand,
+    ) -> Result<(), McapError> {
+        // Not behind the tick that took it.
+        let wall_ns = self.wall_ns;
+        let message = CommandMessage {
+            tick,
+            command: CommandRecord::from(noted),
+        };
+        open.write_json(topics::COMMAND, wall_ns, &message)?;
+        match noted {
+            NotedCommand::Start(origin) | NotedCommand::Replace(origin) => {
+                self.write_plan(open, wall_ns, origin)
+            }
+            NotedCommand::Cancel(_)
+            | NotedCommand::Hold(..)
+            | NotedCommand::Release(..)
+            | NotedCommand::Site(_) => Ok(()),
+        }
+    }
+
+    fn write_plan(
+        &mut self,
+        open: &mut OpenRecord,
+        wall_ns: i64,
+        origin: &JobOrigin,
+    ) -> Result<(), McapError> {
+        // It could be planned before, so it can be again.
+        let Ok(plan) = origin.plan(&self.model) else {
+            return Ok(());
+        };
+        views::path(&views::poses_of(&plan), wall_ns, &mut self.bytes);
+        open.write(topics::PLAN, wall_ns, &self.bytes)
+    }
+
+    fn take_tick(
+        &mut self,
+        open: &mut OpenRecord,
+        frame: &TickFrame,
+        lost: u64,
+    ) -> Result<(), McapError> {
+        let inputs = &frame.inputs;
+        let wall_ns = i64::try_from(inputs.now.wall.as_nanosecond()).unwrap_or_default();
+        self.wall_ns = wall_ns;
+        if self.view != Some(inputs.view) {
+            let message = SafetyMessage {
+                tick: frame.number,
+                view: inputs.view,
+            };
+            open.write_json(topics::SAFETY, wall_ns, &message)?;
+            self.view = Some(inputs.view);
+        }
+        let tick = words::tick_message(frame, &mut self.samples);
+        encode(&tick, &mut self.bytes);
+        open.write(topics::TICK, wall_ns, &self.bytes)?;
+        self.write_views(open, frame, wall_ns)?;
+        let now = inputs.now.monotonic;
+        let is_due = |last: Duration| now.saturating_sub(last) >= DIAGNOSTICS_EVERY;
+        if self.diagnosed.is_none_or(is_due) {
+            self.diagnosed = Some(now);
+            views::diagnostics(frame, self.head.robot.as_str(), lost, &mut self.bytes);
+            open.write(topics::DIAGNOSTICS, wall_ns, &self.bytes)?;
+        }
+        Ok(())
+    }
+
+    fn write_views(
+        &mut self,
+        open: &mut OpenRecord,
+        frame: &TickFrame,
+        wall_ns: i64,
+    ) -> Result<(), McapError> {
+        let bytes = &mut self.bytes;
+        for sample in frame.inputs.feedback.samples() {
+            let wall_ns = views::sample_wall_ns(frame, wall_ns, sample);
+            if views::imu(sample, wall_ns, bytes) {
+                open.write(topics::IMU, wall_ns, bytes)?;
+            }
+            if views::joints(sample, wall_ns, bytes) {
+                open.write(topics::JOINTS, wall_ns, bytes)?;
+            }
+            if views::fix(sample, wall_ns, bytes) {
+                open.write(topics::POSE, wall_ns, bytes)?;
+            }
+        }
+        if views::odometry(frame, wall_ns, bytes) {
+            open.write(topics::ODOMETRY, wall_ns, bytes)?;
+        }
+        let commanded = self.model.twist_from_wheel_speeds(frame.outputs.command);
+        views::commanded(commanded, wall_ns, bytes);
+        open.write(topics::COMMANDED, wall_ns, bytes)
+    }
+
+    fn flush_when_due(&mut self) {
+        let now = self.clock.monotonic();
+        let is_due = |open: &OpenRecord| now.saturating_sub(open.flushed) >= FLUSH_EVERY;
+        if self.open.as_ref().is_some_and(is_due) {
+            self.guarded(|_, open| {
+                open.flushed = now;
+                open.writer.flush()
+            });
+        }
+    }
+
+    /// Ends a file that is full; the next note begins another.
+    fn turn_over(&mut self) {
+        let is_full =
+            |open: &OpenRecord| open.bytes.load(Ordering::Relaxed) >= self.config.file_bytes;
+        if self.open.as_ref().is_some_and(is_full) {
+            self.close();
+            self.head.part += 1;
+        }
+    }
+
+    /// Ends the record.
+    pub(crate) fn close(&mut self) {
+        if let Some(mut open) = self.open.take()
+            && let Err(cause) = open.writer.finish()
+        {
+            error!("the end of a record is not written: {cause}");
+        }
+    }
+}
+
+/// Removes the oldest records until there are no more than so many.
+fn make_room(folder: &Path, most: usize) -> io::Result<()> {
+    let (begin, end) = NAME;
+    let mut records = Vec::new();
+    for entry in fs::read_dir(folder)? {
+        let entry = entry?;
+        let name = entry.file_name();
+        let is_record = name
+            .to_str()
+            .is_some_and(|name| name.starts_with(begin) && name.ends_with(end));
+        if is_record {
+            records.push((entry.metadata()?.modified()?, name));
+        }
+    }
+    records.sort();
+    let excess = records.len().saturating_sub(most);
+    for (_, name) in &records[..excess] {
+        fs::remove_file(folder.join(name))?;
+    }
+    Ok(())
+}
