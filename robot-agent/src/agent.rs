@@ -158,7 +158,7 @@ impl Agent {
             .spawn_thread("recorder", move || recorder.run(&events))
             .map_err(no_thread("recorder"))?;
         let mut threads = base
-            .spawn(core, config.period(), &supervisor, &shared, &clock)
+            .spawn(core, &config, &supervisor, &shared, &clock)
             .map_err(no_thread("control loop"))?;
         threads.push(saving);
         threads.extend(writing);
@@ -191,7 +191,6 @@ impl Agent {
             shared: Arc::clone(&shared),
             safety,
             to_loop: commands,
-            driving: Mutex::default(),
         });
         let (connected, is_connected) = watch::channel(false);
         let membership = renew_membership(&supervisor, &config, &dispatcher.clock);

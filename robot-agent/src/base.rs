@@ -8,7 +8,7 @@ use tread_control::robot::RobotModel;
 
 use crate::agent::StartError;
 use crate::clock::SharedClock;
-use crate::config::{DriveConfig, SimulatedConfig};
+use crate::config::{AgentConfig, DriveConfig, SimulatedConfig};
 use crate::control_loop;
 use crate::control_loop::seam::Shared;
 use crate::control_loop::tick::LoopCore;
@@ -73,17 +73,18 @@ impl Base {
     pub(crate) fn spawn(
         self,
         core: LoopCore,
-        period: Duration,
+        config: &AgentConfig,
         supervisor: &Supervisor,
         shared: &Arc<Shared>,
         clock: &SharedClock,
     ) -> std::io::Result<Vec<JoinHandle<()>>> {
         let mut threads = Vec::new();
-        if let Some(bus) = self.bus {
+        if let Some(mut bus) = self.bus {
+            bus.tell_of(shared, self.counts.unwrap_or_default(), &config.robot);
             // It ends when the loop lets go of its drive.
             threads.push(supervisor.spawn_thread("robot's bus", move || bus.run())?);
         }
-        let (drive, loop_clock) = (self.drive, Arc::clone(clock));
+        let (drive, period, loop_clock) = (self.drive, config.period(), Arc::clone(clock));
         threads.push(supervisor.spawn_thread("control loop", move || {
             control_loop::run(core, drive, &loop_clock, period);
         })?);

@@ -10,8 +10,8 @@
 //!                                                                 └ refused: loop lets it go on
 //! ```
 
+use std::sync::Arc;
 use std::sync::mpsc::{SyncSender, TrySendError};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::mpsc;
@@ -31,7 +31,7 @@ use tread_control::robot::RobotModel;
 use crate::clock::SharedClock;
 use crate::control_loop::active::Hold;
 use crate::control_loop::origin::JobOrigin;
-use crate::control_loop::seam::{Job, LoopCommand, Shared};
+use crate::control_loop::seam::{GivenPlan, Job, LoopCommand, Shared};
 use crate::control_loop::site_view::SiteView;
 use crate::fleet::{Commands, IncomingCommand};
 use crate::knowledge::{Missions, SiteCell};
@@ -62,16 +62,6 @@ pub(crate) struct Dispatcher {
     pub(crate) shared: Arc<Shared>,
     pub(crate) safety: Arc<Safety>,
     pub(crate) to_loop: SyncSender<LoopCommand>,
-    /// The plan that the loop was given last.
-    pub(crate) driving: Mutex<Option<Driving>>,
-}
-
-/// A plan that was given to the loop, to foretell where the robot comes to stand.
-#[derive(Debug, Clone)]
-pub(crate) struct Driving {
-    mission: MissionId,
-    revision: u32,
-    plan: Arc<Plan>,
 }
 
 /// A plan that can be driven.
@@ -98,8 +88,8 @@ fn held_of(offer: &Offer, plan: PlanSummary) -> Held {
     }
 }
 
-fn driving_of(offer: &Offer, plan: Arc<Plan>) -> Driving {
-    Driving {
+fn given_of(offer: &Offer, plan: Arc<Plan>) -> GivenPlan {
+    GivenPlan {
         mission: offer.mission,
         revision: offer.revision,
         plan,
@@ -274,10 +264,6 @@ impl Dispatcher {
         self.to_loop.try_send(command).is_ok()
     }
 
-    fn driving(&self) -> MutexGuard<'_, Option<Driving>> {
-        self.driving.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     fn hold(&self, mission: MissionId, revision: u32, is_pause: bool) -> Outcome {
         if let Err((code, detail)) = self.missions.holder().check_held(mission, revision) {
             return refused(code, detail);
@@ -356,7 +342,7 @@ impl Dispatcher {
                 }
             };
         }
-        *self.driving() = Some(driving_of(&offer, planned.plan));
+        self.shared.show_plan(given_of(&offer, planned.plan));
         match self.to_loop.try_send(LoopCommand::Start(planned.job)) {
             Ok(()) => {}
             Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => {
@@ -395,7 +381,7 @@ impl Dispatcher {
             self.missions.holder().restore(former);
             return refused(OfferRefusal::NotReady, "the control loop is busy");
         }
-        *self.driving() = Some(driving_of(&offer, planned.plan));
+        self.shared.show_plan(given_of(&offer, planned.plan));
         let revision = offer.revision;
         info!(mission.id = %mission, revision, "took revision {revision} of {mission}");
         self.save().await;
@@ -404,7 +390,7 @@ impl Dispatcher {
 
     /// Where the robot comes to stand, once the loop holds the mission.
     async fn rest_of(&self, mission: MissionId) -> Option<Pose> {
-        let driving = self.driving().clone()?;
+        let driving = self.shared.given_plan()?;
         let looking = async {
             loop {
                 let snapshot = self.shared.snapshot();

@@ -31,7 +31,7 @@ fn trajectory(text: &str) -> Trajectory {
 }
 
 /// A robot that has driven for three seconds, with the plan that it drives.
-fn driving() -> (Bench, MissionId, Plan) {
+pub(crate) fn driving() -> (Bench, MissionId, Plan) {
     let scenario = Scenario::built_in().unwrap();
     let mut bench = Bench::new(&scenario, START, 5).unwrap();
     bench.know_site(site_of(&scenario).unwrap()).unwrap();

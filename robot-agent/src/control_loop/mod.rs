@@ -82,7 +82,7 @@ pub(crate) fn run(
 }
 
 #[cfg(test)]
-mod hold_tests;
+pub(crate) mod hold_tests;
 #[cfg(test)]
 mod prior_tests;
 #[cfg(test)]

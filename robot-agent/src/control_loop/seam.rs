@@ -18,6 +18,7 @@ use tread_control::estimation::SegmentStatistics;
 use tread_control::follower::{FailureReason, Follower};
 use tread_control::gate::GateCause;
 use tread_control::geometry::{Point, Pose, Twist};
+use tread_control::plan::Plan;
 use tread_control::reference::Governor;
 
 use super::active::Hold;
@@ -276,6 +277,14 @@ impl Default for Snapshot {
     }
 }
 
+/// A plan that was given to the loop.
+#[derive(Debug, Clone)]
+pub(crate) struct GivenPlan {
+    pub(crate) mission: MissionId,
+    pub(crate) revision: u32,
+    pub(crate) plan: Arc<Plan>,
+}
+
 /// What both sides may look at.
 #[derive(Debug, Default)]
 pub(crate) struct Shared {
@@ -300,6 +309,8 @@ pub(crate) struct Shared {
     pub(crate) lost_samples: AtomicU64,
     /// Commands of the server that found no room.
     pub(crate) lost_commands: AtomicU64,
+    /// The plan that the loop was given last, for whoever shows it; the loop itself never looks.
+    plan: Mutex<Option<GivenPlan>>,
     /// When the server was last heard, microseconds of the agent's monotonic clock.
     server_heard_us: AtomicU64,
 }
@@ -311,10 +322,21 @@ impl Shared {
     }
 
     /// Leaves a newer one, unless somebody is reading right now: the next tick brings another.
-    pub(super) fn publish(&self, snapshot: &Snapshot) {
+    pub(crate) fn publish(&self, snapshot: &Snapshot) {
         if let Ok(mut cell) = self.snapshot.try_lock() {
             *cell = *snapshot;
         }
+    }
+
+    /// Leaves the plan that the loop was given.
+    pub(crate) fn show_plan(&self, given: GivenPlan) {
+        *self.plan.lock().unwrap_or_else(PoisonError::into_inner) = Some(given);
+    }
+
+    /// The plan that the loop was given last.
+    pub(crate) fn given_plan(&self) -> Option<GivenPlan> {
+        let plan = self.plan.lock();
+        plan.unwrap_or_else(PoisonError::into_inner).clone()
     }
 
     pub(crate) fn count(counter: &AtomicU64) {

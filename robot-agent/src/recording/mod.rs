@@ -11,7 +11,7 @@ pub(crate) mod frame;
 mod read;
 pub(crate) mod replay;
 pub(crate) mod told;
-mod views;
+pub(crate) mod views;
 mod words;
 mod writer;
 

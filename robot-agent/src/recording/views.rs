@@ -16,6 +16,7 @@ use tread_ros2::messages::{
 };
 
 use super::frame::TickFrame;
+use crate::control_loop::seam::Fault;
 use crate::drive::SensorSample;
 
 /// The frame of everything that has a place.
@@ -180,8 +181,8 @@ pub(super) fn fix(sample: &SensorSample, wall_ns: i64, into: &mut Vec<u8>) -> bo
 }
 
 /// A way, at most [`PATH_POINTS_MAX`] points of it.
-pub(crate) fn path(poses: &[PlanePose], wall_ns: i64, into: &mut Vec<u8>) {
-    let head = header(wall_ns, SITE_FRAME);
+pub(crate) fn path(poses: &[PlanePose], frame: &str, wall_ns: i64, into: &mut Vec<u8>) {
+    let head = header(wall_ns, frame);
     let poses: Vec<PoseStamped<'_>> = poses
         .iter()
         .take(PATH_POINTS_MAX as usize)
@@ -215,16 +216,21 @@ fn value<'text>(key: &'text str, value: &'text str) -> KeyValue<'text> {
     KeyValue { key, value }
 }
 
-/// How the loop is, of a tick.
-pub(super) fn diagnostics(frame: &TickFrame, robot: &str, lost: u64, into: &mut Vec<u8>) {
-    let outputs = &frame.outputs;
-    let (level, text) = match (outputs.mode, outputs.fault) {
+/// How bad a state is, and what it is.
+pub(crate) fn state(mode: RobotMode, fault: Option<Fault>) -> (Level, &'static str) {
+    match (mode, fault) {
         (_, Some(fault)) => (Level::Error, fault.text()),
         (RobotMode::Stopped, _) => (Level::Warn, "stopped"),
         (RobotMode::Teleoperated, _) => (Level::Ok, "driven by hand"),
         (RobotMode::Tracking, _) => (Level::Ok, "on a mission"),
         (RobotMode::Idle | RobotMode::Fault, _) => (Level::Ok, "idle"),
-    };
+    }
+}
+
+/// How the loop is, of a tick.
+pub(super) fn diagnostics(frame: &TickFrame, robot: &str, lost: u64, into: &mut Vec<u8>) {
+    let outputs = &frame.outputs;
+    let (level, text) = state(outputs.mode, outputs.fault);
     let wall_ns = i64::try_from(frame.inputs.now.wall.as_nanosecond()).unwrap_or(i64::MAX);
     let gate = outputs.gate.map(|cause| format!("{cause:?}"));
     let silence_s = seconds(frame.inputs.server_silence);

@@ -361,7 +361,12 @@ impl RecordWriter {
         let Ok(plan) = origin.plan(&self.model) else {
             return Ok(());
         };
-        views::path(&views::poses_of(&plan), wall_ns, &mut self.bytes);
+        views::path(
+            &views::poses_of(&plan),
+            views::SITE_FRAME,
+            wall_ns,
+            &mut self.bytes,
+        );
         open.write(topics::PLAN, wall_ns, &self.bytes)
     }
 

@@ -85,6 +85,7 @@ pub(in crate::config) struct Ros2File {
     pub(super) pose: Option<PoseFile>,
     pub(super) battery: Option<BatteryFile>,
     pub(super) command: CommandFile,
+    pub(super) outward: OutwardFile,
 }
 
 #[derive(Debug, Clone, Default, Deserialize)]
@@ -149,4 +150,14 @@ pub(super) struct CommandFile {
     pub(super) track_width_m: Option<f64>,
     pub(super) turn_sign: Option<f64>,
     pub(super) ahead_sign: Option<f64>,
+}
+
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct OutwardFile {
+    pub(super) enabled: Option<bool>,
+    pub(super) plan: Option<String>,
+    pub(super) driven: Option<String>,
+    pub(super) theta: Option<String>,
+    pub(super) diagnostics: Option<String>,
 }

@@ -1,6 +1,7 @@
 //! `[drive.ros2]` in `robot.toml`: what makes it a [`Ros2Settings`].
 
 mod file;
+mod outward;
 
 use std::time::Duration;
 
@@ -143,11 +144,16 @@ impl Ros2File {
                 .transpose()?,
             battery: battery.transpose()?,
             command: self.command.checked(&topics, joints.as_ref(), model)?,
+            outward: None,
             joints,
             bus,
         };
         check_whole(&settings)?;
-        Ok(settings)
+        let outward = self.outward.checked(&topics, &settings)?;
+        Ok(Ros2Settings {
+            outward,
+            ..settings
+        })
     }
 
     fn bus(&self) -> Result<BusSettings, ConfigError> {

@@ -2,13 +2,14 @@
 //!
 //! The fleet's session and this one never meet: what is said on the bus stays on the robot. One
 //! thread opens the session, however long that takes, announces the agent's node in the ROS graph,
-//! listens, and writes the loop's commands.
+//! listens, and writes the loop's commands; a second one tells the robot how the agent is.
 
 use std::str::FromStr as _;
 use std::sync::Arc;
 use std::time::Duration;
 
 use tracing::{debug, info, warn};
+use tread_api::ids::RobotId;
 use tread_control::measured::WheelSpeeds;
 use tread_ros2::bridge;
 use tread_ros2::messages::MessageType;
@@ -22,8 +23,11 @@ use zenoh::qos::{CongestionControl, Priority};
 use super::command;
 use super::inlet::{Inlet, Numbering};
 use super::outlet::{COMMAND_SILENCE_MAX, Outlet};
+use super::outward::{LOOK_EVERY, Outward, Word};
+use super::refusal::Counts;
 use super::settings::{BusMode, BusSettings, Ros2Settings, Scheme};
 use crate::clock::SharedClock;
+use crate::control_loop::seam::Shared;
 use crate::fleet::{LinkError, zenoh_failed};
 
 /// Longest row of tries to connect before the thread looks whether it is to end, milliseconds.
@@ -88,12 +92,14 @@ pub struct Bus {
     pub(super) inlets: Vec<Arc<Inlet>>,
     outlet: Arc<Outlet>,
     clock: SharedClock,
+    outward: Option<Outward>,
 }
 
 /// Everything that lives as long as the session.
 #[derive(Debug)]
 struct Declared {
     commands: Writer,
+    words: Vec<(Word, Writer)>,
     _tokens: Vec<LivelinessToken>,
 }
 
@@ -149,17 +155,26 @@ impl Bus {
             inlets: inlets.into_iter().map(Arc::new).collect(),
             outlet,
             clock,
+            outward: None,
         })
     }
 
+    /// Lets it tell the rest of the robot how the agent is, if its settings want that.
+    pub(crate) fn tell_of(&mut self, shared: &Arc<Shared>, counts: Arc<Counts>, robot: &RobotId) {
+        let settings = self.settings.outward.clone();
+        self.outward = settings
+            .map(|settings| Outward::new(settings, Arc::clone(shared), counts, robot.to_string()));
+    }
+
     /// Speaks on the bus until the loop's end of the outlet is closed. For a thread of its own.
-    pub fn run(self) {
+    pub fn run(mut self) {
         self.outlet.attend();
+        let mut outward = self.outward.take();
         let endpoint = &self.settings.bus.endpoint;
         while let Some(session) = self.open() {
             info!(endpoint, "on the robot's bus at `{endpoint}`");
-            match self.declare(&session) {
-                Ok(declared) => self.write_commands(&declared.commands),
+            match self.declare(&session, outward.is_some()) {
+                Ok(declared) => self.speak(&declared, outward.as_mut()),
                 Err(cause) => {
                     let cause = &cause as &dyn std::error::Error;
                     warn!(error = cause, "the robot's bus cannot be used");
@@ -194,7 +209,7 @@ impl Bus {
         }
     }
 
-    fn declare(&self, session: &zenoh::Session) -> Result<Declared, LinkError> {
+    fn declare(&self, session: &zenoh::Session, tells: bool) -> Result<Declared, LinkError> {
         let bus = &self.settings.bus;
         let node = Node {
             domain: bus.domain,
@@ -231,9 +246,10 @@ impl Bus {
         }
         let command = &self.settings.command;
         let message_type = command::message_type(command.kind);
+        number += 1;
         let topic = Topic {
             role: Role::Publisher,
-            number: number + 1,
+            number,
             name: &command.topic,
             message_type: &message_type,
             quality: Quality {
@@ -241,29 +257,67 @@ impl Bus {
                 depth: 1,
             },
         };
-        let token = self.token(&node, &topic);
+        let commands = self.writer(session, &node, &topic, Priority::RealTime, &mut tokens)?;
+        let mut words = Vec::new();
+        if let Some(outward) = self.settings.outward.as_ref().filter(|_| tells) {
+            for word in Word::ALL {
+                number += 1;
+                let message_type = word.message_type();
+                let topic = Topic {
+                    role: Role::Publisher,
+                    number,
+                    name: word.topic(outward),
+                    message_type: &message_type,
+                    quality: Quality {
+                        is_reliable: true,
+                        depth: 1,
+                    },
+                };
+                // A way of hundreds of points must not go before a command or a sensor's message.
+                let writer =
+                    self.writer(session, &node, &topic, Priority::Background, &mut tokens)?;
+                words.push((word, writer));
+            }
+        }
+        Ok(Declared {
+            commands,
+            words,
+            _tokens: tokens,
+        })
+    }
+
+    /// Announces a topic that is written, and makes it ready.
+    fn writer(
+        &self,
+        session: &zenoh::Session,
+        node: &Node,
+        topic: &Topic<'_>,
+        priority: Priority,
+        tokens: &mut Vec<LivelinessToken>,
+    ) -> Result<Writer, LinkError> {
+        let bus = &self.settings.bus;
+        let token = self.token(node, topic);
         let key = match self.generation() {
-            Some(generation) => rmw::topic_key(bus.domain, topic.name, &message_type, generation),
+            Some(generation) => {
+                rmw::topic_key(bus.domain, topic.name, topic.message_type, generation)
+            }
             None => bridge::topic_key(&bus.namespace, topic.name),
         };
         let publisher = session
             .declare_publisher(key)
             .congestion_control(CongestionControl::Drop)
-            .priority(Priority::RealTime)
-            .express(true)
+            .priority(priority)
+            .express(priority == Priority::RealTime)
             .wait()
-            .map_err(zenoh_failed("declare the commands"))?;
+            .map_err(zenoh_failed("declare a topic"))?;
         let gid = token.as_deref().map(rmw::gid);
         if let Some(token) = token {
             tokens.push(declare_token(session, token)?);
         }
-        Ok(Declared {
-            commands: Writer {
-                publisher,
-                gid,
-                numbering: Numbering::default(),
-            },
-            _tokens: tokens,
+        Ok(Writer {
+            publisher,
+            gid,
+            numbering: Numbering::default(),
         })
     }
 
@@ -307,6 +361,39 @@ impl Bus {
             .background()
             .wait()
             .map_err(zenoh_failed("listen to a topic"))
+    }
+
+    /// Writes commands, and what there is to say from a thread of its own, so that no command waits
+    /// for a way of hundreds of points.
+    fn speak(&self, declared: &Declared, outward: Option<&mut Outward>) {
+        std::thread::scope(|scope| {
+            let telling = outward.and_then(|outward| {
+                let body = || self.tell(&declared.words, outward);
+                let named = std::thread::Builder::new().name("told to the robot".to_owned());
+                let spawned = named.spawn_scoped(scope, body);
+                spawned
+                    .inspect_err(|cause| warn!("nothing is told to the robot: {cause}"))
+                    .ok()
+            });
+            self.write_commands(&declared.commands);
+            if let Some(telling) = telling {
+                telling.thread().unpark();
+            }
+        });
+    }
+
+    /// Tells the rest of the robot what is due, until the loop's end of the outlet is closed.
+    fn tell(&self, words: &[(Word, Writer)], outward: &mut Outward) {
+        while !self.outlet.is_closed() {
+            let (now, wall_ns) = (self.clock.monotonic(), self.clock.host_wall_ns());
+            outward.step(now, wall_ns, |word, bytes| {
+                let writer = words.iter().find(|(known, _)| *known == word);
+                if let Some(Err(cause)) = writer.map(|(_, writer)| writer.put(bytes, wall_ns)) {
+                    debug!("{word:?} was not said: {cause}");
+                }
+            });
+            std::thread::park_timeout(LOOK_EVERY);
+        }
     }
 
     /// Writes each command once, and rest when there is none for too long.

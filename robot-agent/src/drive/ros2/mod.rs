@@ -3,6 +3,7 @@
 //! ```text
 //! bus ─callback─► inlet (key, attachment, CDR, values, stamp) ─channel─► assemble ─► loop
 //! bus ◄─thread─── command ◄──────────── outlet ◄──────────────────────────────────── loop
+//! bus ◄─thread─── outward (plan, way driven, θ, diagnostics) ◄─── newest snapshot ◄─── loop
 //! ```
 //! A message that is not wholly good is dropped and counted by its reason. A base that is not
 //! heard for [`Timing::silent_after`](settings::Timing) is told to rest at once; it hears nothing
@@ -14,6 +15,7 @@ mod command;
 pub mod inlet;
 pub mod obedience;
 pub mod outlet;
+pub(crate) mod outward;
 pub mod reading;
 pub mod refusal;
 pub mod settings;

@@ -28,6 +28,8 @@ pub struct Ros2Settings {
     pub battery: Option<Name>,
     /// What is written.
     pub command: CommandSettings,
+    /// What is said to the rest of the robot, if anything is.
+    pub outward: Option<OutwardSettings>,
 }
 
 /// How ROS 2 is spoken over zenoh.
@@ -200,4 +202,36 @@ pub struct CommandSettings {
     pub joints: [usize; 2],
     /// Turns of a joint for one turn of its wheel, each side with its sign.
     pub joint_ratios: [f64; 2],
+}
+
+impl Ros2Settings {
+    /// Every topic that is read or commanded.
+    pub(crate) fn topics(&self) -> Vec<&Name> {
+        let read = [
+            self.odometry.as_ref().map(|odometry| &odometry.topic),
+            self.imu.as_ref().map(|imu| &imu.topic),
+            self.joints.as_ref().map(|joints| &joints.topic),
+            self.pose.as_ref().map(|pose| &pose.topic),
+            self.battery.as_ref(),
+        ];
+        let read = read.into_iter().flatten();
+        read.chain([&self.command.topic]).collect()
+    }
+}
+
+/// What is said to the rest of the robot.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OutwardSettings {
+    /// The plan of the mission in hand, `nav_msgs/Path`.
+    pub plan: Name,
+    /// The way driven, `nav_msgs/Path`.
+    pub driven: Name,
+    /// θ, its standard deviation and θ̂ of the law, `std_msgs/Float64MultiArray`.
+    pub theta: Name,
+    /// How the agent is, `diagnostic_msgs/DiagnosticArray`.
+    pub diagnostics: Name,
+    /// The frame of both ways: that of the topic which gives the position.
+    pub frame: String,
+    /// Where that frame lies in the site.
+    pub site_from_frame: Pose,
 }

@@ -17,11 +17,11 @@ const TOLD: WheelSpeeds = WheelSpeeds {
     right_rad_s: 5.0,
 };
 
-fn topic(text: &str) -> Name {
+pub(super) fn topic(text: &str) -> Name {
     Name::topic(text, &Name::default()).unwrap()
 }
 
-fn settings() -> Ros2Settings {
+pub(super) fn settings() -> Ros2Settings {
     let side = |name: &str| SideJoints {
         names: vec![name.to_owned()],
         sign: 1.0,
@@ -68,6 +68,7 @@ fn settings() -> Ros2Settings {
             joints: [1, 1],
             joint_ratios: [1.0, 1.0],
         },
+        outward: None,
     }
 }
 

@@ -22,6 +22,15 @@ const REST: f64 = 1.0e-9;
 /// A command that comes later is not the answer to a sensor's message.
 const ANSWER_MAX: Duration = Duration::from_secs(1);
 
+/// Topic, type and the begin of the type's hash of all that the agent tells the robot, as tokens
+/// have them.
+const TOLD: [&str; 4] = [
+    "/%rover%tread%plan/nav_msgs::msg::dds_::Path_/RIHS01_1957a5bb",
+    "/%rover%tread%driven/nav_msgs::msg::dds_::Path_/RIHS01_1957a5bb",
+    "/%rover%tread%theta/std_msgs::msg::dds_::Float64MultiArray_/RIHS01_1025ddc6",
+    "/%diagnostics/diagnostic_msgs::msg::dds_::DiagnosticArray_/RIHS01_5a8a36ef",
+];
+
 /// What was seen on the bus.
 #[derive(Debug, Default)]
 struct Seen {
@@ -160,8 +169,12 @@ impl Observer {
         };
         Ok(vec![
             counted("the agent's node", "/NN/", 1),
-            counted("what it commands", "/MP/", 1),
+            counted("what it commands and tells", "/MP/", 1 + TOLD.len()),
             counted("what it listens to", "/MS/", 5),
+            Check::so(
+                "graph: plan, way driven, friction and diagnostics by topic and type",
+                TOLD.iter().all(|told| of_agent(told) == 1),
+            ),
             Check::so(
                 "graph: the robot's own node",
                 tokens.iter().any(|token| token.ends_with("/base")),

@@ -1,0 +1,118 @@
+//! `[drive.ros2.outward]`: what the agent says to the rest of the robot, and where.
+
+use tread_control::geometry::Pose;
+
+use super::file::OutwardFile;
+use super::{Topics, refused};
+use crate::config::ConfigError;
+use crate::drive::ros2::outward::Word;
+use crate::drive::ros2::settings::{OutwardSettings, Ros2Settings};
+
+/// The frame of whatever gives the position, and where it lies in the site.
+fn frame(read: &Ros2Settings) -> Option<(String, Pose)> {
+    if let Some(pose) = &read.pose {
+        return Some((pose.frame.clone(), pose.site_from_map));
+    }
+    let odometry = read.odometry.as_ref()?;
+    Some((odometry.frame.clone(), odometry.site_from_odom?))
+}
+
+impl OutwardFile {
+    /// What is said, beside everything that is read and commanded.
+    pub(super) fn checked(
+        &self,
+        topics: &Topics,
+        others: &Ros2Settings,
+    ) -> Result<Option<OutwardSettings>, ConfigError> {
+        if self.enabled == Some(false) {
+            return Ok(None);
+        }
+        // Where nothing gives a position both ways stay empty.
+        let (frame, site_from_frame) = frame(others).unwrap_or_default();
+        let name = |word, given: &Option<String>, default| {
+            topics.name(key(word), given.as_deref(), default)
+        };
+        let settings = OutwardSettings {
+            plan: name(Word::Plan, &self.plan, "tread/plan")?,
+            driven: name(Word::Driven, &self.driven, "tread/driven")?,
+            theta: name(Word::Theta, &self.theta, "tread/theta")?,
+            diagnostics: name(Word::Diagnostics, &self.diagnostics, "/diagnostics")?,
+            frame,
+            site_from_frame,
+        };
+        // A base that takes lists of numbers would drive by θ.
+        let mut taken = others.topics();
+        for word in Word::ALL {
+            let topic = word.topic(&settings);
+            if taken.contains(&topic) {
+                return Err(refused(key(word), format!("`{topic}` is used already")));
+            }
+            taken.push(topic);
+        }
+        Ok(Some(settings))
+    }
+}
+
+fn key(word: Word) -> &'static str {
+    match word {
+        Word::Plan => "drive.ros2.outward.plan",
+        Word::Driven => "drive.ros2.outward.driven",
+        Word::Theta => "drive.ros2.outward.theta",
+        Word::Diagnostics => "drive.ros2.outward.diagnostics",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Ros2File;
+    use super::*;
+    use crate::geometry::paper_robot;
+
+    fn checked(text: &str) -> Result<Option<OutwardSettings>, String> {
+        let file: Ros2File = toml::from_str(text).map_err(|refused| refused.to_string())?;
+        let checked = file.checked(&paper_robot());
+        checked
+            .map(|settings| settings.outward)
+            .map_err(|refused| refused.to_string())
+    }
+
+    #[test]
+    fn it_speaks_unless_it_is_switched_off() {
+        let text = "namespace = \"/robot7\"\n[odometry]\ngives_position = true\nsite_x_m = 2.0\n";
+        let settings = checked(text).unwrap().unwrap();
+        let names = Word::ALL.map(|word| word.topic(&settings).to_string());
+        let expected = [
+            "/robot7/tread/plan",
+            "/robot7/tread/driven",
+            "/robot7/tread/theta",
+            "/diagnostics",
+        ];
+        assert_eq!(names, expected);
+        assert_eq!(settings.frame, "odom");
+        assert!((settings.site_from_frame.x_m - 2.0).abs() < f64::EPSILON);
+        let off = format!("{text}[outward]\nenabled = false\n");
+        assert_eq!(checked(&off).unwrap(), None);
+    }
+
+    #[test]
+    fn both_ways_are_in_the_frame_of_the_pose_where_there_is_one() {
+        let text = "[odometry]\n[pose]\nframe = \"hall\"\nsite_heading_rad = 0.5\n";
+        let settings = checked(text).unwrap().unwrap();
+        assert_eq!(settings.frame, "hall");
+        assert!((settings.site_from_frame.heading_rad - 0.5).abs() < f64::EPSILON);
+    }
+
+    #[test]
+    fn a_topic_that_is_used_already_is_refused_by_its_key() {
+        for (outward, key) in [
+            ("theta = \"cmd_vel\"", "outward.theta"),
+            ("plan = \"odom\"", "outward.plan"),
+            ("driven = \"tread/plan\"", "outward.driven"),
+            ("diagnostics = \"a b\"", "outward.diagnostics"),
+            ("speed = \"a\"", "speed"),
+        ] {
+            let refused = checked(&format!("[odometry]\n[outward]\n{outward}\n")).unwrap_err();
+            assert!(refused.contains(key), "`{key}` is missing in: {refused}");
+        }
+    }
+}

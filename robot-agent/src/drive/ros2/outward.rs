@@ -1,0 +1,346 @@
+//! What the agent says to the rest of the robot: plan, way driven, friction, and how it is.
+//!
+//! It looks at what the loop and the dispatcher leave for everybody, and makes messages of it, once
+//! a second and when a mission begins or ends. It has a thread of its own, so nothing waits for it:
+//! the loop passes a snapshot by while it is being read, and commands are written by another thread.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tread_api::ids::MissionId;
+use tread_control::geometry::{Pose, wrap_angle_rad};
+use tread_ros2::cdr::{Sequence, encode};
+use tread_ros2::messages::{
+    DiagnosticArray, DiagnosticStatus, Float64MultiArray, KeyValue, Level, Message as _,
+    MessageType, MultiArrayDimension, MultiArrayLayout, Path,
+};
+use tread_ros2::names::Name;
+
+use super::refusal::Counts;
+use super::settings::OutwardSettings;
+use crate::control_loop::seam::{GivenPlan, Shared, Snapshot};
+use crate::recording::views::{PATH_POINTS_MAX, header, path, poses_of, state};
+
+/// Time between two looks.
+pub(crate) const LOOK_EVERY: Duration = Duration::from_millis(100);
+/// Time between two words.
+const SAY_EVERY: Duration = Duration::from_secs(1);
+/// Silence of the server that is worth a warning.
+const SILENT_SERVER: Duration = Duration::from_secs(5);
+/// Distance between two points of the way driven, metres.
+const SPACING_M: f64 = 0.1;
+/// What the numbers of friction are, in their order; what is not known is NaN.
+const THETA_LABEL: &str = "theta,theta_std_dev,theta_loop";
+
+/// One of the topics.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Word {
+    /// The plan of the mission in hand; empty without one.
+    Plan,
+    /// The way driven since the last mission began, the newest [`PATH_POINTS_MAX`] points.
+    Driven,
+    /// θ as measured, its standard deviation, and θ̂ of the law.
+    Theta,
+    /// How the agent is.
+    Diagnostics,
+}
+
+impl Word {
+    /// Every topic.
+    pub(crate) const ALL: [Self; 4] = [Self::Plan, Self::Driven, Self::Theta, Self::Diagnostics];
+
+    /// Its name.
+    pub(crate) fn topic(self, settings: &OutwardSettings) -> &Name {
+        match self {
+            Self::Plan => &settings.plan,
+            Self::Driven => &settings.driven,
+            Self::Theta => &settings.theta,
+            Self::Diagnostics => &settings.diagnostics,
+        }
+    }
+
+    /// Its messages.
+    pub(crate) fn message_type(self) -> MessageType {
+        match self {
+            Self::Plan | Self::Driven => Path::TYPE,
+            Self::Theta => Float64MultiArray::TYPE,
+            Self::Diagnostics => DiagnosticArray::TYPE,
+        }
+    }
+}
+
+/// What is said of one part.
+#[derive(Debug)]
+struct Part {
+    name: &'static str,
+    level: Level,
+    message: String,
+    values: Vec<(String, String)>,
+}
+
+/// Who says it.
+#[derive(Debug)]
+pub(crate) struct Outward {
+    settings: OutwardSettings,
+    shared: Arc<Shared>,
+    counts: Arc<Counts>,
+    robot: String,
+    /// When it last spoke, by the agent's monotonic clock.
+    said: Option<Duration>,
+    /// Mission and revision whose plan is shown.
+    mission: Option<(MissionId, u32)>,
+    /// Both in the robot's frame.
+    plan: Vec<Pose>,
+    driven: Vec<Pose>,
+    /// Messages that had been dropped when it was last said.
+    dropped: u64,
+}
+
+impl Outward {
+    pub(crate) fn new(
+        settings: OutwardSettings,
+        shared: Arc<Shared>,
+        counts: Arc<Counts>,
+        robot: String,
+    ) -> Self {
+        Self {
+            settings,
+            shared,
+            counts,
+            robot,
+            said: None,
+            mission: None,
+            plan: Vec::new(),
+            driven: Vec::with_capacity(PATH_POINTS_MAX as usize),
+            dropped: 0,
+        }
+    }
+
+    /// Says what is due to be said.
+    pub(crate) fn step(&mut self, now: Duration, wall_ns: i64, mut say: impl FnMut(Word, &[u8])) {
+        let snapshot = self.shared.snapshot();
+        let is_new = self.look_at_mission(&snapshot);
+        self.look_at_place(&snapshot);
+        let is_due = |said: Duration| now.saturating_sub(said) >= SAY_EVERY;
+        if !is_new && !self.said.is_none_or(is_due) {
+            return;
+        }
+        self.said = Some(now);
+        let (frame, mut bytes) = (self.settings.frame.as_str(), Vec::new());
+        path(&self.plan, frame, wall_ns, &mut bytes);
+        say(Word::Plan, &bytes);
+        path(&self.driven, frame, wall_ns, &mut bytes);
+        say(Word::Driven, &bytes);
+        theta(&snapshot, &mut bytes);
+        say(Word::Theta, &bytes);
+        let parts = self.parts(now, &snapshot);
+        diagnostics(&parts, &self.robot, wall_ns, &mut bytes);
+        say(Word::Diagnostics, &bytes);
+    }
+
+    /// Whether another plan is driven than before.
+    fn look_at_mission(&mut self, snapshot: &Snapshot) -> bool {
+        let driven = snapshot.mission.map(|now| (now.id, now.revision));
+        if driven == self.mission {
+            return false;
+        }
+        let Some((mission, revision)) = driven else {
+            self.mission = None;
+            self.plan.clear();
+            return true;
+        };
+        // The loop may have begun before the dispatcher has left the plan for others.
+        let given = self.shared.given_plan();
+        let is_it = |given: &GivenPlan| (given.mission, given.revision) == (mission, revision);
+        let Some(given) = given.filter(is_it) else {
+            return false;
+        };
+        if self.mission.is_none_or(|(before, _)| before != mission) {
+            self.driven.clear();
+        }
+        self.plan = poses_of(&given.plan);
+        for pose in &mut self.plan {
+            *pose = seen_from(self.settings.site_from_frame, *pose);
+        }
+        self.mission = driven;
+        true
+    }
+
+    fn look_at_place(&mut self, snapshot: &Snapshot) {
+        let Some((pose, _)) = snapshot.pose else {
+            return;
+        };
+        let pose = seen_from(self.settings.site_from_frame, pose);
+        let is_near = |last: &Pose| last.point().distance_m(pose.point()) < SPACING_M;
+        if self.driven.last().is_some_and(is_near) {
+            return;
+        }
+        if self.driven.len() >= PATH_POINTS_MAX as usize {
+            self.driven.remove(0);
+        }
+        self.driven.push(pose);
+    }
+
+    fn parts(&mut self, now: Duration, snapshot: &Snapshot) -> [Part; 4] {
+        [
+            control(snapshot),
+            link(self.shared.server_silence(now)),
+            estimator(snapshot),
+            self.base(),
+        ]
+    }
+
+    fn base(&mut self) -> Part {
+        let drops: Vec<_> = self.counts.drops().collect();
+        let sum = drops.iter().map(|(_, _, count)| count).sum();
+        let before = std::mem::replace(&mut self.dropped, sum);
+        let is_dropping = sum > before;
+        Part {
+            name: "tread_agent: base",
+            level: if is_dropping { Level::Warn } else { Level::Ok },
+            message: if is_dropping {
+                format!("messages dropped of late: {}", sum - before)
+            } else {
+                "nothing was dropped of late".to_owned()
+            },
+            values: drops
+                .into_iter()
+                .map(|(source, refusal, count)| {
+                    let key = format!("{}: {}", source.section(), refusal.code());
+                    (key, count.to_string())
+                })
+                .collect(),
+        }
+    }
+}
+
+/// A pose of the site as it is in a frame that lies in it.
+fn seen_from(site_from_frame: Pose, pose: Pose) -> Pose {
+    let point = site_from_frame.body_from_site(pose.point());
+    Pose {
+        x_m: point.x_m,
+        y_m: point.y_m,
+        heading_rad: wrap_angle_rad(pose.heading_rad - site_from_frame.heading_rad),
+    }
+}
+
+fn control(snapshot: &Snapshot) -> Part {
+    let (level, message) = match state(snapshot.mode, snapshot.fault) {
+        (Level::Ok, _) if snapshot.is_held => (Level::Ok, "holds its mission"),
+        known => known,
+    };
+    let gate = snapshot.gate.cause.map(|cause| format!("{cause:?}"));
+    let mut values = vec![
+        ("mode".to_owned(), format!("{:?}", snapshot.mode)),
+        ("gate".to_owned(), gate.unwrap_or_else(|| "open".to_owned())),
+        ("ticks".to_owned(), snapshot.ticks.to_string()),
+    ];
+    if let Some(mission) = snapshot.mission {
+        values.push(("mission".to_owned(), mission.id.to_string()));
+        let way = format!("{:.2} of {:.2}", mission.driven_m, mission.length_m);
+        values.push(("driven, m".to_owned(), way));
+        let off = format!("{:.3}", mission.cross_track_m);
+        values.push(("cross-track error, m".to_owned(), off));
+    }
+    Part {
+        name: "tread_agent: control",
+        level,
+        message: message.to_owned(),
+        values,
+    }
+}
+
+fn link(silence: Duration) -> Part {
+    let is_silent = silence >= SILENT_SERVER;
+    Part {
+        name: "tread_agent: link",
+        level: if is_silent { Level::Warn } else { Level::Ok },
+        message: if is_silent {
+            "the server is silent".to_owned()
+        } else {
+            "the server is heard".to_owned()
+        },
+        values: vec![(
+            "server silent for, s".to_owned(),
+            format!("{:.1}", silence.as_secs_f64()),
+        )],
+    }
+}
+
+fn estimator(snapshot: &Snapshot) -> Part {
+    let (level, message) = if snapshot.dug_in_at.is_some() {
+        (Level::Warn, "the wheels turn without progress")
+    } else if snapshot.surface_change.is_some() {
+        (Level::Warn, "the ground is not as the map says")
+    } else if snapshot.excited {
+        (Level::Ok, "learns")
+    } else {
+        (Level::Ok, "learns nothing new from this motion")
+    };
+    let number = |value: Option<f64>| value.map_or("unknown".to_owned(), |it| format!("{it:.4}"));
+    let measured = snapshot.theta_measured;
+    Part {
+        name: "tread_agent: estimator",
+        level,
+        message: message.to_owned(),
+        values: vec![
+            ("theta".to_owned(), number(measured.map(|it| it.theta))),
+            (
+                "deviation of theta".to_owned(),
+                number(measured.map(|it| it.std_dev)),
+            ),
+            ("theta of the law".to_owned(), number(snapshot.theta_loop)),
+        ],
+    }
+}
+
+fn theta(snapshot: &Snapshot, into: &mut Vec<u8>) {
+    let measured = snapshot.theta_measured;
+    let numbers = [
+        measured.map_or(f64::NAN, |it| it.theta),
+        measured.map_or(f64::NAN, |it| it.std_dev),
+        snapshot.theta_loop.unwrap_or(f64::NAN),
+    ];
+    let dimensions = [MultiArrayDimension {
+        label: THETA_LABEL,
+        size: 3,
+        stride: 3,
+    }];
+    let message = Float64MultiArray {
+        layout: MultiArrayLayout {
+            dim: Sequence::from(&dimensions),
+            data_offset: 0,
+        },
+        data: Sequence::from(&numbers),
+    };
+    encode(&message, into);
+}
+
+fn diagnostics(parts: &[Part], robot: &str, wall_ns: i64, into: &mut Vec<u8>) {
+    let values: Vec<Vec<KeyValue<'_>>> = parts
+        .iter()
+        .map(|part| {
+            let values = part.values.iter();
+            values.map(|(key, value)| KeyValue { key, value }).collect()
+        })
+        .collect();
+    let status: Vec<DiagnosticStatus<'_>> = parts
+        .iter()
+        .zip(&values)
+        .map(|(part, values)| DiagnosticStatus {
+            level: part.level as u8,
+            name: part.name,
+            message: &part.message,
+            hardware_id: robot,
+            values: Sequence::from(values.as_slice()),
+        })
+        .collect();
+    let message = DiagnosticArray {
+        header: header(wall_ns, ""),
+        status: Sequence::from(status.as_slice()),
+    };
+    encode(&message, into);
+}
+
+#[cfg(test)]
+mod tests;
