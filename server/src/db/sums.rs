@@ -12,7 +12,7 @@ use super::rows::{Row, RowsStatement};
 use super::{DbError, corrupt, parse, unsigned};
 use crate::friction::Sums;
 use crate::friction::fixed::Fixed;
-use crate::friction::sums::{Pair, Pass};
+use crate::friction::sums::{Pair, Pass, TELLING_DEVIATIONS};
 
 /// What one sum is about.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -45,75 +45,62 @@ static ADD: LazyLock<RowsStatement> = LazyLock::new(|| {
              rolling_weighted_hi, rolling_weighted_lo, segments, samples, mu_peak, newest_at_us,
              newest_information, newest_weighted, newest_mu, pass_at_us)",
         COLUMNS,
-        ADDED,
+        &added(),
     )
 });
 
-/// Of two passes the one that tells something counts (`TELLING_DEVIATIONS` squared is 20.25), of two
-/// such the later, of equally late ones the one with larger numbers; NULL is smaller than any number,
-/// and nothing is smaller than -1 here.
-const ADDED: &str = "
-ON CONFLICT DO UPDATE SET
-    information_hi = information_hi + excluded.information_hi
-        + ((information_lo + excluded.information_lo) >> 32),
-    information_lo = (information_lo + excluded.information_lo) & 4294967295,
-    weighted_hi = weighted_hi + excluded.weighted_hi
-        + ((weighted_lo + excluded.weighted_lo) >> 32),
-    weighted_lo = (weighted_lo + excluded.weighted_lo) & 4294967295,
-    square_hi = square_hi + excluded.square_hi
-        + ((square_lo + excluded.square_lo) >> 32),
-    square_lo = (square_lo + excluded.square_lo) & 4294967295,
-    track_information_hi = track_information_hi + excluded.track_information_hi
-        + ((track_information_lo + excluded.track_information_lo) >> 32),
-    track_information_lo =
-        (track_information_lo + excluded.track_information_lo) & 4294967295,
-    track_weighted_hi = track_weighted_hi + excluded.track_weighted_hi
-        + ((track_weighted_lo + excluded.track_weighted_lo) >> 32),
-    track_weighted_lo = (track_weighted_lo + excluded.track_weighted_lo) & 4294967295,
-    rolling_information_hi = rolling_information_hi + excluded.rolling_information_hi
-        + ((rolling_information_lo + excluded.rolling_information_lo) >> 32),
-    rolling_information_lo =
-        (rolling_information_lo + excluded.rolling_information_lo) & 4294967295,
-    rolling_weighted_hi = rolling_weighted_hi + excluded.rolling_weighted_hi
-        + ((rolling_weighted_lo + excluded.rolling_weighted_lo) >> 32),
-    rolling_weighted_lo =
-        (rolling_weighted_lo + excluded.rolling_weighted_lo) & 4294967295,
-    segments = segments + excluded.segments,
-    samples = samples + excluded.samples,
-    mu_peak = COALESCE(MAX(mu_peak, excluded.mu_peak), mu_peak, excluded.mu_peak),
-    newest_information = CASE WHEN (COALESCE(excluded.newest_weighted * excluded.newest_weighted
-                >= 20.25 * excluded.newest_information, 0), excluded.pass_at_us,
-            COALESCE(excluded.newest_information, -1), COALESCE(excluded.newest_weighted, -1),
-            COALESCE(excluded.newest_mu, -1))
-        > (COALESCE(newest_weighted * newest_weighted >= 20.25 * newest_information, 0),
-            pass_at_us, COALESCE(newest_information, -1), COALESCE(newest_weighted, -1),
-            COALESCE(newest_mu, -1))
-        THEN excluded.newest_information ELSE newest_information END,
-    newest_weighted = CASE WHEN (COALESCE(excluded.newest_weighted * excluded.newest_weighted
-                >= 20.25 * excluded.newest_information, 0), excluded.pass_at_us,
-            COALESCE(excluded.newest_information, -1), COALESCE(excluded.newest_weighted, -1),
-            COALESCE(excluded.newest_mu, -1))
-        > (COALESCE(newest_weighted * newest_weighted >= 20.25 * newest_information, 0),
-            pass_at_us, COALESCE(newest_information, -1), COALESCE(newest_weighted, -1),
-            COALESCE(newest_mu, -1))
-        THEN excluded.newest_weighted ELSE newest_weighted END,
-    newest_mu = CASE WHEN (COALESCE(excluded.newest_weighted * excluded.newest_weighted
-                >= 20.25 * excluded.newest_information, 0), excluded.pass_at_us,
-            COALESCE(excluded.newest_information, -1), COALESCE(excluded.newest_weighted, -1),
-            COALESCE(excluded.newest_mu, -1))
-        > (COALESCE(newest_weighted * newest_weighted >= 20.25 * newest_information, 0),
-            pass_at_us, COALESCE(newest_information, -1), COALESCE(newest_weighted, -1),
-            COALESCE(newest_mu, -1))
-        THEN excluded.newest_mu ELSE newest_mu END,
-    pass_at_us = CASE WHEN (COALESCE(excluded.newest_weighted * excluded.newest_weighted
-                >= 20.25 * excluded.newest_information, 0), excluded.pass_at_us,
-            COALESCE(excluded.newest_information, -1), COALESCE(excluded.newest_weighted, -1),
-            COALESCE(excluded.newest_mu, -1))
-        > (COALESCE(newest_weighted * newest_weighted >= 20.25 * newest_information, 0),
-            pass_at_us, COALESCE(newest_information, -1), COALESCE(newest_weighted, -1),
-            COALESCE(newest_mu, -1))
-        THEN excluded.pass_at_us ELSE pass_at_us END,
-    newest_at_us = MAX(newest_at_us, excluded.newest_at_us)";
+/// Numbers in fixed point, each in two halves.
+const FIXED: [&str; 7] = [
+    "information",
+    "weighted",
+    "square",
+    "track_information",
+    "track_weighted",
+    "rolling_information",
+    "rolling_weighted",
+];
+/// What is kept of the pass that is kept by itself.
+const PASS: [&str; 4] = [
+    "newest_information",
+    "newest_weighted",
+    "newest_mu",
+    "pass_at_us",
+];
+
+/// How a sum is added to one that is there: the same as [`Sums::add`].
+fn added() -> String {
+    let fixed = FIXED.map(|name| {
+        format!(
+            "{name}_hi = {name}_hi + excluded.{name}_hi
+                 + (({name}_lo + excluded.{name}_lo) >> 32),
+             {name}_lo = ({name}_lo + excluded.{name}_lo) & 4294967295,"
+        )
+    });
+    // Of two passes the one that tells something counts, of two such the later, of equally late ones
+    // the one with larger numbers; NULL is smaller than any, and nothing is smaller than -1 here.
+    let least = TELLING_DEVIATIONS * TELLING_DEVIATIONS;
+    let order = |of: &str| {
+        format!(
+            "(COALESCE({of}newest_weighted * {of}newest_weighted
+                 >= {least} * {of}newest_information, 0), {of}pass_at_us,
+              COALESCE({of}newest_information, -1), COALESCE({of}newest_weighted, -1),
+              COALESCE({of}newest_mu, -1))"
+        )
+    };
+    let (new, present) = (order("excluded."), order(""));
+    let pass = PASS.map(|name| {
+        format!("{name} = CASE WHEN {new} > {present} THEN excluded.{name} ELSE {name} END,")
+    });
+    format!(
+        "ON CONFLICT DO UPDATE SET {} {}
+             segments = segments + excluded.segments,
+             samples = samples + excluded.samples,
+             mu_peak = COALESCE(MAX(mu_peak, excluded.mu_peak), mu_peak, excluded.mu_peak),
+             newest_at_us = MAX(newest_at_us, excluded.newest_at_us)",
+        fixed.join(" "),
+        pass.join(" ")
+    )
+}
 
 fn count(number: u64) -> Result<i64, DbError> {
     i64::try_from(number).map_err(|_range| DbError::DoesNotFit("count"))
