@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 pub use self::event::{Actor, Cause, MissionEvent};
-use crate::geometry::Point;
+use crate::geometry::{Point, Pose};
 use crate::ids::{BootId, MissionId, PlanHash, RobotId, SiteId};
 use crate::robot::MissionProgress;
 use crate::trajectory::Trajectory;
@@ -357,6 +357,9 @@ pub struct PlanSummary {
     pub duration_s: f64,
     /// Fastest planned speed, m/s.
     pub speed_peak_m_s: f64,
+    /// Where the robot was when it planned, and how it was headed. Absent from an older agent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub begin: Option<Pose>,
 }
 
 #[cfg(test)]

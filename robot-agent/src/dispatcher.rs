@@ -34,6 +34,7 @@ use crate::control_loop::origin::JobOrigin;
 use crate::control_loop::seam::{GivenPlan, Job, LoopCommand, Shared};
 use crate::control_loop::site_view::SiteView;
 use crate::fleet::{Commands, IncomingCommand};
+use crate::geometry::wire_pose;
 use crate::knowledge::{Missions, SiteCell};
 use crate::missions::{CancelDecision, Held, OfferDecision};
 use crate::safety::{Safety, answers};
@@ -449,6 +450,7 @@ impl Dispatcher {
                 length_m: plan.length_m(),
                 duration_s: plan.duration_s(),
                 speed_peak_m_s: plan.peak_speed_m_s(),
+                begin: Some(wire_pose(start)),
             };
             let kept = Arc::new(plan.clone());
             let job = origin.job(plan, model)?;

@@ -286,6 +286,7 @@ mod tests {
         length_m: 1.0,
         duration_s: 2.0,
         speed_peak_m_s: 0.5,
+        begin: None,
     };
 
     #[derive(Debug, Clone, Copy)]

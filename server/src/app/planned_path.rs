@@ -1,8 +1,7 @@
 //! Where the planner lays a mission's way, for people to see before and after it was driven.
 
-use tread_api::geometry::{Point, Pose};
+use tread_api::geometry::Point;
 use tread_api::ids::MissionId;
-use tread_api::mission::DrivenPath;
 use tread_api::trajectory::{PLANNED_POINTS_MAX, PlannedPath, Trajectory};
 use tread_control::plan::Plan;
 
@@ -14,8 +13,8 @@ use crate::db;
 const STEP_MIN_M: f64 = 0.1;
 
 impl App {
-    /// The smooth way of a mission's present revision: from where its robot began, once it has said
-    /// how it drove, and from the begin of the trajectory before.
+    /// The smooth way of a mission's present revision: from where its robot planned it, once it has
+    /// taken it, and from the begin of the trajectory before.
     ///
     /// # Errors
     /// [`AppError::UnknownMission`]; [`AppError::Impossible`] for what its robot has refused or
@@ -26,7 +25,6 @@ impl App {
             .await?
             .ok_or(AppError::UnknownMission(id))?;
         let mission = row.mission;
-        let (_quality, driven) = db::missions::outcome(&mut tx, id).await?;
         let site_pk = super::site_row(&mut tx, &mission.site).await?.pk;
         let robot = db::robots::find(&mut tx, site_pk, &mission.robot).await?;
         let unknown = || AppError::UnknownRobot(mission.site.clone(), mission.robot.clone());
@@ -34,13 +32,10 @@ impl App {
         drop(tx);
         let _turn = self.check_turn().await;
         let trajectory = mission.trajectory;
+        let begin = mission.plan.and_then(|plan| plan.begin);
         let planning = move || {
-            let began = driven.as_ref().and_then(begin_of_driven);
-            let from_there = began.and_then(|began| planned(&model, &trajectory, began).ok());
-            let planned = match from_there {
-                Some(planned) => planned,
-                None => planned(&model, &trajectory, begin_of(&trajectory))?,
-            };
+            let begin = begin.unwrap_or_else(|| begin_of(&trajectory));
+            let planned = planned(&model, &trajectory, begin)?;
             Ok(way(&planned.plan, &trajectory))
         };
         match tokio::task::spawn_blocking(planning).await {
@@ -52,18 +47,6 @@ impl App {
             }),
         }
     }
-}
-
-/// Where a robot began, headed as it went first.
-fn begin_of_driven(driven: &DrivenPath) -> Option<Pose> {
-    let [first, second, ..] = driven.points[..] else {
-        return None;
-    };
-    Some(Pose {
-        x_m: first.x_m,
-        y_m: first.y_m,
-        heading_rad: (second.y_m - first.y_m).atan2(second.x_m - first.x_m),
-    })
 }
 
 /// Points along a plan, evenly spaced, at most [`PLANNED_POINTS_MAX`].

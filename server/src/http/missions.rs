@@ -105,8 +105,8 @@ pub(super) async fn get(
     Ok(Json(app.mission(mission).await?))
 }
 
-/// Where the planner lays a mission: from where its robot began once it has ended, and from the
-/// begin of its trajectory before.
+/// Where the planner lays a mission: from where its robot planned it once it has taken it, and
+/// from the begin of its trajectory before.
 #[utoipa::path(get, path = "/v1/missions/{mission}/path", tag = "missions",
     security(("token" = ["viewer"])),
     operation_id = "get_planned_path", params(("mission" = MissionId, Path)),

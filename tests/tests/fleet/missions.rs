@@ -3,7 +3,8 @@
 use tread_api::friction::{StoredSegment, TerrainFriction};
 use tread_api::ids::RobotId;
 use tread_api::mission::{Actor, MissionDetail, MissionState};
-use tread_tests::fleet::{GROUND, GROUND_THETA, SITE};
+use tread_api::trajectory::PlannedPath;
+use tread_tests::fleet::{Fleet, GROUND, GROUND_THETA, SITE};
 use tread_tests::wait::{DRIVE, SHORT, eventually};
 
 use crate::{arc, bend, fleet};
@@ -12,6 +13,32 @@ fn states_of(detail: &MissionDetail) -> Vec<MissionState> {
     let mut states: Vec<_> = detail.events.iter().map(|event| event.to).collect();
     states.dedup();
     states
+}
+
+/// Farthest that the way shown may be longer or shorter than the one planned on the robot, metres.
+const LENGTH_TOLERANCE_M: f64 = 0.001;
+
+/// The way that the server shows is as long as the robot's own, and everything that the robot
+/// drove is as near to it as the robot says.
+async fn assert_the_way_shown_was_driven(fleet: &Fleet, ended: &MissionDetail) {
+    let id = ended.mission.id;
+    let way: PlannedPath = fleet.rest.get(&format!("/v1/missions/{id}/path")).await;
+    let plan = ended.mission.plan.expect("the robot told its plan");
+    let steps = u32::try_from(way.points.len() - 1).expect("at most a thousand");
+    let length_m = way.step_m * f64::from(steps);
+    assert!(
+        (length_m - plan.length_m).abs() < LENGTH_TOLERANCE_M,
+        "{length_m} m are shown of {plan:?}"
+    );
+    let driven = ended.driven.as_ref().expect("the robot told its way");
+    let quality = ended.quality.as_ref().expect("and how well it drove it");
+    assert!(plan.begin.is_some(), "and from where it planned");
+    let near_m = quality.cross_track_max_m + driven.tolerance_m + way.step_m;
+    for point in &driven.points {
+        let distances = way.points.iter().map(|shown| shown.distance_m(*point));
+        let off_m = distances.fold(f64::INFINITY, f64::min);
+        assert!(off_m < near_m, "{point:?} is {off_m} m off, not {near_m} m");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -42,6 +69,7 @@ async fn a_circle_and_waypoints_reach_their_ends_and_the_ground_is_measured() {
             ended.events.last().map(|event| event.actor),
             Some(Actor::Robot)
         );
+        assert_the_way_shown_was_driven(&fleet, &ended).await;
     }
 
     // The last segment of a mission may still be on its way when the mission

@@ -1,5 +1,5 @@
-// The smooth ways of missions in hand, which the server plans on request and which never change
-// while mission and revision stay the same. Not reactive: the map draws them.
+// The smooth ways of missions in hand, which the server plans on request. They change when their
+// robot says from where it planned, and with the revision. Not reactive: the map draws them.
 import type { Mission, PlannedPath } from '../api/schema';
 import { ask } from '../api/client';
 import type { PointM } from '../map/camera';
@@ -14,8 +14,8 @@ export class Plans {
 
   /** The way of a mission, as soon as it is known. */
   of(mission: Mission): PointM[] | null {
-    // A circle is drawn exactly by what was asked for, and its begin is only known to the robot.
-    if ('circle' in mission.trajectory) return null;
+    // Until its robot has said from where it comes, a circle is drawn exactly by what was asked for.
+    if ('circle' in mission.trajectory && !mission.plan?.begin) return null;
     const key = keyOf(mission);
     const known = this.#ways.get(key);
     if (known !== undefined || this.#ways.size >= WAYS_MAX) return known ?? null;
@@ -39,5 +39,5 @@ export class Plans {
 }
 
 function keyOf(mission: Mission): string {
-  return `${mission.id}/${mission.revision}`;
+  return JSON.stringify([mission.id, mission.revision, mission.plan?.begin]);
 }
