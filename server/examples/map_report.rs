@@ -1,7 +1,7 @@
 //! How fast and how large the map is: `cargo run --release -p tread-server --example map_report --
 //! --json`. A million cells, each driven by three robots; then, through the whole REST API and over
-//! a database on the disk, paths of a kilometre and tiles of 256 by 256 cells, while robots upload
-//! 20 000 segments a second to the same cells. Exits with 1 if a goal is missed.
+//! a database on the disk, paths of a kilometre, and once more with tiles of 256 by 256 cells while
+//! robots upload 20 000 segments a second to the same cells. Exits with 1 if a goal is missed.
 
 use std::alloc::System;
 use std::path::Path;
@@ -306,8 +306,18 @@ fn request(token: &str, method: &str, path: &str, body: Body) -> anyhow::Result<
         .body(body)?)
 }
 
-/// The 99th percentiles of paths, of tiles, of the first tile of each place, and the uploads.
-async fn measured(folder: &Path, robots: &[RobotId]) -> anyhow::Result<(f64, f64, f64, Uploaded)> {
+/// How long questions took.
+struct Asked {
+    path_p99_ms: f64,
+    path_under_uploads_p99_ms: f64,
+    tile_p99_ms: f64,
+    /// The longest of the first tiles of three places.
+    tile_first_ms: f64,
+    uploaded: Uploaded,
+}
+
+/// Asks for paths while nothing else happens, and for paths and tiles while robots upload.
+async fn measured(folder: &Path, robots: &[RobotId]) -> anyhow::Result<Asked> {
     let (app, token) = server(folder, robots).await?;
     let supervisor = Supervisor::new();
     let (uploads, uploads_in) = mpsc::channel(UPLOADS_WAITING_MAX);
@@ -315,8 +325,6 @@ async fn measured(folder: &Path, robots: &[RobotId]) -> anyhow::Result<(f64, f64
     supervisor.spawn_vital("ingest", writer);
     let router = http::router(app.clone(), Names::default());
     let stop = Arc::new(AtomicBool::new(false));
-    let mut uploading = tokio::task::JoinSet::new();
-    uploading.spawn(upload(robots.to_vec(), uploads, Arc::clone(&stop)));
     // A kilometre across the map, changing rows: a cell for each metre and some more.
     let path = |number: i32| {
         let y_m = f64::from(number * 3) + 0.25;
@@ -337,14 +345,23 @@ async fn measured(folder: &Path, robots: &[RobotId]) -> anyhow::Result<(f64, f64
     };
     // The first time of each place: nothing of it is kept.
     let cold = |number: i32| tile(number % 3 * 83);
-    let cold_ms = asked(&router, 3, cold, 4 * 65_536).await?;
-    let path_ms = asked(&router, QUESTIONS, path, 100_000).await?;
-    let tile_ms = asked(&router, TILES, tile, 4 * 65_536).await?;
+    let path_p99_ms = asked(&router, QUESTIONS, path, 100_000).await?;
+    let mut uploading = tokio::task::JoinSet::new();
+    uploading.spawn(upload(robots.to_vec(), uploads, Arc::clone(&stop)));
+    let tile_first_ms = asked(&router, 3, cold, 4 * 65_536).await?;
+    let path_under_uploads_p99_ms = asked(&router, QUESTIONS, path, 100_000).await?;
+    let tile_p99_ms = asked(&router, TILES, tile, 4 * 65_536).await?;
     stop.store(true, Ordering::Relaxed);
     let uploaded = uploading.join_next().await.context("nobody uploads")???;
     supervisor.stop().await?;
     app.db().close().await;
-    Ok((path_ms, tile_ms, cold_ms, uploaded))
+    Ok(Asked {
+        path_p99_ms,
+        path_under_uploads_p99_ms,
+        tile_p99_ms,
+        tile_first_ms,
+        uploaded,
+    })
 }
 
 fn main() -> anyhow::Result<ExitCode> {
@@ -356,27 +373,33 @@ fn main() -> anyhow::Result<ExitCode> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()?;
-    let (path_ms, tile_ms, cold_ms, uploaded) =
-        runtime.block_on(measured(folder.path(), &robots))?;
+    let asked = runtime.block_on(measured(folder.path(), &robots))?;
     let Uploaded {
-        segments_per_s: rate,
-        ack_p99_ms: ack,
-    } = uploaded;
+        segments_per_s,
+        ack_p99_ms,
+    } = asked.uploaded;
+    let at_most = |name, goal, most: f64, value: f64| (name, goal, value, value <= most);
     let checks = [
-        (
-            "memory_bytes_per_sum",
-            "<= 200",
-            with_squares,
-            with_squares <= 200.0,
+        at_most("memory_bytes_per_sum", "<= 200", 200.0, with_squares),
+        at_most("path_1_km_p99_ms", "<= 5", 5.0, asked.path_p99_ms),
+        at_most(
+            "path_1_km_under_uploads_p99_ms",
+            "<= 5",
+            5.0,
+            asked.path_under_uploads_p99_ms,
         ),
-        ("path_1_km_p99_ms", "<= 5", path_ms, path_ms <= 5.0),
-        ("tile_256_p99_ms", "<= 20", tile_ms, tile_ms <= 20.0),
-        ("segments_per_s", ">= 19000", rate, rate >= 19_000.0),
-        ("upload_ack_p99_ms", "<= 100", ack, ack <= 100.0),
+        at_most("tile_256_p99_ms", "<= 20", 20.0, asked.tile_p99_ms),
+        (
+            "segments_per_s",
+            ">= 19000",
+            segments_per_s,
+            segments_per_s >= 19_000.0,
+        ),
+        at_most("upload_ack_p99_ms", "<= 100", 100.0, ack_p99_ms),
     ];
     let told = [
         ("memory_bytes_per_sum_without_kept_squares", bytes),
-        ("tile_256_first_time_longest_of_3_ms", cold_ms),
+        ("tile_256_first_time_longest_of_3_ms", asked.tile_first_ms),
     ];
     let is_json = std::env::args().any(|argument| argument == "--json");
     if is_json {

@@ -34,7 +34,7 @@ use tread_api::ids::{RobotId, SiteId};
 use self::enrolment::Membership;
 pub use self::error::AppError;
 use self::events::Hub;
-use self::friction::{MapNews, Pictures};
+use self::friction::{MapNews, Pictures, Views};
 use self::identity::Identity;
 use self::map::Maps;
 use self::missions::idempotency::InFlight;
@@ -85,6 +85,7 @@ struct Inner {
     normalisations: OnceLock<Vec<Arc<Normalisation>>>,
     map_readers: Semaphore,
     pictures: Pictures,
+    views: Views,
     news: MapNews,
     removed: Removed,
     drive_slots: Arc<Semaphore>,
@@ -133,6 +134,7 @@ impl App {
             normalisations: OnceLock::new(),
             map_readers: Semaphore::new(friction::READERS_MAX),
             pictures: Pictures::default(),
+            views: Views::default(),
             news: MapNews::default(),
             removed: Removed::default(),
             drive_slots: Arc::new(Semaphore::new(teleop::SESSIONS_MAX)),
@@ -257,6 +259,10 @@ impl App {
 
     fn pictures(&self) -> &Pictures {
         &self.inner.pictures
+    }
+
+    fn views(&self) -> &Views {
+        &self.inner.views
     }
 
     fn news(&self) -> &MapNews {

@@ -31,6 +31,7 @@ use std::panic::Location;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use jiff::Timestamp;
@@ -61,6 +62,8 @@ const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 pub struct Tx {
     inner: Transaction<'static, Sqlite>,
     noted: Noted,
+    /// What its commit counts up.
+    generation: Option<Arc<AtomicU64>>,
 }
 
 /// Notes how long a transaction took when it is over.
@@ -85,10 +88,27 @@ impl Tx {
     /// # Errors
     /// SQLite failed; nothing is written then.
     pub async fn commit(self) -> Result<(), sqlx::Error> {
-        let Self { inner, noted } = self;
-        let committed = inner.commit().await;
-        drop(noted);
-        committed
+        let Self {
+            inner,
+            noted,
+            generation,
+        } = self;
+        let Some(generation) = generation else {
+            let committed = inner.commit().await;
+            drop(noted);
+            return committed;
+        };
+        #[expect(
+            clippy::disallowed_methods,
+            reason = "ends with the commit; whoever waits for it may go away, and it must be counted"
+        )]
+        let committing = tokio::spawn(async move {
+            let committed = inner.commit().await;
+            generation.fetch_add(1, Ordering::AcqRel);
+            drop(noted);
+            committed
+        });
+        committing.await.unwrap_or(Err(sqlx::Error::WorkerCrashed))
     }
 }
 
@@ -172,6 +192,7 @@ pub struct Db {
     version: String,
     write_waits: Arc<Histogram>,
     transactions: Arc<Transactions>,
+    generation: Arc<AtomicU64>,
 }
 
 impl Db {
@@ -239,7 +260,14 @@ impl Db {
             version,
             write_waits: Arc::default(),
             transactions: Arc::default(),
+            generation: Arc::default(),
         })
+    }
+
+    /// Counts what was committed, but for measurements: what was read at a generation is as it was
+    /// while that is the present one.
+    pub fn generation(&self) -> u64 {
+        self.generation.load(Ordering::Acquire)
     }
 
     /// Version of the SQLite library.
@@ -258,7 +286,26 @@ impl Db {
             let asked_at = Instant::now();
             let inner = self.writer.begin_with("BEGIN IMMEDIATE").await?;
             self.write_waits.note(asked_at.elapsed());
-            Ok(self.timed(inner, begun, true))
+            let tx = self.timed(inner, begun, true);
+            Ok(Tx {
+                generation: Some(Arc::clone(&self.generation)),
+                ..tx
+            })
+        }
+    }
+
+    /// The same for measurements alone, which [`Db::generation`] does not count.
+    ///
+    /// # Errors
+    /// The turn did not come in time, or SQLite failed.
+    #[track_caller]
+    pub fn write_measurements(&self) -> impl Future<Output = Result<Tx, DbError>> + use<'_> {
+        let writing = self.write();
+        async move {
+            Ok(Tx {
+                generation: None,
+                ..writing.await?
+            })
         }
     }
 
@@ -274,7 +321,11 @@ impl Db {
             writes,
             began_at: Instant::now(),
         };
-        Tx { inner, noted }
+        Tx {
+            inner,
+            noted,
+            generation: None,
+        }
     }
 
     /// How long transactions took.
@@ -385,5 +436,32 @@ mod tests {
             .execute(&mut *reading)
             .await;
         assert!(refused.is_err(), "a reader wrote");
+    }
+
+    #[tokio::test]
+    async fn what_is_committed_counts_even_if_nobody_waits_for_it_and_measurements_never_do() {
+        let folder = tempfile::tempdir().unwrap();
+        let db = Db::open(&folder.path().join("some.db")).await.unwrap();
+        let before = db.generation();
+        drop(db.write().await.unwrap());
+        let mut committing = Box::pin(db.write().await.unwrap().commit());
+        assert!(futures_util::FutureExt::now_or_never(&mut committing).is_none());
+        drop(committing);
+        let counted = async {
+            while db.generation() == before {
+                tokio::task::yield_now().await;
+            }
+        };
+        tokio::time::timeout(ACQUIRE_TIMEOUT, counted)
+            .await
+            .unwrap();
+        assert_eq!(db.generation(), before + 1);
+        db.write_measurements()
+            .await
+            .unwrap()
+            .commit()
+            .await
+            .unwrap();
+        assert_eq!(db.generation(), before + 1);
     }
 }

@@ -34,7 +34,7 @@ impl App {
         limit: u32,
     ) -> Result<Page<VisitSuggestion>, AppError> {
         let reading = Reading::new(self, asked)?;
-        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let view = self.site_view(site).await?;
         let grid = view.row.site.grid;
         let count = area.count(grid.cell_m);
         if count > LOOKED_AT_MAX {
@@ -76,7 +76,7 @@ impl App {
         limit: u32,
     ) -> Result<Page<RobotContribution>, AppError> {
         let reading = Reading::new(self, &Asked::default())?;
-        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let view = self.site_view(site).await?;
         let after = cursor.map(str::to_owned);
         let looking = move |app: &Self| {
             let (biases, contributions) = app.maps().look(&view.row, |map| {

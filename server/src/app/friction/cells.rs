@@ -148,7 +148,7 @@ impl App {
         point: Point,
     ) -> Result<PointFriction, AppError> {
         let reading = Reading::new(self, asked)?;
-        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let view = self.site_view(site).await?;
         let off_the_map = || AppError::InvalidQuery {
             parameter: "x_m",
             detail: format!("a point lies on the map, within {COORDINATE_MAX_M} m of the origin"),

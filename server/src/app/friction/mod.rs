@@ -10,6 +10,7 @@ mod pictures;
 mod prior;
 mod raster;
 mod reading;
+mod views;
 
 use std::collections::HashMap;
 
@@ -28,6 +29,7 @@ use self::prior::Classes;
 pub use self::raster::{PictureAsked, SQUARES_MAX};
 pub use self::reading::Asked;
 pub(super) use self::reading::Reading;
+pub(super) use self::views::Views;
 use super::{App, AppError, page, site_row};
 use crate::db::sites::SiteRow;
 use crate::db::{self, Tx};
@@ -41,7 +43,8 @@ const TIMES_MAX: i64 = 1_000;
 pub(in crate::app) const READERS_MAX: usize = 4;
 
 /// Everything that answers about a site's terrains need from the database.
-pub(super) struct SiteView {
+#[derive(Debug)]
+pub(in crate::app) struct SiteView {
     pub(super) row: SiteRow,
     pub(super) terrains: Vec<Terrain>,
     /// Of each terrain, the revisions that are the same ground as the present one.
@@ -111,7 +114,7 @@ impl App {
         limit: u32,
     ) -> Result<Page<TerrainFriction>, AppError> {
         let reading = Reading::new(self, asked)?;
-        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let view = self.site_view(site).await?;
         let cursor = cursor.map(str::to_owned);
         let listing = move |app: &Self| {
             let classes = app.classes(&view, &reading);
@@ -141,7 +144,7 @@ impl App {
         asked: &Asked,
     ) -> Result<TerrainFriction, AppError> {
         let reading = Reading::new(self, asked)?;
-        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let view = self.site_view(site).await?;
         let terrain = view.find(site, id)?.clone();
         let looking = move |app: &Self| {
             let models = app
@@ -181,7 +184,7 @@ impl App {
                 ..asked.clone()
             },
         )?;
-        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let view = self.site_view(site).await?;
         let terrain = view.find(site, id)?.clone();
         let looking = move |app: &Self| {
             let back =
@@ -258,7 +261,7 @@ impl App {
         let reading = Reading::new(self, &Asked::default())?;
         let (mut found, mut left_out) = (Vec::new(), 0);
         for site in self.all_sites().await? {
-            let view = SiteView::read(&mut self.db().read().await?, &site).await?;
+            let view = self.site_view(&site).await?;
             let reading = reading.clone();
             let looking = move |app: &Self| {
                 let mut known = Vec::new();

@@ -17,7 +17,6 @@ use tread_control::robot::RobotModel as PlannedModel;
 
 use super::drawn::{Drawn, Near};
 use super::{App, AppError, Asked, Reading, SiteView};
-use crate::db;
 use crate::friction::grip;
 use crate::friction::index::{Lens, Room, SiteMap};
 
@@ -52,10 +51,8 @@ impl App {
             as_of,
             normalisation,
         } = request;
-        let mut tx = self.db().read().await?;
-        let view = SiteView::read(&mut tx, site).await?;
-        let found = db::robots::find(&mut tx, view.row.pk, &robot).await?;
-        drop(tx);
+        let view = self.site_view(site).await?;
+        let found = self.robot_of(view.row.pk, &robot).await?;
         let found = found.ok_or_else(|| AppError::UnknownRobot(site.clone(), robot.clone()))?;
         let asked = Asked {
             as_of,
@@ -103,10 +100,8 @@ impl App {
         (site, robot): (&SiteId, &RobotId),
         trajectory: &Trajectory,
     ) -> Result<Option<PathPrior>, AppError> {
-        let mut tx = self.db().read().await?;
-        let view = SiteView::read(&mut tx, site).await?;
-        let found = db::robots::find(&mut tx, view.row.pk, robot).await?;
-        drop(tx);
+        let view = self.site_view(site).await?;
+        let found = self.robot_of(view.row.pk, robot).await?;
         let Some(found) = found else { return Ok(None) };
         let asked = Asked {
             configuration: Some(found.configuration),

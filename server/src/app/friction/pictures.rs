@@ -106,7 +106,7 @@ impl App {
         write: impl FnOnce(&Raster) -> Result<Vec<u8>, AppError> + Send + 'static,
     ) -> Result<Picture, AppError> {
         let reading = Reading::new(self, &asked.asked)?;
-        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let view = self.site_view(site).await?;
         let drawing = move |app: &Self| {
             let key = format!("{}/{format}/{asked:?}", view.row.pk);
             // Looked at before the squares are made: what changes meanwhile makes it stale.
