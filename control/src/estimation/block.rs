@@ -1,11 +1,13 @@
 //! Samples averaged over blocks, and the two differential rows that a block gives.
 
-use super::curved::{Bent, SLIP_MIN, SideSlips, Turn, bent, drift_bend, spread_out, uneven};
+use super::curved::{
+    Bent, SLIP_MIN, SideSlips, Turn, bent, bent_slope, drift_bend, spread_out, uneven,
+};
 use super::regression::{Parameters, Row, index};
 use super::window::{TurnMeans, TurnWindow};
 use super::{
     BLOCK_S, RIM_SPEED_MIN_M_S, SLIP_LINEAR_FIRST_MAX, SLIP_LINEAR_MAX, SensorNoise, SensorSample,
-    TyrePrior, ValueWithDeviation,
+    THETA_FIRST, TyrePrior, ValueWithDeviation,
 };
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
@@ -29,6 +31,8 @@ pub(super) struct Force {
     mean_bent: Bent,
     /// θκ's regressor over the force, whose noise it has.
     bend: f64,
+    /// Covariance of the difference's θκ regressor with the response.
+    slip_noise: f64,
 }
 
 /// What is known about θ when a block is judged.
@@ -40,6 +44,14 @@ pub(super) struct ThetaBound {
     pub(super) theta_weights: f64,
     /// Largest θ that the ground may have, for all that is known.
     pub(super) theta_most: f64,
+}
+
+impl ThetaBound {
+    /// θ with which a block reckons slip from force. One that is barely known may be many times too
+    /// large, and what a row holds is never taken back.
+    pub(super) fn theta_of_slip(&self) -> f64 {
+        self.theta.unwrap_or(THETA_FIRST)
+    }
 }
 
 /// Means over one block of samples.
@@ -114,6 +126,7 @@ impl Block {
         let mut common_noise = Parameters::zeros();
         common_noise[index::RADIUS_OFFSET] = self.rim_difference_noise;
         common_noise[index::RESISTANCE] = -self.rim_difference_noise;
+        common_noise[index::CURVATURE] = force.slip_noise;
         Some(Row {
             regressors,
             response: self.difference_m_s,
@@ -355,6 +368,19 @@ impl BlockBuilder {
         } else {
             (sides.left, sides.right)
         };
+        // The rims and the gyro that give slip stand in the response too.
+        let order = if mean_m_s < 0.0 { [1, 0] } else { [0, 1] };
+        let contact = [left_force_m_s - rolling_m_s, right_force_m_s - rolling_m_s];
+        let slopes = [
+            -bent_slope(contact[0], left_slip, tyres.curvature),
+            bent_slope(contact[1], right_slip, tyres.curvature),
+        ];
+        let along = |by: [f64; 2]| slopes[0] * by[order[0]] + slopes[1] * by[order[1]];
+        let rim_noise = 2.0 * (noise.wheel_speed_rad_s * model.wheel_radius_m()).powi(2) / count;
+        let turn_noise = model.track_width_m() * noise.gyro_rad_s.powi(2) / count;
+        let slip_noise = along(sides.by_apart) / mean_m_s.abs()
+            * (rim_noise + model.track_width_m() * turn_noise)
+            - along(sides.by_turn_s) * turn_noise;
         let left = Bent::of(left_force_m_s, rolling_m_s, left_slip, tyres);
         let right = Bent::of(right_force_m_s, rolling_m_s, right_slip, tyres);
         Force {
@@ -366,6 +392,7 @@ impl BlockBuilder {
             difference_bent: Bent::sum(right, 1.0, left, -1.0),
             mean_bent: Bent::sum(right, 0.5, left, 0.5),
             bend: bent(1.0, sides.mean, tyres.curvature),
+            slip_noise,
         }
     }
 }

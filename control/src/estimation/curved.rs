@@ -23,6 +23,12 @@ pub(super) fn bent(force_m_s: f64, slip: f64, curvature: f64) -> f64 {
     force_m_s * slip * (1.0 + bend * (2.0 / 3.0 + bend * (1.0 / 3.0 + bend / 9.0)))
 }
 
+/// [`bent`] by slip.
+pub(super) fn bent_slope(force_m_s: f64, slip: f64, curvature: f64) -> f64 {
+    let bend = curvature * slip;
+    force_m_s * (1.0 + bend * (4.0 / 3.0 + bend * (1.0 + bend * (4.0 / 9.0))))
+}
+
 /// What a force counts on tyres of which only mean and spread of κ are known: the bend is not even
 /// in κ, so that its mean is not that of the mean κ. Rows are linear in κ and would leave it to θ.
 pub(super) fn spread_out(force_m_s: f64, slip: f64, tyres: &TyrePrior) -> f64 {
@@ -72,6 +78,10 @@ pub(super) struct SideSlips {
     pub(super) unequal: f64,
     /// Right minus left slip ahead.
     pub(super) apart: f64,
+    /// Left and right combined slip by `apart`.
+    pub(super) by_apart: [f64; 2],
+    /// Left and right combined slip by the turn rate, seconds.
+    pub(super) by_turn_s: [f64; 2],
 }
 
 impl SideSlips {
@@ -88,14 +98,21 @@ impl SideSlips {
         let apart = (rim_difference_m_s - model.track_width_m() * yaw_rate_rad_s) / rim_m_s
             - radius_difference;
         let combined = |ahead: f64, side_m_s: f64| {
-            let across = 0.5 * model.wheelbase_m() * yaw_rate_rad_s / side_m_s;
-            (ahead * ahead + across * across + 0.25 * SWING_SHARE * apart_variance)
+            let arm_s = 0.5 * model.wheelbase_m() / side_m_s;
+            let across = arm_s * yaw_rate_rad_s;
+            let slip = (ahead * ahead + across * across + 0.25 * SWING_SHARE * apart_variance)
                 .max(0.0)
-                .sqrt()
+                .sqrt();
+            let inverse = slip.max(SLIP_MIN).recip();
+            (slip, 0.5 * ahead * inverse, arm_s * across * inverse)
         };
-        let left = combined(common - 0.5 * apart, rim_m_s - 0.5 * rim_difference_m_s);
-        let right = combined(common + 0.5 * apart, rim_m_s + 0.5 * rim_difference_m_s);
+        let (left, left_by_apart, left_by_turn_s) =
+            combined(common - 0.5 * apart, rim_m_s - 0.5 * rim_difference_m_s);
+        let (right, right_by_apart, right_by_turn_s) =
+            combined(common + 0.5 * apart, rim_m_s + 0.5 * rim_difference_m_s);
         Self {
+            by_apart: [-left_by_apart, right_by_apart],
+            by_turn_s: [left_by_turn_s, right_by_turn_s],
             left,
             right,
             mean: 0.5 * (left + right),

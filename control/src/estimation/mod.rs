@@ -189,7 +189,7 @@ impl Estimator {
             noise: &self.noise,
             tyres: &self.tyres,
             radius_difference: self.estimate.radius_difference.value,
-            theta: self.bound.theta_weights,
+            theta: self.bound.theta_of_slip(),
         };
         let block = builder.finish(context);
         if block.is_none() {

@@ -9,6 +9,8 @@ use super::{SensorNoise, THETA_FIRST, THETA_RANGE, TyrePrior, ValueWithDeviation
 /// Standard deviation of θ that is assumed, about [`THETA_FIRST`], when offsets are learned.
 const THETA_VAGUE: f64 = 2.0;
 
+/// Share of what is known with which equations of few kinds of rows are made regular.
+const REGULAR_SHARE: f64 = 1.0e-3;
 /// Information on `θf` while nothing is known: far below what anything else tells.
 const RESISTANCE_VAGUE: f64 = 1.0;
 
@@ -72,13 +74,10 @@ impl OffsetKnowledge {
         }
         let theta = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
         let channels = sums.channels();
-        let mut normal = Normal::of(&channels, theta, tyres).with_resistance(self, theta);
-        let vague = THETA_VAGUE.powi(-2);
-        let theta_at = (index::THETA, index::THETA);
-        // A corrected square below its own noise is not known to be smaller than that noise.
-        normal.matrix[theta_at] = normal.matrix[theta_at].max(2.0 * normal.noise_std_dev) + vague;
-        normal.right[index::THETA] += vague * THETA_FIRST;
-        let (matrix, right) = without_ground(&normal.matrix, &normal.right);
+        let normal = Normal::of(&channels, theta, tyres).with_resistance(self, theta);
+        let Some((matrix, right)) = self.without_ground(&normal) else {
+            return *self;
+        };
         let Some(together) = (self.information + matrix).cholesky() else {
             return *self;
         };
@@ -99,6 +98,37 @@ impl OffsetKnowledge {
         }
     }
 
+    /// The Schur complement that takes θκ, then θ, out of normal equations; none where what is left
+    /// would not be regular.
+    fn without_ground(
+        &self,
+        normal: &Normal,
+    ) -> Option<(SMatrix<f64, OFFSETS, OFFSETS>, SVector<f64, OFFSETS>)> {
+        let mut matrix = normal.matrix;
+        let mut right = normal.right;
+        take_out(index::CURVATURE, &mut matrix, &mut right);
+        // A corrected square below its own noise is not known to be smaller than that noise, and it
+        // is no smaller than what the other regressors explain of it: rows whose force hardly varies
+        // would tell the radii by what the correction takes too much.
+        let others = self.information * REGULAR_SHARE + matrix.fixed_view::<OFFSETS, OFFSETS>(1, 1);
+        let with_others = matrix
+            .fixed_view::<OFFSETS, 1>(1, index::THETA)
+            .into_owned();
+        let explained = with_others.dot(&others.cholesky()?.solve(&with_others));
+        let theta_at = (index::THETA, index::THETA);
+        let vague = THETA_VAGUE.powi(-2);
+        matrix[theta_at] = matrix[theta_at]
+            .max(2.0 * normal.noise_std_dev)
+            .max(explained)
+            + vague;
+        right[index::THETA] += vague * THETA_FIRST;
+        take_out(index::THETA, &mut matrix, &mut right);
+        Some((
+            matrix.fixed_view::<OFFSETS, OFFSETS>(1, 1).into_owned(),
+            right.fixed_rows::<OFFSETS>(1).into_owned(),
+        ))
+    }
+
     /// `δ_c` and `δ_d` with their deviations.
     pub(super) fn values(&self) -> (ValueWithDeviation, ValueWithDeviation) {
         let covariance = self
@@ -114,22 +144,10 @@ impl OffsetKnowledge {
     }
 }
 
-/// The Schur complement that takes θ and θκ out of normal equations.
-fn without_ground(
-    matrix: &ParameterMatrix,
-    right: &Parameters,
-) -> (SMatrix<f64, OFFSETS, OFFSETS>, SVector<f64, OFFSETS>) {
-    let mut matrix = *matrix;
-    let mut right = *right;
-    for parameter in [index::CURVATURE, index::THETA] {
-        let own = matrix[(parameter, parameter)].max(f64::MIN_POSITIVE);
-        let column = matrix.column(parameter).into_owned();
-        let share = right[parameter] / own;
-        matrix -= column * column.transpose() / own;
-        right -= column * share;
-    }
-    (
-        matrix.fixed_view::<OFFSETS, OFFSETS>(1, 1).into_owned(),
-        right.fixed_rows::<OFFSETS>(1).into_owned(),
-    )
+fn take_out(parameter: usize, matrix: &mut ParameterMatrix, right: &mut Parameters) {
+    let own = matrix[(parameter, parameter)].max(f64::MIN_POSITIVE);
+    let column = matrix.column(parameter).into_owned();
+    let share = right[parameter] / own;
+    *matrix -= column * column.transpose() / own;
+    *right -= column * share;
 }
