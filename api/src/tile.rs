@@ -25,6 +25,8 @@
 //! A mean is within 0.015 % of what it was, a deviation at most 5.6 % too large, a count within
 //! 4.5 %.
 
+use std::f64::consts::LOG10_E;
+
 use uuid::Uuid;
 
 use crate::ids::ConfigurationId;
@@ -110,10 +112,19 @@ pub enum InvalidTile {
     TooLarge,
 }
 
-/// The code of a share of a range, rounded by `round`.
-fn code(share: f64, steps: f64, round: fn(f64) -> f64) -> f64 {
-    // What is off by the last bits of a logarithm belongs to its own step.
-    round((share * steps * 1.0e6).round() / 1.0e6).clamp(0.0, steps)
+/// Steps of a code that are told apart: what is off by the last bits of a logarithm belongs to its
+/// own step.
+const PARTS_OF_A_STEP: f64 = 1.0e6;
+
+/// How many parts of a step a share of a range is, from 0 to those of `steps`. Rounded by casts,
+/// as a picture has a million of these.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "clamped to numbers of 37 bits"
+)]
+fn parts(share: f64, steps: f64) -> u64 {
+    ((share * steps).clamp(0.0, steps) * PARTS_OF_A_STEP + 0.5) as u64
 }
 
 #[expect(
@@ -122,14 +133,15 @@ fn code(share: f64, steps: f64, round: fn(f64) -> f64) -> f64 {
     reason = "clamped to the steps of the type"
 )]
 fn codes(square: &TileSquare) -> (u16, u8, u8) {
-    let share = |value: f64, low: f64, span: f64| (value.log10() - low) / span;
+    const STEP: u64 = PARTS_OF_A_STEP as u64;
+    let share = |value: f64, low: f64, span: f64| (value.ln() * LOG10_E - low) / span;
     let theta = share(square.theta, THETA_LOW_LOG, THETA_SPAN_LOG);
     let deviation = share(square.std_dev, DEVIATION_LOW_LOG, DEVIATION_SPAN_LOG);
     let count = f64::from(square.segments.max(1)).log2() * COUNT_STEPS;
     (
-        code(theta, 65_534.0, f64::round) as u16 + 1,
-        code(deviation, 255.0, f64::ceil) as u8,
-        code(count / 255.0, 255.0, f64::round) as u8,
+        ((parts(theta, 65_534.0) + STEP / 2) / STEP) as u16 + 1,
+        parts(deviation, 255.0).div_ceil(STEP) as u8,
+        ((parts(count / 255.0, 255.0) + STEP / 2) / STEP) as u8,
     )
 }
 
@@ -155,11 +167,20 @@ fn square((mean, deviation, count): (u16, u8, u8)) -> Option<TileSquare> {
 impl Tile {
     /// The tile as bytes.
     pub fn encode(&self) -> Vec<u8> {
+        self.encode_with(self.squares.iter().copied())
+    }
+
+    /// The tile as bytes with these squares, as many as columns and rows say, in place of its own:
+    /// for a writer that has them in another form.
+    pub fn encode_with(
+        &self,
+        squares: impl ExactSizeIterator<Item = Option<TileSquare>>,
+    ) -> Vec<u8> {
         let name = self.normalisation.as_deref().unwrap_or_default().as_bytes();
         // A longer name is cut; none is.
         let name = &name[..name.len().min(usize::from(u16::MAX) - HEADER)];
         let header = HEADER + name.len();
-        let count = self.squares.len();
+        let count = squares.len();
         let mut bytes = Vec::with_capacity(header + SQUARE * count);
         bytes.extend(MAGIC);
         bytes.extend(VERSION.to_le_bytes());
@@ -175,14 +196,15 @@ impl Tile {
         let configuration = self.configuration.map(|found| found.as_uuid());
         bytes.extend(configuration.unwrap_or(Uuid::nil()).as_bytes());
         bytes.extend(name);
-        let (means, deviations) = (header, header + 2 * count);
         bytes.resize(header + SQUARE * count, 0);
-        for (index, found) in self.squares.iter().enumerate() {
+        let (means, rest) = bytes[header..].split_at_mut(2 * count);
+        let (deviations, counts) = rest.split_at_mut(count);
+        let planes = means.chunks_exact_mut(2).zip(deviations).zip(counts);
+        for (found, ((mean, deviation), segments)) in squares.zip(planes) {
             let Some(found) = found else { continue };
-            let (mean, deviation, segments) = codes(found);
-            bytes[means + 2 * index..means + 2 * index + 2].copy_from_slice(&mean.to_le_bytes());
-            bytes[deviations + index] = deviation;
-            bytes[deviations + count + index] = segments;
+            let theta;
+            (theta, *deviation, *segments) = codes(&found);
+            mean.copy_from_slice(&theta.to_le_bytes());
         }
         bytes
     }

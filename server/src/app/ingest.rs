@@ -43,7 +43,7 @@ pub const UPLOADS_WAITING_MAX: usize = 256;
 const GROUP_RECORDS_MAX: usize = 2_000;
 /// Least time from the begin of one transaction to the begin of the next, while uploads come in
 /// faster: a transaction has a price of its own, in processor time as well as on the disk.
-const GROUP_INTERVAL: Duration = Duration::from_millis(25);
+const GROUP_INTERVAL: Duration = Duration::from_millis(40);
 /// Integers on the wire and in JSON stay exact below this.
 const SEQ_MAX: u64 = 1 << 53;
 /// Measurements of one robot that may wait for the clock of their run.

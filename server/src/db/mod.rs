@@ -48,6 +48,11 @@ pub const SQLITE_VERSION_MIN: (u32, u32, u32) = (3, 51, 3);
 const READERS_MAX: u32 = 4;
 /// How long a request waits for a connection.
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(10);
+/// Pages of the write-ahead log, 64 MiB in all, at which a commit also brings them into the file:
+/// the more there are, the more commits have changed the same page, which is then written once.
+const WAL_PAGES: u32 = 16_384;
+/// Memory for the writer's pages, KiB: what robots drive over now is read once.
+const WRITER_CACHE_KIB: u32 = 32 * 1_024;
 /// How long SQLite waits for a lock that another process holds.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -191,16 +196,23 @@ impl Db {
             .journal_mode(SqliteJournalMode::Wal)
             .synchronous(SqliteSynchronous::Full)
             .foreign_keys(true)
-            .busy_timeout(BUSY_TIMEOUT);
+            .busy_timeout(BUSY_TIMEOUT)
+            .pragma("wal_autocheckpoint", WAL_PAGES.to_string());
         let pool = |connections_max| {
             SqlitePoolOptions::new()
                 .max_connections(connections_max)
                 .acquire_timeout(ACQUIRE_TIMEOUT)
                 .idle_timeout(None)
                 .max_lifetime(None)
+                // It is looked at when it comes back, and nothing but this process can end it.
+                .test_before_acquire(false)
         };
         let writer = pool(1)
-            .connect_with(options.clone())
+            .connect_with(
+                options
+                    .clone()
+                    .pragma("cache_size", format!("-{WRITER_CACHE_KIB}")),
+            )
             .await
             .map_err(failed)?;
         let version = sqlx::query_scalar!(r#"SELECT sqlite_version() AS "version!: String""#)

@@ -23,7 +23,7 @@ pub fn encode(raster: &Raster) -> Vec<u8> {
         grid_revision: raster.site.grid.revision,
         configuration: raster.configuration,
         normalisation: raster.normalisation.clone(),
-        squares: raster.squares.iter().map(square).collect(),
+        squares: Vec::new(),
     };
-    tile.encode()
+    tile.encode_with(raster.squares.iter().map(square))
 }

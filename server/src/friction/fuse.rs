@@ -18,6 +18,8 @@ use crate::config::FrictionConfig;
 
 /// Smallest θ that the map states: stiffer than K = 10⁶ is not told apart.
 pub const THETA_MIN: f64 = 1.0e-6;
+/// Largest standard deviation of θ that tells something: the whole range of θ, to K 0.1.
+pub const THETA_STD_DEV_MAX: f64 = 10.0;
 /// Standard deviations from which measurements contradict each other. With as many comparisons as
 /// a cell ever sees, one in ten thousand of them cuts off what was true.
 pub const CHANGE_DEVIATIONS: f64 = 4.5;
@@ -173,7 +175,8 @@ pub enum Ground {
     Area,
 }
 
-/// One estimate of what was seen; `None` when nothing was.
+/// One estimate of what was seen; `None` when nothing was, or nothing that tells one ground from
+/// another ([`THETA_STD_DEV_MAX`]).
 ///
 /// `seen` has one entry for each robot and epoch; it comes back sorted.
 pub fn fuse<R: Ord + Copy>(
@@ -257,6 +260,10 @@ fn fuse_in<R: Ord + Copy>(
     let drift = config.drift_variance_per_s;
     let words = &mut room.robots;
     let (theta, spread) = joined(seen, words, |one| Some(one.theta), config, (now_us, drift))?;
+    let std_dev = theta.std_dev * spread.widening();
+    if std_dev > THETA_STD_DEV_MAX {
+        return None;
+    }
     let mut layer = |value_of: fn(&Seen<R>) -> Option<Known>| {
         let is_known = seen.iter().any(|one| value_of(one).is_some());
         let joined = is_known.then(|| joined(seen, words, value_of, config, (now_us, 0.0)));
@@ -267,7 +274,7 @@ fn fuse_in<R: Ord + Copy>(
     Some(Fused {
         theta: Estimate {
             value: theta.value.max(THETA_MIN),
-            std_dev: theta.std_dev * spread.widening(),
+            std_dev,
         },
         mu_peak: seen
             .iter()

@@ -6,6 +6,7 @@ use proptest::prelude::*;
 use tread_api::friction::Information;
 
 use super::fixed::Fixed;
+use super::fuse::THETA_STD_DEV_MAX;
 use super::sums::{Pair, Pass};
 use super::*;
 use crate::config::FrictionConfig;
@@ -104,6 +105,14 @@ fn nothing_measured_is_nothing_known() {
     let mut empty = measured(0.2, 0.01, 0);
     empty.theta.information = Fixed::default();
     assert_eq!(fused([(1, empty)], &FrictionConfig::default()), None);
+}
+
+#[test]
+fn what_tells_no_ground_from_another_is_unknown_until_enough_of_it_has_come() {
+    let vague = measured(0.2, 1.5 * THETA_STD_DEV_MAX, 0);
+    assert_eq!(fused([(1, vague)], &no_bias()), None);
+    let three = fused([1, 2, 3].map(|robot| (robot, vague)), &no_bias()).unwrap();
+    assert!(three.std_dev < THETA_STD_DEV_MAX, "{three:?}");
 }
 
 #[test]
