@@ -10,7 +10,7 @@ use tread_control::plan::Plan;
 use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
-use super::replay::{Replayed, replay};
+use super::replay::replay;
 use super::tests::{SECOND, bench, config, files};
 use super::told;
 use crate::bench::Bench;
@@ -50,7 +50,7 @@ fn run_to_end(bench: &mut Bench) -> EndReason {
 }
 
 /// Lives through this from the mission's third second on, and runs the record of it again.
-fn recorded(live: impl FnOnce(&mut Bench, MissionId, &Plan)) -> Replayed {
+fn recorded(live: impl FnOnce(&mut Bench, MissionId, &Plan)) {
     let folder = TempDir::new().unwrap();
     let mut bench = bench(config(folder.path()));
     let (mission, plan) = driving(&mut bench);
@@ -62,7 +62,6 @@ fn recorded(live: impl FnOnce(&mut Bench, MissionId, &Plan)) -> Replayed {
     assert!(told::holds(&found), "{}", told::text(&found));
     assert_eq!((found.ticks, found.differing), (ticks, 0));
     assert!(found.driving_ticks > 250, "{}", found.driving_ticks);
-    found
 }
 
 #[test]
