@@ -231,7 +231,9 @@ class Robot:
         if self.is_on("inverted"):
             speeds[0], torques[0] = -speeds[0], -torques[0]
         noise = 0.01 * self.plant.mass * GRAVITY / 2 * self.plant.radius
-        pulls = [self.averaged(torque * self.torque_scale, noise) / 2 for torque in torques]
+        # What is off by a factor is off with its noise.
+        factor = self.faults.get("effort", 1.0)
+        pulls = [factor * self.averaged(torque * self.torque_scale, noise) / 2 for torque in torques]
         names = ["front_left_wheel", "front_right_wheel", "rear_left_wheel", "rear_right_wheel"]
         sides = [0, 1, 0, 1]
         effort = [] if self.is_on("effortless") else [pulls[side] for side in sides]

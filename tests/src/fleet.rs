@@ -1,7 +1,7 @@
 //! A server and its robots, each a process, in a folder of their own.
 
 use std::collections::HashMap;
-use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus};
 
@@ -13,6 +13,7 @@ use tread_agent::membership::{self, Enrolment, Membership, Trust};
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::robot::LinkState;
 
+use crate::ports::free_address;
 use crate::process::{Process, Usage};
 use crate::relay::Relay;
 use crate::rest::Rest;
@@ -408,10 +409,4 @@ fn first_token(node: &Path, folder: &Path, config: Option<&Path>) -> String {
     assert!(made.status.success(), "no token was made: {said}");
     let token = String::from_utf8(made.stdout).expect("a token is text");
     token.trim().to_owned()
-}
-
-/// A port of the loopback that is free now.
-fn free_address() -> SocketAddr {
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
-    listener.local_addr().expect("a bound port has an address")
 }

@@ -3,6 +3,7 @@
 //!
 //! * [`fleet`]: starts and stops the processes.
 //! * [`rest`]: speaks to the server as any client would.
+//! * [`ports`]: where they listen.
 //! * [`relay`]: a network between robot and server that can be cut.
 //! * [`wait`]: waits for a state with a bound, and says what was seen last.
 //! * [`chaos`]: runs in which things fail at random, from a seed of [`random`].
@@ -13,6 +14,7 @@
 pub mod chaos;
 pub mod fleet;
 pub mod light_robot;
+pub mod ports;
 pub mod process;
 pub mod random;
 pub mod relay;

@@ -1,12 +1,13 @@
 //! `tread-agent doctor`: what is wrong with the installation on a ROS 2 robot, before it drives.
 //!
 //! It listens for a while ([`listening`]); with `--move` it turns the robot on the spot and drives
-//! it ahead for a metre, slowly, and compares what was told with what was said ([`moving`]). Each finding names the
-//! key of `robot.toml` to look at.
+//! it ahead for a metre, slowly, and compares what was told with what was said ([`moving`]), and how its wheels
+//! pull with its mass ([`pulling`]). Each finding names the key of `robot.toml` to look at.
 
 mod heard;
 mod listening;
 mod moving;
+mod pulling;
 
 use std::io::Write as _;
 use std::path::PathBuf;
@@ -18,7 +19,7 @@ use clap::Args;
 use serde::Serialize;
 use tread_control::measured::WheelSpeeds;
 
-use self::heard::Heard;
+use self::heard::{Heard, Message};
 use crate::clock::{SharedClock, SystemClock};
 use crate::config::{AgentConfig, DriveConfig, Flags};
 use crate::drive::Drive as _;
@@ -35,12 +36,16 @@ const FIRST_WORD_MAX: Duration = Duration::from_secs(5);
 const PERIOD: Duration = Duration::from_millis(10);
 /// How long it takes to the whole speed, and back to rest.
 const RAMP: Duration = Duration::from_millis(500);
-/// How long the whole speed is held; the second half of it counts.
-const HOLD: Duration = Duration::from_secs(4);
+/// How long a servo takes at the most to follow the ramp to its end.
+const SETTLE: Duration = Duration::from_millis(500);
+/// How long the whole speed is held after that before it counts.
+const STEADY_AFTER: Duration = Duration::from_millis(1_500);
+/// How long it counts.
+const STEADY_FOR: Duration = Duration::from_secs(2);
 /// How long the robot stands between two motions.
 const REST: Duration = Duration::from_secs(1);
 /// How often a motion is tried of a base that falls silent in the middle of it.
-const TRIES_MAX: u32 = 5;
+const TRIES_MAX: u32 = 12;
 /// Longest wait for the bus to be left.
 const CLOSE_MAX: Duration = Duration::from_secs(2);
 /// Speed of the wheels' rims, metres per second.
@@ -173,35 +178,49 @@ struct Hands {
 }
 
 impl Hands {
-    /// Commands this for so long; whether the base was heard all the while.
-    fn hold(&mut self, command: WheelSpeeds, span: Duration) -> bool {
+    /// Commands this for so long, whatever the base says.
+    fn hold(&mut self, command: WheelSpeeds, span: Duration) {
+        self.go(command, span, |_| true);
+    }
+
+    /// Commands this for so long while the base is heard; whether it was all the while.
+    fn hold_heard(&mut self, command: WheelSpeeds, span: Duration) -> bool {
+        self.go(command, span, |drive| !drive.must_rest())
+    }
+
+    fn go(
+        &mut self,
+        command: WheelSpeeds,
+        span: Duration,
+        may: impl Fn(&Ros2Drive) -> bool,
+    ) -> bool {
+        self.said = command;
         let until = self.clock.monotonic() + span;
-        let mut is_heard = true;
         while self.clock.monotonic() < until {
             let _ = self.drive.read(self.clock.monotonic());
             self.drive.write(command);
-            is_heard &= !self.drive.must_rest();
+            if !may(&self.drive) {
+                return false;
+            }
             std::thread::sleep(PERIOD);
         }
-        self.said = command;
-        is_heard
+        true
     }
 
-    /// Goes from what was commanded to this, evenly; whether the base was heard all the while.
+    /// Goes from what was commanded to this, evenly, while the base is heard; whether it was all
+    /// the while.
     fn ramp(&mut self, to: WheelSpeeds) -> bool {
         let from = self.said;
         let steps = u32::try_from(RAMP.as_millis() / PERIOD.as_millis()).unwrap_or(1);
-        let mut is_heard = true;
-        for step in 1..=steps {
+        (1..=steps).all(|step| {
             let share = f64::from(step) / f64::from(steps);
             let between = |from: f64, to: f64| from + share * (to - from);
             let command = WheelSpeeds {
                 left_rad_s: between(from.left_rad_s, to.left_rad_s),
                 right_rad_s: between(from.right_rad_s, to.right_rad_s),
             };
-            is_heard &= self.hold(command, PERIOD);
-        }
-        is_heard
+            self.hold_heard(command, PERIOD)
+        })
     }
 
     /// Drives like this for a while, and says what was said meanwhile. A base that falls silent is
@@ -212,19 +231,26 @@ impl Hands {
         settings: &Ros2Settings,
         heard: &Heard,
     ) -> moving::Drove {
-        let mut drove = moving::Drove::default();
         for _ in 0..TRIES_MAX {
-            let mut is_heard = self.ramp(command) && self.hold(command, HOLD / 2);
-            heard.forget();
-            is_heard = is_heard && self.hold(command, HOLD / 2);
-            drove = moving::drove(command, settings, &heard.taken());
-            drove.is_heard = is_heard;
+            let messages = self.try_to_drive(command, heard);
             self.ramp(WheelSpeeds::default());
             self.hold(WheelSpeeds::default(), REST);
-            if is_heard {
-                break;
+            if let Some([starting, steady]) = messages {
+                return moving::drove(command, settings, &starting, &steady);
             }
         }
-        drove
+        moving::Drove::default()
+    }
+
+    /// What was said while the robot set off, and when its speed was steady; none of a base that fell
+    /// silent.
+    fn try_to_drive(&mut self, command: WheelSpeeds, heard: &Heard) -> Option<[Vec<Message>; 2]> {
+        heard.forget();
+        let mut is_heard = self.ramp(command) && self.hold_heard(command, SETTLE);
+        let starting = heard.taken();
+        is_heard = is_heard && self.hold_heard(command, STEADY_AFTER);
+        heard.forget();
+        is_heard = is_heard && self.hold_heard(command, STEADY_FOR);
+        is_heard.then(|| [starting, heard.taken()])
     }
 }

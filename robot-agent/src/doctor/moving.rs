@@ -3,13 +3,14 @@
 //! Pure: from what was told and what was said while the robot turned to the left on the spot, and
 //! while it drove ahead.
 
-use tread_control::measured::WheelSpeeds;
+use tread_control::measured::{WheelSpeeds, WheelTorques};
 use tread_control::robot::RobotModel;
+use tread_ros2::messages::Time;
 
-use super::Finding;
 use super::heard::Message;
+use super::{Finding, pulling};
 use crate::drive::ros2::inlet::decoded;
-use crate::drive::ros2::reading::{Content, Position, wheels_of};
+use crate::drive::ros2::reading::{Content, Position, Wheels, wheels_of};
 use crate::drive::ros2::settings::{MotionOf, Ros2Settings};
 
 /// Speed below which a wheel counts as standing, as a share of what it was told.
@@ -18,6 +19,8 @@ const STANDING_SHARE: f64 = 0.2;
 const TURNING_RAD_S: f64 = 0.05;
 /// Least spread of the places' times for a speed, seconds squared: ten over a second.
 const PLACES_SPREAD_MIN_S2: f64 = 0.8;
+/// Messages of the wheels whose mean is the speed that they gained.
+const LAST_SPEEDS: usize = 10;
 /// Error of a radius that is borne, as a share.
 const RADIUS_SHARE: f64 = 0.06;
 
@@ -32,8 +35,23 @@ pub(super) struct Drove {
     pub(super) turn_rad_s: Option<f64>,
     /// How fast it went over ground, metres per second.
     pub(super) ground_m_s: Option<f64>,
+    /// How they pulled; none if that is not known.
+    pub(super) torques: Option<WheelTorques>,
+    /// How both sides together pulled while the robot set off.
+    pub(super) set_off: Option<SetOff>,
     /// Whether the base was heard all the while.
     pub(super) is_heard: bool,
+}
+
+/// How the wheels of both sides pulled from rest to the whole speed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct SetOff {
+    /// Their mean torque together, newton metres.
+    pub(super) torque_n_m: f64,
+    /// How long that took, by the messages' stamps.
+    pub(super) span_s: f64,
+    /// How fast they turned at its end.
+    pub(super) gained_rad_s: f64,
 }
 
 /// A mean that grows.
@@ -54,9 +72,15 @@ impl Mean {
     }
 }
 
-/// Sums up what was said.
-pub(super) fn drove(told: WheelSpeeds, settings: &Ros2Settings, messages: &[Message]) -> Drove {
+/// Sums up what was said while the robot set off, and when its speed was steady.
+pub(super) fn drove(
+    told: WheelSpeeds,
+    settings: &Ros2Settings,
+    starting: &[Message],
+    messages: &[Message],
+) -> Drove {
     let (mut left, mut right) = (Mean::default(), Mean::default());
+    let (mut left_torque, mut right_torque) = (Mean::default(), Mean::default());
     let (mut gyro, mut odometry_turn, mut speed) =
         (Mean::default(), Mean::default(), Mean::default());
     let mut places: Vec<(f64, Position)> = Vec::new();
@@ -72,9 +96,15 @@ pub(super) fn drove(told: WheelSpeeds, settings: &Ros2Settings, messages: &[Mess
             left.add(speeds.left_rad_s);
             right.add(speeds.right_rad_s);
         };
-        let at_s = f64::from(stamp.sec) + 1.0e-9 * f64::from(stamp.nanosec);
+        let at_s = seconds(stamp);
         match content {
-            Content::Wheels(wheels) => add_wheels(wheels.speeds),
+            Content::Wheels(wheels) => {
+                add_wheels(wheels.speeds);
+                if let Some(torques) = wheels.torques {
+                    left_torque.add(torques.left_n_m);
+                    right_torque.add(torques.right_n_m);
+                }
+            }
             Content::Inertial(inertial) => gyro.add(inertial.yaw_rate_rad_s),
             Content::Motion(motion) => {
                 odometry_turn.add(motion.yaw_rate_rad_s);
@@ -101,8 +131,53 @@ pub(super) fn drove(told: WheelSpeeds, settings: &Ros2Settings, messages: &[Mess
             }),
         turn_rad_s: gyro.value().or(odometry_turn.value()),
         ground_m_s: speed_of(&places).or(speed.value()),
+        torques: left_torque
+            .value()
+            .zip(right_torque.value())
+            .map(|(left_n_m, right_n_m)| WheelTorques {
+                left_n_m,
+                right_n_m,
+            }),
+        set_off: set_off(settings, starting),
         is_heard: true,
     }
+}
+
+/// How the wheels pulled in all of these messages.
+fn set_off(settings: &Ros2Settings, messages: &[Message]) -> Option<SetOff> {
+    let mut torque = Mean::default();
+    let mut said = Vec::with_capacity(messages.len());
+    for message in messages {
+        let Ok(Some((stamp, content))) = decoded(settings, message.source, &message.payload) else {
+            continue;
+        };
+        if let Content::Wheels(Wheels {
+            speeds,
+            torques: Some(torques),
+        }) = content
+        {
+            torque.add(torques.left_n_m + torques.right_n_m);
+            let speed_rad_s = 0.5 * (speeds.left_rad_s + speeds.right_rad_s);
+            said.push((seconds(stamp), speed_rad_s));
+        }
+    }
+    let ((first_s, _), (last_s, _)) = (said.first()?, said.last()?);
+    let intervals = torque.count - 1.0;
+    let mut gained = Mean::default();
+    for (_, speed_rad_s) in said.iter().rev().take(LAST_SPEEDS) {
+        gained.add(*speed_rad_s);
+    }
+    let gained_rad_s = gained.value()?;
+    (intervals > 0.0).then(|| SetOff {
+        torque_n_m: torque.sum / torque.count,
+        // Each message stands for the time since the one before it.
+        span_s: (last_s - first_s) * torque.count / intervals,
+        gained_rad_s,
+    })
+}
+
+fn seconds(stamp: Time) -> f64 {
+    f64::from(stamp.sec) + 1.0e-9 * f64::from(stamp.nanosec)
 }
 
 /// How fast the places went ahead: the slope of the line through all of them.
@@ -179,6 +254,7 @@ pub(super) fn findings(
         findings.push(of_base(settings, &going, ahead));
         findings.extend(of_radius(model, &going, ahead));
         findings.push(of_track(model, &turning, turn_rad_s));
+        findings.extend(pulling::findings(settings, model, turned, ahead));
     }
     findings
 }

@@ -184,4 +184,6 @@ pub(crate) struct SafetyMessage {
 }
 
 #[cfg(test)]
+mod mission_tests;
+#[cfg(test)]
 mod tests;

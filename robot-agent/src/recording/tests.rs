@@ -25,9 +25,9 @@ use super::{RecordingConfig, RunHead, told, topics};
 use crate::bench::{Bench, boot, site_of};
 use crate::sim::scenario::Scenario;
 
-const SECOND: Duration = Duration::from_secs(1);
+pub(super) const SECOND: Duration = Duration::from_secs(1);
 
-fn config(folder: &Path) -> RecordingConfig {
+pub(super) fn config(folder: &Path) -> RecordingConfig {
     RecordingConfig {
         folder: folder.to_owned(),
         file_bytes: 64 << 20,
@@ -35,7 +35,7 @@ fn config(folder: &Path) -> RecordingConfig {
     }
 }
 
-fn bench(config: RecordingConfig) -> Bench {
+pub(super) fn bench(config: RecordingConfig) -> Bench {
     let scenario = Scenario::built_in().unwrap();
     let start = Pose {
         x_m: 4.0,
@@ -59,7 +59,7 @@ fn drive(bench: &mut Bench, time: Duration) {
 }
 
 /// The files of a folder, in no order that means anything.
-fn files(folder: &Path) -> Vec<PathBuf> {
+pub(super) fn files(folder: &Path) -> Vec<PathBuf> {
     let mut files: Vec<PathBuf> = fs::read_dir(folder)
         .unwrap()
         .map(|entry| entry.unwrap().path())

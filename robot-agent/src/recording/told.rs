@@ -7,7 +7,7 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use super::VERSION;
-use super::replay::{DifferingTick, Replayed, replay};
+use super::replay::{DifferingTick, ReplayError, Replayed, replay};
 
 /// Arguments of `tread-agent replay`.
 #[derive(Debug, Clone, Args)]
@@ -23,16 +23,21 @@ pub(crate) struct ReplayArgs {
 /// Runs a record again and says where it differs; whether it does not.
 ///
 /// # Errors
-/// The record cannot be read at all, or nothing can be written.
+/// The record cannot be read at all, and no JSON is wanted to say so in; or nothing can be written.
 pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<bool> {
-    let found = replay(&args.files)?;
+    let replayed = replay(&args.files);
     let mut out = std::io::stdout().lock();
     if args.json {
-        serde_json::to_writer(&mut out, &object(&found))?;
+        let object = match &replayed {
+            Ok(found) => object(found),
+            Err(refused) => unread(refused),
+        };
+        serde_json::to_writer(&mut out, &object)?;
         writeln!(out)?;
-    } else {
-        write!(out, "{}", text(&found))?;
+        return Ok(replayed.is_ok_and(|found| holds(&found)));
     }
+    let found = replayed?;
+    write!(out, "{}", text(&found))?;
     Ok(holds(&found))
 }
 
@@ -55,6 +60,10 @@ fn checks(found: &Replayed) -> [(&'static str, &'static str, Value, bool); 3] {
     ]
 }
 
+fn check(name: &str, goal: &str, value: &Value, holds: bool) -> Value {
+    json!({ "name": name, "goal": goal, "value": value, "holds": holds })
+}
+
 /// Whether all was run again as it was recorded; a torn end is no difference.
 pub(crate) fn holds(found: &Replayed) -> bool {
     checks(found).iter().all(|(_, _, _, holds)| *holds)
@@ -73,9 +82,7 @@ fn told(tick: &DifferingTick) -> Value {
 pub(crate) fn object(found: &Replayed) -> Value {
     let checks: Vec<Value> = checks(found)
         .into_iter()
-        .map(|(name, goal, value, holds)| {
-            json!({ "name": name, "goal": goal, "value": value, "holds": holds })
-        })
+        .map(|(name, goal, value, holds)| check(name, goal, &value, holds))
         .collect();
     json!({
         "robot": found.head.robot,
@@ -88,6 +95,21 @@ pub(crate) fn object(found: &Replayed) -> Value {
         "gap": found.gap,
         "differing": found.told.iter().map(told).collect::<Vec<_>>(),
         "checks": checks,
+    })
+}
+
+/// For programs, of a record that cannot be read or run at all.
+pub(crate) fn unread(refused: &ReplayError) -> Value {
+    let mut words = refused.to_string();
+    let mut cause = std::error::Error::source(refused);
+    while let Some(deeper) = cause {
+        words = format!("{words}: {deeper}");
+        cause = deeper.source();
+    }
+    json!({
+        "replayed_by": VERSION,
+        "refused": words,
+        "checks": [check("records that cannot be run again", "0", &json!(1), false)],
     })
 }
 

@@ -52,12 +52,32 @@ async fn a_recorded_mission_of_a_real_agent_runs_again_to_the_bit() {
     // Without a run's begin there is nothing to compare, and the program says so.
     let mut later = files.clone();
     later.sort();
-    let refused = Command::new(env!("CARGO_BIN_EXE_tread-agent"))
-        .arg("replay")
-        .args(&later[1..])
-        .output()
-        .unwrap();
-    assert_eq!(refused.status.code(), Some(1));
+    let replayed_anyway = |words: &[&str]| {
+        let replay = Command::new(env!("CARGO_BIN_EXE_tread-agent"))
+            .arg("replay")
+            .args(words)
+            .args(&later[1..])
+            .output()
+            .unwrap();
+        assert_eq!(replay.status.code(), Some(1), "{replay:?}");
+        replay
+    };
+    let refused = replayed_anyway(&[]);
     let said = String::from_utf8_lossy(&refused.stderr);
     assert!(said.contains("part 0 is missing"), "{said}");
+    // A program that reads JSON gets it there, also of a file that is none.
+    for (words, expected) in [
+        (&["--json"][..], "part 0 is missing"),
+        (
+            &["--json", "gone.mcap"],
+            "`gone.mcap` cannot be opened: No such file",
+        ),
+        (&["--json", env!("CARGO_MANIFEST_PATH")], "is no MCAP file"),
+    ] {
+        let refused = replayed_anyway(words);
+        let object: Value = serde_json::from_slice(&refused.stdout).unwrap();
+        let said = object["refused"].as_str().unwrap();
+        assert!(said.contains(expected), "{said}");
+        assert_eq!(object["checks"][0]["holds"], false, "{object}");
+    }
 }

@@ -118,6 +118,8 @@ pub(super) struct JointsFile {
     pub(super) right: Vec<String>,
     pub(super) left_sign: Option<f64>,
     pub(super) right_sign: Option<f64>,
+    pub(super) left_effort_sign: Option<f64>,
+    pub(super) right_effort_sign: Option<f64>,
     pub(super) gear_ratio: Option<f64>,
     #[serde(default)]
     pub(super) effort: EffortFile,

@@ -289,23 +289,23 @@ impl JointsFile {
         }
         let effort = match (self.effort, constant) {
             (EffortFile::None, _) => Effort::None,
-            (EffortFile::Torque, None) => Effort::Times(1.0),
+            (EffortFile::Torque, None) => Effort::Torque,
             (EffortFile::Torque, Some(_)) => {
                 return Err(refused(key, "it is for effort = \"current\""));
             }
-            (EffortFile::Current, Some(constant)) => Effort::Times(constant),
+            (EffortFile::Current, Some(constant)) => Effort::Current(constant),
             (EffortFile::Current, None) => {
                 return Err(refused(key, "effort = \"current\" needs it"));
             }
         };
-        let side = |key, names: &[String], sign_key, given| {
+        let side = |key, names: &[String], [turns, pulls]: [(&'static str, Option<f64>); 2]| {
             if names.is_empty() || names.len() > JOINTS_MAX {
                 return Err(refused(key, format!("1 to {JOINTS_MAX} joints are needed")));
             }
-            let sign = sign(sign_key, given)?;
             Ok(SideJoints {
                 names: names.to_vec(),
-                sign,
+                sign: sign(turns.0, turns.1)?,
+                effort_sign: sign(pulls.0, pulls.1)?,
             })
         };
         if self.left.iter().any(|name| self.right.contains(name)) {
@@ -323,14 +323,21 @@ impl JointsFile {
             left: side(
                 "drive.ros2.joints.left",
                 &self.left,
-                "drive.ros2.joints.left_sign",
-                self.left_sign,
+                [
+                    ("drive.ros2.joints.left_sign", self.left_sign),
+                    ("drive.ros2.joints.left_effort_sign", self.left_effort_sign),
+                ],
             )?,
             right: side(
                 "drive.ros2.joints.right",
                 &self.right,
-                "drive.ros2.joints.right_sign",
-                self.right_sign,
+                [
+                    ("drive.ros2.joints.right_sign", self.right_sign),
+                    (
+                        "drive.ros2.joints.right_effort_sign",
+                        self.right_effort_sign,
+                    ),
+                ],
             )?,
             gear_ratio,
             effort,

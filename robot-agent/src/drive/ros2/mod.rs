@@ -40,7 +40,7 @@ use crate::clock::SharedClock;
 use crate::fleet::LinkError;
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 /// A ROS 2 base, seen from the loop.
 #[derive(Debug)]

@@ -12,7 +12,7 @@ use tread_ros2::messages::{
 
 use super::refusal::Refusal;
 use super::settings::{
-    CommandSettings, Effort, ImuSettings, JointSettings, MotionOf, OdometrySettings, PoseSettings,
+    CommandSettings, ImuSettings, JointSettings, MotionOf, OdometrySettings, PoseSettings,
     SideJoints,
 };
 use crate::drive::Battery;
@@ -206,16 +206,16 @@ pub fn joints(bytes: &[u8], settings: &JointSettings) -> Result<Option<Reading>,
             let index = index.ok_or(Refusal::Joints)?;
             let turned = message.velocity.get(index).ok_or(Refusal::Joints)?;
             speed_rad_s += bounded(turned / settings.gear_ratio, RATE_MAX)?;
-            torque_n_m = match settings.effort {
-                Effort::Times(constant) if has_effort => {
+            torque_n_m = match settings.effort.torque_n_m() {
+                Some(constant) if has_effort => {
                     let effort = message.effort.get(index).unwrap_or(f64::NAN);
-                    let pulled = effort * constant * settings.gear_ratio;
+                    let pulled = effort * constant * joints.effort_sign * settings.gear_ratio;
                     // Some bases write no number for an effort that they do not measure.
                     torque_n_m
                         .filter(|_| pulled.abs() <= TORQUE_MAX_N_M)
                         .map(|sum| sum + pulled)
                 }
-                Effort::Times(_) | Effort::None => None,
+                _ => None,
             };
         }
         let wheels = f64::from(u32::try_from(joints.names.len()).unwrap_or(u32::MAX));

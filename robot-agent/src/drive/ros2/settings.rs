@@ -131,8 +131,21 @@ pub struct ImuSettings {
 pub enum Effort {
     /// Nothing that can be used.
     None,
-    /// Newton metres, or amperes; times this it is newton metres of the motor.
-    Times(f64),
+    /// Newton metres of the joint.
+    Torque,
+    /// Amperes, each so many newton metres of the joint.
+    Current(f64),
+}
+
+impl Effort {
+    /// Newton metres of the joint for one of its effort; none where it is of no use.
+    pub const fn torque_n_m(self) -> Option<f64> {
+        match self {
+            Self::None => None,
+            Self::Torque => Some(1.0),
+            Self::Current(n_m_a) => Some(n_m_a),
+        }
+    }
 }
 
 /// The joints of one side.
@@ -142,6 +155,8 @@ pub struct SideJoints {
     pub names: Vec<String>,
     /// 1.0, or -1.0 where they turn backwards when the robot goes ahead.
     pub sign: f64,
+    /// 1.0, or -1.0 where their effort is positive against the way they turn.
+    pub effort_sign: f64,
 }
 
 /// The joints that drive.

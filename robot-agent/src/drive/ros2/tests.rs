@@ -21,10 +21,11 @@ pub(super) fn topic(text: &str) -> Name {
     Name::topic(text, &Name::default()).unwrap()
 }
 
-pub(super) fn settings() -> Ros2Settings {
+pub(crate) fn settings() -> Ros2Settings {
     let side = |name: &str| SideJoints {
         names: vec![name.to_owned()],
         sign: 1.0,
+        effort_sign: 1.0,
     };
     Ros2Settings {
         bus: BusSettings {
@@ -53,7 +54,7 @@ pub(super) fn settings() -> Ros2Settings {
             left: side("left"),
             right: side("right"),
             gear_ratio: 2.0,
-            effort: Effort::Times(0.5),
+            effort: Effort::Current(0.5),
         }),
         pose: None,
         battery: None,

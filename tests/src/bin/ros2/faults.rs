@@ -8,8 +8,9 @@ use tread_api::ids::RobotId;
 use tread_api::mission::MissionState;
 use tread_api::robot::Robot;
 use tread_tests::fleet::Fleet;
-use tread_tests::wait::{SHORT, eventually};
+use tread_tests::wait::SHORT;
 
+use crate::judgement::Judgement;
 use crate::observer::Observer;
 use crate::python_robot::PythonRobot;
 use tread_tests::report::Check;
@@ -20,8 +21,15 @@ const ZERO_MAX_MS: f64 = 150.0;
 const ZERO_OF_A_LIE_MAX_MS: f64 = 900.0;
 /// How long a fault lasts.
 const LASTS: Duration = Duration::from_millis(1_500);
+/// How long one lasts on a slow machine that leaves the agent without a position: it must be over
+/// before a mission fails without one.
+const LASTS_SLOW: Duration = Duration::from_secs(1);
 /// Longest until the robot moves again.
 const AGAIN_MAX: Duration = Duration::from_secs(10);
+/// The same on a slow machine.
+const AGAIN_AT_ALL_MAX: Duration = Duration::from_mins(1);
+/// Time between two looks.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
 /// How long it must have moved before the next fault.
 const MOVES_FOR: Duration = Duration::from_secs(2);
 
@@ -60,12 +68,21 @@ const FAULTS: [Fault; 9] = [
     },
 ];
 
+/// What a robot's faults are tried with.
+struct Trial<'a> {
+    fleet: &'a Fleet,
+    robot: &'a RobotId,
+    observer: &'a Observer,
+    judgement: Judgement,
+}
+
 /// Breaks the base in every way and mends it again.
 pub(crate) async fn measure(
     fleet: &Fleet,
     robot: &RobotId,
     base: &mut PythonRobot,
     observer: &Observer,
+    judgement: Judgement,
 ) -> anyhow::Result<Vec<Check>> {
     let circle = json!({"circle": {
         "center": {"x_m": 0.0, "y_m": 1.5}, "radius_m": 1.5, "speed_m_s": 0.5, "turns": 40.0
@@ -73,19 +90,24 @@ pub(crate) async fn measure(
     let mission = fleet.rest.send(robot, circle).await;
     let active = [MissionState::Active];
     fleet.rest.mission_reaches(mission, &active, SHORT).await;
+    let trial = Trial {
+        fleet,
+        robot,
+        observer,
+        judgement,
+    };
     let mut checks = Vec::new();
     for fault in &FAULTS {
-        if !moves(observer, AGAIN_MAX).await {
+        if !trial.moves_for(MOVES_FOR).await {
             checks.push(Check::so(
                 format!("{}: the robot moves before it", fault.name),
                 false,
             ));
             break;
         }
-        tokio::time::sleep(MOVES_FOR).await;
-        checks.extend(try_fault(fleet, robot, base, observer, fault).await?);
+        checks.extend(trial.of(fault, base).await?);
     }
-    let goes_on = moves(observer, AGAIN_MAX).await;
+    let goes_on = trial.moves_for(Duration::ZERO).await;
     let detail = fleet.rest.mission(mission).await;
     let is_active = detail.mission.state == MissionState::Active;
     if !is_active {
@@ -98,66 +120,107 @@ pub(crate) async fn measure(
     Ok(checks)
 }
 
-async fn try_fault(
-    fleet: &Fleet,
-    robot: &RobotId,
-    base: &mut PythonRobot,
-    observer: &Observer,
-    fault: &Fault,
-) -> anyhow::Result<Vec<Check>> {
-    let name = fault.name;
-    observer.forget_commands();
-    let switched_at = Instant::now();
-    base.switch(name, fault.value)?;
-    let path = format!("{name}: it says so");
-    let is_said = eventually(
-        &path,
-        SHORT,
-        || fleet.rest.robot(robot),
-        |seen| {
-            seen.as_ref().is_some_and(|seen| says(seen, fault.said))
-                || switched_at.elapsed() > LASTS.mul_f64(0.9)
-        },
-    )
-    .await
-    .is_some_and(|seen| says(&seen, fault.said));
-    tokio::time::sleep(LASTS.saturating_sub(switched_at.elapsed())).await;
-    // The last good word: the last of all, if the base fell silent, or the one before the fault.
-    let last_word = observer.sensor_at().unwrap_or(switched_at);
-    let fell_silent = name == "silent" || name == "restart";
-    let is_of_pause = last_word.duration_since(switched_at) < Duration::from_millis(100);
-    let since = if fell_silent && is_of_pause {
-        last_word
-    } else {
-        switched_at
-    };
-    let (zero_ms, last_ms) =
-        observer
-            .zero_after(since)
-            .map_or((f64::INFINITY, 0.0), |(first, last)| {
-                let ms = |span: Duration| 1.0e3 * span.as_secs_f64();
-                (ms(first), last.map_or(0.0, ms))
-            });
-    if name != "restart" {
-        base.switch(name, "off")?;
-    }
-    Ok(vec![
-        Check::at_most(
-            format!("{name}: first zero command, ms"),
-            fault.zero_max_ms,
-            zero_ms,
-        ),
-        Check::at_most(
-            format!("{name}: last command that was none, ms"),
-            fault.zero_max_ms,
-            last_ms,
-        ),
-        Check::so(path, is_said),
-        Check::so(
+impl Trial<'_> {
+    async fn of(&self, fault: &Fault, base: &mut PythonRobot) -> anyhow::Result<Vec<Check>> {
+        let name = fault.name;
+        self.observer.forget_commands();
+        // A lie takes longer to be seen through, and leaves the position as it is.
+        let lasts = if name == "stuck" {
+            LASTS
+        } else {
+            self.judgement.patience(LASTS, LASTS_SLOW)
+        };
+        let switched_at = Instant::now();
+        base.switch(name, fault.value)?;
+        // The base is mended in time however long an answer takes: without a position a mission fails.
+        let (mut is_said, tried) = tokio::join!(
+            self.is_said_by(switched_at + lasts.mul_f64(0.9), fault.said),
+            async {
+                tokio::time::sleep_until(switched_at + lasts).await;
+                let checks = self.of_rest(fault, switched_at);
+                if name != "restart" {
+                    base.switch(name, "off")?;
+                }
+                anyhow::Ok(checks)
+            }
+        );
+        let mut checks = tried?;
+        if self.judgement == Judgement::Behaviour && !is_said {
+            // A robot says how it is twice a second, and what it dropped for a while afterwards.
+            is_said = self.is_said_by(Instant::now() + SHORT, fault.said).await;
+        }
+        let moves_again = self.moves_for(Duration::ZERO).await;
+        checks.push(Check::so(format!("{name}: it says so"), is_said));
+        checks.push(Check::so(
             format!("{name}: the robot moves again"),
-            moves(observer, AGAIN_MAX).await,
-        ),
-    ])
+            moves_again,
+        ));
+        Ok(checks)
+    }
+
+    /// Whether and how soon the robot was told to rest.
+    fn of_rest(&self, fault: &Fault, switched_at: Instant) -> Vec<Check> {
+        let name = fault.name;
+        // The last good word: the last of all, if the base fell silent, or the one before the fault.
+        let last_word = self.observer.sensor_at().unwrap_or(switched_at);
+        let fell_silent = name == "silent" || name == "restart";
+        let is_of_pause = last_word.duration_since(switched_at) < Duration::from_millis(100);
+        let since = if fell_silent && is_of_pause {
+            last_word
+        } else {
+            switched_at
+        };
+        let ms = |span: Duration| 1.0e3 * span.as_secs_f64();
+        let zero = self.observer.zero_after(since);
+        let zero_ms = zero.map_or(f64::INFINITY, |(first, _)| ms(first));
+        let last_ms = zero.and_then(|(_, last)| last).map_or(0.0, ms);
+        let most_ms = fault.zero_max_ms;
+        let first = format!("{name}: first zero command, ms");
+        let last = format!("{name}: last command that was none, ms");
+        let mut checks = vec![
+            self.judgement.at_most(first, most_ms, zero_ms),
+            self.judgement.at_most(last, most_ms, last_ms),
+        ];
+        // A base that starts again may be heard again by now.
+        if name != "restart" {
+            let is_at_rest = zero.is_some() && !self.observer.is_moving();
+            checks.push(Check::so(format!("{name}: it is told to rest"), is_at_rest));
+        }
+        checks
+    }
+
+    /// Whether the robot says this of itself before that time.
+    async fn is_said_by(&self, until: Instant, words: &str) -> bool {
+        loop {
+            let seen = self.fleet.rest.robot(self.robot).await;
+            if seen.is_some_and(|seen| says(&seen, words)) {
+                return true;
+            }
+            if Instant::now() >= until {
+                return false;
+            }
+            tokio::time::sleep(LOOK_EVERY).await;
+        }
+    }
+
+    /// Waits until the robot has been told to move for so long without a pause.
+    async fn moves_for(&self, span: Duration) -> bool {
+        let bound = self.judgement.patience(AGAIN_MAX, AGAIN_AT_ALL_MAX) + span;
+        let until = Instant::now() + bound;
+        let mut since = None;
+        while Instant::now() < until {
+            if self.observer.is_moving() {
+                let since: Instant = *since.get_or_insert_with(Instant::now);
+                if since.elapsed() >= span {
+                    return true;
+                }
+            } else {
+                since = None;
+            }
+            tokio::time::sleep(LOOK_EVERY).await;
+        }
+        false
+    }
 }
 
 /// Whether the robot says this of itself.
@@ -165,16 +228,4 @@ fn says(seen: &Robot, words: &str) -> bool {
     let fault = seen.live.as_ref().and_then(|live| live.fault.as_ref());
     fault.is_some_and(|fault| fault.contains(words))
         || seen.alerts.iter().any(|alert| alert.text.contains(words))
-}
-
-/// Waits until the robot is told to move.
-async fn moves(observer: &Observer, bound: Duration) -> bool {
-    let until = Instant::now() + bound;
-    while Instant::now() < until {
-        if observer.is_moving() {
-            return true;
-        }
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
-    false
 }

@@ -10,21 +10,27 @@
 //! 3. **doctor**: `tread-agent doctor` on a healthy robot, and on robots with one planted fault each.
 //! 4. **faults**: a dead, late, lying, restarting base; how soon the command is zero, what the agent says,
 //!    and that it goes on.
+//!
+//! With `--behaviour` all of that happens too, at once and without the simulated robot, and what the agent does is
+//! judged. Times and accuracy are shown then and judged without it: they are of an optimised build on
+//! a machine that does nothing else.
 
 mod doctor;
 mod faults;
+mod judgement;
 mod missions;
 mod observer;
 mod python_robot;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Parser;
 use tread_tests::fleet::Fleet;
 use tread_tests::process::node;
-use tread_tests::report;
+use tread_tests::report::{self, Check};
 
+use self::judgement::Judgement;
 use self::observer::Observer;
 use self::python_robot::PythonRobot;
 
@@ -35,6 +41,9 @@ struct Arguments {
     /// A Python with the packages of tests/ros2/requirements.txt
     #[arg(long, default_value = "python3")]
     python: PathBuf,
+    /// Judge what the agent does, and only show what needs an optimised build on a quiet machine
+    #[arg(long)]
+    behaviour: bool,
     /// Print one JSON object instead of a table
     #[arg(long)]
     json: bool,
@@ -44,20 +53,37 @@ struct Arguments {
 async fn main() -> anyhow::Result<ExitCode> {
     let arguments = Arguments::parse();
     let node = node()?;
-    let mut fleet = Fleet::start_with(&node).await;
+    let driven = driven(&arguments, &node);
+    let examined = doctor::measure(&arguments.python, &node);
+    let checks = if arguments.behaviour {
+        let (driven, examined) = tokio::join!(driven, examined);
+        [driven?, examined?].concat()
+    } else {
+        // One after the other: the times of one are not to be those of both.
+        [driven.await?, examined.await?].concat()
+    };
+    report::tell(arguments.json, &checks)
+}
+
+/// Drives a robot on missions, then into faults.
+async fn driven(arguments: &Arguments, node: &Path) -> anyhow::Result<Vec<Check>> {
+    let judgement = if arguments.behaviour {
+        Judgement::Behaviour
+    } else {
+        Judgement::Figures
+    };
+    let mut fleet = Fleet::start_with(node).await;
     let mut base = PythonRobot::start(&arguments.python, &[])?;
     let observer = Observer::start(base.endpoint())?;
     let robot = missions::start_robot(&mut fleet, &base).await?;
-    let mut checks = missions::measure(&mut fleet, &robot, &observer).await;
-    checks.extend(observer.graph(python_robot::DOMAIN)?);
+    let mut checks = missions::measure(&mut fleet, &robot, &observer, judgement).await;
+    checks.extend(observer.graph(python_robot::DOMAIN).await?);
     checks.push(observer::stays_on_the_robot(&fleet).await?);
-    checks.extend(faults::measure(&fleet, &robot, &mut base, &observer).await?);
-    drop(base);
-    checks.extend(doctor::measure(&arguments.python, &node).await?);
+    checks.extend(faults::measure(&fleet, &robot, &mut base, &observer, judgement).await?);
     if !checks.iter().all(|check| check.holds) {
         for line in fleet.log_tail(robot.as_str()) {
             eprintln!("{line}");
         }
     }
-    report::tell(arguments.json, &checks)
+    Ok(checks)
 }

@@ -11,9 +11,10 @@ use tread_api::mission::{MissionQuality, MissionState};
 use tread_tests::fleet::{Fleet, GROUND, GROUND_THETA, SITE};
 use tread_tests::wait::{SHORT, eventually};
 
+use crate::judgement::Judgement;
 use crate::observer::Observer;
 use crate::python_robot::PythonRobot;
-use tread_tests::report::Check;
+use tread_tests::report::{Check, quantile};
 
 /// Longest that a mission may take.
 const MISSION_MAX: Duration = Duration::from_mins(2);
@@ -32,7 +33,7 @@ pub(crate) async fn start_robot(fleet: &mut Fleet, base: &PythonRobot) -> anyhow
     let folder = fleet.robot_folder(&robot);
     std::fs::create_dir_all(&folder)?;
     let file = folder.join("robot.toml");
-    std::fs::write(&file, base.configuration())?;
+    std::fs::write(&file, base.configuration(""))?;
     let flag = format!("--config={}", file.display());
     fleet.agents_get(&[&flag]);
     fleet.start_agent(&robot, 0.0).await;
@@ -83,8 +84,14 @@ async fn drive(
     ended.quality.context("the robot says how well it drove")
 }
 
-/// Drives circle and waypoints on the ROS 2 robot, then on the simulated one.
-pub(crate) async fn measure(fleet: &mut Fleet, robot: &RobotId, observer: &Observer) -> Vec<Check> {
+/// Drives circle and waypoints on the ROS 2 robot, and on the simulated one where they are compared.
+pub(crate) async fn measure(
+    fleet: &mut Fleet,
+    robot: &RobotId,
+    observer: &Observer,
+    judgement: Judgement,
+) -> Vec<Check> {
+    let mut checks = Vec::new();
     observer.take_delays_ms();
     let ours = match missions(fleet, robot).await {
         Ok(qualities) => qualities,
@@ -95,15 +102,43 @@ pub(crate) async fn measure(fleet: &mut Fleet, robot: &RobotId, observer: &Obser
     };
     let mut delays_ms = observer.take_delays_ms();
     let theta = theta_of_fleet(fleet).await;
-    let simulated: RobotId = "rover-sim".parse().expect("it is an identifier");
-    fleet.start_agent(&simulated, 0.0).await;
-    let theirs = match missions(fleet, &simulated).await {
-        Ok(qualities) => qualities,
-        Err(cause) => {
-            eprintln!("{cause:#}");
-            return vec![Check::so("missions: the simulated robot succeeds", false)];
+    match judgement {
+        Judgement::Figures => match compared(fleet, &ours).await {
+            Ok(ratios) => checks.extend(ratios),
+            Err(cause) => {
+                eprintln!("{cause:#}");
+                return vec![Check::so("missions: the simulated robot succeeds", false)];
+            }
+        },
+        Judgement::Behaviour => {
+            checks.push(Check::so("missions: circle and waypoints succeed", true));
+            let rms = |quality: &MissionQuality| 1.0e3 * quality.cross_track_rms_m;
+            let [circle, waypoints] = [rms(&ours[0]), rms(&ours[1])];
+            checks.push(Check::shown("missions: circle, RMS, mm", circle));
+            checks.push(Check::shown("missions: waypoints, RMS, mm", waypoints));
         }
-    };
+    }
+    let error = (theta - GROUND_THETA).abs() / GROUND_THETA;
+    checks.push(Check::at_most(
+        format!("missions: θ {theta:.3} of the fleet, true {GROUND_THETA}, error"),
+        THETA_ERROR_MAX,
+        error,
+    ));
+    let p50_ms = quantile(&mut delays_ms, 0.5);
+    let times = delays_ms.len();
+    checks.push(judgement.at_most(
+        format!("bus: sensor to command, {times} times, p50 {p50_ms:.2} ms, p99, ms"),
+        DELAY_P99_MS,
+        quantile(&mut delays_ms, 0.99),
+    ));
+    checks
+}
+
+/// How far from the path beside the simulated robot.
+async fn compared(fleet: &mut Fleet, ours: &[MissionQuality; 2]) -> anyhow::Result<[Check; 2]> {
+    let simulated: RobotId = "rover-sim".parse()?;
+    fleet.start_agent(&simulated, 0.0).await;
+    let theirs = missions(fleet, &simulated).await?;
     fleet.kill_agent(&simulated);
     let ratio = |name: &str, index: usize| {
         let (own, other): (&MissionQuality, &MissionQuality) = (&ours[index], &theirs[index]);
@@ -115,30 +150,7 @@ pub(crate) async fn measure(fleet: &mut Fleet, robot: &RobotId, observer: &Obser
             format!("missions: {name}, RMS {own_mm:.1} mm, simulated {other_mm:.1} mm, ratio");
         Check::at_most(name, CROSS_TRACK_RATIO_MAX, own_mm / other_mm)
     };
-    delays_ms.sort_by(f64::total_cmp);
-    let quantile = |percent: usize| {
-        let index = (delays_ms.len() * percent).div_ceil(100).saturating_sub(1);
-        delays_ms.get(index).copied().unwrap_or(f64::INFINITY)
-    };
-    let error = (theta - GROUND_THETA).abs() / GROUND_THETA;
-    vec![
-        ratio("circle", 0),
-        ratio("waypoints", 1),
-        Check::at_most(
-            format!("missions: θ {theta:.3} of the fleet, true {GROUND_THETA}, error"),
-            THETA_ERROR_MAX,
-            error,
-        ),
-        Check::at_most(
-            format!(
-                "bus: sensor to command, {} times, p50 {:.2} ms, p99, ms",
-                delays_ms.len(),
-                quantile(50)
-            ),
-            DELAY_P99_MS,
-            quantile(99),
-        ),
-    ]
+    Ok([ratio("circle", 0), ratio("waypoints", 1)])
 }
 
 async fn missions(fleet: &Fleet, robot: &RobotId) -> anyhow::Result<[MissionQuality; 2]> {

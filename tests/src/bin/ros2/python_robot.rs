@@ -2,11 +2,11 @@
 
 use std::fmt::Write as _;
 use std::io::{BufRead as _, BufReader, Write as _};
-use std::net::{Ipv4Addr, TcpListener};
 use std::path::Path;
 use std::process::{Child, ChildStdin, Command, Stdio};
 
 use anyhow::Context;
+use tread_tests::ports::free_address;
 
 /// The robot's domain.
 pub(crate) const DOMAIN: u32 = 7;
@@ -22,10 +22,7 @@ pub(crate) struct PythonRobot {
 impl PythonRobot {
     /// Starts a robot that is its own router, and waits until it speaks.
     pub(crate) fn start(python: &Path, flags: &[&str]) -> anyhow::Result<Self> {
-        let port = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?
-            .local_addr()?
-            .port();
-        let endpoint = format!("tcp/127.0.0.1:{port}");
+        let endpoint = format!("tcp/{}", free_address());
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("ros2/robot.py");
         let mut child = Command::new(python)
             .arg(&script)
@@ -64,8 +61,8 @@ impl PythonRobot {
         Ok(self.input.flush()?)
     }
 
-    /// The `robot.toml` of an agent that drives it.
-    pub(crate) fn configuration(&self) -> String {
+    /// The `robot.toml` of an agent that drives it, with more to say of its joints.
+    pub(crate) fn configuration(&self, joints: &str) -> String {
         let mut text = String::from("[drive]\nkind = \"ros2\"\n[drive.ros2]\n");
         // Writing to a string cannot fail.
         let _ = write!(
@@ -77,8 +74,11 @@ impl PythonRobot {
             "namespace = \"/rover\"\n\
              [drive.ros2.joints]\n\
              left = [\"front_left_wheel\", \"rear_left_wheel\"]\n\
-             right = [\"front_right_wheel\", \"rear_right_wheel\"]\n\
-             [drive.ros2.imu]\n\
+             right = [\"front_right_wheel\", \"rear_right_wheel\"]\n",
+        );
+        text.push_str(joints);
+        text.push_str(
+            "[drive.ros2.imu]\n\
              [drive.ros2.odometry]\ntopic = \"vio/odom\"\nmotion_of = \"ground\"\n\
              [drive.ros2.pose]\n\
              [drive.ros2.battery]\n",

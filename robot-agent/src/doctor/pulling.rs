@@ -1,0 +1,256 @@
+//! Whether the joints' effort can be the torque of the wheels: its signs, gear and torque constant.
+//!
+//! Pure. Nothing measures a torque directly here, but two things bound it. Wheels that scrub in a turn on
+//! the spot work against the ground, so each side pulls the way it turns, and as hard as a friction
+//! coefficient that grounds have: by the balance of moments of four equal contacts a side pulls
+//! `μ·(m·g/2)·L/√(L² + W²)`. And what the wheels pull to set off ahead, above what keeps the robot
+//! going, is its momentum `m·v`, whatever the ground and its slope; the motors' own inertia behind the
+//! gear comes on top. A factor of some four is found, one of two is not.
+
+use tread_control::robot::RobotModel;
+
+use super::Finding;
+use super::moving::{Drove, SetOff};
+use crate::drive::ros2::settings::{Effort, Ros2Settings};
+
+/// Share of a side's load below which a pull against the motion counts as none.
+const AGAINST_MIN: f64 = 0.02;
+/// Friction coefficients that grounds have for scrubbing wheels, drive train included.
+const FRICTION: std::ops::RangeInclusive<f64> = 0.1..=1.5;
+/// Momentum that the wheels gave as a share of the robot's. Heavy rotors behind a high gear can make it
+/// several times as much, nothing can make it a third.
+const MOMENTUM_RATIO: std::ops::RangeInclusive<f64> = 0.4..=8.0;
+/// Least speed that the robot must have gained, as a share of what it was told.
+const GAINED_MIN: f64 = 0.5;
+
+/// What the wheels pulled, beside what they can have pulled.
+#[derive(Debug, Clone, Copy)]
+struct Pull {
+    /// Friction coefficients that a side's pull in the turn needs, left and right; negative against the motion.
+    friction: [f64; 2],
+    /// Momentum that the wheels gave over the robot's own, if it gained enough speed.
+    momentum_ratio: Option<f64>,
+}
+
+/// What was found; nothing of joints that say no torque.
+pub(super) fn findings(
+    settings: &Ros2Settings,
+    model: &RobotModel,
+    turned: &Drove,
+    ahead: &Drove,
+) -> Option<Finding> {
+    let effort = settings.joints.as_ref()?.effort;
+    (effort != Effort::None).then_some(())?;
+    let pull = Pull {
+        friction: friction(model, turned)?,
+        momentum_ratio: ahead.set_off.and_then(|set_off| {
+            let steady = ahead.torques?;
+            momentum_ratio(model, ahead, &set_off, steady.left_n_m + steady.right_n_m)
+        }),
+    };
+    Some(of_signs(&pull).unwrap_or_else(|| of_size(&pull, effort, model)))
+}
+
+fn friction(model: &RobotModel, turned: &Drove) -> Option<[f64; 2]> {
+    let (torques, wheels) = (turned.torques?, turned.wheels?);
+    let along = model.wheelbase_m() / model.wheelbase_m().hypot(model.track_width_m());
+    let grip_n_m = model.wheel_radius_m() * model.side_load_n() * along;
+    Some([
+        torques.left_n_m * wheels.left_rad_s.signum() / grip_n_m,
+        torques.right_n_m * wheels.right_rad_s.signum() / grip_n_m,
+    ])
+}
+
+fn momentum_ratio(
+    model: &RobotModel,
+    ahead: &Drove,
+    set_off: &SetOff,
+    steady_n_m: f64,
+) -> Option<f64> {
+    let told_rad_s = 0.5 * (ahead.told.left_rad_s + ahead.told.right_rad_s);
+    (set_off.gained_rad_s > GAINED_MIN * told_rad_s).then_some(())?;
+    let gained_m_s = model.wheel_radius_m() * set_off.gained_rad_s;
+    let given_n_s = (set_off.torque_n_m - steady_n_m) * set_off.span_s / model.wheel_radius_m();
+    Some(given_n_s / (model.mass_kg() * gained_m_s))
+}
+
+/// Effort that points against the motion.
+fn of_signs(pull: &Pull) -> Option<Finding> {
+    let [is_left, is_right] = pull.friction.map(|friction| friction < -AGAINST_MIN);
+    let (key, text) = match (is_left, is_right) {
+        (true, true) => (
+            "drive.ros2.joints.left_effort_sign",
+            "in a turn on the spot the joints' effort points against their motion, which nothing but \
+             its sign explains: give `left_effort_sign` and `right_effort_sign`",
+        ),
+        (true, false) => (
+            "drive.ros2.joints.left_effort_sign",
+            "in a turn on the spot the left joints' effort points against their motion, the right \
+             joints' does not: its sign is wrong",
+        ),
+        (false, true) => (
+            "drive.ros2.joints.right_effort_sign",
+            "in a turn on the spot the right joints' effort points against their motion, the left \
+             joints' does not: its sign is wrong",
+        ),
+        (false, false) => return None,
+    };
+    Some(Finding::wrong("torque", key, text))
+}
+
+/// Effort that is too great or too small.
+fn of_size(pull: &Pull, effort: Effort, model: &RobotModel) -> Finding {
+    let [least, most] = [
+        pull.friction.into_iter().fold(f64::INFINITY, f64::min),
+        pull.friction.into_iter().fold(0.0, f64::max),
+    ];
+    let turn = format!(
+        "a turn on the spot pulls as on ground with a friction coefficient of {least:.2} to {most:.2}"
+    );
+    let setting_off = pull.momentum_ratio.map_or_else(String::new, |ratio| {
+        let mass_kg = model.mass_kg();
+        format!(
+            ", setting off as with {:.1} kg where the model says {mass_kg:.1} kg",
+            ratio * mass_kg
+        )
+    });
+    let ratio = pull.momentum_ratio;
+    let verdict = if most > *FRICTION.end() || ratio.is_some_and(|it| it > *MOMENTUM_RATIO.end()) {
+        "too much"
+    } else if least < *FRICTION.start() || ratio.is_some_and(|it| it < *MOMENTUM_RATIO.start()) {
+        "too little"
+    } else {
+        return Finding::well("torque", format!("{turn}{setting_off}"));
+    };
+    let (key, hint) = match effort {
+        Effort::Current(n_m_a) => (
+            "drive.ros2.joints.torque_constant_n_m_a",
+            ratio.filter(|ratio| *ratio > 0.0).map_or_else(
+                    || "the torque constant is another".to_owned(),
+                    |ratio| {
+                        let fits = n_m_a / ratio;
+                        format!("with {fits:.3} N·m/A, not {n_m_a:.3}, it would fit the mass")
+                    },
+                ),
+        ),
+        Effort::Torque | Effort::None => (
+            "drive.ros2.joints.effort",
+            "it is no torque of the joints in newton metres, but perhaps a current, or the motors' \
+             before a gear"
+                .to_owned(),
+        ),
+    };
+    let text = format!("{turn}{setting_off}: the joints' effort is {verdict}; {hint}");
+    Finding::wrong("torque", key, text)
+}
+
+#[cfg(test)]
+mod tests {
+    use tread_control::measured::{WheelSpeeds, WheelTorques};
+
+    use super::*;
+    use crate::drive::ros2::settings::JointSettings;
+    use crate::drive::ros2::tests::settings;
+
+    /// A turn and a start of the paper's robot on ground of this friction, its torques times these factors.
+    fn found(effort: Effort, friction: f64, factors: [f64; 2]) -> Option<Finding> {
+        let model = RobotModel::yi2007();
+        let mut settings = settings();
+        let joints = settings.joints.take().unwrap();
+        settings.joints = Some(JointSettings { effort, ..joints });
+        let speeds = |left_rad_s, right_rad_s| WheelSpeeds {
+            left_rad_s,
+            right_rad_s,
+        };
+        let torques = |left: f64, right: f64| {
+            Some(WheelTorques {
+                left_n_m: left * factors[0],
+                right_n_m: right * factors[1],
+            })
+        };
+        let along = model.wheelbase_m() / model.wheelbase_m().hypot(model.track_width_m());
+        let scrub_n_m = friction * along * model.side_load_n() * model.wheel_radius_m();
+        let turned = Drove {
+            told: speeds(-2.0, 2.0),
+            wheels: Some(speeds(-2.0, 2.0)),
+            torques: torques(-scrub_n_m, scrub_n_m),
+            ..Drove::default()
+        };
+        // On a slope that takes half a newton metre of each side, to 2 rad/s within a second.
+        let setting_off_n_m = model.mass_kg() * 2.0 * model.wheel_radius_m().powi(2);
+        let ahead = Drove {
+            told: speeds(2.0, 2.0),
+            wheels: Some(speeds(2.0, 2.0)),
+            torques: torques(0.5, 0.5),
+            set_off: Some(SetOff {
+                torque_n_m: factors.iter().sum::<f64>() * 0.5 * (1.0 + setting_off_n_m),
+                span_s: 1.0,
+                gained_rad_s: 2.0,
+            }),
+            ..Drove::default()
+        };
+        findings(&settings, &model, &turned, &ahead)
+    }
+
+    fn key(effort: Effort, friction: f64, factors: [f64; 2]) -> Option<&'static str> {
+        found(effort, friction, factors).unwrap().key
+    }
+
+    #[test]
+    fn a_plausible_torque_is_told_with_friction_and_mass() {
+        let well = found(Effort::Torque, 0.5, [1.0, 1.0]).unwrap();
+        assert!(well.holds);
+        assert!(well.text.contains("0.50 to 0.50"), "{}", well.text);
+        let mass = format!("with {:.1} kg", RobotModel::yi2007().mass_kg());
+        assert!(well.text.contains(&mass), "{}", well.text);
+        for friction in [0.2, 1.1] {
+            assert_eq!(key(Effort::Current(0.4), friction, [1.3, 0.8]), None);
+        }
+    }
+
+    #[test]
+    fn each_sign_of_effort_has_its_key() {
+        let of = |factors| key(Effort::Torque, 0.5, factors);
+        let [left, right] = [
+            "drive.ros2.joints.left_effort_sign",
+            "drive.ros2.joints.right_effort_sign",
+        ];
+        assert_eq!(of([-1.0, 1.0]), Some(left));
+        assert_eq!(of([1.0, -1.0]), Some(right));
+        assert_eq!(of([-1.0, -1.0]), Some(left));
+        assert_eq!(of([-10.0, -10.0]), Some(left));
+    }
+
+    #[test]
+    fn a_torque_constant_ten_times_off_is_told_with_the_one_that_fits() {
+        let constant = Effort::Current(0.5);
+        let of_constant = Some("drive.ros2.joints.torque_constant_n_m_a");
+        for (factor, fits) in [(10.0, "0.050 N·m/A"), (0.1, "5.000 N·m/A")] {
+            let wrong = found(constant, 0.5, [factor, factor]).unwrap();
+            assert_eq!(wrong.key, of_constant, "{}", wrong.text);
+            assert!(wrong.text.contains(fits), "{}", wrong.text);
+        }
+        // Whatever the ground: on ice the pull itself could be that of a good constant.
+        for friction in [0.1, 0.3, 1.0] {
+            for factor in [10.0, 0.1] {
+                let named = key(constant, friction, [factor, factor]);
+                assert_eq!(named, of_constant, "{friction} {factor}");
+            }
+        }
+        let torque = key(Effort::Torque, 0.5, [0.1, 0.1]);
+        assert_eq!(torque, Some("drive.ros2.joints.effort"));
+    }
+
+    #[test]
+    fn a_side_that_says_nothing_is_not_hidden_by_the_other() {
+        assert_eq!(
+            key(Effort::Torque, 0.5, [0.0, 1.0]),
+            Some("drive.ros2.joints.effort")
+        );
+    }
+
+    #[test]
+    fn joints_that_say_no_torque_are_not_judged() {
+        assert_eq!(found(Effort::None, 0.5, [1.0, 1.0]), None);
+    }
+}
