@@ -17,6 +17,8 @@ pub const REFUSED_MAX: u32 = 20;
 /// Squared Mahalanobis distance beyond which a fix is refused (three degrees of freedom, one in
 /// 10⁶ true ones).
 const GATE: f64 = 30.7;
+/// Curvature of ways that nobody heard of, one standard deviation, 1/m: a bend may begin in them.
+const UNHEARD_CURVATURE_PER_M: f64 = 1.0;
 /// Longest prediction in one call, seconds.
 const STEP_MAX_S: f64 = 0.5;
 /// Oldest fix that is used, seconds.
@@ -237,6 +239,22 @@ impl Localisation {
         self.covariance[(5, 5)] += dt_s * self.noise.gyro_offset_walk.powi(2);
     }
 
+    /// Nothing was heard for `unheard_s` seconds: the robot may be wherever its last speeds could
+    /// have brought it, or where it was. Called before the prediction that ends the silence, whose
+    /// rates are already those of after it.
+    pub fn lose_track(&mut self, unheard_s: f64) {
+        if !self.started || !unheard_s.is_finite() || unheard_s <= 0.0 {
+            return;
+        }
+        let (ahead_m_s, left_m_s) = (self.ahead_m_s + self.state[3], self.state[4]);
+        let way_m = ahead_m_s.hypot(left_m_s) * unheard_s;
+        let turn_rad = (self.turn_rad_s * unheard_s).hypot(UNHEARD_CURVATURE_PER_M * way_m);
+        let turn_rad = turn_rad.min(std::f64::consts::PI);
+        for (index, deviation) in [way_m, way_m, turn_rad].into_iter().enumerate() {
+            self.covariance[(index, index)] += deviation * deviation;
+        }
+    }
+
     /// Takes a position fix.
     pub fn correct(&mut self, fix: &PositionFix) -> FixOutcome {
         let fix_noise = fix.noise.unwrap_or(FixNoise {
@@ -369,6 +387,35 @@ mod tests {
         filter.predict(0.0, WheelSpeeds::default(), 0.05);
         assert_eq!(filter.correct(&fix(50.0, 0.0)), FixOutcome::Restarted);
         assert!((filter.pose().unwrap().x_m - 50.0).abs() < 1.0e-9);
+    }
+
+    #[test]
+    fn after_a_silence_a_fix_is_believed_as_far_as_the_robot_can_have_come() {
+        let wheels = |speed_rad_s: f64| WheelSpeeds {
+            left_rad_s: speed_rad_s,
+            right_rad_s: speed_rad_s,
+        };
+        let speed_m_s = 0.5;
+        let speed_rad_s = speed_m_s / RobotModel::yi2007().wheel_radius_m();
+        let driven = |is_silence_known: bool, speed_rad_s: f64, jump_m: f64| {
+            let mut filter = filter();
+            filter.correct(&fix(0.0, 0.0));
+            for _ in 0..20 {
+                filter.predict(0.0, wheels(speed_rad_s), 0.05);
+                let x_m = filter.pose().unwrap().x_m;
+                filter.correct(&fix(x_m, 0.0));
+            }
+            let x_m = filter.pose().unwrap().x_m;
+            if is_silence_known {
+                filter.lose_track(1.5);
+            }
+            filter.predict(0.0, wheels(0.0), 0.2);
+            filter.correct(&fix(x_m + jump_m, 0.0))
+        };
+        assert_eq!(driven(true, speed_rad_s, 0.3), FixOutcome::Fused);
+        assert_eq!(driven(false, speed_rad_s, 0.3), FixOutcome::Outlier);
+        assert_eq!(driven(true, speed_rad_s, 50.0), FixOutcome::Outlier);
+        assert_eq!(driven(true, 0.0, 0.3), FixOutcome::Outlier);
     }
 
     #[test]

@@ -178,6 +178,20 @@ impl Drive for Blind<'_> {
     }
 }
 
+/// A base that is not heard, though it hears.
+struct Unheard<'base>(&'base mut SimulatedDrive);
+
+impl Drive for Unheard<'_> {
+    fn read(&mut self, now: Duration) -> Feedback {
+        self.0.read(now);
+        Feedback::default()
+    }
+
+    fn write(&mut self, command: WheelSpeeds) {
+        self.0.write(command);
+    }
+}
+
 /// A base that says nothing.
 struct Silence;
 
@@ -436,6 +450,14 @@ impl Bench {
         self.simulate();
         let now = self.moment();
         self.core.tick(now, false, &mut Blind(&mut self.drive));
+        self.collect();
+    }
+
+    /// A tick in which the base goes on as it is told, but is not heard.
+    pub fn tick_unheard(&mut self) {
+        self.simulate();
+        let now = self.moment();
+        self.core.tick(now, false, &mut Unheard(&mut self.drive));
         self.collect();
     }
 

@@ -233,3 +233,17 @@ fn a_mission_whose_base_is_silent_for_a_while_is_held_and_goes_on_when_it_is_hea
     assert!(!is_held(&bench));
     assert_eq!(run_to_end(&mut bench), EndReason::Reached);
 }
+
+#[test]
+fn a_base_that_is_heard_again_says_at_once_where_the_robot_is() {
+    let (mut bench, _, _) = driving();
+    let silent_until = bench.now + 11 * SECOND / 5;
+    while bench.now < silent_until {
+        bench.tick_unheard();
+    }
+    bench.run_for(SECOND / 5);
+    let (_, fixed_at) = bench.ends.shared.snapshot().pose.unwrap();
+    let age = bench.now.saturating_sub(fixed_at);
+    assert!(age < SECOND / 5, "{age:?}");
+    assert_eq!(run_to_end(&mut bench), EndReason::Reached);
+}

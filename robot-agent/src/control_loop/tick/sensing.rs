@@ -55,6 +55,8 @@ impl LoopCore {
                 // Only what can be used counts as a word of the base: one that says nothing but
                 // nonsense is as good as silent.
                 self.last_sample = Some(sample.at);
+                self.mind_gap(sample.at);
+                self.reckoned_to = self.reckoned_to.max(Some(sample.at));
                 self.measured_wheels = wheel_speeds;
                 if dt_s > 0.0 {
                     let ahead = self.model.twist_from_wheel_speeds(wheel_speeds).linear_m_s;
@@ -82,6 +84,7 @@ impl LoopCore {
                 }
             }
             if let Some(pose) = sample.position {
+                self.mind_gap(sample.at);
                 self.progress.note_fix(pose.point());
                 // A position takes longer to be found than the motion since.
                 let fix = PositionFix {
@@ -103,6 +106,19 @@ impl LoopCore {
             self.estimate = self.estimator.estimate();
         }
         ground_changed
+    }
+
+    /// Where the robot went while its wheels were not heard, nobody knows: without this, what its
+    /// position says afterwards would be refused as a jump.
+    fn mind_gap(&mut self, at: Duration) {
+        let Some(reckoned_to) = self.reckoned_to else {
+            return;
+        };
+        let gap = at.saturating_sub(reckoned_to);
+        if gap > self.silent_after {
+            self.localisation.lose_track(gap.as_secs_f64());
+            self.reckoned_to = Some(at);
+        }
     }
 
     /// How fast the robot really goes along its path, as well as it is known: slip tells wheels and
