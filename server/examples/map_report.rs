@@ -24,6 +24,7 @@ use tread_api::site::Cell;
 use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::{Batch, Record, RecordContent};
 use tread_server::app::App;
+use tread_server::app::checkpoints;
 use tread_server::app::identity::FirstAdmin;
 use tread_server::app::ingest::{self, UPLOADS_WAITING_MAX, Upload};
 use tread_server::clock::Clock;
@@ -323,6 +324,8 @@ async fn measured(folder: &Path, robots: &[RobotId]) -> anyhow::Result<Asked> {
     let (uploads, uploads_in) = mpsc::channel(UPLOADS_WAITING_MAX);
     let writer = ingest::run(app.clone(), uploads_in, supervisor.stop_token());
     supervisor.spawn_vital("ingest", writer);
+    let logging = checkpoints::run(app.clone(), supervisor.stop_token());
+    supervisor.spawn_vital("checkpoints", logging);
     let router = http::router(app.clone(), Names::default());
     let stop = Arc::new(AtomicBool::new(false));
     // A kilometre across the map, changing rows: a cell for each metre and some more.

@@ -41,7 +41,7 @@ use tread_api::startup::give_zenoh_threads;
 
 use self::app::enrolment::Office;
 use self::app::identity::audit;
-use self::app::{App, Links, events, ingest, merging, reconciler, retention};
+use self::app::{App, Links, checkpoints, events, ingest, merging, reconciler, retention};
 use self::authority::Authority;
 use self::clock::Clock;
 use self::config::RobotsConfig;
@@ -130,6 +130,7 @@ impl Server {
         );
         supervisor.spawn_vital("reconciler", reconciling);
         supervisor.spawn_vital("events", events::run(app.clone(), stop()));
+        supervisor.spawn_vital("checkpoints", checkpoints::run(app.clone(), stop()));
         supervisor.spawn_vital("merging", merging::run(app.clone(), stop()));
         let telling = app::friction::live::run(app.clone(), stop());
         supervisor.spawn_vital("map", telling);

@@ -2,6 +2,7 @@
 
 pub mod alerts;
 pub mod check;
+pub mod checkpoints;
 pub mod enrolment;
 mod error;
 pub mod events;

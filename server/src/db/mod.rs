@@ -49,8 +49,8 @@ pub const SQLITE_VERSION_MIN: (u32, u32, u32) = (3, 51, 3);
 const READERS_MAX: u32 = 4;
 /// How long a request waits for a connection.
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(10);
-/// Pages of the write-ahead log, 64 MiB in all, at which a commit also brings them into the file:
-/// the more there are, the more commits have changed the same page, which is then written once.
+/// Pages of the write-ahead log, 64 MiB in all, at which a commit also brings them into the file,
+/// if [`Db::checkpoint`] has not done so.
 const WAL_PAGES: u32 = 16_384;
 /// Memory for the writer's pages, KiB: what robots drive over now is read once.
 const WRITER_CACHE_KIB: u32 = 32 * 1_024;
@@ -189,6 +189,8 @@ pub enum OpenError {
 pub struct Db {
     writer: SqlitePool,
     readers: SqlitePool,
+    /// Brings the log into the file beside the writer.
+    checkpoints: SqlitePool,
     version: String,
     write_waits: Arc<Histogram>,
     transactions: Arc<Transactions>,
@@ -250,6 +252,10 @@ impl Db {
                 path: path.to_owned(),
                 cause,
             })?;
+        let checkpoints = pool(1)
+            .connect_with(options.clone())
+            .await
+            .map_err(failed)?;
         let readers = pool(READERS_MAX)
             .connect_with(options.read_only(true))
             .await
@@ -257,6 +263,7 @@ impl Db {
         Ok(Self {
             writer,
             readers,
+            checkpoints,
             version,
             write_waits: Arc::default(),
             transactions: Arc::default(),
@@ -351,9 +358,22 @@ impl Db {
         }
     }
 
+    /// Brings what is in the log into the file, as far as nobody reads it there; whoever writes
+    /// meanwhile does not wait for it.
+    ///
+    /// # Errors
+    /// SQLite failed, as on a full disk; the log has it all the same.
+    pub async fn checkpoint(&self) -> Result<(), DbError> {
+        sqlx::query("PRAGMA wal_checkpoint(PASSIVE)")
+            .execute(&self.checkpoints)
+            .await?;
+        Ok(())
+    }
+
     /// Closes all connections after what they are doing; the file is whole then.
     pub async fn close(&self) {
         self.readers.close().await;
+        self.checkpoints.close().await;
         self.writer.close().await;
     }
 }
