@@ -221,7 +221,7 @@ impl Writer {
         let mut tally = Tally::default();
         let app = self.app.clone();
         let _turn = app.maps().turn().await;
-        let mut tx = app.db().write_measurements().await?;
+        let mut tx = app.db().write_uploads().await?;
         let now = self.app.clock().now();
         for (index, upload) in group.iter().enumerate() {
             let Upload { site, batch, .. } = upload;

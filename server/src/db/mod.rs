@@ -271,8 +271,8 @@ impl Db {
         })
     }
 
-    /// Counts what was committed, but for measurements: what was read at a generation is as it was
-    /// while that is the present one.
+    /// Counts what was committed, but for uploads: what was read at a generation is as it was while
+    /// that is the present one, if no upload changes it.
     pub fn generation(&self) -> u64 {
         self.generation.load(Ordering::Acquire)
     }
@@ -301,12 +301,13 @@ impl Db {
         }
     }
 
-    /// The same for measurements alone, which [`Db::generation`] does not count.
+    /// The same for what robots upload, measurements and reports of missions, which
+    /// [`Db::generation`] does not count.
     ///
     /// # Errors
     /// The turn did not come in time, or SQLite failed.
     #[track_caller]
-    pub fn write_measurements(&self) -> impl Future<Output = Result<Tx, DbError>> + use<'_> {
+    pub fn write_uploads(&self) -> impl Future<Output = Result<Tx, DbError>> + use<'_> {
         let writing = self.write();
         async move {
             Ok(Tx {
@@ -459,7 +460,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_is_committed_counts_even_if_nobody_waits_for_it_and_measurements_never_do() {
+    async fn what_is_committed_counts_even_if_nobody_waits_for_it_and_uploads_never_do() {
         let folder = tempfile::tempdir().unwrap();
         let db = Db::open(&folder.path().join("some.db")).await.unwrap();
         let before = db.generation();
@@ -476,12 +477,7 @@ mod tests {
             .await
             .unwrap();
         assert_eq!(db.generation(), before + 1);
-        db.write_measurements()
-            .await
-            .unwrap()
-            .commit()
-            .await
-            .unwrap();
+        db.write_uploads().await.unwrap().commit().await.unwrap();
         assert_eq!(db.generation(), before + 1);
     }
 }

@@ -1,7 +1,8 @@
-//! What every answer about the map needs from the database, kept until something but a measurement
-//! is written: a question about the map then waits for no connection.
+//! What every answer about the map needs from the database, kept until something but an upload is
+//! written: a question about the map then waits for no connection.
 
 use std::collections::HashMap;
+use std::hash::Hash;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use tread_api::ids::{RobotId, SiteId};
@@ -10,39 +11,48 @@ use super::{App, AppError, SiteView};
 use crate::db;
 use crate::db::robots::RobotRow;
 
-/// Robots that are kept; beyond, all are read again.
-const ROBOTS_MAX: usize = 1_000;
-/// Sites that are kept; beyond, all are read again.
-const SITES_MAX: usize = 100;
+/// Sites, and robots, that are kept; beyond, all are read again.
+const KEPT_MAX: usize = 1_000;
 
 /// What is kept.
 #[derive(Debug, Default)]
 pub(in crate::app) struct Views {
-    inner: Mutex<Kept>,
+    sites: Kept<SiteId, SiteView>,
+    robots: Kept<(i64, RobotId), RobotRow>,
 }
 
-#[derive(Debug, Default)]
-struct Kept {
-    /// The generation of the database that all of it is of.
-    generation: u64,
-    sites: HashMap<SiteId, Arc<SiteView>>,
-    robots: HashMap<(i64, RobotId), Arc<RobotRow>>,
+/// Things that were read at one generation of the database.
+#[derive(Debug)]
+struct Kept<K, V> {
+    of: Mutex<(u64, HashMap<K, Arc<V>>)>,
 }
 
-impl Views {
-    /// Looks at what is kept of this generation, or keeps something of it.
-    fn of<T>(&self, generation: u64, look: impl FnOnce(&mut Kept) -> T) -> Option<T> {
-        let mut kept = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
-        if kept.generation > generation {
-            return None;
+impl<K, V> Default for Kept<K, V> {
+    fn default() -> Self {
+        Self {
+            of: Mutex::default(),
         }
-        if kept.generation < generation {
-            *kept = Kept {
-                generation,
-                ..Kept::default()
-            };
+    }
+}
+
+impl<K: Eq + Hash, V> Kept<K, V> {
+    fn find(&self, generation: u64, key: &K) -> Option<Arc<V>> {
+        let of = self.of.lock().unwrap_or_else(PoisonError::into_inner);
+        (of.0 == generation).then(|| of.1.get(key).cloned())?
+    }
+
+    /// Keeps what was read when the generation was this or a later one.
+    fn keep(&self, generation: u64, key: K, value: V) -> Arc<V> {
+        let value = Arc::new(value);
+        let mut of = self.of.lock().unwrap_or_else(PoisonError::into_inner);
+        if of.0 < generation || of.1.len() >= KEPT_MAX {
+            of.1.clear();
+            of.0 = of.0.max(generation);
         }
-        Some(look(&mut kept))
+        if of.0 == generation {
+            of.1.insert(key, Arc::clone(&value));
+        }
+        value
     }
 }
 
@@ -50,21 +60,11 @@ impl App {
     /// A site as answers about its map need it.
     pub(in crate::app) async fn site_view(&self, site: &SiteId) -> Result<Arc<SiteView>, AppError> {
         let generation = self.db().generation();
-        let found = self
-            .views()
-            .of(generation, |kept| kept.sites.get(site).cloned());
-        if let Some(view) = found.flatten() {
+        if let Some(view) = self.views().sites.find(generation, site) {
             return Ok(view);
         }
         let view = SiteView::read(&mut self.db().read().await?, site).await?;
-        let view = Arc::new(view);
-        self.views().of(generation, |kept| {
-            if kept.sites.len() >= SITES_MAX {
-                kept.sites.clear();
-            }
-            kept.sites.insert(site.clone(), Arc::clone(&view));
-        });
-        Ok(view)
+        Ok(self.views().sites.keep(generation, site.clone(), view))
     }
 
     /// A robot of a site, if there is one.
@@ -75,23 +75,10 @@ impl App {
     ) -> Result<Option<Arc<RobotRow>>, AppError> {
         let generation = self.db().generation();
         let key = (site_pk, robot.clone());
-        let found = self
-            .views()
-            .of(generation, |kept| kept.robots.get(&key).cloned());
-        if let Some(row) = found.flatten() {
+        if let Some(row) = self.views().robots.find(generation, &key) {
             return Ok(Some(row));
         }
-        let mut tx = self.db().read().await?;
-        let Some(row) = db::robots::find(&mut tx, site_pk, robot).await? else {
-            return Ok(None);
-        };
-        let row = Arc::new(row);
-        self.views().of(generation, |kept| {
-            if kept.robots.len() >= ROBOTS_MAX {
-                kept.robots.clear();
-            }
-            kept.robots.insert(key, Arc::clone(&row));
-        });
-        Ok(Some(row))
+        let found = db::robots::find(&mut *self.db().read().await?, site_pk, robot).await?;
+        Ok(found.map(|row| self.views().robots.keep(generation, key, row)))
     }
 }
