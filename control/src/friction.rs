@@ -62,12 +62,22 @@ impl From<FrictionCurve> for FrictionSpec {
 }
 
 impl FrictionCurve {
-    /// A curve of stiffness K with the paper's `λ_m` = 0.2 and α = 0.8.
+    /// The paper's shape, `λ_m` = 0.2 and α = 0.8, of stiffness 1.
+    pub fn yi2007() -> Self {
+        Self {
+            spec: FrictionSpec {
+                stiffness: 1.0,
+                peak_slip: 0.2,
+                sliding_ratio: 0.8,
+            },
+        }
+    }
+
+    /// A curve of stiffness K with the paper's shape.
     pub fn with_stiffness(stiffness: f64) -> Result<Self, FrictionError> {
         FrictionSpec {
             stiffness,
-            peak_slip: 0.2,
-            sliding_ratio: 0.8,
+            ..Self::yi2007().spec
         }
         .try_into()
     }

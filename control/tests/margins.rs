@@ -24,7 +24,7 @@ struct Margins {
     gain: f64,
 }
 
-fn open_loop(gains: CrossGains, inner_gain: f64, plant: Plant, rate_rad_s: f64) -> Complex<f64> {
+fn open_loop(gains: CrossGains, plant: Plant, rate_rad_s: f64) -> Complex<f64> {
     let s = Complex::new(0.0, rate_rad_s);
     let one = Complex::new(1.0, 0.0);
     let model = RobotModel::yi2007();
@@ -34,14 +34,14 @@ fn open_loop(gains: CrossGains, inner_gain: f64, plant: Plant, rate_rad_s: f64) 
     let slip_pole = GRAVITY_M_S2 * plant.stiffness / v;
     let base = (-s * (1.5 * plant.loop_s)).exp()
         / ((s * plant.servo_lag_s + one) * (s / (slip_pole * shape) + one));
-    let inner = base * (1.0 + inner_gain) / (one + base * inner_gain);
+    let inner = base * (1.0 + gains.yaw_rate) / (one + base * gains.yaw_rate);
     let course = one / (s / slip_pole + one);
     let across = (one * (v * v * gains.cross_1_m2)) / (s * s)
         + (one * (v.powi(3) * gains.integral_1_m3)) / (s * s * s);
     inner * ((one * (v * gains.heading_1_m)) / s + course * across)
 }
 
-fn margins(gains: CrossGains, inner_gain: f64, plant: Plant) -> Margins {
+fn margins(gains: CrossGains, plant: Plant) -> Margins {
     let mut found = Margins {
         phase_deg: f64::INFINITY,
         delay_s: f64::INFINITY,
@@ -50,7 +50,7 @@ fn margins(gains: CrossGains, inner_gain: f64, plant: Plant) -> Margins {
     let mut before: Option<(f64, f64)> = None;
     for step in 0..20_000_u16 {
         let rate_rad_s = 10.0_f64.powf(-1.0 + 3.3 * f64::from(step) / 20_000.0);
-        let value = open_loop(gains, inner_gain, plant, rate_rad_s);
+        let value = open_loop(gains, plant, rate_rad_s);
         let mut phase = value.arg();
         // Three integrators at low rates: the phase starts at −270°.
         let near = before.map_or(-1.5 * std::f64::consts::PI, |(phase, _)| phase);
@@ -82,7 +82,7 @@ fn the_loop_keeps_margins_from_slippery_to_firm_ground() {
                 loop_s: 0.02,
             };
             for gains in [config.quiet, config.noisy] {
-                let found = margins(gains, config.yaw_rate_gain, plant);
+                let found = margins(gains, plant);
                 assert!(
                     found.phase_deg > 20.0 && found.delay_s > 0.06 && found.gain > 1.7,
                     "K {stiffness}, {speed_m_s} m/s, {gains:?}: {found:?}"
@@ -100,6 +100,10 @@ fn without_the_inner_loop_slippery_ground_leaves_no_margin() {
         servo_lag_s: 0.05,
         loop_s: 0.02,
     };
-    let found = margins(TrackerConfig::default().quiet, 0.0, plant);
+    let without = CrossGains {
+        yaw_rate: 0.0,
+        ..TrackerConfig::default().quiet
+    };
+    let found = margins(without, plant);
     assert!(found.phase_deg < 5.0, "{found:?}");
 }

@@ -2,7 +2,10 @@
 
 use thiserror::Error;
 
-/// Gains across the path; in metres driven, so that the speed does not change their damping.
+use crate::friction::FrictionCurve;
+
+/// Gains across the path; in metres driven, so that the speed does not change their damping. Only
+/// the inner loop's is not.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CrossGains {
     /// Cross-track gain `k_y`, per metre squared.
@@ -11,6 +14,9 @@ pub struct CrossGains {
     pub heading_1_m: f64,
     /// Integral gain `k_I` on the cross-track error over the way driven, per metre cubed.
     pub integral_1_m3: f64,
+    /// Gain from the gap between the wanted and the measured turn rate to the command; below 1, so
+    /// that no lag or delay of the base can make this inner loop unstable.
+    pub yaw_rate: f64,
 }
 
 impl CrossGains {
@@ -21,6 +27,7 @@ impl CrossGains {
             cross_1_m2: mix(first.cross_1_m2, second.cross_1_m2),
             heading_1_m: mix(first.heading_1_m, second.heading_1_m),
             integral_1_m3: mix(first.integral_1_m3, second.integral_1_m3),
+            yaw_rate: mix(first.yaw_rate, second.yaw_rate),
         }
     }
 }
@@ -34,9 +41,6 @@ pub struct TrackerConfig {
     pub quiet: CrossGains,
     /// Gains across the path while the pose is noisy.
     pub noisy: CrossGains,
-    /// Gain from the gap between the wanted and the measured turn rate to the command; below 1, so
-    /// that no lag or delay of the base can make this inner loop unstable.
-    pub yaw_rate_gain: f64,
     /// Noise of the pose half-way between both, as density `σ√T` of white noise, m·√s.
     pub noise_middle_m_sqrt_s: f64,
     /// Largest turn of the path's curvature by the integral, per metre.
@@ -45,6 +49,10 @@ pub struct TrackerConfig {
     pub servo_lag_s: f64,
     /// Adaptation gain ρ.
     pub adaptation_gain: f64,
+    /// How grip is lost beyond its peak; of this curve only the shape counts, never the stiffness.
+    pub grip: FrictionCurve,
+    /// Adaptation gain of the share of that loss which shows.
+    pub beyond_gain: f64,
     /// Fastest change of θ̂, per second.
     pub adaptation_rate_max_1_s: f64,
     /// Pull of θ̂ to a θ that is known, per second, at full confidence.
@@ -63,17 +71,20 @@ impl Default for TrackerConfig {
                 cross_1_m2: 20.0,
                 heading_1_m: 8.0,
                 integral_1_m3: 40.0,
+                yaw_rate: 0.7,
             },
             noisy: CrossGains {
                 cross_1_m2: 14.0,
                 heading_1_m: 9.0,
-                integral_1_m3: 2.5,
+                integral_1_m3: 5.0,
+                yaw_rate: 0.5,
             },
-            yaw_rate_gain: 0.7,
             noise_middle_m_sqrt_s: 7.0e-4,
             integral_max_1_m: 0.5,
             servo_lag_s: 0.05,
             adaptation_gain: 2000.0,
+            grip: FrictionCurve::yi2007(),
+            beyond_gain: 8_000.0,
             adaptation_rate_max_1_s: 0.3,
             adaptation_pull_1_s: 10.0,
             theta_max: 4.0,
@@ -109,12 +120,14 @@ impl TrackerConfig {
             ("pose_age_max_s", self.pose_age_max_s),
         ];
         let at_least_zero = [
-            ("yaw_rate_gain", self.yaw_rate_gain),
+            ("quiet.yaw_rate", self.quiet.yaw_rate),
+            ("noisy.yaw_rate", self.noisy.yaw_rate),
             ("quiet.integral_1_m3", self.quiet.integral_1_m3),
             ("noisy.integral_1_m3", self.noisy.integral_1_m3),
             ("integral_max_1_m", self.integral_max_1_m),
             ("servo_lag_s", self.servo_lag_s),
             ("adaptation_gain", self.adaptation_gain),
+            ("beyond_gain", self.beyond_gain),
             ("adaptation_rate_max_1_s", self.adaptation_rate_max_1_s),
             ("adaptation_pull_1_s", self.adaptation_pull_1_s),
         ];
@@ -128,20 +141,20 @@ impl TrackerConfig {
                 return Err(TrackerError::OutOfRange { field, value });
             }
         }
-        if self.yaw_rate_gain >= 1.0 {
-            return Err(TrackerError::OutOfRange {
-                field: "yaw_rate_gain",
-                value: self.yaw_rate_gain,
-            });
-        }
-        // Routh's criterion of the loop across the path, `s³ + k_θ s² + k_y s + k_I`.
-        for (field, gains) in [
-            ("quiet.integral_1_m3", self.quiet),
-            ("noisy.integral_1_m3", self.noisy),
+        for (integral, yaw_rate, gains) in [
+            ("quiet.integral_1_m3", "quiet.yaw_rate", self.quiet),
+            ("noisy.integral_1_m3", "noisy.yaw_rate", self.noisy),
         ] {
+            if gains.yaw_rate >= 1.0 {
+                return Err(TrackerError::OutOfRange {
+                    field: yaw_rate,
+                    value: gains.yaw_rate,
+                });
+            }
+            // Routh's criterion of the loop across the path, `s³ + k_θ s² + k_y s + k_I`.
             if gains.integral_1_m3 >= gains.heading_1_m * gains.cross_1_m2 {
                 return Err(TrackerError::OutOfRange {
-                    field,
+                    field: integral,
                     value: gains.integral_1_m3,
                 });
             }

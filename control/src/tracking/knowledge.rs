@@ -1,5 +1,8 @@
 //! What the law is told about the ground.
 
+/// How many standard deviations apart two words contradict each other.
+const CONTRADICTION: f64 = 3.0;
+
 /// What is known about θ: a map's prior or the robot's own measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ThetaKnowledge {
@@ -10,6 +13,12 @@ pub struct ThetaKnowledge {
 }
 
 impl ThetaKnowledge {
+    /// Whether both cannot well be true of one ground.
+    pub(super) fn contradicts(self, other: Self) -> bool {
+        let apart = (self.theta - other.theta).abs();
+        apart > CONTRADICTION * self.std_dev.hypot(other.std_dev)
+    }
+
     /// How much of it to believe, 0 to 1: falls with the relative deviation.
     pub fn confidence(&self) -> f64 {
         let relative = self.std_dev / self.theta;

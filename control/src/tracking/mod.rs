@@ -7,20 +7,27 @@
 //! adaptation (26) of the paper, on a law that never inverts a measured velocity: it is regular at
 //! standstill.
 //!
-//! The command is the reference's motion, corrected by the errors (Kanayama's form, with integral
-//! action over the way driven), plus feed-forward with θ̂: the sideslip above, lead for the wheel
-//! servo and half a sample, and lead for slip relaxation, `vθ/g` along and
-//! `(vθ/g)·4 I_G/(m(W² + L²))` in yaw. An inner loop on the measured turn rate, of gain below one,
-//! keeps margin where slip is slow. Gains across the path follow the noise of the pose.
+//! In tight bends wheels slip beyond the peak of their grip, whatever the speed, and the sideslip
+//! is several times as large. The turn is therefore reckoned by the four-wheel sum itself, in its
+//! linear range and with the loss beyond the peak of [`TrackerConfig::grip`]; a share χ̂ of that
+//! loss is believed, adapted like θ̂, so that tyres of another shape are found out.
 //!
-//! θ̂ starts at zero: no knowledge, no feed-forward. A known θ pulls it, by the confidence in it. It
-//! is bounded in range and rate, and held while the wheels saturate, something outside cuts the
-//! command, or the pose is stale. It serves this loop only; what the map gets comes from
-//! [`crate::estimation`].
+//! The command is the reference's motion, corrected by the errors (Kanayama's form, with integral
+//! action over the way driven), plus feed-forward with θ̂: the sideslip, the rims that the turn
+//! needs, lead for the wheel servo and half a sample, and lead for slip relaxation, `vθ/g` along
+//! and `(vθ/g)·4 I_G/(m(W² + L²))` in yaw. An inner loop on the measured turn rate, of gain below
+//! one, keeps margin where slip is slow. Gains follow the noise of the pose.
+//!
+//! θ̂ starts at zero: no knowledge, no sideslip. A known θ pulls it, by the confidence in it. χ̂
+//! starts at one, and does so again when a known θ contradicts the one before. Both are bounded in
+//! range and rate, and held while the wheels saturate, something outside cuts the command, or the
+//! pose is stale. They serve this loop only; what the map gets comes from [`crate::estimation`].
 
 mod config;
 mod knowledge;
 mod noise;
+mod sideslip;
+mod turn;
 
 use crate::geometry::{Twist, wrap_angle_rad};
 use crate::measured::{Measured, WheelSpeeds};
@@ -30,6 +37,7 @@ use crate::robot::{GRAVITY_M_S2, RobotModel};
 pub use config::{CrossGains, TrackerConfig, TrackerError};
 pub use knowledge::ThetaKnowledge;
 use noise::NoiseLevel;
+use sideslip::{Belief, Sideslip};
 
 /// How much faster than the plan's limits feedback may drive.
 const FEEDBACK_HEADROOM: f64 = 1.2;
@@ -43,6 +51,9 @@ const INTEGRAL_SPEED_MIN_M_S: f64 = 0.05;
 const HEADING_SPEED_MIN_M_S: f64 = 0.15;
 /// Cross-track errors smaller than this do not move θ̂, metres.
 const ADAPTATION_DEAD_ZONE_M: f64 = 5.0e-4;
+
+/// Fastest change of the share of the loss beyond the peak that is believed, per second.
+const BEYOND_RATE_MAX_1_S: f64 = 1.0;
 
 /// How far the robot is from its reference.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -83,6 +94,10 @@ pub struct TrackerOutput {
     pub errors: TrackingErrors,
     /// θ̂ in the loop; never a measurement.
     pub theta_loop: f64,
+    /// The sideslip that is reckoned with: course minus heading, radians.
+    pub sideslip_rad: f64,
+    /// How much of the grip that is lost beyond its peak is believed in the loop, χ̂, 0 to 1.
+    pub beyond_loop: f64,
     /// How much the known θ is believed, 0 to 1.
     pub confidence: f64,
     /// Whether the wheel limits cut the command.
@@ -96,6 +111,10 @@ pub struct Tracker {
     config: TrackerConfig,
     integral_1_m: f64,
     theta: f64,
+    /// Share of the loss beyond the grip's peak that is believed, χ̂.
+    beyond: f64,
+    /// The θ under which χ̂ was adapted.
+    known: Option<ThetaKnowledge>,
     noise: NoiseLevel,
     was_saturated: bool,
     held_from_outside: bool,
@@ -113,6 +132,8 @@ impl Tracker {
             config,
             integral_1_m: 0.0,
             theta: 0.0,
+            beyond: 1.0,
+            known: None,
             noise: NoiseLevel::default(),
             was_saturated: false,
             held_from_outside: false,
@@ -145,13 +166,18 @@ impl Tracker {
         dt_s: f64,
     ) -> TrackerOutput {
         let config = self.config;
+        self.heed(knowledge);
         let theta = self.theta;
         let density = self.noise.update(measured, dt_s);
         let middle = config.noise_middle_m_sqrt_s.powi(2);
         let gains = CrossGains::blend(config.quiet, config.noisy, middle / (middle + density));
 
         let speed_m_s = reference.speed_m_s;
-        let sideslip = Sideslip::of(reference, theta, &self.model);
+        let belief = Belief {
+            theta,
+            beyond: self.beyond,
+        };
+        let sideslip = Sideslip::of(reference, belief, &config.grip, &self.model);
         let mut course = measured.pose;
         course.heading_rad += sideslip.angle_rad;
         let ahead = course.body_from_site(reference.pose.point());
@@ -167,7 +193,7 @@ impl Tracker {
             || speed_m_s < INTEGRAL_SPEED_MIN_M_S;
         if !held {
             self.integrate(gains.integral_1_m3 * cross_m * speed_m_s * dt_s);
-            self.adapt(reference, cross_m, knowledge, dt_s);
+            self.adapt(&sideslip, cross_m, knowledge, dt_s);
         }
 
         let slip_lead_s = speed_m_s * theta / GRAVITY_M_S2;
@@ -177,13 +203,15 @@ impl Tracker {
         let lead_s = config.servo_lag_s + 0.5 * dt_s;
         let linear_m_s = speed_m_s * heading_rad.cos()
             + config.along_gain_1_s * along_m
-            + (lead_s + slip_lead_s) * reference.acceleration_m_s2;
+            + (lead_s + slip_lead_s) * reference.acceleration_m_s2
+            + sideslip.rims.linear_m_s;
         let wanted_rad_s = reference.turn_rad_s - sideslip.rate_rad_s
             + speed_m_s * (gains.cross_1_m2 * cross_m + self.integral_1_m)
             + speed_m_s.max(HEADING_SPEED_MIN_M_S) * gains.heading_1_m * heading_rad.sin();
         let angular_rad_s = wanted_rad_s
-            + config.yaw_rate_gain * (wanted_rad_s - measured.twist.angular_rad_s)
-            + (lead_s + slip_lead_s * yaw_shape) * reference.turn_acceleration_rad_s2;
+            + gains.yaw_rate * (wanted_rad_s - measured.twist.angular_rad_s)
+            + (lead_s + slip_lead_s * yaw_shape) * reference.turn_acceleration_rad_s2
+            + sideslip.rims.angular_rad_s;
         let twist = self.bounded(Twist {
             linear_m_s,
             angular_rad_s,
@@ -195,9 +223,22 @@ impl Tracker {
             twist: self.model.twist_from_wheel_speeds(wheel_speeds),
             errors: TrackingErrors::between(reference, measured),
             theta_loop: self.theta,
+            sideslip_rad: sideslip.angle_rad,
+            beyond_loop: self.beyond,
             confidence: knowledge.map_or(0.0, |known| known.confidence()),
             saturated,
         }
+    }
+
+    /// What was adapted under a θ that is now contradicted says nothing.
+    fn heed(&mut self, knowledge: Option<ThetaKnowledge>) {
+        let Some(now) = knowledge else {
+            return;
+        };
+        if self.known.is_some_and(|before| before.contradicts(now)) {
+            self.beyond = 1.0;
+        }
+        self.known = Some(now);
     }
 
     /// Bounded, so that it cannot wind up.
@@ -206,22 +247,22 @@ impl Tracker {
         self.integral_1_m = (self.integral_1_m + change_1_m).clamp(-bound, bound);
     }
 
-    /// `θ̂̇ = ρ e_y φ + pull·c (cθ − θ̂)`, φ = v²ω/g, c the confidence; bounded in rate and range.
+    /// `θ̂̇ = ρ e_y φ + pull·c (cθ − θ̂)` and `χ̂̇ = ρ_χ e_y φ_χ`, c the confidence, φ and `φ_χ` the
+    /// drifts per θ and per χ; bounded in rate and range.
     fn adapt(
         &mut self,
-        reference: &ReferenceSample,
+        sideslip: &Sideslip,
         cross_m: f64,
         knowledge: Option<ThetaKnowledge>,
         dt_s: f64,
     ) {
         let config = &self.config;
-        let regressor = reference.speed_m_s.powi(2) * reference.turn_rad_s / GRAVITY_M_S2;
         let error_m = if cross_m.abs() < ADAPTATION_DEAD_ZONE_M {
             0.0
         } else {
             cross_m
         };
-        let gradient = config.adaptation_gain * error_m * regressor;
+        let gradient = config.adaptation_gain * error_m * sideslip.drift_per_theta_m_s;
         let pull = knowledge.map_or(0.0, |known| {
             let weight = known.confidence();
             config.adaptation_pull_1_s * weight * (weight * known.theta - self.theta)
@@ -230,6 +271,9 @@ impl Tracker {
         // The pull is a way back, not a drift: it may act faster than the gradient.
         let rate = gradient.clamp(-bound, bound) + pull;
         self.theta = (self.theta + rate * dt_s).clamp(0.0, config.theta_max);
+        let gradient = config.beyond_gain * error_m * sideslip.drift_per_beyond_m_s;
+        let rate = gradient.clamp(-BEYOND_RATE_MAX_1_S, BEYOND_RATE_MAX_1_S);
+        self.beyond = (self.beyond + rate * dt_s).clamp(0.0, 1.0);
     }
 
     fn bounded(&self, twist: Twist) -> Twist {
@@ -240,26 +284,6 @@ impl Tracker {
                 .linear_m_s
                 .clamp(-REVERSE_MAX_M_S, FEEDBACK_HEADROOM * limits.linear_max_m_s),
             angular_rad_s: twist.angular_rad_s.clamp(-angular_max, angular_max),
-        }
-    }
-}
-
-/// The angle between course and heading, and its rate.
-struct Sideslip {
-    angle_rad: f64,
-    rate_rad_s: f64,
-}
-
-impl Sideslip {
-    fn of(reference: &ReferenceSample, theta: f64, model: &RobotModel) -> Self {
-        // Tight turns: the inner wheels' reference speed falls, and with it the sideslip.
-        let tight = 0.5 * model.effective_track_m() * reference.curvature_1_m;
-        let gain = -theta / GRAVITY_M_S2 * (1.0 - tight * tight).max(0.0);
-        Self {
-            angle_rad: gain * reference.speed_m_s * reference.turn_rad_s,
-            rate_rad_s: gain
-                * (reference.acceleration_m_s2 * reference.turn_rad_s
-                    + reference.speed_m_s * reference.turn_acceleration_rad_s2),
         }
     }
 }

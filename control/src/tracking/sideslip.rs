@@ -1,0 +1,113 @@
+//! What the reference's turn asks beyond the kinematics: sideslip, and rims that roll otherwise.
+
+use crate::friction::FrictionCurve;
+use crate::geometry::Twist;
+use crate::measured::WheelSpeeds;
+use crate::reference::ReferenceSample;
+use crate::robot::{GRAVITY_M_S2, RobotModel};
+
+use super::turn::{SteadyTurn, Turn};
+
+/// Time over which the sideslip's rate is looked at, seconds.
+const RATE_SPAN_S: f64 = 0.02;
+/// Speed that curvature is taken over at least, metres per second.
+const SPEED_MIN_M_S: f64 = 1.0e-3;
+/// θ with which a turn is reckoned at least: sideslip is looked at per θ.
+const THETA_LOOK_MIN: f64 = 0.02;
+
+/// What the law believes of the ground.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Belief {
+    /// θ̂.
+    pub(super) theta: f64,
+    /// Share of the loss beyond the peak that is believed, 0 to 1.
+    pub(super) beyond: f64,
+}
+
+/// Sideslip of a reference, and what adapts it.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Sideslip {
+    /// The angle between course and heading.
+    pub(super) angle_rad: f64,
+    /// Its rate.
+    pub(super) rate_rad_s: f64,
+    /// How much the robot drifts to the right per θ, metres per second.
+    pub(super) drift_per_theta_m_s: f64,
+    /// The same per share of the loss beyond the peak.
+    pub(super) drift_per_beyond_m_s: f64,
+    /// What the rims must roll beyond the kinematics of the reference.
+    pub(super) rims: Twist,
+}
+
+impl Sideslip {
+    pub(super) fn of(
+        reference: &ReferenceSample,
+        belief: Belief,
+        grip: &FrictionCurve,
+        model: &RobotModel,
+    ) -> Self {
+        let speed_m_s = reference.speed_m_s;
+        let at = |speed_m_s: f64, turn_rad_s: f64| {
+            Moment::of(speed_m_s, turn_rad_s, belief, grip, model)
+        };
+        let now = at(speed_m_s, reference.turn_rad_s);
+        let then = at(
+            (speed_m_s + RATE_SPAN_S * reference.acceleration_m_s2).max(0.0),
+            reference.turn_rad_s + RATE_SPAN_S * reference.turn_acceleration_rad_s2,
+        );
+        let angle_rad = -belief.theta * now.per_theta;
+        Self {
+            angle_rad,
+            rate_rad_s: (-belief.theta * then.per_theta - angle_rad) / RATE_SPAN_S,
+            drift_per_theta_m_s: speed_m_s * now.per_theta,
+            drift_per_beyond_m_s: speed_m_s * belief.theta * now.per_theta_beyond,
+            rims: now.rims,
+        }
+    }
+}
+
+/// One moment of a reference.
+struct Moment {
+    /// Sideslip per θ, to the right.
+    per_theta: f64,
+    /// What of it is lost grip, if all of it is believed.
+    per_theta_beyond: f64,
+    rims: Twist,
+}
+
+impl Moment {
+    fn of(
+        speed_m_s: f64,
+        turn_rad_s: f64,
+        belief: Belief,
+        grip: &FrictionCurve,
+        model: &RobotModel,
+    ) -> Self {
+        let asked_1_m = turn_rad_s / speed_m_s.max(SPEED_MIN_M_S);
+        let theta = belief.theta.max(THETA_LOOK_MIN);
+        let compliance_m = theta * speed_m_s * speed_m_s / GRAVITY_M_S2;
+        let turn = Turn::steady(model, grip, asked_1_m, compliance_m);
+        let per_theta = |turn: SteadyTurn| -turn.sideslip / theta;
+        let (linear, beyond) = (per_theta(turn.linear), per_theta(turn.beyond));
+        let of_rims = |turn: SteadyTurn| {
+            let [left_rad_s, right_rad_s] = turn
+                .rims
+                .map(|rim| rim * speed_m_s / model.wheel_radius_m());
+            model.twist_from_wheel_speeds(WheelSpeeds {
+                left_rad_s,
+                right_rad_s,
+            })
+        };
+        let (straight, slid) = (of_rims(turn.linear), of_rims(turn.beyond));
+        let believed = |one: f64, other: f64| one + belief.beyond * (other - one);
+        Self {
+            per_theta: believed(linear, beyond),
+            per_theta_beyond: beyond - linear,
+            rims: Twist {
+                linear_m_s: believed(straight.linear_m_s, slid.linear_m_s) - speed_m_s,
+                angular_rad_s: believed(straight.angular_rad_s, slid.angular_rad_s)
+                    - speed_m_s * turn.curvature_1_m,
+            },
+        }
+    }
+}

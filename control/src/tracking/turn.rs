@@ -1,0 +1,266 @@
+//! A steady turn of the four-wheel sum, with wheels beyond the peak of their grip.
+//!
+//! In a turn every wheel slips, by what the turn's geometry asks and by what the force across it
+//! takes. With the rims' speeds as unknowns the balances of force along and of moment are linear in
+//! them, and the balance across gives the sideslip, while the share of stiffness that each wheel
+//! has left, `μ(σ)/(Kσ)` of (7), stands still; those shares are found in a few rounds. Curvature
+//! and `θv²/g` decide alone.
+
+use crate::friction::FrictionCurve;
+use crate::robot::RobotModel;
+
+/// Rounds in which a turn in the linear range is found: force along takes up the sideslip.
+const LINEAR_ROUNDS: u32 = 2;
+/// Rounds in which the shares of stiffness are found.
+const SHARE_ROUNDS: u32 = 6;
+/// Change of a share that asks for another round.
+const SHARE_STEP_MIN: f64 = 1.0e-6;
+/// Largest sideslip that is reckoned with, left over ahead: beyond it the robot slides, and a nose
+/// that is turned further in makes it slide more.
+const SIDESLIP_MAX: f64 = 0.1;
+/// Share of the curvature at which the inner rims stand, up to which a turn is reckoned.
+const TIGHT_MAX: f64 = 0.7;
+
+/// A steady turn, all speeds over the speed ahead.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct SteadyTurn {
+    /// Speed to the left.
+    pub(super) sideslip: f64,
+    /// Speed of the left and of the right rims.
+    pub(super) rims: [f64; 2],
+}
+
+/// The same turn twice: as if every wheel stayed in the linear range, and with what grip is lost
+/// beyond the peak.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Turn {
+    /// Curvature that was reckoned with, 1/m: the asked one up to a bound.
+    pub(super) curvature_1_m: f64,
+    pub(super) linear: SteadyTurn,
+    pub(super) beyond: SteadyTurn,
+}
+
+impl Turn {
+    /// The turn of a curvature, 1/m, finite; `compliance_m` is `θv²/g`, metres, ≥ 0. Only the shape
+    /// of `grip` counts, not its stiffness.
+    pub(super) fn steady(
+        model: &RobotModel,
+        grip: &FrictionCurve,
+        curvature_1_m: f64,
+        compliance_m: f64,
+    ) -> Self {
+        let bound_1_m = TIGHT_MAX * 2.0 / model.effective_track_m();
+        let curvature_1_m = curvature_1_m.clamp(-bound_1_m, bound_1_m);
+        let mut wheels = Wheels::new(model, curvature_1_m, compliance_m);
+        for _ in 0..LINEAR_ROUNDS {
+            wheels.balance();
+        }
+        let linear = wheels.turn();
+        for _ in 0..SHARE_ROUNDS {
+            if !wheels.lose(grip) {
+                break;
+            }
+            wheels.balance();
+        }
+        Self {
+            curvature_1_m,
+            linear,
+            beyond: wheels.turn(),
+        }
+    }
+}
+
+/// Four wheels on their way to balance.
+struct Wheels {
+    curvature_1_m: f64,
+    /// `4θv²/g`, metres: slip of one wheel that carries the force of all, over curvature.
+    compliance_m: f64,
+    /// Half the wheelbase over half the track.
+    slenderness: f64,
+    /// Speed of the ground under the left and the right wheels, ahead.
+    ground: [f64; 2],
+    /// Speed across under the front wheels that the turn itself brings.
+    across: f64,
+    /// Share of stiffness left: front and rear of the left side, then of the right.
+    shares: [[f64; 2]; 2],
+    /// One over the rims' speeds.
+    per_rim: [f64; 2],
+    sideslip: f64,
+}
+
+impl Wheels {
+    fn new(model: &RobotModel, curvature_1_m: f64, compliance_m: f64) -> Self {
+        let half_track_m = 0.5 * model.track_width_m();
+        let half_base_m = 0.5 * model.wheelbase_m();
+        let outward = curvature_1_m * half_track_m;
+        Self {
+            curvature_1_m,
+            compliance_m: 4.0 * compliance_m,
+            slenderness: half_base_m / half_track_m,
+            ground: [1.0 - outward, 1.0 + outward],
+            across: curvature_1_m * half_base_m,
+            shares: [[1.0; 2]; 2],
+            per_rim: [1.0; 2],
+            sideslip: 0.0,
+        }
+    }
+
+    fn turn(&self) -> SteadyTurn {
+        SteadyTurn {
+            sideslip: self.sideslip,
+            rims: self.per_rim.map(f64::recip),
+        }
+    }
+
+    /// Solves the balances for these shares.
+    fn balance(&mut self) {
+        let sums = self.shares.map(|[front, rear]| front + rear);
+        let gaps = self.shares.map(|[front, rear]| front - rear);
+        // Force along: the body's acceleration along, v²κ times sideslip, is what is left of it.
+        let along = [sums[0] * self.ground[0], sums[1] * self.ground[1]];
+        let force = sums[0] + sums[1] + self.compliance_m * self.sideslip * self.curvature_1_m;
+        // Moment over half the track: what the sides push apart, less what the axles scrub.
+        let scrubs = [0, 1]
+            .map(|side| self.slenderness * (gaps[side] * self.sideslip + sums[side] * self.across));
+        let (left, right) = (along[0] - scrubs[0], -along[1] - scrubs[1]);
+        let moment = sums[0] - sums[1];
+        let determinant = along[0] * right - along[1] * left;
+        self.per_rim = [
+            (force * right - along[1] * moment) / determinant,
+            (along[0] * moment - force * left) / determinant,
+        ];
+        // Force across.
+        let stiffness = self.per_rim[0] * sums[0] + self.per_rim[1] * sums[1];
+        let unequal = self.per_rim[0] * gaps[0] + self.per_rim[1] * gaps[1];
+        let sideslip =
+            -(self.compliance_m * self.curvature_1_m + unequal * self.across) / stiffness;
+        self.sideslip = sideslip.clamp(-SIDESLIP_MAX, SIDESLIP_MAX);
+    }
+
+    /// Takes the shares of stiffness that this slip leaves; whether any moved.
+    fn lose(&mut self, grip: &FrictionCurve) -> bool {
+        let mut has_moved = false;
+        for side in [0, 1] {
+            let ahead = self.ground[side] * self.per_rim[side] - 1.0;
+            for (axle, across) in [self.across, -self.across].into_iter().enumerate() {
+                let left = (self.sideslip + across) * self.per_rim[side];
+                let slip = (ahead * ahead + left * left).sqrt();
+                let share = grip.mu_over_slip(slip) / grip.stiffness();
+                has_moved |= (share - self.shares[side][axle]).abs() > SHARE_STEP_MIN;
+                self.shares[side][axle] = share;
+            }
+        }
+        has_moved
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::friction::FrictionSpec;
+    use crate::geometry::Pose;
+    use crate::measured::WheelSpeeds;
+    use crate::plant::{Ground, Plant, PlantSpec};
+    use crate::robot::GRAVITY_M_S2;
+
+    fn grip(stiffness: f64, peak_slip: f64) -> FrictionCurve {
+        let sliding_ratio = 0.8;
+        FrictionSpec {
+            stiffness,
+            peak_slip,
+            sliding_ratio,
+        }
+        .try_into()
+        .unwrap()
+    }
+
+    /// A simulated base that has driven on these rims for long: speed ahead, sideslip, curvature.
+    fn driven(curve: FrictionCurve, rims_m_s: [f64; 2]) -> (f64, f64, f64) {
+        let model = RobotModel::yi2007();
+        let spec = PlantSpec {
+            rolling_resistance_ratio: 0.0,
+            ..PlantSpec::default()
+        };
+        let mut plant = Plant::new(model, spec, Pose::default()).unwrap();
+        let rims = rims_m_s.map(|rim_m_s| rim_m_s / model.wheel_radius_m());
+        let command = WheelSpeeds {
+            left_rad_s: rims[0],
+            right_rad_s: rims[1],
+        };
+        for _ in 0..3_000 {
+            plant.step(command, &Ground::uniform(curve), 0.01);
+        }
+        let state = plant.state();
+        let ahead_m_s = state.ahead_m_s;
+        (
+            ahead_m_s,
+            state.left_m_s / ahead_m_s,
+            state.yaw_rate_rad_s / ahead_m_s,
+        )
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(48))]
+        #[test]
+        fn a_simulated_base_turns_as_reckoned(
+            stiffness in 0.5..20.0_f64, peak_slip in 0.15..0.9_f64,
+            curvature in -1.4..1.4_f64, speed_m_s in 0.3..0.6_f64,
+        ) {
+            let curve = grip(stiffness, peak_slip);
+            let compliance_m = speed_m_s * speed_m_s / (stiffness * GRAVITY_M_S2);
+            // Ground that cannot hold the turn at all is not reckoned.
+            prop_assume!(speed_m_s * speed_m_s * curvature.abs() < 0.5 * curve.mu_peak() * GRAVITY_M_S2);
+            let model = RobotModel::yi2007();
+            let turn = Turn::steady(&model, &curve, curvature, compliance_m);
+            prop_assume!(turn.beyond.sideslip.abs() < SIDESLIP_MAX);
+            let rims = turn.beyond.rims.map(|rim| rim * speed_m_s);
+            let (ahead_m_s, sideslip, driven) = driven(curve, rims);
+            prop_assert!((ahead_m_s / speed_m_s - 1.0).abs() < 0.02, "{ahead_m_s} of {speed_m_s}");
+            prop_assert!((driven - curvature).abs() < 0.03, "{driven} of {curvature}");
+            prop_assert!((sideslip - turn.beyond.sideslip).abs() < 0.01, "{sideslip} of {turn:?}");
+        }
+
+        #[test]
+        fn a_turn_to_the_right_is_the_mirror_of_one_to_the_left(
+            curvature in -5.0..5.0_f64, compliance_m in 0.0..0.3_f64, peak_slip in 0.05..0.9_f64,
+        ) {
+            let model = RobotModel::yi2007();
+            let turn = |curvature| Turn::steady(&model, &grip(1.0, peak_slip), curvature, compliance_m);
+            let (one, other) = (turn(curvature), turn(-curvature));
+            for (one, other) in [(one.linear, other.linear), (one.beyond, other.beyond)] {
+                prop_assert!((one.sideslip + other.sideslip).abs() < 1.0e-9);
+                prop_assert!((one.rims[0] - other.rims[1]).abs() < 1.0e-9);
+                prop_assert!(one.rims.into_iter().all(f64::is_finite));
+            }
+        }
+    }
+
+    #[test]
+    fn without_compliance_there_is_no_sideslip_and_on_a_straight_no_slip() {
+        let model = RobotModel::yi2007();
+        let bend = Turn::steady(&model, &grip(1.0, 0.2), 1.2, 0.0);
+        assert!(bend.beyond.sideslip.abs() < 1.0e-12, "{bend:?}");
+        assert!(bend.beyond != bend.linear, "{bend:?}");
+        let straight = Turn::steady(&model, &grip(1.0, 0.2), 0.0, 0.1);
+        let rolls = SteadyTurn {
+            sideslip: 0.0,
+            rims: [1.0, 1.0],
+        };
+        assert_eq!(straight.linear, rolls);
+        assert_eq!(straight.linear, straight.beyond);
+    }
+
+    #[test]
+    fn in_the_linear_range_the_sideslip_is_that_of_the_law_less_what_a_tight_turn_takes() {
+        let model = RobotModel::yi2007();
+        let turn = Turn::steady(&model, &grip(1.0, 0.2), 0.3, 0.01);
+        let plain = -0.01 * 0.3;
+        assert!(
+            (turn.linear.sideslip / plain - 1.0).abs() < 0.01,
+            "{turn:?}"
+        );
+        assert_eq!(turn.linear, turn.beyond);
+    }
+}
