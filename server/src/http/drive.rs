@@ -45,6 +45,8 @@ const PING_PERIOD: Duration = Duration::from_secs(1);
 const SILENCE_MAX: Duration = Duration::from_secs(3);
 /// How long a frame to a client may take; one that does not read is lost.
 const SEND_MAX: Duration = Duration::from_secs(1);
+/// How long a socket that the server closes waits for its client to close it too.
+const GOODBYE_MAX: Duration = Duration::from_millis(500);
 /// Frames that are read before they are acted on, so that the newest drive command counts.
 const DRAIN_MAX: usize = 64;
 /// Least time between two refusals of drive commands for the same cause: a driver sends many.
@@ -341,9 +343,28 @@ impl Connection {
                     reason: reason.into(),
                 };
                 // A client that is gone needs no reason.
-                let _ = self.put(Message::Close(Some(frame))).await;
+                if self.put(Message::Close(Some(frame))).await.is_ok() {
+                    self.let_it_be_read().await;
+                }
             }
         }
+    }
+
+    /// Keeps the socket until the client has closed it too: one that writes into a socket that is
+    /// gone never reads why.
+    async fn let_it_be_read(&mut self) {
+        let answered = async {
+            loop {
+                match self.socket.recv().await {
+                    Some(Ok(Message::Close(_))) => return,
+                    Some(Ok(_)) => {}
+                    // After a frame that could not be read there is no more reading.
+                    Some(Err(_)) | None => std::future::pending().await,
+                }
+            }
+        };
+        // Whether it was read does not matter any more.
+        let _ = tokio::time::timeout(GOODBYE_MAX, answered).await;
     }
 }
 
