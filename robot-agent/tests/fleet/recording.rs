@@ -72,7 +72,10 @@ async fn a_recorded_mission_of_a_real_agent_runs_again_to_the_bit() {
             &["--json", "gone.mcap"],
             "`gone.mcap` cannot be opened: No such file",
         ),
-        (&["--json", env!("CARGO_MANIFEST_PATH")], "is no MCAP file"),
+        (
+            &["--json", env!("CARGO_BIN_EXE_tread-agent")],
+            "is no MCAP file",
+        ),
     ] {
         let refused = replayed_anyway(words);
         let object: Value = serde_json::from_slice(&refused.stdout).unwrap();

@@ -1,6 +1,6 @@
 //! A server in a temporary folder, a client, and what is sent between them.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -30,6 +30,11 @@ use zenoh::Wait as _;
 /// How long anything may take to come about.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(15);
 const LOOK_AGAIN: Duration = Duration::from_millis(10);
+
+/// Asked now: a test that was compiled elsewhere knows another folder.
+pub(crate) fn folder_of_the_crate() -> PathBuf {
+    std::env::var_os("CARGO_MANIFEST_DIR").unwrap().into()
+}
 
 pub(crate) fn site() -> SiteId {
     "yard".parse().unwrap()

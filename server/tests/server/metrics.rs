@@ -1,13 +1,12 @@
 //! The metrics say what happened, and nobody looks for one that does not exist.
 
 use std::collections::BTreeSet;
-use std::path::Path;
 
 use reqwest::StatusCode;
 use tread_api::mission::MissionState;
 use tread_api::wire::ingest::MissionPhase;
 
-use crate::harness::{Yard, eventually};
+use crate::harness::{Yard, eventually, folder_of_the_crate};
 use crate::robot::Robot;
 
 async fn page(yard: &Yard) -> String {
@@ -68,7 +67,7 @@ async fn alert_rules_and_dashboard_name_only_metrics_that_exist() {
             exist.extend(["bucket", "sum", "count"].map(|part| format!("{name}_{part}")));
         }
     }
-    let deploy = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy");
+    let deploy = folder_of_the_crate().join("../deploy");
     for file in ["prometheus-alerts.yml", "grafana-dashboard.json"] {
         let looked_for = names(&std::fs::read_to_string(deploy.join(file)).unwrap());
         assert!(looked_for.len() > 5, "{file}: {looked_for:?}");

@@ -1,12 +1,10 @@
 //! The description of the API is part of the API.
 
-use std::path::Path;
-
-use crate::harness::Yard;
+use crate::harness::{Yard, folder_of_the_crate};
 
 #[test]
 fn the_description_is_the_committed_one() {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("openapi.json");
+    let path = folder_of_the_crate().join("openapi.json");
     let mut now = serde_json::to_string_pretty(&tread_server::http::openapi()).unwrap();
     now.push('\n');
     if std::env::var_os("UPDATE_OPENAPI").is_some() {

@@ -19,7 +19,9 @@ fn sources(folder: &Path, text: &mut String) {
 
 #[test]
 fn every_test_that_the_page_on_safety_names_is_there() {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    // Asked now: a test that was compiled elsewhere knows another folder.
+    let tests = std::env::var_os("CARGO_MANIFEST_DIR").unwrap();
+    let root = Path::new(&tests).parent().unwrap();
     let page = std::fs::read_to_string(root.join("docs/safety.md")).unwrap();
     let mut code = String::new();
     for part in ["api", "cli", "control", "robot-agent", "server", "tests"] {

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 use std::io::{BufRead as _, BufReader, Write as _};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
 
 use anyhow::Context;
@@ -10,6 +10,15 @@ use tread_tests::ports::free_address;
 
 /// The robot's domain.
 pub(crate) const DOMAIN: u32 = 7;
+
+/// The robot's program, in this folder or one above it.
+fn script() -> anyhow::Result<PathBuf> {
+    let here = std::env::current_dir()?;
+    here.ancestors()
+        .map(|folder| folder.join("tests/ros2/robot.py"))
+        .find(|script| script.is_file())
+        .context("there is no tests/ros2/robot.py here: run this inside the repository")
+}
 
 /// A running robot; it ends when it is dropped.
 #[derive(Debug)]
@@ -23,7 +32,7 @@ impl PythonRobot {
     /// Starts a robot that is its own router, and waits until it speaks.
     pub(crate) fn start(python: &Path, flags: &[&str]) -> anyhow::Result<Self> {
         let endpoint = format!("tcp/{}", free_address());
-        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("ros2/robot.py");
+        let script = script()?;
         let mut child = Command::new(python)
             .arg(&script)
             .args(["--router", "--endpoint", &endpoint])
