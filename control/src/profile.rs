@@ -4,8 +4,10 @@
 //! limits, by a forward and a backward pass over `E = v²/2`. Then its mean over a window T,
 //! `s₁(t) = (1/T) ∫ s₀(u) du` for u from t − T to t. The mean's acceleration is a mean of
 //! accelerations, so within the bound; its jerk is at most `2a/T`, which chooses T. Its speed at a
-//! place is a mean of speeds at places at most `D = T·v_max` away; so the passes use limits that
-//! were lowered to their minimum within D, and the bound holds exactly. Both ends are at rest.
+//! place is a mean of speeds at places that are driven at most T before and after. No timing under
+//! the limits drives farther in T than the quickest one under the limits as they are, nor farther
+//! than `D = T·v_max`; so the passes use limits that were lowered to their minimum within one of
+//! both, and the bound holds exactly. Both ends are at rest.
 
 #![expect(
     clippy::cast_precision_loss,
@@ -66,8 +68,14 @@ pub struct SpeedProfile {
 }
 
 impl SpeedProfile {
-    /// Timing over an even grid of at least two nodes, from rest to rest.
-    pub(crate) fn new(length_m: f64, limits: &[NodeLimits], jerk_max_m_s3: f64) -> Self {
+    /// Timing over an even grid of at least two nodes, from rest to rest. The first `brisk` nodes
+    /// keep to limits within the time T, the others within the way D.
+    pub(crate) fn new(
+        length_m: f64,
+        limits: &[NodeLimits],
+        brisk: usize,
+        jerk_max_m_s3: f64,
+    ) -> Self {
         let cells = limits.len().saturating_sub(1).max(1);
         let cell_m = length_m / cells as f64;
         let hardest_m_s2 = limits
@@ -78,19 +86,10 @@ impl SpeedProfile {
         let window_s = 2.0 * hardest_m_s2 / jerk_max_m_s3;
         // One cell more than the distance, so that limits between nodes are covered too.
         let reach = ((window_s * fastest_m_s / cell_m).ceil() + 1.0).min(cells as f64) as usize;
-        let speeds = lowest_within(limits, reach, |node| node.speed_m_s);
-        let accelerations = lowest_within(limits, reach, |node| node.acceleration_m_s2);
-        let mut energies: Vec<f64> = speeds.iter().map(|speed| 0.5 * speed * speed).collect();
-        energies[0] = 0.0;
-        let last = energies.len() - 1;
-        energies[last] = 0.0;
-        let gain = |cell: usize| accelerations[cell].min(accelerations[cell + 1]) * cell_m;
-        for cell in 0..last {
-            energies[cell + 1] = energies[cell + 1].min(energies[cell] + gain(cell));
-        }
-        for cell in (0..last).rev() {
-            energies[cell] = energies[cell].min(energies[cell + 1] + gain(cell));
-        }
+        let spans = spans(limits, cell_m, reach, brisk, window_s);
+        let speeds = lowest_within(limits, &spans, |node| node.speed_m_s);
+        let accelerations = lowest_within(limits, &spans, |node| node.acceleration_m_s2);
+        let energies = quickest(&speeds, &accelerations, cell_m);
         Self {
             nodes: time_nodes(&energies, cell_m),
             window_s,
@@ -140,6 +139,61 @@ impl SpeedProfile {
     }
 }
 
+/// `E` at every node of the quickest timing under limits, by a forward and a backward pass.
+fn quickest(speeds_m_s: &[f64], accelerations_m_s2: &[f64], cell_m: f64) -> Vec<f64> {
+    let mut energies: Vec<f64> = speeds_m_s.iter().map(|speed| 0.5 * speed * speed).collect();
+    energies[0] = 0.0;
+    let last = energies.len() - 1;
+    energies[last] = 0.0;
+    let gain = |cell: usize| accelerations_m_s2[cell].min(accelerations_m_s2[cell + 1]) * cell_m;
+    for cell in 0..last {
+        energies[cell + 1] = energies[cell + 1].min(energies[cell] + gain(cell));
+    }
+    for cell in (0..last).rev() {
+        energies[cell] = energies[cell].min(energies[cell + 1] + gain(cell));
+    }
+    energies
+}
+
+/// First and last node to whose limits each node keeps; neither ever goes back.
+fn spans(
+    limits: &[NodeLimits],
+    cell_m: f64,
+    reach: usize,
+    brisk: usize,
+    window_s: f64,
+) -> Vec<(usize, usize)> {
+    let last = limits.len() - 1;
+    let within_reach = |index: usize| (index.saturating_sub(reach), (index + reach).min(last));
+    if brisk == 0 {
+        return (0..=last).map(within_reach).collect();
+    }
+    let speeds: Vec<f64> = limits.iter().map(|node| node.speed_m_s).collect();
+    let accelerations: Vec<f64> = limits.iter().map(|node| node.acceleration_m_s2).collect();
+    let timed = time_nodes(&quickest(&speeds, &accelerations, cell_m), cell_m);
+    let (mut before, mut after) = (0, 0);
+    let mut first = 0;
+    (0..=last)
+        .map(|index| {
+            let (mut from, mut to) = within_reach(index);
+            if index < brisk {
+                let time_s = timed[index].time_s;
+                while timed[before].time_s < time_s - window_s {
+                    before += 1;
+                }
+                while after < last && timed[after].time_s < time_s + window_s {
+                    after += 1;
+                }
+                // One cell more on each side, so that limits between nodes are covered too.
+                from = from.max(before.saturating_sub(2));
+                to = to.min(after + 1);
+            }
+            first = first.max(from);
+            (first, to)
+        })
+        .collect()
+}
+
 fn time_nodes(energies: &[f64], cell_m: f64) -> Vec<Node> {
     let mut nodes = Vec::with_capacity(energies.len());
     let mut node = Node {
@@ -166,17 +220,17 @@ fn time_nodes(energies: &[f64], cell_m: f64) -> Vec<Node> {
     nodes
 }
 
-/// Minimum over all nodes at most `reach` away, in linear time.
+/// Minimum over each span of nodes, in linear time; no begin or end of a span goes back.
 fn lowest_within(
     limits: &[NodeLimits],
-    reach: usize,
+    spans: &[(usize, usize)],
     value: impl Fn(&NodeLimits) -> f64,
 ) -> Vec<f64> {
     let mut lowest = Vec::with_capacity(limits.len());
     let mut window: VecDeque<usize> = VecDeque::new();
     let mut next = 0;
-    for index in 0..limits.len() {
-        while next < limits.len() && next <= index + reach {
+    for &(first, last) in spans {
+        while next <= last {
             while window
                 .back()
                 .is_some_and(|&back| value(&limits[back]) >= value(&limits[next]))
@@ -186,7 +240,7 @@ fn lowest_within(
             window.push_back(next);
             next += 1;
         }
-        while window.front().is_some_and(|&front| front + reach < index) {
+        while window.front().is_some_and(|&front| front < first) {
             window.pop_front();
         }
         lowest.push(
@@ -196,4 +250,49 @@ fn lowest_within(
         );
     }
     lowest
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const CELL_M: f64 = 0.02;
+
+    proptest! {
+        #[test]
+        fn brisk_or_not_no_limit_is_passed_and_brisk_is_never_slower(
+            stretches in prop::collection::vec((1..60_usize, 0.05..1.0_f64, 0.1..1.0_f64), 2..12),
+            brisk_share in 0.0..=1.0_f64, jerk_m_s3 in 1.0..8.0_f64,
+        ) {
+            let limits: Vec<NodeLimits> = stretches
+                .iter()
+                .flat_map(|&(count, speed_m_s, acceleration_m_s2)| {
+                    std::iter::repeat_n(NodeLimits { speed_m_s, acceleration_m_s2 }, count)
+                })
+                .chain([NodeLimits { speed_m_s: 1.0, acceleration_m_s2: 1.0 }])
+                .collect();
+            let cells = limits.len() - 1;
+            let length_m = CELL_M * cells as f64;
+            let brisk = (brisk_share * limits.len() as f64) as usize;
+            let cautious = SpeedProfile::new(length_m, &limits, 0, jerk_m_s3);
+            let quick = SpeedProfile::new(length_m, &limits, brisk, jerk_m_s3);
+            prop_assert!(quick.duration_s() <= cautious.duration_s() + 1.0e-9);
+            let (mut time_s, mut before_m_s2) = (0.0, 0.0);
+            while time_s < quick.duration_s() {
+                let now = quick.sample(time_s);
+                let node = ((now.arc_m / CELL_M) as usize).min(cells - 1);
+                let fastest_m_s = limits[node].speed_m_s.max(limits[node + 1].speed_m_s);
+                let hardest_m_s2 =
+                    limits[node].acceleration_m_s2.max(limits[node + 1].acceleration_m_s2);
+                prop_assert!(now.speed_m_s <= fastest_m_s + 1.0e-9);
+                prop_assert!(now.acceleration_m_s2.abs() <= hardest_m_s2 + 1.0e-6);
+                let jerk = (now.acceleration_m_s2 - before_m_s2).abs() / 0.01;
+                prop_assert!(jerk <= 1.01 * jerk_m_s3, "{jerk} m/s³");
+                before_m_s2 = now.acceleration_m_s2;
+                time_s += 0.01;
+            }
+        }
+    }
 }

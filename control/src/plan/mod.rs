@@ -380,7 +380,13 @@ impl Plan {
             Some(spec) => Some(wiggled(spec, &mut nodes, &mut jerk_m_s3)?),
             None => None,
         };
-        let profile = SpeedProfile::new(length_m, &nodes, jerk_m_s3);
+        // On unknown ground the way to the trajectory is bounded by a cautious grip already, and
+        // needs no more room before and after a bend than the mean takes.
+        let brisk = match options.least_grip_mu() {
+            Some(_) => 0,
+            None => (approach_end_m / cell_m).ceil() as usize,
+        };
+        let profile = SpeedProfile::new(length_m, &nodes, brisk, jerk_m_s3);
         let mut plan = Self {
             excitation,
             approach_length_m: path.piece_start_m(approach_pieces),
