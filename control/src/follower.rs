@@ -13,6 +13,7 @@ use crate::measured::{Measured, WheelSpeeds};
 use crate::plan::Plan;
 use crate::reference::{Governor, GovernorInput, ReferenceSample};
 use crate::robot::RobotModel;
+use crate::sliding::Sliding;
 use crate::tracking::{
     ThetaKnowledge, Tracker, TrackerConfig, TrackerError, TrackingErrors, desaturated,
 };
@@ -164,6 +165,8 @@ pub struct Follower {
     config: FollowerConfig,
     governor: Governor,
     tracker: Tracker,
+    /// On the way to a trajectory whose ground is unknown.
+    sliding: Option<Sliding>,
     status: FollowerStatus,
     aligning: bool,
     align_rate_rad_s: f64,
@@ -195,7 +198,11 @@ impl Follower {
         } else {
             FollowerStatus::Tracking
         };
+        let sliding = plan
+            .reckoned_mu()
+            .map(|reckoned_mu| Sliding::new(model, reckoned_mu));
         Ok(Self {
+            sliding,
             governor: Governor::new(&model),
             plan,
             model,
@@ -300,6 +307,14 @@ impl Follower {
         self.governor
             .set_rate_cap(if usable { self.rate_cap } else { 0.0 });
         let errors = TrackingErrors::between(&self.governor.sample(&self.plan), measured);
+        if self.status != FollowerStatus::Approach {
+            self.sliding = None;
+        }
+        if let Some(sliding) = self.sliding.as_mut() {
+            sliding.step(measured, dt_s);
+        }
+        let bounds = self.sliding.and_then(|sliding| sliding.bounds());
+        self.governor.set_sliding(bounds, errors.heading_rad);
         let input = GovernorInput {
             lag_m: errors.distance_m(),
             saturated: self.saturated,

@@ -31,5 +31,6 @@ pub mod plant;
 pub mod profile;
 pub mod reference;
 pub mod robot;
+mod sliding;
 pub mod tracking;
 pub mod trajectory;

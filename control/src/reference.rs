@@ -8,6 +8,7 @@
 use crate::geometry::Pose;
 use crate::plan::{Plan, PlanSample};
 use crate::robot::RobotModel;
+use crate::sliding::SlidingBounds;
 
 /// Plan speed below which rates of σ are reckoned as at this one, metres per second.
 const SPEED_FLOOR_M_S: f64 = 0.05;
@@ -32,6 +33,19 @@ const SATURATED_RATE: f64 = 0.5;
 const LOOK_AHEAD_S: f64 = 1.5;
 /// Samples of that look.
 const LOOK_AHEAD_STEPS: u8 = 6;
+
+/// How far bounds on sliding ground look ahead, plan seconds.
+const SLIDING_AHEAD_S: f64 = 0.96;
+/// Samples of that look.
+const SLIDING_STEPS: u8 = 16;
+/// Gain from a gap in σ to its rate on sliding ground, per second.
+const SLIDING_GAIN_1_S: f64 = 10.0;
+/// Heading error that does not slow a sliding robot's reference, radians.
+const HEADING_FREE_RAD: f64 = 0.2;
+/// Heading error at which it would wait, radians.
+const HEADING_FULL_RAD: f64 = 0.8;
+/// Least σ that a heading error asks for: only a robot that drives can come back to its path.
+const HEADING_RATE_MIN: f64 = 0.3;
 
 /// Where the robot should be, and how it should move.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -84,6 +98,13 @@ pub struct GovernorInput {
     pub saturated: bool,
 }
 
+/// A robot that slides: what it may ask of the ground, and how far it is turned off its path.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Sliding {
+    bounds: SlidingBounds,
+    heading_rad: f64,
+}
+
 /// Walks along a plan.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Governor {
@@ -92,6 +113,7 @@ pub struct Governor {
     rate_slope_1_s: f64,
     rate_cap: f64,
     speed_limit_m_s: Option<f64>,
+    sliding: Option<Sliding>,
     stopping: bool,
     brake_m_s2: f64,
     jerk_m_s3: f64,
@@ -106,6 +128,7 @@ impl Governor {
             rate_slope_1_s: 0.0,
             rate_cap: 1.0,
             speed_limit_m_s: None,
+            sliding: None,
             stopping: false,
             brake_m_s2: model.limits().linear_acceleration_max_m_s2,
             jerk_m_s3: model.limits().linear_jerk_max_m_s3,
@@ -143,6 +166,40 @@ impl Governor {
             .map(|ahead_s| plan.sample(self.clock_s + ahead_s).speed_m_s)
             .fold(f64::MIN_POSITIVE, f64::max);
         (limit_m_s / fastest_m_s).min(1.0)
+    }
+
+    /// Bounds what is asked of ground that was found to slide; none lifts the bounds.
+    pub(crate) fn set_sliding(&mut self, bounds: Option<SlidingBounds>, heading_rad: f64) {
+        self.sliding = bounds.map(|bounds| Sliding {
+            bounds,
+            heading_rad,
+        });
+    }
+
+    /// The largest σ that sliding ground allows: within its bounds at every bend ahead, as far as
+    /// braking along the way does not do, and slow while the robot is turned off its path.
+    fn rate_on_sliding_ground(&self, plan: &Plan, planned: &PlanSample) -> f64 {
+        let Some(Sliding {
+            bounds,
+            heading_rad,
+        }) = self.sliding
+        else {
+            return 1.0;
+        };
+        let mut energy = f64::INFINITY;
+        for step in 0..=SLIDING_STEPS {
+            let ahead_s = SLIDING_AHEAD_S * f64::from(step) / f64::from(SLIDING_STEPS);
+            let there = plan.sample(self.clock_s + ahead_s);
+            let bend_1_m = there.path.curvature_1_m.abs().max(f64::MIN_POSITIVE);
+            let slope_1_m2 = there.path.curvature_slope_1_m2.abs().max(f64::MIN_POSITIVE);
+            let square = (bounds.across_m_s2 / bend_1_m).min(bounds.yaw_rad_s2 / slope_1_m2);
+            let way_m = there.arc_m - planned.arc_m;
+            energy = energy.min(0.5 * square + bounds.along_m_s2 * way_m);
+        }
+        let turned = (HEADING_FULL_RAD - heading_rad.abs()) / (HEADING_FULL_RAD - HEADING_FREE_RAD);
+        ((2.0 * energy).sqrt() / planned.speed_m_s.max(f64::MIN_POSITIVE))
+            .min(turned.max(HEADING_RATE_MIN))
+            .min(1.0)
     }
 
     /// Starts to brake along the path, for good.
@@ -192,6 +249,7 @@ impl Governor {
             wait.min(followed)
                 .min(self.rate_cap)
                 .min(self.rate_within_speed_limit(plan))
+                .min(self.rate_on_sliding_ground(plan, &planned))
         };
         // A change of σ asks for σ̇v₁ on top of σ²a₁; braking gets what the limit leaves. The brake
         // is let go as the speed falls, a = √(jv), so that rest is met without a knock.
@@ -203,10 +261,15 @@ impl Governor {
         let fall_1_s = -((brake_m_s2 + own_m_s2) / floor_m_s).max(0.0);
         let rise_1_s = ((0.5 * self.brake_m_s2 - own_m_s2) / floor_m_s).clamp(0.0, RISE_MAX_1_S);
         let gap = target - self.rate;
+        let gain_1_s = if self.sliding.is_some() {
+            SLIDING_GAIN_1_S
+        } else {
+            RATE_GAIN_1_S
+        };
         let wanted_1_s = if self.stopping {
             fall_1_s
         } else {
-            (RATE_GAIN_1_S * gap).clamp(fall_1_s, rise_1_s)
+            (gain_1_s * gap).clamp(fall_1_s, rise_1_s)
         };
         let slew = self.jerk_m_s3 / floor_m_s * dt_s;
         self.rate_slope_1_s +=
@@ -254,5 +317,53 @@ impl Governor {
         let acceleration_m_s2 = self.rate * self.rate * planned.acceleration_m_s2
             + self.rate_slope_1_s * planned.speed_m_s;
         ReferenceSample::at(planned, speed_m_s, acceleration_m_s2)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::geometry::Point;
+    use crate::trajectory::{CircleSpec, Direction, Trajectory};
+
+    proptest! {
+        #![proptest_config(ProptestConfig { cases: 32, ..ProptestConfig::default() })]
+        #[test]
+        fn sliding_ground_slows_the_reference_without_a_jump_and_lets_it_arrive(
+            from_s in 0.0..4.0_f64, shown_m_s2 in 0.27..0.8_f64, heading_rad in -3.0..3.0_f64,
+        ) {
+            let model = RobotModel::yi2007();
+            let circle = Trajectory::Circle(CircleSpec {
+                center: Point::default(),
+                radius_m: 5.0,
+                speed_m_s: 0.6,
+                direction: Direction::CounterClockwise,
+                turns: 0.2,
+            });
+            let start = Pose { x_m: 7.5, y_m: 0.0, heading_rad: 1.5 };
+            let plan = Plan::new(&circle, start, &model).unwrap();
+            let mut governor = Governor::new(&model);
+            let bounds = SlidingBounds {
+                along_m_s2: 0.5 * shown_m_s2,
+                across_m_s2: 0.5 * shown_m_s2,
+                yaw_rad_s2: shown_m_s2,
+            };
+            let dt_s = 0.01;
+            let mut before = governor.sample(&plan);
+            for tick in 0..30_000 {
+                if f64::from(tick) * dt_s >= from_s {
+                    governor.set_sliding(Some(bounds), heading_rad);
+                }
+                let now = governor.step(&plan, &GovernorInput::default(), dt_s);
+                prop_assert!(now.arc_m >= before.arc_m - 1.0e-9);
+                let change_m_s2 = (now.speed_m_s - before.speed_m_s).abs() / dt_s;
+                let most_m_s2 = 2.0 * model.limits().linear_acceleration_max_m_s2;
+                prop_assert!(change_m_s2 < most_m_s2, "{change_m_s2} m/s²");
+                before = now;
+            }
+            prop_assert!(governor.is_at_end(&plan));
+        }
     }
 }

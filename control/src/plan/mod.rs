@@ -94,6 +94,7 @@ pub struct Plan {
     profile: SpeedProfile,
     excitation: Option<Excitation>,
     approach_length_m: f64,
+    grip_is_known: bool,
     peak_speed_m_s: f64,
     peak_acceleration_m_s2: f64,
     peak_lateral_m_s2: f64,
@@ -390,6 +391,7 @@ impl Plan {
         let mut plan = Self {
             excitation,
             approach_length_m: path.piece_start_m(approach_pieces),
+            grip_is_known: options.least_grip_mu().is_some(),
             path,
             profile,
             peak_speed_m_s: 0.0,
@@ -467,6 +469,12 @@ impl Plan {
     /// Length of the way to the circle or the first waypoint, metres.
     pub fn approach_length_m(&self) -> f64 {
         self.approach_length_m
+    }
+
+    /// Peak friction coefficient that the way to the trajectory is reckoned with, unless the ground
+    /// is known.
+    pub(crate) fn reckoned_mu(&self) -> Option<f64> {
+        (!self.grip_is_known).then_some(GRIP_UNKNOWN_MU)
     }
 
     /// Time from rest to rest when nothing slows the robot, without turning on the spot, seconds.

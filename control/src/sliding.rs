@@ -1,0 +1,245 @@
+//! Whether the ground gives less than a plan reckons with, seen from gyro and wheel speeds.
+//!
+//! In the linear range the turn that the wheels ask for runs ahead of the body's by
+//! `θ (u/g) (4 I_G/(m(W² + L²))) ω̇`, u the speed of the rims. Ground whose peak the plan reckons
+//! with explains so much of it with `θ = λ_m/μ`; what is left over, less what radii, the effective
+//! track and noise may do, is summed to an angle, and a robot slides once that is large:
+//!
+//! ```text
+//! gripping ─ angle large, too little shown ─► sliding (for good)
+//! ```
+//! What the body did shows what the ground gave: four wheels of equal load that push the body
+//! with `a_y = vω` and turn it with `I_G ω̇` have a mean square of at least
+//! `a_y² + (2 I_G ω̇/(m √(W² + L²)))²`, so that some wheel had at least the root of it over g as μ. It
+//! is a lower bound: a wrong guess makes the robot slower, never quicker.
+
+use crate::measured::Measured;
+use crate::robot::{GRAVITY_M_S2, RobotModel};
+
+/// Time over which rates are smoothed, seconds.
+const SMOOTHING_S: f64 = 0.05;
+/// Slip up to which friction grows in proportion to it.
+const SLIP_LINEAR: f64 = 0.2;
+/// What the linear range explains is taken this much larger.
+const EXPLAINED_RATIO: f64 = 1.2;
+/// Difference of the sides' rolling radii that is not taken for sliding before it is measured.
+const RADII_RATIO: f64 = 0.04;
+/// The same after.
+const RADII_LEFT_RATIO: f64 = 0.004;
+/// Turn rate below which a robot drives straight on, so that its radii can be measured, radians
+/// per second.
+const STRAIGHT_RAD_S: f64 = 0.03;
+/// Speed squared over time that measures them half-way, metres squared per second.
+const RADII_MIDDLE_M2_S: f64 = 0.002;
+/// The same of the effective track: it grows in tight turns.
+const TRACK_RATIO: f64 = 0.1;
+/// The same of the turn rates' noise, radians per second.
+const NOISE_RAD_S: f64 = 0.01;
+/// Angle from which a robot slides, radians.
+const SLIDING_RAD: f64 = 0.007;
+/// Slowest rims that slip is reckoned with, metres per second.
+const RIM_MIN_M_S: f64 = 0.05;
+/// Share of what was shown that may be asked for along and across the path.
+const SHARE: f64 = 0.5;
+/// The same in yaw, where turning wheels scrub.
+const SHARE_YAW: f64 = 0.35;
+/// Least that counts as shown, over what the plan reckons with.
+const SHOWN_RATIO_MIN: f64 = 0.2;
+
+/// What may be asked of ground that slides.
+#[expect(
+    clippy::struct_field_names,
+    reason = "all are accelerations, and units stand last"
+)]
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct SlidingBounds {
+    /// Along the path, metres per second squared.
+    pub(crate) along_m_s2: f64,
+    /// Across the path, metres per second squared.
+    pub(crate) across_m_s2: f64,
+    /// In yaw, radians per second squared.
+    pub(crate) yaw_rad_s2: f64,
+}
+
+/// Turn rates of body and wheels, smoothed alike.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Smoothed {
+    turn_rad_s: f64,
+    ahead_rad_s: f64,
+}
+
+/// Watches one robot on its way.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Sliding {
+    model: RobotModel,
+    reckoned_mu: f64,
+    smoothed: Option<Smoothed>,
+    /// `∫ (turn of the wheels − turn of the body) u` and `∫ u²` straight on.
+    straight: [f64; 2],
+    shown_m_s2: f64,
+    left_over_rad: f64,
+    slides: bool,
+}
+
+impl Sliding {
+    /// A robot that grips, on ground whose plan reckons with a peak friction coefficient.
+    pub(crate) fn new(model: RobotModel, reckoned_mu: f64) -> Self {
+        Self {
+            model,
+            reckoned_mu,
+            smoothed: None,
+            straight: [0.0; 2],
+            shown_m_s2: 0.0,
+            left_over_rad: 0.0,
+            slides: false,
+        }
+    }
+
+    /// Takes one tick.
+    pub(crate) fn step(&mut self, measured: &Measured, dt_s: f64) {
+        let model = &self.model;
+        let turn_rad_s = measured.twist.angular_rad_s;
+        let wheels = measured.wheel_speeds;
+        let ahead_rad_s = model.twist_from_wheel_speeds(wheels).angular_rad_s - turn_rad_s;
+        let before = self.smoothed.unwrap_or(Smoothed {
+            turn_rad_s,
+            ahead_rad_s,
+        });
+        let share = (dt_s / SMOOTHING_S).min(1.0);
+        let change_rad_s = turn_rad_s - before.turn_rad_s;
+        let smoothed = Smoothed {
+            turn_rad_s: before.turn_rad_s + share * change_rad_s,
+            ahead_rad_s: before.ahead_rad_s + share * (ahead_rad_s - before.ahead_rad_s),
+        };
+        self.smoothed = Some(smoothed);
+        let yaw_rad_s2 = change_rad_s / SMOOTHING_S;
+        let across_m_s2 = measured.twist.linear_m_s * smoothed.turn_rad_s;
+        let shown_m_s2 = across_m_s2.hypot(yaw_rad_s2 * Self::lever_m(model));
+        self.shown_m_s2 = self.shown_m_s2.max(shown_m_s2);
+
+        let rim_m_s =
+            0.5 * model.wheel_radius_m() * (wheels.left_rad_s.abs() + wheels.right_rad_s.abs());
+        if turn_rad_s.abs() < STRAIGHT_RAD_S {
+            self.straight[0] += ahead_rad_s * rim_m_s * dt_s;
+            self.straight[1] += rim_m_s * rim_m_s * dt_s;
+        }
+        let known_m2_s = RADII_MIDDLE_M2_S + self.straight[1];
+        let radii_rad_s = self.straight[0] / known_m2_s * rim_m_s;
+        let radii_ratio = RADII_RATIO * RADII_MIDDLE_M2_S / known_m2_s + RADII_LEFT_RATIO;
+        let square_m2 = model.track_width_m().powi(2) + model.wheelbase_m().powi(2);
+        let inertia_ratio = 4.0 * model.yaw_inertia_kg_m2() / (model.mass_kg() * square_m2);
+        let theta = SLIP_LINEAR / self.reckoned_mu;
+        let lag_s = theta * inertia_ratio * rim_m_s.max(RIM_MIN_M_S) / GRAVITY_M_S2;
+        let explained_rad_s = EXPLAINED_RATIO * lag_s * yaw_rad_s2.abs()
+            + radii_ratio * rim_m_s / model.effective_track_m()
+            + TRACK_RATIO * turn_rad_s.abs()
+            + NOISE_RAD_S;
+        let left_over_rad_s = (smoothed.ahead_rad_s - radii_rad_s).abs() - explained_rad_s;
+        self.left_over_rad = (self.left_over_rad + left_over_rad_s * dt_s).max(0.0);
+        // Ground that has given what the plan asks of it along the path is as good as reckoned.
+        let is_enough = self.shown_m_s2 >= RobotModel::grip_along_m_s2(self.reckoned_mu);
+        self.slides |= self.left_over_rad > SLIDING_RAD && !is_enough;
+    }
+
+    /// What may be asked of the ground, if the robot slides; rises with what was shown.
+    pub(crate) fn bounds(&self) -> Option<SlidingBounds> {
+        let least_m_s2 = SHOWN_RATIO_MIN * self.reckoned_mu * GRAVITY_M_S2;
+        let shown_m_s2 = self.shown_m_s2.max(least_m_s2);
+        self.slides.then(|| SlidingBounds {
+            along_m_s2: SHARE * shown_m_s2,
+            across_m_s2: SHARE * shown_m_s2,
+            yaw_rad_s2: SHARE_YAW * shown_m_s2 / Self::lever_m(&self.model),
+        })
+    }
+
+    /// Acceleration of the wheels per yaw acceleration, metres.
+    fn lever_m(model: &RobotModel) -> f64 {
+        let half_m = 0.5 * model.track_width_m().hypot(model.wheelbase_m());
+        model.yaw_inertia_kg_m2() / (model.mass_kg() * half_m)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::geometry::Twist;
+    use crate::measured::WheelSpeeds;
+
+    const DT_S: f64 = 0.01;
+    const RECKONED_MU: f64 = 0.14;
+
+    fn measured(turn_rad_s: f64, wheels: Twist, radii: [f64; 2]) -> Measured {
+        let wheels = RobotModel::yi2007().wheel_speeds_from_twist(wheels);
+        Measured {
+            twist: Twist {
+                linear_m_s: 0.5,
+                angular_rad_s: turn_rad_s,
+            },
+            wheel_speeds: WheelSpeeds {
+                left_rad_s: wheels.left_rad_s / radii[0],
+                right_rad_s: wheels.right_rad_s / radii[1],
+            },
+            ..Measured::default()
+        }
+    }
+
+    /// A robot that drives faster and faster, then swings, its body behind its wheels by a lag.
+    fn driven(swing_rad_s: f64, pace_1_s: f64, lag_s: f64, radii: [f64; 2]) -> Vec<Measured> {
+        (0..300)
+            .map(|tick| {
+                let time_s = DT_S * f64::from(tick);
+                let phase = pace_1_s * (time_s - 1.0).max(0.0);
+                let turn_rad_s = swing_rad_s * (1.0 - phase.cos());
+                let wheels = Twist {
+                    linear_m_s: 0.5 * time_s.min(1.0),
+                    angular_rad_s: turn_rad_s + lag_s * swing_rad_s * pace_1_s * phase.sin(),
+                };
+                measured(turn_rad_s, wheels, radii)
+            })
+            .collect()
+    }
+
+    proptest! {
+        #[test]
+        fn wheels_of_unequal_radii_on_firm_ground_do_not_slide(
+            swing_rad_s in -0.8..0.8_f64, pace_1_s in 0.5..4.0_f64, lag_s in 0.0..0.03_f64,
+            left in 0.98..1.02_f64, right in 0.98..1.02_f64,
+        ) {
+            let mut sliding = Sliding::new(RobotModel::yi2007(), RECKONED_MU);
+            for tick in driven(swing_rad_s, pace_1_s, lag_s, [left, right]) {
+                sliding.step(&tick, DT_S);
+                prop_assert!(sliding.bounds().is_none());
+            }
+        }
+
+        #[test]
+        fn bounds_are_below_what_was_shown_or_the_least_and_never_fall(
+            swing_rad_s in 0.1..0.4_f64, pace_1_s in 0.5..2.0_f64, lag_s in 0.1..2.0_f64,
+        ) {
+            let mut sliding = Sliding::new(RobotModel::yi2007(), RECKONED_MU);
+            let (mut before_m_s2, least_m_s2) = (0.0, SHOWN_RATIO_MIN * RECKONED_MU * GRAVITY_M_S2);
+            for tick in driven(swing_rad_s, pace_1_s, lag_s, [1.0; 2]) {
+                sliding.step(&tick, DT_S);
+                if let Some(bounds) = sliding.bounds() {
+                    prop_assert!(bounds.along_m_s2 <= sliding.shown_m_s2.max(least_m_s2));
+                    prop_assert!(bounds.across_m_s2 >= before_m_s2 && bounds.yaw_rad_s2 > 0.0);
+                    before_m_s2 = bounds.across_m_s2;
+                } else {
+                    prop_assert!(before_m_s2 <= 0.0, "a robot that slides stays one that slides");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_body_that_stays_behind_its_wheels_slides() {
+        let mut sliding = Sliding::new(RobotModel::yi2007(), RECKONED_MU);
+        for tick in driven(0.4, 2.0, 0.5, [1.0; 2]) {
+            sliding.step(&tick, DT_S);
+        }
+        let bounds = sliding.bounds().unwrap();
+        assert!(bounds.across_m_s2 < 0.5, "{bounds:?}");
+    }
+}
