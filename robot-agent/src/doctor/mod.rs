@@ -45,7 +45,7 @@ const STEADY_FOR: Duration = Duration::from_secs(2);
 /// How long the robot stands between two motions.
 const REST: Duration = Duration::from_secs(1);
 /// How often a motion is tried of a base that falls silent in the middle of it.
-const TRIES_MAX: u32 = 12;
+const TRIES_MAX: u32 = 5;
 /// Longest wait for the bus to be left.
 const CLOSE_MAX: Duration = Duration::from_secs(2);
 /// Speed of the wheels' rims, metres per second.

@@ -7,7 +7,7 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use super::VERSION;
-use super::replay::{DifferingTick, ReplayError, Replayed, replay};
+use super::replay::{DifferingTick, Replayed, replay};
 
 /// Arguments of `tread-agent replay`.
 #[derive(Debug, Clone, Args)]
@@ -28,13 +28,13 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<bool> {
     let replayed = replay(&args.files);
     let mut out = std::io::stdout().lock();
     if args.json {
-        let object = match &replayed {
-            Ok(found) => object(found),
-            Err(refused) => unread(refused),
+        let (object, holds) = match replayed {
+            Ok(found) => (object(&found), holds(&found)),
+            Err(refused) => (unread(&refused.into()), false),
         };
         serde_json::to_writer(&mut out, &object)?;
         writeln!(out)?;
-        return Ok(replayed.is_ok_and(|found| holds(&found)));
+        return Ok(holds);
     }
     let found = replayed?;
     write!(out, "{}", text(&found))?;
@@ -99,16 +99,10 @@ pub(crate) fn object(found: &Replayed) -> Value {
 }
 
 /// For programs, of a record that cannot be read or run at all.
-pub(crate) fn unread(refused: &ReplayError) -> Value {
-    let mut words = refused.to_string();
-    let mut cause = std::error::Error::source(refused);
-    while let Some(deeper) = cause {
-        words = format!("{words}: {deeper}");
-        cause = deeper.source();
-    }
+fn unread(refused: &anyhow::Error) -> Value {
     json!({
         "replayed_by": VERSION,
-        "refused": words,
+        "refused": format!("{refused:#}"),
         "checks": [check("records that cannot be run again", "0", &json!(1), false)],
     })
 }

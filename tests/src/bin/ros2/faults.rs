@@ -21,9 +21,6 @@ const ZERO_MAX_MS: f64 = 150.0;
 const ZERO_OF_A_LIE_MAX_MS: f64 = 900.0;
 /// How long a fault lasts.
 const LASTS: Duration = Duration::from_millis(1_500);
-/// How long one lasts on a slow machine that leaves the agent without a position: it must be over
-/// before a mission fails without one.
-const LASTS_SLOW: Duration = Duration::from_secs(1);
 /// Longest until the robot moves again.
 const AGAIN_MAX: Duration = Duration::from_secs(10);
 /// The same on a slow machine.
@@ -124,19 +121,13 @@ impl Trial<'_> {
     async fn of(&self, fault: &Fault, base: &mut PythonRobot) -> anyhow::Result<Vec<Check>> {
         let name = fault.name;
         self.observer.forget_commands();
-        // A lie takes longer to be seen through, and leaves the position as it is.
-        let lasts = if name == "stuck" {
-            LASTS
-        } else {
-            self.judgement.patience(LASTS, LASTS_SLOW)
-        };
         let switched_at = Instant::now();
         base.switch(name, fault.value)?;
         // The base is mended in time however long an answer takes: without a position a mission fails.
         let (mut is_said, tried) = tokio::join!(
-            self.is_said_by(switched_at + lasts.mul_f64(0.9), fault.said),
+            self.is_said_by(switched_at + LASTS.mul_f64(0.9), fault.said),
             async {
-                tokio::time::sleep_until(switched_at + lasts).await;
+                tokio::time::sleep_until(switched_at + LASTS).await;
                 let checks = self.of_rest(fault, switched_at);
                 if name != "restart" {
                     base.switch(name, "off")?;
