@@ -14,8 +14,10 @@
 
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-use super::curved::{SLIP_MIN, SideSlips, Turn, bent, drift_bend, spread_out, uneven};
-use super::regression::{Parameters, Row, index};
+use super::contacts::{BendInput, Loss, MeanSlip};
+use super::curved::{Curvatures, SLIP_MIN, SideSlips, Turn, uneven};
+use super::rows::{Regressors, Row, index};
+use super::window::Moment;
 use super::{SLIP_LINEAR_MAX, SensorNoise, SensorSample, TyrePrior, signed_rims};
 
 /// Time over which samples are averaged, seconds.
@@ -30,6 +32,14 @@ const STANDING_NOISE_M_S: f64 = 1.0e-3;
 const TURNING_MIN_RAD_S: f64 = 1.0e-3;
 /// Steps the wheels must have stood before the body does too.
 const STANDING_STEPS: u32 = 3;
+
+/// No swing.
+const STILL: Moment = Moment {
+    apart: 0.0,
+    turn_rad_s: 0.0,
+    ahead_mu: 0.0,
+    weight: 1.0,
+};
 
 /// Averages over one step.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -72,8 +82,8 @@ pub(super) struct SlipBound {
 struct Sideways {
     /// θ as it is known.
     theta: f64,
-    /// [`drift_bend`].
-    bend: f64,
+    /// By how much more a curved tyre drifts, as shares of θκ and θκ².
+    bend: [f64; 2],
 }
 
 /// The filter.
@@ -82,7 +92,7 @@ pub(super) struct AlongFilter {
     step: Step,
     speed_m_s: f64,
     variance: f64,
-    sensitivity: Parameters,
+    sensitivity: Regressors,
     /// Change of speed that the last step leaves to its successor.
     last_share_m_s: f64,
     last_duration_s: f64,
@@ -100,7 +110,7 @@ impl AlongFilter {
             step: Step::default(),
             speed_m_s: 0.0,
             variance: UNKNOWN_M2_S2,
-            sensitivity: Parameters::zeros(),
+            sensitivity: Regressors::zeros(),
             last_share_m_s: 0.0,
             last_duration_s: 0.0,
             last_gyro_rad_s: 0.0,
@@ -156,7 +166,7 @@ impl AlongFilter {
         let gyro_rad_s = step.gyro_rad_s / count;
         let sideways = Sideways {
             theta: bound.theta,
-            bend: sideways_bend(&step, gyro_rad_s, model, bound.tyres.curvature),
+            bend: sideways_bend(&step, gyro_rad_s, model, bound.theta, &bound.tyres),
         };
         self.predict(&step, ahead_m_s2, gyro_rad_s, noise, sideways);
         let mut rows: Rows = [None; 3];
@@ -166,8 +176,8 @@ impl AlongFilter {
             rows[0] = self.wheels(&step, ahead_m_s2, gyro_rad_s, model, noise, bound);
         }
         if self.standing >= STANDING_STEPS {
-            rows[1] = Some(self.observe(Parameters::zeros(), 0.0, STANDING_NOISE_M_S.powi(2), 0.0));
-            let mut regressors = Parameters::zeros();
+            rows[1] = Some(self.observe(Regressors::zeros(), 0.0, STANDING_NOISE_M_S.powi(2), 0.0));
+            let mut regressors = Regressors::zeros();
             regressors[index::GYRO_OFFSET] = 1.0;
             rows[2] = Some(Row::white(
                 regressors,
@@ -177,7 +187,7 @@ impl AlongFilter {
         } else if step.body_samples > 0.0 {
             // The samples were taken off the step's middle.
             let late_s = step.body_time_s / step.body_samples - 0.5 * step.duration_s;
-            let mut regressors = Parameters::zeros();
+            let mut regressors = Regressors::zeros();
             regressors[index::AHEAD_OFFSET] = -late_s;
             rows[1] = Some(self.observe(
                 regressors,
@@ -224,7 +234,8 @@ impl AlongFilter {
             - drift_s * (self.speed_m_s * turn_rad_s2 + 2.0 * ahead_m_s2 * turn_rad_s);
         let sideways_m_s = span_s * self.speed_m_s * turn_rad_s * across_m_s2 / GRAVITY_M_S2;
         self.sensitivity[index::THETA] -= sideways_m_s;
-        self.sensitivity[index::CURVATURE] -= sideways_m_s * sideways.bend;
+        self.sensitivity[index::CURVATURE] -= sideways_m_s * sideways.bend[0];
+        self.sensitivity[index::CURVATURE_SQUARE] -= sideways_m_s * sideways.bend[1];
         self.variance = (self.variance
             + (span_s * noise.accelerometer_m_s2).powi(2) / step.samples)
             .min(UNKNOWN_M2_S2);
@@ -251,26 +262,30 @@ impl AlongFilter {
         }
         let harmonic_m_s = step.harmonic_m_s / count;
         let force_m_s = step.force_m_s / count;
-        let slip = lateral.hypot(turning + bound.theta * ahead_m_s2.abs() / GRAVITY_M_S2);
-        let mut regressors = Parameters::zeros();
-        regressors[index::THETA] = spread_out(force_m_s, slip, &bound.tyres);
+        let mut regressors = Regressors::zeros();
+        regressors[index::THETA] = force_m_s;
         regressors[index::RADIUS_OFFSET] = harmonic_m_s;
         regressors[index::RADIUS_DIFFERENCE] = 0.25 * rim_difference_m_s;
-        // On a curved tyre the side that slips more carries less: with equal and opposite slip of
-        // the two sides in a turn, both together hold the robot back.
         let turn = Turn {
             rim_m_s: harmonic_m_s.abs(),
             rim_difference_m_s,
             yaw_rate_rad_s: gyro_rad_s,
             radius_difference: bound.radius_difference * harmonic_m_s.signum(),
-            apart_variance: 0.0,
         };
-        let common = bound.theta * ahead_m_s2 / GRAVITY_M_S2 * harmonic_m_s.signum();
-        let sides = SideSlips::of(&turn, common, model);
-        let curvature = bound.tyres.curvature;
-        let uneven_gain = uneven(sides.mean, curvature);
-        regressors[index::CURVATURE] = bent(force_m_s, slip, curvature)
-            - 0.25 * uneven_gain * sides.unequal * sides.apart * harmonic_m_s / bound.theta;
+        let ahead_mu = ahead_m_s2 / GRAVITY_M_S2 * harmonic_m_s.signum();
+        let input = BendInput {
+            turn: &turn,
+            swing: &[STILL],
+            mu: MeanSlip {
+                ahead: ahead_mu,
+                across: harmonic_m_s.abs() * gyro_rad_s / GRAVITY_M_S2,
+            },
+            theta: bound.theta,
+            force_m_s,
+            uneven_m_s: |loss: &Loss| harmonic_m_s * loss.ahead,
+        };
+        let (bends, mut bend) = input.bends(model, &bound.tyres);
+        bends.put(&mut regressors);
         // The measured acceleration is averaged over the step, and so is its offset.
         let felt_noise = (harmonic_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2) / count;
         let rim_noise = 0.5 * (noise.wheel_speed_rad_s * model.wheel_radius_m()).powi(2) / count;
@@ -278,15 +293,24 @@ impl AlongFilter {
         let spread = rim_noise + bound.theta.powi(2) * felt_noise;
         let mut row = self.observe(regressors, step.wheels_m_s / count, spread, felt_noise);
         // The force makes the sides' slip unequal too, with its noise.
-        row.bend = bent(1.0, slip, curvature)
-            + 0.25 * uneven_gain * sides.apart * sides.apart / sides.mean.max(SLIP_MIN);
+        let sides = SideSlips::of(&turn, bound.theta * ahead_mu, model);
+        let unequal_by_force = 0.25 * sides.apart * sides.apart / sides.mean.max(SLIP_MIN);
+        let curvatures = Curvatures::of(&bound.tyres);
+        let more = curvatures.split(
+            curvatures
+                .nodes()
+                .map(|curvature| unequal_by_force * uneven(sides.mean, curvature)),
+        );
+        bend[0] += more[0];
+        bend[1] += more[1];
+        row.bend = bend;
         Some(row)
     }
 
     /// One measurement of the speed, less what the parameters add to it.
     fn observe(
         &mut self,
-        regressors: Parameters,
+        regressors: Regressors,
         response_m_s: f64,
         noise: f64,
         force_noise: f64,
@@ -304,30 +328,42 @@ impl AlongFilter {
             spread,
             // What is wrong in this row stays in the next ones until it has faded.
             force_noise: force_noise * 2.0 / (2.0 - gain),
-            bend: 0.0,
-            common_noise: Parameters::zeros(),
+            bend: [0.0; 3],
+            common_noise: Regressors::zeros(),
             ramp_noise: 0.0,
         }
     }
 }
 
-/// [`drift_bend`] of a step; zero on a straight.
-fn sideways_bend(step: &Step, gyro_rad_s: f64, model: &RobotModel, curvature: f64) -> f64 {
+/// By how much more curved tyres drift in a step, as shares of θκ and θκ²; zero on a straight.
+fn sideways_bend(
+    step: &Step,
+    gyro_rad_s: f64,
+    model: &RobotModel,
+    theta: f64,
+    tyres: &TyrePrior,
+) -> [f64; 2] {
     let rim_m_s = step.harmonic_m_s.abs() / step.samples;
     if step.usable < step.samples || gyro_rad_s.abs() < TURNING_MIN_RAD_S {
-        return 0.0;
+        return [0.0; 2];
     }
     let turn = Turn {
         rim_m_s,
         rim_difference_m_s: step.rim_difference_m_s / step.samples,
         yaw_rate_rad_s: gyro_rad_s,
         radius_difference: 0.0,
-        apart_variance: 0.0,
     };
-    let slip = SideSlips::of(&turn, 0.0, model).mean;
-    drift_bend(
-        slip,
-        0.5 * model.wheelbase_m() * gyro_rad_s / rim_m_s,
-        curvature,
-    )
+    let across = theta * rim_m_s * gyro_rad_s / GRAVITY_M_S2;
+    let curvatures = Curvatures::of(tyres);
+    curvatures.split(curvatures.nodes().map(|curvature| {
+        let loss = Loss::of(
+            &turn,
+            &[STILL],
+            MeanSlip { ahead: 0.0, across },
+            theta,
+            model,
+            curvature,
+        );
+        (loss.mean + loss.across / across) / loss.left
+    }))
 }

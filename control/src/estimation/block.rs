@@ -1,9 +1,8 @@
 //! Samples averaged over blocks, and the two differential rows that a block gives.
 
-use super::curved::{
-    Bent, SLIP_MIN, SideSlips, Turn, bent, bent_slope, drift_bend, spread_out, uneven,
-};
-use super::regression::{Parameters, Row, index};
+use super::contacts::{BendInput, Loss, MeanSlip};
+use super::curved::{Curvatures, SideSlips, Turn, bent, bent_slope};
+use super::rows::{Regressors, Row, index};
 use super::window::{TurnMeans, TurnWindow};
 use super::{
     BLOCK_S, RIM_SPEED_MIN_M_S, SLIP_LINEAR_FIRST_MAX, SLIP_LINEAR_MAX, SensorNoise, SensorSample,
@@ -26,13 +25,13 @@ pub(super) struct Force {
     mean_m_s: f64,
     /// Variance of the former; that of the latter is a quarter of it.
     difference_noise: f64,
-    /// What both add to θκ's regressor, and both to θ's, each side at its own slip.
-    difference_bent: Bent,
-    mean_bent: Bent,
-    /// θκ's regressor over the force, whose noise it has.
-    bend: f64,
-    /// Covariance of the difference's θκ regressor with the response.
-    slip_noise: f64,
+    /// What both add to the regressors of θκ and θκ², each side at its own slip.
+    difference_bent: [f64; 2],
+    mean_bent: [f64; 2],
+    /// Those regressors over the force, whose noise they have.
+    bend: [f64; 2],
+    /// Covariance of the difference's with the response.
+    slip_noise: [f64; 2],
 }
 
 /// What is known about θ when a block is judged.
@@ -116,23 +115,29 @@ impl Block {
         let Some(force) = self.force else {
             return self.turning;
         };
-        let mut regressors = Parameters::zeros();
-        regressors[index::THETA] = force.difference_bent.theta_m_s;
+        let mut regressors = Regressors::zeros();
+        regressors[index::THETA] = force.difference_m_s;
         regressors[index::RADIUS_OFFSET] = self.rim_difference_m_s;
         regressors[index::RADIUS_DIFFERENCE] = self.rim_mean_m_s;
         regressors[index::GYRO_OFFSET] = -self.track_width_m;
-        regressors[index::CURVATURE] = force.difference_bent.curvature_m_s;
+        [
+            regressors[index::CURVATURE],
+            regressors[index::CURVATURE_SQUARE],
+        ] = force.difference_bent;
         regressors[index::RESISTANCE] = -self.rim_difference_m_s;
-        let mut common_noise = Parameters::zeros();
+        let mut common_noise = Regressors::zeros();
         common_noise[index::RADIUS_OFFSET] = self.rim_difference_noise;
         common_noise[index::RESISTANCE] = -self.rim_difference_noise;
-        common_noise[index::CURVATURE] = force.slip_noise;
+        [
+            common_noise[index::CURVATURE],
+            common_noise[index::CURVATURE_SQUARE],
+        ] = force.slip_noise;
         Some(Row {
             regressors,
             response: self.difference_m_s,
             spread: self.difference_noise,
             force_noise: force.difference_noise,
-            bend: force.bend,
+            bend: [force.bend[0], force.bend[1], 0.0],
             common_noise,
             ramp_noise: 0.0,
         })
@@ -147,19 +152,22 @@ impl Block {
     pub(super) fn mean_row(&self) -> Option<Row> {
         let force = self.force?;
         let slip_m_s = self.slip_m_s.filter(|_| self.is_steady)?;
-        let mut regressors = Parameters::zeros();
-        regressors[index::THETA] = force.mean_bent.theta_m_s;
+        let mut regressors = Regressors::zeros();
+        regressors[index::THETA] = force.mean_m_s;
         regressors[index::RADIUS_OFFSET] = self.rim_mean_m_s;
         regressors[index::RADIUS_DIFFERENCE] = 0.25 * self.rim_difference_m_s;
-        regressors[index::CURVATURE] = force.mean_bent.curvature_m_s;
+        [
+            regressors[index::CURVATURE],
+            regressors[index::CURVATURE_SQUARE],
+        ] = force.mean_bent;
         regressors[index::RESISTANCE] = -self.rim_mean_m_s;
         Some(Row {
             regressors,
             response: slip_m_s,
             spread: self.slip_noise,
             force_noise: 0.25 * force.difference_noise,
-            bend: force.bend,
-            common_noise: Parameters::zeros(),
+            bend: [force.bend[0], force.bend[1], 0.0],
+            common_noise: Regressors::zeros(),
             ramp_noise: 0.0,
         })
     }
@@ -352,7 +360,6 @@ impl BlockBuilder {
             rim_difference_m_s: right_m_s - left_m_s,
             yaw_rate_rad_s: self.gyro_rad_s / count,
             radius_difference: radius_difference * mean_m_s.signum(),
-            apart_variance: 0.0,
         };
         // The torque holds rolling resistance, which no contact carries.
         let contact_m_s = if self.with_acceleration == self.samples {
@@ -371,28 +378,36 @@ impl BlockBuilder {
         // The rims and the gyro that give slip stand in the response too.
         let order = if mean_m_s < 0.0 { [1, 0] } else { [0, 1] };
         let contact = [left_force_m_s - rolling_m_s, right_force_m_s - rolling_m_s];
-        let slopes = [
-            -bent_slope(contact[0], left_slip, tyres.curvature),
-            bent_slope(contact[1], right_slip, tyres.curvature),
-        ];
-        let along = |by: [f64; 2]| slopes[0] * by[order[0]] + slopes[1] * by[order[1]];
         let rim_noise = 2.0 * (noise.wheel_speed_rad_s * model.wheel_radius_m()).powi(2) / count;
         let turn_noise = model.track_width_m() * noise.gyro_rad_s.powi(2) / count;
-        let slip_noise = along(sides.by_apart) / mean_m_s.abs()
-            * (rim_noise + model.track_width_m() * turn_noise)
-            - along(sides.by_turn_s) * turn_noise;
-        let left = Bent::of(left_force_m_s, rolling_m_s, left_slip, tyres);
-        let right = Bent::of(right_force_m_s, rolling_m_s, right_slip, tyres);
+        let slip_noise = |curvature: f64| {
+            let slopes = [
+                -bent_slope(contact[0], left_slip, curvature),
+                bent_slope(contact[1], right_slip, curvature),
+            ];
+            let along = |by: [f64; 2]| slopes[0] * by[order[0]] + slopes[1] * by[order[1]];
+            along(sides.by_apart) / mean_m_s.abs()
+                * (rim_noise + model.track_width_m() * turn_noise)
+                - along(sides.by_turn_s) * turn_noise
+        };
+        let curvatures = Curvatures::of(tyres);
+        let nodes = curvatures.nodes();
+        let bent_sides = nodes.map(|curvature| {
+            [
+                bent(contact[0], left_slip, curvature),
+                bent(contact[1], right_slip, curvature),
+            ]
+        });
         Force {
             difference_m_s: right_force_m_s - left_force_m_s,
             mean_m_s: mean_force_m_s,
             difference_noise: noise.torque_mu.powi(2)
                 * (left_m_s * left_m_s + right_m_s * right_m_s)
                 / count,
-            difference_bent: Bent::sum(right, 1.0, left, -1.0),
-            mean_bent: Bent::sum(right, 0.5, left, 0.5),
-            bend: bent(1.0, sides.mean, tyres.curvature),
-            slip_noise,
+            difference_bent: curvatures.split(bent_sides.map(|[left, right]| right - left)),
+            mean_bent: curvatures.split(bent_sides.map(|[left, right]| 0.5 * (left + right))),
+            bend: curvatures.split(nodes.map(|curvature| bent(1.0, sides.mean, curvature))),
+            slip_noise: curvatures.split(nodes.map(slip_noise)),
         }
     }
 }
@@ -413,7 +428,7 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
     let force_m_s = inertia * means.harmonic_m_s * means.turn_acceleration_rad_s2
         + means.ahead_force_m_s
         - radius_difference * means.rim_mean_m_s * means.ahead_mu;
-    let mut regressors = Parameters::zeros();
+    let mut regressors = Regressors::zeros();
     regressors[index::RADIUS_OFFSET] = means.rim_difference_m_s;
     regressors[index::RADIUS_DIFFERENCE] = means.rim_mean_m_s;
     regressors[index::TRACK] = track_m * (model.effective_track_ratio() - 1.0) * means.turn_rad_s;
@@ -427,41 +442,30 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
         rim_difference_m_s: means.rim_difference_m_s,
         yaw_rate_rad_s: means.turn_rad_s,
         radius_difference: radius_difference * means.rim_mean_m_s.signum(),
-        // A loop on noisy poses swings the slip within a window; its noise is no slip.
-        apart_variance: means.apart_variance
-            - (2.0 * rim_noise_m_s.powi(2) + track_m * track_m * gyro_noise)
-                / means.harmonic_m_s.powi(2),
     };
-    let sides = SideSlips::of(&turn, theta * means.ahead_mu, model);
-    regressors[index::THETA] = spread_out(force_m_s, sides.mean, tyres);
-    let gap = means.rim_difference_m_s / means.harmonic_m_s.powi(2);
-    let lever_m = model.wheelbase_m().powi(2) / track_m;
-    let uneven_gain = uneven(sides.mean, tyres.curvature);
-    let uneven = sides.unequal * uneven_gain;
-    // Slip that the sides have in common: of the force ahead, less what unequal sides hold back.
-    let common = bent(theta * means.ahead_mu, sides.mean, tyres.curvature) * tyres.curvature
-        + theta * means.ahead_mu
-        - 0.25 * sides.apart * tyres.curvature * uneven;
-    let odd_m_s = means.harmonic_m_s
-        * uneven
-        * (0.5 * sides.apart * gap * means.harmonic_m_s
-            + 0.5 * lever_m * means.turn_rad_s * gap
-            + 2.0 * common);
-    // Drift makes the axles slip unequally, so that their moments no longer cancel its force's.
-    let across = 0.5 * model.wheelbase_m() * means.turn_rad_s / means.harmonic_m_s;
-    let drift = theta * means.harmonic_m_s * means.turn_rad_s / GRAVITY_M_S2
-        * (1.0 + tyres.curvature * drift_bend(sides.mean, across, tyres.curvature));
-    let axles_m_s = 2.0 * model.wheelbase_m() / track_m
-        * means.harmonic_m_s
-        * uneven_gain
-        * across
-        * drift
-        * drift
-        / sides.mean.max(SLIP_MIN);
-    regressors[index::CURVATURE] =
-        bent(force_m_s, sides.mean, tyres.curvature) - (0.5 * odd_m_s + axles_m_s) / theta;
+    // A loop on noisy poses swings the slip within a window; its noise is no slip.
+    let swing = means.swing.without_noise(
+        (2.0 * rim_noise_m_s.powi(2) + track_m * track_m * gyro_noise) / means.harmonic_m_s.powi(2),
+    );
+    regressors[index::THETA] = force_m_s;
+    let gap = means.rim_difference_m_s / means.harmonic_m_s;
+    let input = BendInput {
+        turn: &turn,
+        swing: &swing,
+        mu: MeanSlip {
+            ahead: means.ahead_mu,
+            across: means.harmonic_m_s * means.turn_rad_s / GRAVITY_M_S2,
+        },
+        theta,
+        force_m_s,
+        uneven_m_s: |loss: &Loss| {
+            means.harmonic_m_s * (4.0 * loss.moment_m / track_m + gap * loss.ahead)
+        },
+    };
+    let (bends, bend) = input.bends(model, tyres);
+    bends.put(&mut regressors);
     let difference_noise = 2.0 * rim_noise_m_s.powi(2) / means.samples;
-    let mut common_noise = Parameters::zeros();
+    let mut common_noise = Regressors::zeros();
     common_noise[index::RADIUS_OFFSET] = difference_noise;
     common_noise[index::TRACK] =
         -track_m * (model.effective_track_ratio() - 1.0) * model.effective_track_m() * gyro_noise
@@ -477,7 +481,7 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
         force_noise: ramp_noise
             + (means.rim_difference_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2)
                 / means.samples,
-        bend: bent(1.0, sides.mean, tyres.curvature),
+        bend,
         common_noise,
         ramp_noise,
     }

@@ -4,7 +4,7 @@
 //! A running mean of it says whether there was more. Without torque the regressor is an
 //! acceleration, and its sensor's offset is no excitation: there it is taken about its own mean.
 
-use super::regression::{Row, index};
+use super::rows::{Row, index};
 
 /// Blocks over which is averaged.
 const MEMORY_BLOCKS: f64 = 10.0;

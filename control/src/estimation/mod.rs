@@ -24,11 +24,13 @@
 mod along;
 mod block;
 mod change;
+mod contacts;
 mod curved;
 mod excitation;
 mod expectation;
 mod offsets;
 mod regression;
+mod rows;
 mod segment;
 mod sums;
 mod types;
@@ -43,7 +45,8 @@ use change::ChangeDetector;
 use excitation::Excitation;
 pub use expectation::{ExpectedAccuracy, expected_accuracy};
 use offsets::OffsetKnowledge;
-use regression::{Row, Solution, SolveInput, solve};
+use regression::{Solution, SolveInput, solve};
+use rows::Row;
 pub use segment::SegmentStatistics;
 use segment::{Claims, SegmentTheta};
 use sums::Sums;
@@ -326,7 +329,10 @@ impl Estimator {
             },
         };
         let theta_ground = solution.map_or(THETA_FIRST, |found| found.theta);
-        let offsets = self.offsets.with_ground(&sums, &self.tyres, theta_ground);
+        let tyres = solution.map_or(self.tyres, |found| found.tyres(&self.tyres));
+        let offsets = self
+            .offsets
+            .with_ground(&sums, &self.tyres, theta_ground, &tyres);
         let (radius_offset, radius_difference) = offsets.values();
         self.estimate = Estimate {
             theta,
@@ -362,12 +368,13 @@ impl Estimator {
         let ground = self
             .solve(&whole, None)
             .filter(|found| found.is_measurement(whole.blocks));
+        let tyres = before.map_or(self.tyres, |found| found.tyres(&self.tyres));
         let offsets = self.offsets.with_ground(
             &self.ground,
             &self.tyres,
             before.map_or(THETA_FIRST, |found| found.theta),
+            &tyres,
         );
-        let tyres = before.map_or(self.tyres, |found| found.tyres(&self.tyres));
         let solution = ground.and_then(|ground| {
             let input = SolveInput {
                 offsets: &offsets,
@@ -400,12 +407,12 @@ impl Estimator {
     /// Starts on new ground: θ is forgotten, what was learned about the robot stays.
     /// An open segment is dropped; close it first.
     pub fn begin_ground(&mut self) {
-        let theta = self
-            .solve(&self.ground, None)
-            .map_or(THETA_FIRST, |found| found.theta);
+        let found = self.solve(&self.ground, None);
+        let theta = found.map_or(THETA_FIRST, |found| found.theta);
+        let tyres = found.map_or(self.tyres, |found| found.tyres(&self.tyres));
         self.offsets = self
             .offsets
-            .with_ground(&self.ground, &self.tyres, theta)
+            .with_ground(&self.ground, &self.tyres, theta, &tyres)
             .on_new_ground();
         self.ground = Sums::default();
         self.claims = Claims::default();

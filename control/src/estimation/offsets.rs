@@ -2,7 +2,8 @@
 
 use nalgebra::{SMatrix, SVector};
 
-use super::regression::{Normal, OFFSETS, ParameterMatrix, Parameters, index, inflation};
+use super::regression::{Normal, inflation};
+use super::rows::{OFFSETS, ParameterMatrix, Parameters, Tangent, index};
 use super::sums::Sums;
 use super::{SensorNoise, THETA_FIRST, THETA_RANGE, TyrePrior, ValueWithDeviation};
 
@@ -66,15 +67,22 @@ impl OffsetKnowledge {
         known
     }
 
-    /// With what these sums tell about the robot, whatever their θ; the given one only weighs them.
-    /// Without excitation there is no θ, and the rest is learned all the same.
-    pub(super) fn with_ground(&self, sums: &Sums, tyres: &TyrePrior, theta: f64) -> Self {
+    /// With what these sums tell about the robot, whatever their θ and κ; the given ones only weigh
+    /// them. Without excitation there is no θ, and the rest is learned all the same.
+    pub(super) fn with_ground(
+        &self,
+        sums: &Sums,
+        tyres: &TyrePrior,
+        theta: f64,
+        found: &TyrePrior,
+    ) -> Self {
         if sums.blocks == 0 {
             return *self;
         }
         let theta = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
         let channels = sums.channels();
-        let normal = Normal::of(&channels, theta, tyres).with_resistance(self, theta);
+        let tangent = Tangent::at(theta, found);
+        let normal = Normal::of(&channels, theta, tangent, tyres).with_resistance(self, theta);
         let Some((matrix, right)) = self.without_ground(&normal) else {
             return *self;
         };
@@ -85,8 +93,8 @@ impl OffsetKnowledge {
         let mut parameters = Parameters::zeros();
         parameters.fixed_rows_mut::<OFFSETS>(1).copy_from(&offsets);
         parameters[index::THETA] = theta;
-        parameters[index::CURVATURE] = theta * tyres.curvature;
-        let inflation = inflation(&channels, &parameters, theta);
+        parameters[index::CURVATURE] = theta * found.curvature;
+        let inflation = inflation(&channels, &parameters, theta, tangent);
         let information = self.information + matrix / inflation;
         if information.cholesky().is_none() {
             return *self;

@@ -7,45 +7,11 @@
 //! Noise that the response shares with another regressor, `u_R − u_L` beside `δ_c` above all, is
 //! taken out of their product: θ would read low by up to a third of its deviation.
 
-use nalgebra::{SMatrix, SVector};
-
 use super::offsets::OffsetKnowledge;
+use super::rows::{Channel, OFFSETS, ParameterMatrix, Parameters, Tangent, index};
 use super::sums::Sums;
 use super::{BLOCKS_MIN, RELATIVE_STD_DEV_MAX, THETA_RANGE, TyrePrior};
 use crate::estimation::block::Block;
-
-/// Number of parameters.
-pub(super) const PARAMETERS: usize = 9;
-/// Number of the parameters that all segments of a ground share, which follow θ: the robot's own,
-/// and the rolling resistance.
-pub(super) const OFFSETS: usize = 7;
-/// A value for each parameter.
-pub(super) type Parameters = SVector<f64, PARAMETERS>;
-/// A value for each pair of parameters.
-pub(super) type ParameterMatrix = SMatrix<f64, PARAMETERS, PARAMETERS>;
-
-/// Which parameter stands where.
-pub(super) mod index {
-    /// θ.
-    pub(in crate::estimation) const THETA: usize = 0;
-    /// `δ_c`, mean share by which nominal radii are too large.
-    pub(in crate::estimation) const RADIUS_OFFSET: usize = 1;
-    /// `δ_d`, right minus left of the same.
-    pub(in crate::estimation) const RADIUS_DIFFERENCE: usize = 2;
-    /// `ε_w`, by which `W_eff/W − 1` differs from `(L/W)²`, as a share of the latter.
-    pub(in crate::estimation) const TRACK: usize = 3;
-    /// `b_g`, the gyro's offset, radians per second.
-    pub(in crate::estimation) const GYRO_OFFSET: usize = 4;
-    /// `b_a`, the accelerometer's offset ahead, metres per second squared.
-    pub(in crate::estimation) const AHEAD_OFFSET: usize = 5;
-    /// Share by which the accelerometer reads too little.
-    pub(in crate::estimation) const AHEAD_SCALE: usize = 6;
-    /// `θf`, θ times the rolling resistance over load that measured torques hold. It is the
-    /// ground's: new ground forgets it.
-    pub(in crate::estimation) const RESISTANCE: usize = 7;
-    /// θκ, θ times the tyre's curvature per slip.
-    pub(in crate::estimation) const CURVATURE: usize = 8;
-}
 
 /// Rounds of the iteration on the weights.
 const ROUNDS: usize = 5;
@@ -59,139 +25,15 @@ const SIGNIFICANCE_MIN: f64 = 6.0;
 const INFLATION_ROWS: f64 = 15.0;
 /// How large rolling resistance over load may be, one standard deviation.
 const ROLLING_SPREAD: f64 = 0.02;
-/// Share of the effect of curved tyres that the rows may miss: they hold it to second order.
-const BEND_SHARE: f64 = 0.05;
+/// Share of the effect of curved tyres that rows on accelerations may miss: they hold what swings
+/// in their time by its measured shape, and κ to second order.
+const BEND_SHARE: f64 = 0.04;
+/// The same of rows on torques, which know their slip by its mean only.
+const BEND_SHARE_TORQUE: f64 = 0.05;
 /// Most of a variance that neighbouring rows may take from it.
 const NEIGHBOURS_SHARE_MAX: f64 = 0.9;
 /// Least spread of a tyre's curvature, so that the matrix stays regular.
 const CURVATURE_SPREAD_MIN: f64 = 1.0e-3;
-
-/// One equation, linear in the parameters.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Row {
-    pub(super) regressors: Parameters,
-    pub(super) response: f64,
-    /// Variance of the response, with that of the force at the θ of the time.
-    pub(super) spread: f64,
-    /// Variance of the force regressor.
-    pub(super) force_noise: f64,
-    /// The force's share in the regressor of θκ, which has the same noise.
-    pub(super) bend: f64,
-    /// Covariance of the other regressors' noise with that of the response: rim speeds and turn
-    /// rate stand on both sides.
-    pub(super) common_noise: Parameters,
-    /// The part of the force's variance that is the gyro's over two ramps, each shared with a
-    /// neighbouring row with the other sign.
-    pub(super) ramp_noise: f64,
-}
-
-impl Row {
-    /// A row whose regressors are known.
-    pub(super) fn white(regressors: Parameters, response: f64, spread: f64) -> Self {
-        Self {
-            regressors,
-            response,
-            spread,
-            force_noise: 0.0,
-            bend: 0.0,
-            common_noise: Parameters::zeros(),
-            ramp_noise: 0.0,
-        }
-    }
-}
-
-/// Sums of one kind of row.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Channel {
-    pub(super) count: f64,
-    square: ParameterMatrix,
-    product: Parameters,
-    response: f64,
-    /// Sum of the force regressor's variances.
-    force_noise: f64,
-    /// The same times the share in θκ's regressor, and times its square.
-    bent_noise: [f64; 2],
-    common_noise: Parameters,
-    /// `Σ (x xᵀ′ + x′ xᵀ) cov` over neighbouring rows x, x′ whose force noise has this covariance.
-    neighbours: ParameterMatrix,
-    /// Sum of the response's variances.
-    response_noise: f64,
-}
-
-impl Default for Channel {
-    fn default() -> Self {
-        Self {
-            count: 0.0,
-            square: ParameterMatrix::zeros(),
-            product: Parameters::zeros(),
-            response: 0.0,
-            force_noise: 0.0,
-            bent_noise: [0.0; 2],
-            common_noise: Parameters::zeros(),
-            neighbours: ParameterMatrix::zeros(),
-            response_noise: 0.0,
-        }
-    }
-}
-
-impl Channel {
-    /// Adds a row; its `spread` is that of the response alone.
-    pub(super) fn add(&mut self, row: &Row) {
-        self.count += 1.0;
-        self.square += row.regressors * row.regressors.transpose();
-        self.product += row.regressors * row.response;
-        self.response += row.response * row.response;
-        self.force_noise += row.force_noise;
-        self.bent_noise[0] += row.force_noise * row.bend;
-        self.bent_noise[1] += row.force_noise * row.bend * row.bend;
-        self.common_noise += row.common_noise;
-        self.response_noise += row.spread;
-    }
-
-    /// Notes that a row that was added stands next to another one: they share a ramp.
-    pub(super) fn note_neighbour(&mut self, row: &Row, before: &Row) {
-        let covariance = -0.5 * (row.ramp_noise * before.ramp_noise).sqrt();
-        let product = row.regressors * before.regressors.transpose();
-        self.neighbours += (product + product.transpose()) * covariance;
-    }
-
-    /// Adds a row in units of its own spread, which holds the force's noise at this θ.
-    pub(super) fn add_standardised(&mut self, row: &Row, theta: f64) {
-        let force_noise = row.force_noise / row.spread;
-        let scale = row.spread.sqrt().recip();
-        self.add(&Row {
-            common_noise: row.common_noise * (scale * scale),
-            regressors: row.regressors * scale,
-            response: row.response * scale,
-            spread: (1.0 - theta * theta * force_noise).max(0.1),
-            force_noise,
-            bend: row.bend,
-            ramp_noise: 0.0,
-        });
-    }
-
-    pub(super) fn plus(&self, other: &Self) -> Self {
-        Self {
-            count: self.count + other.count,
-            square: self.square + other.square,
-            product: self.product + other.product,
-            response: self.response + other.response,
-            force_noise: self.force_noise + other.force_noise,
-            bent_noise: [
-                self.bent_noise[0] + other.bent_noise[0],
-                self.bent_noise[1] + other.bent_noise[1],
-            ],
-            common_noise: self.common_noise + other.common_noise,
-            neighbours: self.neighbours + other.neighbours,
-            response_noise: self.response_noise + other.response_noise,
-        }
-    }
-
-    /// `s²` at a θ.
-    fn spread(&self, theta: f64) -> f64 {
-        (self.response_noise + theta * theta * self.force_noise) / self.count
-    }
-}
 
 /// Normal equations at one choice of weights.
 pub(super) struct Normal {
@@ -204,8 +46,13 @@ pub(super) struct Normal {
 }
 
 impl Normal {
-    /// Of these channels, with what is known about the tyres.
-    pub(super) fn of(channels: &[&Channel], theta: f64, tyres: &TyrePrior) -> Self {
+    /// Of these channels, with what is known about the tyres, at this θ and near this κ.
+    pub(super) fn of(
+        channels: &[&Channel],
+        theta: f64,
+        tangent: Tangent,
+        tyres: &TyrePrior,
+    ) -> Self {
         let mut normal = Self {
             matrix: ParameterMatrix::zeros(),
             right: Parameters::zeros(),
@@ -218,14 +65,9 @@ impl Normal {
                 continue;
             }
             let spread = channel.spread(theta);
-            let force_noise = channel.force_noise / channel.count;
-            normal.matrix += channel.square / spread;
-            normal.matrix[(index::THETA, index::THETA)] -= channel.force_noise / spread;
-            let [cross, bent] = channel.bent_noise.map(|noise| noise / spread);
-            normal.matrix[(index::THETA, index::CURVATURE)] -= cross;
-            normal.matrix[(index::CURVATURE, index::THETA)] -= cross;
-            normal.matrix[(index::CURVATURE, index::CURVATURE)] -= bent;
-            normal.right += (channel.product - channel.common_noise) / spread;
+            let force_noise = channel.force_variance();
+            normal.matrix += channel.corrected_square(tangent) / spread;
+            normal.right += channel.corrected_product(tangent) / spread;
             normal.excess += channel.count * (force_noise * spread + (theta * force_noise).powi(2))
                 / (spread * spread);
             noise_variance += 2.0 * channel.count * (force_noise / spread).powi(2);
@@ -260,15 +102,20 @@ impl Normal {
 }
 
 /// How much larger the residuals are than the assumed noise; never below one.
-pub(super) fn inflation(channels: &[&Channel], parameters: &Parameters, theta: f64) -> f64 {
+pub(super) fn inflation(
+    channels: &[&Channel],
+    parameters: &Parameters,
+    theta: f64,
+    tangent: Tangent,
+) -> f64 {
     let mut squares = 0.0;
     let mut count = 0.0;
     for channel in channels {
         if channel.count < 1.0 {
             continue;
         }
-        let fitted = (channel.square * parameters).dot(parameters);
-        let sum = channel.response - 2.0 * channel.product.dot(parameters) + fitted;
+        let fitted = (channel.square(tangent) * parameters).dot(parameters);
+        let sum = channel.response - 2.0 * channel.product(tangent).dot(parameters) + fitted;
         squares += sum / channel.spread(theta);
         count += channel.count;
     }
@@ -287,29 +134,27 @@ pub(super) fn inflation(channels: &[&Channel], parameters: &Parameters, theta: f
 
 /// What neighbouring rows add to the variance in the direction `M⁻¹v`; below zero where the force
 /// changes slowly, since what one row has too much of a ramp the next has too little.
-fn neighbours(channels: &[&Channel], direction: &Parameters, theta: f64) -> f64 {
+fn neighbours(channels: &[&Channel], direction: &Parameters, theta: f64, tangent: Tangent) -> f64 {
     let of_channel = |channel: &&Channel| {
         if channel.count < 1.0 {
             return 0.0;
         }
         let scale = theta / channel.spread(theta);
-        (channel.neighbours * direction).dot(direction) * scale * scale
+        (channel.neighbours(tangent) * direction).dot(direction) * scale * scale
     };
     channels.iter().map(of_channel).sum()
 }
 
-/// How large the regressor of θκ is beside that of θ.
-fn bend_ratio(channels: &[&Channel]) -> f64 {
-    let sum = |parameter: usize| {
-        let squares = channels.iter().map(|channel| {
-            let noise = (channel.response_noise / channel.count.max(1.0)).max(f64::MIN_POSITIVE);
-            channel.square[(parameter, parameter)] / noise
-        });
-        squares.sum::<f64>()
-    };
-    let own = sum(index::THETA);
-    if own > 0.0 {
-        (sum(index::CURVATURE) / own).sqrt()
+/// How large the effect of the bend is beside that of θ alone.
+fn bend_ratio(channels: &[&Channel], tangent: Tangent, curvature: f64) -> f64 {
+    let mut sums = [0.0; 2];
+    for channel in channels {
+        let squares = channel.force_and_bend(tangent, curvature);
+        sums[0] += squares[0];
+        sums[1] += squares[1];
+    }
+    if sums[0] > 0.0 {
+        (sums[1] / sums[0]).sqrt()
     } else {
         0.0
     }
@@ -333,17 +178,21 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
     }
     let channels = sums.channels();
     let mut theta_weights = input.theta_given.unwrap_or(input.theta_start);
+    let mut tyres = *input.tyres;
     for round in 1..=ROUNDS {
-        let normal = Normal::of(&channels, theta_weights, input.tyres)
+        let tangent = Tangent::at(theta_weights, &tyres);
+        let normal = Normal::of(&channels, theta_weights, tangent, input.tyres)
             .with_resistance(input.offsets, theta_weights)
             .with_offsets(input.offsets);
         let covariance = normal.matrix.cholesky()?.inverse();
         let parameters = covariance * normal.right;
         let theta = parameters[index::THETA];
         let next = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
-        let is_settled = (next - theta_weights).abs() < CONVERGED * theta_weights;
+        tyres = learned_tyres(&parameters, &covariance, input.tyres);
+        let is_settled = (next - theta_weights).abs() < CONVERGED * theta_weights
+            && Tangent::at(next, &tyres).is_near(tangent);
         if input.theta_given.is_some() || round == ROUNDS || is_settled {
-            let inflation = inflation(&channels, &parameters, theta_weights);
+            let inflation = inflation(&channels, &parameters, theta_weights, tangent);
             let base = covariance[(index::THETA, index::THETA)];
             let (theta, scale) = if sums.has_torque() {
                 (theta, 0.0)
@@ -360,15 +209,23 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
             of_theta[index::THETA] = 1.0;
             of_theta[index::RADIUS_OFFSET] = scale;
             let direction = covariance * of_theta;
-            let neighbours =
-                neighbours(&channels, &direction, theta_weights).max(-NEIGHBOURS_SHARE_MAX * base);
-            let missed = BEND_SHARE * parameters[index::CURVATURE] * bend_ratio(&channels);
+            let neighbours = neighbours(&channels, &direction, theta_weights, tangent)
+                .max(-NEIGHBOURS_SHARE_MAX * base);
+            let curvature = parameters[index::CURVATURE] / parameters[index::THETA];
+            let share = if sums.has_torque() {
+                BEND_SHARE_TORQUE
+            } else {
+                BEND_SHARE
+            };
+            let missed =
+                share * parameters[index::THETA] * bend_ratio(&channels, tangent, curvature);
             return Some(Solution {
                 theta,
                 parameters,
                 covariance: covariance * inflation,
                 inflation,
                 of_theta,
+                tangent,
                 variance: (base + scaled + neighbours) * inflation
                     + base * base * normal.excess
                     + missed * missed,
@@ -379,6 +236,29 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
         theta_weights = next;
     }
     None
+}
+
+/// What a solution tells about the tyres' curvature beyond what was known.
+fn learned_tyres(
+    parameters: &Parameters,
+    covariance: &ParameterMatrix,
+    known: &TyrePrior,
+) -> TyrePrior {
+    let variance = covariance[(index::CURVATURE, index::CURVATURE)];
+    let cross = covariance[(index::CURVATURE, index::THETA)];
+    let own = covariance[(index::THETA, index::THETA)];
+    let curvature = parameters[index::CURVATURE] / parameters[index::THETA];
+    let of_ratio = variance - 2.0 * curvature * cross + curvature * curvature * own;
+    let spread = of_ratio.max(0.0).sqrt() / parameters[index::THETA].abs();
+    if curvature.is_finite() && spread.is_finite() && spread < known.curvature_spread {
+        TyrePrior {
+            curvature,
+            curvature_spread: spread,
+            ..*known
+        }
+    } else {
+        *known
+    }
 }
 
 /// Estimated parameters.
@@ -395,6 +275,8 @@ pub(super) struct Solution {
     inflation: f64,
     /// How θ follows from the parameters.
     of_theta: Parameters,
+    /// θκ² as it was reckoned with.
+    tangent: Tangent,
     /// What rows to second order may miss of curved tyres, in θ; alike everywhere.
     missed: f64,
 }
@@ -436,21 +318,7 @@ impl Solution {
 
     /// What this tells about the tyres' curvature beyond what was known.
     pub(super) fn tyres(&self, known: &TyrePrior) -> TyrePrior {
-        let variance = self.covariance[(index::CURVATURE, index::CURVATURE)];
-        let cross = self.covariance[(index::CURVATURE, index::THETA)];
-        let own = self.covariance[(index::THETA, index::THETA)];
-        let curvature = self.parameters[index::CURVATURE] / self.parameters[index::THETA];
-        let of_ratio = variance - 2.0 * curvature * cross + curvature * curvature * own;
-        let spread = of_ratio.max(0.0).sqrt() / self.parameters[index::THETA].abs();
-        if curvature.is_finite() && spread.is_finite() && spread < known.curvature_spread {
-            TyrePrior {
-                curvature,
-                curvature_spread: spread,
-                ..*known
-            }
-        } else {
-            *known
-        }
+        learned_tyres(&self.parameters, &self.covariance, known)
     }
 
     /// Whether a segment's sums carry information at all, judged by the ground's θ.
@@ -468,11 +336,12 @@ impl Solution {
         }
         let row = block.differential_row()?;
         let force = row.regressors[index::THETA];
-        let error = row.response - row.regressors.dot(&self.parameters);
+        let regressors = self.tangent.of_parameters(&row.regressors);
+        let error = row.response - regressors.dot(&self.parameters);
         let missed = MODEL_SHARE * self.theta * (force.abs() + block.mean_force_m_s());
         let variance = row.spread
             + self.theta.powi(2) * row.force_noise
-            + (self.covariance * row.regressors).dot(&row.regressors)
+            + (self.covariance * regressors).dot(&regressors)
             + missed * missed;
         Some(error * force.signum() / variance.sqrt())
     }

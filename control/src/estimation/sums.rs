@@ -3,7 +3,7 @@
 use super::ValueWithDeviation;
 use super::block::Block;
 use super::offsets::OffsetKnowledge;
-use super::regression::{Channel, Row, index};
+use super::rows::{Channel, Row, index};
 
 /// Blocks of straight driving for a rolling resistance.
 const RESISTANCE_BLOCKS_MIN: f64 = 10.0;

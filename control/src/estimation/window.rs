@@ -8,12 +8,58 @@
 //! ```
 //! Windows are trapezoids that add up to one: each begins on the ramp on which the one before
 //! ends. Then `∫ψφ̈` is the difference of the gyro's means over two ramps, and no sample is lost.
+//! How slip swings within a window is kept for curved tyres.
 
 use super::{BLOCK_S, SensorSample, signed_rims};
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
+/// Most by which the moments of a swing are enlarged for what they average out.
+const SWING_SCALE_MAX: f64 = 1.5;
 /// Time of a ramp, seconds.
 const RAMP_S: f64 = 0.05;
+
+/// Moments of a window at which a swing is looked at.
+pub(super) const MOMENTS: usize = 10;
+
+/// What a swing is at one moment, about the means of its window.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Moment {
+    /// Right minus left slip ahead.
+    pub(super) apart: f64,
+    pub(super) turn_rad_s: f64,
+    /// Acceleration ahead over gravity.
+    pub(super) ahead_mu: f64,
+    /// Share of the window; all add up to one.
+    pub(super) weight: f64,
+}
+
+/// How a robot swings about its mean motion within a window.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Swing {
+    /// Means over short times.
+    moments: [Moment; MOMENTS],
+    /// Variance of the samples' `apart`, with the sensors' noise.
+    apart_variance: f64,
+}
+
+impl Swing {
+    /// With the variance of the samples less that of their noise: the shape is that of the moments.
+    pub(super) fn without_noise(&self, apart_noise: f64) -> [Moment; MOMENTS] {
+        let seen = self
+            .moments
+            .iter()
+            .map(|moment| moment.weight * moment.apart * moment.apart)
+            .sum::<f64>();
+        let clean = (self.apart_variance - apart_noise).max(0.0);
+        let scale = (clean / seen.max(f64::MIN_POSITIVE))
+            .sqrt()
+            .min(SWING_SCALE_MAX);
+        self.moments.map(|moment| Moment {
+            apart: moment.apart * scale,
+            ..moment
+        })
+    }
+}
 
 /// Weighed sums over one window.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -30,6 +76,8 @@ struct Part {
     rim_mean: f64,
     /// Right minus left slip ahead, and its square.
     apart: [f64; 2],
+    /// Sums by the time since the window's start.
+    moments: [Moment; MOMENTS],
     /// Gyro over the ramp, radians per second, and how much of the ramp there was.
     ramp: [f64; 2],
     ramp_share: [f64; 2],
@@ -53,8 +101,7 @@ pub(super) struct TurnMeans {
     pub(super) rim_difference_m_s: f64,
     /// `(u_R + u_L)/2`, metres per second, negative in reverse.
     pub(super) rim_mean_m_s: f64,
-    /// Variance of right minus left slip ahead within the window, with the sensors' noise.
-    pub(super) apart_variance: f64,
+    pub(super) swing: Swing,
     pub(super) duration_s: f64,
     pub(super) samples: f64,
     pub(super) ramp_samples: f64,
@@ -85,11 +132,13 @@ impl TurnWindow {
         dt_s: f64,
     ) {
         let rise = ((time_s - (BLOCK_S - RAMP_S)) / RAMP_S).clamp(0.0, 1.0);
-        self.ending.add(sample, model, 1.0 - rise, dt_s);
+        self.ending
+            .add(sample, model, 1.0 - rise, time_s + RAMP_S, dt_s);
         if rise <= 0.0 {
             return;
         }
-        self.beginning.add(sample, model, rise, dt_s);
+        self.beginning
+            .add(sample, model, rise, time_s - (BLOCK_S - RAMP_S), dt_s);
         let share = dt_s / RAMP_S;
         self.ending.ramp[1] += sample.gyro_rad_s * share;
         self.ending.ramp_share[1] += share;
@@ -119,7 +168,7 @@ impl TurnWindow {
             turn_acceleration_rad_s2: (rates[1] - rates[0]) / block_s,
             rim_difference_m_s: mean(part.rim_difference),
             rim_mean_m_s: mean(part.rim_mean),
-            apart_variance: mean(part.apart[1]) - mean(part.apart[0]).powi(2),
+            swing: part.swing(),
             duration_s: block_s,
             samples: part.samples,
             ramp_samples: part.ramp_samples.max(1.0),
@@ -128,7 +177,34 @@ impl TurnWindow {
 }
 
 impl Part {
-    fn add(&mut self, sample: &SensorSample, model: &RobotModel, share: f64, dt_s: f64) {
+    fn swing(&self) -> Swing {
+        let [apart, square] = self.apart.map(|sum| sum / self.weight_s);
+        let (turn_rad_s, ahead_mu) = (self.turn / self.weight_s, self.ahead_mu / self.weight_s);
+        Swing {
+            moments: self.moments.map(|sum| {
+                if sum.weight <= 0.0 {
+                    return Moment::default();
+                }
+                Moment {
+                    apart: sum.apart / sum.weight - apart,
+                    turn_rad_s: sum.turn_rad_s / sum.weight - turn_rad_s,
+                    ahead_mu: sum.ahead_mu / sum.weight - ahead_mu,
+                    weight: sum.weight / self.weight_s,
+                }
+            }),
+            apart_variance: square - apart * apart,
+        }
+    }
+
+    /// Takes a sample whose middle is `time_s` after the window's start.
+    fn add(
+        &mut self,
+        sample: &SensorSample,
+        model: &RobotModel,
+        share: f64,
+        time_s: f64,
+        dt_s: f64,
+    ) {
         let (Some(rims), Some(acceleration)) = (signed_rims(sample, model), sample.acceleration)
         else {
             self.is_broken = true;
@@ -153,6 +229,18 @@ impl Part {
         let apart = (rims.right_m_s - rims.left_m_s - track_m * sample.gyro_rad_s) * half_sum;
         self.apart[0] += weight_s * apart;
         self.apart[1] += weight_s * apart * apart;
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            clippy::cast_precision_loss,
+            reason = "a share of a few moments, not below zero"
+        )]
+        let moment = (time_s.max(0.0) * MOMENTS as f64 / (BLOCK_S + RAMP_S)) as usize;
+        let moment = &mut self.moments[moment.min(MOMENTS - 1)];
+        moment.apart += weight_s * apart;
+        moment.turn_rad_s += weight_s * sample.gyro_rad_s;
+        moment.ahead_mu += weight_s * ahead_m_s2 / GRAVITY_M_S2;
+        moment.weight += weight_s;
         self.rim_mean += weight_s * rims.sign * 0.5 * (rims.right_m_s + rims.left_m_s);
     }
 }

@@ -1,0 +1,217 @@
+//! What four contacts on curved tyres carry together.
+//!
+//! Contact i keeps `w_i = 1 − κℓ_i` of its stiffness, `ℓ = s − κs²/3` at its combined slip s. A force
+//! or moment F to which contacts add their slip times a lever `m_i` then obeys `Σ w_i m_i = θF`, so
+//! that with the means `ℓ̄`, `w̄` over the contacts, exactly,
+//!
+//! ```text
+//! Σ m_i = (θF + κ Σ (ℓ_i − ℓ̄) m_i) / w̄
+//! ```
+//! Slip that swings within a row's time is taken as that of several moments.
+
+use super::TyrePrior;
+use super::curved::{Curvatures, Turn};
+use super::rows::Bends;
+use super::window::Moment;
+use crate::robot::{GRAVITY_M_S2, RobotModel};
+
+/// Rounds in which the slips that the forces cause are found.
+const ROUNDS: usize = 3;
+/// Share of a tyre's stiffness that is reckoned with at least.
+const STIFFNESS_LEFT_MIN: f64 = 0.2;
+
+/// What contacts lose, over κ.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Loss {
+    /// `ℓ̄`.
+    pub(super) mean: f64,
+    /// `w̄`.
+    pub(super) left: f64,
+    /// Mean of `(ℓ_i − ℓ̄)` times the slip ahead.
+    pub(super) ahead: f64,
+    /// The same with the slip across, to the left.
+    pub(super) across: f64,
+    /// The same with the moment of the slip, metres.
+    pub(super) moment_m: f64,
+}
+
+/// Forces over load times θ: the mean slip that they cause on straight tyres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct MeanSlip {
+    pub(super) ahead: f64,
+    pub(super) across: f64,
+}
+
+impl Loss {
+    /// At a mean rim speed above zero, all of a robot that drives ahead.
+    pub(super) fn of(
+        turn: &Turn,
+        swing: &[Moment],
+        slip: MeanSlip,
+        theta: f64,
+        model: &RobotModel,
+        curvature: f64,
+    ) -> Self {
+        let apart = (turn.rim_difference_m_s - model.track_width_m() * turn.yaw_rate_rad_s)
+            / turn.rim_m_s
+            - turn.radius_difference;
+        let sides_m_s = [
+            turn.rim_m_s - 0.5 * turn.rim_difference_m_s,
+            turn.rim_m_s + 0.5 * turn.rim_difference_m_s,
+        ];
+        let half_base_m = 0.5 * model.wheelbase_m();
+        let half_track_m = 0.5 * model.track_width_m();
+        let mut found = Self {
+            left: 1.0,
+            ..Self::default()
+        };
+        let mut now = slip;
+        for _ in 0..ROUNDS {
+            // Sums of ℓ, of ℓ times each slip, of the slips themselves.
+            let (mut loss, mut ahead, mut across, mut turning) = (0.0, 0.0, 0.0, 0.0);
+            let (mut sum_ahead, mut sum_across, mut sum_moment) = (0.0, 0.0, 0.0);
+            for moment in swing {
+                let share = 0.25 * moment.weight;
+                let gap = apart + moment.apart;
+                let turn_rad_s = turn.yaw_rate_rad_s + moment.turn_rad_s;
+                let common = now.ahead + theta * moment.ahead_mu;
+                let drift = now.across + theta * turn.rim_m_s * moment.turn_rad_s / GRAVITY_M_S2;
+                for (side, sign) in [-1.0, 1.0].into_iter().enumerate() {
+                    let slip_ahead = common + 0.5 * sign * gap;
+                    for x_m in [half_base_m, -half_base_m] {
+                        let slip_across = drift - x_m * turn_rad_s / sides_m_s[side];
+                        let slip = slip_ahead.hypot(slip_across);
+                        let kept_back = share * slip * (1.0 - curvature * slip / 3.0);
+                        let lever = sign * half_track_m * slip_ahead + x_m * slip_across;
+                        loss += kept_back;
+                        ahead += kept_back * slip_ahead;
+                        across += kept_back * slip_across;
+                        turning += kept_back * lever;
+                        sum_ahead += share * slip_ahead;
+                        sum_across += share * slip_across;
+                        sum_moment += share * lever;
+                    }
+                }
+            }
+            let mean = loss;
+            found = Self {
+                mean,
+                left: (1.0 - curvature * mean).max(STIFFNESS_LEFT_MIN),
+                ahead: ahead - mean * sum_ahead,
+                across: across - mean * sum_across,
+                moment_m: turning - mean * sum_moment,
+            };
+            now = MeanSlip {
+                ahead: (slip.ahead + curvature * found.ahead) / found.left,
+                across: (slip.across + curvature * found.across) / found.left,
+            };
+        }
+        found
+    }
+}
+
+/// θ over that which is known at which the bend is looked at too: slips by force follow θ.
+const THETA_STEP: f64 = 1.5;
+
+/// What the bend adds to a row whose force is `force_m_s`; `uneven_m_s` is what contacts that carry
+/// unequal shares add, from their [`Loss`] and over `w̄`. `theta` is above zero.
+pub(super) struct BendInput<'of, F: Fn(&Loss) -> f64> {
+    pub(super) turn: &'of Turn,
+    pub(super) swing: &'of [Moment],
+    /// Forces over load.
+    pub(super) mu: MeanSlip,
+    pub(super) theta: f64,
+    pub(super) force_m_s: f64,
+    pub(super) uneven_m_s: F,
+}
+
+impl<F: Fn(&Loss) -> f64> BendInput<'_, F> {
+    /// The row's regressors, and the force's shares in those of θκ, θκ² and θ²κ.
+    pub(super) fn bends(&self, model: &RobotModel, tyres: &TyrePrior) -> (Bends, [f64; 3]) {
+        if tyres.curvature <= 0.0 && tyres.curvature_spread <= 0.0 {
+            return (Bends::default(), [0.0; 3]);
+        }
+        let at = |theta: f64, curvature: f64| {
+            let slip = MeanSlip {
+                ahead: theta * self.mu.ahead,
+                across: theta * self.mu.across,
+            };
+            let loss = Loss::of(self.turn, self.swing, slip, theta, model, curvature);
+            [loss.mean / loss.left, (self.uneven_m_s)(&loss) / loss.left]
+        };
+        let theta = self.theta;
+        let curvatures = Curvatures::of(tyres);
+        let known = curvatures.nodes().map(|curvature| at(theta, curvature));
+        let [share, square_share] = curvatures.split(known.map(|[share, _]| share));
+        let bends = curvatures
+            .split(known.map(|[share, uneven_m_s]| self.force_m_s * share + uneven_m_s / theta));
+        // By θ, at the mean κ: both parts along a straight line.
+        let here = at(theta, tyres.curvature);
+        let there = at(THETA_STEP * theta, tyres.curvature);
+        let slope = [0, 1].map(|part| (there[part] - here[part]) / ((THETA_STEP - 1.0) * theta));
+        let alone_m_s = here[1] - slope[1] * theta;
+        let of_theta_m_s = slope[0] * self.force_m_s;
+        let found = Bends {
+            curvature: [
+                bends[0] - alone_m_s / theta - of_theta_m_s * theta,
+                bends[1],
+            ],
+            theta: [alone_m_s, of_theta_m_s],
+        };
+        (found, [share - slope[0] * theta, square_share, slope[0]])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// Stiffness left of a brush.
+    fn left(slip: f64, curvature: f64) -> f64 {
+        let bend = curvature * slip;
+        1.0 - bend + bend * bend / 3.0
+    }
+
+    proptest! {
+        #[test]
+        fn what_contacts_lose_is_that_of_four_brushes(
+            curvature in 0.3..3.0_f64, ahead in -0.04..0.04_f64, apart in -0.06..0.06_f64,
+            turn_rad_s in -0.3..0.3_f64, across in -0.01..0.01_f64,
+        ) {
+            let model = RobotModel::yi2007();
+            let rim_m_s = 0.6;
+            let turn = Turn {
+                rim_m_s,
+                rim_difference_m_s: apart * rim_m_s + model.track_width_m() * turn_rad_s,
+                yaw_rate_rad_s: turn_rad_s,
+                radius_difference: 0.0,
+            };
+            let still = [Moment { weight: 1.0, ..Moment::default() }];
+            // The forces that these slips cause.
+            let (mut force_ahead, mut force_across, mut moment_m) = (0.0, 0.0, 0.0);
+            let mut straight_moment_m = 0.0;
+            for sign in [-1.0, 1.0] {
+                for end in [-0.5, 0.5] {
+                    let x_m = end * model.wheelbase_m();
+                    let side_m_s = rim_m_s + 0.5 * sign * turn.rim_difference_m_s;
+                    let slip_ahead = ahead + 0.5 * sign * apart;
+                    let slip_across = across - x_m * turn_rad_s / side_m_s;
+                    let lever_m = 0.5 * sign * model.track_width_m() * slip_ahead + x_m * slip_across;
+                    let stiffness = left(slip_ahead.hypot(slip_across), curvature);
+                    force_ahead += 0.25 * stiffness * slip_ahead;
+                    force_across += 0.25 * stiffness * slip_across;
+                    moment_m += 0.25 * stiffness * lever_m;
+                    straight_moment_m += 0.25 * lever_m;
+                }
+            }
+            let forces = MeanSlip { ahead: force_ahead, across: force_across };
+            let loss = Loss::of(&turn, &still, forces, 0.2, &model, curvature);
+            let found_m = (moment_m + curvature * loss.moment_m) / loss.left;
+            prop_assert!((found_m - straight_moment_m).abs() < 2.0e-5);
+            let found_ahead = (force_ahead + curvature * loss.ahead) / loss.left;
+            prop_assert!((found_ahead - ahead).abs() < 2.0e-4);
+        }
+    }
+}

@@ -1,0 +1,297 @@
+//! Rows of the regression, and additive sums of them.
+
+use nalgebra::{SMatrix, SVector};
+
+use super::TyrePrior;
+
+/// Number of parameters.
+pub(super) const PARAMETERS: usize = 9;
+/// Number of the parameters that all segments of a ground share, which follow θ: the robot's own,
+/// and the rolling resistance.
+pub(super) const OFFSETS: usize = 7;
+/// A value for each parameter.
+pub(super) type Parameters = SVector<f64, PARAMETERS>;
+/// A value for each pair of parameters.
+pub(super) type ParameterMatrix = SMatrix<f64, PARAMETERS, PARAMETERS>;
+/// Number of regressors: those of the parameters, and of products of θ and κ that follow from them.
+const REGRESSORS: usize = PARAMETERS + 3;
+/// A value for each regressor.
+pub(super) type Regressors = SVector<f64, REGRESSORS>;
+/// A value for each pair of regressors.
+type RegressorMatrix = SMatrix<f64, REGRESSORS, REGRESSORS>;
+
+/// Which parameter stands where.
+pub(super) mod index {
+    /// θ.
+    pub(in crate::estimation) const THETA: usize = 0;
+    /// `δ_c`, mean share by which nominal radii are too large.
+    pub(in crate::estimation) const RADIUS_OFFSET: usize = 1;
+    /// `δ_d`, right minus left of the same.
+    pub(in crate::estimation) const RADIUS_DIFFERENCE: usize = 2;
+    /// `ε_w`, by which `W_eff/W − 1` differs from `(L/W)²`, as a share of the latter.
+    pub(in crate::estimation) const TRACK: usize = 3;
+    /// `b_g`, the gyro's offset, radians per second.
+    pub(in crate::estimation) const GYRO_OFFSET: usize = 4;
+    /// `b_a`, the accelerometer's offset ahead, metres per second squared.
+    pub(in crate::estimation) const AHEAD_OFFSET: usize = 5;
+    /// Share by which the accelerometer reads too little.
+    pub(in crate::estimation) const AHEAD_SCALE: usize = 6;
+    /// `θf`, θ times the rolling resistance over load that measured torques hold. It is the
+    /// ground's: new ground forgets it.
+    pub(in crate::estimation) const RESISTANCE: usize = 7;
+    /// θκ, θ times the tyre's curvature per slip.
+    pub(in crate::estimation) const CURVATURE: usize = 8;
+    /// θκ², a regressor's place only, as all that follow.
+    pub(in crate::estimation) const CURVATURE_SQUARE: usize = 9;
+    /// κ.
+    pub(in crate::estimation) const CURVATURE_ALONE: usize = 10;
+    /// θ²κ.
+    pub(in crate::estimation) const THETA_CURVATURE: usize = 11;
+}
+
+/// The regressors that have the force's noise.
+const FORCED: [usize; 4] = [
+    index::THETA,
+    index::CURVATURE,
+    index::CURVATURE_SQUARE,
+    index::THETA_CURVATURE,
+];
+
+/// Step of κ per slip, or of its square, at which the search for it ends.
+const SETTLED: f64 = 1.0e-2;
+
+/// Products of θ and κ as what they are near one θ and κ: linear in θ and θκ. With `κ = κ₀ ± σ`,
+/// `θκ² = 2κ₀·θκ + (σ² − κ₀²)·θ` on average, since σ adds to the square's mean.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Tangent {
+    square_by_theta: f64,
+    square_by_curvature: f64,
+    theta: f64,
+}
+
+impl Tangent {
+    /// At what is known of θ, above zero, and of κ.
+    pub(super) fn at(theta: f64, tyres: &TyrePrior) -> Self {
+        Self {
+            square_by_theta: tyres.curvature_spread.powi(2) - tyres.curvature.powi(2),
+            square_by_curvature: 2.0 * tyres.curvature,
+            theta,
+        }
+    }
+
+    /// Whether κ is the same but for what no estimate feels.
+    pub(super) fn is_near(self, other: Self) -> bool {
+        (self.square_by_curvature - other.square_by_curvature).abs() < SETTLED
+            && (self.square_by_theta - other.square_by_theta).abs() < SETTLED
+    }
+
+    /// By how much each parameter moves each regressor's quantity.
+    fn lift(self) -> SMatrix<f64, REGRESSORS, PARAMETERS> {
+        let mut lift = SMatrix::identity();
+        lift[(index::CURVATURE_SQUARE, index::THETA)] = self.square_by_theta;
+        lift[(index::CURVATURE_SQUARE, index::CURVATURE)] = self.square_by_curvature;
+        lift[(index::CURVATURE_ALONE, index::CURVATURE)] = self.theta.recip();
+        lift[(index::THETA_CURVATURE, index::CURVATURE)] = self.theta;
+        lift
+    }
+
+    /// Regressors of the parameters alone.
+    pub(super) fn of_parameters(self, regressors: &Regressors) -> Parameters {
+        self.lift().tr_mul(regressors)
+    }
+
+    /// The same of a matrix with a row and a column for each regressor.
+    fn of_pairs(self, square: &RegressorMatrix) -> ParameterMatrix {
+        let lift = self.lift();
+        lift.tr_mul(&(square * lift))
+    }
+}
+
+/// The bend's regressors, as they stand in a row.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Bends {
+    /// Of θκ and θκ².
+    pub(super) curvature: [f64; 2],
+    /// Of κ and θ²κ.
+    pub(super) theta: [f64; 2],
+}
+
+impl Bends {
+    /// Puts them where they belong.
+    pub(super) fn put(&self, regressors: &mut Regressors) {
+        regressors[index::CURVATURE] = self.curvature[0];
+        regressors[index::CURVATURE_SQUARE] = self.curvature[1];
+        regressors[index::CURVATURE_ALONE] = self.theta[0];
+        regressors[index::THETA_CURVATURE] = self.theta[1];
+    }
+}
+
+/// One equation, linear in the parameters.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Row {
+    pub(super) regressors: Regressors,
+    pub(super) response: f64,
+    /// Variance of the response, with that of the force at the θ of the time.
+    pub(super) spread: f64,
+    /// Variance of the force regressor.
+    pub(super) force_noise: f64,
+    /// The force's shares in the regressors of θκ, θκ² and θ²κ, which have the same noise.
+    pub(super) bend: [f64; 3],
+    /// Covariance of the other regressors' noise with that of the response: rim speeds and turn
+    /// rate stand on both sides.
+    pub(super) common_noise: Regressors,
+    /// The part of the force's variance that is the gyro's over two ramps, each shared with a
+    /// neighbouring row with the other sign.
+    pub(super) ramp_noise: f64,
+}
+
+impl Row {
+    /// A row whose regressors are known.
+    pub(super) fn white(regressors: Regressors, response: f64, spread: f64) -> Self {
+        Self {
+            regressors,
+            response,
+            spread,
+            force_noise: 0.0,
+            bend: [0.0; 3],
+            common_noise: Regressors::zeros(),
+            ramp_noise: 0.0,
+        }
+    }
+}
+
+/// Sums of one kind of row.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Channel {
+    pub(super) count: f64,
+    square: RegressorMatrix,
+    product: Regressors,
+    pub(super) response: f64,
+    /// Sum of the variances that the force gives its regressors.
+    force_noise: SMatrix<f64, 4, 4>,
+    common_noise: Regressors,
+    /// `Σ (x xᵀ′ + x′ xᵀ) cov` over neighbouring rows x, x′ whose force noise has this covariance.
+    neighbours: RegressorMatrix,
+    /// Sum of the response's variances.
+    response_noise: f64,
+}
+
+impl Default for Channel {
+    fn default() -> Self {
+        Self {
+            count: 0.0,
+            square: RegressorMatrix::zeros(),
+            product: Regressors::zeros(),
+            response: 0.0,
+            force_noise: SMatrix::zeros(),
+            common_noise: Regressors::zeros(),
+            neighbours: RegressorMatrix::zeros(),
+            response_noise: 0.0,
+        }
+    }
+}
+
+impl Channel {
+    /// Adds a row; its `spread` is that of the response alone.
+    pub(super) fn add(&mut self, row: &Row) {
+        self.count += 1.0;
+        self.square += row.regressors * row.regressors.transpose();
+        self.product += row.regressors * row.response;
+        self.response += row.response * row.response;
+        let shares = SVector::from([1.0, row.bend[0], row.bend[1], row.bend[2]]);
+        self.force_noise += shares * shares.transpose() * row.force_noise;
+        self.common_noise += row.common_noise;
+        self.response_noise += row.spread;
+    }
+
+    /// Notes that a row that was added stands next to another one: they share a ramp.
+    pub(super) fn note_neighbour(&mut self, row: &Row, before: &Row) {
+        let covariance = -0.5 * (row.ramp_noise * before.ramp_noise).sqrt();
+        let product = row.regressors * before.regressors.transpose();
+        self.neighbours += (product + product.transpose()) * covariance;
+    }
+
+    /// Adds a row in units of its own spread, which holds the force's noise at this θ.
+    pub(super) fn add_standardised(&mut self, row: &Row, theta: f64) {
+        let force_noise = row.force_noise / row.spread;
+        let scale = row.spread.sqrt().recip();
+        self.add(&Row {
+            common_noise: row.common_noise * (scale * scale),
+            regressors: row.regressors * scale,
+            response: row.response * scale,
+            spread: (1.0 - theta * theta * force_noise).max(0.1),
+            force_noise,
+            bend: row.bend,
+            ramp_noise: 0.0,
+        });
+    }
+
+    pub(super) fn plus(&self, other: &Self) -> Self {
+        Self {
+            count: self.count + other.count,
+            square: self.square + other.square,
+            product: self.product + other.product,
+            response: self.response + other.response,
+            force_noise: self.force_noise + other.force_noise,
+            common_noise: self.common_noise + other.common_noise,
+            neighbours: self.neighbours + other.neighbours,
+            response_noise: self.response_noise + other.response_noise,
+        }
+    }
+
+    /// `s²` at a θ.
+    pub(super) fn spread(&self, theta: f64) -> f64 {
+        self.response_noise / self.count + theta * theta * self.force_variance()
+    }
+
+    /// Mean variance of the force regressor.
+    pub(super) fn force_variance(&self) -> f64 {
+        self.force_noise[(0, 0)] / self.count
+    }
+
+    /// `Σ xxᵀ`, with the noise of the regressors.
+    pub(super) fn square(&self, tangent: Tangent) -> ParameterMatrix {
+        tangent.of_pairs(&self.square)
+    }
+
+    /// `Σ xxᵀ` without the force's noise.
+    pub(super) fn corrected_square(&self, tangent: Tangent) -> ParameterMatrix {
+        let mut square = self.square;
+        for (row, row_of) in FORCED.into_iter().enumerate() {
+            for (column, column_of) in FORCED.into_iter().enumerate() {
+                square[(row_of, column_of)] -= self.force_noise[(row, column)];
+            }
+        }
+        tangent.of_pairs(&square)
+    }
+
+    /// `Σ xy`, with the noise that both have.
+    pub(super) fn product(&self, tangent: Tangent) -> Parameters {
+        tangent.of_parameters(&self.product)
+    }
+
+    /// `Σ xy` without the noise that both have.
+    pub(super) fn corrected_product(&self, tangent: Tangent) -> Parameters {
+        tangent.of_parameters(&(self.product - self.common_noise))
+    }
+
+    /// What neighbouring rows have in common.
+    pub(super) fn neighbours(&self, tangent: Tangent) -> ParameterMatrix {
+        tangent.of_pairs(&self.neighbours)
+    }
+
+    /// Squares of what the forces add at this κ by θ itself and by the bend, over the noise.
+    pub(super) fn force_and_bend(&self, tangent: Tangent, curvature: f64) -> [f64; 2] {
+        let noise = (self.response_noise / self.count.max(1.0)).max(f64::MIN_POSITIVE);
+        let mut bend = Regressors::zeros();
+        bend[index::CURVATURE] = curvature;
+        bend[index::CURVATURE_SQUARE] = curvature * curvature;
+        bend[index::CURVATURE_ALONE] = curvature / tangent.theta;
+        bend[index::THETA_CURVATURE] = curvature * tangent.theta;
+        let square = (self.square * bend).dot(&bend);
+        [
+            self.square[(index::THETA, index::THETA)] / noise,
+            square / noise,
+        ]
+    }
+}
