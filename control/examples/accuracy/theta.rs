@@ -1,7 +1,5 @@
 //! How well θ is measured: bias, RMS error, coverage of the intervals, abstention.
 
-use std::fmt::Write as _;
-
 use serde_json::{Value, json};
 use tread_control::estimation::{MODEL_RATIO, TyrePrior};
 
@@ -191,8 +189,7 @@ pub(crate) fn measure(scenarios: Vec<Scenario>, first_seed: u64, options: &Optio
         let found = figures(&scenario, &runs);
         check(&scenario, &found, &mut checks);
         let [half, most, nearly_all] = found.coverage.map(|share| 100.0 * share);
-        let _ = writeln!(
-            text,
+        let row = format!(
             "| {} | {:.2} | {:.2} | {:.2} | {half:.1} | {most:.1} | {nearly_all:.1} | {:.1} | {} | {:.1} \
              | {:.2} | {:.1} |",
             scenario.name,
@@ -205,6 +202,9 @@ pub(crate) fn measure(scenarios: Vec<Scenario>, first_seed: u64, options: &Optio
             100.0 * found.segment_rms,
             100.0 * found.segment_coverage,
         );
+        // A run that measured nothing has no error.
+        text.push_str(&row.replace("NaN", "–"));
+        text.push('\n');
         lines.push(line(&scenario.name, &found));
     }
     Section {
