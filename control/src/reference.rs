@@ -100,7 +100,7 @@ pub struct GovernorInput {
 
 /// A robot that slides: what it may ask of the ground, and how far it is turned off its path.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Sliding {
+struct Slide {
     bounds: SlidingBounds,
     heading_rad: f64,
 }
@@ -113,7 +113,7 @@ pub struct Governor {
     rate_slope_1_s: f64,
     rate_cap: f64,
     speed_limit_m_s: Option<f64>,
-    sliding: Option<Sliding>,
+    sliding: Option<Slide>,
     stopping: bool,
     brake_m_s2: f64,
     jerk_m_s3: f64,
@@ -170,7 +170,7 @@ impl Governor {
 
     /// Bounds what is asked of ground that was found to slide; none lifts the bounds.
     pub(crate) fn set_sliding(&mut self, bounds: Option<SlidingBounds>, heading_rad: f64) {
-        self.sliding = bounds.map(|bounds| Sliding {
+        self.sliding = bounds.map(|bounds| Slide {
             bounds,
             heading_rad,
         });
@@ -179,7 +179,7 @@ impl Governor {
     /// The largest σ that sliding ground allows: within its bounds at every bend ahead, as far as
     /// braking along the way does not do, and slow while the robot is turned off its path.
     fn rate_on_sliding_ground(&self, plan: &Plan, planned: &PlanSample) -> f64 {
-        let Some(Sliding {
+        let Some(Slide {
             bounds,
             heading_rad,
         }) = self.sliding
@@ -328,6 +328,9 @@ mod tests {
     use crate::geometry::Point;
     use crate::trajectory::{CircleSpec, Direction, Trajectory};
 
+    /// Time in which a robot that drives is slowed, seconds.
+    const BRAKED_S: f64 = 2.0;
+
     proptest! {
         #![proptest_config(ProptestConfig { cases: 32, ..ProptestConfig::default() })]
         #[test]
@@ -361,6 +364,10 @@ mod tests {
                 let change_m_s2 = (now.speed_m_s - before.speed_m_s).abs() / dt_s;
                 let most_m_s2 = 2.0 * model.limits().linear_acceleration_max_m_s2;
                 prop_assert!(change_m_s2 < most_m_s2, "{change_m_s2} m/s²");
+                if f64::from(tick) * dt_s >= from_s + BRAKED_S {
+                    let across_m_s2 = now.speed_m_s.powi(2) * now.curvature_1_m.abs();
+                    prop_assert!(across_m_s2 < 1.1 * bounds.across_m_s2, "{across_m_s2} m/s²");
+                }
                 before = now;
             }
             prop_assert!(governor.is_at_end(&plan));

@@ -81,21 +81,27 @@ fn tyres_that_lose_no_grip_in_a_bend_are_found_out() {
     }
 }
 
+/// Told ten times too much for a lap, then in a time less and less, then the truth.
+fn lies(theta: f64, falls_s: f64) -> impl Fn(f64) -> ThetaKnowledge {
+    move |time_s| {
+        let share = ((time_s - LAP_S) / falls_s).clamp(0.0, 1.0);
+        known(theta * 10.0_f64.powf(1.0 - share))
+    }
+}
+
+const LAP_S: f64 = 42.0;
+
 #[test]
-fn what_was_adapted_under_a_theta_that_is_contradicted_is_forgotten() {
-    let (theta, until_s) = (0.2, 42.0);
-    let ticks = figure_8(curve(1.0 / theta, 0.2), |time_s| {
-        known(if time_s < until_s {
-            10.0 * theta
-        } else {
-            theta
-        })
-    });
-    let told = ticks
-        .iter()
-        .position(|tick| tick.time_s >= until_s)
-        .unwrap();
-    let (before, after) = (believed(&ticks[told - 1]), believed(&ticks[told + 1]));
-    assert!(before < 0.5, "{before} still believed");
-    assert!(after > 0.99, "{after} believed");
+fn what_was_adapted_under_a_theta_that_is_contradicted_is_forgotten_within_a_second() {
+    for falls_s in [0.01, 10.0] {
+        let theta = 0.2;
+        let ticks = figure_8(curve(1.0 / theta, 0.2), lies(theta, falls_s));
+        let at = |time_s: f64| {
+            let found = ticks.iter().find(|tick| tick.time_s >= time_s);
+            believed(found.expect("three laps take longer"))
+        };
+        let (before, after) = (at(LAP_S - 0.1), at(LAP_S + falls_s + 1.1));
+        assert!(before < 0.5, "{before} still believed");
+        assert!(after > 0.9, "in {falls_s} s: {after} believed");
+    }
 }

@@ -49,9 +49,11 @@ const ALONG_MAX_M: f64 = 0.3;
 const INTEGRAL_SPEED_MIN_M_S: f64 = 0.05;
 /// Heading feedback acts as if driving at least this fast, so that it holds at rest too.
 const HEADING_SPEED_MIN_M_S: f64 = 0.15;
-/// Cross-track errors smaller than this do not move θ̂, metres.
+/// Cross-track errors smaller than this move neither θ̂ nor χ̂, metres.
 const ADAPTATION_DEAD_ZONE_M: f64 = 5.0e-4;
 
+/// How much smaller the deviation of a word is that replaces the one χ̂ was adapted under.
+const BETTER_WORD: f64 = 0.5;
 /// Fastest change of the share of the loss beyond the peak that is believed, per second.
 const BEYOND_RATE_MAX_1_S: f64 = 1.0;
 
@@ -115,6 +117,8 @@ pub struct Tracker {
     beyond: f64,
     /// The θ under which χ̂ was adapted.
     known: Option<ThetaKnowledge>,
+    /// χ̂ is on its way back to one.
+    forgets: bool,
     noise: NoiseLevel,
     was_saturated: bool,
     held_from_outside: bool,
@@ -134,6 +138,7 @@ impl Tracker {
             theta: 0.0,
             beyond: 1.0,
             known: None,
+            forgets: false,
             noise: NoiseLevel::default(),
             was_saturated: false,
             held_from_outside: false,
@@ -166,7 +171,8 @@ impl Tracker {
         dt_s: f64,
     ) -> TrackerOutput {
         let config = self.config;
-        self.heed(knowledge);
+        let knowledge = knowledge.filter(|known| known.confidence() > 0.0);
+        self.heed(knowledge, dt_s);
         let theta = self.theta;
         let density = self.noise.update(measured, dt_s);
         let middle = config.noise_middle_m_sqrt_s.powi(2);
@@ -230,15 +236,21 @@ impl Tracker {
         }
     }
 
-    /// What was adapted under a θ that is now contradicted says nothing.
-    fn heed(&mut self, knowledge: Option<ThetaKnowledge>) {
-        let Some(now) = knowledge else {
-            return;
-        };
-        if self.known.is_some_and(|before| before.contradicts(now)) {
-            self.beyond = 1.0;
+    /// What was adapted under a θ that is now contradicted says nothing: χ̂ goes back to one.
+    fn heed(&mut self, knowledge: Option<ThetaKnowledge>, dt_s: f64) {
+        if let Some(now) = knowledge {
+            let anchor = *self.known.get_or_insert(now);
+            self.forgets |= anchor.contradicts(now);
+            // A better word on the same ground takes its place; many slightly better ones would
+            // carry it along with a θ that moves.
+            if anchor.contradicts(now) || now.std_dev < BETTER_WORD * anchor.std_dev {
+                self.known = Some(now);
+            }
         }
-        self.known = Some(now);
+        if self.forgets {
+            self.beyond = (self.beyond + BEYOND_RATE_MAX_1_S * dt_s).min(1.0);
+            self.forgets = self.beyond < 1.0;
+        }
     }
 
     /// Bounded, so that it cannot wind up.
@@ -262,7 +274,13 @@ impl Tracker {
         } else {
             cross_m
         };
-        let gradient = config.adaptation_gain * error_m * sideslip.drift_per_theta_m_s;
+        // More changes nothing at the end of what is reckoned with, and would wind up.
+        let most = if sideslip.is_at_end {
+            0.0
+        } else {
+            f64::INFINITY
+        };
+        let gradient = (config.adaptation_gain * error_m * sideslip.drift_per_theta_m_s).min(most);
         let pull = knowledge.map_or(0.0, |known| {
             let weight = known.confidence();
             config.adaptation_pull_1_s * weight * (weight * known.theta - self.theta)
@@ -271,7 +289,7 @@ impl Tracker {
         // The pull is a way back, not a drift: it may act faster than the gradient.
         let rate = gradient.clamp(-bound, bound) + pull;
         self.theta = (self.theta + rate * dt_s).clamp(0.0, config.theta_max);
-        let gradient = config.beyond_gain * error_m * sideslip.drift_per_beyond_m_s;
+        let gradient = (config.beyond_gain * error_m * sideslip.drift_per_beyond_m_s).min(most);
         let rate = gradient.clamp(-BEYOND_RATE_MAX_1_S, BEYOND_RATE_MAX_1_S);
         self.beyond = (self.beyond + rate * dt_s).clamp(0.0, 1.0);
     }

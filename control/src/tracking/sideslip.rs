@@ -6,7 +6,7 @@ use crate::measured::WheelSpeeds;
 use crate::reference::ReferenceSample;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-use super::turn::{SteadyTurn, Turn};
+use super::turn::{SIDESLIP_MAX, SteadyTurn, Turn};
 
 /// Time over which the sideslip's rate is looked at, seconds.
 const RATE_SPAN_S: f64 = 0.02;
@@ -35,6 +35,8 @@ pub(super) struct Sideslip {
     pub(super) drift_per_theta_m_s: f64,
     /// The same per share of the loss beyond the peak.
     pub(super) drift_per_beyond_m_s: f64,
+    /// Whether it is at the end of what is reckoned with: more of θ or of the loss changes nothing.
+    pub(super) is_at_end: bool,
     /// What the rims must roll beyond the kinematics of the reference.
     pub(super) rims: Twist,
 }
@@ -48,7 +50,7 @@ impl Sideslip {
     ) -> Self {
         let speed_m_s = reference.speed_m_s;
         let at = |speed_m_s: f64, turn_rad_s: f64| {
-            Moment::of(speed_m_s, turn_rad_s, belief, grip, model)
+            Instant::of(speed_m_s, turn_rad_s, belief, grip, model)
         };
         let now = at(speed_m_s, reference.turn_rad_s);
         let then = at(
@@ -61,21 +63,23 @@ impl Sideslip {
             rate_rad_s: (-belief.theta * then.per_theta - angle_rad) / RATE_SPAN_S,
             drift_per_theta_m_s: speed_m_s * now.per_theta,
             drift_per_beyond_m_s: speed_m_s * belief.theta * now.per_theta_beyond,
+            is_at_end: now.is_at_end,
             rims: now.rims,
         }
     }
 }
 
-/// One moment of a reference.
-struct Moment {
+/// A reference at one time.
+struct Instant {
     /// Sideslip per θ, to the right.
     per_theta: f64,
     /// What of it is lost grip, if all of it is believed.
     per_theta_beyond: f64,
+    is_at_end: bool,
     rims: Twist,
 }
 
-impl Moment {
+impl Instant {
     fn of(
         speed_m_s: f64,
         turn_rad_s: f64,
@@ -103,6 +107,8 @@ impl Moment {
         Self {
             per_theta: believed(linear, beyond),
             per_theta_beyond: beyond - linear,
+            is_at_end: turn.linear.sideslip.abs() >= SIDESLIP_MAX
+                || belief.beyond > 0.0 && turn.beyond.sideslip.abs() >= SIDESLIP_MAX,
             rims: Twist {
                 linear_m_s: believed(straight.linear_m_s, slid.linear_m_s) - speed_m_s,
                 angular_rad_s: believed(straight.angular_rad_s, slid.angular_rad_s)
