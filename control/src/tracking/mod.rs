@@ -19,7 +19,7 @@
 //! one, keeps margin where slip is slow. Gains follow the noise of the pose.
 //!
 //! θ̂ starts at zero: no knowledge, no sideslip. A known θ pulls it, by the confidence in it. χ̂
-//! starts at one, and does so again when a known θ contradicts the one before. Both are bounded in
+//! starts at one, and goes back to it when a known θ contradicts the one before. Both are bounded in
 //! range and rate, and held while the wheels saturate, something outside cuts the command, or the
 //! pose is stale. They serve this loop only; what the map gets comes from [`crate::estimation`].
 
