@@ -85,25 +85,45 @@ impl Tangent {
             && (self.square_by_theta - other.square_by_theta).abs() < SETTLED
     }
 
-    /// By how much each parameter moves each regressor's quantity.
-    fn lift(self) -> SMatrix<f64, REGRESSORS, PARAMETERS> {
-        let mut lift = SMatrix::identity();
-        lift[(index::CURVATURE_SQUARE, index::THETA)] = self.square_by_theta;
-        lift[(index::CURVATURE_SQUARE, index::CURVATURE)] = self.square_by_curvature;
-        lift[(index::CURVATURE_ALONE, index::CURVATURE)] = self.theta.recip();
-        lift[(index::THETA_CURVATURE, index::CURVATURE)] = self.theta;
-        lift
+    /// What moves with which parameter besides the parameter itself: the regressor's quantity, the
+    /// parameter, and by how much.
+    fn followers(self) -> [(usize, usize, f64); 4] {
+        [
+            (index::CURVATURE_SQUARE, index::THETA, self.square_by_theta),
+            (
+                index::CURVATURE_SQUARE,
+                index::CURVATURE,
+                self.square_by_curvature,
+            ),
+            (index::CURVATURE_ALONE, index::CURVATURE, self.theta.recip()),
+            (index::THETA_CURVATURE, index::CURVATURE, self.theta),
+        ]
     }
 
     /// Regressors of the parameters alone.
     pub(super) fn of_parameters(self, regressors: &Regressors) -> Parameters {
-        self.lift().tr_mul(regressors)
+        let mut found = regressors.fixed_rows::<PARAMETERS>(0).into_owned();
+        for (from, to, by) in self.followers() {
+            found[to] += by * regressors[from];
+        }
+        found
     }
 
     /// The same of a matrix with a row and a column for each regressor.
     fn of_pairs(self, square: &RegressorMatrix) -> ParameterMatrix {
-        let lift = self.lift();
-        lift.tr_mul(&(square * lift))
+        let mut columns = square.fixed_columns::<PARAMETERS>(0).into_owned();
+        for (from, to, by) in self.followers() {
+            let more = square.column(from) * by;
+            let mut column = columns.column_mut(to);
+            column += more;
+        }
+        let mut found = columns.fixed_rows::<PARAMETERS>(0).into_owned();
+        for (from, to, by) in self.followers() {
+            let more = columns.row(from) * by;
+            let mut row = found.row_mut(to);
+            row += more;
+        }
+        found
     }
 }
 
@@ -293,5 +313,39 @@ impl Channel {
             self.square[(index::THETA, index::THETA)] / noise,
             square / noise,
         ]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn rows_of_the_parameters_say_what_rows_of_all_regressors_say(
+            values in prop::collection::vec(-2.0..2.0_f64, REGRESSORS),
+            parameters in prop::collection::vec(-2.0..2.0_f64, PARAMETERS),
+            theta in 0.02..4.0_f64, curvature in 0.0..3.0_f64, curvature_spread in 0.0..1.0_f64,
+        ) {
+            let tyres = TyrePrior { curvature, curvature_spread, ..TyrePrior::default() };
+            let tangent = Tangent::at(theta, &tyres);
+            let row = Regressors::from_column_slice(&values);
+            let parameters = Parameters::from_column_slice(&parameters);
+            let mut all = Regressors::zeros();
+            all.fixed_rows_mut::<PARAMETERS>(0).copy_from(&parameters);
+            let (of_theta, of_curvature) = (parameters[index::THETA], parameters[index::CURVATURE]);
+            all[index::CURVATURE_SQUARE] =
+                tangent.square_by_theta * of_theta + tangent.square_by_curvature * of_curvature;
+            all[index::CURVATURE_ALONE] = of_curvature / theta;
+            all[index::THETA_CURVATURE] = of_curvature * theta;
+            let said = row.dot(&all);
+            let lean = tangent.of_parameters(&row).dot(&parameters);
+            prop_assert!((lean - said).abs() < 1.0e-9 * (1.0 + said.abs()));
+            let square = tangent.of_pairs(&(row * row.transpose()));
+            let twice = (square * parameters).dot(&parameters);
+            prop_assert!((twice - said * said).abs() < 1.0e-8 * (1.0 + said * said));
+        }
     }
 }
