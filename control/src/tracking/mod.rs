@@ -96,8 +96,6 @@ pub struct TrackerOutput {
     pub errors: TrackingErrors,
     /// θ̂ in the loop; never a measurement.
     pub theta_loop: f64,
-    /// The sideslip that is reckoned with: course minus heading, radians.
-    pub sideslip_rad: f64,
     /// How much of the grip that is lost beyond its peak is believed in the loop, χ̂, 0 to 1.
     pub beyond_loop: f64,
     /// How much the known θ is believed, 0 to 1.
@@ -229,7 +227,6 @@ impl Tracker {
             twist: self.model.twist_from_wheel_speeds(wheel_speeds),
             errors: TrackingErrors::between(reference, measured),
             theta_loop: self.theta,
-            sideslip_rad: sideslip.angle_rad,
             beyond_loop: self.beyond,
             confidence: knowledge.map_or(0.0, |known| known.confidence()),
             saturated,
