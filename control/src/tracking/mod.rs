@@ -286,9 +286,12 @@ impl Tracker {
         // The pull is a way back, not a drift: it may act faster than the gradient.
         let rate = gradient.clamp(-bound, bound) + pull;
         self.theta = (self.theta + rate * dt_s).clamp(0.0, config.theta_max);
-        let gradient = (config.beyond_gain * error_m * sideslip.drift_per_beyond_m_s).min(most);
-        let rate = gradient.clamp(-BEYOND_RATE_MAX_1_S, BEYOND_RATE_MAX_1_S);
-        self.beyond = (self.beyond + rate * dt_s).clamp(0.0, 1.0);
+        // On its way back to one nothing leads it off.
+        if !self.forgets {
+            let gradient = (config.beyond_gain * error_m * sideslip.drift_per_beyond_m_s).min(most);
+            let rate = gradient.clamp(-BEYOND_RATE_MAX_1_S, BEYOND_RATE_MAX_1_S);
+            self.beyond = (self.beyond + rate * dt_s).clamp(0.0, 1.0);
+        }
     }
 
     fn bounded(&self, twist: Twist) -> Twist {
