@@ -8,14 +8,13 @@ use tread_control::robot::RobotModel;
 use tread_control::tracking::ThetaKnowledge;
 
 fn curve(stiffness: f64, peak_slip: f64) -> FrictionCurve {
-    let sliding_ratio = 0.8;
-    FrictionSpec {
+    let shape = FrictionCurve::yi2007().into();
+    let spec = FrictionSpec {
         stiffness,
         peak_slip,
-        sliding_ratio,
-    }
-    .try_into()
-    .expect("a curve that is possible")
+        ..shape
+    };
+    spec.try_into().expect("a curve that is possible")
 }
 
 fn known(theta: f64) -> ThetaKnowledge {

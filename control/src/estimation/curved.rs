@@ -9,6 +9,7 @@ use crate::robot::RobotModel;
 
 /// Slip that is divided by at least.
 pub(super) const SLIP_MIN: f64 = 1.0e-4;
+
 /// Regressor of θκ: the force's slip grows with slip itself on a curved tyre, by
 /// `1/(1 − x + x²/3) − 1` with x = κλ.
 pub(super) fn bent(force_m_s: f64, slip: f64, curvature: f64) -> f64 {

@@ -22,7 +22,8 @@ pub(super) const SIDESLIP_MAX: f64 = 0.1;
 const SHARE_MIN: f64 = 0.05;
 /// Slowest and fastest rims over the speed ahead.
 const RIMS: std::ops::RangeInclusive<f64> = 0.05..=20.0;
-/// Share of the curvature at which the inner rims would stand, by kinematics alone, up to which a turn is reckoned.
+/// Share of the curvature at which the inner rims would stand, by kinematics alone, up to which a
+/// turn is reckoned.
 const TIGHT_MAX: f64 = 0.7;
 
 /// A steady turn, all speeds over the speed ahead.
@@ -171,14 +172,13 @@ mod tests {
     use crate::robot::GRAVITY_M_S2;
 
     fn grip(stiffness: f64, peak_slip: f64) -> FrictionCurve {
-        let sliding_ratio = 0.8;
-        FrictionSpec {
+        let shape = FrictionCurve::yi2007().into();
+        let spec = FrictionSpec {
             stiffness,
             peak_slip,
-            sliding_ratio,
-        }
-        .try_into()
-        .unwrap()
+            ..shape
+        };
+        spec.try_into().unwrap()
     }
 
     /// A simulated base that has driven on these rims for long: speed ahead, sideslip, curvature.
