@@ -4,29 +4,16 @@ mod common;
 
 use std::f64::consts::{PI, TAU};
 
-use common::SimRobot;
+use common::{SimRobot, circle, follower};
 use proptest::prelude::*;
 use tread_control::bench::{CrossTrack, KanayamaGains, Law, Scenario, cross_track};
-use tread_control::follower::{FailureReason, Follower, FollowerConfig, FollowerStatus};
+use tread_control::follower::{FailureReason, FollowerStatus};
 use tread_control::geometry::{Point, Pose, wrap_angle_rad};
-use tread_control::plan::{Plan, PlanOptions};
+use tread_control::plan::Plan;
 use tread_control::plant::Ground;
 use tread_control::robot::{Limits, RobotModel, RobotModelSpec};
 use tread_control::tracking::ThetaKnowledge;
-use tread_control::trajectory::{CircleSpec, Direction, Trajectory, Waypoint, WaypointsSpec};
-
-fn circle(direction: Direction, turns: f64) -> Trajectory {
-    Trajectory::Circle(CircleSpec {
-        center: Point {
-            x_m: 1.0,
-            y_m: -2.0,
-        },
-        radius_m: 6.0,
-        speed_m_s: 0.6,
-        direction,
-        turns,
-    })
-}
+use tread_control::trajectory::{Direction, Trajectory, Waypoint, WaypointsSpec};
 
 fn figure_8() -> Trajectory {
     let points = (0..=24)
@@ -42,12 +29,6 @@ fn figure_8() -> Trajectory {
         points,
         speed_m_s: 0.6,
     })
-}
-
-fn follower(trajectory: &Trajectory, start: Pose) -> Follower {
-    let model = RobotModel::yi2007();
-    let plan = Plan::new(trajectory, start, &model).expect("a path that can be driven");
-    Follower::new(plan, model, FollowerConfig::default()).expect("valid gains")
 }
 
 /// Root mean square and largest cross-track error on the trajectory itself, metres.
@@ -127,53 +108,6 @@ fn a_robot_on_the_circle_makes_no_detour() {
     let follower = follower(&circle(Direction::CounterClockwise, 1.0), start);
     assert!((follower.plan().length_m() - TAU * 6.0).abs() < 1.0e-6);
     assert_eq!(follower.status(), FollowerStatus::Tracking);
-}
-
-#[test]
-fn from_three_metres_off_the_circle_is_reached_soon() {
-    let start = Pose {
-        x_m: 10.0,
-        y_m: -2.0,
-        heading_rad: PI / 2.0,
-    };
-    let follower = follower(&circle(Direction::CounterClockwise, 1.0), start);
-    let approach_m = follower.plan().approach_length_m();
-    assert!((2.9..9.0).contains(&approach_m), "{approach_m} m");
-}
-
-#[test]
-fn three_metres_off_are_made_good_within_six_seconds_on_slippery_ground_too() {
-    let center = Point {
-        x_m: 1.0,
-        y_m: -2.0,
-    };
-    for (off_m, heading_rad) in [(-3.0, PI / 2.0), (-3.0, 0.0), (3.0, PI)] {
-        for stiffness in [0.5, 5.0] {
-            let start = Pose {
-                x_m: center.x_m + 6.0 + off_m,
-                y_m: center.y_m,
-                heading_rad,
-            };
-            let options = PlanOptions {
-                approach_speed_m_s: Some(1.0),
-                ..PlanOptions::default()
-            };
-            let model = RobotModel::yi2007();
-            let trajectory = circle(Direction::CounterClockwise, 1.0);
-            let plan = Plan::with_options(&trajectory, start, &model, &options).unwrap();
-            let mut follower = Follower::new(plan, model, FollowerConfig::default()).unwrap();
-            let mut robot = SimRobot::new(start, stiffness, 1, false);
-            let (mut time_s, mut outside_s) = (0.0, 0.0);
-            robot.drive(&mut follower, 12.0, |_, _, robot| {
-                time_s += common::LOOP_S;
-                let place = robot.plant.state().pose.point();
-                if (place.distance_m(center) - 6.0).abs() > 0.05 {
-                    outside_s = time_s;
-                }
-            });
-            assert!(outside_s < 6.0, "{start:?}, K {stiffness}: {outside_s} s");
-        }
-    }
 }
 
 #[test]

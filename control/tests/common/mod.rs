@@ -9,20 +9,43 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tread_control::estimation::{Estimator, SensorNoise, SensorSample};
-use tread_control::follower::{Follower, FollowerOutput};
+use tread_control::follower::{Follower, FollowerConfig, FollowerOutput};
 use tread_control::friction::FrictionCurve;
 use tread_control::gate::{GateInput, GateLimits, gate};
-use tread_control::geometry::Pose;
+use tread_control::geometry::{Point, Pose};
 use tread_control::localisation::{Localisation, LocalisationNoise, PositionFix};
 use tread_control::measured::{BodyAcceleration, Measured, WheelSpeeds, WheelTorques};
+use tread_control::plan::Plan;
 use tread_control::plant::{Ground, Plant, PlantSpec};
 use tread_control::robot::RobotModel;
 use tread_control::tracking::ThetaKnowledge;
+use tread_control::trajectory::{CircleSpec, Direction, Trajectory};
 
 /// Control loop, seconds.
 pub(crate) const LOOP_S: f64 = 0.01;
 /// Sensor samples per loop tick.
 pub(crate) const SAMPLES: u32 = 2;
+
+/// A circle of 6 m about (1, −2) m at 0.6 m/s.
+pub(crate) fn circle(direction: Direction, turns: f64) -> Trajectory {
+    Trajectory::Circle(CircleSpec {
+        center: Point {
+            x_m: 1.0,
+            y_m: -2.0,
+        },
+        radius_m: 6.0,
+        speed_m_s: 0.6,
+        direction,
+        turns,
+    })
+}
+
+/// A robot's follower of a path from where it stands, at the defaults.
+pub(crate) fn follower(trajectory: &Trajectory, start: Pose) -> Follower {
+    let model = RobotModel::yi2007();
+    let plan = Plan::new(trajectory, start, &model).expect("a path that can be driven");
+    Follower::new(plan, model, FollowerConfig::default()).expect("valid gains")
+}
 
 pub(crate) fn curve(stiffness: f64) -> FrictionCurve {
     FrictionCurve::with_stiffness(stiffness).expect("a positive stiffness")
