@@ -215,10 +215,10 @@ pub struct AlertReport {
 pub struct Alert {
     /// The alert's identifier; a code that is raised again later is another alert.
     pub id: AlertId,
-    /// The robot's site.
-    pub site: SiteId,
-    /// The robot.
-    pub robot: RobotId,
+    /// The robot's site; null for an alert about the server itself.
+    pub site: Option<SiteId>,
+    /// The robot; null for an alert about the server itself.
+    pub robot: Option<RobotId>,
     /// What it is, for programs.
     pub code: AlertCode,
     /// How much it matters.
@@ -229,8 +229,20 @@ pub struct Alert {
     pub raised_at: Timestamp,
     /// When a person said to have seen it.
     pub acknowledged_at: Option<Timestamp>,
-    /// When the robot no longer said it.
+    /// When its cause was gone.
     pub cleared_at: Option<Timestamp>,
+}
+
+impl Alert {
+    /// What it is about, for people: the robot's name, or `server`.
+    pub fn about(&self) -> &str {
+        self.robot.as_ref().map_or("server", RobotId::as_str)
+    }
+
+    /// Site and name of the robot that it is about, if it is about one.
+    pub fn robot_key(&self) -> Option<(SiteId, RobotId)> {
+        Some((self.site.clone()?, self.robot.clone()?))
+    }
 }
 
 /// The body of `PATCH /v1/sites/{site}/robots/{robot}`; what is absent stays as it is.

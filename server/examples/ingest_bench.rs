@@ -21,7 +21,7 @@ use tread_api::wire::ingest::{Batch, Record, RecordContent};
 use tread_server::app::App;
 use tread_server::app::ingest::{self, UPLOADS_WAITING_MAX, Upload};
 use tread_server::clock::Clock;
-use tread_server::config::FrictionConfig;
+use tread_server::config::{FrictionConfig, StorageConfig};
 use tread_server::db::Db;
 use tread_server::supervisor::Supervisor;
 use uuid::Uuid;
@@ -123,7 +123,12 @@ impl Bench {
             .enable_all()
             .build()?;
         let db = runtime.block_on(Db::open(database))?;
-        let app = App::new(db, Clock::system(), FrictionConfig::default());
+        let app = App::new(
+            db,
+            Clock::system(),
+            FrictionConfig::default(),
+            StorageConfig::default(),
+        );
         let site: SiteId = "yard".parse()?;
         let robots: Vec<RobotId> = (0..robots)
             .map(|robot| format!("r-{robot}").parse())

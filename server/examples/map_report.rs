@@ -28,7 +28,7 @@ use tread_server::app::checkpoints;
 use tread_server::app::identity::FirstAdmin;
 use tread_server::app::ingest::{self, UPLOADS_WAITING_MAX, Upload};
 use tread_server::clock::Clock;
-use tread_server::config::FrictionConfig;
+use tread_server::config::{FrictionConfig, StorageConfig};
 use tread_server::db::Db;
 use tread_server::friction::index::{BLOCK_SQUARES, Labelled, SiteMap, Square};
 use tread_server::friction::{Sums, epoch_h};
@@ -272,7 +272,12 @@ async fn asked(
 /// A server without a network, with a million cells.
 async fn server(folder: &Path, robots: &[RobotId]) -> anyhow::Result<(App, String)> {
     let db = Db::open(&folder.join("map.db")).await?;
-    let app = App::new(db, Clock::system(), FrictionConfig::default());
+    let app = App::new(
+        db,
+        Clock::system(),
+        FrictionConfig::default(),
+        StorageConfig::default(),
+    );
     app.ensure_site(&site()?).await?;
     for robot in robots {
         let hello = Hello {

@@ -82,6 +82,8 @@ pub struct Config {
     pub normalisations: Vec<Normalisation>,
     /// How long raw measurements are kept.
     pub retention: RetentionConfig,
+    /// What is expected of the storage.
+    pub storage: StorageConfig,
     /// The REST API's certificate; without one it listens on this machine alone.
     pub tls: Option<TlsFiles>,
     /// What browsers may do.
@@ -181,6 +183,46 @@ impl RetentionConfig {
     }
 }
 
+/// What is expected of the storage.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct StorageConfig {
+    /// An alert is raised when less than this is free on the disk of the database, MiB; within
+    /// [`DISK_FREE_MIN_MIB_RANGE`].
+    pub disk_free_min_mib: u64,
+}
+
+/// How much of the disk may be asked to be free, MiB.
+pub const DISK_FREE_MIN_MIB_RANGE: std::ops::RangeInclusive<u64> = 16..=1_000_000_000;
+const BYTES_PER_MIB: u64 = 1_024 * 1_024;
+
+impl Default for StorageConfig {
+    fn default() -> Self {
+        Self {
+            disk_free_min_mib: 1_024,
+        }
+    }
+}
+
+impl StorageConfig {
+    /// The limit in bytes.
+    pub const fn disk_free_min_bytes(self) -> u64 {
+        self.disk_free_min_mib.saturating_mul(BYTES_PER_MIB)
+    }
+
+    #[expect(clippy::cast_precision_loss, reason = "for a message")]
+    fn check(self) -> Result<(), ConfigError> {
+        if DISK_FREE_MIN_MIB_RANGE.contains(&self.disk_free_min_mib) {
+            return Ok(());
+        }
+        Err(ConfigError::OutOfRange {
+            key: "storage.disk_free_min_mib",
+            range: "16 to 1e9",
+            value: self.disk_free_min_mib as f64,
+        })
+    }
+}
+
 /// How measurements of several robots and times are weighed.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -274,6 +316,8 @@ struct File {
     normalisations: BTreeMap<String, NormalisationFields>,
     #[serde(default)]
     retention: RetentionConfig,
+    #[serde(default)]
+    storage: StorageConfig,
     tls: Option<TlsFiles>,
     #[serde(default)]
     web: WebConfig,
@@ -364,6 +408,7 @@ impl Config {
             friction: file.friction,
             normalisations: normalisations(file.normalisations)?,
             retention: file.retention,
+            storage: file.storage,
             tls: file.tls,
             web: file.web,
             robots: file.robots,
@@ -402,6 +447,7 @@ impl Config {
             robots.check()?;
         }
         self.retention.check()?;
+        self.storage.check()?;
         self.friction.check()
     }
 }

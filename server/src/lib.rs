@@ -41,12 +41,13 @@ use tread_api::startup::give_zenoh_threads;
 
 use self::app::enrolment::Office;
 use self::app::identity::audit;
-use self::app::{App, Links, checkpoints, events, ingest, merging, reconciler, retention};
+use self::app::{App, Links, checkpoints, events, ingest, merging, reconciler, retention, storage};
 use self::authority::Authority;
 use self::clock::Clock;
 use self::config::RobotsConfig;
 pub use self::config::{Config, ServerArgs};
 use self::db::Db;
+use self::db::lock::DatabaseLock;
 use self::fleet::{Fleet, Security};
 use self::http::serve::Serving;
 use self::http::tls::Tls;
@@ -67,6 +68,7 @@ pub struct RunningServer {
     app: App,
     fleet: Fleet,
     supervisor: Supervisor,
+    lock: DatabaseLock,
 }
 
 impl Server {
@@ -86,8 +88,9 @@ impl Server {
         let security = config.robots.as_ref().map(security).transpose()?;
         let names = config.names();
         let tls = config.tls.map(Tls::load).transpose()?.map(Arc::new);
+        let lock = DatabaseLock::take(&config.database)?;
         let db = Db::open(&config.database).await?;
-        let app = App::new(db, clock, config.friction);
+        let app = App::new(db, clock, config.friction, config.storage);
         app.declare(config.normalisations);
         app.ensure_site(&config.site).await?;
         app.know_robots().await?;
@@ -131,6 +134,7 @@ impl Server {
         supervisor.spawn_vital("reconciler", reconciling);
         supervisor.spawn_vital("events", events::run(app.clone(), stop()));
         supervisor.spawn_vital("checkpoints", checkpoints::run(app.clone(), stop()));
+        supervisor.spawn_vital("storage", storage::run(app.clone(), stop()));
         supervisor.spawn_vital("merging", merging::run(app.clone(), stop()));
         let telling = app::friction::live::run(app.clone(), stop());
         supervisor.spawn_vital("map", telling);
@@ -175,6 +179,7 @@ impl Server {
             app,
             fleet,
             supervisor,
+            lock,
         })
     }
 }
@@ -221,6 +226,7 @@ impl RunningServer {
         let stopped = self.supervisor.stop().await;
         self.fleet.close().await;
         self.app.db().close().await;
+        drop(self.lock);
         Ok(stopped?)
     }
 }

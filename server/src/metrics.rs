@@ -18,6 +18,7 @@ use tread_api::problem::ProblemType;
 use crate::app::friction::KnownGround;
 use crate::app::{App, AppError};
 use crate::db;
+use crate::db::failure::{self, StorageFailure};
 
 /// Upper bounds of the buckets, seconds.
 const BOUNDS_S: [f64; 10] = [0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.5, 1.0, 5.0];
@@ -227,14 +228,19 @@ const OF_CLIENTS: [&str; 10] = [
 ];
 
 impl App {
-    /// All metrics as text.
-    ///
-    /// # Errors
-    /// The database failed.
-    pub async fn metrics(&self) -> Result<String, AppError> {
+    /// All metrics as text; those that come from the database are missing while it cannot be read.
+    pub async fn metrics(&self) -> String {
         let mut text = String::new();
-        self.write_fleet(&mut text).await?;
-        self.write_ground(&mut text).await?;
+        self.write_storage(&mut text);
+        // What is in memory is shown also while the database cannot be read.
+        for written in [
+            self.write_fleet(&mut text).await,
+            self.write_ground(&mut text).await,
+        ] {
+            if let Err(error) = written {
+                self.log_failure("read metrics", &error);
+            }
+        }
         self.write_clients(&mut text);
         let name = "tread_uptime_seconds";
         head(&mut text, name, "gauge", "Time since the start.");
@@ -251,7 +257,46 @@ impl App {
         self.queues().write(&mut text);
         self.write_refusals(&mut text, counters.as_object());
         self.write_durations(&mut text);
-        Ok(text)
+        text
+    }
+
+    /// What the storage was found to be.
+    fn write_storage(&self, text: &mut String) {
+        let condition = self.storage_condition();
+        let gauges = [
+            (
+                "tread_storage_writable",
+                Some(u64::from(condition.unwritable.is_none())),
+                "Whether the database takes writes.",
+            ),
+            (
+                "tread_storage_damaged",
+                Some(u64::from(condition.damaged.is_some())),
+                "Whether the database is known to be damaged.",
+            ),
+            (
+                "tread_storage_disk_low",
+                Some(u64::from(condition.is_disk_low)),
+                "Whether less is free on the disk of the database than configured.",
+            ),
+            (
+                "tread_storage_disk_free_bytes",
+                condition.disk_free_bytes,
+                "Free bytes on the disk of the database.",
+            ),
+        ];
+        for (name, value, help) in gauges {
+            if let Some(value) = value {
+                head(text, name, "gauge", help);
+                line(text, &format!("{name} {value}"));
+            }
+        }
+        let name = "tread_storage_failures_total";
+        head(text, name, "counter", "Failures of the storage, by kind.");
+        for failure in StorageFailure::ALL {
+            let (kind, count) = (failure.as_str(), failure::count(failure));
+            line(text, &format!("{name}{{kind=\"{kind}\"}} {count}"));
+        }
     }
 
     /// Missions, robots and stops.

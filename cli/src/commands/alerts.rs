@@ -18,7 +18,8 @@ pub(super) async fn run(
         output.show(&alert, |alert| {
             format!(
                 "`{}` of {} is noted as seen; it stands until its cause is gone",
-                alert.code, alert.robot
+                alert.code,
+                alert.about()
             )
         })?;
         return Ok(ExitCode::SUCCESS);
@@ -35,12 +36,12 @@ fn list(alerts: &[Alert]) -> String {
         return "no alert stands".to_owned();
     }
     let mut table = table([
-        "ALERT", "ROBOT", "SEVERITY", "CODE", "RAISED", "SEEN", "CLEARED", "TEXT",
+        "ALERT", "ABOUT", "SEVERITY", "CODE", "RAISED", "SEEN", "CLEARED", "TEXT",
     ]);
     for alert in alerts {
         table.add_row([
             alert.id.to_string(),
-            alert.robot.to_string(),
+            alert.about().to_owned(),
             alert.severity.as_str().to_owned(),
             alert.code.to_string(),
             format!("{:.0}", alert.raised_at),

@@ -8,7 +8,7 @@ use tempfile::TempDir;
 use tread_agent::sim::scenario::Scenario;
 use tread_agent::{Agent, AgentConfig, RunningAgent};
 use tread_server::app::identity::FirstAdmin;
-use tread_server::config::{FrictionConfig, RetentionConfig, TlsFiles, WebConfig};
+use tread_server::config::{FrictionConfig, RetentionConfig, StorageConfig, TlsFiles, WebConfig};
 use tread_server::{Config, RunningServer, Server};
 
 use crate::terminal::{PATIENCE, Terminal, eventually};
@@ -40,6 +40,7 @@ impl Yard {
             site: "yard".parse().unwrap(),
             friction: FrictionConfig::default(),
             retention: RetentionConfig::default(),
+            storage: StorageConfig::default(),
             normalisations: Vec::new(),
             tls: Some(TlsFiles {
                 certificate: at("cert.pem"),

@@ -1,7 +1,8 @@
 //! Alerts: what robots say needs a person's attention, kept with its history.
 //!
 //! A robot says all its alerts in each state; the difference to what is raised here raises and
-//! clears. A robot that is not heard clears nothing.
+//! clears. A robot that is not heard clears nothing. Alerts about the server itself are those of
+//! [`super::storage`].
 
 use jiff::Timestamp;
 use tread_api::ids::{AlertCode, AlertId};
@@ -20,12 +21,18 @@ impl App {
     pub async fn alerts(&self, filter: &AlertFilter, limit: u32) -> Result<Page<Alert>, AppError> {
         let mut tx = self.db().read().await?;
         check_named(&mut tx, filter.site.as_ref(), filter.robot.as_ref()).await?;
-        let alerts = db::alerts::list(&mut tx, filter, limit + 1).await?;
+        let mut alerts = self.storage().alerts(filter);
+        alerts.extend(db::alerts::list(&mut tx, filter, limit + 1).await?);
+        alerts.sort_by_key(|alert| std::cmp::Reverse(alert.id));
         Ok(page(alerts, limit, |alert: &Alert| alert.id.to_string()))
     }
 
     /// Notes that a person has seen an alert.
     pub async fn acknowledge_alert(&self, id: AlertId) -> Result<Alert, AppError> {
+        if let Some(alert) = self.storage().acknowledge(id, self.clock().now()) {
+            self.hub().alert(&alert);
+            return Ok(alert);
+        }
         let mut tx = self.db().write().await?;
         db::alerts::acknowledge(&mut tx, id, self.clock().now()).await?;
         let found = db::alerts::find(&mut tx, id).await?;

@@ -6,6 +6,7 @@ use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 
 use super::App;
+use crate::db;
 
 /// Time between two looks at the log.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
@@ -13,8 +14,8 @@ const LOOK_EVERY: Duration = Duration::from_millis(250);
 /// Brings the log in now and then until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
     while !stop.is_cancelled() {
-        if let Err(cause) = app.db().checkpoint().await {
-            tracing::warn!("cannot bring the database's log into its file: {cause:?}");
+        if let Err(cause) = db::limited(app.db().checkpoint()).await {
+            app.log_failure("bring the database's log into its file", &cause);
         }
         tokio::select! {
             () = stop.cancelled() => {}

@@ -17,7 +17,7 @@ use serde_json::value::RawValue;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, timeout_at};
 use tokio_util::sync::CancellationToken;
-use tracing::{error, warn};
+use tracing::warn;
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::site::Grid;
 use tread_api::wire::ingest::{
@@ -151,7 +151,7 @@ impl Writer {
         let outcomes = match self.commit(&group).await {
             Ok(outcomes) => outcomes,
             Err(cause) => {
-                error!("cannot store a group of {} batches: {cause:?}", group.len());
+                self.app.log_failure("store a group of batches", &cause);
                 let mut outcomes = Vec::with_capacity(group.len());
                 for upload in &group {
                     let alone = self.commit(std::slice::from_ref(upload)).await;
@@ -186,7 +186,7 @@ impl Writer {
 
     async fn commit(&mut self, group: &[Upload]) -> Result<Vec<Outcome>, DbError> {
         self.keys.bound();
-        let result = self.commit_once(group).await;
+        let result = db::limited(self.commit_once(group)).await;
         if result.is_err() {
             // Keys of a transaction that was rolled back name nothing.
             self.keys.forget();

@@ -38,8 +38,8 @@ pub async fn run(app: App, stop: CancellationToken) {
 }
 
 async fn merge_all(app: &App, stop: &CancellationToken) -> Result<(), AppError> {
-    app.move_horizons().await?;
-    while !stop.is_cancelled() && app.merge_some(ROWS_MERGED_MAX).await? {}
+    db::limited(app.move_horizons()).await?;
+    while !stop.is_cancelled() && db::limited(app.merge_some(ROWS_MERGED_MAX)).await? {}
     Ok(())
 }
 

@@ -21,6 +21,7 @@ pub mod robots;
 pub mod segments;
 pub mod sites;
 pub mod stops;
+pub mod storage;
 pub mod teleop;
 pub mod terrains;
 pub mod withdrawals;
@@ -40,8 +41,10 @@ use self::identity::Identity;
 use self::map::Maps;
 use self::missions::idempotency::InFlight;
 use self::retention::Removed;
+use self::stops::Unrecorded;
+use self::storage::Storage;
 use crate::clock::Clock;
-use crate::config::FrictionConfig;
+use crate::config::{FrictionConfig, StorageConfig};
 use crate::counters::Counters;
 use crate::db::sites::SiteRow;
 use crate::db::{self, Db, Tx};
@@ -89,6 +92,8 @@ struct Inner {
     views: Views,
     news: MapNews,
     removed: Removed,
+    storage: Storage,
+    unrecorded: Unrecorded,
     drive_slots: Arc<Semaphore>,
 }
 
@@ -108,7 +113,7 @@ pub struct Links {
 
 impl App {
     /// The server's use cases on this database and clock.
-    pub fn new(db: Db, clock: Clock, friction: FrictionConfig) -> Self {
+    pub fn new(db: Db, clock: Clock, friction: FrictionConfig, storage: StorageConfig) -> Self {
         let started_at = clock.elapsed();
         let hub = Hub::new(clock.now());
         let inner = Inner {
@@ -138,6 +143,8 @@ impl App {
             views: Views::default(),
             news: MapNews::default(),
             removed: Removed::default(),
+            storage: Storage::new(storage),
+            unrecorded: Unrecorded::default(),
             drive_slots: Arc::new(Semaphore::new(teleop::SESSIONS_MAX)),
         };
         Self {
@@ -274,6 +281,14 @@ impl App {
         &self.inner.removed
     }
 
+    fn storage(&self) -> &Storage {
+        &self.inner.storage
+    }
+
+    fn unrecorded(&self) -> &Unrecorded {
+        &self.inner.unrecorded
+    }
+
     fn robots_changed(&self) {
         self.inner.robots_generation.fetch_add(1, Ordering::Relaxed);
     }
@@ -288,16 +303,6 @@ impl App {
 
     fn friction_config(&self) -> &FrictionConfig {
         &self.inner.friction
-    }
-
-    /// Whether the database answers.
-    ///
-    /// # Errors
-    /// [`AppError::Storage`] if not.
-    pub async fn ready(&self) -> Result<(), AppError> {
-        let mut tx = self.db().read().await?;
-        db::sites::list(&mut tx, "", 1).await?;
-        Ok(())
     }
 }
 

@@ -61,7 +61,7 @@ async fn remove_all(
 ) -> Result<(), AppError> {
     let mut removed = 0;
     while !stop.is_cancelled() {
-        let some = app.remove_some(config, REMOVED_MAX).await?;
+        let some = db::limited(app.remove_some(config, REMOVED_MAX)).await?;
         removed += some;
         if some == 0 {
             break;

@@ -127,7 +127,13 @@ impl App {
     pub async fn hello(&self, site: &SiteId, hello: &Hello) -> Result<Welcome, Refusal> {
         check_model(hello).map_err(|detail| refusal(RefusalCode::Malformed, detail))?;
         let welcome = self.introduce(site, hello).await.map_err(|error| {
-            tracing::error!("cannot write down robot `{}`: {error:?}", hello.robot);
+            self.log_failure("write down a robot's introduction", &error);
+            // Its states count all the same, if it is known; it introduces itself again.
+            let key = (site.clone(), hello.robot.clone());
+            if matches!(&error, AppError::Storage(_)) && self.presences().is_known(&key) {
+                self.presences()
+                    .hello(key, hello.boot, self.clock().elapsed());
+            }
             refusal(RefusalCode::Busy, "the server cannot write now".to_owned())
         })?;
         let unknown = || {

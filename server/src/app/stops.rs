@@ -13,6 +13,7 @@
 //! hand or in its queue is held, and goes on only when a person says so.
 
 mod delivery;
+mod unrecorded;
 
 use std::collections::HashSet;
 use std::time::Duration;
@@ -30,6 +31,7 @@ use tread_api::wire::safety::ClearStop;
 
 use self::delivery::{Outgoing, Settling};
 pub(super) use self::delivery::{Told, tell};
+pub(super) use self::unrecorded::Unrecorded;
 use super::missions::control::hold_all;
 use super::{App, AppError, page, site_row};
 use crate::db::stops::StopFilter;
@@ -145,6 +147,7 @@ impl App {
             error!("a stop was asked for before the network was open");
             return stops;
         };
+        self.unrecorded().extend(&stops);
         let (tell, confirmations) = mpsc::channel(stops.len().max(1));
         let (recorded, is_recorded) = watch::channel(false);
         for stop in &stops {
@@ -233,7 +236,13 @@ impl App {
     /// Stops, newest first.
     pub async fn stops(&self, filter: &StopFilter, limit: u32) -> Result<Page<Stop>, AppError> {
         let mut tx = self.db().read().await?;
-        let stops = db::stops::list(&mut tx, filter, limit + 1).await?;
+        // Looked at first: one that is written down meanwhile is in both.
+        let mut stops = self.unrecorded().list(filter);
+        for stop in db::stops::list(&mut tx, filter, limit + 1).await? {
+            stops.retain(|unrecorded| unrecorded.id != stop.id);
+            stops.push(stop);
+        }
+        stops.sort_by_key(|stop| std::cmp::Reverse(stop.id));
         let shown = stops.into_iter().map(|stop| self.with_confirmation(stop));
         Ok(page(shown.collect(), limit, |stop: &Stop| {
             stop.id.to_string()

@@ -26,8 +26,8 @@ impl TryFrom<Raw> for Alert {
         let severity = Severity::from_name(&raw.severity);
         Ok(Self {
             id: parse("alert", &raw.id)?,
-            site: parse("site", &raw.site)?,
-            robot: parse("robot", &raw.robot)?,
+            site: Some(parse("site", &raw.site)?),
+            robot: Some(parse("robot", &raw.robot)?),
             code: parse("alert code", &raw.code)?,
             severity: severity.ok_or_else(|| corrupt("severity", &raw.severity))?,
             text: raw.text,

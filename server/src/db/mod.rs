@@ -7,11 +7,14 @@
 pub mod alerts;
 pub mod aside;
 pub mod audit;
+mod connections;
 pub mod enrolments;
+pub mod failure;
 pub mod geofences;
 pub mod history;
 pub mod idempotency;
 pub mod join_tokens;
+pub mod lock;
 pub mod missions;
 pub mod removed;
 pub mod robots;
@@ -35,32 +38,38 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use jiff::Timestamp;
+use nix::sys::statvfs::statvfs;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
-use sqlx::{Sqlite, SqliteConnection, SqlitePool, Transaction};
+use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqliteSynchronous};
+use sqlx::{AssertSqlSafe, SqliteConnection};
 use tokio::time::Instant;
 
+use self::connections::{Connections, Lent};
+use self::failure::StorageFailure;
 use crate::metrics::{Histogram, Transactions};
 
 /// Oldest SQLite that is free of the bug that can lose a WAL.
 pub const SQLITE_VERSION_MIN: (u32, u32, u32) = (3, 51, 3);
 /// Connections that read at the same time.
 const READERS_MAX: u32 = 4;
-/// How long a request waits for a connection.
-const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Pages of the write-ahead log, 64 MiB in all, at which a commit also brings them into the file,
 /// if [`Db::checkpoint`] has not done so.
 const WAL_PAGES: u32 = 16_384;
 /// Memory for the writer's pages, KiB: what robots drive over now is read once.
 const WRITER_CACHE_KIB: u32 = 32 * 1_024;
+/// How long work in the background may take. It is far longer than any takes, but the library never
+/// answers a statement that is sent while its thread ends without memory.
+const WORK_MAX: Duration = Duration::from_secs(30);
+/// How long the operating system may take to tell how much of a disk is free.
+const DISK_TIMEOUT: Duration = Duration::from_secs(2);
 /// How long SQLite waits for a lock that another process holds.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A transaction on the database, rolled back unless it is committed.
 #[derive(Debug)]
 pub struct Tx {
-    inner: Transaction<'static, Sqlite>,
+    inner: Lent,
     noted: Noted,
     /// What its commit counts up.
     generation: Option<Arc<AtomicU64>>,
@@ -96,7 +105,7 @@ impl Tx {
         let Some(generation) = generation else {
             let committed = inner.commit().await;
             drop(noted);
-            return committed;
+            return committed.inspect_err(failure::note);
         };
         #[expect(
             clippy::disallowed_methods,
@@ -108,7 +117,10 @@ impl Tx {
             drop(noted);
             committed
         });
-        committing.await.unwrap_or(Err(sqlx::Error::WorkerCrashed))
+        committing
+            .await
+            .unwrap_or(Err(sqlx::Error::WorkerCrashed))
+            .inspect_err(failure::note)
     }
 }
 
@@ -131,7 +143,7 @@ impl DerefMut for Tx {
 pub enum DbError {
     /// SQLite or its pool failed.
     #[error("the database failed")]
-    Sqlite(#[from] sqlx::Error),
+    Sqlite(#[source] sqlx::Error),
     /// A stored value does not read back.
     #[error("the database holds a {what} that does not read back: `{value}`")]
     Corrupt {
@@ -145,7 +157,22 @@ pub enum DbError {
     DoesNotFit(&'static str),
 }
 
+impl From<sqlx::Error> for DbError {
+    fn from(error: sqlx::Error) -> Self {
+        failure::note(&error);
+        Self::Sqlite(error)
+    }
+}
+
 impl DbError {
+    /// What failed, unless it is the statement or what is stored.
+    pub fn failure(&self) -> Option<StorageFailure> {
+        match self {
+            Self::Sqlite(error) => StorageFailure::of(error),
+            Self::Corrupt { .. } | Self::DoesNotFit(_) => None,
+        }
+    }
+
     /// Whether a rule of uniqueness refused the write.
     pub fn is_unique_violation(&self) -> bool {
         match self {
@@ -187,10 +214,11 @@ pub enum OpenError {
 /// The open database; clones are handles to the same.
 #[derive(Debug, Clone)]
 pub struct Db {
-    writer: SqlitePool,
-    readers: SqlitePool,
+    writer: Connections,
+    readers: Connections,
+    path: PathBuf,
     /// Brings the log into the file beside the writer.
-    checkpoints: SqlitePool,
+    checkpoints: Connections,
     version: String,
     write_waits: Arc<Histogram>,
     transactions: Arc<Transactions>,
@@ -221,48 +249,41 @@ impl Db {
             .foreign_keys(true)
             .busy_timeout(BUSY_TIMEOUT)
             .pragma("wal_autocheckpoint", WAL_PAGES.to_string());
-        let pool = |connections_max| {
-            SqlitePoolOptions::new()
-                .max_connections(connections_max)
-                .acquire_timeout(ACQUIRE_TIMEOUT)
-                .idle_timeout(None)
-                .max_lifetime(None)
-                // It is looked at when it comes back, and nothing but this process can end it.
-                .test_before_acquire(false)
-        };
-        let writer = pool(1)
-            .connect_with(
-                options
-                    .clone()
-                    .pragma("cache_size", format!("-{WRITER_CACHE_KIB}")),
-            )
+        let cache = format!("-{WRITER_CACHE_KIB}");
+        let of_writer = options.clone().pragma("cache_size", cache);
+        let writer = Connections::open(of_writer, 1).await.map_err(failed)?;
+        let version = writer
+            .with_first(async |connection| {
+                sqlx::query_scalar!(r#"SELECT sqlite_version() AS "version!: String""#)
+                    .fetch_one(connection)
+                    .await
+            })
             .await
-            .map_err(failed)?;
-        let version = sqlx::query_scalar!(r#"SELECT sqlite_version() AS "version!: String""#)
-            .fetch_one(&writer)
-            .await
+            .flatten()
             .map_err(failed)?;
         if !is_new_enough(&version) {
             return Err(OpenError::TooOld(version));
         }
-        sqlx::migrate!("../migrations")
-            .run(&writer)
+        writer
+            .with_first(async |connection| sqlx::migrate!("../migrations").run(connection).await)
             .await
+            .map_err(failed)?
             .map_err(|cause| OpenError::Migrate {
                 path: path.to_owned(),
                 cause,
             })?;
-        let checkpoints = pool(1)
-            .connect_with(options.clone())
+        // It has no transactions that could be left open, and is never replaced: while one
+        // connection is open the log's index exists, which a full disk has no room for.
+        let checkpoints = Connections::open(options.clone(), 1)
             .await
             .map_err(failed)?;
-        let readers = pool(READERS_MAX)
-            .connect_with(options.read_only(true))
+        let readers = Connections::open(options.read_only(true), READERS_MAX)
             .await
             .map_err(failed)?;
         Ok(Self {
             writer,
             readers,
+            path: path.to_owned(),
             checkpoints,
             version,
             write_waits: Arc::default(),
@@ -291,7 +312,7 @@ impl Db {
         let begun = Location::caller();
         async move {
             let asked_at = Instant::now();
-            let inner = self.writer.begin_with("BEGIN IMMEDIATE").await?;
+            let inner = self.writer.begin("BEGIN IMMEDIATE").await?;
             self.write_waits.note(asked_at.elapsed());
             let tx = self.timed(inner, begun, true);
             Ok(Tx {
@@ -317,12 +338,7 @@ impl Db {
         }
     }
 
-    fn timed(
-        &self,
-        inner: Transaction<'static, Sqlite>,
-        begun: &'static Location<'static>,
-        writes: bool,
-    ) -> Tx {
+    fn timed(&self, inner: Lent, begun: &'static Location<'static>, writes: bool) -> Tx {
         let noted = Noted {
             transactions: Arc::clone(&self.transactions),
             begun,
@@ -354,7 +370,7 @@ impl Db {
     pub fn read(&self) -> impl Future<Output = Result<Tx, DbError>> + use<'_> {
         let begun = Location::caller();
         async move {
-            let inner = self.readers.begin().await?;
+            let inner = self.readers.begin("BEGIN").await?;
             Ok(self.timed(inner, begun, false))
         }
     }
@@ -365,10 +381,64 @@ impl Db {
     /// # Errors
     /// SQLite failed, as on a full disk; the log has it all the same.
     pub async fn checkpoint(&self) -> Result<(), DbError> {
-        sqlx::query("PRAGMA wal_checkpoint(PASSIVE)")
-            .execute(&self.checkpoints)
+        let checkpoint = self.checkpoints.run("PRAGMA wal_checkpoint(PASSIVE)");
+        Ok(checkpoint.await?)
+    }
+
+    /// Writes something that says nothing, as durably as everything else.
+    ///
+    /// # Errors
+    /// The database cannot be written.
+    pub async fn probe_write(&self) -> Result<(), DbError> {
+        let mut tx = self.write_uploads().await?;
+        // A number in the file's header that nobody else uses; the page is written each time.
+        sqlx::query("PRAGMA user_version = 1")
+            .execute(&mut *tx)
             .await?;
+        Ok(tx.commit().await?)
+    }
+
+    /// Reads from every table: a damaged root page, or a lost one, is found.
+    ///
+    /// # Errors
+    /// A table cannot be read.
+    pub async fn probe_tables(&self) -> Result<(), DbError> {
+        let mut tx = self.read().await?;
+        let tables: Vec<(String,)> =
+            sqlx::query_as("SELECT name FROM sqlite_schema WHERE type = 'table'")
+                .fetch_all(&mut *tx)
+                .await?;
+        for (table,) in tables {
+            let look = AssertSqlSafe(format!("SELECT 1 FROM \"{table}\" LIMIT 1"));
+            sqlx::query(look).fetch_optional(&mut *tx).await?;
+        }
         Ok(())
+    }
+
+    /// Checks the structure of the whole file; what is wrong, if anything is. Takes its time.
+    ///
+    /// # Errors
+    /// The database cannot be read.
+    pub async fn quick_check(&self) -> Result<Option<String>, DbError> {
+        let mut tx = self.read().await?;
+        let (finding,): (String,) = sqlx::query_as("PRAGMA quick_check(1)")
+            .fetch_one(&mut *tx)
+            .await?;
+        Ok((finding != "ok").then_some(finding))
+    }
+
+    /// Free bytes on the disk of the file, if the operating system tells.
+    pub async fn disk_free_bytes(&self) -> Option<u64> {
+        let path = self.path.clone();
+        // It may wait for a disk that hangs.
+        let asked = tokio::task::spawn_blocking(move || statvfs(&path));
+        let found = tokio::time::timeout(DISK_TIMEOUT, asked).await.ok()?;
+        let found = found.ok()?.ok()?;
+        Some(
+            found
+                .blocks_available()
+                .saturating_mul(found.fragment_size()),
+        )
     }
 
     /// Closes all connections after what they are doing; the file is whole then.
@@ -377,6 +447,18 @@ impl Db {
         self.checkpoints.close().await;
         self.writer.close().await;
     }
+}
+
+/// Ends work on the database that takes too long, for whatever has no limit of its own.
+///
+/// # Errors
+/// As the work; [`sqlx::Error::WorkerCrashed`] after [`WORK_MAX`].
+pub async fn limited<T, E: From<sqlx::Error>>(
+    work: impl Future<Output = Result<T, E>>,
+) -> Result<T, E> {
+    tokio::time::timeout(WORK_MAX, work)
+        .await
+        .unwrap_or_else(|_elapsed| Err(sqlx::Error::WorkerCrashed.into()))
 }
 
 fn is_new_enough(version: &str) -> bool {
@@ -419,6 +501,7 @@ fn unsigned<T: TryFrom<i64>>(what: &'static str, value: i64) -> Result<T, DbErro
 
 #[cfg(test)]
 mod tests {
+    use super::connections::ACQUIRE_TIMEOUT;
     use super::*;
 
     #[test]

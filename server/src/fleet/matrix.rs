@@ -28,7 +28,7 @@ use crate::app::App;
 use crate::app::enrolment::Office;
 use crate::authority::{Authority, RobotName, RobotRequest};
 use crate::clock::Clock;
-use crate::config::FrictionConfig;
+use crate::config::{FrictionConfig, StorageConfig};
 use crate::db::Db;
 use crate::supervisor::Supervisor;
 
@@ -105,7 +105,12 @@ impl Rig {
         let folder = tempfile::tempdir().unwrap();
         let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
         let clock = Clock::system();
-        let app = App::new(db, clock.clone(), FrictionConfig::default());
+        let app = App::new(
+            db,
+            clock.clone(),
+            FrictionConfig::default(),
+            StorageConfig::default(),
+        );
         app.ensure_site(&site()).await.unwrap();
         let authority = Arc::new(Authority::generate("fleet", clock.now()).unwrap());
         let security = Security {

@@ -128,7 +128,7 @@ mod tests {
     use super::*;
     use crate::app::App;
     use crate::clock::Clock;
-    use crate::config::FrictionConfig;
+    use crate::config::{FrictionConfig, StorageConfig};
     use crate::db::Db;
 
     const PATIENCE: Duration = Duration::from_secs(30);
@@ -137,7 +137,12 @@ mod tests {
     async fn a_router_that_no_longer_answers_is_opened_again_and_takes_robots() {
         let folder = tempfile::tempdir().unwrap();
         let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
-        let app = App::new(db, Clock::system(), FrictionConfig::default());
+        let app = App::new(
+            db,
+            Clock::system(),
+            FrictionConfig::default(),
+            StorageConfig::default(),
+        );
         let supervisor = Supervisor::new();
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
         let opening = Fleet::open(address, None, Clock::system(), supervisor.clone());

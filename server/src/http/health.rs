@@ -8,6 +8,7 @@ use utoipa::ToSchema;
 use super::extract::Json;
 use super::problem::Problem;
 use crate::app::App;
+use crate::app::storage::StorageCondition;
 use crate::counters::CounterValues;
 
 /// The server is there.
@@ -15,6 +16,33 @@ use crate::counters::CounterValues;
 pub struct Health {
     /// Always `ok`.
     pub status: String,
+}
+
+/// The storage as it was checked last, at most a few seconds ago.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct StorageStatus {
+    /// Whether everything works.
+    pub ok: bool,
+    /// Why nothing can be stored, if that is so.
+    pub unwritable: Option<String>,
+    /// What is damaged, if anything is.
+    pub damaged: Option<String>,
+    /// Free bytes on the disk of the database; null if the operating system does not tell.
+    pub disk_free_bytes: Option<u64>,
+    /// Whether that is below `storage.disk_free_min_mib`.
+    pub disk_low: bool,
+}
+
+impl From<StorageCondition> for StorageStatus {
+    fn from(condition: StorageCondition) -> Self {
+        Self {
+            ok: condition.problem().is_none(),
+            unwritable: condition.unwritable,
+            damaged: condition.damaged,
+            disk_free_bytes: condition.disk_free_bytes,
+            disk_low: condition.is_disk_low,
+        }
+    }
 }
 
 /// The server about itself.
@@ -26,6 +54,8 @@ pub struct ServerStatus {
     pub uptime_ms: u64,
     /// Version of the SQLite library.
     pub sqlite_version: String,
+    /// The storage as it was checked last.
+    pub storage: StorageStatus,
     /// Robots that are on the network now.
     pub robots_present: usize,
     /// What it has counted since the start.
@@ -44,16 +74,16 @@ pub(super) async fn healthz() -> Json<Health> {
     ok()
 }
 
-/// Whether the server can work: the database answers.
+/// Whether the server can work: the database takes a write, and no damage of it is known. The answer
+/// may be a second old.
 #[utoipa::path(get, path = "/readyz", tag = "server",
     responses((status = 200, body = Health), (status = 503, body = ProblemBody)))]
 pub(super) async fn readyz(State(app): State<App>) -> Result<Json<Health>, Problem> {
-    let unready = |error| {
-        tracing::warn!("not ready: {error:?}");
-        Problem::new(ProblemType::Unavailable).detail("the database does not answer")
-    };
-    app.ready().await.map_err(unready)?;
-    Ok(ok())
+    let condition = app.ready().await;
+    match condition.problem() {
+        Some(problem) => Err(Problem::new(ProblemType::Unavailable).detail(problem)),
+        None => Ok(ok()),
+    }
 }
 
 /// Version, uptime and counters.
@@ -65,6 +95,7 @@ pub(super) async fn status(State(app): State<App>) -> Json<ServerStatus> {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         uptime_ms: u64::try_from(app.uptime().as_millis()).unwrap_or(u64::MAX),
         sqlite_version: app.db().sqlite_version().to_owned(),
+        storage: app.storage_condition().into(),
         robots_present: app.presences().present_count(),
         counters: app.counters().values(),
     })

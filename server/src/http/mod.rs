@@ -234,7 +234,7 @@ pub fn metrics_router(app: App) -> Router {
 }
 
 async fn metrics(State(app): State<App>) -> Result<Response, Problem> {
-    let text = app.metrics().await?;
+    let text = app.metrics().await;
     let media_type = "text/plain; version=0.0.4";
     Ok(([(axum::http::header::CONTENT_TYPE, media_type)], text).into_response())
 }

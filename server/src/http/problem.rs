@@ -7,6 +7,10 @@ use tracing::error;
 use tread_api::problem::{PROBLEM_MEDIA_TYPE, ProblemBody, ProblemType};
 
 use crate::app::AppError;
+use crate::db::DbError;
+
+/// When a client should ask again after the server could not do its work, seconds.
+const RETRY_AFTER_S: u32 = 5;
 
 /// An error answer on its way out.
 #[derive(Debug, Clone, PartialEq)]
@@ -31,6 +35,19 @@ impl Problem {
             place: None,
         });
         Self { body }
+    }
+
+    /// The database did not do it. The cause is for the log alone, and is logged here once.
+    pub(super) fn storage(cause: &DbError) -> Self {
+        error!("a request failed: {cause:?}");
+        match cause.failure() {
+            Some(failure) => Self::new(ProblemType::Unavailable).detail(format!(
+                "{}; ask again later, with the same idempotency key if there is one",
+                failure.explanation()
+            )),
+            None => Self::new(ProblemType::Internal)
+                .detail("the cause is in the server's log, under the id of this request"),
+        }
     }
 
     /// Says what is wrong here, for people.
@@ -130,12 +147,7 @@ impl From<AppError> for Problem {
                 error!("a request failed: {app_error}");
                 ProblemType::Internal
             }
-            AppError::Storage(cause) => {
-                // The cause is for the log alone, and is logged here once.
-                error!("a request failed: {cause:?}");
-                return Self::new(ProblemType::Internal)
-                    .detail("the cause is in the server's log, under the id of this request");
-            }
+            AppError::Storage(cause) => return Self::storage(cause),
         };
         let mut problem = Self::new(kind).detail(app_error.to_string());
         problem.body.state = app_error.state();
@@ -157,6 +169,10 @@ impl IntoResponse for Problem {
         response
             .headers_mut()
             .insert(header::CONTENT_TYPE, media_type);
+        if self.body.kind == ProblemType::Unavailable {
+            let seconds = HeaderValue::from(RETRY_AFTER_S);
+            response.headers_mut().insert(header::RETRY_AFTER, seconds);
+        }
         response.extensions_mut().insert(Refused(self.body.kind));
         response
     }

@@ -22,7 +22,7 @@ use tread_api::wire::{self, Refusal};
 use tread_server::app::identity::FirstAdmin;
 use tread_server::authority::Authority;
 use tread_server::clock::Clock;
-use tread_server::config::{FrictionConfig, RobotsConfig, TlsFiles, WebConfig};
+use tread_server::config::{FrictionConfig, RobotsConfig, StorageConfig, TlsFiles, WebConfig};
 use tread_server::counters::CounterValues;
 use tread_server::{Config, RunningServer, Server};
 use zenoh::Wait as _;
@@ -94,6 +94,14 @@ impl Yard {
     /// A server whose clock stands until it is moved.
     pub(crate) async fn start_at(wall: Timestamp) -> Self {
         Self::start_with(wall, |_config| {}).await
+    }
+
+    /// A server on a clock that the test moves.
+    pub(crate) async fn start_on(clock: Clock) -> Self {
+        let folder = Arc::new(tempfile::tempdir().unwrap());
+        let config = config(folder.path(), "127.0.0.1:0");
+        let server = Server::start_with_clock(config, clock);
+        Self::of(folder, server.await.unwrap()).await
     }
 
     /// The same, with a configuration of one's own.
@@ -238,7 +246,7 @@ impl Yard {
     }
 }
 
-fn config(folder: &Path, zenoh: &str) -> Config {
+pub(crate) fn config(folder: &Path, zenoh: &str) -> Config {
     Config {
         http: "127.0.0.1:0".parse().unwrap(),
         metrics: Some("127.0.0.1:0".parse().unwrap()),
@@ -248,6 +256,7 @@ fn config(folder: &Path, zenoh: &str) -> Config {
         friction: FrictionConfig::default(),
         normalisations: Vec::new(),
         retention: tread_server::config::RetentionConfig::default(),
+        storage: StorageConfig::default(),
         tls: None,
         robots: None,
         web: WebConfig {

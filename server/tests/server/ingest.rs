@@ -13,7 +13,7 @@ use tread_api::wire::ingest::{Batch, Receipt, Record};
 use tread_server::app::App;
 use tread_server::app::ingest::{self, UPLOADS_WAITING_MAX, Upload};
 use tread_server::clock::Clock;
-use tread_server::config::FrictionConfig;
+use tread_server::config::{FrictionConfig, StorageConfig};
 use tread_server::db::sums::SumRow;
 use tread_server::db::{self, Db};
 use tread_server::supervisor::Supervisor;
@@ -39,7 +39,12 @@ impl Writer {
         let folder = tempfile::tempdir().unwrap();
         let db = Db::open(&database(folder.path())).await.unwrap();
         let clock = Clock::manual(time("2026-11-01T00:00:00Z"));
-        let app = App::new(db, clock, FrictionConfig::default());
+        let app = App::new(
+            db,
+            clock,
+            FrictionConfig::default(),
+            StorageConfig::default(),
+        );
         app.ensure_site(&site()).await.unwrap();
         for robot in ["rover-1", "rover-2"] {
             let hello = Hello {

@@ -53,3 +53,5 @@ mod robots;
 mod slow_client;
 #[cfg(test)]
 mod stops;
+#[cfg(test)]
+mod storage;

@@ -13,7 +13,7 @@ use tread_api::wire::ingest::{Batch, Receipt, Record};
 use tread_server::app::App;
 use tread_server::app::friction::{Area, Asked, CellsAsked};
 use tread_server::app::ingest::Upload;
-use tread_server::config::FrictionConfig;
+use tread_server::config::{FrictionConfig, StorageConfig};
 
 use crate::harness::{Yard, measured, segment, site, time};
 use crate::ingest::{Writer, boot};
@@ -241,7 +241,12 @@ async fn a_robot_that_is_withdrawn_leaves_the_map_as_if_it_had_never_come() {
 /// What a server has in memory that starts now on the same database.
 pub(crate) async fn restarted(app: &App) -> App {
     let config = FrictionConfig::default();
-    let restarted = App::new(app.db().clone(), app.clock().clone(), config);
+    let restarted = App::new(
+        app.db().clone(),
+        app.clock().clone(),
+        config,
+        StorageConfig::default(),
+    );
     restarted.load_map().await.unwrap();
     restarted
 }
@@ -284,6 +289,7 @@ async fn old_hours_are_merged_into_days_and_a_kill_on_the_way_changes_nothing_th
             app.db().clone(),
             app.clock().clone(),
             FrictionConfig::default(),
+            StorageConfig::default(),
         );
         restarted.load_map().await.unwrap();
         assert_eq!(said(&restarted).await, expected, "after {rounds} rounds");

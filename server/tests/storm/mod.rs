@@ -32,7 +32,7 @@ use tread_server::app::ingest::{Upload, Writer};
 use tread_server::app::reconciler::Reconciler;
 use tread_server::app::{App, AppError};
 use tread_server::clock::Clock;
-use tread_server::config::FrictionConfig;
+use tread_server::config::{FrictionConfig, StorageConfig};
 use tread_server::db::Db;
 use tread_server::fleet::commands::Commands;
 use tread_server::supervisor::Supervisor;
@@ -66,7 +66,12 @@ struct Storm {
 
 async fn app_on(path: &std::path::Path, clock: &Clock, site: &SiteId) -> App {
     let db = Db::open(path).await.expect("the database opens");
-    let app = App::new(db, clock.clone(), FrictionConfig::default());
+    let app = App::new(
+        db,
+        clock.clone(),
+        FrictionConfig::default(),
+        StorageConfig::default(),
+    );
     app.ensure_site(site).await.expect("the site is made");
     app
 }

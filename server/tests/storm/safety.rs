@@ -69,7 +69,9 @@ impl Storm {
             let is_confirmed = found
                 .as_ref()
                 .is_some_and(|found| found.confirmed_at.is_some());
-            let is_told = alerts.iter().any(|alert| alert.robot == stop.robot);
+            let is_told = alerts
+                .iter()
+                .any(|alert| alert.robot.as_ref() == Some(&stop.robot));
             if is_confirmed || (found.is_some() && is_told) {
                 return Ok(());
             }

@@ -151,7 +151,7 @@ async fn learn(
         false_alarms: surface_alerts(world)
             .await
             .into_iter()
-            .map(|alert| format!("{}: {}", alert.robot, alert.text))
+            .map(|alert| format!("{}: {}", alert.about(), alert.text))
             .collect(),
         ice: Vec::new(),
         frozen: MapFigures::default(),
@@ -260,9 +260,9 @@ async fn freeze(
                 cells: 0,
                 shown: 0,
                 disputed: 0,
-                alert: alerts
-                    .iter()
-                    .any(|alert| alert.robot == entry.robot && alert.raised_at >= frozen_at),
+                alert: alerts.iter().any(|alert| {
+                    alert.robot.as_ref() == Some(&entry.robot) && alert.raised_at >= frozen_at
+                }),
             };
             for cell in of_pass {
                 pass.cells += 1;

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use tread_api::event::Event;
-use tread_api::ids::{MissionId, RobotId};
+use tread_api::ids::{AlertId, MissionId, RobotId};
 use tread_api::mission::{Mission, MissionState};
 use tread_api::robot::{Alert, LinkState, Robot};
 
@@ -15,6 +15,8 @@ const MISSIONS_KEPT: usize = 1_000;
 pub(super) struct Known {
     robots: BTreeMap<RobotId, Robot>,
     missions: BTreeMap<MissionId, Mission>,
+    /// Those about the server itself that stand.
+    server_alerts: BTreeMap<AlertId, Alert>,
     is_whole: bool,
 }
 
@@ -42,6 +44,13 @@ impl Known {
                 self.missions.insert(mission.id, *mission);
                 if self.missions.len() > MISSIONS_KEPT {
                     self.missions.pop_first();
+                }
+            }
+            Event::Alert(alert) if alert.robot.is_none() => {
+                if alert.cleared_at.is_some() {
+                    self.server_alerts.remove(&alert.id);
+                } else {
+                    self.server_alerts.insert(alert.id, *alert);
                 }
             }
             // A robot's alerts come with the robot, its steps with the mission.
@@ -89,7 +98,8 @@ impl Known {
 
     /// Alerts that stand: those that nobody has seen first, then the newest.
     pub(super) fn alerts(&self) -> Vec<&Alert> {
-        let mut alerts: Vec<&Alert> = self.robots().flat_map(|robot| &robot.alerts).collect();
+        let of_robots = self.robots().flat_map(|robot| &robot.alerts);
+        let mut alerts: Vec<&Alert> = self.server_alerts.values().chain(of_robots).collect();
         alerts.sort_by_key(|alert| {
             let newest = std::cmp::Reverse(alert.raised_at);
             (alert.acknowledged_at.is_some(), newest)

@@ -44,7 +44,7 @@ impl Lines {
                 };
                 (
                     format!("alert    {}", alert.id),
-                    format!("{} {how}: {}", alert.robot, alert.text),
+                    format!("{} {how}: {}", alert.about(), alert.text),
                 )
             }
             Event::SnapshotBegin

@@ -308,7 +308,7 @@ fn draw_alerts(frame: &mut Frame<'_>, area: Rect, picture: &Picture<'_>) {
             (None, Severity::Warning) => Style::new().fg(Color::Yellow),
         };
         Row::new([
-            alert.robot.to_string(),
+            alert.about().to_owned(),
             alert.severity.as_str().to_owned(),
             format!("{:.0}", alert.raised_at),
             alert.text.clone(),
@@ -321,7 +321,7 @@ fn draw_alerts(frame: &mut Frame<'_>, area: Rect, picture: &Picture<'_>) {
         Constraint::Length(20),
         Constraint::Fill(1),
     ];
-    let header = ["ROBOT", "ALERT", "SINCE", "WHAT"];
+    let header = ["ABOUT", "ALERT", "SINCE", "WHAT"];
     let title = (" alerts ".to_owned(), &header[..]);
     draw_table(frame, area, picture, Section::Alerts, title, rows, widths);
 }

@@ -313,7 +313,7 @@ impl<'client> Screen<'client> {
             }
             Section::Alerts => {
                 let alert = self.shown.alert(&self.known);
-                alert.map(|alert| alert.robot.to_string())
+                alert.and_then(|alert| Some(alert.robot.as_ref()?.to_string()))
             }
         };
         if robot.is_some() {

@@ -4,7 +4,6 @@ use std::collections::{HashMap, HashSet};
 use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
-use tracing::error;
 use tread_api::event::{Event, Topic};
 use tread_api::robot::{Alert, Robot};
 
@@ -30,8 +29,8 @@ pub async fn run(app: App, stop: CancellationToken) {
         rows_of: (0, None),
     };
     loop {
-        if let Err(error) = feed.look().await {
-            error!("cannot read what is new: {error:?}");
+        if let Err(error) = db::limited(feed.look()).await {
+            app.log_failure("read what is new", &error);
         }
         tokio::select! {
             biased;
@@ -43,10 +42,13 @@ pub async fn run(app: App, stop: CancellationToken) {
     app.hub().close();
 }
 
+/// Robots with the alerts that are raised about them.
+type Rows = HashMap<RobotKey, (RobotRow, Vec<Alert>)>;
+
 struct Feed {
     app: App,
     last_step: Option<i64>,
-    rows: HashMap<RobotKey, (RobotRow, Vec<Alert>)>,
+    rows: Rows,
     /// The generation of the rows, and when they were read.
     rows_of: (u64, Option<Duration>),
 }
@@ -54,10 +56,11 @@ struct Feed {
 impl Feed {
     async fn look(&mut self) -> Result<(), AppError> {
         let now = self.app.clock().elapsed();
-        self.steps().await?;
-        self.robots(now).await?;
+        // What robots say of themselves goes on while the database does not.
+        let steps = self.steps().await;
+        let robots = self.robots(now).await;
         self.app.hub().sweep(now);
-        Ok(())
+        steps.and(robots)
     }
 
     async fn steps(&mut self) -> Result<(), AppError> {
@@ -105,19 +108,15 @@ impl Feed {
             .1
             .is_none_or(|read_at| now.saturating_sub(read_at) >= ROWS_PERIOD);
         let mut news: HashSet<RobotKey> = HashSet::new();
+        let mut failed = None;
         if due && self.rows_of.0 != generation {
-            let mut tx = self.app.db().read().await?;
-            let mut rows = HashMap::new();
-            for row in db::robots::all(&mut tx, ROBOTS_MAX).await? {
-                let key = (row.site.clone(), row.id.clone());
-                rows.insert(key, (row, Vec::new()));
-            }
-            for alert in db::alerts::raised(&mut tx, ROBOTS_MAX).await? {
-                let key = (alert.site.clone(), alert.robot.clone());
-                if let Some((_row, alerts)) = rows.get_mut(&key) {
-                    alerts.push(alert);
+            let rows = match self.read_rows().await {
+                Ok(rows) => rows,
+                Err(error) => {
+                    failed = Some(error);
+                    self.rows.clone()
                 }
-            }
+            };
             for (key, (row, alerts)) in &rows {
                 let is_same = |(before, raised): &(RobotRow, Vec<Alert>)| {
                     (&before.name, before.retired_at, raised) == (&row.name, row.retired_at, alerts)
@@ -127,11 +126,17 @@ impl Feed {
                 }
             }
             self.rows = rows;
-            self.rows_of = (generation, Some(now));
+            // After a failure they are read again when they are due.
+            let read = if failed.is_some() {
+                self.rows_of.0
+            } else {
+                generation
+            };
+            self.rows_of = (read, Some(now));
         }
         news.extend(self.app.presences().take_news(now));
         if self.app.hub().client_count() == 0 {
-            return Ok(());
+            return failed.map_or(Ok(()), Err);
         }
         for key in news {
             if let Some((row, alerts)) = self.rows.get(&key) {
@@ -140,6 +145,22 @@ impl Feed {
                 self.app.hub().publish(&event, Topic::Robots, key);
             }
         }
-        Ok(())
+        failed.map_or(Ok(()), Err)
+    }
+
+    async fn read_rows(&self) -> Result<Rows, AppError> {
+        let mut tx = self.app.db().read().await?;
+        let mut rows = Rows::new();
+        for row in db::robots::all(&mut tx, ROBOTS_MAX).await? {
+            let key = (row.site.clone(), row.id.clone());
+            rows.insert(key, (row, Vec::new()));
+        }
+        for alert in db::alerts::raised(&mut tx, ROBOTS_MAX).await? {
+            let row = alert.robot_key().and_then(|key| rows.get_mut(&key));
+            if let Some((_row, alerts)) = row {
+                alerts.push(alert);
+            }
+        }
+        Ok(rows)
     }
 }

@@ -194,17 +194,18 @@ impl Hub {
     }
 
     pub(super) fn publish(&self, event: &Event, topic: Topic, (site, robot): RobotKey) {
-        self.publish_about(event, topic, (site, Some(robot)));
+        self.publish_about(event, topic, Some((site, Some(robot))));
     }
 
-    fn publish_about(&self, event: &Event, topic: Topic, about: About) {
+    /// Publishes what is about a robot, a site, or, without either, the server.
+    fn publish_about(&self, event: &Event, topic: Topic, about: Option<About>) {
         let mut state = self.lock();
         state.seq += 1;
         let seq = state.seq;
         let sent = Arc::new(Sent {
             id: Some(format!("{}-{seq}", self.run)),
             seq,
-            ..unnumbered(event, Some(topic), Some(about))
+            ..unnumbered(event, Some(topic), about)
         });
         state.kept_bytes += sent.text.len();
         state.kept.push_back(Arc::clone(&sent));
@@ -228,14 +229,14 @@ impl Hub {
     pub(in crate::app) fn map(&self, change: &MapChange) {
         let about = (change.site.clone(), None);
         let event = Event::Map(Box::new(change.clone()));
-        self.publish_about(&event, Topic::Map, about);
+        self.publish_about(&event, Topic::Map, Some(about));
     }
 
     /// Publishes an alert as it is now.
     pub(in crate::app) fn alert(&self, alert: &Alert) {
-        let robot = (alert.site.clone(), alert.robot.clone());
+        let about = alert.robot_key().map(|(site, robot)| (site, Some(robot)));
         let event = Event::Alert(Box::new(alert.clone()));
-        self.publish(&event, Topic::Alerts, robot);
+        self.publish_about(&event, Topic::Alerts, about);
     }
 
     /// Drops clients that do not read their snapshot in time, and cuts the connections of those

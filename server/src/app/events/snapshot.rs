@@ -17,6 +17,7 @@ use super::super::{App, AppError};
 use super::ROBOTS_MAX;
 use super::hub::{EventFilter, Sent, unnumbered};
 use crate::db;
+use crate::db::alerts::AlertFilter;
 use crate::db::missions::MissionFilter;
 use crate::fleet::presence::RobotKey;
 
@@ -148,37 +149,47 @@ impl App {
         };
         let covered = self.hub().newest();
         let mut events = vec![unnumbered(&Event::SnapshotBegin, None, None)];
-        let mut add = |event: &Event, topic, (site, robot): RobotKey| {
-            let about = (site, Some(robot));
-            events.push(unnumbered(event, Some(topic), Some(about)));
+        let mut add = |event: &Event, topic, robot: Option<RobotKey>| {
+            let about = robot.map(|(site, robot)| (site, Some(robot)));
+            events.push(unnumbered(event, Some(topic), about));
         };
         let mut tx = self.db().read().await?;
         let alerts = db::alerts::raised(&mut tx, ROBOTS_MAX).await?;
         if filter.wants(Topic::Robots) {
             let mut of_robots: HashMap<RobotKey, Vec<Alert>> = HashMap::new();
             for alert in &alerts {
-                let key = (alert.site.clone(), alert.robot.clone());
-                of_robots.entry(key).or_default().push(alert.clone());
+                if let Some(key) = alert.robot_key() {
+                    of_robots.entry(key).or_default().push(alert.clone());
+                }
             }
             for row in db::robots::all(&mut tx, ROBOTS_MAX).await? {
                 if row.retired_at.is_none() && filter.wants_robot(&row.site, &row.id) {
                     let key = (row.site.clone(), row.id.clone());
                     let alerts = of_robots.remove(&key).unwrap_or_default();
                     let robot = Event::Robot(Box::new(self.with_live(row, alerts)));
-                    add(&robot, Topic::Robots, key);
+                    add(&robot, Topic::Robots, Some(key));
                 }
             }
         }
         if filter.wants(Topic::Missions) {
             for mission in self.missions_to_show(&mut tx, &filter).await? {
                 let key = (mission.site.clone(), mission.robot.clone());
-                add(&Event::Mission(Box::new(mission)), Topic::Missions, key);
+                add(
+                    &Event::Mission(Box::new(mission)),
+                    Topic::Missions,
+                    Some(key),
+                );
             }
         }
         if filter.wants(Topic::Alerts) {
-            for alert in alerts {
-                let key = (alert.site.clone(), alert.robot.clone());
-                if filter.wants_robot(&key.0, &key.1) {
+            let of_server = self.storage().alerts(&AlertFilter {
+                raised: true,
+                ..AlertFilter::default()
+            });
+            for alert in alerts.into_iter().chain(of_server) {
+                let key = alert.robot_key();
+                let is_wanted = |(site, robot): &RobotKey| filter.wants_robot(site, robot);
+                if key.as_ref().is_none_or(is_wanted) {
                     add(&Event::Alert(Box::new(alert)), Topic::Alerts, key);
                 }
             }

@@ -44,8 +44,8 @@ struct Told {
 pub async fn run(app: App, stop: CancellationToken) {
     let mut told = HashMap::new();
     loop {
-        if let Err(cause) = app.tell_changes(&mut told).await {
-            tracing::error!("cannot tell where the map has changed: {cause:?}");
+        if let Err(cause) = db::limited(app.tell_changes(&mut told)).await {
+            app.log_failure("tell where the map has changed", &cause);
         }
         tokio::select! {
             () = stop.cancelled() => break,

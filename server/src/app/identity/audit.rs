@@ -162,11 +162,8 @@ pub async fn run(app: App, stop: CancellationToken) {
                 () = stop.cancelled() => {}
             }
         }
-        while let Err(error) = app.write_notes(&notes).await {
-            tracing::error!(
-                "cannot write {} entries of the audit log: {error:?}",
-                notes.len()
-            );
+        while let Err(error) = db::limited(app.write_notes(&notes)).await {
+            app.log_failure("write entries of the audit log", &error);
             if stop.is_cancelled() {
                 return;
             }

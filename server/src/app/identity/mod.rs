@@ -44,6 +44,8 @@ pub const SESSION_LASTS: SignedDuration = SignedDuration::from_hours(12);
 const DEAD_KEPT: SignedDuration = SignedDuration::from_hours(400 * 24);
 /// Dead tokens that are forgotten with each new one.
 const FORGET_MAX: u32 = 10;
+/// How long a request waits for whoever is known to be looked up again.
+const RECHECK_MAX: Duration = Duration::from_millis(250);
 /// How often a look-up is repeated that something was ended during.
 const LOOK_UPS_MAX: u32 = 5;
 
@@ -254,7 +256,7 @@ impl App {
             Kind::Join => false,
         });
         if let Some(secret) = &secret
-            && let Some(credential) = self.known(secret).await?
+            && let Some(credential) = self.known(secret).await
         {
             self.used(&credential);
             return Ok(credential);
@@ -281,26 +283,26 @@ impl App {
     }
 
     /// Who is known in memory, and still holds.
-    async fn known(&self, secret: &Secret) -> Result<Option<Arc<Credential>>, DbError> {
+    async fn known(&self, secret: &Secret) -> Option<Arc<Credential>> {
         let known = &self.identity().known;
-        let found = known.find(&secret.fingerprint(), self.clock().now());
-        let Some(credential) = found else {
-            return Ok(None);
-        };
+        let credential = known.find(&secret.fingerprint(), self.clock().now())?;
         if credential.is_fresh(self.clock().elapsed()) {
-            return Ok(Some(credential));
+            return Some(credential);
         }
-        match self.kept(secret).await {
-            Ok(_) => {
-                credential.checked(self.clock().elapsed());
-                Ok(Some(credential))
+        // Who was let in before is let in while the database fails or is slow, for a Stop above
+        // all: what is revoked here ends in memory, and elsewhere as soon as it can be read.
+        match tokio::time::timeout(RECHECK_MAX, self.kept(secret)).await {
+            Ok(Ok(_)) => credential.checked(self.clock().elapsed()),
+            Ok(Err(SignInError::Storage(cause))) => {
+                self.log_failure("look up again who is signed in", &cause);
             }
-            Err(SignInError::Storage(cause)) => Err(cause),
-            Err(_gone) => {
+            Err(_slow) => {}
+            Ok(Err(_gone)) => {
                 known.end(|other| std::ptr::eq(other, &raw const *credential));
-                Ok(None)
+                return None;
             }
         }
+        Some(credential)
     }
 
     /// What the database says of a secret.

@@ -14,7 +14,7 @@ use std::time::Duration;
 use jiff::SignedDuration;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
-use tracing::{debug, error};
+use tracing::debug;
 use tread_api::ids::{MissionId, SiteId, StopId};
 use tread_api::mission::MissionState;
 
@@ -75,8 +75,8 @@ struct Retry {
 pub async fn run(app: App, commands: Commands, supervisor: Supervisor, stop: CancellationToken) {
     let mut reconciler = Reconciler::new(app.clone(), commands, supervisor);
     loop {
-        if let Err(error) = reconciler.pass().await {
-            error!("cannot reconcile missions: {error:?}");
+        if let Err(error) = db::limited(reconciler.pass()).await {
+            app.log_failure("reconcile missions", &error);
         }
         let pause = reconciler.pause();
         tokio::select! {
@@ -242,7 +242,7 @@ impl Reconciler {
     async fn stop_again(&mut self) {
         let again = match self.app.tend_stops().await {
             Ok(again) => again,
-            Err(error) => return error!("cannot look after stops: {error:?}"),
+            Err(error) => return self.app.log_failure("look after stops", &error),
         };
         let wanted: HashSet<StopId> = again.iter().map(|stop| stop.id).collect();
         self.retries
@@ -464,11 +464,12 @@ impl Reconciler {
             how: Finished::Again,
             finished: self.finished.clone(),
         };
+        let app = self.app.clone();
         self.supervisor.spawn_passing("command", async move {
             let mut report = report;
             match work.await {
                 Ok(how) => report.how = how,
-                Err(error) => error!("cannot write down a command's answer: {error:?}"),
+                Err(error) => app.log_failure("write down a command's answer", &error),
             }
         });
     }

@@ -13,6 +13,7 @@ use tread_api::wire::command::{Answer, OfferRefusal, Outcome};
 use tread_api::wire::safety::Stop as StopCommand;
 
 use super::super::{App, AppError, Links};
+use crate::db;
 use crate::fleet::commands::Commands;
 
 /// What a robot has said to a stop.
@@ -70,6 +71,7 @@ impl Outgoing {
     /// on.
     pub(super) async fn deliver(self, tell_of: mpsc::Sender<(StopId, Timestamp)>) {
         let ending = self.links.supervisor.stop_token();
+        let unrecorded = self.app.unrecorded();
         loop {
             let told = tell(&self.app, &self.links.commands, &self.stop).await;
             if told != Told::Unconfirmed {
@@ -82,7 +84,10 @@ impl Outgoing {
                 () = ending.cancelled() => return,
                 () = tokio::time::sleep(UNRECORDED_RETRY) => {}
             }
-            if *self.recorded.borrow() {
+            let is_newest = !unrecorded
+                .newest_of(std::slice::from_ref(&self.stop))
+                .is_empty();
+            if *self.recorded.borrow() || !is_newest {
                 return;
             }
         }
@@ -105,15 +110,24 @@ impl Settling {
         recorded: watch::Sender<bool>,
     ) {
         let recording = async {
-            while !self.record().await {
+            let mut waiting = self.stops.clone();
+            while !self.record(&waiting).await {
                 tokio::select! {
                     () = self.stop.cancelled() => return,
                     () = tokio::time::sleep(UNRECORDED_RETRY) => {}
                 }
+                // A newer stop of a robot has replaced this one there, and need alone be kept.
+                waiting = self.app.unrecorded().newest_of(&self.stops);
             }
             recorded.send_replace(true);
         };
-        let ((), confirmed) = tokio::join!(recording, self.collect(&mut confirmations, shown));
+        let collecting = async {
+            let confirmed = self.collect(&mut confirmations, shown).await;
+            // Shown while the database does not take it.
+            self.app.unrecorded().confirm(&confirmed);
+            confirmed
+        };
+        let ((), confirmed) = tokio::join!(recording, collecting);
         self.note(&confirmed).await;
         let is_open = |stop: &&Stop| !confirmed.iter().any(|(id, _)| *id == stop.id);
         let open: Vec<&Stop> = self.stops.iter().filter(is_open).collect();
@@ -121,7 +135,8 @@ impl Settling {
             warn!("{} robots have not confirmed a stop", open.len());
             self.app.counters().stops_unconfirmed.add(open.len() as u64);
             if let Err(error) = self.app.note_unconfirmed(&open).await {
-                error!("cannot write down that stops are unconfirmed: {error:?}");
+                self.app
+                    .log_failure("write down that stops are unconfirmed", &error);
             }
         }
         self.app.wake();
@@ -130,17 +145,25 @@ impl Settling {
         }
     }
 
-    async fn record(&self) -> bool {
+    /// Writes stops down; whether that is done.
+    async fn record(&self, waiting: &[Stop]) -> bool {
+        if waiting.is_empty() {
+            return true;
+        }
         let writing = async {
             let mut tx = self.app.db().write().await?;
-            self.app.record_stops(&mut tx, &self.stops).await?;
+            self.app.record_stops(&mut tx, waiting).await?;
             tx.commit().await?;
             Ok::<(), AppError>(())
         };
-        match writing.await {
-            Ok(()) => true,
+        match db::limited(writing).await {
+            Ok(()) => {
+                self.app.unrecorded().remove(waiting);
+                true
+            }
             Err(error) => {
-                error!("cannot write down a stop; it is sent all the same: {error:?}");
+                self.app
+                    .log_failure("write down a stop; it is sent all the same", &error);
                 false
             }
         }
@@ -171,9 +194,11 @@ impl Settling {
         if confirmed.is_empty() {
             return;
         }
+        self.app.unrecorded().confirm(confirmed);
         if let Err(error) = self.app.note_confirmed(&self.stops, confirmed).await {
             // The reconciler asks the robot again, which says the same.
-            error!("cannot write down that stops are confirmed: {error:?}");
+            self.app
+                .log_failure("write down that stops are confirmed", &error);
         }
     }
 }

@@ -362,8 +362,7 @@ pub(super) fn sign_in_problem(app: &App, error: &SignInError) -> Response {
         SignInError::Revoked => &counters.refused_token_revoked,
         SignInError::Locked(left) => return locked(app, *left, error.to_string()),
         SignInError::Storage(cause) => {
-            tracing::error!("cannot look up a token: {cause:?}");
-            return Problem::new(ProblemType::Internal).into_response();
+            return Problem::storage(cause).into_response();
         }
     };
     counter.one();

@@ -1,0 +1,394 @@
+//! Whether the storage works: checked all the time, and shown by `/readyz`, metrics and alerts.
+//!
+//! ```text
+//! every 5 s, and when somebody asks ─► a real write, the root page of every table, the free disk
+//!   a failure ──► not ready, and an alert, until nothing has failed for 10 s
+//!   damage ─────► not ready, and an alert, until `PRAGMA quick_check` finds nothing
+//! ```
+//!
+//! These alerts are about the server and no robot. They are kept in memory and in the log, because
+//! what they say is that nothing can be stored.
+
+use std::collections::{HashMap, VecDeque};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use jiff::Timestamp;
+use tokio_util::sync::CancellationToken;
+use tracing::{error, info};
+use tread_api::ids::{AlertId, RobotId};
+use tread_api::robot::{Alert, Severity};
+
+use super::App;
+use crate::config::StorageConfig;
+use crate::db::DbError;
+use crate::db::alerts::AlertFilter;
+use crate::db::failure::{self, StorageFailure};
+
+/// How often the storage is checked although nobody asks.
+const CHECK_EVERY: Duration = Duration::from_secs(5);
+/// How old a check may be that answers a question about readiness: anybody may ask, and each check
+/// costs a write that is synced.
+const CHECK_SHARED_FOR: Duration = Duration::from_secs(1);
+/// How long one part of a check may take before it counts as failed.
+const CHECK_TIMEOUT: Duration = Duration::from_secs(5);
+/// How long nothing may have failed before the storage counts as working again.
+const RECOVERED_AFTER: Duration = Duration::from_secs(10);
+/// How often a damaged database is examined again.
+const EXAMINE_EVERY: Duration = Duration::from_mins(10);
+/// Free space above the limit, as a share of it, at which the alert ends.
+const DISK_LOW_HYSTERESIS: f64 = 0.1;
+/// Alerts about the server that are kept after they have cleared.
+const CLEARED_KEPT_MAX: usize = 100;
+/// How often the failure of one and the same thing is logged: a full disk fails the same
+/// transactions many times a second.
+const LOG_EVERY: Duration = Duration::from_secs(30);
+/// Characters of SQLite's finding that an alert shows.
+const FINDING_MAX: usize = 200;
+
+/// The alert of a database that cannot be written.
+pub const UNWRITABLE_ALERT: &str = "storage-unwritable";
+/// The alert of a database that is damaged.
+pub const DAMAGED_ALERT: &str = "database-damaged";
+/// The alert of a disk that is nearly full.
+pub const DISK_LOW_ALERT: &str = "disk-low";
+
+/// What the last check found.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct StorageCondition {
+    /// Why nothing can be written, if that is so.
+    pub unwritable: Option<String>,
+    /// What is damaged, if anything is.
+    pub damaged: Option<String>,
+    /// Free bytes on the disk of the database, if the operating system tells.
+    pub disk_free_bytes: Option<u64>,
+    /// Whether that is below the configured limit.
+    pub is_disk_low: bool,
+}
+
+impl StorageCondition {
+    /// Why the server cannot do its work, if that is so.
+    pub fn problem(&self) -> Option<&str> {
+        let damaged = self.damaged.as_deref();
+        damaged.or(self.unwritable.as_deref())
+    }
+}
+
+/// The last check, and the alerts about the server.
+#[derive(Debug)]
+pub(super) struct Storage {
+    config: StorageConfig,
+    /// Held by whoever checks.
+    checking: tokio::sync::Mutex<()>,
+    inner: Mutex<Inner>,
+}
+
+#[derive(Debug, Default)]
+struct Inner {
+    condition: StorageCondition,
+    checked_at: Option<Duration>,
+    /// When the database was examined last, and how many reports of damage there were by then.
+    examined: Option<(Duration, u64)>,
+    /// When each failure was logged last, and how often it was left out since.
+    logged: HashMap<&'static str, (Duration, u64)>,
+    raised: Vec<Alert>,
+    /// Newest last.
+    cleared: VecDeque<Alert>,
+}
+
+impl Storage {
+    pub(super) fn new(config: StorageConfig) -> Self {
+        Self {
+            config,
+            checking: tokio::sync::Mutex::default(),
+            inner: Mutex::default(),
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Alerts about the server that a filter lets through, newest first.
+    pub(super) fn alerts(&self, filter: &AlertFilter) -> Vec<Alert> {
+        // They concern every site, and no robot.
+        if filter.robot.is_some() {
+            return Vec::new();
+        }
+        let inner = self.lock();
+        let cleared = inner.cleared.iter().filter(|_| !filter.raised);
+        let all = inner.raised.iter().chain(cleared);
+        let before = |alert: &&Alert| filter.before.is_none_or(|before| alert.id < before);
+        let mut alerts: Vec<Alert> = all.filter(before).cloned().collect();
+        alerts.sort_by_key(|alert| std::cmp::Reverse(alert.id));
+        alerts
+    }
+
+    /// Notes that a person has seen an alert about the server; `None` if there is none of that
+    /// identifier.
+    pub(super) fn acknowledge(&self, id: AlertId, now: Timestamp) -> Option<Alert> {
+        let mut inner = self.lock();
+        let Inner {
+            raised, cleared, ..
+        } = &mut *inner;
+        let mut all = raised.iter_mut().chain(cleared.iter_mut());
+        let alert = all.find(|alert| alert.id == id)?;
+        alert.acknowledged_at.get_or_insert(now);
+        Some(alert.clone())
+    }
+}
+
+impl App {
+    /// Logs that something failed in the background and will be tried again; repeats are counted.
+    pub(crate) fn log_failure(&self, what: &'static str, cause: &dyn std::error::Error) {
+        let now = self.clock().elapsed();
+        let left_out = {
+            let mut inner = self.storage().lock();
+            match inner.logged.get_mut(what) {
+                Some((at, left_out)) if now.saturating_sub(*at) < LOG_EVERY => {
+                    *left_out += 1;
+                    return;
+                }
+                // As many as there are places that call this.
+                Some(_) | None => inner.logged.insert(what, (now, 0)),
+            }
+        };
+        let repeats = left_out.map_or(0, |(_, count)| count);
+        error!(repeats, "cannot {what}: {}", chain(cause));
+    }
+
+    /// What the last check found.
+    pub fn storage_condition(&self) -> StorageCondition {
+        self.storage().lock().condition.clone()
+    }
+
+    /// Whether the server can do its work now; checks, unless that was done a moment ago.
+    pub async fn ready(&self) -> StorageCondition {
+        self.check_storage(CHECK_SHARED_FOR).await
+    }
+
+    /// Checks unless the last check is younger than `shared_for`.
+    async fn check_storage(&self, shared_for: Duration) -> StorageCondition {
+        let _checking = self.storage().checking.lock().await;
+        let checked_at = self.storage().lock().checked_at;
+        let now = self.clock().elapsed();
+        if checked_at.is_some_and(|at| now.saturating_sub(at) < shared_for) {
+            return self.storage_condition();
+        }
+        let written = limited(self.db().probe_write()).await;
+        let read = limited(self.db().probe_tables()).await;
+        let disk_free_bytes = self.db().disk_free_bytes().await;
+        let condition = {
+            let mut inner = self.storage().lock();
+            inner.checked_at = Some(self.clock().elapsed());
+            let is_damaged = inner.has_new_damage();
+            let condition = &mut inner.condition;
+            condition.unwritable = unwritable(written.err(), read.err());
+            if is_damaged && condition.damaged.is_none() {
+                let text = "SQLite met a damaged page; the whole file is being checked";
+                condition.damaged = Some(text.to_owned());
+            }
+            condition.disk_free_bytes = disk_free_bytes;
+            let limit = self.storage().config.disk_free_min_bytes();
+            condition.is_disk_low = is_low(disk_free_bytes, limit, condition.is_disk_low);
+            condition.clone()
+        };
+        self.show_condition(&condition);
+        condition
+    }
+
+    /// Examines the whole file, if there is a reason to and it was not done a moment ago.
+    async fn examine_database(&self) {
+        let reports = failure::count(StorageFailure::Damaged);
+        let now = self.clock().elapsed();
+        {
+            let inner = self.storage().lock();
+            let is_due = inner
+                .examined
+                .is_none_or(|(at, _)| now.saturating_sub(at) >= EXAMINE_EVERY);
+            if !(inner.has_new_damage() || inner.condition.damaged.is_some() && is_due) {
+                return;
+            }
+        }
+        let found = self.db().quick_check().await;
+        let condition = {
+            let mut inner = self.storage().lock();
+            // What this very examination met is no news.
+            let reports = failure::count(StorageFailure::Damaged).max(reports);
+            inner.examined = Some((self.clock().elapsed(), reports));
+            inner.condition.damaged = match found {
+                Ok(None) => None,
+                Ok(Some(finding)) => Some(finding.chars().take(FINDING_MAX).collect()),
+                Err(cause) if cause.failure() == Some(StorageFailure::Damaged) => {
+                    Some(StorageFailure::Damaged.explanation().to_owned())
+                }
+                Err(cause) => {
+                    error!("cannot examine the database: {cause:?}");
+                    inner.condition.damaged.take()
+                }
+            };
+            inner.condition.clone()
+        };
+        self.show_condition(&condition);
+    }
+
+    /// Raises and clears the alerts about the storage.
+    fn show_condition(&self, condition: &StorageCondition) {
+        let unwritable = condition.unwritable.as_ref().map(|why| {
+            format!(
+                "nothing can be stored: {why}; missions and measurements wait, Stop and \
+                 teleoperation work"
+            )
+        });
+        let damaged = condition.damaged.as_ref().map(|finding| {
+            format!("the database is damaged, restore a backup of it; SQLite says: {finding}")
+        });
+        let disk = condition.is_disk_low.then(|| {
+            let limit = self.storage().config.disk_free_min_mib;
+            format!("less than {limit} MiB are free on the disk of the database")
+        });
+        for (code, severity, text) in [
+            (UNWRITABLE_ALERT, Severity::Critical, unwritable),
+            (DAMAGED_ALERT, Severity::Critical, damaged),
+            (DISK_LOW_ALERT, Severity::Warning, disk),
+        ] {
+            self.set_server_alert(code, severity, text);
+        }
+    }
+
+    fn set_server_alert(&self, code: &'static str, severity: Severity, text: Option<String>) {
+        let now = self.clock().now();
+        let mut inner = self.storage().lock();
+        let found = inner
+            .raised
+            .iter()
+            .position(|alert| alert.code.as_str() == code);
+        let alert = match (found, text) {
+            (None, Some(text)) => {
+                let Ok(code) = code.parse() else { return };
+                error!("{text}");
+                let alert = Alert {
+                    id: AlertId::from_uuid(self.clock().mission_id().as_uuid()),
+                    site: None,
+                    robot: None::<RobotId>,
+                    code,
+                    severity,
+                    text,
+                    raised_at: now,
+                    acknowledged_at: None,
+                    cleared_at: None,
+                };
+                inner.raised.push(alert.clone());
+                alert
+            }
+            (Some(index), None) => {
+                info!("the alert `{code}` is over");
+                let mut alert = inner.raised.remove(index);
+                alert.cleared_at = Some(now.max(alert.raised_at));
+                inner.cleared.push_back(alert.clone());
+                if inner.cleared.len() > CLEARED_KEPT_MAX {
+                    inner.cleared.pop_front();
+                }
+                alert
+            }
+            (Some(index), Some(text)) if inner.raised[index].text != text => {
+                let alert = &mut inner.raised[index];
+                alert.text = text;
+                alert.clone()
+            }
+            (Some(_), Some(_)) | (None, None) => return,
+        };
+        drop(inner);
+        self.hub().alert(&alert);
+    }
+}
+
+impl Inner {
+    /// Whether SQLite has met damage since the whole file was examined.
+    fn has_new_damage(&self) -> bool {
+        let examined = self.examined.map_or(0, |(_, reports)| reports);
+        failure::count(StorageFailure::Damaged) > examined
+    }
+}
+
+/// An error with the causes behind it, on one line.
+fn chain(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        text.push_str(": ");
+        text.push_str(&error.to_string());
+        cause = error.source();
+    }
+    text
+}
+
+async fn limited(
+    probe: impl Future<Output = Result<(), DbError>>,
+) -> Result<(), Option<StorageFailure>> {
+    match tokio::time::timeout(CHECK_TIMEOUT, probe).await {
+        Ok(Ok(())) => Ok(()),
+        Ok(Err(cause)) => {
+            tracing::debug!("a check of the storage failed: {cause:?}");
+            Err(cause.failure())
+        }
+        Err(_elapsed) => Err(Some(StorageFailure::Busy)),
+    }
+}
+
+/// Why nothing can be stored, by the checks and by what has failed of late.
+fn unwritable(
+    written: Option<Option<StorageFailure>>,
+    read: Option<Option<StorageFailure>>,
+) -> Option<String> {
+    let explained = |failure: Option<StorageFailure>| {
+        let unknown = "the database answers with an error, see the log";
+        failure.map_or(unknown, StorageFailure::explanation)
+    };
+    if let Some(failure) = written.or(read) {
+        return Some(explained(failure).to_owned());
+    }
+    let (failure, since) = failure::last()?;
+    (since < RECOVERED_AFTER).then(|| failure.explanation().to_owned())
+}
+
+#[expect(
+    clippy::cast_precision_loss,
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "bytes of a disk, to a few per cent"
+)]
+fn is_low(free_bytes: Option<u64>, limit_bytes: u64, was_low: bool) -> bool {
+    let hysteresis = (limit_bytes as f64 * DISK_LOW_HYSTERESIS) as u64;
+    let bound = limit_bytes.saturating_add(if was_low { hysteresis } else { 0 });
+    free_bytes.is_some_and(|free| free < bound)
+}
+
+/// Checks until the stop.
+pub async fn run(app: App, stop: CancellationToken) {
+    while !stop.is_cancelled() {
+        app.check_storage(CHECK_SHARED_FOR).await;
+        tokio::select! {
+            () = stop.cancelled() => return,
+            () = app.examine_database() => {}
+        }
+        tokio::select! {
+            () = stop.cancelled() => {}
+            () = tokio::time::sleep(CHECK_EVERY) => {}
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_disk_is_low_until_there_is_clearly_more_than_the_limit() {
+        assert!(!is_low(Some(1_000), 1_000, false));
+        assert!(is_low(Some(999), 1_000, false));
+        assert!(is_low(Some(1_099), 1_000, true));
+        assert!(!is_low(Some(1_100), 1_000, true));
+        assert!(!is_low(None, 1_000, true));
+    }
+}

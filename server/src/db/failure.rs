@@ -1,0 +1,185 @@
+//! Failures of the storage itself, told apart from answers such as a violated constraint.
+//!
+//! After some errors (a full disk, a failed read or write, no memory) SQLite rolls a transaction
+//! back by itself, and the library's count of open transactions no longer fits the connection. A
+//! damaged page may also stay in a connection's cache. So every connection that is older than the
+//! last failure is replaced before it is used again: [`is_older_than_last`].
+
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::time::Duration;
+
+use tokio::time::Instant;
+
+/// What failed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum StorageFailure {
+    /// The disk is full.
+    Full,
+    /// The operating system could not open, read, write or sync the file.
+    Io,
+    /// There was no memory.
+    Memory,
+    /// The file is damaged, or is no database.
+    Damaged,
+    /// Another process holds the file's lock, or no connection became free in time.
+    Busy,
+    /// The connection is in a state in which it cannot go on.
+    Connection,
+}
+
+impl StorageFailure {
+    /// Every kind.
+    pub const ALL: [Self; 6] = [
+        Self::Full,
+        Self::Io,
+        Self::Memory,
+        Self::Damaged,
+        Self::Busy,
+        Self::Connection,
+    ];
+
+    /// Its name in metrics.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Full => "full",
+            Self::Io => "io",
+            Self::Memory => "memory",
+            Self::Damaged => "damaged",
+            Self::Busy => "busy",
+            Self::Connection => "connection",
+        }
+    }
+
+    /// What an operator should know of it.
+    pub const fn explanation(self) -> &'static str {
+        match self {
+            Self::Full => "the disk is full",
+            Self::Io => "the operating system cannot read or write the database's files",
+            Self::Memory => "there is no memory",
+            Self::Damaged => "the database is damaged",
+            Self::Busy => "another process holds the database, or it is too slow",
+            Self::Connection => "a connection to the database broke",
+        }
+    }
+
+    /// The failure behind an error; `None` for an error of the statement or its values.
+    pub fn of(error: &sqlx::Error) -> Option<Self> {
+        match error {
+            sqlx::Error::Database(error) => {
+                let extended: u32 = error.code()?.parse().ok()?;
+                Self::of_code(extended)
+            }
+            sqlx::Error::PoolTimedOut => Some(Self::Busy),
+            sqlx::Error::Io(_) => Some(Self::Io),
+            sqlx::Error::WorkerCrashed
+            | sqlx::Error::PoolClosed
+            | sqlx::Error::BeginFailed
+            | sqlx::Error::InvalidSavePointStatement
+            // The library's thread ended without memory for a value: what must give a row, as a
+            // count, gave none.
+            | sqlx::Error::RowNotFound => Some(Self::Connection),
+            _ => None,
+        }
+    }
+
+    /// By SQLite's extended result code.
+    const fn of_code(extended: u32) -> Option<Self> {
+        /// `SQLITE_IOERR_NOMEM`.
+        const IO_NO_MEMORY: u32 = 10 | (12 << 8);
+        match (extended, extended & 0xff) {
+            (IO_NO_MEMORY, _) | (_, 7) => Some(Self::Memory),
+            (_, 13) => Some(Self::Full),
+            // IOERR, CANTOPEN, READONLY, PERM, AUTH.
+            (_, 10 | 14 | 8 | 3 | 23) => Some(Self::Io),
+            // CORRUPT, NOTADB.
+            (_, 11 | 26) => Some(Self::Damaged),
+            // BUSY, LOCKED, PROTOCOL.
+            (_, 5 | 6 | 15) => Some(Self::Busy),
+            _ => None,
+        }
+    }
+}
+
+/// Failures since the start of the process, whichever database had them: to replace a connection
+/// too many costs a millisecond.
+struct FailureLog {
+    counts: [AtomicU64; StorageFailure::ALL.len()],
+    /// When the last one that spoils connections was seen, microseconds after [`origin`]; 0 for
+    /// never.
+    last_us: AtomicU64,
+    /// Which one that was, as its place in [`StorageFailure::ALL`].
+    last: AtomicUsize,
+}
+
+static FAILURES: FailureLog = FailureLog {
+    counts: [const { AtomicU64::new(0) }; StorageFailure::ALL.len()],
+    last_us: AtomicU64::new(0),
+    last: AtomicUsize::new(0),
+};
+
+fn origin() -> Instant {
+    static ORIGIN: OnceLock<Instant> = OnceLock::new();
+    *ORIGIN.get_or_init(Instant::now)
+}
+
+fn now_us() -> u64 {
+    u64::try_from(origin().elapsed().as_micros()).unwrap_or(u64::MAX)
+}
+
+/// Takes note of an error.
+pub(super) fn note(error: &sqlx::Error) {
+    let Some(failure) = StorageFailure::of(error) else {
+        return;
+    };
+    FAILURES.counts[failure as usize].fetch_add(1, Ordering::AcqRel);
+    if failure != StorageFailure::Busy {
+        FAILURES.last.store(failure as usize, Ordering::Release);
+        FAILURES.last_us.store(now_us().max(1), Ordering::Release);
+    }
+}
+
+/// How often it was seen since the start of the process.
+pub fn count(failure: StorageFailure) -> u64 {
+    FAILURES.counts[failure as usize].load(Ordering::Acquire)
+}
+
+/// The last failure that was more than a lock, and the time since.
+pub fn last() -> Option<(StorageFailure, Duration)> {
+    let last_us = FAILURES.last_us.load(Ordering::Acquire);
+    let failure = StorageFailure::ALL.get(FAILURES.last.load(Ordering::Acquire))?;
+    let since = Duration::from_micros(now_us().saturating_sub(last_us));
+    (last_us > 0).then_some((*failure, since))
+}
+
+/// Whether a connection of that age may have been spoiled by the last failure.
+pub(super) fn is_older_than_last(age: Duration) -> bool {
+    last().is_some_and(|(_, since)| age >= since)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn result_codes_say_what_failed() {
+        let cases = [
+            (13, Some(StorageFailure::Full)),
+            (10, Some(StorageFailure::Io)),
+            (10 | (4 << 8), Some(StorageFailure::Io)),
+            (10 | (12 << 8), Some(StorageFailure::Memory)),
+            (7, Some(StorageFailure::Memory)),
+            (11, Some(StorageFailure::Damaged)),
+            (26, Some(StorageFailure::Damaged)),
+            (5 | (2 << 8), Some(StorageFailure::Busy)),
+            (14, Some(StorageFailure::Io)),
+            // A violated constraint and a misuse are errors of whoever wrote the statement.
+            (19 | (8 << 8), None),
+            (1, None),
+            (21, None),
+        ];
+        for (code, failure) in cases {
+            assert_eq!(StorageFailure::of_code(code), failure, "{code}");
+        }
+    }
+}

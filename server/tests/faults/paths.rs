@@ -1,0 +1,418 @@
+//! Every write path of the server, each as something that is prepared while all works, and an act
+//! in which a call fails.
+
+use std::pin::Pin;
+use std::time::Duration;
+
+use jiff::{SignedDuration, Timestamp};
+use serde::de::DeserializeOwned;
+use serde_json::{Value, json};
+use tread_api::ids::{AlertId, BootId, ConfigurationId, MissionId, SessionId, TokenId};
+use tread_api::mission::{Cause, MissionState, Replacement};
+use tread_server::app::AppError;
+use tread_server::config::RetentionConfig;
+use tread_server::db;
+use tread_server::db::aside::Origin;
+use tread_server::db::idempotency::Given;
+use tread_server::db::missions::Facts;
+use tread_server::db::robots::Introduction;
+use tread_server::db::sessions::NewSession;
+use tread_server::db::withdrawals::WithdrawalRow;
+use tread_server::identity::secret::{Fingerprint, Kind, Secret};
+
+use crate::ground::{Ground, boot, hello, mission, now, segment, uuid};
+
+type Writing<'ground> = Pin<Box<dyn Future<Output = Result<(), AppError>> + Send + 'ground>>;
+type Write = for<'ground> fn(&'ground Ground, u64) -> Writing<'ground>;
+
+/// One way in which the server writes; the number names what is new.
+pub(crate) struct WritePath {
+    pub(crate) name: &'static str,
+    pub(crate) prepare: Write,
+    pub(crate) act: Write,
+}
+
+fn nothing(_ground: &Ground, _number: u64) -> Writing<'_> {
+    Box::pin(async { Ok(()) })
+}
+
+/// What JSON says, as a type of the API.
+fn of<T: DeserializeOwned>(value: Value) -> T {
+    serde_json::from_value(value).unwrap()
+}
+
+fn fingerprint(kind: Kind, number: u64) -> Fingerprint {
+    let mut random = [0; 32];
+    random[..8].copy_from_slice(&number.to_le_bytes());
+    Secret::from_random(kind, &random).fingerprint()
+}
+
+fn later() -> Timestamp {
+    now() + SignedDuration::from_hours(24)
+}
+
+const LONG_AGO: Timestamp = Timestamp::UNIX_EPOCH;
+
+pub(crate) const PATHS: &[WritePath] = &[
+    WritePath {
+        name: "site",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(ground.write(async move |tx| {
+                let site = of(json!({
+                    "id": format!("site-{number}"), "name": "a site", "terrain_revision": 0,
+                    "grid": {"revision": 1, "cell_m": 1.0}, "created_at": now(),
+                }));
+                db::sites::insert(tx, &site).await?;
+                let row = db::sites::find(tx, &site.id).await?;
+                let pk = row.map_or(0, |row| row.pk);
+                let origin =
+                    of(json!({"latitude_deg": 48.0, "longitude_deg": 11.0, "x_axis_deg": 90.0}));
+                db::sites::set_origin(tx, pk, Some(origin)).await?;
+                db::sites::count_terrain_change(tx, pk).await
+            }))
+        },
+    },
+    WritePath {
+        name: "terrain",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(ground.write(async move |tx| {
+                let square = json!([{"x_m": -90, "y_m": -90}, {"x_m": 90, "y_m": -90}, {"x_m": 90, "y_m": 90},
+                    {"x_m": -90, "y_m": 90}]);
+                let terrain = of(json!({
+                    "id": format!("lawn-{number}"), "revision": 1, "name": "a lawn", "class": "grass",
+                    "polygon": square, "layer": 0, "updated_at": now(),
+                }));
+                db::terrains::put(tx, ground.site_pk, &terrain).await?;
+                let geofence = of(json!({"revision": number, "keep_in": [square], "keep_out": []}));
+                db::geofences::insert(tx, ground.site_pk, &geofence, now()).await?;
+                db::terrains::delete(tx, ground.site_pk, &terrain.id).await.map(|_| ())
+            }))
+        },
+    },
+    WritePath {
+        name: "robot",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(ground.write(async move |tx| {
+                let id = format!("rover-{number}").parse().unwrap();
+                let hello = hello(&id, number);
+                let introduction = Introduction {
+                    id: &id,
+                    boot: hello.boot,
+                    agent_version: &hello.agent_version,
+                    model: &hello.model,
+                    capabilities: &hello.capabilities,
+                    at: now(),
+                };
+                db::robots::introduce(tx, ground.site_pk, introduction).await?;
+                db::robots::rename(tx, ground.robot_pk, &format!("rover {number}")).await?;
+                db::robots::set_retired(tx, ground.robot_pk, Some(now())).await?;
+                db::robots::set_retired(tx, ground.robot_pk, None).await?;
+                db::robots::count_refused(tx, ground.robot_pk, 1, "a test").await?;
+                let other = BootId::from_uuid(uuid(number));
+                db::robots::boot_key(tx, ground.robot_pk, other).await?;
+                let configuration: ConfigurationId = of(json!(format!("{number:032x}")));
+                db::robots::configuration_key(tx, configuration)
+                    .await
+                    .map(|_| ())
+            }))
+        },
+    },
+    WritePath {
+        name: "mission created once for a key",
+        prepare: |ground, _number| Box::pin(end_missions(ground)),
+        act: |ground, number| {
+            Box::pin(async move {
+                let request = mission(&ground.site, &ground.robot);
+                let key = format!("key-{number}");
+                ground.app.create_mission_once(&key, request).await?;
+                ground
+                    .write(async |tx| db::idempotency::forget_before(tx, LONG_AGO, 10).await)
+                    .await
+            })
+        },
+    },
+    WritePath {
+        name: "mission cancelled",
+        prepare: |ground, _number| {
+            Box::pin(async move {
+                end_missions(ground).await?;
+                let request = mission(&ground.site, &ground.robot);
+                ground.app.create_mission(request).await.map(|_| ())
+            })
+        },
+        act: |ground, _number| {
+            Box::pin(async move {
+                for id in open_missions(ground).await? {
+                    ground.app.cancel_mission(id).await?;
+                }
+                Ok(())
+            })
+        },
+    },
+    WritePath {
+        name: "what becomes of a mission",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(ground.write(async move |tx| {
+                let id = ground.mission;
+                let facts = Facts {
+                    boot: Some(boot()),
+                    plan: None,
+                    progress: None,
+                    started_at: Some(now()),
+                    ended_at: None,
+                };
+                db::missions::add_facts(tx, id, facts).await?;
+                let replacement = Replacement {
+                    revision: 2,
+                    plan_hash: of(json!(format!("{number:032x}"))),
+                    trajectory: mission(&ground.site, &ground.robot).trajectory,
+                };
+                db::missions::want_pause(tx, id, number % 2 == 0).await?;
+                db::missions::set_replacement(tx, id, Some(&replacement)).await?;
+                db::missions::swap_content(tx, id, 1, &replacement).await?;
+                db::missions::set_silence(tx, id, Some(now())).await?;
+                db::missions::add_outcome(tx, id, None, None).await?;
+                let queued = MissionState::Queued;
+                db::missions::compare_and_set(tx, id, queued, queued, Cause::Returned, None)
+                    .await?;
+                let event = of(json!({"at": now(), "actor": "server", "from": "queued",
+                    "to": "queued", "cause": "noted", "reason": "a test"}));
+                db::history::add_event(tx, id, &event).await?;
+                let boot_pk = db::robots::boot_key(tx, ground.robot_pk, boot()).await?;
+                let seq = i64::try_from(number).unwrap_or_default();
+                db::history::note_report(tx, boot_pk, seq).await
+            }))
+        },
+    },
+    WritePath {
+        name: "upload",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(async move {
+                let records = vec![segment(10 * number), segment(10 * number + 1)];
+                let receipt = ground.upload(records).await?;
+                assert_eq!((receipt.committed, receipt.duplicates), (2, 0));
+                Ok(())
+            })
+        },
+    },
+    WritePath {
+        name: "measurement that waits for its clock",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(ground.write(async move |tx| {
+                let boot_pk = db::robots::boot_key(tx, ground.robot_pk, boot()).await?;
+                let origin = Origin {
+                    boot_pk,
+                    seq: i64::try_from(10 * number + 5).unwrap_or_default(),
+                    site_pk: ground.site_pk,
+                    robot_pk: ground.robot_pk,
+                };
+                let measurement = serde_json::value::RawValue::from_string("{}".to_owned());
+                let at_us = later().as_microsecond();
+                db::aside::put(tx, origin, (at_us, at_us), &measurement.unwrap()).await?;
+                db::aside::take(tx, boot_pk, 0, 10).await.map(|_| ())
+            }))
+        },
+    },
+    WritePath {
+        name: "retention",
+        prepare: |ground, number| {
+            Box::pin(async move {
+                let records = (0..4).map(|one| segment(10 * number + one)).collect();
+                ground.upload(records).await.map(|_| ())
+            })
+        },
+        act: |ground, _number| {
+            Box::pin(async move {
+                let config = RetentionConfig {
+                    segments_max: 2,
+                    ..RetentionConfig::default()
+                };
+                ground.app.remove_some(&config, 10).await.map(|_| ())
+            })
+        },
+    },
+    WritePath {
+        name: "hours merged into days",
+        prepare: |ground, number| {
+            Box::pin(async move {
+                let records = (0..4).map(|one| segment(10 * number + one)).collect();
+                ground.upload(records).await?;
+                ground.app.clock().advance(Duration::from_hours(24));
+                Ok(())
+            })
+        },
+        act: |ground, _number| {
+            Box::pin(async move {
+                ground.app.move_horizons().await?;
+                ground.app.merge_some(50).await.map(|_| ())
+            })
+        },
+    },
+    WritePath {
+        name: "alert",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(ground.write(async move |tx| {
+                let id = AlertId::from_uuid(uuid(number));
+                let report: tread_api::robot::AlertReport =
+                    of(json!({"code": "test-alert", "severity": "warning", "text": "a test"}));
+                db::alerts::raise(tx, ground.robot_pk, id, &report, now()).await?;
+                db::alerts::acknowledge(tx, id, now()).await?;
+                db::alerts::clear(tx, ground.robot_pk, &report.code, now()).await
+            }))
+        },
+    },
+    WritePath {
+        name: "stop",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(ground.write(async move |tx| {
+                let stop: tread_api::stop::Stop = of(json!({
+                    "id": uuid(number), "site": ground.site, "robot": ground.robot, "by": "a test",
+                    "reason": "a test", "wanted_at": now(), "confirmed_at": null,
+                    "unconfirmed": false, "clear_asked_by": null, "clear_asked_at": null,
+                    "cleared_at": null,
+                }));
+                db::stops::insert(tx, std::slice::from_ref(&stop)).await?;
+                db::stops::confirm(tx, &[stop.id], now()).await?;
+                db::stops::unconfirm(tx, stop.id).await?;
+                db::stops::ask_clear(tx, stop.id, "a test", now()).await?;
+                db::stops::refuse_clear(tx, stop.id).await?;
+                db::stops::clear(tx, stop.id, now()).await?;
+                db::stops::end(tx, stop.id, now()).await
+            }))
+        },
+    },
+    WritePath {
+        name: "token and session",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(ground.write(async move |tx| {
+                let id = TokenId::from_uuid(uuid(number));
+                let token = of(json!({
+                    "id": id, "name": format!("token {number}"), "role": "viewer",
+                    "created_at": now(), "created_by": "a test", "expires_at": later(),
+                    "revoked_at": null, "last_used_at": null,
+                }));
+                let kind = Kind::Token(tread_api::identity::Role::Viewer);
+                db::tokens::insert(tx, &token, &fingerprint(kind, number)).await?;
+                let session = NewSession {
+                    id: SessionId::from_uuid(uuid(number)),
+                    token: id,
+                    fingerprint: fingerprint(Kind::Session, number),
+                    created_at: now(),
+                    expires_at: later(),
+                };
+                db::sessions::insert(tx, &session).await?;
+                db::sessions::forget_expired(tx, LONG_AGO).await?;
+                db::sessions::delete(tx, session.id).await?;
+                db::tokens::touch(tx, id, now()).await?;
+                db::tokens::revoke(tx, id, now()).await?;
+                db::tokens::forget_dead(tx, LONG_AGO, 10).await
+            }))
+        },
+    },
+    WritePath {
+        name: "audit log",
+        prepare: nothing,
+        act: |ground, _number| {
+            Box::pin(ground.write(async move |tx| {
+                let entry = of(json!({
+                    "id": 0, "at": now(), "who": "a test", "token": null, "role": null,
+                    "address": "127.0.0.1", "method": "GET", "route": "/", "path": "/",
+                    "status": 200, "request_id": "1", "what": null,
+                }));
+                db::audit::insert(tx, &entry).await?;
+                db::audit::forget(tx, LONG_AGO, 100, 10).await
+            }))
+        },
+    },
+    WritePath {
+        name: "robot that joins",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(ground.write(async move |tx| {
+                let token: tread_api::enrolment::JoinToken = of(json!({
+                    "id": uuid(number), "site": ground.site, "robot": null, "created_at": now(),
+                    "created_by": "a test", "expires_at": later(), "used_at": null,
+                    "used_by": null, "revoked_at": null,
+                }));
+                let secret = fingerprint(Kind::Join, number);
+                db::join_tokens::insert(tx, &token, &secret).await?;
+                db::join_tokens::use_up(tx, token.id, &ground.robot, now()).await?;
+                db::join_tokens::revoke(tx, token.id, now()).await?;
+                db::join_tokens::forget_dead(tx, LONG_AGO, 10).await?;
+                let enrolment = of(json!({
+                    "site": ground.site, "robot": ground.robot, "number": number,
+                    "enrolled_at": now(), "join_token": token.id, "renewed_at": now(),
+                    "expires_at": later(), "revoked_at": null, "revoked_by": null,
+                }));
+                db::enrolments::insert(tx, &enrolment).await?;
+                let one = (&ground.site, &ground.robot, enrolment.number);
+                db::enrolments::renew(tx, one, now(), later()).await?;
+                db::enrolments::revoke(tx, (&ground.site, &ground.robot), "a test", now()).await
+            }))
+        },
+    },
+    WritePath {
+        name: "withdrawal",
+        prepare: nothing,
+        act: |ground, _number| {
+            Box::pin(ground.write(async move |tx| {
+                // Hours in which nothing was measured.
+                let row = WithdrawalRow {
+                    pk: 0,
+                    robot_pk: ground.robot_pk,
+                    from_h: 1,
+                    to_h: 2,
+                    reason: "a test".to_owned(),
+                    by: "a test".to_owned(),
+                    at: now(),
+                };
+                db::withdrawals::insert(tx, &row).await?;
+                db::sums::remove_hours(tx, ground.robot_pk, (1, 2))
+                    .await
+                    .map(|_| ())
+            }))
+        },
+    },
+    WritePath {
+        name: "idempotency key kept by itself",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(ground.write(async move |tx| {
+                let given = Given {
+                    request_hash: uuid(number),
+                    answer: "{}".to_owned(),
+                };
+                let key = format!("alone-{number}");
+                db::idempotency::insert(tx, &key, &given, now()).await
+            }))
+        },
+    },
+    WritePath {
+        name: "log brought into the file",
+        prepare: |ground, _number| Box::pin(async { Ok(ground.app.db().probe_write().await?) }),
+        act: |ground, _number| Box::pin(async { Ok(ground.app.db().checkpoint().await?) }),
+    },
+];
+
+async fn open_missions(ground: &Ground) -> Result<Vec<MissionId>, AppError> {
+    let mut tx = ground.app.db().read().await?;
+    let open = db::missions::open_of_robot(&mut tx, ground.robot_pk).await?;
+    let others = open.into_iter().map(|one| one.id);
+    Ok(others.filter(|id| *id != ground.mission).collect())
+}
+
+async fn end_missions(ground: &Ground) -> Result<(), AppError> {
+    for id in open_missions(ground).await? {
+        ground.app.cancel_mission(id).await?;
+    }
+    Ok(())
+}
