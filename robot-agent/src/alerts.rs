@@ -11,6 +11,7 @@ use crate::control_loop::seam::Fault;
 use crate::control_loop::surface::Comparison;
 use crate::drive::Battery;
 use crate::drive::ros2::refusal::{Counts, Dropping};
+use crate::outbox::OutboxDamage;
 
 /// Charge below which the battery is low, and above which it no longer is.
 const BATTERY_LOW: (f64, f64) = (0.20, 0.25);
@@ -26,6 +27,8 @@ pub(crate) struct Causes<'a> {
     pub(crate) fault: Option<Fault>,
     pub(crate) is_stopped: bool,
     pub(crate) outbox: OutboxStatus,
+    /// What was lost by damage of the outbox's files.
+    pub(crate) outbox_damage: Option<&'a OutboxDamage>,
     /// What of the base's words was dropped.
     pub(crate) base: Option<&'a Counts>,
     /// Where the ground is not as the map says.
@@ -113,7 +116,17 @@ impl Alerts {
             let text = "many measurements wait for the server".to_owned();
             alert("outbox-long", Severity::Warning, text)
         });
-        let lost = (causes.outbox.dropped > 0).then(|| {
+        let damage = causes.outbox_damage;
+        let damaged = damage.and_then(|damage| {
+            let (lost, kept_in) = (damage.lost_records, damage.kept_in.as_ref()?.display());
+            let text = format!(
+                "files of the outbox were damaged, {lost} records were lost: the disk may be failing; \
+                 what was damaged is in `{kept_in}`"
+            );
+            alert("outbox-damaged", Severity::Warning, text)
+        });
+        let by_damage = damage.map_or(0, |damage| damage.lost_records);
+        let lost = (causes.outbox.dropped > by_damage).then(|| {
             let text = "measurements were lost: the store was full".to_owned();
             alert("outbox-dropped", Severity::Warning, text)
         });
@@ -135,6 +148,7 @@ impl Alerts {
             causes.surface_change.as_ref().and_then(surface_change),
             long.flatten(),
             lost.flatten(),
+            damaged,
         ]
         .into_iter()
         .flatten()
@@ -196,6 +210,44 @@ mod tests {
         assert!(codes(&alerts.judge(&causes)).contains(&"outbox-long"));
         causes.outbox.pending = 20_000;
         assert!(!codes(&alerts.judge(&causes)).contains(&"outbox-long"));
+    }
+
+    #[test]
+    fn records_lost_by_damage_are_an_alert_of_their_own_with_their_number() {
+        let damage = OutboxDamage {
+            lost_records: 34,
+            kept_in: Some("/data/outbox/damaged.bin".into()),
+        };
+        let mut causes = Causes {
+            outbox: OutboxStatus {
+                pending: 34,
+                dropped: 34,
+                refused: 0,
+            },
+            outbox_damage: Some(&damage),
+            ..Causes::default()
+        };
+        let mut alerts = Alerts::default();
+        let said = alerts.judge(&causes);
+        assert_eq!(codes(&said), ["outbox-damaged"]);
+        let text = &said[0].text;
+        assert!(
+            text.contains("34 records") && text.contains("damaged.bin"),
+            "{text}"
+        );
+        causes.outbox.dropped = 35;
+        let both = ["outbox-dropped", "outbox-damaged"];
+        assert_eq!(codes(&alerts.judge(&causes)), both, "a full store too");
+        causes.outbox.dropped = 34;
+        let seen = OutboxDamage {
+            kept_in: None,
+            ..damage.clone()
+        };
+        causes.outbox_damage = Some(&seen);
+        assert!(
+            alerts.judge(&causes).is_empty(),
+            "somebody has looked at it"
+        );
     }
 
     #[test]
