@@ -7,6 +7,7 @@ use tread_api::ids::AlertCode;
 use tread_api::robot::{AlertReport, OutboxStatus, Severity};
 use tread_control::geometry::Point;
 
+use crate::control_loop::overrun::{Overrun, WINDOW_TICKS};
 use crate::control_loop::seam::Fault;
 use crate::control_loop::surface::Comparison;
 use crate::drive::Battery;
@@ -35,6 +36,8 @@ pub(crate) struct Causes<'a> {
     pub(crate) surface_change: Option<Comparison>,
     /// Where the wheels turn without progress.
     pub(crate) dug_in_at: Option<Point>,
+    /// How far the loop is from its rate, while the robot is held for it.
+    pub(crate) overrun: Option<Overrun>,
 }
 
 /// Which wavering alerts stand.
@@ -139,8 +142,17 @@ impl Alerts {
             let text = format!("the wheels turn and the robot stays at ({x_m:.1} m, {y_m:.1} m)");
             alert("dug-in", Severity::Critical, text)
         });
+        let overrun = causes.overrun.and_then(|Overrun { late, late_ticks }| {
+            let late_ms = late.as_millis();
+            let text = format!(
+                "the control loop is late and the robot is held: a tick by {late_ms} ms, \
+                 {late_ticks} of {WINDOW_TICKS} ticks"
+            );
+            alert("loop-overrun", Severity::Critical, text)
+        });
         [
             battery,
+            overrun,
             fault,
             dropped,
             stopped.flatten(),
@@ -158,6 +170,8 @@ impl Alerts {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use tread_api::site::Cell;
     use tread_control::tracking::ThetaKnowledge;
 
@@ -210,6 +224,22 @@ mod tests {
         assert!(codes(&alerts.judge(&causes)).contains(&"outbox-long"));
         causes.outbox.pending = 20_000;
         assert!(!codes(&alerts.judge(&causes)).contains(&"outbox-long"));
+    }
+
+    #[test]
+    fn a_loop_that_is_late_is_an_alert_with_its_figures() {
+        let causes = Causes {
+            overrun: Some(Overrun {
+                late: Duration::from_millis(310),
+                late_ticks: 5,
+            }),
+            ..Causes::default()
+        };
+        let said = Alerts::default().judge(&causes);
+        assert_eq!(codes(&said), ["loop-overrun"]);
+        let text =
+            "the control loop is late and the robot is held: a tick by 310 ms, 5 of 64 ticks";
+        assert_eq!(said[0].text, text);
     }
 
     #[test]

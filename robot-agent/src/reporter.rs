@@ -59,6 +59,7 @@ fn wire_cause(cause: GateCause) -> safety::GateCause {
         GateCause::Lease => safety::GateCause::Lease,
         GateCause::LinkPolicy => safety::GateCause::LinkPolicy,
         GateCause::ExternalHold => safety::GateCause::ExternalHold,
+        GateCause::LoopOverrun => safety::GateCause::LoopOverrun,
         GateCause::StalePosition => safety::GateCause::StalePosition,
         GateCause::Tilt => safety::GateCause::Tilt,
         GateCause::StaleFeedback => safety::GateCause::StaleFeedback,
@@ -89,6 +90,7 @@ impl Reporter {
             base: self.base.as_deref(),
             surface_change: snapshot.surface_change,
             dug_in_at: snapshot.dug_in_at,
+            overrun: snapshot.overrun,
         };
         let counted = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         RobotState {
