@@ -8,40 +8,40 @@ use std::path::Path;
 
 use crate::checksum::crc32;
 
-/// What stands in front of the checksum, on a line of its own behind the content.
-const SEAL: &str = "\ncrc32 ";
-/// Length of that line: eight hexadecimal digits and the line's end follow.
-const SEAL_BYTES: usize = SEAL.len() + 8 + 1;
+/// What stands in front of the checksum, the last field of a file's JSON object.
+const SEAL: &str = ",\"crc32\":\"";
+/// What stands behind it.
+const SEAL_END: &str = "\"}";
+/// Length of the field: eight hexadecimal digits are between.
+const SEAL_BYTES: usize = SEAL.len() + 8 + SEAL_END.len();
 
 /// The content of a file is not what was written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("its checksum does not fit")]
 pub(crate) struct Damaged;
 
-/// A content with its checksum.
-pub(crate) fn sealed(content: &[u8]) -> Vec<u8> {
-    let mut sealed = content.to_vec();
-    sealed.extend_from_slice(format!("{SEAL}{:08x}\n", crc32(content)).as_bytes());
+/// A JSON object with its checksum as one more field, which readers that do not know it ignore.
+pub(crate) fn sealed(object: &[u8]) -> Vec<u8> {
+    let open = object.strip_suffix(b"}").unwrap_or(object);
+    let mut sealed = open.to_vec();
+    sealed.extend_from_slice(format!("{SEAL}{:08x}{SEAL_END}", crc32(open)).as_bytes());
     sealed
 }
 
-/// The content of a file that was written with its checksum. What an earlier agent wrote has none
-/// and is given whole: a damaged seal stays in it, and does not parse.
+/// The JSON object of a file that was written with its checksum, which it still holds. What an
+/// earlier agent wrote has none and is given as it is.
 ///
 /// # Errors
 /// [`Damaged`].
 pub(crate) fn unsealed(file: &[u8]) -> Result<&[u8], Damaged> {
-    let Some((content, seal)) = file.split_last_chunk::<SEAL_BYTES>() else {
+    let Some((open, seal)) = file.split_last_chunk::<SEAL_BYTES>() else {
         return Ok(file);
     };
-    if !seal.starts_with(SEAL.as_bytes()) {
-        return Ok(file);
+    let is_sealed = seal.starts_with(SEAL.as_bytes()) && seal.ends_with(SEAL_END.as_bytes());
+    if is_sealed && !seal[SEAL.len()..].starts_with(format!("{:08x}", crc32(open)).as_bytes()) {
+        return Err(Damaged);
     }
-    if sealed(content) == file {
-        Ok(content)
-    } else {
-        Err(Damaged)
-    }
+    Ok(file)
 }
 
 /// Replaces a file in a folder and waits until the disk has it; the former content stays when it
@@ -93,22 +93,31 @@ mod tests {
     fn a_sealed_file_of_which_any_bit_is_flipped_or_any_end_is_missing_gives_no_other_content() {
         let content = br#"{"latch":null,"seen":["a"]}"#;
         let file = sealed(content);
-        assert_eq!(unsealed(&file), Ok(&content[..]));
+        let value = |bytes: &[u8]| serde_json::from_slice::<serde_json::Value>(bytes).ok();
+        let fields = |bytes: &[u8]| {
+            let mut object = value(bytes)?;
+            let fields = object.as_object_mut()?;
+            // The checksum itself is no content, whatever it is called.
+            fields.retain(|name, _| name == "latch" || name == "seen");
+            Some(object)
+        };
+        let expected = value(content);
+        assert_eq!(fields(unsealed(&file).unwrap()), expected);
         assert_eq!(unsealed(content), Ok(&content[..]), "of an earlier agent");
-        let is_harmless = |read: Result<&[u8], Damaged>| {
-            read.is_err()
-                || read == Ok(content)
-                || read.is_ok_and(|read| serde_json::from_slice::<serde_json::Value>(read).is_err())
+        let is_harmless = |damaged: &[u8]| {
+            let Ok(read) = unsealed(damaged) else {
+                return true;
+            };
+            let read = fields(read);
+            read.is_none() || read == expected
         };
         for bit in 0..file.len() * 8 {
             let mut damaged = file.clone();
             damaged[bit / 8] ^= 1 << (bit % 8);
-            assert!(is_harmless(unsealed(&damaged)), "bit {bit}");
+            assert!(is_harmless(&damaged), "bit {bit}");
         }
         for length in 0..file.len() {
-            let read = unsealed(&file[..length]);
-            let without_seal = read.map(<[u8]>::trim_ascii_end);
-            assert!(is_harmless(without_seal), "{length} bytes");
+            assert!(is_harmless(&file[..length]), "{length} bytes");
         }
     }
 }
