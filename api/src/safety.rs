@@ -85,6 +85,8 @@ pub enum GateCause {
     LinkPolicy,
     /// An external limit holds the robot, or a required holder is silent.
     ExternalHold,
+    /// The robot's control loop does not keep its rate.
+    LoopOverrun,
     /// The robot does not know where it is.
     StalePosition,
     /// The robot leans too far.

@@ -230,7 +230,8 @@ fn loop_core(
 ) -> Result<(LoopCore, Option<JoinHandle<()>>), StartError> {
     let mut core = LoopCore::new(model, ends)
         .with_blind_within_fence(config.blind_within_fence)
-        .with_silent_after(base.silent_after());
+        .with_silent_after(base.silent_after())
+        .with_period(config.period());
     let part = "record of the loop";
     let Some((to, head)) = RunHead::of(config, boot, base.silent_after()) else {
         return Ok((core, None));

@@ -7,10 +7,12 @@ use tread_api::ids::AlertCode;
 use tread_api::robot::{AlertReport, OutboxStatus, Severity};
 use tread_control::geometry::Point;
 
+use crate::control_loop::overrun::{Overrun, WINDOW_TICKS};
 use crate::control_loop::seam::Fault;
 use crate::control_loop::surface::Comparison;
 use crate::drive::Battery;
 use crate::drive::ros2::refusal::{Counts, Dropping};
+use crate::outbox::OutboxDamage;
 
 /// Charge below which the battery is low, and above which it no longer is.
 const BATTERY_LOW: (f64, f64) = (0.20, 0.25);
@@ -26,12 +28,16 @@ pub(crate) struct Causes<'a> {
     pub(crate) fault: Option<Fault>,
     pub(crate) is_stopped: bool,
     pub(crate) outbox: OutboxStatus,
+    /// What was lost by damage of the outbox's files.
+    pub(crate) outbox_damage: Option<&'a OutboxDamage>,
     /// What of the base's words was dropped.
     pub(crate) base: Option<&'a Counts>,
     /// Where the ground is not as the map says.
     pub(crate) surface_change: Option<Comparison>,
     /// Where the wheels turn without progress.
     pub(crate) dug_in_at: Option<Point>,
+    /// How far the loop is from its rate, while the robot is held for it.
+    pub(crate) overrun: Option<Overrun>,
 }
 
 /// Which wavering alerts stand.
@@ -113,7 +119,17 @@ impl Alerts {
             let text = "many measurements wait for the server".to_owned();
             alert("outbox-long", Severity::Warning, text)
         });
-        let lost = (causes.outbox.dropped > 0).then(|| {
+        let damage = causes.outbox_damage;
+        let damaged = damage.and_then(|damage| {
+            let (lost, kept_in) = (damage.lost_records, damage.kept_in.as_ref()?.display());
+            let text = format!(
+                "files of the outbox were damaged, {lost} records were lost: the disk may be failing; \
+                 what was damaged is in `{kept_in}`"
+            );
+            alert("outbox-damaged", Severity::Warning, text)
+        });
+        let by_damage = damage.map_or(0, |damage| damage.lost_records);
+        let lost = (causes.outbox.dropped > by_damage).then(|| {
             let text = "measurements were lost: the store was full".to_owned();
             alert("outbox-dropped", Severity::Warning, text)
         });
@@ -126,8 +142,17 @@ impl Alerts {
             let text = format!("the wheels turn and the robot stays at ({x_m:.1} m, {y_m:.1} m)");
             alert("dug-in", Severity::Critical, text)
         });
+        let overrun = causes.overrun.and_then(|Overrun { late, late_ticks }| {
+            let late_ms = late.as_millis();
+            let text = format!(
+                "the control loop is late and the robot is held: a tick by {late_ms} ms, \
+                 {late_ticks} of {WINDOW_TICKS} ticks"
+            );
+            alert("loop-overrun", Severity::Critical, text)
+        });
         [
             battery,
+            overrun,
             fault,
             dropped,
             stopped.flatten(),
@@ -135,6 +160,7 @@ impl Alerts {
             causes.surface_change.as_ref().and_then(surface_change),
             long.flatten(),
             lost.flatten(),
+            damaged,
         ]
         .into_iter()
         .flatten()
@@ -144,6 +170,8 @@ impl Alerts {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use tread_api::site::Cell;
     use tread_control::tracking::ThetaKnowledge;
 
@@ -196,6 +224,60 @@ mod tests {
         assert!(codes(&alerts.judge(&causes)).contains(&"outbox-long"));
         causes.outbox.pending = 20_000;
         assert!(!codes(&alerts.judge(&causes)).contains(&"outbox-long"));
+    }
+
+    #[test]
+    fn a_loop_that_is_late_is_an_alert_with_its_figures() {
+        let causes = Causes {
+            overrun: Some(Overrun {
+                late: Duration::from_millis(310),
+                late_ticks: 5,
+            }),
+            ..Causes::default()
+        };
+        let said = Alerts::default().judge(&causes);
+        assert_eq!(codes(&said), ["loop-overrun"]);
+        let text =
+            "the control loop is late and the robot is held: a tick by 310 ms, 5 of 64 ticks";
+        assert_eq!(said[0].text, text);
+    }
+
+    #[test]
+    fn records_lost_by_damage_are_an_alert_of_their_own_with_their_number() {
+        let damage = OutboxDamage {
+            lost_records: 34,
+            kept_in: Some("/data/outbox/damaged.bin".into()),
+        };
+        let mut causes = Causes {
+            outbox: OutboxStatus {
+                pending: 34,
+                dropped: 34,
+                refused: 0,
+            },
+            outbox_damage: Some(&damage),
+            ..Causes::default()
+        };
+        let mut alerts = Alerts::default();
+        let said = alerts.judge(&causes);
+        assert_eq!(codes(&said), ["outbox-damaged"]);
+        let text = &said[0].text;
+        assert!(
+            text.contains("34 records") && text.contains("damaged.bin"),
+            "{text}"
+        );
+        causes.outbox.dropped = 35;
+        let both = ["outbox-dropped", "outbox-damaged"];
+        assert_eq!(codes(&alerts.judge(&causes)), both, "a full store too");
+        causes.outbox.dropped = 34;
+        let seen = OutboxDamage {
+            kept_in: None,
+            ..damage.clone()
+        };
+        causes.outbox_damage = Some(&seen);
+        assert!(
+            alerts.judge(&causes).is_empty(),
+            "somebody has looked at it"
+        );
     }
 
     #[test]

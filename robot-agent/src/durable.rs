@@ -1,9 +1,48 @@
-//! Small files that are replaced as a whole and outlive a crash.
+//! Small files that are replaced as a whole and outlive a crash, with a checksum where a changed
+//! byte must not pass for another content.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::Path;
+
+use crate::checksum::crc32;
+
+/// What stands in front of the checksum, the last field of a file's JSON object.
+const SEAL: &str = ",\"crc32\":\"";
+/// What stands behind it.
+const SEAL_END: &str = "\"}";
+/// Length of the field: eight hexadecimal digits are between.
+const SEAL_BYTES: usize = SEAL.len() + 8 + SEAL_END.len();
+
+/// The content of a file is not what was written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("its checksum does not fit")]
+pub(crate) struct Damaged;
+
+/// A JSON object with its checksum as one more field, which readers that do not know it ignore.
+pub(crate) fn sealed(object: &[u8]) -> Vec<u8> {
+    let open = object.strip_suffix(b"}").unwrap_or(object);
+    let mut sealed = open.to_vec();
+    sealed.extend_from_slice(format!("{SEAL}{:08x}{SEAL_END}", crc32(open)).as_bytes());
+    sealed
+}
+
+/// The JSON object of a file that was written with its checksum, which it still holds. What an
+/// earlier agent wrote has none and is given as it is.
+///
+/// # Errors
+/// [`Damaged`].
+pub(crate) fn unsealed(file: &[u8]) -> Result<&[u8], Damaged> {
+    let Some((open, seal)) = file.split_last_chunk::<SEAL_BYTES>() else {
+        return Ok(file);
+    };
+    let is_sealed = seal.starts_with(SEAL.as_bytes()) && seal.ends_with(SEAL_END.as_bytes());
+    if is_sealed && !seal[SEAL.len()..].starts_with(format!("{:08x}", crc32(open)).as_bytes()) {
+        return Err(Damaged);
+    }
+    Ok(file)
+}
 
 /// Replaces a file in a folder and waits until the disk has it; the former content stays when it
 /// refuses. Blocks.
@@ -44,4 +83,41 @@ fn put_in_place(folder: &Path, name: &str, mut file: File, content: &[u8]) -> io
     file.sync_data()?;
     fs::rename(new_path(folder, name), folder.join(name))?;
     File::open(folder).and_then(|folder| folder.sync_all())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sealed_file_of_which_any_bit_is_flipped_or_any_end_is_missing_gives_no_other_content() {
+        let content = br#"{"latch":null,"seen":["a"]}"#;
+        let file = sealed(content);
+        let value = |bytes: &[u8]| serde_json::from_slice::<serde_json::Value>(bytes).ok();
+        let fields = |bytes: &[u8]| {
+            let mut object = value(bytes)?;
+            let fields = object.as_object_mut()?;
+            // The checksum itself is no content, whatever it is called.
+            fields.retain(|name, _| name == "latch" || name == "seen");
+            Some(object)
+        };
+        let expected = value(content);
+        assert_eq!(fields(unsealed(&file).unwrap()), expected);
+        assert_eq!(unsealed(content), Ok(&content[..]), "of an earlier agent");
+        let is_harmless = |damaged: &[u8]| {
+            let Ok(read) = unsealed(damaged) else {
+                return true;
+            };
+            let read = fields(read);
+            read.is_none() || read == expected
+        };
+        for bit in 0..file.len() * 8 {
+            let mut damaged = file.clone();
+            damaged[bit / 8] ^= 1 << (bit % 8);
+            assert!(is_harmless(&damaged), "bit {bit}");
+        }
+        for length in 0..file.len() {
+            assert!(is_harmless(&file[..length]), "{length} bytes");
+        }
+    }
 }

@@ -31,6 +31,7 @@ pub mod sim;
 
 mod alerts;
 mod base;
+mod checksum;
 mod control_loop;
 mod dispatcher;
 mod doctor;

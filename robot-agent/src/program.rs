@@ -14,6 +14,7 @@ use crate::agent::{Agent, RunningAgent};
 use crate::config::{AgentConfig, Flags, LogFormat};
 use crate::doctor::{self, DoctorArgs};
 use crate::enroll::{self, EnrollArgs};
+use crate::recording::salvage::{self, RecoverArgs};
 use crate::recording::told::{self, ReplayArgs};
 
 /// Drives one robot and measures its ground.
@@ -34,6 +35,8 @@ enum Action {
     Doctor(DoctorArgs),
     /// Run controller and estimator on a record again, and say where they differ from it
     Replay(ReplayArgs),
+    /// Copy what is readable of a damaged or torn record into a whole one
+    Recover(RecoverArgs),
 }
 
 /// Runs an agent until it is told to stop by SIGTERM or ctrl-c; the first argument is the
@@ -66,6 +69,7 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
             Ok(false) => return ExitCode::FAILURE,
             Err(cause) => Err(cause),
         },
+        Some(Action::Recover(args)) => salvage::run(&args),
         None => run(&words.flags),
     };
     match ended {

@@ -59,6 +59,7 @@ fn wire_cause(cause: GateCause) -> safety::GateCause {
         GateCause::Lease => safety::GateCause::Lease,
         GateCause::LinkPolicy => safety::GateCause::LinkPolicy,
         GateCause::ExternalHold => safety::GateCause::ExternalHold,
+        GateCause::LoopOverrun => safety::GateCause::LoopOverrun,
         GateCause::StalePosition => safety::GateCause::StalePosition,
         GateCause::Tilt => safety::GateCause::Tilt,
         GateCause::StaleFeedback => safety::GateCause::StaleFeedback,
@@ -79,15 +80,17 @@ impl Reporter {
     pub(crate) fn state(&self) -> RobotState {
         let snapshot = self.shared.snapshot();
         let now = self.clock.monotonic();
-        let outbox = self.outbox.status();
+        let (outbox, outbox_damage) = (self.outbox.status(), self.outbox.damage());
         let causes = Causes {
             battery: snapshot.battery,
             fault: snapshot.fault,
             is_stopped: self.shared.safety.stop() != 0,
             outbox,
+            outbox_damage: Some(&outbox_damage),
             base: self.base.as_deref(),
             surface_change: snapshot.surface_change,
             dug_in_at: snapshot.dug_in_at,
+            overrun: snapshot.overrun,
         };
         let counted = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         RobotState {

@@ -12,7 +12,7 @@ pub use sequence::{Items, Sequence};
 /// Largest message that is looked at, bytes: a laser scan is 10 KiB, what Tread reads is far less.
 pub const MESSAGE_BYTES_MAX: usize = 256 * 1024;
 /// Bytes of the encapsulation before the message.
-const ENCAPSULATION_BYTES: usize = 4;
+pub const ENCAPSULATION_BYTES: usize = 4;
 /// Most bytes behind a message that are taken for padding to a multiple of four.
 const PADDING_BYTES_MAX: usize = 3;
 /// Plain CDR, high byte first.
@@ -23,8 +23,8 @@ const LITTLE_ENDIAN: [u8; 2] = [0, 1];
 /// Why bytes are no message of the type.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum CdrError {
-    /// The message is larger than [`MESSAGE_BYTES_MAX`].
-    #[error("the message is larger than {MESSAGE_BYTES_MAX} bytes")]
+    /// The message is larger than [`MESSAGE_BYTES_MAX`], or than it may be where it is read.
+    #[error("the message is too large")]
     TooLarge,
     /// It begins with another encapsulation than plain CDR's.
     #[error("the message is not in plain CDR")]
@@ -65,6 +65,17 @@ pub trait Field<'a>: Copy {
 /// # Errors
 /// [`CdrError`]; nothing was allocated, whatever the message claims.
 pub fn decode<'a, T: Field<'a>>(message: &'a [u8]) -> Result<T, CdrError> {
+    decode_up_to(message, MESSAGE_BYTES_MAX)
+}
+
+/// Reads a whole message that may have so many bytes; for what does not come from a network.
+///
+/// # Errors
+/// [`CdrError`]; nothing was allocated, whatever the message claims.
+pub fn decode_up_to<'a, T: Field<'a>>(message: &'a [u8], bytes_max: usize) -> Result<T, CdrError> {
+    if message.len() > bytes_max {
+        return Err(CdrError::TooLarge);
+    }
     let mut reader = Reader::new(message)?;
     let decoded = T::read(&mut reader)?;
     if reader.left() > PADDING_BYTES_MAX {
@@ -92,9 +103,6 @@ pub struct Reader<'a> {
 
 impl<'a> Reader<'a> {
     fn new(message: &'a [u8]) -> Result<Self, CdrError> {
-        if message.len() > MESSAGE_BYTES_MAX {
-            return Err(CdrError::TooLarge);
-        }
         let (head, body) = message
             .split_at_checked(ENCAPSULATION_BYTES)
             .ok_or(CdrError::Short)?;

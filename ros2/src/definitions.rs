@@ -7,7 +7,7 @@ const RULE: &str =
     "================================================================================\n";
 
 /// Package and name, and the fields.
-const DEFINITIONS: [(&str, &str); 24] = [
+const DEFINITIONS: [(&str, &str); 25] = [
     (
         "builtin_interfaces/Time",
         "int32 sec\n\
@@ -18,6 +18,7 @@ const DEFINITIONS: [(&str, &str); 24] = [
         "builtin_interfaces/Time stamp\n\
          string frame_id\n",
     ),
+    ("std_msgs/String", "string data\n"),
     (
         "std_msgs/MultiArrayDimension",
         "string label\n\
@@ -195,7 +196,8 @@ const DEFINITIONS: [(&str, &str); 24] = [
          float64 segment_weighted\n\
          uint8 mode\n\
          uint8 fault\n\
-         uint8 gate\n",
+         uint8 gate\n\
+         uint64 judged_ns\n",
     ),
 ];
 

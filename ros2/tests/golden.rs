@@ -9,7 +9,7 @@ use tread_ros2::definitions::schema;
 use tread_ros2::messages::{
     BatteryState, DiagnosticArray, DiagnosticStatus, Float64MultiArray, Header, Imu, JointState,
     KeyValue, Message, MultiArrayDimension, MultiArrayLayout, Odometry, Path, Point, Pose,
-    PoseStamped, PoseWithCovariance, PoseWithCovarianceStamped, Quaternion, Time, Twist,
+    PoseStamped, PoseWithCovariance, PoseWithCovarianceStamped, Quaternion, Text, Time, Twist,
     TwistStamped, TwistWithCovariance, Vector3,
 };
 use tread_ros2::rmw::{Attachment, gid};
@@ -219,6 +219,12 @@ fn commands_and_what_is_published_are_read_and_written_as_by_rosbags() {
         };
         same(&mut left, name, message);
     }
+    for (name, data) in [
+        ("text", "{\"tick\": 7, \"to\": \"hört\"}"),
+        ("empty_text", ""),
+    ] {
+        same(&mut left, name, Text { data });
+    }
     let poses = ["", "m", "mm"].map(|frame| PoseStamped {
         header: header(frame),
         pose: POSE,
@@ -271,6 +277,7 @@ fn hashes_of_all_types_are_those_of_rosbags() {
     check(Odometry::TYPE);
     check(Path::TYPE);
     check(PoseWithCovarianceStamped::TYPE);
+    check(Text::TYPE);
     check(Twist::TYPE);
     check(TwistStamped::TYPE);
     assert!(left.is_empty(), "{left:?}");

@@ -123,6 +123,8 @@ messages = {
     "array": array("wheels", 4),
     "plain_array": array("", 2),
     "empty_array": array("", 0),
+    "text": make("std_msgs/msg/String", '{"tick": 7, "to": "hört"}'),
+    "empty_text": make("std_msgs/msg/String", ""),
     "path": path(3),
     "empty_path": path(0),
     "diagnostics": diagnostics(4),

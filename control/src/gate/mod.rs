@@ -38,6 +38,8 @@ pub enum GateCause {
     LinkPolicy,
     /// A hold from outside.
     ExternalHold,
+    /// The control loop does not keep its rate.
+    LoopOverrun,
     /// The robot does not know where it is.
     StalePosition,
     /// The robot leans too far.
@@ -50,7 +52,7 @@ pub enum GateCause {
 
 impl GateCause {
     /// Every cause, in order.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 15] = [
         Self::Acceleration,
         Self::Speed,
         Self::CommandAge,
@@ -61,6 +63,7 @@ impl GateCause {
         Self::Lease,
         Self::LinkPolicy,
         Self::ExternalHold,
+        Self::LoopOverrun,
         Self::StalePosition,
         Self::Tilt,
         Self::StaleFeedback,
@@ -88,6 +91,8 @@ pub struct Reasons {
     pub tilt_rad: Option<f64>,
     /// The robot must know where it is, and does not.
     pub is_position_lost: bool,
+    /// The control loop does not keep its rate.
+    pub is_loop_late: bool,
     /// Somebody outside holds the robot.
     pub is_held_outside: bool,
     /// The server has been silent for longer than it may.
@@ -117,6 +122,7 @@ impl Reasons {
             (self.is_stopped, GateCause::Stop),
             (leans, GateCause::Tilt),
             (self.is_position_lost, GateCause::StalePosition),
+            (self.is_loop_late, GateCause::LoopOverrun),
             (self.is_held_outside, GateCause::ExternalHold),
             (self.is_link_silent, GateCause::LinkPolicy),
             (self.is_driver_silent, GateCause::Lease),

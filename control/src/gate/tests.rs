@@ -10,7 +10,7 @@ fn maybe(most: f64) -> impl Strategy<Value = Option<f64>> {
 
 fn reasons() -> impl Strategy<Value = Reasons> {
     let rare = || prop::bool::weighted(0.1);
-    let holds = (rare(), rare(), rare(), rare(), rare());
+    let holds = (rare(), rare(), rare(), rare(), rare(), rare());
     let caps = (maybe(0.9), maybe(1.5), maybe(1.5), maybe(1.5), maybe(1.5));
     let real = prop_oneof![
         2 => Just(None),
@@ -23,6 +23,7 @@ fn reasons() -> impl Strategy<Value = Reasons> {
         is_held_outside: holds.2,
         is_link_silent: holds.3,
         is_driver_silent: holds.4,
+        is_loop_late: holds.5,
         tilt_rad: caps.0,
         fence_max_m_s: caps.1,
         outside_max_m_s: caps.2,

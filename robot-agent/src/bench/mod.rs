@@ -225,7 +225,7 @@ impl Bench {
         let individual = Individual::of_seed(seed);
         let drive = SimulatedDrive::new(scenario, model, start, individual, SimMode::Explicit)?;
         Ok(Self {
-            core: LoopCore::new(model, loop_ends),
+            core: LoopCore::new(model, loop_ends).with_period(PERIOD),
             drive,
             ends,
             safety,
@@ -380,7 +380,7 @@ impl Bench {
     }
 
     /// Lets time pass.
-    fn pass_time(&mut self, time: Duration) {
+    pub(crate) fn pass_time(&mut self, time: Duration) {
         self.now += time;
         self.clock.advance(time);
     }
@@ -458,6 +458,17 @@ impl Bench {
         self.simulate();
         let now = self.moment();
         self.core.tick(now, false, &mut Unheard(&mut self.drive));
+        self.collect();
+    }
+
+    /// A tick whose thread gets no time for a while before it judges what is wanted.
+    #[cfg(test)]
+    pub(crate) fn tick_interrupted(&mut self, time: Duration) {
+        self.simulate();
+        let now = self.moment();
+        self.pass_time(time);
+        let judged = self.now;
+        self.core.tick_by(now, &|| judged, false, &mut self.drive);
         self.collect();
     }
 

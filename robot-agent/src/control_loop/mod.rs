@@ -8,6 +8,7 @@ pub(crate) mod driven;
 mod gain;
 pub(crate) mod origin;
 mod outgoing;
+pub(crate) mod overrun;
 mod pace;
 pub(crate) mod prior;
 mod progress;
@@ -53,14 +54,11 @@ pub(crate) fn run(
             core.note_overrun();
         }
         let stop = core.is_told_to_stop();
-        core.tick(
-            Moment {
-                monotonic: began,
-                wall: clock.wall(),
-            },
-            stop,
-            drive.as_mut(),
-        );
+        let now = Moment {
+            monotonic: began,
+            wall: clock.wall(),
+        };
+        core.tick_by(now, &|| clock.monotonic(), stop, drive.as_mut());
         let ended = clock.monotonic();
         core.note_tick_time(ended.saturating_sub(began));
         if stop {
@@ -83,6 +81,8 @@ pub(crate) fn run(
 
 #[cfg(test)]
 pub(crate) mod hold_tests;
+#[cfg(test)]
+mod overrun_tests;
 #[cfg(test)]
 mod prior_tests;
 #[cfg(test)]

@@ -24,6 +24,7 @@ use tread_control::reference::Governor;
 use super::active::Hold;
 use super::driven::Driven;
 use super::origin::JobOrigin;
+use super::overrun::Overrun;
 use super::prior::Prior;
 use super::site_view::SiteView;
 use super::surface::Comparison;
@@ -235,6 +236,8 @@ pub(crate) struct Snapshot {
     pub(crate) surface_change: Option<Comparison>,
     /// Where the wheels turn without progress.
     pub dug_in_at: Option<Point>,
+    /// How far the loop is from its rate, while the robot is held for it.
+    pub(crate) overrun: Option<Overrun>,
     /// How much the wheels slip along their way, while they turn.
     pub slip: Option<SideSlip>,
     /// The cell that the robot is in.
@@ -268,6 +271,7 @@ impl Default for Snapshot {
             excited: false,
             surface_change: None,
             dug_in_at: None,
+            overrun: None,
             slip: None,
             cell: None,
             terrain: None,

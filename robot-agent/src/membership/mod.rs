@@ -82,6 +82,12 @@ pub enum MembershipFileError {
         #[source]
         source: io::Error,
     },
+    /// It is not as it was written.
+    #[error("`{}` is damaged; join the fleet again", path.display())]
+    Damaged {
+        /// Which file.
+        path: PathBuf,
+    },
     /// It does not say what it should.
     #[error("`{}` does not read; join the fleet again", path.display())]
     Malformed {
@@ -109,12 +115,15 @@ impl Membership {
     /// [`MembershipFileError`]: it cannot be read.
     pub fn load(folder: &Path) -> Result<Option<Self>, MembershipFileError> {
         let path = folder.join(FILE);
-        let text = match std::fs::read(&path) {
-            Ok(text) => text,
+        let file = match std::fs::read(&path) {
+            Ok(file) => file,
             Err(cause) if cause.kind() == io::ErrorKind::NotFound => return Ok(None),
             Err(source) => return Err(MembershipFileError::Unreadable { path, source }),
         };
-        serde_json::from_slice(&text)
+        let Ok(text) = durable::unsealed(&file) else {
+            return Err(MembershipFileError::Damaged { path });
+        };
+        serde_json::from_slice(text)
             .map(Some)
             .map_err(|source| MembershipFileError::Malformed { path, source })
     }
@@ -129,7 +138,7 @@ impl Membership {
             .map_err(io::Error::other)
             .and_then(|text| {
                 std::fs::create_dir_all(folder)?;
-                durable::replace_private(folder, FILE, &text)
+                durable::replace_private(folder, FILE, &durable::sealed(&text))
             });
         written.map_err(|source| MembershipFileError::Unwritable { path, source })
     }
@@ -186,6 +195,34 @@ mod tests {
         }
         std::fs::write(folder.join(FILE), "{}").unwrap();
         assert!(Membership::load(&folder).is_err());
+    }
+
+    #[test]
+    fn a_file_with_any_bit_flipped_is_refused_and_never_another_membership() {
+        let folder = tempfile::tempdir().unwrap();
+        membership().save(folder.path()).unwrap();
+        let path = folder.path().join(FILE);
+        let intact = std::fs::read(&path).unwrap();
+        for bit in 0..intact.len() * 8 {
+            let mut damaged = intact.clone();
+            damaged[bit / 8] ^= 1 << (bit % 8);
+            std::fs::write(&path, damaged).unwrap();
+            match Membership::load(folder.path()) {
+                // In the checksum's own name.
+                Ok(read) => assert_eq!(read, Some(membership()), "bit {bit}"),
+                Err(refused) => {
+                    let refused = refused.to_string();
+                    assert!(
+                        refused.contains("join the fleet again"),
+                        "bit {bit}: {refused}"
+                    );
+                }
+            }
+        }
+        let earlier = serde_json::to_vec_pretty(&membership()).unwrap();
+        std::fs::write(&path, earlier).unwrap();
+        let read = Membership::load(folder.path()).unwrap();
+        assert_eq!(read, Some(membership()), "of an earlier agent");
     }
 
     #[test]

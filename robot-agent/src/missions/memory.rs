@@ -23,6 +23,12 @@ pub enum MemoryError {
         #[source]
         source: io::Error,
     },
+    /// The file is not as it was written.
+    #[error("the mission memory `{}` is damaged; move it away to start afresh", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+    },
     /// The file does not hold what it should.
     #[error("the mission memory `{}` does not parse; move it away to start afresh", path.display())]
     Malformed {
@@ -55,8 +61,13 @@ impl Memory {
     pub fn load(&self) -> Result<Holder, MemoryError> {
         let path = self.folder.join(FILE_NAME);
         match fs::read(&path) {
-            Ok(text) => serde_json::from_slice(&text)
-                .map_err(|source| MemoryError::Malformed { path, source }),
+            Ok(file) => {
+                let Ok(text) = durable::unsealed(&file) else {
+                    return Err(MemoryError::Damaged { path });
+                };
+                serde_json::from_slice(text)
+                    .map_err(|source| MemoryError::Malformed { path, source })
+            }
             Err(source) if source.kind() == io::ErrorKind::NotFound => Ok(Holder::default()),
             Err(source) => Err(MemoryError::File {
                 action: "read",
@@ -72,7 +83,8 @@ impl Memory {
     /// [`MemoryError`] when the disk refuses; the former content stays then.
     pub fn save(&self, holder: &Holder) -> Result<(), MemoryError> {
         let text = serde_json::to_vec(holder).map_err(io::Error::from);
-        let written = text.and_then(|text| durable::replace(&self.folder, FILE_NAME, &text));
+        let written = text
+            .and_then(|text| durable::replace(&self.folder, FILE_NAME, &durable::sealed(&text)));
         written.map_err(|source| MemoryError::File {
             action: "written",
             path: self.folder.join(FILE_NAME),
@@ -106,5 +118,32 @@ mod tests {
         fs::write(folder.path().join(FILE_NAME), b"{").unwrap();
         let refused = Memory::new(folder.path()).load().unwrap_err();
         assert!(refused.to_string().contains(FILE_NAME), "{refused}");
+    }
+
+    #[test]
+    fn a_memory_with_any_bit_flipped_is_refused_and_never_another_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let memory = Memory::new(folder.path());
+        let mut holder = Holder::default();
+        holder.cancel(MissionId::from_uuid(Uuid::from_u128(7)));
+        memory.save(&holder).unwrap();
+        let path = folder.path().join(FILE_NAME);
+        let intact = fs::read(&path).unwrap();
+        for bit in 0..intact.len() * 8 {
+            let mut damaged = intact.clone();
+            damaged[bit / 8] ^= 1 << (bit % 8);
+            fs::write(&path, damaged).unwrap();
+            match memory.load() {
+                // In the checksum's own name.
+                Ok(read) => assert_eq!(read, holder, "bit {bit}"),
+                Err(refused) => {
+                    let refused = refused.to_string();
+                    assert!(refused.contains("move it away"), "bit {bit}: {refused}");
+                }
+            }
+        }
+        let earlier = serde_json::to_vec(&holder).unwrap();
+        fs::write(&path, earlier).unwrap();
+        assert_eq!(memory.load().unwrap(), holder, "of an earlier agent");
     }
 }

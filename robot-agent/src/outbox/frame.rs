@@ -7,17 +7,29 @@
 //! | … | the body: 1 byte kind, then its fields, integers little-endian |
 //!
 //! Kind 1 is a record: 8 ordinal, 16 boot id, 8 seq, then its content as JSON. Kind 2 is the head:
-//! 8 ordinal of the first record that still waits, 8 records dropped and 8 refused since ever.
+//! 8 ordinal of the first record that still waits, 8 records dropped and 8 refused since ever, 8 of
+//! the dropped ones lost by damage, 8 ordinal of the next record, 8 records that wait. Earlier
+//! agents wrote heads without the last three.
+//!
+//! A damaged frame hides its own end, so [`find`] looks for the next intact one byte by byte. No
+//! frame is found inside the content of another: a frame begins with a length below 16 MiB, so its
+//! fourth byte is 0, which JSON never contains.
+
+use std::ops::Range;
 
 use tread_api::ids::BootId;
 use uuid::Uuid;
+
+use crate::checksum::crc32;
 
 /// Length and checksum in front of a body.
 pub(super) const HEADER_BYTES: usize = 8;
 /// Fields of a record in front of its content.
 const RECORD_FIELDS_BYTES: usize = 1 + 8 + 16 + 8;
-/// Length of a head's body.
-const HEAD_BYTES: usize = 1 + 8 + 8 + 8;
+/// Length of a head's body as earlier agents wrote it, and as it is written now.
+const HEAD_BYTES: [usize; 2] = [1 + 3 * 8, 1 + 6 * 8];
+/// Length of a head's whole frame.
+pub(super) const HEAD_FRAME_BYTES: usize = HEADER_BYTES + HEAD_BYTES[1];
 /// Largest body; a length above it is damage.
 pub(super) const BODY_BYTES_MAX: usize = 1024 * 1024;
 /// Largest content of a record, bytes.
@@ -31,10 +43,36 @@ const KIND_HEAD: u8 = 2;
 pub(super) struct Head {
     /// Ordinal of the first record that still waits.
     pub(super) first_pending: u64,
-    /// Records dropped since the store was made.
+    /// Records dropped since the store was made, those lost by damage included.
     pub(super) dropped: u64,
     /// Records refused since the store was made.
     pub(super) refused: u64,
+    /// Records lost by damage since the store was made.
+    pub(super) damaged: u64,
+    /// Ordinal of the next record when this was written.
+    pub(super) next_ordinal: u64,
+    /// Records from the first to the next ordinal that waited when this was written; the others
+    /// were lost before and are counted.
+    pub(super) waiting: u64,
+}
+
+impl Head {
+    /// The newer one of two heads of one store: their counters only rise.
+    pub(super) fn newest(self, other: Self) -> Self {
+        let age = |head: &Self| {
+            (
+                head.next_ordinal,
+                head.first_pending,
+                head.dropped,
+                head.refused,
+            )
+        };
+        if age(&other) > age(&self) {
+            other
+        } else {
+            self
+        }
+    }
 }
 
 /// A record's name and place in the order of all.
@@ -53,34 +91,6 @@ pub(super) struct RecordName {
 pub(super) enum Frame<'file> {
     Record(RecordName, &'file [u8]),
     Head(Head),
-}
-
-const CRC_TABLE: [u32; 256] = {
-    let mut table = [0; 256];
-    let mut index = 0;
-    while index < 256 {
-        #[expect(clippy::cast_possible_truncation, reason = "below 256")]
-        let mut value = index as u32;
-        let mut bit = 0;
-        while bit < 8 {
-            value = if value & 1 == 1 {
-                0xEDB8_8320 ^ (value >> 1)
-            } else {
-                value >> 1
-            };
-            bit += 1;
-        }
-        table[index] = value;
-        index += 1;
-    }
-    table
-};
-
-fn crc32(bytes: &[u8]) -> u32 {
-    !bytes.iter().fold(u32::MAX, |crc, &byte| {
-        let [low, ..] = crc.to_le_bytes();
-        CRC_TABLE[usize::from(low ^ byte)] ^ (crc >> 8)
-    })
 }
 
 fn seal(body: &[u8], frame: &mut Vec<u8>) {
@@ -103,9 +113,16 @@ pub(super) fn write_record(name: RecordName, content: &[u8], frame: &mut Vec<u8>
 
 /// Appends a head's frame.
 pub(super) fn write_head(head: Head, frame: &mut Vec<u8>) {
-    let mut body = Vec::with_capacity(HEAD_BYTES);
+    let mut body = Vec::with_capacity(HEAD_BYTES[1]);
     body.push(KIND_HEAD);
-    for field in [head.first_pending, head.dropped, head.refused] {
+    for field in [
+        head.first_pending,
+        head.dropped,
+        head.refused,
+        head.damaged,
+        head.next_ordinal,
+        head.waiting,
+    ] {
         body.extend_from_slice(&field.to_le_bytes());
     }
     seal(&body, frame);
@@ -138,19 +155,69 @@ pub(super) fn read(bytes: &[u8]) -> Option<(Frame<'_>, usize)> {
             let seq = u64::from_le_bytes(take(&mut fields)?);
             Frame::Record(RecordName { ordinal, boot, seq }, fields)
         }
-        KIND_HEAD => Frame::Head(Head {
-            first_pending: u64::from_le_bytes(take(&mut fields)?),
-            dropped: u64::from_le_bytes(take(&mut fields)?),
-            refused: u64::from_le_bytes(take(&mut fields)?),
-        }),
+        KIND_HEAD => Frame::Head(read_head(&mut fields)?),
         _ => return None,
     };
     Some((frame, HEADER_BYTES + length))
 }
 
-/// Bytes in front of a record's content within its frame.
-pub(super) const fn content_offset() -> usize {
-    HEADER_BYTES + RECORD_FIELDS_BYTES
+fn read_head(fields: &mut &[u8]) -> Option<Head> {
+    let mut field = || Some(u64::from_le_bytes(take(fields)?));
+    let head = Head {
+        first_pending: field()?,
+        dropped: field()?,
+        refused: field()?,
+        ..Head::default()
+    };
+    Some(match (field(), field(), field()) {
+        (Some(damaged), Some(next_ordinal), Some(waiting)) => Head {
+            damaged,
+            next_ordinal,
+            waiting,
+            ..head
+        },
+        // Of an earlier agent: it says nothing of records behind the first that waits.
+        _ => Head {
+            next_ordinal: head.first_pending,
+            ..head
+        },
+    })
+}
+
+/// Whether a frame may begin here, judged without its checksum: a cheap look before a costly one.
+fn may_begin(bytes: &[u8], ordinals: &Range<u64>) -> bool {
+    let mut rest = bytes;
+    let (Some(length), Some(_), Some([kind])) = (
+        take(&mut rest).map(u32::from_le_bytes),
+        take::<4>(&mut rest),
+        take(&mut rest),
+    ) else {
+        return false;
+    };
+    let length = usize::try_from(length).unwrap_or(usize::MAX);
+    match kind {
+        KIND_RECORD => {
+            let ordinal = take(&mut rest).map(u64::from_le_bytes);
+            (RECORD_FIELDS_BYTES..=BODY_BYTES_MAX).contains(&length)
+                && ordinal.is_some_and(|ordinal| ordinals.contains(&ordinal))
+        }
+        KIND_HEAD => HEAD_BYTES.contains(&length),
+        _ => false,
+    }
+}
+
+/// The first intact frame at or behind `from` that is a head or a record with one of these
+/// ordinals: where it begins, what it is, and its whole length.
+pub(super) fn find<'file>(
+    bytes: &'file [u8],
+    from: usize,
+    ordinals: &Range<u64>,
+) -> Option<(usize, Frame<'file>, usize)> {
+    (from..bytes.len()).find_map(|at| {
+        let rest = &bytes[at..];
+        let (frame, length) = may_begin(rest, ordinals).then(|| read(rest)).flatten()?;
+        Some((at, frame, length))
+    })
 }
 
 #[cfg(test)]
@@ -158,8 +225,48 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_checksum_is_the_one_of_ethernet() {
-        assert_eq!(crc32(b"123456789"), 0xCBF4_3926);
+    fn a_head_of_an_earlier_agent_says_nothing_of_what_waits() {
+        let mut body = vec![KIND_HEAD];
+        for field in [7_u64, 2, 1] {
+            body.extend_from_slice(&field.to_le_bytes());
+        }
+        let mut frame = Vec::new();
+        seal(&body, &mut frame);
+        let head = Head {
+            first_pending: 7,
+            dropped: 2,
+            refused: 1,
+            next_ordinal: 7,
+            ..Head::default()
+        };
+        assert_eq!(read(&frame), Some((Frame::Head(head), frame.len())));
+        frame.clear();
+        write_head(head, &mut frame);
+        assert_eq!(frame.len(), HEAD_FRAME_BYTES);
+        assert_eq!(read(&frame), Some((Frame::Head(head), frame.len())));
+    }
+
+    #[test]
+    fn the_next_intact_frame_is_found_behind_damage_and_only_with_a_fitting_ordinal() {
+        let name = |ordinal| RecordName {
+            ordinal,
+            boot: BootId::from_uuid(Uuid::from_u128(9)),
+            seq: ordinal,
+        };
+        let mut bytes = Vec::new();
+        write_record(name(3), b"{}", &mut bytes);
+        let second = bytes.len();
+        write_record(name(4), b"{\"x\":1}", &mut bytes);
+        bytes[2] ^= 1;
+        let found = find(&bytes, 0, &(3..9)).unwrap();
+        let length = bytes.len() - second;
+        assert_eq!(
+            found,
+            (second, Frame::Record(name(4), b"{\"x\":1}"), length)
+        );
+        assert_eq!(find(&bytes, 0, &(5..9)), None);
+        bytes[second..].fill(0);
+        assert_eq!(find(&bytes, 0, &(0..9)), None);
     }
 
     #[test]

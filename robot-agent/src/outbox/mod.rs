@@ -3,15 +3,19 @@
 //! ```text
 //! append → pending → (server's receipt) → settled
 //!             │             └─ refused → dead-letter file, settled
-//!             └─ store full → dropped, counted
+//!             └─ store full, or damaged on the disk → dropped, counted
 //! ```
 //!
 //! Records are named `(robot, boot, seq)`; the server counts none twice, so a record may be sent
 //! again whenever an answer was lost. Syncing is batched: a crash loses at most what was appended
 //! within [`SYNC_DELAY`]. The outbox knows nothing of zenoh.
 
+mod bounded_file;
+mod damage;
 mod dead_letters;
 mod frame;
+mod head_file;
+mod recovery;
 mod store;
 
 use std::fs::{self, File, TryLockError};
@@ -77,6 +81,15 @@ pub struct PendingBatch {
     through_ordinal: u64,
 }
 
+/// Damage of the outbox's files.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct OutboxDamage {
+    /// Records lost by it since the store was made.
+    pub lost_records: u64,
+    /// Where the damaged bytes are, until a person has removed them and the agent has started again.
+    pub kept_in: Option<PathBuf>,
+}
+
 /// A handle to one robot's outbox; clones share it.
 #[derive(Debug, Clone)]
 pub struct Outbox {
@@ -126,11 +139,17 @@ impl Outbox {
             Err(TryLockError::Error(source)) => return Err(lock_failed(source)),
         }
         let (store, recovery) = Store::open(folder, limits, boot)?;
-        if recovery.torn_bytes > 0 || recovery.lost_records > 0 {
-            warn!(
-                torn_bytes = recovery.torn_bytes,
-                lost_records = recovery.lost_records,
-                "repaired the outbox after a crash",
+        if recovery.torn_bytes > 0 {
+            let torn_bytes = recovery.torn_bytes;
+            warn!(torn_bytes, "repaired the outbox after a crash");
+        }
+        if recovery.damaged_bytes > 0 || recovery.lost_records > 0 {
+            let (bytes, lost) = (recovery.damaged_bytes, recovery.lost_records);
+            error!(
+                damaged_bytes = bytes,
+                lost_records = lost,
+                "files of the outbox `{}` are damaged: {lost} records are lost",
+                folder.display(),
             );
         }
         let dead_letters = DeadLetters::new(folder);
@@ -253,6 +272,15 @@ impl Outbox {
         }
     }
 
+    /// What was lost by damage of the files.
+    pub fn damage(&self) -> OutboxDamage {
+        let store = locked(&self.shared.store);
+        OutboxDamage {
+            kept_in: store.damage(),
+            lost_records: store.head().damaged,
+        }
+    }
+
     /// How many records this folder has ever taken, over all runs.
     pub fn appended(&self) -> u64 {
         locked(&self.shared.store).appended()
@@ -306,5 +334,7 @@ impl Outbox {
     }
 }
 
+#[cfg(test)]
+mod damage_tests;
 #[cfg(test)]
 mod tests;

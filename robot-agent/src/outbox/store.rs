@@ -3,7 +3,8 @@
 //! Records are counted by *ordinals* over the life of the store. A file is named after the first
 //! ordinal that it may hold, so a file is settled as soon as the next file's name is not above the
 //! head. The head (how far everything is settled) is a frame among the records; it is written with
-//! the next sync. After a crash, whatever was synced is as it was; of what was not, a prefix may
+//! the next sync, and each sync leaves a copy of it in a file of its own. Damage costs the records
+//! that it hits and no others ([`recovery`]). After a crash, whatever was synced is as it was; of what was not, a prefix may
 //! survive: a record that was settled a moment before may show up again, and the server knows it.
 
 use std::collections::{BTreeMap, VecDeque};
@@ -12,9 +13,13 @@ use std::io::{self, Write};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
+use tracing::error;
 use tread_api::ids::BootId;
 
+use super::damage::DamagedBytes;
 use super::frame::{self, CONTENT_BYTES_MAX, Frame, Head, RecordName};
+use super::head_file::{HeadFile, HeadWrite};
+use super::recovery::{self, Recovery, Scan};
 
 /// The ending of the store's files.
 const FILE_ENDING: &str = "log";
@@ -59,7 +64,7 @@ pub enum StoreError {
     TooLarge(usize),
 }
 
-fn failure<'path>(
+pub(super) fn failure<'path>(
     action: &'static str,
     path: &'path Path,
 ) -> impl FnOnce(io::Error) -> StoreError + 'path {
@@ -82,17 +87,9 @@ struct LogFile {
 struct Entry {
     name: RecordName,
     file: u64,
-    content_at: u64,
+    frame_at: u64,
+    frame_bytes: usize,
     content_bytes: usize,
-}
-
-/// What was found when the store was opened.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct Recovery {
-    /// Bytes cut off behind the last whole frame of a file.
-    pub(super) torn_bytes: u64,
-    /// Records that should be there and are not.
-    pub(super) lost_records: u64,
 }
 
 /// The files and what they hold. Every call may touch the disk.
@@ -108,6 +105,9 @@ pub(super) struct Store {
     pending_bytes: u64,
     head: Head,
     head_is_dirty: bool,
+    head_file: HeadFile,
+    damaged: DamagedBytes,
+    has_damage: bool,
 }
 
 /// Files to sync without holding the store, and the head that is safe once that is done.
@@ -115,6 +115,7 @@ pub(super) struct Store {
 pub(super) struct SyncTicket {
     files: Vec<(u64, PathBuf, File, u64)>,
     head: Head,
+    head_write: HeadWrite,
 }
 
 impl SyncTicket {
@@ -123,7 +124,8 @@ impl SyncTicket {
         for (_, path, file, _) in &self.files {
             file.sync_data().map_err(failure("sync", path))?;
         }
-        Ok(())
+        // Afterwards: it says that those are safe.
+        self.head_write.run()
     }
 }
 
@@ -135,92 +137,67 @@ impl Store {
         boot: BootId,
     ) -> Result<(Self, Recovery), StoreError> {
         fs::create_dir_all(folder).map_err(failure("make the folder", folder))?;
+        let (head_file, known) = HeadFile::open(folder)?;
+        if known.is_none() {
+            sync_folder(folder)?;
+        }
+        let mut damaged = DamagedBytes::new(folder);
+        let has_damage = damaged.is_present();
+        let found = recovery::recover(folder, &file_names(folder)?, known, &mut damaged)?;
+        let recovery = found.recovery;
         let mut store = Self {
             folder: folder.to_owned(),
             limits,
             boot,
             next_seq: 0,
-            next_ordinal: 0,
+            next_ordinal: found.next_ordinal,
             files: BTreeMap::new(),
             pending: VecDeque::new(),
             pending_bytes: 0,
-            head: Head::default(),
-            head_is_dirty: false,
+            head: found.head,
+            head_is_dirty: recovery.lost_records > 0,
+            head_file,
+            damaged,
+            has_damage: has_damage || recovery.damaged_bytes > 0 || recovery.lost_records > 0,
         };
-        let mut recovery = Recovery::default();
-        for (index, first_ordinal) in file_names(folder)?.into_iter().enumerate() {
-            let expected = (index > 0).then_some(store.next_ordinal);
-            store.recover_file(first_ordinal, expected, &mut recovery)?;
-        }
-        store.next_ordinal = store.next_ordinal.max(store.head.first_pending);
-        let first_pending = store.head.first_pending;
-        store
-            .pending
-            .retain(|entry| entry.name.ordinal >= first_pending);
-        store.pending_bytes = store
-            .pending
-            .iter()
-            .map(|entry| size(entry.content_bytes))
-            .sum();
-        if recovery.lost_records > 0 {
-            store.head.dropped += recovery.lost_records;
-            store.head_is_dirty = true;
+        for (scan, bytes) in found.files {
+            store.take_file(&scan, bytes)?;
         }
         // Records that were dropped just before a crash may be back.
         store.make_room(0, 0);
         if store.files.is_empty() {
             store.start_file()?;
         }
+        if recovery.lost_records > 0 {
+            // At once, so that they are counted once whatever comes.
+            let ticket = store.begin_sync()?;
+            ticket.run()?;
+            store.finish_sync(&ticket)?;
+        }
         Ok((store, recovery))
     }
 
-    /// Reads one file into the store. `expected` is the ordinal that it should begin with.
-    fn recover_file(
-        &mut self,
-        first_ordinal: u64,
-        expected: Option<u64>,
-        recovery: &mut Recovery,
-    ) -> Result<(), StoreError> {
-        let path = file_path(&self.folder, first_ordinal);
-        let bytes = fs::read(&path).map_err(failure("read", &path))?;
-        let mut next_ordinal = first_ordinal.max(self.next_ordinal);
-        let mut at = 0;
-        while let Some((frame, length)) = frame::read(&bytes[at..]) {
-            match frame {
-                Frame::Record(name, content) => {
-                    if name.ordinal < next_ordinal {
-                        break;
-                    }
-                    next_ordinal = name.ordinal + 1;
-                    self.pending.push_back(Entry {
-                        name,
-                        file: first_ordinal,
-                        content_at: size(at + frame::content_offset()),
-                        content_bytes: content.len(),
-                    });
-                }
-                Frame::Head(head) => self.head = head,
+    /// Takes over a file of an earlier run, which has been repaired.
+    fn take_file(&mut self, scan: &Scan, bytes: u64) -> Result<(), StoreError> {
+        let first_pending = self.head.first_pending;
+        for record in &scan.records {
+            if record.name.ordinal < first_pending {
+                continue;
             }
-            at += length;
+            self.pending_bytes += size(record.content_bytes);
+            self.pending.push_back(Entry {
+                name: record.name,
+                file: scan.first_ordinal,
+                frame_at: size(record.at),
+                frame_bytes: record.bytes,
+                content_bytes: record.content_bytes,
+            });
         }
-        recovery.torn_bytes += size(bytes.len() - at);
-        if at == 0 {
-            // Nothing of it had reached the disk when the machine died, or nothing is left.
-            return fs::remove_file(&path).map_err(failure("remove", &path));
-        }
-        let settled = expected.map(|expected| expected.max(self.head.first_pending));
-        recovery.lost_records += settled.map_or(0, |from| first_ordinal.saturating_sub(from));
-        self.next_ordinal = next_ordinal;
-        let file = open_for_append(&path)?;
-        if at < bytes.len() {
-            file.set_len(size(at)).map_err(failure("repair", &path))?;
-        }
-        let bytes = size(at);
         self.files.insert(
-            first_ordinal,
+            scan.first_ordinal,
             LogFile {
-                path,
-                file,
+                path: scan.path.clone(),
+                file: open_for_append(&scan.path)?,
                 bytes,
                 is_dirty: true,
             },
@@ -296,11 +273,11 @@ impl Store {
         self.next_ordinal += 1;
         self.next_seq += 1;
         self.make_room(1, bytes);
-        let content_at = frame_at + size(frame::content_offset());
         self.pending.push_back(Entry {
             name,
             file,
-            content_at,
+            frame_at,
+            frame_bytes: frame.len(),
             content_bytes: content.len(),
         });
         self.pending_bytes += bytes;
@@ -327,34 +304,80 @@ impl Store {
         Some(entry)
     }
 
-    /// The oldest records of one run, read from the disk: at least one if any waits.
+    /// The oldest records of one run, read from the disk: at least one if any waits. One that has
+    /// been damaged since it was written is lost and counted.
     pub(super) fn oldest(
+        &mut self,
+        records_max: usize,
+        bytes_max: u64,
+    ) -> Result<Vec<(RecordName, Vec<u8>)>, StoreError> {
+        while !self.pending.is_empty() {
+            let records = self.intact_oldest(records_max, bytes_max)?;
+            if !records.is_empty() {
+                return Ok(records);
+            }
+            self.lose_oldest()?;
+        }
+        Ok(Vec::new())
+    }
+
+    /// The oldest records of one run up to the first that is damaged.
+    fn intact_oldest(
         &self,
         records_max: usize,
         bytes_max: u64,
     ) -> Result<Vec<(RecordName, Vec<u8>)>, StoreError> {
-        let Some(first) = self.pending.front() else {
-            return Ok(Vec::new());
-        };
-        let mut records = Vec::new();
+        let mut records: Vec<(RecordName, Vec<u8>)> = Vec::new();
         let mut bytes = 0;
         for entry in self.pending.iter().take(records_max) {
             bytes += size(entry.content_bytes);
-            if entry.name.boot != first.name.boot || (bytes > bytes_max && !records.is_empty()) {
+            let is_of_another_run = records
+                .first()
+                .is_some_and(|(first, _)| first.boot != entry.name.boot);
+            if is_of_another_run || (bytes > bytes_max && !records.is_empty()) {
                 break;
             }
-            records.push((entry.name, self.content(entry)?));
+            let Some(content) = self.content(entry)? else {
+                break;
+            };
+            records.push((entry.name, content));
         }
         Ok(records)
     }
 
-    fn content(&self, entry: &Entry) -> Result<Vec<u8>, StoreError> {
+    /// Gives up the oldest record, whose frame is damaged.
+    fn lose_oldest(&mut self) -> Result<(), StoreError> {
+        let Some(&entry) = self.pending.front() else {
+            return Ok(());
+        };
         let log = &self.files[&entry.file];
-        let mut content = vec![0; entry.content_bytes];
-        log.file
-            .read_exact_at(&mut content, entry.content_at)
-            .map_err(failure("read", &log.path))?;
-        Ok(content)
+        let mut bytes = vec![0; entry.frame_bytes];
+        // What cannot be read any more is zeros.
+        let _ = log.file.read_exact_at(&mut bytes, entry.frame_at);
+        let at = usize::try_from(entry.frame_at).unwrap_or(usize::MAX);
+        let place = at..at.saturating_add(entry.frame_bytes);
+        self.damaged.keep(&log.path, place, &bytes)?;
+        let RecordName { boot, seq, .. } = entry.name;
+        error!(%boot, seq, "record {seq} of the outbox is damaged and lost");
+        self.pop_oldest();
+        self.head.dropped += 1;
+        self.head.damaged += 1;
+        self.has_damage = true;
+        Ok(())
+    }
+
+    /// A record's content as it was written; none if its frame is damaged.
+    fn content(&self, entry: &Entry) -> Result<Option<Vec<u8>>, StoreError> {
+        let log = &self.files[&entry.file];
+        let mut bytes = vec![0; entry.frame_bytes];
+        match log.file.read_exact_at(&mut bytes, entry.frame_at) {
+            Err(cause) if recovery::is_unreadable(&cause) => return Ok(None),
+            outcome => outcome.map_err(failure("read", &log.path))?,
+        }
+        Ok(match frame::read(&bytes) {
+            Some((Frame::Record(name, content), _)) if name == entry.name => Some(content.to_vec()),
+            Some(_) | None => None,
+        })
     }
 
     /// Everything up to this ordinal is settled, `refused` of it by refusal.
@@ -372,6 +395,8 @@ impl Store {
 
     /// Writes the head if it has moved, and names the files to be synced.
     pub(super) fn begin_sync(&mut self) -> Result<SyncTicket, StoreError> {
+        self.head.next_ordinal = self.next_ordinal;
+        self.head.waiting = size(self.pending.len());
         if self.head_is_dirty {
             let mut frame = Vec::new();
             frame::write_head(self.head, &mut frame);
@@ -386,6 +411,7 @@ impl Store {
         Ok(SyncTicket {
             files,
             head: self.head,
+            head_write: self.head_file.write(self.head)?,
         })
     }
 
@@ -418,7 +444,10 @@ impl Store {
     pub(super) fn every_pending(&self) -> Result<Vec<(RecordName, Vec<u8>)>, StoreError> {
         self.pending
             .iter()
-            .map(|entry| Ok((entry.name, self.content(entry)?)))
+            .filter_map(|entry| match self.content(entry) {
+                Ok(content) => content.map(|content| Ok((entry.name, content))),
+                Err(cause) => Some(Err(cause)),
+            })
             .collect()
     }
 
@@ -444,13 +473,19 @@ impl Store {
     pub(super) fn head(&self) -> Head {
         self.head
     }
+
+    /// Where damaged bytes are kept, if anything was found damaged in this run, or was before and
+    /// nobody has removed what was kept of it.
+    pub(super) fn damage(&self) -> Option<PathBuf> {
+        self.has_damage.then(|| self.damaged.path())
+    }
 }
 
 pub(super) fn size(length: usize) -> u64 {
     u64::try_from(length).expect("no machine has longer pointers than 64 bits")
 }
 
-fn file_path(folder: &Path, first_ordinal: u64) -> PathBuf {
+pub(super) fn file_path(folder: &Path, first_ordinal: u64) -> PathBuf {
     folder.join(format!("{first_ordinal:020}.{FILE_ENDING}"))
 }
 

@@ -10,7 +10,8 @@ use tread_api::ids::MissionId;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RefusedRecord};
 use uuid::Uuid;
 
-use super::store::{Recovery, Store};
+use super::recovery::Recovery;
+use super::store::Store;
 use super::*;
 
 #[derive(Debug, Clone)]
@@ -38,11 +39,11 @@ fn steps() -> impl Strategy<Value = Vec<Step>> {
     prop::collection::vec(step, 1..120)
 }
 
-fn boot(number: u128) -> BootId {
+pub(super) fn boot(number: u128) -> BootId {
     BootId::from_uuid(Uuid::from_u128(number))
 }
 
-fn log_files(folder: &Path) -> Vec<(PathBuf, u64)> {
+pub(super) fn log_files(folder: &Path) -> Vec<(PathBuf, u64)> {
     let mut files: Vec<_> = fs::read_dir(folder)
         .unwrap()
         .map(|entry| entry.unwrap().path())
@@ -107,19 +108,19 @@ impl Model {
     }
 }
 
-const SMALL: Limits = Limits {
+pub(super) const SMALL: Limits = Limits {
     pending_bytes_max: 3_000,
     pending_records_max: 25,
     file_bytes: 700,
 };
 
-fn sync(store: &mut Store) {
+pub(super) fn sync(store: &mut Store) {
     let ticket = store.begin_sync().unwrap();
     ticket.run().unwrap();
     store.finish_sync(&ticket).unwrap();
 }
 
-fn contents(store: &Store) -> Vec<(u64, Vec<u8>)> {
+pub(super) fn contents(store: &Store) -> Vec<(u64, Vec<u8>)> {
     // Records of one run come at a time, so all of them are read by settling a copy's head.
     store
         .every_pending()
@@ -130,7 +131,7 @@ fn contents(store: &Store) -> Vec<(u64, Vec<u8>)> {
 }
 
 /// A folder in memory where there is one: thousands of syncs on a real disk take minutes.
-fn fast_folder() -> TempDir {
+pub(super) fn fast_folder() -> TempDir {
     TempDir::new_in("/dev/shm")
         .or_else(|_| TempDir::new())
         .unwrap()
@@ -223,7 +224,7 @@ proptest! {
     }
 }
 
-fn report(number: u128) -> RecordContent {
+pub(super) fn report(number: u128) -> RecordContent {
     RecordContent::Mission(MissionReport {
         mission: MissionId::from_uuid(Uuid::from_u128(number)),
         revision: 1,
@@ -238,7 +239,7 @@ fn report(number: u128) -> RecordContent {
     })
 }
 
-fn open(folder: &Path, number: u128) -> Result<Outbox, OutboxError> {
+pub(super) fn open(folder: &Path, number: u128) -> Result<Outbox, OutboxError> {
     Outbox::open(
         folder,
         Limits::default(),
@@ -247,7 +248,7 @@ fn open(folder: &Path, number: u128) -> Result<Outbox, OutboxError> {
     )
 }
 
-fn receipt(refused: &[u64]) -> Receipt {
+pub(super) fn receipt(refused: &[u64]) -> Receipt {
     let refused = refused
         .iter()
         .map(|&seq| RefusedRecord {
@@ -336,7 +337,21 @@ fn the_dead_letters_are_bounded() {
         .unwrap()
         .map(|entry| entry.unwrap().metadata().unwrap().len())
         .sum();
-    assert!(bytes <= 2 * dead_letters::DEAD_LETTER_BYTES_MAX, "{bytes}");
+    assert!(bytes <= 2 * bounded_file::FILE_BYTES_MAX, "{bytes}");
+}
+
+#[test]
+fn a_dead_letter_that_a_crash_left_half_written_does_not_spoil_the_next() {
+    let folder = TempDir::new().unwrap();
+    let mut letters = DeadLetters::new(folder.path());
+    letters.write(boot(1), 1, "refused", "{}").unwrap();
+    let path = folder.path().join("dead-letters.jsonl");
+    let torn = fs::read(&path).unwrap();
+    fs::write(&path, &torn[..torn.len() - 9]).unwrap();
+    letters.write(boot(1), 2, "refused", "{}").unwrap();
+    let text = fs::read_to_string(&path).unwrap();
+    let last: serde_json::Value = serde_json::from_str(text.lines().last().unwrap()).unwrap();
+    assert_eq!(last["seq"], 2);
 }
 
 #[test]
@@ -349,7 +364,7 @@ fn a_folder_serves_one_agent_at_a_time() {
 }
 
 #[test]
-fn damage_in_the_middle_loses_only_the_rest_of_that_file_and_counts_it() {
+fn damage_in_the_middle_loses_only_the_record_that_it_hits_and_counts_it() {
     let folder = TempDir::new().unwrap();
     let (mut store, _) = Store::open(folder.path(), SMALL, boot(1)).unwrap();
     for _ in 0..20 {
@@ -363,13 +378,33 @@ fn damage_in_the_middle_loses_only_the_rest_of_that_file_and_counts_it() {
     bytes[10] ^= 1;
     fs::write(&files[1].0, bytes).unwrap();
     let (store, recovery) = Store::open(folder.path(), SMALL, boot(2)).unwrap();
-    let Recovery {
-        lost_records,
-        torn_bytes,
-    } = recovery;
-    assert!(lost_records > 0 && torn_bytes > 0, "{recovery:?}");
-    assert_eq!(store.head().dropped, lost_records);
-    assert_eq!(store.pending_records() as u64, 20 - lost_records);
+    let expected = Recovery {
+        torn_bytes: 0,
+        damaged_bytes: 141,
+        lost_records: 1,
+    };
+    assert_eq!(recovery, expected);
+    assert_eq!((store.head().dropped, store.pending_records()), (1, 19));
+}
+
+#[test]
+fn a_torn_end_is_cut_off_and_counts_as_no_damage() {
+    let folder = TempDir::new().unwrap();
+    let (mut store, _) = Store::open(folder.path(), SMALL, boot(1)).unwrap();
+    for _ in 0..3 {
+        store.append(&[7; 100]).unwrap();
+    }
+    sync(&mut store);
+    // Of this one the machine's death lets a part survive.
+    store.append(&[8; 100]).unwrap();
+    drop(store);
+    let (path, length) = log_files(folder.path()).remove(0);
+    let file = OpenOptions::new().write(true).open(&path).unwrap();
+    file.set_len(length - 50).unwrap();
+    let (store, recovery) = Store::open(folder.path(), SMALL, boot(2)).unwrap();
+    assert_eq!((recovery.torn_bytes, recovery.damaged_bytes), (91, 0));
+    assert_eq!((store.head().dropped, store.damage()), (0, None));
+    assert_eq!(store.pending_records(), 3);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -27,6 +27,8 @@ pub(crate) const NOTES_MAX: usize = 512;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TickInputs {
     pub(crate) now: Moment,
+    /// When what a driver wants was judged, and what else carries its own end.
+    pub(crate) judged: Duration,
     pub(crate) is_told_to_stop: bool,
     /// Commands that it took, noted before it.
     pub(crate) commands: u32,

@@ -10,6 +10,7 @@
 pub(crate) mod frame;
 mod read;
 pub(crate) mod replay;
+pub(crate) mod salvage;
 pub(crate) mod told;
 pub(crate) mod views;
 mod words;
@@ -30,8 +31,12 @@ use crate::safety::LoopView;
 use frame::NotedCommand;
 pub(crate) use writer::RecordWriter;
 
-/// The version of what is written here; another one is not read.
-pub(crate) const FORMAT: u32 = 1;
+/// The version of what is written here. Format 1 had JSON messages, a tick without
+/// [`LoopTick::judged_ns`](tread_ros2::messages::tread::LoopTick), and a loop that did not watch its
+/// own rate.
+pub(crate) const FORMAT: u32 = 2;
+/// Versions that are read.
+pub(crate) const FORMATS_READ: std::ops::RangeInclusive<u32> = 1..=FORMAT;
 /// The version of this agent.
 pub(crate) const VERSION: &str = env!("CARGO_PKG_VERSION");
 /// Smallest and largest file, MiB.

@@ -7,12 +7,16 @@ use std::path::{Path, PathBuf};
 use mcap::McapError;
 use mcap::io::MessageReader;
 use mcap::sans_io::LinearReaderOptions;
+use serde::de::DeserializeOwned;
 use tread_api::ids::BootId;
 
-use super::{CommandMessage, FORMAT, RunHead, SafetyMessage, topics};
+use super::{CommandMessage, FORMAT, FORMATS_READ, RunHead, SafetyMessage, topics, words};
 
 /// Largest piece of a file that is looked at, bytes.
 const PIECE_BYTES_MAX: usize = 256 * 1024 * 1024;
+/// The encoding of messages that are JSON.
+const JSON: &str = "json";
+
 /// Why a record cannot be run again at all.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ReadError {
@@ -29,7 +33,7 @@ pub(crate) enum ReadError {
     #[error("`{file}` has no channel `{topic}`: it is no record of tread-agent")]
     NoChannel { file: PathBuf, topic: &'static str },
     #[error(
-        "`{file}` is written in format {found}, and this agent reads format {FORMAT}: replay it with tread-agent {version}"
+        "`{file}` is written in format {found}, and this agent reads formats up to {FORMAT}: replay it with tread-agent {version}"
     )]
     OtherFormat {
         file: PathBuf,
@@ -85,6 +89,22 @@ struct Part {
 struct Raw {
     topic: String,
     bytes: Vec<u8>,
+    /// Whether it is JSON itself, as in format 1, and not a text of ROS.
+    is_json: bool,
+}
+
+impl Raw {
+    /// The JSON in it.
+    fn json<T: DeserializeOwned>(&self, part: &Part) -> Result<T, ReadError> {
+        let json = if self.is_json {
+            &self.bytes[..]
+        } else {
+            let text = words::text_of(&self.bytes);
+            text.map_err(|refused| part.malformed(&self.topic, refused))?
+                .as_bytes()
+        };
+        serde_json::from_slice(json).map_err(|refused| part.malformed(&self.topic, refused))
+    }
 }
 
 impl Part {
@@ -105,6 +125,7 @@ impl Part {
     fn next(&mut self) -> Option<Result<Raw, McapError>> {
         Some(self.messages.next()?.map(|message| Raw {
             topic: message.channel.topic.clone(),
+            is_json: message.channel.message_encoding == JSON,
             bytes: message.data.into_owned(),
         }))
     }
@@ -123,7 +144,7 @@ impl Part {
         loop {
             match self.next() {
                 Some(Ok(raw)) if raw.topic == topics::RUN => {
-                    return self.read_head(&raw.bytes);
+                    return self.read_head(&raw);
                 }
                 Some(Ok(_)) => has_message = true,
                 Some(Err(_)) | None if !has_message => {
@@ -137,14 +158,13 @@ impl Part {
         }
     }
 
-    fn read_head(&self, bytes: &[u8]) -> Result<RunHead, ReadError> {
-        let refused = |problem: serde_json::Error| self.malformed(topics::RUN, problem);
+    fn read_head(&self, raw: &Raw) -> Result<RunHead, ReadError> {
         // The format first: of another one nothing else is known.
-        let spelled: serde_json::Value = serde_json::from_slice(bytes).map_err(refused)?;
+        let spelled: serde_json::Value = raw.json(self)?;
         let found = spelled.get("format").and_then(serde_json::Value::as_u64);
         let found = found.and_then(|found| u32::try_from(found).ok());
         let found = found.ok_or_else(|| self.malformed(topics::RUN, "it names no format"))?;
-        if found != FORMAT {
+        if !FORMATS_READ.contains(&found) {
             let version = spelled.get("version").and_then(serde_json::Value::as_str);
             return Err(ReadError::OtherFormat {
                 file: self.file.clone(),
@@ -152,7 +172,7 @@ impl Part {
                 version: version.unwrap_or("of its time").to_owned(),
             });
         }
-        serde_json::from_slice(bytes).map_err(refused)
+        raw.json(self)
     }
 
     /// Whether a channel was met so far.
@@ -233,21 +253,10 @@ impl Run {
 }
 
 fn entry_of(part: &Part, raw: Raw) -> Result<Option<Entry>, ReadError> {
-    let Raw { topic, bytes } = raw;
-    Ok(match topic.as_str() {
-        topics::COMMAND => {
-            let message = serde_json::from_slice(&bytes);
-            Some(Entry::Command(Box::new(
-                message.map_err(|refused| part.malformed(&topic, refused))?,
-            )))
-        }
-        topics::SAFETY => {
-            let message = serde_json::from_slice(&bytes);
-            Some(Entry::Safety(Box::new(
-                message.map_err(|refused| part.malformed(&topic, refused))?,
-            )))
-        }
-        topics::TICK => Some(Entry::Tick(bytes)),
+    Ok(match raw.topic.as_str() {
+        topics::COMMAND => Some(Entry::Command(Box::new(raw.json(part)?))),
+        topics::SAFETY => Some(Entry::Safety(Box::new(raw.json(part)?))),
+        topics::TICK => Some(Entry::Tick(raw.bytes)),
         // The rest is for people.
         _ => None,
     })

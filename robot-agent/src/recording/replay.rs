@@ -17,7 +17,7 @@ use tread_ros2::messages::tread::{LoopSample, LoopTick, tick_bits};
 
 use super::frame::{Note, Notes, TickFrame, notes};
 use super::read::{Entry, ReadError, Run};
-use super::{CommandMessage, CommandRecord, RunHead, VERSION, words};
+use super::{CommandMessage, CommandRecord, FORMAT, RunHead, VERSION, words};
 use crate::control_loop::origin::JobOrigin;
 use crate::control_loop::seam::{AgentEnds, COMMANDS_MAX, Job, LoopCommand, seam};
 use crate::control_loop::segments::Moment;
@@ -141,7 +141,7 @@ pub(crate) fn replay(files: &[PathBuf]) -> Result<Replayed, ReplayError> {
             None => break,
             Some(Entry::Command(command)) => player.waiting.push(*command),
             Some(Entry::Safety(message)) => player.view = message.view,
-            Some(Entry::Tick(bytes)) => player.tick(&bytes)?,
+            Some(Entry::Tick(bytes)) => player.take(&bytes)?,
         }
     }
     player.found.torn = run.torn;
@@ -156,6 +156,12 @@ impl Player {
         let mut core = LoopCore::new(model, loop_ends)
             .with_blind_within_fence(head.blind_within_fence)
             .with_silent_after(head.silent_after);
+        let period = Duration::try_from_secs_f64(head.rate_hz.recip());
+        if let Ok(period) = period
+            && head.format >= FORMAT
+        {
+            core = core.with_period(period);
+        }
         core.note_to(Some(taker));
         Ok(Self {
             model,
@@ -179,6 +185,19 @@ impl Player {
                 torn: None,
             },
         })
+    }
+
+    /// Takes a tick as it is in the record.
+    fn take(&mut self, bytes: &[u8]) -> Result<(), ReplayError> {
+        if self.found.head.format >= FORMAT {
+            return self.tick(bytes);
+        }
+        let tick = self.last_tick + 1;
+        let bytes = words::from_format_1(bytes).map_err(|refused| ReplayError::Malformed {
+            tick,
+            problem: refused.to_string(),
+        })?;
+        self.tick(&bytes)
     }
 
     fn tick(&mut self, recorded_bytes: &[u8]) -> Result<(), ReplayError> {
@@ -216,7 +235,9 @@ impl Player {
         shared.safety.show(recorded.stop, &self.view);
         let silence = Duration::from_nanos(recorded.server_silence_ns);
         shared.show_server_silence(now.monotonic, silence);
-        self.core.tick(now, has(tick_bits::TOLD_TO_STOP), &mut base);
+        let judged = Duration::from_nanos(recorded.judged_ns);
+        let stop = has(tick_bits::TOLD_TO_STOP);
+        self.core.tick_by(now, &|| judged, stop, &mut base);
         // What the loop hands back is freed.
         self.ends.events.try_iter().for_each(drop);
         if let Some(frame) = self.noted() {

@@ -21,7 +21,7 @@ use uuid::Uuid;
 
 use super::read::ReadError;
 use super::replay::{ReplayError, Replayed, replay};
-use super::{RecordingConfig, RunHead, told, topics};
+use super::{RecordingConfig, RunHead, told, topics, words};
 use crate::bench::{Bench, boot, site_of};
 use crate::sim::scenario::Scenario;
 
@@ -70,7 +70,7 @@ pub(super) fn files(folder: &Path) -> Vec<PathBuf> {
 }
 
 /// A record of a short mission in one file.
-fn short(folder: &Path) -> PathBuf {
+pub(super) fn short(folder: &Path) -> PathBuf {
     let mut bench = bench(config(folder));
     drive(&mut bench, 4 * SECOND);
     assert_eq!(bench.end_record(), 0);
@@ -85,6 +85,16 @@ fn replayed(file: &Path) -> Replayed {
 fn rewritten(
     file: &Path,
     without: Option<&str>,
+    change: impl FnMut(&str, &[u8]) -> Option<Vec<u8>>,
+) -> PathBuf {
+    rewritten_in(file, None, without, change)
+}
+
+/// The same in another encoding of messages, of which only the name is changed here.
+fn rewritten_in(
+    file: &Path,
+    encoding: Option<&str>,
+    without: Option<&str>,
     mut change: impl FnMut(&str, &[u8]) -> Option<Vec<u8>>,
 ) -> PathBuf {
     let path = file.with_extension("changed.mcap");
@@ -96,14 +106,10 @@ fn rewritten(
         if without == Some(channel.topic.as_str()) {
             continue;
         }
+        let encoding = encoding.unwrap_or(&channel.message_encoding);
         let channel_id = *known.entry(channel.topic.clone()).or_insert_with(|| {
             writer
-                .add_channel(
-                    0,
-                    &channel.topic,
-                    &channel.message_encoding,
-                    &BTreeMap::new(),
-                )
+                .add_channel(0, &channel.topic, encoding, &BTreeMap::new())
                 .unwrap()
         });
         let Some(bytes) = change(&channel.topic, &message.data) else {
@@ -127,9 +133,11 @@ fn with_head(file: &Path, change: impl Fn(&mut RunHead)) -> PathBuf {
         if topic != topics::RUN {
             return Some(bytes.to_vec());
         }
-        let mut head: RunHead = serde_json::from_slice(bytes).unwrap();
+        let mut head: RunHead = serde_json::from_str(words::text_of(bytes).unwrap()).unwrap();
         change(&mut head);
-        Some(serde_json::to_vec(&head).unwrap())
+        let mut changed = Vec::new();
+        words::text_message(&serde_json::to_string(&head).unwrap(), &mut changed);
+        Some(changed)
     })
 }
 
@@ -275,6 +283,58 @@ fn a_day_with_all_that_happens_runs_again_to_the_bit() {
     ));
     let begin = replay(&[first]).unwrap();
     assert!(begin.ticks > 0 && begin.ticks < ticks && told::holds(&begin));
+}
+
+#[test]
+fn a_record_in_which_the_loop_was_late_and_interrupted_runs_again_to_the_bit() {
+    let folder = TempDir::new().unwrap();
+    let mut bench = bench(config(folder.path()));
+    drive(&mut bench, 3 * SECOND);
+    bench.pass_time(SECOND / 4);
+    bench.run_for(2 * SECOND);
+    bench.tick_interrupted(SECOND / 5);
+    bench.run_for(3 * SECOND);
+    drive_by_hand_under_a_limit(&mut bench);
+    bench.tick_interrupted(SECOND / 5);
+    bench.run_for(SECOND);
+    assert_eq!(bench.end_record(), 0);
+    let found = replayed(&files(folder.path()).remove(0));
+    assert!(told::holds(&found), "{}", told::text(&found));
+    assert!(found.ticks > 1_000 && found.driving_ticks > 500);
+}
+
+#[test]
+fn a_record_of_format_1_still_runs_again_to_the_bit() {
+    let folder = TempDir::new().unwrap();
+    let file = short(folder.path());
+    let ticks = replayed(&file).ticks;
+    // Its texts were plain JSON, its ticks ended with the gate's cause.
+    let earlier = rewritten_in(&file, Some("json"), None, |topic, bytes| {
+        Some(match topic {
+            topics::RUN => {
+                let text = words::text_of(bytes).unwrap();
+                let mut head: RunHead = serde_json::from_str(text).unwrap();
+                head.format = 1;
+                serde_json::to_vec(&head).unwrap()
+            }
+            topics::COMMAND | topics::SAFETY => words::text_of(bytes).unwrap().as_bytes().to_vec(),
+            topics::TICK => {
+                let tick: LoopTick<'_> = decode(bytes).unwrap();
+                bytes[..tick_bytes_in_format_1(&tick)].to_vec()
+            }
+            _ => bytes.to_vec(),
+        })
+    });
+    let found = replayed(&earlier);
+    assert_eq!(found.head.format, 1);
+    assert!(told::holds(&found), "{}", told::text(&found));
+    assert_eq!(found.ticks, ticks);
+}
+
+/// Length of a tick up to the gate's cause: encapsulation, what stands before the samples, these,
+/// 18 numbers, and 3 single bytes.
+fn tick_bytes_in_format_1(tick: &LoopTick<'_>) -> usize {
+    4 + 104 + 128 * tick.samples.len() + 8 * 18 + 3
 }
 
 #[test]

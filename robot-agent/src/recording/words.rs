@@ -3,10 +3,12 @@
 use std::time::Duration;
 
 use tread_api::robot::RobotMode;
+use tread_control::gate::GateCause;
 use tread_control::geometry::Pose;
 use tread_control::localisation::FixNoise;
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
-use tread_ros2::cdr::Sequence;
+use tread_ros2::cdr::{CdrError, ENCAPSULATION_BYTES, Sequence, decode, decode_up_to, encode};
+use tread_ros2::messages::Text;
 use tread_ros2::messages::tread::{LoopSample, LoopTick, sample_bits, tick_bits};
 
 use super::frame::TickFrame;
@@ -14,6 +16,8 @@ use super::replay::Difference;
 use crate::control_loop::seam::Fault;
 use crate::drive::{Battery, Feedback, SAMPLES_MAX, SensorSample, StatedNoise};
 
+/// Largest text that is read: a site of many polygons, a prior of many cells.
+const TEXT_BYTES_MAX: usize = 64 * 1024 * 1024;
 /// What stands where there is nothing.
 const NONE: f64 = f64::NAN;
 
@@ -131,6 +135,54 @@ fn mode_number(mode: RobotMode) -> u8 {
     }
 }
 
+/// The number of a cause in records, which never changes; its place in the list of causes may.
+fn gate_number(cause: GateCause) -> u8 {
+    match cause {
+        GateCause::Acceleration => 0,
+        GateCause::Speed => 1,
+        GateCause::CommandAge => 2,
+        GateCause::ExternalLimit => 3,
+        GateCause::Fence => 4,
+        GateCause::NotFinite => 5,
+        GateCause::NoCommand => 6,
+        GateCause::Lease => 7,
+        GateCause::LinkPolicy => 8,
+        GateCause::ExternalHold => 9,
+        GateCause::StalePosition => 10,
+        GateCause::Tilt => 11,
+        GateCause::StaleFeedback => 12,
+        GateCause::Stop => 13,
+        GateCause::LoopOverrun => 14,
+    }
+}
+
+/// Where the part of a tick that format 1 lacks has its place, behind the encapsulation.
+const JUDGED_ALIGNED: usize = 8;
+
+/// A tick of format 1 as one of the present format, judged at its begin.
+pub(super) fn from_format_1(tick: &[u8]) -> Result<Vec<u8>, CdrError> {
+    let mut padded = tick.to_vec();
+    let body = tick.len().saturating_sub(ENCAPSULATION_BYTES);
+    let room = body.next_multiple_of(JUDGED_ALIGNED) + size_of::<u64>();
+    padded.resize(ENCAPSULATION_BYTES + room, 0);
+    let mut present: LoopTick<'_> = decode(&padded)?;
+    present.judged_ns = present.monotonic_ns;
+    let mut bytes = Vec::with_capacity(padded.len());
+    encode(&present, &mut bytes);
+    Ok(bytes)
+}
+
+/// A text as it is recorded.
+pub(super) fn text_message(text: &str, into: &mut Vec<u8>) {
+    encode(&Text { data: text }, into);
+}
+
+/// The text of a record.
+pub(super) fn text_of(message: &[u8]) -> Result<&str, CdrError> {
+    let text: Text<'_> = decode_up_to(message, TEXT_BYTES_MAX)?;
+    Ok(text.data)
+}
+
 /// A tick as it is recorded; `samples` is room for those of the base.
 pub(super) fn tick_message<'room>(
     frame: &TickFrame,
@@ -197,7 +249,8 @@ pub(super) fn tick_message<'room>(
             Some(Fault::BaseSilent) | None => 0,
             Some(Fault::PositionLost) => 1,
         },
-        gate: outputs.gate.map_or(0, |cause| cause as u8),
+        gate: outputs.gate.map_or(0, gate_number),
+        judged_ns: nanoseconds(inputs.judged),
     }
 }
 

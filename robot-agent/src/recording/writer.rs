@@ -1,13 +1,14 @@
 //! The thread that writes records: files of bounded size, and not too many of them.
 //!
 //! Each second what is under way is closed and handed to the operating system, so that a file that
-//! is torn by a crash is good up to there. A disk that refuses costs the record: it is said once,
+//! is torn by a crash is good up to there. All is as ROS 2 wants it of an MCAP file: its profile,
+//! messages in CDR with their definitions, and each channel's quality of service. A disk that refuses costs the record: it is said once,
 //! and a new file is tried after a while.
 
 use std::collections::BTreeMap;
 use std::fmt;
 use std::fs::{self, File};
-use std::io::{self, BufWriter, Write};
+use std::io::{self, BufWriter, Seek, Write};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -25,7 +26,7 @@ use tread_ros2::definitions::schema;
 use tread_ros2::messages::tread::{self, LoopSample};
 use tread_ros2::messages::{
     DiagnosticArray, Imu, JointState, Message, Odometry, Path as PathMessage,
-    PoseWithCovarianceStamped, TwistStamped,
+    PoseWithCovarianceStamped, Text, TwistStamped,
 };
 
 use super::frame::{Note, NotedCommand, Notes, TickFrame};
@@ -72,30 +73,78 @@ struct OpenRecord {
     flushed: Duration,
 }
 
-fn ros_channel(
-    writer: &mut Writer<NoSeek<Counted>>,
+/// The profile of files that ROS 2 tools read.
+const PROFILE: &str = "ros2";
+/// The key of a channel's metadata that says with which quality of service it was published, which
+/// ROS 2 tools require.
+const QOS_KEY: &str = "offered_qos_profiles";
+/// Reliable, volatile, the last ten: what a publisher offers unless it says otherwise. In the notation
+/// of recordings, with numbers for names; times without end are the largest that can be written.
+const QOS: &str = "- history: 1
+  depth: 10
+  reliability: 1
+  durability: 2
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: 1
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false";
+
+/// Package and name of a message.
+type Kind = (&'static str, &'static str);
+
+const fn kind<'a, T: Message<'a>>() -> Kind {
+    (T::TYPE.package, T::TYPE.name)
+}
+
+/// The channels of a record in the order of their numbers.
+const CHANNELS: [(&str, Kind); 11] = [
+    (topics::RUN, kind::<Text<'_>>()),
+    (topics::COMMAND, kind::<Text<'_>>()),
+    (topics::SAFETY, kind::<Text<'_>>()),
+    (topics::TICK, (tread::PACKAGE, tread::LOOP_TICK)),
+    (topics::ODOMETRY, kind::<Odometry<'_>>()),
+    (topics::COMMANDED, kind::<TwistStamped<'_>>()),
+    (topics::IMU, kind::<Imu<'_>>()),
+    (topics::JOINTS, kind::<JointState<'_>>()),
+    (topics::POSE, kind::<PoseWithCovarianceStamped<'_>>()),
+    (topics::PLAN, kind::<PathMessage<'_>>()),
+    (topics::DIAGNOSTICS, kind::<DiagnosticArray<'_>>()),
+];
+
+/// The channel that a record of this agent has under a number: its topic and what it carries.
+pub(super) fn channel_numbered(number: u16) -> Option<(&'static str, Kind)> {
+    // Numbers begin with one.
+    CHANNELS.get(usize::from(number).checked_sub(1)?).copied()
+}
+
+/// How records are written.
+pub(super) fn options() -> WriteOptions {
+    WriteOptions::new()
+        .profile(PROFILE)
+        .library(concat!("tread-agent ", env!("CARGO_PKG_VERSION")))
+        .compression(Some(Compression::Zstd))
+        .compression_threads(0)
+        .disable_seeking(true)
+}
+
+/// Adds a channel of ROS to a record.
+pub(super) fn ros_channel<W: Write + Seek>(
+    writer: &mut Writer<W>,
     topic: &str,
-    (package, name): (&str, &str),
+    (package, name): Kind,
 ) -> Result<u16, McapError> {
     let text = schema(package, name).unwrap_or_default();
     let full = format!("{package}/msg/{name}");
     let schema = writer.add_schema(&full, "ros2msg", text.as_bytes())?;
-    writer.add_channel(schema, topic, "cdr", &BTreeMap::new())
-}
-
-fn json_channel(
-    writer: &mut Writer<NoSeek<Counted>>,
-    topic: &str,
-    title: &str,
-    required: &[&str],
-) -> Result<u16, McapError> {
-    let schema = serde_json::json!({ "title": title, "type": "object", "required": required });
-    let schema = writer.add_schema(title, "jsonschema", schema.to_string().as_bytes())?;
-    writer.add_channel(schema, topic, "json", &BTreeMap::new())
-}
-
-fn ros_type<'a, T: Message<'a>>() -> (&'static str, &'static str) {
-    (T::TYPE.package, T::TYPE.name)
+    let metadata = BTreeMap::from([(QOS_KEY.to_owned(), QOS.to_owned())]);
+    writer.add_channel(schema, topic, "cdr", &metadata)
 }
 
 impl OpenRecord {
@@ -105,35 +154,9 @@ impl OpenRecord {
             file: BufWriter::new(File::create_new(path)?),
             bytes: Arc::clone(&bytes),
         };
-        let mut writer = WriteOptions::new()
-            .library(concat!("tread-agent ", env!("CARGO_PKG_VERSION")))
-            .compression(Some(Compression::Zstd))
-            .compression_threads(0)
-            .disable_seeking(true)
-            .create(NoSeek::new(counted))?;
+        let mut writer = options().create(NoSeek::new(counted))?;
         let mut channels = BTreeMap::new();
-        for (topic, title, required) in [
-            (
-                topics::RUN,
-                "tread.Run",
-                &["format", "version", "boot", "part"][..],
-            ),
-            (topics::COMMAND, "tread.Command", &["tick", "command"]),
-            (topics::SAFETY, "tread.Safety", &["tick", "view"]),
-        ] {
-            let channel = json_channel(&mut writer, topic, title, required)?;
-            channels.insert(topic, (channel, 0));
-        }
-        for (topic, kind) in [
-            (topics::TICK, (tread::PACKAGE, tread::LOOP_TICK)),
-            (topics::ODOMETRY, ros_type::<Odometry<'_>>()),
-            (topics::COMMANDED, ros_type::<TwistStamped<'_>>()),
-            (topics::IMU, ros_type::<Imu<'_>>()),
-            (topics::JOINTS, ros_type::<JointState<'_>>()),
-            (topics::POSE, ros_type::<PoseWithCovarianceStamped<'_>>()),
-            (topics::PLAN, ros_type::<PathMessage<'_>>()),
-            (topics::DIAGNOSTICS, ros_type::<DiagnosticArray<'_>>()),
-        ] {
+        for (topic, kind) in CHANNELS {
             let channel = ros_channel(&mut writer, topic, kind)?;
             channels.insert(topic, (channel, 0));
         }
@@ -160,13 +183,15 @@ impl OpenRecord {
         self.writer.write_to_known_channel(&header, message)
     }
 
-    fn write_json(
+    fn write_text(
         &mut self,
         topic: &str,
         wall_ns: i64,
         message: &impl Serialize,
     ) -> Result<(), McapError> {
-        let bytes = serde_json::to_vec(message).map_err(io::Error::from)?;
+        let text = serde_json::to_string(message).map_err(io::Error::from)?;
+        let mut bytes = Vec::with_capacity(text.len());
+        words::text_message(&text, &mut bytes);
         self.write(topic, wall_ns, &bytes)
     }
 }
@@ -313,7 +338,7 @@ impl RecordWriter {
         if self.wall_ns == 0 {
             self.wall_ns = i64::try_from(wall.as_nanosecond()).unwrap_or_default();
         }
-        open.write_json(topics::RUN, self.wall_ns, head)?;
+        open.write_text(topics::RUN, self.wall_ns, head)?;
         // Each file says by itself what was allowed when it began.
         self.view = None;
         info!("recording to `{}`", path.display());
@@ -339,7 +364,7 @@ impl RecordWriter {
             tick,
             command: CommandRecord::from(noted),
         };
-        open.write_json(topics::COMMAND, wall_ns, &message)?;
+        open.write_text(topics::COMMAND, wall_ns, &message)?;
         match noted {
             NotedCommand::Start(origin) | NotedCommand::Replace(origin) => {
                 self.write_plan(open, wall_ns, origin)
@@ -384,7 +409,7 @@ impl RecordWriter {
                 tick: frame.number,
                 view: inputs.view,
             };
-            open.write_json(topics::SAFETY, wall_ns, &message)?;
+            open.write_text(topics::SAFETY, wall_ns, &message)?;
             self.view = Some(inputs.view);
         }
         let tick = words::tick_message(frame, &mut self.samples);

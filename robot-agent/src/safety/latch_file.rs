@@ -1,4 +1,4 @@
-//! The stop latch on the disk. An agent that cannot read it starts stopped.
+//! The stop latch on the disk. An agent that cannot read it, or finds it damaged, starts stopped.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -30,8 +30,9 @@ impl LatchFile {
     pub(crate) fn load(&self, clock: &SharedClock) -> StopState {
         let path = self.folder.join(FILE_NAME);
         let problem = match std::fs::read(&path) {
-            Ok(text) => match serde_json::from_slice(&text) {
-                Ok(state) => return state,
+            Ok(file) => match durable::unsealed(&file).map(serde_json::from_slice) {
+                Ok(Ok(state)) => return state,
+                Ok(Err(cause)) => cause.to_string(),
                 Err(cause) => cause.to_string(),
             },
             Err(cause) if cause.kind() == io::ErrorKind::NotFound => return StopState::default(),
@@ -56,7 +57,7 @@ impl LatchFile {
     /// What the operating system said; the former content stays then.
     pub(crate) fn save(&self, state: &StopState) -> io::Result<()> {
         let text = serde_json::to_vec(state)?;
-        durable::replace(&self.folder, FILE_NAME, &text)
+        durable::replace(&self.folder, FILE_NAME, &durable::sealed(&text))
     }
 }
 
@@ -76,5 +77,40 @@ mod tests {
         let cleared = state.cleared(id).unwrap().unwrap();
         file.save(&cleared).unwrap();
         assert_eq!(file.load(&clock), cleared);
+    }
+
+    #[test]
+    fn no_damage_of_a_latch_that_stops_the_robot_ever_frees_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let (file, clock) = (LatchFile::new(folder.path()), SystemClock::shared());
+        let stopped = StopState::latched(StopLatch {
+            id: tread_api::ids::StopId::from_uuid(uuid::Uuid::from_u128(7)),
+            by: "ada".to_owned(),
+            reason: "a person is in the way".to_owned(),
+            since: clock.wall(),
+        });
+        file.save(&stopped).unwrap();
+        let path = folder.path().join(FILE_NAME);
+        let intact = std::fs::read(&path).unwrap();
+        let is_stopped = |bytes: &[u8]| {
+            std::fs::write(&path, bytes).unwrap();
+            file.load(&clock).latch().is_some()
+        };
+        for bit in 0..intact.len() * 8 {
+            let mut damaged = intact.clone();
+            damaged[bit / 8] ^= 1 << (bit % 8);
+            assert!(is_stopped(&damaged), "bit {bit}");
+        }
+        for length in 0..intact.len() {
+            assert!(is_stopped(&intact[..length]), "cut to {length} bytes");
+            let mut zeroed = intact.clone();
+            zeroed[length..].fill(0);
+            assert!(is_stopped(&zeroed), "zeros from {length}");
+        }
+        // Of an earlier agent there is no checksum; a name that is damaged is no absent latch.
+        let earlier = serde_json::to_string(&stopped).unwrap();
+        assert!(is_stopped(earlier.as_bytes()));
+        assert!(is_stopped(earlier.replace("latch", "lat#h").as_bytes()));
+        assert!(!is_stopped(br#"{"latch":null,"seen":[]}"#));
     }
 }

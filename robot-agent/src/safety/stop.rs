@@ -23,6 +23,8 @@ const REASON_LENGTH_MAX: usize = tread_api::mission::REASON_LENGTH_MAX;
 /// Whether a stop is in force, and which were seen before.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub(crate) struct StopState {
+    /// None is written as such: a file that does not name it says nothing.
+    #[serde(deserialize_with = "Option::deserialize")]
     latch: Option<StopLatch>,
     seen: VecDeque<StopId>,
 }

@@ -83,6 +83,20 @@ message!(
     "1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f"
 );
 
+record! {
+    /// A text: `std_msgs/String`.
+    Text<'a> {
+        /// The text.
+        data: &'a str,
+    }
+}
+message!(
+    Text<'a>,
+    "std_msgs",
+    "String",
+    "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+);
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -10,7 +10,7 @@ mod nav;
 mod sensor;
 pub mod tread;
 
-pub use common::{Float64MultiArray, Header, MultiArrayDimension, MultiArrayLayout, Time};
+pub use common::{Float64MultiArray, Header, MultiArrayDimension, MultiArrayLayout, Text, Time};
 pub use diagnostic::{DiagnosticArray, DiagnosticStatus, KeyValue, Level};
 pub use geometry::{
     Point, Pose, PoseStamped, PoseWithCovariance, PoseWithCovarianceStamped, Quaternion, Twist,

@@ -174,5 +174,7 @@ record! {
         fault: u8,
         /// The strictest cause for which the gate reduced the command, by its place in the list.
         gate: u8,
+        /// When commands of a driver were judged in it, nanoseconds of the agent's monotonic clock.
+        judged_ns: u64,
     }
 }

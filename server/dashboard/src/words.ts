@@ -75,6 +75,7 @@ const gate: Record<GateCause, string> = {
   lease: 'last command has ended',
   link_policy: 'server not heard',
   external_hold: 'held from outside',
+  loop_overrun: 'control loop is late',
   stale_position: 'position is old',
   tilt: 'leans too much',
   stale_feedback: 'base is silent',

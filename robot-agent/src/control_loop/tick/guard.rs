@@ -23,6 +23,7 @@ use crate::safety::{LoopView, microseconds};
 pub(super) struct Guard {
     view: LoopView,
     now_us: u64,
+    judged: Duration,
     /// The number of the stop in force; 0 for none.
     stop: u64,
     /// How long the server has been silent.
@@ -40,6 +41,17 @@ impl Guard {
     /// Whether somebody has the lease of driving by hand.
     pub(super) fn is_leased(&self) -> bool {
         self.view.hand.is_leased(self.now_us)
+    }
+
+    /// Judges what carries its own end by this time from now on.
+    pub(super) fn judge(&mut self, now: Duration) {
+        self.judged = now;
+        self.now_us = microseconds(now);
+    }
+
+    /// The time by which it judges.
+    pub(super) fn judged(&self) -> Duration {
+        self.judged
     }
 
     /// What the gate did so far.
@@ -76,8 +88,12 @@ pub(super) struct Wanted {
 impl LoopCore {
     /// Looks at stops, leases and limits, and holds the mission in hand where they ask for it.
     pub(super) fn look_at_safety(&mut self, now: Duration) {
+        if let Some(watch) = &mut self.overrun {
+            watch.note(now);
+        }
+        let is_loop_late = self.overrun().is_some();
         let shared = &self.ends.shared;
-        self.guard.now_us = microseconds(now);
+        self.guard.judge(now);
         self.guard.stop = shared.safety.stop();
         self.guard.server_silence = shared.server_silence(now);
         if let Some(view) = shared.safety.try_view() {
@@ -96,6 +112,7 @@ impl LoopCore {
         let most_m_s = limits.linear_max_m_s(guard.now_us);
         let is_held = limits.holds(guard.now_us) || most_m_s.is_some_and(|most| most < STANDING);
         active.hold(Hold::Outside, is_held);
+        active.hold(Hold::Overrun, is_loop_late);
         active.limit_speed(most_m_s);
     }
 
@@ -199,6 +216,7 @@ impl LoopCore {
             is_stopped: guard.is_stopped(),
             tilt_rad: self.tilt_rad,
             is_position_lost,
+            is_loop_late: self.overrun().is_some(),
             is_held_outside: guard.view.limits.holds(guard.now_us),
             is_link_silent: self.is_long_silent(),
             is_driver_silent: wanted.is_driver_silent,

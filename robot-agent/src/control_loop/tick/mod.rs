@@ -1,7 +1,7 @@
 //! One tick of the control loop: read → localise → estimate → track → gate → write.
 //!
 //! Pure but for the drive and the channels' ends; nothing here waits, allocates or looks at a
-//! clock. What has to be freed goes out with an event, to be freed by somebody else. [`sensing`] is
+//! clock but the one that it is handed. What has to be freed goes out with an event, to be freed by somebody else. [`sensing`] is
 //! what comes from the base, [`orders`] what comes from the rest of the agent, [`guard`] what may only
 //! slow the robot down, [`snapshot`] what goes out, [`noting`] what a record holds of a tick.
 
@@ -24,6 +24,7 @@ use tread_control::robot::RobotModel;
 use super::active::Active;
 use super::gain::GroundRecord;
 use super::outgoing::Outgoing;
+use super::overrun::{Overrun, OverrunWatch};
 use super::progress::ProgressWatch;
 use super::seam::{EndReason, LoopEnds, Shared};
 use super::segments::{Moment, SegmentCutter};
@@ -74,6 +75,8 @@ pub(crate) struct LoopCore {
     /// What the base says of its sensors' noise.
     stated_noise: StatedNoise,
     guard: Guard,
+    /// Whether the loop keeps its rate, where that is known.
+    overrun: Option<OverrunWatch>,
     /// Whether the robot may be driven by hand within a fence without knowing where it is.
     blind_within_fence: bool,
     /// Whether a wheel slips beyond the model.
@@ -122,6 +125,7 @@ impl LoopCore {
             base_silent_at: None,
             stated_noise: StatedNoise::default(),
             guard: Guard::default(),
+            overrun: None,
             blind_within_fence: false,
             slips: false,
             known: GroundRecord::default(),
@@ -151,6 +155,13 @@ impl LoopCore {
         self
     }
 
+    /// The same loop, which holds the robot when it does not keep this period.
+    #[must_use]
+    pub(crate) fn with_period(mut self, period: Duration) -> Self {
+        self.overrun = Some(OverrunWatch::new(period));
+        self
+    }
+
     /// From now on it notes what it takes and gives, or no longer.
     pub(crate) fn note_to(&mut self, notes: Option<NoteTaker>) {
         self.notes = notes;
@@ -163,8 +174,21 @@ impl LoopCore {
             && self.measured_wheels.magnitude_max_rad_s() * radius_m < 5.0 * STANDING
     }
 
-    /// One tick. With `stop`, the robot brakes and its mission ends.
+    /// One tick that takes no time; see [`Self::tick_by`].
     pub(crate) fn tick(&mut self, now: Moment, stop: bool, drive: &mut dyn Drive) {
+        self.tick_by(now, &|| now.monotonic, stop, drive);
+    }
+
+    /// One tick that begins at `now`. With `stop`, the robot brakes and its mission ends. What carries
+    /// its own end, such as a driver's command, is judged by the clock right before the gate: a tick
+    /// that was interrupted lets nothing last longer.
+    pub(crate) fn tick_by(
+        &mut self,
+        now: Moment,
+        clock: &dyn Fn() -> Duration,
+        stop: bool,
+        drive: &mut dyn Drive,
+    ) {
         self.outgoing.flush();
         self.closed = None;
         let dt_s = self.time_step_s(now.monotonic);
@@ -180,8 +204,10 @@ impl LoopCore {
         let fault = self.fault(now.monotonic);
         self.hold_for_base(now.monotonic, fault);
         let by_mission = self.follow(now, fault, dt_s);
-        let wanted = self.choose(now.monotonic, by_mission, dt_s);
-        let gated = self.pass(now.monotonic, fault, &wanted, stop, dt_s);
+        let judged = clock().max(now.monotonic);
+        self.guard.judge(judged);
+        let wanted = self.choose(judged, by_mission, dt_s);
+        let gated = self.pass(judged, fault, &wanted, stop, dt_s);
         self.command = gated.wheel_speeds;
         drive.write(self.command);
         self.note_written();
@@ -214,6 +240,11 @@ impl LoopCore {
     /// Notes a tick that began more than one period late.
     pub(crate) fn note_overrun(&self) {
         Shared::count(&self.ends.shared.overruns);
+    }
+
+    /// How far the loop is from its rate, while the robot is held for it.
+    fn overrun(&self) -> Option<Overrun> {
+        self.overrun.as_ref().and_then(OverrunWatch::overrun)
     }
 
     /// Whether the rest of the agent wants the loop to end.

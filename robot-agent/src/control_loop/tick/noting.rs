@@ -21,11 +21,13 @@ impl LoopCore {
             return;
         };
         let (stop_number, server_silence, view) = self.guard.looked_at();
+        let judged = self.guard.judged();
         let mission = snapshot.mission;
         notes.tick(&TickFrame {
             number: self.ticks,
             inputs: TickInputs {
                 now,
+                judged,
                 is_told_to_stop: stop,
                 commands: notes.commands(),
                 feedback: *feedback,

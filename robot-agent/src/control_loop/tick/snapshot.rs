@@ -90,6 +90,7 @@ impl LoopCore {
             excited: !self.estimate.no_new_information,
             surface_change: self.surface.raised(),
             dug_in_at: self.progress.dug_in_at(),
+            overrun: self.overrun(),
             slip: self.slip.slip(),
             cell: self.cutter.cell(),
             terrain,

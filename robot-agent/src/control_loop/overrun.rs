@@ -1,0 +1,217 @@
+//! Whether the loop keeps its rate, and what to do when it does not: the robot is held. Pure.
+//!
+//! ```text
+//!           a tick far too late, several late ones in a row, or many of the newest
+//! on time ────────────────────────────────────────────────────────────────────────► held
+//!    ▲                                                                                │
+//!    └──────────────────── no late tick for RELEASE_AFTER ────────────────────────────┘
+//! ```
+//! Every promise on how soon the robot reacts (a silent driver, a stop, a fence) counts on ticks. A
+//! loop that gets no time from its machine cannot keep them, so the robot does not drive on it. How
+//! late a tick is follows from the moments of the ticks alone, so a record gives the same again.
+
+use std::time::Duration;
+
+/// Time by which a tick may exceed its period before it counts as late.
+pub(crate) const LATE_AFTER: Duration = Duration::from_millis(40);
+/// One tick that exceeds its period by this much holds the robot.
+pub(crate) const LATE_MAX: Duration = Duration::from_millis(120);
+/// So many late ticks in a row hold the robot.
+pub(crate) const LATE_IN_A_ROW_MAX: u32 = 3;
+/// The newest ticks of which [`LATE_IN_WINDOW_MAX`] is a share: one bit each.
+pub(crate) const WINDOW_TICKS: u32 = u64::BITS;
+/// So many late ticks of the newest [`WINDOW_TICKS`] hold the robot: one of eight.
+pub(crate) const LATE_IN_WINDOW_MAX: u32 = WINDOW_TICKS / 8;
+/// Time without a late tick after which the robot is let go.
+pub(crate) const RELEASE_AFTER: Duration = Duration::from_secs(1);
+
+/// How far a loop is from its rate.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Overrun {
+    /// The most by which a tick exceeded its period since the robot is held.
+    pub(crate) late: Duration,
+    /// The most late ticks of [`WINDOW_TICKS`] since then.
+    pub(crate) late_ticks: u32,
+}
+
+/// Watches the moments of the ticks.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct OverrunWatch {
+    period: Duration,
+    last_tick: Option<Duration>,
+    /// The newest ticks, the last one lowest; a bit for each late one.
+    late: u64,
+    in_a_row: u32,
+    late_at: Duration,
+    overrun: Option<Overrun>,
+}
+
+impl OverrunWatch {
+    /// A loop of this period that has not ticked yet.
+    pub(crate) fn new(period: Duration) -> Self {
+        Self {
+            period,
+            last_tick: None,
+            late: 0,
+            in_a_row: 0,
+            late_at: Duration::ZERO,
+            overrun: None,
+        }
+    }
+
+    /// Notes a tick.
+    pub(crate) fn note(&mut self, now: Duration) {
+        let since = self
+            .last_tick
+            .replace(now)
+            .map_or(Duration::ZERO, |last| now.saturating_sub(last));
+        let late = since.saturating_sub(self.period);
+        let is_late = late > LATE_AFTER;
+        self.late = (self.late << 1) | u64::from(is_late);
+        self.in_a_row = if is_late { self.in_a_row + 1 } else { 0 };
+        if is_late {
+            self.late_at = now;
+        }
+        let late_ticks = self.late.count_ones();
+        let is_overrun = late >= LATE_MAX
+            || self.in_a_row >= LATE_IN_A_ROW_MAX
+            || late_ticks >= LATE_IN_WINDOW_MAX;
+        match &mut self.overrun {
+            Some(overrun) => {
+                overrun.late = overrun.late.max(late);
+                overrun.late_ticks = overrun.late_ticks.max(late_ticks);
+                if now.saturating_sub(self.late_at) >= RELEASE_AFTER {
+                    self.overrun = None;
+                    self.late = 0;
+                }
+            }
+            None if is_overrun => self.overrun = Some(Overrun { late, late_ticks }),
+            None => {}
+        }
+    }
+
+    /// How far the loop is from its rate, while the robot is held for it.
+    pub(crate) fn overrun(&self) -> Option<Overrun> {
+        self.overrun
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const PERIOD: Duration = Duration::from_millis(10);
+
+    /// A watch and its clock.
+    struct Loop {
+        watch: OverrunWatch,
+        now: Duration,
+    }
+
+    impl Loop {
+        fn new() -> Self {
+            let mut watch = OverrunWatch::new(PERIOD);
+            watch.note(Duration::ZERO);
+            Self {
+                watch,
+                now: Duration::ZERO,
+            }
+        }
+
+        /// Ticks after a time, and says whether the robot is held then.
+        fn tick_after(&mut self, gap_ms: u64) -> bool {
+            self.now += Duration::from_millis(gap_ms);
+            self.watch.note(self.now);
+            self.watch.overrun().is_some()
+        }
+    }
+
+    #[test]
+    fn one_tick_that_is_far_too_late_holds_the_robot_and_a_second_on_time_lets_it_go() {
+        let mut ticking = Loop::new();
+        assert!(!ticking.tick_after(129));
+        assert!(ticking.tick_after(130));
+        let found = ticking.watch.overrun().unwrap();
+        assert_eq!(found.late, LATE_MAX);
+        for tick in 1..100 {
+            assert!(ticking.tick_after(10), "tick {tick}");
+        }
+        assert!(!ticking.tick_after(10));
+    }
+
+    #[test]
+    fn late_ticks_in_a_row_hold_the_robot_and_a_late_one_prolongs_it() {
+        let mut ticking = Loop::new();
+        assert!(!ticking.tick_after(60));
+        assert!(!ticking.tick_after(60));
+        assert!(!ticking.tick_after(10), "not in a row");
+        assert!(!ticking.tick_after(60));
+        assert!(!ticking.tick_after(60));
+        assert!(ticking.tick_after(60));
+        for _ in 0..90 {
+            assert!(ticking.tick_after(10));
+        }
+        assert!(ticking.tick_after(60), "late again");
+        for _ in 0..99 {
+            assert!(ticking.tick_after(10));
+        }
+        assert!(!ticking.tick_after(10));
+    }
+
+    #[test]
+    fn many_late_ticks_of_the_newest_hold_the_robot() {
+        let mut ticking = Loop::new();
+        let mut held_after = None;
+        for round in 1..=20 {
+            // One of six is late.
+            let mut is_held = ticking.tick_after(60);
+            for _ in 0..5 {
+                is_held |= ticking.tick_after(10);
+            }
+            if is_held {
+                held_after = Some(round);
+                break;
+            }
+        }
+        assert_eq!(held_after, Some(LATE_IN_WINDOW_MAX));
+        assert_eq!(
+            ticking.watch.overrun().unwrap().late_ticks,
+            LATE_IN_WINDOW_MAX
+        );
+    }
+
+    proptest! {
+        #[test]
+        fn a_loop_that_is_a_little_late_now_and_then_is_let_drive(
+            gaps_ms in prop::collection::vec(0..=50_u64, 1..400),
+        ) {
+            let mut ticking = Loop::new();
+            for gap_ms in gaps_ms {
+                prop_assert!(!ticking.tick_after(gap_ms));
+            }
+        }
+
+        #[test]
+        fn whoever_is_let_go_has_had_no_late_tick_for_a_second(
+            gaps_ms in prop::collection::vec(prop_oneof![8 => 5..15_u64, 1 => 40..200_u64], 1..600),
+        ) {
+            let mut ticking = Loop::new();
+            let (mut late_at_ms, mut was_held) = (0, false);
+            let mut now_ms = 0;
+            for gap_ms in gaps_ms {
+                now_ms += gap_ms;
+                let is_held = ticking.tick_after(gap_ms);
+                if gap_ms > 50 {
+                    late_at_ms = now_ms;
+                }
+                prop_assert!(is_held || gap_ms < 130);
+                if was_held && !is_held {
+                    prop_assert!(now_ms - late_at_ms >= 1_000);
+                }
+                was_held = is_held;
+            }
+        }
+    }
+}

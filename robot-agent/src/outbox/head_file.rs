@@ -1,0 +1,94 @@
+//! A second copy of the head, and how far records were safe on the disk: one file with two places
+//! that are written in turn, so that a torn or damaged one leaves the other.
+//!
+//! The heads among the records are lost with the file that they stand in. And a file whose end is
+//! cut off does not say that anything is missing: this one does.
+
+use std::fs::{File, OpenOptions};
+use std::io;
+use std::os::unix::fs::FileExt as _;
+use std::path::{Path, PathBuf};
+
+use super::frame::{self, Frame, HEAD_FRAME_BYTES, Head};
+use super::store::{StoreError, failure};
+
+const FILE_NAME: &str = "head";
+/// Where the two places begin.
+const PLACES: [u64; 2] = [0, 64];
+
+/// The file, open.
+#[derive(Debug)]
+pub(super) struct HeadFile {
+    path: PathBuf,
+    file: File,
+    next_place: usize,
+}
+
+/// A head to be written, without holding the store.
+#[derive(Debug)]
+pub(super) struct HeadWrite {
+    path: PathBuf,
+    file: File,
+    place: u64,
+    frame: Vec<u8>,
+}
+
+impl HeadFile {
+    /// Opens the file, which is made if it is not there, and reads the newest head of it.
+    pub(super) fn open(folder: &Path) -> Result<(Self, Option<Head>), StoreError> {
+        let path = folder.join(FILE_NAME);
+        let mut options = OpenOptions::new();
+        let options = options.read(true).write(true).create(true).truncate(false);
+        let file = options.open(&path).map_err(failure("open", &path))?;
+        let mut heads = [None; PLACES.len()];
+        for (head, place) in heads.iter_mut().zip(PLACES) {
+            *head = read_at(&file, place).map_err(failure("read", &path))?;
+        }
+        let newest = heads.into_iter().flatten().reduce(Head::newest);
+        // The newest one is not written over.
+        let next_place = usize::from(heads[0].is_some() && heads[0] == newest);
+        let opened = Self {
+            path,
+            file,
+            next_place,
+        };
+        Ok((opened, newest))
+    }
+
+    /// What has to be done to replace the older head by this one.
+    pub(super) fn write(&mut self, head: Head) -> Result<HeadWrite, StoreError> {
+        let file = self.file.try_clone().map_err(failure("open", &self.path))?;
+        let place = PLACES[self.next_place];
+        self.next_place = (self.next_place + 1) % PLACES.len();
+        let mut frame = Vec::with_capacity(HEAD_FRAME_BYTES);
+        frame::write_head(head, &mut frame);
+        Ok(HeadWrite {
+            path: self.path.clone(),
+            file,
+            place,
+            frame,
+        })
+    }
+}
+
+impl HeadWrite {
+    /// Waits until the disk has it.
+    pub(super) fn run(&self) -> Result<(), StoreError> {
+        let written = self.file.write_all_at(&self.frame, self.place);
+        written.map_err(failure("write", &self.path))?;
+        self.file.sync_data().map_err(failure("sync", &self.path))
+    }
+}
+
+fn read_at(file: &File, place: u64) -> io::Result<Option<Head>> {
+    let mut bytes = [0; HEAD_FRAME_BYTES];
+    match file.read_exact_at(&mut bytes, place) {
+        Ok(()) => {}
+        Err(cause) if cause.kind() == io::ErrorKind::UnexpectedEof => return Ok(None),
+        Err(cause) => return Err(cause),
+    }
+    Ok(match frame::read(&bytes) {
+        Some((Frame::Head(head), _)) => Some(head),
+        Some((Frame::Record(..), _)) | None => None,
+    })
+}
