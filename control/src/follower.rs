@@ -265,6 +265,11 @@ impl Follower {
         self.governor.set_speed_limit(limit_m_s);
     }
 
+    /// Tells the mission what the base was commanded last, where that is not what it gave itself.
+    pub fn set_commanded(&mut self, commanded: WheelSpeeds) {
+        self.tracker.set_commanded(commanded);
+    }
+
     /// Holds θ̂ and the integral, for instance while something else cuts the command.
     pub fn hold_adaptation(&mut self, held: bool) {
         self.tracker.hold_adaptation(held);
@@ -359,7 +364,8 @@ impl Follower {
         } else {
             (ALIGN_GAIN_1_S * error_rad).clamp(-most_rad_s, most_rad_s) * self.rate_cap
         };
-        let step = ALIGN_ACCELERATION_RAD_S2 * dt_s;
+        let step =
+            ALIGN_ACCELERATION_RAD_S2.min(self.model.angular_acceleration_max_rad_s2()) * dt_s;
         self.align_rate_rad_s += (wanted_rad_s - self.align_rate_rad_s).clamp(-step, step);
         if held {
             self.phase_s -= dt_s;
