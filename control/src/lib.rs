@@ -29,6 +29,7 @@ pub mod path;
 pub mod plan;
 pub mod plant;
 pub mod profile;
+pub mod progress;
 pub mod reference;
 pub mod robot;
 mod sliding;

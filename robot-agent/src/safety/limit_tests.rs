@@ -3,11 +3,15 @@
 use std::fmt::Write as _;
 use std::time::Duration;
 
+use tread_control::follower::FailureReason;
 use tread_control::geometry::Pose;
+use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 
 use super::tests::{Hand, limit};
 use crate::bench::{Bench, PERIOD, site_of};
+use crate::control_loop::seam::EndReason;
+use crate::drive::SensorSample;
 use crate::sim::scenario::Scenario;
 
 const START: Pose = Pose {
@@ -228,4 +232,44 @@ fn driving_by_hand_keeps_every_limit_when_the_hand_turns_about() {
     assert!(bench.stands());
     assert!(watch.fastest_m_s > 0.95);
     assert_eq!(PERIOD, Duration::from_millis(10));
+}
+
+#[test]
+fn a_base_whose_feedback_is_frozen_ends_its_mission_for_want_of_progress() {
+    for frozen_at in [2, 4, 9] {
+        let mut bench = bench(6);
+        let mission = bench
+            .begin(1, &serde_json::from_str(FAST).unwrap(), None)
+            .unwrap();
+        bench.run_for(frozen_at * SECOND);
+        let model = RobotModel::yi2007();
+        let truth = *bench.drive.truth();
+        // Its odometry says for ever where it was then, and that it stands.
+        let said = SensorSample {
+            yaw_rate_rad_s: Some(0.0),
+            wheel_speeds: Some(WheelSpeeds::default()),
+            position: Some(truth.pose),
+            ..SensorSample::default()
+        };
+        let mut watch = Watch::of(&bench);
+        let frozen_from = bench.now;
+        while bench.ended.is_empty() {
+            bench.tick_frozen(said);
+            watch.look(&bench);
+            assert!(
+                bench.now.saturating_sub(frozen_from) < 25 * SECOND,
+                "still active at {:?}",
+                bench.drive.truth().pose
+            );
+        }
+        assert_eq!(
+            bench.ended,
+            [(mission, EndReason::Failed(FailureReason::Stuck))]
+        );
+        for _ in 0..200 {
+            bench.tick_frozen(said);
+        }
+        let rests = model.twist_from_wheel_speeds(bench.core.command());
+        assert!(rests.linear_m_s.abs() <= 0.0, "{rests:?}");
+    }
 }
