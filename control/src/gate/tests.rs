@@ -211,7 +211,8 @@ proptest! {
                     .max(tick.reasons.hold(&gate_limits))
             };
             let is_no_command = tick.command.is_none_or(|command| !command.is_finite());
-            if hold.is_some() || is_no_command || !(tick.dt_s >= 0.0) {
+            let is_timeless = !tick.dt_s.is_finite() || tick.dt_s < 0.0;
+            if hold.is_some() || is_no_command || is_timeless {
                 prop_assert_eq!(output.target, WheelSpeeds::default());
                 prop_assert!(got.left_rad_s.abs() <= previous.left_rad_s.abs());
                 prop_assert!(got.right_rad_s.abs() <= previous.right_rad_s.abs());
