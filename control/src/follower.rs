@@ -11,6 +11,7 @@
 use crate::geometry::{Twist, wrap_angle_rad};
 use crate::measured::{Measured, WheelSpeeds};
 use crate::plan::Plan;
+use crate::progress::{ProgressBounds, ProgressMonitor, ProgressTick};
 use crate::reference::{Governor, GovernorInput, ReferenceSample};
 use crate::robot::RobotModel;
 use crate::sliding::Sliding;
@@ -50,8 +51,8 @@ pub struct FollowerConfig {
     pub cross_track_max_m: f64,
     /// How long it must last, seconds.
     pub cross_track_max_for_s: f64,
-    /// How long the robot may be held up without progress, seconds.
-    pub stuck_max_s: f64,
+    /// What counts as no progress.
+    pub progress: ProgressBounds,
     /// Age of the pose at which the robot waits, seconds.
     pub pose_age_hold_s: f64,
     /// Age of the pose that fails the mission, seconds.
@@ -68,7 +69,11 @@ impl Default for FollowerConfig {
             settle_max_s: 5.0,
             cross_track_max_m: 0.5,
             cross_track_max_for_s: 2.0,
-            stuck_max_s: 20.0,
+            progress: ProgressBounds {
+                time_max_s: 20.0,
+                gain_m: 0.3,
+                beyond_plan_max_m: 5.0,
+            },
             pose_age_hold_s: 0.3,
             pose_age_max_s: 3.0,
         }
@@ -173,7 +178,8 @@ pub struct Follower {
     phase_s: f64,
     hold_s: f64,
     off_path_s: f64,
-    stuck_s: f64,
+    monitor: ProgressMonitor,
+    is_stuck: bool,
     best_arc_m: f64,
     /// Paused, or slowed to nothing, by the operator.
     rate_cap: f64,
@@ -214,7 +220,8 @@ impl Follower {
             phase_s: 0.0,
             hold_s: 0.0,
             off_path_s: 0.0,
-            stuck_s: 0.0,
+            monitor: ProgressMonitor::default(),
+            is_stuck: false,
             best_arc_m: 0.0,
             rate_cap: 1.0,
             invalid_s: 0.0,
@@ -263,6 +270,11 @@ impl Follower {
     /// Limits the speed along the path, metres per second; none lifts the limit.
     pub fn set_speed_limit(&mut self, limit_m_s: Option<f64>) {
         self.governor.set_speed_limit(limit_m_s);
+    }
+
+    /// Tells the mission what the base was commanded last, where that is not what it gave itself.
+    pub fn set_commanded(&mut self, commanded: WheelSpeeds) {
+        self.tracker.set_commanded(commanded);
     }
 
     /// Holds θ̂ and the integral, for instance while something else cuts the command.
@@ -323,6 +335,7 @@ impl Follower {
         let tracked = self.tracker.step(&reference, measured, knowledge, dt_s);
         self.saturated = tracked.saturated;
         self.last_errors = tracked.errors;
+        self.watch_progress(&reference, tracked.twist.linear_m_s, dt_s);
         self.advance(&reference, measured, dt_s);
         if self.status.is_final() {
             return self.at_rest();
@@ -359,7 +372,8 @@ impl Follower {
         } else {
             (ALIGN_GAIN_1_S * error_rad).clamp(-most_rad_s, most_rad_s) * self.rate_cap
         };
-        let step = ALIGN_ACCELERATION_RAD_S2 * dt_s;
+        let step =
+            ALIGN_ACCELERATION_RAD_S2.min(self.model.angular_acceleration_max_rad_s2()) * dt_s;
         self.align_rate_rad_s += (wanted_rad_s - self.align_rate_rad_s).clamp(-step, step);
         if held {
             self.phase_s -= dt_s;
@@ -382,13 +396,23 @@ impl Follower {
         })
     }
 
+    /// Looks whether the robot itself gets on along its path.
+    fn watch_progress(&mut self, reference: &ReferenceSample, commanded_m_s: f64, dt_s: f64) {
+        let tick = ProgressTick {
+            robot_m: reference.arc_m - self.last_errors.along_m,
+            allowed_m_s: self.governor.allowed_speed_m_s(&self.plan),
+            commanded_m_s,
+            reference_m_s: reference.speed_m_s,
+            dt_s,
+        };
+        self.is_stuck = self.monitor.step(&tick, &self.config.progress);
+    }
+
     /// Moves the state on after a tick of driving.
     fn advance(&mut self, reference: &ReferenceSample, measured: &Measured, dt_s: f64) {
         let config = self.config;
         let far = self.last_errors.cross_m.abs() > config.cross_track_max_m;
         self.off_path_s = if far { self.off_path_s + dt_s } else { 0.0 };
-        let waiting = self.rate_cap <= 0.0 || reference.arc_m > self.best_arc_m + 1.0e-4;
-        self.stuck_s = if waiting { 0.0 } else { self.stuck_s + dt_s };
         self.best_arc_m = self.best_arc_m.max(reference.arc_m);
         let standing = measured.twist.linear_m_s.abs() < config.rest_speed_m_s;
         match self.status {
@@ -402,9 +426,7 @@ impl Follower {
             {
                 self.enter(FollowerStatus::Settling);
             }
-            FollowerStatus::Approach | FollowerStatus::Tracking
-                if self.stuck_s > config.stuck_max_s =>
-            {
+            FollowerStatus::Approach | FollowerStatus::Tracking if self.is_stuck => {
                 self.enter(FollowerStatus::Failed(FailureReason::Stuck));
             }
             FollowerStatus::Approach if reference.arc_m >= self.plan.approach_length_m() => {

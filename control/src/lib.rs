@@ -8,7 +8,7 @@
 //! * Planning (may allocate): [`trajectory`] is what is asked for, [`path`] its geometry,
 //!   [`profile`] its timing, [`excitation`] a wiggle of it, [`plan`] all, from where the robot stands.
 //! * Driving (one call per tick): [`mod@reference`] walks along the plan, [`tracking`] turns errors
-//!   into wheel speeds, [`follower`] runs one mission, [`mod@gate`] has the last word, [`fence`] says
+//!   into wheel speeds, [`follower`] runs one mission, [`mod@gate`] has the last word within [`twist_limits`], [`fence`] says
 //!   how fast a robot may be where it is.
 //! * Knowing: [`localisation`] says where the robot is, [`estimation`] how the ground grips.
 //! * [`mod@paper`] is the paper this began with, exactly; its law is a bench, not what ships.
@@ -29,8 +29,10 @@ pub mod path;
 pub mod plan;
 pub mod plant;
 pub mod profile;
+pub mod progress;
 pub mod reference;
 pub mod robot;
 mod sliding;
 pub mod tracking;
 pub mod trajectory;
+pub mod twist_limits;

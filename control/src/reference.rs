@@ -168,6 +168,17 @@ impl Governor {
         (limit_m_s / fastest_m_s).min(1.0)
     }
 
+    /// Fastest speed now and soon that plan, pace and speed limit allow a robot that keeps up, metres
+    /// per second.
+    pub(crate) fn allowed_speed_m_s(&self, plan: &Plan) -> f64 {
+        if self.stopping {
+            return 0.0;
+        }
+        let speed_m_s = |ahead_s: f64| plan.sample(self.clock_s + ahead_s).speed_m_s;
+        let planned_m_s = speed_m_s(0.0).max(speed_m_s(LOOK_AHEAD_S));
+        planned_m_s * self.rate_cap.min(self.rate_within_speed_limit(plan))
+    }
+
     /// Bounds what is asked of ground that was found to slide; none lifts the bounds.
     pub(crate) fn set_sliding(&mut self, bounds: Option<SlidingBounds>, heading_rad: f64) {
         self.sliding = bounds.map(|bounds| Slide {

@@ -208,6 +208,14 @@ impl RobotModel {
         self.spec.track_width_m * self.effective_track_ratio()
     }
 
+    /// Fastest speeding up of a turn, radians per second squared: with the rims' share of it as
+    /// strong as the acceleration limit along the path, and within what the wheels may do.
+    pub fn angular_acceleration_max_rad_s2(&self) -> f64 {
+        let limits = self.limits();
+        let rim_max_m_s2 = limits.wheel_acceleration_max_rad_s2 * self.spec.wheel_radius_m;
+        limits.linear_acceleration_max_m_s2.min(rim_max_m_s2) / (0.5 * self.effective_track_m())
+    }
+
     /// Wheel speeds that give this twist at low speed, through the effective track.
     pub fn wheel_speeds_from_twist(&self, twist: Twist) -> WheelSpeeds {
         let half_m_s = 0.5 * self.effective_track_m() * twist.angular_rad_s;

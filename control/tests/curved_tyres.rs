@@ -90,6 +90,7 @@ fn radii_are_never_said_to_be_what_no_robot_has_however_little_the_force_varies(
     let most = 5.0 * std::f64::consts::SQRT_2 * SensorNoise::default().radius_ratio;
     for seed in 0..40 {
         let mut robot = brush_robot(seed, 2.0, [0.985, 1.012]);
+        robot.drive_wheel_by_wheel();
         drive(&mut robot, 10.0, 0.0, |robot| {
             let said = robot.estimator.estimate();
             assert!(

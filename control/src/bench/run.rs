@@ -6,6 +6,7 @@ use crate::bench::kanayama::Kanayama;
 use crate::bench::paper_law::PaperLaw;
 use crate::bench::pursuit::Pursuit;
 use crate::friction::FrictionCurve;
+use crate::gate::{GateInput, GateLimits, gate};
 use crate::geometry::{Point, Pose};
 use crate::measured::{Measured, WheelSpeeds};
 use crate::plan::Plan;
@@ -95,6 +96,9 @@ pub struct Run {
     scenario: Scenario,
     driver: Driver,
     plant: Plant,
+    limits: GateLimits,
+    /// What the gate let through last.
+    command: WheelSpeeds,
     nearest_s: f64,
     ticks: u32,
     given_up: bool,
@@ -116,16 +120,17 @@ impl Run {
             ..PlantSpec::default()
         };
         let start = course.sample(0.0);
+        let command = model.wheel_speeds_from_twist(crate::geometry::Twist {
+            linear_m_s: start.speed_m_s,
+            angular_rad_s: start.turn_rad_s,
+        });
         let mut plant = Plant::new(model, spec, start.pose)?;
         plant.set_state(PlantState {
             pose: start.pose,
             ahead_m_s: start.speed_m_s,
             left_m_s: 0.0,
             yaw_rate_rad_s: start.turn_rad_s,
-            wheel_speeds: model.wheel_speeds_from_twist(crate::geometry::Twist {
-                linear_m_s: start.speed_m_s,
-                angular_rad_s: start.turn_rad_s,
-            }),
+            wheel_speeds: command,
         });
         let mut tracker = Tracker::new(model, scenario.tracker)?;
         let driver = match law {
@@ -146,6 +151,8 @@ impl Run {
             scenario,
             driver,
             plant,
+            limits: GateLimits::of(&model),
+            command,
             nearest_s: 0.0,
             ticks: 0,
             given_up: false,
@@ -196,7 +203,7 @@ impl Run {
         };
         let reference = self.course.sample(time_s);
         let mut told = None;
-        let command = match &mut self.driver {
+        let wanted = match &mut self.driver {
             Driver::Kanayama(law) => law.step(&reference, &measured, dt_s),
             Driver::Pursuit(law) => law.step(&self.course, &measured),
             Driver::Paper(law) => {
@@ -209,6 +216,18 @@ impl Run {
                 output.wheel_speeds
             }
         };
+        let passed = gate(
+            &GateInput {
+                command: Some(wanted),
+                previous: self.command,
+                stop: false,
+                feedback_age_s: 0.0,
+                dt_s,
+            },
+            &self.limits,
+        );
+        self.command = passed.wheel_speeds;
+        let command = self.command;
         let sample_s = dt_s / f64::from(self.scenario.samples.max(1));
         for _ in 0..self.scenario.samples.max(1) {
             self.plant.step(command, input.ground, sample_s);

@@ -11,6 +11,7 @@
 use super::SLIP_LEAST_M_S;
 use crate::geometry::Twist;
 use crate::robot::RobotModel;
+use crate::twist_limits::{Slowing, TwistLimits};
 
 /// Age of commands up to which the whole speed is allowed, seconds.
 pub const AGE_FULL_S: f64 = 0.15;
@@ -99,13 +100,11 @@ pub fn within_limits(twist: Twist, model: &RobotModel) -> (Twist, bool) {
 /// that, as it brakes.
 pub fn approach(previous: Twist, target: Twist, model: &RobotModel, dt_s: f64) -> Twist {
     let dt_s = if dt_s.is_finite() { dt_s.max(0.0) } else { 0.0 };
-    let linear = model.limits().linear_acceleration_max_m_s2 * dt_s;
-    // The wheels' share of a turn is as strong as that along the path.
-    let angular = linear / (0.5 * model.effective_track_m());
-    Twist {
-        linear_m_s: step(previous.linear_m_s, target.linear_m_s, linear),
-        angular_rad_s: step(previous.angular_rad_s, target.angular_rad_s, angular),
-    }
+    let slowing = Slowing {
+        linear_m_s2: 2.0 * model.limits().linear_acceleration_max_m_s2,
+        angular_rad_s2: 2.0 * model.angular_acceleration_max_rad_s2(),
+    };
+    TwistLimits::of(model).step(previous, target, slowing, dt_s)
 }
 
 /// A target that is no faster than what is driven already, and never the other way.
@@ -137,12 +136,6 @@ pub fn not_ahead(twist: Twist, real_m_s: f64) -> Twist {
         linear_m_s: share * twist.linear_m_s,
         angular_rad_s: share * twist.angular_rad_s,
     }
-}
-
-fn step(previous: f64, target: f64, rise: f64) -> f64 {
-    let is_slowing = previous * target <= 0.0 || target.abs() < previous.abs();
-    let most = if is_slowing { 2.0 * rise } else { rise };
-    previous + (target - previous).clamp(-most, most)
 }
 
 #[cfg(test)]

@@ -2,15 +2,18 @@
 //!
 //! A stop, a stale base, a lost position, a lean, a hold from outside, silence of whoever must be
 //! heard, or a command that is not finite asks for rest; limits and caps of the speed cut what is
-//! left, both sides by the same share, so that a cut command bends the same way. Speeding up is
-//! bounded by the wheels' acceleration, slowing down for a reason by the braking limit: rest is met
-//! on a ramp, along the arc that was being driven. The strictest cause is reported: the order of
-//! [`GateCause`].
+//! left, both sides by the same share, so that a cut command bends the same way. The limits are
+//! those of the commanded twist and of the wheels ([`crate::twist_limits`]): in every tick and
+//! for every cause, speeding up stays within the acceleration limits, and while the base's word is
+//! late nothing speeds up. Slowing down for a reason is
+//! bounded by the braking limit: rest is met on a ramp, along the arc that was being driven. The
+//! strictest cause is reported: the order of [`GateCause`].
 
 pub mod hand;
 
 use crate::measured::WheelSpeeds;
 use crate::robot::RobotModel;
+use crate::twist_limits::{Slowing, TwistLimits};
 
 /// Why a command was reduced; later ones are stricter.
 #[derive(
@@ -18,9 +21,9 @@ use crate::robot::RobotModel;
 )]
 #[serde(rename_all = "snake_case")]
 pub enum GateCause {
-    /// The command changed faster than the wheels may.
+    /// The command changed faster than the robot or its wheels may.
     Acceleration,
-    /// The command was above the wheels' speed limit.
+    /// The command was above a speed limit: along the path, in yaw, or of a wheel.
     Speed,
     /// Commands by hand come late: the slower the link, the slower the robot.
     CommandAge,
@@ -144,9 +147,10 @@ impl Reasons {
 /// Bounds of the gate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GateLimits {
+    model: RobotModel,
     /// Fastest wheel, radians per second.
     pub wheel_speed_max_rad_s: f64,
-    /// Fastest speeding up of a wheel, radians per second squared.
+    /// Fastest change of a wheel's speed, radians per second squared.
     pub wheel_acceleration_max_rad_s2: f64,
     /// Fastest slowing down of the robot's centre on the way to rest, as a wheel's, radians per
     /// second squared.
@@ -162,6 +166,13 @@ pub struct GateLimits {
 /// Farthest that a robot may lean from level unless said otherwise, radians: 25 degrees.
 pub const TILT_MAX_RAD: f64 = 0.436;
 
+/// Time that a tick without one is taken to have lasted, seconds.
+const TICK_USUAL_S: f64 = 0.01;
+/// Share of the oldest feedback that is trusted beyond which nothing speeds up: what is wanted for
+/// a base that falls silent is reckoned from where it was.
+const LATE_SHARE: f64 = 0.5;
+/// Share above a speed limit that is rounding.
+const ROUNDING_SHARE: f64 = 1.0e-9;
 /// Speed below which a robot's slip says nothing, metres per second.
 const SLIP_LEAST_M_S: f64 = 0.01;
 
@@ -172,6 +183,7 @@ impl GateLimits {
         let limits = model.limits();
         let braking = 2.0 * limits.linear_acceleration_max_m_s2 / model.wheel_radius_m();
         Self {
+            model: *model,
             wheel_speed_max_rad_s: limits.wheel_speed_max_rad_s,
             wheel_acceleration_max_rad_s2: limits.wheel_acceleration_max_rad_s2,
             wheel_braking_max_rad_s2: braking.min(limits.wheel_acceleration_max_rad_s2),
@@ -229,6 +241,21 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
         }
         Some(command) => command,
     };
+    // Without a time there is no ramp up; rest is met as if a usual tick had passed.
+    let dt_s = if input.dt_s.is_finite() && input.dt_s >= 0.0 {
+        input.dt_s
+    } else {
+        note(GateCause::NotFinite);
+        target = rest;
+        TICK_USUAL_S
+    };
+    let previous = if input.previous.is_finite() {
+        input.previous
+    } else {
+        note(GateCause::NotFinite);
+        target = rest;
+        rest
+    };
     let is_fresh =
         input.feedback_age_s.is_finite() && input.feedback_age_s <= limits.feedback_age_max_s;
     let hold = if input.stop {
@@ -241,10 +268,14 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
         note(hold);
         target = rest;
     }
-    let fastest_rad_s = target.magnitude_max_rad_s();
-    if fastest_rad_s > limits.wheel_speed_max_rad_s {
-        note(GateCause::Speed);
-        target = scaled(target, limits.wheel_speed_max_rad_s / fastest_rad_s);
+    let share =
+        TwistLimits::of(&limits.model).share_within(limits.model.twist_from_wheel_speeds(target));
+    if share < 1.0 {
+        // Rounding between wheel speeds and twists is no reason to report.
+        if share < 1.0 - ROUNDING_SHARE {
+            note(GateCause::Speed);
+        }
+        target = scaled(target, share);
     }
     let mut is_capped = false;
     for (most_m_s, capped_by) in reasons.caps() {
@@ -265,16 +296,15 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
             target = scaled(target, most_m_s / ahead_m_s);
         }
     }
-    let previous = if input.previous.is_finite() {
-        input.previous
-    } else {
-        rest
-    };
-    let dt_s = if input.dt_s.is_finite() {
-        input.dt_s.max(0.0)
-    } else {
-        0.0
-    };
+    if input.feedback_age_s > LATE_SHARE * limits.feedback_age_max_s {
+        let model = &limits.model;
+        let twist = |wheels: WheelSpeeds| model.twist_from_wheel_speeds(wheels);
+        let steady = hand::no_faster(twist(previous), twist(target));
+        if steady != twist(target) {
+            target = model.wheel_speeds_from_twist(steady);
+            note(GateCause::Acceleration);
+        }
+    }
     let step = Step {
         dt_s,
         is_capped,
@@ -344,9 +374,9 @@ fn scaled(speeds: WheelSpeeds, share: f64) -> WheelSpeeds {
 
 /// From `previous` towards `target` as far as `dt_s` allows.
 ///
-/// While the command stands, both sides may change at the wheels' rate, for turning back and
-/// forth; on the way to rest, and where a cap cuts, the braking ramp holds. Rest is met by both
-/// sides at once, so that the robot stays on its arc.
+/// While the command stands, it speeds up within the limits of the twist and slows down as the
+/// wheels may; where a cap cuts, the braking ramp holds along the path. Rest is met by both sides at
+/// once, so that the robot stays on its arc.
 fn ramped(
     previous: WheelSpeeds,
     target: WheelSpeeds,
@@ -360,26 +390,25 @@ fn ramped(
         let slip = slip_share(previous, step.real_m_s, limits.wheel_radius_m, up);
         return scaled(previous, 1.0 - share.max(slip));
     }
-    let down = if step.is_capped { braking } else { up };
-    WheelSpeeds {
-        left_rad_s: ramp(previous.left_rad_s, target.left_rad_s, up, down),
-        right_rad_s: ramp(previous.right_rad_s, target.right_rad_s, up, down),
-    }
-}
-
-/// From `previous` towards `target`: away from zero by `up` at most, towards zero by `down`; a
-/// change of sign stops at zero for a tick.
-fn ramp(previous: f64, target: f64, up: f64, down: f64) -> f64 {
-    if previous * target < 0.0 {
-        return (previous.abs() - down).max(0.0).copysign(previous);
-    }
-    let sign = if previous.abs() > 0.0 {
-        previous
+    let twist_limits = TwistLimits::of(&limits.model);
+    let by_wheels = twist_limits.slowing_by_wheels();
+    let slowing = if step.is_capped {
+        Slowing {
+            linear_m_s2: limits.wheel_braking_max_rad_s2 * limits.wheel_radius_m,
+            ..by_wheels
+        }
     } else {
-        target
+        by_wheels
     };
-    let (from, to) = (previous.abs(), target.abs());
-    (from + (to - from).clamp(-down, up)).copysign(sign)
+    let model = &limits.model;
+    let from = model.twist_from_wheel_speeds(previous);
+    let to = model.twist_from_wheel_speeds(target);
+    let next = twist_limits.step(from, to, slowing, step.dt_s);
+    if next == to {
+        // Not through the twist and back: a command that passes whole passes to the bit.
+        return target;
+    }
+    model.wheel_speeds_from_twist(next)
 }
 
 #[cfg(test)]

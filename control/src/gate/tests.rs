@@ -37,6 +37,57 @@ fn centre_m_s(speeds: WheelSpeeds) -> f64 {
     0.5 * RobotModel::yi2007().wheel_radius_m() * (speeds.left_rad_s + speeds.right_rad_s).abs()
 }
 
+/// Whether neither the speed ahead nor the turn rate is beyond both what was wanted and what was
+/// commanded before.
+fn is_within(got: WheelSpeeds, before: WheelSpeeds, wanted: WheelSpeeds) -> bool {
+    let model = RobotModel::yi2007();
+    let [got, before, wanted] =
+        [got, before, wanted].map(|wheels| model.twist_from_wheel_speeds(wheels));
+    let most = |before: f64, wanted: f64| before.abs().max(wanted.abs()) + 1.0e-9;
+    got.linear_m_s.abs() <= most(before.linear_m_s, wanted.linear_m_s)
+        && got.angular_rad_s.abs() <= most(before.angular_rad_s, wanted.angular_rad_s)
+}
+
+/// One tick of a gate that is asked for anything.
+#[derive(Debug, Clone, Copy)]
+struct AnyTick {
+    command: Option<WheelSpeeds>,
+    reasons: Reasons,
+    stop: bool,
+    feedback_age_s: f64,
+    dt_s: f64,
+}
+
+fn any_tick() -> impl Strategy<Value = AnyTick> {
+    let command = prop_oneof![
+        1 => Just(None),
+        9 => (speed(), speed()).prop_map(|(left_rad_s, right_rad_s)| Some(WheelSpeeds {
+            left_rad_s,
+            right_rad_s,
+        })),
+    ];
+    let age_s = prop_oneof![6 => Just(0.0), 1 => 0.0..0.4_f64, 1 => Just(f64::NAN)];
+    // On time, late, twice in a moment, and without a time.
+    let dt_s = prop_oneof![
+        8 => Just(0.01),
+        2 => 0.0..0.2_f64,
+        1 => Just(0.0),
+        1 => Just(f64::NAN),
+        1 => Just(-0.01),
+    ];
+    let calm = prop_oneof![2 => Just(Reasons::default()), 1 => reasons()];
+    let is_stopped = prop::bool::weighted(0.05);
+    (command, calm, is_stopped, age_s, dt_s).prop_map(
+        |(command, reasons, stop, feedback_age_s, dt_s)| AnyTick {
+            command,
+            reasons,
+            stop,
+            feedback_age_s,
+            dt_s,
+        },
+    )
+}
+
 fn speed() -> impl Strategy<Value = f64> {
     prop_oneof![8 => -60.0..60.0_f64, 1 => Just(f64::NAN), 1 => Just(f64::INFINITY)]
 }
@@ -54,12 +105,11 @@ proptest! {
         let input = GateInput { command, previous, stop, feedback_age_s: age_s, dt_s };
         let output = gate(&input, &limits);
         let wanted = command.filter(|wanted| wanted.is_finite()).unwrap_or_default();
-        for (got, want, before) in [
-            (output.wheel_speeds.left_rad_s, wanted.left_rad_s, before_left),
-            (output.wheel_speeds.right_rad_s, wanted.right_rad_s, before_right),
+        prop_assert!(is_within(output.wheel_speeds, previous, wanted));
+        for (got, before) in [
+            (output.wheel_speeds.left_rad_s, before_left),
+            (output.wheel_speeds.right_rad_s, before_right),
         ] {
-            // Never beyond both what was wanted and what the wheels already do.
-            prop_assert!(got.abs() <= want.abs().max(before.abs()) + 1.0e-12);
             prop_assert!(got.abs() <= limits.wheel_speed_max_rad_s.max(before.abs()) + 1.0e-9);
             let change = (got - before).abs();
             prop_assert!(change <= limits.wheel_acceleration_max_rad_s2 * dt_s + 1.0e-9);
@@ -88,11 +138,8 @@ proptest! {
         let got = output.wheel_speeds;
         prop_assert!(got.is_finite());
         let wanted = if command.is_finite() { command } else { WheelSpeeds::default() };
-        for (got, want, before) in [
-            (got.left_rad_s, wanted.left_rad_s, before_left),
-            (got.right_rad_s, wanted.right_rad_s, before_right),
-        ] {
-            prop_assert!(got.abs() <= want.abs().max(before.abs()) + 1.0e-12);
+        prop_assert!(is_within(got, previous, wanted));
+        for (got, before) in [(got.left_rad_s, before_left), (got.right_rad_s, before_right)] {
             prop_assert!((got - before).abs() <= limits.wheel_acceleration_max_rad_s2 * dt_s + 1.0e-9);
         }
         if let Some(hold) = reasons.hold(&limits) {
@@ -112,6 +159,88 @@ proptest! {
         for (most_m_s, cause) in reasons.caps() {
             let most_m_s = most_m_s.map_or(f64::INFINITY, |most| if most.is_nan() { 0.0 } else { most });
             prop_assert!(centre_m_s(settled) <= most_m_s + 1.0e-9, "{:?}", cause);
+        }
+    }
+
+    #[test]
+    fn over_any_sequence_commands_keep_to_every_limit_of_speed_and_of_speeding_up(
+        ticks in prop::collection::vec(any_tick(), 1..60),
+    ) {
+        let model = RobotModel::yi2007();
+        let (gate_limits, limits) = (GateLimits::of(&model), *model.limits());
+        let mut previous = WheelSpeeds::default();
+        for tick in ticks {
+            let input = GateInput {
+                command: tick.command,
+                previous,
+                stop: tick.stop,
+                feedback_age_s: tick.feedback_age_s,
+                dt_s: tick.dt_s,
+            };
+            let output = gate_with(&input, &tick.reasons, &gate_limits);
+            let got = output.wheel_speeds;
+            prop_assert!(got.is_finite());
+            let (before, after) = (
+                model.twist_from_wheel_speeds(previous),
+                model.twist_from_wheel_speeds(got),
+            );
+            prop_assert!(after.linear_m_s.abs() <= limits.linear_max_m_s + 1.0e-9);
+            prop_assert!(after.angular_rad_s.abs() <= limits.angular_max_rad_s + 1.0e-9);
+            prop_assert!(got.magnitude_max_rad_s() <= limits.wheel_speed_max_rad_s + 1.0e-9);
+            // Without a time, and while the base is late, nothing speeds up.
+            let is_timed = tick.dt_s.is_finite() && tick.dt_s > 0.0;
+            let is_late = tick.feedback_age_s > 0.5 * gate_limits.feedback_age_max_s;
+            let dt_s = if is_timed && !is_late { tick.dt_s } else { 0.0 };
+            for (before, after, most) in [
+                (before.linear_m_s, after.linear_m_s, limits.linear_acceleration_max_m_s2),
+                (
+                    before.angular_rad_s,
+                    after.angular_rad_s,
+                    model.angular_acceleration_max_rad_s2(),
+                ),
+            ] {
+                let gained = most * dt_s + 1.0e-9;
+                prop_assert!(after.abs() - before.abs() <= gained, "{} to {}", before, after);
+                prop_assert!(before * after >= 0.0 || after.abs() <= gained);
+            }
+            let is_fresh = tick.feedback_age_s <= gate_limits.feedback_age_max_s;
+            let hold = if tick.stop {
+                Some(GateCause::Stop)
+            } else {
+                (!is_fresh)
+                    .then_some(GateCause::StaleFeedback)
+                    .max(tick.reasons.hold(&gate_limits))
+            };
+            let is_no_command = tick.command.is_none_or(|command| !command.is_finite());
+            let is_timeless = !tick.dt_s.is_finite() || tick.dt_s < 0.0;
+            if hold.is_some() || is_no_command || is_timeless {
+                prop_assert_eq!(output.target, WheelSpeeds::default());
+                prop_assert!(got.left_rad_s.abs() <= previous.left_rad_s.abs());
+                prop_assert!(got.right_rad_s.abs() <= previous.right_rad_s.abs());
+            }
+            if hold.is_some() {
+                prop_assert_eq!(output.cause, hold);
+            }
+            previous = got;
+        }
+    }
+
+    #[test]
+    fn a_stop_is_at_rest_within_the_time_of_the_braking_limit(
+        left_rad_s in -20.0..20.0_f64, right_rad_s in -20.0..20.0_f64,
+        spans_s in prop::collection::vec(0.001..0.2_f64, 2..400),
+    ) {
+        let limits = GateLimits::of(&RobotModel::yi2007());
+        let mut previous = WheelSpeeds { left_rad_s, right_rad_s };
+        let bound_s = previous.magnitude_max_rad_s() / limits.wheel_braking_max_rad_s2;
+        let mut time_s = 0.0;
+        for dt_s in spans_s {
+            let input = GateInput {
+                command: Some(previous), previous, stop: true, feedback_age_s: f64::NAN, dt_s,
+            };
+            previous = gate(&input, &limits).wheel_speeds;
+            time_s += dt_s;
+            prop_assert!(time_s < bound_s || previous == WheelSpeeds::default(), "{} s", time_s);
         }
     }
 
@@ -172,6 +301,40 @@ fn a_robot_slower_than_its_wheels_is_not_pulled_on_while_they_brake() {
 }
 
 #[test]
+fn a_command_without_a_time_or_without_what_was_commanded_before_is_rest() {
+    let limits = GateLimits::of(&RobotModel::yi2007());
+    let wheels = WheelSpeeds {
+        left_rad_s: 5.0,
+        right_rad_s: 5.0,
+    };
+    let input = GateInput {
+        command: Some(wheels),
+        previous: wheels,
+        stop: false,
+        feedback_age_s: 0.0,
+        dt_s: f64::NAN,
+    };
+    let output = gate(&input, &limits);
+    assert_eq!(output.cause, Some(GateCause::NotFinite));
+    assert!(
+        output.wheel_speeds.left_rad_s < 5.0,
+        "it brakes all the same"
+    );
+    let unknown = WheelSpeeds {
+        left_rad_s: f64::NAN,
+        right_rad_s: 5.0,
+    };
+    let input = GateInput {
+        previous: unknown,
+        dt_s: 0.01,
+        ..input
+    };
+    let output = gate(&input, &limits);
+    assert_eq!(output.cause, Some(GateCause::NotFinite));
+    assert_eq!(output.wheel_speeds, WheelSpeeds::default());
+}
+
+#[test]
 fn a_command_within_all_limits_passes_whole() {
     let limits = GateLimits::of(&RobotModel::yi2007());
     let command = WheelSpeeds {
@@ -181,7 +344,7 @@ fn a_command_within_all_limits_passes_whole() {
     let input = GateInput {
         command: Some(command),
         previous: WheelSpeeds {
-            left_rad_s: 4.9,
+            left_rad_s: 4.95,
             right_rad_s: 5.1,
         },
         stop: false,

@@ -25,7 +25,7 @@ pub use error::PlanError;
 pub use grip::{GripMap, GripSquare};
 pub use slowed::{SLOWED_MAX, Slowed, SlowedBy};
 
-use limits::{Blame, NodeBounds, WHEEL_SHARE, node_limits, wiggled};
+use limits::{Blame, NodeBounds, Shares, WHEEL_SHARE, node_limits, wiggled};
 use slowed::{CellBounds, Stretches};
 
 /// Most waypoints of a path.
@@ -357,7 +357,8 @@ impl Plan {
             } else {
                 (model, blame)
             };
-            let mut node = node_limits(&here, speed_m_s, model, blame);
+            let shares = Shares::on(arc_m < approach_end_m);
+            let mut node = node_limits(&here, speed_m_s, model, blame, shares);
             let bend_1_m = here.curvature_1_m.abs();
             // A sharp bend may have its peak between two nodes: both keep to what is in between.
             if bend_1_m.max(bend_before_1_m) > BEND_LOOKED_INTO_1_M
@@ -366,7 +367,7 @@ impl Plan {
                 for part in 1..PARTS_LOOKED_INTO {
                     let back_m = cell_m * f64::from(part) / f64::from(PARTS_LOOKED_INTO);
                     let between = path.sample(arc_m - back_m);
-                    let between = node_limits(&between, speed_m_s, model, blame);
+                    let between = node_limits(&between, speed_m_s, model, blame, shares);
                     *before = before.stricter(&between);
                     node = node.stricter(&between);
                 }

@@ -9,7 +9,7 @@ pub enum SlowedBy {
     AngularSpeed,
     /// Wheel speed.
     WheelSpeed,
-    /// Wheel acceleration where the bend changes.
+    /// Wheel or yaw acceleration where the bend changes.
     WheelAcceleration,
     /// Acceleration or braking along the path.
     LinearAcceleration,

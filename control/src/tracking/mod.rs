@@ -33,16 +33,20 @@ use crate::geometry::{Twist, wrap_angle_rad};
 use crate::measured::{Measured, WheelSpeeds};
 use crate::reference::ReferenceSample;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
+use crate::twist_limits::TwistLimits;
 
 pub use config::{CrossGains, TrackerConfig, TrackerError};
 pub use knowledge::ThetaKnowledge;
 use noise::NoiseLevel;
 use sideslip::{Belief, Sideslip};
 
-/// How much faster than the plan's limits feedback may drive.
-const FEEDBACK_HEADROOM: f64 = 1.2;
 /// Fastest drive backwards, to come back to a point that was overrun, metres per second.
 const REVERSE_MAX_M_S: f64 = 0.15;
+/// How much faster than its reference a robot that lags drives at the most, metres per second. One
+/// that gathers more speed comes to the next bend too fast for slippery ground.
+const CATCH_UP_MAX_M_S: f64 = 0.06;
+/// Share of the robot's speed limit up to which it may drive faster than that.
+const CATCH_UP_SPEED_SHARE: f64 = 0.5;
 /// Largest error along the path that acts, metres.
 const ALONG_MAX_M: f64 = 0.3;
 /// Reference speed below which the integral is held, metres per second.
@@ -51,6 +55,12 @@ const INTEGRAL_SPEED_MIN_M_S: f64 = 0.05;
 const HEADING_SPEED_MIN_M_S: f64 = 0.15;
 /// Cross-track errors smaller than this move neither θ̂ nor χ̂, metres.
 const ADAPTATION_DEAD_ZONE_M: f64 = 5.0e-4;
+/// Most of what the acceleration limits cut that is carried into the next tick. Noise would be cut
+/// on the side of speeding up alone, and the robot would turn and drive too slowly in the mean.
+const CARRIED_MAX: Twist = Twist {
+    linear_m_s: 0.05,
+    angular_rad_s: 0.3,
+};
 
 /// How much smaller the deviation of a word is that replaces the one χ̂ was adapted under.
 const BETTER_WORD: f64 = 0.5;
@@ -104,6 +114,15 @@ pub struct TrackerOutput {
     pub saturated: bool,
 }
 
+/// What a speed limit cut from a command.
+#[derive(Debug, Clone, Copy)]
+struct Cut {
+    /// A wheel's.
+    by_wheels: bool,
+    /// That of the turn rate.
+    in_yaw: bool,
+}
+
 /// The law and its memory.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tracker {
@@ -118,8 +137,12 @@ pub struct Tracker {
     /// χ̂ is on its way back to one.
     forgets: bool,
     noise: NoiseLevel,
-    was_saturated: bool,
+    was_cut: bool,
     held_from_outside: bool,
+    /// What the acceleration limits cut from the last command.
+    carried: Twist,
+    /// What was commanded last; none before the first tick.
+    commanded: Option<Twist>,
 }
 
 impl Tracker {
@@ -138,14 +161,23 @@ impl Tracker {
             known: None,
             forgets: false,
             noise: NoiseLevel::default(),
-            was_saturated: false,
+            was_cut: false,
             held_from_outside: false,
+            carried: Twist::default(),
+            commanded: None,
         })
     }
 
     /// Holds θ̂ and the integral while something outside, such as the gate, cuts the command.
     pub fn hold_adaptation(&mut self, held: bool) {
         self.held_from_outside = held;
+    }
+
+    /// Tells the law what the base was commanded last, where that is not what it gave itself: it
+    /// speeds up from there.
+    pub fn set_commanded(&mut self, commanded: WheelSpeeds) {
+        self.commanded =
+            Some(self.model.twist_from_wheel_speeds(commanded)).filter(|twist| twist.is_finite());
     }
 
     /// Starts with what a map or an earlier run knows, at its full weight from the first metre.
@@ -186,12 +218,15 @@ impl Tracker {
         course.heading_rad += sideslip.angle_rad;
         let ahead = course.body_from_site(reference.pose.point());
         let heading_rad = wrap_angle_rad(reference.pose.heading_rad - course.heading_rad);
-        let along_m = ahead.x_m.clamp(-ALONG_MAX_M, ALONG_MAX_M);
+        let catch_up_m_s = (CATCH_UP_SPEED_SHARE * self.model.limits().linear_max_m_s - speed_m_s)
+            .max(CATCH_UP_MAX_M_S);
+        let catch_up_m = catch_up_m_s / config.along_gain_1_s;
+        let along_m = ahead.x_m.clamp(-ALONG_MAX_M, catch_up_m.min(ALONG_MAX_M));
         // Bounded so that a far-off robot comes in at a bounded angle instead of spinning.
         let cross_max_m = 0.8 * gains.heading_1_m / gains.cross_1_m2;
         let cross_m = ahead.y_m.clamp(-cross_max_m, cross_max_m);
 
-        let held = self.was_saturated
+        let held = self.was_cut
             || self.held_from_outside
             || measured.pose_age_s > config.pose_age_max_s
             || speed_m_s < INTEGRAL_SPEED_MIN_M_S;
@@ -216,12 +251,16 @@ impl Tracker {
             + gains.yaw_rate * (wanted_rad_s - measured.twist.angular_rad_s)
             + (lead_s + slip_lead_s * yaw_shape) * reference.turn_acceleration_rad_s2
             + sideslip.rims.angular_rad_s;
-        let twist = self.bounded(Twist {
+        let wanted = Twist {
             linear_m_s,
             angular_rad_s,
-        });
-        let (wheel_speeds, saturated) = desaturated(&self.model, twist);
-        self.was_saturated = saturated;
+        };
+        let before = self
+            .commanded
+            .unwrap_or_else(|| self.model.twist_from_wheel_speeds(measured.wheel_speeds));
+        let (wheel_speeds, cut) = self.within_limits(before, wanted, dt_s);
+        self.commanded = Some(self.model.twist_from_wheel_speeds(wheel_speeds));
+        self.was_cut = cut.by_wheels || cut.in_yaw;
         TrackerOutput {
             wheel_speeds,
             twist: self.model.twist_from_wheel_speeds(wheel_speeds),
@@ -229,7 +268,7 @@ impl Tracker {
             theta_loop: self.theta,
             beyond_loop: self.beyond,
             confidence: knowledge.map_or(0.0, |known| known.confidence()),
-            saturated,
+            saturated: cut.by_wheels,
         }
     }
 
@@ -294,15 +333,39 @@ impl Tracker {
         }
     }
 
-    fn bounded(&self, twist: Twist) -> Twist {
+    /// The wheel speeds that come nearest to what is wanted within every limit, and which speed
+    /// limit cut it.
+    fn within_limits(&mut self, before: Twist, wanted: Twist, dt_s: f64) -> (WheelSpeeds, Cut) {
         let limits = self.model.limits();
-        let angular_max = FEEDBACK_HEADROOM * limits.angular_max_rad_s;
-        Twist {
-            linear_m_s: twist
-                .linear_m_s
-                .clamp(-REVERSE_MAX_M_S, FEEDBACK_HEADROOM * limits.linear_max_m_s),
-            angular_rad_s: twist.angular_rad_s.clamp(-angular_max, angular_max),
-        }
+        let reverse_max_m_s = REVERSE_MAX_M_S.min(limits.linear_max_m_s);
+        let angular_max_rad_s = limits.angular_max_rad_s;
+        let bounded = Twist {
+            linear_m_s: (wanted.linear_m_s + self.carried.linear_m_s)
+                .clamp(-reverse_max_m_s, limits.linear_max_m_s),
+            angular_rad_s: (wanted.angular_rad_s + self.carried.angular_rad_s)
+                .clamp(-angular_max_rad_s, angular_max_rad_s),
+        };
+        let turns_too_fast = wanted.angular_rad_s.abs() > angular_max_rad_s;
+        let (wheels, saturated) = desaturated(&self.model, bounded);
+        let target = self.model.twist_from_wheel_speeds(wheels);
+        let twist_limits = TwistLimits::of(&self.model);
+        let next = twist_limits.step(before, target, twist_limits.slowing_by_wheels(), dt_s);
+        let cut = |wanted: f64, got: f64, most: f64| (wanted - got).clamp(-most, most);
+        self.carried = Twist {
+            linear_m_s: cut(target.linear_m_s, next.linear_m_s, CARRIED_MAX.linear_m_s),
+            angular_rad_s: cut(
+                target.angular_rad_s,
+                next.angular_rad_s,
+                CARRIED_MAX.angular_rad_s,
+            ),
+        };
+        (
+            self.model.wheel_speeds_from_twist(next),
+            Cut {
+                by_wheels: saturated,
+                in_yaw: turns_too_fast,
+            },
+        )
     }
 }
 

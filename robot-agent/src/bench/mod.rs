@@ -192,6 +192,30 @@ impl Drive for Unheard<'_> {
     }
 }
 
+/// A base whose sensors say the same for ever, with fresh stamps, though it moves.
+#[cfg(test)]
+struct Frozen<'base> {
+    base: &'base mut SimulatedDrive,
+    said: SensorSample,
+}
+
+#[cfg(test)]
+impl Drive for Frozen<'_> {
+    fn read(&mut self, now: Duration) -> Feedback {
+        self.base.read(now);
+        let mut feedback = Feedback::default();
+        feedback.push(SensorSample {
+            at: now,
+            ..self.said
+        });
+        feedback
+    }
+
+    fn write(&mut self, command: WheelSpeeds) {
+        self.base.write(command);
+    }
+}
+
 /// A base that says nothing.
 struct Silence;
 
@@ -469,6 +493,16 @@ impl Bench {
         self.pass_time(time);
         let judged = self.now;
         self.core.tick_by(now, &|| judged, false, &mut self.drive);
+        self.collect();
+    }
+
+    /// A tick of a base that moves as it is told, and whose sensors say this and nothing else.
+    #[cfg(test)]
+    pub(crate) fn tick_frozen(&mut self, said: SensorSample) {
+        self.simulate();
+        let now = self.moment();
+        let base = &mut self.drive;
+        self.core.tick(now, false, &mut Frozen { base, said });
         self.collect();
     }
 

@@ -282,6 +282,7 @@ impl Active {
                 theta_loop: f64::NAN,
             };
         }
+        self.job.follower.set_commanded(command);
         let output = self.job.follower.step(measured, knowledge, dt_s);
         self.progress.driven_m = self.progress.driven_m.max(output.progress_m);
         self.progress.cross_track_m = output.errors.cross_m;

@@ -17,7 +17,9 @@ use std::time::Duration;
 use anyhow::{Context as _, bail};
 use clap::Args;
 use serde::Serialize;
+use tread_control::gate::{GateInput, GateLimits, gate};
 use tread_control::measured::WheelSpeeds;
+use tread_control::twist_limits::TwistLimits;
 
 use self::heard::{Heard, Message};
 use crate::clock::{SharedClock, SystemClock};
@@ -140,6 +142,7 @@ fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     let mut hands = Hands {
         drive,
         clock,
+        limits: GateLimits::of(&model),
         said: WheelSpeeds::default(),
     };
     let until = hands.clock.monotonic() + FIRST_WORD_MAX;
@@ -151,9 +154,17 @@ fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     let mut findings = listening::findings(settings, &heard.taken(), LISTEN_FOR);
     if args.moves {
         let rim_rad_s = RIM_M_S / model.wheel_radius_m();
-        let speeds = |left: f64, right: f64| WheelSpeeds {
-            left_rad_s: left * rim_rad_s,
-            right_rad_s: right * rim_rad_s,
+        let speeds = |left: f64, right: f64| {
+            let asked = WheelSpeeds {
+                left_rad_s: left * rim_rad_s,
+                right_rad_s: right * rim_rad_s,
+            };
+            let twist = model.twist_from_wheel_speeds(asked);
+            let share = TwistLimits::of(&model).share_within(twist);
+            WheelSpeeds {
+                left_rad_s: share * asked.left_rad_s,
+                right_rad_s: share * asked.right_rad_s,
+            }
         };
         heard.forget();
         let turned = hands.drive_for(speeds(-1.0, 1.0), settings, &heard);
@@ -174,6 +185,7 @@ fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
 struct Hands {
     drive: Ros2Drive,
     clock: SharedClock,
+    limits: GateLimits,
     said: WheelSpeeds,
 }
 
@@ -194,11 +206,19 @@ impl Hands {
         span: Duration,
         may: impl Fn(&Ros2Drive) -> bool,
     ) -> bool {
-        self.said = command;
         let until = self.clock.monotonic() + span;
         while self.clock.monotonic() < until {
             let _ = self.drive.read(self.clock.monotonic());
-            self.drive.write(command);
+            let input = GateInput {
+                command: Some(command),
+                previous: self.said,
+                stop: false,
+                // The drive itself lets a silent base rest.
+                feedback_age_s: 0.0,
+                dt_s: PERIOD.as_secs_f64(),
+            };
+            self.said = gate(&input, &self.limits).wheel_speeds;
+            self.drive.write(self.said);
             if !may(&self.drive) {
                 return false;
             }

@@ -340,4 +340,6 @@ impl Safety {
 }
 
 #[cfg(test)]
+mod limit_tests;
+#[cfg(test)]
 mod tests;

@@ -108,13 +108,13 @@ fn lease(bench: &Bench, request: u128, action: LeaseAction, who: u128) -> Outcom
     })
 }
 
-struct Hand {
+pub(super) struct Hand {
     epoch: u64,
     seq: u64,
 }
 
 impl Hand {
-    fn acquire(bench: &Bench) -> Self {
+    pub(super) fn acquire(bench: &Bench) -> Self {
         let Outcome::Leased { epoch } = lease(bench, 1, LeaseAction::Acquire, 1) else {
             panic!("no lease");
         };
@@ -122,7 +122,13 @@ impl Hand {
     }
 
     /// Drives for a while, with a command every 50 ms.
-    fn drive(&mut self, bench: &mut Bench, linear_m_s: f64, angular_rad_s: f64, time: Duration) {
+    pub(super) fn drive(
+        &mut self,
+        bench: &mut Bench,
+        linear_m_s: f64,
+        angular_rad_s: f64,
+        time: Duration,
+    ) {
         self.drive_with_age(bench, linear_m_s, angular_rad_s, time, 10_000);
     }
 
@@ -142,7 +148,13 @@ impl Hand {
     }
 
     /// One command.
-    fn say(&mut self, bench: &mut Bench, linear_m_s: f64, angular_rad_s: f64, age_us: u64) {
+    pub(super) fn say(
+        &mut self,
+        bench: &mut Bench,
+        linear_m_s: f64,
+        angular_rad_s: f64,
+        age_us: u64,
+    ) {
         self.say_for(bench, linear_m_s, angular_rad_s, age_us, 300_000);
     }
 
@@ -171,7 +183,7 @@ impl Hand {
     }
 }
 
-fn limit(bench: &Bench, seq: u64, for_us: u64, hold: bool, linear_max_m_s: Option<f64>) {
+pub(super) fn limit(bench: &Bench, seq: u64, for_us: u64, hold: bool, linear_max_m_s: Option<f64>) {
     let limit = ExternalLimit {
         holder: "lidar".parse().unwrap(),
         boot: boot(),

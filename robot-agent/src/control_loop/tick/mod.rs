@@ -167,6 +167,12 @@ impl LoopCore {
         self.notes = notes;
     }
 
+    /// What the base was commanded last.
+    #[cfg(test)]
+    pub(crate) fn command(&self) -> WheelSpeeds {
+        self.command
+    }
+
     /// Whether the wheels are commanded to rest and do.
     pub(crate) fn stands(&self) -> bool {
         let radius_m = self.model.wheel_radius_m();

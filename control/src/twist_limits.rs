@@ -1,0 +1,215 @@
+//! The limits of a commanded twist, and one bounded step of a command towards what is wanted.
+//!
+//! The *commanded twist* is what the commanded wheel speeds mean by the kinematics of the configured
+//! model: `v = r (ω_l + ω_r)/2` and `ω = r (ω_r − ω_l)/W_eff`. Each step bounds the speeding up of
+//! both parts, and of every wheel: away from zero a part gains at most its acceleration limit times
+//! the time. Slowing down is bounded apart, by whoever takes the step. What the robot truly does
+//! beyond the kinematics (slip, rolling radii that differ, a slope) is not limited here.
+
+use crate::geometry::Twist;
+use crate::measured::WheelSpeeds;
+use crate::robot::RobotModel;
+
+/// How hard a command may slow down in one step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Slowing {
+    /// Along the path, metres per second squared.
+    pub linear_m_s2: f64,
+    /// In yaw, radians per second squared.
+    pub angular_rad_s2: f64,
+}
+
+/// Limits of a commanded twist and of the wheel speeds behind it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TwistLimits {
+    model: RobotModel,
+}
+
+impl TwistLimits {
+    /// Limits of a robot.
+    pub fn of(model: &RobotModel) -> Self {
+        Self { model: *model }
+    }
+
+    /// Slowing as hard as the wheels' acceleration limit lets them.
+    pub fn slowing_by_wheels(&self) -> Slowing {
+        let rim_m_s2 =
+            self.model.limits().wheel_acceleration_max_rad_s2 * self.model.wheel_radius_m();
+        Slowing {
+            linear_m_s2: rim_m_s2,
+            angular_rad_s2: rim_m_s2 / (0.5 * self.model.effective_track_m()),
+        }
+    }
+
+    /// The share, at most 1, by which a twist must be scaled to be within every speed limit.
+    pub fn share_within(&self, twist: Twist) -> f64 {
+        let limits = self.model.limits();
+        let wheels_rad_s = self
+            .model
+            .wheel_speeds_from_twist(twist)
+            .magnitude_max_rad_s();
+        let share = |value: f64, most: f64| {
+            if value.abs() > most {
+                most / value.abs()
+            } else {
+                1.0
+            }
+        };
+        share(twist.linear_m_s, limits.linear_max_m_s)
+            .min(share(twist.angular_rad_s, limits.angular_max_rad_s))
+            .min(share(wheels_rad_s, limits.wheel_speed_max_rad_s))
+    }
+
+    /// From `previous` towards `target`, as far as `dt_s` allows: speeding up within the
+    /// acceleration limits, slowing down within `slowing`, every wheel within its own limits.
+    ///
+    /// Both must be finite and `target` within the speed limits; so is the result, if `previous` is.
+    pub fn step(&self, previous: Twist, target: Twist, slowing: Slowing, dt_s: f64) -> Twist {
+        let limits = self.model.limits();
+        let free = Twist {
+            linear_m_s: stepped(
+                previous.linear_m_s,
+                target.linear_m_s,
+                limits.linear_acceleration_max_m_s2 * dt_s,
+                slowing.linear_m_s2 * dt_s,
+            ),
+            angular_rad_s: stepped(
+                previous.angular_rad_s,
+                target.angular_rad_s,
+                self.model.angular_acceleration_max_rad_s2() * dt_s,
+                slowing.angular_rad_s2 * dt_s,
+            ),
+        };
+        let from = self.model.wheel_speeds_from_twist(previous);
+        let to = self.model.wheel_speeds_from_twist(free);
+        let share = self.wheel_share(from, to, dt_s);
+        if share >= 1.0 {
+            return free;
+        }
+        Twist {
+            linear_m_s: previous.linear_m_s + share * (free.linear_m_s - previous.linear_m_s),
+            angular_rad_s: previous.angular_rad_s
+                + share * (free.angular_rad_s - previous.angular_rad_s),
+        }
+    }
+
+    /// The share of a change of the wheel speeds that the wheels' limits leave. On the straight
+    /// line between two commands within the speed limits every command is within them.
+    fn wheel_share(&self, from: WheelSpeeds, to: WheelSpeeds, dt_s: f64) -> f64 {
+        let limits = self.model.limits();
+        let change_max_rad_s = limits.wheel_acceleration_max_rad_s2 * dt_s;
+        let speed_max_rad_s = limits.wheel_speed_max_rad_s;
+        [
+            (from.left_rad_s, to.left_rad_s),
+            (from.right_rad_s, to.right_rad_s),
+        ]
+        .into_iter()
+        .fold(1.0, |share: f64, (from, to)| {
+            let change = (to - from).abs();
+            let room = if to.abs() > from.abs() {
+                (speed_max_rad_s - from * to.signum()).max(0.0)
+            } else {
+                f64::INFINITY
+            };
+            let most = change_max_rad_s.min(room);
+            if change > most {
+                share.min(most / change)
+            } else {
+                share
+            }
+        })
+    }
+}
+
+/// One part of a twist towards its target: away from zero by `up` at most, towards zero by `down`.
+/// Through zero it takes the time for both.
+fn stepped(previous: f64, target: f64, up: f64, down: f64) -> f64 {
+    if previous * target >= 0.0 {
+        let sign = if previous.abs() > 0.0 {
+            previous
+        } else {
+            target
+        };
+        let gap = target.abs() - previous.abs();
+        return if (-down..=up).contains(&gap) {
+            target
+        } else {
+            (previous.abs() + gap.clamp(-down, up)).copysign(sign)
+        };
+    }
+    if previous.abs() >= down {
+        return (previous.abs() - down).copysign(previous);
+    }
+    let left = 1.0 - previous.abs() / down;
+    target.abs().min(up * left).copysign(target)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// Twists within the speed limits.
+    fn twist() -> impl Strategy<Value = Twist> {
+        (-1.5..1.5_f64, -3.0..3.0_f64).prop_map(|(linear_m_s, angular_rad_s)| {
+            let free = Twist {
+                linear_m_s,
+                angular_rad_s,
+            };
+            let share = TwistLimits::of(&RobotModel::yi2007()).share_within(free);
+            Twist {
+                linear_m_s: share * linear_m_s,
+                angular_rad_s: share * angular_rad_s,
+            }
+        })
+    }
+
+    proptest! {
+        #[test]
+        fn a_step_speeds_up_within_the_acceleration_limits_and_never_passes_its_target(
+            from in twist(), to in twist(), dt_s in 0.0..0.2_f64,
+        ) {
+            let model = RobotModel::yi2007();
+            let limits = TwistLimits::of(&model);
+            let next = limits.step(from, to, limits.slowing_by_wheels(), dt_s);
+            let linear = model.limits().linear_acceleration_max_m_s2 * dt_s;
+            let angular = model.angular_acceleration_max_rad_s2() * dt_s;
+            for (before, after, wanted, most) in [
+                (from.linear_m_s, next.linear_m_s, to.linear_m_s, linear),
+                (from.angular_rad_s, next.angular_rad_s, to.angular_rad_s, angular),
+            ] {
+                prop_assert!(after.abs() <= before.abs() + most + 1.0e-12);
+                prop_assert!(before * after >= 0.0 || after.abs() <= most + 1.0e-12);
+                prop_assert!(after >= before.min(wanted) - 1.0e-12);
+                prop_assert!(after <= before.max(wanted) + 1.0e-12);
+            }
+            prop_assert!(limits.share_within(next) > 1.0 - 1.0e-9);
+        }
+
+        #[test]
+        fn steps_arrive_from_every_command_at_every_other(from in twist(), to in twist()) {
+            let limits = TwistLimits::of(&RobotModel::yi2007());
+            let mut now = from;
+            for _ in 0..600 {
+                now = limits.step(now, to, limits.slowing_by_wheels(), 0.01);
+            }
+            prop_assert!((now.linear_m_s - to.linear_m_s).abs() < 1.0e-9);
+            prop_assert!((now.angular_rad_s - to.angular_rad_s).abs() < 1.0e-9);
+        }
+    }
+
+    #[test]
+    fn without_time_nothing_changes() {
+        let limits = TwistLimits::of(&RobotModel::yi2007());
+        let from = Twist {
+            linear_m_s: 0.4,
+            angular_rad_s: -0.3,
+        };
+        let to = Twist {
+            linear_m_s: -0.4,
+            angular_rad_s: 0.3,
+        };
+        assert_eq!(limits.step(from, to, limits.slowing_by_wheels(), 0.0), from);
+    }
+}
