@@ -12,7 +12,9 @@
 pub mod assemble;
 pub mod bus;
 mod command;
+mod command_watch;
 pub mod inlet;
+pub mod notices;
 pub mod obedience;
 pub mod outlet;
 pub(crate) mod outward;
@@ -31,7 +33,7 @@ use tread_control::measured::WheelSpeeds;
 use self::assemble::{Arrived, Assembler};
 use self::bus::Bus;
 use self::inlet::{Inlet, Tap, WAITING_MAX};
-use self::obedience::Obedience;
+use self::obedience::{Obedience, Verdict};
 use self::outlet::Outlet;
 use self::refusal::{Counts, Refusal, Source};
 use self::settings::Ros2Settings;
@@ -111,7 +113,8 @@ impl Ros2Drive {
             must_rest: false,
             settings: Arc::clone(&settings),
         };
-        let bus = Bus::new(settings, inlets, outlet, Arc::clone(clock))?;
+        let counts = Arc::clone(&drive.counts);
+        let bus = Bus::new(settings, inlets, outlet, Arc::clone(clock), counts)?;
         Ok((drive, bus))
     }
 
@@ -146,8 +149,13 @@ impl Drive for Ros2Drive {
             let Some(measured) = self.assembler.take(&arrived, &mut feedback) else {
                 continue;
             };
-            if !self.obedience.judge(now, measured) && !self.is_examined {
-                self.counts.refuse(self.pace_source(), Refusal::Disobedient);
+            let refusal = match self.obedience.judge(now, measured) {
+                Verdict::Obeys => None,
+                Verdict::Stands => Some(Refusal::Disobedient),
+                Verdict::MovesOtherwise => Some(Refusal::OtherMotion),
+            };
+            if let Some(refusal) = refusal.filter(|_| !self.is_examined) {
+                self.counts.refuse(self.pace_source(), refusal);
                 feedback.pop();
                 continue;
             }
