@@ -22,11 +22,11 @@ const BLOCKS_COUNT: f64 = 8.0;
 /// Messages after which a figure that never changed counts as frozen.
 const FROZEN_MIN: u32 = 10;
 
-/// What was told and said over the second half of a motion.
+/// What was commanded and said over the second half of a motion.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Drove {
-    /// What the wheels were told.
-    pub(super) told: WheelSpeeds,
+    /// What the wheels were commanded.
+    pub(super) commanded: WheelSpeeds,
     /// What they said; none if they said nothing.
     pub(super) wheels: Option<WheelSpeeds>,
     /// How the robot turned, radians per second.
@@ -209,7 +209,7 @@ impl Mean {
 
 /// Sums up what was said while the robot set off, and when its speed was steady.
 pub(super) fn drove(
-    told: WheelSpeeds,
+    commanded: WheelSpeeds,
     settings: &Ros2Settings,
     starting: &[Message],
     messages: &[Message],
@@ -262,7 +262,7 @@ pub(super) fn drove(
         }
     }
     Drove {
-        told,
+        commanded,
         twist: planar_twist(messages),
         turn_blocks: turn_blocks(settings, messages),
         ranges,

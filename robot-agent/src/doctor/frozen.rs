@@ -145,8 +145,8 @@ impl Seen {
         let has_turned = |span: f64, commanded: f64| span > TURNED_SHARE * commanded.abs();
         let turn_rad_s = turned.turn_rad_s.unwrap_or(0.0);
         Self {
-            left: has_turned(ranges.left.span(), ahead.told.left_rad_s),
-            right: has_turned(ranges.right.span(), ahead.told.right_rad_s),
+            left: has_turned(ranges.left.span(), ahead.commanded.left_rad_s),
+            right: has_turned(ranges.right.span(), ahead.commanded.right_rad_s),
             gyro: turn_rad_s.abs() > TURNED_RAD_S && !ranges.gyro.is_frozen(),
             odometry: ranges.odometry_ahead.span() > MOVED_M_S,
             position: ranges.x.span().hypot(ranges.y.span()) > MOVED_M,
@@ -184,7 +184,7 @@ mod tests {
             let scale = if moves { 1.0 } else { 0.0 };
             let (turn, ahead) = (scale * (right - left), scale * (left + right));
             let mut drove = Drove {
-                told: WheelSpeeds {
+                commanded: WheelSpeeds {
                     left_rad_s: 2.5 * left,
                     right_rad_s: 2.5 * right,
                 },

@@ -36,8 +36,8 @@ fn direction(said: f64, commanded: f64) -> i8 {
 
 fn directions(said: WheelSpeeds, drove: &Drove) -> [i8; 2] {
     [
-        direction(said.left_rad_s, drove.told.left_rad_s),
-        direction(said.right_rad_s, drove.told.right_rad_s),
+        direction(said.left_rad_s, drove.commanded.left_rad_s),
+        direction(said.right_rad_s, drove.commanded.right_rad_s),
     ]
 }
 
@@ -229,7 +229,7 @@ mod tests {
     fn healthy() -> [Drove; 2] {
         let turn_rad_s = 2.0 * 0.2 / RobotModel::yi2007().effective_track_m();
         let turned = Drove {
-            told: speeds(-2.5, 2.5),
+            commanded: speeds(-2.5, 2.5),
             wheels: Some(speeds(-2.5, 2.5)),
             turn_rad_s: Some(turn_rad_s),
             turn_blocks: vec![
@@ -249,7 +249,7 @@ mod tests {
             ..Drove::default()
         };
         let ahead = Drove {
-            told: speeds(2.5, 2.5),
+            commanded: speeds(2.5, 2.5),
             wheels: Some(speeds(2.5, 2.5)),
             turn_rad_s: Some(0.0),
             odometry_m_s: Some(0.2),

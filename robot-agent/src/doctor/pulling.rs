@@ -68,7 +68,7 @@ fn momentum_ratio(
     set_off: &SetOff,
     steady_n_m: f64,
 ) -> Option<f64> {
-    let told_rad_s = 0.5 * (ahead.told.left_rad_s + ahead.told.right_rad_s);
+    let told_rad_s = 0.5 * (ahead.commanded.left_rad_s + ahead.commanded.right_rad_s);
     (set_off.gained_rad_s > GAINED_MIN * told_rad_s).then_some(())?;
     let gained_m_s = model.wheel_radius_m() * set_off.gained_rad_s;
     let given_n_s = (set_off.torque_n_m - steady_n_m) * set_off.span_s / model.wheel_radius_m();
@@ -188,7 +188,7 @@ mod tests {
         let along = model.wheelbase_m() / model.wheelbase_m().hypot(model.track_width_m());
         let scrub_n_m = friction * along * model.side_load_n() * model.wheel_radius_m();
         let turned = Drove {
-            told: speeds(-2.0, 2.0),
+            commanded: speeds(-2.0, 2.0),
             wheels: Some(speeds(-2.0, 2.0)),
             torques: torques(-scrub_n_m, scrub_n_m),
             ..Drove::default()
@@ -196,7 +196,7 @@ mod tests {
         // On a slope that takes half a newton metre of each side, to 2 rad/s within a second.
         let setting_off_n_m = model.mass_kg() * 2.0 * model.wheel_radius_m().powi(2);
         let ahead = Drove {
-            told: speeds(2.0, 2.0),
+            commanded: speeds(2.0, 2.0),
             wheels: Some(speeds(2.0, 2.0)),
             torques: torques(0.5, 0.5),
             set_off: Some(SetOff {

@@ -12,7 +12,7 @@
 //! Ground that grips alike in all directions has α = 1, whatever its θ, and the tyres of real
 //! robots lie within [`STIFFNESS_RATIO`]. So a configured W is impossible where `W_eff` is below it, and
 //! implausible where α would have to lie outside that range. A W within the range that `W_eff` allows
-//! cannot be told from another ground: that range is said, to be compared with a tape measure.
+//! looks like another ground: that range is said, to be compared with a tape measure.
 
 use super::drove::{Drove, TurnBlock};
 use super::finding::Finding;
@@ -115,9 +115,9 @@ pub(super) fn findings(
     };
     let obeyed = Obeyed {
         turn: (turning.right_rad_s - turning.left_rad_s)
-            / (turned.told.right_rad_s - turned.told.left_rad_s),
+            / (turned.commanded.right_rad_s - turned.commanded.left_rad_s),
         ahead: (going.left_rad_s + going.right_rad_s)
-            / (ahead.told.left_rad_s + ahead.told.right_rad_s),
+            / (ahead.commanded.left_rad_s + ahead.commanded.right_rad_s),
     };
     let effective = EffectiveTrack::measured(&turned.turn_blocks, gyro_bias_rad_s, radius_m);
     let mut findings = vec![of_radius_of_base(settings, obeyed)];
@@ -311,13 +311,13 @@ mod tests {
             });
             [
                 Drove {
-                    told: speeds(-commanded, commanded),
+                    commanded: speeds(-commanded, commanded),
                     wheels: Some(speeds(-wheels_rad_s, wheels_rad_s)),
                     turn_blocks: blocks.collect(),
                     ..Drove::default()
                 },
                 Drove {
-                    told: speeds(commanded, commanded),
+                    commanded: speeds(commanded, commanded),
                     wheels: Some(speeds(commanded, commanded)),
                     ..Drove::default()
                 },

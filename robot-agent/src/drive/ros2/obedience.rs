@@ -112,7 +112,7 @@ impl Envelope {
 /// What is to be thought of the wheels' word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
-    /// They do what they are told, as far as is known.
+    /// They obey, as far as is known.
     Obeys,
     /// They say that they stand: their encoders are stuck, or the drive is off.
     Stands,
@@ -126,13 +126,13 @@ pub struct Obedience {
     spans: [Envelope; SPANS],
     /// The span that is being filled, and when it began.
     present: (usize, Duration),
-    /// For how long the wheels did not do as told of late.
+    /// For how long the wheels did not obey of late.
     disobeyed: Duration,
     /// For how long of that they stood.
     stood: Duration,
-    /// For how long they did as told since.
+    /// For how long they obeyed since.
     obeyed: Duration,
-    /// Since when the wheels do as told again.
+    /// Since when the wheels obey again.
     obeys_since: Option<Duration>,
     judged_at: Option<Duration>,
     verdict: Verdict,

@@ -38,7 +38,7 @@ struct Fault {
     value: &'static str,
     /// Part of an alert's text.
     said: &'static str,
-    /// How soon the robot must be told to rest; none of what does not stop it.
+    /// How soon rest must be commanded; none of what does not stop the robot.
     zero_max_ms: Option<f64>,
     lasts: Duration,
 }
@@ -74,7 +74,7 @@ const FAULTS: [Fault; 12] = [
         lasts: Duration::from_secs(5),
         ..fault("hijack", "on", "as if another node commands")
     },
-    // What another node writes is heard, and said; the base still does most of what it is told.
+    // What another node writes is heard, and said; the base still does most of what the agent commands.
     Fault {
         zero_max_ms: None,
         ..fault("rival", "0.4", "another node writes on the command topic")
