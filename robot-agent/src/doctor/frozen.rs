@@ -32,10 +32,11 @@ pub(super) struct Frozen {
 }
 
 impl Frozen {
-    /// Which sensors froze during both motions.
-    pub(super) fn of(turned: &Drove, ahead: &Drove) -> Self {
+    /// Which sensors froze during both motions of a robot whose gyro has this bias.
+    pub(super) fn of(turned: &Drove, ahead: &Drove, gyro_bias_rad_s: f64) -> Self {
         let ranges = turned.ranges.with(&ahead.ranges);
-        let seen = Seen::of(&ranges, turned, ahead);
+        let turn_rad_s = turned.turn_rad_s.unwrap_or(gyro_bias_rad_s) - gyro_bias_rad_s;
+        let seen = Seen::of(&ranges, turn_rad_s, ahead);
         let Ranges {
             left,
             right,
@@ -141,9 +142,8 @@ struct Seen {
 }
 
 impl Seen {
-    fn of(ranges: &Ranges, turned: &Drove, ahead: &Drove) -> Self {
+    fn of(ranges: &Ranges, turn_rad_s: f64, ahead: &Drove) -> Self {
         let has_turned = |span: f64, commanded: f64| span > TURNED_SHARE * commanded.abs();
-        let turn_rad_s = turned.turn_rad_s.unwrap_or(0.0);
         Self {
             left: has_turned(ranges.left.span(), ahead.commanded.left_rad_s),
             right: has_turned(ranges.right.span(), ahead.commanded.right_rad_s),
@@ -221,7 +221,7 @@ mod tests {
 
     fn found(frozen: Frozen, moves: bool, noise: f64) -> Frozen {
         let [turned, ahead] = robot(frozen, moves, noise);
-        Frozen::of(&turned, &ahead)
+        Frozen::of(&turned, &ahead, 0.0)
     }
 
     #[test]
@@ -266,7 +266,7 @@ mod tests {
             ),
         ] {
             let [turned, ahead] = robot(frozen, true, 0.01);
-            let findings = Frozen::of(&turned, &ahead).findings(&settings(), &turned, &ahead);
+            let findings = Frozen::of(&turned, &ahead, 0.0).findings(&settings(), &turned, &ahead);
             let keys: Vec<_> = findings.iter().filter_map(|finding| finding.key).collect();
             assert_eq!(keys, [key], "{frozen:?}");
         }
@@ -275,6 +275,16 @@ mod tests {
     #[test]
     fn a_robot_that_stood_has_no_frozen_sensor_though_its_perfect_sensors_never_changed() {
         assert_eq!(found(Frozen::default(), false, 0.0), Frozen::default());
+    }
+
+    #[test]
+    fn a_gyro_with_a_bias_did_not_see_a_robot_turn_that_stood() {
+        let [mut turned, ahead] = robot(Frozen::default(), false, 0.0);
+        turned.turn_rad_s = Some(0.3);
+        turned.ranges.gyro.add(0.3);
+        assert_eq!(Frozen::of(&turned, &ahead, 0.3), Frozen::default());
+        let found = Frozen::of(&turned, &ahead, 0.0);
+        assert!(found.left && found.right, "{found:?}");
     }
 
     proptest! {

@@ -64,7 +64,7 @@ pub(super) fn findings(
             "the wheels said nothing while they were commanded to move",
         )];
     };
-    let frozen = Frozen::of(turned, ahead);
+    let frozen = Frozen::of(turned, ahead, gyro_bias_rad_s);
     let mut findings = frozen.findings(settings, turned, ahead);
     if frozen.left || frozen.right {
         let text = "sides, signs, radius and track: they need the joints";
