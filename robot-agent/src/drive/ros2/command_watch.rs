@@ -4,9 +4,13 @@
 //! `zenoh-bridge-ros2dds` none does: what the agent did not write itself of late is another's. The
 //! bridge never hands back what it wrote on DDS itself, and commands that equal one of ours of
 //! late, such as rest while we command rest, do no harm.
+//!
+//! A base that obeys two nodes follows nobody's path, so while others write ([`Contest`]) the wheels are
+//! not believed, and nothing but rest is commanded.
 
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use tread_ros2::messages::MessageType;
 use tread_ros2::rmw::{Attachment, GID_BYTES, check_key};
@@ -16,6 +20,41 @@ use super::settings::Scheme;
 
 /// Newest commands of our own that are known again, more than half a second of them.
 const REMEMBERED: usize = 64;
+
+/// Commands of others within [`CONTEST_SPAN`] that make a contest; a node that ends often writes one.
+const CONTEST_MIN: usize = 3;
+/// The time within which they come, and after which the last one is past.
+const CONTEST_SPAN: Duration = Duration::from_millis(500);
+
+/// Whether another node commands the base while the agent drives it. Pure.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Contest {
+    heard: u64,
+    /// When the newest commands of others came, the oldest first.
+    newest: [Option<Duration>; CONTEST_MIN],
+    is_contested: bool,
+}
+
+impl Contest {
+    /// Looks at how many commands others wrote so far, and whether the agent drives.
+    pub(super) fn look(&mut self, now: Duration, foreign_commands: u64, drives: bool) -> bool {
+        let new = foreign_commands.saturating_sub(self.heard);
+        self.heard = foreign_commands;
+        for _ in 0..new.min(CONTEST_MIN as u64) {
+            self.newest.rotate_left(1);
+            self.newest[CONTEST_MIN - 1] = Some(now);
+        }
+        let is_late =
+            |at: &Option<Duration>| at.is_some_and(|at| now.saturating_sub(at) <= CONTEST_SPAN);
+        // Once there is a contest each further command keeps it up.
+        self.is_contested = if self.is_contested {
+            self.newest.last().is_some_and(is_late)
+        } else {
+            drives && self.newest.iter().all(is_late)
+        };
+        self.is_contested
+    }
+}
 
 /// Hears the command topic.
 #[derive(Debug)]
@@ -103,6 +142,52 @@ mod tests {
         let counts = Arc::new(Counts::default());
         let watch = CommandWatch::new(scheme, Twist::TYPE, Arc::clone(&counts));
         (watch, counts)
+    }
+
+    /// Looks every 10 ms for so long; when a contest began and when it ended last.
+    fn contest(
+        span_ms: u64,
+        foreign: impl Fn(u64) -> u64,
+        drives: impl Fn(u64) -> bool,
+    ) -> (Option<u64>, Option<u64>) {
+        let (mut contest, mut began, mut ended, mut was) = (Contest::default(), None, None, false);
+        for now_ms in (0..span_ms).step_by(10) {
+            let now = Duration::from_millis(now_ms);
+            let is = contest.look(now, foreign(now_ms), drives(now_ms));
+            if is && !was {
+                began = began.or(Some(now_ms));
+            }
+            if was && !is {
+                ended = Some(now_ms);
+            }
+            was = is;
+        }
+        (began, ended)
+    }
+
+    #[test]
+    fn a_node_that_commands_a_driven_base_contests_it_until_half_a_second_after_its_last() {
+        for period_ms in [5, 20, 100, 200] {
+            // From one second to three.
+            let foreign =
+                |now_ms: u64| now_ms.clamp(1_000, 3_000).saturating_sub(1_000) / period_ms;
+            let (began, ended) = contest(5_000, foreign, |_| true);
+            let began = began.unwrap() - 1_000;
+            assert!(began <= 3 * period_ms + 10, "{period_ms}: {began}");
+            let ended = ended.unwrap() - 3_000;
+            assert!(ended <= 510, "{period_ms}: {ended}");
+        }
+    }
+
+    #[test]
+    fn a_stray_command_or_one_to_a_base_at_rest_is_no_contest() {
+        let stray = |now_ms: u64| 1 + now_ms / 400;
+        assert_eq!(contest(5_000, stray, |_| true), (None, None));
+        let steady = |now_ms: u64| now_ms / 20;
+        assert_eq!(contest(5_000, steady, |_| false), (None, None));
+        // Once it is contested the agent rests, and it stays contested.
+        let (began, ended) = contest(5_000, steady, |now_ms| now_ms < 100);
+        assert!(began.is_some() && ended.is_none());
     }
 
     #[test]

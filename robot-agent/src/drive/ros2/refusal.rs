@@ -39,13 +39,15 @@ pub enum Refusal {
     Disobedient,
     /// The wheels turn, and otherwise than commanded: somebody else may command them.
     OtherMotion,
+    /// Another node commands the base while the agent drives it.
+    Contested,
     /// More messages than the loop takes.
     Overflow,
 }
 
 impl Refusal {
     /// Every reason.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 16] = [
         Self::WrongType,
         Self::WrongHash,
         Self::NoAttachment,
@@ -60,6 +62,7 @@ impl Refusal {
         Self::SecondWriter,
         Self::Disobedient,
         Self::OtherMotion,
+        Self::Contested,
         Self::Overflow,
     ];
 
@@ -83,6 +86,7 @@ impl Refusal {
                 "messages of wheels that turn otherwise than commanded, as if another node commands \
                  the base,"
             }
+            Self::Contested => "messages of wheels that another node commands too",
             Self::Overflow => "more messages than could be taken",
         }
     }
@@ -106,6 +110,7 @@ impl Refusal {
             Self::SecondWriter => "second-writer",
             Self::Disobedient => "disobedient",
             Self::OtherMotion => "other-motion",
+            Self::Contested => "contested",
             Self::Overflow => "overflow",
         }
     }

@@ -406,6 +406,36 @@ fn wheels_that_do_not_do_what_they_are_told_are_not_believed() {
 }
 
 #[test]
+fn a_base_that_another_node_commands_too_rests_until_that_ceases() {
+    let mut talk = Talk::new();
+    for _ in 0..5 {
+        talk.say(&GOOD);
+        assert_eq!(talk.tell(TOLD), TOLD);
+    }
+    let counts = talk.drive.counts();
+    let rest = WheelSpeeds::default();
+    let mut ticks = 0;
+    while talk.tell(TOLD) == TOLD {
+        counts.note_foreign_command();
+        talk.say(&GOOD);
+        ticks += 1;
+        assert!(ticks < 20, "it is driven on");
+    }
+    for _ in 0..100 {
+        counts.note_foreign_command();
+        talk.say(&GOOD);
+        assert_eq!(talk.tell(rest), rest);
+    }
+    assert!(counts.dropped(Source::Joints, Refusal::Contested) > 100);
+    // The other falls silent.
+    for _ in 0..60 {
+        talk.say(&GOOD);
+        talk.tell(rest);
+    }
+    assert_eq!(talk.tell(TOLD), TOLD);
+}
+
+#[test]
 fn more_than_the_loop_takes_is_counted_and_the_newest_is_not_waited_for() {
     let mut talk = Talk::new();
     let joints = JointState {

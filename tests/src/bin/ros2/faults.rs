@@ -38,8 +38,8 @@ struct Fault {
     value: &'static str,
     /// Part of an alert's text.
     said: &'static str,
-    /// How soon rest must be commanded; none of what does not stop the robot.
-    zero_max_ms: Option<f64>,
+    /// How soon rest must be commanded.
+    zero_max_ms: f64,
     lasts: Duration,
 }
 
@@ -48,7 +48,7 @@ const fn fault(name: &'static str, value: &'static str, said: &'static str) -> F
         name,
         value,
         said,
-        zero_max_ms: Some(ZERO_MAX_MS),
+        zero_max_ms: ZERO_MAX_MS,
         lasts: LASTS,
     }
 }
@@ -63,20 +63,20 @@ const FAULTS: [Fault; 12] = [
     fault("short", "on", "not what their type says"),
     fault("restart", "1.0", "has not been heard"),
     Fault {
-        zero_max_ms: Some(ZERO_OF_A_LIE_MAX_MS),
+        zero_max_ms: ZERO_OF_A_LIE_MAX_MS,
         ..fault("stuck", "on", "do not do what they are told")
     },
     // Started again under its identifier, after a pause that a supervisor makes.
     fault("again", "1.0", "started again"),
     // Somebody who halts the base every other quarter of a second, past every topic.
     Fault {
-        zero_max_ms: Some(ZERO_OF_TWO_MASTERS_MAX_MS),
+        zero_max_ms: ZERO_OF_TWO_MASTERS_MAX_MS,
         lasts: Duration::from_secs(5),
         ..fault("hijack", "on", "as if another node commands")
     },
-    // What another node writes is heard, and said; the base still does most of what the agent commands.
+    // What another node writes is heard, before it shows in the wheels.
     Fault {
-        zero_max_ms: None,
+        zero_max_ms: ZERO_OF_A_LIE_MAX_MS,
         ..fault("rival", "0.4", "another node writes on the command topic")
     },
 ];
@@ -168,9 +168,7 @@ impl Trial<'_> {
     /// Whether and how soon the robot was told to rest.
     fn of_rest(&self, fault: &Fault, switched_at: Instant) -> Vec<Check> {
         let name = fault.name;
-        let Some(most_ms) = fault.zero_max_ms else {
-            return Vec::new();
-        };
+        let most_ms = fault.zero_max_ms;
         // The last good word: the last of all, if the base fell silent, or the one before the fault.
         let last_word = self.observer.sensor_at().unwrap_or(switched_at);
         let fell_silent = name == "silent" || starts_again(name);
@@ -187,12 +185,13 @@ impl Trial<'_> {
         let first = format!("{name}: first zero command, ms");
         let last = format!("{name}: last command that was none, ms");
         let mut checks = vec![self.judgement.at_most(first, most_ms, zero_ms)];
-        // A base that obeys now and then is tried again and again.
-        if name != "hijack" {
+        // A base that obeys now and then is tried again and again, and what a rival writes is no rest.
+        let is_shared = name == "hijack" || name == "rival";
+        if !is_shared {
             checks.push(self.judgement.at_most(last, most_ms, last_ms));
         }
         // A base that starts again may be heard again by now.
-        if !starts_again(name) && name != "hijack" {
+        if !starts_again(name) && !is_shared {
             let is_at_rest = zero.is_some() && !self.observer.is_moving();
             checks.push(Check::so(format!("{name}: it is told to rest"), is_at_rest));
         }
