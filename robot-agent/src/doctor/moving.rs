@@ -71,9 +71,12 @@ pub(super) fn findings(
         findings.push(Finding::skipped("sides", text));
         return findings;
     }
-    let rim_m_s = 0.5 * model.wheel_radius_m() * (going.left_rad_s + going.right_rad_s);
+    let (of_turn, of_ahead) = (directions(turning, turned), directions(going, ahead));
+    // By the command, for joints that disagree have no mean.
+    let commanded_rad_s = 0.5 * (ahead.commanded.left_rad_s + ahead.commanded.right_rad_s);
+    let rim_m_s = model.wheel_radius_m() * commanded_rad_s;
     let twist = ahead.twist.filter(|_| !frozen.odometry);
-    let twist = twist.and_then(|twist| twist_frame::finding(&twist, rim_m_s));
+    let twist = twist.and_then(|twist| twist_frame::finding(&twist, rim_m_s, of_ahead));
     let is_twist_well = twist.is_none();
     findings.extend(twist);
     let ground_m_s = ahead.places_m_s.filter(|_| !frozen.position).or(ahead
@@ -81,7 +84,6 @@ pub(super) fn findings(
         .filter(|_| !frozen.odometry && is_twist_well));
     let turn_rad_s = turned.turn_rad_s.filter(|_| !frozen.gyro);
     let turn_rad_s = turn_rad_s.map(|rate| rate - gyro_bias_rad_s);
-    let (of_turn, of_ahead) = (directions(turning, turned), directions(going, ahead));
     if let Some(standing) = of_standing(of_turn, of_ahead) {
         findings.push(standing);
         return findings;
@@ -334,6 +336,21 @@ mod tests {
             });
         });
         assert_eq!(world, ["drive.ros2.odometry.child_frame"]);
+    }
+
+    #[test]
+    fn one_side_inverted_is_a_sign_and_no_twist_after_a_turn_half_around() {
+        let inverted = keys_of(|turned, ahead| {
+            turned.wheels = Some(speeds(2.5, 2.5));
+            ahead.wheels = Some(speeds(-2.5001, 2.5));
+            ahead.twist = Some(PlanarTwist {
+                x_m_s: -0.2,
+                y_m_s: 0.001,
+                heading_rad: std::f64::consts::PI,
+            });
+            ahead.odometry_m_s = None;
+        });
+        assert_eq!(inverted, ["drive.ros2.joints.left_sign"]);
     }
 
     #[test]

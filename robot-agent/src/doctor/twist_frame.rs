@@ -22,13 +22,18 @@ pub(super) fn is_along_x(heading_rad: f64) -> bool {
 }
 
 /// Whether the motion is in the wrong frame; nothing of a robot whose odometry does not move.
-pub(super) fn finding(twist: &PlanarTwist, rim_m_s: f64) -> Option<Finding> {
+///
+/// The wheels' rims are commanded to that speed, and the joints of the left and the right say that
+/// they turn ahead (1) or back (-1). Where these disagree, one of them is inverted and nobody knows
+/// which way the robot went.
+pub(super) fn finding(twist: &PlanarTwist, rim_m_s: f64, joints: [i8; 2]) -> Option<Finding> {
     let speed_m_s = twist.x_m_s.hypot(twist.y_m_s);
     (speed_m_s > SPEED_MIN_SHARE * rim_m_s.abs()).then_some(())?;
     // A robot that goes backwards is judged by its back.
-    let back_rad = if rim_m_s < 0.0 { PI } else { 0.0 };
+    let back_rad = if joints == [-1, -1] { PI } else { 0.0 };
     let direction_rad = wrap_angle_rad(twist.y_m_s.atan2(twist.x_m_s) - back_rad);
-    if direction_rad.abs() <= AHEAD_MAX_RAD {
+    let is_along = direction_rad.abs() >= PI - AHEAD_MAX_RAD;
+    if direction_rad.abs() <= AHEAD_MAX_RAD || (is_along && joints[0] != joints[1]) {
         return None;
     }
     let key = "drive.ros2.odometry.child_frame";
@@ -42,7 +47,7 @@ pub(super) fn finding(twist: &PlanarTwist, rim_m_s: f64) -> Option<Finding> {
         return Some(Finding::wrong("twist", key, text));
     }
     // Straight backwards is a matter of signs.
-    if direction_rad.abs() >= PI - AHEAD_MAX_RAD {
+    if is_along {
         return None;
     }
     let text = format!(
@@ -60,6 +65,8 @@ mod tests {
     use super::*;
 
     const RIM_M_S: f64 = 0.2;
+    const AHEAD: [i8; 2] = [1, 1];
+    const BACK: [i8; 2] = [-1, -1];
 
     fn twist(direction_rad: f64, heading_rad: f64) -> PlanarTwist {
         PlanarTwist {
@@ -71,13 +78,13 @@ mod tests {
 
     #[test]
     fn a_twist_that_is_turned_otherwise_is_named_as_that() {
-        let turned = finding(&twist(PI / 2.0, 2.8), RIM_M_S).unwrap();
+        let turned = finding(&twist(PI / 2.0, 2.8), RIM_M_S, AHEAD).unwrap();
         assert!(
             turned.text.contains("child frame is turned"),
             "{}",
             turned.text
         );
-        assert_eq!(finding(&twist(PI, 1.0), RIM_M_S), None, "backwards");
+        assert_eq!(finding(&twist(PI, 1.0), RIM_M_S, AHEAD), None, "backwards");
     }
 
     #[test]
@@ -87,20 +94,33 @@ mod tests {
             y_m_s: -0.001,
             heading_rad: 1.0,
         };
-        assert_eq!(finding(&still, RIM_M_S), None);
+        assert_eq!(finding(&still, RIM_M_S, AHEAD), None);
     }
 
     #[test]
     fn a_robot_that_goes_backwards_where_it_heads_back_is_well() {
-        assert_eq!(finding(&twist(PI - 0.01, PI - 0.02), -RIM_M_S), None);
-        let world = finding(&twist(1.5 + PI, 1.5), -RIM_M_S).unwrap();
+        assert_eq!(finding(&twist(PI - 0.01, PI - 0.02), RIM_M_S, BACK), None);
+        let world = finding(&twist(1.5 + PI, 1.5), RIM_M_S, BACK).unwrap();
         assert!(world.text.contains("frame of the pose"), "{}", world.text);
+    }
+
+    #[test]
+    fn joints_of_which_one_is_inverted_do_not_make_a_twist_wrong() {
+        for joints in [[-1, 1], [1, -1]] {
+            // The robot turned half around before, and went back or ahead.
+            for direction_rad in [0.02, PI - 0.02] {
+                let twist = twist(direction_rad, PI - 0.01);
+                assert_eq!(finding(&twist, RIM_M_S, joints), None);
+            }
+            let world = finding(&twist(1.5, 1.4), RIM_M_S, joints).unwrap();
+            assert!(world.text.contains("frame of the pose"), "{}", world.text);
+        }
     }
 
     proptest! {
         #[test]
         fn a_twist_of_the_body_is_well_wherever_the_robot_heads(heading_rad in -3.2_f64..3.2, off_rad in -0.3_f64..0.3) {
-            prop_assert_eq!(finding(&twist(off_rad, heading_rad), RIM_M_S), None);
+            prop_assert_eq!(finding(&twist(off_rad, heading_rad), RIM_M_S, AHEAD), None);
         }
 
         #[test]
@@ -108,7 +128,7 @@ mod tests {
             heading_rad in -3.1_f64..3.1,
             off_rad in -0.15_f64..0.15,
         ) {
-            let found = finding(&twist(heading_rad + off_rad, heading_rad), RIM_M_S);
+            let found = finding(&twist(heading_rad + off_rad, heading_rad), RIM_M_S, AHEAD);
             if is_along_x(heading_rad) {
                 prop_assert!(found.is_none_or(|finding| finding.text.contains("frame of the pose")));
             } else {
