@@ -11,6 +11,7 @@ use crate::control_loop::overrun::{Overrun, WINDOW_TICKS};
 use crate::control_loop::seam::Fault;
 use crate::control_loop::surface::Comparison;
 use crate::drive::Battery;
+use crate::drive::ros2::notices::{ForeignCommands, Notice, Noticing};
 use crate::drive::ros2::refusal::{Counts, Dropping};
 use crate::outbox::OutboxDamage;
 
@@ -47,6 +48,8 @@ pub(crate) struct Alerts {
     battery_critical: bool,
     outbox_long: bool,
     dropping: Dropping,
+    noticing: [Noticing; Notice::ALL.len()],
+    foreign_commands: ForeignCommands,
 }
 
 /// Whether a figure counts as below, with the bound that holds in the present state.
@@ -115,6 +118,14 @@ impl Alerts {
             let code = format!("base-{}", refusal.code());
             alert(&code, Severity::Warning, format!("the base: {text}"))
         });
+        let noticed = Notice::ALL.map(|notice| {
+            let text = self.noticing[notice as usize].look(causes.base?, notice)?;
+            alert(notice.code(), Severity::Warning, text)
+        });
+        let foreign = causes.base.and_then(|base| {
+            let text = self.foreign_commands.look(base)?;
+            alert("command-second-writer", Severity::Critical, text)
+        });
         let long = self.outbox_long.then(|| {
             let text = "many measurements wait for the server".to_owned();
             alert("outbox-long", Severity::Warning, text)
@@ -161,8 +172,10 @@ impl Alerts {
             long.flatten(),
             lost.flatten(),
             damaged,
+            foreign,
         ]
         .into_iter()
+        .chain(noticed)
         .flatten()
         .collect()
     }
@@ -176,6 +189,7 @@ mod tests {
     use tread_control::tracking::ThetaKnowledge;
 
     use super::*;
+    use crate::drive::ros2::refusal::Source;
 
     fn codes(alerts: &[AlertReport]) -> Vec<&str> {
         alerts.iter().map(|alert| alert.code.as_str()).collect()
@@ -278,6 +292,25 @@ mod tests {
             alerts.judge(&causes).is_empty(),
             "somebody has looked at it"
         );
+    }
+
+    #[test]
+    fn a_base_that_started_again_and_a_second_commander_are_alerts() {
+        let counts = Counts::default();
+        let (mut alerts, causes) = (
+            Alerts::default(),
+            Causes {
+                base: Some(&counts),
+                ..Causes::default()
+            },
+        );
+        assert!(alerts.judge(&causes).is_empty());
+        counts.note(Source::Joints, Notice::Restarted);
+        counts.note_foreign_command();
+        let said = alerts.judge(&causes);
+        assert_eq!(codes(&said), ["command-second-writer", "base-restarted"]);
+        assert!(said[0].text.contains("another node"), "{said:?}");
+        assert!(said[1].text.contains("joints"), "{said:?}");
     }
 
     #[test]

@@ -16,6 +16,7 @@ use tread_control::gate::GateCause;
 use crate::alerts::{Alerts, Causes};
 use crate::clock::SharedClock;
 use crate::control_loop::seam::{Shared, Snapshot};
+use crate::drive::ros2::notices::{ForeignCommands, Notice, Noticing};
 use crate::drive::ros2::refusal::{Counts, Dropping};
 use crate::fleet::{FleetLink, Identity};
 use crate::geometry::{wire_pose, wire_twist};
@@ -211,6 +212,9 @@ pub(crate) async fn log_losses(
 ) {
     let (mut dropping, mut said) = (Dropping::default(), None);
     let (mut segments, mut blocks) = (0, 0);
+    let mut noticing = [Noticing::default(); Notice::ALL.len()];
+    let mut noticed = [const { None }; Notice::ALL.len()];
+    let (mut foreign, mut foreign_said) = (ForeignCommands::default(), None);
     loop {
         tokio::select! {
             () = tokio::time::sleep(LOSSES_EVERY) => {}
@@ -222,6 +226,20 @@ pub(crate) async fn log_losses(
             warn!("{text}");
         }
         said = dropped;
+        if let Some(base) = base.as_deref() {
+            for notice in Notice::ALL {
+                let text = noticing[notice as usize].look(base, notice);
+                let former = std::mem::replace(&mut noticed[notice as usize], text.clone());
+                if let Some(text) = text.filter(|text| former.as_ref() != Some(text)) {
+                    warn!("{text}");
+                }
+            }
+            let text = foreign.look(base);
+            if let Some(text) = text.as_ref().filter(|_| text != foreign_said) {
+                warn!("{text}");
+            }
+            foreign_said = text;
+        }
         let lost = shared.lost_segments.load(Ordering::Relaxed);
         if lost > segments {
             warn!(

@@ -113,7 +113,11 @@ def session(settings):
 
 
 class Node:
-    """A node as `rmw_zenoh_cpp` shows it; started again it is another one."""
+    """A node as `rmw_zenoh_cpp` shows it; started again it is another one.
+
+    By `--scheme ros2dds` it is what `zenoh-bridge-ros2dds` shows of a robot on DDS: keys without type,
+    no attachments and no tokens.
+    """
 
     def __init__(self, robot):
         self.robot = robot
@@ -138,8 +142,11 @@ class Node:
         key = self.key("cmd_vel", "geometry_msgs/msg/Twist")
         self.subscriber = self.session.declare_subscriber(key, robot.take_command)
 
+    def is_bridge(self):
+        return self.robot.arguments.scheme == "ros2dds"
+
     def token(self, key):
-        return self.session.liveliness().declare_token(key)
+        return None if self.is_bridge() else self.session.liveliness().declare_token(key)
 
     def name(self, topic):
         return f"{self.robot.arguments.namespace}/{topic}".strip("/")
@@ -149,6 +156,8 @@ class Node:
         return f"{package}::msg::dds_::{name}_", store.hash_rihs01(kind)
 
     def key(self, topic, kind):
+        if self.is_bridge():
+            return self.name(topic)
         name, hash_ = self.typed(kind)
         if self.robot.is_on("hash") and topic == "joint_states":
             hash_ = "RIHS01_" + 64 * "0"
@@ -167,7 +176,7 @@ class Node:
         publisher, gid, _ = entry
         entry[2] += 1
         attachment = entry[2].to_bytes(8, "little") + time.time_ns().to_bytes(8, "little") + b"\x10" + gid
-        if self.robot.is_on("bare"):
+        if self.robot.is_on("bare") or self.is_bridge():
             attachment = None
         payload = bytes(store.serialize_cdr(content, content.__msgtype__))
         if self.robot.is_on("short") and topic == "joint_states":
@@ -175,10 +184,32 @@ class Node:
         if self.robot.is_on("hash") and topic == "joint_states":
             self.session.put(self.key(topic, content.__msgtype__), payload, attachment=attachment)
         else:
-            publisher.put(payload, attachment=attachment)
+            for _ in range(2 if self.robot.is_on("twice") else 1):
+                publisher.put(payload, attachment=attachment)
+
+    def begin_again(self):
+        """As a node whose session has a fixed identifier: started again, it numbers its messages from one."""
+        for entry in self.publishers.values():
+            entry[2] = 0
 
     def close(self):
         self.session.close()
+
+
+class Rival:
+    """Another node, which writes on a topic that has its writer."""
+
+    def __init__(self, node, topic, kind):
+        self.node, self.topic, self.sequence = node, topic, 0
+        self.session = session({"mode": "peer", "connect/endpoints": [node.robot.arguments.endpoint], "listen/endpoints": []})
+        self.publisher = self.session.declare_publisher(node.key(topic, kind), express=True)
+        self.gid = xxhash.xxh3_128_intdigest(str(self.session.info.zid()).encode()).to_bytes(16, "little")
+
+    def write(self, content):
+        self.sequence += 1
+        attachment = self.sequence.to_bytes(8, "little") + time.time_ns().to_bytes(8, "little") + b"\x10" + self.gid
+        payload = bytes(store.serialize_cdr(content, content.__msgtype__))
+        self.publisher.put(payload, attachment=None if self.node.is_bridge() else attachment)
 
 
 class Robot:
@@ -189,7 +220,7 @@ class Robot:
         self.bias = [0.02 * self.rng.uniform(-1, 1) for _ in range(2)]
         self.torque_scale = 1 + 0.02 * self.rng.uniform(-1, 1)
         self.faults, self.commanded_at, self.bare_commands, self.commands = {}, 0.0, 0, 0
-        self.late = []
+        self.late, self.rivals, self.frozen, self.own_command = [], {}, {}, [0.0, 0.0]
         # What `rmw_zenohd` is beside the nodes.
         self.router = session({"mode": "router", "listen/endpoints": [arguments.endpoint]}) if arguments.router else None
         self.node = Node(self)
@@ -199,13 +230,35 @@ class Robot:
 
     def take_command(self, sample):
         # As rmw_zenoh_cpp: nothing without an attachment.
-        if sample.attachment is None or len(sample.attachment.to_bytes()) != 33:
+        is_bare = sample.attachment is None or len(sample.attachment.to_bytes()) != 33
+        if is_bare and self.arguments.scheme == "rmw_zenoh":
             self.bare_commands += 1
             return
         twist = store.deserialize_cdr(sample.payload.to_bytes(), "geometry_msgs/msg/Twist")
-        half = self.plant.track / 2 * twist.angular.z
-        self.plant.command = [(twist.linear.x - half) / BASE_RADIUS, (twist.linear.x + half) / BASE_RADIUS]
+        sign = -1.0 if self.is_on("flipped") else 1.0
+        half = self.plant.track / 2 * sign * twist.angular.z
+        ahead = sign * twist.linear.x
+        self.own_command = [(ahead - half) / BASE_RADIUS, (ahead + half) / BASE_RADIUS]
+        self.plant.command = self.own_command
         self.commanded_at, self.commands = time.monotonic(), self.commands + 1
+
+    def hijack(self):
+        """Somebody past every topic, who halts the base every other quarter of a second."""
+        if self.is_on("hijack"):
+            self.plant.command = [0.0, 0.0] if int(time.monotonic() * 4) % 2 else self.own_command
+
+    def write_as_another(self, fault, topic, content):
+        """Another node writes this."""
+        if fault not in self.rivals:
+            self.rivals[fault] = Rival(self.node, topic, content.__msgtype__)
+        self.rivals[fault].write(content)
+
+    def held(self, fault, values):
+        """What a sensor that froze says: what it said first when it did."""
+        if not self.is_on(fault):
+            self.frozen.pop(fault, None)
+            return values
+        return self.frozen.setdefault(fault, values)
 
     def noisy(self, value, deviation):
         return value + self.rng.gauss(0.0, deviation)
@@ -225,6 +278,8 @@ class Robot:
             speeds[0] = math.nan
         if self.is_on("stuck"):
             speeds = [0.0, 0.0]
+        speeds, torques = self.held("frozen_joints", (speeds, torques))
+        speeds, torques = list(speeds), list(torques)
         if self.is_on("swapped"):
             speeds.reverse()
             torques.reverse()
@@ -235,6 +290,8 @@ class Robot:
         factor = self.faults.get("effort", 1.0)
         pulls = [factor * self.averaged(torque * self.torque_scale, noise) / 2 for torque in torques]
         names = ["front_left_wheel", "front_right_wheel", "rear_left_wheel", "rear_right_wheel"]
+        if self.is_on("renamed"):
+            names = ["fl_wheel_joint", "fr_wheel_joint", "rl_wheel_joint", "rr_wheel_joint"]
         sides = [0, 1, 0, 1]
         effort = [] if self.is_on("effortless") else [pulls[side] for side in sides]
         return message(
@@ -246,9 +303,10 @@ class Robot:
         _, _, turn, ahead, left, *_ = means
         felt = vector(self.averaged(ahead + self.bias[0], 0.05), self.averaged(left + self.bias[1], 0.05), GRAVITY)
         small = np.diag([1e-4, 1e-4, 1e-4]).flatten()
+        turn = self.held("frozen_imu", self.averaged(turn, 0.003) + self.faults.get("bias", 0.0))
         return message(
             "sensor_msgs/msg/Imu", self.header("camera" if self.is_on("frame") else "imu_link"), turned(self.plant.state[2]), small,
-            vector(0.0, 0.0, self.averaged(turn, 0.003)), np.diag([9e-6] * 3).flatten(),
+            vector(0.0, 0.0, turn), np.diag([9e-6] * 3).flatten(),
             felt, np.diag([2.5e-3] * 3).flatten(),
         )
 
@@ -265,7 +323,11 @@ class Robot:
         return message("geometry_msgs/msg/PoseWithCovariance", pose, covariance)
 
     def odometry(self, ahead, turn):
-        twist = message("geometry_msgs/msg/Twist", vector(ahead, 0.0, 0.0), vector(0.0, 0.0, turn))
+        ahead, turn = self.held("frozen_odometry", (ahead, turn))
+        # The frame of the twist is the body's, unless its writer got that wrong.
+        angle = self.plant.state[2] if self.is_on("world") else 0.0
+        linear = vector(ahead * math.cos(angle), ahead * math.sin(angle), 0.0)
+        twist = message("geometry_msgs/msg/Twist", linear, vector(0.0, 0.0, turn))
         covariance = np.diag([4e-4] * 6).flatten()
         twist = message("geometry_msgs/msg/TwistWithCovariance", twist, covariance)
         return message("nav_msgs/msg/Odometry", self.header("odom", self.faults.get("delay", 0.0)), "base_link", self.covariant_pose(), twist)
@@ -295,6 +357,11 @@ class Robot:
         if not self.is_on("silent"):
             for topic, content in said:
                 self.node.publish(topic, content)
+        if self.is_on("two_imus"):
+            self.write_as_another("two_imus", "imu/data", self.imu(means))
+        if "rival" in self.faults and tick % 2 == 0:
+            ahead = self.faults["rival"]
+            self.write_as_another("rival", "cmd_vel", message("geometry_msgs/msg/Twist", vector(ahead, 0.0, 0.0), vector(0.0, 0.0, 0.0)))
 
     def report(self, **line):
         print(json.dumps(line), flush=True)
@@ -310,8 +377,13 @@ class Robot:
                 self.plant.command = [0.0, 0.0]
                 self.node, began, tick, steps = Node(self), time.monotonic(), 0, []
                 self.report(event="restarted")
+            if "again" in self.faults:
+                time.sleep(self.faults.pop("again"))
+                self.node.begin_again()
+                began, tick, steps = time.monotonic(), 0, []
             if time.monotonic() - self.commanded_at > COMMAND_TIMEOUT_S:
                 self.plant.command = [0.0, 0.0]
+            self.hijack()
             for _ in range(STEPS):
                 steps.append(self.plant.step())
             if len(steps) * STEP_S >= SENSOR_S:
@@ -336,6 +408,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--endpoint", required=True)
     parser.add_argument("--router", action="store_true", help="be the robot's router too")
+    parser.add_argument("--scheme", choices=["rmw_zenoh", "ros2dds"], default="rmw_zenoh")
     parser.add_argument("--domain", type=int, default=0)
     parser.add_argument("--namespace", default="/rover")
     parser.add_argument("--stiffness", type=float, default=2.5)

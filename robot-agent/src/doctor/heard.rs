@@ -2,6 +2,8 @@
 
 use std::sync::{Mutex, PoisonError};
 
+use tread_ros2::rmw::Attachment;
+
 use crate::drive::ros2::inlet::Tap;
 use crate::drive::ros2::refusal::Source;
 use crate::drive::ros2::stamps::Arrival;
@@ -15,7 +17,7 @@ pub(super) struct Message {
     pub(super) source: Source,
     pub(super) arrival: Arrival,
     pub(super) key: String,
-    pub(super) has_attachment: bool,
+    pub(super) attachment: Option<Attachment>,
     pub(super) payload: Vec<u8>,
 }
 
@@ -59,7 +61,7 @@ impl Tap for Heard {
                 source,
                 arrival,
                 key: key.to_owned(),
-                has_attachment: attachment.is_some_and(|bytes| !bytes.is_empty()),
+                attachment: attachment.and_then(Attachment::from_bytes),
                 payload: payload.to_vec(),
             });
         }

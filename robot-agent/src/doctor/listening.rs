@@ -6,19 +6,32 @@ use tread_ros2::cdr::decode;
 use tread_ros2::messages::{Imu, JointState, Odometry, PoseWithCovarianceStamped};
 use tread_ros2::rmw::{KeyMismatch, check_key};
 
-use super::Finding;
+use super::finding::Finding;
 use super::heard::Message;
+use super::joint_names::JointNames;
 use crate::drive::ros2::inlet::{decoded, topic_of, type_of};
 use crate::drive::ros2::reading::Content;
 use crate::drive::ros2::refusal::{Refusal, Source};
-use crate::drive::ros2::settings::{Effort, Ros2Settings, Scheme};
+use crate::drive::ros2::settings::{Effort, Ros2Settings, Scheme, StampClock};
 
 /// Slowest messages of wheels and inertial unit, Hz.
 const RATE_MIN_HZ: f64 = 20.0;
 /// Oldest that a message of the base may be when it comes, milliseconds.
 const AGE_MAX_MS: f64 = 50.0;
+/// From here on an age is of another clock, milliseconds.
+const CLOCK_MIN_MS: f64 = 2_000.0;
 /// Share of messages that may be bad.
 const BAD_SHARE_MAX: f64 = 0.02;
+/// Share of messages that may come twice.
+const REPEATED_SHARE_MAX: f64 = 0.02;
+/// Messages among which one is looked for that came already.
+const REPEATED_AMONG: usize = 32;
+/// Messages after which a stamp that never changed stands still.
+const STANDING_STAMPS_MIN: usize = 5;
+/// Largest turn rate that the gyro of a standing robot may say on average, radians per second.
+const GYRO_BIAS_MAX_RAD_S: f64 = 0.01;
+/// Speed up to which a wheel counts as standing, radians per second.
+const WHEEL_STANDING_RAD_S: f64 = 0.1;
 
 /// The finding's name and the key of a source's section.
 fn names(source: Source) -> (&'static str, &'static str) {
@@ -64,12 +77,146 @@ pub(super) fn findings(
             }
             continue;
         }
-        findings.push(of_topic(settings, source, &of_source, span));
         if source == Source::Joints {
-            findings.extend(effort(settings, &of_source));
+            findings.extend(of_joints(settings, &of_source, span));
+        } else {
+            findings.push(of_topic(settings, source, &of_source, span));
         }
     }
+    findings.extend(of_gyro_at_rest(settings, messages));
     findings
+}
+
+/// What was found of the joints. Others than the robot's may be said on the same topic.
+fn of_joints(settings: &Ros2Settings, messages: &[&Message], span: Duration) -> Vec<Finding> {
+    let Some(joints) = &settings.joints else {
+        return Vec::new();
+    };
+    if let Some(finding) = of_keys(settings, Source::Joints, messages) {
+        return vec![finding];
+    }
+    let mut names = JointNames::default();
+    for message in messages {
+        if let Ok(read) = decode::<JointState<'_>>(&message.payload) {
+            names.add(read.name.iter());
+        }
+    }
+    if let Some(finding) = names.finding(joints) {
+        return vec![finding];
+    }
+    let is_of_others = |message: &&&Message| {
+        matches!(
+            decoded(settings, Source::Joints, &message.payload),
+            Ok(None)
+        )
+    };
+    let own: Vec<&Message> = messages
+        .iter()
+        .filter(|it| !is_of_others(it))
+        .copied()
+        .collect();
+    let mut finding = of_topic(settings, Source::Joints, &own, span);
+    finding.text = format!("{}; it names {}", finding.text, names.text());
+    let is_well = finding.holds;
+    let effort = effort(settings, &own).filter(|_| is_well);
+    std::iter::once(finding).chain(effort).collect()
+}
+
+/// Mean turn rate that the inertial unit says of a robot whose wheels stand; none where they do not,
+/// or where it is not known.
+pub(super) fn gyro_at_rest_rad_s(settings: &Ros2Settings, messages: &[Message]) -> Option<f64> {
+    let (mut sum, mut count) = (0.0, 0.0);
+    for message in messages {
+        let Ok(Some((_, content))) = decoded(settings, message.source, &message.payload) else {
+            continue;
+        };
+        match content {
+            Content::Inertial(inertial) => {
+                sum += inertial.yaw_rate_rad_s;
+                count += 1.0;
+            }
+            Content::Wheels(wheels) => {
+                if wheels.speeds.magnitude_max_rad_s() > WHEEL_STANDING_RAD_S {
+                    return None;
+                }
+            }
+            Content::Motion(_) | Content::Position(_) | Content::Battery(_) => {}
+        }
+    }
+    (count > 0.0).then(|| sum / count)
+}
+
+fn of_gyro_at_rest(settings: &Ros2Settings, messages: &[Message]) -> Option<Finding> {
+    let bias_rad_s = gyro_at_rest_rad_s(settings, messages)?;
+    let degrees = bias_rad_s.to_degrees();
+    if bias_rad_s.abs() <= GYRO_BIAS_MAX_RAD_S {
+        let text = format!("the gyro says {bias_rad_s:.4} rad/s ({degrees:.2} °/s) at rest");
+        return Some(Finding::well("gyro", text));
+    }
+    let text = format!(
+        "the gyro says {bias_rad_s:.4} rad/s ({degrees:.2} °/s) while the robot stands, at most \
+         {GYRO_BIAS_MAX_RAD_S} rad/s is good: it has a bias. Let its driver calibrate it at rest; no key of \
+         robot.toml can"
+    );
+    Some(Finding::wrong("gyro", "drive.ros2.imu.topic", text))
+}
+
+/// Who writes on a topic, and whether what comes is new.
+fn of_writers(source: Source, messages: &[&Message]) -> Option<Finding> {
+    let (name, topic_key) = names(source);
+    let mut writers = Vec::new();
+    for attachment in messages.iter().filter_map(|message| message.attachment) {
+        if !writers.contains(&attachment.gid) {
+            writers.push(attachment.gid);
+        }
+    }
+    if writers.len() > 1 {
+        let text = format!(
+            "{} nodes write on it, and the agent hears only one: stop the others, or give each its own topic",
+            writers.len()
+        );
+        return Some(Finding::wrong(name, topic_key, text));
+    }
+    let is_repeated = |index: &usize| {
+        let message = messages[*index];
+        let before = &messages[index.saturating_sub(REPEATED_AMONG)..*index];
+        before
+            .iter()
+            .any(|other| other.attachment == message.attachment && other.payload == message.payload)
+    };
+    let repeated = (0..messages.len()).filter(is_repeated).count();
+    let share = share(repeated, messages.len());
+    if share > REPEATED_SHARE_MAX {
+        let text = format!(
+            "{:.0} % of its messages come again: two paths lead here, such as two bridges, or a bridge and a \
+             router",
+            100.0 * share
+        );
+        return Some(Finding::wrong(name, topic_key, text));
+    }
+    None
+}
+
+fn share(part: usize, whole: usize) -> f64 {
+    let figure = |count: usize| f64::from(u32::try_from(count).unwrap_or(u32::MAX));
+    figure(part) / figure(whole).max(1.0)
+}
+
+/// Stamps that never change, while messages come.
+fn of_stamps(settings: &Ros2Settings, source: Source, messages: &[&Message]) -> Option<Finding> {
+    let stamp = |message: &&Message| {
+        let read = decoded(settings, source, &message.payload).ok()??;
+        read.0.nanoseconds()
+    };
+    let stamps: Vec<i64> = messages.iter().filter_map(stamp).collect();
+    let first = stamps.first()?;
+    let stands = stamps.len() >= STANDING_STAMPS_MIN && stamps.iter().all(|it| it == first);
+    let (name, topic_key) = names(source);
+    stands.then(|| {
+        let text =
+            "its time stamp stands still: what writes it says the same message again and again";
+        Finding::wrong(name, topic_key, text)
+    })
 }
 
 fn of_topic(
@@ -94,6 +241,10 @@ fn of_topic(
     if let Some((refusal, message)) = worst.filter(|_| bad > BAD_SHARE_MAX * count) {
         return of_refusal(source, refusal, message, bad / count);
     }
+    let finding = of_writers(source, messages);
+    if let Some(finding) = finding.or_else(|| of_stamps(settings, source, messages)) {
+        return finding;
+    }
     let rate_hz = count / span.as_secs_f64();
     if is_fast(settings, source) && rate_hz < RATE_MIN_HZ {
         let text = format!("only {rate_hz:.1} messages a second: {RATE_MIN_HZ} are needed");
@@ -117,7 +268,17 @@ fn of_topic(
              good: what writes them is slow, or stamps them by another clock (then `stamps = \
              \"base\"`)"
         );
-        return Finding::wrong(name, "drive.ros2.stamps", text);
+        let finding = Finding::wrong(name, "drive.ros2.stamps", text);
+        let other = match settings.timing.stamps {
+            StampClock::Host => "\"base\"",
+            StampClock::Base => "\"host\"",
+        };
+        // A delay that is within reason is one; another clock is farther off.
+        return if middle_ms.abs() > CLOCK_MIN_MS {
+            finding.with_line("drive.ros2", "stamps", other)
+        } else {
+            finding
+        };
     }
     let gaps = messages.windows(2).map(|pair| {
         let gap = pair[1]
@@ -151,7 +312,7 @@ fn of_keys(settings: &Ros2Settings, source: Source, messages: &[&Message]) -> Op
             let text = format!("its type is defined otherwise: `{}`", message.key);
             Some(Finding::wrong(name, "drive.ros2.distribution", text))
         }
-        Ok(()) if !message.has_attachment => {
+        Ok(()) if message.attachment.is_none() => {
             let text = "its messages have no attachment: they are not written by rmw_zenoh_cpp";
             Some(Finding::wrong(name, "drive.ros2.bus", text))
         }
@@ -163,14 +324,19 @@ fn of_refusal(source: Source, refusal: Refusal, message: &Message, share: f64) -
     let (name, topic_key) = names(source);
     let percent = 100.0 * share;
     if refusal == Refusal::WrongFrame {
-        let key = match source {
-            Source::Odometry => "drive.ros2.odometry.frame",
-            Source::Imu => "drive.ros2.imu.frame",
-            Source::Joints | Source::Pose | Source::Battery => "drive.ros2.pose.frame",
-        };
-        let frames = frames_of(source, &message.payload).unwrap_or_default();
+        let (key, lines) = frames_of(source, &message.payload).unwrap_or((topic_key, Vec::new()));
+        let frames: Vec<_> = lines
+            .iter()
+            .map(|(_, _, frame)| format!("`{frame}`"))
+            .collect();
+        let frames = frames.join(" and ");
         let text = format!("it is of the frame {frames}, which the configuration does not name");
-        return Finding::wrong(name, key, text);
+        let finding = Finding::wrong(name, key, text);
+        return lines
+            .into_iter()
+            .fold(finding, |finding, (table, key, frame)| {
+                finding.with_line(table, key, format!("{frame:?}"))
+            });
     }
     let key = if refusal == Refusal::Joints {
         "drive.ros2.joints.left"
@@ -181,22 +347,36 @@ fn of_refusal(source: Source, refusal: Refusal, message: &Message, share: f64) -
     Finding::wrong(name, key, text)
 }
 
-fn frames_of(source: Source, payload: &[u8]) -> Option<String> {
+/// A table, a key in it, and the frame that is heard.
+type FrameLine = (&'static str, &'static str, String);
+
+/// The key of a source's frame, and what its message says of frames.
+fn frames_of(source: Source, payload: &[u8]) -> Option<(&'static str, Vec<FrameLine>)> {
     match source {
         Source::Odometry => {
             let read: Odometry<'_> = decode(payload).ok()?;
-            Some(format!(
-                "`{}` and `{}`",
-                read.header.frame_id, read.child_frame_id
-            ))
+            let table = "drive.ros2.odometry";
+            let lines = vec![
+                (table, "frame", read.header.frame_id.to_owned()),
+                (table, "child_frame", read.child_frame_id.to_owned()),
+            ];
+            Some(("drive.ros2.odometry.frame", lines))
         }
         Source::Imu => {
             let read: Imu<'_> = decode(payload).ok()?;
-            Some(format!("`{}`", read.header.frame_id))
+            let frame = read.header.frame_id.to_owned();
+            Some((
+                "drive.ros2.imu.frame",
+                vec![("drive.ros2.imu", "frame", frame)],
+            ))
         }
         Source::Pose => {
             let read: PoseWithCovarianceStamped<'_> = decode(payload).ok()?;
-            Some(format!("`{}`", read.header.frame_id))
+            let frame = read.header.frame_id.to_owned();
+            Some((
+                "drive.ros2.pose.frame",
+                vec![("drive.ros2.pose", "frame", frame)],
+            ))
         }
         Source::Joints | Source::Battery => None,
     }
@@ -229,11 +409,13 @@ fn effort(settings: &Ros2Settings, messages: &[&Message]) -> Option<Finding> {
             "drive.ros2.joints.effort",
             "the joints say no effort: friction shows in acceleration and turns alone (`effort = \
              \"none\"` says so)",
-        ));
+        )
+        .with_line("drive.ros2.joints", "effort", "\"none\""));
     }
     if messages.iter().all(is_zero) {
         let text = "the joints' effort is always zero: it is not measured (`effort = \"none\"`)";
-        return Some(Finding::wrong("effort", "drive.ros2.joints.effort", text));
+        let finding = Finding::wrong("effort", "drive.ros2.joints.effort", text);
+        return Some(finding.with_line("drive.ros2.joints", "effort", "\"none\""));
     }
     Some(Finding::well("effort", "the joints say how they pull"))
 }

@@ -1,13 +1,22 @@
 //! `tread-agent doctor`: what is wrong with the installation on a ROS 2 robot, before it drives.
 //!
 //! It listens for a while ([`listening`]); with `--move` it turns the robot on the spot and drives
-//! it ahead for a metre, slowly, and compares what was told with what was said ([`moving`]), and how its wheels
-//! pull with its mass ([`pulling`]). Each finding names the key of `robot.toml` to look at.
+//! it ahead for a metre, slowly, and compares what was commanded with what was said ([`moving`]): sensors that
+//! froze ([`frozen`]), sides and signs ([`signs`]), the frame of the odometry's twist ([`twist_frame`]), the
+//! tracks ([`track`]), and how the wheels pull with the robot's mass ([`pulling`]). Each finding names the key of
+//! `robot.toml` to look at, and the lines that mend it where there are such.
 
+mod drove;
+mod finding;
+mod frozen;
 mod heard;
+mod joint_names;
 mod listening;
 mod moving;
 mod pulling;
+mod signs;
+mod track;
+mod twist_frame;
 
 use std::io::Write as _;
 use std::path::PathBuf;
@@ -16,11 +25,13 @@ use std::time::Duration;
 
 use anyhow::{Context as _, bail};
 use clap::Args;
-use serde::Serialize;
 use tread_control::gate::{GateInput, GateLimits, gate};
 use tread_control::measured::WheelSpeeds;
+use tread_control::robot::RobotModel;
 use tread_control::twist_limits::TwistLimits;
 
+use self::drove::Drove;
+use self::finding::Finding;
 use self::heard::{Heard, Message};
 use crate::clock::{SharedClock, SystemClock};
 use crate::config::{AgentConfig, DriveConfig, Flags};
@@ -67,56 +78,30 @@ pub(crate) struct DoctorArgs {
     json: bool,
 }
 
-/// What was found on one question.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub(crate) struct Finding {
-    /// The question.
-    pub(crate) name: &'static str,
-    /// Whether all is well.
-    pub(crate) holds: bool,
-    /// The key of `robot.toml` to look at, where all is not.
-    pub(crate) key: Option<&'static str>,
-    /// In words.
-    pub(crate) text: String,
-}
-
-impl Finding {
-    fn well(name: &'static str, text: impl Into<String>) -> Self {
-        Self {
-            name,
-            holds: true,
-            key: None,
-            text: text.into(),
-        }
-    }
-
-    fn wrong(name: &'static str, key: &'static str, text: impl Into<String>) -> Self {
-        Self {
-            name,
-            holds: false,
-            key: Some(key),
-            text: text.into(),
-        }
-    }
-}
-
 /// Examines the robot and says what was found; whether all is well.
 ///
 /// # Errors
 /// The configuration is refused, it is of no ROS 2 robot, or nothing can be written.
 pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<bool> {
     let findings = examine(args)?;
+    let robot_toml = finding::robot_toml(&findings);
     let mut out = std::io::stdout().lock();
     if args.json {
-        serde_json::to_writer(&mut out, &serde_json::json!({ "checks": findings }))?;
+        let report = serde_json::json!({ "checks": findings, "robot_toml": robot_toml });
+        serde_json::to_writer(&mut out, &report)?;
         writeln!(out)?;
     } else {
         for finding in &findings {
-            let mark = if finding.holds { "ok   " } else { "WRONG" };
-            writeln!(out, "{mark} {}: {}", finding.name, finding.text)?;
+            writeln!(out, "{} {}: {}", finding.mark(), finding.name, finding.text)?;
             if let Some(key) = finding.key {
                 writeln!(out, "      look at `{key}` in robot.toml")?;
             }
+        }
+        if !robot_toml.is_empty() {
+            writeln!(
+                out,
+                "\n# These lines in robot.toml mend that:\n{robot_toml}"
+            )?;
         }
     }
     Ok(findings.iter().all(|finding| finding.holds))
@@ -151,25 +136,12 @@ fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     }
     heard.forget();
     hands.hold(WheelSpeeds::default(), LISTEN_FOR);
-    let mut findings = listening::findings(settings, &heard.taken(), LISTEN_FOR);
+    let at_rest = heard.taken();
+    let mut findings = listening::findings(settings, &at_rest, LISTEN_FOR);
+    findings.extend(hands.other_commander(settings));
     if args.moves {
-        let rim_rad_s = RIM_M_S / model.wheel_radius_m();
-        let speeds = |left: f64, right: f64| {
-            let asked = WheelSpeeds {
-                left_rad_s: left * rim_rad_s,
-                right_rad_s: right * rim_rad_s,
-            };
-            let twist = model.twist_from_wheel_speeds(asked);
-            let share = TwistLimits::of(&model).share_within(twist);
-            WheelSpeeds {
-                left_rad_s: share * asked.left_rad_s,
-                right_rad_s: share * asked.right_rad_s,
-            }
-        };
-        heard.forget();
-        let turned = hands.drive_for(speeds(-1.0, 1.0), settings, &heard);
-        let ahead = hands.drive_for(speeds(1.0, 1.0), settings, &heard);
-        findings.extend(moving::findings(settings, &model, &turned, &ahead));
+        let bias_rad_s = listening::gyro_at_rest_rad_s(settings, &at_rest).unwrap_or(0.0);
+        findings = hands.move_about(settings, &model, &heard, bias_rad_s, findings);
     }
     let until = hands.clock.monotonic() + CLOSE_MAX;
     let clock = Arc::clone(&hands.clock);
@@ -190,6 +162,65 @@ struct Hands {
 }
 
 impl Hands {
+    /// Another node that writes on the command topic.
+    fn other_commander(&self, settings: &Ros2Settings) -> Option<Finding> {
+        let times = self.drive.counts().foreign_commands();
+        (times > 0).then(|| {
+            let text = format!(
+                "another node writes on `{}` ({times} commands while it was listened to), and the base obeys both: \
+                 stop it, or let both write on topics of their own and put a twist_mux behind them",
+                settings.command.topic
+            );
+            Finding::wrong("command", "drive.ros2.command.topic", text)
+        })
+    }
+
+    /// Turns and drives the robot, unless what was found before forbids it; all findings.
+    fn move_about(
+        &mut self,
+        settings: &Ros2Settings,
+        model: &RobotModel,
+        heard: &Heard,
+        bias_rad_s: f64,
+        mut findings: Vec<Finding>,
+    ) -> Vec<Finding> {
+        let is_unusable = self.drive.must_rest() && findings.iter().any(|finding| !finding.holds);
+        if is_unusable || self.other_commander(settings).is_some() {
+            let text = "the robot was not moved: mend the findings above first";
+            findings.push(Finding::skipped("moving", text));
+            return findings;
+        }
+        let rim_rad_s = RIM_M_S / model.wheel_radius_m();
+        let speeds = |left: f64, right: f64| {
+            let asked = WheelSpeeds {
+                left_rad_s: left * rim_rad_s,
+                right_rad_s: right * rim_rad_s,
+            };
+            let twist = model.twist_from_wheel_speeds(asked);
+            let share = TwistLimits::of(model).share_within(twist);
+            WheelSpeeds {
+                left_rad_s: share * asked.left_rad_s,
+                right_rad_s: share * asked.right_rad_s,
+            }
+        };
+        heard.forget();
+        let mut turned = self.drive_for(speeds(-1.0, 1.0), settings, heard);
+        // Along the x axis of its odometry's frame a twist of that frame looks like one of the robot.
+        if turned.twist.is_some() && heads_along_x(settings, heard) {
+            turned = self.drive_for(speeds(-1.0, 1.0), settings, heard);
+        }
+        let ahead = self.drive_for(speeds(1.0, 1.0), settings, heard);
+        // What two nodes command says nothing of signs and tracks.
+        if let Some(finding) = self.other_commander(settings) {
+            findings.push(finding);
+            return findings;
+        }
+        findings.extend(moving::findings(
+            settings, model, &turned, &ahead, bias_rad_s,
+        ));
+        findings
+    }
+
     /// Commands this for so long, whatever the base says.
     fn hold(&mut self, command: WheelSpeeds, span: Duration) {
         self.go(command, span, |_| true);
@@ -245,21 +276,16 @@ impl Hands {
 
     /// Drives like this for a while, and says what was said meanwhile. A base that falls silent is
     /// at rest then, and the motion is tried again.
-    fn drive_for(
-        &mut self,
-        command: WheelSpeeds,
-        settings: &Ros2Settings,
-        heard: &Heard,
-    ) -> moving::Drove {
+    fn drive_for(&mut self, command: WheelSpeeds, settings: &Ros2Settings, heard: &Heard) -> Drove {
         for _ in 0..TRIES_MAX {
             let messages = self.try_to_drive(command, heard);
             self.ramp(WheelSpeeds::default());
             self.hold(WheelSpeeds::default(), REST);
             if let Some([starting, steady]) = messages {
-                return moving::drove(command, settings, &starting, &steady);
+                return drove::drove(command, settings, &starting, &steady);
             }
         }
-        moving::Drove::default()
+        Drove::default()
     }
 
     /// What was said while the robot set off, and when its speed was steady; none of a base that fell
@@ -273,4 +299,10 @@ impl Hands {
         is_heard = is_heard && self.hold_heard(command, STEADY_FOR);
         is_heard.then(|| [starting, heard.taken()])
     }
+}
+
+/// Whether the newest word of the odometry heads along the x axis of its frame.
+fn heads_along_x(settings: &Ros2Settings, heard: &Heard) -> bool {
+    let heading_rad = drove::newest_heading_rad(settings, &heard.taken());
+    heading_rad.is_some_and(twist_frame::is_along_x)
 }

@@ -9,9 +9,9 @@
 
 use tread_control::robot::RobotModel;
 
-use super::Finding;
-use super::moving::{Drove, SetOff};
-use crate::drive::ros2::settings::{Effort, Ros2Settings};
+use super::drove::{Drove, SetOff};
+use super::finding::Finding;
+use crate::drive::ros2::settings::{Effort, JointSettings, Ros2Settings};
 
 /// Share of a side's load below which a pull against the motion counts as none.
 const AGAINST_MIN: f64 = 0.02;
@@ -39,7 +39,8 @@ pub(super) fn findings(
     turned: &Drove,
     ahead: &Drove,
 ) -> Option<Finding> {
-    let effort = settings.joints.as_ref()?.effort;
+    let joints = settings.joints.as_ref()?;
+    let effort = joints.effort;
     (effort != Effort::None).then_some(())?;
     let pull = Pull {
         friction: friction(model, turned)?,
@@ -48,7 +49,7 @@ pub(super) fn findings(
             momentum_ratio(model, ahead, &set_off, steady.left_n_m + steady.right_n_m)
         }),
     };
-    Some(of_signs(&pull).unwrap_or_else(|| of_size(&pull, effort, model)))
+    Some(of_signs(&pull, joints).unwrap_or_else(|| of_size(&pull, effort, model)))
 }
 
 fn friction(model: &RobotModel, turned: &Drove) -> Option<[f64; 2]> {
@@ -67,7 +68,7 @@ fn momentum_ratio(
     set_off: &SetOff,
     steady_n_m: f64,
 ) -> Option<f64> {
-    let told_rad_s = 0.5 * (ahead.told.left_rad_s + ahead.told.right_rad_s);
+    let told_rad_s = 0.5 * (ahead.commanded.left_rad_s + ahead.commanded.right_rad_s);
     (set_off.gained_rad_s > GAINED_MIN * told_rad_s).then_some(())?;
     let gained_m_s = model.wheel_radius_m() * set_off.gained_rad_s;
     let given_n_s = (set_off.torque_n_m - steady_n_m) * set_off.span_s / model.wheel_radius_m();
@@ -75,7 +76,7 @@ fn momentum_ratio(
 }
 
 /// Effort that points against the motion.
-fn of_signs(pull: &Pull) -> Option<Finding> {
+fn of_signs(pull: &Pull, joints: &JointSettings) -> Option<Finding> {
     let [is_left, is_right] = pull.friction.map(|friction| friction < -AGAINST_MIN);
     let (key, text) = match (is_left, is_right) {
         (true, true) => (
@@ -95,7 +96,18 @@ fn of_signs(pull: &Pull) -> Option<Finding> {
         ),
         (false, false) => return None,
     };
-    Some(Finding::wrong("torque", key, text))
+    let wrong = Finding::wrong("torque", key, text);
+    let lines = [
+        (is_left, "left_effort_sign", joints.left.effort_sign),
+        (is_right, "right_effort_sign", joints.right.effort_sign),
+    ];
+    Some(lines.into_iter().filter(|(is_wrong, _, _)| *is_wrong).fold(
+        wrong,
+        |finding, (_, key, sign)| {
+            let opposite = if sign > 0.0 { "-1" } else { "1" };
+            finding.with_line("drive.ros2.joints", key, opposite)
+        },
+    ))
 }
 
 /// Effort that is too great or too small.
@@ -122,26 +134,32 @@ fn of_size(pull: &Pull, effort: Effort, model: &RobotModel) -> Finding {
     } else {
         return Finding::well("torque", format!("{turn}{setting_off}"));
     };
-    let (key, hint) = match effort {
-        Effort::Current(n_m_a) => (
-            "drive.ros2.joints.torque_constant_n_m_a",
-            ratio.filter(|ratio| *ratio > 0.0).map_or_else(
-                    || "the torque constant is another".to_owned(),
-                    |ratio| {
-                        let fits = n_m_a / ratio;
-                        format!("with {fits:.3} N·m/A, not {n_m_a:.3}, it would fit the mass")
-                    },
-                ),
-        ),
+    let (key, hint, fits) = match effort {
+        Effort::Current(n_m_a) => {
+            let fits = ratio.filter(|ratio| *ratio > 0.0).map(|ratio| n_m_a / ratio);
+            let hint = fits.map_or_else(
+                || "the torque constant is another".to_owned(),
+                |fits| format!("with {fits:.3} N·m/A, not {n_m_a:.3}, it would fit the mass"),
+            );
+            ("drive.ros2.joints.torque_constant_n_m_a", hint, fits)
+        }
         Effort::Torque | Effort::None => (
             "drive.ros2.joints.effort",
             "it is no torque of the joints in newton metres, but perhaps a current, or the motors' \
              before a gear"
                 .to_owned(),
+            None,
         ),
     };
     let text = format!("{turn}{setting_off}: the joints' effort is {verdict}; {hint}");
-    Finding::wrong("torque", key, text)
+    let wrong = Finding::wrong("torque", key, text);
+    match fits {
+        Some(fits) => {
+            let value = format!("{fits:.3}");
+            wrong.with_line("drive.ros2.joints", "torque_constant_n_m_a", value)
+        }
+        None => wrong,
+    }
 }
 
 #[cfg(test)]
@@ -149,7 +167,6 @@ mod tests {
     use tread_control::measured::{WheelSpeeds, WheelTorques};
 
     use super::*;
-    use crate::drive::ros2::settings::JointSettings;
     use crate::drive::ros2::tests::settings;
 
     /// A turn and a start of the paper's robot on ground of this friction, its torques times these factors.
@@ -171,7 +188,7 @@ mod tests {
         let along = model.wheelbase_m() / model.wheelbase_m().hypot(model.track_width_m());
         let scrub_n_m = friction * along * model.side_load_n() * model.wheel_radius_m();
         let turned = Drove {
-            told: speeds(-2.0, 2.0),
+            commanded: speeds(-2.0, 2.0),
             wheels: Some(speeds(-2.0, 2.0)),
             torques: torques(-scrub_n_m, scrub_n_m),
             ..Drove::default()
@@ -179,7 +196,7 @@ mod tests {
         // On a slope that takes half a newton metre of each side, to 2 rad/s within a second.
         let setting_off_n_m = model.mass_kg() * 2.0 * model.wheel_radius_m().powi(2);
         let ahead = Drove {
-            told: speeds(2.0, 2.0),
+            commanded: speeds(2.0, 2.0),
             wheels: Some(speeds(2.0, 2.0)),
             torques: torques(0.5, 0.5),
             set_off: Some(SetOff {

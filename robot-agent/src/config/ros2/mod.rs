@@ -2,6 +2,8 @@
 
 mod file;
 mod outward;
+#[cfg(test)]
+mod tests;
 
 use std::time::Duration;
 
@@ -393,93 +395,5 @@ impl CommandFile {
             joints,
             joint_ratios,
         })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::geometry::paper_robot;
-
-    fn checked(text: &str) -> Result<Ros2Settings, String> {
-        let file: Ros2File = toml::from_str(text).map_err(|refused| refused.to_string())?;
-        file.checked(&paper_robot())
-            .map_err(|refused| refused.to_string())
-    }
-
-    #[test]
-    fn a_short_file_is_a_robot_by_its_odometry_alone() {
-        let settings = checked("[odometry]\ngives_position = true\n").unwrap();
-        assert_eq!(settings.bus.scheme, Scheme::RmwZenoh(Generation::Hashed));
-        assert_eq!(settings.bus.endpoint, ENDPOINT_DEFAULT);
-        assert_eq!(settings.command.topic.to_string(), "/cmd_vel");
-        assert_eq!(settings.timing.silent_after, Duration::from_millis(100));
-        assert!(settings.odometry.unwrap().site_from_odom.is_some());
-    }
-
-    #[test]
-    fn names_are_within_the_namespace_but_for_the_bridge() {
-        let text = "namespace = \"/robot7\"\n[odometry]\n[command]\ntopic = \"/cmd\"\n";
-        let settings = checked(text).unwrap();
-        assert_eq!(settings.odometry.unwrap().topic.to_string(), "/robot7/odom");
-        assert_eq!(settings.command.topic.to_string(), "/cmd");
-        let settings = checked(&format!("bus = \"ros2dds\"\n{text}")).unwrap();
-        assert_eq!(settings.odometry.unwrap().topic.to_string(), "/odom");
-    }
-
-    #[test]
-    fn what_cannot_be_is_named_by_its_key() {
-        let joints = "[joints]\nleft = [\"l\"]\nright = [\"r\"]\n";
-        for (text, key) in [
-            (String::new(), "wheels' speeds"),
-            ("[imu]\n".to_owned(), "wheels' speeds"),
-            (joints.to_owned(), "turn rate"),
-            (
-                "[odometry]\nmotion_of = \"ground\"\n".to_owned(),
-                "wheels' speeds",
-            ),
-            (
-                "endpoint = \"tcp/192.0.2.1:7447\"\n[odometry]\n".to_owned(),
-                "endpoint",
-            ),
-            (
-                "silent_after_ms = 500\n[odometry]\n".to_owned(),
-                "silent_after_ms",
-            ),
-            ("domain = 233\n[odometry]\n".to_owned(), "domain"),
-            ("[odometry]\ntopic = \"a b\"\n".to_owned(), "odometry.topic"),
-            (
-                "[odometry]\n[command]\nkind = \"joint_speeds\"\n".to_owned(),
-                "command.kind",
-            ),
-            (
-                "[odometry]\n[command]\nturn_sign = 2\n".to_owned(),
-                "turn_sign",
-            ),
-            (
-                "[odometry]\ngives_position = true\n[pose]\n".to_owned(),
-                "gives_position",
-            ),
-            (
-                "[odometry]\n[pose]\nsite_x_m = nan\n".to_owned(),
-                "pose.site_x_m",
-            ),
-            (
-                format!("[odometry]\n{joints}effort = \"current\"\n"),
-                "torque_constant",
-            ),
-            (
-                format!("[odometry]\n{joints}gear_ratio = 0.0\n"),
-                "gear_ratio",
-            ),
-            (
-                "[odometry]\n[joints]\nleft = [\"l\"]\nright = [\"l\"]\n".to_owned(),
-                "both sides",
-            ),
-            ("[odometry]\nspeed = 1\n".to_owned(), "speed"),
-        ] {
-            let refused = checked(&text).map(|_| ()).unwrap_err();
-            assert!(refused.contains(key), "`{key}` is missing in: {refused}");
-        }
     }
 }

@@ -19,8 +19,10 @@ use zenoh::Wait as _;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
+use zenoh::sample::Locality;
 
 use super::command;
+use super::command_watch::CommandWatch;
 use super::inlet::{Inlet, Numbering};
 use super::outlet::{COMMAND_SILENCE_MAX, Outlet};
 use super::outward::{LOOK_EVERY, Outward, Word};
@@ -93,6 +95,7 @@ pub struct Bus {
     outlet: Arc<Outlet>,
     clock: SharedClock,
     outward: Option<Outward>,
+    command_watch: Arc<CommandWatch>,
 }
 
 /// Everything that lives as long as the session.
@@ -148,9 +151,12 @@ impl Bus {
         inlets: Vec<Inlet>,
         outlet: Arc<Outlet>,
         clock: SharedClock,
+        counts: Arc<Counts>,
     ) -> Result<Self, LinkError> {
+        let command_type = command::message_type(settings.command.kind);
         Ok(Self {
             config: session_config(&settings.bus)?,
+            command_watch: Arc::new(CommandWatch::new(settings.bus.scheme, command_type, counts)),
             settings,
             inlets: inlets.into_iter().map(Arc::new).collect(),
             outlet,
@@ -258,6 +264,8 @@ impl Bus {
             },
         };
         let commands = self.writer(session, &node, &topic, Priority::RealTime, &mut tokens)?;
+        self.command_watch.write_as(commands.gid);
+        self.watch_commands(session)?;
         let mut words = Vec::new();
         if let Some(outward) = self.settings.outward.as_ref().filter(|_| tells) {
             for word in Word::ALL {
@@ -339,28 +347,37 @@ impl Bus {
         inlet: &Arc<Inlet>,
         topic: &Name,
     ) -> Result<(), LinkError> {
-        let bus = &self.settings.bus;
-        let key = match self.generation() {
-            Some(_) => rmw::any_type_key(bus.domain, topic),
-            None => bridge::topic_key(&bus.namespace, topic),
-        };
         let inlet = Arc::clone(inlet);
         session
-            .declare_subscriber(key)
+            .declare_subscriber(self.key_to_hear(topic))
             .callback(move |sample| {
-                let attachment = sample.attachment().map(small);
-                let payload = sample.payload();
-                // What is too large is not even put together.
-                let bytes = if payload.len() > PAYLOAD_BYTES_MAX {
-                    std::borrow::Cow::Borrowed(&[] as &[u8])
-                } else {
-                    payload.to_bytes()
-                };
-                inlet.take(sample.key_expr().as_str(), attachment.as_deref(), &bytes);
+                hand_over(&sample, |key, with, said| inlet.take(key, with, said));
             })
             .background()
             .wait()
             .map_err(zenoh_failed("listen to a topic"))
+    }
+
+    fn key_to_hear(&self, topic: &Name) -> String {
+        let bus = &self.settings.bus;
+        match self.generation() {
+            Some(_) => rmw::any_type_key(bus.domain, topic),
+            None => bridge::topic_key(&bus.namespace, topic),
+        }
+    }
+
+    /// Hears who else commands the base. No token announces it: the graph shows who obeys commands.
+    fn watch_commands(&self, session: &zenoh::Session) -> Result<(), LinkError> {
+        let watch = Arc::clone(&self.command_watch);
+        session
+            .declare_subscriber(self.key_to_hear(&self.settings.command.topic))
+            .callback(move |sample| {
+                hand_over(&sample, |key, with, said| watch.hear(key, with, said));
+            })
+            .allowed_origin(Locality::Remote)
+            .background()
+            .wait()
+            .map_err(zenoh_failed("listen to the command topic"))
     }
 
     /// Writes commands, and what there is to say from a thread of its own, so that no command waits
@@ -416,6 +433,7 @@ impl Bus {
                 written_at = now;
                 let wall_ns = self.clock.host_wall_ns();
                 command::write(command, wall_ns, &self.settings.command, &mut bytes);
+                self.command_watch.wrote(&bytes);
                 if let Err(cause) = writer.put(&bytes, wall_ns) {
                     debug!("a command was not written: {cause}");
                 }
@@ -431,6 +449,19 @@ impl Bus {
 fn declare_token(session: &zenoh::Session, token: String) -> Result<LivelinessToken, LinkError> {
     let declaring = session.liveliness().declare_token(token);
     declaring.wait().map_err(zenoh_failed("announce the node"))
+}
+
+/// Hands a sample over by its key, its attachment and its payload.
+fn hand_over(sample: &zenoh::sample::Sample, take: impl FnOnce(&str, Option<&[u8]>, &[u8])) {
+    let attachment = sample.attachment().map(small);
+    let payload = sample.payload();
+    // What is too large is not even put together.
+    let bytes = if payload.len() > PAYLOAD_BYTES_MAX {
+        std::borrow::Cow::Borrowed(&[] as &[u8])
+    } else {
+        payload.to_bytes()
+    };
+    take(sample.key_expr().as_str(), attachment.as_deref(), &bytes);
 }
 
 /// An attachment, if it is no larger than one of ROS.

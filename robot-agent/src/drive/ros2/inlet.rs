@@ -11,11 +11,12 @@ use tread_ros2::names::Name;
 use tread_ros2::rmw::{Attachment, check_key};
 
 use super::assemble::Arrived;
+use super::notices::Notice;
 use super::reading::{self, Content, Reading};
 use super::refusal::{Counts, Refusal, Source};
 use super::settings::{Ros2Settings, Scheme};
 use super::stamps::{Arrival, Stamps};
-use super::writer_watch::WriterWatch;
+use super::writer_watch::{Order, WriterWatch};
 use crate::clock::SharedClock;
 use crate::drive::Arrivals;
 
@@ -164,15 +165,29 @@ impl Inlet {
             return Ok(None);
         };
         let mut watched = self.watched.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(attachment) = &writer {
-            watched.writer.check(attachment, arrival.monotonic)?;
-        }
+        let order = writer
+            .map(|message| watched.writer.look(&message, arrival.monotonic))
+            .transpose()?;
         let at = if matches!(content, Content::Battery(_)) {
             arrival.monotonic
         } else {
             let stamp_ns = stamp.nanoseconds().ok_or(Refusal::Stamp)?;
-            watched.stamps.place(stamp_ns, arrival)?
+            let leaps = watched.stamps.leaps();
+            let placed = watched.stamps.place(stamp_ns, arrival)?;
+            if watched.stamps.leaps() > leaps {
+                self.counts.note(self.source, Notice::ClockLeapt);
+            }
+            placed
         };
+        // Only what is usable is followed: repeated data is no writer that started again.
+        if let Some((message, order)) = writer.zip(order) {
+            watched.writer.follow(&message, order, arrival.monotonic);
+            match order {
+                Order::Continues => {}
+                Order::Restarted => self.counts.note(self.source, Notice::Restarted),
+                Order::MayHaveRestarted => return Err(Refusal::OutOfOrder),
+            }
+        }
         Ok(Some(Arrived { at, content }))
     }
 }

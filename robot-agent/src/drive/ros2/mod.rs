@@ -12,7 +12,9 @@
 pub mod assemble;
 pub mod bus;
 mod command;
+mod command_watch;
 pub mod inlet;
+pub mod notices;
 pub mod obedience;
 pub mod outlet;
 pub(crate) mod outward;
@@ -30,8 +32,9 @@ use tread_control::measured::WheelSpeeds;
 
 use self::assemble::{Arrived, Assembler};
 use self::bus::Bus;
+use self::command_watch::Contest;
 use self::inlet::{Inlet, Tap, WAITING_MAX};
-use self::obedience::Obedience;
+use self::obedience::{Obedience, Verdict};
 use self::outlet::Outlet;
 use self::refusal::{Counts, Refusal, Source};
 use self::settings::Ros2Settings;
@@ -59,6 +62,9 @@ pub struct Ros2Drive {
     must_rest: bool,
     /// Whether wheels are believed whatever they do.
     is_examined: bool,
+    contest: Contest,
+    /// Whether the newest command was to move.
+    drives: bool,
 }
 
 impl Ros2Drive {
@@ -100,6 +106,8 @@ impl Ros2Drive {
             .collect();
         let drive = Self {
             is_examined,
+            contest: Contest::default(),
+            drives: false,
             assembler: Assembler::new(&settings),
             obedience: Obedience::default(),
             arrived,
@@ -111,7 +119,8 @@ impl Ros2Drive {
             must_rest: false,
             settings: Arc::clone(&settings),
         };
-        let bus = Bus::new(settings, inlets, outlet, Arc::clone(clock))?;
+        let counts = Arc::clone(&drive.counts);
+        let bus = Bus::new(settings, inlets, outlet, Arc::clone(clock), counts)?;
         Ok((drive, bus))
     }
 
@@ -138,6 +147,8 @@ impl Drive for Ros2Drive {
     fn read(&mut self, now: Duration) -> Feedback {
         self.now = now;
         let mut feedback = Feedback::default();
+        let (foreign, drives) = (self.counts.foreign_commands(), self.drives);
+        let is_contested = self.contest.look(now, foreign, drives);
         // Bounded by the channel's room.
         for _ in 0..WAITING_MAX {
             let Ok(arrived) = self.arrived.try_recv() else {
@@ -146,8 +157,14 @@ impl Drive for Ros2Drive {
             let Some(measured) = self.assembler.take(&arrived, &mut feedback) else {
                 continue;
             };
-            if !self.obedience.judge(now, measured) && !self.is_examined {
-                self.counts.refuse(self.pace_source(), Refusal::Disobedient);
+            let refusal = match self.obedience.judge(now, measured) {
+                _ if is_contested => Some(Refusal::Contested),
+                Verdict::Obeys => None,
+                Verdict::Stands => Some(Refusal::Disobedient),
+                Verdict::MovesOtherwise => Some(Refusal::OtherMotion),
+            };
+            if let Some(refusal) = refusal.filter(|_| !self.is_examined) {
+                self.counts.refuse(self.pace_source(), refusal);
                 feedback.pop();
                 continue;
             }
@@ -168,6 +185,7 @@ impl Drive for Ros2Drive {
         let rest = WheelSpeeds::default();
         self.must_rest = self.is_silent() || (self.must_rest && command != rest);
         let written = if self.must_rest { rest } else { command };
+        self.drives = written != rest;
         self.obedience.command(self.now, written);
         self.outlet.leave(written);
     }

@@ -1,9 +1,13 @@
 //! Whether the wheels do what they are told, or somebody lies: stuck encoders, swapped sides, a
-//! drive that was switched off.
+//! drive that was switched off, another node that commands the base too.
 //!
 //! A wheel's speed must lie between the least and the greatest command of the last
-//! [`MEMORY`], widened by a tolerance: no lag within that time is taken for disobedience.
+//! [`MEMORY`], widened by a tolerance: no lag within that time is taken for disobedience. Slip does
+//! not matter, for it parts the robot from its wheels and not the wheels from their command.
 //! Nothing is judged while the robot is to stand, for others may move it then.
+//!
+//! Two nodes that command one base take turns, so its wheels obey ours some of the time. The time
+//! for which they do not is therefore summed up, and what they obey takes [`PARDON`] of itself off.
 
 use std::time::Duration;
 
@@ -13,8 +17,16 @@ use tread_control::measured::WheelSpeeds;
 const MEMORY: Duration = Duration::from_millis(600);
 /// Spans into which it is parted.
 const SPANS: usize = 12;
-/// How long the wheels must disobey.
+/// How long the wheels must disobey, in all.
 const FOR: Duration = Duration::from_millis(500);
+/// Share of the time of obedience that is taken off that: wheels may disobey a third of the time.
+const PARDON: f64 = 0.5;
+/// Longest time for which one word of the wheels stands.
+const WORD_MAX: Duration = Duration::from_millis(100);
+/// Share of the time of disobedience for which wheels stand that do nothing else.
+const STANDS_SHARE: f64 = 0.7;
+/// Share of its command below which a wheel counts as standing.
+const STANDING_SHARE: f64 = 0.1;
 /// How long they must obey again.
 const AGAIN_FOR: Duration = Duration::from_secs(1);
 /// Tolerance: a part of its own, radians per second, and a share of the command.
@@ -71,6 +83,22 @@ impl Envelope {
         )
     }
 
+    /// Whether every wheel that is commanded to turn stands.
+    fn stands(&self, measured: WheelSpeeds) -> bool {
+        let stands = |measured: f64, least: f64, most: f64| {
+            measured.abs() <= STANDING_SHARE * least.abs().max(most.abs())
+        };
+        stands(
+            measured.left_rad_s,
+            self.least.left_rad_s,
+            self.most.left_rad_s,
+        ) && stands(
+            measured.right_rad_s,
+            self.least.right_rad_s,
+            self.most.right_rad_s,
+        )
+    }
+
     /// Whether all of it is rest, or there is nothing.
     fn is_rest(&self) -> bool {
         let fastest = self
@@ -81,15 +109,33 @@ impl Envelope {
     }
 }
 
+/// What is to be thought of the wheels' word.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// They obey, as far as is known.
+    Obeys,
+    /// They say that they stand: their encoders are stuck, or the drive is off.
+    Stands,
+    /// They turn, but otherwise than commanded: somebody else commands them, or sides are mixed up.
+    MovesOtherwise,
+}
+
 /// The wheels' obedience.
 #[derive(Debug, Clone, Copy)]
 pub struct Obedience {
     spans: [Envelope; SPANS],
     /// The span that is being filled, and when it began.
     present: (usize, Duration),
-    /// Since when the wheels do not do as told, or do again.
-    since: Option<Duration>,
-    is_trusted: bool,
+    /// For how long the wheels did not obey of late.
+    disobeyed: Duration,
+    /// For how long of that they stood.
+    stood: Duration,
+    /// For how long they obeyed since.
+    obeyed: Duration,
+    /// Since when the wheels obey again.
+    obeys_since: Option<Duration>,
+    judged_at: Option<Duration>,
+    verdict: Verdict,
 }
 
 impl Default for Obedience {
@@ -97,8 +143,12 @@ impl Default for Obedience {
         Self {
             spans: [Envelope::NONE; SPANS],
             present: (0, Duration::ZERO),
-            since: None,
-            is_trusted: true,
+            disobeyed: Duration::ZERO,
+            stood: Duration::ZERO,
+            obeyed: Duration::ZERO,
+            obeys_since: None,
+            judged_at: None,
+            verdict: Verdict::Obeys,
         }
     }
 }
@@ -129,21 +179,46 @@ impl Obedience {
     }
 
     /// Whether what the wheels are said to do can be believed.
-    pub fn judge(&mut self, now: Duration, measured: WheelSpeeds) -> bool {
+    pub fn judge(&mut self, now: Duration, measured: WheelSpeeds) -> Verdict {
         let spans = self.spans.iter();
         let all = spans.fold(Envelope::NONE, Envelope::with);
         let obeys = all.is_rest() || all.holds(measured);
-        if obeys == self.is_trusted {
-            self.since = None;
+        let judged_at = self.judged_at.replace(now).unwrap_or(now);
+        let span = now.saturating_sub(judged_at).min(WORD_MAX);
+        if self.verdict != Verdict::Obeys {
+            let since = obeys.then(|| self.obeys_since.unwrap_or(now));
+            self.obeys_since = since;
+            if since.is_some_and(|since| now.saturating_sub(since) >= AGAIN_FOR) {
+                self.verdict = Verdict::Obeys;
+                self.forgive();
+            }
+        } else if obeys {
+            self.disobeyed = self.disobeyed.saturating_sub(span.mul_f64(PARDON));
+            self.obeyed += span;
+            if self.disobeyed.is_zero() {
+                self.forgive();
+            }
         } else {
-            let since = *self.since.get_or_insert(now);
-            let bound = if self.is_trusted { FOR } else { AGAIN_FOR };
-            if now.saturating_sub(since) >= bound {
-                self.is_trusted = obeys;
-                self.since = None;
+            self.disobeyed += span;
+            if all.stands(measured) {
+                self.stood += span;
+            }
+            if self.disobeyed >= FOR {
+                let bound = FOR.mul_f64(1.0 - STANDS_SHARE);
+                let only_stood = self.stood >= FOR.mul_f64(STANDS_SHARE) && self.obeyed < bound;
+                self.verdict = if only_stood {
+                    Verdict::Stands
+                } else {
+                    Verdict::MovesOtherwise
+                };
             }
         }
-        self.is_trusted
+        self.verdict
+    }
+
+    fn forgive(&mut self) {
+        (self.disobeyed, self.stood) = (Duration::ZERO, Duration::ZERO);
+        (self.obeyed, self.obeys_since) = (Duration::ZERO, None);
     }
 }
 
@@ -160,17 +235,42 @@ mod tests {
         }
     }
 
-    /// Drives for so many ticks; when the wheels are no longer trusted.
+    /// Drives for so many ticks; when the wheels are no longer trusted, and what is thought of them.
     fn run(
         ticks: u32,
         commanded: impl Fn(f64) -> WheelSpeeds,
-        measured: impl Fn(f64) -> WheelSpeeds,
-    ) -> Option<Duration> {
+        mut measured: impl FnMut(f64) -> WheelSpeeds,
+    ) -> Option<(Duration, Verdict)> {
         let mut obedience = Obedience::default();
-        (0..ticks).map(|tick| tick * STEP).find(|&now| {
+        (0..ticks).map(|tick| tick * STEP).find_map(|now| {
             obedience.command(now, commanded(now.as_secs_f64()));
-            !obedience.judge(now, measured(now.as_secs_f64()))
+            let verdict = obedience.judge(now, measured(now.as_secs_f64()));
+            (verdict != Verdict::Obeys).then_some((now, verdict))
         })
+    }
+
+    /// The wheels of a base with a servo of first order that obeys us and another node, which writes
+    /// this every so many of our periods.
+    fn shared(
+        ours: impl Fn(f64) -> WheelSpeeds,
+        theirs: WheelSpeeds,
+        every: u32,
+    ) -> impl FnMut(f64) -> WheelSpeeds {
+        const LAG_S: f64 = 0.05;
+        let mut wheels = WheelSpeeds::default();
+        let mut tick = 0;
+        move |at_s: f64| {
+            // Theirs comes in the middle of a period.
+            for half in 0..2 {
+                let is_theirs = tick % every == 0 && half == 1;
+                let target = if is_theirs { theirs } else { ours(at_s) };
+                let share = 0.5 * STEP.as_secs_f64() / LAG_S;
+                wheels.left_rad_s += share * (target.left_rad_s - wheels.left_rad_s);
+                wheels.right_rad_s += share * (target.right_rad_s - wheels.right_rad_s);
+            }
+            tick += 1;
+            wheels
+        }
     }
 
     fn wave(at_s: f64) -> WheelSpeeds {
@@ -196,10 +296,54 @@ mod tests {
 
     #[test]
     fn stuck_encoders_and_swapped_sides_are_seen() {
-        let stuck = run(500, |_| speeds(8.0, 8.0), |_| speeds(0.0, 0.0)).unwrap();
+        let forward = |_| speeds(8.0, 8.0);
+        let (stuck, verdict) = run(500, forward, |_| speeds(0.0, 0.0)).unwrap();
         assert!(stuck <= FOR + 2 * STEP, "{stuck:?}");
-        let swapped = run(500, |_| speeds(2.0, 8.0), |_| speeds(8.0, 2.0)).unwrap();
+        assert_eq!(verdict, Verdict::Stands);
+        // A drive that is switched off coasts for a moment.
+        let coasting = |at_s: f64| {
+            let speed = 8.0 * (-at_s / 0.08).exp();
+            speeds(speed, speed)
+        };
+        let (_, verdict) = run(500, forward, coasting).unwrap();
+        assert_eq!(verdict, Verdict::Stands);
+        let (swapped, verdict) = run(500, |_| speeds(2.0, 8.0), |_| speeds(8.0, 2.0)).unwrap();
         assert!(swapped <= FOR + 2 * STEP, "{swapped:?}");
+        assert_eq!(verdict, Verdict::MovesOtherwise);
+    }
+
+    #[test]
+    fn a_base_that_obeys_another_node_too_is_seen_and_named() {
+        let ours = |_: f64| speeds(5.0, 7.0);
+        for theirs in [speeds(-6.0, -6.0), speeds(0.0, 0.0), speeds(12.0, -12.0)] {
+            let found = run(500, ours, shared(ours, theirs, 1));
+            let (after, verdict) = found.unwrap_or_else(|| panic!("{theirs:?}"));
+            assert!(after <= Duration::from_secs(2), "{theirs:?}: {after:?}");
+            assert_eq!(verdict, Verdict::MovesOtherwise, "{theirs:?}");
+        }
+    }
+
+    #[test]
+    fn wheels_that_obey_two_nodes_in_turns_are_seen_though_they_obey_ours_every_other_time() {
+        let ours = |_: f64| speeds(6.0, 6.0);
+        for theirs in [speeds(1.0, 11.0), speeds(0.0, 0.0)] {
+            let in_turns = |at_s: f64| {
+                if at_s % 0.4 < 0.2 {
+                    speeds(6.0, 6.0)
+                } else {
+                    theirs
+                }
+            };
+            let (after, verdict) = run(1_000, ours, in_turns).unwrap();
+            assert!(after <= Duration::from_secs(3), "{after:?}");
+            assert_eq!(verdict, Verdict::MovesOtherwise);
+        }
+        // A wheel that is blocked now and then for a moment is not another node's.
+        let knocked = |at_s: f64| {
+            let factor = if at_s % 1.0 < 0.2 { 0.3 } else { 1.0 };
+            speeds(6.0 * factor, 6.0)
+        };
+        assert_eq!(run(3_000, ours, knocked), None);
     }
 
     #[test]
@@ -212,7 +356,7 @@ mod tests {
             let told = speeds(5.0, 5.0);
             obedience.command(now, told);
             let measured = if is_stuck { speeds(0.0, 0.0) } else { told };
-            trusted.push(obedience.judge(now, measured));
+            trusted.push(obedience.judge(now, measured) == Verdict::Obeys);
         }
         assert!(!trusted[99] && !trusted[199 - 5] && trusted[205]);
     }

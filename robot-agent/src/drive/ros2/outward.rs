@@ -94,6 +94,8 @@ pub(crate) struct Outward {
     driven: Vec<Pose>,
     /// Messages that had been dropped when it was last said.
     dropped: u64,
+    /// Commands of other nodes, when it was last said.
+    foreign_commands: u64,
 }
 
 impl Outward {
@@ -113,6 +115,7 @@ impl Outward {
             plan: Vec::new(),
             driven: Vec::with_capacity(PATH_POINTS_MAX as usize),
             dropped: 0,
+            foreign_commands: 0,
         }
     }
 
@@ -194,22 +197,27 @@ impl Outward {
         let drops: Vec<_> = self.counts.drops().collect();
         let sum = drops.iter().map(|(_, _, count)| count).sum();
         let before = std::mem::replace(&mut self.dropped, sum);
-        let is_dropping = sum > before;
+        let foreign = self.counts.foreign_commands();
+        let foreign_before = std::mem::replace(&mut self.foreign_commands, foreign);
+        let (level, message) = if foreign > foreign_before {
+            let text = "another node writes on the command topic";
+            (Level::Error, text.to_owned())
+        } else if sum > before {
+            let text = format!("messages dropped of late: {}", sum - before);
+            (Level::Warn, text)
+        } else {
+            (Level::Ok, "nothing was dropped of late".to_owned())
+        };
+        let of_drops = drops.into_iter().map(|(source, refusal, count)| {
+            let key = format!("{}: {}", source.section(), refusal.code());
+            (key, count.to_string())
+        });
+        let foreign = (foreign > 0).then(|| ("commands of others".to_owned(), foreign.to_string()));
         Part {
             name: "tread_agent: base",
-            level: if is_dropping { Level::Warn } else { Level::Ok },
-            message: if is_dropping {
-                format!("messages dropped of late: {}", sum - before)
-            } else {
-                "nothing was dropped of late".to_owned()
-            },
-            values: drops
-                .into_iter()
-                .map(|(source, refusal, count)| {
-                    let key = format!("{}: {}", source.section(), refusal.code());
-                    (key, count.to_string())
-                })
-                .collect(),
+            level,
+            message,
+            values: of_drops.chain(foreign).collect(),
         }
     }
 }

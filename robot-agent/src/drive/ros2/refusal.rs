@@ -5,6 +5,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use tread_ros2::cdr::CdrError;
 use tread_ros2::rmw::KeyMismatch;
 
+use super::notices::Notice;
+
 /// Why a message was dropped. What is dropped is no word of the base: one that says nothing else is
 /// silent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,13 +37,17 @@ pub enum Refusal {
     SecondWriter,
     /// The wheels do not do what they are told.
     Disobedient,
+    /// The wheels turn, and otherwise than commanded: somebody else may command them.
+    OtherMotion,
+    /// Another node commands the base while the agent drives it.
+    Contested,
     /// More messages than the loop takes.
     Overflow,
 }
 
 impl Refusal {
     /// Every reason.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 16] = [
         Self::WrongType,
         Self::WrongHash,
         Self::NoAttachment,
@@ -55,6 +61,8 @@ impl Refusal {
         Self::OutOfOrder,
         Self::SecondWriter,
         Self::Disobedient,
+        Self::OtherMotion,
+        Self::Contested,
         Self::Overflow,
     ];
 
@@ -74,6 +82,11 @@ impl Refusal {
             Self::OutOfOrder => "messages that came twice or out of order",
             Self::SecondWriter => "messages of a second writer",
             Self::Disobedient => "messages of wheels that do not do what they are told",
+            Self::OtherMotion => {
+                "messages of wheels that turn otherwise than commanded, as if another node commands \
+                 the base,"
+            }
+            Self::Contested => "messages of wheels that another node commands too",
             Self::Overflow => "more messages than could be taken",
         }
     }
@@ -96,6 +109,8 @@ impl Refusal {
             Self::OutOfOrder => "order",
             Self::SecondWriter => "second-writer",
             Self::Disobedient => "disobedient",
+            Self::OtherMotion => "other-motion",
+            Self::Contested => "contested",
             Self::Overflow => "overflow",
         }
     }
@@ -158,6 +173,8 @@ impl Source {
 pub struct Counts {
     taken: [AtomicU64; Source::ALL.len()],
     dropped: [[AtomicU64; Refusal::ALL.len()]; Source::ALL.len()],
+    noted: [[AtomicU64; Notice::ALL.len()]; Source::ALL.len()],
+    foreign_commands: AtomicU64,
 }
 
 impl Counts {
@@ -181,6 +198,26 @@ impl Counts {
         self.dropped[source as usize][refusal as usize].load(Ordering::Relaxed)
     }
 
+    /// Something happened on a topic that people should know of.
+    pub fn note(&self, source: Source, notice: Notice) {
+        self.noted[source as usize][notice as usize].fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// How often that happened.
+    pub fn noted(&self, source: Source, notice: Notice) -> u64 {
+        self.noted[source as usize][notice as usize].load(Ordering::Relaxed)
+    }
+
+    /// Somebody else wrote a command.
+    pub fn note_foreign_command(&self) {
+        self.foreign_commands.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Commands that somebody else wrote on the command topic.
+    pub fn foreign_commands(&self) -> u64 {
+        self.foreign_commands.load(Ordering::Relaxed)
+    }
+
     /// Every topic and reason for which messages were dropped, with how many.
     pub fn drops(&self) -> impl Iterator<Item = (Source, Refusal, u64)> + '_ {
         Source::ALL
@@ -192,7 +229,7 @@ impl Counts {
 }
 
 /// Looks without a new drop after which dropping is over.
-const QUIET_LOOKS: u32 = 10;
+pub(super) const QUIET_LOOKS: u32 = 10;
 
 /// What was dropped of late, for whoever looks at the counts from time to time.
 #[derive(Debug, Clone, Copy, Default)]

@@ -4,7 +4,8 @@
 //! that clock at its arrival, whatever steps the clock makes. By [`StampClock::Base`] the least
 //! delay of late is taken for none, and slowly forgotten, so that a clock that runs otherwise is
 //! followed; where the stamps leap for good, that is believed after [`AGREE_MIN`] messages. Until
-//! then the base is as good as silent.
+//! then the base is as good as silent. A leap is more than a second, or any step back: no delay
+//! makes a writer's later stamp lower than its earlier one.
 
 use std::time::Duration;
 
@@ -44,6 +45,10 @@ pub struct Stamps {
     leap: Option<(i64, u32)>,
     last_arrival: Duration,
     last_ns: Option<i64>,
+    /// The stamp of the last message that was placed.
+    last_stamp_ns: Option<i64>,
+    /// Leaps that were believed.
+    leaps: u32,
 }
 
 fn nanoseconds(span: Duration) -> i64 {
@@ -60,7 +65,14 @@ impl Stamps {
             leap: None,
             last_arrival: Duration::ZERO,
             last_ns: None,
+            last_stamp_ns: None,
+            leaps: 0,
         }
+    }
+
+    /// How many leaps of the base's clock were believed.
+    pub fn leaps(&self) -> u32 {
+        self.leaps
     }
 
     /// When the message was measured.
@@ -88,6 +100,7 @@ impl Stamps {
             return Err(Refusal::OutOfOrder);
         }
         self.last_ns = Some(at_ns);
+        self.last_stamp_ns = Some(stamp_ns);
         Ok(Duration::from_nanos(at_ns.unsigned_abs()))
     }
 
@@ -102,14 +115,19 @@ impl Stamps {
         let offset_ns = offset_ns.saturating_add(nanoseconds(since.mul_f64(FORGET_SHARE)));
         let age_ns = seen_ns.saturating_sub(offset_ns);
         if age_ns.unsigned_abs() > LEAP_NS.unsigned_abs() {
-            return self.leapt(seen_ns);
+            return self.leapt(seen_ns, Refusal::Stamp);
+        }
+        let is_back = |last_ns: i64| stamp_ns < last_ns.saturating_sub(SAME_NS);
+        if self.last_stamp_ns.is_some_and(is_back) {
+            // One such message is out of order; many are of a clock that was put back.
+            return self.leapt(seen_ns, Refusal::OutOfOrder);
         }
         self.leap = None;
         self.offset_ns = Some(offset_ns.min(seen_ns));
         Ok(age_ns.max(0))
     }
 
-    fn leapt(&mut self, seen_ns: i64) -> Result<i64, Refusal> {
+    fn leapt(&mut self, seen_ns: i64, refusal: Refusal) -> Result<i64, Refusal> {
         let agreed = match self.leap {
             Some((least_ns, count)) if seen_ns.abs_diff(least_ns) <= AGREE_NS.unsigned_abs() => {
                 (least_ns.min(seen_ns), count + 1)
@@ -118,9 +136,10 @@ impl Stamps {
         };
         if agreed.1 < AGREE_MIN {
             self.leap = Some(agreed);
-            return Err(Refusal::Stamp);
+            return Err(refusal);
         }
         self.leap = None;
+        self.leaps = self.leaps.saturating_add(1);
         self.offset_ns = Some(agreed.0);
         Ok(seen_ns - agreed.0)
     }
@@ -211,6 +230,40 @@ mod tests {
             }
         }
         assert_eq!(refused, AGREE_MIN - 1);
+    }
+
+    #[test]
+    fn a_base_whose_clock_is_put_back_by_any_step_is_heard_after_ten_messages() {
+        for back_ms in [15, 150, 500, 999, 5_000] {
+            let mut stamps = stamps(StampClock::Base);
+            let mut refused = 0;
+            for index in 0..200 {
+                let now_ms = 10_000 + 10 * index;
+                let stamp_ms = now_ms - if index < 100 { 0 } else { back_ms };
+                match stamps.place(stamp_ms * MS, at(now_ms, 0)) {
+                    Ok(placed) => assert!(
+                        placed.abs_diff(Duration::from_millis(now_ms.unsigned_abs()))
+                            < Duration::from_millis(20)
+                    ),
+                    Err(_) => refused += 1,
+                }
+            }
+            assert!(refused < AGREE_MIN, "{back_ms} ms: {refused}");
+        }
+    }
+
+    #[test]
+    fn messages_that_are_repeated_are_not_taken_for_a_clock_that_was_put_back() {
+        let mut stamps = stamps(StampClock::Base);
+        for index in 0..300 {
+            let now_ms = 10_000 + 10 * index;
+            assert!(stamps.place(now_ms * MS, at(now_ms, 0)).is_ok());
+            for old_ms in [now_ms, now_ms - 50] {
+                let refused = stamps.place(old_ms * MS, at(now_ms + 1, 0));
+                assert_eq!(refused, Err(Refusal::OutOfOrder));
+            }
+        }
+        assert_eq!(stamps.leaps(), 0);
     }
 
     #[test]

@@ -6,6 +6,7 @@ use tread_ros2::messages::{Header, Imu, JointState, Quaternion, Time, Vector3};
 use tread_ros2::names::Name;
 use tread_ros2::rmw::{Attachment, Generation, topic_key};
 
+use super::notices::Notice;
 use super::settings::*;
 use super::*;
 use crate::clock::{Clock as _, ManualClock};
@@ -125,7 +126,7 @@ impl Talk {
         self.sequence += 1;
         let attachment = Attachment {
             sequence: self.sequence,
-            source_time_ns: 0,
+            source_time_ns: self.clock.host_wall_ns() - said.stamp_behind_ns,
             gid: said.gid,
         };
         let attachment = attachment.to_bytes();
@@ -354,6 +355,36 @@ fn a_silent_base_rests_in_time_and_hears_nothing_until_the_loop_has_come_to_rest
 }
 
 #[test]
+fn a_base_that_starts_again_under_its_identifier_is_heard_and_old_messages_are_not() {
+    let mut talk = Talk::new();
+    for _ in 0..300 {
+        assert!(!talk.say(&GOOD).samples().is_empty());
+    }
+    let counts = talk.drive.counts();
+    let restarts = || counts.noted(Source::Joints, Notice::Restarted);
+    // It falls silent, and what it said three seconds ago is said again, as it was.
+    for _ in 0..50 {
+        talk.pass();
+    }
+    let old = Said {
+        stamp_behind_ns: 3_500_000_000,
+        ..GOOD
+    };
+    talk.sequence = 0;
+    for _ in 0..100 {
+        assert!(talk.say(&old).samples().is_empty());
+    }
+    assert_eq!(restarts(), 0);
+    // It starts again, with the first number.
+    talk.sequence = 0;
+    let silent = (0..10).take_while(|_| talk.say(&GOOD).samples().is_empty());
+    let silent = u32::try_from(silent.count()).unwrap();
+    assert!(silent < super::writer_watch::AGREE_MIN, "{silent} messages");
+    assert_eq!(restarts(), 1);
+    assert!(!talk.say(&GOOD).samples().is_empty());
+}
+
+#[test]
 fn wheels_that_do_not_do_what_they_are_told_are_not_believed() {
     let mut talk = Talk::new();
     let stuck = Said {
@@ -372,6 +403,36 @@ fn wheels_that_do_not_do_what_they_are_told_are_not_believed() {
             .dropped(Source::Joints, Refusal::Disobedient)
             > 0
     );
+}
+
+#[test]
+fn a_base_that_another_node_commands_too_rests_until_that_ceases() {
+    let mut talk = Talk::new();
+    for _ in 0..5 {
+        talk.say(&GOOD);
+        assert_eq!(talk.tell(TOLD), TOLD);
+    }
+    let counts = talk.drive.counts();
+    let rest = WheelSpeeds::default();
+    let mut ticks = 0;
+    while talk.tell(TOLD) == TOLD {
+        counts.note_foreign_command();
+        talk.say(&GOOD);
+        ticks += 1;
+        assert!(ticks < 20, "it is driven on");
+    }
+    for _ in 0..100 {
+        counts.note_foreign_command();
+        talk.say(&GOOD);
+        assert_eq!(talk.tell(rest), rest);
+    }
+    assert!(counts.dropped(Source::Joints, Refusal::Contested) > 100);
+    // The other falls silent.
+    for _ in 0..60 {
+        talk.say(&GOOD);
+        talk.tell(rest);
+    }
+    assert_eq!(talk.tell(TOLD), TOLD);
 }
 
 #[test]

@@ -1,4 +1,17 @@
 //! Who writes on a topic: one writer, its messages in order.
+//!
+//! A writer that starts again numbers its messages from the beginning. Under another identifier it
+//! takes the topic over once the former writer has been silent. Under the same identifier its low
+//! numbers look like messages that were heard before, and two things tell them apart:
+//!
+//! * their source times are newer than any that was heard: the writer's clock went on, and
+//!   [`AGREE_MIN`] messages in a row are enough;
+//! * else, where the writer's clock began again too, the writer has been silent for
+//!   [`SILENT_AFTER`], none of the messages is one of the last [`REMEMBERED`], and
+//!   [`AGREE_WITHOUT_CLOCK_MIN`] of them come in a row.
+//!
+//! The caller looks at a message first and follows it only if its content is usable as well, so that
+//! old data which is repeated never counts as a writer that starts again.
 
 use std::time::Duration;
 
@@ -8,18 +21,57 @@ use super::refusal::Refusal;
 
 /// Silence after which another writer may take the topic over: a node that was started again.
 const SILENT_AFTER: Duration = Duration::from_millis(200);
+/// Messages in a row that show that a writer started again.
+pub const AGREE_MIN: u32 = 3;
+/// The same where the writer's clock does not show it.
+pub const AGREE_WITHOUT_CLOCK_MIN: u32 = 10;
+/// Newest messages that are known again when they are repeated.
+const REMEMBERED: usize = 64;
+
+/// How a message follows those before it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Order {
+    /// It is the first, or a later one of the same writer.
+    Continues,
+    /// The writer started again, or another took over from one that fell silent.
+    Restarted,
+    /// The writer may have started again; more messages must agree.
+    MayHaveRestarted,
+}
 
 /// The writer of one topic.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct WriterWatch {
     writer: Option<Heard>,
+    restart: Option<Restart>,
 }
 
 #[derive(Debug, Clone, Copy)]
 struct Heard {
     gid: [u8; GID_BYTES],
     sequence: i64,
+    /// The newest source time of all its messages.
+    source_time_ns: i64,
     at: Duration,
+    /// Numbers and source times of the newest messages, in a ring.
+    recent: [(i64, i64); REMEMBERED],
+    /// How many there were.
+    count: usize,
+}
+
+/// Messages that look like those of a writer that started again.
+#[derive(Debug, Clone, Copy)]
+struct Restart {
+    sequence: i64,
+    source_time_ns: i64,
+    count: u32,
+}
+
+impl Heard {
+    fn knows(&self, message: &Attachment) -> bool {
+        let known = &self.recent[..self.count.min(REMEMBERED)];
+        known.contains(&(message.sequence, message.source_time_ns))
+    }
 }
 
 impl WriterWatch {
@@ -27,45 +79,220 @@ impl WriterWatch {
     ///
     /// # Errors
     /// [`Refusal::OutOfOrder`] for one that came already, [`Refusal::SecondWriter`] for another's.
-    pub fn check(&mut self, attachment: &Attachment, now: Duration) -> Result<(), Refusal> {
-        if let Some(heard) = self.writer {
-            let is_same = heard.gid == attachment.gid;
-            if is_same && attachment.sequence <= heard.sequence {
+    pub fn look(&self, message: &Attachment, now: Duration) -> Result<Order, Refusal> {
+        let Some(heard) = &self.writer else {
+            return Ok(Order::Continues);
+        };
+        let is_silent = now.saturating_sub(heard.at) >= SILENT_AFTER;
+        if heard.gid != message.gid {
+            return if is_silent {
+                Ok(Order::Restarted)
+            } else {
+                Err(Refusal::SecondWriter)
+            };
+        }
+        if message.sequence > heard.sequence {
+            return Ok(Order::Continues);
+        }
+        let went_on = message.source_time_ns > heard.source_time_ns;
+        if heard.knows(message) || !(went_on || is_silent) {
+            return Err(Refusal::OutOfOrder);
+        }
+        let before = match &self.restart {
+            Some(restart) if is_after(message, restart) => restart.count,
+            Some(restart) if message.sequence == restart.sequence => {
                 return Err(Refusal::OutOfOrder);
             }
-            if !is_same && now.saturating_sub(heard.at) < SILENT_AFTER {
-                return Err(Refusal::SecondWriter);
-            }
-        }
-        self.writer = Some(Heard {
-            gid: attachment.gid,
-            sequence: attachment.sequence,
-            at: now,
-        });
-        Ok(())
+            Some(_) | None => 0,
+        };
+        let enough = if went_on {
+            AGREE_MIN
+        } else {
+            AGREE_WITHOUT_CLOCK_MIN
+        };
+        Ok(if before + 1 >= enough {
+            Order::Restarted
+        } else {
+            Order::MayHaveRestarted
+        })
     }
+
+    /// Follows a message that was looked at and whose content is usable.
+    pub fn follow(&mut self, message: &Attachment, order: Order, now: Duration) {
+        if order == Order::MayHaveRestarted {
+            let before = self.restart.filter(|restart| is_after(message, restart));
+            self.restart = Some(Restart {
+                sequence: message.sequence,
+                source_time_ns: message.source_time_ns,
+                count: before.map_or(0, |restart| restart.count) + 1,
+            });
+            return;
+        }
+        self.restart = None;
+        let Attachment {
+            sequence,
+            source_time_ns,
+            gid,
+        } = *message;
+        let former = self.writer.filter(|_| order == Order::Continues);
+        let mut heard = former.unwrap_or(Heard {
+            gid,
+            sequence,
+            source_time_ns,
+            at: now,
+            recent: [(0, 0); REMEMBERED],
+            count: 0,
+        });
+        heard.recent[heard.count % REMEMBERED] = (sequence, source_time_ns);
+        self.writer = Some(Heard {
+            sequence,
+            source_time_ns: heard.source_time_ns.max(source_time_ns),
+            at: now,
+            count: heard.count + 1,
+            ..heard
+        });
+    }
+}
+
+/// Whether a message comes after the newest of a writer that may have started again.
+fn is_after(message: &Attachment, restart: &Restart) -> bool {
+    message.sequence > restart.sequence && message.source_time_ns >= restart.source_time_ns
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    const PERIOD_MS: i64 = 10;
+
+    fn message(writer: u8, sequence: i64, source_ms: i64) -> Attachment {
+        Attachment {
+            sequence,
+            source_time_ns: source_ms * 1_000_000,
+            gid: [writer; GID_BYTES],
+        }
+    }
+
+    /// Whether a message is taken; one that may be of a writer that started again is not.
+    fn take(watch: &mut WriterWatch, message: &Attachment, now_ms: i64) -> Result<Order, Refusal> {
+        let now = Duration::from_millis(now_ms.unsigned_abs());
+        let order = watch.look(message, now)?;
+        watch.follow(message, order, now);
+        Ok(order)
+    }
+
+    /// A writer that has written a number of messages, the last at that time in milliseconds.
+    fn written(count: i64) -> (WriterWatch, i64) {
+        let mut watch = WriterWatch::default();
+        for index in 1..=count {
+            let now_ms = index * PERIOD_MS;
+            let taken = take(&mut watch, &message(1, index, now_ms), now_ms);
+            assert_eq!(taken, Ok(Order::Continues));
+        }
+        (watch, count * PERIOD_MS)
+    }
+
     #[test]
     fn one_writer_is_heard_in_order_and_another_when_it_is_silent() {
         let mut watch = WriterWatch::default();
-        let mut check = |writer: u8, sequence: i64, now_ms: u64| {
-            let attachment = Attachment {
-                sequence,
-                source_time_ns: 0,
-                gid: [writer; GID_BYTES],
-            };
-            watch.check(&attachment, Duration::from_millis(now_ms))
+        let mut check = |writer: u8, sequence: i64, now_ms: i64| {
+            take(&mut watch, &message(writer, sequence, now_ms), now_ms)
         };
-        assert_eq!(check(1, 7, 0), Ok(()));
-        assert_eq!(check(1, 9, 10), Ok(()));
-        assert_eq!(check(1, 9, 11), Err(Refusal::OutOfOrder));
+        assert_eq!(check(1, 7, 0), Ok(Order::Continues));
+        assert_eq!(check(1, 9, 10), Ok(Order::Continues));
+        assert_eq!(check(1, 9, 10), Err(Refusal::OutOfOrder));
         assert_eq!(check(2, 1, 20), Err(Refusal::SecondWriter));
-        assert_eq!(check(2, 2, 210), Ok(()));
+        assert_eq!(check(2, 2, 210), Ok(Order::Restarted));
+        assert_eq!(check(2, 3, 213), Ok(Order::Continues));
         assert_eq!(check(1, 10, 215), Err(Refusal::SecondWriter));
+    }
+
+    #[test]
+    fn a_writer_that_starts_again_under_its_identifier_is_heard_after_three_messages() {
+        // Whether it is away for long or not at all.
+        for pause_ms in [0, 50, 1_000] {
+            let (mut watch, last_ms) = written(500);
+            let mut orders = Vec::new();
+            for index in 1..=5 {
+                let now_ms = last_ms + pause_ms + index * PERIOD_MS;
+                orders.push(take(&mut watch, &message(1, index, now_ms), now_ms).unwrap());
+            }
+            let [first, second, third, rest @ ..] = orders.as_slice() else {
+                panic!("{orders:?}");
+            };
+            assert_eq!(
+                [*first, *second, *third],
+                [
+                    Order::MayHaveRestarted,
+                    Order::MayHaveRestarted,
+                    Order::Restarted
+                ]
+            );
+            assert!(rest.iter().all(|order| *order == Order::Continues));
+        }
+    }
+
+    #[test]
+    fn a_writer_whose_clock_begins_again_is_heard_after_a_silence_and_ten_messages() {
+        let (mut watch, last_ms) = written(500);
+        let mut restarted = None;
+        for index in 1..=60 {
+            let now_ms = last_ms + index * PERIOD_MS;
+            // Half a millisecond off the first life's times, within which it lies.
+            let mut again = message(1, index, index * PERIOD_MS);
+            again.source_time_ns += 500_000;
+            match take(&mut watch, &again, now_ms) {
+                Ok(Order::Restarted) => {
+                    restarted = Some(now_ms - last_ms);
+                    break;
+                }
+                Ok(order) => assert_eq!(order, Order::MayHaveRestarted),
+                Err(refusal) => assert_eq!(refusal, Refusal::OutOfOrder),
+            }
+        }
+        let bound_ms = 200 + 10 * PERIOD_MS;
+        assert!(
+            restarted.is_some_and(|after_ms| after_ms <= bound_ms),
+            "{restarted:?}"
+        );
+    }
+
+    #[test]
+    fn messages_that_are_repeated_are_never_those_of_a_writer_that_started_again() {
+        let (mut watch, last_ms) = written(500);
+        // The newest again and again, while the writer speaks and after it fell silent.
+        for repeat in 0..50 {
+            for back in 0..40 {
+                let index = 500 - 39 + back;
+                let now_ms = last_ms + 400 * repeat + back * PERIOD_MS;
+                let refused = take(&mut watch, &message(1, index, index * PERIOD_MS), now_ms);
+                assert_eq!(refused, Err(Refusal::OutOfOrder));
+            }
+        }
+        // The writer goes on, and each of its messages comes twice, and an old one with it.
+        for index in 501..700 {
+            let now_ms = last_ms + 20_000 + index * PERIOD_MS;
+            let next = message(1, index, index * PERIOD_MS);
+            assert_eq!(take(&mut watch, &next, now_ms), Ok(Order::Continues));
+            let old = message(1, index - 300, (index - 300) * PERIOD_MS);
+            for again in [next, old] {
+                assert_eq!(
+                    take(&mut watch, &again, now_ms + 1),
+                    Err(Refusal::OutOfOrder)
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn two_writers_of_one_identifier_do_not_take_turns() {
+        let (mut watch, last_ms) = written(500);
+        for index in 1..200 {
+            let now_ms = last_ms + index * PERIOD_MS;
+            let live = message(1, 500 + index, now_ms);
+            assert_eq!(take(&mut watch, &live, now_ms), Ok(Order::Continues));
+            let other = take(&mut watch, &message(1, index, now_ms + 1), now_ms + 1);
+            assert_eq!(other, Ok(Order::MayHaveRestarted));
+        }
     }
 }

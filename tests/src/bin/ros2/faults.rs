@@ -19,6 +19,8 @@ use tread_tests::report::Check;
 const ZERO_MAX_MS: f64 = 150.0;
 /// The same for a base whose words are good but not true.
 const ZERO_OF_A_LIE_MAX_MS: f64 = 900.0;
+/// The same for a base that obeys somebody else too, every other moment.
+const ZERO_OF_TWO_MASTERS_MAX_MS: f64 = 4_000.0;
 /// How long a fault lasts.
 const LASTS: Duration = Duration::from_millis(1_500);
 /// Longest until the robot moves again.
@@ -36,7 +38,9 @@ struct Fault {
     value: &'static str,
     /// Part of an alert's text.
     said: &'static str,
+    /// How soon rest must be commanded.
     zero_max_ms: f64,
+    lasts: Duration,
 }
 
 const fn fault(name: &'static str, value: &'static str, said: &'static str) -> Fault {
@@ -45,10 +49,11 @@ const fn fault(name: &'static str, value: &'static str, said: &'static str) -> F
         value,
         said,
         zero_max_ms: ZERO_MAX_MS,
+        lasts: LASTS,
     }
 }
 
-const FAULTS: [Fault; 9] = [
+const FAULTS: [Fault; 12] = [
     fault("silent", "on", "has not been heard"),
     fault("late", "0.3", "came late"),
     fault("stamp", "3600", "time stamp leapt"),
@@ -58,10 +63,21 @@ const FAULTS: [Fault; 9] = [
     fault("short", "on", "not what their type says"),
     fault("restart", "1.0", "has not been heard"),
     Fault {
-        name: "stuck",
-        value: "on",
-        said: "do not do what they are told",
         zero_max_ms: ZERO_OF_A_LIE_MAX_MS,
+        ..fault("stuck", "on", "do not do what they are told")
+    },
+    // Started again under its identifier, after a pause that a supervisor makes.
+    fault("again", "1.0", "started again"),
+    // Somebody who halts the base every other quarter of a second, past every topic.
+    Fault {
+        zero_max_ms: ZERO_OF_TWO_MASTERS_MAX_MS,
+        lasts: Duration::from_secs(5),
+        ..fault("hijack", "on", "as if another node commands")
+    },
+    // What another node writes is heard, before it shows in the wheels.
+    Fault {
+        zero_max_ms: ZERO_OF_A_LIE_MAX_MS,
+        ..fault("rival", "0.4", "another node writes on the command topic")
     },
 ];
 
@@ -125,11 +141,11 @@ impl Trial<'_> {
         base.switch(name, fault.value)?;
         // The base is mended in time however long an answer takes: without a position a mission fails.
         let (mut is_said, tried) = tokio::join!(
-            self.is_said_by(switched_at + LASTS.mul_f64(0.9), fault.said),
+            self.is_said_by(switched_at + fault.lasts.mul_f64(0.9), fault.said),
             async {
-                tokio::time::sleep_until(switched_at + LASTS).await;
+                tokio::time::sleep_until(switched_at + fault.lasts).await;
                 let checks = self.of_rest(fault, switched_at);
-                if name != "restart" {
+                if !starts_again(name) {
                     base.switch(name, "off")?;
                 }
                 anyhow::Ok(checks)
@@ -152,9 +168,10 @@ impl Trial<'_> {
     /// Whether and how soon the robot was told to rest.
     fn of_rest(&self, fault: &Fault, switched_at: Instant) -> Vec<Check> {
         let name = fault.name;
+        let most_ms = fault.zero_max_ms;
         // The last good word: the last of all, if the base fell silent, or the one before the fault.
         let last_word = self.observer.sensor_at().unwrap_or(switched_at);
-        let fell_silent = name == "silent" || name == "restart";
+        let fell_silent = name == "silent" || starts_again(name);
         let is_of_pause = last_word.duration_since(switched_at) < Duration::from_millis(100);
         let since = if fell_silent && is_of_pause {
             last_word
@@ -165,15 +182,16 @@ impl Trial<'_> {
         let zero = self.observer.zero_after(since);
         let zero_ms = zero.map_or(f64::INFINITY, |(first, _)| ms(first));
         let last_ms = zero.and_then(|(_, last)| last).map_or(0.0, ms);
-        let most_ms = fault.zero_max_ms;
         let first = format!("{name}: first zero command, ms");
         let last = format!("{name}: last command that was none, ms");
-        let mut checks = vec![
-            self.judgement.at_most(first, most_ms, zero_ms),
-            self.judgement.at_most(last, most_ms, last_ms),
-        ];
+        let mut checks = vec![self.judgement.at_most(first, most_ms, zero_ms)];
+        // A base that obeys now and then is tried again and again, and what a rival writes is no rest.
+        let is_shared = name == "hijack" || name == "rival";
+        if !is_shared {
+            checks.push(self.judgement.at_most(last, most_ms, last_ms));
+        }
         // A base that starts again may be heard again by now.
-        if name != "restart" {
+        if !starts_again(name) && !is_shared {
             let is_at_rest = zero.is_some() && !self.observer.is_moving();
             checks.push(Check::so(format!("{name}: it is told to rest"), is_at_rest));
         }
@@ -212,6 +230,11 @@ impl Trial<'_> {
         }
         false
     }
+}
+
+/// Whether it is a base that starts again, and ends by itself.
+fn starts_again(name: &str) -> bool {
+    name == "restart" || name == "again"
 }
 
 /// Whether the robot says this of itself.

@@ -44,17 +44,42 @@ struct Arguments {
     /// Judge what the agent does, and only show what needs an optimised build on a quiet machine
     #[arg(long)]
     behaviour: bool,
+    /// Only this part
+    #[arg(long, value_enum)]
+    only: Option<Part>,
     /// Print one JSON object instead of a table
     #[arg(long)]
     json: bool,
+}
+
+/// What can be run alone.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Part {
+    /// Missions and faults of one robot, with its bus
+    Driven,
+    /// The doctor's robots
+    Doctor,
 }
 
 #[tokio::main]
 async fn main() -> anyhow::Result<ExitCode> {
     let arguments = Arguments::parse();
     let node = node()?;
-    let driven = driven(&arguments, &node);
-    let examined = doctor::measure(&arguments.python, &node);
+    let is_wanted = |part| arguments.only.is_none_or(|only| only == part);
+    let driven = async {
+        if is_wanted(Part::Driven) {
+            driven(&arguments, &node).await
+        } else {
+            Ok(Vec::new())
+        }
+    };
+    let examined = async {
+        if is_wanted(Part::Doctor) {
+            doctor::measure(&arguments.python, &node).await
+        } else {
+            Ok(Vec::new())
+        }
+    };
     let checks = if arguments.behaviour {
         let (driven, examined) = tokio::join!(driven, examined);
         [driven?, examined?].concat()

@@ -13,7 +13,7 @@ use tread_tests::wait::{SHORT, eventually};
 
 use crate::judgement::Judgement;
 use crate::observer::Observer;
-use crate::python_robot::PythonRobot;
+use crate::python_robot::{Configuration, PythonRobot};
 use tread_tests::report::{Check, quantile};
 
 /// Longest that a mission may take.
@@ -33,7 +33,7 @@ pub(crate) async fn start_robot(fleet: &mut Fleet, base: &PythonRobot) -> anyhow
     let folder = fleet.robot_folder(&robot);
     std::fs::create_dir_all(&folder)?;
     let file = folder.join("robot.toml");
-    std::fs::write(&file, base.configuration(""))?;
+    std::fs::write(&file, base.configuration(&Configuration::PLAIN))?;
     let flag = format!("--config={}", file.display());
     fleet.agents_get(&[&flag]);
     fleet.start_agent(&robot, 0.0).await;

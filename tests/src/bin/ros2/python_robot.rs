@@ -1,6 +1,5 @@
 //! The process of `tests/ros2/robot.py`.
 
-use std::fmt::Write as _;
 use std::io::{BufRead as _, BufReader, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
@@ -70,30 +69,57 @@ impl PythonRobot {
         Ok(self.input.flush()?)
     }
 
-    /// The `robot.toml` of an agent that drives it, with more to say of its joints.
-    pub(crate) fn configuration(&self, joints: &str) -> String {
-        let mut text = String::from("[drive]\nkind = \"ros2\"\n[drive.ros2]\n");
-        // Writing to a string cannot fail.
-        let _ = write!(
-            text,
-            "endpoint = \"{}\"\ndomain = {DOMAIN}\n",
-            self.endpoint
-        );
-        text.push_str(
-            "namespace = \"/rover\"\n\
+    /// The `robot.toml` of an agent that drives it.
+    pub(crate) fn configuration(&self, more: &Configuration) -> String {
+        let Configuration {
+            model,
+            bus,
+            joints,
+            command,
+            pose,
+        } = more;
+        format!(
+            "{model}[drive]\nkind = \"ros2\"\n[drive.ros2]\n\
+             endpoint = \"{}\"\ndomain = {DOMAIN}\nbus = \"{bus}\"\n\
+             namespace = \"/rover\"\n\
              [drive.ros2.joints]\n\
              left = [\"front_left_wheel\", \"rear_left_wheel\"]\n\
-             right = [\"front_right_wheel\", \"rear_right_wheel\"]\n",
-        );
-        text.push_str(joints);
-        text.push_str(
-            "[drive.ros2.imu]\n\
+             right = [\"front_right_wheel\", \"rear_right_wheel\"]\n\
+             {joints}\
+             [drive.ros2.command]\n{command}\
+             [drive.ros2.imu]\n\
              [drive.ros2.odometry]\ntopic = \"vio/odom\"\nmotion_of = \"ground\"\n\
-             [drive.ros2.pose]\n\
+             {pose}\
              [drive.ros2.battery]\n",
-        );
-        text
+            self.endpoint
+        )
     }
+}
+
+/// What a `robot.toml` says beside what every one says.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Configuration {
+    /// Whole sections before all others.
+    pub(crate) model: &'static str,
+    /// How ROS 2 is spoken.
+    pub(crate) bus: &'static str,
+    /// Lines of the joints beside their names.
+    pub(crate) joints: &'static str,
+    /// Lines of the command.
+    pub(crate) command: &'static str,
+    /// The section of the pose, if it is read.
+    pub(crate) pose: &'static str,
+}
+
+impl Configuration {
+    /// Nothing more.
+    pub(crate) const PLAIN: Self = Self {
+        model: "",
+        bus: "rmw_zenoh",
+        joints: "",
+        command: "",
+        pose: "[drive.ros2.pose]\n",
+    };
 }
 
 impl Drop for PythonRobot {

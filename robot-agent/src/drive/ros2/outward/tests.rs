@@ -210,6 +210,11 @@ fn what_is_wrong_is_said_and_is_over_when_it_is() {
         (level, values["imu: late"].as_str()),
         (Level::Ok as u8, "1")
     );
+    outward.counts.note_foreign_command();
+    let words = said(&mut outward, now + SILENT_SERVER + 2 * SAY_EVERY);
+    let (level, text, values) = part(&words, "tread_agent: base");
+    assert_eq!(level, Level::Error as u8, "{text}");
+    assert_eq!(values["commands of others"], "1");
 }
 
 /// One message as it was heard: key, attachment, bytes.

@@ -1,0 +1,471 @@
+//! What was commanded and said during one motion, summed up. Pure.
+
+use tread_control::geometry::wrap_angle_rad;
+use tread_control::measured::{WheelSpeeds, WheelTorques};
+use tread_ros2::cdr::decode;
+use tread_ros2::messages::{Odometry, Time};
+
+use super::heard::Message;
+use crate::drive::ros2::inlet::decoded;
+use crate::drive::ros2::reading::{Content, Position, Wheels, wheels_of};
+use crate::drive::ros2::refusal::Source;
+use crate::drive::ros2::settings::{MotionOf, Ros2Settings};
+
+/// Least spread of the places' times for a speed, seconds squared: ten over a second.
+const PLACES_SPREAD_MIN_S2: f64 = 0.8;
+/// Messages of the wheels whose mean is the speed that they gained.
+const LAST_SPEEDS: usize = 10;
+/// Parts into which the steady part of a motion is cut, so that means have a standard error.
+const BLOCKS: usize = 8;
+/// The same as a figure.
+const BLOCKS_COUNT: f64 = 8.0;
+/// Messages after which a figure that never changed counts as frozen.
+const FROZEN_MIN: u32 = 10;
+
+/// What was commanded and said over the second half of a motion.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(super) struct Drove {
+    /// What the wheels were commanded.
+    pub(super) commanded: WheelSpeeds,
+    /// What they said; none if they said nothing.
+    pub(super) wheels: Option<WheelSpeeds>,
+    /// How the robot turned, radians per second.
+    pub(super) turn_rad_s: Option<f64>,
+    /// How fast it went ahead by its positions, metres per second.
+    pub(super) places_m_s: Option<f64>,
+    /// The same as its odometry says, where that is of the ground.
+    pub(super) odometry_m_s: Option<f64>,
+    /// The odometry's motion, and where its pose heads.
+    pub(super) twist: Option<PlanarTwist>,
+    /// Difference of the wheels' speeds, right minus left, and turn rate: means of parts of the motion.
+    pub(super) turn_blocks: Vec<TurnBlock>,
+    /// Between which bounds each figure lay, from setting off to the end.
+    pub(super) ranges: Ranges,
+    /// How they pulled; none if that is not known.
+    pub(super) torques: Option<WheelTorques>,
+    /// How both sides together pulled while the robot set off.
+    pub(super) set_off: Option<SetOff>,
+    /// Whether the base was heard all the while.
+    pub(super) is_heard: bool,
+}
+
+/// The motion that odometry says, as it is written in the message, and the heading of its pose.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct PlanarTwist {
+    pub(super) x_m_s: f64,
+    pub(super) y_m_s: f64,
+    pub(super) heading_rad: f64,
+}
+
+/// Means of a part of a motion.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct TurnBlock {
+    pub(super) difference_rad_s: f64,
+    pub(super) turn_rad_s: f64,
+}
+
+/// Least and greatest of a figure, and how often it was said.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Range {
+    least: f64,
+    most: f64,
+    count: u32,
+}
+
+impl Default for Range {
+    fn default() -> Self {
+        Self {
+            least: f64::INFINITY,
+            most: f64::NEG_INFINITY,
+            count: 0,
+        }
+    }
+}
+
+impl Range {
+    pub(super) fn add(&mut self, value: f64) {
+        self.least = self.least.min(value);
+        self.most = self.most.max(value);
+        self.count += 1;
+    }
+
+    pub(super) fn with(self, other: Self) -> Self {
+        Self {
+            least: self.least.min(other.least),
+            most: self.most.max(other.most),
+            count: self.count + other.count,
+        }
+    }
+
+    /// How far it went; nothing of a figure that was not said.
+    pub(super) fn span(&self) -> f64 {
+        if self.count == 0 {
+            0.0
+        } else {
+            self.most - self.least
+        }
+    }
+
+    /// Whether it was said often enough and never changed by the least bit: what is measured does.
+    pub(super) fn is_frozen(&self) -> bool {
+        self.count >= FROZEN_MIN && self.span() <= 0.0
+    }
+}
+
+/// Between which bounds each figure lay.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Ranges {
+    pub(super) left: Range,
+    pub(super) right: Range,
+    pub(super) gyro: Range,
+    pub(super) odometry_ahead: Range,
+    pub(super) odometry_turn: Range,
+    pub(super) x: Range,
+    pub(super) y: Range,
+    pub(super) heading: Range,
+}
+
+impl Ranges {
+    /// Both motions together.
+    pub(super) fn with(&self, other: &Self) -> Self {
+        Self {
+            left: self.left.with(other.left),
+            right: self.right.with(other.right),
+            gyro: self.gyro.with(other.gyro),
+            odometry_ahead: self.odometry_ahead.with(other.odometry_ahead),
+            odometry_turn: self.odometry_turn.with(other.odometry_turn),
+            x: self.x.with(other.x),
+            y: self.y.with(other.y),
+            heading: self.heading.with(other.heading),
+        }
+    }
+
+    fn add(&mut self, settings: &Ros2Settings, content: &Content) {
+        match content {
+            Content::Wheels(wheels) => self.add_wheels(wheels.speeds),
+            Content::Inertial(inertial) => self.gyro.add(inertial.yaw_rate_rad_s),
+            Content::Motion(motion) => {
+                self.odometry_ahead.add(motion.ahead_m_s);
+                self.odometry_turn.add(motion.yaw_rate_rad_s);
+                if settings.joints.is_none() {
+                    self.add_wheels(wheels_of(motion, &settings.command));
+                }
+                if let Some(position) = &motion.position {
+                    self.add_place(position);
+                }
+            }
+            Content::Position(position) => self.add_place(position),
+            Content::Battery(_) => {}
+        }
+    }
+
+    fn add_wheels(&mut self, speeds: WheelSpeeds) {
+        self.left.add(speeds.left_rad_s);
+        self.right.add(speeds.right_rad_s);
+    }
+
+    fn add_place(&mut self, position: &Position) {
+        self.x.add(position.pose.x_m);
+        self.y.add(position.pose.y_m);
+        self.heading.add(position.pose.heading_rad);
+    }
+}
+
+/// How the wheels of both sides pulled from rest to the whole speed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct SetOff {
+    /// Their mean torque together, newton metres.
+    pub(super) torque_n_m: f64,
+    /// How long that took, by the messages' stamps.
+    pub(super) span_s: f64,
+    /// How fast they turned at its end.
+    pub(super) gained_rad_s: f64,
+}
+
+impl Drove {
+    /// How fast the robot went over ground, metres per second: by its positions where it has them.
+    pub(super) fn ground_m_s(&self) -> Option<f64> {
+        self.places_m_s.or(self.odometry_m_s)
+    }
+}
+
+/// A mean that grows.
+#[derive(Debug, Clone, Copy, Default)]
+struct Mean {
+    sum: f64,
+    count: f64,
+}
+
+impl Mean {
+    fn add(&mut self, value: f64) {
+        self.sum += value;
+        self.count += 1.0;
+    }
+
+    fn value(self) -> Option<f64> {
+        (self.count > 0.0).then(|| self.sum / self.count)
+    }
+}
+
+/// Sums up what was said while the robot set off, and when its speed was steady.
+pub(super) fn drove(
+    commanded: WheelSpeeds,
+    settings: &Ros2Settings,
+    starting: &[Message],
+    messages: &[Message],
+) -> Drove {
+    let (mut left, mut right) = (Mean::default(), Mean::default());
+    let (mut left_torque, mut right_torque) = (Mean::default(), Mean::default());
+    let (mut gyro, mut odometry_turn, mut speed) =
+        (Mean::default(), Mean::default(), Mean::default());
+    let mut places: Vec<(f64, Position)> = Vec::new();
+    let motion_of = settings
+        .odometry
+        .as_ref()
+        .map(|odometry| odometry.motion_of);
+    for message in messages {
+        let Ok(Some((stamp, content))) = decoded(settings, message.source, &message.payload) else {
+            continue;
+        };
+        let mut add_wheels = |speeds: WheelSpeeds| {
+            left.add(speeds.left_rad_s);
+            right.add(speeds.right_rad_s);
+        };
+        let at_s = seconds(stamp);
+        match content {
+            Content::Wheels(wheels) => {
+                add_wheels(wheels.speeds);
+                if let Some(torques) = wheels.torques {
+                    left_torque.add(torques.left_n_m);
+                    right_torque.add(torques.right_n_m);
+                }
+            }
+            Content::Inertial(inertial) => gyro.add(inertial.yaw_rate_rad_s),
+            Content::Motion(motion) => {
+                odometry_turn.add(motion.yaw_rate_rad_s);
+                if settings.joints.is_none() {
+                    add_wheels(wheels_of(&motion, &settings.command));
+                }
+                if motion_of == Some(MotionOf::Ground) {
+                    speed.add(motion.ahead_m_s);
+                }
+                places.extend(motion.position.map(|position| (at_s, position)));
+            }
+            Content::Position(position) => places.push((at_s, position)),
+            Content::Battery(_) => {}
+        }
+    }
+    let mut ranges = Ranges::default();
+    for message in starting.iter().chain(messages) {
+        if let Ok(Some((_, content))) = decoded(settings, message.source, &message.payload) {
+            ranges.add(settings, &content);
+        }
+    }
+    Drove {
+        commanded,
+        twist: planar_twist(messages),
+        turn_blocks: turn_blocks(settings, messages),
+        ranges,
+        wheels: left
+            .value()
+            .zip(right.value())
+            .map(|(left_rad_s, right_rad_s)| WheelSpeeds {
+                left_rad_s,
+                right_rad_s,
+            }),
+        turn_rad_s: gyro.value().or(odometry_turn.value()),
+        places_m_s: speed_of(&places),
+        odometry_m_s: speed.value(),
+        torques: left_torque
+            .value()
+            .zip(right_torque.value())
+            .map(|(left_n_m, right_n_m)| WheelTorques {
+                left_n_m,
+                right_n_m,
+            }),
+        set_off: set_off(settings, starting),
+        is_heard: true,
+    }
+}
+
+/// Means of the parts of a motion in which wheels and turn rate were said.
+fn turn_blocks(settings: &Ros2Settings, messages: &[Message]) -> Vec<TurnBlock> {
+    let (Some(first), Some(last)) = (messages.first(), messages.last()) else {
+        return Vec::new();
+    };
+    let began = first.arrival.monotonic;
+    let span_s = last.arrival.monotonic.saturating_sub(began).as_secs_f64();
+    let mut sums = [(Mean::default(), Mean::default()); BLOCKS];
+    let has_gyro = settings.imu.is_some();
+    for message in messages {
+        let Ok(Some((_, content))) = decoded(settings, message.source, &message.payload) else {
+            continue;
+        };
+        let at_s = message
+            .arrival
+            .monotonic
+            .saturating_sub(began)
+            .as_secs_f64();
+        // The last bound that it has reached; there are few.
+        let index = (1..BLOCKS).rev().find(|index| {
+            let share = f64::from(u32::try_from(*index).unwrap_or(0)) / BLOCKS_COUNT;
+            at_s >= share * span_s
+        });
+        let (difference, turn) = &mut sums[index.unwrap_or(0)];
+        match content {
+            Content::Wheels(Wheels { speeds, .. }) => {
+                difference.add(speeds.right_rad_s - speeds.left_rad_s);
+            }
+            Content::Inertial(inertial) => turn.add(inertial.yaw_rate_rad_s),
+            Content::Motion(motion) => {
+                if settings.joints.is_none() {
+                    let speeds = wheels_of(&motion, &settings.command);
+                    difference.add(speeds.right_rad_s - speeds.left_rad_s);
+                }
+                if !has_gyro {
+                    turn.add(motion.yaw_rate_rad_s);
+                }
+            }
+            Content::Position(_) | Content::Battery(_) => {}
+        }
+    }
+    let block = |(difference, turn): (Mean, Mean)| {
+        Some(TurnBlock {
+            difference_rad_s: difference.value()?,
+            turn_rad_s: turn.value()?,
+        })
+    };
+    sums.into_iter().filter_map(block).collect()
+}
+
+/// The mean motion of the odometry's messages, in whatever frame they have it.
+fn planar_twist(messages: &[Message]) -> Option<PlanarTwist> {
+    let (mut x, mut y, mut sin, mut cos) = <(Mean, Mean, Mean, Mean)>::default();
+    for message in messages.iter().filter(|it| it.source == Source::Odometry) {
+        let Ok(read) = decode::<Odometry<'_>>(&message.payload) else {
+            continue;
+        };
+        let linear = read.twist.twist.linear;
+        x.add(linear.x);
+        y.add(linear.y);
+        if let Some(heading_rad) = read.pose.pose.orientation.yaw_rad() {
+            sin.add(heading_rad.sin());
+            cos.add(heading_rad.cos());
+        }
+    }
+    Some(PlanarTwist {
+        x_m_s: x.value()?,
+        y_m_s: y.value()?,
+        heading_rad: wrap_angle_rad(sin.value()?.atan2(cos.value()?)),
+    })
+}
+
+/// Where the newest odometry heads in its own frame.
+pub(super) fn newest_heading_rad(settings: &Ros2Settings, messages: &[Message]) -> Option<f64> {
+    settings.odometry.as_ref()?;
+    let mut newest = messages.iter().rev();
+    let message = newest.find(|message| message.source == Source::Odometry)?;
+    let read: Odometry<'_> = decode(&message.payload).ok()?;
+    read.pose.pose.orientation.yaw_rad()
+}
+
+/// How the wheels pulled in all of these messages.
+fn set_off(settings: &Ros2Settings, messages: &[Message]) -> Option<SetOff> {
+    let mut torque = Mean::default();
+    let mut said = Vec::with_capacity(messages.len());
+    for message in messages {
+        let Ok(Some((stamp, content))) = decoded(settings, message.source, &message.payload) else {
+            continue;
+        };
+        if let Content::Wheels(Wheels {
+            speeds,
+            torques: Some(torques),
+        }) = content
+        {
+            torque.add(torques.left_n_m + torques.right_n_m);
+            let speed_rad_s = 0.5 * (speeds.left_rad_s + speeds.right_rad_s);
+            said.push((seconds(stamp), speed_rad_s));
+        }
+    }
+    let ((first_s, _), (last_s, _)) = (said.first()?, said.last()?);
+    let intervals = torque.count - 1.0;
+    let mut gained = Mean::default();
+    for (_, speed_rad_s) in said.iter().rev().take(LAST_SPEEDS) {
+        gained.add(*speed_rad_s);
+    }
+    let gained_rad_s = gained.value()?;
+    (intervals > 0.0).then(|| SetOff {
+        torque_n_m: torque.sum / torque.count,
+        // Each message stands for the time since the one before it.
+        span_s: (last_s - first_s) * torque.count / intervals,
+        gained_rad_s,
+    })
+}
+
+fn seconds(stamp: Time) -> f64 {
+    f64::from(stamp.sec) + 1.0e-9 * f64::from(stamp.nanosec)
+}
+
+/// How fast the places went ahead: the slope of the line through all of them.
+fn speed_of(places: &[(f64, Position)]) -> Option<f64> {
+    let (first_s, first) = places.first()?;
+    let (sin, cos) = first.pose.heading_rad.sin_cos();
+    let (mut span, mut way) = (Mean::default(), Mean::default());
+    let points: Vec<(f64, f64)> = places
+        .iter()
+        .map(|(at_s, place)| {
+            let ahead_m = cos * place.pose.x_m + sin * place.pose.y_m;
+            (at_s - first_s, ahead_m)
+        })
+        .inspect(|(at_s, ahead_m)| {
+            span.add(*at_s);
+            way.add(*ahead_m);
+        })
+        .collect();
+    let (middle_s, middle_m) = (span.value()?, way.value()?);
+    let (mut squares, mut products) = (0.0, 0.0);
+    for (at_s, ahead_m) in points {
+        squares += (at_s - middle_s).powi(2);
+        products += (at_s - middle_s) * (ahead_m - middle_m);
+    }
+    (squares > PLACES_SPREAD_MIN_S2).then(|| products / squares)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_figure_is_frozen_if_it_was_said_often_and_never_changed() {
+        let mut range = Range::default();
+        assert!(!range.is_frozen(), "nothing was said");
+        for _ in 0..FROZEN_MIN {
+            range.add(0.25);
+        }
+        assert!(range.is_frozen());
+        assert!(
+            !Range::default()
+                .with(Range { count: 3, ..range })
+                .is_frozen()
+        );
+        range.add(0.25 + f64::EPSILON);
+        assert!(!range.is_frozen());
+    }
+
+    #[test]
+    fn a_speed_is_the_slope_of_all_places() {
+        let at = |index: u32| {
+            let at_s = 100.0 + 0.05 * f64::from(index);
+            // Every other place is a centimetre off.
+            let off_m = if index.is_multiple_of(2) { 0.01 } else { -0.01 };
+            let pose = tread_control::geometry::Pose {
+                x_m: 0.2 * at_s + off_m,
+                ..Default::default()
+            };
+            (at_s, Position { pose, noise: None })
+        };
+        let places: Vec<_> = (0..40).map(at).collect();
+        assert!((speed_of(&places).unwrap() - 0.2).abs() < 0.002);
+        assert_eq!(speed_of(&places[..3]), None);
+    }
+}

@@ -1,0 +1,140 @@
+//! What was found on one question, and the lines of `robot.toml` that mend it.
+
+use std::fmt::Write as _;
+
+use serde::Serialize;
+
+/// A line of `robot.toml`, ready to be copied into its table.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct Line {
+    /// The table, such as `drive.ros2.command`.
+    pub(crate) table: &'static str,
+    /// The key in it.
+    pub(crate) key: &'static str,
+    /// The value as TOML.
+    pub(crate) value: String,
+}
+
+/// What was found on one question.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct Finding {
+    /// The question.
+    pub(crate) name: &'static str,
+    /// Whether nothing is wrong, as far as it was examined.
+    pub(crate) holds: bool,
+    /// Whether it could not be examined.
+    pub(crate) is_skipped: bool,
+    /// The key of `robot.toml` to look at, where all is not.
+    pub(crate) key: Option<&'static str>,
+    /// In words.
+    pub(crate) text: String,
+    /// What to write into `robot.toml`, where that mends it.
+    pub(crate) lines: Vec<Line>,
+}
+
+impl Finding {
+    pub(super) fn well(name: &'static str, text: impl Into<String>) -> Self {
+        Self {
+            name,
+            holds: true,
+            is_skipped: false,
+            key: None,
+            text: text.into(),
+            lines: Vec::new(),
+        }
+    }
+
+    pub(super) fn wrong(name: &'static str, key: &'static str, text: impl Into<String>) -> Self {
+        Self {
+            holds: false,
+            key: Some(key),
+            ..Self::well(name, text)
+        }
+    }
+
+    /// A question that could not be examined, because of another finding.
+    pub(super) fn skipped(name: &'static str, text: impl Into<String>) -> Self {
+        Self {
+            is_skipped: true,
+            ..Self::well(name, text)
+        }
+    }
+
+    /// The same with a line that mends it.
+    pub(super) fn with_line(
+        mut self,
+        table: &'static str,
+        key: &'static str,
+        value: impl Into<String>,
+    ) -> Self {
+        self.lines.push(Line {
+            table,
+            key,
+            value: value.into(),
+        });
+        self
+    }
+
+    pub(super) fn mark(&self) -> &'static str {
+        match (self.holds, self.is_skipped) {
+            (false, _) => "WRONG",
+            (true, true) => "--   ",
+            (true, false) => "ok   ",
+        }
+    }
+}
+
+/// A list of names as TOML.
+pub(super) fn list(names: &[String]) -> String {
+    let quoted: Vec<String> = names.iter().map(|name| format!("{name:?}")).collect();
+    format!("[{}]", quoted.join(", "))
+}
+
+/// All lines that the findings want, as a part of `robot.toml`: each table once.
+pub(super) fn robot_toml(findings: &[Finding]) -> String {
+    let lines: Vec<&Line> = findings.iter().flat_map(|finding| &finding.lines).collect();
+    let mut text = String::new();
+    for (index, line) in lines.iter().enumerate() {
+        if lines[..index].iter().any(|other| other.table == line.table) {
+            continue;
+        }
+        // Writing to a string cannot fail.
+        let _ = writeln!(text, "[{}]", line.table);
+        let mut keys = Vec::new();
+        for line in lines.iter().filter(|other| other.table == line.table) {
+            if !keys.contains(&line.key) {
+                keys.push(line.key);
+                let _ = writeln!(text, "{} = {}", line.key, line.value);
+            }
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_of_all_findings_are_tables_that_toml_reads() {
+        let left = list(&["front \"left\"".to_owned(), "rear".to_owned()]);
+        let findings = [
+            Finding::wrong("command", "drive.ros2.command.track_width_m", "")
+                .with_line("drive.ros2.command", "track_width_m", "0.430")
+                .with_line("drive.ros2.joints", "left", left),
+            Finding::well("imu", "all is well"),
+            Finding::wrong("signs", "drive.ros2.command.turn_sign", "")
+                .with_line("drive.ros2.command", "turn_sign", "-1")
+                .with_line("drive.ros2.command", "track_width_m", "0.5"),
+        ];
+        let text = robot_toml(&findings);
+        let read: toml::Value = toml::from_str(&text).unwrap();
+        let ros2 = &read["drive"]["ros2"];
+        let track = ros2["command"]["track_width_m"].as_float().unwrap();
+        assert!((track - 0.43).abs() < f64::EPSILON);
+        assert_eq!(ros2["command"]["turn_sign"].as_integer(), Some(-1));
+        assert_eq!(ros2["joints"]["left"][0].as_str(), Some("front \"left\""));
+        assert_eq!(text.matches("[drive.ros2.command]").count(), 1);
+        assert_eq!(robot_toml(&findings[1..2]), "");
+    }
+}

@@ -1,0 +1,305 @@
+//! Which signs and sides explain how wheels, gyro and ground answer two commands. Pure.
+//!
+//! The robot is commanded to turn left on the spot, and then to drive ahead. Each of the flips of
+//! [`Flip`] changes some of the answers. Every set of flips is tried, and the smallest one that
+//! explains all answers is what is wrong: one flip rather than two, and two rather than three.
+
+use super::finding::{Finding, list};
+use crate::drive::ros2::settings::Ros2Settings;
+
+/// How the robot answered: 1 or -1 for a direction.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Answers {
+    /// How the left and the right joints turned when a turn to the left was commanded.
+    pub(super) turn: [i8; 2],
+    /// The same when it was commanded to drive ahead.
+    pub(super) ahead: [i8; 2],
+    /// Whether the robot turned to the left then, by its gyro; 0 where that is not known.
+    pub(super) turned: i8,
+    /// Whether it went ahead, by its position or its speed over ground; 0 where that is not known.
+    pub(super) went: i8,
+}
+
+/// Something that is the wrong way round.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Flip {
+    /// Left and right joints are swapped.
+    Sides,
+    /// The left joints say the opposite.
+    LeftJoints,
+    /// The right joints say the opposite.
+    RightJoints,
+    /// The base takes a turn to the right for positive.
+    TurnCommand,
+    /// The base takes backwards for positive.
+    AheadCommand,
+    /// The gyro says the opposite.
+    Gyro,
+    /// The position or the odometry says the opposite.
+    Ground,
+}
+
+impl Flip {
+    const ALL: [Self; 7] = [
+        Self::Sides,
+        Self::LeftJoints,
+        Self::RightJoints,
+        Self::TurnCommand,
+        Self::AheadCommand,
+        Self::Gyro,
+        Self::Ground,
+    ];
+
+    fn key(self) -> &'static str {
+        match self {
+            Self::Sides => "drive.ros2.joints.left",
+            Self::LeftJoints => "drive.ros2.joints.left_sign",
+            Self::RightJoints => "drive.ros2.joints.right_sign",
+            Self::TurnCommand => "drive.ros2.command.turn_sign",
+            Self::AheadCommand => "drive.ros2.command.ahead_sign",
+            Self::Gyro => "drive.ros2.imu.upside_down",
+            Self::Ground => "drive.ros2.pose.topic",
+        }
+    }
+
+    fn text(self) -> &'static str {
+        match self {
+            Self::Sides => "left and right joints are swapped",
+            Self::LeftJoints => "the left joints say the opposite of what they do",
+            Self::RightJoints => "the right joints say the opposite of what they do",
+            Self::TurnCommand => "the base takes a turn to the right for positive",
+            Self::AheadCommand => "the base takes backwards for positive",
+            Self::Gyro => "the gyro turns the other way: it hangs upside down",
+            Self::Ground => "position or odometry says backwards where the robot went ahead",
+        }
+    }
+
+    fn mend(self, finding: Finding, settings: &Ros2Settings) -> Finding {
+        let opposite = |sign: f64| if sign > 0.0 { "-1" } else { "1" };
+        let (command, joints) = (&settings.command, settings.joints.as_ref());
+        match (self, joints) {
+            (Self::Sides, Some(joints)) => finding
+                .with_line("drive.ros2.joints", "left", list(&joints.right.names))
+                .with_line("drive.ros2.joints", "right", list(&joints.left.names)),
+            (Self::LeftJoints, Some(joints)) => {
+                let sign = opposite(joints.left.sign);
+                finding.with_line("drive.ros2.joints", "left_sign", sign)
+            }
+            (Self::RightJoints, Some(joints)) => {
+                let sign = opposite(joints.right.sign);
+                finding.with_line("drive.ros2.joints", "right_sign", sign)
+            }
+            (Self::TurnCommand, _) => {
+                let sign = opposite(command.turn_sign);
+                finding.with_line("drive.ros2.command", "turn_sign", sign)
+            }
+            (Self::AheadCommand, _) => {
+                let sign = opposite(command.ahead_sign);
+                finding.with_line("drive.ros2.command", "ahead_sign", sign)
+            }
+            (Self::Gyro, _) => match &settings.imu {
+                Some(imu) => {
+                    let upside_down = (!imu.is_upside_down).to_string();
+                    finding.with_line("drive.ros2.imu", "upside_down", upside_down)
+                }
+                None => finding,
+            },
+            (Self::Sides | Self::LeftJoints | Self::RightJoints | Self::Ground, _) => finding,
+        }
+    }
+}
+
+/// What a robot with these flips answers.
+fn predicted(flips: &[Flip]) -> Answers {
+    let sign = |flip: Flip| if flips.contains(&flip) { -1 } else { 1 };
+    let (turned, went) = (sign(Flip::TurnCommand), sign(Flip::AheadCommand));
+    let said = |left: i8, right: i8| {
+        let [left, right] = if flips.contains(&Flip::Sides) {
+            [right, left]
+        } else {
+            [left, right]
+        };
+        [
+            left * sign(Flip::LeftJoints),
+            right * sign(Flip::RightJoints),
+        ]
+    };
+    Answers {
+        turn: said(-turned, turned),
+        ahead: said(went, went),
+        turned: turned * sign(Flip::Gyro),
+        went: went * sign(Flip::Ground),
+    }
+}
+
+/// The smallest sets of flips that explain the answers; a set without flips for a healthy robot.
+pub(super) fn explanations(answers: Answers) -> Vec<Vec<Flip>> {
+    let agrees = |known: i8, predicted: i8| known == 0 || known == predicted;
+    let mut found: Vec<Vec<Flip>> = (0..1_u32 << Flip::ALL.len())
+        .map(|set| {
+            let flips = Flip::ALL.into_iter().enumerate();
+            flips
+                .filter(|(index, _)| set & (1 << index) != 0)
+                .map(|(_, flip)| flip)
+                .collect::<Vec<_>>()
+        })
+        .filter(|flips| {
+            let predicted = predicted(flips);
+            answers.turn == predicted.turn
+                && answers.ahead == predicted.ahead
+                && agrees(answers.turned, predicted.turned)
+                && agrees(answers.went, predicted.went)
+        })
+        .collect();
+    let least = found.iter().map(Vec::len).min().unwrap_or(0);
+    found.retain(|flips| flips.len() == least);
+    found
+}
+
+/// What was found of sides and signs.
+pub(super) fn finding(answers: Answers, settings: &Ros2Settings) -> Finding {
+    let explanations = explanations(answers);
+    let Some(flips) = explanations.first() else {
+        let text = "the wheels do not do what they are commanded, in no way that signs explain";
+        return Finding::wrong("sides", "drive.ros2.joints.left", text);
+    };
+    let Some(first) = flips.first() else {
+        return Finding::well(
+            "sides",
+            "wheels, gyro, ground and command agree on left and ahead",
+        );
+    };
+    let sentence = |flips: &[Flip]| {
+        let texts: Vec<_> = flips.iter().map(|flip| flip.text()).collect();
+        texts.join(", and ")
+    };
+    let mut text = sentence(flips);
+    for other in &explanations[1..] {
+        text = format!("{text}; or {}", sentence(other));
+    }
+    let is_odometrys = *first == Flip::Ground && settings.pose.is_none();
+    let key = if is_odometrys {
+        "drive.ros2.odometry.topic"
+    } else {
+        first.key()
+    };
+    let finding = Finding::wrong("sides", key, text);
+    if explanations.len() > 1 {
+        // Which of them is right a person must see.
+        return finding;
+    }
+    let mend = |finding, flip: &Flip| flip.mend(finding, settings);
+    flips.iter().fold(finding, mend)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::drive::ros2::tests::settings;
+
+    /// A robot as it really is, simulated on its own terms: where its wheels go, and what says so.
+    fn robot(flips: &[Flip], sees_ground: bool) -> Answers {
+        let is = |flip| flips.contains(&flip);
+        let drive = |ahead: f64, turn: f64| {
+            let ahead = if is(Flip::AheadCommand) {
+                -ahead
+            } else {
+                ahead
+            };
+            let turn = if is(Flip::TurnCommand) { -turn } else { turn };
+            let (left, right) = (ahead - turn, ahead + turn);
+            let (mut first, mut second) = if is(Flip::Sides) {
+                (right, left)
+            } else {
+                (left, right)
+            };
+            if is(Flip::LeftJoints) {
+                first = -first;
+            }
+            if is(Flip::RightJoints) {
+                second = -second;
+            }
+            let gyro = if is(Flip::Gyro) { -turn } else { turn };
+            let ground = if is(Flip::Ground) { -ahead } else { ahead };
+            (first, second, gyro, ground)
+        };
+        let sign = |value: f64| if value > 0.0 { 1 } else { -1 };
+        let (turn, ahead) = (drive(0.0, 1.0), drive(1.0, 0.0));
+        Answers {
+            turn: [sign(turn.0), sign(turn.1)],
+            ahead: [sign(ahead.0), sign(ahead.1)],
+            turned: sign(turn.2),
+            went: if sees_ground { sign(ahead.3) } else { 0 },
+        }
+    }
+
+    #[test]
+    fn every_single_flip_is_named_alone_and_nothing_of_a_healthy_robot() {
+        for sees_ground in [true, false] {
+            assert!(finding(robot(&[], sees_ground), &settings()).holds);
+            for flip in Flip::ALL {
+                if flip == Flip::Ground && !sees_ground {
+                    continue;
+                }
+                let found = explanations(robot(&[flip], sees_ground));
+                assert_eq!(found, [vec![flip]], "{flip:?} {sees_ground}");
+            }
+        }
+    }
+
+    #[test]
+    fn both_signs_of_the_command_are_named_and_not_the_joints() {
+        let flips = [Flip::TurnCommand, Flip::AheadCommand];
+        for sees_ground in [true, false] {
+            let found = finding(robot(&flips, sees_ground), &settings());
+            assert_eq!(found.key, Some("drive.ros2.command.turn_sign"));
+            let lines: Vec<_> = found
+                .lines
+                .iter()
+                .map(|line| (line.key, line.value.as_str()))
+                .collect();
+            assert_eq!(lines, [("turn_sign", "-1"), ("ahead_sign", "-1")]);
+        }
+    }
+
+    #[test]
+    fn swapped_sides_come_with_the_lines_that_swap_them() {
+        let found = finding(robot(&[Flip::Sides], true), &settings());
+        let lines: Vec<_> = found
+            .lines
+            .iter()
+            .map(|line| (line.key, line.value.as_str()))
+            .collect();
+        assert_eq!(lines, [("left", "[\"right\"]"), ("right", "[\"left\"]")]);
+    }
+
+    #[test]
+    fn a_sign_that_is_set_already_is_taken_back() {
+        let mut settings = settings();
+        settings.command.turn_sign = -1.0;
+        let found = finding(robot(&[Flip::TurnCommand], true), &settings);
+        assert_eq!(found.lines[0].value, "1");
+    }
+
+    proptest! {
+        /// Whatever is flipped, what is named explains all answers with no more flips than there are.
+        #[test]
+        fn what_is_named_explains_the_answers(set in 0_u32..128, sees_ground: bool) {
+            let flips: Vec<Flip> = Flip::ALL
+                .into_iter()
+                .enumerate()
+                .filter(|(index, _)| set & (1 << index) != 0)
+                .map(|(_, flip)| flip)
+                .collect();
+            let answers = robot(&flips, sees_ground);
+            let found = explanations(answers);
+            prop_assert!(!found.is_empty());
+            for named in &found {
+                prop_assert!(named.len() <= flips.len());
+                prop_assert_eq!(robot(named, sees_ground), answers);
+            }
+        }
+    }
+}

@@ -1,0 +1,228 @@
+//! Whether somebody else writes on the command topic.
+//!
+//! The agent hears its own command topic. Over `rmw_zenoh` each message names its writer. Over
+//! `zenoh-bridge-ros2dds` none does: what the agent did not write itself of late is another's. The
+//! bridge never hands back what it wrote on DDS itself, and commands that equal one of ours of
+//! late, such as rest while we command rest, do no harm.
+//!
+//! A base that obeys two nodes follows nobody's path, so while others write ([`Contest`]) the wheels are
+//! not believed, and nothing but rest is commanded.
+
+use std::hash::{DefaultHasher, Hash as _, Hasher as _};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use tread_ros2::messages::MessageType;
+use tread_ros2::rmw::{Attachment, GID_BYTES, check_key};
+
+use super::refusal::Counts;
+use super::settings::Scheme;
+
+/// Newest commands of our own that are known again, more than half a second of them.
+const REMEMBERED: usize = 64;
+
+/// Commands of others within [`CONTEST_SPAN`] that make a contest; a node that ends often writes one.
+const CONTEST_MIN: usize = 3;
+/// The time within which they come, and after which the last one is past.
+const CONTEST_SPAN: Duration = Duration::from_millis(500);
+
+/// Whether another node commands the base while the agent drives it. Pure.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Contest {
+    heard: u64,
+    /// When the newest commands of others came, the oldest first.
+    newest: [Option<Duration>; CONTEST_MIN],
+    is_contested: bool,
+}
+
+impl Contest {
+    /// Looks at how many commands others wrote so far, and whether the agent drives.
+    pub(super) fn look(&mut self, now: Duration, foreign_commands: u64, drives: bool) -> bool {
+        let new = foreign_commands.saturating_sub(self.heard);
+        self.heard = foreign_commands;
+        for _ in 0..new.min(CONTEST_MIN as u64) {
+            self.newest.rotate_left(1);
+            self.newest[CONTEST_MIN - 1] = Some(now);
+        }
+        let is_late =
+            |at: &Option<Duration>| at.is_some_and(|at| now.saturating_sub(at) <= CONTEST_SPAN);
+        // Once there is a contest each further command keeps it up.
+        self.is_contested = if self.is_contested {
+            self.newest.last().is_some_and(is_late)
+        } else {
+            drives && self.newest.iter().all(is_late)
+        };
+        self.is_contested
+    }
+}
+
+/// Hears the command topic.
+#[derive(Debug)]
+pub(super) struct CommandWatch {
+    scheme: Scheme,
+    message_type: MessageType,
+    counts: Arc<Counts>,
+    written: Mutex<Written>,
+}
+
+/// What the agent wrote itself.
+#[derive(Debug)]
+struct Written {
+    gid: Option<[u8; GID_BYTES]>,
+    recent: [u64; REMEMBERED],
+    count: usize,
+}
+
+fn digest(payload: &[u8]) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    payload.hash(&mut hasher);
+    hasher.finish()
+}
+
+impl CommandWatch {
+    /// A watch of a topic on which nothing was written yet.
+    pub(super) fn new(scheme: Scheme, message_type: MessageType, counts: Arc<Counts>) -> Self {
+        Self {
+            scheme,
+            message_type,
+            counts,
+            written: Mutex::new(Written {
+                gid: None,
+                recent: [0; REMEMBERED],
+                count: 0,
+            }),
+        }
+    }
+
+    fn written(&self) -> std::sync::MutexGuard<'_, Written> {
+        self.written.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// From now on the agent writes under this identifier.
+    pub(super) fn write_as(&self, gid: Option<[u8; GID_BYTES]>) {
+        self.written().gid = gid;
+    }
+
+    /// The agent writes this.
+    pub(super) fn wrote(&self, payload: &[u8]) {
+        let mut written = self.written();
+        let place = written.count % REMEMBERED;
+        written.recent[place] = digest(payload);
+        written.count = written.count.wrapping_add(1);
+    }
+
+    /// A message came on the command topic. What no base would take for a command is passed over.
+    pub(super) fn hear(&self, key: &str, attachment: Option<&[u8]>, payload: &[u8]) {
+        let is_ours = match self.scheme {
+            Scheme::RmwZenoh(generation) => {
+                let attachment = attachment.and_then(Attachment::from_bytes);
+                let is_command = check_key(key, &self.message_type, generation).is_ok();
+                let Some(attachment) = attachment.filter(|_| is_command) else {
+                    return;
+                };
+                self.written().gid == Some(attachment.gid)
+            }
+            Scheme::Ros2Dds => self.written().recent.contains(&digest(payload)),
+        };
+        if !is_ours {
+            self.counts.note_foreign_command();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tread_ros2::messages::{Message as _, Twist};
+    use tread_ros2::names::Name;
+    use tread_ros2::rmw::{Generation, topic_key};
+
+    use super::*;
+
+    fn watch(scheme: Scheme) -> (CommandWatch, Arc<Counts>) {
+        let counts = Arc::new(Counts::default());
+        let watch = CommandWatch::new(scheme, Twist::TYPE, Arc::clone(&counts));
+        (watch, counts)
+    }
+
+    /// Looks every 10 ms for so long; when a contest began and when it ended last.
+    fn contest(
+        span_ms: u64,
+        foreign: impl Fn(u64) -> u64,
+        drives: impl Fn(u64) -> bool,
+    ) -> (Option<u64>, Option<u64>) {
+        let (mut contest, mut began, mut ended, mut was) = (Contest::default(), None, None, false);
+        for now_ms in (0..span_ms).step_by(10) {
+            let now = Duration::from_millis(now_ms);
+            let is = contest.look(now, foreign(now_ms), drives(now_ms));
+            if is && !was {
+                began = began.or(Some(now_ms));
+            }
+            if was && !is {
+                ended = Some(now_ms);
+            }
+            was = is;
+        }
+        (began, ended)
+    }
+
+    #[test]
+    fn a_node_that_commands_a_driven_base_contests_it_until_half_a_second_after_its_last() {
+        for period_ms in [5, 20, 100, 200] {
+            // From one second to three.
+            let foreign =
+                |now_ms: u64| now_ms.clamp(1_000, 3_000).saturating_sub(1_000) / period_ms;
+            let (began, ended) = contest(5_000, foreign, |_| true);
+            let began = began.unwrap() - 1_000;
+            assert!(began <= 3 * period_ms + 10, "{period_ms}: {began}");
+            let ended = ended.unwrap() - 3_000;
+            assert!(ended <= 510, "{period_ms}: {ended}");
+        }
+    }
+
+    #[test]
+    fn a_stray_command_or_one_to_a_base_at_rest_is_no_contest() {
+        let stray = |now_ms: u64| 1 + now_ms / 400;
+        assert_eq!(contest(5_000, stray, |_| true), (None, None));
+        let steady = |now_ms: u64| now_ms / 20;
+        assert_eq!(contest(5_000, steady, |_| false), (None, None));
+        // Once it is contested the agent rests, and it stays contested.
+        let (began, ended) = contest(5_000, steady, |now_ms| now_ms < 100);
+        assert!(began.is_some() && ended.is_none());
+    }
+
+    #[test]
+    fn over_rmw_zenoh_another_writer_is_known_by_its_identifier() {
+        let (watch, counts) = watch(Scheme::RmwZenoh(Generation::Hashed));
+        let topic = Name::topic("cmd_vel", &Name::default()).unwrap();
+        let key = topic_key(0, &topic, &Twist::TYPE, Generation::Hashed);
+        let from = |gid: u8| {
+            let attachment = Attachment {
+                sequence: 1,
+                source_time_ns: 0,
+                gid: [gid; GID_BYTES],
+            };
+            attachment.to_bytes()
+        };
+        watch.write_as(Some([1; GID_BYTES]));
+        watch.hear(&key, Some(&from(1)), b"ours");
+        watch.hear(&key, None, b"what no base takes");
+        watch.hear("0/cmd_vel/another/type", Some(&from(2)), b"nor this");
+        assert_eq!(counts.foreign_commands(), 0);
+        watch.hear(&key, Some(&from(2)), b"ours");
+        assert_eq!(counts.foreign_commands(), 1);
+    }
+
+    #[test]
+    fn over_ros2dds_what_we_did_not_write_of_late_is_anothers() {
+        let (watch, counts) = watch(Scheme::Ros2Dds);
+        for index in 0..1_000_u32 {
+            watch.wrote(&index.to_le_bytes());
+            // It comes back a little later.
+            watch.hear("cmd_vel", None, &index.saturating_sub(20).to_le_bytes());
+        }
+        assert_eq!(counts.foreign_commands(), 0);
+        watch.hear("cmd_vel", None, &1_000_u32.to_le_bytes());
+        watch.hear("cmd_vel", None, &100_u32.to_le_bytes());
+        assert_eq!(counts.foreign_commands(), 2);
+    }
+}

@@ -1,0 +1,123 @@
+//! What happened on the bus and was dealt with, for people: writers that started again, clocks that
+//! leapt, and commands that somebody else writes.
+
+use super::refusal::{Counts, QUIET_LOOKS, Source};
+
+/// Something that happened on a topic that is read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Notice {
+    /// Its writer started again, or another writer took over from one that fell silent.
+    Restarted,
+    /// The stamps leapt, and the new ones are believed.
+    ClockLeapt,
+}
+
+impl Notice {
+    /// Each.
+    pub const ALL: [Self; 2] = [Self::Restarted, Self::ClockLeapt];
+
+    fn text(self) -> &'static str {
+        match self {
+            Self::Restarted => "started again and is heard again",
+            Self::ClockLeapt => "set its clock anew and is heard again",
+        }
+    }
+
+    /// For programs, as an alert's code.
+    pub fn code(self) -> &'static str {
+        match self {
+            Self::Restarted => "base-restarted",
+            Self::ClockLeapt => "base-clock",
+        }
+    }
+}
+
+/// What happened of late, for whoever looks at the counts from time to time.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Noticing {
+    before: [[u64; Notice::ALL.len()]; Source::ALL.len()],
+    /// Looks for which it is still said.
+    left: [[u32; Notice::ALL.len()]; Source::ALL.len()],
+}
+
+impl Noticing {
+    /// Looks again: for people, on which topics that happened of late.
+    pub fn look(&mut self, counts: &Counts, notice: Notice) -> Option<String> {
+        let mut sections = Vec::new();
+        for source in Source::ALL {
+            let times = counts.noted(source, notice);
+            let before = &mut self.before[source as usize][notice as usize];
+            let left = &mut self.left[source as usize][notice as usize];
+            let is_new = times > std::mem::replace(before, times);
+            *left = if is_new {
+                QUIET_LOOKS
+            } else {
+                left.saturating_sub(1)
+            };
+            if *left > 0 {
+                sections.push(format!("{} ({times} so far)", source.section()));
+            }
+        }
+        (!sections.is_empty())
+            .then(|| format!("what writes {} {}", sections.join(", "), notice.text()))
+    }
+}
+
+/// Commands of others of late.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct ForeignCommands {
+    before: u64,
+    left: u32,
+}
+
+impl ForeignCommands {
+    /// Looks again: for people, that somebody else commands the base.
+    pub fn look(&mut self, counts: &Counts) -> Option<String> {
+        let times = counts.foreign_commands();
+        self.left = if times > std::mem::replace(&mut self.before, times) {
+            QUIET_LOOKS
+        } else {
+            self.left.saturating_sub(1)
+        };
+        (self.left > 0).then(|| {
+            format!("another node writes on the command topic, and the base obeys both ({times} commands so far)")
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_happened_is_said_by_topic_until_it_is_over() {
+        let (counts, mut noticing) = (Counts::default(), Noticing::default());
+        assert_eq!(noticing.look(&counts, Notice::Restarted), None);
+        counts.note(Source::Imu, Notice::Restarted);
+        counts.note(Source::Joints, Notice::Restarted);
+        counts.note(Source::Joints, Notice::ClockLeapt);
+        let text = noticing.look(&counts, Notice::Restarted).unwrap();
+        assert_eq!(
+            text,
+            "what writes imu (1 so far), joints (1 so far) started again and is heard again"
+        );
+        let text = noticing.look(&counts, Notice::ClockLeapt).unwrap();
+        assert!(text.contains("joints (1 so far) set its clock"), "{text}");
+        for _ in 1..QUIET_LOOKS {
+            assert!(noticing.look(&counts, Notice::Restarted).is_some());
+        }
+        assert_eq!(noticing.look(&counts, Notice::Restarted), None);
+    }
+
+    #[test]
+    fn commands_of_others_are_said_until_they_cease() {
+        let (counts, mut foreign) = (Counts::default(), ForeignCommands::default());
+        assert_eq!(foreign.look(&counts), None);
+        counts.note_foreign_command();
+        assert!(foreign.look(&counts).unwrap().contains("1 commands so far"));
+        for _ in 1..QUIET_LOOKS {
+            assert!(foreign.look(&counts).is_some());
+        }
+        assert_eq!(foreign.look(&counts), None);
+    }
+}
