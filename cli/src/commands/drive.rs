@@ -353,6 +353,7 @@ fn slowed_by(cause: GateCause) -> Option<&'static str> {
         GateCause::Fence => Some("slow: the geofence is near"),
         GateCause::LinkPolicy => Some("held: the server was silent"),
         GateCause::ExternalHold => Some("held by another program"),
+        GateCause::SensorFault => Some("slow or held: its sensors contradict each other"),
         GateCause::StalePosition => Some("slow or held: it does not know where it is"),
         GateCause::Tilt => Some("held: it leans too far"),
         GateCause::StaleFeedback => Some("held: its base is silent"),

@@ -335,7 +335,7 @@ pub(crate) struct Trial {
     pub(crate) wrong: Option<Subject>,
 }
 
-/// Breaks a robot on its way and waits for the name of it.
+/// Breaks a robot while it drives and waits for the name of it.
 pub(crate) fn trial(case: &Case, seed: u64) -> Trial {
     let mut robot = Robot::new(
         seed,

@@ -11,7 +11,7 @@ use crate::localisation::FixNoise;
 const FIXES: usize = 40;
 /// Fewest fixes in half a span.
 const HALF_MIN: usize = 3;
-/// Smallest deviation of a fix that is reckoned with, metres and radians.
+/// Smallest deviation of a fix that is assumed, metres and radians.
 const DEVIATION_MIN: (f64, f64) = (0.02, 0.008);
 /// Standard deviations that noise is let reach; spans overlap, so there are few independent ones.
 const DEVIATIONS: f64 = 5.5;
@@ -35,8 +35,8 @@ const BACK_AFTER_S: f64 = 1.0;
 struct Fix {
     at_s: f64,
     pose: Pose,
-    reckoned: Point,
-    reckoned_rad: f64,
+    integrated: Point,
+    integrated_rad: f64,
     /// How far the wheels' heading is before the gyro's, and odometry's path before the wheels'.
     wheels_lead_rad: f64,
     odometry_lead_m: f64,
@@ -47,8 +47,8 @@ impl Fix {
         Self {
             at_s: edge.at_s,
             pose,
-            reckoned: edge.at,
-            reckoned_rad: edge.heading_rad(),
+            integrated: edge.at,
+            integrated_rad: edge.heading_rad(),
             wheels_lead_rad: edge.wheels_lead_rad(),
             odometry_lead_m: edge.odometry_lead_m(),
         }
@@ -56,16 +56,16 @@ impl Fix {
 
     /// Where dead reckoning comes from this fix, and how far that is.
     fn carried(&self, to: &Self) -> (Pose, f64) {
-        let offset_rad = self.pose.heading_rad - self.reckoned_rad;
+        let offset_rad = self.pose.heading_rad - self.integrated_rad;
         let (sin, cos) = offset_rad.sin_cos();
         let (x_m, y_m) = (
-            to.reckoned.x_m - self.reckoned.x_m,
-            to.reckoned.y_m - self.reckoned.y_m,
+            to.integrated.x_m - self.integrated.x_m,
+            to.integrated.y_m - self.integrated.y_m,
         );
         let pose = Pose {
             x_m: self.pose.x_m + cos * x_m - sin * y_m,
             y_m: self.pose.y_m + sin * x_m + cos * y_m,
-            heading_rad: to.reckoned_rad + offset_rad,
+            heading_rad: to.integrated_rad + offset_rad,
         };
         (pose, x_m.hypot(y_m))
     }
@@ -258,7 +258,7 @@ impl Fixes {
     pub(super) fn seen(&self, span_s: f64) -> Option<Seen> {
         let newest = self.ring[self.newest];
         let reference = newest;
-        let offset_rad = |fix: &Fix| wrap_angle_rad(fix.pose.heading_rad - fix.reckoned_rad);
+        let offset_rad = |fix: &Fix| wrap_angle_rad(fix.pose.heading_rad - fix.integrated_rad);
         let reference_rad = offset_rad(&reference);
         let mut halves = [Half::default(), Half::default()];
         let mut angles = [0.0; FIXES];
@@ -278,15 +278,15 @@ impl Fixes {
         let turned_rad = reference_rad + median(&mut angles[..used]);
         let (sin, cos) = turned_rad.sin_cos();
         let middle = &self.ring[(self.newest + FIXES - used / 2) % FIXES];
-        let (middle_sin, middle_cos) = middle.reckoned_rad.sin_cos();
+        let (middle_sin, middle_cos) = middle.integrated_rad.sin_cos();
         for places in 0..used {
             let fix = &self.ring[(self.newest + FIXES - places) % FIXES];
             let (x_m, y_m) = (
                 fix.pose.x_m - reference.pose.x_m,
                 fix.pose.y_m - reference.pose.y_m,
             );
-            let east_m = cos * x_m + sin * y_m - (fix.reckoned.x_m - reference.reckoned.x_m);
-            let north_m = cos * y_m - sin * x_m - (fix.reckoned.y_m - reference.reckoned.y_m);
+            let east_m = cos * x_m + sin * y_m - (fix.integrated.x_m - reference.integrated.x_m);
+            let north_m = cos * y_m - sin * x_m - (fix.integrated.y_m - reference.integrated.y_m);
             let ahead_m = middle_cos * east_m + middle_sin * north_m;
             let left_m = middle_cos * north_m - middle_sin * east_m;
             let turned_rad = wrap_angle_rad(offset_rad(fix) - reference_rad);

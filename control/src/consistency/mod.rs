@@ -62,7 +62,7 @@ pub enum Subject {
     LeftWheels,
     /// The right wheels do.
     RightWheels,
-    /// Wheels and body disagree, by slip or by a sensor: it cannot be told.
+    /// Wheels and body disagree, by slip or by a sensor: nothing distinguishes them.
     WheelsAndMotion,
     /// Channels that say how the body moves disagree, and nothing tells which is right.
     Motion,

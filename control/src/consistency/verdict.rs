@@ -481,7 +481,7 @@ struct Witnesses {
 }
 
 impl Witnesses {
-    /// Which of both is right, if that can be told.
+    /// Which of both is right, if anything distinguishes them.
     fn side(&self) -> Option<Nearer> {
         let agrees = (
             self.by_wheels.0 <= self.slack,
@@ -584,7 +584,7 @@ fn ahead(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) -> bool {
             wheels_against_body(view, &body, wheels, &commanded, axis, verdicts);
             break;
         }
-        if is_sideways(seen, &means, position, wheels) {
+        if moves_laterally(seen, &means, position, wheels) {
             is_clean = false;
             let (subject, left) = (Subject::WheelsAndMotion, seen.left_error_m_s);
             let found = finding(subject, Kind::Inconsistent, 0.0, left, axis);
@@ -613,7 +613,7 @@ fn ahead(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) -> bool {
 }
 
 /// Whether fixes say that the robot goes where it does not look.
-fn is_sideways(seen: &Seen, means: &Means, position_m_s: f64, wheels_m_s: f64) -> bool {
+fn moves_laterally(seen: &Seen, means: &Means, position_m_s: f64, wheels_m_s: f64) -> bool {
     let (own_m_s, share, lever_m) = LEFT;
     let speed_m_s = position_m_s.abs().max(wheels_m_s.abs());
     let slack = own_m_s + share * speed_m_s + lever_m * means.gyro_rad_s.abs() + seen.noise_m_s;

@@ -61,6 +61,8 @@ pub(crate) enum Hold {
     Outside,
     /// The base is silent, or is heard again for too short a time; it goes on by itself.
     Base,
+    /// A sensor that it drives by is wrong; it goes on by itself when it is right again.
+    Sensors,
 }
 
 /// What holds a mission now.
@@ -74,6 +76,7 @@ struct Holds {
     replacement: bool,
     outside: bool,
     base: bool,
+    sensors: bool,
 }
 
 /// The mission in hand.
@@ -170,6 +173,7 @@ impl Active {
             Hold::Replacement => &mut self.holds.replacement,
             Hold::Outside => &mut self.holds.outside,
             Hold::Base => &mut self.holds.base,
+            Hold::Sensors => &mut self.holds.sensors,
         };
         if std::mem::replace(present, is_wanted) == is_wanted {
             return;
@@ -183,7 +187,8 @@ impl Active {
 
     /// Whether it is held, braking or standing.
     pub(super) fn is_held(&self) -> bool {
-        self.holds.pause || self.holds.replacement || self.holds.outside || self.holds.base
+        let holds = &self.holds;
+        holds.pause || holds.replacement || holds.outside || holds.base || holds.sensors
     }
 
     /// Whether it leaves the wheels to others: it stands held, or is over but for a revision.

@@ -90,6 +90,8 @@ impl LoopCore {
             excited: !self.estimate.no_new_information,
             surface_change: self.surface.raised(),
             dug_in_at: self.progress.dug_in_at(),
+            findings: self.findings,
+            standing: self.standing.report(),
             slip: self.slip.slip(),
             cell: self.cutter.cell(),
             terrain,
