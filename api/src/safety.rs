@@ -87,6 +87,8 @@ pub enum GateCause {
     ExternalHold,
     /// The robot's control loop does not keep its rate.
     LoopOverrun,
+    /// Sensors contradict each other: the robot is held, or slowed down.
+    SensorFault,
     /// The robot does not know where it is.
     StalePosition,
     /// The robot leans too far.
@@ -164,6 +166,33 @@ pub struct LimitStatus {
     pub ends_in_ms: Option<u64>,
 }
 
+/// Whether a robot that is commanded to rest does: by wheels, odometry, gyro and position.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+pub struct StandingStatus {
+    /// What is measured.
+    pub state: StandingState,
+    /// Time from the command of rest until the robot stood, milliseconds; `null` until then.
+    pub took_ms: Option<u64>,
+}
+
+/// What is measured of a robot that is commanded to rest.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum StandingState {
+    /// It brakes, or has not stood for long enough to be sure.
+    #[default]
+    Stopping,
+    /// It stands.
+    Standing,
+    /// It should stand by now and moves: its base does not obey.
+    DoesNotStand,
+    /// It stood and moves again: it is pushed, rolls away, or somebody else drives it.
+    Moves,
+    /// Anything else, of a newer peer.
+    #[serde(other)]
+    Other,
+}
+
 /// Everything on a robot that may only slow it down.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct SafetyStatus {
@@ -185,6 +214,9 @@ pub struct SafetyStatus {
     /// External limits refused since the agent's start.
     #[serde(default)]
     pub limits_refused: u64,
+    /// Whether the robot stands, as measured; absent while it may drive.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub standing: Option<StandingStatus>,
     /// The revision of the geofence that the robot has; absent before it knows its site.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fence_revision: Option<u64>,

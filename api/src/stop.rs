@@ -65,9 +65,13 @@ pub struct Stop {
     pub reason: String,
     /// When the server was asked.
     pub wanted_at: Timestamp,
-    /// When the server heard that the robot's wheels are told to stand and that it will remember
-    /// the stop over a restart; `null` until then.
+    /// When it was commanded: the server heard that the robot's wheels are commanded to rest and
+    /// that it will remember the stop over a restart; `null` until then.
     pub confirmed_at: Option<Timestamp>,
+    /// When the server heard that the robot was measured to stand, by wheels, odometry, gyro and
+    /// position; `null` until then. A robot that does not stand in time raises the alert
+    /// `does-not-stand`.
+    pub standing_at: Option<Timestamp>,
     /// Whether the robot has not confirmed within 300 ms. It is told again until it does.
     pub unconfirmed: bool,
     /// Who asked last to clear it.

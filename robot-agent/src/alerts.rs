@@ -4,11 +4,13 @@
 //! waver have two bounds, so that an alert does not flicker.
 
 use tread_api::ids::AlertCode;
-use tread_api::robot::{AlertReport, OutboxStatus, Severity};
+use tread_api::robot::{ALERT_TEXT_MAX, AlertReport, OutboxStatus, Severity};
+use tread_control::consistency::{Consequence, Finding, Findings, Kind, Subject};
 use tread_control::geometry::Point;
 
 use crate::control_loop::overrun::{Overrun, WINDOW_TICKS};
 use crate::control_loop::seam::Fault;
+use crate::control_loop::standing::{Shown, StandingReport};
 use crate::control_loop::surface::Comparison;
 use crate::drive::Battery;
 use crate::drive::ros2::notices::{ForeignCommands, Notice, Noticing};
@@ -39,6 +41,10 @@ pub(crate) struct Causes<'a> {
     pub(crate) dug_in_at: Option<Point>,
     /// How far the loop is from its rate, while the robot is held for it.
     pub(crate) overrun: Option<Overrun>,
+    /// Sensors that contradict each other.
+    pub(crate) findings: Findings,
+    /// Whether the robot stands, where it is to.
+    pub(crate) standing: StandingReport,
 }
 
 /// Which wavering alerts stand.
@@ -83,6 +89,89 @@ fn surface_change(found: &Comparison) -> Option<AlertReport> {
         expected.std_dev,
     );
     alert("surface-change", Severity::Warning, text)
+}
+
+/// How a finding is called, how bad it is, and its text.
+fn sensor_alert(finding: &Finding) -> (&'static str, Severity, String) {
+    let Finding {
+        subject,
+        kind,
+        observed,
+        predicted,
+        unit,
+    } = *finding;
+    let code = match (subject, kind) {
+        (Subject::WheelsAndMotion, _) => "wheels-and-motion-disagree",
+        (_, Kind::Locked) => "wheel-locked",
+        (_, Kind::Frozen) => "sensor-frozen",
+        (_, Kind::Inverted | Kind::Jumped | Kind::Inconsistent) => "sensor-inconsistent",
+    };
+    let how = match kind {
+        Kind::Frozen => "frozen",
+        Kind::Inverted => "inverted",
+        Kind::Jumped => "jumped",
+        Kind::Inconsistent => "inconsistent",
+        Kind::Locked => "locked",
+    };
+    let (name, unit) = (subject.text(), unit.symbol());
+    let text = if subject == Subject::WheelsAndMotion {
+        format!(
+            "wheels and motion disagree: wheels {observed:.2} {unit}, motion {predicted:.2} {unit}; \
+             they slip, or a sensor is wrong"
+        )
+    } else if subject == Subject::Motion {
+        format!("{name} disagree: {observed:.2} against {predicted:.2} {unit}")
+    } else if kind == Kind::Jumped {
+        format!("{name} jumped by {observed:.2} {unit}")
+    } else {
+        format!("{name} {how}: observed {observed:.2} {unit}, predicted {predicted:.2} {unit}")
+    };
+    let severity = match subject.consequence() {
+        Consequence::Hold => Severity::Critical,
+        Consequence::Slow | Consequence::NoLearning => Severity::Warning,
+    };
+    (code, severity, text)
+}
+
+/// One alert for each code: a robot says each code once.
+fn sensor_alerts<'a>(findings: impl IntoIterator<Item = &'a Finding>) -> Vec<AlertReport> {
+    let mut alerts: Vec<AlertReport> = Vec::new();
+    for (code, severity, text) in findings.into_iter().map(sensor_alert) {
+        match alerts.iter_mut().find(|known| known.code.as_str() == code) {
+            Some(known) => {
+                known.severity = known.severity.max(severity);
+                known.text = format!("{}; {text}", known.text)
+                    .chars()
+                    .take(ALERT_TEXT_MAX)
+                    .collect();
+            }
+            None => alerts.extend(alert(code, severity, text)),
+        }
+    }
+    alerts
+}
+
+/// A robot that is to stand and moves.
+fn standing_alert(report: &StandingReport) -> Option<AlertReport> {
+    let measured = |shown: Shown| match shown {
+        Shown::Speed(speed_m_s) => format!("{speed_m_s:.2} m/s"),
+        Shown::Turn(turn_rad_s) => format!("{turn_rad_s:.2} rad/s"),
+        Shown::Distance(distance_m) => format!("{distance_m:.1} m from where it stood"),
+    };
+    let (code, text) = if let Some(shown) = report.does_not_stand {
+        let text = format!(
+            "the robot is commanded to rest and does not stand: {}; its base does not obey",
+            measured(shown)
+        );
+        ("does-not-stand", text)
+    } else {
+        let text = format!(
+            "the robot stood and moves again: {}; it is pushed, rolls, or is driven by another program",
+            measured(report.moves?)
+        );
+        ("moves-while-stopped", text)
+    };
+    alert(code, Severity::Critical, text)
 }
 
 impl Alerts {
@@ -161,7 +250,8 @@ impl Alerts {
             );
             alert("loop-overrun", Severity::Critical, text)
         });
-        [
+        let mut alerts: Vec<AlertReport> = [
+            standing_alert(&causes.standing),
             battery,
             overrun,
             fault,
@@ -177,7 +267,9 @@ impl Alerts {
         .into_iter()
         .chain(noticed)
         .flatten()
-        .collect()
+        .collect();
+        alerts.extend(sensor_alerts(causes.findings.iter()));
+        alerts
     }
 }
 
@@ -186,6 +278,7 @@ mod tests {
     use std::time::Duration;
 
     use tread_api::site::Cell;
+    use tread_control::consistency::Unit;
     use tread_control::tracking::ThetaKnowledge;
 
     use super::*;
@@ -339,5 +432,64 @@ mod tests {
             said[1].text,
             "the ground in cell (-3, 12) slips more than the map says: θ 1.43 ± 0.05, not 0.20 ± 0.02"
         );
+    }
+
+    #[test]
+    fn sensors_that_contradict_are_alerts_by_code_with_channel_and_both_values() {
+        let finding = |subject, kind, observed, predicted| Finding {
+            subject,
+            kind,
+            observed,
+            predicted,
+            unit: Unit::RadiansPerSecond,
+        };
+        let mut alerts = sensor_alerts(&[finding(Subject::Gyro, Kind::Frozen, 0.52, -0.31)]);
+        let only = alerts.pop().unwrap();
+        assert_eq!(only.code.as_str(), "sensor-frozen");
+        assert_eq!(only.severity, Severity::Critical);
+        assert_eq!(
+            only.text,
+            "gyro frozen: observed 0.52 rad/s, predicted -0.31 rad/s"
+        );
+        let said = sensor_alerts(&[
+            finding(Subject::Odometry, Kind::Inconsistent, 0.9, 0.6),
+            finding(Subject::Position, Kind::Jumped, 5.0, 0.0),
+            finding(Subject::WheelsAndMotion, Kind::Inconsistent, 0.9, 0.1),
+            finding(Subject::LeftWheels, Kind::Locked, 0.0, 6.0),
+        ]);
+        assert_eq!(
+            codes(&said),
+            [
+                "sensor-inconsistent",
+                "wheels-and-motion-disagree",
+                "wheel-locked"
+            ]
+        );
+        assert_eq!(said[0].severity, Severity::Critical, "the worse of both");
+        assert!(
+            said[0].text.contains("odometry speed") && said[0].text.contains("position jumped")
+        );
+        assert_eq!(said[1].severity, Severity::Warning);
+    }
+
+    #[test]
+    fn a_robot_that_does_not_stand_is_the_first_alert() {
+        let mut causes = Causes {
+            is_stopped: true,
+            standing: StandingReport {
+                is_to_stand: true,
+                does_not_stand: Some(Shown::Speed(0.59)),
+                ..StandingReport::default()
+            },
+            ..Causes::default()
+        };
+        let said = Alerts::default().judge(&causes);
+        assert_eq!(codes(&said), ["does-not-stand", "stopped"]);
+        assert!(said[0].text.contains("0.59 m/s"), "{}", said[0].text);
+        assert_eq!(said[0].severity, Severity::Critical);
+        causes.standing.does_not_stand = None;
+        causes.standing.moves = Some(Shown::Distance(0.6));
+        let said = Alerts::default().judge(&causes);
+        assert_eq!(codes(&said), ["moves-while-stopped", "stopped"]);
     }
 }

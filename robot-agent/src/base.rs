@@ -106,5 +106,6 @@ fn simulated_drive(
     let drive = SimulatedDrive::new(scenario, model, start, simulated.individual, SimMode::Auto)?;
     let drive = drive.with_charge(simulated.battery_charge_ratio);
     let drive = drive.with_stall(simulated.stall);
+    let drive = drive.with_faults(simulated.faults.clone());
     Ok(drive.with_trace(simulated.trace.clone()))
 }

@@ -9,13 +9,14 @@ use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 use tread_api::friction::LiveFriction;
 use tread_api::robot::{Aged, Battery, LoopStatus};
-use tread_api::safety::{self, GateCount, GateStatus, SafetyStatus};
+use tread_api::safety::{self, GateCount, GateStatus, SafetyStatus, StandingState, StandingStatus};
 use tread_api::wire::state::{FrictionReport, RobotState};
 use tread_control::gate::GateCause;
 
 use crate::alerts::{Alerts, Causes};
 use crate::clock::SharedClock;
 use crate::control_loop::seam::{Shared, Snapshot};
+use crate::control_loop::standing::StandingReport;
 use crate::drive::ros2::notices::{ForeignCommands, Notice, Noticing};
 use crate::drive::ros2::refusal::{Counts, Dropping};
 use crate::fleet::{FleetLink, Identity};
@@ -61,11 +62,30 @@ fn wire_cause(cause: GateCause) -> safety::GateCause {
         GateCause::LinkPolicy => safety::GateCause::LinkPolicy,
         GateCause::ExternalHold => safety::GateCause::ExternalHold,
         GateCause::LoopOverrun => safety::GateCause::LoopOverrun,
+        GateCause::SensorFault => safety::GateCause::SensorFault,
         GateCause::StalePosition => safety::GateCause::StalePosition,
         GateCause::Tilt => safety::GateCause::Tilt,
         GateCause::StaleFeedback => safety::GateCause::StaleFeedback,
         GateCause::Stop => safety::GateCause::Stop,
     }
+}
+
+/// Whether the robot stands, for the wire; absent while it may drive.
+fn wire_standing(report: &StandingReport) -> Option<StandingStatus> {
+    let state = if report.does_not_stand.is_some() {
+        StandingState::DoesNotStand
+    } else if report.moves.is_some() {
+        StandingState::Moves
+    } else if report.stands.is_some() {
+        StandingState::Standing
+    } else {
+        StandingState::Stopping
+    };
+    let took = report.stands.map(|(_, took)| took.as_millis());
+    report.is_to_stand.then(|| StandingStatus {
+        state,
+        took_ms: took.map(|took| u64::try_from(took).unwrap_or(u64::MAX)),
+    })
 }
 
 fn aged<T>(value: T, at: Duration, now: Duration) -> Aged<T> {
@@ -92,6 +112,8 @@ impl Reporter {
             surface_change: snapshot.surface_change,
             dug_in_at: snapshot.dug_in_at,
             overrun: snapshot.overrun,
+            findings: snapshot.findings,
+            standing: snapshot.standing,
         };
         let counted = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         RobotState {
@@ -157,6 +179,7 @@ impl Reporter {
             },
             limits,
             limits_refused,
+            standing: wire_standing(&snapshot.standing),
             fence_revision: snapshot.fence_revision,
         }
     }

@@ -354,6 +354,7 @@ fn slowed_by(cause: GateCause) -> Option<&'static str> {
         GateCause::LinkPolicy => Some("held: the server was silent"),
         GateCause::ExternalHold => Some("held by another program"),
         GateCause::LoopOverrun => Some("held: its control loop is late"),
+        GateCause::SensorFault => Some("slow or held: its sensors contradict each other"),
         GateCause::StalePosition => Some("slow or held: it does not know where it is"),
         GateCause::Tilt => Some("held: it leans too far"),
         GateCause::StaleFeedback => Some("held: its base is silent"),

@@ -107,6 +107,7 @@ fn past(stops: &[Stop]) -> String {
         "ROBOT",
         "WANTED",
         "CONFIRMED",
+        "STOOD",
         "CLEARED",
         "BY",
         "REASON",
@@ -121,6 +122,10 @@ fn past(stops: &[Stop]) -> String {
             stop.robot.to_string(),
             format!("{:.0}", stop.wanted_at),
             after.unwrap_or_else(|| "NOT YET".to_owned()),
+            or_dash(stop.standing_at.map(|at| {
+                let after = at.duration_since(stop.wanted_at);
+                format!("after {:.1} s", after.as_secs_f64())
+            })),
             or_dash(stop.cleared_at.map(|at| format!("{at:.0}"))),
             stop.by.clone(),
             stop.reason.clone(),

@@ -1,6 +1,7 @@
 //! The last word before the wheels: it can only reduce a command.
 //!
-//! A stop, a stale base, a lost position, a lean, a hold from outside, silence of whoever must be
+//! A stop, a stale base, a lost position, sensors that
+//! contradict each other, a lean, a hold from outside, silence of whoever must be
 //! heard, or a command that is not finite asks for rest; limits and caps of the speed cut what is
 //! left, both sides by the same share, so that a cut command bends the same way. The limits are
 //! those of the commanded twist and of the wheels ([`crate::twist_limits`]): in every tick and
@@ -43,6 +44,8 @@ pub enum GateCause {
     ExternalHold,
     /// The control loop does not keep its rate.
     LoopOverrun,
+    /// Sensors contradict each other.
+    SensorFault,
     /// The robot does not know where it is.
     StalePosition,
     /// The robot leans too far.
@@ -67,6 +70,7 @@ impl GateCause {
         Self::LinkPolicy,
         Self::ExternalHold,
         Self::LoopOverrun,
+        Self::SensorFault,
         Self::StalePosition,
         Self::Tilt,
         Self::StaleFeedback,
@@ -96,6 +100,8 @@ pub struct Reasons {
     pub is_position_lost: bool,
     /// The control loop does not keep its rate.
     pub is_loop_late: bool,
+    /// A sensor that the robot drives by is wrong.
+    pub is_sensor_wrong: bool,
     /// Somebody outside holds the robot.
     pub is_held_outside: bool,
     /// The server has been silent for longer than it may.
@@ -110,6 +116,8 @@ pub struct Reasons {
     pub command_age_max_m_s: Option<f64>,
     /// Fastest speed of a robot that does not know where it is, metres per second.
     pub blind_max_m_s: Option<f64>,
+    /// Fastest speed of a robot whose sensors contradict each other, metres per second.
+    pub sensors_max_m_s: Option<f64>,
     /// How fast the robot really goes along its path, metres per second, if that is known. On the
     /// way to rest its wheels do not pull it on to a speed that it does not have yet.
     pub real_m_s: Option<f64>,
@@ -125,6 +133,7 @@ impl Reasons {
             (self.is_stopped, GateCause::Stop),
             (leans, GateCause::Tilt),
             (self.is_position_lost, GateCause::StalePosition),
+            (self.is_sensor_wrong, GateCause::SensorFault),
             (self.is_loop_late, GateCause::LoopOverrun),
             (self.is_held_outside, GateCause::ExternalHold),
             (self.is_link_silent, GateCause::LinkPolicy),
@@ -134,8 +143,9 @@ impl Reasons {
         .find_map(|(is_so, cause)| is_so.then_some(cause))
     }
 
-    fn caps(&self) -> [(Option<f64>, GateCause); 4] {
+    fn caps(&self) -> [(Option<f64>, GateCause); 5] {
         [
+            (self.sensors_max_m_s, GateCause::SensorFault),
             (self.blind_max_m_s, GateCause::StalePosition),
             (self.command_age_max_m_s, GateCause::CommandAge),
             (self.outside_max_m_s, GateCause::ExternalLimit),

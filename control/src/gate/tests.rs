@@ -10,8 +10,9 @@ fn maybe(most: f64) -> impl Strategy<Value = Option<f64>> {
 
 fn reasons() -> impl Strategy<Value = Reasons> {
     let rare = || prop::bool::weighted(0.1);
-    let holds = (rare(), rare(), rare(), rare(), rare(), rare());
-    let caps = (maybe(0.9), maybe(1.5), maybe(1.5), maybe(1.5), maybe(1.5));
+    let holds = (rare(), rare(), rare(), rare(), rare(), rare(), rare());
+    let cap = || maybe(1.5);
+    let caps = (maybe(0.9), cap(), cap(), cap(), cap(), cap());
     let real = prop_oneof![
         2 => Just(None),
         4 => (-1.5..1.5_f64).prop_map(Some),
@@ -24,11 +25,13 @@ fn reasons() -> impl Strategy<Value = Reasons> {
         is_link_silent: holds.3,
         is_driver_silent: holds.4,
         is_loop_late: holds.5,
+        is_sensor_wrong: holds.6,
         tilt_rad: caps.0,
         fence_max_m_s: caps.1,
         outside_max_m_s: caps.2,
         command_age_max_m_s: caps.3,
         blind_max_m_s: caps.4,
+        sensors_max_m_s: caps.5,
         real_m_s,
     })
 }

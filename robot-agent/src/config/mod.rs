@@ -26,6 +26,7 @@ use crate::geometry::{control_model, paper_robot};
 use crate::membership::{Membership, MembershipFileError};
 use crate::outbox;
 use crate::recording::RecordingConfig;
+use crate::sim::faults::Fault;
 use crate::sim::scenario::{BUILT_IN_NAME, Scenario, ScenarioError};
 use crate::sim::trace::Trace;
 
@@ -167,6 +168,8 @@ pub struct SimulatedConfig {
     pub clock_ahead_s: i64,
     /// Its fault, if it is to have one.
     pub stall: Option<Stall>,
+    /// What of its sensors and wheels breaks, as the scenario says.
+    pub faults: Vec<Fault>,
     /// Where it leaves word of what it truly does.
     pub trace: Option<Trace>,
 }
@@ -517,6 +520,9 @@ fn simulated(
         grip_ratio: listed.grip_ratio,
         has_torque: listed.wheel_torque,
     });
+    let faults = listed
+        .map(|listed| listed.faults.clone())
+        .unwrap_or_default();
     Ok(SimulatedConfig {
         scenario,
         start,
@@ -524,6 +530,7 @@ fn simulated(
         battery_charge_ratio,
         clock_ahead_s,
         stall: flags.stall_s,
+        faults,
         trace: None,
     })
 }

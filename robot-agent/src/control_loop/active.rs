@@ -63,6 +63,8 @@ pub(crate) enum Hold {
     Base,
     /// The control loop does not keep its rate; it goes on by itself.
     Overrun,
+    /// A sensor that it drives by is wrong; it goes on by itself when it is right again.
+    Sensors,
 }
 
 /// What holds a mission now.
@@ -77,6 +79,7 @@ struct Holds {
     outside: bool,
     base: bool,
     overrun: bool,
+    sensors: bool,
 }
 
 /// The mission in hand.
@@ -174,6 +177,7 @@ impl Active {
             Hold::Outside => &mut self.holds.outside,
             Hold::Base => &mut self.holds.base,
             Hold::Overrun => &mut self.holds.overrun,
+            Hold::Sensors => &mut self.holds.sensors,
         };
         if std::mem::replace(present, is_wanted) == is_wanted {
             return;
@@ -188,7 +192,12 @@ impl Active {
     /// Whether it is held, braking or standing.
     pub(super) fn is_held(&self) -> bool {
         let holds = &self.holds;
-        holds.pause || holds.replacement || holds.outside || holds.base || holds.overrun
+        holds.pause
+            || holds.replacement
+            || holds.outside
+            || holds.base
+            || holds.overrun
+            || holds.sensors
     }
 
     /// Whether it leaves the wheels to others: it stands held, or is over but for a revision.

@@ -16,6 +16,7 @@ pub(crate) mod seam;
 pub(crate) mod segments;
 pub(crate) mod site_view;
 pub(crate) mod slip;
+pub(crate) mod standing;
 pub(crate) mod surface;
 pub(crate) mod tick;
 
@@ -85,6 +86,8 @@ pub(crate) mod hold_tests;
 mod overrun_tests;
 #[cfg(test)]
 mod prior_tests;
+#[cfg(test)]
+mod sensor_tests;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]

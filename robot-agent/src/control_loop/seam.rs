@@ -14,6 +14,7 @@ use tread_api::ids::{MissionId, PlanHash};
 use tread_api::robot::{MissionProgress, RobotMode};
 use tread_api::site::Cell;
 use tread_api::wire::ingest::MissionPhase;
+use tread_control::consistency::Findings;
 use tread_control::estimation::SegmentStatistics;
 use tread_control::follower::{FailureReason, Follower};
 use tread_control::gate::GateCause;
@@ -27,6 +28,7 @@ use super::origin::JobOrigin;
 use super::overrun::Overrun;
 use super::prior::Prior;
 use super::site_view::SiteView;
+use super::standing::StandingReport;
 use super::surface::Comparison;
 use crate::drive::Battery;
 use crate::safety::SafetyCell;
@@ -82,6 +84,7 @@ pub(crate) enum EndReason {
     AnotherInHand,
     AgentStopped,
     ServerSilent,
+    SensorFault,
 }
 
 impl EndReason {
@@ -90,9 +93,11 @@ impl EndReason {
             Self::Reached => MissionPhase::Succeeded,
             Self::Cancelled => MissionPhase::Cancelled,
             Self::TooLate => MissionPhase::Expired,
-            Self::Failed(_) | Self::AnotherInHand | Self::AgentStopped | Self::ServerSilent => {
-                MissionPhase::Failed
-            }
+            Self::Failed(_)
+            | Self::AnotherInHand
+            | Self::AgentStopped
+            | Self::ServerSilent
+            | Self::SensorFault => MissionPhase::Failed,
         }
     }
 
@@ -105,6 +110,7 @@ impl EndReason {
             Self::TooLate => Some("its latest start passed before it began"),
             Self::AnotherInHand => Some("another mission was being driven"),
             Self::AgentStopped => Some("the agent was stopped"),
+            Self::SensorFault => Some("sensors contradicted each other for too long"),
             Self::ServerSilent => Some("the server was silent for longer than the mission allows"),
         }
     }
@@ -238,6 +244,10 @@ pub(crate) struct Snapshot {
     pub dug_in_at: Option<Point>,
     /// How far the loop is from its rate, while the robot is held for it.
     pub(crate) overrun: Option<Overrun>,
+    /// Sensors that contradict each other.
+    pub(crate) findings: Findings,
+    /// Whether the robot stands, where it is to.
+    pub(crate) standing: StandingReport,
     /// How much the wheels slip along their way, while they turn.
     pub slip: Option<SideSlip>,
     /// The cell that the robot is in.
@@ -272,6 +282,8 @@ impl Default for Snapshot {
             surface_change: None,
             dug_in_at: None,
             overrun: None,
+            findings: Findings::default(),
+            standing: StandingReport::default(),
             slip: None,
             cell: None,
             terrain: None,

@@ -12,6 +12,7 @@ use tread_control::robot::RobotModel;
 
 use super::{Battery, Drive, Feedback, SensorSample};
 use crate::sim::battery::SimulatedBattery;
+use crate::sim::faults::{Fault, Faults};
 use crate::sim::ground::GroundMap;
 use crate::sim::scenario::{GroundSpec, Scenario, ScenarioError};
 use crate::sim::sensors::{SAMPLE_PERIOD, SensorSpec, Sensors};
@@ -61,6 +62,7 @@ pub struct SimulatedDrive {
     plant: Plant,
     ground: GroundMap,
     sensors: Sensors,
+    faults: Faults,
     track_width_m: f64,
     battery: SimulatedBattery,
     command: WheelSpeeds,
@@ -127,6 +129,7 @@ impl SimulatedDrive {
             plant: Plant::new(model, spec, start)?,
             ground: GroundMap::new(scenario, grip_ratio)?,
             sensors,
+            faults: Faults::default(),
             track_width_m: model.track_width_m(),
             battery: SimulatedBattery::new(1.0),
             command: WheelSpeeds::default(),
@@ -152,6 +155,13 @@ impl SimulatedDrive {
     #[must_use]
     pub fn with_stall(mut self, stall: Option<Stall>) -> Self {
         self.stall = stall;
+        self
+    }
+
+    /// The same base with these faults.
+    #[must_use]
+    pub fn with_faults(mut self, faults: Vec<Fault>) -> Self {
+        self.faults = Faults::new(faults);
         self
     }
 
@@ -194,15 +204,17 @@ impl SimulatedDrive {
             if at.saturating_sub(self.commanded_at) > COMMAND_TIMEOUT {
                 self.command = WheelSpeeds::default();
             }
+            let command = self.faults.command(at, self.command);
             let pose = self.plant.state().pose;
             let ground = self.ground.under(pose, self.track_width_m, at);
             self.plant
-                .step(self.command, &ground, SAMPLE_PERIOD.as_secs_f64());
+                .step(command, &ground, SAMPLE_PERIOD.as_secs_f64());
             let (wheels, torques) = (self.plant.state().wheel_speeds, self.plant.wheel_torques());
             let wheels_w =
                 wheels.left_rad_s * torques.left_n_m + wheels.right_rad_s * torques.right_n_m;
             self.battery.step(wheels_w, SAMPLE_PERIOD.as_secs_f64());
             let sample = self.sensors.sample(&self.plant, at);
+            let sample = self.faults.sample(sample, pose.heading_rad);
             self.waiting.push(SensorSample {
                 tilt_rad: Some(self.tilt_rad),
                 wheel_torques: sample.wheel_torques.filter(|_| self.has_torque),

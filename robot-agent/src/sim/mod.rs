@@ -5,6 +5,7 @@
 //! robots of one process go through a time of their own.
 
 pub mod battery;
+pub mod faults;
 pub mod ground;
 pub mod scenario;
 pub mod sensors;

@@ -13,6 +13,8 @@ use tread_api::terrain::{TERRAINS_MAX, TerrainClass};
 use tread_api::trajectory::Trajectory;
 use tread_control::friction::{FrictionCurve, FrictionSpec};
 
+use super::faults::{FAULTS_MAX, Fault};
+
 /// The scenario that comes with the agent.
 pub const BUILT_IN: &str = include_str!("../../scenarios/yard.toml");
 /// What [`BUILT_IN`] is called in error messages and on the command line.
@@ -219,6 +221,9 @@ pub struct ScenarioRobot {
     /// Whether its base measures wheel torque.
     #[serde(default = "default_wheel_torque")]
     pub wheel_torque: bool,
+    /// What breaks on it, at most [`FAULTS_MAX`].
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub faults: Vec<Fault>,
 }
 
 fn default_grip_ratio() -> f64 {
@@ -346,6 +351,12 @@ impl Scenario {
                     robot.grip_ratio
                 )));
             }
+            if robot.faults.len() > FAULTS_MAX {
+                return Err(refused(format!("faults: there are more than {FAULTS_MAX}")));
+            }
+            for fault in &robot.faults {
+                fault.check().map_err(refused)?;
+            }
             if !robots.insert(&robot.id) {
                 return Err(refused(format!("id: `{}` is there twice", robot.id)));
             }
@@ -451,6 +462,18 @@ speed_m_s = 0.5
                 "seed = 1\ngrip_ratio = nan",
                 "line 11",
                 "grip_ratio",
+            ),
+            (
+                "seed = 1",
+                "seed = 1\nfaults = [{ after_s = 9.0, until_s = 3.0, kind = \"ignores_commands\" }]",
+                "line 11",
+                "until_s",
+            ),
+            (
+                "seed = 1",
+                "seed = 1\nfaults = [{ after_s = 9.0, kind = \"scaled\", channel = \"gyro\", factor = nan }]",
+                "line 11",
+                "factor",
             ),
             (
                 "stiffness = 8.0",

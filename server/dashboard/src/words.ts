@@ -8,6 +8,7 @@ import type {
   PauseCause,
   RobotMode,
   Role,
+  StandingState,
   TerrainClass,
 } from './api/schema';
 
@@ -76,6 +77,7 @@ const gate: Record<GateCause, string> = {
   link_policy: 'server not heard',
   external_hold: 'held from outside',
   loop_overrun: 'control loop is late',
+  sensor_fault: 'sensors contradict each other',
   stale_position: 'position is old',
   tilt: 'leans too much',
   stale_feedback: 'base is silent',
@@ -105,6 +107,14 @@ const terrainClass: Record<TerrainClass, string> = {
 };
 const role: Record<Role, string> = { viewer: 'viewer', operator: 'operator', admin: 'admin' };
 
+const standing: Record<StandingState, string> = {
+  stopping: 'stopping',
+  standing: 'stopped, stands',
+  does_not_stand: 'DOES NOT STAND',
+  moves: 'MOVES WHILE STOPPED',
+  other: 'stopped',
+};
+
 export const words = {
   name: 'Tread',
   problem: {
@@ -121,6 +131,7 @@ export const words = {
     as: (name: string, what: string) => `${name}, ${what}`,
   },
   role,
+  standing,
   limitNames: limit,
   header: {
     site: 'Site',
@@ -130,6 +141,7 @@ export const words = {
     lost: 'server lost',
     lostSince: (time: string) =>
       `The server has not answered since ${time}. What is shown is old and stays; connecting again …`,
+    runs: (robots: string) => `DOES NOT STAND: ${robots}`,
     noSite: 'There is no site yet: an admin makes one with `tread sites create`.',
     panel: 'Fleet',
   },
@@ -145,7 +157,10 @@ export const words = {
     failed: (robot: string) =>
       `${robot} may not have been told to stop: the server does not answer. Use the switch on the robot.`,
     refused: (robot: string, why: string) => `${robot} was not stopped. ${why}`,
-    confirmed: (robot: string) => `${robot} is stopped`,
+    stopping: (robot: string) => `${robot} is stopping: its wheels are commanded to rest`,
+    confirmed: (robot: string) => `${robot} is stopped and stands`,
+    runs: (robot: string) => `${robot} is stopped and DOES NOT STAND. Use the switch on the robot.`,
+    moves: (robot: string) => `${robot} is stopped and MOVES though it stood: it is pushed, rolls, or is driven.`,
     by: (name: string) => `by ${name}`,
     clear: (robot: string) => `Clear ${robot}`,
     everyRobot: 'the robots',

@@ -4,6 +4,7 @@
 //! asked ─┬─► every robot at once ─► confirmed ──────────────┐
 //!        └─► the database, beside ─► not confirmed in 300 ms: shown, an alert, ─► sent again
 //!                                    by the reconciler until the robot confirms, over restarts
+//! the robot's state ─► standing, measured: noted by the reconciler
 //! clear ──► the database ─► the robot ─► cleared, or refused: a newer stop, or it still moves
 //! ```
 //!
@@ -25,6 +26,7 @@ use tread_api::ids::{RobotId, SiteId, StopId};
 use tread_api::keys::Verb;
 use tread_api::page::Page;
 use tread_api::robot::Severity;
+use tread_api::safety::StandingState;
 use tread_api::stop::{FleetStop, STOP_CONFIRM_MAX_MS, STOP_TEXT_MAX, Stop};
 use tread_api::wire::command::Outcome;
 use tread_api::wire::safety::ClearStop;
@@ -137,6 +139,7 @@ impl App {
             reason: reason.clone(),
             wanted_at,
             confirmed_at: None,
+            standing_at: None,
             unconfirmed: false,
             clear_asked_by: None,
             clear_asked_at: None,
@@ -283,6 +286,7 @@ impl App {
             reason: words(Some(latch.reason), "the robot did not say why"),
             wanted_at: now,
             confirmed_at: Some(now),
+            standing_at: None,
             unconfirmed: false,
             clear_asked_by: None,
             clear_asked_at: None,
@@ -364,7 +368,7 @@ impl App {
     pub(super) async fn tend_stops(&self) -> Result<Vec<Stop>, AppError> {
         let stops = self.stops_in_force().await?;
         let now = self.clock().now();
-        let (mut lost, mut cleared) = (Vec::new(), Vec::new());
+        let (mut lost, mut cleared, mut standing) = (Vec::new(), Vec::new(), Vec::new());
         let mut known: HashSet<StopId> = HashSet::new();
         let mut again = Vec::new();
         for stop in stops {
@@ -375,6 +379,14 @@ impl App {
             let shows_none = presence
                 .state()
                 .is_some_and(|state| state.safety.stop.is_none());
+            let stands = presence.state().is_some_and(|state| {
+                let is_this = state.safety.stop.as_ref().map(|latch| latch.id) == Some(stop.id);
+                let standing = state.safety.standing.map(|standing| standing.state);
+                is_this && standing == Some(StandingState::Standing)
+            });
+            if stands && stop.standing_at.is_none() {
+                standing.push(stop.id);
+            }
             let since = stop.clear_asked_at.or(stop.confirmed_at);
             let is_later = presence
                 .state_age(self.clock().elapsed())
@@ -395,7 +407,7 @@ impl App {
             .filter(|(_, id)| !known.contains(id))
             .map(|(key, _)| key)
             .collect();
-        if lost.is_empty() && cleared.is_empty() && new.is_empty() {
+        if lost.is_empty() && cleared.is_empty() && standing.is_empty() && new.is_empty() {
             return Ok(again);
         }
         let mut tx = self.db().write().await?;
@@ -405,6 +417,9 @@ impl App {
             self.counters().stops_lost.one();
             db::stops::unconfirm(&mut tx, stop.id).await?;
             again.push(stop);
+        }
+        for id in standing {
+            db::stops::stand(&mut tx, id, now).await?;
         }
         for id in cleared {
             db::stops::clear(&mut tx, id, now).await?;

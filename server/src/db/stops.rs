@@ -15,6 +15,7 @@ struct Raw {
     reason: String,
     wanted_at_us: i64,
     confirmed_at_us: Option<i64>,
+    standing_at_us: Option<i64>,
     clear_asked_by: Option<String>,
     clear_asked_at_us: Option<i64>,
     cleared_at_us: Option<i64>,
@@ -32,6 +33,7 @@ impl TryFrom<Raw> for Stop {
             reason: raw.reason,
             wanted_at: from_us(raw.wanted_at_us)?,
             confirmed_at: raw.confirmed_at_us.map(from_us).transpose()?,
+            standing_at: raw.standing_at_us.map(from_us).transpose()?,
             // Whoever shows it knows the time.
             unconfirmed: false,
             clear_asked_by: raw.clear_asked_by,
@@ -46,7 +48,7 @@ macro_rules! stops {
         sqlx::query_as!(
             Raw,
             r#"SELECT stops.id, sites.id AS site, robots.id AS robot, stops.stopped_by,
-                   stops.reason, stops.wanted_at_us, stops.confirmed_at_us,
+                   stops.reason, stops.wanted_at_us, stops.confirmed_at_us, stops.standing_at_us,
                    stops.clear_asked_by, stops.clear_asked_at_us, stops.cleared_at_us
                FROM stops
                JOIN robots ON robots.pk = stops.robot_pk
@@ -186,12 +188,25 @@ pub async fn confirm(
     Ok(())
 }
 
+/// Notes that a robot was measured to stand; the first time counts.
+pub async fn stand(db: &mut SqliteConnection, id: StopId, at: Timestamp) -> Result<(), DbError> {
+    let (id, at_us) = (id.to_string(), to_us(at));
+    sqlx::query!(
+        "UPDATE stops SET standing_at_us = COALESCE(standing_at_us, ?) WHERE id = ?",
+        at_us,
+        id,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
 /// Takes a confirmation back: the robot shows that the stop is not in force, and nobody asked to
 /// clear it.
 pub async fn unconfirm(db: &mut SqliteConnection, id: StopId) -> Result<(), DbError> {
     let id = id.to_string();
     sqlx::query!(
-        "UPDATE stops SET confirmed_at_us = NULL
+        "UPDATE stops SET confirmed_at_us = NULL, standing_at_us = NULL
          WHERE id = ? AND clear_asked_at_us IS NULL AND cleared_at_us IS NULL",
         id
     )

@@ -12,6 +12,7 @@ use jiff::Timestamp;
 use tread_api::friction::LiveFriction;
 use tread_api::ids::{BootId, MissionId, RobotId, SiteId, StopId};
 use tread_api::robot::{Aged, LinkCause, LinkState, RobotLive};
+use tread_api::safety::StandingState;
 use tread_api::wire::state::{FrictionReport, RobotState};
 
 pub use self::looks::Held;
@@ -317,6 +318,7 @@ impl Presences {
             before.mode != state.mode
                 || content(before) != content(&state)
                 || stop_of(before) != stop_of(&state)
+                || standing_of(before) != standing_of(&state)
                 || lease_of(before) != lease_of(&state)
                 || before.safety.fence_revision != state.safety.fence_revision
                 || before.terrain_revision != state.terrain_revision
@@ -377,6 +379,10 @@ fn monotonic_offset_us(state: &RobotState, now: Duration) -> Option<i64> {
     let robot_us = i64::try_from(state.monotonic_us?).ok()?;
     let now_us = i64::try_from(now.as_micros()).ok()?;
     Some(robot_us - now_us)
+}
+
+fn standing_of(state: &RobotState) -> Option<StandingState> {
+    state.safety.standing.map(|standing| standing.state)
 }
 
 fn stop_of(state: &RobotState) -> Option<StopId> {

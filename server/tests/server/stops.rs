@@ -10,7 +10,8 @@ use tokio::time::Instant;
 use tread_api::keys::Verb;
 use tread_api::mission::{Mission, MissionState};
 use tread_api::page::Page;
-use tread_api::robot::{Alert, MissionProgress, PauseCause};
+use tread_api::robot::{Alert, AlertReport, MissionProgress, PauseCause, Severity};
+use tread_api::safety::{StandingState, StandingStatus};
 use tread_api::stop::{FleetStop, Stop};
 use tread_api::wire::ingest::{MissionPhase, Record, RecordContent};
 
@@ -117,6 +118,47 @@ async fn a_stop_is_confirmed_shown_and_cleared_and_nothing_goes_on_by_itself() {
     let (status, body) = yard.post(&resume, &Value::Null).await;
     assert_eq!(status, StatusCode::ACCEPTED, "{body}");
     yard.mission_becomes(waiting.id, MissionState::Active).await;
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_says_when_it_was_commanded_and_when_the_robot_stood() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let stop = yard.stop_robot(&Value::Null).await;
+    assert!(stop.confirmed_at.is_some() && stop.standing_at.is_none());
+    let stands = |state, took_ms| Some(StandingStatus { state, took_ms });
+    robot.say(|said| {
+        said.safety.standing = stands(StandingState::DoesNotStand, None);
+        said.alerts = vec![AlertReport {
+            code: "does-not-stand".parse().unwrap(),
+            severity: Severity::Critical,
+            text: "0.59 m/s".to_owned(),
+        }];
+    });
+    eventually("the alert is raised", async || {
+        let raised = yard.raised().await;
+        let is_raised = raised.iter().any(|code| code == "does-not-stand");
+        if is_raised { Ok(()) } else { Err(raised) }
+    })
+    .await;
+    let shown: Page<Stop> = yard.get("/v1/stops").await;
+    assert_eq!(shown.items[0].standing_at, None, "it was only commanded");
+    robot.say(|said| {
+        said.safety.standing = stands(StandingState::Standing, Some(4_200));
+        said.alerts.clear();
+    });
+    let stood = yard
+        .stop_becomes("the robot stands", |stop| stop.standing_at.is_some())
+        .await;
+    assert!(stood.standing_at >= stood.confirmed_at, "{stood:?}");
+    // The first time counts: it may be pushed afterwards.
+    robot.say(|said| said.safety.standing = stands(StandingState::Moves, None));
+    robot.say(|said| said.safety.standing = stands(StandingState::Standing, Some(4_200)));
+    let again = yard
+        .stop_becomes("it is the same stop", |stop| stop.id == stood.id)
+        .await;
+    assert_eq!(again.standing_at, stood.standing_at);
     yard.server.stop().await.unwrap();
 }
 

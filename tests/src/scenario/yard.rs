@@ -198,6 +198,7 @@ pub fn put(
             seed: random.next_u64() >> 12,
             grip_ratio: (1.0 + bias).recip(),
             wheel_torque: row.has_torque,
+            faults: Vec::new(),
         });
         entries.push(Entry {
             robot,

@@ -36,6 +36,7 @@ stiffness = 2.5
             seed,
             grip_ratio,
             wheel_torque: true,
+            faults: Vec::new(),
         });
     }
     scenario

@@ -7,7 +7,8 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Borders, Paragraph, Row, Table, TableState, Wrap};
 use tread_api::ids::SiteId;
 use tread_api::mission::{Mission, MissionState};
-use tread_api::robot::{LinkState, MissionProgress, Robot, RobotMode, Severity};
+use tread_api::robot::{LinkState, MissionProgress, Robot, RobotLive, RobotMode, Severity};
+use tread_api::safety::StandingState;
 
 use super::known::Known;
 use super::screen::{Order, Section, Shown};
@@ -157,13 +158,33 @@ fn bar(progress: Option<MissionProgress>) -> String {
 fn robot_style(robot: &Robot) -> Style {
     let live = robot.live.as_ref();
     let is_down = live.is_some_and(|live| {
-        live.safety.stop.is_some() || matches!(live.mode, RobotMode::Fault | RobotMode::Stopped)
+        let standing = live.safety.standing.map(|standing| standing.state);
+        let runs = matches!(
+            standing,
+            Some(StandingState::DoesNotStand | StandingState::Moves)
+        );
+        runs || live.safety.stop.is_some()
+            || matches!(live.mode, RobotMode::Fault | RobotMode::Stopped)
     });
     match (is_down, robot.link) {
         (true, _) => bold(Color::Red),
         (false, LinkState::Offline) => Style::new().fg(Color::Red),
         (false, LinkState::Stale) => Style::new().fg(Color::Yellow),
         (false, LinkState::Online) => Style::new(),
+    }
+}
+
+/// What it does: `stopped` once it stands, and in any case that it does not though it should.
+fn mode_and_standing(live: &RobotLive) -> String {
+    let mode = mode_name(live.mode);
+    let standing = live.safety.standing.map(|standing| standing.state);
+    match standing {
+        Some(StandingState::DoesNotStand) => "DOES NOT STAND".to_owned(),
+        Some(StandingState::Moves) => "MOVES".to_owned(),
+        Some(StandingState::Stopping) if live.mode == RobotMode::Stopped => "stopping".to_owned(),
+        Some(StandingState::Stopping | StandingState::Standing | StandingState::Other) | None => {
+            mode.to_owned()
+        }
     }
 }
 
@@ -176,7 +197,7 @@ fn robot_row(robot: &Robot, is_wide: bool) -> Row<'static> {
     let mut cells = vec![
         robot.id.to_string(),
         link_name(robot.link).to_owned(),
-        or_dash(live.map(|live| mode_name(live.mode))),
+        or_dash(live.map(mode_and_standing)),
         bar(mission),
         or_dash(twist.map(|twist| fixed(twist.value.linear_m_s, 2))),
         or_dash(off),
@@ -221,7 +242,7 @@ fn draw_robots(frame: &mut Frame<'_>, area: Rect, picture: &Picture<'_>) {
     let mut widths = vec![
         Constraint::Length(u16::try_from(longest).unwrap_or_default()),
         Constraint::Length(7),
-        Constraint::Length(12),
+        Constraint::Length(14),
         Constraint::Length(16),
         Constraint::Length(5),
         Constraint::Length(6),

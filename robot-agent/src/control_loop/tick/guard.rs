@@ -12,6 +12,7 @@ use tread_control::gate::{GateCause, GateInput, GateOutput, Reasons, gate_with};
 use tread_control::geometry::Twist;
 use tread_control::measured::WheelSpeeds;
 
+use super::sensors::sensors_max_m_s;
 use super::{LoopCore, STANDING, age_s};
 use crate::control_loop::BRAKING_MAX;
 use crate::control_loop::active::{Active, Hold};
@@ -113,6 +114,8 @@ impl LoopCore {
         let is_held = limits.holds(guard.now_us) || most_m_s.is_some_and(|most| most < STANDING);
         active.hold(Hold::Outside, is_held);
         active.hold(Hold::Overrun, is_loop_late);
+        let sensors = sensors_max_m_s(&self.findings);
+        let most_m_s = most_m_s.into_iter().chain(sensors).reduce(f64::min);
         active.limit_speed(most_m_s);
     }
 
@@ -178,7 +181,9 @@ impl LoopCore {
     /// A mission needs a position. By hand the driver sees where the robot is: it goes slowly, and
     /// within a fence only if its configuration says so.
     fn blindness(&self, fault: Option<Fault>, wanted: &Wanted) -> (bool, Option<f64>) {
-        let is_lost = fault == Some(Fault::PositionLost) || self.localisation.pose().is_none();
+        let is_lost = fault == Some(Fault::PositionLost)
+            || self.localisation.pose().is_none()
+            || self.is_position_doubted();
         if !is_lost {
             return (false, None);
         }
@@ -217,6 +222,7 @@ impl LoopCore {
             tilt_rad: self.tilt_rad,
             is_position_lost,
             is_loop_late: self.overrun().is_some(),
+            is_sensor_wrong: self.must_hold() && !wanted.is_by_hand,
             is_held_outside: guard.view.limits.holds(guard.now_us),
             is_link_silent: self.is_long_silent(),
             is_driver_silent: wanted.is_driver_silent,
@@ -225,6 +231,7 @@ impl LoopCore {
             command_age_max_m_s: (wanted.is_by_hand && share < 1.0)
                 .then_some(share * linear_max_m_s),
             blind_max_m_s,
+            sensors_max_m_s: sensors_max_m_s(&self.findings),
             real_m_s: Some(self.real_m_s(now)),
         }
     }

@@ -1,20 +1,23 @@
 //! One tick of the control loop: read → localise → estimate → track → gate → write.
 //!
 //! Pure but for the drive and the channels' ends; nothing here waits, allocates or looks at a
-//! clock but the one that it is handed. What has to be freed goes out with an event, to be freed by somebody else. [`sensing`] is
-//! what comes from the base, [`orders`] what comes from the rest of the agent, [`guard`] what may only
+//! clock but the one that it is handed. What has to be freed goes out with an event, to be freed by
+//! somebody else. [`sensing`] is what comes from the base, [`sensors`] whether it can be true,
+//! [`orders`] what comes from the rest of the agent, [`guard`] what may only
 //! slow the robot down, [`snapshot`] what goes out, [`noting`] what a record holds of a tick.
 
 mod guard;
 mod noting;
 mod orders;
 mod sensing;
+mod sensors;
 mod snapshot;
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use tread_control::consistency::{Findings, Monitor};
 use tread_control::estimation::{Estimate, Estimator, SensorNoise};
 use tread_control::gate::GateLimits;
 use tread_control::localisation::{Localisation, LocalisationNoise};
@@ -30,6 +33,7 @@ use super::seam::{EndReason, LoopEnds, Shared};
 use super::segments::{Moment, SegmentCutter};
 use super::site_view::{Footing, SiteView};
 use super::slip::SlipMeter;
+use super::standing::{Motion, StandingWatch};
 use super::surface::SurfaceWatch;
 use crate::drive::{Drive, SILENT_AFTER_MAX, StatedNoise};
 use crate::recording::frame::NoteTaker;
@@ -87,6 +91,14 @@ pub(crate) struct LoopCore {
     progress: ProgressWatch,
     /// How much they slip.
     slip: SlipMeter,
+    /// Whether the sensors agree, and what was found.
+    monitor: Monitor,
+    findings: Findings,
+    /// Since when they hold the mission.
+    sensors_hold_since: Option<Duration>,
+    /// Whether the robot stands where it is to, and what was measured for that.
+    standing: StandingWatch,
+    motion: Motion,
     /// Until when the mission is held for its next revision.
     replacement_until: Option<Duration>,
     ticks: u64,
@@ -132,6 +144,11 @@ impl LoopCore {
             surface: SurfaceWatch::default(),
             progress: ProgressWatch::default(),
             slip: SlipMeter::default(),
+            monitor: Monitor::new(model),
+            findings: Findings::default(),
+            sensors_hold_since: None,
+            standing: StandingWatch::default(),
+            motion: Motion::default(),
             replacement_until: None,
             ticks: 0,
             closed: None,
@@ -209,6 +226,7 @@ impl LoopCore {
         self.mind_bounds(now.monotonic);
         let fault = self.fault(now.monotonic);
         self.hold_for_base(now.monotonic, fault);
+        self.hold_for_sensors(now);
         let by_mission = self.follow(now, fault, dt_s);
         let judged = clock().max(now.monotonic);
         self.guard.judge(judged);
@@ -217,6 +235,7 @@ impl LoopCore {
         self.command = gated.wheel_speeds;
         drive.write(self.command);
         self.note_written();
+        self.look_at_standing(now.monotonic, &gated);
         self.record(dt_s, ground_changed, gated.cause);
         if stop {
             self.end_mission(now, EndReason::AgentStopped);

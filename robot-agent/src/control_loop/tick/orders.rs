@@ -193,7 +193,10 @@ impl LoopCore {
         let speed_m_s = self.localisation.twist().linear_m_s.abs();
         let measured = self.estimate.theta;
         // While something cuts the command, errors say nothing on the ground.
-        active.hold_adaptation(gate.is_some_and(|cause| cause > GateCause::Acceleration));
+        let may_learn = self.findings.consequence().is_none();
+        active.hold_adaptation(
+            !may_learn || gate.is_some_and(|cause| cause > GateCause::Acceleration),
+        );
         active.record(TickRecord {
             dt_s,
             at: self.localisation.pose().map(Pose::point),

@@ -24,7 +24,7 @@ const HEARD_AGAIN_FOR: Duration = Duration::from_millis(500);
 /// Range within which a base's own word on its noise is believed, as a multiple of the default.
 const NOISE_RANGE: std::ops::RangeInclusive<f64> = 0.1..=30.0;
 /// Oldest word of a sensor of the robot's own speed that says how fast it is now.
-const BODY_SPEED_AGE_MAX: Duration = Duration::from_millis(150);
+pub(super) const BODY_SPEED_AGE_MAX: Duration = Duration::from_millis(150);
 /// Oldest position fix with which the position does not count as lost.
 const POSITION_LOST_AFTER: Duration = Duration::from_secs(3);
 
@@ -38,7 +38,9 @@ impl LoopCore {
             .shared
             .lost_samples
             .fetch_add(lost, Ordering::Relaxed);
+        self.motion.fix = None;
         for sample in feedback.samples() {
+            self.check_sensors(sample);
             if sample.tilt_rad.is_some() {
                 self.tilt_rad = sample.tilt_rad;
             }
@@ -63,7 +65,7 @@ impl LoopCore {
                     self.progress.note_wheels(ahead * dt_s);
                     self.localisation.predict(gyro_rad_s, wheel_speeds, dt_s);
                     // With wheels on two grounds there is no one θ to learn.
-                    if self.footing != Some(Footing::Mixed) {
+                    if self.footing != Some(Footing::Mixed) && self.may_learn() {
                         let taken = SensorSample {
                             wheel_speeds,
                             gyro_rad_s,
@@ -126,7 +128,7 @@ impl LoopCore {
     pub(super) fn real_m_s(&self, now: Duration) -> f64 {
         let is_new = |at: Duration| now.saturating_sub(at) <= BODY_SPEED_AGE_MAX;
         match self.body_speed {
-            Some((speed_m_s, at)) if is_new(at) => speed_m_s,
+            Some((speed_m_s, at)) if is_new(at) && self.is_odometry_right() => speed_m_s,
             Some(_) | None => self.localisation.twist().linear_m_s,
         }
     }

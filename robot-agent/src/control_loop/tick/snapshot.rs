@@ -91,6 +91,8 @@ impl LoopCore {
             surface_change: self.surface.raised(),
             dug_in_at: self.progress.dug_in_at(),
             overrun: self.overrun(),
+            findings: self.findings,
+            standing: self.standing.report(),
             slip: self.slip.slip(),
             cell: self.cutter.cell(),
             terrain,

@@ -4,6 +4,7 @@ import type { Alert, Geofence, Mission, MissionStep, Robot, Site, Terrain, Terra
 import { ask, list, sentence } from '../api/client';
 import { Stream, type Listener } from '../api/stream';
 import { signedIn } from './session.svelte';
+import { doing } from '../standing';
 import { words } from '../words';
 import { Stops } from './stops.svelte';
 import { Tracked } from './tracked';
@@ -83,6 +84,11 @@ export class Fleet implements Listener {
     if (robot.link === 'offline') return { text: words.link.offline, look: 'bad' };
     if (this.lostAt !== null) return { text: words.robots.lastKnown, look: 'warn' };
     return { text: words.link[robot.link], look: robot.link === 'online' ? 'good' : 'warn' };
+  }
+
+  /** Robots of the site that are to stand and move. */
+  get runaways(): Robot[] {
+    return this.robots.map((entry) => entry.robot).filter((robot) => doing(robot.live).isBad);
   }
 
   async start(): Promise<void> {

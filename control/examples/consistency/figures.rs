@@ -1,0 +1,525 @@
+//! Trials with each fault, and hours without one.
+
+use tread_control::consistency::{Kind, Subject};
+
+use crate::generator::{Fault, Kit, Robot, STEP_S};
+
+const USAGE: &str = "consistency [--json] [--hours N] [--trials N]";
+/// Most hours and trials.
+const HOURS_MAX: u32 = 1_000;
+const TRIALS_MAX: u32 = 10_000;
+/// Longest excited time that a trial waits for, seconds.
+const EXCITED_MAX_S: f64 = 15.0;
+/// Longest trial, seconds.
+const TRIAL_MAX_S: f64 = 120.0;
+/// Goals of most faults: time of exciting motion until something is said, in half of the trials, and
+/// until the fault is named, in most of them, seconds; and the share of trials in which it is.
+const USUAL: Goals = Goals {
+    noticed_p50_s: 1.0,
+    named_p95_s: 3.0,
+    named_share_min: 0.99,
+};
+/// The same of wheels on a robot without odometry: slip is one explanation for a while.
+const WHEELS_ALONE: Goals = Goals {
+    noticed_p50_s: 1.5,
+    named_p95_s: 5.0,
+    named_share_min: 0.98,
+};
+/// The same where noise of 2 cm at 10 Hz hides a third of the speed for a while, and slip is allowed
+/// as much.
+const HIDDEN: Goals = Goals {
+    noticed_p50_s: 4.0,
+    named_p95_s: 15.0,
+    named_share_min: 0.9,
+};
+
+/// What was asked for.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Options {
+    pub(crate) json: bool,
+    pub(crate) hours: u32,
+    pub(crate) trials: u32,
+}
+
+impl Options {
+    /// Reads the arguments; an error is a sentence for people.
+    pub(crate) fn from_arguments(
+        mut arguments: impl Iterator<Item = String>,
+    ) -> Result<Self, &'static str> {
+        let mut options = Self {
+            json: false,
+            hours: 10,
+            trials: 100,
+        };
+        while let Some(argument) = arguments.next() {
+            let mut value = |most: u32| {
+                let value = arguments.next().and_then(|value| value.parse().ok());
+                value
+                    .filter(|value| (1..=most).contains(value))
+                    .ok_or(USAGE)
+            };
+            match argument.as_str() {
+                "--json" => options.json = true,
+                "--hours" => options.hours = value(HOURS_MAX)?,
+                "--trials" => options.trials = value(TRIALS_MAX)?,
+                _ => return Err(USAGE),
+            }
+        }
+        Ok(options)
+    }
+}
+
+/// One figure that must be reached.
+#[derive(Debug, Clone)]
+pub(crate) struct Check {
+    pub(crate) name: String,
+    pub(crate) goal: String,
+    pub(crate) value: f64,
+    pub(crate) holds: bool,
+}
+
+impl Check {
+    fn at_most(name: String, value: f64, most: f64) -> Self {
+        Self {
+            name,
+            goal: format!("≤ {most}"),
+            value,
+            holds: value <= most,
+        }
+    }
+}
+
+/// Largest share of trials in which another channel is blamed.
+const BLAMED_SHARE_MAX: f64 = 0.01;
+
+/// What must be reached.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Goals {
+    pub(crate) noticed_p50_s: f64,
+    pub(crate) named_p95_s: f64,
+    pub(crate) named_share_min: f64,
+}
+
+/// A fault, what it must be called, and whether its robot has odometry over ground.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Case {
+    pub(crate) name: &'static str,
+    pub(crate) fault: Fault,
+    /// Any of these is right.
+    pub(crate) subjects: &'static [Subject],
+    pub(crate) kind: Option<Kind>,
+    pub(crate) has_odometry: bool,
+    pub(crate) goals: Goals,
+}
+
+const fn case(
+    name: &'static str,
+    fault: Fault,
+    subjects: &'static [Subject],
+    kind: Option<Kind>,
+    has_odometry: bool,
+    goals: Goals,
+) -> Case {
+    Case {
+        name,
+        fault,
+        subjects,
+        kind,
+        has_odometry,
+        goals,
+    }
+}
+
+const GYRO: &[Subject] = &[Subject::Gyro];
+const WHEELS: &[Subject] = &[Subject::Wheels];
+const ODOMETRY: &[Subject] = &[Subject::Odometry];
+const POSITION: &[Subject] = &[Subject::Position];
+const FELT: &[Subject] = &[Subject::Accelerometer];
+
+/// Every fault that is tried.
+pub(crate) const CASES: &[Case] = &[
+    case(
+        "gyro frozen",
+        Fault::GyroFrozen,
+        GYRO,
+        Some(Kind::Frozen),
+        false,
+        USUAL,
+    ),
+    case(
+        "gyro inverted",
+        Fault::GyroInverted,
+        GYRO,
+        None,
+        false,
+        USUAL,
+    ),
+    case(
+        "gyro scaled by 1.5",
+        Fault::GyroScaled(1.5),
+        GYRO,
+        None,
+        false,
+        USUAL,
+    ),
+    case(
+        "gyro scaled by 1/1.5",
+        Fault::GyroScaled(1.0 / 1.5),
+        GYRO,
+        None,
+        false,
+        USUAL,
+    ),
+    case(
+        "gyro biased by 0.2 rad/s",
+        Fault::GyroBiased(0.2),
+        GYRO,
+        None,
+        false,
+        USUAL,
+    ),
+    case(
+        "gyro at its limit",
+        Fault::GyroAtLimit,
+        GYRO,
+        None,
+        true,
+        USUAL,
+    ),
+    case(
+        "wheel speeds frozen",
+        Fault::WheelsFrozen,
+        WHEELS,
+        Some(Kind::Frozen),
+        false,
+        WHEELS_ALONE,
+    ),
+    case(
+        "wheel speeds scaled by 1.5",
+        Fault::WheelsScaled(1.5),
+        WHEELS,
+        None,
+        false,
+        HIDDEN,
+    ),
+    case(
+        "wheel speeds scaled by 1/1.5",
+        Fault::WheelsScaled(1.0 / 1.5),
+        WHEELS,
+        None,
+        true,
+        HIDDEN,
+    ),
+    case(
+        "left encoder dead",
+        Fault::LeftEncoderDead,
+        WHEELS,
+        None,
+        false,
+        WHEELS_ALONE,
+    ),
+    case(
+        "left wheels locked",
+        Fault::LeftWheelsLocked,
+        &[Subject::LeftWheels],
+        Some(Kind::Locked),
+        false,
+        USUAL,
+    ),
+    case(
+        "odometry speed frozen",
+        Fault::OdometryFrozen,
+        ODOMETRY,
+        Some(Kind::Frozen),
+        true,
+        USUAL,
+    ),
+    case(
+        "odometry speed scaled by 1.5",
+        Fault::OdometryScaled(1.5),
+        ODOMETRY,
+        None,
+        true,
+        USUAL,
+    ),
+    case(
+        "odometry twist in the world frame",
+        Fault::OdometryInWorldFrame,
+        ODOMETRY,
+        None,
+        true,
+        USUAL,
+    ),
+    case(
+        "position frozen",
+        Fault::PositionFrozen,
+        POSITION,
+        Some(Kind::Frozen),
+        false,
+        USUAL,
+    ),
+    case(
+        "position jumps by 5 m",
+        Fault::PositionJumps,
+        POSITION,
+        Some(Kind::Jumped),
+        false,
+        USUAL,
+    ),
+    case(
+        "position rotated by 90°",
+        Fault::PositionRotated,
+        POSITION,
+        Some(Kind::Jumped),
+        false,
+        USUAL,
+    ),
+    case(
+        "position scaled by 1.5, with odometry",
+        Fault::PositionScaled(1.5),
+        POSITION,
+        None,
+        true,
+        HIDDEN,
+    ),
+    case(
+        "accelerometer frozen",
+        Fault::AccelerometerFrozen,
+        FELT,
+        Some(Kind::Frozen),
+        false,
+        USUAL,
+    ),
+    case(
+        "accelerometer inverted",
+        Fault::AccelerometerInverted,
+        FELT,
+        None,
+        false,
+        HIDDEN,
+    ),
+    case(
+        "accelerometer at its limit",
+        Fault::AccelerometerAtLimit,
+        FELT,
+        None,
+        false,
+        USUAL,
+    ),
+    case(
+        "all of one odometry frozen",
+        Fault::EverythingFrozen,
+        &[Subject::Position, Subject::Wheels],
+        Some(Kind::Frozen),
+        false,
+        USUAL,
+    ),
+    case(
+        "encoders of the base's own loop scaled by 1.5",
+        Fault::EncodersOfTheBaseScaled(1.5),
+        &[Subject::WheelsAndMotion],
+        None,
+        false,
+        HIDDEN,
+    ),
+];
+
+/// How one trial went.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Trial {
+    /// Exciting motion until anything was said, seconds.
+    pub(crate) noticed_s: Option<f64>,
+    /// Exciting motion until the right name, seconds; none if it was not named.
+    pub(crate) named_s: Option<f64>,
+    /// The first channel that was wrongly blamed.
+    pub(crate) wrong: Option<Subject>,
+}
+
+/// Breaks a robot while it drives and waits for the name of it.
+pub(crate) fn trial(case: &Case, seed: u64) -> Trial {
+    let mut robot = Robot::new(
+        seed,
+        Kit {
+            has_odometry: case.has_odometry,
+            has_accelerometer: true,
+            meets_ice: false,
+        },
+    );
+    let warm_s = 5.0 + 15.0 * robot.chance();
+    while robot.time_s() < warm_s {
+        robot.step();
+    }
+    robot.break_with(case.fault);
+    let (mut excited_s, mut noticed_s, mut wrong) = (0.0, None, None);
+    while excited_s < EXCITED_MAX_S && robot.time_s() < warm_s + TRIAL_MAX_S {
+        robot.step();
+        if robot.is_excited() {
+            excited_s += STEP_S;
+        }
+        for found in robot.monitor.findings().iter() {
+            noticed_s = noticed_s.or(Some(excited_s));
+            if case.subjects.contains(&found.subject) {
+                let is_right = case.kind.is_none_or(|kind| kind == found.kind);
+                return Trial {
+                    noticed_s,
+                    named_s: Some(excited_s).filter(|_| is_right),
+                    wrong,
+                };
+            }
+            // Saying that two of them disagree blames nobody.
+            let blames = !matches!(found.subject, Subject::WheelsAndMotion | Subject::Motion);
+            if blames {
+                wrong = wrong.or(Some(found.subject));
+            }
+        }
+    }
+    Trial {
+        noticed_s,
+        named_s: None,
+        wrong,
+    }
+}
+
+/// What was found in hours without a fault.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Quiet {
+    /// Channels that were blamed.
+    pub(crate) blamed: u32,
+    /// Wheels and motion that were said to disagree off the ice.
+    pub(crate) slip_off_ice: u32,
+    /// The same on the ice.
+    pub(crate) slip_on_ice: u32,
+}
+
+/// Drives without a fault.
+pub(crate) fn quiet(seconds: f64, seed: u64, kit: Kit) -> Quiet {
+    let mut robot = Robot::new(seed, kit);
+    let mut quiet = Quiet::default();
+    let mut standing = [false; Subject::ALL.len()];
+    while robot.time_s() < seconds {
+        robot.step();
+        let findings = robot.monitor.findings();
+        for subject in Subject::ALL {
+            let found = findings.about(subject);
+            let was = std::mem::replace(&mut standing[subject as usize], found.is_some());
+            if was || found.is_none() {
+                continue;
+            }
+            match subject {
+                Subject::WheelsAndMotion if robot.is_on_ice() => quiet.slip_on_ice += 1,
+                Subject::WheelsAndMotion => quiet.slip_off_ice += 1,
+                Subject::Wheels
+                | Subject::Gyro
+                | Subject::Accelerometer
+                | Subject::Odometry
+                | Subject::Position
+                | Subject::LeftWheels
+                | Subject::RightWheels
+                | Subject::Motion => quiet.blamed += 1,
+            }
+        }
+    }
+    quiet
+}
+
+fn percentile(sorted: &[f64], share: f64) -> f64 {
+    #[expect(
+        clippy::cast_precision_loss,
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "an index into what was counted"
+    )]
+    let index = ((sorted.len().saturating_sub(1)) as f64 * share).round() as usize;
+    sorted.get(index).copied().unwrap_or(f64::INFINITY)
+}
+
+fn case_checks(case: &Case, trials: u32) -> Vec<Check> {
+    let results: Vec<Trial> = (0..trials)
+        .map(|seed| trial(case, u64::from(seed)))
+        .collect();
+    let times = |of: fn(&Trial) -> Option<f64>| {
+        let mut times: Vec<f64> = results.iter().filter_map(of).collect();
+        times.sort_by(f64::total_cmp);
+        times
+    };
+    let (noticed, named) = (times(|trial| trial.noticed_s), times(|trial| trial.named_s));
+    let count = |is: fn(&Trial) -> bool| {
+        let found = results.iter().filter(|trial| is(trial)).count();
+        u32::try_from(found).map_or(f64::INFINITY, f64::from)
+    };
+    let identified = count(|trial| trial.named_s.is_some()) / f64::from(trials);
+    let wrong = count(|trial| trial.wrong.is_some()) / f64::from(trials);
+    let (name, goals) = (case.name, case.goals);
+    vec![
+        Check::at_most(
+            format!("{name}: exciting motion until noticed, p50, s"),
+            percentile(&noticed, 0.5),
+            goals.noticed_p50_s,
+        ),
+        Check::at_most(
+            format!("{name}: exciting motion until named, p50, s"),
+            percentile(&named, 0.5),
+            goals.named_p95_s,
+        ),
+        Check::at_most(
+            format!("{name}: exciting motion until named, p95, s"),
+            percentile(&named, 0.95),
+            goals.named_p95_s,
+        ),
+        Check::at_most(
+            format!("{name}: exciting motion until named, max, s"),
+            percentile(&named, 1.0),
+            EXCITED_MAX_S,
+        ),
+        Check {
+            name: format!("{name}: share of trials in which it is named"),
+            goal: format!("≥ {}", goals.named_share_min),
+            value: identified,
+            holds: identified >= goals.named_share_min,
+        },
+        Check::at_most(
+            format!("{name}: share of trials in which another channel is blamed"),
+            wrong,
+            BLAMED_SHARE_MAX,
+        ),
+    ]
+}
+
+/// Every check.
+pub(crate) fn checks(options: &Options) -> Vec<Check> {
+    let mut checks: Vec<Check> = CASES
+        .iter()
+        .flat_map(|case| case_checks(case, options.trials))
+        .collect();
+    let mut all = Quiet::default();
+    let mut ice = 0;
+    for hour in 0..options.hours {
+        let kit = Kit {
+            has_odometry: hour % 2 == 1,
+            has_accelerometer: hour % 4 < 3,
+            meets_ice: true,
+        };
+        let found = quiet(3_600.0, 1_000 + u64::from(hour), kit);
+        all.blamed += found.blamed;
+        all.slip_off_ice += found.slip_off_ice;
+        ice += found.slip_on_ice;
+    }
+    let hours = options.hours;
+    checks.push(Check::at_most(
+        format!("channels blamed in {hours} h without a fault, ice included"),
+        f64::from(all.blamed),
+        0.0,
+    ));
+    checks.push(Check::at_most(
+        format!("wheels and motion said to disagree off the ice in {hours} h"),
+        f64::from(all.slip_off_ice),
+        0.0,
+    ));
+    checks.push(Check {
+        name: format!("slip on ice said to be a disagreement in {hours} h"),
+        goal: "≥ 1".to_owned(),
+        value: f64::from(ice),
+        holds: ice >= 1,
+    });
+    checks
+}
