@@ -88,6 +88,7 @@ impl Server {
         let tls = config.tls.map(Tls::load).transpose()?.map(Arc::new);
         let db = Db::open(&config.database).await?;
         let app = App::new(db, clock, config.friction);
+        app.continue_time().await?;
         app.declare(config.normalisations);
         app.ensure_site(&config.site).await?;
         app.know_robots().await?;

@@ -6,6 +6,7 @@
 
 pub mod alerts;
 pub mod aside;
+pub mod attendance;
 pub mod audit;
 pub mod enrolments;
 pub mod geofences;
@@ -22,6 +23,7 @@ pub mod sites;
 pub mod stops;
 pub mod sums;
 pub mod terrains;
+pub mod times;
 pub mod tokens;
 pub mod withdrawals;
 

@@ -25,6 +25,15 @@ impl Presences {
         known.map(|(key, _)| key.clone()).collect()
     }
 
+    /// Every robot that has ever said hello, with what is known of it now.
+    pub fn welcomed(&self) -> Vec<(RobotKey, Presence)> {
+        let robots = self.lock();
+        let known = robots.iter().filter(|(_, presence)| presence.welcomed);
+        known
+            .map(|(key, presence)| (key.clone(), presence.clone()))
+            .collect()
+    }
+
     /// The stops that robots show to be in force.
     pub fn shown_stops(&self) -> Vec<(RobotKey, StopId)> {
         let robots = self.lock();
