@@ -14,7 +14,7 @@ use tread_api::ids::{BootId, MissionId, RobotId, SiteId, StopId};
 use tread_api::robot::{Aged, LinkCause, LinkState, MissionProgress, RobotLive};
 use tread_api::wire::state::{FrictionReport, RobotState};
 
-pub use self::looks::Held;
+pub use self::looks::{Attending, Held};
 use self::news::Shown;
 use self::rivals::OtherRun;
 pub use self::rivals::Rival;

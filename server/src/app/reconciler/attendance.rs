@@ -14,11 +14,11 @@
 use std::collections::HashMap;
 use std::time::Duration;
 
-use tread_api::robot::{LinkCause, LinkState, Severity};
+use tread_api::robot::{LinkCause, Severity};
 
 use crate::app::{App, AppError};
 use crate::db;
-use crate::fleet::presence::{Presence, RobotKey};
+use crate::fleet::presence::RobotKey;
 
 /// The alert of a robot that was present and is no longer.
 pub(in crate::app) const ROBOT_LOST_ALERT: &str = "robot-lost";
@@ -27,6 +27,8 @@ pub(in crate::app) const ROBOT_LOST_ALERT: &str = "robot-lost";
 pub(in crate::app) const LOST_AFTER: Duration = Duration::from_secs(15);
 /// How long a robot must be heard again before its alert is cleared.
 pub(in crate::app) const BACK_AFTER: Duration = Duration::from_secs(3);
+/// Least time between two looks: the reconciler is woken far more often in a large fleet.
+const LOOK_EVERY: Duration = Duration::from_millis(500);
 /// After a start of the server no robot counts as lost for so long: all of them come at once.
 pub(in crate::app) const START_GRACE: Duration = Duration::from_secs(30);
 
@@ -95,6 +97,7 @@ impl Seen {
 #[derive(Debug, Default)]
 pub(super) struct Attendance {
     robots: Option<HashMap<RobotKey, Seen>>,
+    looked_at: Option<Duration>,
 }
 
 impl Attendance {
@@ -103,27 +106,33 @@ impl Attendance {
     /// # Errors
     /// The database failed; the next look does what this one did not.
     pub(super) async fn look(&mut self, app: &App) -> Result<(), AppError> {
+        let elapsed = app.clock().elapsed();
+        let is_early = |looked_at: Duration| elapsed.saturating_sub(looked_at) < LOOK_EVERY;
+        if self.looked_at.is_some_and(is_early) {
+            return Ok(());
+        }
         let robots = match &mut self.robots {
             Some(robots) => robots,
             none => none.insert(expected(app).await?),
         };
         let now = Now {
-            elapsed: app.clock().elapsed(),
+            elapsed,
             uptime: app.uptime(),
         };
-        for (key, presence) in app.presences().welcomed() {
+        for (key, attending) in app.presences().attending(elapsed) {
             let seen = robots.entry(key.clone()).or_default();
             let look = Look {
-                is_heard: presence.link(now.elapsed) != LinkState::Offline,
-                has_left: presence.has_left(),
+                is_heard: attending.is_heard,
+                has_left: attending.has_left,
                 // One that was never heard has been silent at least since the start.
-                silent: presence.silent_for(now.elapsed).unwrap_or(now.uptime),
+                silent: attending.silent_for.unwrap_or(now.uptime),
             };
             if let Some(turn) = seen.judge(look, now) {
-                write_down(app, &key, turn, &presence).await?;
+                write_down(app, &key, turn, attending.cause).await?;
                 seen.apply(turn);
             }
         }
+        self.looked_at = Some(elapsed);
         Ok(())
     }
 }
@@ -146,7 +155,7 @@ async fn write_down(
     app: &App,
     key: &RobotKey,
     turn: Turn,
-    presence: &Presence,
+    cause: Option<LinkCause>,
 ) -> Result<(), AppError> {
     let (site, robot) = key;
     let mut tx = app.db().write().await?;
@@ -162,8 +171,7 @@ async fn write_down(
     let is_missed = row.retired_at.is_none() && app.roll().may_speak(key);
     let alert = match turn {
         Turn::Lost if is_missed => {
-            let text = lost_text(presence.link_cause(app.clock().elapsed()));
-            let alert = (ROBOT_LOST_ALERT, Severity::Critical, text);
+            let alert = (ROBOT_LOST_ALERT, Severity::Critical, lost_text(cause));
             app.begin_alert(&mut tx, row.pk, alert).await?
         }
         Turn::Back => app.end_alert(&mut tx, row.pk, ROBOT_LOST_ALERT).await?,
