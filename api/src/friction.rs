@@ -210,7 +210,8 @@ pub struct FusedFriction {
     pub effective_track_ratio: Option<ValueEstimate>,
     /// Rolling resistance coefficient; `null` where no torque showed it.
     pub rolling_resistance: Option<ValueEstimate>,
-    /// Segments that were ever measured here: how often it was visited.
+    /// Segments that were ever measured here, also those that told nothing of θ and those from
+    /// before the ground changed: how often it was visited.
     pub segments: u64,
     /// Robots behind the estimate.
     pub robots: u32,
@@ -256,6 +257,10 @@ pub struct TerrainFriction {
     pub name: String,
     /// Kind of ground.
     pub class: TerrainClass,
+    /// As of when: nothing that was measured later counts. The end of the last epoch before the time
+    /// that was asked for; `null` when no time was, and all that has come counts.
+    #[serde(default)]
+    pub as_of: Option<Timestamp>,
     /// What is known for each robot model, kept apart.
     pub models: Vec<ModelFriction>,
 }
@@ -304,6 +309,9 @@ pub struct TerrainHistory {
 pub struct TerrainAt {
     /// The time.
     pub at: Timestamp,
+    /// As of when this is: nothing that was measured later counts. The end of the last epoch before
+    /// `at`; `at` itself where that is now.
+    pub as_of: Timestamp,
     /// Per robot model.
     pub models: Vec<ModelFriction>,
 }
@@ -311,6 +319,10 @@ pub struct TerrainAt {
 /// What is known of the ground at a point.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PointFriction {
+    /// As of when: nothing that was measured later counts. The end of the last epoch before the time
+    /// that was asked for; `null` when no time was, and all that has come counts.
+    #[serde(default)]
+    pub as_of: Option<Timestamp>,
     /// The cell.
     pub cell: Cell,
     /// The terrain under the point; `null` where none is drawn. Only measurements on it count.
@@ -337,6 +349,10 @@ pub struct AskPath {
 /// What is known along a path.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PathFriction {
+    /// As of when: nothing that was measured later counts. The end of the last epoch before the time
+    /// that was asked for; `null` when no time was, and all that has come counts.
+    #[serde(default)]
+    pub as_of: Option<Timestamp>,
     /// Length, metres.
     pub length_m: f64,
     /// The robot model whose θ this is.

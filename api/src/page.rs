@@ -1,5 +1,6 @@
 //! The envelope of every list.
 
+use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -15,4 +16,17 @@ pub struct Page<T> {
     pub items: Vec<T>,
     /// Give this as `cursor` for the next page; `null` on the last one.
     pub next_cursor: Option<String>,
+}
+
+/// One page of what the friction map knows.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct MapPage<T> {
+    /// The entries.
+    pub items: Vec<T>,
+    /// Give this as `cursor` for the next page; `null` on the last one.
+    pub next_cursor: Option<String>,
+    /// As of when: nothing that was measured later counts. The end of the last epoch before the time
+    /// that was asked for; `null` when no time was, and all that has come counts.
+    #[serde(default)]
+    pub as_of: Option<Timestamp>,
 }

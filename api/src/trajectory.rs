@@ -8,7 +8,7 @@ use utoipa::ToSchema;
 
 pub use self::check::{
     BINDINGS_MAX, Binding, BindingLimit, CheckTrajectory, ExpectedMeasurement, PLANNED_POINTS_MAX,
-    Place, PlannedPath, THETA_ASSUMED, TrajectoryCheck,
+    Place, PlannedPath, StartSource, THETA_ASSUMED, TrajectoryCheck,
 };
 pub use self::rules::InvalidTrajectory;
 use self::rules::{CircleFields, WaypointsFields, is_speed};

@@ -3,6 +3,7 @@
 
 use std::ops::ControlFlow;
 use std::sync::Arc;
+use std::time::Duration;
 
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
@@ -18,6 +19,9 @@ use crate::fleet::{self, COMMANDS_MAX, FleetLink, Identity, Listeners, Note, Not
 use crate::membership::Membership;
 use crate::outbox::Outbox;
 use crate::reporter::{Reporter, every, publish_states};
+
+/// How long the last state has to leave the machine before the session closes.
+const LAST_WORD_WAIT: Duration = Duration::from_millis(100);
 
 /// Waits for the next certificate; for ever where there is none.
 async fn renewed(membership: &mut Option<watch::Receiver<Arc<Membership>>>) {
@@ -129,8 +133,20 @@ impl Online {
             () = self.stop.cancelled() => ControlFlow::Break(()),
             () = renewed(membership) => ControlFlow::Continue(()),
         };
+        if self.stop.is_cancelled() {
+            self.take_leave(&link).await;
+        }
         link.close().await;
         next
+    }
+
+    /// Tells the server that the agent ends by itself, so that nobody misses it. A robot of which
+    /// this is lost raises an alert at the server, as any that goes away.
+    async fn take_leave(&self, link: &FleetLink) {
+        let mut last = self.reporter.state();
+        last.leaving = true;
+        link.publish_state(&last);
+        tokio::time::sleep(LAST_WORD_WAIT).await;
     }
 
     /// Says hello on every new connection until it is answered.

@@ -121,6 +121,7 @@ impl Reporter {
             boot: self.identity.boot,
             seq: self.states.fetch_add(1, Ordering::Relaxed),
             robot_time: self.clock.wall(),
+            leaving: false,
             monotonic_us: Some(microseconds(now)),
             mode: snapshot.mode,
             fault: snapshot.fault.map(|fault| fault.text().to_owned()),

@@ -1,18 +1,40 @@
 //! Time and identifiers that grow with it, injected: nothing else here asks the machine.
+//!
+//! The wall time that [`Clock::now`] gives never goes back while the process lives. A machine whose
+//! clock is set back by up to [`STEP_BACK_HELD_MAX`] is waited for: from the last time given on, this
+//! clock advances at half the pace until the machine's has caught up. A larger step is followed,
+//! because a clock that was a day ahead was wrong, and would keep the fleet in the future for days.
+//! The order within one history does not depend on this clock alone: SQL keeps it over restarts.
+
+mod floor;
 
 use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use jiff::{SignedDuration, Timestamp};
+use tracing::{info, warn};
 use tread_api::ids::MissionId;
 use uuid::{ContextV7, Uuid};
 
-/// A clock: the machine's, that of a simulated site, or one that a test moves by hand.
+pub use self::floor::{ClockSteps, STEP_BACK_HELD_MAX, STEP_NOTED_MIN};
+use self::floor::{Floor, Step};
+
+/// A clock: the machine's, that of a simulated site, or one that a test moves.
 #[derive(Debug, Clone)]
 pub struct Clock {
     source: Source,
-    context: Arc<Mutex<ContextV7>>,
+    floor: Arc<Mutex<Floor>>,
+    identifiers: Arc<Mutex<Identifiers>>,
+}
+
+/// What keeps identifiers in the order of their creation.
+#[derive(Debug)]
+struct Identifiers {
+    /// Keeps the order within this process, whatever time it is given.
+    context: ContextV7,
+    /// No identifier has an earlier time than this.
+    not_before: Timestamp,
 }
 
 #[derive(Clone)]
@@ -22,7 +44,7 @@ enum Source {
     Manual(Arc<Mutex<ManualTime>>),
 }
 
-/// Tells the wall time of a simulated site.
+/// Gives the wall time of a simulated site.
 type SiteWall = Arc<dyn Fn() -> Timestamp + Send + Sync>;
 
 impl fmt::Debug for Source {
@@ -32,6 +54,35 @@ impl fmt::Debug for Source {
             Self::Site { .. } => "Site",
             Self::Manual(_) => "Manual",
         })
+    }
+}
+
+impl Source {
+    #[expect(
+        clippy::disallowed_methods,
+        reason = "this is where the time comes from"
+    )]
+    fn wall(&self) -> Timestamp {
+        match self {
+            Self::System { .. } => Timestamp::now(),
+            Self::Site { wall, .. } => wall(),
+            Self::Manual(time) => lock(time).wall,
+        }
+    }
+
+    fn elapsed(&self) -> Duration {
+        match self {
+            Self::System { origin } | Self::Site { origin, .. } => origin.elapsed(),
+            Self::Manual(time) => lock(time).elapsed,
+        }
+    }
+
+    /// Whether wall time and monotonic time have the same pace, so that a step forward shows.
+    const fn has_one_pace(&self) -> bool {
+        match self {
+            Self::System { .. } | Self::Manual(_) => true,
+            Self::Site { .. } => false,
+        }
     }
 }
 
@@ -52,8 +103,8 @@ impl Clock {
         Self::of(Source::System { origin })
     }
 
-    /// The wall clock of a simulated site, whose time may go faster than the machine's. What is
-    /// reckoned with beside it, as the silence of robots, goes by the machine's.
+    /// The wall clock of a simulated site, whose time may go faster than the machine's. Ages and
+    /// bounds, as of the silence of robots, go by the machine's monotonic clock.
     #[expect(
         clippy::disallowed_methods,
         reason = "this is where the time comes from"
@@ -73,30 +124,72 @@ impl Clock {
     }
 
     fn of(source: Source) -> Self {
-        let context = Arc::new(Mutex::new(ContextV7::new()));
-        Self { source, context }
+        Self {
+            source,
+            floor: Arc::default(),
+            identifiers: Arc::new(Mutex::new(Identifiers {
+                context: ContextV7::new(),
+                not_before: Timestamp::UNIX_EPOCH,
+            })),
+        }
     }
 
-    /// Wall time, UTC, in whole microseconds: as fine as the database keeps it.
-    #[expect(
-        clippy::disallowed_methods,
-        reason = "this is where the time comes from"
-    )]
+    /// Wall time, UTC, in whole microseconds: as fine as the database keeps it. It never goes back
+    /// by a step of the machine's clock up to [`STEP_BACK_HELD_MAX`].
     pub fn now(&self) -> Timestamp {
-        let wall = match &self.source {
-            Source::System { .. } => Timestamp::now(),
-            Source::Site { wall, .. } => wall(),
-            Source::Manual(time) => lock(time).wall,
+        let (issued_us, step) = {
+            // Read under the lock, so that threads cannot overtake each other.
+            let mut floor = lock(&self.floor);
+            let (wall, elapsed) = (self.source.wall(), self.source.elapsed());
+            floor.issue(wall.as_microsecond(), elapsed, self.source.has_one_pace())
         };
+        if let Some(step) = step {
+            log_step(step);
+        }
+        Timestamp::from_microsecond(issued_us).unwrap_or(Timestamp::MAX)
+    }
+
+    /// The wall clock as it stands, which may go back: for certificates, which other machines judge
+    /// by their own clocks.
+    pub fn machine_time(&self) -> Timestamp {
+        let wall = self.source.wall();
         Timestamp::from_microsecond(wall.as_microsecond()).unwrap_or(wall)
+    }
+
+    /// Takes up where an earlier run of the server left off: no time before the newest one that the
+    /// database holds, if the machine's clock is behind it by at most [`STEP_BACK_HELD_MAX`], and no
+    /// identifier before the newest one.
+    pub fn continue_after(&self, newest: Option<Timestamp>, newest_id: Option<Uuid>) {
+        let id_time = newest_id.and_then(|id| id.get_timestamp());
+        let id_time = id_time.and_then(|time| {
+            let (seconds, nanos) = time.to_unix();
+            Timestamp::new(i64::try_from(seconds).ok()?, i32::try_from(nanos).ok()?).ok()
+        });
+        // Identifiers of one millisecond are told apart by a counter that begins anywhere.
+        let after = id_time.and_then(|time| time.checked_add(Duration::from_millis(1)).ok());
+        if let Some(after) = after {
+            let mut identifiers = lock(&self.identifiers);
+            identifiers.not_before = identifiers.not_before.max(after);
+        }
+        let Some(newest) = newest else { return };
+        let step = {
+            let mut floor = lock(&self.floor);
+            let (wall, elapsed) = (self.source.wall(), self.source.elapsed());
+            floor.continue_after(newest.as_microsecond(), wall.as_microsecond(), elapsed)
+        };
+        if let Some(step) = step {
+            log_step(step);
+        }
+    }
+
+    /// Steps of the machine's clock that were seen.
+    pub fn steps(&self) -> ClockSteps {
+        lock(&self.floor).steps()
     }
 
     /// Time since an arbitrary origin; it never jumps. For ages and bounds.
     pub fn elapsed(&self) -> Duration {
-        match &self.source {
-            Source::System { origin } | Source::Site { origin, .. } => origin.elapsed(),
-            Source::Manual(time) => lock(time).elapsed,
-        }
+        self.source.elapsed()
     }
 
     /// Moves a manual clock forward; the others move by themselves.
@@ -108,14 +201,52 @@ impl Clock {
         }
     }
 
-    /// A new mission's identifier; they sort by creation, also within one microsecond.
+    /// Sets the wall time of a manual clock forward or back, as an operator or NTP may do to a
+    /// machine's; its monotonic time stays.
+    pub fn step(&self, by: SignedDuration) {
+        if let Source::Manual(time) = &self.source {
+            let mut time = lock(time);
+            time.wall += by;
+        }
+    }
+
+    /// A new mission's identifier; they sort by creation, also within one microsecond, and also
+    /// while the machine's clock is behind.
     pub fn mission_id(&self) -> MissionId {
         let now = self.now();
+        let identifiers = lock(&self.identifiers);
+        let now = now.max(identifiers.not_before);
         let seconds = u64::try_from(now.as_second()).unwrap_or(0);
         let nanos = u32::try_from(now.subsec_nanosecond()).unwrap_or(0);
-        let context = lock(&self.context);
-        let timestamp = uuid::Timestamp::from_unix(&*context, seconds, nanos);
+        let timestamp = uuid::Timestamp::from_unix(&identifiers.context, seconds, nanos);
         MissionId::from_uuid(Uuid::new_v7(timestamp))
+    }
+}
+
+/// Says once for each step what the machine's clock did.
+fn log_step(step: Step) {
+    let seconds = |span_us: i64| SignedDuration::from_micros(span_us).as_secs_f64();
+    match step {
+        Step::BackHeld { by_us } => warn!(
+            "the machine's clock has gone back: it is {:.3} s behind the server's times, which \
+             advance at half the pace until it has caught up",
+            seconds(by_us)
+        ),
+        Step::BackFollowed { by_us } => warn!(
+            "the machine's clock has gone back by {:.3} s, more than is waited for; the server \
+             follows it, and keeps the order within each history",
+            seconds(by_us)
+        ),
+        Step::Forward { by_us } => warn!(
+            "the machine's clock was set forward by {:.3} s, or the machine was suspended",
+            seconds(by_us)
+        ),
+        Step::CaughtUp => info!("the machine's clock has caught up with the server's times"),
+        Step::DatabaseAhead { by_us } => warn!(
+            "the database holds times that are {:.3} s ahead of the machine's clock, more than is \
+             waited for; look whether the clock is right",
+            seconds(by_us)
+        ),
     }
 }
 
@@ -148,6 +279,37 @@ mod tests {
         let before = clock.elapsed();
         std::thread::sleep(Duration::from_millis(2));
         assert!(clock.elapsed() > before && clock.now() == wall);
+    }
+
+    #[test]
+    fn neither_time_nor_identifiers_go_back_when_the_machines_clock_does() {
+        let clock = Clock::manual("2026-11-01T00:00:00Z".parse().unwrap());
+        let before = (clock.now(), clock.mission_id());
+        clock.step(SignedDuration::from_hours(-1));
+        let held = (clock.now(), clock.mission_id());
+        assert!(held > before, "{held:?} {before:?}");
+        assert_eq!(
+            clock.machine_time(),
+            before.0 - SignedDuration::from_hours(1)
+        );
+        clock.advance(Duration::from_secs(10));
+        assert_eq!(clock.now(), before.0 + SignedDuration::from_secs(5));
+        assert_eq!(clock.steps().back, 1);
+        // Two days are not waited for, and identifiers sort all the same.
+        clock.step(SignedDuration::from_hours(-48));
+        assert!(clock.now() < before.0);
+        assert!(clock.mission_id() > held.1);
+    }
+
+    #[test]
+    fn a_new_run_takes_up_after_the_newest_time_and_identifier() {
+        let wall: Timestamp = "2026-11-01T00:00:00Z".parse().unwrap();
+        let last = Clock::manual(wall + SignedDuration::from_hours(100)).mission_id();
+        let clock = Clock::manual(wall);
+        let newest = wall + SignedDuration::from_mins(5);
+        clock.continue_after(Some(newest), Some(last.as_uuid()));
+        assert_eq!(clock.now(), newest);
+        assert!(clock.mission_id() > last);
     }
 
     #[test]

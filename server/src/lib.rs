@@ -91,6 +91,7 @@ impl Server {
         let lock = DatabaseLock::take(&config.database)?;
         let db = Db::open(&config.database).await?;
         let app = App::new(db, clock, config.friction, config.storage);
+        app.continue_time().await?;
         app.declare(config.normalisations);
         app.ensure_site(&config.site).await?;
         app.know_robots().await?;

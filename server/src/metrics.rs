@@ -248,6 +248,7 @@ impl App {
             &mut text,
             &format!("{name} {}", self.uptime().as_secs_f64()),
         );
+        self.write_clock(&mut text);
         let counters = serde_json::to_value(self.counters().values()).unwrap_or_default();
         for (counter, value) in counters.as_object().into_iter().flatten() {
             let name = format!("tread_{counter}_total");
@@ -297,6 +298,25 @@ impl App {
             let (kind, count) = (failure.as_str(), failure::count(failure));
             line(text, &format!("{name}{{kind=\"{kind}\"}} {count}"));
         }
+    }
+
+    /// What the machine's clock did.
+    fn write_clock(&self, text: &mut String) {
+        // So that a step shows although nothing else asked for the time.
+        self.clock().now();
+        let steps = self.clock().steps();
+        let name = "tread_clock_steps_total";
+        head(text, name, "counter", "Steps of the machine's clock.");
+        for (direction, count) in [("back", steps.back), ("forward", steps.forward)] {
+            line(
+                text,
+                &format!("{name}{{direction=\"{direction}\"}} {count}"),
+            );
+        }
+        let name = "tread_clock_ahead_seconds";
+        let help = "How far the server's time is ahead of the machine's clock, which was set back.";
+        head(text, name, "gauge", help);
+        line(text, &format!("{name} {}", steps.ahead.as_secs_f64()));
     }
 
     /// Missions, robots and stops.

@@ -188,6 +188,7 @@ impl LightRobot {
             },
             battery: None,
             alerts: Vec::new(),
+            leaving: false,
             monotonic_us: None,
             safety: tread_api::safety::SafetyStatus::default(),
         };

@@ -5,7 +5,8 @@ use utoipa::ToSchema;
 
 use super::Trajectory;
 use crate::geometry::{Point, Pose};
-use crate::ids::{RobotId, SiteId};
+use crate::ids::{MissionId, RobotId, SiteId};
+use crate::mission::StartPolicy;
 
 /// The body of `POST /v1/trajectories/check`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -16,10 +17,21 @@ pub struct CheckTrajectory {
     pub robot: RobotId,
     /// What would be driven.
     pub trajectory: Trajectory,
-    /// From where; the robot's last known pose when absent, and the start of the path if there is
-    /// none.
+    /// From where. When absent: the expected end of the last mission that is driven before it; the
+    /// robot's last known pose if there is none; the start of the path if that is not known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start: Option<Pose>,
+    /// The priority that the mission would have: queued missions of a lower one are driven after it.
+    #[serde(default)]
+    #[schema(minimum = -100, maximum = 100)]
+    pub priority: i32,
+    /// What would become of the robot's other missions; it waits behind them when absent.
+    #[serde(default)]
+    pub start_policy: StartPolicy,
+    /// The mission of this robot whose trajectory it would replace; it is driven in that one's
+    /// place then, and priority and policy do not count.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub replaces: Option<MissionId>,
     /// Assumed θ of the ground, for the accuracy to expect; what the robot measures now when
     /// absent, and [`THETA_ASSUMED`] if it measures nothing.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -49,6 +61,10 @@ pub struct ExpectedMeasurement {
 pub struct TrajectoryCheck {
     /// From where it was planned.
     pub start: Pose,
+    /// What `start` is.
+    pub start_source: StartSource,
+    /// The mission whose expected end `start` is, if it is one.
+    pub after_mission: Option<MissionId>,
     /// Length with the way to its start, metres.
     pub length_m: f64,
     /// Length of the way to its start, metres.
@@ -73,6 +89,20 @@ pub struct TrajectoryCheck {
     pub measurement: ExpectedMeasurement,
     /// Where it would be driven, the way to its start with it.
     pub path: PlannedPath,
+}
+
+/// From where a trajectory was planned.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum StartSource {
+    /// From the pose that the request says.
+    Request,
+    /// From the expected end of the last mission that is driven before.
+    Mission,
+    /// From where the robot is now: nothing is driven before.
+    Robot,
+    /// From the start of the trajectory: nobody knows where the robot is.
+    Trajectory,
 }
 
 /// Most points of a planned path.

@@ -54,6 +54,9 @@ pub struct RobotState {
     /// [`ALERTS_MAX`](crate::robot::ALERTS_MAX), each code once.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub alerts: Vec<AlertReport>,
+    /// The agent ends by itself, and this is its last word. Nobody misses it then.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub leaving: bool,
     /// What may only slow the robot down. Absent from an older agent.
     #[serde(default)]
     pub safety: SafetyStatus,

@@ -7,8 +7,8 @@ use anyhow::Context;
 use jiff::Timestamp;
 use tread_api::mission::{CreateMission, ReplaceMission};
 use tread_api::trajectory::{
-    BindingLimit, CheckTrajectory, Circle, Direction, Excitation, Trajectory, TrajectoryCheck,
-    TrajectoryOptions, Waypoints,
+    BindingLimit, CheckTrajectory, Circle, Direction, Excitation, StartSource, Trajectory,
+    TrajectoryCheck, TrajectoryOptions, Waypoints,
 };
 
 use super::missions::summary;
@@ -74,6 +74,9 @@ async fn check(
         robot: order.robot.clone(),
         trajectory,
         start: None,
+        priority: order.priority,
+        start_policy: order.start_policy(),
+        replaces: None,
         theta: None,
     };
     let checked = client.check_trajectory(&request).await?;
@@ -81,8 +84,24 @@ async fn check(
     Ok(ExitCode::SUCCESS)
 }
 
+/// From where it was planned, in words.
+fn planned_from(checked: &TrajectoryCheck) -> String {
+    let place = format!("x {:.2} m, y {:.2} m", checked.start.x_m, checked.start.y_m);
+    match (checked.start_source, checked.after_mission) {
+        (StartSource::Mission, Some(mission)) => {
+            format!("planned from the end of mission {mission}, at {place}")
+        }
+        (StartSource::Request, _) => format!("planned from {place}, as asked"),
+        (StartSource::Robot, _) => format!("planned from where the robot is, {place}"),
+        (StartSource::Mission | StartSource::Trajectory, _) => {
+            format!("planned from the start of the path, {place}: the robot's place is not known")
+        }
+    }
+}
+
 fn demands(checked: &TrajectoryCheck) -> String {
     let mut lines = vec![
+        planned_from(checked),
         format!(
             "{:.2} m, {:.2} m of it on the way there, in {:.1} s",
             checked.length_m, checked.approach_length_m, checked.duration_s

@@ -153,6 +153,7 @@ fn gate_number(cause: GateCause) -> u8 {
         GateCause::StaleFeedback => 12,
         GateCause::Stop => 13,
         GateCause::LoopOverrun => 14,
+        GateCause::SensorFault => 15,
     }
 }
 

@@ -327,3 +327,29 @@ async fn a_wiggle_and_a_slower_approach_are_planned_as_asked() {
     agent.stop().await;
     server.stop().await;
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_agent_that_is_stopped_says_that_it_leaves_with_its_last_state() {
+    let rig = Rig::new();
+    let server = rig.serve();
+    let agent = rig.agent();
+    rig.ready(agent.boot()).await;
+    rig.sees("it publishes", |memory| {
+        (memory.states.len() > 3).then_some(())
+    })
+    .await;
+    agent.stop().await;
+    let last = rig
+        .sees("its last state", |memory| {
+            let last = memory.states.last().cloned();
+            last.filter(|_| !memory.gone.is_empty())
+        })
+        .await;
+    assert!(last.leaving, "{last:?}");
+    let leaving = {
+        let said = rig.memory.lock().unwrap();
+        said.states.iter().filter(|state| state.leaving).count()
+    };
+    assert_eq!(leaving, 1, "it says so once, at the end");
+    server.stop().await;
+}

@@ -5,16 +5,30 @@
 //! [`super::storage`].
 
 use jiff::Timestamp;
-use tread_api::ids::{AlertCode, AlertId};
+use tread_api::ids::{AlertCode, AlertId, MissionId};
+use tread_api::mission::MissionState;
 use tread_api::page::Page;
 use tread_api::robot::{ALERT_TEXT_MAX, ALERTS_MAX, Alert, AlertReport, Severity};
+use tread_api::wire::ingest::MissionReport;
 
 use super::enrolment::REVOKED_ALERT;
+use super::missions::reports::Taken;
+use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::stops::UNCONFIRMED_ALERT;
 use super::{App, AppError, check_named, page};
-use crate::db;
 use crate::db::alerts::AlertFilter;
+use crate::db::{self, DbError};
 use crate::fleet::presence::RobotKey;
+
+/// The alert of a mission that failed.
+pub(super) const MISSION_FAILED_ALERT: &str = "mission-failed";
+/// Alerts that the server raises and ends, whatever the robot says.
+const OWN_ALERTS: [&str; 4] = [
+    UNCONFIRMED_ALERT,
+    REVOKED_ALERT,
+    ROBOT_LOST_ALERT,
+    MISSION_FAILED_ALERT,
+];
 
 impl App {
     /// Alerts, newest first.
@@ -27,7 +41,7 @@ impl App {
         Ok(page(alerts, limit, |alert: &Alert| alert.id.to_string()))
     }
 
-    /// Notes that a person has seen an alert.
+    /// Notes that a person has seen an alert. One that tells of something past is cleared by that.
     pub async fn acknowledge_alert(&self, id: AlertId) -> Result<Alert, AppError> {
         if let Some(alert) = self.storage().acknowledge(id, self.clock().now()) {
             self.hub().alert(&alert);
@@ -36,7 +50,15 @@ impl App {
         let mut tx = self.db().write().await?;
         db::alerts::acknowledge(&mut tx, id, self.clock().now()).await?;
         let found = db::alerts::find(&mut tx, id).await?;
-        let alert = found.ok_or(AppError::UnknownAlert(id))?;
+        let mut alert = found.ok_or(AppError::UnknownAlert(id))?;
+        if alert.code.as_str() == MISSION_FAILED_ALERT && alert.cleared_at.is_none() {
+            let now = self.clock().now();
+            let robot_pk = db::robots::pk_of(&mut tx, &alert.site, &alert.robot).await?;
+            if let Some(robot_pk) = robot_pk {
+                db::alerts::clear(&mut tx, robot_pk, &alert.code, now).await?;
+            }
+            alert = db::alerts::find(&mut tx, id).await?.unwrap_or(alert);
+        }
         tx.commit().await?;
         self.robots_changed();
         self.hub().alert(&alert);
@@ -75,8 +97,7 @@ impl App {
         let has = |alert: &Alert| said.iter().any(|report| report.code == alert.code);
         let is_new = |report: &&AlertReport| !raised.iter().any(|alert| alert.code == report.code);
         // What the server itself has raised is not for the robot to end.
-        let own =
-            |alert: &&Alert| [UNCONFIRMED_ALERT, REVOKED_ALERT].contains(&alert.code.as_str());
+        let own = |alert: &&Alert| OWN_ALERTS.contains(&alert.code.as_str());
         let gone = raised.iter().filter(|alert| !has(alert) && !own(alert));
         let gone: Vec<&Alert> = gone.collect();
         let new: Vec<&AlertReport> = said.iter().filter(is_new).collect();
@@ -105,13 +126,49 @@ impl App {
         Ok(true)
     }
 
+    /// Raises the alert of a mission that failed, and ends that of an earlier one; a mission that
+    /// succeeds ends it too.
+    pub(super) async fn alert_mission_end(
+        &self,
+        tx: &mut db::Tx,
+        robot_pk: i64,
+        (mission, state, reason): (MissionId, MissionState, &str),
+    ) -> Result<Vec<Alert>, DbError> {
+        if !matches!(state, MissionState::Failed | MissionState::Succeeded) {
+            return Ok(Vec::new());
+        }
+        let ended = self.end_alert(tx, robot_pk, MISSION_FAILED_ALERT).await?;
+        let mut changed: Vec<Alert> = ended.into_iter().collect();
+        if state == MissionState::Failed {
+            let text = format!("mission `{mission}` failed: {reason}");
+            let alert = (MISSION_FAILED_ALERT, Severity::Warning, text);
+            changed.extend(self.begin_alert(tx, robot_pk, alert).await?);
+        }
+        Ok(changed)
+    }
+
+    /// The same for a report that was taken.
+    pub(super) async fn alert_report(
+        &self,
+        tx: &mut db::Tx,
+        robot_pk: i64,
+        report: &MissionReport,
+        taken: &Taken,
+    ) -> Result<Vec<Alert>, DbError> {
+        let Some((state, reason)) = &taken.ended else {
+            return Ok(Vec::new());
+        };
+        let ended = (report.mission, *state, reason.as_str());
+        self.alert_mission_end(tx, robot_pk, ended).await
+    }
+
     /// Raises an alert of the server's own about a robot, unless it is raised already.
     pub(super) async fn begin_alert(
         &self,
         tx: &mut db::Tx,
         robot_pk: i64,
         (code, severity, text): (&'static str, Severity, String),
-    ) -> Result<Option<Alert>, AppError> {
+    ) -> Result<Option<Alert>, DbError> {
         let Ok(code) = code.parse::<AlertCode>() else {
             return Ok(None);
         };
@@ -127,7 +184,7 @@ impl App {
         let id = self
             .raise(tx, robot_pk, &report, self.clock().now())
             .await?;
-        Ok(db::alerts::find(tx, id).await?)
+        db::alerts::find(tx, id).await
     }
 
     /// Ends an alert of the server's own.
@@ -136,13 +193,13 @@ impl App {
         tx: &mut db::Tx,
         robot_pk: i64,
         code: &'static str,
-    ) -> Result<Option<Alert>, AppError> {
+    ) -> Result<Option<Alert>, DbError> {
         let raised = db::alerts::raised_of(tx, robot_pk).await?;
         let Some(alert) = raised.into_iter().find(|alert| alert.code.as_str() == code) else {
             return Ok(None);
         };
         db::alerts::clear(tx, robot_pk, &alert.code, self.clock().now()).await?;
-        Ok(db::alerts::find(tx, alert.id).await?)
+        db::alerts::find(tx, alert.id).await
     }
 
     /// Shows alerts that were written.
@@ -161,7 +218,7 @@ impl App {
         robot_pk: i64,
         report: &AlertReport,
         now: Timestamp,
-    ) -> Result<AlertId, AppError> {
+    ) -> Result<AlertId, DbError> {
         let id = AlertId::from_uuid(self.clock().mission_id().as_uuid());
         let report = AlertReport {
             text: report.text.chars().take(ALERT_TEXT_MAX).collect(),

@@ -1,5 +1,7 @@
 //! Dry runs: what a trajectory would ask of a robot, planned by the robot's own planner.
 
+mod start;
+
 use std::ops::RangeInclusive;
 
 use tread_api::geometry::{Point, Polygon, Pose};
@@ -8,7 +10,7 @@ use tread_api::robot::RobotModel;
 use tread_api::safety::Geofence;
 use tread_api::trajectory::{
     BINDINGS_MAX, Binding, BindingLimit, CheckTrajectory, Direction, ExpectedMeasurement, Place,
-    THETA_ASSUMED, Trajectory, TrajectoryCheck, Waypoint,
+    StartSource, THETA_ASSUMED, Trajectory, TrajectoryCheck, Waypoint,
 };
 use tread_control::estimation::{SensorNoise, expected_accuracy};
 use tread_control::excitation::{Excitation, ExcitationSpec};
@@ -18,6 +20,7 @@ use tread_control::plan::{Plan, PlanError, PlanOptions, Slowed, SlowedBy};
 use tread_control::robot::{self, RobotModelError, RobotModelSpec};
 use tread_control::trajectory as planned;
 
+use self::start::{Start, after, earlier};
 use super::planned_path::way;
 use super::{App, AppError, site_row};
 use crate::db;
@@ -32,7 +35,8 @@ const FENCE_STEP_M: f64 = 0.02;
 const FENCE_STEPS_MAX: f64 = 500_000.0;
 
 impl App {
-    /// Plans a trajectory for a robot without moving anything.
+    /// Plans a trajectory for a robot without moving anything: from where the robot will be after
+    /// what it drives and what is queued before, unless the request says from where.
     ///
     /// # Errors
     /// [`AppError::Impossible`] names place and reason; site and robot must be known.
@@ -45,6 +49,9 @@ impl App {
             robot,
             trajectory,
             start,
+            priority,
+            start_policy,
+            replaces,
             theta,
         } = request;
         if let Some(theta) = theta.filter(|theta| !THETA_RANGE.contains(theta)) {
@@ -60,12 +67,28 @@ impl App {
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
         let row = row.ok_or_else(unknown)?;
         let fence = control_fence(&db::geofences::present(&mut tx, site_pk).await?);
+        let place = start::Place {
+            priority,
+            policy: start_policy,
+            replaces,
+        };
+        let before = match start {
+            Some(_) => Vec::new(),
+            None => earlier(&mut tx, row.pk, place).await?,
+        };
         drop(tx);
         let presence = self.presences().get(&(site.clone(), robot.clone()));
         let shown = presence.state().and_then(|state| state.pose);
-        let start = start
-            .or(shown.map(|pose| pose.value))
-            .unwrap_or_else(|| begin_of(&trajectory));
+        let (pose, source) = match (start, shown) {
+            (Some(start), _) => (start, StartSource::Request),
+            (None, Some(pose)) => (pose.value, StartSource::Robot),
+            (None, None) => (begin_of(&trajectory), StartSource::Trajectory),
+        };
+        let first = Start {
+            pose,
+            source,
+            after_mission: None,
+        };
         let measured = presence.friction().and_then(|said| said.theta_measured);
         let ground = AssumedGround {
             theta: theta
@@ -76,7 +99,10 @@ impl App {
         let _turn = self.check_turn().await;
         // The planner works on a thread of its own: a path may have 100 000 points.
         let model = row.model;
-        let checking = move || check(&model, &trajectory, start, ground, &fence);
+        let checking = move || {
+            let start = after(first, &before, &model);
+            check(&model, &trajectory, start, ground, &fence)
+        };
         match tokio::task::spawn_blocking(checking).await {
             Ok(checked) => checked.map_err(|refused| refused.of(robot)),
             Err(_panic) => Err(AppError::Impossible {
@@ -228,11 +254,11 @@ pub(super) fn planned(
 fn check(
     model: &RobotModel,
     trajectory: &Trajectory,
-    start: Pose,
+    start: Start,
     ground: AssumedGround,
     fence: &Fence,
 ) -> Result<TrajectoryCheck, Refused> {
-    let planned = planned(model, trajectory, start)?;
+    let planned = planned(model, trajectory, start.pose)?;
     fenced(&planned, trajectory, fence)?;
     let plan = &planned.plan;
     let AssumedGround { theta, has_torque } = ground;
@@ -240,7 +266,9 @@ fn check(
     let expected = expected_accuracy(plan, &planned.model, noise, theta, has_torque);
     let bindings = plan.slowed().iter().take(BINDINGS_MAX);
     Ok(TrajectoryCheck {
-        start,
+        start: start.pose,
+        start_source: start.source,
+        after_mission: start.after_mission,
         length_m: plan.length_m(),
         approach_length_m: plan.approach_length_m(),
         duration_s: plan.duration_s(),

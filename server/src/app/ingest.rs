@@ -19,6 +19,7 @@ use tokio::time::{Instant, timeout_at};
 use tokio_util::sync::CancellationToken;
 use tracing::warn;
 use tread_api::ids::{RobotId, SiteId};
+use tread_api::robot::Alert;
 use tread_api::site::Grid;
 use tread_api::wire::ingest::{
     BATCH_RECORDS_MAX, Batch, MissionReport, Receipt, RecordContent, RefusedRecord,
@@ -29,7 +30,7 @@ use self::keys::{Keys, RobotKeys};
 use self::prepared::{Prepared, Ready, Skew, prepared};
 use super::App;
 use super::map::Folded;
-use super::missions::reports::{Foreign, Reporting, take_report};
+use super::missions::reports::{Foreign, Reporting, Taken, take_report};
 use crate::db::aside::Origin;
 use crate::db::segments::{Inserted, NewSegment};
 use crate::db::sums::SumKey;
@@ -119,12 +120,19 @@ struct Tally {
     reports: u64,
     foreign: u64,
     aside: u64,
+    /// Alerts that began or ended with missions.
+    alerts: Vec<Alert>,
 }
 
 impl Tally {
-    fn note_report(&mut self, taken: Option<Result<(), Foreign>>, seq: u64, receipt: &mut Receipt) {
+    fn note_report(
+        &mut self,
+        taken: Option<Result<Taken, Foreign>>,
+        seq: u64,
+        receipt: &mut Receipt,
+    ) {
         match taken {
-            Some(Ok(())) => {
+            Some(Ok(_taken)) => {
                 receipt.committed += 1;
                 self.reports += 1;
             }
@@ -198,6 +206,7 @@ impl Writer {
         counters.mission_reports_committed.add(tally.reports);
         counters.reports_foreign.add(tally.foreign);
         counters.segments_aside.add(tally.aside);
+        self.app.show_alerts(&tally.alerts);
         if tally.reports > 0 {
             self.app.wake();
         }
@@ -213,6 +222,27 @@ impl Writer {
         (boot == upload.batch.boot)
             .then(|| at.checked_sub(ahead).ok())
             .flatten()
+    }
+
+    /// Who reports on a mission, and when, with how far the robot showed last that it had come.
+    fn reporting(
+        &self,
+        upload: &Upload,
+        robot_pk: i64,
+        report: &MissionReport,
+        (now, skew): (Timestamp, Skew),
+    ) -> Reporting {
+        let at = skew.put_right(report.at);
+        let since = report.since.and_then(|since| self.heard_of(upload, since));
+        let key = (upload.site.clone(), upload.batch.robot.clone());
+        Reporting {
+            robot_pk,
+            boot: upload.batch.boot,
+            now,
+            at,
+            since: since.unwrap_or(at),
+            shown: self.app.presences().get(&key).progress_of(report.mission),
+        }
     }
 
     async fn commit_once(&mut self, group: &[Upload]) -> Result<(Vec<Outcome>, Tally), DbError> {
@@ -289,16 +319,12 @@ impl Writer {
                         Err(reason) => refuse(reason),
                     },
                     RecordContent::Mission(report) => {
-                        let at = skew.put_right(report.at);
-                        let since = report.since.and_then(|since| self.heard_of(upload, since));
-                        let of = Reporting {
-                            robot_pk,
-                            boot: batch.boot,
-                            now,
-                            at,
-                            since: since.unwrap_or(at),
-                        };
+                        let of = self.reporting(upload, robot_pk, report, (now, skew));
                         let taken = take_new_report(&mut tx, of, keys, report).await?;
+                        if let Some(Ok(taken)) = &taken {
+                            let alerts = app.alert_report(&mut tx, robot_pk, report, taken);
+                            tally.alerts.extend(alerts.await?);
+                        }
                         tally.note_report(taken, seq, &mut receipt);
                     }
                 }
@@ -498,7 +524,7 @@ async fn take_new_report(
     reporting: Reporting,
     (boot_pk, seq): (i64, i64),
     report: &MissionReport,
-) -> Result<Option<Result<(), Foreign>>, DbError> {
+) -> Result<Option<Result<Taken, Foreign>>, DbError> {
     if db::history::has_report(tx, boot_pk, seq).await? {
         return Ok(None);
     }

@@ -32,6 +32,7 @@ use std::time::Duration;
 
 use tokio::sync::{Notify, Semaphore, SemaphorePermit};
 use tread_api::ids::{RobotId, SiteId};
+use uuid::Uuid;
 
 use self::enrolment::Membership;
 pub use self::error::AppError;
@@ -84,6 +85,8 @@ struct Inner {
     mission_durations: MissionDurations,
     /// Counts changes of what is kept of robots.
     robots_generation: AtomicU64,
+    /// Tells this run of the server from any other.
+    run_id: Uuid,
     started_at: Duration,
     links: OnceLock<Links>,
     normalisations: OnceLock<Vec<Arc<Normalisation>>>,
@@ -116,6 +119,7 @@ impl App {
     pub fn new(db: Db, clock: Clock, friction: FrictionConfig, storage: StorageConfig) -> Self {
         let started_at = clock.elapsed();
         let hub = Hub::new(clock.now());
+        let run_id = clock.mission_id().as_uuid();
         let inner = Inner {
             db,
             clock,
@@ -135,6 +139,7 @@ impl App {
             queues: Queues::default(),
             mission_durations: MissionDurations::default(),
             robots_generation: AtomicU64::new(1),
+            run_id,
             started_at,
             links: OnceLock::new(),
             normalisations: OnceLock::new(),
@@ -289,6 +294,11 @@ impl App {
         &self.inner.unrecorded
     }
 
+    /// A name of this run of the server: counts in memory begin anew with each.
+    fn run_id(&self) -> String {
+        self.inner.run_id.to_string()
+    }
+
     fn robots_changed(&self) {
         self.inner.robots_generation.fetch_add(1, Ordering::Relaxed);
     }
@@ -303,6 +313,19 @@ impl App {
 
     fn friction_config(&self) -> &FrictionConfig {
         &self.inner.friction
+    }
+
+    /// Has the clock take up where the database left off, so that time does not go back over a
+    /// restart either.
+    ///
+    /// # Errors
+    /// The database failed.
+    pub async fn continue_time(&self) -> Result<(), AppError> {
+        let mut tx = self.db().read().await?;
+        let newest = db::times::newest(&mut tx).await?;
+        let newest_id = db::times::newest_id(&mut tx).await?;
+        self.clock().continue_after(newest, newest_id);
+        Ok(())
     }
 }
 

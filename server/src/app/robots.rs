@@ -9,8 +9,10 @@ use tread_api::site::NAME_LENGTH_MAX;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::{Refusal, RefusalCode};
 
+use super::alerts::MISSION_FAILED_ALERT;
 use super::missions::end_all;
 use super::missions::transitions::Change;
+use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::terrains::site_definition;
 use super::{App, AppError, name_or, page, site_row};
 use crate::db;
@@ -61,6 +63,7 @@ impl App {
         let unknown = || AppError::UnknownRobot(site.clone(), id.clone());
         let found = db::robots::find(&mut tx, site_pk, id).await?;
         let row = found.ok_or_else(unknown)?;
+        let mut ended = Vec::new();
         if change.name.is_some() {
             let name = name_or(change.name, id.as_str())?;
             db::robots::rename(&mut tx, row.pk, &name).await?;
@@ -70,6 +73,9 @@ impl App {
                 let why = (Change::Retire, Actor::Client, Change::Retire.reason());
                 end_all(&mut tx, row.pk, why, now).await?;
                 db::robots::set_retired(&mut tx, row.pk, Some(now)).await?;
+                for code in [ROBOT_LOST_ALERT, MISSION_FAILED_ALERT] {
+                    ended.extend(self.end_alert(&mut tx, row.pk, code).await?);
+                }
             }
             (Some(false), Some(_)) => db::robots::set_retired(&mut tx, row.pk, None).await?,
             (Some(true), Some(_)) | (Some(false), None) | (None, _) => {}
@@ -78,6 +84,7 @@ impl App {
         let row = found.ok_or_else(unknown)?;
         let alerts = db::alerts::raised_of(&mut tx, row.pk).await?;
         tx.commit().await?;
+        self.show_alerts(&ended);
         self.robots_changed();
         self.wake();
         Ok(self.with_live(row, alerts))

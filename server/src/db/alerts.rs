@@ -154,7 +154,7 @@ pub async fn raise(
     Ok(())
 }
 
-/// Clears a robot's alert of that code.
+/// Clears a robot's alert of that code, not before it was raised or acknowledged.
 pub async fn clear(
     db: &mut SqliteConnection,
     robot_pk: i64,
@@ -163,7 +163,8 @@ pub async fn clear(
 ) -> Result<(), DbError> {
     let (code, at_us) = (code.as_str(), to_us(at));
     sqlx::query!(
-        "UPDATE alerts SET cleared_at_us = ?
+        "UPDATE alerts
+         SET cleared_at_us = MAX(?, COALESCE(acknowledged_at_us, raised_at_us), raised_at_us)
          WHERE robot_pk = ? AND code = ? AND cleared_at_us IS NULL",
         at_us,
         robot_pk,
@@ -182,7 +183,8 @@ pub async fn acknowledge(
 ) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
-        "UPDATE alerts SET acknowledged_at_us = COALESCE(acknowledged_at_us, ?) WHERE id = ?",
+        "UPDATE alerts SET acknowledged_at_us = COALESCE(acknowledged_at_us, MAX(raised_at_us, ?))
+         WHERE id = ?",
         at_us,
         id,
     )

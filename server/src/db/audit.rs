@@ -83,7 +83,7 @@ pub async fn list(
     raw.into_iter().map(AuditEntry::try_from).collect()
 }
 
-/// Writes one entry; its number is made here.
+/// Writes one entry, not before the one that precedes it; its number is made here.
 pub async fn insert(db: &mut SqliteConnection, entry: &AuditEntry) -> Result<(), DbError> {
     let (at_us, status) = (to_us(entry.at), i64::from(entry.status));
     let token = entry.token.map(|id: TokenId| id.to_string());
@@ -93,7 +93,8 @@ pub async fn insert(db: &mut SqliteConnection, entry: &AuditEntry) -> Result<(),
     sqlx::query!(
         "INSERT INTO audit (at_us, who, token_id, role, address, method, route, path, status,
              request_id, what)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+         VALUES (MAX(?1, COALESCE((SELECT at_us FROM audit ORDER BY id DESC LIMIT 1), ?1)),
+             ?2, ?3, ?4, ?5, ?6, ?7, ?8, ?9, ?10, ?11)",
         at_us,
         entry.who,
         token,

@@ -144,7 +144,7 @@ pub async fn renew(
     let (site, robot) = (site.as_str(), robot.as_str());
     let (at_us, expires_at_us) = (to_us(at), to_us(expires_at));
     let done = sqlx::query!(
-        "UPDATE enrolments SET renewed_at_us = ?, expires_at_us = ?
+        "UPDATE enrolments SET renewed_at_us = MAX(?, renewed_at_us), expires_at_us = ?
          WHERE site = ? AND robot = ? AND number = ? AND revoked_at_us IS NULL",
         at_us,
         expires_at_us,
@@ -166,7 +166,7 @@ pub async fn revoke(
 ) -> Result<(), DbError> {
     let (site, robot, at_us) = (site.as_str(), robot.as_str(), to_us(at));
     sqlx::query!(
-        "UPDATE enrolments SET revoked_at_us = ?, revoked_by = ?
+        "UPDATE enrolments SET revoked_at_us = MAX(?, renewed_at_us, enrolled_at_us), revoked_by = ?
          WHERE site = ? AND robot = ? AND revoked_at_us IS NULL",
         at_us,
         by,

@@ -39,7 +39,9 @@ pub async fn insert(
     let at_us = to_us(at);
     let result = sqlx::query!(
         "INSERT INTO geofences (site_pk, revision, keep_in, keep_out, written_at_us)
-         VALUES (?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
+         VALUES (?1, ?2, ?3, ?4, MAX(?5, COALESCE(
+             (SELECT MAX(written_at_us) FROM geofences WHERE site_pk = ?1), ?5)))
+         ON CONFLICT DO NOTHING",
         site_pk,
         revision,
         keep_in,

@@ -8,7 +8,7 @@ use tread_api::mission::{Actor, MissionEvent, MissionState};
 use super::missions::{cause, state};
 use super::{DbError, corrupt, from_us, parse, to_us, unsigned};
 
-/// Writes a step into a mission's history.
+/// Writes a step into a mission's history, not before the step that precedes it there.
 pub async fn add_event(
     db: &mut SqliteConnection,
     id: MissionId,
@@ -19,7 +19,9 @@ pub async fn add_event(
     let cause = event.cause.as_str();
     sqlx::query!(
         "INSERT INTO mission_events (mission, at_us, actor, from_state, to_state, cause, reason)
-         VALUES (?, ?, ?, ?, ?, ?, ?)",
+         VALUES (?1,
+             MAX(?2, COALESCE((SELECT MAX(at_us) FROM mission_events WHERE mission = ?1), ?2)),
+             ?3, ?4, ?5, ?6, ?7)",
         id,
         at_us,
         actor,

@@ -131,7 +131,7 @@ pub async fn use_up(
 ) -> Result<bool, DbError> {
     let (id, by, at_us) = (id.to_string(), by.as_str(), to_us(at));
     let done = sqlx::query!(
-        "UPDATE join_tokens SET used_at_us = ?, used_by = ?
+        "UPDATE join_tokens SET used_at_us = MAX(?, created_at_us), used_by = ?
          WHERE id = ? AND used_at_us IS NULL AND revoked_at_us IS NULL",
         at_us,
         by,
@@ -150,7 +150,9 @@ pub async fn revoke(
 ) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
-        "UPDATE join_tokens SET revoked_at_us = COALESCE(revoked_at_us, ?) WHERE id = ?",
+        "UPDATE join_tokens SET revoked_at_us = COALESCE(revoked_at_us,
+             MAX(?, created_at_us, COALESCE(used_at_us, created_at_us)))
+         WHERE id = ?",
         at_us,
         id
     )

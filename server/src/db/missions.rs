@@ -268,7 +268,7 @@ pub struct Facts {
     pub ended_at: Option<Timestamp>,
 }
 
-/// Adds facts to a mission.
+/// Adds facts to a mission; its times never decrease from its creation to its end.
 pub async fn add_facts(
     db: &mut SqliteConnection,
     id: MissionId,
@@ -284,10 +284,13 @@ pub async fn add_facts(
     let started_at_us = facts.started_at.map(to_us);
     let ended_at_us = facts.ended_at.map(to_us);
     sqlx::query!(
-        "UPDATE missions SET boot = COALESCE(?, boot), plan = COALESCE(?, plan),
-             progress = COALESCE(?, progress), started_at_us = COALESCE(started_at_us, ?),
-             ended_at_us = COALESCE(ended_at_us, ?)
-         WHERE id = ?",
+        "UPDATE missions SET boot = COALESCE(?1, boot), plan = COALESCE(?2, plan),
+             progress = COALESCE(?3, progress),
+             started_at_us = COALESCE(started_at_us,
+                 MIN(MAX(?4, created_at_us), COALESCE(ended_at_us, MAX(?4, created_at_us)))),
+             ended_at_us = COALESCE(ended_at_us,
+                 MAX(?5, COALESCE(started_at_us, ?4, created_at_us), created_at_us))
+         WHERE id = ?6",
         boot,
         plan,
         progress,

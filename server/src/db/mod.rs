@@ -6,6 +6,7 @@
 
 pub mod alerts;
 pub mod aside;
+pub mod attendance;
 pub mod audit;
 mod connections;
 pub mod enrolments;
@@ -25,6 +26,7 @@ pub mod sites;
 pub mod stops;
 pub mod sums;
 pub mod terrains;
+pub mod times;
 pub mod tokens;
 pub mod withdrawals;
 

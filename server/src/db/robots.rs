@@ -221,7 +221,8 @@ pub async fn introduce(
                first_seen_at_us, last_hello_at_us, capabilities)
            VALUES (?1, ?2, (SELECT pk FROM configurations WHERE id = ?3), ?4, ?5, ?6, ?6, ?7)
            ON CONFLICT (site_pk, id) DO UPDATE SET configuration_pk = excluded.configuration_pk,
-               agent_version = ?4, boot = ?5, last_hello_at_us = ?6, capabilities = ?7
+               agent_version = ?4, boot = ?5, capabilities = ?7,
+               last_hello_at_us = MAX(?6, robots.last_hello_at_us)
            RETURNING pk AS "pk!""#,
         site_pk,
         id,
@@ -304,7 +305,7 @@ pub async fn set_retired(
 ) -> Result<(), DbError> {
     let at_us = at.map(to_us);
     sqlx::query!(
-        "UPDATE robots SET retired_at_us = ? WHERE pk = ?",
+        "UPDATE robots SET retired_at_us = MAX(?, first_seen_at_us) WHERE pk = ?",
         at_us,
         robot_pk
     )

@@ -58,10 +58,13 @@ pub async fn insert_new(
     if segments.is_empty() {
         return Ok(Inserted::All);
     }
-    let last = sqlx::query_scalar!(r#"SELECT COALESCE(MAX(pk), 0) AS "last!: i64" FROM segments"#)
-        .fetch_one(&mut *db)
-        .await?;
-    let received_at_us = to_us(received_at);
+    let last = sqlx::query!(
+        r#"SELECT pk AS "pk!", received_at_us FROM segments ORDER BY pk DESC LIMIT 1"#
+    );
+    let last = last.fetch_optional(&mut *db).await?;
+    let (last, last_us) = last.map_or((0, i64::MIN), |row| (row.pk, row.received_at_us));
+    // In the order of their commits, whatever the clock did.
+    let received_at_us = to_us(received_at).max(last_us);
     let bind = |row: &mut Row<'_>, segment: &NewSegment<'_>| {
         let NewSegment(boot_pk, seq, robot_pk, site_pk, terrain, measurement) = *segment;
         row.add(boot_pk)?
@@ -139,6 +142,76 @@ macro_rules! segments {
             $($argument),*
         )
     };
+}
+
+/// Which measurements there are: none can be added or removed that leaves this as it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Extent {
+    /// Key of the oldest one; the oldest are removed first.
+    pub first: Option<i64>,
+    /// Key of the newest one.
+    pub last: Option<i64>,
+    /// When the newest one came, microseconds since 1970: keys may begin anew after all were removed.
+    pub last_at_us: Option<i64>,
+}
+
+/// Which measurements of a robot or terrain there are; of all sites without a filter, since one
+/// more look than needed at a list costs less than an index.
+pub async fn extent(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+    filter: &SegmentFilter,
+) -> Result<Extent, DbError> {
+    let robot = filter.robot.as_ref().map(RobotId::as_str);
+    let terrain = filter.terrain.as_ref().map(TerrainId::as_str);
+    let (first, last) = match (robot, terrain) {
+        (Some(robot), _) => {
+            let row = sqlx::query!(
+                r#"SELECT
+                       (SELECT MIN(pk) FROM segments WHERE robot_pk = robots.pk) AS "first: i64",
+                       (SELECT MAX(pk) FROM segments WHERE robot_pk = robots.pk) AS "last: i64"
+                   FROM robots WHERE site_pk = ? AND id = ?"#,
+                site_pk,
+                robot,
+            );
+            let row = row.fetch_optional(&mut *db).await?;
+            row.map_or((None, None), |row| (row.first, row.last))
+        }
+        (None, Some(terrain)) => {
+            let row = sqlx::query!(
+                r#"SELECT
+                       (SELECT MIN(pk) FROM segments WHERE site_pk = ?1 AND terrain = ?2)
+                           AS "first: i64",
+                       (SELECT MAX(pk) FROM segments WHERE site_pk = ?1 AND terrain = ?2)
+                           AS "last: i64""#,
+                site_pk,
+                terrain,
+            );
+            let row = row.fetch_one(&mut *db).await?;
+            (row.first, row.last)
+        }
+        (None, None) => {
+            let row = sqlx::query!(
+                r#"SELECT (SELECT MIN(pk) FROM segments) AS "first: i64",
+                       (SELECT MAX(pk) FROM segments) AS "last: i64""#
+            );
+            let row = row.fetch_one(&mut *db).await?;
+            (row.first, row.last)
+        }
+    };
+    let last_at_us = match last {
+        Some(last) => {
+            let at_us =
+                sqlx::query_scalar!("SELECT received_at_us FROM segments WHERE pk = ?", last);
+            at_us.fetch_optional(db).await?
+        }
+        None => None,
+    };
+    Ok(Extent {
+        first,
+        last,
+        last_at_us,
+    })
 }
 
 /// Measurements of a site in the order of their commits.

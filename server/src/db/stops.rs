@@ -178,7 +178,7 @@ pub async fn confirm(
 ) -> Result<(), DbError> {
     let (ids, at_us) = (to_json("stops", &ids)?, to_us(at));
     sqlx::query!(
-        "UPDATE stops SET confirmed_at_us = COALESCE(confirmed_at_us, ?)
+        "UPDATE stops SET confirmed_at_us = COALESCE(confirmed_at_us, MAX(?, wanted_at_us))
          WHERE id IN (SELECT value FROM json_each(?))",
         at_us,
         ids,
@@ -223,7 +223,16 @@ pub async fn ask_clear(
     by: &str,
     at: Timestamp,
 ) -> Result<(), DbError> {
-    let (id, at_us) = (id.to_string(), to_us(at));
+    let id = id.to_string();
+    // All that are cleared together have one time, which is not before any of theirs.
+    let newest_us = sqlx::query_scalar!(
+        r#"SELECT COALESCE(MAX(MAX(wanted_at_us, COALESCE(confirmed_at_us, 0))), 0)
+               AS "newest!: i64"
+           FROM stops
+           WHERE cleared_at_us IS NULL AND robot_pk = (SELECT robot_pk FROM stops WHERE id = ?)"#,
+        id,
+    );
+    let at_us = to_us(at).max(newest_us.fetch_one(&mut *db).await?);
     sqlx::query!(
         "UPDATE stops SET clear_asked_by = ?1, clear_asked_at_us = ?2
          WHERE robot_pk = (SELECT robot_pk FROM stops WHERE id = ?3)
@@ -258,7 +267,8 @@ pub async fn refuse_clear(db: &mut SqliteConnection, id: StopId) -> Result<(), D
 pub async fn clear(db: &mut SqliteConnection, id: StopId, at: Timestamp) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
-        "UPDATE stops SET cleared_at_us = ?1
+        "UPDATE stops SET cleared_at_us = MAX(?1, wanted_at_us,
+             COALESCE(confirmed_at_us, wanted_at_us), COALESCE(clear_asked_at_us, wanted_at_us))
          WHERE robot_pk = (SELECT robot_pk FROM stops WHERE id = ?2)
            AND (id = ?2
                OR clear_asked_at_us = (SELECT clear_asked_at_us FROM stops WHERE id = ?2))
@@ -275,7 +285,9 @@ pub async fn clear(db: &mut SqliteConnection, id: StopId, at: Timestamp) -> Resu
 pub async fn end(db: &mut SqliteConnection, id: StopId, at: Timestamp) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
-        "UPDATE stops SET confirmed_at_us = COALESCE(confirmed_at_us, ?1), cleared_at_us = ?1
+        "UPDATE stops SET confirmed_at_us = COALESCE(confirmed_at_us, MAX(?1, wanted_at_us)),
+             cleared_at_us = MAX(?1, wanted_at_us, COALESCE(confirmed_at_us, wanted_at_us),
+                 COALESCE(clear_asked_at_us, wanted_at_us))
          WHERE id = ?2 AND cleared_at_us IS NULL",
         at_us,
         id,

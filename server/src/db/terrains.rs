@@ -133,7 +133,8 @@ pub async fn put(
         "INSERT INTO terrains (site_pk, id, revision, name, class, polygon, layer, updated_at_us)
          VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8)
          ON CONFLICT (site_pk, id) DO UPDATE SET revision = ?3, name = ?4, class = ?5,
-             polygon = ?6, layer = ?7, updated_at_us = ?8",
+             polygon = ?6, layer = ?7,
+             updated_at_us = MAX(?8, terrains.updated_at_us)",
         site_pk,
         id,
         revision,
@@ -148,7 +149,9 @@ pub async fn put(
     sqlx::query!(
         "INSERT INTO terrain_revisions
              (site_pk, id, revision, class, polygon, layer, written_at_us)
-         VALUES (?, ?, ?, ?, ?, ?, ?)",
+         VALUES (?1, ?2, ?3, ?4, ?5, ?6, MAX(?7, COALESCE(
+             (SELECT MAX(written_at_us) FROM terrain_revisions WHERE site_pk = ?1 AND id = ?2),
+             ?7)))",
         site_pk,
         id,
         revision,

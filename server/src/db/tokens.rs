@@ -138,7 +138,9 @@ pub async fn insert(
 pub async fn revoke(db: &mut SqliteConnection, id: TokenId, at: Timestamp) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
-        "UPDATE tokens SET revoked_at_us = COALESCE(revoked_at_us, ?) WHERE id = ?",
+        "UPDATE tokens SET revoked_at_us = COALESCE(revoked_at_us,
+             MAX(?, created_at_us, COALESCE(last_used_at_us, created_at_us)))
+         WHERE id = ?",
         at_us,
         id
     )
@@ -154,7 +156,9 @@ pub async fn revoke(db: &mut SqliteConnection, id: TokenId, at: Timestamp) -> Re
 pub async fn touch(db: &mut SqliteConnection, id: TokenId, at: Timestamp) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
-        "UPDATE tokens SET last_used_at_us = ? WHERE id = ?",
+        "UPDATE tokens SET last_used_at_us =
+             MAX(?, created_at_us, COALESCE(last_used_at_us, created_at_us))
+         WHERE id = ?",
         at_us,
         id
     )

@@ -57,7 +57,8 @@ pub async fn insert(db: &mut SqliteConnection, row: &WithdrawalRow) -> Result<i6
     let at_us = to_us(row.at);
     let done = sqlx::query!(
         "INSERT INTO withdrawals (robot_pk, from_h, to_h, reason, withdrawn_by, withdrawn_at_us)
-         VALUES (?, ?, ?, ?, ?, ?)",
+         VALUES (?1, ?2, ?3, ?4, ?5, MAX(?6, COALESCE(
+             (SELECT withdrawn_at_us FROM withdrawals ORDER BY pk DESC LIMIT 1), ?6)))",
         row.robot_pk,
         row.from_h,
         row.to_h,

@@ -11,11 +11,11 @@ use std::time::Duration;
 use jiff::Timestamp;
 use tread_api::friction::LiveFriction;
 use tread_api::ids::{BootId, MissionId, RobotId, SiteId, StopId};
-use tread_api::robot::{Aged, LinkCause, LinkState, RobotLive};
+use tread_api::robot::{Aged, LinkCause, LinkState, MissionProgress, RobotLive};
 use tread_api::safety::StandingState;
 use tread_api::wire::state::{FrictionReport, RobotState};
 
-pub use self::looks::Held;
+pub use self::looks::{Attending, Held};
 use self::news::Shown;
 use self::rivals::OtherRun;
 pub use self::rivals::Rival;
@@ -69,6 +69,8 @@ pub struct Presence {
     other: Option<OtherRun>,
     shown: Option<Shown>,
     state: Option<(RobotState, Duration)>,
+    /// The last mission that it showed, whatever run of the agent drove it.
+    progress: Option<MissionProgress>,
     friction: Option<(LiveFriction, Duration)>,
 }
 
@@ -105,6 +107,17 @@ impl Presence {
         } else {
             LinkCause::LinkDown
         })
+    }
+
+    /// Whether the agent said that it leaves, and has not come back.
+    pub fn has_left(&self) -> bool {
+        self.state().is_some_and(|state| state.leaving)
+    }
+
+    /// How far the robot had come with a mission when it showed it last, also before it was off
+    /// the network or its agent began another run.
+    pub fn progress_of(&self, mission: MissionId) -> Option<MissionProgress> {
+        self.progress.filter(|progress| progress.id == mission)
     }
 
     /// Time since the last heartbeat; `None` if there was none.
@@ -352,6 +365,7 @@ impl Presences {
         }
         let said = presence.state().map(|before| &before.alerts);
         presence.alerts_changed |= said != Some(&state.alerts);
+        presence.progress = state.mission.or(presence.progress);
         presence.state = Some((state, now));
         if news || !was_online {
             Heard::News

@@ -5,6 +5,7 @@
 //! `null` and the polygon stands in `place`, with `coordRefSys` beside it, in the manner of OGC
 //! JSON-FG.
 
+use jiff::Timestamp;
 use serde::Serialize;
 use serde_json::{Value, json};
 use tread_api::friction::CellFriction;
@@ -23,7 +24,7 @@ type Write<T> = Box<dyn Fn(&T) -> Result<Value, serde_json::Error> + Send>;
 /// Entries of a list, with what stands before and behind them.
 struct List<T> {
     before: String,
-    after: &'static str,
+    after: String,
     entry: Write<T>,
     is_first: bool,
 }
@@ -46,24 +47,24 @@ impl<T> Writer<T> for List<T> {
     }
 
     fn end(&mut self) -> Result<Vec<u8>, TableError> {
-        Ok(self.after.as_bytes().to_vec())
+        Ok(self.after.clone().into_bytes())
     }
 }
 
-/// Everything on one page, as the API's lists are.
-pub fn page<T: Serialize + 'static>() -> Box<dyn Writer<T>> {
+/// Everything on one page, as the API's lists of the map are, with as of when it is.
+pub fn page<T: Serialize + 'static>(as_of: Option<Timestamp>) -> Box<dyn Writer<T>> {
     Box::new(List {
         before: "{\"items\":[".to_owned(),
-        after: "],\"next_cursor\":null}\n",
+        after: format!("],\"next_cursor\":null,\"as_of\":{}}}\n", json!(as_of)),
         entry: Box::new(|entry: &T| serde_json::to_value(entry)),
         is_first: true,
     })
 }
 
-/// Cells of a site as features.
-pub fn features(site: &Site) -> Box<dyn Writer<CellFriction>> {
+/// Cells of a site as features, with as of when they are.
+pub fn features(site: &Site, as_of: Option<Timestamp>) -> Box<dyn Writer<CellFriction>> {
     let origin = site.origin;
-    let head = match origin {
+    let mut head = match origin {
         Some(_) => json!({
             "type": "FeatureCollection",
             "tread:frame": "WGS 84, longitude and latitude in degrees",
@@ -75,13 +76,14 @@ pub fn features(site: &Site) -> Box<dyn Writer<CellFriction>> {
             "tread:frame": "metres in the site's own frame, which is not tied to WGS 84",
         }),
     };
+    head["tread:as_of"] = json!(as_of);
     let mut before = head.to_string();
     // The list comes last in the object.
     before.pop();
     before.push_str(",\"features\":[");
     Box::new(List {
         before,
-        after: "]}\n",
+        after: "]}\n".to_owned(),
         entry: Box::new(move |entry: &CellFriction| {
             let (x, y) = (f64::from(entry.cell.ix), f64::from(entry.cell.iy));
             let corners = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (0.0, 0.0)];

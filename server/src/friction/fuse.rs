@@ -154,7 +154,7 @@ pub struct Fused {
     pub track: Option<Estimate>,
     /// Rolling resistance coefficient.
     pub rolling: Option<Estimate>,
-    /// Passes that ever came, also those that a change has made void.
+    /// Passes that ever came, also those that a change has made void and those that told nothing.
     pub passes: u64,
     /// Robots behind the estimate.
     pub robots: u32,
@@ -164,6 +164,18 @@ pub struct Fused {
     pub is_disputed: bool,
     /// Since when the ground is as it is, if it was otherwise; microseconds since 1970.
     pub changed_at_us: Option<i64>,
+}
+
+impl Fused {
+    /// The same with passes that told nothing counted too: their information is below what the sums
+    /// resolve, 2.3·10⁻¹⁰, so that they change no estimate.
+    #[must_use]
+    pub fn with_uninformative(self, uninformative_passes: u64) -> Self {
+        Self {
+            passes: self.passes + uninformative_passes,
+            ..self
+        }
+    }
 }
 
 /// What a piece of ground is, which says how a difference between measurements is understood.

@@ -1,6 +1,6 @@
 //! Answers that a client need not fetch again while they are the same.
 
-use std::hash::{DefaultHasher, Hash as _, Hasher as _};
+use std::hash::{DefaultHasher, Hash, Hasher as _};
 
 use axum::body::Bytes;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
@@ -27,18 +27,40 @@ pub(super) fn bytes(headers: &HeaderMap, media_type: &'static str, body: Bytes) 
     media_type.hash(&mut hasher);
     body.hash(&mut hasher);
     let tag = format!("\"{:016x}-{:x}\"", hasher.finish(), body.len());
-    let response = if is_held(headers, &tag) {
-        StatusCode::NOT_MODIFIED.into_response()
-    } else {
+    let make = || {
         let media_type = HeaderValue::from_static(media_type);
         ([(header::CONTENT_TYPE, media_type)], body).into_response()
     };
-    let cached = [
-        (header::ETAG, tag),
-        // Held, but asked for again each time: the map changes while robots drive.
-        (header::CACHE_CONTROL, "private, no-cache".to_owned()),
-    ];
-    (cached, response).into_response()
+    tagged(headers, tag, make)
+}
+
+/// An answer that is sent while it is made, with a weak `ETag` of what it is made from: whatever
+/// changes it changes `state`. 304 without a body to who has it already.
+pub(super) fn streamed(
+    headers: &HeaderMap,
+    media_type: &'static str,
+    state: impl Hash,
+    make: impl FnOnce() -> Response,
+) -> Response {
+    let mut hasher = DefaultHasher::new();
+    (media_type, state).hash(&mut hasher);
+    tagged(headers, format!("W/\"{:016x}\"", hasher.finish()), make)
+}
+
+fn tagged(headers: &HeaderMap, tag: String, make: impl FnOnce() -> Response) -> Response {
+    let mut response = if is_held(headers, &tag) {
+        StatusCode::NOT_MODIFIED.into_response()
+    } else {
+        make()
+    };
+    let said = response.headers_mut();
+    if let Ok(tag) = HeaderValue::try_from(tag) {
+        said.insert(header::ETAG, tag);
+    }
+    // Held, but asked for again each time: the map changes while robots drive.
+    let held = HeaderValue::from_static("private, no-cache");
+    said.insert(header::CACHE_CONTROL, held);
+    response
 }
 
 /// Whether the client says that it has this.
@@ -48,5 +70,6 @@ fn is_held(headers: &HeaderMap, tag: &str) -> bool {
         .filter_map(|value| value.to_str().ok())
         .flat_map(|value| value.split(','))
         .map(|entry| entry.trim().trim_start_matches("W/"));
+    let tag = tag.trim_start_matches("W/");
     listed.any(|entry| entry == tag || entry == "*")
 }

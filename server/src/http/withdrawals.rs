@@ -1,12 +1,14 @@
 //! `/v1/sites/{site}/withdrawals` and `/v1/sites/{site}/robots/{robot}/withdrawals`.
 
 use axum::extract::State;
-use axum::http::StatusCode;
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::Response;
 use tread_api::friction::{CreateWithdrawal, Withdrawal};
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::page::Page;
 use tread_api::problem::ProblemBody;
 
+use super::etag;
 use super::extract::{Json, Path, Query, cursor, page_limit};
 use super::identity::guard::Subject;
 use super::problem::Problem;
@@ -36,13 +38,16 @@ pub(super) async fn create(
 #[utoipa::path(get, path = "/v1/sites/{site}/withdrawals", tag = "friction",
     security(("token" = ["viewer"])),
     operation_id = "list_withdrawals", params(("site" = SiteId, Path), PageQuery),
-    responses((status = 200, body = Page<Withdrawal>), (status = 404, body = ProblemBody)))]
+    responses((status = 200, body = Page<Withdrawal>), (status = 304),
+        (status = 404, body = ProblemBody)))]
 pub(super) async fn list(
     State(app): State<App>,
     Path(site): Path<SiteId>,
     Query(query): Query<PageQuery>,
-) -> Result<Json<Page<Withdrawal>>, Problem> {
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
     let limit = page_limit(query.limit)?;
     let after = cursor(query.cursor.as_deref())?;
-    Ok(Json(app.withdrawals(&site, after, limit).await?))
+    let found = app.withdrawals(&site, after, limit).await?;
+    Ok(etag::json(&headers, &found))
 }

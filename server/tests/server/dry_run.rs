@@ -2,8 +2,10 @@
 
 use reqwest::StatusCode;
 use serde_json::{Value, json};
+use tread_api::geometry::Pose;
+use tread_api::robot::Aged;
 
-use crate::harness::{Yard, circle};
+use crate::harness::{Yard, circle, eventually};
 use crate::robot::Robot;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -135,5 +137,107 @@ async fn a_dry_run_tells_how_well_friction_would_be_measured() {
     let (status, refused) = check(&body).await;
     assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{refused}");
     assert_eq!(refused["field"], "theta", "{refused}");
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_dry_run_plans_from_the_end_of_what_is_driven_before() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    robot.say(|state| {
+        let value = Pose {
+            x_m: 0.0,
+            y_m: 0.0,
+            heading_rad: 0.0,
+        };
+        state.pose = Some(Aged { value, age_ms: 0 });
+    });
+    eventually("the server knows where the robot is", async || {
+        let (_, shown) = yard.get_value("/v1/sites/yard/robots/rover-1").await;
+        let pose = shown["live"]["pose"].clone();
+        if pose.is_object() { Ok(()) } else { Err(shown) }
+    })
+    .await;
+    let line = |from: (f64, f64), to: (f64, f64)| {
+        let points = json!([{"x_m": from.0, "y_m": from.1}, {"x_m": to.0, "y_m": to.1}]);
+        json!({"site": "yard", "robot": "rover-1",
+               "trajectory": {"waypoints": {"speed_m_s": 0.5, "points": points}}})
+    };
+    let check = async |body: &Value| {
+        let (status, said) = yard.post("/v1/trajectories/check", body).await;
+        assert_eq!(status, StatusCode::OK, "{said}");
+        said
+    };
+    let near = |said: &Value, x_m: f64, y_m: f64| {
+        let place = |name: &str| said["start"][name].as_f64().unwrap();
+        let off_m = (place("x_m") - x_m).hypot(place("y_m") - y_m);
+        assert!(off_m < 1e-3, "{said}");
+    };
+    let wanted = line((0.0, 1.0), (5.0, 1.0));
+    let idle = check(&wanted).await;
+    assert_eq!(idle["start_source"], "robot");
+    near(&idle, 0.0, 0.0);
+    // One is driven to x 10, one waits that comes back to x 4, and one of low priority goes off.
+    let send = async |mut body: Value, priority: i32| {
+        body["priority"] = json!(priority);
+        let (status, mission) = yard.post("/v1/missions", &body).await;
+        assert_eq!(status, StatusCode::CREATED, "{mission}");
+        mission["id"].clone()
+    };
+    let driven = send(line((0.0, 0.0), (10.0, 0.0)), 0).await;
+    eventually("the robot drives it", async || {
+        let (_, mission) = yard
+            .get_value(&format!("/v1/missions/{}", driven.as_str().unwrap()))
+            .await;
+        if mission["state"] == "active" {
+            Ok(())
+        } else {
+            Err(mission)
+        }
+    })
+    .await;
+    let after = check(&wanted).await;
+    assert_eq!(
+        (&after["start_source"], &after["after_mission"]),
+        (&json!("mission"), &driven)
+    );
+    near(&after, 10.0, 0.0);
+    assert!(
+        after["length_m"].as_f64() > idle["length_m"].as_f64(),
+        "{after}"
+    );
+    let back = send(line((10.0, 0.0), (4.0, -3.0)), 5).await;
+    let low = send(line((4.0, -3.0), (40.0, -3.0)), -5).await;
+    let queued = check(&wanted).await;
+    assert_eq!(queued["after_mission"], back);
+    near(&queued, 4.0, -3.0);
+    let mut body = wanted.clone();
+    body["priority"] = json!(-5);
+    assert_eq!(check(&body).await["after_mission"], low);
+    body["priority"] = json!(9);
+    assert_eq!(check(&body).await["after_mission"], driven);
+    body["start_policy"] = json!("replace");
+    let replacing = check(&body).await;
+    assert_eq!(replacing["start_source"], "robot");
+    near(&replacing, 0.0, 0.0);
+    let mut body = wanted.clone();
+    body["replaces"] = back.clone();
+    assert_eq!(check(&body).await["after_mission"], driven);
+    let mut body = wanted.clone();
+    body["start"] = json!({"x_m": 1.0, "y_m": 1.0, "heading_rad": 0.0});
+    assert_eq!(check(&body).await["start_source"], "request");
+    // The path that is held against the geofence is the one from there: from where the robot is, it
+    // would be clear.
+    let fence = json!({"keep_in": [], "keep_out": [[{"x_m": 1.0, "y_m": -2.4}, {"x_m": 3.4, "y_m": -2.4},
+        {"x_m": 3.4, "y_m": -0.9}, {"x_m": 1.0, "y_m": -0.9}]]});
+    let path = yard.url("/v1/sites/yard/geofence");
+    let (status, said) = yard.send(yard.client().put(path).json(&fence)).await;
+    assert_eq!(status, StatusCode::OK, "{said}");
+    let (status, said) = yard.post("/v1/trajectories/check", &wanted).await;
+    assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{said}");
+    assert_eq!(said["type"], "/problems/crosses-geofence", "{said}");
+    let mut body = wanted.clone();
+    body["start_policy"] = json!("replace");
+    assert_eq!(check(&body).await["start_source"], "robot");
     yard.server.stop().await.unwrap();
 }

@@ -277,3 +277,141 @@ async fn geojson_is_in_degrees_where_the_site_is_tied_and_says_metres_where_it_i
     assert_eq!(status, StatusCode::NOT_FOUND);
     yard.server.stop().await.unwrap();
 }
+
+/// All that the map and the measurements can be given as.
+const REPRESENTATIONS: [&str; 12] = [
+    "friction/map?format=png",
+    "friction/map?format=tile",
+    "friction/map?format=nav2",
+    "friction/map?format=pgm",
+    "friction/map?format=json",
+    "friction/map?format=geojson",
+    "friction/map?format=csv",
+    "friction/map?format=parquet",
+    "segments",
+    "segments?format=csv",
+    "segments?format=parquet",
+    "withdrawals",
+];
+
+async fn tag_of(yard: &Yard, path: &str, held: Option<&str>) -> (StatusCode, String, usize) {
+    let url = yard.url(&format!("/v1/sites/yard/{path}"));
+    let mut request = yard.client().get(url);
+    if let Some(held) = held {
+        request = request.header(header::IF_NONE_MATCH, held);
+    }
+    let response = request.send().await.unwrap();
+    let status = response.status();
+    let tag = response.headers().get(header::ETAG);
+    let tag = tag.unwrap_or_else(|| panic!("{path} has no ETag"));
+    let tag = tag.to_str().unwrap().to_owned();
+    (status, tag, response.bytes().await.unwrap().len())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn every_representation_has_a_tag_of_its_own_that_changes_when_its_content_does() {
+    let yard = driven_yard().await;
+    let mut tags = BTreeMap::new();
+    for path in REPRESENTATIONS {
+        let (status, tag, length) = tag_of(&yard, path, None).await;
+        assert_eq!(status, StatusCode::OK, "{path}");
+        assert!(length > 0, "{path}");
+        let held = format!("\"of-another\", {tag}");
+        let (status, again, length) = tag_of(&yard, path, Some(&held)).await;
+        assert_eq!(status, StatusCode::NOT_MODIFIED, "{path}");
+        assert_eq!((again, length), (tag.clone(), 0), "{path}");
+        if let Some(other) = tags.insert(tag, path) {
+            panic!("{path} and {other} have one tag");
+        }
+    }
+    // Boxes and pages are representations too.
+    for path in [
+        "friction/map?format=csv&x_min_m=0&y_min_m=-9&x_max_m=2&y_max_m=9",
+        "segments?format=csv&robot=rover-1",
+        "segments?format=csv&terrain=lawn",
+        "segments?format=csv&cursor=2",
+    ] {
+        let (_, tag, _) = tag_of(&yard, path, None).await;
+        assert_eq!(tags.insert(tag, path), None, "{path}");
+    }
+    // One more measurement, and one that is taken off.
+    let robot = Robot::join(&yard, "rover-3").await;
+    robot
+        .upload(vec![measured(0, segment((1, -1), 0.2, 700))])
+        .await
+        .unwrap();
+    let path = "/v1/sites/yard/robots/rover-2/withdrawals";
+    let (status, said) = yard.post(path, &json!({"reason": "worn tyres"})).await;
+    assert_eq!(status, StatusCode::CREATED, "{said}");
+    for (tag, path) in &tags {
+        // Speeds follow from the grip, which is the same as before; so is the mask's YAML.
+        if ["robot=rover-1", "nav2", "pgm"]
+            .iter()
+            .any(|same| path.contains(same))
+        {
+            continue;
+        }
+        let (status, new, length) = tag_of(&yard, path, Some(tag)).await;
+        assert_eq!(status, StatusCode::OK, "{path}");
+        assert!(new != *tag && length > 0, "{path}");
+    }
+    let (status, ..) = {
+        let tag = tags.iter().find(|(_, path)| path.contains("robot=rover-1"));
+        tag_of(
+            &yard,
+            "segments?format=csv&robot=rover-1",
+            tag.map(|(tag, _)| tag.as_str()),
+        )
+        .await
+    };
+    assert_eq!(
+        status,
+        StatusCode::NOT_MODIFIED,
+        "nothing of this robot has changed"
+    );
+    // Ages are counted in whole minutes.
+    let (_, before, _) = tag_of(&yard, "friction/map?format=csv", None).await;
+    yard.server
+        .app()
+        .clock()
+        .advance(std::time::Duration::from_mins(2));
+    let (status, ..) = tag_of(&yard, "friction/map?format=csv", Some(&before)).await;
+    assert_eq!(status, StatusCode::OK);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_export_says_as_of_when_it_is() {
+    let yard = driven_yard().await;
+    let measured_at = segment((0, 0), 0.2, 600).ended_at;
+    for (asked, count) in [
+        (measured_at, 0),
+        (measured_at + SignedDuration::from_hours(1), 6),
+    ] {
+        let hour = asked.as_second().div_euclid(3_600) * 3_600;
+        let effective = jiff::Timestamp::from_second(hour).unwrap().to_string();
+        for format in ["json", "geojson", "csv", "parquet", "png", "tile"] {
+            let path = format!("{MAP}?format={format}&as_of={asked}");
+            let (headers, bytes) = fetched(&yard, &path).await;
+            assert_eq!(headers["tread-as-of"], effective, "{format}");
+            match format {
+                "csv" => assert_eq!(comma_rows(&bytes).len(), count),
+                "parquet" => assert_eq!(parquet_rows(bytes).len(), count),
+                "json" => {
+                    let listed: Value = serde_json::from_slice(&bytes).unwrap();
+                    assert_eq!(listed["as_of"], effective);
+                    assert_eq!(listed["items"].as_array().unwrap().len(), count);
+                }
+                "geojson" => {
+                    let listed: Value = serde_json::from_slice(&bytes).unwrap();
+                    assert_eq!(listed["tread:as_of"], effective);
+                    assert_eq!(listed["features"].as_array().unwrap().len(), count);
+                }
+                _ => {}
+            }
+        }
+    }
+    let now: Value = yard.get(&format!("{MAP}?format=json")).await;
+    assert!(now["as_of"].is_null(), "all that has come counts");
+    yard.server.stop().await.unwrap();
+}

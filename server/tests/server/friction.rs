@@ -6,11 +6,11 @@ use jiff::{SignedDuration, Timestamp};
 use reqwest::{StatusCode, header};
 use serde_json::{Value, json};
 use tread_api::friction::{
-    CellDifference, CellFriction, PathFriction, PointFriction, RobotContribution, Segment,
-    TerrainFriction, TerrainHistory, VisitSuggestion,
+    CellDifference, CellFriction, Information, PathFriction, PointFriction, RobotContribution,
+    Segment, TerrainFriction, TerrainHistory, VisitSuggestion,
 };
 use tread_api::ids::ConfigurationId;
-use tread_api::page::Page;
+use tread_api::page::{MapPage, Page};
 use tread_api::tile::Tile;
 use tread_api::wire::ingest::Record;
 use tread_server::friction::index::Normalisation;
@@ -161,7 +161,8 @@ async fn a_terrain_has_a_history_and_cells_differ_between_two_times() {
         })
         .collect();
     // Both robots drove three cells in the first hour and two in each later one.
-    assert_eq!(segments, [0, 6, 14, 22, 22]);
+    // The hours of measuring end between those times: what is not over then does not count.
+    assert_eq!(segments, [0, 0, 10, 18, 22]);
     let as_of: TerrainFriction = yard
         .get(&format!("{BASE}/terrains/lawn?as_of={}", after_h(2)))
         .await;
@@ -566,5 +567,100 @@ async fn a_bad_question_is_refused_with_the_bound_that_it_breaks() {
         assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{said}");
         assert!(said["detail"].as_str().unwrap().contains(said_of), "{said}");
     }
+    yard.server.stop().await.unwrap();
+}
+
+/// One pass through another cell each ten minutes, over four hours.
+fn drive_of_four_hours() -> Vec<Segment> {
+    (0..24)
+        .map(|number| segment((number, 0), 0.2, 600 * i64::from(number)))
+        .collect()
+}
+
+/// A yard with that drive, whose clock stands so long after its begin.
+async fn driven_for_four_hours(after: SignedDuration) -> Yard {
+    let yard = Yard::start_at(begin() + after).await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    robot.upload(numbered(drive_of_four_hours())).await.unwrap();
+    yard
+}
+
+/// Asks as of a time, and holds what counts against what was measured by the time that is stated.
+async fn stated_as_of(yard: &Yard, asked: Timestamp) -> Timestamp {
+    let said: MapPage<CellFriction> = yard.get(&format!("{BASE}/cells?as_of={asked}")).await;
+    let as_of = said.as_of.unwrap();
+    assert!(as_of <= asked, "{as_of} {asked}");
+    let newest = said.items.iter().map(|item| item.friction.newest_at).max();
+    assert!(
+        newest.is_none_or(|newest| newest <= as_of),
+        "{newest:?} {as_of}"
+    );
+    let counted: u64 = said.items.iter().map(|item| item.friction.segments).sum();
+    let drive = drive_of_four_hours();
+    let measured = drive.iter().filter(|pass| pass.ended_at < as_of).count();
+    assert_eq!(counted, u64::try_from(measured).unwrap(), "as of {as_of}");
+    let x_m = f64::from(u32::try_from(measured).unwrap()) + 0.5;
+    let point: PointFriction = yard
+        .get(&format!("{BASE}/point?x_m={x_m}&y_m=0.5&as_of={asked}"))
+        .await;
+    assert_eq!(point.as_of, Some(as_of));
+    let is_unknown = point.models.iter().all(|model| model.friction.is_none());
+    assert!(is_unknown, "the next cell as of {as_of}: {point:?}");
+    as_of
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn nothing_counts_that_was_measured_after_the_time_the_answer_states() {
+    let yard = driven_for_four_hours(SignedDuration::from_hours(5)).await;
+    for minutes in [1_i64, 15, 29, 61, 100, 180, 233] {
+        let asked = begin() + SignedDuration::from_mins(minutes);
+        let as_of = stated_as_of(&yard, asked).await;
+        assert!(asked.duration_since(as_of) < SignedDuration::from_hours(1));
+    }
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn days_of_which_the_hours_are_merged_count_when_they_are_over() {
+    let yard = driven_for_four_hours(SignedDuration::from_hours(24 * 10)).await;
+    yard.server.app().move_horizons().await.unwrap();
+    for hours in [1, 3, 30, 60] {
+        let asked = begin() + SignedDuration::from_hours(hours);
+        let as_of = stated_as_of(&yard, asked).await;
+        assert_eq!(as_of.as_second() % 86_400, 0, "{as_of}");
+    }
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn passes_that_tell_nothing_are_counted_and_change_no_estimate() {
+    let first = segment((0, 0), 0.2, 0).ended_at;
+    let yard = Yard::start_at(first + SignedDuration::from_hours(5)).await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let telling = (0..3).map(|number| segment((0, 0), 0.2, number));
+    robot.upload(numbered(telling)).await.unwrap();
+    let cells = format!("{BASE}/cells");
+    let before: MapPage<CellFriction> = yard.get(&cells).await;
+    // In an hour of their own, so that their sum is all that is known of it.
+    let silent = (0..8).map(|number| {
+        let mut silent = segment((0, 0), 0.2, 7_200 + number);
+        silent.theta = Information {
+            information: 1e-11,
+            weighted: 2e-12,
+        };
+        silent
+    });
+    let two = Robot::join(&yard, "rover-2").await;
+    two.upload(numbered(silent)).await.unwrap();
+    let after: MapPage<CellFriction> = yard.get(&cells).await;
+    let [was, is] = [before.items[0].friction, after.items[0].friction];
+    assert_eq!((was.segments, is.segments), (3, 11));
+    assert_eq!(
+        (was.theta, was.std_dev, was.robots),
+        (is.theta, is.std_dev, is.robots)
+    );
+    let box_of = "x_min_m=-1&y_min_m=-1&x_max_m=1&y_max_m=1&resolution_m=2";
+    let coarse: MapPage<CellFriction> = yard.get(&format!("{cells}?{box_of}")).await;
+    assert_eq!(coarse.items[0].friction.segments, 11);
     yard.server.stop().await.unwrap();
 }

@@ -181,6 +181,15 @@ impl Yard {
         Self::start_in(self.folder, zenoh.trim_start_matches("tcp/")).await
     }
 
+    /// The same with a clock that stands at another time.
+    pub(crate) async fn restart_at(self, wall: Timestamp) -> Self {
+        let zenoh = self.server.zenoh_endpoint();
+        self.server.stop().await.unwrap();
+        let config = config(self.folder.path(), zenoh.trim_start_matches("tcp/"));
+        let server = Server::start_with_clock(config, Clock::manual(wall));
+        Self::of(self.folder, server.await.unwrap()).await
+    }
+
     pub(crate) fn url(&self, path: &str) -> String {
         format!("http://{}{path}", self.server.http_address())
     }

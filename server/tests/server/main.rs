@@ -2,7 +2,11 @@
 //! played by the test.
 
 #[cfg(test)]
+mod alerts;
+#[cfg(test)]
 mod bad_input;
+#[cfg(test)]
+mod clock;
 #[cfg(test)]
 mod control;
 #[cfg(test)]

@@ -7,7 +7,7 @@ use reqwest::StatusCode;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
 use tread_api::friction::{CellFriction, Information, Segment, Withdrawal};
-use tread_api::page::Page;
+use tread_api::page::{MapPage, Page};
 use tread_api::robot::Robot as ShownRobot;
 use tread_api::wire::ingest::{Batch, Receipt, Record};
 use tread_server::app::App;
@@ -252,7 +252,7 @@ pub(crate) async fn restarted(app: &App) -> App {
 }
 
 /// What the map says of all cells.
-pub(crate) async fn said(app: &App) -> Page<CellFriction> {
+pub(crate) async fn said(app: &App) -> MapPage<CellFriction> {
     let cells = CellsAsked {
         area: Area::new((None, None), (None, None)).unwrap(),
         resolution_m: None,

@@ -132,8 +132,8 @@ async fn a_picture_follows_each_change_and_is_kept_until_then() {
         .advance(std::time::Duration::from_hours(20));
     let fourth = tile().await;
     assert!(fourth.squares[1].unwrap().std_dev > third.squares[1].unwrap().std_dev);
-    // As it was known when the first hour had begun and the others had not.
-    let then = segment((0, 0), 0.2, 1).ended_at;
+    // As it was known when the first hour was over and the others were not.
+    let then = segment((0, 0), 0.2, 3_600).ended_at;
     let (_, bytes) = fetched(&yard, &format!("format=tile&as_of={then}")).await;
     let early = Tile::decode(&bytes).unwrap();
     assert_eq!(early.squares.iter().flatten().count(), 4);

@@ -95,6 +95,32 @@ pub(crate) async fn session(yard: &Yard) -> zenoh::Session {
         .unwrap()
 }
 
+/// What a robot says first, with that many records in its store.
+fn first_state(id: &RobotId, boot: BootId, pending: u64) -> RobotState {
+    RobotState {
+        robot: id.clone(),
+        boot,
+        seq: 0,
+        robot_time: time("2026-11-01T00:00:00Z"),
+        mode: RobotMode::Idle,
+        fault: None,
+        pose: None,
+        twist: None,
+        mission: None,
+        terrain_revision: None,
+        outbox: OutboxStatus {
+            pending,
+            ..OutboxStatus::default()
+        },
+        control_loop: LoopStatus::default(),
+        battery: None,
+        alerts: Vec::new(),
+        leaving: false,
+        monotonic_us: None,
+        safety: SafetyStatus::default(),
+    }
+}
+
 impl Robot {
     pub(crate) async fn join(yard: &Yard, id: &str) -> Self {
         Self::join_with_pending(yard, id, 0).await
@@ -120,27 +146,7 @@ impl Robot {
             stops_are_over: false,
             epoch: 0,
         }));
-        let state = Arc::new(Mutex::new(RobotState {
-            robot: id.clone(),
-            boot,
-            seq: 0,
-            robot_time: time("2026-11-01T00:00:00Z"),
-            mode: RobotMode::Idle,
-            fault: None,
-            pose: None,
-            twist: None,
-            mission: None,
-            terrain_revision: None,
-            outbox: OutboxStatus {
-                pending,
-                ..OutboxStatus::default()
-            },
-            control_loop: LoopStatus::default(),
-            battery: None,
-            alerts: Vec::new(),
-            monotonic_us: None,
-            safety: SafetyStatus::default(),
-        }));
+        let state = Arc::new(Mutex::new(first_state(&id, boot, pending)));
         let (listener, holding) = (Arc::clone(&heard), Arc::clone(&state));
         session
             .declare_queryable(keys::commands(&site(), &id))

@@ -192,6 +192,7 @@ impl Robot {
             },
             battery: None,
             alerts: Vec::new(),
+            leaving: false,
             monotonic_us: None,
             safety: SafetyStatus {
                 stop: self.stop.clone(),

@@ -76,6 +76,9 @@ pub fn session_config(bus: &BusSettings) -> Result<zenoh::Config, LinkError> {
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
         ("transport/link/tx/lease", LEASE_MS.to_string()),
+        // A router with a clock of its own holds the time of every message against it, and logs an
+        // error for each one once the machine's clock was set back. Stamps are in the messages.
+        ("timestamping/enabled", "false".to_owned()),
     ];
     let mut config = zenoh::Config::default();
     for (key, value) in settings {
@@ -470,5 +473,27 @@ fn small(attachment: &zenoh::bytes::ZBytes) -> std::borrow::Cow<'_, [u8]> {
         attachment.to_bytes()
     } else {
         std::borrow::Cow::Borrowed(&[])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_bus_holds_no_messages_time_against_its_own_clock() {
+        for mode in [BusMode::Client, BusMode::Router] {
+            let bus = BusSettings {
+                scheme: Scheme::Ros2Dds,
+                mode,
+                endpoint: "tcp/127.0.0.1:7447".to_owned(),
+                domain: 0,
+                namespace: Name::namespace("/rover").unwrap(),
+                node: Name::node("tread_agent").unwrap(),
+            };
+            let config = session_config(&bus).unwrap();
+            let is_stamping = config.get_json("timestamping/enabled").unwrap();
+            assert_eq!(is_stamping, "false", "{mode:?}");
+        }
     }
 }

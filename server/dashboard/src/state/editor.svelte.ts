@@ -178,7 +178,15 @@ export class Editor {
     try {
       const check = await ask<TrajectoryCheck>('/v1/trajectories/check', {
         method: 'POST',
-        body: { site, robot: this.robot, trajectory },
+        body: {
+          site,
+          robot: this.robot,
+          trajectory,
+          // Planned from where the robot will be when this mission's turn comes.
+          ...(this.purpose?.what === 'replace'
+            ? { replaces: this.purpose.mission.id }
+            : { priority: this.priority, start_policy: this.startPolicy }),
+        },
       });
       if (mine === this.#asked) this.check = check;
     } catch (error) {

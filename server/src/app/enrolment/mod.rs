@@ -30,6 +30,7 @@ use self::outsiders::Outsiders;
 pub(super) use self::outsiders::REVOKED_ALERT;
 use self::roll::Roll;
 use super::identity::new_secret;
+use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::{App, AppError, page, site_row};
 use crate::authority::{Authority, CertificateError, RobotName, RobotRequest};
 use crate::db::{self, DbError};
@@ -290,7 +291,13 @@ impl App {
         let found = db::enrolments::newest(&mut tx, site, robot).await?;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
         let enrolment = found.ok_or_else(unknown)?;
+        let mut ended = None;
+        if let Some(robot_pk) = db::robots::pk_of(&mut tx, site, robot).await? {
+            // Nobody misses it any more.
+            ended = self.end_alert(&mut tx, robot_pk, ROBOT_LOST_ALERT).await?;
+        }
         tx.commit().await?;
+        self.show_alerts(ended.as_slice());
         self.roll().note(&enrolment);
         tracing::warn!(robot.id = %robot, "robot `{robot}` of site `{site}` was put out by {revoked_by}");
         Ok(enrolment)
@@ -379,7 +386,7 @@ impl App {
             robot: robot.clone(),
             enrolment: number,
         };
-        let certificate = office.sign(key, &name, now)?;
+        let certificate = office.sign(key, &name, self.clock().machine_time())?;
         if !db::join_tokens::use_up(&mut tx, token.id, &robot, now).await? {
             return Err(EnrolError::Used(token.id));
         }
@@ -428,7 +435,7 @@ impl App {
         let proven = present.check_proof(&request.certificate_request, proof);
         proven.map_err(EnrolError::Certificate)?;
         let name = present.name();
-        let certificate = office.sign(&key, name, now)?;
+        let certificate = office.sign(&key, name, self.clock().machine_time())?;
         let mut tx = self.db().write().await?;
         let enrolment = (&name.site, &name.robot, name.enrolment);
         if !db::enrolments::renew(&mut tx, enrolment, now, certificate.expires_at).await? {

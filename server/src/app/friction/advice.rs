@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use tread_api::friction::{RobotContribution, VisitSuggestion};
 use tread_api::geometry::Point;
 use tread_api::ids::{RobotId, SiteId};
-use tread_api::page::Page;
+use tread_api::page::{MapPage, Page};
 use tread_api::site::Cell;
 
 use super::cells::Area;
@@ -32,9 +32,11 @@ impl App {
         asked: &Asked,
         area: Area,
         limit: u32,
-    ) -> Result<Page<VisitSuggestion>, AppError> {
+    ) -> Result<MapPage<VisitSuggestion>, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
+        let reading = reading.of_site(self, &view.row);
+        let as_of = reading.as_of;
         let grid = view.row.site.grid;
         let count = area.count(grid.cell_m);
         if count > LOOKED_AT_MAX {
@@ -62,9 +64,10 @@ impl App {
             by_gain.then_with(|| (left.cell.iy, left.cell.ix).cmp(&(right.cell.iy, right.cell.ix)))
         });
         found.truncate(usize::try_from(limit).unwrap_or(usize::MAX));
-        Ok(Page {
+        Ok(MapPage {
             items: found,
             next_cursor: None,
+            as_of,
         })
     }
 

@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use tread_api::friction::{CellDifference, CellFriction, ModelFriction, PointFriction};
 use tread_api::geometry::{COORDINATE_MAX_M, Point};
 use tread_api::ids::{ConfigurationId, SiteId};
-use tread_api::page::Page;
+use tread_api::page::MapPage;
 use tread_api::site::{CELL_MAX_M, Cell, Grid};
 use tread_api::terrain::TerrainRef;
 
@@ -104,7 +104,7 @@ impl App {
         site: &SiteId,
         asked: &Asked,
         cells: CellsAsked<'_>,
-    ) -> Result<Page<CellFriction>, AppError> {
+    ) -> Result<MapPage<CellFriction>, AppError> {
         let CellsAsked {
             area,
             resolution_m,
@@ -114,6 +114,7 @@ impl App {
         let reading = Reading::new(self, asked)?;
         let after = cursor.map(read_cursor).transpose()?;
         let row = site_row(&mut self.db().read().await?, site).await?;
+        let reading = reading.of_site(self, &row);
         let grid = row.site.grid;
         let factor = factor(&grid, resolution_m)?;
         check_count(&area, resolution_m)?;
@@ -131,9 +132,10 @@ impl App {
                 let cells = page(found, limit, |(cell, _)| format!("{},{}", cell.ix, cell.iy));
                 let squares = cells.items.into_iter();
                 let items = squares.flat_map(|square| of_square(map, &reading, square, size_m));
-                Page {
+                MapPage {
                     items: items.collect(),
                     next_cursor: cells.next_cursor,
+                    as_of: reading.as_of,
                 }
             })
         };
@@ -149,6 +151,7 @@ impl App {
     ) -> Result<PointFriction, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
+        let reading = reading.of_site(self, &view.row);
         let off_the_map = || AppError::InvalidQuery {
             parameter: "x_m",
             detail: format!("a point lies on the map, within {COORDINATE_MAX_M} m of the origin"),
@@ -193,6 +196,7 @@ impl App {
             _ => measured,
         };
         PointFriction {
+            as_of: reading.as_of,
             cell,
             terrain: terrain.map(terrain_ref),
             models,
@@ -206,7 +210,7 @@ impl App {
         asked: &Asked,
         (from, to): (Timestamp, Option<Timestamp>),
         cells: CellsAsked<'_>,
-    ) -> Result<Page<CellDifference>, AppError> {
+    ) -> Result<MapPage<CellDifference>, AppError> {
         let asked = Asked {
             as_of: to,
             ..asked.clone()
@@ -218,9 +222,11 @@ impl App {
                 detail: "to lies before from".to_owned(),
             });
         }
-        let early = late.at(from);
         let after = cells.cursor.map(read_cursor).transpose()?;
         let row = site_row(&mut self.db().read().await?, site).await?;
+        let late = late.of_site(self, &row);
+        let early = late.at(from).of_site(self, &row);
+        let early_us = early.now_us;
         let (min, max) = cells.area.cells(&row.site.grid)?;
         let wanted = usize::try_from(cells.limit).unwrap_or(usize::MAX);
         let limit = cells.limit;
@@ -228,7 +234,7 @@ impl App {
             app.maps().look(&row, |map| {
                 let measured = map.cells_in(min, max, after).filter(|&cell| {
                     let newest = map.newest_at_us(cell, late.choice());
-                    newest.is_some_and(|newest_us| newest_us > from.as_microsecond())
+                    newest.is_some_and(|newest_us| newest_us >= early_us)
                 });
                 let found: Vec<Cell> = measured.take(wanted.saturating_add(1)).collect();
                 let cells = page(found, limit, |cell| format!("{},{}", cell.ix, cell.iy));
@@ -236,9 +242,10 @@ impl App {
                     .items
                     .into_iter()
                     .flat_map(|cell| differences(map, cell, &early, &late));
-                Page {
+                MapPage {
                     items: items.collect(),
                     next_cursor: cells.next_cursor,
+                    as_of: late.as_of,
                 }
             })
         };
@@ -308,7 +315,10 @@ pub(super) fn same_ground<'map>(groups: impl Iterator<Item = Group<'map>>) -> Ve
             .iter_mut()
             .find(|present| present.configuration == group.configuration);
         match same {
-            Some(present) => present.seen.extend(group.seen),
+            Some(present) => {
+                present.seen.extend(group.seen);
+                present.uninformative_passes += group.uninformative_passes;
+            }
             None => joined.push(group),
         }
     }

@@ -1,5 +1,8 @@
 //! Everything that is known, or was measured, piece by piece: only one piece is ever held.
 
+use std::hash::Hash;
+
+use jiff::Timestamp;
 use tread_api::friction::{CellFriction, StoredSegment};
 use tread_api::ids::SiteId;
 use tread_api::site::{Cell, Grid, Site};
@@ -41,6 +44,7 @@ pub struct CellExport {
     bounds: (Cell, Cell),
     after: Option<Cell>,
     stage: Stage,
+    state: (String, String),
     writer: Box<dyn Writer<CellFriction>>,
 }
 
@@ -54,10 +58,14 @@ impl App {
         &self,
         site: &SiteId,
         asked: &PictureAsked,
-        writer_of: impl FnOnce(&Site) -> Result<Box<dyn Writer<CellFriction>>, TableError>,
+        writer_of: impl FnOnce(
+            &Site,
+            Option<Timestamp>,
+        ) -> Result<Box<dyn Writer<CellFriction>>, TableError>,
     ) -> Result<CellExport, AppError> {
         let reading = Reading::new(self, &asked.asked)?;
         let row = site_row(&mut self.db().read().await?, site).await?;
+        let reading = reading.of_site(self, &row);
         let grid = row.site.grid;
         let factor = factor(&grid, asked.resolution_m)?;
         let area = match asked.area {
@@ -68,14 +76,19 @@ impl App {
             cell_m: grid.cell_m * f64::from(factor),
             ..grid
         };
+        // Looked at before anything is made: what changes meanwhile makes another state.
+        let state = self.state_of(&row, &reading, asked);
+        let state = (self.run_id(), format!("{state:?} {:?} {asked:?}", row.site));
+        let as_of = reading.as_of;
         Ok(CellExport {
             app: self.clone(),
+            state,
             reading,
             factor,
             bounds: area.cells(&coarse)?,
             after: None,
             stage: Stage::Begin,
-            writer: writer_of(&row.site)?,
+            writer: writer_of(&row.site, as_of)?,
             row,
         })
     }
@@ -90,10 +103,14 @@ impl App {
         filter: SegmentFilter,
         writer: Box<dyn Writer<StoredSegment>>,
     ) -> Result<SegmentExport, AppError> {
-        let row = site_row(&mut self.db().read().await?, site).await?;
+        let mut tx = self.db().read().await?;
+        let row = site_row(&mut tx, site).await?;
+        let extent = db::segments::extent(&mut tx, row.pk, &filter).await?;
+        let state = format!("{extent:?} {filter:?} {site}");
         Ok(SegmentExport {
             app: self.clone(),
             site_pk: row.pk,
+            state,
             filter,
             stage: Stage::Begin,
             writer,
@@ -102,6 +119,17 @@ impl App {
 }
 
 impl CellExport {
+    /// What the export is made from: another state of the map, another minute in which ages are
+    /// counted, or another run of the server give another one.
+    pub fn state(&self) -> impl Hash + use<> {
+        self.state.clone()
+    }
+
+    /// As of when it is: all that counts was measured before. `None` when no time was asked for.
+    pub fn as_of(&self) -> Option<Timestamp> {
+        self.reading.as_of
+    }
+
     /// The next piece, and what comes after it; `None` at the end.
     ///
     /// # Errors
@@ -147,12 +175,18 @@ impl CellExport {
 pub struct SegmentExport {
     app: App,
     site_pk: i64,
+    state: String,
     filter: SegmentFilter,
     stage: Stage,
     writer: Box<dyn Writer<StoredSegment>>,
 }
 
 impl SegmentExport {
+    /// What the export is made from: measurements that are added or removed give another state.
+    pub fn state(&self) -> impl Hash + use<> {
+        self.state.clone()
+    }
+
     /// The next piece, and what comes after it; `None` at the end.
     ///
     /// # Errors

@@ -115,6 +115,7 @@ impl App {
     ) -> Result<Page<TerrainFriction>, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
+        let reading = reading.of_site(self, &view.row);
         let cursor = cursor.map(str::to_owned);
         let listing = move |app: &Self| {
             let classes = app.classes(&view, &reading);
@@ -125,9 +126,10 @@ impl App {
             };
             let listed: Vec<&Terrain> = view.terrains.iter().filter(wanted).collect();
             let Page { items, next_cursor } = page(listed, limit, |terrain| terrain.id.to_string());
-            let items = items
-                .into_iter()
-                .map(|terrain| terrain_friction(terrain, classes.models(&view, &reading, terrain)));
+            let items = items.into_iter().map(|terrain| {
+                let models = classes.models(&view, &reading, terrain);
+                terrain_friction(terrain, models, reading.as_of)
+            });
             Page {
                 items: items.collect(),
                 next_cursor,
@@ -145,12 +147,13 @@ impl App {
     ) -> Result<TerrainFriction, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
+        let reading = reading.of_site(self, &view.row);
         let terrain = view.find(site, id)?.clone();
         let looking = move |app: &Self| {
             let models = app
                 .classes(&view, &reading)
                 .models(&view, &reading, &terrain);
-            terrain_friction(&terrain, models)
+            terrain_friction(&terrain, models, reading.as_of)
         };
         Ok(self.off_thread(looking).await)
     }
@@ -163,6 +166,7 @@ impl App {
         (from, to): (Timestamp, Option<Timestamp>),
         step: SignedDuration,
     ) -> Result<TerrainHistory, AppError> {
+        let is_to_now = to.is_none();
         let to = to.unwrap_or_else(|| self.clock().now());
         let invalid = |parameter, detail| AppError::InvalidQuery { parameter, detail };
         if to < from {
@@ -190,9 +194,18 @@ impl App {
             let back =
                 |index| step.saturating_mul(i32::try_from(steps - index).unwrap_or(i32::MAX));
             let times = (0..=steps).map(|index| to.checked_sub(back(index)).unwrap_or(from));
-            let known = |at| TerrainAt {
-                at,
-                models: app.measured_models(&view, &reading.at(at), &terrain),
+            let known = |at| {
+                // Now is asked without a time, so that all that has come counts.
+                let reading = if is_to_now && at == to {
+                    reading.clone()
+                } else {
+                    reading.at(at).of_site(app, &view.row)
+                };
+                TerrainAt {
+                    at,
+                    as_of: reading.as_of.unwrap_or(to),
+                    models: app.measured_models(&view, &reading, &terrain),
+                }
             };
             TerrainHistory {
                 terrain: terrain_ref(&terrain),
@@ -297,8 +310,13 @@ fn terrain_ref(terrain: &Terrain) -> TerrainRef {
     }
 }
 
-fn terrain_friction(terrain: &Terrain, models: Vec<ModelFriction>) -> TerrainFriction {
+fn terrain_friction(
+    terrain: &Terrain,
+    models: Vec<ModelFriction>,
+    as_of: Option<Timestamp>,
+) -> TerrainFriction {
     TerrainFriction {
+        as_of,
         models,
         terrain: terrain_ref(terrain),
         name: terrain.name.clone(),

@@ -60,6 +60,7 @@ impl App {
             normalisation,
         };
         let reading = Reading::new(self, &asked).map_err(in_body)?;
+        let reading = reading.of_site(self, &view.row);
         let length_m = checked_length(&points)?;
         let cut = cut(&points, &view.row.site.grid)?;
         let looking = move |app: &Self| {
@@ -78,6 +79,7 @@ impl App {
                 .map(|(_, cut)| cut.length_m)
                 .sum();
             PathFriction {
+                as_of: reading.as_of,
                 length_m,
                 configuration: found.configuration,
                 normalisation: reading.normalisation(),

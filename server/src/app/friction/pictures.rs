@@ -6,7 +6,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use tread_api::ids::SiteId;
 
 use super::raster::{Blocks, PictureAsked};
-use super::{App, AppError, Reading, SiteView};
+use super::{App, AppError, Reading};
+use crate::db::sites::SiteRow;
 use crate::friction::Raster;
 use crate::friction::index::Block;
 
@@ -25,8 +26,8 @@ pub struct Picture {
 }
 
 /// What makes a picture another one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct State {
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) struct State {
     /// Newest change of the cells that it shows.
     change: u64,
     terrain_revision: u64,
@@ -107,10 +108,11 @@ impl App {
     ) -> Result<Picture, AppError> {
         let reading = Reading::new(self, &asked.asked)?;
         let view = self.site_view(site).await?;
+        let reading = reading.of_site(self, &view.row);
         let drawing = move |app: &Self| {
             let key = format!("{}/{format}/{asked:?}", view.row.pk);
             // Looked at before the squares are made: what changes meanwhile makes it stale.
-            let state = app.state_of(&view, &reading, &asked);
+            let state = app.state_of(&view.row, &reading, &asked);
             if let Some(picture) = app.pictures().find(&key, state) {
                 return Ok(picture);
             }
@@ -125,11 +127,11 @@ impl App {
         self.off_thread(drawing).await
     }
 
-    fn state_of(&self, view: &SiteView, reading: &Reading, asked: &PictureAsked) -> State {
-        let grid = view.row.site.grid;
+    pub(super) fn state_of(&self, row: &SiteRow, reading: &Reading, asked: &PictureAsked) -> State {
+        let grid = row.site.grid;
         let bounds = asked.area.and_then(|area| area.cells(&grid).ok());
         let bounds = bounds.map(|(min, max)| (Block::of(min), Block::of(max)));
-        let change = self.maps().look(&view.row, |map| match bounds {
+        let change = self.maps().look(row, |map| match bounds {
             // Which model most have driven, for who asks for none, is of the whole map.
             Some((low, high)) if reading.reference().is_some() => {
                 map.changes().newest_in(low, high)
@@ -138,7 +140,7 @@ impl App {
         });
         State {
             change,
-            terrain_revision: view.row.site.terrain_revision,
+            terrain_revision: row.site.terrain_revision,
             now_us: reading.now_us,
         }
     }

@@ -8,6 +8,7 @@ use tread_api::ids::ConfigurationId;
 
 use crate::app::{App, AppError};
 use crate::config::FrictionConfig;
+use crate::db::sites::SiteRow;
 use crate::friction::index::{At, Choice, Group, Normalisation};
 use crate::friction::{Ground, fuse};
 
@@ -28,6 +29,7 @@ pub struct Asked {
 /// The same, checked.
 #[derive(Debug, Clone)]
 pub(in crate::app) struct Reading {
+    /// As of when; `None` for all that has come.
     pub(in crate::app) as_of: Option<Timestamp>,
     configuration: Option<ConfigurationId>,
     normalisation: Option<Arc<Normalisation>>,
@@ -62,6 +64,15 @@ impl Reading {
             config: *app.friction_config(),
             now_us: asked.as_of.map_or(minute_us, Timestamp::as_microsecond),
         })
+    }
+
+    /// The same as of the newest time, not after the one that was asked for, at which an epoch of
+    /// this site's map was over. Sums are kept per epoch, and nothing tells which part of one was
+    /// measured before a time within it.
+    pub(in crate::app) fn of_site(self, app: &App, row: &SiteRow) -> Self {
+        let Some(as_of) = self.as_of else { return self };
+        let effective = app.maps().look(row, |map| map.effective_as_of(as_of));
+        self.at(effective)
     }
 
     /// The same as of another time.
@@ -109,6 +120,10 @@ impl Reading {
         ground: Ground,
     ) -> Option<FusedFriction> {
         let fused = fuse(&mut group.seen, ground, &self.config, self.now_us);
-        fused.map(|fused| fused.to_api(self.now_us))
+        fused.map(|fused| {
+            fused
+                .with_uninformative(group.uninformative_passes)
+                .to_api(self.now_us)
+        })
     }
 }

@@ -2,7 +2,9 @@
 
 use jiff::Timestamp;
 use tread_api::ids::{BootId, MissionId};
-use tread_api::mission::{Actor, Cause, DRIVEN_POINTS_MAX, Mission, THETA_SAMPLES_MAX};
+use tread_api::mission::{
+    Actor, Cause, DRIVEN_POINTS_MAX, Mission, MissionState, THETA_SAMPLES_MAX,
+};
 use tread_api::robot::MissionProgress;
 use tread_api::wire::ingest::{MissionPhase, MissionReport};
 
@@ -27,7 +29,18 @@ pub(crate) struct Reporting {
     pub(crate) at: Timestamp,
     /// When what paused the mission began, by the server's clock; `at` if that is not known.
     pub(crate) since: Timestamp,
+    /// How far the robot showed last that it had come with this mission.
+    pub(crate) shown: Option<MissionProgress>,
 }
+
+/// What became of a report that was taken: the state in which it ended the mission, and why.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Taken {
+    pub(crate) ended: Option<(MissionState, String)>,
+}
+
+/// A report that ended nothing.
+const NOTED: Taken = Taken { ended: None };
 
 /// Why a report can never be taken.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -42,7 +55,7 @@ pub(crate) async fn take_report(
     tx: &mut Tx,
     reporting: Reporting,
     report: &MissionReport,
-) -> Result<Result<(), Foreign>, DbError> {
+) -> Result<Result<Taken, Foreign>, DbError> {
     let id = report.mission;
     let row = db::missions::find(tx, id).await?;
     let Some(row) = row.filter(|row| row.robot_pk == reporting.robot_pk) else {
@@ -65,19 +78,27 @@ pub(crate) async fn take_report(
         Content::Earlier => {
             let text = format!("the robot reported late of revision {}", report.revision);
             note(tx, &row, Actor::Robot, reporting.now, &text).await?;
-            return Ok(Ok(()));
+            return Ok(Ok(NOTED));
         }
         Content::Other => {
             let reason = format!("mission `{id}` was sent with other content");
             return Ok(Err(Foreign(reason)));
         }
     };
-    take_phase(tx, reporting, report, &row).await?;
+    let ended = take_phase(tx, reporting, report, &row).await?;
     if is_end(report.phase) {
         let (quality, driven) = (report.quality.as_ref(), report.driven.as_ref());
         db::missions::add_outcome(tx, id, quality, driven).await?;
+        // The robot's own word is final, also of a mission that was settled without it.
+        if report.progress.is_some() {
+            let facts = Facts {
+                progress: report.progress,
+                ..Facts::default()
+            };
+            db::missions::add_facts(tx, id, facts).await?;
+        }
     }
-    Ok(Ok(()))
+    Ok(Ok(Taken { ended }))
 }
 
 enum Content {
@@ -142,7 +163,7 @@ async fn take_phase(
     reporting: Reporting,
     report: &MissionReport,
     row: &MissionRow,
-) -> Result<(), DbError> {
+) -> Result<Option<(MissionState, String)>, DbError> {
     let (change, name) = match report.phase {
         MissionPhase::Started => (Some(Change::Accept), "started"),
         MissionPhase::Paused => (Some(Change::Pause), "paused"),
@@ -157,13 +178,13 @@ async fn take_phase(
     let facts = Facts {
         boot: Some(reporting.boot),
         plan: None,
-        progress: report.progress,
+        progress: report.progress.or_else(|| shown_of(reporting, report)),
         started_at: started.then_some(reporting.at),
         ended_at: is_end(report.phase).then_some(reporting.at),
     };
     let mission = &row.mission;
     let Some(change) = change else {
-        return Ok(());
+        return Ok(None);
     };
     let is_for_safety = |progress: &MissionProgress| progress.is_paused_for_safety();
     let is_safety_pause =
@@ -179,25 +200,41 @@ async fn take_phase(
         at: reporting.now,
         facts,
     };
-    if take_step(tx, &mission.into(), step).await?.is_some() {
-        return Ok(());
+    if let Some(state) = take_step(tx, &mission.into(), step).await? {
+        let why = reason.unwrap_or(change.reason()).to_owned();
+        return Ok(state.is_terminal().then_some((state, why)));
     }
     let open = !mission.state.is_terminal();
     if started && open && mission.started_at.is_none() {
         db::missions::add_facts(tx, mission.id, facts).await?;
         let text = "the robot began to drive";
-        return note(tx, row, Actor::Robot, reporting.now, text).await;
+        note(tx, row, Actor::Robot, reporting.now, text).await?;
+        return Ok(None);
     }
     // The robot says what its answer to the command had said before.
     let is_known = open && next_is_reached(change, mission);
     if is_known {
-        return Ok(());
+        return Ok(None);
     }
     let reason = reason
         .map(|reason| format!(": {reason}"))
         .unwrap_or_default();
     let text = format!("the robot reported late that it {name}{reason}");
-    note(tx, row, Actor::Robot, reporting.now, &text).await
+    note(tx, row, Actor::Robot, reporting.now, &text).await?;
+    Ok(None)
+}
+
+/// What the robot showed last of the mission that it ends without saying how far it came, as after
+/// a restart of its agent.
+fn shown_of(reporting: Reporting, report: &MissionReport) -> Option<MissionProgress> {
+    let is_same = |shown: &MissionProgress| {
+        (shown.id, shown.revision, shown.plan_hash)
+            == (report.mission, report.revision, report.plan_hash)
+    };
+    reporting
+        .shown
+        .filter(is_same)
+        .filter(|_| is_end(report.phase))
 }
 
 /// Whether a person let a mission go on after this: then a pause from before, reported late, is not

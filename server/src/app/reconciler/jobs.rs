@@ -4,6 +4,7 @@ use tracing::warn;
 use tread_api::ids::MissionId;
 use tread_api::keys::Verb;
 use tread_api::mission::{Actor, Cause, MissionState};
+use tread_api::robot::MissionProgress;
 use tread_api::stop::Stop;
 use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome, Pause, Resume};
 
@@ -40,15 +41,33 @@ pub(super) async fn settle(app: &App, mission: &Standing, change: Change) -> Res
             .then(taken_by)
             .flatten()
             .map(|(boot, _since)| boot),
+        progress: last_progress(app, mission),
         ..Facts::default()
     };
     let mut tx = app.db().write().await?;
     let step = server_step(app, change, None, facts);
-    take_step(&mut tx, mission, step).await?;
+    let mut alerts = Vec::new();
+    if let Some(state) = take_step(&mut tx, mission, step).await?
+        && let Some(robot_pk) = db::robots::pk_of(&mut tx, &mission.site, &mission.robot).await?
+    {
+        let ended = (mission.id, state, change.reason());
+        alerts = app.alert_mission_end(&mut tx, robot_pk, ended).await?;
+    }
     tx.commit().await?;
+    app.show_alerts(&alerts);
     // The robot's next mission may go now.
     app.wake();
     Ok(())
+}
+
+/// How far the robot said last that it had come with what counts of this mission now: true also
+/// when it never reports an end.
+fn last_progress(app: &App, mission: &Standing) -> Option<MissionProgress> {
+    let progress = app
+        .presences()
+        .get(&key_of(mission))
+        .progress_of(mission.id);
+    progress.filter(|said| (said.revision, said.plan_hash) == mission.content)
 }
 
 fn key_of(mission: &Standing) -> RobotKey {
@@ -348,10 +367,15 @@ pub(super) async fn cancel(
     let mut tx = app.db().write().await?;
     if let Some(row) = db::missions::find(&mut tx, mission.id).await? {
         let reason = detail.or(row.mission.reason.as_deref());
-        let step = server_step(&app, Change::Cancel, reason, Facts::default());
+        let standing = (&row.mission).into();
+        let facts = Facts {
+            progress: last_progress(&app, &standing),
+            ..Facts::default()
+        };
+        let step = server_step(&app, Change::Cancel, reason, facts);
         take_step(
             &mut tx,
-            &(&row.mission).into(),
+            &standing,
             Step {
                 actor: Actor::Robot,
                 ..step

@@ -5,6 +5,7 @@
 //! one mission is pure (`needs`); commands to different robots are under way at the same time,
 //! at most one of a kind per robot.
 
+pub(super) mod attendance;
 mod jobs;
 pub mod needs;
 
@@ -18,11 +19,12 @@ use tracing::debug;
 use tread_api::ids::{MissionId, SiteId, StopId};
 use tread_api::mission::MissionState;
 
+use self::attendance::Attendance;
 use self::jobs::{
     Finished, adopt_shown, cancel, disown, end_rival, hold, offer, push_site, replace, settle,
     stop_again,
 };
-use self::needs::{Memory, Need, Now, decide, is_absent, is_heard, is_held_otherwise};
+use self::needs::{Memory, Need, Now, Silence, decide, is_absent, is_heard, is_held_otherwise};
 use super::missions::transitions::Change;
 use super::{App, AppError};
 use crate::db;
@@ -103,6 +105,7 @@ pub struct Reconciler {
     memories: HashMap<MissionId, Memory>,
     /// Missions that robots show and that are none of their open ones here, and since when.
     foreign: HashMap<RobotKey, (MissionId, Duration)>,
+    attendance: Attendance,
 }
 
 impl Reconciler {
@@ -119,6 +122,7 @@ impl Reconciler {
             retries: HashMap::new(),
             memories: HashMap::new(),
             foreign: HashMap::new(),
+            attendance: Attendance::default(),
         }
     }
 
@@ -203,6 +207,7 @@ impl Reconciler {
         self.expire().await?;
         self.end_rivals();
         self.app.sync_alerts().await?;
+        self.attendance.look(&self.app).await?;
         let mut tx = self.app.db().read().await?;
         let mut open = db::missions::in_hand(&mut tx).await?;
         open.extend(db::missions::next_in_queues(&mut tx).await?);
@@ -387,6 +392,7 @@ impl Reconciler {
             .then(|| memory.absent_since.unwrap_or(now.elapsed));
         memory.differs_from = is_held_otherwise(&mission, &presence)
             .then(|| memory.differs_from.unwrap_or(now.elapsed));
+        memory.silence = Silence::of(&mission, memory.silence, now);
         let memory = *memory;
         let (app, commands) = (self.app.clone(), self.commands.clone());
         let need = decide(&mission, &presence, memory, now);

@@ -55,6 +55,33 @@ pub(super) struct Memory {
     pub(super) absent_since: Option<Duration>,
     /// Since when the robot has shown it as paused while it is not, or the other way round.
     pub(super) differs_from: Option<Duration>,
+    /// How long the robot has not been heard.
+    pub(super) silence: Option<Silence>,
+}
+
+/// A robot's silence: by the wall clock as far as it lies before the first look of this process, by
+/// the monotonic clock from then on, so that a step of the wall clock loses no robot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Silence {
+    before: Duration,
+    looked_at: Duration,
+}
+
+impl Silence {
+    /// The silence of a mission's robot, which goes on if it was there before; `None` while the
+    /// robot is heard.
+    pub(super) fn of(mission: &Standing, before: Option<Self>, now: Now) -> Option<Self> {
+        let since = mission.silent_since?;
+        let silence = || Self {
+            before: Duration::try_from(now.wall.duration_since(since)).unwrap_or_default(),
+            looked_at: now.elapsed,
+        };
+        Some(before.unwrap_or_else(silence))
+    }
+
+    fn lasts(self, now: Now) -> Duration {
+        self.before + now.elapsed.saturating_sub(self.looked_at)
+    }
 }
 
 /// The two clocks.
@@ -121,7 +148,7 @@ pub(super) fn is_held_otherwise(mission: &Standing, presence: &Presence) -> bool
 pub(super) fn decide(mission: &Standing, presence: &Presence, memory: Memory, now: Now) -> Need {
     let heard = is_heard(presence, now.elapsed);
     if !heard && mission.state != MissionState::Queued {
-        return if is_lost(mission, presence, now) {
+        return if is_lost(mission, presence, memory, now) {
             Need::Settle(Change::LoseRobot)
         } else if is_lost_by_restart(mission, presence, false, now.elapsed) {
             Need::Settle(Change::LoseRun)
@@ -224,11 +251,11 @@ pub(super) fn lost_after_s(mission: &Standing, said: Option<MissionProgress>) ->
 }
 
 /// Whether a mission's robot has stayed away past its bound.
-fn is_lost(mission: &Standing, presence: &Presence, now: Now) -> bool {
+fn is_lost(mission: &Standing, presence: &Presence, memory: Memory, now: Now) -> bool {
     let bound_s = lost_after_s(mission, driven(mission, presence));
-    mission
-        .silent_since
-        .is_some_and(|since| now.wall.duration_since(since).as_secs_f64() > bound_s)
+    memory
+        .silence
+        .is_some_and(|silence| silence.lasts(now).as_secs_f64() > bound_s)
 }
 
 /// Whether the agent that took a mission is gone, its records have had their say, and its

@@ -5,7 +5,7 @@ use sqlx::SqliteConnection;
 use tread_api::ids::{BootId, MissionId, PlanHash, RobotId, SiteId};
 use tread_api::mission::{LinkPolicy, Mission, MissionState};
 
-use super::super::{DbError, from_json, from_us, parse, to_us, unsigned};
+use super::super::{DbError, corrupt, from_json, from_us, parse, to_us, unsigned};
 use super::state;
 
 /// Where an open mission stands, without what is to be driven, which may be long.
@@ -25,6 +25,8 @@ pub struct Standing {
     pub boot: Option<BootId>,
     /// Whether it is to be paused.
     pub pause_wanted: bool,
+    /// Those of a higher one are driven first.
+    pub priority: i32,
     /// The revision and hash that count now.
     pub content: (u32, PlanHash),
     /// The revision and hash that the robot does not hold whole yet.
@@ -49,6 +51,7 @@ impl From<&Mission> for Standing {
             reason: mission.reason.clone(),
             boot: mission.boot,
             pause_wanted: mission.pause_wanted,
+            priority: mission.priority,
             content: (mission.revision, mission.plan_hash),
             replacement: mission
                 .replacement
@@ -70,6 +73,7 @@ struct RawStanding {
     reason: Option<String>,
     boot: Option<String>,
     pause_wanted: bool,
+    priority: i64,
     revision: i64,
     plan_hash: String,
     replacement_revision: Option<i64>,
@@ -96,6 +100,8 @@ impl TryFrom<RawStanding> for Standing {
                 .map(|boot| parse("boot", boot))
                 .transpose()?,
             pause_wanted: raw.pause_wanted,
+            priority: i32::try_from(raw.priority)
+                .map_err(|_range| corrupt("priority", raw.priority))?,
             content: (
                 unsigned("mission revision", raw.revision)?,
                 parse("plan hash", &raw.plan_hash)?,
@@ -121,7 +127,8 @@ macro_rules! standings {
             RawStanding,
             r#"SELECT missions.id, sites.id AS site, robots.id AS robot, missions.state,
                    missions.reason, missions.boot,
-                   missions.pause_wanted AS "pause_wanted: bool", missions.revision,
+                   missions.pause_wanted AS "pause_wanted: bool", missions.priority,
+                   missions.revision,
                    missions.plan_hash,
                    missions.replacement ->> 'revision' AS "replacement_revision: i64",
                    missions.replacement ->> 'plan_hash' AS "replacement_hash: String",

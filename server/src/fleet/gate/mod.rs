@@ -24,7 +24,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
+use rustls::pki_types::UnixTime;
 use rustls::server::WebPkiClientVerifier;
+use rustls::time_provider::TimeProvider;
 use rustls::{RootCertStore, ServerConfig};
 use tokio::net::{TcpListener, TcpSocket};
 use tokio_rustls::TlsAcceptor;
@@ -84,8 +86,8 @@ impl std::fmt::Debug for Door {
 
 impl Door {
     fn new(security: Security, clock: Clock) -> anyhow::Result<Self> {
-        let made_at = clock.now();
-        let config = Arc::new(server_config(&security, made_at)?);
+        let made_at = clock.machine_time();
+        let config = Arc::new(server_config(&security, &clock)?);
         Ok(Self {
             security,
             clock,
@@ -95,11 +97,11 @@ impl Door {
 
     /// What makes TLS of a connection; the certificate is made anew in time.
     fn acceptor(&self) -> TlsAcceptor {
-        let now = self.clock.now();
+        let now = self.clock.machine_time();
         let mut present = self.present.lock().unwrap_or_else(PoisonError::into_inner);
         let age = now.duration_since(present.made_at);
         if age > PORT_LASTS / 3 || age < SignedDuration::ZERO {
-            match server_config(&self.security, now) {
+            match server_config(&self.security, &self.clock) {
                 Ok(config) => {
                     *present = Present {
                         config: Arc::new(config),
@@ -113,7 +115,20 @@ impl Door {
     }
 }
 
-fn server_config(security: &Security, now: Timestamp) -> anyhow::Result<ServerConfig> {
+/// Certificates of robots are judged by the server's time: one that was made shortly before the
+/// machine's clock was set back stays valid.
+#[derive(Debug)]
+struct ServerTime(Clock);
+
+impl TimeProvider for ServerTime {
+    fn current_time(&self) -> Option<UnixTime> {
+        let seconds = u64::try_from(self.0.now().as_second()).ok()?;
+        Some(UnixTime::since_unix_epoch(Duration::from_secs(seconds)))
+    }
+}
+
+fn server_config(security: &Security, clock: &Clock) -> anyhow::Result<ServerConfig> {
+    let now = clock.machine_time();
     let identity = security.authority.port_identity(&security.names, now)?;
     let mut roots = RootCertStore::empty();
     roots.add(security.authority.certificate().clone())?;
@@ -121,7 +136,8 @@ fn server_config(security: &Security, now: Timestamp) -> anyhow::Result<ServerCo
     let verifier =
         WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&provider))
             .build()?;
-    let config = ServerConfig::builder_with_provider(provider)
+    let time = Arc::new(ServerTime(clock.clone()));
+    let config = ServerConfig::builder_with_details(provider, time)
         .with_protocol_versions(&[&rustls::version::TLS13])?
         .with_client_cert_verifier(verifier)
         .with_single_cert(identity.chain, identity.key)?;

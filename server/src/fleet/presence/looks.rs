@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use tread_api::ids::{MissionId, StopId};
-use tread_api::robot::LinkState;
+use tread_api::robot::{LinkCause, LinkState};
 
 use super::{Presence, Presences, RobotKey, stop_of};
 
@@ -17,12 +17,40 @@ pub struct Held {
     pub fence: Option<u64>,
 }
 
+/// Whether a robot is there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Attending {
+    /// Whether it is heard now.
+    pub is_heard: bool,
+    /// Whether its agent said that it leaves.
+    pub has_left: bool,
+    /// Time since its last heartbeat; `None` if there was none.
+    pub silent_for: Option<Duration>,
+    /// Why it is not heard; `None` while it is online.
+    pub cause: Option<LinkCause>,
+}
+
 impl Presences {
     /// Every robot that has ever said hello.
     pub fn known(&self) -> Vec<RobotKey> {
         let robots = self.lock();
         let known = robots.iter().filter(|(_, presence)| presence.welcomed);
         known.map(|(key, _)| key.clone()).collect()
+    }
+
+    /// Every robot that has ever said hello, and whether it is there now.
+    pub fn attending(&self, now: Duration) -> Vec<(RobotKey, Attending)> {
+        let robots = self.lock();
+        let known = robots.iter().filter(|(_, presence)| presence.welcomed);
+        let attending = |presence: &Presence| Attending {
+            is_heard: presence.link(now) != LinkState::Offline,
+            has_left: presence.has_left(),
+            silent_for: presence.silent_for(now),
+            cause: presence.link_cause(now),
+        };
+        known
+            .map(|(key, presence)| (key.clone(), attending(presence)))
+            .collect()
     }
 
     /// The stops that robots show to be in force.

@@ -33,6 +33,7 @@ pub(super) fn state(boot: BootId, seq: u64) -> RobotState {
         },
         battery: None,
         alerts: Vec::new(),
+        leaving: false,
         monotonic_us: None,
         safety: SafetyStatus::default(),
     }

@@ -21,7 +21,7 @@ pub use self::changes::{BLOCK_CELLS, Block, Changes};
 use self::names::{Names, Number};
 use self::part::{Part, PartKey};
 pub use self::squares::{At, BLOCK_SQUARES, GROUND_NONE, Lens, Room, Square, SquareKnown};
-use super::sums::bucket_h;
+use super::sums::{DAY_H, bucket_h};
 use super::{Seen, Sums};
 
 /// Seconds of an hour.
@@ -73,7 +73,7 @@ fn cell_at(place: u64) -> Cell {
 /// Which measurements count, and how.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Choice<'choice> {
-    /// Only epochs that had begun by then.
+    /// Only epochs that were over by then: a sum does not tell what of it came before.
     pub as_of: Option<Timestamp>,
     /// Only this configuration.
     pub configuration: Option<ConfigurationId>,
@@ -132,6 +132,15 @@ pub struct Group<'map> {
     pub configuration: ConfigurationId,
     /// What each robot saw in each epoch.
     pub seen: Vec<Seen<u32>>,
+    /// Passes beside those that told nothing: their information vanishes in the sums.
+    pub uninformative_passes: u64,
+}
+
+impl Group<'_> {
+    /// Whether any of its passes told anything.
+    fn tells(&self) -> bool {
+        !self.seen.is_empty()
+    }
 }
 
 impl SiteMap {
@@ -362,34 +371,53 @@ impl SiteMap {
         }
         let mut groups: BTreeMap<ConfigurationId, Group<'_>> = BTreeMap::new();
         for ((configuration, rank, epoch_h), sums) in sums {
-            let Some(seen) = Seen::of(rank, i64::from(epoch_h), &sums) else {
-                continue;
-            };
             let Some((configuration, ratio)) = choice.brought_to(configuration) else {
                 continue;
             };
-            let seen = seen.scaled(ratio);
             let group = groups.entry(configuration).or_insert_with(|| Group {
                 terrain: None,
                 configuration,
                 seen: Vec::new(),
+                uninformative_passes: 0,
             });
-            group.seen.push(seen);
+            match Seen::of(rank, i64::from(epoch_h), &sums) {
+                Some(seen) => group.seen.push(seen.scaled(ratio)),
+                None => group.uninformative_passes += sums.segments,
+            }
         }
-        groups.into_values().collect()
+        groups.into_values().filter(Group::tells).collect()
     }
 
     fn counts(&self, key: &PartKey, choice: &Choice<'_>) -> bool {
         let names = &self.names;
         choice
             .as_of
-            .is_none_or(|as_of| i64::from(key.epoch_h) * HOUR_S <= as_of.as_second())
+            .is_none_or(|as_of| self.end_h(key.epoch_h) * HOUR_S <= as_of.as_second())
             && choice
                 .robot
                 .is_none_or(|robot| names.robots.name(key.robot) == robot)
             && choice
                 .brought_to(*names.configurations.name(key.configuration))
                 .is_some()
+    }
+
+    /// The hour in which an epoch is over.
+    fn end_h(&self, epoch_h: i32) -> i64 {
+        let epoch_h = i64::from(epoch_h);
+        epoch_h
+            + if epoch_h < self.merged_before_h {
+                DAY_H
+            } else {
+                1
+            }
+    }
+
+    /// The newest time, not after this one, as of which the map can answer: the end of an hour, of a
+    /// day among those that are merged.
+    pub fn effective_as_of(&self, as_of: Timestamp) -> Timestamp {
+        let hour = as_of.as_second().div_euclid(HOUR_S);
+        let end_s = bucket_h(hour, self.merged_before_h).saturating_mul(HOUR_S);
+        Timestamp::from_second(end_s).unwrap_or(as_of)
     }
 
     /// Parts of one cell, which are sorted by key, as groups in the order of their names.
@@ -403,27 +431,30 @@ impl SiteMap {
                 ..
             } = part.key;
             let rank = self.names.robots.rank(robot);
-            let Some(seen) = part.seen(rank) else {
-                continue;
-            };
+            let seen = part.seen(rank);
             let configuration = *self.names.configurations.name(configuration);
             let terrain = self.names.terrains.name(terrain).as_ref();
             let Some((configuration, ratio)) = choice.brought_to(configuration) else {
                 continue;
             };
-            let seen = seen.scaled(ratio);
-            let group = groups
-                .iter_mut()
-                .find(|group| group.configuration == configuration && group.terrain == terrain);
-            match group {
-                Some(group) => group.seen.push(seen),
-                None => groups.push(Group {
+            let is_same = |group: &Group<'_>| {
+                group.configuration == configuration && group.terrain == terrain
+            };
+            let index = groups.iter().position(is_same).unwrap_or_else(|| {
+                groups.push(Group {
                     terrain,
                     configuration,
-                    seen: vec![seen],
-                }),
+                    seen: Vec::new(),
+                    uninformative_passes: 0,
+                });
+                groups.len() - 1
+            });
+            match seen {
+                Some(seen) => groups[index].seen.push(seen.scaled(ratio)),
+                None => groups[index].uninformative_passes += part.passes(),
             }
         }
+        groups.retain(Group::tells);
         groups.sort_unstable_by_key(|group| (group.terrain, group.configuration));
         groups
     }

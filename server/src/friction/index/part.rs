@@ -110,6 +110,11 @@ impl Part {
         }
     }
 
+    /// How many passes it has, whether they told anything or not.
+    pub(super) fn passes(&self) -> u64 {
+        u64::from(self.segments)
+    }
+
     /// The same as [`Seen::of`] of [`Self::sums`], to the bit, without the detour.
     pub(super) fn seen<R>(&self, robot: R) -> Option<Seen<R>> {
         let number = |index: usize| {

@@ -1,6 +1,7 @@
 //! Cells as pictures have them: one value for each, of one configuration, for the ground under its
 //! middle. Nothing is allocated for a cell.
 
+use jiff::Timestamp;
 use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
 
@@ -80,16 +81,17 @@ pub struct Lens {
     grounds: Vec<u16>,
     /// What each configuration's θ is divided by; `None` for those that do not count.
     ratios: Vec<Option<f64>>,
-    as_of_h: Option<i64>,
+    /// Epochs that end later do not count; seconds since 1970.
+    as_of_s: Option<i64>,
 }
 
 impl Lens {
-    fn sees(&self, key: &PartKey, ground: u16) -> Option<f64> {
+    fn sees(&self, map: &SiteMap, key: &PartKey, ground: u16) -> Option<f64> {
         let is_here = self.grounds.get(key.terrain as usize) == Some(&ground);
-        let has_begun = self
-            .as_of_h
-            .is_none_or(|as_of_h| i64::from(key.epoch_h) <= as_of_h);
-        if !is_here || !has_begun {
+        let is_over = self
+            .as_of_s
+            .is_none_or(|as_of_s| map.end_h(key.epoch_h) * HOUR_S <= as_of_s);
+        if !is_here || !is_over {
             return None;
         }
         *self.ratios.get(key.configuration as usize)?
@@ -110,6 +112,8 @@ pub struct At<'config> {
 pub struct Room {
     fuser: Fuser<u32>,
     seen: Vec<Seen<u32>>,
+    /// Passes that told nothing.
+    uninformative_passes: u64,
 }
 
 impl SiteMap {
@@ -132,9 +136,7 @@ impl SiteMap {
                     (Some(reference) == choice.configuration).then_some(ratio)
                 })
                 .collect(),
-            as_of_h: choice
-                .as_of
-                .map(|as_of| as_of.as_second().div_euclid(HOUR_S)),
+            as_of_s: choice.as_of.map(Timestamp::as_second),
         }
     }
 
@@ -185,7 +187,7 @@ impl SiteMap {
         let mut sums: std::collections::BTreeMap<PartKey, Sums> = std::collections::BTreeMap::new();
         for cell in self.cells_in(min, max, None) {
             for part in self.cells.get(&place(cell)).into_iter().flatten() {
-                if lens.sees(&part.key, ground).is_some() {
+                if lens.sees(self, &part.key, ground).is_some() {
                     let added = part.sums();
                     let entry = sums.entry(part.key);
                     entry.and_modify(|sums| sums.add(&added)).or_insert(added);
@@ -199,7 +201,8 @@ impl SiteMap {
         self.gather(&parts, (ground, lens), room);
         let fused = room
             .fuser
-            .fuse(&mut room.seen, Ground::Area, at.config, at.now_us);
+            .fuse(&mut room.seen, Ground::Area, at.config, at.now_us)
+            .map(|fused| fused.with_uninformative(room.uninformative_passes));
         fused.map_or_else(Square::default, |fused| Square::of(&fused))
     }
 
@@ -223,7 +226,8 @@ impl SiteMap {
     ) -> Option<Fused> {
         self.gather(parts, which, room);
         let (fuser, seen) = (&mut room.fuser, &mut room.seen);
-        fuser.fuse(seen, Ground::Cell, at.config, at.now_us)
+        let known = fuser.fuse(seen, Ground::Cell, at.config, at.now_us)?;
+        Some(known.with_uninformative(room.uninformative_passes))
     }
 
     fn square(&self, parts: &[Part], which: (u16, &Lens), at: At<'_>, room: &mut Room) -> Square {
@@ -233,13 +237,16 @@ impl SiteMap {
 
     fn gather(&self, parts: &[Part], (ground, lens): (u16, &Lens), room: &mut Room) {
         room.seen.clear();
+        room.uninformative_passes = 0;
         for part in parts {
-            let Some(ratio) = lens.sees(&part.key, ground) else {
+            let Some(ratio) = lens.sees(self, &part.key, ground) else {
                 continue;
             };
             let rank = self.names.robots.rank(part.key.robot);
-            room.seen
-                .extend(part.seen(rank).map(|seen| seen.scaled(ratio)));
+            match part.seen(rank) {
+                Some(seen) => room.seen.push(seen.scaled(ratio)),
+                None => room.uninformative_passes += part.passes(),
+            }
         }
     }
 

@@ -8,7 +8,7 @@ use jiff::Timestamp;
 use serde::Deserialize;
 use tread_api::friction::CellFriction;
 use tread_api::ids::{ConfigurationId, SiteId};
-use tread_api::page::Page;
+use tread_api::page::MapPage;
 use tread_api::problem::{ProblemBody, ProblemType};
 use tread_api::site::Site;
 use utoipa::IntoParams;
@@ -30,7 +30,8 @@ use crate::http::problem::Problem;
 const CONFIGURATION: HeaderName = HeaderName::from_static("tread-configuration");
 /// The normalisation that was used.
 const NORMALISATION: HeaderName = HeaderName::from_static("tread-normalisation");
-/// The time at which ages are counted.
+/// The time at which ages are counted; where `as_of` was asked for, nothing that counts was measured
+/// later.
 const AS_OF: HeaderName = HeaderName::from_static("tread-as-of");
 /// Speed of a hundred in a speed mask when nothing is said, metres per second.
 const SPEED_MAX_DEFAULT_M_S: f64 = 2.0;
@@ -114,7 +115,7 @@ pub(in crate::http) struct MapQuery {
     /// Side of the squares, metres, a multiple of the grid's; the grid's own when absent. There
     /// may be 1 048 576 squares.
     resolution_m: Option<f64>,
-    /// As of when; now when absent.
+    /// As of when, rounded down to the end of an epoch; all that has come when absent.
     as_of: Option<Timestamp>,
     /// The robot model and tyres whose θ it is; the one with most measurements when absent.
     #[param(value_type = Option<String>)]
@@ -233,13 +234,13 @@ fn refused(error: PngError) -> AppError {
 
 /// The map of one robot model, as a picture with a legend, a compact binary tile or a speed mask
 /// for Nav2; or all that is known of every cell, per ground and robot model, as a list without
-/// pages that is sent while it is made. Headers of pictures say whose θ it is (`tread-configuration`), by which normalisation
-/// (`tread-normalisation`) and as of when (`tread-as-of`).
+/// pages that is sent while it is made. Headers say whose θ it is (`tread-configuration`), by which normalisation
+/// (`tread-normalisation`), both of pictures alone, and as of when (`tread-as-of`).
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/map", tag = "friction",
     security(("token" = ["viewer"])),
     operation_id = "get_friction_map", params(("site" = SiteId, Path), MapQuery),
     responses((status = 200, description = "The map in that format", content(
-            (Vec<u8> = "image/png"), (Page<CellFriction> = "application/json"),
+            (Vec<u8> = "image/png"), (MapPage<CellFriction> = "application/json"),
             (Vec<u8> = "application/vnd.tread.friction-tile"), (Value = "application/geo+json"),
             (String = "application/yaml"), (Vec<u8> = "image/x-portable-graymap"),
             (String = "text/csv"), (Vec<u8> = "application/vnd.apache.parquet"))),
@@ -259,9 +260,12 @@ pub(in crate::http) async fn map(
         }
         Format::List(format) => {
             let (asked, media_type) = (query.asked()?, media_type_of(format));
-            let writer_of = |site: &Site| list_writer(format, site, &asked.asked);
+            let writer_of = |site: &Site, as_of| list_writer(format, site, (&asked.asked, as_of));
             let export = app.export_cells(&site, &asked, writer_of).await?;
-            Ok(streamed(media_type, export, CellExport::next))
+            let (state, as_of) = ((query.format, export.state()), export.as_of());
+            let make = || streamed(media_type, export, CellExport::next);
+            let response = etag::streamed(&headers, media_type, state, make);
+            Ok(say_as_of(response, as_of))
         }
     }
 }
@@ -278,11 +282,11 @@ fn media_type_of(format: ListFormat) -> &'static str {
 fn list_writer(
     format: ListFormat,
     site: &Site,
-    asked: &Asked,
+    (asked, as_of): (&Asked, Option<Timestamp>),
 ) -> Result<Box<dyn Writer<CellFriction>>, TableError> {
     Ok(match format {
-        ListFormat::Json => json::page(),
-        ListFormat::GeoJson => json::features(site),
+        ListFormat::Json => json::page(as_of),
+        ListFormat::GeoJson => json::features(site, as_of),
         ListFormat::Csv => table::comma(cells::COLUMNS, cells::row),
         ListFormat::Parquet => {
             let mut said = vec![
@@ -291,9 +295,19 @@ fn list_writer(
             ];
             let normalisation = asked.normalisation.clone();
             said.extend(normalisation.map(|name| ("tread:normalisation".to_owned(), name)));
+            said.extend(as_of.map(|as_of| ("tread:as_of".to_owned(), as_of.to_string())));
             table::parquet(cells::COLUMNS, cells::row, said)?
         }
     })
+}
+
+/// Says as of when an answer is, where a time was asked for.
+pub(super) fn say_as_of(mut response: Response, as_of: Option<Timestamp>) -> Response {
+    let as_of = as_of.and_then(|as_of| HeaderValue::try_from(as_of.to_string()).ok());
+    if let Some(as_of) = as_of {
+        response.headers_mut().insert(AS_OF, as_of);
+    }
+    response
 }
 
 fn answer(headers: &HeaderMap, media_type: &'static str, picture: Picture) -> Response {

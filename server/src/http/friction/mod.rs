@@ -1,7 +1,7 @@
 //! `/v1/sites/{site}/friction` and `/v1/sites/{site}/segments`.
 //!
 //! Every answer about the map has an `ETag` and takes `as_of`: the map as it was known then, in
-//! whole epochs (those that had begun), with the ages of then.
+//! whole epochs (those that were over), with the ages of then. The answer says as of when it is.
 
 pub(super) mod map;
 pub(super) mod places;
@@ -9,7 +9,7 @@ mod streamed;
 
 use axum::extract::State;
 use axum::http::HeaderMap;
-use axum::response::{IntoResponse as _, Response};
+use axum::response::Response;
 use jiff::{SignedDuration, Timestamp};
 use serde::Deserialize;
 use tread_api::friction::{RobotContribution, StoredSegment, TerrainFriction, TerrainHistory};
@@ -18,9 +18,10 @@ use tread_api::page::Page;
 use tread_api::problem::{ProblemBody, ProblemType};
 use utoipa::IntoParams;
 
+use self::map::say_as_of;
 use self::streamed::{CSV_MEDIA_TYPE, JSON_MEDIA_TYPE, PARQUET_MEDIA_TYPE, streamed};
 use super::etag;
-use super::extract::{Json, Path, Query, cursor, page_limit};
+use super::extract::{Path, Query, cursor, page_limit};
 use super::negotiate::{Offered, choose, offered};
 use super::problem::Problem;
 use super::sites::PageQuery;
@@ -37,7 +38,7 @@ const STEP_MAX_S: i64 = 366 * 86_400;
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ReadingQuery {
-    /// As of when; now when absent.
+    /// As of when, rounded down to the end of an epoch; all that has come when absent.
     as_of: Option<Timestamp>,
     /// Only measurements of this robot model and tyres.
     #[param(value_type = Option<String>)]
@@ -81,8 +82,11 @@ pub(super) async fn terrains(
     let limit = page_limit(query.limit)?;
     let asked = asked(query.as_of, query.configuration, query.normalisation);
     let cursor = query.cursor.as_deref();
-    let found = app.friction_of_terrains(&site, &asked, cursor, limit);
-    Ok(etag::json(&headers, &found.await?))
+    let found = app
+        .friction_of_terrains(&site, &asked, cursor, limit)
+        .await?;
+    let as_of = found.items.first().and_then(|terrain| terrain.as_of);
+    Ok(say_as_of(etag::json(&headers, &found), as_of))
 }
 
 /// What is asked for of one terrain.
@@ -90,7 +94,7 @@ pub(super) async fn terrains(
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct OneQuery {
-    /// As of when; now when absent.
+    /// As of when, rounded down to the end of an epoch; all that has come when absent.
     as_of: Option<Timestamp>,
     /// Only measurements of this robot model and tyres.
     #[param(value_type = Option<String>)]
@@ -114,7 +118,7 @@ pub(super) async fn terrain(
 ) -> Result<Response, Problem> {
     let asked = asked(query.as_of, query.configuration, query.normalisation);
     let found = app.friction_of_terrain(&site, &terrain, &asked).await?;
-    Ok(etag::json(&headers, &found))
+    Ok(say_as_of(etag::json(&headers, &found), found.as_of))
 }
 
 /// Which times of a terrain's history.
@@ -219,7 +223,7 @@ const SEGMENT_FORMATS: [Offered<SegmentFormat>; 3] = [
     responses((status = 200, description = "The measurements", content(
             (Page<StoredSegment> = "application/json"), (String = "text/csv"),
             (Vec<u8> = "application/vnd.apache.parquet"))),
-        (status = 400, body = ProblemBody), (status = 404, body = ProblemBody),
+        (status = 304), (status = 400, body = ProblemBody), (status = 404, body = ProblemBody),
         (status = 406, body = ProblemBody)))]
 pub(super) async fn segments(
     State(app): State<App>,
@@ -238,7 +242,8 @@ pub(super) async fn segments(
     };
     let (media_type, writer) = match format {
         SegmentFormat::Json => {
-            return Ok(Json(app.segments(&site, &filter, limit).await?).into_response());
+            let found = app.segments(&site, &filter, limit).await?;
+            return Ok(etag::json(&headers, &found));
         }
         SegmentFormat::Csv => (
             CSV_MEDIA_TYPE,
@@ -251,5 +256,7 @@ pub(super) async fn segments(
         }
     };
     let export = app.export_segments(&site, filter, writer).await?;
-    Ok(streamed(media_type, export, SegmentExport::next))
+    let state = export.state();
+    let make = || streamed(media_type, export, SegmentExport::next);
+    Ok(etag::streamed(&headers, media_type, state, make))
 }

@@ -10,11 +10,12 @@ use tread_api::friction::{
 };
 use tread_api::geometry::Point;
 use tread_api::ids::{ConfigurationId, SiteId};
-use tread_api::page::Page;
+use tread_api::page::MapPage;
 use tread_api::problem::ProblemBody;
 use utoipa::IntoParams;
 
 use super::asked;
+use super::map::say_as_of;
 use crate::app::App;
 use crate::app::friction::{Area, CellsAsked};
 use crate::http::etag;
@@ -37,7 +38,7 @@ pub(in crate::http) struct CellQuery {
     /// Side of the squares that cells are put together to, metres, a multiple of the grid's; the
     /// box may have 4 194 304 of them. Different ground is never put together.
     resolution_m: Option<f64>,
-    /// As of when; now when absent.
+    /// As of when, rounded down to the end of an epoch; all that has come when absent.
     as_of: Option<Timestamp>,
     /// Only measurements of this robot model and tyres.
     #[param(value_type = Option<String>)]
@@ -55,7 +56,7 @@ pub(in crate::http) struct CellQuery {
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/cells", tag = "friction",
     security(("token" = ["viewer"])),
     operation_id = "list_cell_friction", params(("site" = SiteId, Path), CellQuery),
-    responses((status = 200, body = Page<CellFriction>), (status = 304),
+    responses((status = 200, body = MapPage<CellFriction>), (status = 304),
         (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
 pub(in crate::http) async fn cells(
     State(app): State<App>,
@@ -74,7 +75,7 @@ pub(in crate::http) async fn cells(
         limit: page_limit(query.limit)?,
     };
     let found = app.friction_of_cells(&site, &asked, cells).await?;
-    Ok(etag::json(&headers, &found))
+    Ok(say_as_of(etag::json(&headers, &found), found.as_of))
 }
 
 /// Which point.
@@ -86,7 +87,7 @@ pub(in crate::http) struct PointQuery {
     x_m: f64,
     /// North-like coordinate, metres.
     y_m: f64,
-    /// As of when; now when absent.
+    /// As of when, rounded down to the end of an epoch; all that has come when absent.
     as_of: Option<Timestamp>,
     /// Only measurements of this robot model and tyres.
     #[param(value_type = Option<String>)]
@@ -113,7 +114,7 @@ pub(in crate::http) async fn point(
         y_m: query.y_m,
     };
     let found = app.friction_at(&site, &asked, point).await?;
-    Ok(etag::json(&headers, &found))
+    Ok(say_as_of(etag::json(&headers, &found), found.as_of))
 }
 
 /// Friction along a path, how sure it is, and the speed that follows for a robot.
@@ -130,7 +131,7 @@ pub(in crate::http) async fn path(
     Json(request): Json<AskPath>,
 ) -> Result<Response, Problem> {
     let found = app.friction_along(&site, request).await?;
-    Ok(etag::json(&headers, &found))
+    Ok(say_as_of(etag::json(&headers, &found), found.as_of))
 }
 
 /// Which times and cells.
@@ -166,7 +167,7 @@ pub(in crate::http) struct DifferenceQuery {
     security(("token" = ["viewer"])),
     operation_id = "list_friction_differences",
     params(("site" = SiteId, Path), DifferenceQuery),
-    responses((status = 200, body = Page<CellDifference>), (status = 304),
+    responses((status = 200, body = MapPage<CellDifference>), (status = 304),
         (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
 pub(in crate::http) async fn difference(
     State(app): State<App>,
@@ -185,8 +186,8 @@ pub(in crate::http) async fn difference(
         limit: page_limit(query.limit)?,
     };
     let times = (query.from, query.to);
-    let found = app.friction_difference(&site, &asked, times, cells);
-    Ok(etag::json(&headers, &found.await?))
+    let found = app.friction_difference(&site, &asked, times, cells).await?;
+    Ok(say_as_of(etag::json(&headers, &found), found.as_of))
 }
 
 /// Where to look for visits that teach.
@@ -202,7 +203,7 @@ pub(in crate::http) struct VisitQuery {
     x_max_m: f64,
     /// Highest y of the area, metres.
     y_max_m: f64,
-    /// As of when; now when absent.
+    /// As of when, rounded down to the end of an epoch; all that has come when absent.
     as_of: Option<Timestamp>,
     /// Only measurements of this robot model and tyres.
     #[param(value_type = Option<String>)]
@@ -217,7 +218,7 @@ pub(in crate::http) struct VisitQuery {
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/visits", tag = "friction",
     security(("token" = ["viewer"])),
     operation_id = "list_visit_suggestions", params(("site" = SiteId, Path), VisitQuery),
-    responses((status = 200, body = Page<VisitSuggestion>), (status = 304),
+    responses((status = 200, body = MapPage<VisitSuggestion>), (status = 304),
         (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
 pub(in crate::http) async fn visits(
     State(app): State<App>,
@@ -231,6 +232,6 @@ pub(in crate::http) async fn visits(
         (Some(query.x_max_m), Some(query.y_max_m)),
     )?;
     let limit = page_limit(query.limit)?;
-    let found = app.visits_worth_most(&site, &asked, area, limit);
-    Ok(etag::json(&headers, &found.await?))
+    let found = app.visits_worth_most(&site, &asked, area, limit).await?;
+    Ok(say_as_of(etag::json(&headers, &found), found.as_of))
 }

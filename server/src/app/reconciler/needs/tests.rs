@@ -32,6 +32,7 @@ fn mission(state: MissionState, boot: Option<BootId>) -> Standing {
         reason: None,
         boot,
         pause_wanted: false,
+        priority: 0,
         content: (1, hash(1)),
         replacement: None,
         silent_since: None,
@@ -86,6 +87,7 @@ fn presence(said: &Said) -> Presence {
         control_loop: LoopStatus::default(),
         battery: None,
         alerts: Vec::new(),
+        leaving: false,
         monotonic_us: None,
         safety: tread_api::safety::SafetyStatus::default(),
     };
@@ -294,7 +296,11 @@ fn a_robot_that_stays_away_past_its_bound_loses_what_it_has_in_hand() {
             silent_since: Some(since),
             ..mission(state, Some(boot(1)))
         };
-        decide(&mission, &Presence::default(), Memory::default(), now())
+        let memory = Memory {
+            silence: Silence::of(&mission, None, now()),
+            ..Memory::default()
+        };
+        decide(&mission, &Presence::default(), memory, now())
     };
     for state in [
         MissionState::Offered,
@@ -308,6 +314,32 @@ fn a_robot_that_stays_away_past_its_bound_loses_what_it_has_in_hand() {
         assert_eq!(away_s(state, 170), lost, "{state:?}");
     }
     assert_eq!(away_s(MissionState::Queued, 1_000_000), Need::Wait);
+}
+
+#[test]
+fn a_step_of_the_wall_clock_loses_no_robot_and_keeps_none() {
+    let silent = Standing {
+        silent_since: Some(now().wall),
+        ..mission(MissionState::Active, Some(boot(1)))
+    };
+    let decided = |first: Now, later: Now| {
+        let before = Silence::of(&silent, None, first);
+        let memory = Memory {
+            silence: Silence::of(&silent, before, later),
+            ..Memory::default()
+        };
+        decide(&silent, &Presence::default(), memory, later)
+    };
+    // The plan takes 100 s, and a margin of a minute.
+    for hours in [-5, 0, 5] {
+        let after = |passed: u64| Now {
+            elapsed: ELAPSED + Duration::from_secs(passed),
+            wall: now().wall + jiff::SignedDuration::from_hours(hours),
+        };
+        assert_eq!(decided(now(), after(150)), Need::Wait, "{hours} h");
+        let lost = Need::Settle(Change::LoseRobot);
+        assert_eq!(decided(now(), after(170)), lost, "{hours} h");
+    }
 }
 
 #[test]

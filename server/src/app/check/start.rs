@@ -1,0 +1,196 @@
+//! From where a robot will start a mission that is asked for now: the expected end of what it drives
+//! and of what is queued before it.
+
+use tread_api::geometry::Pose;
+use tread_api::ids::MissionId;
+use tread_api::mission::{Mission, MissionState, StartPolicy};
+use tread_api::robot::RobotModel;
+use tread_api::trajectory::{StartSource, Trajectory};
+
+use super::planned;
+use crate::app::AppError;
+use crate::db::missions::Standing;
+use crate::db::{self, Tx};
+
+/// Most missions before it whose ends are planned; waypoints end where they say, whatever was
+/// before, so more are only needed after as many circles.
+const CHAIN_MAX: usize = 100;
+
+/// Where planning begins, and why there.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Start {
+    pub(super) pose: Pose,
+    pub(super) source: StartSource,
+    pub(super) after_mission: Option<MissionId>,
+}
+
+/// Where a mission would stand among those of its robot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Place {
+    pub(super) priority: i32,
+    pub(super) policy: StartPolicy,
+    /// The mission whose place it takes, if any.
+    pub(super) replaces: Option<MissionId>,
+}
+
+/// A mission that is driven before.
+#[derive(Debug)]
+pub(super) struct Earlier {
+    id: MissionId,
+    trajectory: Trajectory,
+    /// From where its robot planned it, once it has taken it.
+    begin: Option<Pose>,
+}
+
+/// Whether this open mission is driven before one of that place.
+fn is_before(open: &Standing, place: Place) -> bool {
+    match open.state {
+        MissionState::Offered | MissionState::Active | MissionState::Paused => true,
+        // What is held in the queue is passed over.
+        MissionState::Queued => {
+            !open.pause_wanted && (place.replaces.is_some() || open.priority >= place.priority)
+        }
+        // It ends where the robot comes to rest now.
+        MissionState::Cancelling
+        | MissionState::Succeeded
+        | MissionState::Failed
+        | MissionState::Cancelled
+        | MissionState::Rejected
+        | MissionState::Expired => false,
+    }
+}
+
+/// Of a robot's open missions, which are in the order of driving, those before one of that place.
+fn before(open: &[Standing], place: Place) -> Vec<MissionId> {
+    if place.policy == StartPolicy::Replace {
+        return Vec::new();
+    }
+    let ahead = open
+        .iter()
+        .take_while(|open| Some(open.id) != place.replaces);
+    let before = ahead.filter(|open| is_before(open, place));
+    before.map(|open| open.id).collect()
+}
+
+/// The missions on whose ends the start of a new one depends, in the order in which they are driven.
+pub(super) async fn earlier(
+    tx: &mut Tx,
+    robot_pk: i64,
+    place: Place,
+) -> Result<Vec<Earlier>, AppError> {
+    let open = db::missions::open_of_robot(tx, robot_pk).await?;
+    let mut chain = Vec::new();
+    for id in before(&open, place).into_iter().rev().take(CHAIN_MAX) {
+        let Some(row) = db::missions::find(tx, id).await? else {
+            continue;
+        };
+        let earlier = Earlier::of(row.mission);
+        let says_its_end = matches!(earlier.trajectory, Trajectory::Waypoints(_));
+        chain.push(earlier);
+        if says_its_end {
+            break;
+        }
+    }
+    chain.reverse();
+    Ok(chain)
+}
+
+impl Earlier {
+    fn of(mission: Mission) -> Self {
+        let begin = mission.plan.and_then(|plan| plan.begin);
+        match mission.replacement {
+            // It will be driven from wherever the robot is then.
+            Some(replacement) => Self {
+                id: mission.id,
+                trajectory: replacement.trajectory,
+                begin: None,
+            },
+            None => Self {
+                id: mission.id,
+                trajectory: mission.trajectory,
+                begin,
+            },
+        }
+    }
+}
+
+/// Where the robot will be after those missions. What cannot be planned is left out: its robot will
+/// refuse it and stay where it is.
+pub(super) fn after(first: Start, earlier: &[Earlier], model: &RobotModel) -> Start {
+    earlier.iter().fold(first, |start, mission| {
+        let from = mission.begin.unwrap_or(start.pose);
+        let Ok(planned) = planned(model, &mission.trajectory, from) else {
+            return start;
+        };
+        let plan = &planned.plan;
+        let end = plan.path().sample(plan.length_m()).pose;
+        Start {
+            pose: Pose {
+                x_m: end.x_m,
+                y_m: end.y_m,
+                heading_rad: end.heading_rad,
+            },
+            source: StartSource::Mission,
+            after_mission: Some(mission.id),
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use tread_api::ids::PlanHash;
+    use tread_api::mission::LinkPolicy;
+    use uuid::Uuid;
+
+    use super::*;
+
+    fn open(number: u128, state: MissionState, priority: i32, pause_wanted: bool) -> Standing {
+        Standing {
+            id: MissionId::from_uuid(Uuid::from_u128(number)),
+            site: "yard".parse().unwrap(),
+            robot: "rover-1".parse().unwrap(),
+            state,
+            reason: None,
+            boot: None,
+            pause_wanted,
+            priority,
+            content: (1, PlanHash::from_uuid(Uuid::from_u128(1))),
+            replacement: None,
+            silent_since: None,
+            lost_after_s: None,
+            link_policy: LinkPolicy::Continue,
+            duration_s: None,
+        }
+    }
+
+    #[test]
+    fn a_new_mission_comes_after_what_is_driven_and_what_is_queued_with_at_least_its_priority() {
+        use MissionState as S;
+        let queue = [
+            open(1, S::Active, -5, false),
+            open(2, S::Queued, 9, false),
+            open(3, S::Queued, 4, true),
+            open(4, S::Queued, 4, false),
+            open(5, S::Queued, 0, false),
+        ];
+        let ids = |place| -> Vec<u128> {
+            let before = before(&queue, place).into_iter();
+            before.map(|id| id.as_uuid().as_u128()).collect()
+        };
+        let place = |priority, policy, replaces: Option<u128>| Place {
+            priority,
+            policy,
+            replaces: replaces.map(|number| MissionId::from_uuid(Uuid::from_u128(number))),
+        };
+        let append = |priority| ids(place(priority, StartPolicy::Append, None));
+        assert_eq!(append(0), [1, 2, 4, 5]);
+        assert_eq!(append(4), [1, 2, 4]);
+        assert_eq!(append(10), [1]);
+        assert_eq!(ids(place(0, StartPolicy::Replace, None)), []);
+        // What takes the place of another one is driven when that would have been.
+        assert_eq!(ids(place(0, StartPolicy::Append, Some(1))), []);
+        assert_eq!(ids(place(0, StartPolicy::Append, Some(4))), [1, 2]);
+        let cancelled = [open(1, S::Cancelling, 0, false)];
+        assert_eq!(before(&cancelled, place(0, StartPolicy::Append, None)), []);
+    }
+}

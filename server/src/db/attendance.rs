@@ -1,0 +1,57 @@
+//! Which robots are expected on the network.
+
+use sqlx::SqliteConnection;
+use tread_api::ids::{RobotId, SiteId};
+
+use super::{DbError, parse};
+
+/// Whether a robot is expected on the network.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Expected {
+    /// The robot's site.
+    pub site: SiteId,
+    /// The robot.
+    pub robot: RobotId,
+    /// Whether it was there and has not left by itself.
+    pub is_present: bool,
+    /// Whether an alert of that code is raised.
+    pub is_alerted: bool,
+}
+
+/// All robots, and whether each has an alert of that code.
+pub async fn all(db: &mut SqliteConnection, code: &str) -> Result<Vec<Expected>, DbError> {
+    let rows = sqlx::query!(
+        r#"SELECT sites.id AS site, robots.id AS robot, robots.is_present AS "is_present: bool",
+               EXISTS (SELECT 1 FROM alerts WHERE alerts.robot_pk = robots.pk
+                   AND alerts.code = ? AND alerts.cleared_at_us IS NULL) AS "is_alerted!: bool"
+           FROM robots JOIN sites ON sites.pk = robots.site_pk"#,
+        code,
+    );
+    let rows = rows.fetch_all(db).await?;
+    rows.into_iter()
+        .map(|row| {
+            Ok(Expected {
+                site: parse("site", &row.site)?,
+                robot: parse("robot", &row.robot)?,
+                is_present: row.is_present,
+                is_alerted: row.is_alerted,
+            })
+        })
+        .collect()
+}
+
+/// Notes whether a robot is on the network.
+pub async fn set_present(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+    is_present: bool,
+) -> Result<(), DbError> {
+    sqlx::query!(
+        "UPDATE robots SET is_present = ? WHERE pk = ?",
+        is_present,
+        robot_pk
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}

@@ -1,0 +1,268 @@
+//! Alerts that the server raises itself: robots that are lost, and missions that failed.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use reqwest::StatusCode;
+use serde_json::{Value, json};
+use tread_api::ids::MissionId;
+use tread_api::mission::{MissionDetail, MissionState};
+use tread_api::robot::{ChangeRobot, LinkState};
+use tread_api::wire::ingest::{MissionPhase, Record, RecordContent};
+
+use crate::harness::{Yard, eventually, report, time};
+use crate::robot::Robot;
+
+const BEGIN: &str = "2026-11-10T08:00:00Z";
+
+/// All alerts of that code, the newest first.
+async fn alerts(yard: &Yard, code: &str) -> Vec<Value> {
+    let (status, found) = yard.get_value("/v1/alerts?site=yard").await;
+    assert_eq!(status, StatusCode::OK, "{found}");
+    let items = found["items"].as_array().unwrap().iter();
+    items
+        .filter(|alert| alert["code"] == code)
+        .cloned()
+        .collect()
+}
+
+/// Waits until that many alerts of a code were raised, the newest of which is raised or cleared.
+async fn there_are(yard: &Yard, code: &str, count: usize, raised: bool) -> Vec<Value> {
+    let what = format!("{count} alerts `{code}`, the newest raised: {raised}");
+    eventually(&what, async || {
+        let found = alerts(yard, code).await;
+        let is_raised = found.first().map(|alert| alert["cleared_at"].is_null());
+        if found.len() == count && is_raised == Some(raised) {
+            Ok(found)
+        } else {
+            Err(found)
+        }
+    })
+    .await
+}
+
+async fn link_is(yard: &Yard, robot: &str, link: LinkState) {
+    eventually("the link", async || {
+        let (_, found) = yard
+            .get_value(&format!("/v1/sites/yard/robots/{robot}"))
+            .await;
+        if found["link"] == link.as_str() {
+            Ok(())
+        } else {
+            Err(found)
+        }
+    })
+    .await;
+}
+
+/// Lets the server's time go on while its robots are heard.
+async fn pass(yard: &Yard, seconds: u64) {
+    for _ in 0..seconds {
+        yard.server.app().clock().advance(Duration::from_secs(1));
+        yard.server.app().wake();
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_robot_that_goes_away_raises_an_alert_until_it_is_back_also_over_a_restart() {
+    let yard = Yard::start_at(time(BEGIN)).await;
+    pass(&yard, 31).await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    link_is(&yard, "rover-1", LinkState::Online).await;
+    pass(&yard, 1).await;
+    drop(robot);
+    link_is(&yard, "rover-1", LinkState::Offline).await;
+    yard.server.app().clock().advance(Duration::from_secs(10));
+    pass(&yard, 1).await;
+    assert_eq!(alerts(&yard, "robot-lost").await, Vec::<Value>::new());
+    yard.server.app().clock().advance(Duration::from_secs(10));
+    let raised = there_are(&yard, "robot-lost", 1, true).await;
+    assert_eq!(raised[0]["severity"], "critical");
+    let text = raised[0]["text"].as_str().unwrap();
+    assert!(text.contains("15 s"), "{text}");
+    // It is the same alert after a restart.
+    let yard = yard.restart_at(time("2026-11-10T09:00:00Z")).await;
+    pass(&yard, 35).await;
+    there_are(&yard, "robot-lost", 1, true).await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    link_is(&yard, "rover-1", LinkState::Online).await;
+    pass(&yard, 1).await;
+    there_are(&yard, "robot-lost", 1, true).await;
+    pass(&yard, 4).await;
+    let cleared = there_are(&yard, "robot-lost", 1, false).await;
+    assert_eq!(cleared[0]["id"], raised[0]["id"]);
+    // One that goes away while the server is down is missed as well.
+    drop(robot);
+    let yard = yard.restart_at(time("2026-11-10T10:00:00Z")).await;
+    pass(&yard, 20).await;
+    there_are(&yard, "robot-lost", 1, false).await;
+    pass(&yard, 11).await;
+    there_are(&yard, "robot-lost", 2, true).await;
+    // Nobody misses a robot that is retired.
+    let retired = ChangeRobot {
+        name: None,
+        retired: Some(true),
+    };
+    let path = yard.url("/v1/sites/yard/robots/rover-1");
+    let (status, said) = yard.send(yard.client().patch(path).json(&retired)).await;
+    assert_eq!(status, StatusCode::OK, "{said}");
+    there_are(&yard, "robot-lost", 2, false).await;
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_agent_that_leaves_by_itself_is_not_missed() {
+    let yard = Yard::start_at(time(BEGIN)).await;
+    pass(&yard, 31).await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    link_is(&yard, "rover-1", LinkState::Online).await;
+    pass(&yard, 1).await;
+    robot.say(|state| state.leaving = true);
+    let key = ("yard".parse().unwrap(), "rover-1".parse().unwrap());
+    eventually("the last word is heard", async || {
+        let presence = yard.server.app().presences().get(&key);
+        if presence.has_left() { Ok(()) } else { Err(()) }
+    })
+    .await;
+    drop(robot);
+    link_is(&yard, "rover-1", LinkState::Offline).await;
+    yard.server.app().clock().advance(Duration::from_mins(1));
+    pass(&yard, 3).await;
+    assert_eq!(alerts(&yard, "robot-lost").await, Vec::<Value>::new());
+    yard.server.stop().await.unwrap();
+}
+
+async fn failed(robot: &Robot, yard: &Yard, seq: u64, reason: &str) -> MissionId {
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    robot.say(|state| state.mission = None);
+    let RecordContent::Mission(mut said) = report(&mission, MissionPhase::Failed) else {
+        unreachable!("it is a report");
+    };
+    said.reason = Some(reason.to_owned());
+    let content = RecordContent::Mission(said);
+    robot.upload(vec![Record { seq, content }]).await.unwrap();
+    yard.mission_becomes(mission.id, MissionState::Failed).await;
+    mission.id
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_mission_that_failed_raises_an_alert_until_it_is_acknowledged_or_one_succeeds() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mut events = yard
+        .client()
+        .get(yard.url("/v1/events?topics=alerts"))
+        .send()
+        .await
+        .unwrap();
+    let first = failed(&robot, &yard, 0, "a wheel is stuck").await;
+    let raised = there_are(&yard, "mission-failed", 1, true).await;
+    let text = raised[0]["text"].as_str().unwrap();
+    assert!(
+        text.contains(&first.to_string()) && text.contains("a wheel is stuck"),
+        "{text}"
+    );
+    let mut heard = String::new();
+    while !heard.contains("mission-failed") {
+        let next = tokio::time::timeout(Duration::from_secs(15), events.chunk()).await;
+        heard.push_str(&String::from_utf8_lossy(&next.unwrap().unwrap().unwrap()));
+    }
+    // Another failure is another alert, and only the newest is raised.
+    let second = failed(&robot, &yard, 1, "a wheel is off").await;
+    let raised = there_are(&yard, "mission-failed", 2, true).await;
+    assert!(
+        raised[0]["text"]
+            .as_str()
+            .unwrap()
+            .contains(&second.to_string())
+    );
+    assert!(raised[1]["cleared_at"].is_string(), "{raised:?}");
+    let yard = yard.restart().await;
+    let raised = there_are(&yard, "mission-failed", 2, true).await;
+    let id = raised[0]["id"].as_str().unwrap();
+    let path = format!("/v1/alerts/{id}/acknowledge");
+    let (status, seen) = yard.post(&path, &json!({})).await;
+    assert_eq!(status, StatusCode::OK);
+    assert!(seen["cleared_at"].is_string(), "{seen}");
+    let times = [
+        &seen["raised_at"],
+        &seen["acknowledged_at"],
+        &seen["cleared_at"],
+    ];
+    let times = times.map(|at| at.as_str().unwrap().parse::<Timestamp>().unwrap());
+    assert!(times.is_sorted(), "{seen}");
+    drop(robot);
+    let robot = Robot::join(&yard, "rover-1").await;
+    failed(&robot, &yard, 0, "again").await;
+    there_are(&yard, "mission-failed", 3, true).await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    robot.report(1, &mission, MissionPhase::Succeeded).await;
+    there_are(&yard, "mission-failed", 3, false).await;
+    yard.server.stop().await.unwrap();
+}
+
+fn driven_m(detail: &MissionDetail) -> f64 {
+    detail.mission.progress.unwrap().driven_m
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_mission_that_ended_without_its_robots_word_keeps_how_far_it_was_shown_to_have_come() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    robot.drive(&mission, 0.0);
+    robot.report(0, &mission, MissionPhase::Started).await;
+    robot.drive(&mission, 11.5);
+    eventually("the server knows how far it is", async || {
+        let detail = yard.mission(mission.id).await;
+        let driven_m = detail.mission.progress.map(|progress| progress.driven_m);
+        if driven_m == Some(11.5) {
+            Ok(())
+        } else {
+            Err(driven_m)
+        }
+    })
+    .await;
+    // The agent starts again, and knows only that it drove the mission.
+    let robot = robot.reboot(&yard).await;
+    robot.report(1, &mission, MissionPhase::Failed).await;
+    let detail = yard.mission_becomes(mission.id, MissionState::Failed).await;
+    assert!((driven_m(&detail) - 11.5).abs() < 1e-9, "{detail:?}");
+    let (_, alert) = yard.get_value("/v1/alerts").await;
+    assert_eq!(alert["items"][0]["code"], "mission-failed", "{alert}");
+
+    // What the server ended by itself keeps it too, until the robot's own word comes.
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    robot.drive(&mission, 3.25);
+    eventually("the server knows how far it is", async || {
+        let detail = yard.mission(mission.id).await;
+        let driven_m = detail.mission.progress.map(|progress| progress.driven_m);
+        if driven_m == Some(3.25) {
+            Ok(())
+        } else {
+            Err(driven_m)
+        }
+    })
+    .await;
+    let first_run = robot.boot;
+    let robot = robot.reboot(&yard).await;
+    let detail = yard.mission_becomes(mission.id, MissionState::Failed).await;
+    assert!((driven_m(&detail) - 3.25).abs() < 1e-9, "{detail:?}");
+    let RecordContent::Mission(mut late) = report(&mission, MissionPhase::Failed) else {
+        unreachable!("it is a report");
+    };
+    let mut progress = detail.mission.progress.unwrap();
+    progress.driven_m = 3.5;
+    late.progress = Some(progress);
+    let content = RecordContent::Mission(late);
+    let late = vec![Record { seq: 9, content }];
+    robot.upload_as(first_run, late).await.unwrap();
+    let detail = yard.mission(mission.id).await;
+    assert!((driven_m(&detail) - 3.5).abs() < 1e-9, "{detail:?}");
+    yard.server.stop().await.unwrap();
+}
