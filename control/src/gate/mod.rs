@@ -58,7 +58,7 @@ pub enum GateCause {
 
 impl GateCause {
     /// Every cause, in order.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 16] = [
         Self::Acceleration,
         Self::Speed,
         Self::CommandAge,

@@ -53,7 +53,10 @@ impl App {
         let mut alert = found.ok_or(AppError::UnknownAlert(id))?;
         if alert.code.as_str() == MISSION_FAILED_ALERT && alert.cleared_at.is_none() {
             let now = self.clock().now();
-            let robot_pk = db::robots::pk_of(&mut tx, &alert.site, &alert.robot).await?;
+            let robot_pk = match alert.robot_key() {
+                Some((site, robot)) => db::robots::pk_of(&mut tx, &site, &robot).await?,
+                None => None,
+            };
             if let Some(robot_pk) = robot_pk {
                 db::alerts::clear(&mut tx, robot_pk, &alert.code, now).await?;
             }

@@ -183,7 +183,7 @@ impl App {
             inner.checked_at = Some(self.clock().elapsed());
             let is_damaged = inner.has_new_damage();
             let condition = &mut inner.condition;
-            condition.unwritable = unwritable(written.err(), read.err());
+            condition.unwritable = unwritable(written.and(read).err());
             if is_damaged && condition.damaged.is_none() {
                 let text = "SQLite met a damaged page; the whole file is being checked";
                 condition.damaged = Some(text.to_owned());
@@ -323,33 +323,26 @@ fn chain(error: &dyn std::error::Error) -> String {
     text
 }
 
-async fn limited(
-    probe: impl Future<Output = Result<(), DbError>>,
-) -> Result<(), Option<StorageFailure>> {
+/// Runs a check within its time; what failed, for people.
+async fn limited(probe: impl Future<Output = Result<(), DbError>>) -> Result<(), &'static str> {
     match tokio::time::timeout(CHECK_TIMEOUT, probe).await {
         Ok(Ok(())) => Ok(()),
         Ok(Err(cause)) => {
             tracing::debug!("a check of the storage failed: {cause:?}");
-            Err(cause.failure())
+            let unknown = "the database answers with an error, see the log";
+            Err(cause.failure().map_or(unknown, StorageFailure::explanation))
         }
-        Err(_elapsed) => Err(Some(StorageFailure::Busy)),
+        Err(_elapsed) => Err(StorageFailure::Busy.explanation()),
     }
 }
 
 /// Why nothing can be stored, by the checks and by what has failed of late.
-fn unwritable(
-    written: Option<Option<StorageFailure>>,
-    read: Option<Option<StorageFailure>>,
-) -> Option<String> {
-    let explained = |failure: Option<StorageFailure>| {
-        let unknown = "the database answers with an error, see the log";
-        failure.map_or(unknown, StorageFailure::explanation)
+fn unwritable(found: Option<&'static str>) -> Option<String> {
+    let recent = || {
+        let (failure, since) = failure::last()?;
+        (since < RECOVERED_AFTER).then(|| failure.explanation())
     };
-    if let Some(failure) = written.or(read) {
-        return Some(explained(failure).to_owned());
-    }
-    let (failure, since) = failure::last()?;
-    (since < RECOVERED_AFTER).then(|| failure.explanation().to_owned())
+    found.or_else(recent).map(str::to_owned)
 }
 
 #[expect(

@@ -64,6 +64,10 @@ impl StorageFailure {
     }
 
     /// The failure behind an error; `None` for an error of the statement or its values.
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "whatever else there is or will be says nothing of the storage"
+    )]
     pub fn of(error: &sqlx::Error) -> Option<Self> {
         match error {
             sqlx::Error::Database(error) => {
@@ -86,7 +90,7 @@ impl StorageFailure {
     /// By SQLite's extended result code.
     const fn of_code(extended: u32) -> Option<Self> {
         /// `SQLITE_IOERR_NOMEM`.
-        const IO_NO_MEMORY: u32 = 10 | (12 << 8);
+        const IO_NO_MEMORY: u32 = 0x0c0a;
         match (extended, extended & 0xff) {
             (IO_NO_MEMORY, _) | (_, 7) => Some(Self::Memory),
             (_, 13) => Some(Self::Full),
@@ -166,15 +170,15 @@ mod tests {
         let cases = [
             (13, Some(StorageFailure::Full)),
             (10, Some(StorageFailure::Io)),
-            (10 | (4 << 8), Some(StorageFailure::Io)),
-            (10 | (12 << 8), Some(StorageFailure::Memory)),
+            (0x040a, Some(StorageFailure::Io)),
+            (0x0c0a, Some(StorageFailure::Memory)),
             (7, Some(StorageFailure::Memory)),
             (11, Some(StorageFailure::Damaged)),
             (26, Some(StorageFailure::Damaged)),
-            (5 | (2 << 8), Some(StorageFailure::Busy)),
+            (0x0205, Some(StorageFailure::Busy)),
             (14, Some(StorageFailure::Io)),
             // A violated constraint and a misuse are errors of whoever wrote the statement.
-            (19 | (8 << 8), None),
+            (0x0813, None),
             (1, None),
             (21, None),
         ];

@@ -101,21 +101,21 @@ pub(crate) fn run_with_faults(test: &str) {
         "{}\n{printed}\n{said}",
         child.status
     );
-    println!("{printed}");
+    eprintln!("{printed}");
 }
 
 fn compiled(folder: &Path) -> PathBuf {
     let here = PathBuf::from(std::env::var_os("CARGO_MANIFEST_DIR").unwrap());
     let library = folder.join("interpose.so");
     let compiler = std::env::var_os("CC").unwrap_or_else(|| OsString::from("cc"));
-    let compiled = Command::new(compiler)
+    let done = Command::new(compiler)
         .args(["-shared", "-fPIC", "-O1", "-Wall", "-o"])
         .arg(&library)
         .arg(here.join("tests/faults/interpose.c"))
         .arg("-ldl")
         .output()
         .expect("a C compiler is there: SQLite is built with it");
-    let said = String::from_utf8_lossy(&compiled.stderr);
-    assert!(compiled.status.success(), "{said}");
+    let said = String::from_utf8_lossy(&done.stderr);
+    assert!(done.status.success(), "{said}");
     library
 }

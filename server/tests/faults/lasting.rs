@@ -5,6 +5,7 @@ use std::time::Duration;
 use serde_json::Value;
 use tread_server::app::identity::FirstAdmin;
 use tread_server::config::{FrictionConfig, RetentionConfig, StorageConfig, WebConfig};
+use tread_server::db::stops::StopFilter;
 use tread_server::{Config, RunningServer, Server};
 
 use crate::ground::{hello, mission};
@@ -141,8 +142,10 @@ async fn fill_and_empty(interposer: &Interposer) {
                 .all(|one| one["code"] != "storage-unwritable")
         })
         .await;
-    let mut filter = tread_server::db::stops::StopFilter::default();
-    filter.robot = Some(robot);
+    let filter = StopFilter {
+        robot: Some(robot),
+        ..StopFilter::default()
+    };
     let recorded = async {
         loop {
             let mut tx = server.app().db().read().await.unwrap();

@@ -125,7 +125,7 @@ async fn who_was_signed_in_may_stop_robots_while_nothing_can_be_read() {
     let (status, _body) = yard.get_value("/v1/server").await;
     assert_eq!(status, StatusCode::OK);
     // Beyond the time in which a token is not looked up again.
-    clock.advance(std::time::Duration::from_secs(60));
+    clock.advance(std::time::Duration::from_mins(1));
     yard.server.app().db().close().await;
     let (status, body) = yard.get_value("/readyz").await;
     assert_eq!(status, StatusCode::SERVICE_UNAVAILABLE, "{body}");

@@ -146,19 +146,19 @@ impl Settling {
     }
 
     /// Writes stops down; whether that is done.
-    async fn record(&self, waiting: &[Stop]) -> bool {
-        if waiting.is_empty() {
+    async fn record(&self, stops: &[Stop]) -> bool {
+        if stops.is_empty() {
             return true;
         }
         let writing = async {
             let mut tx = self.app.db().write().await?;
-            self.app.record_stops(&mut tx, waiting).await?;
+            self.app.record_stops(&mut tx, stops).await?;
             tx.commit().await?;
             Ok::<(), AppError>(())
         };
         match db::limited(writing).await {
             Ok(()) => {
-                self.app.unrecorded().remove(waiting);
+                self.app.unrecorded().remove(stops);
                 true
             }
             Err(error) => {

@@ -95,6 +95,7 @@ mod tests {
             reason: "test".to_owned(),
             wanted_at: Timestamp::UNIX_EPOCH,
             confirmed_at: None,
+            standing_at: None,
             unconfirmed: false,
             clear_asked_by: None,
             clear_asked_at: None,
