@@ -91,7 +91,10 @@ impl Server {
         let lock = DatabaseLock::take(&config.database)?;
         let db = Db::open(&config.database).await?;
         let app = App::new(db, clock, config.friction, config.storage);
-        app.continue_time().await?;
+        // With a damaged table robots can still be stopped; only a clock that was set back shows.
+        if let Err(error) = app.continue_time().await {
+            app.log_failure("continue the time of the database", &error);
+        }
         app.declare(config.normalisations);
         app.ensure_site(&config.site).await?;
         app.know_robots().await?;

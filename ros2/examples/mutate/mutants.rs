@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 use tread_ros2::cdr::{CdrError, Field, decode};
 use tread_ros2::messages::{
     BatteryState, DiagnosticArray, Float64MultiArray, Imu, JointState, Odometry, Path,
-    PoseWithCovarianceStamped, Twist, TwistStamped,
+    PoseWithCovarianceStamped, Text, Twist, TwistStamped,
 };
 
 /// Counts that claim much.
@@ -25,7 +25,7 @@ fn all<'a, T: Field<'a>, R>(bytes: &'a [u8], fields: impl Fn(T) -> R) -> Result<
 }
 
 /// The types, each by a word of its messages' names in `golden.json`; the first that fits counts.
-const TYPES: [(&str, Read); 10] = [
+const TYPES: [(&str, Read); 11] = [
     ("odometry", |bytes| {
         all(bytes, |read: Odometry<'_>| read.child_frame_id.len())
     }),
@@ -75,6 +75,7 @@ const TYPES: [(&str, Read); 10] = [
                 .sum()
         })
     }),
+    ("text", |bytes| all(bytes, |read: Text<'_>| read.data.len())),
 ];
 
 /// What became of the mutants.

@@ -350,6 +350,7 @@ export const words = {
   },
   alerts: {
     none: 'No alert stands.',
+    server: 'Server',
     acknowledge: 'Acknowledge',
     acknowledged: 'acknowledged',
     raised: 'since',

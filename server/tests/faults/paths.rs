@@ -111,6 +111,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                 db::robots::set_retired(tx, ground.robot_pk, Some(now())).await?;
                 db::robots::set_retired(tx, ground.robot_pk, None).await?;
                 db::robots::count_refused(tx, ground.robot_pk, 1, "a test").await?;
+                db::attendance::set_present(tx, ground.robot_pk, true).await?;
                 let other = BootId::from_uuid(uuid(number));
                 db::robots::boot_key(tx, ground.robot_pk, other).await?;
                 let configuration: ConfigurationId = of(json!(format!("{number:032x}")));
@@ -281,6 +282,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                 }));
                 db::stops::insert(tx, std::slice::from_ref(&stop)).await?;
                 db::stops::confirm(tx, &[stop.id], now()).await?;
+                db::stops::stand(tx, stop.id, now()).await?;
                 db::stops::unconfirm(tx, stop.id).await?;
                 db::stops::ask_clear(tx, stop.id, "a test", now()).await?;
                 db::stops::refuse_clear(tx, stop.id).await?;

@@ -34,7 +34,11 @@ async fn of_two_agents_under_one_name_the_newest_counts_and_the_other_ends_its_m
     .unwrap();
     let newer = seen.live.unwrap().boot;
     assert_ne!(newer, older);
-    let alert = &seen.alerts[0];
+    let alert = seen
+        .alerts
+        .iter()
+        .find(|it| it.code.as_str() == "two-agents");
+    let alert = alert.unwrap();
     for boot in [older, newer] {
         assert!(alert.text.contains(&boot.to_string()), "{alert:?}");
     }

@@ -75,6 +75,11 @@ export class Fleet implements Listener {
     [...this.alerts.values()].filter((alert) => !alert.cleared_at).sort((a, b) => (a.raised_at < b.raised_at ? 1 : -1)),
   );
 
+  /** What stands about the server itself and stops its work. */
+  get serverProblems(): Alert[] {
+    return this.standingAlerts.filter((alert) => alert.robot === null && alert.severity === 'critical');
+  }
+
   get selectedRobot(): Robot | null {
     return this.robots.find((view) => view.id === this.selected)?.robot ?? null;
   }
