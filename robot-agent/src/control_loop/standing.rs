@@ -24,6 +24,8 @@ const DISTANCE_MIN_M: f64 = 0.3;
 const FIXES: u32 = 3;
 /// How long it must be at rest until it counts as standing.
 const STANDS_FOR: Duration = Duration::from_millis(300);
+/// How long fixes alone must stay at one place: a robot that creeps leaves it meanwhile.
+const FIXES_STAY_FOR: Duration = Duration::from_secs(3);
 /// How long it must move until it counts as moving.
 const MOVES_FOR: Duration = Duration::from_millis(300);
 /// Weakest braking that is expected, metres per second squared: half of what unknown ground gives.
@@ -37,13 +39,24 @@ const MARGIN: Duration = Duration::from_millis(700);
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct Motion {
     /// Fastest rim, metres per second.
-    pub(crate) wheels_m_s: f64,
+    pub(crate) wheels_m_s: Option<f64>,
     /// Odometry over ground, metres per second.
     pub(crate) odometry_m_s: Option<f64>,
     /// Gyro, radians per second.
     pub(crate) turn_rad_s: Option<f64>,
     /// A position fix of this tick.
     pub(crate) fix: Option<Point>,
+}
+
+impl Motion {
+    /// The faster one of wheels and odometry.
+    fn speed_m_s(&self) -> Option<f64> {
+        let odometry_m_s = self.odometry_m_s.map(f64::abs);
+        self.wheels_m_s
+            .into_iter()
+            .chain(odometry_m_s)
+            .reduce(f64::max)
+    }
 }
 
 /// Which channel shows motion, and how fast.
@@ -76,6 +89,8 @@ pub(crate) struct StandingWatch {
     /// When rest was commanded, and when it should be met.
     commanded: Option<(Duration, Duration)>,
     still_since: Option<Duration>,
+    /// The first of the fixes that stay at one place.
+    first_fix: Option<(Duration, Point)>,
     moving_since: Option<Duration>,
     stands: Option<(Duration, Duration)>,
     anchor: Option<Point>,
@@ -92,18 +107,23 @@ impl StandingWatch {
             return;
         }
         let (commanded_at, due) = *self.commanded.get_or_insert_with(|| {
-            let speed_m_s = motion
-                .odometry_m_s
-                .map_or(motion.wheels_m_s, |odometry_m_s| {
-                    motion.wheels_m_s.max(odometry_m_s.abs())
-                });
+            let speed_m_s = motion.speed_m_s().unwrap_or(0.0);
             let braking = Duration::try_from_secs_f64(speed_m_s / BRAKING_M_S2);
             let braking = braking.map_or(BRAKING_MAX, |braking| braking.min(BRAKING_MAX));
             (now, now + braking + MARGIN)
         });
         let Some(shown) = self.shown(motion) else {
             self.moving_since = None;
-            let since = *self.still_since.get_or_insert(now);
+            // Without wheels or odometry that can be believed only fixes show that it stands.
+            let since = if motion.speed_m_s().is_some() {
+                *self.still_since.get_or_insert(now)
+            } else {
+                self.still_since = None;
+                let Some(since) = self.stays_since(now, motion.fix) else {
+                    return;
+                };
+                since
+            };
             if now.saturating_sub(since) >= STANDS_FOR {
                 let took = since.saturating_sub(commanded_at);
                 self.stands.get_or_insert((since, took));
@@ -114,7 +134,7 @@ impl StandingWatch {
             }
             return;
         };
-        self.still_since = None;
+        (self.still_since, self.first_fix) = (None, None);
         let since = *self.moving_since.get_or_insert(now);
         let lasts = now.saturating_sub(since) >= MOVES_FOR;
         if self.stands.is_some() {
@@ -126,18 +146,34 @@ impl StandingWatch {
         }
     }
 
+    /// Since when position fixes have stayed at one place, if that is long enough.
+    fn stays_since(&mut self, now: Duration, fix: Option<Point>) -> Option<Duration> {
+        let fix = fix?;
+        let (since, first) = *self.first_fix.get_or_insert((now, fix));
+        if first.distance_m(fix) > DISTANCE_MIN_M {
+            self.first_fix = Some((now, fix));
+            return None;
+        }
+        (now.saturating_sub(since) >= FIXES_STAY_FOR).then_some(since)
+    }
+
+    /// Nothing is heard of the robot any more: whether it stands is not known until it is.
+    pub(crate) fn forget(&mut self) {
+        *self = Self {
+            commanded: self.commanded,
+            ..Self::default()
+        };
+    }
+
     /// What shows motion.
     fn shown(&mut self, motion: &Motion) -> Option<Shown> {
         if let (Some(anchor), Some(fix)) = (self.anchor, motion.fix) {
             let is_away = anchor.distance_m(fix) > DISTANCE_MIN_M;
             self.away = if is_away { self.away + 1 } else { 0 };
         }
-        let speed_m_s = motion
-            .odometry_m_s
-            .map_or(motion.wheels_m_s, |odometry_m_s| {
-                motion.wheels_m_s.max(odometry_m_s.abs())
-            });
-        if speed_m_s > SPEED_MIN_M_S {
+        if let Some(speed_m_s) = motion.speed_m_s()
+            && speed_m_s > SPEED_MIN_M_S
+        {
             return Some(Shown::Speed(speed_m_s));
         }
         if let Some(turn_rad_s) = motion.turn_rad_s
@@ -180,7 +216,7 @@ mod tests {
 
     fn rolling(wheels_m_s: f64) -> Motion {
         Motion {
-            wheels_m_s,
+            wheels_m_s: Some(wheels_m_s),
             ..Motion::default()
         }
     }
@@ -304,12 +340,41 @@ mod tests {
     }
 
     #[test]
+    fn without_anything_that_shows_it_a_robot_is_not_said_to_stand() {
+        let nothing = |_| Motion::default();
+        let creeping = |at_s: f64| Motion {
+            fix: Some(Point {
+                x_m: 0.3 * at_s,
+                y_m: 0.0,
+            }),
+            ..Motion::default()
+        };
+        let mut watch = StandingWatch::default();
+        let stands = |report: &StandingReport| report.stands.is_some();
+        assert_eq!(until(&mut watch, 0, nothing, stands), None);
+        let mut watch = StandingWatch::default();
+        assert_eq!(until(&mut watch, 0, creeping, stands), None);
+    }
+
+    #[test]
+    fn a_robot_that_is_not_heard_is_no_longer_said_to_stand() {
+        let mut watch = StandingWatch::default();
+        let stands = |report: &StandingReport| report.stands.is_some();
+        until(&mut watch, 0, |_| rolling(0.0), stands).unwrap();
+        watch.forget();
+        let report = watch.report();
+        assert!(report.is_to_stand && report.stands.is_none());
+        let again = until(&mut watch, 9_000, |_| rolling(0.0), stands);
+        assert!(again.unwrap() >= 30, "rest counts from when it is heard");
+    }
+
+    #[test]
     fn noise_of_a_standing_robot_is_no_motion_and_driving_ends_it_all() {
         let mut watch = StandingWatch::default();
         for tick in 0..20_000_u32 {
             let noise = f64::from(tick % 13) - 6.0;
             let motion = Motion {
-                wheels_m_s: 0.005 * noise.abs(),
+                wheels_m_s: Some(0.005 * noise.abs()),
                 odometry_m_s: Some(0.01 * noise),
                 turn_rad_s: Some(0.015 * noise),
                 fix: Some(Point {

@@ -125,11 +125,15 @@ impl Scan {
                 continue;
             }
             recovery.damaged_bytes += size(span.len());
-            damaged.keep(
+            let kept = damaged.keep(
                 path,
                 span.clone(),
                 bytes.get(span.clone()).unwrap_or_default(),
-            )?;
+            );
+            // A full disk must not keep what is intact behind it.
+            if let Err(cause) = kept {
+                tracing::error!("the damaged bytes are not kept: {cause}");
+            }
         }
         let spoilt_bytes: usize = self.spoilt.iter().map(Range::len).sum();
         let intact_bytes = self.bytes - spoilt_bytes;

@@ -316,7 +316,7 @@ impl Store {
             if !records.is_empty() {
                 return Ok(records);
             }
-            self.lose_oldest()?;
+            self.lose_oldest();
         }
         Ok(Vec::new())
     }
@@ -346,9 +346,9 @@ impl Store {
     }
 
     /// Gives up the oldest record, whose frame is damaged.
-    fn lose_oldest(&mut self) -> Result<(), StoreError> {
+    fn lose_oldest(&mut self) {
         let Some(&entry) = self.pending.front() else {
-            return Ok(());
+            return;
         };
         let log = &self.files[&entry.file];
         let mut bytes = vec![0; entry.frame_bytes];
@@ -356,14 +356,16 @@ impl Store {
         let _ = log.file.read_exact_at(&mut bytes, entry.frame_at);
         let at = usize::try_from(entry.frame_at).unwrap_or(usize::MAX);
         let place = at..at.saturating_add(entry.frame_bytes);
-        self.damaged.keep(&log.path, place, &bytes)?;
+        // A full disk must not keep what is intact behind it.
+        if let Err(cause) = self.damaged.keep(&log.path, place, &bytes) {
+            error!("the damaged bytes are not kept: {cause}");
+        }
         let RecordName { boot, seq, .. } = entry.name;
         error!(%boot, seq, "record {seq} of the outbox is damaged and lost");
         self.pop_oldest();
         self.head.dropped += 1;
         self.head.damaged += 1;
         self.has_damage = true;
-        Ok(())
     }
 
     /// A record's content as it was written; none if its frame is damaged.

@@ -81,7 +81,7 @@ pub(crate) struct Replayed {
 impl Replayed {
     /// Whether the record is of another version of the agent.
     pub(crate) fn is_of_another_version(&self) -> bool {
-        self.head.version != VERSION
+        self.head.version != VERSION || self.head.format < FORMAT
     }
 }
 

@@ -133,14 +133,15 @@ impl App {
     /// cannot write now.
     pub async fn hello(&self, site: &SiteId, hello: &Hello) -> Result<Welcome, Refusal> {
         check_model(hello).map_err(|detail| refusal(RefusalCode::Malformed, detail))?;
-        let welcome = self.introduce(site, hello).await.map_err(|error| {
+        // The states of a robot that is known count at once, whether or not it can be written down.
+        let key = (site.clone(), hello.robot.clone());
+        if self.presences().is_known(&key) {
+            self.presences()
+                .hello(key.clone(), hello.boot, self.clock().elapsed());
+        }
+        let introducing = db::limited(self.introduce(site, hello));
+        let welcome = introducing.await.map_err(|error| {
             self.log_failure("write down a robot's introduction", &error);
-            // Its states count all the same, if it is known; it introduces itself again.
-            let key = (site.clone(), hello.robot.clone());
-            if matches!(&error, AppError::Storage(_)) && self.presences().is_known(&key) {
-                self.presences()
-                    .hello(key, hello.boot, self.clock().elapsed());
-            }
             refusal(RefusalCode::Busy, "the server cannot write now".to_owned())
         })?;
         let unknown = || {
@@ -152,7 +153,6 @@ impl App {
         };
         let welcome = welcome.ok_or_else(unknown)?;
         info!(robot.id = %hello.robot, "robot `{}` of site `{site}` said hello", hello.robot);
-        let key = (site.clone(), hello.robot.clone());
         self.presences()
             .hello(key, hello.boot, self.clock().elapsed());
         self.robots_changed();

@@ -410,24 +410,33 @@ impl App {
         if lost.is_empty() && cleared.is_empty() && standing.is_empty() && new.is_empty() {
             return Ok(again);
         }
-        let mut tx = self.db().write().await?;
-        for stop in lost {
-            let robot = &stop.robot;
-            warn!(robot.id = %robot, "robot `{robot}` no longer shows its stop; it is told again");
-            self.counters().stops_lost.one();
-            db::stops::unconfirm(&mut tx, stop.id).await?;
-            again.push(stop);
+        let writing = async {
+            let mut tx = self.db().write().await?;
+            for stop in &lost {
+                db::stops::unconfirm(&mut tx, stop.id).await?;
+            }
+            for id in standing {
+                db::stops::stand(&mut tx, id, now).await?;
+            }
+            for id in cleared {
+                db::stops::clear(&mut tx, id, now).await?;
+            }
+            for key in new {
+                self.adopt_shown_stop(&mut tx, &key).await?;
+            }
+            tx.commit().await?;
+            for stop in &lost {
+                let robot = &stop.robot;
+                warn!(robot.id = %robot, "robot `{robot}` no longer shows its stop; it is told again");
+                self.counters().stops_lost.one();
+            }
+            Ok::<(), AppError>(())
+        };
+        // Robots are told again also while nothing can be written.
+        if let Err(error) = writing.await {
+            self.log_failure("write down what became of stops", &error);
         }
-        for id in standing {
-            db::stops::stand(&mut tx, id, now).await?;
-        }
-        for id in cleared {
-            db::stops::clear(&mut tx, id, now).await?;
-        }
-        for key in new {
-            self.adopt_shown_stop(&mut tx, &key).await?;
-        }
-        tx.commit().await?;
+        again.extend(lost);
         Ok(again)
     }
 }

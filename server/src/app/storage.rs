@@ -36,6 +36,10 @@ const CHECK_TIMEOUT: Duration = Duration::from_secs(5);
 const RECOVERED_AFTER: Duration = Duration::from_secs(10);
 /// How often a damaged database is examined again.
 const EXAMINE_EVERY: Duration = Duration::from_mins(10);
+/// How long after an examination that found nothing the next report of damage has it done again.
+const EXAMINE_REST: Duration = Duration::from_mins(1);
+/// How long an examination may take.
+const EXAMINE_MAX: Duration = Duration::from_mins(10);
 /// Free space above the limit, as a share of it, at which the alert ends.
 const DISK_LOW_HYSTERESIS: f64 = 0.1;
 /// Alerts about the server that are kept after they have cleared.
@@ -203,14 +207,21 @@ impl App {
         let now = self.clock().elapsed();
         {
             let inner = self.storage().lock();
+            // What keeps touching the damage must not have the whole file read all the time.
+            let every = match inner.condition.damaged {
+                Some(_) => EXAMINE_EVERY,
+                None => EXAMINE_REST,
+            };
             let is_due = inner
                 .examined
-                .is_none_or(|(at, _)| now.saturating_sub(at) >= EXAMINE_EVERY);
-            if !(inner.has_new_damage() || inner.condition.damaged.is_some() && is_due) {
+                .is_none_or(|(at, _)| now.saturating_sub(at) >= every);
+            let has_reason = inner.has_new_damage() || inner.condition.damaged.is_some();
+            if !(has_reason && is_due) {
                 return;
             }
         }
-        let found = self.db().quick_check().await;
+        let found = tokio::time::timeout(EXAMINE_MAX, self.db().quick_check()).await;
+        let found = found.unwrap_or_else(|_elapsed| Err(sqlx::Error::WorkerCrashed.into()));
         let condition = {
             let mut inner = self.storage().lock();
             // What this very examination met is no news.
@@ -340,7 +351,9 @@ async fn limited(probe: impl Future<Output = Result<(), DbError>>) -> Result<(),
 fn unwritable(found: Option<&'static str>) -> Option<String> {
     let recent = || {
         let (failure, since) = failure::last()?;
-        (since < RECOVERED_AFTER).then(|| failure.explanation())
+        // Damage has an alert of its own: what does not touch it goes on.
+        let counts = failure != StorageFailure::Damaged && since < RECOVERED_AFTER;
+        counts.then(|| failure.explanation())
     };
     found.or_else(recent).map(str::to_owned)
 }

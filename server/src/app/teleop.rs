@@ -8,7 +8,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::OwnedSemaphorePermit;
+use tokio::sync::{OwnedSemaphorePermit, oneshot};
 use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 use tread_api::drive::{
@@ -39,6 +39,8 @@ const RELEASE_TRIES: u32 = 5;
 const RELEASE_RETRY: Duration = Duration::from_millis(300);
 /// How long a command to stand lasts: as long as the robot would need to do it by itself.
 const STAND_FOR: Duration = Duration::from_millis(250);
+/// How long a new driver waits until the database has that missions are held.
+const HOLD_WAIT_MAX: Duration = Duration::from_millis(300);
 /// How long the robot's states may still show another lease after one was given: they are on
 /// their way while the answer comes.
 const LEASE_GRACE: Duration = Duration::from_secs(1);
@@ -224,10 +226,23 @@ impl Session {
             line,
             next_seq: 1,
         });
-        if let Err(error) = self.app.hold_for_driver(&self.key, name).await {
-            warn!("cannot write down that missions are held for a driver: {error:?}");
-        }
+        self.hold_missions(name.clone()).await;
         Ok(lease)
+    }
+
+    /// Writes down that missions are held for a driver, who waits for it no longer than
+    /// [`HOLD_WAIT_MAX`].
+    async fn hold_missions(&self, name: String) {
+        let (app, key) = (self.app.clone(), self.key.clone());
+        let (written, is_written) = oneshot::channel();
+        self.links.supervisor.spawn_passing("hold", async move {
+            if let Err(error) = db::limited(app.hold_for_driver(&key, &name)).await {
+                app.log_failure("write down that missions are held for a driver", &error);
+            }
+            // The driver may have ceased to wait.
+            let _ = written.send(());
+        });
+        let _ = tokio::time::timeout(HOLD_WAIT_MAX, is_written).await;
     }
 
     /// Passes one command on; it lasts as long as it says, and no longer than the bound.

@@ -19,6 +19,8 @@ use super::failure;
 
 /// How long a request waits for a connection.
 pub(super) const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long a transaction may take to begin: longer than SQLite waits for another process's lock.
+const BEGIN_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a commit may take, with its sync.
 const COMMIT_TIMEOUT: Duration = Duration::from_secs(15);
 /// How long a rollback may take before its connection is closed instead.
@@ -76,8 +78,10 @@ impl Connections {
         };
         let first = inner.connect().await?;
         inner.idle().push(first);
+        // A file that is gone later, as with its disk, is not made anew.
+        let options = inner.options.create_if_missing(false);
         Ok(Self {
-            inner: Arc::new(inner),
+            inner: Arc::new(Inner { options, ..inner }),
         })
     }
 
@@ -96,9 +100,10 @@ impl Connections {
             None => self.inner.connect().await?,
         };
         // Whoever goes away meanwhile takes the connection along.
-        sqlx::query(statement)
-            .execute(&mut opened.connection)
-            .await?;
+        let beginning = sqlx::query(statement).execute(&mut opened.connection);
+        timeout(BEGIN_TIMEOUT, beginning)
+            .await
+            .map_err(|_elapsed| sqlx::Error::WorkerCrashed)??;
         Ok(Lent {
             opened: Some(opened),
             permit: Some(permit),

@@ -107,7 +107,7 @@ impl Tx {
         let Some(generation) = generation else {
             let committed = inner.commit().await;
             drop(noted);
-            return committed.inspect_err(failure::note);
+            return committed;
         };
         #[expect(
             clippy::disallowed_methods,
@@ -119,10 +119,7 @@ impl Tx {
             drop(noted);
             committed
         });
-        committing
-            .await
-            .unwrap_or(Err(sqlx::Error::WorkerCrashed))
-            .inspect_err(failure::note)
+        committing.await.unwrap_or(Err(sqlx::Error::WorkerCrashed))
     }
 }
 
@@ -410,6 +407,11 @@ impl Db {
             sqlx::query_as("SELECT name FROM sqlite_schema WHERE type = 'table'")
                 .fetch_all(&mut *tx)
                 .await?;
+        if tables.is_empty() {
+            // The file was taken away; whatever connections have open is of no use.
+            failure::note(&sqlx::Error::WorkerCrashed);
+            return Err(corrupt("schema", "no tables"));
+        }
         for (table,) in tables {
             let look = AssertSqlSafe(format!("SELECT 1 FROM \"{table}\" LIMIT 1"));
             sqlx::query(look).fetch_optional(&mut *tx).await?;

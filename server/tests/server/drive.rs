@@ -89,7 +89,7 @@ impl Socket {
         tokio::time::timeout(PATIENCE, reading).await.unwrap()
     }
 
-    async fn acquire(&mut self, name: &str) -> Lease {
+    pub(crate) async fn acquire(&mut self, name: &str) -> Lease {
         // End times are told in the robot's time, which its states tell.
         self.view(|view| view.heard_age_ms.is_some()).await;
         self.send(&json!({"acquire": {"name": name}})).await;
@@ -100,13 +100,13 @@ impl Socket {
         lease
     }
 
-    async fn drive(&mut self, linear_m_s: f64) {
+    pub(crate) async fn drive(&mut self, linear_m_s: f64) {
         let drive = json!({"linear_m_s": linear_m_s, "angular_rad_s": 0.1, "for_ms": 300});
         self.send(&json!({"drive": drive})).await;
     }
 }
 
-async fn driven_at(robot: &Robot, linear_m_s: f64) {
+pub(crate) async fn driven_at(robot: &Robot, linear_m_s: f64) {
     let what = format!("the robot is told {linear_m_s} m/s");
     eventually(&what, async || {
         let is = is_driven_at(robot, linear_m_s);

@@ -3,11 +3,13 @@
 use std::os::unix::fs::FileExt as _;
 
 use reqwest::StatusCode;
+use sqlx::{Connection as _, SqliteConnection};
 use tread_server::Server;
 use tread_server::clock::Clock;
 use tread_server::config::StorageConfig;
 
-use crate::harness::{Yard, config, database, eventually, time};
+use crate::drive::{Socket, driven_at};
+use crate::harness::{Yard, circle, config, database, eventually, time};
 use crate::robot::Robot;
 
 /// Bytes of one page of the database.
@@ -118,7 +120,7 @@ async fn a_disk_with_less_room_than_configured_raises_an_alert_and_the_server_is
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_was_signed_in_may_stop_robots_while_nothing_can_be_read() {
+async fn who_was_signed_in_may_drive_and_stop_robots_while_nothing_can_be_read() {
     let clock = Clock::manual(time("2026-11-01T00:00:00Z"));
     let yard = Yard::start_on(clock.clone()).await;
     let robot = Robot::join(&yard, "rover-1").await;
@@ -129,8 +131,47 @@ async fn who_was_signed_in_may_stop_robots_while_nothing_can_be_read() {
     yard.server.app().db().close().await;
     let (status, body) = yard.get_value("/readyz").await;
     assert_eq!(status, StatusCode::SERVICE_UNAVAILABLE, "{body}");
+    let mut socket = Socket::open(&yard, "rover-1").await;
+    socket.acquire("desk").await;
+    socket.drive(0.4).await;
+    driven_at(&robot, 0.4).await;
     let path = "/v1/sites/yard/robots/rover-1/stop";
     let (status, stop) = yard.post(path, &serde_json::json!({})).await;
     assert_eq!(status, StatusCode::OK, "{stop}");
     assert_eq!(robot.stops().len(), 1);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_database_that_another_process_holds_refuses_writes_until_it_is_let_go() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let path = format!("sqlite:{}", database(yard.folder.path()).display());
+    let mut other = SqliteConnection::connect(&path).await.unwrap();
+    sqlx::query("BEGIN IMMEDIATE")
+        .execute(&mut other)
+        .await
+        .unwrap();
+    let stop = "/v1/sites/yard/robots/rover-1/stop";
+    let (status, stopped) = yard.post(stop, &serde_json::json!({})).await;
+    assert_eq!(status, StatusCode::OK, "{stopped}");
+    let url = yard.url("/v1/missions");
+    let asked = yard.client().post(url).json(&circle(&robot.id)).send();
+    let refused = asked.await.unwrap();
+    assert_eq!(refused.status(), StatusCode::SERVICE_UNAVAILABLE);
+    assert!(refused.headers().contains_key("retry-after"));
+    let (status, body) = yard.get_value("/readyz").await;
+    assert_eq!(status, StatusCode::SERVICE_UNAVAILABLE, "{body}");
+    sqlx::query("ROLLBACK").execute(&mut other).await.unwrap();
+    let ready = eventually("the server is ready", async || {
+        let (status, body) = yard.get_value("/readyz").await;
+        if status == StatusCode::OK {
+            Ok(())
+        } else {
+            Err(body)
+        }
+    });
+    ready.await;
+    yard.create_mission(&robot.id).await;
+    drop(robot);
+    yard.server.stop().await.unwrap();
 }

@@ -85,6 +85,7 @@ impl LoopCore {
             active.hold(Hold::Sensors, is_held);
         }
         if is_over {
+            self.sensors_hold_since = None;
             self.end_mission(at, EndReason::SensorFault);
         }
     }
@@ -97,11 +98,8 @@ impl LoopCore {
         let is_right = |subject: Subject| self.findings.about(subject).is_none();
         let odometry = self.body_speed.filter(|(_, at)| is_new(*at));
         let is_heard = !self.is_base_silent && self.last_sample.is_some_and(is_new);
-        self.motion.wheels_m_s = if is_heard && is_right(wheels) {
-            self.measured_wheels.magnitude_max_rad_s() * self.model.wheel_radius_m()
-        } else {
-            0.0
-        };
+        self.motion.wheels_m_s = (is_heard && is_right(wheels))
+            .then(|| self.measured_wheels.magnitude_max_rad_s() * self.model.wheel_radius_m());
         self.motion.odometry_m_s = odometry
             .map(|(speed_m_s, _)| speed_m_s)
             .filter(|_| is_right(Subject::Odometry));
@@ -115,7 +113,9 @@ impl LoopCore {
         let is_to_stand = gated.target == WheelSpeeds::default();
         if is_heard || self.motion.odometry_m_s.is_some() || self.motion.fix.is_some() {
             self.standing.step(now, is_to_stand, &self.motion);
-        } else if !is_to_stand {
+        } else if is_to_stand {
+            self.standing.forget();
+        } else {
             self.standing.step(now, false, &self.motion);
         }
     }

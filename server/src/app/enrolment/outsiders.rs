@@ -66,8 +66,16 @@ impl App {
         }
         let (site, robot) = key;
         tracing::warn!(robot.id = %robot, "robot `{robot}` of site `{site}` was put out and still tries");
-        if let Err(error) = self.raise_outsider(key).await {
-            tracing::error!("cannot raise an alert about robot `{robot}`: {error:?}");
+        let (app, key) = (self.clone(), key.clone());
+        let raising = async move {
+            if let Err(error) = db::limited(app.raise_outsider(&key)).await {
+                app.log_failure("raise an alert about a robot that was put out", &error);
+            }
+        };
+        match self.links() {
+            // Whoever reads the messages of all robots does not wait for the database.
+            Some(links) => links.supervisor.spawn_passing("outsider", raising),
+            None => raising.await,
         }
     }
 

@@ -86,6 +86,8 @@ impl Feed {
             let event = Event::Step(Box::new(step));
             self.app.hub().publish(&event, Topic::Missions, robot);
         }
+        // Published once, whatever becomes of the rest.
+        self.last_step = Some(last);
         for id in moved {
             if let Some(row) = db::missions::find(&mut tx, id).await? {
                 if ended.contains(&id) {
@@ -97,7 +99,6 @@ impl Feed {
                 self.app.hub().publish(&event, Topic::Missions, robot);
             }
         }
-        self.last_step = Some(last);
         Ok(())
     }
 

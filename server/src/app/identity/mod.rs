@@ -291,7 +291,13 @@ impl App {
         }
         // Who was let in before is let in while the database fails or is slow, for a Stop above
         // all: what is revoked here ends in memory, and elsewhere as soon as it can be read.
-        match tokio::time::timeout(RECHECK_MAX, self.kept(secret)).await {
+        let check = || tokio::time::timeout(RECHECK_MAX, self.kept(secret));
+        let mut checked = check().await;
+        if matches!(&checked, Ok(Err(gone)) if !matches!(gone, SignInError::Storage(_))) {
+            // A row that was lost for want of memory reads as none, but not twice.
+            checked = check().await;
+        }
+        match checked {
             Ok(Ok(_)) => credential.checked(self.clock().elapsed()),
             Ok(Err(SignInError::Storage(cause))) => {
                 self.log_failure("look up again who is signed in", &cause);

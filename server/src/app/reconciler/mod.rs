@@ -18,6 +18,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::debug;
 use tread_api::ids::{MissionId, SiteId, StopId};
 use tread_api::mission::MissionState;
+use tread_api::stop::Stop;
 
 use self::attendance::Attendance;
 use self::jobs::{
@@ -103,6 +104,8 @@ pub struct Reconciler {
     under_way: HashSet<Job>,
     retries: HashMap<Job, Retry>,
     memories: HashMap<MissionId, Memory>,
+    /// Stops to be sent again, as they were read last.
+    stops: Vec<Stop>,
     /// Missions that robots show and that are none of their open ones here, and since when.
     foreign: HashMap<RobotKey, (MissionId, Duration)>,
     attendance: Attendance,
@@ -121,6 +124,7 @@ impl Reconciler {
             under_way: HashSet::new(),
             retries: HashMap::new(),
             memories: HashMap::new(),
+            stops: Vec::new(),
             foreign: HashMap::new(),
             attendance: Attendance::default(),
         }
@@ -245,10 +249,12 @@ impl Reconciler {
 
     /// Tells robots again what they have not confirmed. Whatever else fails, this goes on.
     async fn stop_again(&mut self) {
-        let again = match self.app.tend_stops().await {
-            Ok(again) => again,
-            Err(error) => return self.app.log_failure("look after stops", &error),
-        };
+        match self.app.tend_stops().await {
+            Ok(again) => self.stops = again,
+            // Those that were known go on.
+            Err(error) => self.app.log_failure("look after stops", &error),
+        }
+        let again = self.stops.clone();
         let wanted: HashSet<StopId> = again.iter().map(|stop| stop.id).collect();
         self.retries
             .retain(|job, _| !matches!(job, Job::Stop(id) if !wanted.contains(id)));
@@ -473,7 +479,7 @@ impl Reconciler {
         let app = self.app.clone();
         self.supervisor.spawn_passing("command", async move {
             let mut report = report;
-            match work.await {
+            match db::limited(work).await {
                 Ok(how) => report.how = how,
                 Err(error) => app.log_failure("write down a command's answer", &error),
             }

@@ -121,11 +121,25 @@ impl Settling {
             }
             recorded.send_replace(true);
         };
+        let (done, mut is_done) = oneshot::channel();
+        let recording = async {
+            recording.await;
+            let _ = done.send(());
+        };
         let collecting = async {
-            let confirmed = self.collect(&mut confirmations, shown).await;
-            // Shown while the database does not take it.
+            let mut confirmed = self.collect(&mut confirmations, shown).await;
             self.app.unrecorded().confirm(&confirmed);
-            confirmed
+            // Shown also as long as the database does not take it.
+            loop {
+                tokio::select! {
+                    biased;
+                    _ = &mut is_done => return confirmed,
+                    Some(late) = confirmations.recv() => {
+                        self.app.unrecorded().confirm(&[late]);
+                        confirmed.push(late);
+                    }
+                }
+            }
         };
         let ((), confirmed) = tokio::join!(recording, collecting);
         self.note(&confirmed).await;
@@ -134,7 +148,7 @@ impl Settling {
         if !open.is_empty() {
             warn!("{} robots have not confirmed a stop", open.len());
             self.app.counters().stops_unconfirmed.add(open.len() as u64);
-            if let Err(error) = self.app.note_unconfirmed(&open).await {
+            if let Err(error) = db::limited(self.app.note_unconfirmed(&open)).await {
                 self.app
                     .log_failure("write down that stops are unconfirmed", &error);
             }
@@ -195,7 +209,8 @@ impl Settling {
             return;
         }
         self.app.unrecorded().confirm(confirmed);
-        if let Err(error) = self.app.note_confirmed(&self.stops, confirmed).await {
+        let noting = self.app.note_confirmed(&self.stops, confirmed);
+        if let Err(error) = db::limited(noting).await {
             // The reconciler asks the robot again, which says the same.
             self.app
                 .log_failure("write down that stops are confirmed", &error);
