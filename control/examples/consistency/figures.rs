@@ -15,8 +15,8 @@ const TRIALS_MAX: u32 = 10_000;
 const EXCITED_MAX_S: f64 = 15.0;
 /// Longest trial, seconds.
 const TRIAL_MAX_S: f64 = 120.0;
-/// Goals of most faults: time of exciting motion until something is said, in half of the trials, and
-/// until the fault is named, in most of them, seconds; and the share of trials in which it is.
+/// Goals of most faults: exciting motion until something is reported, in half of the trials, seconds;
+/// and the share of trials in which the fault is named.
 const USUAL: Goals = Goals {
     noticed_p50_s: 1.0,
     named_share_min: 0.99,

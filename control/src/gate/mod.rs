@@ -179,7 +179,7 @@ pub const TILT_MAX_RAD: f64 = 0.436;
 /// Time that a tick without one is taken to have lasted, seconds.
 const TICK_USUAL_S: f64 = 0.01;
 /// Share of the oldest feedback that is trusted beyond which nothing speeds up: what is wanted for
-/// a base that falls silent is reckoned from where it was.
+/// a base that falls silent is predicted from where it was.
 const LATE_SHARE: f64 = 0.5;
 /// Share above a speed limit that is rounding.
 const ROUNDING_SHARE: f64 = 1.0e-9;
