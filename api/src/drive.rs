@@ -50,7 +50,8 @@ pub struct Nothing {}
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DriverName {
-    /// Name for people; others see it when they are refused.
+    /// Name for people; others see it when they are refused, behind the token's name.
+    #[serde(deserialize_with = "crate::text::bounded::<_, {crate::safety::BY_LENGTH_MAX}>")]
     pub name: String,
 }
 
@@ -72,11 +73,19 @@ pub struct Drive {
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StopWords {
-    /// Who stops; the driver's name when absent.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    /// Who stops; the token's name stands before it, and alone when absent.
+    #[serde(
+        default,
+        skip_serializing_if = "Option::is_none",
+        deserialize_with = "crate::text::bounded_option::<_, {crate::stop::STOP_TEXT_MAX}>"
+    )]
     pub by: Option<String>,
     /// Why.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(
+        default,
+        skip_serializing_if = "Option::is_none",
+        deserialize_with = "crate::text::bounded_option::<_, {crate::stop::STOP_TEXT_MAX}>"
+    )]
     pub reason: Option<String>,
 }
 

@@ -4,9 +4,12 @@
 //! for a certificate; with that certificate and key it asks for the next one.
 
 use std::fmt;
+use std::num::ParseIntError;
+use std::str::FromStr;
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
 use utoipa::ToSchema;
 
 use crate::ids::{JoinTokenId, RobotId, SiteId};
@@ -122,7 +125,8 @@ pub struct RobotCertificate {
     pub enrolment: u32,
     /// Its certificate, PEM.
     pub certificate: String,
-    /// The fleet's authority, PEM: who the robots' port must show to be signed by.
+    /// Whom the robots' port may show to be signed by, PEM: the fleet's authority, and during a
+    /// rotation the former one after it.
     pub authority: String,
     /// How long the certificate is good for, seconds from now. Renew it after two thirds of that.
     pub lifetime_s: u64,
@@ -153,4 +157,132 @@ pub struct Enrolment {
     pub revoked_at: Option<Timestamp>,
     /// Who did that.
     pub revoked_by: Option<String>,
+    /// SHA-256 of the authority that signed the certificate which the robot showed last; during a
+    /// rotation it tells who was brought over. `null` for one that has shown none since this is noted.
+    #[serde(default)]
+    pub authority: Option<String>,
+}
+
+/// Names the authorities that a robot trusts, so that both sides see whether they mean the same.
+/// It is a hint and no proof.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct TrustId(u64);
+
+impl TrustId {
+    /// The name of a set of certificates, each as DER; their order does not matter.
+    pub fn of<'der>(certificates: impl IntoIterator<Item = &'der [u8]>) -> Self {
+        let mut hashes: Vec<[u8; 32]> = certificates
+            .into_iter()
+            .map(|der| Sha256::digest(der).into())
+            .collect();
+        hashes.sort_unstable();
+        hashes.dedup();
+        let whole: [u8; 32] = Sha256::digest(hashes.concat()).into();
+        let mut upper = [0; 8];
+        upper.copy_from_slice(&whole[..8]);
+        Self(u64::from_be_bytes(upper))
+    }
+
+    /// Its bits, which are as good as random.
+    pub const fn bits(self) -> u64 {
+        self.0
+    }
+}
+
+impl fmt::Display for TrustId {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(formatter, "{:016x}", self.0)
+    }
+}
+
+impl FromStr for TrustId {
+    type Err = ParseIntError;
+
+    fn from_str(text: &str) -> Result<Self, ParseIntError> {
+        u64::from_str_radix(text, 16).map(Self)
+    }
+}
+
+impl Serialize for TrustId {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+impl<'de> Deserialize<'de> for TrustId {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let text = String::deserialize(deserializer)?;
+        text.parse().map_err(serde::de::Error::custom)
+    }
+}
+
+/// The fleet's authority, and how far its rotation is.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct FleetAuthority {
+    /// SHA-256 of the certificate of the authority that signs robots' certificates.
+    pub signing: String,
+    /// The rotation that is under way.
+    pub rotation: Option<AuthorityRotation>,
+}
+
+/// A rotation of the fleet's authority: both are trusted, and the new one signs.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct AuthorityRotation {
+    /// SHA-256 of the certificate of the authority that is to be retired.
+    pub retiring: String,
+    /// When the rotation was started.
+    pub started_at: Timestamp,
+    /// Who started it.
+    pub started_by: String,
+    /// How many robots have shown a certificate of the new authority.
+    pub robots_moved: u32,
+    /// How many robots have not; once the former authority is retired they must join again.
+    pub robots_left: u32,
+    /// The first of those that have not, at most 1000.
+    pub left: Vec<RobotLeft>,
+}
+
+/// A robot that still holds a certificate of the authority that is to be retired.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct RobotLeft {
+    /// The site.
+    pub site: SiteId,
+    /// The robot.
+    pub robot: RobotId,
+    /// When it got its certificate.
+    pub renewed_at: Timestamp,
+    /// Whether the server hears it now.
+    pub online: bool,
+}
+
+/// Finishes a rotation.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct FinishRotation {
+    /// Retire the former authority though robots still hold certificates of it; they must join again.
+    #[serde(default)]
+    pub force: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn a_trust_id_names_a_set_whatever_its_order(
+            mut certificates in prop::collection::vec(prop::collection::vec(any::<u8>(), 0..20), 0..4),
+            another in prop::collection::vec(any::<u8>(), 21..30),
+        ) {
+            let of = |all: &[Vec<u8>]| TrustId::of(all.iter().map(Vec::as_slice));
+            let id = of(&certificates);
+            certificates.reverse();
+            prop_assert_eq!(of(&certificates), id);
+            let json = serde_json::to_string(&id).unwrap();
+            prop_assert_eq!(serde_json::from_str::<TrustId>(&json).unwrap(), id);
+            certificates.push(another);
+            prop_assert_ne!(of(&certificates), id);
+        }
+    }
 }

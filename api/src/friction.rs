@@ -33,6 +33,10 @@ impl Information {
     }
 }
 
+/// Largest friction coefficient that a segment may name. Rubber on dry concrete has about 1; no
+/// wheel on any ground that robots drive on has more than this.
+pub const MU_PEAK_MAX: f64 = 1.5;
+
 /// What a robot learned in one cell on one pass; it does not contain any prior.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Segment {
@@ -128,7 +132,7 @@ impl Segment {
         )?;
         let peak = self.mu_peak_lower_bound;
         check(
-            peak.is_none_or(|mu| (0.0..=10.0).contains(&mu)),
+            peak.is_none_or(|mu| (0.0..=MU_PEAK_MAX).contains(&mu)),
             "mu_peak_lower_bound",
         )?;
         check((1..=SAMPLES_MAX).contains(&self.samples), "samples")?;

@@ -1,4 +1,5 @@
-//! Who may do what: roles, tokens, sessions of browsers, and the audit log.
+//! Who may do what: roles, tokens, sessions of browsers, and the audit log. A role is a name for some
+//! [rights](crate::rights).
 
 use std::fmt;
 use std::str::FromStr;
@@ -8,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use crate::ids::{SessionId, TokenId};
+use crate::rights::{Right, Rights, Scope, SiteScope};
 
 /// Most days that a token may be valid.
 pub const TOKEN_DAYS_MAX: u32 = 1_826;
@@ -16,7 +18,7 @@ pub const TOKEN_DAYS_DEFAULT: u32 = 90;
 /// Longest name of a token, in characters.
 pub const TOKEN_NAME_MAX: usize = 80;
 
-/// What a person or a program may do; each role may do what those before it may.
+/// A named bundle of rights; each role has those of the ones before it.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
 )]
@@ -24,9 +26,9 @@ pub const TOKEN_NAME_MAX: usize = 80;
 pub enum Role {
     /// Sees everything but tokens and the audit log, and may stop robots.
     Viewer,
-    /// Gives missions, draws terrains, drives robots.
+    /// Gives missions, draws terrains, drives robots: every right but `administer`.
     Operator,
-    /// Makes sites, gives and revokes tokens, reads the audit log.
+    /// Makes sites, gives and revokes tokens, reads the audit log: every right.
     Admin,
 }
 
@@ -46,11 +48,6 @@ impl Role {
     /// The role of that name.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|role| role.as_str() == name)
-    }
-
-    /// Whether this role may do what `needed` may.
-    pub fn includes(self, needed: Self) -> bool {
-        self >= needed
     }
 }
 
@@ -80,8 +77,14 @@ pub struct Token {
     pub id: TokenId,
     /// What people call it.
     pub name: String,
+    /// The role that it was made with; `null` for one with rights of its own.
+    pub role: Option<Role>,
     /// What it may do.
-    pub role: Role,
+    #[schema(value_type = Vec<Right>)]
+    pub rights: Rights,
+    /// Where it may do that; `null` for everywhere.
+    #[schema(value_type = Option<Vec<SiteScope>>)]
+    pub sites: Scope,
     /// When it was made.
     pub created_at: Timestamp,
     /// Who made it.
@@ -94,16 +97,37 @@ pub struct Token {
     pub last_used_at: Option<Timestamp>,
 }
 
-/// Asks for a new token.
+/// Asks for a new token, with a role or with rights of its own.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct CreateToken {
     /// What people call it; no other valid token may have this name.
     pub name: String,
-    /// What it may do.
-    pub role: Role,
+    /// What it may do, as a role.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub role: Option<Role>,
+    /// What it may do, in place of a role. `stop` comes with every right, and `read` with every
+    /// right but `stop`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rights: Option<Vec<Right>>,
+    /// Where it may do that; everywhere when absent. At most 100 sites and 1000 robots.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sites: Option<Vec<SiteScope>>,
     /// Days until it is refused, 1 to 1826; 90 when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub valid_days: Option<u32>,
+}
+
+impl CreateToken {
+    /// One with a role, everywhere.
+    pub fn of_role(name: impl Into<String>, role: Role) -> Self {
+        Self {
+            name: name.into(),
+            role: Some(role),
+            rights: None,
+            sites: None,
+            valid_days: None,
+        }
+    }
 }
 
 /// A new token with its secret, which is told this once.
@@ -144,8 +168,14 @@ impl fmt::Debug for CreateSession {
 pub struct Session {
     /// The name of the token that was shown.
     pub name: String,
+    /// Its role; `null` if it has rights of its own.
+    pub role: Option<Role>,
     /// What it may do.
-    pub role: Role,
+    #[schema(value_type = Vec<Right>)]
+    pub rights: Rights,
+    /// Where it may do that; `null` for everywhere.
+    #[schema(value_type = Option<Vec<SiteScope>>)]
+    pub sites: Scope,
     /// The token.
     pub token: TokenId,
     /// The browser's session, if it is one.
@@ -159,15 +189,20 @@ pub struct Session {
 pub struct AuditEntry {
     /// Its number; they grow with time.
     pub id: u64,
-    /// When it was answered.
+    /// When it was answered; the last one, of several.
     pub at: Timestamp,
+    /// When the first of several was answered; `null` for one.
+    pub since: Option<Timestamp>,
+    /// How many requests it stands for. Repeats of the same request, in the same way answered, are
+    /// one entry when their author has asked for very many.
+    pub count: u64,
     /// The name of the token that was shown; `null` for a request without a good one.
     pub who: Option<String>,
     /// That token.
     pub token: Option<TokenId>,
-    /// Its role.
+    /// Its role; `null` too for one with rights of its own.
     pub role: Option<Role>,
-    /// The address of the other side; a proxy's if there is one.
+    /// The address of the other side, or of the client that a trusted proxy names.
     pub address: String,
     /// The request's method.
     pub method: String,
@@ -181,6 +216,21 @@ pub struct AuditEntry {
     pub request_id: String,
     /// What was asked: the body without secrets, shortened where it was long.
     pub what: Option<serde_json::Value>,
+    /// The hash of the entry before it; `null` in entries of versions that had no chain.
+    pub previous_hash: Option<String>,
+    /// Its own hash, over the one before it and the canonical form of all else.
+    pub hash: Option<String>,
+}
+
+/// Which entries of the audit log come first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum AuditOrder {
+    /// The newest.
+    #[default]
+    Newest,
+    /// The oldest, as the chain goes.
+    Oldest,
 }
 
 #[cfg(test)]
@@ -188,11 +238,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_role_may_do_what_the_weaker_ones_may_and_no_more() {
-        for (index, role) in Role::ALL.into_iter().enumerate() {
-            for (other_index, other) in Role::ALL.into_iter().enumerate() {
-                assert_eq!(role.includes(other), index >= other_index);
-            }
+    fn a_role_reads_back_as_it_is_written() {
+        for role in Role::ALL {
             assert_eq!(role.as_str().parse(), Ok(role));
         }
     }

@@ -6,13 +6,14 @@
 //! * REST shapes: [`site`], [`terrain`], [`robot`], [`trajectory`], [`mission`], [`friction`],
 //!   [`safety`], [`stop`], [`drive`], [`event`], [`identity`], [`page`], [`problem`].
 //! * The friction map as compact binary: [`tile`].
-//! * zenoh shapes: [`wire`], with the key expressions in [`keys`].
+//! * zenoh shapes: [`wire`], with the key expressions in [`keys`]; the TLS around it: [`tunnel`].
 //!
 //! Units are SI and stand last in a name (`_m`, `_m_s`, `_rad`). A site's frame is metric and
 //! right-handed, x east-like, y north-like; headings are counter-clockwise from x. A value that is
 //! not known is `null`, never a default. Integers stay below 2⁵³.
 
 pub mod access;
+pub mod audit;
 pub mod drive;
 pub mod enrolment;
 pub mod event;
@@ -24,12 +25,15 @@ pub mod keys;
 pub mod mission;
 pub mod page;
 pub mod problem;
+pub mod rights;
 pub mod robot;
 pub mod safety;
 pub mod site;
 pub mod startup;
 pub mod stop;
 pub mod terrain;
+pub mod text;
 pub mod tile;
 pub mod trajectory;
+pub mod tunnel;
 pub mod wire;

@@ -310,7 +310,7 @@ pub struct PriorGain {
 }
 
 /// Relative standard deviation below which θ counts as known.
-pub const THETA_SURE_RATIO: f64 = 0.15;
+pub const THETA_SURE_RATIO: f64 = 0.2;
 
 /// Friction at one place of a mission.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]

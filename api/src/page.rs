@@ -30,3 +30,18 @@ pub struct MapPage<T> {
     #[serde(default)]
     pub as_of: Option<Timestamp>,
 }
+
+/// One page of how the friction map changed between two times.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct DifferencePage<T> {
+    /// The entries.
+    pub items: Vec<T>,
+    /// Give this as `cursor` for the next page; `null` on the last one.
+    pub next_cursor: Option<String>,
+    /// The first time: the end of the last epoch before the one that was asked for.
+    #[serde(default)]
+    pub from: Option<Timestamp>,
+    /// The second time, as [`MapPage::as_of`].
+    #[serde(default)]
+    pub as_of: Option<Timestamp>,
+}

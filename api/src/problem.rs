@@ -19,6 +19,8 @@ pub enum ProblemType {
     InvalidBody,
     #[serde(rename = "/problems/unknown-field")]
     UnknownField,
+    #[serde(rename = "/problems/body-timeout")]
+    BodyTimeout,
     #[serde(rename = "/problems/body-too-large")]
     BodyTooLarge,
     #[serde(rename = "/problems/unsupported-media-type")]
@@ -83,6 +85,8 @@ pub enum ProblemType {
     Forbidden,
     #[serde(rename = "/problems/too-many-attempts")]
     TooManyAttempts,
+    #[serde(rename = "/problems/too-many-requests")]
+    TooManyRequests,
     #[serde(rename = "/problems/foreign-origin")]
     ForeignOrigin,
     #[serde(rename = "/problems/unknown-host")]
@@ -93,6 +97,10 @@ pub enum ProblemType {
     RequestTooLong,
     #[serde(rename = "/problems/robots-do-not-join")]
     RobotsDoNotJoin,
+    #[serde(rename = "/problems/authority-rotation")]
+    AuthorityRotation,
+    #[serde(rename = "/problems/robots-left")]
+    RobotsLeft,
     #[serde(rename = "/problems/too-many")]
     TooMany,
     #[serde(rename = "/problems/timeout")]
@@ -105,10 +113,11 @@ pub enum ProblemType {
 
 impl ProblemType {
     /// Every kind.
-    pub const ALL: [Self; 44] = [
+    pub const ALL: [Self; 48] = [
         Self::MalformedBody,
         Self::InvalidBody,
         Self::UnknownField,
+        Self::BodyTimeout,
         Self::BodyTooLarge,
         Self::UnsupportedMediaType,
         Self::NotAcceptable,
@@ -141,11 +150,14 @@ impl ProblemType {
         Self::Unauthenticated,
         Self::Forbidden,
         Self::TooManyAttempts,
+        Self::TooManyRequests,
         Self::ForeignOrigin,
         Self::UnknownHost,
         Self::UnknownToken,
         Self::RequestTooLong,
         Self::RobotsDoNotJoin,
+        Self::AuthorityRotation,
+        Self::RobotsLeft,
         Self::TooMany,
         Self::Timeout,
         Self::Unavailable,
@@ -158,6 +170,7 @@ impl ProblemType {
             Self::MalformedBody => "The body is not JSON",
             Self::InvalidBody => "The body does not say something possible",
             Self::UnknownField => "The body has a field that is not known",
+            Self::BodyTimeout => "The body took too long to arrive",
             Self::BodyTooLarge => "The body is too large",
             Self::UnsupportedMediaType => "The body must be application/json",
             Self::NotAcceptable => "There is no answer in a format that is accepted",
@@ -188,13 +201,16 @@ impl ProblemType {
             Self::IdempotencyKeyReused => "This key was used for another request",
             Self::InvalidHeader => "A header does not say something possible",
             Self::Unauthenticated => "A valid token is needed",
-            Self::Forbidden => "The token's role does not allow this",
+            Self::Forbidden => "The token's rights do not allow this, or not here",
             Self::TooManyAttempts => "There were too many failed attempts",
+            Self::TooManyRequests => "There are too many requests at once",
             Self::ForeignOrigin => "Another site's page may not ask for this",
             Self::UnknownHost => "This server does not go by that name",
             Self::UnknownToken => "The token is not known",
             Self::RequestTooLong => "The path or query is too long",
             Self::RobotsDoNotJoin => "Robots do not join this server",
+            Self::AuthorityRotation => "The authority's rotation does not allow this",
+            Self::RobotsLeft => "Robots still hold certificates of the former authority",
             Self::TooMany => "There are too many of these",
             Self::Timeout => "The answer took too long",
             Self::Unavailable => "The server cannot answer now",

@@ -148,7 +148,11 @@ pub struct Capabilities {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rate_hz: Option<f64>,
     /// The kind of base, for people.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(
+        default,
+        skip_serializing_if = "Option::is_none",
+        deserialize_with = "crate::text::bounded_option::<_, {crate::site::NAME_LENGTH_MAX}>"
+    )]
     pub base: Option<String>,
 }
 
@@ -169,6 +173,10 @@ pub struct Battery {
 pub const ALERTS_MAX: usize = 32;
 /// Longest text of an alert, in characters.
 pub const ALERT_TEXT_MAX: usize = 300;
+/// Longest text of what is broken on a robot, in characters; what is longer is cut.
+pub const FAULT_TEXT_MAX: usize = 300;
+/// Longest version of an agent, in characters; what is longer is cut.
+pub const VERSION_TEXT_MAX: usize = 100;
 
 /// How much an alert matters.
 #[derive(
@@ -207,6 +215,7 @@ pub struct AlertReport {
     /// How much it matters.
     pub severity: Severity,
     /// What it is, for people; at most [`ALERT_TEXT_MAX`] characters.
+    #[serde(deserialize_with = "crate::text::bounded::<_, {ALERT_TEXT_MAX}>")]
     pub text: String,
 }
 

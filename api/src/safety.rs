@@ -34,8 +34,10 @@ pub struct StopLatch {
     /// The newest stop; a clear must name it.
     pub id: StopId,
     /// Who stopped the robot, for people.
+    #[serde(deserialize_with = "crate::text::bounded::<_, {crate::stop::STOP_TEXT_MAX}>")]
     pub by: String,
     /// Why, for people.
+    #[serde(deserialize_with = "crate::text::bounded::<_, {crate::mission::REASON_LENGTH_MAX}>")]
     pub reason: String,
     /// When the robot latched it, by its own wall clock.
     pub since: Timestamp,
@@ -47,6 +49,7 @@ pub struct Driver {
     /// One connection of one driver.
     pub client: Uuid,
     /// Name for people, at most [`BY_LENGTH_MAX`] characters.
+    #[serde(deserialize_with = "crate::text::bounded::<_, {BY_LENGTH_MAX}>")]
     pub name: String,
 }
 

@@ -96,7 +96,8 @@ pub struct GeoOrigin {
     #[schema(minimum = -180.0, maximum = 180.0)]
     pub longitude_deg: f64,
     /// Angle from east to the site's x axis, counter-clockwise, degrees; 0 when absent.
-    #[schema(minimum = -360.0, maximum = 360.0)]
+    #[schema(minimum = -360.0, maximum = 360.0, default = 0.0)]
+    #[serde(default)]
     pub x_axis_deg: f64,
 }
 

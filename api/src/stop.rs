@@ -18,25 +18,42 @@ pub const STOP_TEXT_MAX: usize = 200;
 /// not read stops the robot all the same.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 pub struct StopRobot {
-    /// Who stops, for people.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    /// Who stops, for people; the token's name stands before it.
+    #[serde(
+        default,
+        skip_serializing_if = "Option::is_none",
+        deserialize_with = "crate::text::bounded_option::<_, {STOP_TEXT_MAX}>"
+    )]
     pub by: Option<String>,
     /// Why, for people.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(
+        default,
+        skip_serializing_if = "Option::is_none",
+        deserialize_with = "crate::text::bounded_option::<_, {STOP_TEXT_MAX}>"
+    )]
     pub reason: Option<String>,
 }
 
-/// The body of `POST /v1/stop`; it may be left out, and one that does not read stops every robot.
+/// The body of `POST /v1/stop`; it may be left out, and one that does not read stops every robot, but
+/// for a `site` that is no identifier: that is refused.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 pub struct StopFleet {
     /// Only the robots of this site.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub site: Option<SiteId>,
-    /// Who stops, for people.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    /// Who stops, for people; the token's name stands before it.
+    #[serde(
+        default,
+        skip_serializing_if = "Option::is_none",
+        deserialize_with = "crate::text::bounded_option::<_, {STOP_TEXT_MAX}>"
+    )]
     pub by: Option<String>,
     /// Why, for people.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(
+        default,
+        skip_serializing_if = "Option::is_none",
+        deserialize_with = "crate::text::bounded_option::<_, {STOP_TEXT_MAX}>"
+    )]
     pub reason: Option<String>,
 }
 
@@ -45,8 +62,12 @@ pub struct StopFleet {
 pub struct ClearStop {
     /// The newest stop of the robot: a clear never clears one that its author has not seen.
     pub stop: StopId,
-    /// Who clears, for people.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    /// Who clears, for people; the token's name stands before it.
+    #[serde(
+        default,
+        skip_serializing_if = "Option::is_none",
+        deserialize_with = "crate::text::bounded_option::<_, {STOP_TEXT_MAX}>"
+    )]
     pub by: Option<String>,
 }
 
@@ -80,6 +101,10 @@ pub struct Stop {
     pub clear_asked_at: Option<Timestamp>,
     /// When the robot had cleared it.
     pub cleared_at: Option<Timestamp>,
+    /// The stop of the same robot that came after it and took its place: a robot has at most one
+    /// stop in force. `null` for the newest.
+    #[serde(default)]
+    pub replaced_by: Option<StopId>,
 }
 
 /// The answer to `POST /v1/stop`: one stop for each robot.

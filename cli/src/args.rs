@@ -17,8 +17,9 @@ use tread_api::ids::{RobotId, SiteId};
 
 use self::identity::Showing;
 pub(crate) use self::identity::{
-    AuditArguments, JoinTokenAction, JoinTokenArguments, PlainArguments, RobotArguments,
-    RobotsAction, TokensAction, TokensArguments,
+    AuditAction, AuditArguments, AuthorityAction, AuthorityArguments, JoinTokenAction,
+    JoinTokenArguments, Noted, PlainArguments, RobotArguments, RobotsAction, TokensAction,
+    TokensArguments,
 };
 pub(crate) use self::map::{
     FrictionAction, FrictionArguments, SitesAction, SitesArguments, TerrainsAction,
@@ -174,7 +175,9 @@ pub(crate) enum RemoteCommand {
     Token(PlainArguments),
     /// List tokens, make or revoke one
     Tokens(TokensArguments),
-    /// Show who changed what, and who was refused
+    /// Show the fleet's authority, or rotate it: start, status and finish
+    Authority(AuthorityArguments),
+    /// Show, export or verify who changed what, and who was refused
     Audit(AuditArguments),
 }
 
@@ -195,6 +198,7 @@ impl RemoteCommand {
             | Self::Whoami(arguments)
             | Self::Token(arguments) => &arguments.connection,
             Self::Tokens(arguments) => &arguments.connection,
+            Self::Authority(arguments) => &arguments.connection,
             Self::Audit(arguments) => &arguments.connection,
             Self::Stop(arguments) => &arguments.connection,
             Self::Stops(arguments) => &arguments.connection,

@@ -12,7 +12,7 @@ pub(crate) enum Exit {
     Usage = 2,
     /// No server answers, or the server cannot reach the robot.
     Unreachable = 3,
-    /// The server refused: token, role, or what was asked for.
+    /// The server refused: token, rights, or what was asked for.
     Refused = 4,
     /// What was named is not there.
     NotFound = 5,
@@ -29,7 +29,7 @@ Exit codes:
   1  done, and it went wrong: a mission failed, a robot has not confirmed its stop
   2  wrong words on the command line
   3  no server answers, or the server cannot reach the robot
-  4  the server refused: token, role, or what was asked for
+  4  the server refused: token, rights, or what was asked for
   5  what was named is not there
   6  the present state does not allow it, or somebody was faster
   7  it took too long";

@@ -11,7 +11,7 @@ use std::alloc::System;
 use std::time::Duration;
 
 use figures::{CASES, quiet, trial};
-use generator::{Fault, Kit, Robot};
+use generator::{Fault, Kit, Make, Robot};
 use stats_alloc::{INSTRUMENTED_SYSTEM, Region, StatsAlloc};
 use tread_control::consistency::{Consequence, Monitor, Sample, Subject};
 use tread_control::geometry::Pose;
@@ -28,6 +28,7 @@ const KIT: Kit = Kit {
     has_odometry: true,
     has_accelerometer: true,
     meets_ice: false,
+    make: Make::Usual,
 };
 
 #[test]
@@ -36,7 +37,7 @@ fn every_fault_is_named_and_no_other_channel_is_blamed() {
     for case in CASES {
         let mut named = 0;
         for seed in 5_000..5_000 + TRIALS {
-            let result = trial(case, seed);
+            let result = trial(case, Make::Usual, seed);
             blamed.extend(result.wrong.map(|wrong| (case.name, seed, wrong)));
             named += u64::from(result.named_s.is_some());
         }
@@ -90,6 +91,146 @@ fn a_finding_ends_when_the_channel_agrees_in_motion_again() {
         "not before it agreed for a while: {steps} steps"
     );
     assert_eq!(robot.monitor.findings().iter().count(), 0);
+}
+
+/// Steps of a second.
+const SECOND: u32 = 100;
+
+/// Steps until a finding about this stands, or no longer does.
+fn steps_until(robot: &mut Robot, subject: Subject, stands: bool, most: u32) -> u32 {
+    for step in 0..most {
+        if robot.monitor.findings().about(subject).is_some() == stands {
+            return step;
+        }
+        robot.step();
+    }
+    panic!("{subject:?}: {:?}", robot.monitor.findings());
+}
+
+fn drive_for(robot: &mut Robot, steps: u32) {
+    for _ in 0..steps {
+        robot.step();
+    }
+}
+
+#[test]
+fn a_finding_on_the_position_ends_at_rest_and_is_back_at_once_if_motion_shows_it() {
+    let kit = Kit {
+        has_odometry: true,
+        ..KIT
+    };
+    let fault = Fault::PositionScaled(2.0);
+    let mut relapsed = 0;
+    for seed in 0..6 {
+        let mut robot = Robot::new(seed, kit);
+        drive_for(&mut robot, 15 * SECOND);
+        robot.break_with(fault);
+        steps_until(&mut robot, Subject::Position, true, 60 * SECOND);
+        robot.rest(true);
+        let steps = steps_until(&mut robot, Subject::Position, false, 40 * SECOND);
+        assert!(steps >= 10 * SECOND, "seed {seed}: {steps} steps");
+        drive_for(&mut robot, 3 * SECOND);
+        assert_eq!(robot.monitor.findings().iter().count(), 0, "seed {seed}");
+        // It is still wrong, and motion shows it.
+        robot.rest(false);
+        let (mut excited, mut steps) = (0, 0);
+        while robot.monitor.findings().about(Subject::Position).is_none() {
+            robot.step();
+            excited += u32::from(robot.is_excited());
+            steps += 1;
+            assert!(steps < 60 * SECOND, "seed {seed}");
+        }
+        assert!(
+            excited <= 3 * SECOND / 2,
+            "seed {seed}: {excited} steps of such motion"
+        );
+        // From now on it takes twice as long.
+        robot.rest(true);
+        drive_for(&mut robot, 15 * SECOND);
+        assert!(robot.monitor.findings().about(Subject::Position).is_some());
+        relapsed += 1;
+        steps_until(&mut robot, Subject::Position, false, 60 * SECOND);
+        // A position that is right again in motion is as good as new.
+        robot.mend();
+        robot.rest(false);
+        drive_for(&mut robot, 60 * SECOND);
+        assert_eq!(robot.monitor.findings().iter().count(), 0, "seed {seed}");
+    }
+    assert_eq!(relapsed, 6);
+}
+
+#[test]
+fn a_position_that_is_still_frozen_or_creeps_is_not_believed_for_standing_still() {
+    let mut robot = Robot::new(4, KIT);
+    drive_for(&mut robot, 15 * SECOND);
+    robot.break_with(Fault::PositionFrozen);
+    steps_until(&mut robot, Subject::Position, true, 60 * SECOND);
+    robot.rest(true);
+    drive_for(&mut robot, 120 * SECOND);
+    assert!(robot.monitor.findings().about(Subject::Position).is_some());
+
+    let mut monitor = Monitor::new(RobotModel::yi2007());
+    let mut found_at_s = None;
+    for tick in 0..6_000_u32 {
+        let at = tick * Duration::from_millis(10);
+        let noise = 1.0e-3 * f64::from(tick % 7);
+        // It walks off at 0.3 m/s, and then creeps on.
+        let walked_s = (at.as_secs_f64() - 5.0).max(0.0);
+        let pose = Pose {
+            x_m: 0.3 * walked_s.min(3.0) + 0.05 * (walked_s - 3.0).max(0.0) + noise,
+            ..Pose::default()
+        };
+        monitor.take(&Sample {
+            at,
+            gyro_rad_s: Some(noise),
+            wheel_speeds: Some(WheelSpeeds::default()),
+            odometry_m_s: tick.is_multiple_of(5).then_some(noise),
+            position: tick.is_multiple_of(10).then_some(pose),
+            ..Sample::default()
+        });
+        monitor.command(WheelSpeeds::default());
+        let stands = monitor.findings().consequence() == Some(Consequence::Hold);
+        if stands {
+            found_at_s = found_at_s.or(Some(at.as_secs_f64()));
+        }
+        assert_eq!(
+            stands,
+            found_at_s.is_some(),
+            "at {at:?}: {:?}",
+            monitor.findings()
+        );
+    }
+    assert!(found_at_s.is_some_and(|at_s| at_s < 7.0), "{found_at_s:?}");
+}
+
+#[test]
+fn while_odometry_is_wrong_the_findings_about_others_end_and_its_own_does_not() {
+    let kit = Kit {
+        has_odometry: true,
+        ..KIT
+    };
+    let mut robot = Robot::new(5, kit);
+    drive_for(&mut robot, 15 * SECOND);
+    robot.scale_odometry(1.8);
+    steps_until(&mut robot, Subject::Odometry, true, 60 * SECOND);
+    for fault in [Fault::GyroInverted, Fault::PositionJumps] {
+        let subject = if fault == Fault::GyroInverted {
+            Subject::Gyro
+        } else {
+            Subject::Position
+        };
+        robot.break_with(fault);
+        steps_until(&mut robot, subject, true, 60 * SECOND);
+        robot.mend();
+        steps_until(&mut robot, subject, false, 60 * SECOND);
+        assert!(robot.monitor.findings().about(Subject::Odometry).is_some());
+        drive_for(&mut robot, 60 * SECOND);
+        let findings = robot.monitor.findings();
+        assert_eq!(findings.iter().count(), 1, "{findings:?}");
+        assert!(findings.about(Subject::Odometry).is_some());
+    }
+    robot.scale_odometry(1.0);
+    steps_until(&mut robot, Subject::Odometry, false, 60 * SECOND);
 }
 
 #[test]

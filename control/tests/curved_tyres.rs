@@ -3,7 +3,7 @@
 mod common;
 
 use common::{LOOP_S, SimRobot, curve};
-use tread_control::estimation::{Estimator, SensorNoise, TyrePrior};
+use tread_control::estimation::{Estimator, EstimatorPrior, SensorNoise, TyrePrior};
 use tread_control::friction::FrictionSpec;
 use tread_control::geometry::{Pose, Twist};
 use tread_control::plant::{Ground, Plant, PlantSpec, TyreRise, Tyres};
@@ -33,11 +33,15 @@ fn brush_robot(seed: u64, curvature: f64, radius_ratios: [f64; 2]) -> SimRobot {
     };
     robot.ground = Ground::uniform(ground.try_into().expect("a peak between 0 and 1"));
     let told = TyrePrior {
-        curvature: CURVATURE,
-        curvature_spread: CURVATURE_HALF_RANGE / 3.0_f64.sqrt(),
+        curvature: THETA * CURVATURE,
+        curvature_std_dev: THETA * CURVATURE_HALF_RANGE / 3.0_f64.sqrt(),
         ..TyrePrior::default()
     };
-    robot.estimator = Estimator::with_tyres(robot.model, robot.noise, told);
+    let told = EstimatorPrior {
+        tyres: told,
+        ..EstimatorPrior::exact()
+    };
+    robot.estimator = Estimator::with_prior(robot.model, robot.noise, told);
     robot.torque_gain = [1.0; 2];
     robot
 }

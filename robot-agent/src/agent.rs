@@ -32,7 +32,7 @@ use crate::drive::simulated::SimulatedDriveError;
 use crate::fleet::{self, Identity, LinkError};
 use crate::geometry::control_model;
 use crate::knowledge::{Missions, SiteCell};
-use crate::membership::{Membership, Renewal};
+use crate::membership::{Membership, Renewal, ServerTrust};
 use crate::missions::memory::{Memory, MemoryError};
 use crate::online::Online;
 use crate::outbox::{Outbox, OutboxError};
@@ -41,6 +41,7 @@ use crate::recording::frame::notes;
 use crate::recording::{RecordWriter, RunHead};
 use crate::reporter::{Reporter, log_losses};
 use crate::safety::Safety;
+use crate::safety::latch_file::LatchFile;
 use crate::supervisor::{PartEnded, Supervisor};
 
 /// Longest time that a stopping agent waits for the server to take its last records.
@@ -118,6 +119,9 @@ impl Agent {
         fleet::check_endpoint(&config.server)?;
         let base = Base::new(&config.drive, model, &clock)?;
         let boot = BootId::from_uuid(Uuid::new_v4());
+        // Before anything else is left in the folder: what is there tells a first start from a latch
+        // that was lost.
+        let stops = LatchFile::new(&config.data_dir).load(&clock);
         let outbox_folder = config.data_dir.join("outbox");
         let outbox = Outbox::open(&outbox_folder, config.outbox, config.robot.clone(), boot)?;
         let missions = recall_missions(&config, &outbox, &clock)?;
@@ -127,14 +131,12 @@ impl Agent {
             boot,
         };
 
-        let (
-            loop_ends,
-            AgentEnds {
-                commands,
-                events,
-                shared,
-            },
-        ) = seam();
+        let (loop_ends, ends) = seam();
+        let AgentEnds {
+            commands,
+            events,
+            shared,
+        } = ends;
         let site = Arc::new(SiteCell::default());
         let supervisor = Arc::new(Supervisor::new());
         let recorder = Recorder {
@@ -144,6 +146,7 @@ impl Agent {
         };
         let safety = Safety::open(
             &config.data_dir,
+            stops,
             boot,
             model,
             &config.required_holders,
@@ -193,7 +196,7 @@ impl Agent {
             to_loop: commands,
         });
         let (connected, is_connected) = watch::channel(false);
-        let membership = renew_membership(&supervisor, &config, &dispatcher.clock);
+        let (heard, membership) = renew_membership(&supervisor, &config, &dispatcher.clock);
         let online = Online {
             config,
             identity: identity.clone(),
@@ -203,6 +206,7 @@ impl Agent {
             stop: supervisor.stop_token(),
             connected,
             membership,
+            heard,
         };
         supervisor.spawn("fleet link", online.run());
         info!(robot.id = %identity.robot, %boot, "agent of `{}` runs", identity.robot);
@@ -231,6 +235,7 @@ fn loop_core(
     let mut core = LoopCore::new(model, ends)
         .with_blind_within_fence(config.blind_within_fence)
         .with_silent_after(base.silent_after())
+        .with_prior(config.prior)
         .with_period(config.period());
     let part = "record of the loop";
     let Some((to, head)) = RunHead::of(config, boot, base.silent_after()) else {
@@ -244,20 +249,31 @@ fn loop_core(
     Ok((core, Some(writing)))
 }
 
-/// Begins to renew the certificate, if there is one; it changes with each renewal.
+/// What is heard of whom robots are to trust, and the certificate, which changes with each renewal.
+type Renewing = (
+    watch::Sender<ServerTrust>,
+    Option<watch::Receiver<Arc<Membership>>>,
+);
+
+/// Begins to renew the certificate, if there is one.
 fn renew_membership(
     supervisor: &Supervisor,
     config: &AgentConfig,
     clock: &SharedClock,
-) -> Option<watch::Receiver<Arc<Membership>>> {
-    let (present, membership) = watch::channel(Arc::new(config.membership.clone()?));
+) -> Renewing {
+    let heard = watch::Sender::default();
+    let Some(joined) = config.membership.clone() else {
+        return (heard, None);
+    };
+    let (present, membership) = watch::channel(Arc::new(joined));
     let renewal = Renewal {
         folder: config.data_dir.clone(),
         clock: Arc::clone(clock),
         present,
+        heard: heard.clone(),
     };
     supervisor.spawn("renewal", renewal.run(supervisor.stop_token()));
-    Some(membership)
+    (heard, Some(membership))
 }
 
 /// Reads the mission memory; what was in hand when the agent died is reported as failed.

@@ -1,5 +1,5 @@
 //! The agent's life on the network: connects, introduces the robot, publishes, uploads, answers;
-//! and opens the link again when there is a new certificate.
+//! and opens the link again when there is a new certificate, or other credentials.
 
 use std::ops::ControlFlow;
 use std::sync::Arc;
@@ -16,12 +16,15 @@ use crate::control_loop::seam::Shared;
 use crate::dispatcher::Dispatcher;
 use crate::fleet::uploader::{self, Backoff};
 use crate::fleet::{self, COMMANDS_MAX, FleetLink, Identity, Listeners, Note, Noted};
-use crate::membership::Membership;
+use crate::membership::{Membership, ServerTrust};
 use crate::outbox::Outbox;
 use crate::reporter::{Reporter, every, publish_states};
 
 /// How long the last state has to leave the machine before the session closes.
 const LAST_WORD_WAIT: Duration = Duration::from_millis(100);
+
+/// Rest after the link could not be made for a reason of this machine, such as no free port.
+const LINK_FAILED_REST: Duration = Duration::from_secs(1);
 
 /// Waits for the next certificate; for ever where there is none.
 async fn renewed(membership: &mut Option<watch::Receiver<Arc<Membership>>>) {
@@ -44,6 +47,12 @@ pub(crate) struct Online {
     pub(crate) connected: watch::Sender<bool>,
     /// The certificate, which changes with each renewal; `None` where none is wanted.
     pub(crate) membership: Option<watch::Receiver<Arc<Membership>>>,
+    /// What was heard of whom robots are to trust.
+    pub(crate) heard: watch::Sender<ServerTrust>,
+}
+
+fn hear(heard: &watch::Sender<ServerTrust>, trust: ServerTrust) {
+    heard.send_if_modified(|present| std::mem::replace(present, trust) != trust);
 }
 
 impl Online {
@@ -51,9 +60,12 @@ impl Online {
     pub(crate) async fn run(mut self) {
         let (shared, clock) = (&self.dispatcher.shared, &self.dispatcher.clock);
         let (shared, clock) = (Arc::clone(shared), Arc::clone(clock));
+        let heard = self.heard.clone();
         let note: Note = Arc::new(move |noted| match noted {
             Noted::ServerHeard => shared.note_server_heard(clock.monotonic()),
             Noted::CommandLost => Shared::count(&shared.lost_commands),
+            Noted::Trust(trust) => hear(&heard, ServerTrust::Is(trust)),
+            Noted::Distrusted => hear(&heard, ServerTrust::Distrusted),
         });
         tokio::select! {
             // Robots that get power together do not come all at once.
@@ -99,13 +111,19 @@ impl Online {
         };
         let link = match connected {
             Ok(Some(link)) => Arc::new(link),
-            Ok(None) => return ControlFlow::Break(()),
+            Ok(None) if self.stop.is_cancelled() => return ControlFlow::Break(()),
+            Ok(None) => return ControlFlow::Continue(()),
             Err(cause) => {
                 error!(
                     error = &cause as &dyn std::error::Error,
-                    "the fleet link failed"
+                    "the fleet link failed; it is tried again"
                 );
-                return ControlFlow::Break(());
+                tokio::select! {
+                    () = tokio::time::sleep(LINK_FAILED_REST) => {}
+                    () = renewed(membership) => {}
+                    () = self.stop.cancelled() => return ControlFlow::Break(()),
+                }
+                return ControlFlow::Continue(());
             }
         };
         let (welcomed, is_welcome) = watch::channel(false);
@@ -132,6 +150,7 @@ impl Online {
             () = working => ControlFlow::Break(()),
             () = self.stop.cancelled() => ControlFlow::Break(()),
             () = renewed(membership) => ControlFlow::Continue(()),
+            () = link.lost_for_good() => ControlFlow::Continue(()),
         };
         if self.stop.is_cancelled() {
             self.take_leave(&link).await;

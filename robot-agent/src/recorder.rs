@@ -8,7 +8,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::Duration;
 
 use tracing::{error, info, warn};
-use tread_api::friction::{Information, SAMPLES_MAX, Segment};
+use tread_api::friction::{Information, MU_PEAK_MAX, SAMPLES_MAX, Segment};
 use tread_api::ids::ConfigurationId;
 use tread_api::robot::MissionProgress;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
@@ -183,7 +183,8 @@ fn segment_of(closed: &ClosedSegment, configuration: ConfigurationId) -> Segment
         },
         effective_track_ratio: (track.information > 0.0).then_some(track),
         rolling_resistance: (rolling.information > 0.0).then_some(rolling),
-        mu_peak_lower_bound: statistics.mu_peak_lower_bound,
+        // The server refuses a segment that names more, which noise alone can show.
+        mu_peak_lower_bound: statistics.mu_peak_lower_bound.map(|mu| mu.min(MU_PEAK_MAX)),
         samples: u32::try_from(statistics.samples)
             .unwrap_or(SAMPLES_MAX)
             .min(SAMPLES_MAX),

@@ -19,13 +19,14 @@ use tokio::sync::{mpsc, oneshot};
 use tower::ServiceExt as _;
 use tread_api::friction::{Information, Segment};
 use tread_api::ids::{BootId, ConfigurationId, RobotId, SiteId};
-use tread_api::robot::{Capabilities, RobotLimits, RobotModel};
+use tread_api::robot::{Capabilities, RobotModel};
 use tread_api::site::Cell;
 use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::{Batch, Record, RecordContent};
+use tread_samples::rover;
 use tread_server::app::App;
 use tread_server::app::checkpoints;
-use tread_server::app::identity::FirstAdmin;
+use tread_server::app::identity::tokens::FirstAdmin;
 use tread_server::app::ingest::{self, UPLOADS_WAITING_MAX, Upload};
 use tread_server::clock::Clock;
 use tread_server::config::{FrictionConfig, StorageConfig};
@@ -59,24 +60,7 @@ fn site() -> anyhow::Result<SiteId> {
 }
 
 fn model() -> RobotModel {
-    RobotModel {
-        name: "report rover".to_owned(),
-        tyres: "lugged".to_owned(),
-        mass_kg: 50.0,
-        track_width_m: 0.6,
-        wheelbase_m: 0.5,
-        wheel_radius_m: 0.15,
-        yaw_inertia_kg_m2: 3.0,
-        limits: RobotLimits {
-            linear_max_m_s: 2.0,
-            angular_max_rad_s: 1.5,
-            linear_acceleration_max_m_s2: 1.0,
-            lateral_acceleration_max_m_s2: 1.0,
-            linear_jerk_max_m_s3: 5.0,
-            wheel_speed_max_rad_s: 20.0,
-            wheel_acceleration_max_rad_s2: 50.0,
-        },
-    }
+    rover("report rover", "lugged")
 }
 
 fn segment(configuration: ConfigurationId, cell: Cell, robot: u32, at: jiff::Timestamp) -> Segment {

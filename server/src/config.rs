@@ -13,6 +13,7 @@ use tread_api::ids::{ConfigurationId, SiteId};
 
 use crate::authority::is_port_name;
 use crate::friction::index::Normalisation;
+use crate::identity::address::Network;
 use crate::identity::origin::{Names, Origin};
 
 /// Address of the REST API when nothing else is said.
@@ -88,6 +89,8 @@ pub struct Config {
     pub tls: Option<TlsFiles>,
     /// What browsers may do.
     pub web: WebConfig,
+    /// What becomes of the audit log besides the database.
+    pub audit: AuditConfig,
     /// How robots join and show who they are; without it they connect in the clear, on this
     /// machine alone.
     pub robots: Option<RobotsConfig>,
@@ -136,6 +139,18 @@ pub struct WebConfig {
     pub allowed_origins: Vec<Origin>,
     /// A proxy before this server ends TLS: browsers come by `https`.
     pub behind_https: bool,
+    /// Addresses and networks of the proxies before this server, whose `X-Forwarded-For` says where
+    /// a request comes from. Nobody else's is believed.
+    pub trusted_proxies: Vec<Network>,
+}
+
+/// What becomes of the audit log besides the database.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct AuditConfig {
+    /// Each entry is a line of the server's log too, of the target `tread_audit`: what the journal or
+    /// a collector of logs has, nobody changes who can write the database.
+    pub log: bool,
 }
 
 /// How long raw measurements are kept; what they say stays on the map for ever.
@@ -321,6 +336,8 @@ struct File {
     tls: Option<TlsFiles>,
     #[serde(default)]
     web: WebConfig,
+    #[serde(default)]
+    audit: AuditConfig,
     robots: Option<RobotsConfig>,
 }
 
@@ -411,6 +428,7 @@ impl Config {
             storage: file.storage,
             tls: file.tls,
             web: file.web,
+            audit: file.audit,
             robots: file.robots,
         };
         config.check()?;
@@ -594,6 +612,19 @@ mod tests {
         }
         let half = load("[tls]\ncertificate = \"c.pem\"").unwrap_err();
         assert!(half.to_string().contains("key"), "{half}");
+    }
+
+    #[test]
+    fn a_trusted_proxy_is_an_address_or_a_network() {
+        let config = load("[web]\ntrusted_proxies = [\"127.0.0.1\", \"fd00::/8\"]").unwrap();
+        assert_eq!(config.web.trusted_proxies.len(), 2);
+        let said = load("[web]\ntrusted_proxies = [\"proxy\"]")
+            .unwrap_err()
+            .to_string();
+        assert!(
+            said.contains("line 2") && said.contains("`proxy` is no address"),
+            "{said}"
+        );
     }
 
     #[test]

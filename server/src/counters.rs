@@ -90,6 +90,8 @@ counters! {
     renewals_refused,
     /// Renewals refused because the robot was put out of the fleet, or joined again.
     renewals_revoked,
+    /// Renewals refused because the certificate was of an authority that was retired.
+    renewals_retired,
     /// Connections to the robots' port.
     gate_connections,
     /// Connections to the robots' port that began with something else than TLS.
@@ -109,12 +111,22 @@ counters! {
     gate_revoked,
     /// Connections of robots ended because their certificate was over.
     gate_expired,
+    /// Connections of robots ended because the authority of their certificate was retired.
+    gate_retired,
+    /// Connections to the robots' port that the robot ended because it does not trust the port's
+    /// authority: one of another fleet, or from before the authority was changed.
+    gate_distrusted,
     /// Connections of robots that the router did not take.
     gate_router_failed,
+    /// Sessions of robots that did not open: the link ended, it took too long, or the session was
+    /// not one of a client, or not that of the robot whose certificate it showed.
+    gate_session_failed,
     /// Times that another router was opened beside the present ones, for robots that joined.
     routers_opened,
     /// Messages to a site that is not known.
     refused_unknown_site,
+    /// Messages and liveliness tokens of robots beyond their rate limits.
+    rate_limited,
     /// Messages on a key that is none of ours.
     refused_key,
     /// Changes of presence that found the queue full; the robot shows wrongly until its next one.
@@ -151,6 +163,9 @@ counters! {
     http_connections_refused,
     /// HTTP connections ended to make room for new ones: idle, or without a whole request.
     http_connections_displaced,
+    /// HTTP requests refused because their token, or all others together, had as many connections at
+    /// work as they may.
+    http_requests_without_room,
     /// HTTP connections on which nothing came in time, or no TLS.
     http_connections_silent,
     /// TLS handshakes that failed.
@@ -165,19 +180,22 @@ counters! {
     refused_token_expired,
     /// Requests with a token that was revoked.
     refused_token_revoked,
-    /// Requests with a token that were not looked at after too many failures.
+    /// Requests with a token that opens nothing, from where there were too many before.
     refused_locked,
-    /// Requests that the token's role does not allow.
+    /// Requests that the token's rights do not allow.
     refused_role,
+    /// Requests about a site or robot that the token is not for, or to give more than it has.
+    refused_scope,
     /// Requests of another site's page.
     refused_origin,
     /// Requests to a name that is not this server's.
     refused_host,
     /// Requests whose path or query is too long.
     refused_too_long,
-    /// Refused attempts that the audit log leaves out because there are too many.
-    audit_refusals_left_out,
-    /// Entries of the audit log that found the queue full.
+    /// Requests that the audit log has as a count in one entry for all repeats.
+    audit_repeats,
+    /// Requests that the audit log lost: too many different ones were counted, or the database failed
+    /// until the stop.
     audit_dropped,
     /// Requests whose handler panicked.
     http_panics,

@@ -12,9 +12,9 @@ use anyhow::Context as _;
 use clap::Args;
 use tread_api::identity::TOKEN_DAYS_MAX;
 
-use crate::app::identity::FirstAdmin;
+use crate::app::identity::tokens::FirstAdmin;
 use crate::app::{App, AppError};
-use crate::authority::{Authority, AuthorityError};
+use crate::authority::{Authority, AuthorityError, NEXT_CERTIFICATE_FILE};
 use crate::clock::Clock;
 use crate::config::{Config, ServerArgs};
 use crate::db::Db;
@@ -92,7 +92,10 @@ fn make_authority(folder: &Path, clock: &Clock) -> anyhow::Result<bool> {
             Ok(true)
         }
         Err(AuthorityError::Exists(_)) => {
-            Authority::load(folder)?;
+            // During a rotation the files are the server's to judge, which may be at work on them.
+            if !folder.join(NEXT_CERTIFICATE_FILE).exists() {
+                Authority::load(folder)?;
+            }
             Ok(false)
         }
         Err(failed) => Err(failed.into()),

@@ -21,6 +21,7 @@ pub mod identity;
 mod init;
 mod logging;
 pub mod metrics;
+mod rate_limit;
 pub mod supervisor;
 
 use std::ffi::OsString;
@@ -33,16 +34,18 @@ use anyhow::Context as _;
 use clap::Parser as _;
 use jiff::SignedDuration;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
-use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
+use tread_api::ids::SiteId;
 use tread_api::startup::give_zenoh_threads;
 
 use self::app::enrolment::Office;
 use self::app::identity::audit;
-use self::app::{App, Links, checkpoints, events, ingest, merging, reconciler, retention, storage};
-use self::authority::Authority;
+use self::app::{
+    App, Links, checkpoints, events, ingest, memory, merging, reconciler, retention, storage,
+};
+use self::authority::Authorities;
 use self::clock::Clock;
 use self::config::RobotsConfig;
 pub use self::config::{Config, ServerArgs};
@@ -51,6 +54,7 @@ use self::db::lock::DatabaseLock;
 use self::fleet::{Fleet, Security};
 use self::http::serve::Serving;
 use self::http::tls::Tls;
+use self::identity::address::TrustedProxies;
 use self::supervisor::Supervisor;
 
 /// How long threads that block may take after everything else has stopped.
@@ -85,23 +89,18 @@ impl Server {
     /// # Errors
     /// As [`Server::start`].
     pub async fn start_with_clock(config: Config, clock: Clock) -> anyhow::Result<RunningServer> {
-        let security = config.robots.as_ref().map(security).transpose()?;
         let names = config.names();
+        let proxies = TrustedProxies::new(config.web.trusted_proxies.clone());
         let tls = config.tls.map(Tls::load).transpose()?.map(Arc::new);
         let lock = DatabaseLock::take(&config.database)?;
+        // Not before: a rotation that was cut short is completed here, by one server alone.
+        let security = config.robots.as_ref().map(security).transpose()?;
         let db = Db::open(&config.database).await?;
         let app = App::new(db, clock, config.friction, config.storage);
-        // With a damaged table robots can still be stopped; only a clock that was set back shows.
-        if let Err(error) = app.continue_time().await {
-            app.log_failure("continue the time of the database", &error);
-        }
         app.declare(config.normalisations);
-        app.ensure_site(&config.site).await?;
-        app.know_robots().await?;
-        app.load_map().await?;
-        app.know_enrolments().await?;
-        let listener = TcpListener::bind(config.http)
-            .await
+        app.log_audit(config.audit.log);
+        remember(&app, &config.site).await?;
+        let listener = http::serve::listen(config.http)
             .with_context(|| format!("cannot listen for HTTP on {}", config.http))?;
         let http_address = listener.local_addr()?;
 
@@ -115,7 +114,7 @@ impl Server {
         )?;
         if let (Some(security), Some(robots)) = (security, &config.robots) {
             app.open_office(Office {
-                authority: security.authority,
+                authorities: security.authorities,
                 lifetime: SignedDuration::from_secs(robots.certificate_s.into()),
                 port: fleet.address().port(),
             });
@@ -137,14 +136,13 @@ impl Server {
         );
         supervisor.spawn_vital("reconciler", reconciling);
         supervisor.spawn_vital("events", events::run(app.clone(), stop()));
-        supervisor.spawn_vital("checkpoints", checkpoints::run(app.clone(), stop()));
-        supervisor.spawn_vital("storage", storage::run(app.clone(), stop()));
-        supervisor.spawn_vital("merging", merging::run(app.clone(), stop()));
+        look_after_database(&app, &supervisor);
         let telling = app::friction::live::run(app.clone(), stop());
         supervisor.spawn_vital("map", telling);
         let removing = retention::run(app.clone(), config.retention, stop());
         supervisor.spawn_vital("retention", removing);
         supervisor.spawn_vital("audit", audit::run(app.clone(), stop()));
+        supervisor.spawn_vital("tokens", app::identity::run(app.clone(), stop()));
         let router = http::router(app.clone(), names);
         if let Some(tls) = &tls {
             supervisor.spawn_vital("certificate", http::tls::watch(Arc::clone(tls), stop()));
@@ -154,13 +152,13 @@ impl Server {
             listener,
             router,
             tls,
+            proxies: Arc::new(proxies),
         };
         let serving = http::serve::run(serving, app.clone(), supervisor.clone(), stop());
         supervisor.spawn_vital("http", serving);
         let mut metrics_address = None;
         if let Some(address) = config.metrics {
-            let listener = TcpListener::bind(address)
-                .await
+            let listener = http::serve::listen(address)
                 .with_context(|| format!("cannot listen for metrics on {address}"))?;
             let address = listener.local_addr()?;
             metrics_address = Some(address);
@@ -168,6 +166,7 @@ impl Server {
                 listener,
                 router: http::metrics_router(app.clone()),
                 tls: None,
+                proxies: Arc::default(),
             };
             let serving = http::serve::run(serving, app.clone(), supervisor.clone(), stop());
             supervisor.spawn_vital("metrics", serving);
@@ -188,10 +187,36 @@ impl Server {
     }
 }
 
+/// Starts what keeps the database in order, and memory true to it.
+fn look_after_database(app: &App, supervisor: &Supervisor) {
+    let stop = || supervisor.stop_token();
+    supervisor.spawn_vital("memory", memory::run(app.clone(), stop()));
+    supervisor.spawn_vital("checkpoints", checkpoints::run(app.clone(), stop()));
+    supervisor.spawn_vital("storage", storage::run(app.clone(), stop()));
+    supervisor.spawn_vital("merging", merging::run(app.clone(), stop()));
+}
+
+/// Reads what the server keeps in memory.
+async fn remember(app: &App, site: &SiteId) -> anyhow::Result<()> {
+    // With a damaged table robots can still be stopped; only a clock that was set back shows.
+    if let Err(error) = app.continue_time().await {
+        app.log_failure("continue the time of the database", &error);
+    }
+    app.ensure_site(site).await?;
+    app.know_robots().await?;
+    app.load_map().await?;
+    app.know_enrolments().await?;
+    // Without it each token is looked up when it is shown.
+    if let Err(error) = app.know_tokens().await {
+        app.log_failure("read the valid tokens", &error);
+    }
+    Ok(())
+}
+
 fn security(robots: &RobotsConfig) -> anyhow::Result<Security> {
-    let authority = Authority::load(&robots.authority)?;
+    let authorities = Authorities::load(&robots.authority)?;
     Ok(Security {
-        authority: Arc::new(authority),
+        authorities: Arc::new(authorities),
         names: robots.names.clone(),
     })
 }
@@ -228,6 +253,7 @@ impl RunningServer {
     /// A vital task had failed, or tasks did not end in time.
     pub async fn stop(self) -> anyhow::Result<()> {
         let stopped = self.supervisor.stop().await;
+        audit::finish(&self.app).await;
         self.fleet.close().await;
         self.app.db().close().await;
         drop(self.lock);

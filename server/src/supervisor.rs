@@ -13,6 +13,7 @@ use std::time::Duration;
 use futures_util::FutureExt as _;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
+use tokio_util::task::task_tracker::TaskTrackerToken;
 use tracing::{debug, error};
 
 /// How long tasks may take to end after they were asked to.
@@ -81,6 +82,12 @@ impl Supervisor {
         });
     }
 
+    /// Makes the stop wait for a task that somebody else spawned, such as axum for a `WebSocket`,
+    /// until the result is dropped.
+    pub fn attend(&self) -> TaskTrackerToken {
+        self.tracker.token()
+    }
+
     /// Runs what blocks its thread on a thread of its own kind.
     ///
     /// `None` if it panicked.
@@ -129,6 +136,24 @@ mod tests {
         supervisor.spawn_vital("hasty", async {});
         supervisor.stopping().await;
         assert_eq!(supervisor.stop().await, Err(Stopped::EndedEarly("hasty")));
+    }
+
+    #[tokio::test]
+    async fn the_stop_waits_for_tasks_that_others_have_spawned_and_what_they_spawn_last() {
+        let supervisor = Supervisor::new();
+        let (attended, ending) = (supervisor.attend(), supervisor.clone());
+        let (done, mut is_done) = tokio::sync::oneshot::channel();
+        let mut foreign = tokio::task::JoinSet::new();
+        foreign.spawn(async move {
+            ending.stop_token().cancelled().await;
+            for _ in 0..100 {
+                tokio::task::yield_now().await;
+            }
+            ending.spawn_passing("last", async move { done.send(()).unwrap() });
+            drop(attended);
+        });
+        assert_eq!(supervisor.stop().await, Ok(()));
+        assert_eq!(is_done.try_recv(), Ok(()));
     }
 
     #[tokio::test]

@@ -213,9 +213,43 @@ impl Fleet {
         self.server.as_ref()?.usage()
     }
 
+    /// Whether the server has ended, by itself or otherwise.
+    pub fn has_server_ended(&self) -> bool {
+        self.server.as_ref().is_none_or(Process::has_ended)
+    }
+
     /// The server's process and those of agents.
     pub fn processes(&self) -> impl Iterator<Item = &Process> {
         self.server.iter().chain(self.agents.values())
+    }
+
+    /// Does something while the server lets robots in without certificates, by starting it twice.
+    ///
+    /// # Errors
+    /// The server does not stop.
+    pub async fn without_certificates<T>(
+        &mut self,
+        act: impl AsyncFnOnce(&Self) -> anyhow::Result<T>,
+    ) -> anyhow::Result<T> {
+        self.stop_server().await?;
+        let config = self.config.take();
+        self.start_server().await;
+        let done = act(self).await;
+        self.stop_server().await?;
+        self.config = config;
+        self.start_server().await;
+        done
+    }
+
+    /// How many bytes a process has logged.
+    pub fn log_bytes(&self, name: &str) -> u64 {
+        let log = self.folder.path().join(format!("{name}.log"));
+        std::fs::metadata(log).map_or(0, |log| log.len())
+    }
+
+    /// A file of that name in the fleet's own folder.
+    pub fn file(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
     }
 
     /// Starts the server on the same ports and database as before, and waits until it is ready.

@@ -8,10 +8,12 @@
 //! * [`wait`]: waits for a state with a bound, and says what was seen last.
 //! * [`chaos`]: runs in which things fail at random, from a seed of [`random`].
 //! * [`scenario`]: fleets in a simulated time, from which figures are read.
+//! * [`damage`]: damages payloads.
 //! * [`light_robot`]: robots without physics, for load.
 //! * [`report`]: figures against their goals, as every report program prints them.
 
 pub mod chaos;
+pub mod damage;
 pub mod fleet;
 pub mod light_robot;
 pub mod ports;

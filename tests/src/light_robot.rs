@@ -10,6 +10,8 @@ use jiff::Timestamp;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tokio::time::Instant;
+use tread_agent::fleet::Tunnel;
+use tread_agent::membership::Membership;
 use tread_api::friction::{Information, Segment};
 use tread_api::geometry::Pose;
 use tread_api::ids::{BootId, RobotId, SiteId};
@@ -54,6 +56,23 @@ pub async fn open_session(endpoint: &str) -> anyhow::Result<Session> {
         .map_err(|error| anyhow::anyhow!("no router answers at {endpoint}: {error}"))
 }
 
+/// A session through a robot's TLS tunnel, which must outlive it.
+///
+/// # Errors
+/// The robot is not let in.
+pub async fn open_secure_session(
+    endpoint: &str,
+    membership: &Membership,
+) -> anyhow::Result<(Session, Tunnel)> {
+    let tunnel = Tunnel::open(endpoint, membership).await?;
+    let config = tunnel.session_config()?;
+    // Opening blocks its thread until the router answers.
+    let session = tokio::task::spawn_blocking(move || zenoh::Wait::wait(zenoh::open(config)))
+        .await?
+        .map_err(|error| anyhow::anyhow!("the robot is not let in at {endpoint}: {error}"))?;
+    Ok((session, tunnel))
+}
+
 /// Asks and waits for one answer.
 ///
 /// # Errors
@@ -95,11 +114,34 @@ pub async fn ask_raw<A: DeserializeOwned>(
     }
 }
 
+/// Says hello as a robot, and gives what the server answers.
+///
+/// # Errors
+/// The server does not answer or does not welcome it.
+pub async fn introduce(
+    session: &Session,
+    site: &SiteId,
+    robot: &RobotId,
+    boot: BootId,
+) -> anyhow::Result<Welcome> {
+    let hello = Hello {
+        robot: robot.clone(),
+        boot,
+        agent_version: env!("CARGO_PKG_VERSION").to_owned(),
+        model: paper_robot(),
+        robot_time: now(),
+        capabilities: Capabilities::default(),
+    };
+    ask(session, &keys::hello(site, robot), &hello).await
+}
+
 /// A robot that only talks.
 #[derive(Debug)]
 pub struct LightRobot {
     /// Its identifier.
     pub id: RobotId,
+    /// Its site.
+    pub site: SiteId,
     /// Its boot.
     pub boot: BootId,
     /// Its session.
@@ -110,6 +152,8 @@ pub struct LightRobot {
     ingest_key: String,
     state_publisher: Publisher<'static>,
     _token: LivelinessToken,
+    /// What the session goes through; it must outlive the session.
+    pub tunnel: Option<Tunnel>,
     next_record: u64,
     next_state: u64,
 }
@@ -120,18 +164,29 @@ impl LightRobot {
     /// # Errors
     /// The server does not answer or does not welcome it.
     pub async fn start(endpoint: &str, site: &SiteId, id: RobotId) -> anyhow::Result<Self> {
-        let session = open_session(endpoint).await?;
+        Self::start_on(open_session(endpoint).await?, site, id).await
+    }
+
+    /// The same by TLS, with the robot's certificate.
+    ///
+    /// # Errors
+    /// The robot is not let in, or the server does not answer or does not welcome it.
+    pub async fn start_secure(endpoint: &str, membership: &Membership) -> anyhow::Result<Self> {
+        let (session, tunnel) = open_secure_session(endpoint, membership).await?;
+        let (site, robot) = (&membership.site, membership.robot.clone());
+        let mut started = Self::start_on(session, site, robot).await?;
+        started.tunnel = Some(tunnel);
+        Ok(started)
+    }
+
+    /// Says hello and announces itself on an open session.
+    ///
+    /// # Errors
+    /// The server does not answer or does not welcome it.
+    async fn start_on(session: Session, site: &SiteId, id: RobotId) -> anyhow::Result<Self> {
         let boot = BootId::from_uuid(uuid::Uuid::new_v4());
         let model = paper_robot();
-        let hello = Hello {
-            robot: id.clone(),
-            boot,
-            agent_version: env!("CARGO_PKG_VERSION").to_owned(),
-            model: model.clone(),
-            robot_time: now(),
-            capabilities: Capabilities::default(),
-        };
-        let welcome = ask(&session, &keys::hello(site, &id), &hello).await?;
+        let welcome = introduce(&session, site, &id, boot).await?;
         let failed = |error: zenoh::Error| anyhow::anyhow!("zenoh: {error}");
         let state_publisher = session
             .declare_publisher(keys::state(site, &id))
@@ -145,6 +200,7 @@ impl LightRobot {
         let ingest_key = keys::ingest(site, &id);
         Ok(Self {
             id,
+            site: site.clone(),
             boot,
             session,
             welcome,
@@ -152,16 +208,22 @@ impl LightRobot {
             ingest_key,
             state_publisher,
             _token: token,
+            tunnel: None,
             next_record: 0,
             next_state: 0,
         })
     }
 
-    /// Publishes one state.
+    /// Says hello once more.
     ///
     /// # Errors
-    /// The session is closed.
-    pub async fn publish_state(&mut self) -> anyhow::Result<()> {
+    /// The server does not answer or does not welcome it.
+    pub async fn hello(&self) -> anyhow::Result<Welcome> {
+        introduce(&self.session, &self.site, &self.id, self.boot).await
+    }
+
+    /// The next state of this boot.
+    pub fn next_state(&mut self) -> RobotState {
         let state = RobotState {
             robot: self.id.clone(),
             boot: self.boot,
@@ -193,6 +255,15 @@ impl LightRobot {
             safety: tread_api::safety::SafetyStatus::default(),
         };
         self.next_state += 1;
+        state
+    }
+
+    /// Publishes one state.
+    ///
+    /// # Errors
+    /// The session is closed.
+    pub async fn publish_state(&mut self) -> anyhow::Result<()> {
+        let state = self.next_state();
         let put = self.state_publisher.put(wire::encode(&state)?).await;
         put.map_err(|error| anyhow::anyhow!("cannot publish: {error}"))
     }

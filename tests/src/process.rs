@@ -31,6 +31,20 @@ pub fn node() -> anyhow::Result<PathBuf> {
     Ok(node)
 }
 
+/// The program `tread`, beside this one.
+///
+/// # Errors
+/// It was not built.
+pub fn tread() -> anyhow::Result<PathBuf> {
+    let tread = std::env::current_exe()?.with_file_name("tread");
+    anyhow::ensure!(
+        tread.exists(),
+        "{} is missing: build it with `cargo build -p tread`, in the same profile",
+        tread.display()
+    );
+    Ok(tread)
+}
+
 /// A child process; it is killed when it is dropped.
 #[derive(Debug)]
 pub struct Process {
@@ -96,6 +110,16 @@ impl Process {
     /// How it ended, if it has.
     pub fn ended(&mut self) -> Option<ExitStatus> {
         self.child.try_wait().ok().flatten()
+    }
+
+    /// Whether it has ended. What is left of a process until somebody asks how it ended counts as
+    /// ended.
+    pub fn has_ended(&self) -> bool {
+        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.child.id()));
+        stat.map_or(true, |stat| {
+            let behind_name = stat.rsplit_once(") ");
+            behind_name.is_none_or(|(_, fields)| fields.starts_with(['Z', 'X']))
+        })
     }
 
     /// What it has used so far; `None` when it is gone.

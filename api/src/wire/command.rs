@@ -118,6 +118,7 @@ pub struct Cancel {
     /// The mission.
     pub mission: MissionId,
     /// Why, for people.
+    #[serde(deserialize_with = "crate::text::bounded::<_, {crate::mission::REASON_LENGTH_MAX}>")]
     pub reason: String,
 }
 
@@ -169,6 +170,9 @@ pub enum Outcome {
         /// For programs.
         code: OfferRefusal,
         /// For people.
+        #[serde(
+            deserialize_with = "crate::text::bounded::<_, {crate::mission::REASON_LENGTH_MAX}>"
+        )]
         detail: String,
     },
 }

@@ -17,6 +17,7 @@ pub struct Hello {
     /// This run of the agent.
     pub boot: BootId,
     /// Version of the agent.
+    #[serde(deserialize_with = "crate::text::bounded::<_, {crate::robot::VERSION_TEXT_MAX}>")]
     pub agent_version: String,
     /// Model and tyres.
     pub model: RobotModel,

@@ -65,7 +65,11 @@ pub struct MissionReport {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub since: Option<Timestamp>,
     /// Why, for people.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(
+        default,
+        skip_serializing_if = "Option::is_none",
+        deserialize_with = "crate::text::bounded_option::<_, {crate::mission::REASON_LENGTH_MAX}>"
+    )]
     pub reason: Option<String>,
     /// How far it had come.
     #[serde(default, skip_serializing_if = "Option::is_none")]

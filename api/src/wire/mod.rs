@@ -75,6 +75,7 @@ pub struct Refusal {
     /// For programs.
     pub code: RefusalCode,
     /// For people.
+    #[serde(deserialize_with = "crate::text::bounded::<_, {crate::mission::REASON_LENGTH_MAX}>")]
     pub detail: String,
 }
 

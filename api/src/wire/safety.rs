@@ -21,8 +21,10 @@ pub struct Stop {
     /// The stop.
     pub stop: StopId,
     /// Who stops, for people.
+    #[serde(deserialize_with = "crate::text::bounded::<_, {crate::stop::STOP_TEXT_MAX}>")]
     pub by: String,
     /// Why, for people.
+    #[serde(deserialize_with = "crate::text::bounded::<_, {crate::mission::REASON_LENGTH_MAX}>")]
     pub reason: String,
     /// When it was asked for, by the sender's clock.
     pub at: Timestamp,
@@ -37,6 +39,7 @@ pub struct ClearStop {
     /// The newest stop that its sender knows of.
     pub stop: StopId,
     /// Who clears, for people.
+    #[serde(deserialize_with = "crate::text::bounded::<_, {crate::stop::STOP_TEXT_MAX}>")]
     pub by: String,
 }
 

@@ -3,6 +3,7 @@
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
+use crate::enrolment::TrustId;
 use crate::friction::LiveFriction;
 use crate::geometry::{Pose, Twist};
 use crate::ids::{BootId, RobotId};
@@ -33,7 +34,11 @@ pub struct RobotState {
     /// What the agent is doing.
     pub mode: RobotMode,
     /// What is broken, if anything.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(
+        default,
+        skip_serializing_if = "Option::is_none",
+        deserialize_with = "crate::text::bounded_option::<_, {crate::robot::FAULT_TEXT_MAX}>"
+    )]
     pub fault: Option<String>,
     /// Where it is.
     pub pose: Option<Aged<Pose>>,
@@ -69,6 +74,10 @@ pub struct RobotState {
 pub struct ServerPulse {
     /// The server's wall clock.
     pub server_time: Timestamp,
+    /// Which authorities robots are to trust; a robot that trusts others renews its certificate.
+    /// Absent where robots need no certificates, and from an older server.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trust: Option<TrustId>,
 }
 
 /// How often the server's pulse comes, milliseconds.

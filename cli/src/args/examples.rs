@@ -39,6 +39,13 @@ const EXAMPLES: &[(&str, &str)] = &[
         "  tread robots join-token revoke 0192f0c1-2b3c-7d4e-8f50-617283940a1b",
     ),
     ("robots enrolments", "  tread robots enrolments"),
+    ("authority", "  tread authority"),
+    ("authority status", "  tread authority status --json"),
+    ("authority start", "  tread authority start"),
+    (
+        "authority finish",
+        "  tread authority finish\n  tread authority finish --force",
+    ),
     (
         "robots rename",
         "  tread robots rename rover-1 \"Old Betsy\"",
@@ -176,13 +183,18 @@ const EXAMPLES: &[(&str, &str)] = &[
     ("tokens list", "  tread tokens list"),
     (
         "tokens create",
-        "  tread tokens create \"wall screen\" --role viewer --valid-days 365",
+        "  tread tokens create \"wall screen\" --role viewer --valid-days 365\n  tread tokens create \"night shift\" --rights drive,clear_stop --for yard,park/rover-1",
     ),
     (
         "tokens revoke",
         "  tread tokens revoke 0192f0c1-2b3c-7d4e-8f50-617283940a1b",
     ),
     ("audit", "  tread audit --refused"),
+    ("audit export", "  tread audit export --output audit.jsonl"),
+    (
+        "audit verify",
+        "  tread audit verify\n  tread audit verify audit.jsonl",
+    ),
 ];
 
 /// The same commands, each with its examples below its help.

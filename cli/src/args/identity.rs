@@ -1,11 +1,13 @@
 //! The words of the commands about tokens, and about who is of the fleet.
 
 use std::path::PathBuf;
+use std::str::FromStr;
 
 use clap::{Args, Subcommand};
 use tread_api::enrolment::JOIN_MINUTES_MAX;
 use tread_api::identity::{Role, TOKEN_DAYS_DEFAULT, TOKEN_DAYS_MAX};
 use tread_api::ids::{JoinTokenId, RobotId, TokenId};
+use tread_api::rights::Right;
 
 use super::{Connection, duration};
 
@@ -43,8 +45,15 @@ pub(crate) enum TokensAction {
         /// What people call it
         name: String,
         /// What it may do: viewer, operator or admin
-        #[arg(long)]
-        role: Role,
+        #[arg(long, required_unless_present = "rights", conflicts_with = "rights")]
+        role: Option<Role>,
+        /// What it may do, in place of a role, with commas: `stop`, `read`, `drive`, `clear_stop`,
+        /// `hold`, `release_hold`, `dispatch`, `acknowledge`, `configure`, `administer`
+        #[arg(long, value_name = "RIGHTS", value_delimiter = ',')]
+        rights: Option<Vec<Right>>,
+        /// Where it may do that, with commas, each SITE or SITE/ROBOT; everywhere without it
+        #[arg(long = "for", value_name = "PLACES", value_delimiter = ',')]
+        places: Vec<String>,
         /// Days until it is refused
         #[arg(long, value_name = "DAYS", default_value_t = TOKEN_DAYS_DEFAULT,
             value_parser = clap::value_parser!(u32).range(1..=i64::from(TOKEN_DAYS_MAX)))]
@@ -58,7 +67,32 @@ pub(crate) enum TokensAction {
 }
 
 #[derive(Debug, Args)]
+pub(crate) struct AuthorityArguments {
+    #[command(subcommand)]
+    pub(crate) action: Option<AuthorityAction>,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum AuthorityAction {
+    /// Show who signs robots' certificates and, during a rotation, which robots are left
+    Status,
+    /// Start a rotation: another authority signs from now on, and both are trusted until it is finished
+    Start,
+    /// Finish the rotation: the former authority is retired; refused while robots are left
+    Finish {
+        /// Finish it though robots are left; each of them must join again
+        #[arg(long)]
+        force: bool,
+    },
+}
+
+#[derive(Debug, Args)]
+#[command(args_conflicts_with_subcommands = true)]
 pub(crate) struct AuditArguments {
+    #[command(subcommand)]
+    pub(crate) action: Option<AuditAction>,
     /// Only what was asked with the token of this name
     #[arg(long)]
     pub(crate) who: Option<String>,
@@ -70,6 +104,50 @@ pub(crate) struct AuditArguments {
     pub(crate) limit: u32,
     #[command(flatten)]
     pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum AuditAction {
+    /// Write all entries as JSON Lines, the oldest first
+    Export {
+        /// Write them into this new file, which only its owner can read, instead of printing them
+        #[arg(long, value_name = "FILE")]
+        output: Option<PathBuf>,
+        /// Only those after the entry of this number
+        #[arg(long, value_name = "NUMBER")]
+        after: Option<u64>,
+    },
+    /// Compute the hashes of all entries here, and say which was changed, removed or put in between
+    Verify {
+        /// Verify what was exported into this file instead of asking the server
+        file: Option<PathBuf>,
+        /// Number and hash that an earlier `verify` printed: the entry must still be the same
+        #[arg(long, value_name = "NUMBER:HASH")]
+        noted: Option<Noted>,
+    },
+}
+
+/// An entry of the audit log that was noted before.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Noted {
+    pub(crate) id: u64,
+    pub(crate) hash: String,
+}
+
+impl FromStr for Noted {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let wrong = || "write number and hash with a colon between them".to_owned();
+        let (id, hash) = text.split_once(':').ok_or_else(wrong)?;
+        let is_hash = hash.len() == 64 && hash.bytes().all(|byte| byte.is_ascii_hexdigit());
+        let id = id.parse().map_err(|_error| wrong())?;
+        if !is_hash {
+            return Err(wrong());
+        }
+        let hash = hash.to_ascii_lowercase();
+        Ok(Self { id, hash })
+    }
 }
 
 #[derive(Debug, Subcommand)]

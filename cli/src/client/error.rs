@@ -80,7 +80,7 @@ const NEXT_STEPS: &[(ProblemType, &str)] = &[
     ),
     (
         ProblemType::Forbidden,
-        "`tread whoami` shows your role; an admin makes tokens with `tread tokens create`",
+        "`tread whoami` shows your rights; an admin makes tokens with `tread tokens create`",
     ),
     (
         ProblemType::TooManyAttempts,
@@ -164,6 +164,10 @@ const NEXT_STEPS: &[(ProblemType, &str)] = &[
         "look at it again, and give the new revision with --revision",
     ),
     (
+        ProblemType::RobotsLeft,
+        "`tread authority` lists them; bring them onto the network, or add --force",
+    ),
+    (
         ProblemType::Internal,
         "the server's log names the cause; `tread status` shows whether it works",
     ),
@@ -224,6 +228,7 @@ fn exit_of(problem: &ProblemBody) -> Exit {
         404 => Exit::NotFound,
         409 | 412 => Exit::Conflict,
         408 | 504 => Exit::TimedOut,
+        _ if problem.kind == ProblemType::Timeout => Exit::TimedOut,
         502 | 503 => Exit::Unreachable,
         _ => Exit::Refused,
     }

@@ -1,9 +1,12 @@
 //! Who asks, and who is of the fleet.
 
-use tread_api::enrolment::{CreateJoinToken, CreatedJoinToken, Enrolment, JoinToken};
+use tread_api::audit::AuditChain;
+use tread_api::enrolment::{
+    CreateJoinToken, CreatedJoinToken, Enrolment, FinishRotation, FleetAuthority, JoinToken,
+};
 use tread_api::identity::{AuditEntry, CreateToken, CreatedToken, Session, Token};
 use tread_api::ids::{JoinTokenId, RobotId, SiteId, TokenId};
-use tread_api::page::Page;
+use tread_api::page::{PAGE_LIMIT_MAX, Page};
 
 use super::{Client, ClientError};
 
@@ -62,6 +65,43 @@ impl Client {
     ) -> Result<Enrolment, ClientError> {
         self.delete(&format!("/v1/sites/{site}/enrolments/{robot}"))
             .await
+    }
+
+    /// The fleet's authority and its rotation.
+    pub(crate) async fn authority(&self) -> Result<FleetAuthority, ClientError> {
+        self.get("/v1/authority").await
+    }
+
+    /// Starts a rotation of the fleet's authority.
+    pub(crate) async fn start_rotation(&self) -> Result<FleetAuthority, ClientError> {
+        self.post("/v1/authority/rotation", &serde_json::json!({}))
+            .await
+    }
+
+    /// Finishes it.
+    pub(crate) async fn finish_rotation(
+        &self,
+        request: &FinishRotation,
+    ) -> Result<FleetAuthority, ClientError> {
+        self.post("/v1/authority/rotation/finish", request).await
+    }
+
+    /// A page of the audit log, the oldest first, after the entry of this number.
+    pub(crate) async fn audit_after(
+        &self,
+        after: Option<u64>,
+    ) -> Result<Page<AuditEntry>, ClientError> {
+        let mut query = vec![
+            ("order", "oldest".to_owned()),
+            ("limit", PAGE_LIMIT_MAX.to_string()),
+        ];
+        query.extend(after.map(|after| ("cursor", after.to_string())));
+        self.get_with("/v1/audit", &query).await
+    }
+
+    /// What frames the chain of the audit log.
+    pub(crate) async fn audit_chain(&self) -> Result<AuditChain, ClientError> {
+        self.get("/v1/audit/chain").await
     }
 
     /// The newest entries of the audit log, at most `limit`.

@@ -2,13 +2,14 @@
 
 use jiff::Timestamp;
 use reqwest::Method;
+use serde::Serialize;
 use tread_api::friction::{
     AskPath, CellDifference, CellFriction, CreateWithdrawal, PathFriction, PointFriction,
     RobotContribution, TerrainFriction, TerrainHistory, VisitSuggestion, Withdrawal,
 };
 use tread_api::geometry::Point;
 use tread_api::ids::{ConfigurationId, RobotId, SiteId, TerrainId};
-use tread_api::page::Page;
+use tread_api::page::MapPage;
 use tread_api::terrain::{CreateTerrain, ReplaceTerrain, Terrain};
 
 use super::{Client, ClientError, Query};
@@ -32,6 +33,30 @@ impl Reading {
         query.extend(self.normalisation.map(|name| ("normalisation", name)));
         query
     }
+}
+
+/// Of which times an answer is, as far as it says so.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct MapTimes {
+    /// From when on, in a comparison of two times.
+    pub(crate) from: Option<Timestamp>,
+    /// Nothing that was measured later counts; `None` if all that has come does.
+    pub(crate) as_of: Option<Timestamp>,
+}
+
+impl MapTimes {
+    pub(crate) fn as_of(as_of: Option<Timestamp>) -> Self {
+        Self { from: None, as_of }
+    }
+}
+
+/// Entries of the map, and of which times they are; programs are told the entries.
+#[derive(Debug, Serialize)]
+#[serde(transparent)]
+pub(crate) struct Known<T> {
+    pub(crate) items: Vec<T>,
+    #[serde(skip)]
+    pub(crate) of: MapTimes,
 }
 
 /// A box of the map, metres.
@@ -138,11 +163,11 @@ impl Client {
         area: Option<Area>,
         resolution_m: Option<f64>,
         reading: Reading,
-    ) -> Result<Vec<CellFriction>, ClientError> {
+    ) -> Result<Known<CellFriction>, ClientError> {
         let mut query = reading.query();
         query.extend(area.map(Area::query).unwrap_or_default());
         query.extend(resolution_m.map(|side_m| ("resolution_m", side_m.to_string())));
-        self.all_with(&format!("/v1/sites/{site}/friction/cells"), &query)
+        self.all_of_map(&format!("/v1/sites/{site}/friction/cells"), &query)
             .await
     }
 
@@ -175,12 +200,12 @@ impl Client {
         (from, to): (Timestamp, Option<Timestamp>),
         area: Option<Area>,
         reading: Reading,
-    ) -> Result<Vec<CellDifference>, ClientError> {
+    ) -> Result<Known<CellDifference>, ClientError> {
         let mut query = reading.query();
         query.push(("from", from.to_string()));
         query.extend(to.map(|to| ("to", to.to_string())));
         query.extend(area.map(Area::query).unwrap_or_default());
-        self.all_with(&format!("/v1/sites/{site}/friction/difference"), &query)
+        self.all_of_map(&format!("/v1/sites/{site}/friction/difference"), &query)
             .await
     }
 
@@ -191,7 +216,7 @@ impl Client {
         area: Area,
         limit: u32,
         reading: Reading,
-    ) -> Result<Page<VisitSuggestion>, ClientError> {
+    ) -> Result<MapPage<VisitSuggestion>, ClientError> {
         let mut query = reading.query();
         query.extend(area.query());
         query.push(("limit", limit.to_string()));

@@ -8,6 +8,7 @@ mod map;
 mod missions;
 mod safety;
 
+use std::borrow::Cow;
 use std::io;
 use std::net::IpAddr;
 use std::path::Path;
@@ -16,10 +17,12 @@ use std::time::Duration;
 use reqwest::{Certificate, Method, RequestBuilder, Response, Url};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use tread_api::page::{PAGE_LIMIT_MAX, Page};
+use serde_json::Value;
+use tread_api::page::{DifferencePage, PAGE_LIMIT_MAX};
+use tread_api::text;
 
 pub(crate) use self::error::ClientError;
-pub(crate) use self::map::{Area, Reading};
+pub(crate) use self::map::{Area, Known, MapTimes, Reading};
 
 /// Longest wait for an answer; planning the longest path takes a while.
 const ANSWER_WAIT_MAX: Duration = Duration::from_secs(30);
@@ -58,6 +61,8 @@ pub(crate) struct Client {
     address: String,
     token: Option<String>,
     http: reqwest::Client,
+    /// Whether what comes is to be shown in a terminal, see [`Self::read`].
+    escapes: bool,
 }
 
 fn certificates(file: &Path) -> Result<Vec<Certificate>, ClientError> {
@@ -108,7 +113,36 @@ impl Client {
             address,
             token,
             http,
+            escapes: false,
         })
+    }
+
+    /// The same client, whose answers are shown to people: whatever moves a terminal's cursor or
+    /// turns its writing round stands in them as an escape.
+    #[must_use]
+    pub(crate) fn for_people(mut self, is_for_people: bool) -> Self {
+        self.escapes = is_for_people;
+        self
+    }
+
+    /// The same client, whose answers are as they came.
+    pub(crate) fn exactly(&self) -> Self {
+        Self {
+            escapes: false,
+            ..self.clone()
+        }
+    }
+
+    /// Reads what the server sent. All that comes from elsewhere comes through here.
+    pub(crate) fn read<T: DeserializeOwned>(&self, text: &[u8]) -> serde_json::Result<T> {
+        // What has neither escapes nor other letters is printable as it is.
+        let is_plain = |byte: &u8| byte.is_ascii() && !matches!(byte, b'\\' | 0x7f);
+        if !self.escapes || text.iter().all(is_plain) {
+            return serde_json::from_slice(text);
+        }
+        let mut value: Value = serde_json::from_slice(text)?;
+        escape_all(&mut value);
+        serde_json::from_value(value)
     }
 
     /// The token that is shown.
@@ -151,11 +185,12 @@ impl Client {
         let response = self.answered(request).await?;
         let status = response.status();
         let body = response.bytes().await.map_err(|cause| self.lost(cause))?;
-        serde_json::from_slice(&body).map_err(|cause| ClientError::NotUnderstood {
-            address: self.address.clone(),
-            status,
-            cause,
-        })
+        self.read(&body)
+            .map_err(|cause| ClientError::NotUnderstood {
+                address: self.address.clone(),
+                status,
+                cause,
+            })
     }
 
     /// What an answer that is no success says.
@@ -165,7 +200,7 @@ impl Client {
             Ok(body) => body,
             Err(cause) => return self.lost(cause),
         };
-        match serde_json::from_slice(&body) {
+        match self.read(&body) {
             Ok(problem) => ClientError::Refused { problem },
             Err(cause) => ClientError::NotUnderstood {
                 address,
@@ -211,26 +246,60 @@ impl Client {
         path: &str,
         query: &Query,
     ) -> Result<Vec<T>, ClientError> {
+        Ok(self.all_of_map(path, query).await?.items)
+    }
+
+    /// The same of the map, with the times that the answer is of.
+    async fn all_of_map<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        query: &Query,
+    ) -> Result<Known<T>, ClientError> {
         let mut items = Vec::new();
+        let mut of = MapTimes::default();
         let mut cursor: Option<String> = None;
         for _ in 0..PAGES_MAX {
             let mut query = query.clone();
             query.push(("limit", PAGE_LIMIT_MAX.to_string()));
             query.extend(cursor.map(|cursor| ("cursor", cursor)));
-            let page: Page<T> = self.get_with(path, &query).await?;
+            let page: DifferencePage<T> = self.get_with(path, &query).await?;
+            of = MapTimes {
+                from: page.from,
+                as_of: page.as_of,
+            };
             items.extend(page.items);
             cursor = page.next_cursor;
             if cursor.is_none() {
                 break;
             }
         }
-        Ok(items)
+        Ok(Known { items, of })
     }
 
     /// Whether the server is ready to work.
     pub(crate) async fn is_ready(&self) -> bool {
         let answer = self.request(Method::GET, "/readyz").send().await;
         answer.is_ok_and(|response| response.status().is_success())
+    }
+}
+
+/// Escapes what is not printable in all texts of a value.
+fn escape_all(value: &mut Value) {
+    match value {
+        Value::String(text) => {
+            if let Cow::Owned(escaped) = text::escaped(text) {
+                *text = escaped;
+            }
+        }
+        Value::Array(items) => items.iter_mut().for_each(escape_all),
+        Value::Object(fields) => {
+            let taken = std::mem::take(fields);
+            for (name, mut field) in taken {
+                escape_all(&mut field);
+                fields.insert(text::escaped(&name).into_owned(), field);
+            }
+        }
+        Value::Null | Value::Bool(_) | Value::Number(_) => {}
     }
 }
 
@@ -260,6 +329,13 @@ mod tests {
             );
             assert!(Client::new(away, None, None).is_ok());
         }
+        let client = Client::new("http://127.0.0.1:1", None, None).unwrap();
+        let sent = r#"{"a\u001b": ["x\ny", "\u202ee\u009b", "ü"], "n": 1.5}"#.as_bytes();
+        let shown: Value = client.clone().for_people(true).read(sent).unwrap();
+        let said = serde_json::json!({"a\\u{1b}": ["x\\ny", "\\u{202e}e\\u{9b}", "ü"], "n": 1.5});
+        assert_eq!(shown, said);
+        let exact: Value = client.for_people(true).exactly().read(sent).unwrap();
+        assert_eq!(exact["a\u{1b}"][0], "x\ny");
         assert!(matches!(
             to("ftp://127.0.0.1"),
             Err(ClientError::Address { .. })

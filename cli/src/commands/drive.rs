@@ -20,6 +20,7 @@ use tread_api::drive::{
     Drive, DriveRequest, DriveUpdate, DriveView, DriverName, Nothing, StopWords,
 };
 use tread_api::safety::GateCause;
+use tread_api::text::escaped;
 
 use super::keys::Keyboard;
 use super::robots::{link_name, mode_name};
@@ -158,6 +159,7 @@ pub(super) async fn run(arguments: &DriveArguments, client: &Client) -> anyhow::
     let (keyboard, mut pressed) = Keyboard::read();
     let ended = Driving {
         terminal: &terminal,
+        client,
         arguments,
         keys: Keys::default(),
         has_lease: false,
@@ -192,6 +194,7 @@ async fn send(socket: &mut Socket, request: &DriveRequest) -> anyhow::Result<()>
 
 struct Driving<'terminal> {
     terminal: &'terminal RawTerminal,
+    client: &'terminal Client,
     arguments: &'terminal DriveArguments,
     keys: Keys,
     has_lease: bool,
@@ -229,7 +232,7 @@ impl Driving<'_> {
                         }
                     }
                     Some(Ok(Message::Close(frame))) => {
-                        let why = frame.map(|frame| frame.reason.to_string());
+                        let why = frame.map(|frame| escaped(&frame.reason).into_owned());
                         bail!("the server closed the connection: {}", why.unwrap_or_default());
                     }
                     Some(Ok(_)) => {}
@@ -278,8 +281,10 @@ impl Driving<'_> {
     }
 
     fn read(&mut self, text: &str) -> anyhow::Result<()> {
-        let update: DriveUpdate =
-            serde_json::from_str(text).context("the server said something not known here")?;
+        let update: DriveUpdate = self
+            .client
+            .read(text.as_bytes())
+            .context("the server said something not known here")?;
         match update {
             DriveUpdate::Welcome { .. } => Ok(()),
             DriveUpdate::Leased(lease) => {

@@ -1,13 +1,14 @@
-//! `tread login`, `logout`, `whoami`, `token`, `tokens` and `audit`.
+//! `tread login`, `logout`, `whoami`, `token` and `tokens`.
 
 use std::io::{IsTerminal as _, Read as _};
 use std::process::ExitCode;
 
 use anyhow::{Context as _, ensure};
 use serde_json::json;
-use tread_api::identity::{AuditEntry, CreateToken, Session, Token};
+use tread_api::identity::{CreateToken, Role, Session, Token};
+use tread_api::rights::{Rights, Scope};
 
-use crate::args::{AuditArguments, Connection, TokensAction, TokensArguments};
+use crate::args::{Connection, TokensAction, TokensArguments};
 use crate::client::Client;
 use crate::credentials::{self, Store};
 use crate::output::{Output, line, note, or_dash, render, table};
@@ -30,6 +31,7 @@ pub(super) async fn login(connection: &Connection, output: Output) -> anyhow::Re
         Some(&token),
         connection.showing.ca.as_deref(),
     )?;
+    let client = client.for_people(!output.is_json());
     let session = client.session().await?;
     let store = store()?;
     store.keep(client.address(), &token)?;
@@ -80,10 +82,16 @@ pub(super) fn token(client: &Client) -> anyhow::Result<ExitCode> {
 }
 
 fn who(session: &Session) -> String {
+    let (what, place) = (what(session.role, session.rights), &session.sites);
     format!(
-        "{}, {}, until {}",
-        session.name, session.role, session.expires_at
+        "{}, {what}, {place}, until {}",
+        session.name, session.expires_at
     )
+}
+
+/// The role, or the rights of who has none.
+fn what(role: Option<Role>, rights: Rights) -> String {
+    role.map_or_else(|| rights.to_string(), |role| role.to_string())
 }
 
 pub(super) async fn tokens(
@@ -98,11 +106,19 @@ pub(super) async fn tokens(
         Some(TokensAction::Create {
             name,
             role,
+            rights,
+            places,
             valid_days,
         }) => {
+            let sites = match places.as_slice() {
+                [] => Scope::EVERYWHERE,
+                places => Scope::from_names(places.iter().map(String::as_str))?,
+            };
             let request = CreateToken {
                 name,
                 role,
+                rights,
+                sites: sites.into(),
                 valid_days: Some(valid_days),
             };
             let created = client.create_token(&request).await?;
@@ -110,11 +126,14 @@ pub(super) async fn tokens(
                 let Token {
                     name,
                     role,
+                    rights,
+                    sites,
                     expires_at,
                     ..
                 } = &created.token;
+                let what = what(*role, *rights);
                 note(&format!(
-                    "{role} `{name}`, until {expires_at}; it is told this once:"
+                    "`{name}`: {what}, {sites}, until {expires_at}; it is told this once:"
                 ));
             }
             output.show(&created, |created| created.secret.clone())?;
@@ -131,7 +150,8 @@ fn list(tokens: &[Token]) -> String {
     let mut table = table([
         "TOKEN",
         "NAME",
-        "ROLE",
+        "ROLE OR RIGHTS",
+        "FOR",
         "MADE BY",
         "EXPIRES",
         "LAST USED",
@@ -141,45 +161,12 @@ fn list(tokens: &[Token]) -> String {
         table.add_row([
             token.id.to_string(),
             token.name.clone(),
-            token.role.to_string(),
+            what(token.role, token.rights),
+            token.sites.to_string(),
             token.created_by.clone(),
             format!("{:.0}", token.expires_at),
             or_dash(token.last_used_at.map(|at| format!("{at:.0}"))),
             or_dash(token.revoked_at.map(|at| format!("{at:.0}"))),
-        ]);
-    }
-    render(&table)
-}
-
-pub(super) async fn audit(
-    arguments: &AuditArguments,
-    client: &Client,
-    output: Output,
-) -> anyhow::Result<ExitCode> {
-    let who = arguments.who.as_deref();
-    let page = client
-        .audit(who, arguments.refused, arguments.limit)
-        .await?;
-    output.show(&page.items, |entries| audited(entries))?;
-    Ok(ExitCode::SUCCESS)
-}
-
-fn audited(entries: &[AuditEntry]) -> String {
-    let mut table = table(["AT", "WHO", "ROLE", "FROM", "ASKED", "STATUS", "WHAT"]);
-    for entry in entries {
-        let what = entry
-            .what
-            .as_ref()
-            .map(ToString::to_string)
-            .unwrap_or_default();
-        table.add_row([
-            format!("{:.0}", entry.at),
-            or_dash(entry.who.as_ref()),
-            or_dash(entry.role),
-            entry.address.clone(),
-            format!("{} {}", entry.method, entry.path),
-            entry.status.to_string(),
-            what,
         ]);
     }
     render(&table)

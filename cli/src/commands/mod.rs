@@ -1,6 +1,8 @@
 //! The commands that talk to a running server, a file each.
 
 mod alerts;
+mod audit;
+mod authority;
 mod drive;
 mod enrolment;
 mod friction;
@@ -35,6 +37,7 @@ pub(crate) async fn run(command: RemoteCommand, output: Output) -> anyhow::Resul
     let address = address_of(&connection.server);
     let token = credentials::find(address, showing.token_file.as_deref())?;
     let client = Client::new(address, token.as_deref(), showing.ca.as_deref())?;
+    let client = client.for_people(!output.is_json());
     let site = &connection.site;
     match command {
         RemoteCommand::Login(_) | RemoteCommand::Whoami(_) => {
@@ -43,7 +46,10 @@ pub(crate) async fn run(command: RemoteCommand, output: Output) -> anyhow::Resul
         RemoteCommand::Logout(_) => identity::logout(&client, output),
         RemoteCommand::Token(_) => identity::token(&client),
         RemoteCommand::Tokens(arguments) => identity::tokens(arguments, &client, output).await,
-        RemoteCommand::Audit(arguments) => identity::audit(&arguments, &client, output).await,
+        RemoteCommand::Authority(arguments) => {
+            authority::run(arguments.action.as_ref(), &client, output).await
+        }
+        RemoteCommand::Audit(arguments) => audit::run(&arguments, &client, output).await,
         RemoteCommand::Status(_) => sites::status(&client, output).await,
         RemoteCommand::Sites(arguments) => sites::run(arguments, &client, output).await,
         RemoteCommand::Robots(arguments) => match &arguments.action {

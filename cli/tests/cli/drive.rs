@@ -59,7 +59,7 @@ async fn keys_drive_the_robot_over_tls_stop_it_and_every_way_out_restores_the_te
     let mut terminal = yard.drive(yard.port()).await;
     assert!(terminal.is_raw(), "keys do not come singly");
     let lease = yard.agent.state().safety.lease.unwrap();
-    assert_eq!(lease.driver.name, "Ann");
+    assert_eq!(lease.driver.name, "tests: Ann");
     yard.hold(&mut terminal, "w", |speed_m_s| speed_m_s > 0.2)
         .await;
     // The key is let go.

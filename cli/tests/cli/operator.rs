@@ -75,6 +75,26 @@ async fn the_ground_is_drawn_changed_and_asked_about_by_commands() {
         assert!(!yard.table(words).await.trim().is_empty(), "{words:?}");
         yard.json(words).await;
     }
+    // Tables say of which time they are: the end of an hour, not the time that was asked for.
+    for (words, says) in [
+        (
+            &["friction", "terrains", "sand-pit", "--as-of", "90m"][..],
+            "as of ",
+        ),
+        (&["friction", "cells", "--as-of", "90m"], "as of "),
+        (&["friction", "point", "1,1", "--as-of", "90m"], "as of "),
+        (
+            &["friction", "difference", "--from", "150m", "--to", "90m"],
+            "from ",
+        ),
+    ] {
+        let table = yard.table(words).await;
+        let first = table.lines().next().unwrap_or_default();
+        assert!(
+            first.starts_with(says) && first.ends_with(":00:00Z"),
+            "{words:?}: {table}"
+        );
+    }
     // A picture is drawn of any box, whether or not anybody has driven there.
     let picture = yard.folder.path().join("map.png");
     let map = ["friction", "map", "--png", picture.to_str().unwrap()];
@@ -246,5 +266,48 @@ async fn what_went_wrong_has_its_own_exit_code_and_says_what_to_do_next() {
     let nobody = Ran::of(nobody.map(str::to_owned).to_vec()).await;
     assert_eq!(nobody.code, Some(3), "{}", nobody.errors);
     assert!(nobody.errors.contains("tread demo"), "{}", nobody.errors);
+    yard.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_audit_log_is_exported_and_verified_and_what_was_changed_is_named() {
+    let yard = Yard::start().await;
+    for name in ["annex", "quay"] {
+        yard.table(&["sites", "create", name]).await;
+    }
+    yard.table_that_says(&["audit"], "quay").await;
+    let verified = yard.json(&["audit", "verify"]).await;
+    let last_id = verified["last_id"].as_u64().unwrap();
+    assert!(last_id >= 3, "{verified}");
+    let noted = format!("{last_id}:{}", verified["last_hash"].as_str().unwrap());
+    yard.table(&["sites", "create", "field"]).await;
+    yard.table_that_says(&["audit"], "field").await;
+    let again = yard.table(&["audit", "verify", "--noted", &noted]).await;
+    assert!(again.contains("entries hold, 1 to "), "{again}");
+    let foreign = format!("{last_id}:{}", "0".repeat(64));
+    let refused = yard.run(&["audit", "verify", "--noted", &foreign]).await;
+    assert_eq!(refused.code, Some(1), "{}", refused.text);
+    assert!(
+        refused.errors.contains("written anew"),
+        "{}",
+        refused.errors
+    );
+
+    let file = yard.folder.path().join("audit.jsonl");
+    let path = file.to_str().unwrap();
+    yard.table(&["audit", "export", "--output", path]).await;
+    let whole = std::fs::read_to_string(&file).unwrap();
+    let again = yard.json(&["audit", "verify", path]).await;
+    assert_eq!(again["verified"], json!(whole.lines().count()));
+    // One entry of it says something else.
+    std::fs::write(
+        &file,
+        whole.replacen("\"id\":\"quay\"", "\"id\":\"quai\"", 1),
+    )
+    .unwrap();
+    let refused = yard.run(&["audit", "verify", path]).await;
+    assert_eq!(refused.code, Some(1), "{}", refused.text);
+    let changed = "entry 3 was changed after it was written";
+    assert!(refused.errors.contains(changed), "{}", refused.errors);
     yard.end().await;
 }

@@ -1,6 +1,6 @@
 //! `tread watch`: a picture in a terminal, a line for each change elsewhere.
 
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Stdio};
 
 use crate::terminal::eventually;
 use crate::yard::{ROBOT, Yard};
@@ -38,7 +38,7 @@ async fn without_a_terminal_each_change_is_a_line_and_a_lost_server_is_said() {
         std::fs::File::create(&lines).unwrap(),
         std::fs::File::create(at("errors")).unwrap(),
     );
-    let mut watch = Command::new(env!("CARGO_BIN_EXE_tread"))
+    let watch = Command::new(env!("CARGO_BIN_EXE_tread"))
         .args(["watch", "--site", "yard", "--ca", &at("cert.pem")])
         .args(["--server", &format!("https://localhost:{}", yard.port())])
         .args(["--token-file", &at("token")])
@@ -47,6 +47,7 @@ async fn without_a_terminal_each_change_is_a_line_and_a_lost_server_is_said() {
         .stderr(errors)
         .spawn()
         .unwrap();
+    let _watch = Ended(watch);
     let said = |name: &str| std::fs::read_to_string(at(name)).unwrap();
     eventually("the robot is said", || {
         said("lines").contains(&format!("robot    {ROBOT}  online, idle"))
@@ -54,7 +55,7 @@ async fn without_a_terminal_each_change_is_a_line_and_a_lost_server_is_said() {
     .await;
     yard.table(&["stop", ROBOT, "--by", "Ann"]).await;
     eventually("the stop is said", || {
-        said("lines").contains("STOPPED by Ann")
+        said("lines").contains("STOPPED by tests: Ann")
     })
     .await;
     let count = |text: &str| said("lines").matches(text).count();
@@ -64,7 +65,16 @@ async fn without_a_terminal_each_change_is_a_line_and_a_lost_server_is_said() {
         said("errors").contains("trying again")
     })
     .await;
-    watch.kill().unwrap();
-    watch.wait().unwrap();
     yard.agent.stop().await;
+}
+
+/// A program that ends with its test, however that ends.
+struct Ended(Child);
+
+impl Drop for Ended {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
 }

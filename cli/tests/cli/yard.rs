@@ -7,7 +7,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 use tread_agent::sim::scenario::Scenario;
 use tread_agent::{Agent, AgentConfig, RunningAgent};
-use tread_server::app::identity::FirstAdmin;
+use tread_server::app::identity::tokens::FirstAdmin;
 use tread_server::config::{FrictionConfig, RetentionConfig, StorageConfig, TlsFiles, WebConfig};
 use tread_server::{Config, RunningServer, Server};
 
@@ -47,6 +47,7 @@ impl Yard {
                 key: at("key.pem"),
             }),
             robots: None,
+            audit: tread_server::config::AuditConfig::default(),
             web: WebConfig::default(),
         });
         let server = server.await.unwrap();

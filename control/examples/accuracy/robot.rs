@@ -2,7 +2,9 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use tread_control::estimation::{Estimator, SensorNoise, SensorSample, TyrePrior, UpdateOutcome};
+use tread_control::estimation::{
+    Estimator, EstimatorPrior, SensorNoise, SensorSample, TyrePrior, UpdateOutcome,
+};
 use tread_control::friction::{FrictionCurve, FrictionSpec};
 use tread_control::geometry::Pose;
 use tread_control::localisation::{Localisation, LocalisationNoise, PositionFix};
@@ -95,11 +97,15 @@ impl SeededRobot {
             ..PlantSpec::default()
         };
         let model = spec.model;
+        let prior = EstimatorPrior {
+            tyres: spec.told_tyres,
+            ..EstimatorPrior::exact()
+        };
         let mut robot = Self {
             model,
             plant: Plant::new(model, plant_spec, start).expect("a scenario's plant is valid"),
             ground: Ground::uniform(spec.curve),
-            estimator: Estimator::with_tyres(model, spec.noise, spec.told_tyres),
+            estimator: Estimator::with_prior(model, spec.noise, prior),
             localisation: Localisation::new(model, LocalisationNoise::default()),
             spec,
             torque_gain: [1.0; 2],

@@ -398,10 +398,10 @@ fn sweeps(all: &mut Vec<Scenario>) {
 
 /// Tyres of a smooth curve; the truth is their initial slope.
 fn tyres(all: &mut Vec<Scenario>) {
-    // κ = 1/(3λ_m) of 0.46 to 2.88: mean 1.67, standard deviation 0.7.
+    // κ = 1/(3λ_m) of 0.46 to 2.88, mean 1.67, standard deviation 0.7, at θ = 0.2.
     let told = TyrePrior {
-        curvature: 1.67,
-        curvature_spread: 0.7,
+        curvature: 0.2 * 1.67,
+        curvature_std_dev: 0.2 * 0.7,
         ..TyrePrior::default()
     };
     for (who, told_tyres, goal) in [

@@ -17,12 +17,6 @@ use tread_control::robot::RobotModel;
 
 /// Time of a step: every fast sensor speaks in each.
 pub(crate) const STEP_S: f64 = 0.01;
-/// Steps between two poses.
-const STEPS_PER_POSE: u64 = 10;
-/// Steps between two words of odometry.
-const STEPS_PER_ODOMETRY: u64 = 5;
-/// Counts of an encoder in a turn of its wheel.
-const COUNTS: f64 = 2_048.0;
 const GRAVITY_M_S2: f64 = 9.81;
 
 /// What is wrong.
@@ -63,13 +57,132 @@ pub(crate) struct Kit {
     pub(crate) has_accelerometer: bool,
     /// Whether it drives onto ice at times.
     pub(crate) meets_ice: bool,
+    /// Whether its base, its sensors and its courses are the usual ones, or drawn from its seed.
+    pub(crate) make: Make,
 }
+
+/// By whom a robot is made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Make {
+    /// The one on which the monitor's bounds were chosen.
+    Usual,
+    /// Another one for each seed: none was looked at for that.
+    Other,
+}
+
+/// How a robot is made: figures of its base, its sensors and its courses.
+#[derive(Debug, Clone, Copy)]
+struct Build {
+    /// Counts of an encoder in a turn of its wheel.
+    encoder_counts: f64,
+    /// Memory of the base's filter of the wheel speeds, seconds.
+    wheels_filter_s: f64,
+    /// How wheels follow their command: delay, lag, and most acceleration.
+    command_delay_steps: usize,
+    wheels_lag_s: f64,
+    wheels_most_rad_s2: f64,
+    /// Slip over the force that it gives, in seconds: ahead and to the left, and in yaw.
+    slip_s: (f64, f64),
+    mu: f64,
+    gyro_noise_rad_s: f64,
+    acceleration_noise_m_s2: f64,
+    odometry_noise_m_s: f64,
+    steps_per_odometry: u64,
+    steps_per_pose: u64,
+    /// How late poses come, in steps.
+    pose_late: (f64, f64),
+    pose_noise: (f64, f64),
+    /// A part of that which lasts for seconds, metres.
+    pose_wander_m: f64,
+    /// Most change of speed that is commanded, and the fastest.
+    most_m_s2: f64,
+    most_rad_s2: f64,
+    fastest: f64,
+    /// The fastest that wheels reach when the battery is low, radians per second.
+    low_rad_s: f64,
+}
+
+impl Build {
+    const USUAL: Self = Self {
+        encoder_counts: 2_048.0,
+        wheels_filter_s: 0.0,
+        command_delay_steps: 0,
+        wheels_lag_s: 0.08,
+        wheels_most_rad_s2: 60.0,
+        slip_s: (0.06, 0.06),
+        mu: 0.6,
+        gyro_noise_rad_s: 0.005,
+        acceleration_noise_m_s2: 0.3,
+        odometry_noise_m_s: 0.03,
+        steps_per_odometry: 5,
+        steps_per_pose: 10,
+        pose_late: (5.0, 20.0),
+        pose_noise: (0.02, 0.008),
+        pose_wander_m: 0.0,
+        most_m_s2: 0.8,
+        most_rad_s2: 3.0,
+        fastest: 1.0,
+        low_rad_s: 9.0,
+    };
+
+    fn other(random: &mut ChaCha8Rng) -> Self {
+        let mut between = |least: f64, most: f64| least + (most - least) * random.random::<f64>();
+        let one_of = |of: &[f64], at: f64| {
+            #[expect(
+                clippy::cast_precision_loss,
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "an index into a few"
+            )]
+            let index = (at * of.len() as f64) as usize;
+            of[index.min(of.len() - 1)]
+        };
+        let encoder_counts = one_of(&[512.0, 1_024.0, 4_096.0, 16_384.0], between(0.0, 1.0));
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a few steps"
+        )]
+        let steps = |steps: f64| steps as u64;
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a few steps"
+        )]
+        let command_delay_steps = between(0.0, 8.0) as usize;
+        Self {
+            encoder_counts,
+            wheels_filter_s: between(0.0, 0.06),
+            command_delay_steps,
+            wheels_lag_s: between(0.04, 0.14),
+            wheels_most_rad_s2: between(30.0, 100.0),
+            slip_s: (between(0.03, 0.1), between(0.03, 0.1)),
+            mu: between(0.35, 0.9),
+            gyro_noise_rad_s: between(0.001, 0.02),
+            acceleration_noise_m_s2: between(0.05, 0.4),
+            odometry_noise_m_s: between(0.01, 0.05),
+            steps_per_odometry: steps(one_of(&[2.0, 5.0, 10.0], between(0.0, 1.0))),
+            steps_per_pose: steps(one_of(&[5.0, 10.0, 10.0, 20.0], between(0.0, 1.0))),
+            pose_late: (between(1.0, 8.0), between(9.0, 25.0)),
+            pose_noise: (between(0.005, 0.025), between(0.002, 0.01)),
+            pose_wander_m: between(0.0, 0.02),
+            most_m_s2: between(0.4, 1.5),
+            most_rad_s2: between(1.5, 4.0),
+            fastest: between(0.6, 1.2),
+            low_rad_s: between(7.0, 12.0),
+        }
+    }
+}
+
+/// Time constant of the part of a pose's noise that lasts, seconds.
+const WANDER_S: f64 = 4.0;
 
 /// The robot.
 pub(crate) struct Robot {
     pub(crate) model: RobotModel,
     pub(crate) monitor: Monitor,
     kit: Kit,
+    build: Build,
     random: ChaCha8Rng,
     step: u64,
     // What is true.
@@ -86,11 +199,16 @@ pub(crate) struct Robot {
     // How it is driven.
     target: Twist,
     commanded: Twist,
+    /// What the base has heard and not followed yet.
+    on_the_way: VecDeque<Twist>,
     until: u64,
     // How its sensors are.
     track_ratio: f64,
     radius_ratio: [f64; 2],
     counts: [f64; 2],
+    said_wheels: WheelSpeeds,
+    odometry_ratio: f64,
+    wander: [f64; 2],
     gyro_bias_rad_s: f64,
     lean_m_s2: f64,
     poses: VecDeque<(u64, Sample)>,
@@ -105,6 +223,10 @@ impl Robot {
     pub(crate) fn new(seed: u64, kit: Kit) -> Self {
         let model = RobotModel::yi2007();
         let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let build = match kit.make {
+            Make::Usual => Build::USUAL,
+            Make::Other => Build::other(&mut random),
+        };
         let mut within = |most: f64| most * (2.0 * random.random::<f64>() - 1.0);
         let track_ratio = 1.0 + within(0.12);
         let radius_ratio = [1.0 + within(0.015), 1.0 + within(0.015)];
@@ -118,6 +240,7 @@ impl Robot {
             monitor: Monitor::new(model),
             model,
             kit,
+            build,
             random,
             step: 0,
             pose,
@@ -127,15 +250,19 @@ impl Robot {
             acceleration: BodyAcceleration::default(),
             wheels: [0.0; 2],
             angles: [0.0; 2],
-            mu: 0.6,
+            mu: build.mu,
             ice_until: 0,
             ice_ended: 0,
             target: Twist::default(),
             commanded: Twist::default(),
+            on_the_way: VecDeque::new(),
             until: 0,
             track_ratio,
             radius_ratio,
             counts: [0.0; 2],
+            said_wheels: WheelSpeeds::default(),
+            odometry_ratio: 1.0,
+            wander: [0.0; 2],
             gyro_bias_rad_s,
             lean_m_s2: 0.0,
             poses: VecDeque::new(),
@@ -183,6 +310,25 @@ impl Robot {
     )]
     pub(crate) fn mend(&mut self) {
         self.fault = None;
+    }
+
+    /// It stands from now on, or drives on.
+    #[cfg_attr(
+        not(test),
+        expect(dead_code, reason = "the report program lets it drive")
+    )]
+    pub(crate) fn rest(&mut self, is_to: bool) {
+        self.target = Twist::default();
+        self.until = if is_to { u64::MAX } else { self.step };
+    }
+
+    /// Odometry says so many times what is true.
+    #[cfg_attr(
+        not(test),
+        expect(dead_code, reason = "the report program breaks one channel at a time")
+    )]
+    pub(crate) fn scale_odometry(&mut self, ratio: f64) {
+        self.odometry_ratio = ratio;
     }
 
     /// Whether what is said is wrong by at least 0.2 rad/s or m/s, or by 0.5 m/s².
@@ -244,7 +390,7 @@ impl Robot {
                 }
             } else {
                 Twist {
-                    linear_m_s: self.between(0.25, 1.0),
+                    linear_m_s: self.between(0.25, self.build.fastest),
                     angular_rad_s: self.between(-0.9, 0.9),
                 }
             };
@@ -261,16 +407,16 @@ impl Robot {
             linear_m_s: toward(
                 self.commanded.linear_m_s,
                 self.target.linear_m_s,
-                0.8 * STEP_S,
+                self.build.most_m_s2 * STEP_S,
             ),
             angular_rad_s: toward(
                 self.commanded.angular_rad_s,
                 self.target.angular_rad_s,
-                3.0 * STEP_S,
+                self.build.most_rad_s2 * STEP_S,
             ),
         };
         if self.kit.meets_ice && self.step >= self.ice_until {
-            self.mu = 0.6;
+            self.mu = self.build.mu;
             if self.chance() < 0.0002 {
                 self.mu = self.between(0.015, 0.06);
                 #[expect(
@@ -286,7 +432,13 @@ impl Robot {
     }
 
     fn move_on(&mut self) {
-        let wanted = self.model.wheel_speeds_from_twist(self.commanded);
+        self.on_the_way.push_back(self.commanded);
+        let heard = if self.on_the_way.len() > self.build.command_delay_steps {
+            self.on_the_way.pop_front().unwrap_or_default()
+        } else {
+            Twist::default()
+        };
+        let wanted = self.model.wheel_speeds_from_twist(heard);
         let mut wanted = [wanted.left_rad_s, wanted.right_rad_s];
         if let Some(Fault::EncodersOfTheBaseScaled(scale)) = self.fault {
             wanted = wanted.map(|speed| speed / scale);
@@ -296,13 +448,14 @@ impl Robot {
         }
         // A battery that is low for a while: the motors reach less than was asked.
         let most = if self.step % 60_000 < 6_000 {
-            9.0
+            self.build.low_rad_s
         } else {
             20.0
         };
         for (wheel, wanted) in self.wheels.iter_mut().zip(wanted) {
-            let change = (wanted.clamp(-most, most) - *wheel) * (STEP_S / 0.08);
-            *wheel += change.clamp(-60.0 * STEP_S, 60.0 * STEP_S);
+            let change = (wanted.clamp(-most, most) - *wheel) * (STEP_S / self.build.wheels_lag_s);
+            let most = self.build.wheels_most_rad_s2 * STEP_S;
+            *wheel += change.clamp(-most, most);
         }
         let radius_m = self.model.wheel_radius_m();
         let rims = [0, 1].map(|side| self.wheels[side] * radius_m * self.radius_ratio[side]);
@@ -311,13 +464,17 @@ impl Robot {
         let rim_rad_s = (rims[1] - rims[0]) / track_m;
         // Slip pulls, at most as hard as the ground can.
         let most_m_s2 = self.mu * GRAVITY_M_S2;
-        let (mut x, mut y) = ((rim_m_s - self.ahead_m_s) / 0.06, -self.left_m_s / 0.08);
+        let (mut x, mut y) = (
+            (rim_m_s - self.ahead_m_s) / self.build.slip_s.0,
+            -self.left_m_s / 0.08,
+        );
         let size = x.hypot(y);
         if size > most_m_s2 {
             (x, y) = (x * most_m_s2 / size, y * most_m_s2 / size);
         }
         let most_rad_s2 = 2.5 * most_m_s2;
-        let yaw = ((rim_rad_s - self.turn_rad_s) / 0.06).clamp(-most_rad_s2, most_rad_s2);
+        let yaw =
+            ((rim_rad_s - self.turn_rad_s) / self.build.slip_s.1).clamp(-most_rad_s2, most_rad_s2);
         self.acceleration = BodyAcceleration {
             ahead_m_s2: x,
             left_m_s2: y,
@@ -338,27 +495,39 @@ impl Robot {
     fn fast_sample(&mut self) -> Sample {
         let walk = 3.0e-4 * STEP_S.sqrt() * self.normal();
         self.gyro_bias_rad_s = (self.gyro_bias_rad_s + walk).clamp(-0.02, 0.02);
-        let gyro = self.turn_rad_s + self.gyro_bias_rad_s + 0.005 * self.normal();
+        let gyro =
+            self.turn_rad_s + self.gyro_bias_rad_s + self.build.gyro_noise_rad_s * self.normal();
+        let of_a_turn = self.build.encoder_counts;
         let counts = self
             .angles
-            .map(|angle| (angle / std::f64::consts::TAU * COUNTS).floor());
+            .map(|angle| (angle / std::f64::consts::TAU * of_a_turn).floor());
         let rate = |side: usize| {
-            (counts[side] - self.counts[side]) / COUNTS * std::f64::consts::TAU / STEP_S
+            (counts[side] - self.counts[side]) / of_a_turn * std::f64::consts::TAU / STEP_S
         };
+        let share = STEP_S / (STEP_S + self.build.wheels_filter_s);
+        let filtered = |before: f64, now: f64| before + share * (now - before);
         let wheels = WheelSpeeds {
-            left_rad_s: rate(0),
-            right_rad_s: rate(1),
+            left_rad_s: filtered(self.said_wheels.left_rad_s, rate(0)),
+            right_rad_s: filtered(self.said_wheels.right_rad_s, rate(1)),
         };
+        self.said_wheels = wheels;
         self.counts = counts;
         let acceleration = self.kit.has_accelerometer.then(|| {
             self.lean_m_s2 = 0.5 * (0.05 * self.time_s()).sin();
             BodyAcceleration {
-                ahead_m_s2: self.acceleration.ahead_m_s2 + self.lean_m_s2 + 0.3 * self.normal(),
-                left_m_s2: self.acceleration.left_m_s2 - 0.1 + 0.3 * self.normal(),
+                ahead_m_s2: self.acceleration.ahead_m_s2
+                    + self.lean_m_s2
+                    + self.build.acceleration_noise_m_s2 * self.normal(),
+                left_m_s2: self.acceleration.left_m_s2 - 0.1
+                    + self.build.acceleration_noise_m_s2 * self.normal(),
             }
         });
-        let says_odometry = self.kit.has_odometry && self.step.is_multiple_of(STEPS_PER_ODOMETRY);
-        let odometry = says_odometry.then(|| self.ahead_m_s + 0.03 * self.normal());
+        let says_odometry =
+            self.kit.has_odometry && self.step.is_multiple_of(self.build.steps_per_odometry);
+        let odometry = says_odometry.then(|| {
+            let said_m_s = self.ahead_m_s + self.build.odometry_noise_m_s * self.normal();
+            self.odometry_ratio * said_m_s
+        });
         Sample {
             at: Duration::from_millis(10 * self.step),
             gyro_rad_s: Some(gyro),
@@ -370,10 +539,18 @@ impl Robot {
     }
 
     fn measure_pose(&mut self) {
+        let (noise_m, noise_rad) = self.build.pose_noise;
+        #[expect(clippy::cast_precision_loss, reason = "a few steps")]
+        let since_s = self.build.steps_per_pose as f64 * STEP_S;
+        let keep = (-since_s / WANDER_S).exp();
+        let new_m = (1.0 - keep * keep).sqrt() * self.build.pose_wander_m;
+        for axis in 0..2 {
+            self.wander[axis] = keep * self.wander[axis] + new_m * self.normal();
+        }
         let mut pose = Pose {
-            x_m: self.pose.x_m + 0.02 * self.normal(),
-            y_m: self.pose.y_m + 0.02 * self.normal(),
-            heading_rad: self.pose.heading_rad + 0.008 * self.normal(),
+            x_m: self.pose.x_m + self.wander[0] + noise_m * self.normal(),
+            y_m: self.pose.y_m + self.wander[1] + noise_m * self.normal(),
+            heading_rad: self.pose.heading_rad + noise_rad * self.normal(),
         };
         let said = pose;
         if self.chance() < 0.005 {
@@ -402,7 +579,7 @@ impl Robot {
         if self.fault.is_none() {
             self.said.position = Some(said);
         }
-        let late = self.between(5.0, 20.0);
+        let late = self.between(self.build.pose_late.0, self.build.pose_late.1);
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
@@ -493,7 +670,7 @@ impl Robot {
             ..sample
         };
         self.monitor.take(&sample);
-        if self.step.is_multiple_of(STEPS_PER_POSE) {
+        if self.step.is_multiple_of(self.build.steps_per_pose) {
             self.measure_pose();
         }
         while self.poses.front().is_some_and(|(due, _)| *due <= self.step) {

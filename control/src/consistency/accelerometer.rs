@@ -22,6 +22,15 @@ const GAIN_MAX: f64 = 1.6;
 const GAIN_AGREES: f64 = 0.5;
 /// Gain below which it is inverted.
 const GAIN_INVERTED: f64 = -0.3;
+/// Gain that ice does not give: wheels that slip speed up while the body slows down, but not as much.
+const GAIN_OF_ICE: f64 = -0.5;
+/// How far below that gain must be for how long, seconds: longer than the wheels may lag.
+const INVERTED_S: f64 = 0.35;
+/// Excitation, squared, that shows the sign: at least this, and noise beside it.
+const SIGN_MIN: f64 = 0.06;
+/// What a change of speed weighs against a turn.
+const SIGN_AHEAD: f64 = 0.6;
+const SIGN_NOISE: f64 = 0.015;
 /// Standard deviations of the gain that are let be.
 const DEVIATIONS: f64 = 4.0;
 /// Change of what is expected while it is frozen, metres per second squared.
@@ -62,6 +71,8 @@ pub(super) struct Accelerometer {
     sums: [f64; 4],
     /// What was expected when it froze.
     frozen_from: Option<[f64; 2]>,
+    /// Cumulative sum of the evidence that it is inverted, seconds.
+    inverted_s: f64,
     verdict: Option<Finding>,
     is_healthy: bool,
 }
@@ -117,9 +128,13 @@ impl Accelerometer {
         self.ahead.take(felt[0], expected[0]);
         self.left.take(felt[1], expected[1]);
         let gain = self.regress();
+        if !repeats.is_repeating() {
+            self.sign();
+        }
         self.verdict = self
             .frozen(repeats, felt, expected)
             .or_else(|| impossible(felt, expected))
+            .or_else(|| self.inverted())
             .or_else(|| self.scaled(gain));
         self.is_healthy = self.verdict.is_none()
             && !repeats.is_frozen()
@@ -159,6 +174,40 @@ impl Accelerometer {
         Some((product / square, deviation))
     }
 
+    /// Looks whether what is felt and what is expected have the same sign.
+    fn sign(&mut self) {
+        let square = self.ahead.expected.powi(2) + self.left.expected.powi(2);
+        if square < SIGN_MIN {
+            return;
+        }
+        let product = self.ahead.felt * self.ahead.expected + self.left.felt * self.left.expected;
+        let gain = (product / (square + SIGN_NOISE)).clamp(-1.0, 1.0);
+        // Wheels that slip speed up while the body slows down; in a turn it still goes their way.
+        let weight = if self.ahead.expected.abs() > self.left.expected.abs() {
+            SIGN_AHEAD
+        } else {
+            1.0
+        };
+        let evidence_s = weight * BIN_S * (GAIN_OF_ICE - gain);
+        self.inverted_s = (self.inverted_s + evidence_s).clamp(0.0, 1.0);
+    }
+
+    fn inverted(&self) -> Option<Finding> {
+        (self.inverted_s >= INVERTED_S).then(|| {
+            let axis = self.stronger();
+            finding(Kind::Inverted, axis.felt, axis.expected)
+        })
+    }
+
+    /// The axis that is excited more.
+    fn stronger(&self) -> Axis {
+        if self.ahead.expected.abs() > self.left.expected.abs() {
+            self.ahead
+        } else {
+            self.left
+        }
+    }
+
     fn scaled(&self, gain: Option<(f64, f64)>) -> Option<Finding> {
         let (gain, deviation) = gain?;
         let slack = DEVIATIONS * deviation;
@@ -169,11 +218,7 @@ impl Accelerometer {
         } else {
             return None;
         };
-        let axis = if self.ahead.expected.abs() > self.left.expected.abs() {
-            self.ahead
-        } else {
-            self.left
-        };
+        let axis = self.stronger();
         Some(finding(kind, gain * axis.expected, axis.expected))
     }
 

@@ -1,22 +1,39 @@
 //! Position fixes against dead reckoning: jumps at once, speeds and turn rates over a span.
 //!
-//! Each half of a span gives the median of what fixes and dead reckoning differ by, so that one
-//! wild fix moves neither; the difference of both medians over the time between them is a speed.
+//! What fixes and dead reckoning differ by is fitted, by least squares, with a straight line that
+//! bends where the span begins:
+//! ```text
+//! e(t) = a + s·t + b·max(0, t − begin)      s ~ N(0, usual error), a and b free
+//! ```
+//! The fixes before the span say where it began, better than those in it could, so that a fault that
+//! began with the span shows soon; `s + b` is the speed by which both differ in the span. A wild fix
+//! between two that agree is left out, and what does not fit the line counts as noise.
 
 use super::history::{Edge, History};
 use crate::geometry::{Point, Pose, wrap_angle_rad};
 use crate::localisation::FixNoise;
 
-/// Fixes that are kept: two seconds of 20 Hz.
-const FIXES: usize = 40;
-/// Fewest fixes in half a span.
-const HALF_MIN: usize = 3;
+/// Fixes that are kept: the longest span and what is before it, of 20 Hz.
+const FIXES: usize = 52;
+/// Fewest fixes in a span, and with those before it.
+const FIXES_MIN: (usize, usize) = (3, 5);
+/// How long before a span fixes still say where it began, seconds.
+const BEFORE_S: f64 = 0.6;
+/// Usual speeds by which fixes and right channels differ, metres and radians per second: slip, and
+/// what the gyro is off by.
+const USUAL: (f64, f64) = (0.06, 0.03);
+/// What the error of fixes that follow each other walks off, metres and radians per root of a second:
+/// not all of their noise is new with each.
+const DRIFT: (f64, f64) = (0.01, 0.002);
+/// Deviations, of a fix, from both of its neighbours that make it a wild one.
+const WILD_DEVIATIONS: f64 = 6.0;
 /// Smallest deviation of a fix that is assumed, metres and radians.
 const DEVIATION_MIN: (f64, f64) = (0.02, 0.008);
 /// Standard deviations that noise is let reach; spans overlap, so there are few independent ones.
-const DEVIATIONS: f64 = 5.5;
-/// Standard deviation of a median over that of a mean.
-const MEDIAN_RATIO: f64 = 1.25;
+const DEVIATIONS: f64 = 4.3;
+/// The same of spans shorter than this, seconds.
+const DEVIATIONS_SHORT: f64 = 5.0;
+const SHORT_S: f64 = 0.5;
 /// Shortest jump that is one, metres; smaller ones are a matter of localisation.
 const JUMP_M: f64 = 0.5;
 /// The same of the heading, radians.
@@ -94,7 +111,7 @@ impl Fix {
 #[expect(clippy::struct_field_names, reason = "units stand last")]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Seen {
-    /// When the span's halves lie.
+    /// When the span begins and ends.
     pub(super) from_s: f64,
     pub(super) to_s: f64,
     /// Ahead and to the left over dead reckoning's, metres per second.
@@ -105,9 +122,11 @@ pub(super) struct Seen {
     /// Turn rate over the gyro's, and over the wheels', radians per second.
     pub(super) turn_error_rad_s: f64,
     pub(super) wheels_turn_error_rad_s: f64,
-    /// What noise may do to them.
+    /// What noise may do to the speeds over dead reckoning and over odometry, and to the turn rate.
     pub(super) noise_m_s: f64,
+    pub(super) odometry_noise_m_s: f64,
     pub(super) noise_rad_s: f64,
+    pub(super) wheels_noise_rad_s: f64,
 }
 
 /// A jump of the position.
@@ -128,6 +147,10 @@ pub(super) struct Fixes {
     last_s: Option<f64>,
     /// The last fix where it was expected.
     anchor: Option<Fix>,
+    /// The one before, should that one have been a wild one.
+    before: Option<Fix>,
+    /// How many fixes in a row were, since nothing was known of the place.
+    agreed: u32,
     /// The newest of fixes that agree on another place, the first one's time, and how many.
     elsewhere: Option<(Fix, f64, u32)>,
     jump: Option<Jump>,
@@ -143,6 +166,8 @@ impl Default for Fixes {
             deviations: DEVIATION_MIN,
             last_s: None,
             anchor: None,
+            before: None,
+            agreed: 0,
             elsewhere: None,
             jump: None,
             back_since_s: None,
@@ -167,6 +192,16 @@ impl Fixes {
             jump: self.jump,
             ..Self::default()
         };
+    }
+
+    /// The newest fix that is used.
+    pub(super) fn newest(&self) -> Option<Pose> {
+        (self.count > 0).then(|| self.ring[self.newest].pose)
+    }
+
+    /// Standard deviations of a fix, metres and radians.
+    pub(super) fn deviations(&self) -> (f64, f64) {
+        self.deviations
     }
 
     /// The jump that is not over yet.
@@ -219,14 +254,19 @@ impl Fixes {
                 JUMP_M.max(2.0 * DEVIATIONS * position_m) + JUMP_SLIP_RATIO * driven_m.min(2.0);
             by_m <= most_m && by_rad.abs() <= JUMP_RAD.max(2.0 * DEVIATIONS * heading_rad)
         };
-        if agrees(&anchor) {
+        let with_newest = agrees(&anchor);
+        if with_newest || self.before.is_some_and(|before| agrees(&before)) {
             if self.jump.is_some() {
                 let since_s = *self.back_since_s.get_or_insert(fix.at_s);
                 if fix.at_s - since_s < BACK_AFTER_S {
                     return false;
                 }
             }
+            if with_newest {
+                self.before = Some(anchor);
+            }
             self.forget_jump(fix);
+            self.agreed = self.agreed.saturating_add(1);
             return true;
         }
         self.back_since_s = None;
@@ -236,11 +276,19 @@ impl Fixes {
             Some(_) | None => (fix.at_s, 1),
         };
         self.elsewhere = Some((fix, since_s, count));
+        if count >= JUMP_FIXES && self.agreed < JUMP_FIXES && self.jump.is_none() {
+            // The first fix of all was the wild one.
+            self.count = 0;
+            self.before = None;
+            self.forget_jump(fix);
+            return true;
+        }
         if count >= JUMP_FIXES && self.jump.is_none() {
             self.jump = Some(Jump { by_m, by_rad });
         }
         if self.jump.is_some() && fix.at_s - since_s >= MOVED_AFTER_S {
             self.count = 0;
+            self.before = None;
             self.forget_jump(fix);
             return true;
         }
@@ -257,114 +305,166 @@ impl Fixes {
     /// What the fixes of the last `span_s` seconds say.
     pub(super) fn seen(&self, span_s: f64) -> Option<Seen> {
         let newest = self.ring[self.newest];
-        let reference = newest;
-        let offset_rad = |fix: &Fix| wrap_angle_rad(fix.pose.heading_rad - fix.integrated_rad);
-        let reference_rad = offset_rad(&reference);
-        let mut halves = [Half::default(), Half::default()];
-        let mut angles = [0.0; FIXES];
-        let mut used = 0;
-        // The median angle first: positions are turned by it.
-        for places in 0..self.count {
-            let fix = &self.ring[(self.newest + FIXES - places) % FIXES];
-            if newest.at_s - fix.at_s > span_s {
-                break;
-            }
-            angles[used] = wrap_angle_rad(offset_rad(fix) - reference_rad);
-            used += 1;
-        }
-        if used < 2 * HALF_MIN {
+        let fix = |places: usize| &self.ring[(self.newest + FIXES - places) % FIXES];
+        let age_s = |places: usize| newest.at_s - fix(places).at_s;
+        let within = |most_s: f64| {
+            (0..self.count)
+                .take_while(|places| age_s(*places) <= most_s + 1.0e-9)
+                .count()
+        };
+        let (in_span, used) = (within(span_s), within(span_s + BEFORE_S));
+        if in_span < FIXES_MIN.0 || used < FIXES_MIN.1 || age_s(in_span - 1) < 0.6 * span_s {
             return None;
         }
-        let turned_rad = reference_rad + median(&mut angles[..used]);
+        // The median angle first: positions are turned by it.
+        let offset_rad = |fix: &Fix| wrap_angle_rad(fix.pose.heading_rad - fix.integrated_rad);
+        let reference_rad = offset_rad(&newest);
+        let mut angles = [0.0; FIXES];
+        for (places, angle) in angles.iter_mut().enumerate().take(in_span) {
+            *angle = wrap_angle_rad(offset_rad(fix(places)) - reference_rad);
+        }
+        let turned_rad = reference_rad + median(&mut angles[..in_span]);
         let (sin, cos) = turned_rad.sin_cos();
-        let middle = &self.ring[(self.newest + FIXES - used / 2) % FIXES];
-        let (middle_sin, middle_cos) = middle.integrated_rad.sin_cos();
+        let (middle_sin, middle_cos) = fix(in_span / 2).integrated_rad.sin_cos();
+        let mut errors = [[0.0; COLUMNS]; FIXES];
+        let mut times_s = [0.0; FIXES];
         for places in 0..used {
-            let fix = &self.ring[(self.newest + FIXES - places) % FIXES];
+            let fix = fix(places);
             let (x_m, y_m) = (
-                fix.pose.x_m - reference.pose.x_m,
-                fix.pose.y_m - reference.pose.y_m,
+                fix.pose.x_m - newest.pose.x_m,
+                fix.pose.y_m - newest.pose.y_m,
             );
-            let east_m = cos * x_m + sin * y_m - (fix.integrated.x_m - reference.integrated.x_m);
-            let north_m = cos * y_m - sin * x_m - (fix.integrated.y_m - reference.integrated.y_m);
+            let east_m = cos * x_m + sin * y_m - (fix.integrated.x_m - newest.integrated.x_m);
+            let north_m = cos * y_m - sin * x_m - (fix.integrated.y_m - newest.integrated.y_m);
             let ahead_m = middle_cos * east_m + middle_sin * north_m;
             let left_m = middle_cos * north_m - middle_sin * east_m;
             let turned_rad = wrap_angle_rad(offset_rad(fix) - reference_rad);
-            let half = &mut halves[usize::from(2 * places >= used)];
-            let odometry_m = ahead_m - (fix.odometry_lead_m - reference.odometry_lead_m);
-            let by_wheels_rad = turned_rad - (fix.wheels_lead_rad - reference.wheels_lead_rad);
-            half.add(
-                fix.at_s,
-                [ahead_m, left_m, odometry_m, turned_rad, by_wheels_rad],
-            );
+            times_s[places] = fix.at_s - newest.at_s;
+            errors[places] = [
+                ahead_m,
+                left_m,
+                ahead_m - (fix.odometry_lead_m - newest.odometry_lead_m),
+                turned_rad,
+                turned_rad - (fix.wheels_lead_rad - newest.wheels_lead_rad),
+            ];
         }
-        let [late, early] = &mut halves;
-        let fewest = late.count.min(early.count);
-        if fewest < HALF_MIN {
-            return None;
-        }
-        let (to_s, late) = late.median();
-        let (from_s, early) = early.median();
-        let between_s = to_s - from_s;
-        if between_s < 0.25 * span_s {
-            return None;
-        }
-        let rate = |index: usize| (late[index] - early[index]) / between_s;
-        #[expect(clippy::cast_precision_loss, reason = "there are few fixes")]
-        let share = DEVIATIONS * MEDIAN_RATIO * (2.0 / fewest as f64).sqrt() / between_s;
+        let (position_m, heading_rad) = self.deviations;
+        let fit = |column: usize| {
+            let (deviation, usual) = if column < HEADING {
+                (position_m, USUAL.0)
+            } else {
+                (heading_rad, USUAL.1)
+            };
+            let points = (0..used).map(|places| (times_s[places], errors[places][column]));
+            let away = |one: usize, other: usize| errors[one][column] - errors[other][column];
+            let most = WILD_DEVIATIONS * deviation;
+            let wild = |places: usize| match places {
+                // The newest: the next one will say.
+                0 => away(0, 1).abs() > most && away(1, 2).abs() < 0.5 * most,
+                _ if places + 1 == used => false,
+                _ => {
+                    let (later, earlier) = (away(places, places - 1), away(places, places + 1));
+                    later.abs() > most && earlier.abs() > most && later * earlier > 0.0
+                }
+            };
+            let points = points
+                .enumerate()
+                .filter(|(places, _)| !wild(*places))
+                .map(|(_, point)| point);
+            let bend = Bend {
+                begin_s: -span_s,
+                deviation,
+                usual,
+            };
+            let (speed, spread) = bend.fit(points)?;
+            let drift = if column < HEADING { DRIFT.0 } else { DRIFT.1 };
+            Some((speed, spread.hypot(drift / span_s.sqrt())))
+        };
+        let [ahead, left, odometry, turn, wheels_turn] = [0, 1, 2, 3, 4].map(fit);
+        let (ahead, left, odometry) = (ahead?, left?, odometry?);
+        let (turn, wheels_turn) = (turn?, wheels_turn?);
+        // Few fixes are in a short span, and there are many such spans.
+        let deviations = if span_s < SHORT_S {
+            DEVIATIONS_SHORT
+        } else {
+            DEVIATIONS
+        };
         Some(Seen {
-            from_s,
-            to_s,
-            ahead_error_m_s: rate(0),
-            left_error_m_s: rate(1),
-            odometry_error_m_s: rate(2),
-            turn_error_rad_s: rate(3),
-            wheels_turn_error_rad_s: rate(4),
-            noise_m_s: share * self.deviations.0,
-            noise_rad_s: share * self.deviations.1,
+            from_s: newest.at_s - span_s,
+            to_s: newest.at_s,
+            ahead_error_m_s: ahead.0,
+            left_error_m_s: left.0,
+            odometry_error_m_s: odometry.0,
+            turn_error_rad_s: turn.0,
+            wheels_turn_error_rad_s: wheels_turn.0,
+            noise_m_s: deviations * ahead.1.max(left.1),
+            odometry_noise_m_s: deviations * odometry.1,
+            noise_rad_s: deviations * turn.1,
+            wheels_noise_rad_s: deviations * wheels_turn.1,
         })
     }
 }
 
-/// What is compared of a fix.
+/// What is compared of a fix, and the first column that is an angle.
 const COLUMNS: usize = 5;
+const HEADING: usize = 3;
 
-/// Half of a span.
+/// A line that bends.
 #[derive(Debug, Clone, Copy)]
-struct Half {
-    count: usize,
-    at_s: f64,
-    values: [[f64; FIXES]; COLUMNS],
+struct Bend {
+    begin_s: f64,
+    deviation: f64,
+    /// The usual speed before it bends.
+    usual: f64,
 }
 
-impl Default for Half {
-    fn default() -> Self {
-        Self {
-            count: 0,
-            at_s: 0.0,
-            values: [[0.0; FIXES]; COLUMNS],
+impl Bend {
+    /// The speed behind the bend, and its standard deviation.
+    fn fit(&self, points: impl Iterator<Item = (f64, f64)> + Clone) -> Option<(f64, f64)> {
+        let basis = |at_s: f64| [1.0, at_s, (at_s - self.begin_s).max(0.0)];
+        let (mut normal, mut right) = ([[0.0; 3]; 3], [0.0; 3]);
+        let mut count: f64 = 0.0;
+        for (at_s, value) in points.clone() {
+            let row = basis(at_s);
+            for i in 0..3 {
+                for j in 0..3 {
+                    normal[i][j] += row[i] * row[j];
+                }
+                right[i] += row[i] * value;
+            }
+            count += 1.0;
         }
+        normal[1][1] += (self.deviation / self.usual).powi(2);
+        let inverse = inverse(&normal)?;
+        let solution = [0, 1, 2].map(|i| {
+            let row: &[f64; 3] = &inverse[i];
+            row[0] * right[0] + row[1] * right[1] + row[2] * right[2]
+        });
+        let residual: f64 = points
+            .map(|(at_s, value)| {
+                let row = basis(at_s);
+                let fitted = row[0] * solution[0] + row[1] * solution[1] + row[2] * solution[2];
+                (value - fitted).powi(2)
+            })
+            .sum();
+        let variance = (residual / (count - 2.0).max(1.0)).max(self.deviation.powi(2));
+        let spread = inverse[1][1] + 2.0 * inverse[1][2] + inverse[2][2];
+        Some((solution[1] + solution[2], (variance * spread).sqrt()))
     }
 }
 
-impl Half {
-    fn add(&mut self, at_s: f64, values: [f64; COLUMNS]) {
-        self.at_s += at_s;
-        for (column, value) in self.values.iter_mut().zip(values) {
-            column[self.count] = value;
-        }
-        self.count += 1;
+/// The inverse of a symmetric matrix; none if there is none.
+fn inverse(matrix: &[[f64; 3]; 3]) -> Option<[[f64; 3]; 3]> {
+    let minor = |row: usize, column: usize| {
+        let rows = [(row + 1) % 3, (row + 2) % 3].map(|row| matrix[row]);
+        let (left, right) = ((column + 1) % 3, (column + 2) % 3);
+        rows[0][left] * rows[1][right] - rows[0][right] * rows[1][left]
+    };
+    let determinant = (0..3)
+        .map(|column| matrix[0][column] * minor(0, column))
+        .sum::<f64>();
+    if determinant.is_nan() || determinant <= 1.0e-12 {
+        return None;
     }
-
-    /// Mean time, and the median of each column.
-    fn median(&mut self) -> (f64, [f64; COLUMNS]) {
-        let count = self.count;
-        #[expect(clippy::cast_precision_loss, reason = "there are few fixes")]
-        let at_s = self.at_s / count as f64;
-        let mut medians = [0.0; COLUMNS];
-        for (found, column) in medians.iter_mut().zip(&mut self.values) {
-            *found = median(&mut column[..count]);
-        }
-        (at_s, medians)
-    }
+    Some([0, 1, 2].map(|row| [0, 1, 2].map(|column| minor(column, row) / determinant)))
 }

@@ -16,24 +16,31 @@
 //!            contradicts for RAISE_S                       agrees for CLEAR_S, while excited
 //! consistent ───────────────────────► finding that stands ──────────────────────────────► consistent
 //! ```
+//! How findings end, also at rest, is [`track`]'s matter; who is compared with whom, [`verdict`]'s.
 //! Pure, without allocation.
 
 mod accelerometer;
+mod findings;
 mod fixes;
 mod history;
 mod repeats;
+mod track;
+mod turn_gain;
 mod verdict;
 
 use std::time::Duration;
 
-use crate::geometry::{Pose, Twist};
+use crate::geometry::{Pose, Twist, wrap_angle_rad};
 use crate::localisation::FixNoise;
 use crate::measured::{BodyAcceleration, WheelSpeeds};
 use crate::robot::RobotModel;
 use accelerometer::Accelerometer;
+pub use findings::{Consequence, Finding, Findings, Kind, Subject, Unit};
 use fixes::{Fixes, Seen};
 use history::{BIN_S, History};
 use repeats::Repeats;
+use track::Track;
+use turn_gain::TurnGain;
 use verdict::Verdicts;
 
 /// Longest pause between two samples over which motion is followed.
@@ -41,170 +48,7 @@ const GAP_MAX: Duration = Duration::from_millis(250);
 /// Oldest fix that still says how the robot moves, seconds.
 const FIX_AGE_MAX_S: f64 = 0.8;
 /// Spans over which fixes are compared, seconds: quick for large errors, slow for small ones.
-const SPANS_S: [f64; 2] = [1.0, 2.0];
-/// How long a channel must agree until its finding ends, seconds.
-const CLEAR_S: f64 = 2.0;
-
-/// What a finding is about.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub enum Subject {
-    /// The wheels' measured speeds.
-    Wheels,
-    /// The gyro.
-    Gyro,
-    /// The accelerometer.
-    Accelerometer,
-    /// Odometry: the measured speed of the body over ground.
-    Odometry,
-    /// The position fixes.
-    Position,
-    /// The left wheels stand though they are commanded to turn.
-    LeftWheels,
-    /// The right wheels do.
-    RightWheels,
-    /// Wheels and body disagree, by slip or by a sensor: nothing distinguishes them.
-    WheelsAndMotion,
-    /// Channels that say how the body moves disagree, and nothing tells which is right.
-    Motion,
-}
-
-impl Subject {
-    /// All of them.
-    pub const ALL: [Self; 9] = [
-        Self::Wheels,
-        Self::Gyro,
-        Self::Accelerometer,
-        Self::Odometry,
-        Self::Position,
-        Self::LeftWheels,
-        Self::RightWheels,
-        Self::WheelsAndMotion,
-        Self::Motion,
-    ];
-
-    /// For people.
-    pub fn text(self) -> &'static str {
-        match self {
-            Self::Wheels => "wheel speeds",
-            Self::Gyro => "gyro",
-            Self::Accelerometer => "accelerometer",
-            Self::Odometry => "odometry speed",
-            Self::Position => "position",
-            Self::LeftWheels => "left wheels",
-            Self::RightWheels => "right wheels",
-            Self::WheelsAndMotion => "wheels and motion",
-            Self::Motion => "gyro, odometry and position",
-        }
-    }
-
-    /// What a robot with this finding may still do.
-    pub fn consequence(self) -> Consequence {
-        match self {
-            Self::Accelerometer | Self::Odometry => Consequence::NoLearning,
-            Self::WheelsAndMotion => Consequence::Slow,
-            Self::Wheels
-            | Self::Gyro
-            | Self::Position
-            | Self::LeftWheels
-            | Self::RightWheels
-            | Self::Motion => Consequence::Hold,
-        }
-    }
-}
-
-/// What a finding asks for; later ones are stricter and include the earlier.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Consequence {
-    /// Nothing is learned of the ground.
-    NoLearning,
-    /// The robot drives slowly.
-    Slow,
-    /// The robot does not drive by itself.
-    Hold,
-}
-
-/// How a channel is wrong.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
-    /// It repeats its word to the last bit.
-    Frozen,
-    /// Its sign is wrong.
-    Inverted,
-    /// It leapt.
-    Jumped,
-    /// It contradicts the others otherwise: biased, scaled, rotated.
-    Inconsistent,
-    /// It stands though it is commanded to turn.
-    Locked,
-}
-
-/// What the figures of a finding are.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Unit {
-    /// m
-    Metres,
-    /// rad
-    Radians,
-    /// m/s
-    MetresPerSecond,
-    /// rad/s
-    RadiansPerSecond,
-    /// m/s²
-    MetresPerSecondSquared,
-}
-
-impl Unit {
-    /// Its symbol.
-    pub fn symbol(self) -> &'static str {
-        match self {
-            Self::Metres => "m",
-            Self::Radians => "rad",
-            Self::MetresPerSecond => "m/s",
-            Self::RadiansPerSecond => "rad/s",
-            Self::MetresPerSecondSquared => "m/s²",
-        }
-    }
-}
-
-/// A contradiction.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Finding {
-    /// What it is about.
-    pub subject: Subject,
-    /// How it is wrong.
-    pub kind: Kind,
-    /// What it says.
-    pub observed: f64,
-    /// What the others say.
-    pub predicted: f64,
-    /// The unit of both.
-    pub unit: Unit,
-}
-
-/// The findings that stand, in the order of [`Subject::ALL`].
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Findings {
-    standing: [Option<Finding>; Subject::ALL.len()],
-}
-
-impl Findings {
-    /// Each of them.
-    pub fn iter(&self) -> impl Iterator<Item = &Finding> {
-        self.standing.iter().flatten()
-    }
-
-    /// The one about a subject.
-    pub fn about(&self, subject: Subject) -> Option<&Finding> {
-        self.standing[subject as usize].as_ref()
-    }
-
-    /// The strictest consequence.
-    pub fn consequence(&self) -> Option<Consequence> {
-        self.iter()
-            .map(|finding| finding.subject.consequence())
-            .max()
-    }
-}
+const SPANS_S: [f64; 5] = [0.4, 0.55, 0.75, 1.2, 2.0];
 
 /// What the sensors said at one moment; absent where one said nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -235,14 +79,6 @@ struct AllRepeats {
     position: Repeats,
 }
 
-/// Evidence on one subject.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Track {
-    against_s: f64,
-    agreeing_s: f64,
-    standing: Option<Finding>,
-}
-
 /// Watches one robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Monitor {
@@ -255,6 +91,9 @@ pub struct Monitor {
     last: Option<Duration>,
     repeats: AllRepeats,
     accelerometer: Accelerometer,
+    turn_gain: TurnGain,
+    /// Where fixes were when the robot came to rest.
+    rest_at: Option<Pose>,
     tracks: [Track; Subject::ALL.len()],
 }
 
@@ -270,6 +109,8 @@ impl Monitor {
             last: None,
             repeats: AllRepeats::default(),
             accelerometer: Accelerometer::default(),
+            turn_gain: TurnGain::default(),
+            rest_at: None,
             tracks: [Track::default(); Subject::ALL.len()],
         }
     }
@@ -341,6 +182,7 @@ impl Monitor {
             self.accelerometer.restart();
             for track in &mut self.tracks {
                 track.against_s = 0.0;
+                track.rested_s = 0.0;
             }
             return;
         }
@@ -368,58 +210,126 @@ impl Monitor {
             [None; SPANS_S.len()]
         };
         let mut verdicts = Verdicts::default();
-        verdict::judge(
-            &verdict::View {
-                model: &self.model,
-                history: &self.history,
-                seen: &seen,
-                jump: self.fixes.jump(),
-                repeats: &self.repeats,
-                tracks: &self.tracks,
-            },
-            &mut verdicts,
-        );
+        let stands = self.stands(now_s);
+        let view = verdict::View {
+            model: &self.model,
+            history: &self.history,
+            seen: &seen,
+            jump: self.fixes.jump(),
+            repeats: &self.repeats,
+            tracks: &self.tracks,
+            turn_gain: self.turn_gain,
+            stands,
+            uses: verdict::Uses::default(),
+        }
+        .with_believed();
+        verdict::judge(&view, &mut verdicts);
         // A part of the wheels' motion that is not the body's would be felt as a wrong gain.
         let is_quiet = self
             .tracks
             .iter()
             .zip(Subject::ALL)
-            .all(|(track, subject)| subject == Subject::Accelerometer || track.against_s <= 0.0);
+            .all(|(track, subject)| {
+                subject == Subject::Accelerometer
+                    || track.against_s <= 0.0
+                    || (track.standing.is_some() && subject.is_beside_dead_reckoning())
+            });
         if is_quiet && verdicts.is_consistent() {
+            if seen.iter().any(Option::is_some)
+                && let Some(recent) = self.history.means(now_s - LEARN_FROM_S, now_s - LEARN_TO_S)
+            {
+                self.turn_gain
+                    .learn(recent.gyro_rad_s, recent.wheels.angular_rad_s);
+            }
             if let Some(finding) = self.accelerometer.verdict() {
-                verdicts.contradict(finding, ACCELEROMETER_RAISE_S);
+                let raise_s = if finding.kind == Kind::Inverted {
+                    0.0
+                } else {
+                    ACCELEROMETER_RAISE_S
+                };
+                verdicts.contradict(finding, raise_s);
             } else if self.accelerometer.is_healthy() {
                 verdicts.agree(Subject::Accelerometer);
             }
         }
-        for (track, (against, agrees)) in self.tracks.iter_mut().zip(verdicts.each()) {
-            track.step(against, agrees);
+        let is_on_probation = self.is_on_probation();
+        for (track, subject) in self.tracks.iter_mut().zip(Subject::ALL) {
+            let verdict = verdicts.of(subject);
+            let is_at_once = is_on_probation && !stands && subject.is_of_place();
+            track.step(if is_at_once {
+                verdict.at_once()
+            } else {
+                verdict
+            });
         }
-    }
-}
-
-/// How long the accelerometer must contradict, seconds.
-const ACCELEROMETER_RAISE_S: f64 = 0.2;
-
-impl Track {
-    fn step(&mut self, against: Option<(Finding, f64)>, agrees: bool) {
-        if let Some((finding, raise_s)) = against {
-            self.agreeing_s = 0.0;
-            self.against_s += BIN_S;
-            if self.against_s >= raise_s - 0.5 * BIN_S && self.standing.is_none() {
-                self.standing = Some(finding);
+        let has_relapsed = is_on_probation
+            && Subject::ALL.into_iter().any(|subject| {
+                subject.is_of_place() && self.tracks[subject as usize].standing.is_some()
+            });
+        if has_relapsed {
+            for (track, subject) in self.tracks.iter_mut().zip(Subject::ALL) {
+                if subject.is_of_place() {
+                    track.relapse();
+                }
             }
-            return;
-        }
-        self.against_s = (self.against_s - 2.0 * BIN_S).max(0.0);
-        if agrees {
-            self.agreeing_s += BIN_S;
-        }
-        if self.agreeing_s >= CLEAR_S {
-            *self = Self::default();
         }
     }
+
+    /// Whether a finding on the place ended at rest, and no motion has shown yet that it was right to.
+    fn is_on_probation(&self) -> bool {
+        self.tracks.iter().any(|track| track.is_on_probation)
+    }
+
+    /// Whether the robot stands, by what it is commanded and by its wheels, and the fixes stay where
+    /// they were when it came to rest.
+    fn stands(&mut self, now_s: f64) -> bool {
+        let commanded = self.history.commanded(now_s - REST_SPAN_S, now_s);
+        let is_commanded = [commanded.least, commanded.most]
+            .iter()
+            .all(|twist| *twist == Twist::default());
+        let at_rest = self
+            .history
+            .means(now_s - REST_SPAN_S, now_s)
+            .is_some_and(|means| {
+                means.wheels.linear_m_s.abs() <= REST_M_S
+                    && means.wheels.angular_rad_s.abs() <= REST_RAD_S
+            });
+        if !(is_commanded && at_rest) {
+            self.rest_at = None;
+            return false;
+        }
+        let Some(newest) = self.fixes.newest() else {
+            return false;
+        };
+        let rest_at = *self.rest_at.get_or_insert(newest);
+        let turned_rad = wrap_angle_rad(newest.heading_rad - rest_at.heading_rad);
+        let (position_m, heading_rad) = self.fixes.deviations();
+        let stays = rest_at.point().distance_m(newest.point())
+            <= REST_SPREAD_M.max(REST_DEVIATIONS * position_m)
+            && turned_rad.abs() <= REST_SPREAD_RAD.max(REST_DEVIATIONS * heading_rad);
+        if !stays {
+            self.rest_at = None;
+        }
+        stays
+    }
 }
+
+/// Span over which a robot stands, seconds, and what its wheels may say then, metres and radians per
+/// second.
+const REST_SPAN_S: f64 = 1.0;
+const REST_M_S: f64 = 0.02;
+const REST_RAD_S: f64 = 0.05;
+/// How far fixes of a standing robot may be from the first one, metres and radians, and in standard
+/// deviations of a fix.
+const REST_SPREAD_M: f64 = 0.3;
+const REST_SPREAD_RAD: f64 = 0.1;
+const REST_DEVIATIONS: f64 = 7.0;
+
+/// Span over which the gain of turns is learned, seconds ago: a fault is found sooner than that.
+const LEARN_FROM_S: f64 = 2.3;
+const LEARN_TO_S: f64 = 2.0;
+/// How long the accelerometer must contradict, seconds; the evidence on its sign is summed already.
+const ACCELEROMETER_RAISE_S: f64 = 0.2;
 
 fn finite(value: Option<f64>) -> Option<f64> {
     value.filter(|value| value.is_finite())

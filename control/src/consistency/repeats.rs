@@ -7,6 +7,10 @@ const FROZEN_AFTER: Duration = Duration::from_millis(350);
 /// Fewest equal words that count as frozen.
 const FROZEN_COUNT: u32 = 4;
 
+/// The same of those that may turn out to be frozen.
+const REPEATING_AFTER: Duration = Duration::from_millis(150);
+const REPEATING_COUNT: u32 = 3;
+
 /// Equal words in a row.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Repeats {
@@ -36,6 +40,11 @@ impl Repeats {
     /// Whether they have been equal for long.
     pub(super) fn is_frozen(&self) -> bool {
         self.count >= FROZEN_COUNT && self.for_long >= FROZEN_AFTER
+    }
+
+    /// Whether they may turn out to be frozen: they have been equal for a while.
+    pub(super) fn is_repeating(&self) -> bool {
+        self.count >= REPEATING_COUNT && self.for_long >= REPEATING_AFTER
     }
 
     /// When the first of the equal words came.

@@ -17,8 +17,9 @@ use crate::robot::{GRAVITY_M_S2, RobotModel};
 use super::contacts::{BendInput, Loss, MeanSlip};
 use super::curved::{Curvatures, SLIP_MIN, SideSlips, Turn, uneven};
 use super::rows::{Regressors, Row, index};
+use super::types::Curvature;
 use super::window::Moment;
-use super::{SLIP_LINEAR_MAX, SensorNoise, SensorSample, TyrePrior, signed_rims};
+use super::{SensorNoise, SensorSample, signed_rims};
 
 /// Time over which samples are averaged, seconds.
 pub(super) const STEP_S: f64 = 0.05;
@@ -69,12 +70,14 @@ struct Step {
 pub(super) struct SlipBound {
     /// Largest θ that the ground may have, for all that is known.
     pub(super) theta_most: f64,
+    /// Largest slip at which tyres rise as they are known to.
+    pub(super) slip_max: f64,
     /// θ that weighs the rows.
     pub(super) theta: f64,
     /// `δ_d` as it is known.
     pub(super) radius_difference: f64,
-    /// What is known of the tyres.
-    pub(super) tyres: TyrePrior,
+    /// What is known of the tyres at this θ.
+    pub(super) curvature: Curvature,
 }
 
 /// What sideways drift is reckoned with.
@@ -166,7 +169,7 @@ impl AlongFilter {
         let gyro_rad_s = step.gyro_rad_s / count;
         let sideways = Sideways {
             theta: bound.theta,
-            bend: sideways_bend(&step, gyro_rad_s, model, bound.theta, &bound.tyres),
+            bend: sideways_bend(&step, gyro_rad_s, model, bound.theta, bound.curvature),
         };
         self.predict(&step, ahead_m_s2, gyro_rad_s, noise, sideways);
         let mut rows: Rows = [None; 3];
@@ -257,7 +260,7 @@ impl AlongFilter {
         let lateral = 0.5 * model.wheelbase_m() * gyro_rad_s.abs() / slower_m_s;
         let turning = 0.5 * (rim_difference_m_s - turn_m_s).abs() / slower_m_s;
         let driving = bound.theta_most * ahead_m_s2.abs() / GRAVITY_M_S2;
-        if lateral.hypot(turning + driving) > SLIP_LINEAR_MAX {
+        if lateral.hypot(turning + driving) > bound.slip_max {
             return None;
         }
         let harmonic_m_s = step.harmonic_m_s / count;
@@ -284,7 +287,7 @@ impl AlongFilter {
             force_m_s,
             uneven_m_s: |loss: &Loss| harmonic_m_s * loss.ahead,
         };
-        let (bends, mut bend) = input.bends(model, &bound.tyres);
+        let (bends, mut bend) = input.bends(model, bound.curvature);
         bends.put(&mut regressors);
         // The measured acceleration is averaged over the step, and so is its offset.
         let felt_noise = (harmonic_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2) / count;
@@ -295,7 +298,7 @@ impl AlongFilter {
         // The force makes the sides' slip unequal too, with its noise.
         let sides = SideSlips::of(&turn, bound.theta * ahead_mu, model);
         let unequal_by_force = 0.25 * sides.apart * sides.apart / sides.mean.max(SLIP_MIN);
-        let curvatures = Curvatures::of(&bound.tyres);
+        let curvatures = Curvatures::of(bound.curvature);
         let more = curvatures.split(
             curvatures
                 .nodes()
@@ -341,7 +344,7 @@ fn sideways_bend(
     gyro_rad_s: f64,
     model: &RobotModel,
     theta: f64,
-    tyres: &TyrePrior,
+    known: Curvature,
 ) -> [f64; 2] {
     let rim_m_s = step.harmonic_m_s.abs() / step.samples;
     if step.usable < step.samples || gyro_rad_s.abs() < TURNING_MIN_RAD_S {
@@ -354,7 +357,7 @@ fn sideways_bend(
         radius_difference: 0.0,
     };
     let across = theta * rim_m_s * gyro_rad_s / GRAVITY_M_S2;
-    let curvatures = Curvatures::of(tyres);
+    let curvatures = Curvatures::of(known);
     curvatures.split(curvatures.nodes().map(|curvature| {
         let loss = Loss::of(
             &turn,

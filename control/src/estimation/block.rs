@@ -3,10 +3,11 @@
 use super::contacts::{BendInput, Loss, MeanSlip};
 use super::curved::{Curvatures, SideSlips, Turn, bent, bent_slope};
 use super::rows::{Regressors, Row, index};
+use super::types::Curvature;
 use super::window::{TurnMeans, TurnWindow};
 use super::{
     BLOCK_S, RIM_SPEED_MIN_M_S, SLIP_LINEAR_FIRST_MAX, SLIP_LINEAR_MAX, SensorNoise, SensorSample,
-    THETA_FIRST, TyrePrior, ValueWithDeviation,
+    THETA_FIRST, ValueWithDeviation,
 };
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
@@ -43,6 +44,8 @@ pub(super) struct ThetaBound {
     pub(super) theta_weights: f64,
     /// Largest θ that the ground may have, for all that is known.
     pub(super) theta_most: f64,
+    /// Largest slip at which tyres rise as they are known to.
+    pub(super) slip_max: f64,
 }
 
 impl ThetaBound {
@@ -59,6 +62,8 @@ pub(super) struct Block {
     pub(super) duration_s: f64,
     /// Whether slip was in the linear range.
     pub(super) is_linear: bool,
+    /// Slip of the slower side, across and by the sides' difference, as [`Self::judge_slip`] found it.
+    pub(super) slip: f64,
     /// Geometric slip across of the slower side's wheels.
     slip_lateral: f64,
     /// Acceleration ahead over gravity, magnitude.
@@ -89,25 +94,27 @@ pub(super) struct Block {
 }
 
 impl Block {
-    /// Whether slip was in the linear range, combined from along and across. Across, and along the
+    /// Judges whether slip was in the linear range, combined from along and across. Across, and along the
     /// sides' difference, it is measured well, known θ or not; what the sides have in common is θμ.
     /// Before θ is known that is the most it may be, so that turning alone does not keep a long robot
     /// from ever beginning. With torque it comes from the body speed, which is coarse: the bound is
     /// tighter, or a robot that slides would begin with what sliding shows.
-    pub(super) fn slips_little(&self, bound: &ThetaBound) -> bool {
+    pub(super) fn judge_slip(&mut self, bound: &ThetaBound) {
         let turning = 0.5 * self.difference_m_s.abs() / self.slower_m_s;
+        let most = SLIP_LINEAR_MAX.min(bound.slip_max);
         let (common, limit) = match (bound.theta, self.force) {
-            (Some(theta), Some(force)) => (
-                theta * force.mean_m_s.abs() / self.rim_mean_m_s.abs(),
-                SLIP_LINEAR_MAX,
-            ),
+            (Some(theta), Some(force)) => {
+                (theta * force.mean_m_s.abs() / self.rim_mean_m_s.abs(), most)
+            }
             (None, Some(_)) => (
                 self.slip_m_s.unwrap_or(0.0).abs() / self.slower_m_s,
-                SLIP_LINEAR_FIRST_MAX,
+                SLIP_LINEAR_FIRST_MAX.min(bound.slip_max),
             ),
-            (_, None) => (bound.theta_most * self.ahead_mu, SLIP_LINEAR_MAX),
+            (_, None) => (bound.theta_most * self.ahead_mu, most),
         };
-        (turning + common).hypot(self.slip_lateral) < limit
+        // What is measured well; the rest is an upper bound, or coarse.
+        self.slip = turning.hypot(self.slip_lateral);
+        self.is_linear &= (turning + common).hypot(self.slip_lateral) < limit;
     }
 
     /// Row of the sides' difference: on measured torques, or else on measured accelerations.
@@ -211,7 +218,8 @@ pub(super) struct BlockBuilder {
 pub(super) struct BlockContext<'robot> {
     pub(super) model: &'robot RobotModel,
     pub(super) noise: &'robot SensorNoise,
-    pub(super) tyres: &'robot TyrePrior,
+    /// What is known of the tyres' curvature at this θ.
+    pub(super) curvature: Curvature,
     /// `δ_d` as it is known.
     pub(super) radius_difference: f64,
     /// θ as it is known.
@@ -315,6 +323,7 @@ impl BlockBuilder {
         Some(Block {
             duration_s: self.duration_s,
             is_linear: slip < SLIP_LINEAR_MAX,
+            slip,
             slip_lateral: lateral,
             ahead_mu: ahead_mu.abs(),
             slower_m_s,
@@ -345,7 +354,7 @@ impl BlockBuilder {
         let BlockContext {
             model,
             noise,
-            tyres,
+            curvature,
             radius_difference,
             theta,
         } = *context;
@@ -390,7 +399,7 @@ impl BlockBuilder {
                 * (rim_noise + model.track_width_m() * turn_noise)
                 - along(sides.by_turn_s) * turn_noise
         };
-        let curvatures = Curvatures::of(tyres);
+        let curvatures = Curvatures::of(curvature);
         let nodes = curvatures.nodes();
         let bent_sides = nodes.map(|curvature| {
             [
@@ -417,7 +426,7 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
     let BlockContext {
         model,
         noise,
-        tyres,
+        curvature,
         radius_difference,
         theta,
     } = context;
@@ -462,7 +471,7 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
             means.harmonic_m_s * (4.0 * loss.moment_m / track_m + gap * loss.ahead)
         },
     };
-    let (bends, bend) = input.bends(model, tyres);
+    let (bends, bend) = input.bends(model, curvature);
     bends.put(&mut regressors);
     let difference_noise = 2.0 * rim_noise_m_s.powi(2) / means.samples;
     let mut common_noise = Regressors::zeros();

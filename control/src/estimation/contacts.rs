@@ -9,9 +9,9 @@
 //! ```
 //! Slip that swings within a row's time is taken as that of several moments.
 
-use super::TyrePrior;
 use super::curved::{Curvatures, Turn};
 use super::rows::Bends;
+use super::types::Curvature;
 use super::window::Moment;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
@@ -127,8 +127,8 @@ pub(super) struct BendInput<'of, F: Fn(&Loss) -> f64> {
 
 impl<F: Fn(&Loss) -> f64> BendInput<'_, F> {
     /// The row's regressors, and the force's shares in those of θκ, θκ² and θ²κ.
-    pub(super) fn bends(&self, model: &RobotModel, tyres: &TyrePrior) -> (Bends, [f64; 3]) {
-        if tyres.curvature <= 0.0 && tyres.curvature_spread <= 0.0 {
+    pub(super) fn bends(&self, model: &RobotModel, prior: Curvature) -> (Bends, [f64; 3]) {
+        if prior.mean <= 0.0 && prior.std_dev <= 0.0 {
             return (Bends::default(), [0.0; 3]);
         }
         let at = |theta: f64, curvature: f64| {
@@ -140,14 +140,14 @@ impl<F: Fn(&Loss) -> f64> BendInput<'_, F> {
             [loss.mean / loss.left, (self.uneven_m_s)(&loss) / loss.left]
         };
         let theta = self.theta;
-        let curvatures = Curvatures::of(tyres);
+        let curvatures = Curvatures::of(prior);
         let known = curvatures.nodes().map(|curvature| at(theta, curvature));
         let [share, square_share] = curvatures.split(known.map(|[share, _]| share));
         let bends = curvatures
             .split(known.map(|[share, uneven_m_s]| self.force_m_s * share + uneven_m_s / theta));
         // By θ, at the mean κ: both parts along a straight line.
-        let here = at(theta, tyres.curvature);
-        let there = at(THETA_STEP * theta, tyres.curvature);
+        let here = at(theta, prior.mean);
+        let there = at(THETA_STEP * theta, prior.mean);
         let slope = [0, 1].map(|part| (there[part] - here[part]) / ((THETA_STEP - 1.0) * theta));
         let alone_m_s = here[1] - slope[1] * theta;
         let of_theta_m_s = slope[0] * self.force_m_s;

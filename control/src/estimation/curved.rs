@@ -4,7 +4,7 @@
 //! s at two κ, and to second order in κ between them. What the contacts carry unequally is in
 //! [`super::contacts`].
 
-use super::TyrePrior;
+use super::types::Curvature;
 use crate::robot::RobotModel;
 
 /// Slip that is divided by at least.
@@ -32,10 +32,10 @@ pub(super) struct Curvatures {
 
 impl Curvatures {
     /// One deviation from the mean.
-    pub(super) fn of(tyres: &TyrePrior) -> Self {
+    pub(super) fn of(known: Curvature) -> Self {
         Self {
-            low: (tyres.curvature - tyres.curvature_spread).max(0.0),
-            high: tyres.curvature + tyres.curvature_spread,
+            low: (known.mean - known.std_dev).max(0.0),
+            high: known.mean + known.std_dev,
         }
     }
 

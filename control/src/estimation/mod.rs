@@ -51,8 +51,8 @@ pub use segment::SegmentStatistics;
 use segment::{Claims, SegmentTheta};
 use sums::Sums;
 pub use types::{
-    Estimate, SensorNoise, SensorSample, ThetaMeasurement, TyrePrior, UpdateOutcome,
-    ValueWithDeviation,
+    Estimate, EstimatorPrior, ModelUncertainty, SensorNoise, SensorSample, ThetaMeasurement,
+    TyrePrior, UpdateOutcome, ValueWithDeviation,
 };
 
 /// Time over which samples are averaged, seconds.
@@ -91,6 +91,7 @@ pub struct Estimator {
     model: RobotModel,
     noise: SensorNoise,
     tyres: TyrePrior,
+    uncertainty: ModelUncertainty,
     block: BlockBuilder,
     along: AlongFilter,
     offsets: OffsetKnowledge,
@@ -117,17 +118,22 @@ pub struct Estimator {
 }
 
 impl Estimator {
-    /// An estimator that knows nothing but the model and the noise.
+    /// An estimator of a robot that is exactly as its model says, on tyres that rise straight.
     pub fn new(model: RobotModel, noise: SensorNoise) -> Self {
-        Self::with_tyres(model, noise, TyrePrior::default())
+        Self::with_prior(model, noise, EstimatorPrior::exact())
     }
 
-    /// As [`Self::new`], for tyres of which something is known.
-    pub fn with_tyres(model: RobotModel, noise: SensorNoise, tyres: TyrePrior) -> Self {
+    /// An estimator of a robot of which this is known.
+    pub fn with_prior(model: RobotModel, noise: SensorNoise, prior: EstimatorPrior) -> Self {
+        let EstimatorPrior {
+            tyres,
+            model: uncertainty,
+        } = prior;
         let mut estimator = Self {
             model,
             noise,
             tyres,
+            uncertainty,
             block: BlockBuilder::default(),
             along: AlongFilter::new(),
             offsets: OffsetKnowledge::unknown(&noise, &tyres),
@@ -139,6 +145,7 @@ impl Estimator {
             excitation: Excitation::default(),
             bound: ThetaBound {
                 theta: None,
+                slip_max: f64::INFINITY,
                 theta_weights: THETA_FIRST,
                 theta_most: THETA_MOST_FIRST,
             },
@@ -190,7 +197,7 @@ impl Estimator {
         let context = BlockContext {
             model: &self.model,
             noise: &self.noise,
-            tyres: &self.tyres,
+            curvature: self.tyres.at(self.bound.theta_weights),
             radius_difference: self.estimate.radius_difference.value,
             theta: self.bound.theta_of_slip(),
         };
@@ -230,8 +237,9 @@ impl Estimator {
         let bound = SlipBound {
             theta_most: self.bound.theta_most,
             theta: self.bound.theta_weights,
+            slip_max: SLIP_LINEAR_MAX.min(self.bound.slip_max),
             radius_difference: self.estimate.radius_difference.value,
-            tyres: self.tyres,
+            curvature: self.tyres.at(self.bound.theta_weights),
         };
         let rows = self
             .along
@@ -247,7 +255,7 @@ impl Estimator {
 
     /// Whether the ground has changed, and whether a wheel slips beyond the linear range.
     fn take(&mut self, mut block: Block) -> (bool, bool) {
-        block.is_linear &= block.slips_little(&self.bound);
+        block.judge_slip(&self.bound);
         self.pending.add(&block);
         let row = block.turning_row().filter(|_| block.is_linear);
         if let (Some(row), Some(before)) = (row, self.turning_before) {
@@ -294,15 +302,16 @@ impl Estimator {
     fn refresh(&mut self) {
         let sums = self.ground.plus(&self.segment).plus(&self.pending);
         let solution = self.solve(&sums, None);
-        self.measured = solution.filter(|solution| solution.is_measurement(sums.blocks));
+        self.measured = solution.filter(|solution| self.is_measurement(solution, &sums));
         let theta = self.measured.map(|solution| {
             // Errors of the torque constants scale the forces; each side has its own, and the
             // force difference holds half of each. Errors of the radii cancel: the torque reads
             // too high by what the rim speed beside it reads too low.
             let gain = if sums.has_torque() {
-                self.noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2
+                let constants = self.noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2;
+                constants.hypot(self.uncertainty.mass_ratio)
             } else {
-                MODEL_RATIO
+                MODEL_RATIO.hypot(self.uncertainty.inertia_ratio)
             };
             ThetaMeasurement {
                 theta: solution.theta,
@@ -316,6 +325,7 @@ impl Estimator {
         });
         self.bound = ThetaBound {
             theta: theta.map(|found| found.theta),
+            slip_max: theta.map_or(f64::INFINITY, |found| self.tyres.slip_max(found.theta)),
             theta_weights: solution
                 .filter(|found| found.variance > 0.0 && found.variance.sqrt() < found.theta)
                 .map_or(THETA_FIRST, |found| {
@@ -349,6 +359,13 @@ impl Estimator {
         };
     }
 
+    /// Whether the force varied enough, and the slip behind it was that of the rise which is known.
+    /// Before θ was known, blocks of more slip than that may have come in.
+    fn is_measurement(&self, solution: &Solution, sums: &Sums) -> bool {
+        solution.is_measurement(sums.blocks)
+            && sums.slip_rms() <= self.tyres.slip_max(solution.theta)
+    }
+
     fn accelerometer_offset_mu(&self) -> f64 {
         self.noise.accelerometer_offset_m_s2 / GRAVITY_M_S2
     }
@@ -367,7 +384,7 @@ impl Estimator {
         // Where all blocks together are no measurement, none of them is one.
         let ground = self
             .solve(&whole, None)
-            .filter(|found| found.is_measurement(whole.blocks));
+            .filter(|found| self.is_measurement(found, &whole));
         let tyres = before.map_or(self.tyres, |found| found.tyres(&self.tyres));
         let offsets = self.offsets.with_ground(
             &self.ground,

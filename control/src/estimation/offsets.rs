@@ -81,7 +81,7 @@ impl OffsetKnowledge {
         }
         let theta = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
         let channels = sums.channels();
-        let tangent = Tangent::at(theta, found);
+        let tangent = Tangent::at(theta, found.at(theta));
         let normal = Normal::of(&channels, theta, tangent, tyres).with_resistance(self, theta);
         let Some((matrix, right)) = self.without_ground(&normal) else {
             return *self;
@@ -93,7 +93,7 @@ impl OffsetKnowledge {
         let mut parameters = Parameters::zeros();
         parameters.fixed_rows_mut::<OFFSETS>(1).copy_from(&offsets);
         parameters[index::THETA] = theta;
-        parameters[index::CURVATURE] = theta * found.curvature;
+        parameters[index::CURVATURE] = found.curvature;
         let inflation = inflation(&channels, &parameters, theta, tangent);
         let information = self.information + matrix / inflation;
         if information.cholesky().is_none() {

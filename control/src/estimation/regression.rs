@@ -32,8 +32,8 @@ const BEND_SHARE: f64 = 0.04;
 const BEND_SHARE_TORQUE: f64 = 0.05;
 /// Most of a variance that neighbouring rows may take from it.
 const NEIGHBOURS_SHARE_MAX: f64 = 0.9;
-/// Least spread of a tyre's curvature, so that the matrix stays regular.
-const CURVATURE_SPREAD_MIN: f64 = 1.0e-3;
+/// Least standard deviation of θκ, so that the matrix stays regular.
+const CURVATURE_STD_DEV_MIN: f64 = 2.0e-4;
 
 /// Normal equations at one choice of weights.
 pub(super) struct Normal {
@@ -73,12 +73,9 @@ impl Normal {
             noise_variance += 2.0 * channel.count * (force_noise / spread).powi(2);
         }
         normal.noise_std_dev = noise_variance.sqrt();
-        // θκ is κ₀θ, give or take.
-        let curvature_std_dev = theta * tyres.curvature_spread.max(CURVATURE_SPREAD_MIN);
-        let mut bend = Parameters::zeros();
-        bend[index::THETA] = -tyres.curvature / curvature_std_dev;
-        bend[index::CURVATURE] = 1.0 / curvature_std_dev;
-        normal.matrix += bend * bend.transpose();
+        let known = tyres.curvature_std_dev.max(CURVATURE_STD_DEV_MIN).powi(-2);
+        normal.matrix[(index::CURVATURE, index::CURVATURE)] += known;
+        normal.right[index::CURVATURE] += known * tyres.curvature;
         normal
     }
 
@@ -180,7 +177,7 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
     let mut theta_weights = input.theta_given.unwrap_or(input.theta_start);
     let mut tyres = *input.tyres;
     for round in 1..=ROUNDS {
-        let tangent = Tangent::at(theta_weights, &tyres);
+        let tangent = Tangent::at(theta_weights, tyres.at(theta_weights));
         let normal = Normal::of(&channels, theta_weights, tangent, input.tyres)
             .with_resistance(input.offsets, theta_weights)
             .with_offsets(input.offsets);
@@ -190,7 +187,7 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
         let next = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
         tyres = learned_tyres(&parameters, &covariance, input.tyres);
         let is_settled = (next - theta_weights).abs() < CONVERGED * theta_weights
-            && Tangent::at(next, &tyres).is_near(tangent);
+            && Tangent::at(next, tyres.at(next)).is_near(tangent);
         if input.theta_given.is_some() || round == ROUNDS || is_settled {
             let inflation = inflation(&channels, &parameters, theta_weights, tangent);
             let base = covariance[(index::THETA, index::THETA)];
@@ -245,15 +242,11 @@ fn learned_tyres(
     known: &TyrePrior,
 ) -> TyrePrior {
     let variance = covariance[(index::CURVATURE, index::CURVATURE)];
-    let cross = covariance[(index::CURVATURE, index::THETA)];
-    let own = covariance[(index::THETA, index::THETA)];
-    let curvature = parameters[index::CURVATURE] / parameters[index::THETA];
-    let of_ratio = variance - 2.0 * curvature * cross + curvature * curvature * own;
-    let spread = of_ratio.max(0.0).sqrt() / parameters[index::THETA].abs();
-    if curvature.is_finite() && spread.is_finite() && spread < known.curvature_spread {
+    let (curvature, std_dev) = (parameters[index::CURVATURE], variance.max(0.0).sqrt());
+    if curvature.is_finite() && std_dev < known.curvature_std_dev {
         TyrePrior {
             curvature,
-            curvature_spread: spread,
+            curvature_std_dev: std_dev,
             ..*known
         }
     } else {
@@ -297,14 +290,10 @@ impl Solution {
         let its = later.covariance * later.of_theta / later.inflation;
         let followed = offsets.information * its.fixed_rows::<OFFSETS>(1);
         let of_offsets = followed.dot(&mine.fixed_rows::<OFFSETS>(1));
-        // θκ = κθ give or take: what moves κ moves θ by as much as that prior weighs.
-        let theta = self.parameters[index::THETA];
-        let curvature = self.parameters[index::CURVATURE] / theta;
-        let bend = (mine[index::CURVATURE] - curvature * mine[index::THETA]) / theta;
-        let width = theta * tyres.curvature_spread.max(CURVATURE_SPREAD_MIN);
-        let gain =
-            (its[index::CURVATURE] - tyres.curvature * its[index::THETA]) * theta / (width * width);
-        of_offsets + gain * bend + self.missed * later.missed
+        // What moves θκ moves the later θ by as much as its prior weighs.
+        let width = tyres.curvature_std_dev.max(CURVATURE_STD_DEV_MIN);
+        let of_curvature = its[index::CURVATURE] / (width * width) * mine[index::CURVATURE];
+        of_offsets + of_curvature + self.missed * later.missed
     }
 
     /// Whether the force varied enough, apart from the offsets, to call this a measurement.

@@ -2,7 +2,7 @@
 
 use nalgebra::{SMatrix, SVector};
 
-use super::TyrePrior;
+use super::types::Curvature;
 
 /// Number of parameters.
 pub(super) const PARAMETERS: usize = 9;
@@ -71,10 +71,10 @@ pub(super) struct Tangent {
 
 impl Tangent {
     /// At what is known of θ, above zero, and of κ.
-    pub(super) fn at(theta: f64, tyres: &TyrePrior) -> Self {
+    pub(super) fn at(theta: f64, known: Curvature) -> Self {
         Self {
-            square_by_theta: tyres.curvature_spread.powi(2) - tyres.curvature.powi(2),
-            square_by_curvature: 2.0 * tyres.curvature,
+            square_by_theta: known.std_dev.powi(2) - known.mean.powi(2),
+            square_by_curvature: 2.0 * known.mean,
             theta,
         }
     }
@@ -329,8 +329,8 @@ mod tests {
             parameters in prop::collection::vec(-2.0..2.0_f64, PARAMETERS),
             theta in 0.02..4.0_f64, curvature in 0.0..3.0_f64, curvature_spread in 0.0..1.0_f64,
         ) {
-            let tyres = TyrePrior { curvature, curvature_spread, ..TyrePrior::default() };
-            let tangent = Tangent::at(theta, &tyres);
+            let known = Curvature { mean: curvature, std_dev: curvature_spread };
+            let tangent = Tangent::at(theta, known);
             let row = Regressors::from_column_slice(&values);
             let parameters = Parameters::from_column_slice(&parameters);
             let mut all = Regressors::zeros();

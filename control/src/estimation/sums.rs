@@ -29,6 +29,8 @@ pub(super) struct Sums {
     fast_blocks: f64,
     saturated_blocks: f64,
     mu_seen: f64,
+    /// Squares of the blocks' slip.
+    slip_square: f64,
     track_square: f64,
     track_product: f64,
     track_offset: [f64; 2],
@@ -62,6 +64,7 @@ impl Sums {
         };
         self.blocks += 1;
         self.duration_s += block.duration_s;
+        self.slip_square += block.slip * block.slip;
         self.note_signal(&row, row.spread);
         if block.force.is_some() {
             self.difference.add(&row);
@@ -109,6 +112,7 @@ impl Sums {
             fast_blocks: self.fast_blocks + other.fast_blocks,
             saturated_blocks: self.saturated_blocks + other.saturated_blocks,
             mu_seen: self.mu_seen.max(other.mu_seen),
+            slip_square: self.slip_square + other.slip_square,
             track_square: self.track_square + other.track_square,
             track_product: self.track_product + other.track_product,
             track_offset: [
@@ -126,6 +130,12 @@ impl Sums {
     /// All kinds of rows.
     pub(super) fn channels(&self) -> [&Channel; 4] {
         [&self.difference, &self.mean, &self.turning, &self.along]
+    }
+
+    /// Root of the mean square of the blocks' slip.
+    #[expect(clippy::cast_precision_loss, reason = "blocks of a fifth of a second")]
+    pub(super) fn slip_rms(&self) -> f64 {
+        (self.slip_square / self.blocks.max(1) as f64).sqrt()
     }
 
     /// Whether measured torques had a part in it.

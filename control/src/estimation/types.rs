@@ -53,20 +53,109 @@ pub struct TyrePrior {
     /// How far the tyres' stiffness across may differ from that along, one standard deviation as
     /// a share. It is learned from turning; it only matters until then.
     pub side_grip_spread: f64,
-    /// Mean κ of `λ = θμ(1 + κλ + ⅔κ²λ²)`, per slip: 0 for the paper's straight rise, `1/(3λ_p)`
-    /// for a brush-like tyre that peaks like a straight rise to slip `λ_p`.
+    /// Mean θκ of `λ = θμ(1 + κλ + ⅔κ²λ²)`, per friction coefficient: 0 for the paper's straight
+    /// rise, `1/(3μ_p)` for a brush-like tyre of peak `μ_p`.
     pub curvature: f64,
-    /// Its standard deviation, per slip. It cannot be learned from turns of one radius: where it
-    /// is above zero, intervals are as wide as it makes them.
-    pub curvature_spread: f64,
+    /// Its standard deviation, per friction coefficient. It cannot be learned from turns of one
+    /// radius: where it is above zero, intervals are as wide as it makes them.
+    pub curvature_std_dev: f64,
+    /// Largest friction coefficient at which the rise is as above, somewhat less than the least peak
+    /// that the tyres may have; none if only slip limits it.
+    pub mu_max: Option<f64>,
+}
+
+/// How far a robot may differ from its model, one standard deviation each as a share. These are
+/// errors of all that a robot measures, and no drive on one ground tells them apart from θ.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ModelUncertainty {
+    /// Mass, which measured torques are taken over.
+    pub mass_ratio: f64,
+    /// Yaw inertia over mass, which turns are taken over where torque is not measured.
+    pub inertia_ratio: f64,
+}
+
+impl Default for ModelUncertainty {
+    /// Of a robot of which only the data sheet is known, with some payload.
+    fn default() -> Self {
+        Self {
+            mass_ratio: 0.12,
+            inertia_ratio: 0.15,
+        }
+    }
+}
+
+impl ModelUncertainty {
+    /// Of a robot that was weighed.
+    pub fn exact() -> Self {
+        Self {
+            mass_ratio: 0.0,
+            inertia_ratio: 0.0,
+        }
+    }
+}
+
+/// What is known beforehand of a robot and its tyres. The default fits one of which only the data
+/// sheet is known, on tyres that rise straight.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct EstimatorPrior {
+    /// Its tyres.
+    pub tyres: TyrePrior,
+    /// How far it may differ from its model.
+    pub model: ModelUncertainty,
+}
+
+impl EstimatorPrior {
+    /// A robot that is as its model says, on tyres that rise straight: the paper's.
+    pub fn exact() -> Self {
+        Self {
+            tyres: TyrePrior::default(),
+            model: ModelUncertainty::exact(),
+        }
+    }
+}
+
+/// A tyre's curvature κ at one θ, per slip.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Curvature {
+    /// Mean.
+    pub(super) mean: f64,
+    /// Standard deviation.
+    pub(super) std_dev: f64,
+}
+
+impl TyrePrior {
+    /// Tyres of which nothing is known: straight, or as bent as a brush of a peak of 0.3.
+    pub fn unknown() -> Self {
+        Self {
+            curvature: 0.5,
+            curvature_std_dev: 0.5,
+            mu_max: Some(0.6),
+            ..Self::default()
+        }
+    }
+
+    /// Largest slip at which the rise is as above, at a θ above zero.
+    pub(super) fn slip_max(&self, theta: f64) -> f64 {
+        self.mu_max.map_or(f64::INFINITY, |mu_max| mu_max * theta)
+    }
+
+    /// κ at a θ above zero.
+    pub(super) fn at(&self, theta: f64) -> Curvature {
+        Curvature {
+            mean: self.curvature / theta,
+            std_dev: self.curvature_std_dev / theta,
+        }
+    }
 }
 
 impl Default for TyrePrior {
+    /// Tyres that rise straight to their peak, as the paper's (7).
     fn default() -> Self {
         Self {
             side_grip_spread: 0.3,
             curvature: 0.0,
-            curvature_spread: 0.0,
+            curvature_std_dev: 0.0,
+            mu_max: None,
         }
     }
 }

@@ -8,7 +8,7 @@
 //! for every cause, speeding up stays within the acceleration limits, and while the base's word is
 //! late nothing speeds up. Slowing down for a reason is
 //! bounded by the braking limit: rest is met on a ramp, along the arc that was being driven. The
-//! strictest cause is reported: the order of [`GateCause`].
+//! strictest cause is reported: the order of [`GateCause`], and of several caps the lowest one.
 
 pub mod hand;
 
@@ -143,14 +143,23 @@ impl Reasons {
         .find_map(|(is_so, cause)| is_so.then_some(cause))
     }
 
-    fn caps(&self) -> [(Option<f64>, GateCause); 5] {
+    /// The lowest of the speeds that may be driven, and its cause; the stricter one of equals.
+    fn cap(&self) -> Option<(f64, GateCause)> {
         [
-            (self.sensors_max_m_s, GateCause::SensorFault),
             (self.blind_max_m_s, GateCause::StalePosition),
-            (self.command_age_max_m_s, GateCause::CommandAge),
-            (self.outside_max_m_s, GateCause::ExternalLimit),
+            (self.sensors_max_m_s, GateCause::SensorFault),
             (self.fence_max_m_s, GateCause::Fence),
+            (self.outside_max_m_s, GateCause::ExternalLimit),
+            (self.command_age_max_m_s, GateCause::CommandAge),
         ]
+        .into_iter()
+        // A cap that is no number is no permission.
+        .filter_map(|(most_m_s, cause)| {
+            let most_m_s = most_m_s?;
+            let is_number = !most_m_s.is_nan();
+            Some((if is_number { most_m_s.max(0.0) } else { 0.0 }, cause))
+        })
+        .reduce(|lowest, cap| if cap.0 < lowest.0 { cap } else { lowest })
     }
 }
 
@@ -288,16 +297,7 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
         target = scaled(target, share);
     }
     let mut is_capped = false;
-    for (most_m_s, capped_by) in reasons.caps() {
-        let Some(most_m_s) = most_m_s else {
-            continue;
-        };
-        // A cap that is no number is no permission.
-        let most_m_s = if most_m_s.is_nan() {
-            0.0
-        } else {
-            most_m_s.max(0.0)
-        };
+    if let Some((most_m_s, capped_by)) = reasons.cap() {
         let ahead_m_s =
             0.5 * limits.wheel_radius_m * (target.left_rad_s + target.right_rad_s).abs();
         if ahead_m_s > most_m_s {

@@ -3,6 +3,7 @@
 use proptest::prelude::*;
 
 use super::*;
+use crate::geometry::Twist;
 
 fn maybe(most: f64) -> impl Strategy<Value = Option<f64>> {
     prop_oneof![4 => Just(None), 3 => (0.0..most).prop_map(Some), 1 => Just(Some(f64::NAN))]
@@ -38,6 +39,22 @@ fn reasons() -> impl Strategy<Value = Reasons> {
 
 fn centre_m_s(speeds: WheelSpeeds) -> f64 {
     0.5 * RobotModel::yi2007().wheel_radius_m() * (speeds.left_rad_s + speeds.right_rad_s).abs()
+}
+
+/// The caps that are set; one that is no number is no permission.
+fn caps_of(reasons: &Reasons) -> impl Iterator<Item = (f64, GateCause)> + use<> {
+    [
+        (reasons.fence_max_m_s, GateCause::Fence),
+        (reasons.outside_max_m_s, GateCause::ExternalLimit),
+        (reasons.command_age_max_m_s, GateCause::CommandAge),
+        (reasons.blind_max_m_s, GateCause::StalePosition),
+        (reasons.sensors_max_m_s, GateCause::SensorFault),
+    ]
+    .into_iter()
+    .filter_map(|(most_m_s, cause)| {
+        let most_m_s = most_m_s?;
+        Some((if most_m_s.is_nan() { 0.0 } else { most_m_s }, cause))
+    })
 }
 
 /// Whether neither the speed ahead nor the turn rate is beyond both what was wanted and what was
@@ -159,10 +176,36 @@ proptest! {
             let input = GateInput { previous: settled, ..input };
             settled = gate_with(&input, &reasons, &limits).wheel_speeds;
         }
-        for (most_m_s, cause) in reasons.caps() {
-            let most_m_s = most_m_s.map_or(f64::INFINITY, |most| if most.is_nan() { 0.0 } else { most });
+        for (most_m_s, cause) in caps_of(&reasons) {
             prop_assert!(centre_m_s(settled) <= most_m_s + 1.0e-9, "{:?}", cause);
         }
+    }
+
+    #[test]
+    fn of_several_caps_the_lowest_is_named_and_of_equal_ones_the_strictest(
+        caps in prop::array::uniform5(prop_oneof![
+            1 => Just(None),
+            2 => prop::sample::select(vec![0.1, 0.2, 0.3, f64::NAN]).prop_map(Some),
+        ]),
+    ) {
+        let model = RobotModel::yi2007();
+        let [fence_max_m_s, outside_max_m_s, command_age_max_m_s, blind_max_m_s, sensors_max_m_s] = caps;
+        let reasons = Reasons {
+            fence_max_m_s,
+            outside_max_m_s,
+            command_age_max_m_s,
+            blind_max_m_s,
+            sensors_max_m_s,
+            ..Reasons::default()
+        };
+        let wheels = model.wheel_speeds_from_twist(Twist { linear_m_s: 0.5, angular_rad_s: 0.1 });
+        let input = GateInput {
+            command: Some(wheels), previous: wheels, stop: false, feedback_age_s: 0.0, dt_s: 0.01,
+        };
+        let lowest_m_s = caps_of(&reasons).map(|cap| cap.0).fold(f64::INFINITY, f64::min);
+        let binding = caps_of(&reasons).filter(|cap| cap.0 <= lowest_m_s).map(|cap| cap.1);
+        let output = gate_with(&input, &reasons, &GateLimits::of(&model));
+        prop_assert_eq!(output.cause, binding.max());
     }
 
     #[test]

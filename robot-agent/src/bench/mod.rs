@@ -13,6 +13,7 @@ use std::sync::mpsc::SendError;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use tread_api::friction::ThetaEstimate;
 use tread_api::ids::{BootId, MissionId, PlanHash, RobotId, SiteId};
 use tread_api::safety::Geofence;
 use tread_api::site::Grid;
@@ -22,6 +23,7 @@ use tread_api::wire::command::{Outcome, PathPrior};
 use tread_api::wire::hello::SiteDefinition;
 use tread_api::wire::ingest::MissionPhase;
 use tread_api::wire::safety::LeaseCommand;
+use tread_control::estimation::EstimatorPrior;
 use tread_control::geometry::Pose;
 use tread_control::measured::WheelSpeeds;
 use tread_control::plan::Plan;
@@ -43,6 +45,7 @@ use crate::drive::{Drive, Feedback, SILENT_AFTER_MAX, SensorSample};
 use crate::geometry::paper_robot;
 use crate::recording::frame::{Notes, notes};
 use crate::recording::{FORMAT, RecordWriter, RecordingConfig, RunHead, VERSION};
+use crate::safety::stop::StopState;
 use crate::safety::{Safety, answers, microseconds};
 use crate::sim::scenario::Scenario;
 
@@ -77,11 +80,24 @@ impl<T> From<SendError<T>> for BenchError {
     }
 }
 
-/// A robot on the bench.
+/// A base whose time passes when it is told.
+pub trait SteppedDrive: Drive {
+    /// Moves the base on to `now`.
+    fn advance(&mut self, now: Duration);
+}
+
+impl SteppedDrive for SimulatedDrive {
+    fn advance(&mut self, now: Duration) {
+        Self::advance(self, now);
+    }
+}
+
+/// A robot on the bench, by default with the agent's own simulated base.
 #[derive(Debug)]
-pub struct Bench {
+pub struct Bench<D = SimulatedDrive> {
     pub(crate) core: LoopCore,
-    pub(crate) drive: SimulatedDrive,
+    pub(crate) drive: D,
+    model: RobotModel,
     pub(crate) ends: AgentEnds,
     pub(crate) safety: Arc<Safety>,
     clock: Arc<ManualClock>,
@@ -159,9 +175,9 @@ impl Drive for Nonsense {
 }
 
 /// A base that does not know where it is.
-struct Blind<'base>(&'base mut SimulatedDrive);
+struct Blind<'base, D>(&'base mut D);
 
-impl Drive for Blind<'_> {
+impl<D: Drive> Drive for Blind<'_, D> {
     fn read(&mut self, now: Duration) -> Feedback {
         let mut feedback = Feedback::default();
         for &sample in self.0.read(now).samples() {
@@ -179,9 +195,9 @@ impl Drive for Blind<'_> {
 }
 
 /// A base that is not heard, though it hears.
-struct Unheard<'base>(&'base mut SimulatedDrive);
+struct Unheard<'base, D>(&'base mut D);
 
-impl Drive for Unheard<'_> {
+impl<D: Drive> Drive for Unheard<'_, D> {
     fn read(&mut self, now: Duration) -> Feedback {
         self.0.read(now);
         Feedback::default()
@@ -194,13 +210,13 @@ impl Drive for Unheard<'_> {
 
 /// A base whose sensors say the same for ever, with fresh stamps, though it moves.
 #[cfg(test)]
-struct Frozen<'base> {
-    base: &'base mut SimulatedDrive,
+struct Frozen<'base, D> {
+    base: &'base mut D,
     said: SensorSample,
 }
 
 #[cfg(test)]
-impl Drive for Frozen<'_> {
+impl<D: Drive> Drive for Frozen<'_, D> {
     fn read(&mut self, now: Duration) -> Feedback {
         self.base.read(now);
         let mut feedback = Feedback::default();
@@ -234,38 +250,9 @@ impl Bench {
     /// [`SimulatedDriveError`] when the start is no pose.
     pub fn new(scenario: &Scenario, start: Pose, seed: u64) -> Result<Self, SimulatedDriveError> {
         let model = RobotModel::yi2007();
-        let (loop_ends, ends) = seam();
-        let clock = Arc::new(ManualClock::new(Timestamp::UNIX_EPOCH));
-        clock.advance(START_AT);
-        let safety = Safety::open(
-            // Nothing is there, and nothing is written while nobody waits for a confirmation.
-            Path::new("no-such-folder"),
-            boot(),
-            model,
-            &[],
-            Arc::clone(&ends.shared.safety),
-            Arc::clone(&clock) as SharedClock,
-        );
         let individual = Individual::of_seed(seed);
         let drive = SimulatedDrive::new(scenario, model, start, individual, SimMode::Explicit)?;
-        Ok(Self {
-            core: LoopCore::new(model, loop_ends).with_period(PERIOD),
-            drive,
-            ends,
-            safety,
-            clock,
-            now: START_AT,
-            segments: Vec::new(),
-            starts: Vec::new(),
-            ended: Vec::new(),
-            news: Vec::new(),
-            paused_for: None,
-            silence_max: None,
-            prior: None,
-            last_driven: None,
-            cross_track_m: f64::NAN,
-            record: None,
-        })
+        Ok(Self::with_drive(drive, model))
     }
 
     /// Records from now on, before the first tick.
@@ -281,12 +268,68 @@ impl Bench {
             blind_within_fence: false,
             silent_after: SILENT_AFTER_MAX,
             rate_hz: PERIOD.as_secs_f64().recip(),
+            prior: EstimatorPrior::default(),
         };
         let (taker, notes) = notes();
         self.core.note_to(Some(taker));
         let clock = Arc::clone(&self.clock) as SharedClock;
-        let writer = RecordWriter::new(config, head, RobotModel::yi2007(), clock);
+        let writer = RecordWriter::new(config, head, self.model, clock);
         self.record = Some((writer, notes));
+    }
+}
+
+impl<D: SteppedDrive> Bench<D> {
+    /// A base, driven by an agent that is configured with this model.
+    pub fn with_drive(drive: D, model: RobotModel) -> Self {
+        let (loop_ends, ends) = seam();
+        let clock = Arc::new(ManualClock::new(Timestamp::UNIX_EPOCH));
+        clock.advance(START_AT);
+        let safety = Safety::open(
+            // Nothing is there, and nothing is written while nobody waits for a confirmation.
+            Path::new("no-such-folder"),
+            StopState::default(),
+            boot(),
+            model,
+            &[],
+            Arc::clone(&ends.shared.safety),
+            Arc::clone(&clock) as SharedClock,
+        );
+        Self {
+            core: LoopCore::new(model, loop_ends).with_period(PERIOD),
+            drive,
+            model,
+            ends,
+            safety,
+            clock,
+            now: START_AT,
+            segments: Vec::new(),
+            starts: Vec::new(),
+            ended: Vec::new(),
+            news: Vec::new(),
+            paused_for: None,
+            silence_max: None,
+            prior: None,
+            last_driven: None,
+            cross_track_m: f64::NAN,
+            record: None,
+        }
+    }
+
+    /// The same, with what is known beforehand of the robot.
+    #[must_use]
+    pub fn with_prior(mut self, prior: EstimatorPrior) -> Self {
+        self.core = self.core.with_prior(prior);
+        self
+    }
+
+    /// The base.
+    pub fn drive(&self) -> &D {
+        &self.drive
+    }
+
+    /// What the robot measured of the present ground, as it reports it.
+    pub fn theta(&self) -> Option<ThetaEstimate> {
+        self.ends.shared.snapshot().theta_measured
     }
 
     /// Writes what was noted, if it is to be recorded.
@@ -329,7 +372,7 @@ impl Bench {
         start: Pose,
         start_by: Option<Duration>,
     ) -> Result<Box<Job>, BenchError> {
-        let model = RobotModel::yi2007();
+        let model = self.model;
         let origin = JobOrigin {
             mission: mission_of(number),
             revision,

@@ -25,6 +25,18 @@ pub(super) struct FileConfig {
     pub(super) model: Option<ModelFile>,
     pub(super) drive: Option<DriveFile>,
     pub(super) recording: Option<RecordingFile>,
+    pub(super) estimation: Option<EstimationFile>,
+}
+
+/// `[estimation]` in `robot.toml`.
+#[derive(Debug, Clone, Copy, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct EstimationFile {
+    pub(super) mass_std_dev_ratio: Option<f64>,
+    pub(super) inertia_std_dev_ratio: Option<f64>,
+    pub(super) tyre_curvature: Option<f64>,
+    pub(super) tyre_curvature_std_dev: Option<f64>,
+    pub(super) tyre_mu_max: Option<f64>,
 }
 
 /// `[recording]` in `robot.toml`.

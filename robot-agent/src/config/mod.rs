@@ -2,6 +2,7 @@
 //!
 //! Everything is read and checked before anything is opened. A mistake names file, line and key.
 
+mod estimation;
 mod file;
 mod place;
 mod recording;
@@ -14,6 +15,7 @@ use clap::Parser;
 use tread_api::ids::{HolderId, RobotId, SiteId};
 use tread_api::robot::RobotModel;
 use tread_api::safety::LIMITS_MAX;
+use tread_control::estimation::EstimatorPrior;
 use tread_control::geometry::Pose;
 
 use file::{DriveFile, DriveKind, FileConfig};
@@ -260,6 +262,8 @@ pub struct AgentConfig {
     pub outbox: outbox::Limits,
     /// Where what the loop takes and gives is recorded; absent: nowhere.
     pub recording: Option<RecordingConfig>,
+    /// What is known beforehand of the robot and its tyres.
+    pub prior: EstimatorPrior,
 }
 
 impl AgentConfig {
@@ -426,6 +430,7 @@ fn assemble(
     let recording = recording::checked(file.recording.unwrap_or_default(), &data_dir)?;
     Ok(AgentConfig {
         recording,
+        prior: estimation::checked(file.estimation.unwrap_or_default())?,
         drive,
         site,
         robot,

@@ -23,6 +23,7 @@ use crate::bench::{Bench, PERIOD, boot};
 use crate::clock::{SharedClock, SystemClock};
 use crate::drive::simulated::{Individual, SimMode, SimulatedDrive};
 use crate::drive::{Drive, Feedback};
+use crate::safety::stop::StopState;
 use crate::safety::{Safety, answers, microseconds};
 
 const MILLISECOND: Duration = Duration::from_millis(1);
@@ -90,10 +91,13 @@ fn a_late_loop_holds_the_robot_with_its_figures_and_lets_its_mission_go_on_after
     bench.run_for(RELEASE_AFTER.saturating_sub(2 * PERIOD));
     assert!(bench.stands());
     assert_eq!(cause(&bench), Some(GateCause::LoopOverrun));
+    late_tick(&mut bench, LATE_MAX);
+    bench.run_for(RELEASE_AFTER / 2);
+    // One that is a little late does not prolong it.
     late_tick(&mut bench, LATE_AFTER + MILLISECOND);
-    bench.run_for(RELEASE_AFTER.saturating_sub(2 * PERIOD));
-    assert!(overrun(&bench).is_some(), "late once more");
-    bench.run_for(3 * PERIOD);
+    bench.run_for((RELEASE_AFTER / 2).saturating_sub(LATE_AFTER + 4 * PERIOD));
+    assert!(overrun(&bench).is_some(), "far too late once more");
+    bench.run_for(4 * PERIOD);
     assert_eq!(overrun(&bench), None);
     // Nobody has to resume the mission.
     while bench.end_of(mission).is_none() {
@@ -191,6 +195,7 @@ fn a_loop_on_a_busy_machine_obeys_in_its_next_tick_and_notices_each_late_one() {
     let folder = tempfile::tempdir().unwrap();
     let safety = Safety::open(
         folder.path(),
+        StopState::default(),
         boot(),
         model,
         &[],

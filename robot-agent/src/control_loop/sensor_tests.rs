@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use jiff::Timestamp;
+use tread_api::geometry::{Point, Polygon};
 use tread_api::ids::StopId;
 use tread_api::wire::safety::Stop;
 use tread_control::consistency::{Kind, Subject};
@@ -12,7 +13,7 @@ use uuid::Uuid;
 
 use super::seam::EndReason;
 use super::tests::{CIRCLE, LINE, ORIGIN, bench_at, one_ground, site_of};
-use crate::bench::Bench;
+use crate::bench::{Bench, PERIOD};
 use crate::drive::simulated::{Individual, SimMode, SimulatedDrive};
 use crate::sim::faults::{Channel, Fault, FaultKind};
 use crate::sim::scenario::Scenario;
@@ -117,7 +118,7 @@ fn each_fault_on_a_mission_is_named_holds_it_within_two_seconds_and_ends_it_if_i
             gate.target_rests || gate.cause.is_some_and(|cause| allowed.contains(&cause)),
             "{fault:?}: {gate:?}"
         );
-        bench.run_for(12 * SECOND);
+        bench.run_for(17 * SECOND);
         let ended = bench.ended.last().copied();
         assert_eq!(ended, Some((mission, EndReason::SensorFault)), "{fault:?}");
         assert!(bench.drive.truth().ahead_m_s.abs() < 0.05, "{fault:?}");
@@ -198,6 +199,57 @@ fn a_mission_that_a_sensor_held_goes_on_when_the_sensor_is_right_again() {
     }
     assert!(was_held);
     assert_eq!(bench.ended[0].1, EndReason::Reached);
+}
+
+#[test]
+fn within_a_fence_a_robot_whose_position_was_wrong_goes_on_by_itself_without_moving_blind() {
+    let scenario = one_ground(2.5);
+    let mut bench = bench_with(2.5, 5, &[]);
+    let corner = |x_m: f64, y_m: f64| Point { x_m, y_m };
+    let mut definition = site_of(&scenario);
+    let yard = Polygon::new(vec![
+        corner(-20.0, -20.0),
+        corner(40.0, -20.0),
+        corner(40.0, 40.0),
+        corner(-20.0, 40.0),
+    ]);
+    definition.geofence.keep_in.push(yard.unwrap());
+    bench.know_site(definition).unwrap();
+    let model = tread_control::robot::RobotModel::yi2007();
+    let start = bench.drive.truth().pose;
+    let individual = Individual::of_seed(5);
+    let drive = SimulatedDrive::new(&scenario, model, start, individual, SimMode::Explicit);
+    // Too little for a leap, and enough to contradict the gyro for a moment.
+    bench.drive = drive.unwrap().with_faults(vec![Fault {
+        after_s: BREAKS_AT_S,
+        until_s: Some(BREAKS_AT_S + 1.5),
+        kind: FaultKind::Biased {
+            channel: Channel::Position,
+            by: 0.3,
+        },
+    }]);
+    bench.start(1, CIRCLE, None);
+    let (mut held, mut blind_m) = (Duration::ZERO, 0.0_f64);
+    while bench.ended.is_empty() {
+        bench.tick();
+        let snapshot = bench.ends.shared.snapshot();
+        let is_doubted = [Subject::Position, Subject::Motion]
+            .into_iter()
+            .any(|subject| snapshot.findings.about(subject).is_some());
+        if is_doubted {
+            held += PERIOD;
+            assert!(snapshot.gate.target_rests, "{:?}", snapshot.gate);
+            blind_m += bench.drive.truth().ahead_m_s.abs() * PERIOD.as_secs_f64();
+        }
+        assert!(
+            bench.now < Duration::from_mins(3),
+            "{:?}",
+            snapshot.findings
+        );
+    }
+    assert_eq!(bench.ended[0].1, EndReason::Reached);
+    assert!(held > 10 * SECOND, "held for {held:?}");
+    assert!(blind_m < 0.5, "it brakes and stands: {blind_m} m");
 }
 
 #[test]

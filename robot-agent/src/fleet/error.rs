@@ -13,6 +13,12 @@ pub enum LinkError {
         /// What is wrong with it.
         problem: String,
     },
+    /// The robot's certificate, its key or the fleet's authority cannot be used.
+    #[error("the robot's certificate cannot be used; join the fleet again")]
+    Certificate(#[source] rustls::Error),
+    /// The machine gives no port on the loopback.
+    #[error("the tunnel's local port cannot be opened")]
+    LocalPort(#[source] std::io::Error),
     /// zenoh refused.
     #[error("zenoh could not {action}: {problem}")]
     Zenoh {

@@ -1,6 +1,7 @@
 //! The link to the fleet's server: the only module that calls zenoh.
 //!
-//! The session is a client that connects for ever. Calls of zenoh block the thread that makes
+//! The session is a client that connects for ever; a robot that has joined a fleet connects through
+//! the [`tunnel`]. Calls of zenoh block the thread that makes
 //! them, so all but the cheapest are made on the blocking pool; what comes in is handed over by
 //! callbacks that never wait. Nothing here knows of loops, missions or disks: [`uploader`] alone
 //! knows the outbox.
@@ -8,6 +9,7 @@
 mod command;
 mod error;
 mod session;
+mod tunnel;
 pub mod uploader;
 
 use std::sync::Arc;
@@ -16,12 +18,13 @@ use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
+use tread_api::enrolment::TrustId;
 use tread_api::ids::{BootId, HolderId, RobotId, SiteId};
 use tread_api::keys::{self, Key, Verb};
 use tread_api::safety::SMALL_PAYLOAD_MAX;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::ingest::{Batch, Receipt};
-use tread_api::wire::state::{FrictionReport, RobotState};
+use tread_api::wire::state::{FrictionReport, RobotState, ServerPulse};
 use tread_api::wire::{self, PAYLOAD_BYTES_MAX, Refusal};
 use zenoh::Wait;
 use zenoh::handlers::FifoChannel;
@@ -34,6 +37,7 @@ pub use self::command::IncomingCommand;
 pub(crate) use self::error::zenoh_failed;
 pub use self::error::{AskError, LinkError, may_pass_later};
 pub use self::session::{session_config, start_jitter};
+pub use self::tunnel::{DialError, Tunnel};
 use crate::membership::Membership;
 
 /// Commands that may wait to be answered; more are dropped, and the server asks again.
@@ -67,6 +71,10 @@ pub enum Noted {
     ServerHeard,
     /// A command found no room; the server asks again.
     CommandLost,
+    /// The server said which authorities robots are to trust.
+    Trust(TrustId),
+    /// The server's robot port shows a certificate of an authority that this robot does not trust.
+    Distrusted,
 }
 
 /// Who is told of what the link notices; must not wait.
@@ -114,6 +122,8 @@ pub struct FleetLink {
     ingest: Querier<'static>,
     _alive: LivelinessToken,
     server_seen: watch::Receiver<u64>,
+    /// What the session connects through; it must outlive the session.
+    tunnel: Option<Tunnel>,
 }
 
 /// Commands that wait to be answered. They outlive a link: what came by one is answered though
@@ -137,12 +147,46 @@ fn open(config: &zenoh::Config, given_up: &CancellationToken) -> Option<zenoh::S
     None
 }
 
-/// Checks that a text is an endpoint that zenoh can connect to.
+/// Opens a session on a thread of its own, which can be left behind: opening blocks until the
+/// server is there. `None` once told to stop.
+async fn open_session(
+    config: zenoh::Config,
+    stop: &CancellationToken,
+) -> Result<Option<zenoh::Session>, LinkError> {
+    let (opened, opening) = oneshot::channel();
+    let given_up = stop.child_token();
+    let _give_up = given_up.clone().drop_guard();
+    std::thread::Builder::new()
+        .name("fleet-connect".to_owned())
+        .spawn(move || {
+            let session = open(&config, &given_up);
+            // Nobody may wait any more: the session closes by being dropped.
+            let _ = opened.send(session);
+        })
+        .map_err(|cause| LinkError::Zenoh {
+            action: "start a thread",
+            problem: cause.to_string(),
+        })?;
+    let session = tokio::select! {
+        () = stop.cancelled() => return Ok(None),
+        session = opening => session,
+    };
+    session.map_err(|_| LinkError::Zenoh {
+        action: "open a session",
+        problem: "its thread died".to_owned(),
+    })
+}
+
+/// Checks that a text is an endpoint that the agent can connect to.
 ///
 /// # Errors
 /// [`LinkError::Endpoint`].
 pub fn check_endpoint(server: &str) -> Result<(), LinkError> {
-    session_config(server, None).map(|_| ())
+    if server.starts_with("tls/") {
+        tunnel::check_endpoint(server)
+    } else {
+        session_config(server).map(|_| ())
+    }
 }
 
 impl FleetLink {
@@ -158,36 +202,38 @@ impl FleetLink {
         listeners: Listeners,
         stop: &CancellationToken,
     ) -> Result<Option<Self>, LinkError> {
-        let config = session_config(server, membership)?;
-        let (opened, opening) = oneshot::channel();
-        // Opening blocks until the server is there. A thread of its own can be left behind.
-        let given_up = stop.child_token();
-        let _give_up = given_up.clone().drop_guard();
-        std::thread::Builder::new()
-            .name("fleet-connect".to_owned())
-            .spawn(move || {
-                let session = open(&config, &given_up);
-                // Nobody may wait any more: the session closes by being dropped.
-                let _ = opened.send(session);
-            })
-            .map_err(|cause| LinkError::Zenoh {
-                action: "start a thread",
-                problem: cause.to_string(),
-            })?;
-        let session = tokio::select! {
-            () = stop.cancelled() => return Ok(None),
-            session = opening => session,
+        let Some(membership) = membership else {
+            let session = open_session(session_config(server)?, stop).await?;
+            return Self::introduce(session, server, identity, listeners, None).await;
         };
-        let session = session.map_err(|_| LinkError::Zenoh {
-            action: "open a session",
-            problem: "its thread died".to_owned(),
-        })?;
+        loop {
+            let tunnel = tokio::select! {
+                () = stop.cancelled() => return Ok(None),
+                tunnel = Tunnel::open_noting(server, membership, &listeners.note) => tunnel?,
+            };
+            let session = tokio::select! {
+                session = open_session(tunnel.session_config()?, stop) => session?,
+                () = tunnel.stale() => continue,
+            };
+            return Self::introduce(session, server, identity, listeners, Some(tunnel)).await;
+        }
+    }
+
+    /// Declares everything on an open session; `None` if there is none.
+    async fn introduce(
+        session: Option<zenoh::Session>,
+        server: &str,
+        identity: Identity,
+        listeners: Listeners,
+        tunnel: Option<Tunnel>,
+    ) -> Result<Option<Self>, LinkError> {
         let Some(session) = session else {
             return Ok(None);
         };
         info!(server, "connected to `{server}`");
-        let declaring =
-            tokio::task::spawn_blocking(move || Self::declare(session, identity, &listeners));
+        let declaring = tokio::task::spawn_blocking(move || {
+            Self::declare(session, identity, &listeners, tunnel)
+        });
         declaring
             .await
             .map_or(Ok(None), |declared| declared.map(Some))
@@ -197,6 +243,7 @@ impl FleetLink {
         session: zenoh::Session,
         identity: Identity,
         listeners: &Listeners,
+        tunnel: Option<Tunnel>,
     ) -> Result<Self, LinkError> {
         let (site, robot) = (&identity.site, &identity.robot);
         let command_sender = listeners.commands.clone();
@@ -243,13 +290,7 @@ impl FleetLink {
             .wait()
             .map_err(zenoh_failed("declare the commands"))?;
         Self::listen_urgently(&session, site, robot, &listeners.urgent)?;
-        let noted = Arc::clone(&listeners.note);
-        session
-            .declare_subscriber(keys::pulse(site))
-            .callback(move |_| noted(Noted::ServerHeard))
-            .background()
-            .wait()
-            .map_err(zenoh_failed("listen for the server's pulse"))?;
+        Self::listen_to_pulse(&session, site, &listeners.note)?;
         // The heartbeat goes before all else that the robot says, the bulk of records after it.
         let publisher = |key: String, priority: Priority| {
             let publisher = session.declare_publisher(key).priority(priority);
@@ -295,7 +336,29 @@ impl FleetLink {
             ingest,
             _alive: alive,
             server_seen,
+            tunnel,
         })
+    }
+
+    /// The server's pulse, which also tells whom robots are to trust.
+    fn listen_to_pulse(
+        session: &zenoh::Session,
+        site: &SiteId,
+        note: &Note,
+    ) -> Result<(), LinkError> {
+        let noted = Arc::clone(note);
+        session
+            .declare_subscriber(keys::pulse(site))
+            .callback(move |sample| {
+                noted(Noted::ServerHeard);
+                let pulse = wire::decode::<ServerPulse>(&small(sample.payload()));
+                if let Ok(Some(trust)) = pulse.map(|pulse| pulse.trust) {
+                    noted(Noted::Trust(trust));
+                }
+            })
+            .background()
+            .wait()
+            .map_err(zenoh_failed("listen for the server's pulse"))
     }
 
     /// Drive commands and limits: the latest counts, so each is taken in its callback.
@@ -406,6 +469,14 @@ impl FleetLink {
                 // zenoh itself reports a timeout as an error reply of its own.
                 Err(_) => Err(AskError::NoAnswer),
             },
+        }
+    }
+
+    /// Waits until the session can no longer reconnect, and the link is to be opened again.
+    pub async fn lost_for_good(&self) {
+        match &self.tunnel {
+            Some(tunnel) => tunnel.stale().await,
+            None => std::future::pending().await,
         }
     }
 

@@ -1,15 +1,12 @@
 //! How the robot's session is opened: a client that connects for ever, with short queues below.
 
+use std::net::SocketAddr;
 use std::str::FromStr;
 use std::time::Duration;
 
 use tread_api::ids::BootId;
 
-use base64::Engine as _;
-use base64::prelude::BASE64_STANDARD;
-
 use super::{LinkError, zenoh_failed};
-use crate::membership::Membership;
 
 /// First pause before a lost connection is tried again, milliseconds.
 const RETRY_FIRST_MS: u32 = 100;
@@ -25,6 +22,8 @@ const CONNECT_TIMEOUT_MS: u32 = 5_000;
 const LEASE_MS: u32 = 3_000;
 /// Send buffer of the kernel, bytes.
 const SEND_BUFFER_BYTES: u32 = 32_768;
+/// Send buffer of the kernel towards the tunnel, bytes; another one follows it.
+const TUNNEL_SEND_BUFFER_BYTES: u32 = 4 * 1024;
 /// Largest batch that zenoh hands to the kernel at once, bytes.
 const BATCH_BYTES: u16 = 8_192;
 
@@ -41,22 +40,61 @@ pub fn start_jitter(boot: BootId) -> Duration {
 /// The endpoint with a small send buffer of the kernel, unless it names one: priorities act only
 /// above that buffer, so on a slow link a large one makes everything wait behind the bulk.
 fn with_small_buffer(server: &str) -> String {
-    let is_stream = server.starts_with("tcp/") || server.starts_with("tls/");
-    if !is_stream || server.contains("so_sndbuf") {
+    if !server.starts_with("tcp/") || server.contains("so_sndbuf") {
         return server.to_owned();
     }
     let joint = if server.contains('#') { ';' } else { '#' };
     format!("{server}{joint}so_sndbuf={SEND_BUFFER_BYTES}")
 }
 
-/// How the robot's session is opened; with a certificate where one is wanted.
+/// What a session shows to the router.
+#[derive(Clone)]
+pub(super) struct SessionUser {
+    /// The session's zenoh id, as zenoh's configuration has it.
+    pub(super) session_id: String,
+    /// The user name.
+    pub(super) user: String,
+    /// The password.
+    pub(super) password: String,
+}
+
+impl std::fmt::Debug for SessionUser {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter
+            .debug_struct("SessionUser")
+            .field("user", &self.user)
+            .finish_non_exhaustive()
+    }
+}
+
+/// How the robot's session through a tunnel is opened.
+///
+/// # Errors
+/// [`LinkError`]: zenoh refuses its configuration.
+pub(super) fn through_tunnel(
+    local: SocketAddr,
+    user: &SessionUser,
+) -> Result<zenoh::Config, LinkError> {
+    let endpoint = format!("tcp/{local}#so_sndbuf={TUNNEL_SEND_BUFFER_BYTES}");
+    let mut config = session_config(&endpoint)?;
+    let text = |text: &str| serde_json::Value::from(text).to_string();
+    for (key, value) in [
+        ("id", text(&user.session_id)),
+        ("transport/auth/usrpwd/user", text(&user.user)),
+        ("transport/auth/usrpwd/password", text(&user.password)),
+    ] {
+        config
+            .insert_json5(key, &value)
+            .map_err(zenoh_failed("take its credentials"))?;
+    }
+    Ok(config)
+}
+
+/// How the robot's session in the clear is opened.
 ///
 /// # Errors
 /// [`LinkError`] for an endpoint that is none.
-pub fn session_config(
-    server: &str,
-    membership: Option<&Membership>,
-) -> Result<zenoh::Config, LinkError> {
+pub fn session_config(server: &str) -> Result<zenoh::Config, LinkError> {
     let endpoint_failed = |problem: String| LinkError::Endpoint {
         endpoint: server.to_owned(),
         problem,
@@ -90,28 +128,7 @@ pub fn session_config(
             .insert_json5(key, &value)
             .map_err(zenoh_failed("take its configuration"))?;
     }
-    if let Some(membership) = membership {
-        show_certificate(&mut config, membership)?;
-    }
     Ok(config)
-}
-
-/// TLS both ways: the robot shows its certificate, and takes only the fleet's server.
-fn show_certificate(config: &mut zenoh::Config, membership: &Membership) -> Result<(), LinkError> {
-    let text = |pem: &str| format!("\"{}\"", BASE64_STANDARD.encode(pem));
-    let settings = [
-        ("enable_mtls", "true".to_owned()),
-        ("verify_name_on_connect", "true".to_owned()),
-        ("root_ca_certificate_base64", text(&membership.authority)),
-        ("connect_certificate_base64", text(&membership.certificate)),
-        ("connect_private_key_base64", text(&membership.key)),
-    ];
-    for (key, value) in settings {
-        config
-            .insert_json5(&format!("transport/link/tls/{key}"), &value)
-            .map_err(zenoh_failed("take its certificate"))?;
-    }
-    Ok(())
 }
 
 #[cfg(test)]
@@ -141,13 +158,13 @@ mod tests {
     fn a_stream_gets_a_small_send_buffer_unless_it_names_one() {
         for (given, used) in [
             ("tcp/h:7447", "tcp/h:7447#so_sndbuf=32768"),
-            ("tls/h:7447#a=b", "tls/h:7447#a=b;so_sndbuf=32768"),
+            ("tcp/h:7447#a=b", "tcp/h:7447#a=b;so_sndbuf=32768"),
             ("tcp/h:7447#so_sndbuf=9000", "tcp/h:7447#so_sndbuf=9000"),
             ("quic/h:7447", "quic/h:7447"),
         ] {
             assert_eq!(with_small_buffer(given), used);
         }
-        assert!(session_config("tcp/127.0.0.1:7447", None).is_ok());
-        assert!(session_config("nonsense", None).is_err());
+        assert!(session_config("tcp/127.0.0.1:7447").is_ok());
+        assert!(session_config("nonsense").is_err());
     }
 }

@@ -17,6 +17,9 @@ pub const BACKOFF_FIRST: Duration = Duration::from_millis(100);
 /// Longest pause between two tries.
 pub const BACKOFF_MAX: Duration = Duration::from_secs(5);
 
+/// How long one upload is to take, receipt and all.
+const UPLOAD_AIM: Duration = Duration::from_secs(1);
+
 /// Pauses that grow with each failure in a row.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Backoff {
@@ -37,6 +40,41 @@ impl Backoff {
     }
 }
 
+/// How many records go into one upload: about as many as the link carries in [`UPLOAD_AIM`]. On a
+/// narrow link a full batch would take longer than anybody waits for its receipt, for ever.
+#[derive(Debug, Clone, Copy)]
+struct BatchSize {
+    records_max: usize,
+}
+
+impl BatchSize {
+    fn new() -> Self {
+        Self {
+            records_max: BATCH_RECORDS_MAX,
+        }
+    }
+
+    /// A batch was answered for after that time.
+    fn settled(&mut self, took: Duration) {
+        if took > 2 * UPLOAD_AIM {
+            self.halve();
+        } else if took < UPLOAD_AIM {
+            self.records_max = (2 * self.records_max).min(BATCH_RECORDS_MAX);
+        }
+    }
+
+    /// A batch was not answered for; an absent server does so at once, a narrow link late.
+    fn failed(&mut self, took: Duration) {
+        if took > UPLOAD_AIM {
+            self.halve();
+        }
+    }
+
+    fn halve(&mut self) {
+        self.records_max = (self.records_max / 2).max(1);
+    }
+}
+
 /// Uploads for ever, once the server has welcomed the robot.
 pub async fn run(
     link: Arc<FleetLink>,
@@ -51,16 +89,20 @@ pub async fn run(
         }
         let mut server_seen = link.server_seen();
         let mut backoff = Backoff::new();
-        let mut records_max = BATCH_RECORDS_MAX;
+        let mut size = BatchSize::new();
         loop {
-            match upload_next(&link, &outbox, &clock, records_max).await {
+            let begin = clock.monotonic();
+            let next = upload_next(&link, &outbox, &clock, size.records_max).await;
+            let took = clock.monotonic().saturating_sub(begin);
+            match next {
                 Ok(Next::Empty) => outbox.arrived().await,
                 Ok(Next::Settled) => {
                     backoff = Backoff::new();
-                    records_max = (2 * records_max).min(BATCH_RECORDS_MAX);
+                    size.settled(took);
                 }
-                Ok(Next::TryFewer(fewer)) => records_max = fewer,
+                Ok(Next::TryFewer(fewer)) => size.records_max = fewer,
                 Ok(Next::TryLater) => {
+                    size.failed(took);
                     tokio::select! {
                         () = tokio::time::sleep(backoff.grow()) => {}
                         // The server is back: no need to sit the pause out.
@@ -161,5 +203,48 @@ fn log_refused(cause: &AskError) {
         AskError::Unreadable(_) | AskError::Unwritable(_) | AskError::Link(_) => {
             warn!(error = cause as &dyn std::error::Error, "an upload failed");
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::super::UPLOAD_TIMEOUT;
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn on_any_link_batches_soon_fit_their_timeout_and_make_use_of_it(
+            records_per_s in 2.0_f64..1e5,
+            round_trip_ms in 0_u64..600,
+        ) {
+            let mut size = BatchSize::new();
+            let mut took = Duration::ZERO;
+            for upload in 0..40 {
+                #[expect(clippy::cast_precision_loss, reason = "a small count")]
+                let sending_s = size.records_max as f64 / records_per_s;
+                took = Duration::from_millis(round_trip_ms) + Duration::from_secs_f64(sending_s);
+                let is_answered = took <= UPLOAD_TIMEOUT;
+                prop_assert!(is_answered || upload < 12, "upload {upload} takes {took:?}");
+                if is_answered {
+                    size.settled(took);
+                } else {
+                    size.failed(UPLOAD_TIMEOUT);
+                }
+            }
+            prop_assert!(took <= 4 * UPLOAD_AIM || size.records_max == 1);
+            let is_busy = 4 * took >= UPLOAD_AIM || size.records_max == BATCH_RECORDS_MAX;
+            prop_assert!(is_busy, "{} records take {took:?}", size.records_max);
+        }
+    }
+
+    #[test]
+    fn an_absent_server_makes_batches_no_smaller() {
+        let mut size = BatchSize::new();
+        for _ in 0..100 {
+            size.failed(Duration::from_millis(1));
+        }
+        assert_eq!(size.records_max, BATCH_RECORDS_MAX);
     }
 }

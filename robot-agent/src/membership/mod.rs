@@ -6,6 +6,9 @@
 //!                                         └───────────────────────────────────────────────┘
 //! ```
 //!
+//! When the server says that robots are to trust other authorities than this one does, it renews at
+//! once: the answer brings them, and a certificate of the one that signs now.
+//!
 //! All of it is one file that only its owner can read, replaced as a whole: there is no moment at
 //! which key and certificate do not belong together.
 
@@ -19,10 +22,11 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 use serde::{Deserialize, Serialize};
+use tread_api::enrolment::TrustId;
 use tread_api::ids::{RobotId, SiteId};
 
 pub use self::client::{Enrolment, MembershipError, enrol};
-pub(crate) use self::renewal::Renewal;
+pub(crate) use self::renewal::{Renewal, ServerTrust};
 pub use self::trust::{Fingerprint, InvalidFingerprint, Trust};
 use crate::durable;
 
@@ -44,7 +48,7 @@ pub struct Membership {
     pub certificate: String,
     /// Its key, PEM; it never leaves the robot.
     pub(crate) key: String,
-    /// Who the robots' port must show to be signed by, PEM.
+    /// Whom the robots' port may show to be signed by, PEM; two during a rotation.
     pub authority: String,
     /// Where the REST API is, for renewals.
     pub server: String,
@@ -141,6 +145,12 @@ impl Membership {
                 durable::replace_private(folder, FILE, &durable::sealed(&text))
             });
         written.map_err(|source| MembershipFileError::Unwritable { path, source })
+    }
+
+    /// The name of the authorities that it trusts; `None` if they do not read.
+    pub(crate) fn trust_id(&self) -> Option<TrustId> {
+        let trusted = trust::certificates(&self.authority).ok()?;
+        Some(TrustId::of(trusted.iter().map(AsRef::as_ref)))
     }
 
     /// How long from now until the certificate is to be renewed, by the robot's own clock alone,

@@ -1,12 +1,15 @@
-//! Renews the certificate when two thirds of its time are over, and again until it is renewed.
+//! Renews the certificate when two thirds of its time are over, or at once when the server says that
+//! robots are to trust other authorities than this one does; and again until it is renewed.
 
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use jiff::Timestamp;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
-use tracing::{info, warn};
+use tracing::{error, info, warn};
+use tread_api::enrolment::TrustId;
 
 use super::{Membership, MembershipError};
 use crate::clock::SharedClock;
@@ -17,12 +20,59 @@ const RETRY_FIRST: Duration = Duration::from_secs(1);
 const RETRY_MAX: Duration = Duration::from_mins(5);
 /// Longest sleep at once: the wall clock may be set meanwhile.
 const LOOK_EVERY: Duration = Duration::from_mins(10);
+/// The time over which the robots of a fleet spread when all of them are to renew at once.
+const SPREAD_MAX: Duration = Duration::from_secs(5);
+
+/// What was heard of whom robots are to trust.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) enum ServerTrust {
+    /// Nothing.
+    #[default]
+    Unheard,
+    /// The server said so, over a link that both sides have authenticated.
+    Is(TrustId),
+    /// The robots' port shows a certificate of an authority that this robot does not trust.
+    Distrusted,
+}
+
+/// What is to be done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Due {
+    /// Nothing for so long.
+    In(Duration),
+    /// The certificate's time has come.
+    Now,
+    /// The server trusts others.
+    OtherTrust,
+}
+
+/// Decides what is to be done about a membership.
+fn due(present: &Membership, heard: ServerTrust, now: Timestamp) -> Due {
+    let left = present.renewal_due_in(now);
+    if left == Duration::ZERO {
+        return Due::Now;
+    }
+    match heard {
+        ServerTrust::Unheard => Due::In(left),
+        ServerTrust::Is(trust) if present.trust_id() == Some(trust) => Due::In(left),
+        ServerTrust::Is(_) | ServerTrust::Distrusted => Due::OtherTrust,
+    }
+}
+
+/// The pause of one robot before it renews with all others, the same each time.
+fn spread(present: &Membership) -> Duration {
+    let names = [present.site.as_str(), present.robot.as_str()];
+    let bits = TrustId::of(names.map(str::as_bytes)).bits();
+    let share = f64::from(u32::try_from(bits >> 32).unwrap_or_default()) / f64::from(u32::MAX);
+    SPREAD_MAX.mul_f64(share)
+}
 
 /// What renewing works on.
 pub(crate) struct Renewal {
     pub(crate) folder: PathBuf,
     pub(crate) clock: SharedClock,
     pub(crate) present: watch::Sender<Arc<Membership>>,
+    pub(crate) heard: watch::Sender<ServerTrust>,
 }
 
 impl Renewal {
@@ -36,25 +86,75 @@ impl Renewal {
 
     async fn renew_for_ever(&self) {
         let mut pause = RETRY_FIRST;
+        let mut is_first = true;
+        // Whatever shows another certificate at the port may do so for ever.
+        let mut distrust_backoff = Duration::ZERO;
+        let mut news = self.heard.subscribe();
         loop {
             let present = Arc::clone(&self.present.borrow());
-            let left = present.renewal_due_in(self.clock.wall());
-            if left > Duration::ZERO {
-                tokio::time::sleep(left.min(LOOK_EVERY)).await;
-                continue;
+            let heard = *news.borrow_and_update();
+            match due(&present, heard, self.clock.wall()) {
+                Due::In(left) => {
+                    (pause, is_first) = (RETRY_FIRST, true);
+                    tokio::select! {
+                        () = tokio::time::sleep(left.min(LOOK_EVERY)) => {}
+                        _ = news.changed() => {}
+                    }
+                    continue;
+                }
+                Due::OtherTrust if is_first => {
+                    info!("the server trusts other authorities than this robot: it renews");
+                    tokio::time::sleep(spread(&present)).await;
+                    is_first = false;
+                    continue;
+                }
+                Due::OtherTrust if heard == ServerTrust::Distrusted => {
+                    tokio::time::sleep(distrust_backoff).await;
+                }
+                Due::Now | Due::OtherTrust => {}
             }
             match self.renew(&present).await {
-                Ok(()) => pause = RETRY_FIRST,
+                Ok(()) => {
+                    // What the port showed was shown to the former one.
+                    self.heard.send_if_modified(|heard| {
+                        let was_distrusted = *heard == ServerTrust::Distrusted;
+                        if was_distrusted {
+                            *heard = ServerTrust::Unheard;
+                        }
+                        was_distrusted
+                    });
+                    // The answer may come from before what was heard, so it may be due once more.
+                    let trust_before = present.trust_id();
+                    let present = Arc::clone(&self.present.borrow());
+                    distrust_backoff = if present.trust_id() == trust_before {
+                        (2 * distrust_backoff).max(RETRY_FIRST).min(RETRY_MAX)
+                    } else {
+                        Duration::ZERO
+                    };
+                    let heard = *self.heard.borrow();
+                    if matches!(due(&present, heard, self.clock.wall()), Due::In(_)) {
+                        continue;
+                    }
+                }
                 Err(cause) => {
                     warn!(
                         error = &*cause as &dyn std::error::Error,
                         "the certificate was not renewed; another try in {} s",
                         pause.as_secs()
                     );
-                    tokio::time::sleep(pause).await;
-                    pause = (2 * pause).min(RETRY_MAX);
+                    if heard == ServerTrust::Distrusted && is_refusal(&*cause) {
+                        error!(
+                            "the fleet's authority is another one than this robot trusts, and the \
+                             server gives no certificate for the present one: it was changed while \
+                             this robot was away. Join again, by `tread-agent enroll` with a join \
+                             token that names `{}`",
+                            present.robot
+                        );
+                    }
                 }
             }
+            tokio::time::sleep(pause).await;
+            pause = (2 * pause).min(RETRY_MAX);
         }
     }
 
@@ -71,5 +171,81 @@ impl Renewal {
         info!("the certificate was renewed, for {} s", next.lifetime_s);
         self.present.send_replace(next);
         Ok(())
+    }
+}
+
+/// Whether the server itself said no.
+fn is_refusal(cause: &(dyn std::error::Error + Send + Sync + 'static)) -> bool {
+    let cause = cause.downcast_ref::<MembershipError>();
+    matches!(cause, Some(MembershipError::Refused { .. }))
+}
+
+#[cfg(test)]
+mod tests {
+    use rcgen::{CertificateParams, KeyPair};
+
+    use super::super::Trust;
+    use super::*;
+
+    fn authority() -> String {
+        let key = KeyPair::generate().unwrap();
+        let params = CertificateParams::default();
+        params.self_signed(&key).unwrap().pem()
+    }
+
+    fn trusting(authority: String) -> Membership {
+        Membership {
+            site: "yard".parse().unwrap(),
+            robot: "rover-1".parse().unwrap(),
+            enrolment: 1,
+            certificate: String::new(),
+            key: String::new(),
+            authority,
+            server: "https://tread.example".to_owned(),
+            trust: Trust::Machine,
+            endpoint: "tls/tread.example:7447".to_owned(),
+            issued_at: "2026-11-02T10:00:00Z".parse().unwrap(),
+            lifetime_s: 90,
+        }
+    }
+
+    #[test]
+    fn a_certificate_is_renewed_in_time_and_at_once_when_the_server_trusts_others() {
+        let (former, next) = (authority(), authority());
+        let old = trusting(former.clone());
+        let both = trusting(format!("{next}{former}"));
+        let turned = trusting(format!("{former}{next}"));
+        let id = |membership: &Membership| ServerTrust::Is(membership.trust_id().unwrap());
+        let now = old.issued_at;
+        let in_time = Due::In(Duration::from_mins(1));
+        for (present, heard, expected) in [
+            (&old, ServerTrust::Unheard, in_time),
+            (&old, id(&old), in_time),
+            (&both, id(&turned), in_time),
+            (&old, id(&both), Due::OtherTrust),
+            (&both, id(&trusting(next)), Due::OtherTrust),
+            (&old, ServerTrust::Distrusted, Due::OtherTrust),
+        ] {
+            assert_eq!(due(present, heard, now), expected, "{heard:?}");
+        }
+        let late = now + Duration::from_mins(1);
+        assert_eq!(due(&old, ServerTrust::Unheard, late), Due::Now);
+    }
+
+    #[test]
+    fn robots_that_are_all_to_renew_spread() {
+        let robot = |number: u32| Membership {
+            robot: format!("rover-{number}").parse().unwrap(),
+            ..trusting(String::new())
+        };
+        let pauses: Vec<Duration> = (0..1_000).map(|number| spread(&robot(number))).collect();
+        for tenth in 0..10 {
+            let within = SPREAD_MAX / 10 * tenth..SPREAD_MAX / 10 * (tenth + 1);
+            let count = pauses
+                .iter()
+                .filter(|pause| within.contains(*pause))
+                .count();
+            assert!((40..200).contains(&count), "{count} within {within:?}");
+        }
     }
 }

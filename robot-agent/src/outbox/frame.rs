@@ -57,20 +57,28 @@ pub(super) struct Head {
 }
 
 impl Head {
-    /// The newer one of two heads of one store: their counters only rise.
-    pub(super) fn newest(self, other: Self) -> Self {
-        let age = |head: &Self| {
-            (
-                head.next_ordinal,
-                head.first_pending,
-                head.dropped,
-                head.refused,
-            )
-        };
-        if age(&other) > age(&self) {
-            other
+    /// What two heads of one store say together: their counters only rise.
+    ///
+    /// An agent of an earlier version, which ran in between, settles and drops records without saying
+    /// which wait behind them: its head may be ahead in that and behind in the next ordinal.
+    pub(super) fn joined(self, other: Self) -> Self {
+        let age = |head: &Self| (head.next_ordinal, head.first_pending);
+        let (newer, older) = if age(&other) > age(&self) {
+            (other, self)
         } else {
-            self
+            (self, other)
+        };
+        let first_pending = newer.first_pending.max(older.first_pending);
+        // What was settled since does not wait, though some of it may have been lost before: rather
+        // a loss that is not counted than a record that was sent and counts as lost.
+        let settled_since = first_pending - newer.first_pending;
+        Self {
+            first_pending,
+            dropped: newer.dropped.max(older.dropped),
+            refused: newer.refused.max(older.refused),
+            damaged: newer.damaged.max(older.damaged),
+            next_ordinal: newer.next_ordinal,
+            waiting: newer.waiting.saturating_sub(settled_since),
         }
     }
 }
@@ -108,6 +116,16 @@ pub(super) fn write_record(name: RecordName, content: &[u8], frame: &mut Vec<u8>
     body.extend_from_slice(name.boot.as_uuid().as_bytes());
     body.extend_from_slice(&name.seq.to_le_bytes());
     body.extend_from_slice(content);
+    seal(&body, frame);
+}
+
+/// Appends a head's frame as earlier agents wrote it.
+#[cfg(test)]
+pub(super) fn write_earlier_head(head: Head, frame: &mut Vec<u8>) {
+    let mut body = vec![KIND_HEAD];
+    for field in [head.first_pending, head.dropped, head.refused] {
+        body.extend_from_slice(&field.to_le_bytes());
+    }
     seal(&body, frame);
 }
 
@@ -226,12 +244,7 @@ mod tests {
 
     #[test]
     fn a_head_of_an_earlier_agent_says_nothing_of_what_waits() {
-        let mut body = vec![KIND_HEAD];
-        for field in [7_u64, 2, 1] {
-            body.extend_from_slice(&field.to_le_bytes());
-        }
         let mut frame = Vec::new();
-        seal(&body, &mut frame);
         let head = Head {
             first_pending: 7,
             dropped: 2,
@@ -239,11 +252,44 @@ mod tests {
             next_ordinal: 7,
             ..Head::default()
         };
+        write_earlier_head(head, &mut frame);
         assert_eq!(read(&frame), Some((Frame::Head(head), frame.len())));
         frame.clear();
         write_head(head, &mut frame);
         assert_eq!(frame.len(), HEAD_FRAME_BYTES);
         assert_eq!(read(&frame), Some((Frame::Head(head), frame.len())));
+    }
+
+    #[test]
+    fn heads_of_two_versions_say_together_what_either_knows() {
+        let present = Head {
+            first_pending: 50,
+            dropped: 1,
+            refused: 2,
+            damaged: 1,
+            next_ordinal: 100,
+            waiting: 50,
+        };
+        let earlier = |first_pending| Head {
+            first_pending,
+            dropped: 4,
+            refused: 2,
+            next_ordinal: first_pending,
+            ..Head::default()
+        };
+        for (first_pending, next_ordinal, waiting) in
+            [(40, 100, 50), (80, 100, 20), (100, 100, 0), (130, 130, 0)]
+        {
+            let expected = Head {
+                first_pending: first_pending.max(50),
+                dropped: 4,
+                next_ordinal,
+                waiting,
+                ..present
+            };
+            assert_eq!(present.joined(earlier(first_pending)), expected);
+            assert_eq!(earlier(first_pending).joined(present), expected);
+        }
     }
 
     #[test]

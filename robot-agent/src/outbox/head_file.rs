@@ -29,7 +29,7 @@ pub(super) struct HeadFile {
 pub(super) struct HeadWrite {
     path: PathBuf,
     file: File,
-    place: u64,
+    place: usize,
     frame: Vec<u8>,
 }
 
@@ -44,7 +44,7 @@ impl HeadFile {
         for (head, place) in heads.iter_mut().zip(PLACES) {
             *head = read_at(&file, place).map_err(failure("read", &path))?;
         }
-        let newest = heads.into_iter().flatten().reduce(Head::newest);
+        let newest = heads.into_iter().flatten().reduce(Head::joined);
         // The newest one is not written over.
         let next_place = usize::from(heads[0].is_some() && heads[0] == newest);
         let opened = Self {
@@ -56,25 +56,29 @@ impl HeadFile {
     }
 
     /// What has to be done to replace the older head by this one.
-    pub(super) fn write(&mut self, head: Head) -> Result<HeadWrite, StoreError> {
+    pub(super) fn write(&self, head: Head) -> Result<HeadWrite, StoreError> {
         let file = self.file.try_clone().map_err(failure("open", &self.path))?;
-        let place = PLACES[self.next_place];
-        self.next_place = (self.next_place + 1) % PLACES.len();
         let mut frame = Vec::with_capacity(HEAD_FRAME_BYTES);
         frame::write_head(head, &mut frame);
         Ok(HeadWrite {
             path: self.path.clone(),
             file,
-            place,
+            place: self.next_place,
             frame,
         })
+    }
+
+    /// The disk has what was to be written: the other place is the older one now. A place whose
+    /// writing failed is written again, and the other keeps the last head that is safe.
+    pub(super) fn finish(&mut self, written: &HeadWrite) {
+        self.next_place = (written.place + 1) % PLACES.len();
     }
 }
 
 impl HeadWrite {
     /// Waits until the disk has it.
     pub(super) fn run(&self) -> Result<(), StoreError> {
-        let written = self.file.write_all_at(&self.frame, self.place);
+        let written = self.file.write_all_at(&self.frame, PLACES[self.place]);
         written.map_err(failure("write", &self.path))?;
         self.file.sync_data().map_err(failure("sync", &self.path))
     }
@@ -91,4 +95,42 @@ fn read_at(file: &File, place: u64) -> io::Result<Option<Head>> {
         Some((Frame::Head(head), _)) => Some(head),
         Some((Frame::Record(..), _)) | None => None,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn head(first_pending: u64) -> Head {
+        Head {
+            first_pending,
+            next_ordinal: 100,
+            waiting: 100 - first_pending,
+            ..Head::default()
+        }
+    }
+
+    #[test]
+    fn writes_that_fail_leave_the_last_head_that_is_safe() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut file, found) = HeadFile::open(folder.path()).unwrap();
+        assert_eq!(found, None);
+        for first_pending in 1..=3 {
+            let write = file.write(head(first_pending)).unwrap();
+            write.run().unwrap();
+            file.finish(&write);
+        }
+        for failures in 1..=3 {
+            // The disk fails in the middle of the frame.
+            let write = file.write(head(3 + failures)).unwrap();
+            let torn = &write.frame[..HEAD_FRAME_BYTES / 2];
+            write.file.write_all_at(torn, PLACES[write.place]).unwrap();
+            let (_, found) = HeadFile::open(folder.path()).unwrap();
+            assert_eq!(found, Some(head(3)), "{failures} failures");
+        }
+        let write = file.write(head(9)).unwrap();
+        write.run().unwrap();
+        file.finish(&write);
+        assert_eq!(HeadFile::open(folder.path()).unwrap().1, Some(head(9)));
+    }
 }

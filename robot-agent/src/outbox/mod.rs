@@ -101,6 +101,8 @@ struct Shared {
     robot: RobotId,
     folder: PathBuf,
     store: Mutex<Store>,
+    /// One sync runs at a time, so that no older head is written over a newer one.
+    syncing: Mutex<()>,
     dead_letters: Mutex<DeadLetters>,
     /// Something new waits for the server.
     arrived: Notify,
@@ -158,6 +160,7 @@ impl Outbox {
                 robot,
                 folder: folder.to_owned(),
                 store: Mutex::new(store),
+                syncing: Mutex::default(),
                 dead_letters: Mutex::new(dead_letters),
                 arrived: Notify::new(),
                 unsynced: Notify::new(),
@@ -296,6 +299,7 @@ impl Outbox {
     /// # Errors
     /// [`OutboxError`] when the disk refuses.
     pub fn sync(&self) -> Result<(), OutboxError> {
+        let _syncing = locked(&self.shared.syncing);
         let ticket = locked(&self.shared.store).begin_sync()?;
         // The slow part, while others may append.
         ticket.run()?;

@@ -56,7 +56,7 @@ pub(super) struct Scan {
     pub(super) first_ordinal: u64,
     pub(super) path: PathBuf,
     pub(super) records: Vec<Found>,
-    /// The newest head in it.
+    /// What the heads in it say together.
     head: Option<Head>,
     /// The ordinal that a record behind it has at least.
     next_ordinal: u64,
@@ -99,7 +99,7 @@ impl Scan {
                     });
                 }
                 Frame::Head(head) => {
-                    scan.head = Some(scan.head.map_or(head, |known| known.newest(head)));
+                    scan.head = Some(scan.head.map_or(head, |known| known.joined(head)));
                 }
             }
             at = found_at + length;
@@ -197,7 +197,7 @@ pub(super) fn recover(
         scans.push(Scan::of(folder, first_ordinal, from..below)?);
     }
     let heads = scans.iter().filter_map(|scan| scan.head).chain(known);
-    let mut head = heads.reduce(Head::newest).unwrap_or_default();
+    let mut head = heads.reduce(Head::joined).unwrap_or_default();
     let (lost_records, end) = lost(&scans, head);
     head.dropped += lost_records;
     head.damaged += lost_records;

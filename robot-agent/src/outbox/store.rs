@@ -419,6 +419,7 @@ impl Store {
 
     /// Takes note of a sync that has run: settled files are removed.
     pub(super) fn finish_sync(&mut self, ticket: &SyncTicket) -> Result<(), StoreError> {
+        self.head_file.finish(&ticket.head_write);
         for (first_ordinal, _, _, bytes) in &ticket.files {
             if let Some(log) = self.files.get_mut(first_ordinal) {
                 log.is_dirty = log.bytes != *bytes;

@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 use std::fs::{self, OpenOptions};
+use std::io::Write as _;
 use std::path::Path;
 
 use proptest::prelude::*;
@@ -10,6 +11,7 @@ use tread_api::ids::MissionId;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RefusedRecord};
 use uuid::Uuid;
 
+use super::frame::Head;
 use super::recovery::Recovery;
 use super::store::Store;
 use super::*;
@@ -221,6 +223,58 @@ proptest! {
         // Frames and heads cost something, and up to two files wait for their last record.
         let bound = SMALL.pending_bytes_max + 25 * 41 + 3 * (SMALL.file_bytes + 300);
         prop_assert!(on_disk <= bound, "{on_disk} bytes on the disk");
+    }
+}
+
+/// What an agent of an earlier version does that runs in between: it settles records, removes the
+/// files that hold no others, and knows nothing of the head's own file.
+fn settle_as_an_earlier_agent(folder: &Path, first_pending: u64) {
+    let files = log_files(folder);
+    let first_ordinal = |path: &Path| -> u64 {
+        let stem = path.file_stem().and_then(|stem| stem.to_str()).unwrap();
+        stem.parse().unwrap()
+    };
+    let mut head = Vec::new();
+    let settled = Head {
+        first_pending,
+        ..Head::default()
+    };
+    frame::write_earlier_head(settled, &mut head);
+    let newest = OpenOptions::new()
+        .append(true)
+        .open(&files.last().unwrap().0);
+    newest.unwrap().write_all(&head).unwrap();
+    for pair in files.windows(2) {
+        if first_ordinal(&pair[1].0) <= first_pending {
+            fs::remove_file(&pair[0].0).unwrap();
+        }
+    }
+}
+
+#[test]
+fn what_an_earlier_agent_settled_in_between_is_neither_lost_nor_sent_again() {
+    for settled in [3, 12, 19, 20] {
+        let folder = fast_folder();
+        let path = folder.path();
+        let (mut store, _) = Store::open(path, SMALL, boot(1)).unwrap();
+        for number in 0..20_u8 {
+            store.append(&[number; 100]).unwrap();
+        }
+        sync(&mut store);
+        let mut expected = contents(&store);
+        assert!(log_files(path).len() > 2);
+        drop(store);
+        settle_as_an_earlier_agent(path, settled);
+        expected.retain(|(ordinal, _)| *ordinal >= settled);
+        for start in 2..5 {
+            let (mut store, recovery) = Store::open(path, SMALL, boot(start)).unwrap();
+            assert_eq!(recovery, Recovery::default(), "{settled} settled");
+            assert_eq!(contents(&store), expected, "{settled} settled");
+            assert_eq!((store.head().dropped, store.head().damaged), (0, 0));
+            let name = store.append(b"one more").unwrap();
+            expected.push((name.ordinal, b"one more".to_vec()));
+            sync(&mut store);
+        }
     }
 }
 

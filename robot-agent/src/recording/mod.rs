@@ -23,6 +23,7 @@ use serde::{Deserialize, Serialize};
 use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
 use tread_api::robot::RobotModel;
 use tread_api::wire::hello::SiteDefinition;
+use tread_control::estimation::EstimatorPrior;
 
 use crate::config::AgentConfig;
 use crate::control_loop::active::Hold;
@@ -103,6 +104,10 @@ pub(crate) struct RunHead {
     pub(crate) silent_after: Duration,
     /// Rate of the loop, Hz.
     pub(crate) rate_hz: f64,
+    /// What was known beforehand of the robot; records without it are of agents that took it for
+    /// exactly as its model says.
+    #[serde(default = "EstimatorPrior::exact")]
+    pub(crate) prior: EstimatorPrior,
 }
 
 impl RunHead {
@@ -123,6 +128,7 @@ impl RunHead {
             blind_within_fence: config.blind_within_fence,
             silent_after,
             rate_hz: config.rate_hz,
+            prior: config.prior,
         };
         Some((config.recording.clone()?, head))
     }

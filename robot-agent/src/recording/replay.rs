@@ -155,7 +155,8 @@ impl Player {
         let (taker, notes) = notes();
         let mut core = LoopCore::new(model, loop_ends)
             .with_blind_within_fence(head.blind_within_fence)
-            .with_silent_after(head.silent_after);
+            .with_silent_after(head.silent_after)
+            .with_prior(head.prior);
         let period = Duration::try_from_secs_f64(head.rate_hz.recip());
         if let Ok(period) = period
             && head.format >= FORMAT

@@ -1,4 +1,8 @@
 //! The stop latch on the disk. An agent that cannot read it, or finds it damaged, starts stopped.
+//!
+//! The first start writes a latch that stops nothing, before it leaves anything else in the folder. So
+//! a latch that is missing beside what an agent leaves has been lost, and nobody knows whether it
+//! stopped the robot: the agent starts stopped then too.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -11,6 +15,12 @@ use crate::clock::SharedClock;
 use crate::durable;
 
 const FILE_NAME: &str = "stop.json";
+/// What an agent that ran leaves beside it.
+const TRACES: [&str; 2] = ["outbox", "missions.json"];
+
+const UNREADABLE: &str = "the stop latch on the robot's disk cannot be read";
+const MISSING: &str = "the stop latch on the robot's disk is missing though an agent ran there before, \
+     so nobody knows whether a stop was in force";
 
 /// The file in which the latch outlives the process.
 #[derive(Debug, Clone)]
@@ -26,29 +36,53 @@ impl LatchFile {
         }
     }
 
-    /// Reads it; a robot's first start finds nothing and is free. What cannot be read stops.
+    /// Reads it; a robot's first start finds nothing and is free. What cannot be read stops, and so
+    /// does a latch that is missing though an agent ran here before.
     pub(crate) fn load(&self, clock: &SharedClock) -> StopState {
         let path = self.folder.join(FILE_NAME);
-        let problem = match std::fs::read(&path) {
+        let (problem, reason) = match std::fs::read(&path) {
             Ok(file) => match durable::unsealed(&file).map(serde_json::from_slice) {
                 Ok(Ok(state)) => return state,
-                Ok(Err(cause)) => cause.to_string(),
-                Err(cause) => cause.to_string(),
+                Ok(Err(cause)) => (cause.to_string(), UNREADABLE),
+                Err(cause) => (cause.to_string(), UNREADABLE),
             },
-            Err(cause) if cause.kind() == io::ErrorKind::NotFound => return StopState::default(),
-            Err(cause) => cause.to_string(),
+            Err(cause) if cause.kind() == io::ErrorKind::NotFound => {
+                if !self.has_traces() {
+                    return self.begin();
+                }
+                (cause.to_string(), MISSING)
+            }
+            Err(cause) => (cause.to_string(), UNREADABLE),
+        };
+        let stop = StopLatch {
+            id: tread_api::ids::StopId::from_uuid(uuid::Uuid::new_v4()),
+            by: "the agent".to_owned(),
+            reason: reason.to_owned(),
+            since: clock.wall(),
         };
         error!(
             problem,
-            "the stop latch `{}` cannot be read: starting stopped",
-            path.display()
+            "`{}`: {}: starting stopped",
+            path.display(),
+            stop.reason
         );
-        StopState::latched(StopLatch {
-            id: tread_api::ids::StopId::from_uuid(uuid::Uuid::new_v4()),
-            by: "the agent".to_owned(),
-            reason: "the stop latch on the robot's disk cannot be read".to_owned(),
-            since: clock.wall(),
-        })
+        StopState::latched(stop)
+    }
+
+    /// Whether an agent ran here before. What cannot be looked at may be a trace.
+    fn has_traces(&self) -> bool {
+        let is_there = |name: &&str| self.folder.join(name).try_exists().unwrap_or(true);
+        TRACES.iter().any(is_there)
+    }
+
+    /// The first start: the latch is there from now on.
+    fn begin(&self) -> StopState {
+        let state = StopState::default();
+        let made = std::fs::create_dir_all(&self.folder);
+        if let Err(cause) = made.and_then(|()| self.save(&state)) {
+            error!("the stop latch cannot be written, so the next start will be stopped: {cause}");
+        }
+        state
     }
 
     /// Writes it and waits until the disk has it. Blocks.
@@ -70,13 +104,40 @@ mod tests {
     fn a_latch_that_cannot_be_read_stops_the_robot_and_a_clear_repairs_it() {
         let folder = tempfile::tempdir().unwrap();
         let (file, clock) = (LatchFile::new(folder.path()), SystemClock::shared());
-        assert_eq!(file.load(&clock), StopState::default());
         std::fs::write(folder.path().join(FILE_NAME), b"{\"latch\":").unwrap();
         let state = file.load(&clock);
         let id = state.latch().expect("stopped").id;
         let cleared = state.cleared(id).unwrap().unwrap();
         file.save(&cleared).unwrap();
         assert_eq!(file.load(&clock), cleared);
+    }
+
+    #[test]
+    fn a_latch_that_is_missing_stops_the_robot_unless_no_agent_ran_there_before() {
+        let folder = tempfile::tempdir().unwrap();
+        let (file, clock) = (
+            LatchFile::new(&folder.path().join("data")),
+            SystemClock::shared(),
+        );
+        let path = file.folder.join(FILE_NAME);
+        for start in 0..3 {
+            assert_eq!(file.load(&clock), StopState::default(), "start {start}");
+            assert!(path.exists(), "start {start}");
+            std::fs::create_dir_all(file.folder.join("outbox")).unwrap();
+        }
+        for trace in TRACES {
+            let folder = tempfile::tempdir().unwrap();
+            let file = LatchFile::new(folder.path());
+            std::fs::create_dir(folder.path().join(trace)).unwrap();
+            let state = file.load(&clock);
+            let stop = state.latch().expect("stopped").clone();
+            assert!(stop.reason.contains("missing"), "{stop:?}");
+            // It stays so over restarts until somebody clears it.
+            assert!(file.load(&clock).latch().is_some());
+            file.save(&state.cleared(stop.id).unwrap().unwrap())
+                .unwrap();
+            assert_eq!(file.load(&clock).latch(), None);
+        }
     }
 
     #[test]

@@ -137,8 +137,11 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 impl Safety {
     /// What the disk says of stops, nobody driving, and the required holders silent.
+    ///
+    /// `state` is what the latch file of this folder said when the agent started.
     pub(crate) fn open(
         folder: &Path,
+        state: StopState,
         boot: BootId,
         model: RobotModel,
         required: &[HolderId],
@@ -146,7 +149,6 @@ impl Safety {
         clock: SharedClock,
     ) -> Arc<Self> {
         let file = LatchFile::new(folder);
-        let state = file.load(&clock);
         let number = u64::from(state.latch().is_some());
         if let Some(latch) = state.latch() {
             warn!(stop.id = %latch.id, "starting stopped: {} ({})", latch.reason, latch.by);

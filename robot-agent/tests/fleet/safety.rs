@@ -165,6 +165,21 @@ async fn an_agent_that_cannot_read_its_latch_starts_stopped() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_agent_that_ran_before_and_misses_its_latch_starts_stopped() {
+    let rig = Rig::new();
+    for start in 0..2 {
+        let agent = rig.agent();
+        assert_eq!(agent.state().safety.stop, None, "start {start}");
+        agent.stop().await;
+    }
+    std::fs::remove_file(rig.folder.path().join("stop.json")).unwrap();
+    let agent = rig.agent();
+    let stop = agent.state().safety.stop.expect("stopped");
+    assert!(stop.reason.contains("missing"), "{stop:?}");
+    agent.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_robot_is_driven_by_hand_by_one_driver_and_stops_with_its_silence() {
     let rig = Rig::new();
     let server = rig.serve();

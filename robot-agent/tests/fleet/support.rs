@@ -279,6 +279,7 @@ impl FakeServer {
         #[expect(clippy::disallowed_methods, reason = "a test has no supervisor")]
         tokio::spawn(async move {
             let pulse = ServerPulse {
+                trust: None,
                 server_time: jiff::Timestamp::UNIX_EPOCH,
             };
             loop {

@@ -8,6 +8,7 @@ import type {
   PauseCause,
   RobotMode,
   Role,
+  Session,
   StandingState,
   TerrainClass,
 } from './api/schema';
@@ -130,7 +131,7 @@ export const words = {
     out: 'Sign out',
     as: (name: string, what: string) => `${name}, ${what}`,
   },
-  role,
+  rights: (session: Session) => (session.role ? role[session.role] : session.rights.join(', ')),
   standing,
   limitNames: limit,
   header: {

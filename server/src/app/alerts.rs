@@ -11,21 +11,24 @@ use tread_api::page::Page;
 use tread_api::robot::{ALERT_TEXT_MAX, ALERTS_MAX, Alert, AlertReport, Severity};
 use tread_api::wire::ingest::MissionReport;
 
-use super::enrolment::REVOKED_ALERT;
+use super::enrolment::{RETIRED_ALERT, REVOKED_ALERT};
 use super::missions::reports::Taken;
 use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::stops::UNCONFIRMED_ALERT;
 use super::{App, AppError, check_named, page};
 use crate::db::alerts::AlertFilter;
-use crate::db::{self, DbError};
+use crate::db::{self, DbError, Outcome};
 use crate::fleet::presence::RobotKey;
 
 /// The alert of a mission that failed.
 pub(super) const MISSION_FAILED_ALERT: &str = "mission-failed";
+/// Alerts of one robot that are kept; the oldest that have cleared go first.
+const KEPT_MAX: u32 = 500;
 /// Alerts that the server raises and ends, whatever the robot says.
-const OWN_ALERTS: [&str; 4] = [
+const OWN_ALERTS: [&str; 5] = [
     UNCONFIRMED_ALERT,
     REVOKED_ALERT,
+    RETIRED_ALERT,
     ROBOT_LOST_ALERT,
     MISSION_FAILED_ALERT,
 ];
@@ -34,11 +37,24 @@ impl App {
     /// Alerts, newest first.
     pub async fn alerts(&self, filter: &AlertFilter, limit: u32) -> Result<Page<Alert>, AppError> {
         let mut tx = self.db().read().await?;
-        check_named(&mut tx, filter.site.as_ref(), filter.robot.as_ref()).await?;
+        check_named(
+            &mut tx,
+            filter.site.as_ref(),
+            filter.robot.as_ref(),
+            &filter.within,
+        )
+        .await?;
         let mut alerts = self.storage().alerts(filter);
         alerts.extend(db::alerts::list(&mut tx, filter, limit + 1).await?);
         alerts.sort_by_key(|alert| std::cmp::Reverse(alert.id));
         Ok(page(alerts, limit, |alert: &Alert| alert.id.to_string()))
+    }
+
+    /// Whose alert it is; `None` for one about the server itself, and if it is not known.
+    pub async fn alert_place(&self, id: AlertId) -> Result<Option<RobotKey>, AppError> {
+        let mut tx = self.db().read().await?;
+        let found = db::alerts::find(&mut tx, id).await?;
+        Ok(found.and_then(|alert| alert.robot_key()))
     }
 
     /// Notes that a person has seen an alert. One that tells of something past is cleared by that.
@@ -62,9 +78,7 @@ impl App {
             }
             alert = db::alerts::find(&mut tx, id).await?.unwrap_or(alert);
         }
-        tx.commit().await?;
-        self.robots_changed();
-        self.hub().alert(&alert);
+        self.commit_alerts(tx, vec![alert.clone()]).await?;
         Ok(alert)
     }
 
@@ -84,7 +98,7 @@ impl App {
         Ok(())
     }
 
-    /// False for a robot that is not known yet.
+    /// False for a robot that is not known yet, or that raises too many of late.
     async fn sync_alerts_of(&self, key: &RobotKey, said: &[AlertReport]) -> Result<bool, AppError> {
         let said = &said[..said.len().min(ALERTS_MAX)];
         let mut tx = self.db().read().await?;
@@ -103,9 +117,18 @@ impl App {
         let own = |alert: &&Alert| OWN_ALERTS.contains(&alert.code.as_str());
         let gone = raised.iter().filter(|alert| !has(alert) && !own(alert));
         let gone: Vec<&Alert> = gone.collect();
-        let new: Vec<&AlertReport> = said.iter().filter(is_new).collect();
+        // What may not be raised now is looked at again, until it may or is no longer said.
+        let (mut new, mut has_all) = (Vec::new(), true);
+        for report in said.iter().filter(is_new) {
+            let elapsed = self.clock().elapsed();
+            if self.allowances().take_alert(key, &report.code, elapsed) {
+                new.push(report);
+            } else {
+                has_all = false;
+            }
+        }
         if gone.is_empty() && new.is_empty() {
-            return Ok(true);
+            return Ok(has_all);
         }
         let mut changed = Vec::new();
         let mut tx = self.db().write().await?;
@@ -121,12 +144,8 @@ impl App {
         for id in changed {
             alerts.extend(db::alerts::find(&mut tx, id).await?);
         }
-        tx.commit().await?;
-        self.robots_changed();
-        for alert in &alerts {
-            self.hub().alert(alert);
-        }
-        Ok(true)
+        self.commit_alerts(tx, alerts).await?;
+        Ok(has_all)
     }
 
     /// Raises the alert of a mission that failed, and ends that of an earlier one; a mission that
@@ -205,6 +224,21 @@ impl App {
         db::alerts::find(tx, alert.id).await
     }
 
+    /// Commits, and then shows alerts that were written, whether or not anybody waits for it.
+    pub(super) async fn commit_alerts(
+        &self,
+        tx: db::Tx,
+        alerts: Vec<Alert>,
+    ) -> Result<(), DbError> {
+        let app = self.clone();
+        let committed = tx.commit_then(move |outcome| {
+            if outcome == Outcome::Written {
+                app.show_alerts(&alerts);
+            }
+        });
+        Ok(committed.await?)
+    }
+
     /// Shows alerts that were written.
     pub(super) fn show_alerts(&self, alerts: &[Alert]) {
         if !alerts.is_empty() {
@@ -228,6 +262,7 @@ impl App {
             ..report.clone()
         };
         db::alerts::raise(tx, robot_pk, id, &report, now).await?;
+        db::alerts::forget(tx, robot_pk, KEPT_MAX).await?;
         Ok(id)
     }
 }

@@ -20,6 +20,7 @@ use tread_control::plan::{Plan, PlanError, PlanOptions, Slowed, SlowedBy};
 use tread_control::robot::{self, RobotModelError, RobotModelSpec};
 use tread_control::trajectory as planned;
 
+pub(super) use self::start::Place as StartPlace;
 use self::start::{Start, after, earlier};
 use super::planned_path::way;
 use super::{App, AppError, site_row};
@@ -77,18 +78,15 @@ impl App {
             None => earlier(&mut tx, row.pk, place).await?,
         };
         drop(tx);
+        let first = match start {
+            Some(pose) => Start {
+                pose,
+                source: StartSource::Request,
+                after_mission: None,
+            },
+            None => self.expected_start((&site, &robot), &trajectory),
+        };
         let presence = self.presences().get(&(site.clone(), robot.clone()));
-        let shown = presence.state().and_then(|state| state.pose);
-        let (pose, source) = match (start, shown) {
-            (Some(start), _) => (start, StartSource::Request),
-            (None, Some(pose)) => (pose.value, StartSource::Robot),
-            (None, None) => (begin_of(&trajectory), StartSource::Trajectory),
-        };
-        let first = Start {
-            pose,
-            source,
-            after_mission: None,
-        };
         let measured = presence.friction().and_then(|said| said.theta_measured);
         let ground = AssumedGround {
             theta: theta
@@ -115,8 +113,9 @@ impl App {
 }
 
 impl App {
-    /// Refuses a trajectory that leaves the site's geofence, whatever way the robot comes to its
-    /// begin. Without a geofence it costs nothing.
+    /// Refuses a trajectory that leaves the site's geofence, on it or on the way to its begin from
+    /// where the robot will be after what it drives and what is queued before. Without a geofence it
+    /// costs nothing.
     ///
     /// # Errors
     /// [`AppError::CrossesGeofence`] names the place.
@@ -124,6 +123,7 @@ impl App {
         &self,
         (site, robot): (&SiteId, &RobotId),
         trajectory: &Trajectory,
+        place: start::Place,
     ) -> Result<(), AppError> {
         let mut tx = self.db().read().await?;
         let Some(site_row) = db::sites::find(&mut tx, site).await? else {
@@ -131,15 +131,17 @@ impl App {
         };
         let fence = control_fence(&db::geofences::present(&mut tx, site_row.pk).await?);
         let row = db::robots::find(&mut tx, site_row.pk, robot).await?;
-        drop(tx);
         let Some(row) = row.filter(|_| !fence.is_empty()) else {
             return Ok(());
         };
+        let before = earlier(&mut tx, row.pk, place).await?;
+        drop(tx);
+        let first = self.expected_start((site, robot), trajectory);
         let _turn = self.check_turn().await;
         let trajectory = trajectory.clone();
         let checking = move || {
-            let from = begin_of(&trajectory);
-            match planned(&row.model, &trajectory, from) {
+            let start = after(first, &before, &row.model);
+            match planned(&row.model, &trajectory, start.pose) {
                 Ok(planned) => fenced(&planned, &trajectory, &fence),
                 // What cannot be planned is the robot's to refuse.
                 Err(_impossible) => Ok(()),
@@ -148,6 +150,21 @@ impl App {
         match tokio::task::spawn_blocking(checking).await {
             Ok(checked) => checked.map_err(|refused| refused.of(robot.clone())),
             Err(_panic) => Ok(()),
+        }
+    }
+
+    /// Where a robot is now, before whatever it has to drive first.
+    fn expected_start(&self, (site, robot): (&SiteId, &RobotId), trajectory: &Trajectory) -> Start {
+        let presence = self.presences().get(&(site.clone(), robot.clone()));
+        let shown = presence.state().and_then(|state| state.pose);
+        let (pose, source) = match shown {
+            Some(pose) => (pose.value, StartSource::Robot),
+            None => (begin_of(trajectory), StartSource::Trajectory),
+        };
+        Start {
+            pose,
+            source,
+            after_mission: None,
         }
     }
 }

@@ -7,6 +7,7 @@ use tread_api::ids::{
 use tread_api::mission::MissionState;
 use tread_api::trajectory::Place;
 
+use crate::authority::{AuthorityError, RotationRefused};
 use crate::db::DbError;
 
 /// Why a use case did not do it.
@@ -98,9 +99,32 @@ pub enum AppError {
     /// No join token of that identifier.
     #[error("join token `{0}` is not known")]
     UnknownJoinToken(JoinTokenId),
+    /// It is about a site or robot that the token is not for.
+    #[error("{0}")]
+    OutsideScope(String),
+    /// Somebody would give more than he has.
+    #[error("{0}")]
+    BeyondRights(String),
     /// Robots do not join this server.
     #[error("robots do not join this server: its configuration has no `[robots]`")]
     NoAuthority,
+    /// A rotation of the authority is under way, or none is.
+    #[error(transparent)]
+    Rotation(RotationRefused),
+    /// Robots still hold certificates of the authority that is to be retired.
+    #[error(
+        "{count} robots still hold certificates of the former authority: {first}; wait until they were \
+         on the network, or force it, and each of them must join again"
+    )]
+    RobotsLeft {
+        /// How many.
+        count: usize,
+        /// The first of them.
+        first: String,
+    },
+    /// The authority's files cannot be written.
+    #[error("the files of the fleet's authority cannot be written")]
+    AuthorityFiles(#[source] AuthorityError),
     /// The operating system gives no random numbers.
     #[error("the operating system gives no random numbers: {0}")]
     NoRandomness(String),
@@ -254,6 +278,11 @@ impl AppError {
             | Self::UnknownToken(_)
             | Self::UnknownJoinToken(_)
             | Self::NoAuthority
+            | Self::Rotation(_)
+            | Self::RobotsLeft { .. }
+            | Self::AuthorityFiles(_)
+            | Self::OutsideScope(_)
+            | Self::BeyondRights(_)
             | Self::NoRandomness(_)
             | Self::UnknownStop(_)
             | Self::StopNotCleared { .. }

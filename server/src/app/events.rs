@@ -26,12 +26,24 @@ pub use self::hub::{
 use self::hub::{Client, unnumbered};
 use self::snapshot::Reading;
 pub use self::snapshot::SNAPSHOT_BYTES_MAX;
+use super::identity::Credential;
+use super::shares::{Bounds, Place};
 use super::{App, AppError};
 use crate::db;
 use crate::db::robots::RobotRow;
 
 /// Most clients at once.
 pub const CLIENTS_MAX: usize = 1_500;
+/// Most of one token, with its sessions.
+pub const CLIENTS_PER_IDENTITY_MAX: usize = 1_100;
+/// Those that viewers leave to operators and admins.
+const CLIENTS_AT_WORK: usize = 200;
+/// How they are shared out.
+pub(super) const SHARES: Bounds = Bounds {
+    all: CLIENTS_MAX,
+    viewers: CLIENTS_MAX - CLIENTS_AT_WORK,
+    each: CLIENTS_PER_IDENTITY_MAX,
+};
 /// Robots of one server in a snapshot.
 const ROBOTS_MAX: u32 = 10_000;
 
@@ -96,6 +108,15 @@ impl Subscription {
 }
 
 impl App {
+    /// A place for one more stream of events of somebody.
+    ///
+    /// # Errors
+    /// There are [`CLIENTS_MAX`] already, too many of viewers, or [`CLIENTS_PER_IDENTITY_MAX`] of
+    /// this token's.
+    pub fn event_place(&self, of: &Credential) -> Result<Place, AppError> {
+        self.inner.event_shares.take(of, "event clients")
+    }
+
     /// Subscribes a client: what it missed since its last event, or a snapshot, comes first.
     ///
     /// `cut` is cancelled when the client is dropped and does not read its end.
@@ -174,7 +195,10 @@ impl App {
             return Ok(None);
         }
         let rows = db::robots::all(&mut tx, ROBOTS_MAX).await?;
-        let of_site = |row: &&RobotRow| filter.site.as_ref().is_none_or(|site| *site == row.site);
+        let of_site = |row: &&RobotRow| {
+            let is_site = filter.site.as_ref().is_none_or(|site| *site == row.site);
+            is_site && filter.within.includes_robot(&row.site, &row.id)
+        };
         let known: HashSet<&RobotId> = rows.iter().filter(of_site).map(|row| &row.id).collect();
         let mut names: Vec<&RobotId> = filter.robots.iter().collect();
         names.sort();

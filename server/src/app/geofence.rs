@@ -54,7 +54,7 @@ impl App {
             detail: invalid.to_string(),
         })?;
         let fence = control_fence(&geofence);
-        for row in db::robots::list(&mut tx, site_pk, "", false, ROBOTS_MAX).await? {
+        for row in db::robots::list(&mut tx, (site_pk, None), "", false, ROBOTS_MAX).await? {
             let presence = self.presences().get(&(site.clone(), row.id.clone()));
             let Some(pose) = presence.state().and_then(|state| state.pose) else {
                 continue;

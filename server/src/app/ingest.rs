@@ -18,7 +18,8 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, timeout_at};
 use tokio_util::sync::CancellationToken;
 use tracing::warn;
-use tread_api::ids::{RobotId, SiteId};
+use tread_api::friction::Segment;
+use tread_api::ids::{ConfigurationId, RobotId, SiteId};
 use tread_api::robot::Alert;
 use tread_api::site::Grid;
 use tread_api::wire::ingest::{
@@ -26,10 +27,10 @@ use tread_api::wire::ingest::{
 };
 use tread_api::wire::{Refusal, RefusalCode};
 
-use self::keys::{Keys, RobotKeys};
+use self::keys::{CONFIGURATIONS_MAX, Configured, Keys, RobotKeys};
 use self::prepared::{Prepared, Ready, Skew, prepared};
 use super::App;
-use super::map::Folded;
+use super::map::{Folded, MapChange};
 use super::missions::reports::{Foreign, Reporting, Taken, take_report};
 use crate::db::aside::Origin;
 use crate::db::segments::{Inserted, NewSegment};
@@ -106,8 +107,17 @@ struct Candidate<'group> {
     keys: (i64, i64),
     site_pk: i64,
     robot_pk: i64,
+    configuration_pk: i64,
     robot: &'group RobotId,
     ready: Box<Ready>,
+}
+
+/// A batch whose robot and run are known.
+struct Admitted {
+    of: RobotKeys,
+    boot_pk: i64,
+    /// The configurations that it measured with; those that are missing are too many.
+    configurations: HashMap<ConfigurationId, i64>,
 }
 
 /// What became of one batch.
@@ -206,7 +216,6 @@ impl Writer {
         counters.mission_reports_committed.add(tally.reports);
         counters.reports_foreign.add(tally.foreign);
         counters.segments_aside.add(tally.aside);
-        self.app.show_alerts(&tally.alerts);
         if tally.reports > 0 {
             self.app.wake();
         }
@@ -250,35 +259,40 @@ impl Writer {
         let mut candidates = Vec::new();
         let mut tally = Tally::default();
         let app = self.app.clone();
-        let _turn = app.maps().turn().await;
+        let turn = app.map_turn_to_change().await?;
         let mut tx = app.db().write_uploads().await?;
         let now = self.app.clock().now();
         for (index, upload) in group.iter().enumerate() {
-            let Upload { site, batch, .. } = upload;
-            let found = self.keys.robot(&app, &mut tx, (site, &batch.robot)).await?;
-            if let Some(refused) = refused_whole(upload, found.is_some()) {
-                outcomes.push(Err(refused));
-                continue;
-            }
-            let Some(robot_keys) = found else { continue };
-            let RobotKeys {
-                site_pk,
-                robot_pk,
-                grid,
-            } = robot_keys;
-            let boot_pk = self.keys.boot(&mut tx, robot_pk, batch.boot).await?;
+            let batch = &upload.batch;
+            let Admitted {
+                of,
+                boot_pk,
+                mut configurations,
+            } = match self.admit(&mut tx, upload).await? {
+                Ok(admitted) => admitted,
+                Err(refused) => {
+                    outcomes.push(Err(refused));
+                    continue;
+                }
+            };
+            let (site_pk, robot_pk, grid) = (of.site_pk, of.robot_pk, of.grid);
             let skew = Skew::of(batch.robot_time, now);
-            let candidate = |upload, keys, ready| Candidate {
+            let candidate = |upload, keys, configuration_pk, ready| Candidate {
                 upload,
                 keys,
                 site_pk,
                 robot_pk,
+                configuration_pk,
                 robot: &batch.robot,
                 ready,
             };
             if batch.robot_time.is_some() {
                 for (keys, ready) in released(&mut tx, boot_pk, &grid, skew).await? {
-                    candidates.push(candidate(None, keys, ready));
+                    // It was noted when the segment came.
+                    let id = ready.segment.configuration;
+                    let found = db::robots::note_measured(&mut tx, robot_pk, id).await?;
+                    candidates.push(candidate(None, keys, found, ready));
+                    configurations.insert(id, found);
                 }
             }
             let mut receipt = Receipt {
@@ -295,29 +309,31 @@ impl Writer {
                 };
                 let keys = (boot_pk, seq_key);
                 match &record.content {
-                    RecordContent::Segment(segment) => match prepared(segment, &grid, skew) {
-                        Ok(Prepared::Ready(ready)) => {
-                            candidates.push(candidate(Some(index), keys, ready));
-                        }
-                        Ok(Prepared::Ahead(measurement)) => {
-                            let origin = Origin {
-                                boot_pk,
-                                seq: seq_key,
-                                site_pk,
-                                robot_pk,
-                            };
-                            let times = (segment.ended_at, now);
-                            match put_aside(&mut tx, origin, times, &measurement).await? {
-                                Ok(true) => {
-                                    receipt.committed += 1;
-                                    tally.aside += 1;
-                                }
-                                Ok(false) => receipt.duplicates += 1,
-                                Err(reason) => refuse(reason),
+                    RecordContent::Segment(segment) => {
+                        match possible(segment, &grid, skew, &configurations) {
+                            Ok((configuration, Prepared::Ready(ready))) => {
+                                candidates.push(candidate(Some(index), keys, configuration, ready));
                             }
+                            Ok((_, Prepared::Ahead(measurement))) => {
+                                let origin = Origin {
+                                    boot_pk,
+                                    seq: seq_key,
+                                    site_pk,
+                                    robot_pk,
+                                };
+                                let times = (segment.ended_at, now);
+                                match put_aside(&mut tx, origin, times, &measurement).await? {
+                                    Ok(true) => {
+                                        receipt.committed += 1;
+                                        tally.aside += 1;
+                                    }
+                                    Ok(false) => receipt.duplicates += 1,
+                                    Err(reason) => refuse(reason),
+                                }
+                            }
+                            Err(reason) => refuse(reason),
                         }
-                        Err(reason) => refuse(reason),
-                    },
+                    }
                     RecordContent::Mission(report) => {
                         let of = self.reporting(upload, robot_pk, report, (now, skew));
                         let taken = take_new_report(&mut tx, of, keys, report).await?;
@@ -335,9 +351,48 @@ impl Writer {
         let folded = self
             .insert(&mut tx, &candidates, now, &mut outcomes, &mut tally)
             .await?;
-        tx.commit().await?;
-        app.maps().fold(&folded);
+        let alerts = tally.alerts.clone();
+        turn.commit(tx, MapChange::Add(folded), alerts).await?;
         Ok((outcomes, tally))
+    }
+
+    /// Finds out whose a batch is, or why it is refused whole.
+    async fn admit(
+        &mut self,
+        tx: &mut Tx,
+        upload: &Upload,
+    ) -> Result<Result<Admitted, Refusal>, DbError> {
+        let (app, batch) = (self.app.clone(), &upload.batch);
+        let named = (upload.site.clone(), batch.robot.clone());
+        let found = self.keys.robot(&app, tx, (&named.0, &named.1)).await?;
+        if let Some(refused) = refused_whole(upload, found.is_some()) {
+            return Ok(Err(refused));
+        }
+        let busy = |detail| Ok(Err(refusal(RefusalCode::Busy, detail)));
+        let Some(of) = found else {
+            return busy("the robot is not known here");
+        };
+        let Some(boot_pk) = self.keys.boot(&app, tx, upload, of.robot_pk).await? else {
+            return busy("the robot's agent has begun too many runs of late");
+        };
+        let mut configurations = HashMap::new();
+        for id in measured_with(batch) {
+            let robot = (&named, of.robot_pk);
+            match self.keys.configuration(&app, tx, robot, id).await? {
+                Configured::As(pk) => {
+                    configurations.insert(id, pk);
+                }
+                Configured::Later => {
+                    return busy("the robot has measured with too many new configurations of late");
+                }
+                Configured::Never => {}
+            }
+        }
+        Ok(Ok(Admitted {
+            of,
+            boot_pk,
+            configurations,
+        }))
     }
 
     /// Which of these were stored once and removed after their time. Only runs of which anything
@@ -368,7 +423,7 @@ impl Writer {
 
     /// Stores segments and folds those that are new and not withdrawn.
     async fn insert(
-        &mut self,
+        &self,
         tx: &mut Tx,
         candidates: &[Candidate<'_>],
         now: Timestamp,
@@ -408,7 +463,7 @@ impl Writer {
                 grid_revision: segment.grid_revision,
                 terrain: segment.terrain.clone(),
                 robot_pk: candidate.robot_pk,
-                configuration_pk: self.keys.configuration(tx, configuration).await?,
+                configuration_pk: candidate.configuration_pk,
                 epoch_h: epoch_h(segment.ended_at),
             };
             if withdrawals.iter().any(|row| is_withdrawn(row, &key)) {
@@ -453,6 +508,30 @@ fn rows<'group>(
         .iter()
         .filter(|candidate| !removed.contains(&candidate.keys));
     kept.map(row).collect()
+}
+
+/// The configurations that a batch measured with.
+fn measured_with(batch: &Batch) -> HashSet<ConfigurationId> {
+    let records = batch.records.iter();
+    let configurations = records.filter_map(|record| match &record.content {
+        RecordContent::Segment(segment) => Some(segment.configuration),
+        RecordContent::Mission(_) => None,
+    });
+    configurations.collect()
+}
+
+/// A segment that is possible, with the key of its configuration, or why it is not.
+fn possible(
+    segment: &Segment,
+    grid: &Grid,
+    skew: Skew,
+    configurations: &HashMap<ConfigurationId, i64>,
+) -> Result<(i64, Prepared), String> {
+    let prepared = prepared(segment, grid, skew)?;
+    let configuration = configurations.get(&segment.configuration).ok_or_else(|| {
+        format!("the robot has measured with {CONFIGURATIONS_MAX} other configurations")
+    })?;
+    Ok((*configuration, prepared))
 }
 
 fn is_withdrawn(row: &WithdrawalRow, key: &SumKey) -> bool {

@@ -1,15 +1,21 @@
-//! The map in memory, beside the database: loaded at the start, changed after each commit.
+//! The map in memory, beside the database: loaded at the start, changed with each commit.
+//!
+//! Whoever changes sums takes the turn, writes, and commits with [`MapTurn::commit`]: commit and
+//! change of memory are one task, which nobody who goes away interrupts. After a commit of which
+//! nobody knows what became there is no turn until memory was read again (see [`super::memory`]).
 
 use std::collections::HashMap;
-use std::sync::{PoisonError, RwLock};
+use std::sync::{Arc, PoisonError, RwLock};
 
-use tokio::sync::{Mutex, MutexGuard};
+use tokio::sync::{Mutex, OwnedMutexGuard};
 use tread_api::ids::{ConfigurationId, RobotId};
+use tread_api::rights::Scope;
+use tread_api::robot::Alert;
 
-use super::{App, AppError};
+use super::App;
 use crate::db::sites::SiteRow;
 use crate::db::sums::SumKey;
-use crate::db::{self, Tx};
+use crate::db::{self, DbError, Outcome, Tx};
 use crate::friction::Sums;
 use crate::friction::index::{Labelled, SiteMap};
 
@@ -18,8 +24,31 @@ use crate::friction::index::{Labelled, SiteMap};
 pub(super) struct Maps {
     sites: RwLock<HashMap<i64, SiteMap>>,
     /// Held from before a transaction that changes sums until memory shows it, so that both see
-    /// the same changes in the same order.
-    order: Mutex<()>,
+    /// the same changes in the same order. It holds how many commits of unknown outcome there were
+    /// when memory was read last.
+    order: Arc<Mutex<u64>>,
+}
+
+/// The turn to change sums, in the database and then in memory.
+#[derive(Debug)]
+pub(super) struct MapTurn {
+    app: App,
+    order: OwnedMutexGuard<u64>,
+}
+
+/// What a transaction changes in memory once it is committed.
+#[derive(Debug)]
+pub(super) enum MapChange {
+    /// Nothing: it says the same in another form.
+    Nothing,
+    /// Sums are added.
+    Add(Vec<Folded>),
+    /// What a robot measured from one hour to another goes, both included.
+    Withdraw(Box<SiteRow>, RobotId, (i64, i64)),
+    /// Hours before this one are read as days.
+    MergeBefore(Box<SiteRow>, i64),
+    /// Raw measurements of these runs were removed.
+    Remove(Vec<i64>),
 }
 
 /// Sums on their way into memory.
@@ -31,54 +60,41 @@ pub(super) struct Folded {
     pub(super) sums: Sums,
 }
 
-impl Maps {
-    /// The turn to change sums, in the database and then here.
-    pub(super) async fn turn(&self) -> MutexGuard<'_, ()> {
-        self.order.lock().await
+impl MapTurn {
+    /// Commits, and then changes memory and shows alerts that were written, or has memory read again
+    /// if nobody knows what became of the commit.
+    ///
+    /// # Errors
+    /// As [`Tx::commit`].
+    pub(super) async fn commit(
+        self,
+        tx: Tx,
+        change: MapChange,
+        alerts: Vec<Alert>,
+    ) -> Result<(), DbError> {
+        let Self { app, order } = self;
+        let committed = tx.commit_then(move |outcome| {
+            if outcome == Outcome::Written {
+                app.apply(change);
+                app.show_alerts(&alerts);
+            }
+            drop(order);
+        });
+        Ok(committed.await?)
     }
+}
 
+impl Maps {
     /// Makes room for a site's map.
     pub(super) fn ensure(&self, row: &SiteRow) {
         let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
-        sites
-            .entry(row.pk)
-            .or_insert_with(|| SiteMap::new(row.site.grid.revision, row.merged_before_h));
-    }
-
-    /// Adds what was committed.
-    pub(super) fn fold(&self, folded: &[Folded]) {
-        if folded.is_empty() {
-            return;
-        }
-        let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
-        for Folded {
-            key,
-            robot,
-            configuration,
-            sums,
-        } in folded
-        {
-            if let Some(map) = sites.get_mut(&key.site_pk) {
-                let labelled = Labelled {
-                    cell: key.cell,
-                    grid_revision: key.grid_revision,
-                    terrain: &key.terrain,
-                    configuration: *configuration,
-                    robot,
-                    epoch_h: key.epoch_h,
-                };
-                map.add(labelled, sums);
-            }
-        }
+        ensure(&mut sites, row);
     }
 
     /// Changes a site's map.
-    pub(super) fn change(&self, row: &SiteRow, change: impl FnOnce(&mut SiteMap)) {
-        self.ensure(row);
+    fn change(&self, row: &SiteRow, change: impl FnOnce(&mut SiteMap)) {
         let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
-        if let Some(map) = sites.get_mut(&row.pk) {
-            change(map);
-        }
+        change(ensure(&mut sites, row));
     }
 
     /// Looks at a site's map.
@@ -89,55 +105,138 @@ impl Maps {
             None => look(&SiteMap::new(row.site.grid.revision, row.merged_before_h)),
         }
     }
+
+    /// Takes what was read from the database in place of what there is.
+    fn replace(&self, mut read: HashMap<i64, SiteMap>) {
+        let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
+        for (pk, before) in sites.drain() {
+            match read.get_mut(&pk) {
+                Some(map) => map.follow(&before),
+                None => {
+                    read.insert(pk, before);
+                }
+            }
+        }
+        *sites = read;
+    }
+}
+
+fn ensure<'maps>(sites: &'maps mut HashMap<i64, SiteMap>, row: &SiteRow) -> &'maps mut SiteMap {
+    sites
+        .entry(row.pk)
+        .or_insert_with(|| SiteMap::new(row.site.grid.revision, row.merged_before_h))
+}
+
+/// Adds sums to their maps.
+fn add(sites: &mut HashMap<i64, SiteMap>, folded: &[Folded]) {
+    for Folded {
+        key,
+        robot,
+        configuration,
+        sums,
+    } in folded
+    {
+        if let Some(map) = sites.get_mut(&key.site_pk) {
+            let labelled = Labelled {
+                cell: key.cell,
+                grid_revision: key.grid_revision,
+                terrain: &key.terrain,
+                configuration: *configuration,
+                robot,
+                epoch_h: key.epoch_h,
+            };
+            map.add(labelled, sums);
+        }
+    }
 }
 
 impl App {
-    /// Reads all sums into memory, and of which runs raw measurements were removed; once, before
-    /// anything is taken in.
+    /// The turn to change sums.
+    ///
+    /// # Errors
+    /// [`DbError::Unsettled`] until memory was read again after a commit of unknown outcome.
+    pub(super) async fn map_turn_to_change(&self) -> Result<MapTurn, DbError> {
+        let order = Arc::clone(&self.maps().order).lock_owned().await;
+        if *order != self.db().unknown_outcomes() {
+            return Err(DbError::Unsettled);
+        }
+        let app = self.clone();
+        Ok(MapTurn { app, order })
+    }
+
+    fn apply(&self, change: MapChange) {
+        match change {
+            MapChange::Nothing => {}
+            MapChange::Add(folded) => {
+                if !folded.is_empty() {
+                    let sites = self.maps().sites.write();
+                    add(&mut sites.unwrap_or_else(PoisonError::into_inner), &folded);
+                }
+            }
+            MapChange::Withdraw(row, robot, hours) => {
+                self.maps().change(&row, |map| map.withdraw(&robot, hours));
+            }
+            MapChange::MergeBefore(row, hour) => {
+                self.maps().change(&row, |map| map.merge_before(hour));
+            }
+            MapChange::Remove(boots) => self.removed().extend(boots),
+        }
+    }
+
+    /// Reads all sums into memory, and of which runs raw measurements were removed.
     ///
     /// # Errors
     /// The database failed.
-    pub async fn load_map(&self) -> Result<(), AppError> {
-        let _turn = self.maps().turn().await;
-        let mut tx = self.db().read().await?;
-        self.fill(&mut tx).await
+    pub async fn load_map(&self) -> Result<(), DbError> {
+        self.load_map_again(self.db().unknown_outcomes()).await
     }
 
-    async fn fill(&self, tx: &mut Tx) -> Result<(), AppError> {
-        self.removed().extend(db::removed::boots(tx).await?);
-        let mut after = String::new();
-        loop {
-            let rows = db::sites::list(tx, &after, 100).await?;
-            let Some(last) = rows.last() else { break };
-            after = last.site.id.to_string();
-            for row in &rows {
-                self.maps().ensure(row);
-            }
-        }
-        let robots = db::robots::ids_by_key(tx).await?;
-        let configurations = db::robots::configurations_by_key(tx).await?;
-        let mut chunk = Vec::new();
-        db::sums::each(tx, |row| {
-            let key = row.key;
-            // A sum refers to both, so neither is ever missing.
-            if let (Some(robot), Some(&configuration)) = (
-                robots.get(&key.robot_pk),
-                configurations.get(&key.configuration_pk),
-            ) {
-                chunk.push(Folded {
-                    robot: robot.clone(),
-                    configuration,
-                    sums: row.sums,
-                    key,
-                });
-            }
-            if chunk.len() >= 10_000 {
-                self.maps().fold(&chunk);
-                chunk.clear();
-            }
-        })
-        .await?;
-        self.maps().fold(&chunk);
+    /// The same in place of what is there, when so many commits of unknown outcome have ended. Nobody
+    /// changes sums meanwhile.
+    ///
+    /// # Errors
+    /// The database failed; memory is as it was.
+    pub(super) async fn load_map_again(&self, ended: u64) -> Result<(), DbError> {
+        let mut order = Arc::clone(&self.maps().order).lock_owned().await;
+        let mut tx = self.db().read().await?;
+        let read = read_maps(&mut tx).await?;
+        self.removed().extend(db::removed::boots(&mut tx).await?);
+        drop(tx);
+        self.maps().replace(read);
+        *order = ended;
         Ok(())
     }
+}
+
+async fn read_maps(tx: &mut Tx) -> Result<HashMap<i64, SiteMap>, DbError> {
+    let mut sites = HashMap::new();
+    let mut after = String::new();
+    loop {
+        let rows = db::sites::list(tx, &Scope::EVERYWHERE, &after, 100).await?;
+        let Some(last) = rows.last() else { break };
+        after = last.site.id.to_string();
+        for row in &rows {
+            ensure(&mut sites, row);
+        }
+    }
+    let robots = db::robots::ids_by_key(tx).await?;
+    let configurations = db::robots::configurations_by_key(tx).await?;
+    db::sums::each(tx, |row| {
+        let key = row.key;
+        // A sum refers to both, so neither is ever missing.
+        if let (Some(robot), Some(&configuration)) = (
+            robots.get(&key.robot_pk),
+            configurations.get(&key.configuration_pk),
+        ) {
+            let folded = Folded {
+                robot: robot.clone(),
+                configuration,
+                sums: row.sums,
+                key,
+            };
+            add(&mut sites, std::slice::from_ref(&folded));
+        }
+    })
+    .await?;
+    Ok(sites)
 }

@@ -8,7 +8,9 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
+use tread_api::rights::Scope;
 
+use super::map::MapChange;
 use super::{App, AppError};
 use crate::db;
 use crate::db::sums::SumKey;
@@ -51,17 +53,17 @@ impl App {
     pub async fn move_horizons(&self) -> Result<(), AppError> {
         let horizon_h = bucket_h(epoch_h(self.clock().now()) - HOURS_KEPT, i64::MAX);
         let mut tx = self.db().read().await?;
-        let sites = db::sites::list(&mut tx, "", SITES_MAX).await?;
+        let sites = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         drop(tx);
         for site in sites {
             if site.merged_before_h >= horizon_h {
                 continue;
             }
-            let _turn = self.maps().turn().await;
+            let turn = self.map_turn_to_change().await?;
             let mut tx = self.db().write().await?;
             db::sites::merge_before(&mut tx, site.pk, horizon_h).await?;
-            tx.commit().await?;
-            self.maps().change(&site, |map| map.merge_before(horizon_h));
+            let change = MapChange::MergeBefore(Box::new(site), horizon_h);
+            turn.commit(tx, change, Vec::new()).await?;
         }
         Ok(())
     }
@@ -77,7 +79,7 @@ impl App {
         let Some((robot_pk, horizon_h)) = row else {
             return Ok(false);
         };
-        let _turn = self.maps().turn().await;
+        let turn = self.map_turn_to_change().await?;
         let mut tx = self.db().write().await?;
         let rows = db::sums::unmerged(&mut tx, robot_pk, horizon_h, limit).await?;
         let mut days: BTreeMap<SumKey, Sums> = BTreeMap::new();
@@ -92,7 +94,7 @@ impl App {
                 .or_insert(row.sums);
         }
         db::sums::add(&mut tx, days.iter()).await?;
-        tx.commit().await?;
+        turn.commit(tx, MapChange::Nothing, Vec::new()).await?;
         Ok(true)
     }
 }

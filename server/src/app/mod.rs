@@ -1,6 +1,7 @@
 //! What the server can do: use cases and their transactions. No HTTP, no SQL text.
 
 pub mod alerts;
+mod allowance;
 pub mod check;
 pub mod checkpoints;
 pub mod enrolment;
@@ -12,6 +13,7 @@ pub mod identity;
 pub mod ingest;
 pub mod limits;
 mod map;
+pub mod memory;
 pub mod merging;
 pub mod missions;
 mod planned_path;
@@ -19,6 +21,7 @@ pub mod reconciler;
 pub mod retention;
 pub mod robots;
 pub mod segments;
+pub mod shares;
 pub mod sites;
 pub mod stops;
 pub mod storage;
@@ -32,8 +35,10 @@ use std::time::Duration;
 
 use tokio::sync::{Notify, Semaphore, SemaphorePermit};
 use tread_api::ids::{RobotId, SiteId};
+use tread_api::rights::Scope;
 use uuid::Uuid;
 
+use self::allowance::Allowances;
 use self::enrolment::Membership;
 pub use self::error::AppError;
 use self::events::Hub;
@@ -42,8 +47,10 @@ use self::identity::Identity;
 use self::map::Maps;
 use self::missions::idempotency::InFlight;
 use self::retention::Removed;
+use self::shares::Shares;
 use self::stops::Unrecorded;
 use self::storage::Storage;
+use self::teleop::Holds;
 use crate::clock::Clock;
 use crate::config::{FrictionConfig, StorageConfig};
 use crate::counters::Counters;
@@ -97,7 +104,10 @@ struct Inner {
     removed: Removed,
     storage: Storage,
     unrecorded: Unrecorded,
-    drive_slots: Arc<Semaphore>,
+    allowances: Allowances,
+    holds: Holds,
+    drive_shares: Shares,
+    event_shares: Shares,
 }
 
 /// What use cases reach robots by, once the network is open.
@@ -150,7 +160,10 @@ impl App {
             removed: Removed::default(),
             storage: Storage::new(storage),
             unrecorded: Unrecorded::default(),
-            drive_slots: Arc::new(Semaphore::new(teleop::SESSIONS_MAX)),
+            allowances: Allowances::default(),
+            holds: Holds::default(),
+            drive_shares: Shares::new(teleop::SHARES),
+            event_shares: Shares::new(events::SHARES),
         };
         Self {
             inner: Arc::new(inner),
@@ -294,6 +307,14 @@ impl App {
         &self.inner.unrecorded
     }
 
+    fn holds(&self) -> &Holds {
+        &self.inner.holds
+    }
+
+    fn allowances(&self) -> &Allowances {
+        &self.inner.allowances
+    }
+
     /// A name of this run of the server: counts in memory begin anew with each.
     fn run_id(&self) -> String {
         self.inner.run_id.to_string()
@@ -334,6 +355,7 @@ async fn check_named(
     tx: &mut Tx,
     site: Option<&SiteId>,
     robot: Option<&RobotId>,
+    within: &Scope,
 ) -> Result<(), AppError> {
     let unknown = |parameter, name: &str| {
         let detail = format!("`{name}` names nothing that is known here");
@@ -345,11 +367,30 @@ async fn check_named(
         return unknown("site", site.as_str());
     }
     match robot {
-        Some(robot) if !db::robots::is_known(tx, site, robot).await? => {
+        Some(robot) if !is_known(tx, site, robot, within).await? => {
             unknown("robot", robot.as_str())
         }
         Some(_) | None => Ok(()),
     }
+}
+
+/// Whether a robot of a name is known in a site, or without one in a site of a scope.
+async fn is_known(
+    tx: &mut Tx,
+    site: Option<&SiteId>,
+    robot: &RobotId,
+    within: &Scope,
+) -> Result<bool, AppError> {
+    let (Some(sites), None) = (within.sites(), site) else {
+        return Ok(db::robots::is_known(tx, site, robot).await?);
+    };
+    for site in sites {
+        let is_in = within.includes_robot(site, robot);
+        if is_in && db::robots::is_known(tx, Some(site), robot).await? {
+            return Ok(true);
+        }
+    }
+    Ok(false)
 }
 
 async fn site_row(tx: &mut Tx, site: &SiteId) -> Result<SiteRow, AppError> {
@@ -376,16 +417,16 @@ fn name_or(name: Option<String>, id: &str) -> Result<String, AppError> {
     let Some(name) = name else {
         return Ok(id.to_owned());
     };
-    let length_max = tread_api::site::NAME_LENGTH_MAX;
-    let trimmed = name.trim();
-    if trimmed.is_empty() || trimmed.chars().count() > length_max {
-        let detail = format!("a name has 1 to {length_max} characters");
-        return Err(AppError::Invalid {
-            field: "name",
-            detail,
-        });
-    }
-    Ok(trimmed.to_owned())
+    people_line("name", &name, tread_api::site::NAME_LENGTH_MAX)
+}
+
+/// A line that people gave for people, without blanks around it.
+fn people_line(field: &'static str, given: &str, length_max: usize) -> Result<String, AppError> {
+    let line = tread_api::text::line(given, length_max);
+    line.map(str::to_owned).map_err(|wrong| AppError::Invalid {
+        field,
+        detail: format!("the {field} cannot be taken: {wrong}"),
+    })
 }
 
 fn bad_cursor(cursor: &str) -> AppError {

@@ -12,6 +12,7 @@ use std::time::Duration;
 use jiff::SignedDuration;
 use tokio_util::sync::CancellationToken;
 
+use super::map::MapChange;
 use super::{App, AppError};
 use crate::config::RetentionConfig;
 use crate::db;
@@ -96,11 +97,12 @@ impl App {
             return Ok(0);
         }
         // Uploads wait their turn: none is between its look at the names and its commit.
-        let _turn = self.maps().turn().await;
+        let turn = self.map_turn_to_change().await?;
         let mut tx = self.db().write().await?;
         db::removed::remove(&mut tx, &rows).await?;
-        tx.commit().await?;
-        self.removed().extend(rows.iter().map(|row| row.boot_pk));
+        let boots = rows.iter().map(|row| row.boot_pk).collect();
+        turn.commit(tx, MapChange::Remove(boots), Vec::new())
+            .await?;
         self.counters().segments_removed.add(rows.len() as u64);
         Ok(rows.len() as u64)
     }

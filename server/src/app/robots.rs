@@ -4,33 +4,59 @@ use tracing::info;
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::mission::Actor;
 use tread_api::page::Page;
+use tread_api::rights::Scope;
 use tread_api::robot::{ALERTS_MAX, Alert, ChangeRobot, Robot, RobotModel};
 use tread_api::site::NAME_LENGTH_MAX;
+use tread_api::text::is_printable;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::{Refusal, RefusalCode};
 
 use super::alerts::MISSION_FAILED_ALERT;
+use super::allowance::Kind;
 use super::missions::end_all;
 use super::missions::transitions::Change;
 use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::terrains::site_definition;
 use super::{App, AppError, name_or, page, site_row};
-use crate::db;
 use crate::db::robots::{Introduction, RobotRow};
+use crate::db::{self, Outcome};
+use crate::fleet::presence::RobotKey;
+
+/// Runs of one robot's agent that are kept; older ones only as long as their raw measurements are.
+pub(super) const RUNS_KEPT_MAX: u32 = 500;
 
 impl App {
-    /// Robots of a site after a cursor.
+    /// Whether a robot's agent may begin another run now.
+    pub(super) fn may_begin_run(&self, robot: &RobotKey) -> bool {
+        let now = self.clock().elapsed();
+        self.allowances().take(robot, Kind::Run, now)
+    }
+
+    /// Whether a robot may have another configuration now.
+    pub(super) fn may_change_configuration(&self, robot: &RobotKey) -> bool {
+        let now = self.clock().elapsed();
+        self.allowances().take(robot, Kind::Configuration, now)
+    }
+
+    /// Robots of a site in a scope after a cursor.
     pub async fn robots(
         &self,
-        site: &SiteId,
+        (site, within): (&SiteId, &Scope),
         cursor: Option<&str>,
         retired: bool,
         limit: u32,
     ) -> Result<Page<Robot>, AppError> {
         let mut tx = self.db().read().await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
-        let after = cursor.unwrap_or_default();
-        let rows = db::robots::list(&mut tx, site_pk, after, retired, limit + 1).await?;
+        let (after, named) = (cursor.unwrap_or_default(), within.limit_of(site));
+        let rows = db::robots::list(
+            &mut tx,
+            (site_pk, named.as_ref()),
+            after,
+            retired,
+            limit + 1,
+        )
+        .await?;
         let mut robots = Vec::with_capacity(rows.len());
         for row in rows {
             let alerts = db::alerts::raised_of(&mut tx, row.pk).await?;
@@ -83,10 +109,15 @@ impl App {
         let found = db::robots::find(&mut tx, site_pk, id).await?;
         let row = found.ok_or_else(unknown)?;
         let alerts = db::alerts::raised_of(&mut tx, row.pk).await?;
-        tx.commit().await?;
-        self.show_alerts(&ended);
-        self.robots_changed();
-        self.wake();
+        let app = self.clone();
+        let committed = tx.commit_then(move |outcome| {
+            if outcome == Outcome::Written {
+                app.show_alerts(&ended);
+                app.robots_changed();
+                app.wake();
+            }
+        });
+        committed.await?;
         Ok(self.with_live(row, alerts))
     }
 
@@ -151,7 +182,10 @@ impl App {
                 format!("site `{site}` is not known"),
             )
         };
-        let welcome = welcome.ok_or_else(unknown)?;
+        let welcome = welcome.ok_or_else(unknown)?.map_err(|too_much| {
+            let detail = format!("the robot has {too_much} of late");
+            refusal(RefusalCode::Busy, detail)
+        })?;
         info!(robot.id = %hello.robot, "robot `{}` of site `{site}` said hello", hello.robot);
         self.presences()
             .hello(key, hello.boot, self.clock().elapsed());
@@ -160,12 +194,31 @@ impl App {
         Ok(welcome)
     }
 
-    async fn introduce(&self, site: &SiteId, hello: &Hello) -> Result<Option<Welcome>, AppError> {
+    /// `None` if the site is not known; what the robot has done too often, if anything.
+    async fn introduce(
+        &self,
+        site: &SiteId,
+        hello: &Hello,
+    ) -> Result<Option<Result<Welcome, &'static str>>, AppError> {
         let now = self.clock().now();
         let mut tx = self.db().write().await?;
         let Some(row) = db::sites::find(&mut tx, site).await? else {
             return Ok(None);
         };
+        let key = (site.clone(), hello.robot.clone());
+        let before = db::robots::find(&mut tx, row.pk, &hello.robot).await?;
+        let known_run = match &before {
+            Some(before) => db::robots::find_boot(&mut tx, before.pk, hello.boot).await?,
+            None => None,
+        };
+        if known_run.is_none() && !self.may_begin_run(&key) {
+            return Ok(Some(Err("begun too many runs")));
+        }
+        let configuration = hello.model.configuration();
+        let changes = before.is_some_and(|before| before.configuration != configuration);
+        if changes && !self.may_change_configuration(&key) {
+            return Ok(Some(Err("changed its configuration too often")));
+        }
         let introduction = Introduction {
             id: &hello.robot,
             boot: hello.boot,
@@ -174,12 +227,14 @@ impl App {
             capabilities: &hello.capabilities,
             at: now,
         };
-        db::robots::introduce(&mut tx, row.pk, introduction).await?;
+        db::robots::introduce(&mut tx, row.pk, introduction, RUNS_KEPT_MAX).await?;
         let definition = site_definition(&mut tx, site).await?;
         tx.commit().await?;
-        Ok(definition.map(|site| Welcome {
-            site,
-            server_time: now,
+        Ok(definition.map(|site| {
+            Ok(Welcome {
+                site,
+                server_time: now,
+            })
         }))
     }
 }
@@ -210,6 +265,12 @@ fn check_model(hello: &Hello) -> Result<(), String> {
         if text.chars().count() > NAME_LENGTH_MAX {
             return Err(format!(
                 "{field} is longer than {NAME_LENGTH_MAX} characters"
+            ));
+        }
+        if let Some(letter) = text.chars().find(|letter| !is_printable(*letter)) {
+            let code = u32::from(letter);
+            return Err(format!(
+                "{field} has the character U+{code:04X}, which cannot be seen"
             ));
         }
     }

@@ -2,6 +2,7 @@
 
 use tread_api::ids::SiteId;
 use tread_api::page::Page;
+use tread_api::rights::Scope;
 use tread_api::site::{CELL_MAX_M, CELL_MIN_M, CreateSite, GeoOrigin, Grid, Site};
 
 use super::{App, AppError, name_or, page, site_row};
@@ -13,10 +14,15 @@ const SITES_MAX: u32 = 1_000;
 const CELL_DEFAULT_M: f64 = 1.0;
 
 impl App {
-    /// Sites after a cursor.
-    pub async fn sites(&self, cursor: Option<&str>, limit: u32) -> Result<Page<Site>, AppError> {
+    /// Sites of a scope after a cursor.
+    pub async fn sites(
+        &self,
+        within: &Scope,
+        cursor: Option<&str>,
+        limit: u32,
+    ) -> Result<Page<Site>, AppError> {
         let mut tx = self.db().read().await?;
-        let rows = db::sites::list(&mut tx, cursor.unwrap_or_default(), limit + 1).await?;
+        let rows = db::sites::list(&mut tx, within, cursor.unwrap_or_default(), limit + 1).await?;
         let sites = rows.into_iter().map(|row| row.site).collect();
         Ok(page(sites, limit, |site: &Site| site.id.to_string()))
     }
@@ -24,7 +30,7 @@ impl App {
     /// The names of all sites.
     pub(crate) async fn all_sites(&self) -> Result<Vec<SiteId>, AppError> {
         let mut tx = self.db().read().await?;
-        let rows = db::sites::list(&mut tx, "", SITES_MAX).await?;
+        let rows = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         Ok(rows.into_iter().map(|row| row.site.id).collect())
     }
 
@@ -63,7 +69,9 @@ impl App {
             created_at: self.clock().now(),
         };
         let mut tx = self.db().write().await?;
-        let present = db::sites::list(&mut tx, "", SITES_MAX).await?.len();
+        let present = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX)
+            .await?
+            .len();
         if u32::try_from(present).is_ok_and(|present| present >= SITES_MAX) {
             return Err(AppError::TooMany {
                 what: "sites",

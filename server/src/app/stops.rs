@@ -8,12 +8,18 @@
 //! clear ──► the database ─► the robot ─► cleared, or refused: a newer stop, or it still moves
 //! ```
 //!
+//! An open stop is state of a robot: it has one or none, and the newest takes the place of the one
+//! before, which is history then. So what is sent again is bounded by the number of robots.
+//!
 //! The robot is the truth of what is in force, in the order in which stops came to it: the clear of
 //! the last one ends those before. A robot that does not show a stop which it had confirmed and
-//! which nobody asked to clear is told again, and may answer that it was cleared. Everything that a stopped robot had in
-//! hand or in its queue is held, and goes on only when a person says so.
+//! which nobody asked to clear is told again, and may answer that it was cleared (`judge`).
+//! Everything that a stopped robot had in hand or in its queue is held, and goes on only when a
+//! person says so.
 
 mod delivery;
+mod judge;
+mod tending;
 mod unrecorded;
 
 use std::collections::HashSet;
@@ -25,8 +31,9 @@ use tracing::{error, info, warn};
 use tread_api::ids::{RobotId, SiteId, StopId};
 use tread_api::keys::Verb;
 use tread_api::page::Page;
-use tread_api::robot::Severity;
-use tread_api::safety::StandingState;
+use tread_api::rights::Scope;
+use tread_api::robot::{Alert, Severity};
+use tread_api::safety::StopLatch;
 use tread_api::stop::{FleetStop, STOP_CONFIRM_MAX_MS, STOP_TEXT_MAX, Stop};
 use tread_api::wire::command::Outcome;
 use tread_api::wire::safety::ClearStop;
@@ -42,13 +49,12 @@ use crate::fleet::presence::RobotKey;
 
 /// How long a robot may take to confirm before the stop is shown as unconfirmed.
 pub const STOP_CONFIRM_MAX: Duration = Duration::from_millis(STOP_CONFIRM_MAX_MS);
-/// Most stops that are looked at in one pass of the reconciler.
-const IN_FORCE_MAX: u32 = 20_000;
+/// Stops of a robot that are kept; the oldest that are over go first.
+const KEPT_MAX: u32 = 200;
+/// How long a stop of a robot that nobody has heard of yet may wait for the database to know it.
+const LOOK_UP_MAX: Duration = Duration::from_secs(2);
 /// The alert of a robot that has not confirmed a stop.
 pub(super) const UNCONFIRMED_ALERT: &str = "stop-unconfirmed";
-/// How old a confirmation must be before a robot's state that does not show the stop counts
-/// against it: states overtake answers.
-const SHOWN_GRACE: SignedDuration = SignedDuration::from_secs(2);
 /// Who stopped, when nobody said.
 const SOMEBODY: &str = "somebody";
 
@@ -61,6 +67,10 @@ pub struct StopWords {
     pub reason: Option<String>,
 }
 
+fn key_of(stop: &Stop) -> RobotKey {
+    (stop.site.clone(), stop.robot.clone())
+}
+
 fn words(text: Option<String>, otherwise: &str) -> String {
     let text: String = text
         .unwrap_or_default()
@@ -71,6 +81,18 @@ fn words(text: Option<String>, otherwise: &str) -> String {
         "" => otherwise.to_owned(),
         text => text.to_owned(),
     }
+}
+
+/// Robots of which it is said that they have not confirmed a stop.
+async fn alerted(tx: &mut Tx) -> Result<HashSet<RobotKey>, AppError> {
+    let alerted = db::alerts::raised_about(tx, UNCONFIRMED_ALERT).await?;
+    Ok(alerted.into_iter().collect())
+}
+
+/// Waits for the database as long as somebody who stops a robot may have to.
+async fn looked_up(looking_up: impl Future<Output = Result<(), AppError>>) -> Result<(), AppError> {
+    let looked_up = tokio::time::timeout(LOOK_UP_MAX, looking_up).await;
+    looked_up.unwrap_or_else(|_elapsed| Err(sqlx::Error::PoolTimedOut.into()))
 }
 
 impl App {
@@ -88,32 +110,41 @@ impl App {
         let key = (site.clone(), robot.clone());
         // What is in memory decides, so that a slow database does not delay a stop.
         if !self.presences().is_known(&key) {
-            let mut tx = self.db().read().await?;
-            let site_pk = site_row(&mut tx, site).await?.pk;
-            let found = db::robots::find(&mut tx, site_pk, robot).await?;
-            let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
-            found.ok_or_else(unknown)?;
+            let looking_up = async {
+                let mut tx = self.db().read().await?;
+                let site_pk = site_row(&mut tx, site).await?.pk;
+                let found = db::robots::find(&mut tx, site_pk, robot).await?;
+                let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
+                found.map(|_known| ()).ok_or_else(unknown)
+            };
+            looked_up(looking_up).await?;
         }
         let stops = self.stop_all(vec![key], words).await;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
         stops.into_iter().next().ok_or_else(unknown)
     }
 
-    /// Stops every robot that has ever said hello, of all sites or of one.
+    /// Stops every robot of a scope that has ever said hello, of all its sites or of one.
     ///
     /// # Errors
     /// There is no such site.
     pub async fn stop_fleet(
         &self,
+        within: &Scope,
         site: Option<&SiteId>,
         words: StopWords,
     ) -> Result<FleetStop, AppError> {
         let known = self.presences().known();
-        let wanted = |key: &RobotKey| site.is_none_or(|site| *site == key.0);
+        let wanted = |key: &RobotKey| {
+            site.is_none_or(|site| *site == key.0) && within.includes_robot(&key.0, &key.1)
+        };
         let keys: Vec<RobotKey> = known.into_iter().filter(wanted).collect();
         if let (Some(site), true) = (site, keys.is_empty()) {
-            let mut tx = self.db().read().await?;
-            site_row(&mut tx, site).await?;
+            let looking_up = async {
+                let mut tx = self.db().read().await?;
+                site_row(&mut tx, site).await.map(|_known| ())
+            };
+            looked_up(looking_up).await?;
         }
         let stops = self.stop_all(keys, words).await;
         let confirmed = stops
@@ -144,6 +175,7 @@ impl App {
             clear_asked_by: None,
             clear_asked_at: None,
             cleared_at: None,
+            replaced_by: None,
         };
         let mut stops: Vec<Stop> = keys.into_iter().map(stop).collect();
         let Some(links) = self.links() else {
@@ -201,10 +233,14 @@ impl App {
         let mut tx = self.db().write().await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
-        db::robots::find(&mut tx, site_pk, robot)
+        let row = db::robots::find(&mut tx, site_pk, robot).await?;
+        let robot_pk = row.ok_or_else(unknown)?.pk;
+        let is_open = db::stops::in_force_of(&mut tx, robot_pk)
             .await?
-            .ok_or_else(unknown)?;
-        self.adopt_shown_stop(&mut tx, &key).await?;
+            .is_some_and(|open| open.id == id);
+        if !is_open && self.shown_latch(&key).is_some_and(|latch| latch.id == id) {
+            self.adopt_shown_stop(&mut tx, &key).await?;
+        }
         let found = db::stops::find(&mut tx, id).await?;
         found
             .filter(|stop| (&stop.site, &stop.robot) == (site, robot))
@@ -241,9 +277,14 @@ impl App {
         let mut tx = self.db().read().await?;
         // Looked at first: one that is written down meanwhile is in both.
         let mut stops = self.unrecorded().list(filter);
-        for stop in db::stops::list(&mut tx, filter, limit + 1).await? {
+        for mut stop in db::stops::list(&mut tx, filter, limit + 1).await? {
             stops.retain(|unrecorded| unrecorded.id != stop.id);
-            stops.push(stop);
+            if stop.cleared_at.is_none() && stop.replaced_by.is_none() {
+                stop.replaced_by = self.unrecorded().successor_of(&stop);
+            }
+            if !(filter.in_force && stop.replaced_by.is_some()) {
+                stops.push(stop);
+            }
         }
         stops.sort_by_key(|stop| std::cmp::Reverse(stop.id));
         let shown = stops.into_iter().map(|stop| self.with_confirmation(stop));
@@ -252,29 +293,41 @@ impl App {
         }))
     }
 
-    /// Stops that the reconciler looks at.
+    /// The open stop of each robot that has one.
     pub(crate) async fn stops_in_force(&self) -> Result<Vec<Stop>, AppError> {
         let mut tx = self.db().read().await?;
-        let stops = db::stops::in_force(&mut tx, IN_FORCE_MAX).await?;
+        let stops = db::stops::in_force(&mut tx).await?;
         let shown = stops.into_iter().map(|stop| self.with_confirmation(stop));
         Ok(shown.collect())
     }
 
     fn with_confirmation(&self, mut stop: Stop) -> Stop {
         let age = self.clock().now().duration_since(stop.wanted_at);
-        let bound = SignedDuration::from_millis(300);
-        stop.unconfirmed = stop.confirmed_at.is_none() && stop.cleared_at.is_none() && age > bound;
+        let bound = SignedDuration::try_from(STOP_CONFIRM_MAX).unwrap_or(SignedDuration::MAX);
+        let is_open = stop.cleared_at.is_none() && stop.replaced_by.is_none();
+        stop.unconfirmed = stop.confirmed_at.is_none() && is_open && age > bound;
         stop
     }
 
-    /// Writes down a stop that a robot shows and that is not known here: it stopped by itself, or
-    /// was stopped by another program.
-    async fn adopt_shown_stop(&self, tx: &mut Tx, key: &RobotKey) -> Result<(), AppError> {
+    fn shown_latch(&self, key: &RobotKey) -> Option<StopLatch> {
         let presence = self.presences().get(key);
-        let Some(latch) = presence.state().and_then(|state| state.safety.stop.clone()) else {
+        presence.state().and_then(|state| state.safety.stop.clone())
+    }
+
+    /// Makes the stop that a robot shows its open one. It stopped by itself, was stopped by another
+    /// program, or has another order of its stops.
+    async fn adopt_shown_stop(&self, tx: &mut Tx, key: &RobotKey) -> Result<(), AppError> {
+        let Some(latch) = self.shown_latch(key) else {
             return Ok(());
         };
-        if db::stops::find(tx, latch.id).await?.is_some() {
+        let Some(robot_pk) = db::robots::pk_of(tx, &key.0, &key.1).await? else {
+            return Ok(());
+        };
+        // A stop that the robot has not confirmed yet is newer than what it shows, and is to be told
+        // still; so is one that is not written down.
+        let open = db::stops::in_force_of(tx, robot_pk).await?;
+        let is_untold = open.is_some_and(|open| open.id != latch.id && open.confirmed_at.is_none());
+        if is_untold || self.unrecorded().has_of(key) {
             return Ok(());
         }
         let now = self.clock().now();
@@ -291,19 +344,39 @@ impl App {
             clear_asked_by: None,
             clear_asked_at: None,
             cleared_at: None,
+            replaced_by: None,
         };
-        self.record_stops(tx, &[stop]).await
+        db::stops::adopt(tx, robot_pk, &stop, KEPT_MAX).await?;
+        self.hold_stopped(tx, robot_pk, &stop).await
+    }
+
+    async fn hold_stopped(&self, tx: &mut Tx, robot_pk: i64, stop: &Stop) -> Result<(), AppError> {
+        let reason = format!("the robot was stopped by {}: {}", stop.by, stop.reason);
+        hold_all(tx, robot_pk, &reason, self.clock().now()).await?;
+        Ok(())
     }
 
     /// Writes stops down, and holds everything that their robots have in hand.
     async fn record_stops(&self, tx: &mut Tx, stops: &[Stop]) -> Result<(), AppError> {
-        db::stops::insert(tx, stops).await?;
-        for stop in stops {
-            let Some(robot_pk) = db::robots::pk_of(tx, &stop.site, &stop.robot).await? else {
-                continue;
-            };
-            let reason = format!("the robot was stopped by {}: {}", stop.by, stop.reason);
-            hold_all(tx, robot_pk, &reason, self.clock().now()).await?;
+        db::stops::insert(tx, stops, KEPT_MAX).await?;
+        let mut busy = None;
+        if stops.len() > 1 {
+            // Of a whole fleet most robots may have nothing to hold.
+            let mut missions = db::missions::in_hand(tx).await?;
+            missions.extend(db::missions::next_in_queues(tx).await?);
+            let keys = missions
+                .into_iter()
+                .map(|mission| (mission.site, mission.robot));
+            busy = Some(keys.collect::<HashSet<RobotKey>>());
+        }
+        let is_idle = |stop: &Stop| {
+            let busy = busy.as_ref();
+            busy.is_some_and(|busy| !busy.contains(&key_of(stop)))
+        };
+        for stop in stops.iter().filter(|stop| !is_idle(stop)) {
+            if let Some(robot_pk) = db::robots::pk_of(tx, &stop.site, &stop.robot).await? {
+                self.hold_stopped(tx, robot_pk, stop).await?;
+            }
         }
         Ok(())
     }
@@ -317,15 +390,13 @@ impl App {
         let ids: Vec<StopId> = confirmed.iter().map(|(id, _)| *id).collect();
         let mut tx = self.db().write().await?;
         db::stops::confirm(&mut tx, &ids, self.clock().now()).await?;
+        let alerted = alerted(&mut tx).await?;
+        let is_over = |stop: &&Stop| ids.contains(&stop.id) && alerted.contains(&key_of(stop));
         let mut alerts = Vec::new();
-        for stop in stops.iter().filter(|stop| ids.contains(&stop.id)) {
-            if let Some(robot_pk) = db::robots::pk_of(&mut tx, &stop.site, &stop.robot).await? {
-                alerts.extend(self.end_alert(&mut tx, robot_pk, UNCONFIRMED_ALERT).await?);
-            }
+        for stop in stops.iter().filter(is_over) {
+            alerts.extend(self.settle_alert(&mut tx, &key_of(stop), false).await?);
         }
-        tx.commit().await?;
-        self.show_alerts(&alerts);
-        Ok(())
+        Ok(self.commit_alerts(tx, alerts).await?)
     }
 
     /// Writes down that a stop was in force on its robot and has been cleared there, with one that
@@ -333,110 +404,57 @@ impl App {
     pub(super) async fn note_over(&self, stop: &Stop) -> Result<(), AppError> {
         let mut tx = self.db().write().await?;
         db::stops::end(&mut tx, stop.id, self.clock().now()).await?;
-        let mut alerts = Vec::new();
-        if let Some(robot_pk) = db::robots::pk_of(&mut tx, &stop.site, &stop.robot).await? {
-            alerts.extend(self.end_alert(&mut tx, robot_pk, UNCONFIRMED_ALERT).await?);
-        }
-        tx.commit().await?;
-        self.show_alerts(&alerts);
+        let ended = self.settle_alert(&mut tx, &key_of(stop), false).await?;
+        self.commit_alerts(tx, ended.into_iter().collect()).await?;
         self.wake();
         Ok(())
     }
 
     /// Raises the alert of robots that have not confirmed.
     pub(super) async fn note_unconfirmed(&self, stops: &[&Stop]) -> Result<(), AppError> {
+        let mut tx = self.db().read().await?;
+        let open = db::stops::in_force(&mut tx).await?;
+        let open: HashSet<StopId> = open.into_iter().map(|stop| stop.id).collect();
+        let alerted = alerted(&mut tx).await?;
+        drop(tx);
+        // Most may have been replaced, where somebody stops a fleet again and again.
+        let is_missing =
+            |stop: &&&Stop| open.contains(&stop.id) && !alerted.contains(&key_of(stop));
+        let missing: Vec<&&Stop> = stops.iter().filter(is_missing).collect();
+        if missing.is_empty() {
+            return Ok(());
+        }
         let mut alerts = Vec::new();
         let mut tx = self.db().write().await?;
-        for stop in stops {
-            let Some(robot_pk) = db::robots::pk_of(&mut tx, &stop.site, &stop.robot).await? else {
-                continue;
-            };
-            let text = format!(
-                "it has not confirmed the stop by {} ({}); it is told again until it does",
-                stop.by, stop.reason
-            );
-            let severity = Severity::Critical;
-            let alert = (UNCONFIRMED_ALERT, severity, text);
-            alerts.extend(self.begin_alert(&mut tx, robot_pk, alert).await?);
+        for stop in missing {
+            alerts.extend(self.settle_alert(&mut tx, &key_of(stop), true).await?);
         }
-        tx.commit().await?;
-        self.show_alerts(&alerts);
-        Ok(())
+        Ok(self.commit_alerts(tx, alerts).await?)
     }
 
-    /// Compares the stops in force with what robots show, and gives those to be sent again.
-    pub(super) async fn tend_stops(&self) -> Result<Vec<Stop>, AppError> {
-        let stops = self.stops_in_force().await?;
-        let now = self.clock().now();
-        let (mut lost, mut cleared, mut standing) = (Vec::new(), Vec::new(), Vec::new());
-        let mut known: HashSet<StopId> = HashSet::new();
-        let mut again = Vec::new();
-        for stop in stops {
-            known.insert(stop.id);
-            let presence = self
-                .presences()
-                .get(&(stop.site.clone(), stop.robot.clone()));
-            let shows_none = presence
-                .state()
-                .is_some_and(|state| state.safety.stop.is_none());
-            let stands = presence.state().is_some_and(|state| {
-                let is_this = state.safety.stop.as_ref().map(|latch| latch.id) == Some(stop.id);
-                let standing = state.safety.standing.map(|standing| standing.state);
-                is_this && standing == Some(StandingState::Standing)
-            });
-            if stands && stop.standing_at.is_none() {
-                standing.push(stop.id);
-            }
-            let since = stop.clear_asked_at.or(stop.confirmed_at);
-            let is_later = presence
-                .state_age(self.clock().elapsed())
-                .is_some_and(|age| {
-                    let age = SignedDuration::try_from(age).unwrap_or(SignedDuration::MAX);
-                    since.is_some_and(|since| now.duration_since(since) > age + SHOWN_GRACE)
-                });
-            match (stop.confirmed_at, &stop.clear_asked_by) {
-                (None, _) if stop.unconfirmed => again.push(stop),
-                (Some(_), None) if shows_none && is_later => lost.push(stop),
-                (Some(_), Some(_)) if shows_none && is_later => cleared.push(stop.id),
-                (None | Some(_), _) => {}
-            }
-        }
-        let shown = self.presences().shown_stops();
-        let new: Vec<RobotKey> = shown
-            .into_iter()
-            .filter(|(_, id)| !known.contains(id))
-            .map(|(key, _)| key)
-            .collect();
-        if lost.is_empty() && cleared.is_empty() && standing.is_empty() && new.is_empty() {
-            return Ok(again);
-        }
-        let writing = async {
-            let mut tx = self.db().write().await?;
-            for stop in &lost {
-                db::stops::unconfirm(&mut tx, stop.id).await?;
-            }
-            for id in standing {
-                db::stops::stand(&mut tx, id, now).await?;
-            }
-            for id in cleared {
-                db::stops::clear(&mut tx, id, now).await?;
-            }
-            for key in new {
-                self.adopt_shown_stop(&mut tx, &key).await?;
-            }
-            tx.commit().await?;
-            for stop in &lost {
-                let robot = &stop.robot;
-                warn!(robot.id = %robot, "robot `{robot}` no longer shows its stop; it is told again");
-                self.counters().stops_lost.one();
-            }
-            Ok::<(), AppError>(())
+    /// Ends the alert of a robot that has no unconfirmed stop, or raises that of one that has, if it
+    /// `is_overdue`.
+    async fn settle_alert(
+        &self,
+        tx: &mut Tx,
+        (site, robot): &RobotKey,
+        is_overdue: bool,
+    ) -> Result<Option<Alert>, AppError> {
+        let Some(robot_pk) = db::robots::pk_of(tx, site, robot).await? else {
+            return Ok(None);
         };
-        // Robots are told again also while nothing can be written.
-        if let Err(error) = writing.await {
-            self.log_failure("write down what became of stops", &error);
+        let open = db::stops::in_force_of(tx, robot_pk).await?;
+        let Some(stop) = open.filter(|stop| stop.confirmed_at.is_none()) else {
+            return Ok(self.end_alert(tx, robot_pk, UNCONFIRMED_ALERT).await?);
+        };
+        if !is_overdue {
+            return Ok(None);
         }
-        again.extend(lost);
-        Ok(again)
+        let text = format!(
+            "it has not confirmed the stop by {} ({}); it is told again until it does",
+            stop.by, stop.reason
+        );
+        let alert = (UNCONFIRMED_ALERT, Severity::Critical, text);
+        Ok(self.begin_alert(tx, robot_pk, alert).await?)
     }
 }

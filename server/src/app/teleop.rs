@@ -5,11 +5,13 @@
 //! lease or from another run of the agent is refused there. A session that ends in any way while
 //! it has the lease tells the robot to stand at once and gives the lease back.
 
-use std::sync::Arc;
+use std::collections::HashMap;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use tokio::sync::{OwnedSemaphorePermit, oneshot};
+use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::task_tracker::TaskTrackerToken;
 use tracing::{info, warn};
 use tread_api::drive::{
     DRIVE_FOR_DEFAULT_MS, DRIVE_FOR_MAX_MS, DRIVE_FOR_MIN_MS, Drive, DriveRefusal, DriveView,
@@ -24,7 +26,9 @@ use tread_api::wire::command::{OfferRefusal, Outcome};
 use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
 use uuid::Uuid;
 
+use super::identity::Credential;
 use super::missions::control::hold_all;
+use super::shares::{Bounds, Place};
 use super::stops::StopWords;
 use super::{App, AppError, Links};
 use crate::db;
@@ -33,6 +37,16 @@ use crate::fleet::teleop::Line;
 
 /// Most drive connections at once.
 pub const SESSIONS_MAX: usize = 512;
+/// Most of them of those who may watch and stop, not drive.
+pub const WATCHERS_MAX: usize = 256;
+/// Most of one token, with its sessions.
+pub const SESSIONS_PER_IDENTITY_MAX: usize = 64;
+/// How they are shared out.
+pub(super) const SHARES: Bounds = Bounds {
+    all: SESSIONS_MAX,
+    viewers: WATCHERS_MAX,
+    each: SESSIONS_PER_IDENTITY_MAX,
+};
 /// Tries to give a lease back after its connection was lost; the robot frees it by itself.
 const RELEASE_TRIES: u32 = 5;
 /// Wait between two of them.
@@ -41,6 +55,8 @@ const RELEASE_RETRY: Duration = Duration::from_millis(300);
 const STAND_FOR: Duration = Duration::from_millis(250);
 /// How long a new driver waits until the database has that missions are held.
 const HOLD_WAIT_MAX: Duration = Duration::from_millis(300);
+/// Wait between two tries of that.
+const HOLD_RETRY: Duration = Duration::from_millis(500);
 /// How long the robot's states may still show another lease after one was given: they are on
 /// their way while the answer comes.
 const LEASE_GRACE: Duration = Duration::from_secs(1);
@@ -58,6 +74,40 @@ fn refused(cause: DriveRefusal, detail: impl Into<String>) -> Refused {
     Refused {
         cause,
         detail: detail.into(),
+    }
+}
+
+/// Robots whose missions are being held for a driver, until that is written down: at most one task
+/// for each robot.
+#[derive(Debug, Default)]
+pub(super) struct Holds {
+    /// Whether it was asked for again since the last try began.
+    asked: Mutex<HashMap<RobotKey, bool>>,
+}
+
+impl Holds {
+    fn lock(&self) -> MutexGuard<'_, HashMap<RobotKey, bool>> {
+        self.asked.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Asks for it; whether nobody is at it.
+    fn ask(&self, key: &RobotKey) -> bool {
+        self.lock().insert(key.clone(), true).is_none()
+    }
+
+    /// Whether it was asked for since the last try; if not, nobody is at it any more.
+    fn is_asked(&self, key: &RobotKey) -> bool {
+        let mut asked = self.lock();
+        match asked.get_mut(key) {
+            Some(again) if *again => {
+                *again = false;
+                true
+            }
+            Some(_) | None => {
+                asked.remove(key);
+                false
+            }
+        }
     }
 }
 
@@ -79,6 +129,8 @@ pub struct Session {
     key: RobotKey,
     client: Uuid,
     held: Option<Held>,
+    /// The server's stop waits until the session has commanded the robot to stand; dropped last.
+    _attended: TaskTrackerToken,
 }
 
 impl App {
@@ -92,6 +144,7 @@ impl App {
         let links = self.links().ok_or_else(unreachable)?.clone();
         Ok(Session {
             app: self.clone(),
+            _attended: links.supervisor.attend(),
             links,
             key: (site.clone(), robot.clone()),
             client: Uuid::new_v4(),
@@ -101,19 +154,16 @@ impl App {
 
     /// How many drive connections there are.
     pub(crate) fn drive_clients(&self) -> usize {
-        SESSIONS_MAX - self.inner.drive_slots.available_permits()
+        self.inner.drive_shares.taken()
     }
 
-    /// A place for one more drive connection.
+    /// A place for one more drive connection of somebody.
     ///
     /// # Errors
-    /// There are [`SESSIONS_MAX`] already.
-    pub fn drive_slot(&self) -> Result<OwnedSemaphorePermit, AppError> {
-        let slot = Arc::clone(&self.inner.drive_slots).try_acquire_owned();
-        slot.map_err(|_full| AppError::TooMany {
-            what: "drive connections",
-            count: SESSIONS_MAX,
-        })
+    /// There are [`SESSIONS_MAX`] already, [`WATCHERS_MAX`] of those who may not drive, or
+    /// [`SESSIONS_PER_IDENTITY_MAX`] of this token's.
+    pub fn drive_slot(&self, of: &Credential) -> Result<Place, AppError> {
+        self.inner.drive_shares.take(of, "drive connections")
     }
 
     /// Holds everything that a robot has in hand or in its queue while somebody drives it.
@@ -235,9 +285,21 @@ impl Session {
     async fn hold_missions(&self, name: String) {
         let (app, key) = (self.app.clone(), self.key.clone());
         let (written, is_written) = oneshot::channel();
+        let ending = self.links.supervisor.stop_token();
+        // Whoever tries already does it once more.
+        if !app.holds().ask(&key) {
+            return;
+        }
         self.links.supervisor.spawn_passing("hold", async move {
-            if let Err(error) = db::limited(app.hold_for_driver(&key, &name)).await {
-                app.log_failure("write down that missions are held for a driver", &error);
+            while app.holds().is_asked(&key) {
+                if let Err(error) = db::limited(app.hold_for_driver(&key, &name)).await {
+                    app.log_failure("write down that missions are held for a driver", &error);
+                    app.holds().ask(&key);
+                    tokio::select! {
+                        () = ending.cancelled() => return,
+                        () = tokio::time::sleep(HOLD_RETRY) => {}
+                    }
+                }
             }
             // The driver may have ceased to wait.
             let _ = written.send(());

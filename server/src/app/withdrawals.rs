@@ -7,8 +7,10 @@ use jiff::Timestamp;
 use tread_api::friction::{CreateWithdrawal, Withdrawal};
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::page::Page;
+use tread_api::rights::Scope;
 
-use super::{App, AppError, page, site_row};
+use super::map::MapChange;
+use super::{App, AppError, page, people_line, site_row};
 use crate::db;
 use crate::db::withdrawals::WithdrawalRow;
 use crate::friction::sums::DAY_H;
@@ -33,15 +35,9 @@ impl App {
         by: &str,
     ) -> Result<Withdrawal, AppError> {
         let CreateWithdrawal { from, to, reason } = request;
-        let reason = reason.trim().to_owned();
-        if reason.is_empty() || reason.chars().count() > REASON_LENGTH_MAX {
-            return Err(AppError::Invalid {
-                field: "reason",
-                detail: format!("a reason has 1 to {REASON_LENGTH_MAX} characters"),
-            });
-        }
+        let reason = people_line("reason", &reason, REASON_LENGTH_MAX)?;
         let now = self.clock().now();
-        let _turn = self.maps().turn().await;
+        let turn = self.map_turn_to_change().await?;
         let mut tx = self.db().write().await?;
         let site_row = site_row(&mut tx, site).await?;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
@@ -69,17 +65,16 @@ impl App {
         };
         row.pk = db::withdrawals::insert(&mut tx, &row).await?;
         let removed = db::sums::remove_hours(&mut tx, robot_pk, (from_h, to_h)).await?;
-        tx.commit().await?;
-        self.maps()
-            .change(&site_row, |map| map.withdraw(robot, (from_h, to_h)));
+        let change = MapChange::Withdraw(Box::new(site_row), robot.clone(), (from_h, to_h));
+        turn.commit(tx, change, Vec::new()).await?;
         tracing::info!(robot.id = %robot, "{removed} sums of robot `{robot}` were withdrawn");
         Ok(to_api(row, robot.clone()))
     }
 
-    /// Withdrawals of a site, the oldest first, after a cursor.
+    /// Withdrawals of a site's robots in a scope, the oldest first, after a cursor.
     pub async fn withdrawals(
         &self,
-        site: &SiteId,
+        (site, within): (&SiteId, &Scope),
         cursor: Option<i64>,
         limit: u32,
     ) -> Result<Page<Withdrawal>, AppError> {
@@ -89,7 +84,8 @@ impl App {
         let rows = db::withdrawals::all(&mut tx).await?;
         let found = rows.into_iter().filter_map(|row| {
             let robot = robots.get(&row.robot_pk)?.clone();
-            (row.pk > cursor.unwrap_or(0)).then(|| to_api(row, robot))
+            let is_wanted = within.includes_robot(site, &robot);
+            (is_wanted && row.pk > cursor.unwrap_or(0)).then(|| to_api(row, robot))
         });
         Ok(page(found.collect(), limit, |found| found.id.to_string()))
     }

@@ -7,7 +7,9 @@
 //! name reads back one way only, and what a robot had before it joined again counts no more.
 
 mod file;
+mod rotation;
 
+use std::fmt::Write as _;
 use std::net::IpAddr;
 use std::time::{Duration, SystemTime};
 
@@ -17,15 +19,18 @@ use rcgen::{
     DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, KeyUsagePurpose,
     PKCS_ECDSA_P256_SHA256,
 };
+use ring::hmac;
 use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, UnixTime};
+use sha2::{Digest as _, Sha256};
 use tread_api::enrolment::renewal_message;
 use tread_api::ids::{RobotId, SiteId};
 use webpki::ring::ECDSA_P256_SHA256;
 use webpki::{EndEntityCert, KeyUsage};
 use x509_parser::prelude::{FromDer as _, X509Certificate};
 
-pub use self::file::{AuthorityError, CERTIFICATE_FILE, KEY_FILE};
+pub use self::file::{AuthorityError, CERTIFICATE_FILE, KEY_FILE, NEXT_CERTIFICATE_FILE};
+pub use self::rotation::{Authorities, Retiring, RotationError, RotationRefused, Trusted};
 
 /// How long the authority lasts.
 const AUTHORITY_LASTS: SignedDuration = SignedDuration::from_hours(20 * 365 * 24);
@@ -110,15 +115,12 @@ pub struct PortIdentity {
     pub chain: Vec<CertificateDer<'static>>,
     /// Its key.
     pub key: PrivateKeyDer<'static>,
-    /// The certificate alone, PEM.
-    pub certificate_pem: String,
-    /// Its key, PEM.
-    pub key_pem: String,
 }
 
 /// The fleet's authority.
 pub struct Authority {
     certificate_pem: String,
+    fingerprint: String,
     certificate: CertificateDer<'static>,
     issuer: Issuer<'static, KeyPair>,
 }
@@ -165,10 +167,13 @@ impl Authority {
         );
         params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
         params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
-        let certificate = params.self_signed(&key)?;
+        let signed = params.self_signed(&key)?;
+        let certificate_pem = signed.pem();
+        let certificate: CertificateDer<'static> = signed.into();
         Ok(Self {
-            certificate_pem: certificate.pem(),
-            certificate: certificate.into(),
+            certificate_pem,
+            fingerprint: fingerprint(&certificate),
+            certificate,
             issuer: Issuer::new(params, key),
         })
     }
@@ -187,6 +192,7 @@ impl Authority {
         let issuer = Issuer::from_ca_cert_der(&certificate, key)?;
         Ok(Self {
             certificate_pem,
+            fingerprint: fingerprint(&certificate),
             certificate,
             issuer,
         })
@@ -200,6 +206,18 @@ impl Authority {
     /// The authority's own certificate.
     pub fn certificate(&self) -> &CertificateDer<'static> {
         &self.certificate
+    }
+
+    /// The SHA-256 of the authority's own certificate, in hexadecimal digits.
+    pub fn fingerprint(&self) -> &str {
+        &self.fingerprint
+    }
+
+    /// Derives a secret key for one purpose from the authority's own (HMAC-SHA-256).
+    pub fn derive_key(&self, purpose: &str) -> hmac::Key {
+        let own = hmac::Key::new(hmac::HMAC_SHA256, self.issuer.key().serialized_der());
+        let derived = hmac::sign(&own, purpose.as_bytes());
+        hmac::Key::new(hmac::HMAC_SHA256, derived.as_ref())
     }
 
     /// Signs a certificate for the key in a robot's request. What else the request says is not
@@ -250,100 +268,48 @@ impl Authority {
         let mut all: Vec<String> = NAMES_HERE.map(str::to_owned).to_vec();
         all.extend(names.iter().cloned());
         all.dedup();
-        self.leaf(
-            all,
-            ExtendedKeyUsagePurpose::ServerAuth,
-            "tread-server",
-            now,
-        )
-    }
-
-    /// Makes certificate and key of a client of that name.
-    ///
-    /// # Errors
-    /// There are no random numbers.
-    pub fn client_identity(
-        &self,
-        name: &str,
-        now: Timestamp,
-    ) -> Result<PortIdentity, rcgen::Error> {
-        self.leaf(Vec::new(), ExtendedKeyUsagePurpose::ClientAuth, name, now)
-    }
-
-    fn leaf(
-        &self,
-        names: Vec<String>,
-        purpose: ExtendedKeyUsagePurpose,
-        common_name: &str,
-        now: Timestamp,
-    ) -> Result<PortIdentity, rcgen::Error> {
         let key = KeyPair::generate()?;
-        let mut params = CertificateParams::new(names)?;
-        params.distinguished_name = named(common_name);
+        let mut params = CertificateParams::new(all)?;
+        params.distinguished_name = named("tread-server");
         set_times(
             &mut params,
             earlier(now, BEHIND_MAX),
             later(now, PORT_LASTS),
         );
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
-        params.extended_key_usages = vec![purpose];
+        params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth];
         params.use_authority_key_identifier_extension = true;
         let leaf = params.signed_by(&key, &self.issuer)?;
         Ok(PortIdentity {
-            certificate_pem: leaf.pem(),
-            key_pem: key.serialize_pem(),
             chain: vec![leaf.into(), self.certificate.clone()],
             key: PrivateKeyDer::Pkcs8(key.serialize_der().into()),
         })
     }
-
-    /// Whom a robot's certificate names, and when it ends. The authority must have signed it for
-    /// a client; one that is over counts for another [`RENEWAL_GRACE`].
-    ///
-    /// # Errors
-    /// [`CertificateError`].
-    pub fn read_robot(
-        &self,
-        certificate_pem: &str,
-        now: Timestamp,
-    ) -> Result<PresentCertificate, CertificateError> {
-        let certificate = CertificateDer::from_pem_slice(certificate_pem.as_bytes())
-            .map_err(|_| CertificateError::Unreadable)?;
-        let (name, expires_at) = named_in(&certificate)?;
-        if now > later(expires_at, RENEWAL_GRACE) {
-            return Err(CertificateError::Over);
-        }
-        let looked_at = now.min(expires_at).as_second();
-        let looked_at = Duration::from_secs(u64::try_from(looked_at).unwrap_or_default());
-        let anchors = [webpki::anchor_from_trusted_cert(&self.certificate)
-            .map_err(|_| CertificateError::Foreign)?];
-        let leaf =
-            EndEntityCert::try_from(&certificate).map_err(|_| CertificateError::Unreadable)?;
-        let verified = leaf.verify_for_usage(
-            &[ECDSA_P256_SHA256],
-            &anchors,
-            &[],
-            UnixTime::since_unix_epoch(looked_at),
-            KeyUsage::client_auth(),
-            None,
-            None,
-        );
-        verified.map_err(|_| CertificateError::Foreign)?;
-        Ok(PresentCertificate { certificate, name })
-    }
 }
 
-/// A robot's certificate that the authority has signed.
+/// A robot's certificate that an authority of the fleet has signed.
 #[derive(Debug)]
 pub struct PresentCertificate {
     certificate: CertificateDer<'static>,
     name: RobotName,
+    issuer: String,
+    is_retired: bool,
 }
 
 impl PresentCertificate {
     /// Whom it names.
     pub fn name(&self) -> &RobotName {
         &self.name
+    }
+
+    /// The fingerprint of the authority that signed it.
+    pub fn issuer(&self) -> &str {
+        &self.issuer
+    }
+
+    /// Whether that authority was retired: the certificate tells whose it was and counts for nothing.
+    pub fn is_retired(&self) -> bool {
+        self.is_retired
     }
 
     /// Checks that whoever asks for a renewal has the key of this certificate.
@@ -397,6 +363,39 @@ pub fn named_in(
     let expires_at = Timestamp::from_second(parsed.validity().not_after.timestamp())
         .map_err(|_| CertificateError::Unreadable)?;
     Ok((name, expires_at))
+}
+
+/// The SHA-256 of a certificate in hexadecimal digits.
+fn fingerprint(certificate: &CertificateDer<'_>) -> String {
+    let mut text = String::with_capacity(64);
+    for byte in Sha256::digest(certificate) {
+        // Writing to a text cannot fail.
+        let _ = write!(text, "{byte:02x}");
+    }
+    text
+}
+
+/// Whether an authority has signed a certificate for a client, as of that time.
+fn is_signed_by(
+    leaf: &EndEntityCert<'_>,
+    authority: &CertificateDer<'_>,
+    looked_at: Timestamp,
+) -> bool {
+    let Ok(anchor) = webpki::anchor_from_trusted_cert(authority) else {
+        return false;
+    };
+    let seconds = u64::try_from(looked_at.as_second()).unwrap_or_default();
+    let anchors = [anchor];
+    let verified = leaf.verify_for_usage(
+        &[ECDSA_P256_SHA256],
+        &anchors,
+        &[],
+        UnixTime::since_unix_epoch(Duration::from_secs(seconds)),
+        KeyUsage::client_auth(),
+        None,
+        None,
+    );
+    verified.is_ok()
 }
 
 /// Whether a text may stand as a name in the port's certificate: an address or a host name.

@@ -1,3 +1,5 @@
+use std::sync::Arc;
+
 use proptest::prelude::*;
 
 use super::*;
@@ -16,6 +18,10 @@ fn name(enrolment: u32) -> RobotName {
     }
 }
 
+fn trusting(authority: &Arc<Authority>) -> Trusted {
+    Trusted::one(Arc::clone(authority))
+}
+
 fn request(key: &KeyPair) -> String {
     let params = CertificateParams::default();
     params.serialize_request(key).unwrap().pem().unwrap()
@@ -30,7 +36,7 @@ fn signed(authority: &Authority, key: &KeyPair) -> String {
 
 #[test]
 fn a_certificate_names_its_robot_and_no_request_can_change_that() {
-    let authority = Authority::generate("fleet", now()).unwrap();
+    let authority = Arc::new(Authority::generate("fleet", now()).unwrap());
     let key = KeyPair::generate().unwrap();
     let mut params = CertificateParams::new(vec!["e1.other.yard".to_owned()]).unwrap();
     params.distinguished_name = named("e1.other.yard");
@@ -38,7 +44,9 @@ fn a_certificate_names_its_robot_and_no_request_can_change_that() {
     let greedy = params.serialize_request(&key).unwrap().pem().unwrap();
     let request = RobotRequest::read(&greedy).unwrap();
     let signed = authority.sign(&request, &name(3), now(), DAY).unwrap();
-    let present = authority.read_robot(&signed.certificate, now()).unwrap();
+    let present = trusting(&authority)
+        .read_robot(&signed.certificate, now())
+        .unwrap();
     assert_eq!(*present.name(), name(3));
     let (_, parsed) = X509Certificate::from_der(&present.certificate).unwrap();
     assert!(!parsed.is_ca());
@@ -46,10 +54,12 @@ fn a_certificate_names_its_robot_and_no_request_can_change_that() {
 
 #[test]
 fn a_renewal_needs_the_present_key_and_a_certificate_of_this_authority() {
-    let authority = Authority::generate("fleet", now()).unwrap();
+    let authority = Arc::new(Authority::generate("fleet", now()).unwrap());
     let (old, new) = (KeyPair::generate().unwrap(), KeyPair::generate().unwrap());
     let (certificate, next) = (signed(&authority, &old), request(&new));
-    let present = authority.read_robot(&certificate, now()).unwrap();
+    let present = trusting(&authority)
+        .read_robot(&certificate, now())
+        .unwrap();
     let sign = |key: &KeyPair, message: &[u8]| rcgen::SigningKey::sign(key, message).unwrap();
     let message = renewal_message(&next);
     assert!(present.check_proof(&next, &sign(&old, &message)).is_ok());
@@ -62,31 +72,31 @@ fn a_renewal_needs_the_present_key_and_a_certificate_of_this_authority() {
         let checked = present.check_proof(&next, &wrong);
         assert!(matches!(checked, Err(CertificateError::Proof)));
     }
-    let stranger = Authority::generate("fleet", now()).unwrap();
-    let foreign = stranger.read_robot(&certificate, now());
+    let stranger = Arc::new(Authority::generate("fleet", now()).unwrap());
+    let foreign = trusting(&stranger).read_robot(&certificate, now());
     assert!(matches!(foreign, Err(CertificateError::Foreign)));
 }
 
 #[test]
 fn a_certificate_renews_for_a_while_after_its_end_and_then_no_more() {
-    let authority = Authority::generate("fleet", now()).unwrap();
+    let authority = Arc::new(Authority::generate("fleet", now()).unwrap());
     let certificate = signed(&authority, &KeyPair::generate().unwrap());
     let end = now() + DAY;
     assert!(
-        authority
+        trusting(&authority)
             .read_robot(&certificate, end + RENEWAL_GRACE)
             .is_ok()
     );
     let late = end + RENEWAL_GRACE + SignedDuration::from_secs(1);
-    let over = authority.read_robot(&certificate, late);
+    let over = trusting(&authority).read_robot(&certificate, late);
     assert!(matches!(over, Err(CertificateError::Over)));
-    let before = authority.read_robot(&certificate, now() - DAY);
+    let before = trusting(&authority).read_robot(&certificate, now() - DAY);
     assert!(matches!(before, Err(CertificateError::Foreign)));
 }
 
 #[test]
 fn the_ports_own_certificate_does_not_count_as_a_robots() {
-    let authority = Authority::generate("fleet", now()).unwrap();
+    let authority = Arc::new(Authority::generate("fleet", now()).unwrap());
     let port = authority.port_identity(&[], now()).unwrap();
     assert!(named_in(&port.chain[0]).is_err());
 }
@@ -112,17 +122,17 @@ fn the_authority_comes_back_from_its_folder_and_others_cannot_read_its_key() {
     use std::os::unix::fs::PermissionsExt as _;
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path().join("authority");
-    let made = Authority::create(&folder, now()).unwrap();
+    let made = Arc::new(Authority::create(&folder, now()).unwrap());
     let again = Authority::create(&folder, now());
     assert!(matches!(again, Err(AuthorityError::Exists(_))));
     let key = folder.join(KEY_FILE);
     let rights = std::fs::metadata(&key).unwrap().permissions().mode();
     assert_eq!(rights & 0o777, 0o600);
     let certificate = signed(&made, &KeyPair::generate().unwrap());
-    let loaded = Authority::load(&folder).unwrap();
-    assert!(loaded.read_robot(&certificate, now()).is_ok());
+    let loaded = Arc::new(Authority::load(&folder).unwrap());
+    assert!(trusting(&loaded).read_robot(&certificate, now()).is_ok());
     let next = signed(&loaded, &KeyPair::generate().unwrap());
-    assert!(made.read_robot(&next, now()).is_ok());
+    assert!(trusting(&made).read_robot(&next, now()).is_ok());
     std::fs::set_permissions(&key, std::fs::Permissions::from_mode(0o640)).unwrap();
     assert!(matches!(
         Authority::load(&folder),
@@ -138,6 +148,40 @@ fn the_authority_comes_back_from_its_folder_and_others_cannot_read_its_key() {
         Authority::load(&folder),
         Err(AuthorityError::Unusable { .. })
     ));
+}
+
+#[test]
+fn during_a_rotation_certificates_of_both_count_and_afterwards_those_of_the_former_tell_their_name_only()
+ {
+    let former = Arc::new(Authority::generate("fleet", now()).unwrap());
+    let authorities = Authorities::in_memory(Arc::clone(&former));
+    let key = KeyPair::generate().unwrap();
+    let of_former = signed(&former, &key);
+    let before = authorities.present();
+    let during = authorities.start("admin", now()).unwrap();
+    let next = Arc::clone(during.signing());
+    let of_next = signed(&next, &key);
+    for (certificate, issuer) in [(&of_former, &former), (&of_next, &next)] {
+        let read = during.read_robot(certificate, now()).unwrap();
+        assert_eq!(read.issuer(), issuer.fingerprint());
+        assert!(!read.is_retired());
+        let der = CertificateDer::from_pem_slice(certificate.as_bytes()).unwrap();
+        assert_eq!(during.issuer_of(&der, now()), Some(issuer.fingerprint()));
+    }
+    // Robots that know the former alone accept the port, and so do those that know both.
+    assert_eq!(during.of_port().fingerprint(), former.fingerprint());
+    let bundle = during.bundle_pem();
+    assert_eq!(CertificateDer::pem_slice_iter(bundle.as_bytes()).count(), 2);
+    assert_ne!(during.id(), before.id());
+    let after = authorities.finish().unwrap();
+    assert_eq!(after.of_port().fingerprint(), next.fingerprint());
+    let read = after.read_robot(&of_former, now()).unwrap();
+    assert!(read.is_retired());
+    assert_eq!(*read.name(), name(3));
+    let der = CertificateDer::from_pem_slice(of_former.as_bytes()).unwrap();
+    assert_eq!(after.issuer_of(&der, now()), None);
+    assert!(!after.read_robot(&of_next, now()).unwrap().is_retired());
+    assert_eq!(after.bundle_pem(), next.certificate_pem());
 }
 
 proptest! {

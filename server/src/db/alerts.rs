@@ -3,9 +3,10 @@
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::ids::{AlertCode, AlertId, RobotId, SiteId};
+use tread_api::rights::Scope;
 use tread_api::robot::{Alert, AlertReport, Severity};
 
-use super::{DbError, corrupt, from_us, parse, to_us};
+use super::{DbError, corrupt, from_us, parse, scope_text, to_us};
 
 struct Raw {
     id: String,
@@ -68,6 +69,8 @@ pub struct AlertFilter {
     pub raised: bool,
     /// Only those older than this one.
     pub before: Option<AlertId>,
+    /// Only those of what is in this scope.
+    pub within: Scope,
 }
 
 /// Alerts, newest first.
@@ -79,15 +82,19 @@ pub async fn list(
     let site = filter.site.as_ref().map(SiteId::as_str);
     let robot = filter.robot.as_ref().map(RobotId::as_str);
     let before = filter.before.map(|id| id.to_string());
+    let within = scope_text(&filter.within)?;
     let raw = alerts!(
         "WHERE (?1 IS NULL OR sites.id = ?1) AND (?2 IS NULL OR robots.id = ?2)
            AND (?3 = FALSE OR alerts.cleared_at_us IS NULL) AND (?4 IS NULL OR alerts.id < ?4)
+           AND (?6 IS NULL OR sites.id IN (SELECT value FROM json_each(?6))
+               OR sites.id || '/' || robots.id IN (SELECT value FROM json_each(?6)))
          ORDER BY alerts.id DESC LIMIT ?5",
         site,
         robot,
         filter.raised,
         before,
         limit,
+        within,
     )
     .fetch_all(db)
     .await?;
@@ -103,6 +110,26 @@ pub async fn raised(db: &mut SqliteConnection, limit: u32) -> Result<Vec<Alert>,
     .fetch_all(db)
     .await?;
     rows(raw)
+}
+
+/// The robots of which that alert is raised.
+pub async fn raised_about(
+    db: &mut SqliteConnection,
+    code: &str,
+) -> Result<Vec<(SiteId, RobotId)>, DbError> {
+    let rows = sqlx::query!(
+        "SELECT sites.id AS site, robots.id AS robot
+         FROM alerts
+         JOIN robots ON robots.pk = alerts.robot_pk
+         JOIN sites ON sites.pk = robots.site_pk
+         WHERE alerts.code = ? AND alerts.cleared_at_us IS NULL",
+        code,
+    );
+    let rows = rows.fetch_all(db).await?;
+    let named = |site: &str, robot: &str| Ok((parse("site", site)?, parse("robot", robot)?));
+    rows.iter()
+        .map(|row| named(&row.site, &row.robot))
+        .collect()
 }
 
 /// A robot's alerts that have not cleared, oldest first.
@@ -148,6 +175,21 @@ pub async fn raise(
         severity,
         report.text,
         at_us,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Removes a robot's oldest alerts beyond so many; those that are raised stay.
+pub async fn forget(db: &mut SqliteConnection, robot_pk: i64, kept: u32) -> Result<(), DbError> {
+    sqlx::query!(
+        "DELETE FROM alerts
+         WHERE robot_pk = ?1 AND cleared_at_us IS NOT NULL
+           AND id <= (SELECT more.id FROM alerts AS more WHERE more.robot_pk = ?1
+               ORDER BY more.id DESC LIMIT 1 OFFSET ?2)",
+        robot_pk,
+        kept,
     )
     .execute(db)
     .await?;

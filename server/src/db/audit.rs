@@ -1,8 +1,10 @@
-//! The audit log: who changed what, and who was refused.
+//! The audit log: who changed what, and who was refused, in a chain of hashes
+//! ([`tread_api::audit`]).
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
-use tread_api::identity::{AuditEntry, Role};
+use tread_api::audit::{AuditChain, FIRST_PREVIOUS_HASH, hash_after};
+use tread_api::identity::{AuditEntry, AuditOrder, Role};
 use tread_api::ids::TokenId;
 
 use super::tokens::role;
@@ -11,6 +13,8 @@ use super::{DbError, from_json, from_us, parse, to_json, to_us, unsigned};
 struct Raw {
     id: i64,
     at_us: i64,
+    since_us: Option<i64>,
+    count: i64,
     who: Option<String>,
     token_id: Option<String>,
     role: Option<String>,
@@ -21,6 +25,8 @@ struct Raw {
     status: i64,
     request_id: String,
     what: Option<String>,
+    previous_hash: Option<String>,
+    hash: Option<String>,
 }
 
 impl TryFrom<Raw> for AuditEntry {
@@ -32,6 +38,8 @@ impl TryFrom<Raw> for AuditEntry {
         Ok(Self {
             id: unsigned("number", raw.id)?,
             at: from_us(raw.at_us)?,
+            since: raw.since_us.map(from_us).transpose()?,
+            count: unsigned("count", raw.count)?,
             who: raw.who,
             token: token.map(|id| parse("token", id)).transpose()?,
             role: raw.role.as_deref().map(role).transpose()?,
@@ -42,6 +50,8 @@ impl TryFrom<Raw> for AuditEntry {
             status: unsigned("status", raw.status)?,
             request_id: raw.request_id,
             what: what.map(|what| from_json("body", what)).transpose()?,
+            previous_hash: raw.previous_hash,
+            hash: raw.hash,
         })
     }
 }
@@ -53,49 +63,142 @@ pub struct AuditFilter {
     pub who: Option<String>,
     /// Only those that were refused.
     pub refused: bool,
-    /// Only those before this one.
-    pub before: Option<u64>,
+    /// Which come first.
+    pub order: AuditOrder,
+    /// Only those that come after this one in that order.
+    pub beyond: Option<u64>,
 }
 
-/// Entries, newest first.
+/// Entries in the order that is asked for.
 pub async fn list(
     db: &mut SqliteConnection,
     filter: &AuditFilter,
     limit: u32,
 ) -> Result<Vec<AuditEntry>, DbError> {
-    let before = filter.before.map(i64::try_from).transpose();
-    let before = before.map_err(|_range| DbError::DoesNotFit("number"))?;
-    let raw = sqlx::query_as!(
-        Raw,
-        r#"SELECT id, at_us, who, token_id, role, address, method, route, path, status,
-               request_id, what
-           FROM audit
-           WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR who = ?2)
-             AND (?3 = FALSE OR status >= 400)
-           ORDER BY id DESC LIMIT ?4"#,
-        before,
-        filter.who,
-        filter.refused,
-        limit,
-    )
-    .fetch_all(db)
-    .await?;
+    let beyond = filter.beyond.map(i64::try_from).transpose();
+    let beyond = beyond.map_err(|_range| DbError::DoesNotFit("number"))?;
+    let raw =
+        match filter.order {
+            AuditOrder::Newest => sqlx::query_as!(
+                Raw,
+                r#"SELECT id, at_us, since_us, count, who, token_id, role, address, method, route,
+                       path, status, request_id, what, previous_hash, hash
+                   FROM audit
+                   WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR who = ?2)
+                     AND (?3 = FALSE OR status >= 400)
+                   ORDER BY id DESC LIMIT ?4"#,
+                beyond,
+                filter.who,
+                filter.refused,
+                limit,
+            )
+            .fetch_all(db)
+            .await?,
+            AuditOrder::Oldest => sqlx::query_as!(
+                Raw,
+                r#"SELECT id, at_us, since_us, count, who, token_id, role, address, method, route,
+                       path, status, request_id, what, previous_hash, hash
+                   FROM audit
+                   WHERE (?1 IS NULL OR id > ?1) AND (?2 IS NULL OR who = ?2)
+                     AND (?3 = FALSE OR status >= 400)
+                   ORDER BY id LIMIT ?4"#,
+                beyond,
+                filter.who,
+                filter.refused,
+                limit,
+            )
+            .fetch_all(db)
+            .await?,
+        };
     raw.into_iter().map(AuditEntry::try_from).collect()
 }
 
-/// Writes one entry, not before the one that precedes it; its number is made here.
-pub async fn insert(db: &mut SqliteConnection, entry: &AuditEntry) -> Result<(), DbError> {
-    let (at_us, status) = (to_us(entry.at), i64::from(entry.status));
+/// What frames the chain; `None` if somebody has removed it.
+pub async fn chain(db: &mut SqliteConnection) -> Result<Option<AuditChain>, DbError> {
+    let row = sqlx::query!(
+        "SELECT before_id, before_hash, last_id, last_hash FROM audit_chain WHERE id = 1"
+    )
+    .fetch_optional(db)
+    .await?;
+    row.map(|row| {
+        Ok(AuditChain {
+            before_id: unsigned("number", row.before_id)?,
+            before_hash: row.before_hash,
+            last_id: unsigned("number", row.last_id)?,
+            last_hash: row.last_hash,
+        })
+    })
+    .transpose()
+}
+
+/// Writes entries in their order, none before the one that precedes it; their numbers and hashes are
+/// made here, and they are given back with them.
+pub async fn append(
+    db: &mut SqliteConnection,
+    entries: &[AuditEntry],
+) -> Result<Vec<AuditEntry>, DbError> {
+    let newest = sqlx::query!("SELECT id, at_us, hash FROM audit ORDER BY id DESC LIMIT 1")
+        .fetch_optional(&mut *db)
+        .await?;
+    let mut newest_us = newest.as_ref().map_or(i64::MIN, |newest| newest.at_us);
+    // A chain that somebody removed begins anew after what there is, which shows.
+    let head = chain(&mut *db).await?;
+    let (mut last_id, mut last_hash) = match head {
+        Some(head) => (head.last_id, head.last_hash),
+        None => (0, FIRST_PREVIOUS_HASH.to_owned()),
+    };
+    if let Some(newest) = newest {
+        // A number is not used again, whatever the record says.
+        last_id = last_id.max(unsigned("number", newest.id)?);
+    }
+    let mut written = Vec::with_capacity(entries.len());
+    for entry in entries {
+        newest_us = newest_us.max(to_us(entry.at));
+        last_id = last_id.saturating_add(1);
+        let mut entry = AuditEntry {
+            id: last_id,
+            at: from_us(newest_us)?,
+            since: entry.since.map(|since| from_us(to_us(since))).transpose()?,
+            ..entry.clone()
+        };
+        let hash = hash_after(&last_hash, &entry);
+        entry.previous_hash = Some(std::mem::replace(&mut last_hash, hash.clone()));
+        entry.hash = Some(hash);
+        insert(&mut *db, &entry).await?;
+        written.push(entry);
+    }
+    let last_id = i64::try_from(last_id).map_err(|_range| DbError::DoesNotFit("number"))?;
+    sqlx::query!(
+        "INSERT INTO audit_chain (id, before_id, before_hash, last_id, last_hash)
+         VALUES (1, 0, ?1, ?2, ?3)
+         ON CONFLICT (id) DO UPDATE SET last_id = ?2, last_hash = ?3",
+        FIRST_PREVIOUS_HASH,
+        last_id,
+        last_hash,
+    )
+    .execute(db)
+    .await?;
+    Ok(written)
+}
+
+async fn insert(db: &mut SqliteConnection, entry: &AuditEntry) -> Result<(), DbError> {
+    let does_not_fit = |what| move |_range| DbError::DoesNotFit(what);
+    let id = i64::try_from(entry.id).map_err(does_not_fit("number"))?;
+    let count = i64::try_from(entry.count).map_err(does_not_fit("count"))?;
+    let (at_us, since_us) = (to_us(entry.at), entry.since.map(to_us));
+    let status = i64::from(entry.status);
     let token = entry.token.map(|id: TokenId| id.to_string());
     let role = entry.role.map(Role::as_str);
     let what = entry.what.as_ref().map(|what| to_json("body", what));
     let what = what.transpose()?;
     sqlx::query!(
-        "INSERT INTO audit (at_us, who, token_id, role, address, method, route, path, status,
-             request_id, what)
-         VALUES (MAX(?1, COALESCE((SELECT at_us FROM audit ORDER BY id DESC LIMIT 1), ?1)),
-             ?2, ?3, ?4, ?5, ?6, ?7, ?8, ?9, ?10, ?11)",
+        "INSERT INTO audit (id, at_us, since_us, count, who, token_id, role, address, method, route,
+             path, status, request_id, what, previous_hash, hash)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        id,
         at_us,
+        since_us,
+        count,
         entry.who,
         token,
         role,
@@ -106,13 +209,16 @@ pub async fn insert(db: &mut SqliteConnection, entry: &AuditEntry) -> Result<(),
         status,
         entry.request_id,
         what,
+        entry.previous_hash,
+        entry.hash,
     )
     .execute(db)
     .await?;
     Ok(())
 }
 
-/// Forgets entries that are older than a time or beyond the newest `kept`, at most `limit`.
+/// Forgets the oldest entries, those older than a time or beyond the newest `kept`, at most `limit`.
+/// Number and hash of the last one stay, so that the rest can be verified.
 pub async fn forget(
     db: &mut SqliteConnection,
     before: Timestamp,
@@ -120,16 +226,31 @@ pub async fn forget(
     limit: u32,
 ) -> Result<(), DbError> {
     let before_us = to_us(before);
-    sqlx::query!(
-        "DELETE FROM audit WHERE id IN (
-             SELECT id FROM audit
-             WHERE id <= (SELECT MAX(id) FROM audit) - ?1 OR at_us < ?2
-             ORDER BY id LIMIT ?3)",
+    let gone = sqlx::query!(
+        "SELECT id, hash FROM audit
+         WHERE id <= (SELECT MAX(id) FROM audit) - ?1 OR at_us < ?2
+         ORDER BY id LIMIT ?3",
         kept,
         before_us,
         limit,
     )
-    .execute(db)
+    .fetch_all(&mut *db)
     .await?;
+    let Some(last) = gone.into_iter().next_back() else {
+        return Ok(());
+    };
+    sqlx::query!("DELETE FROM audit WHERE id <= ?", last.id)
+        .execute(&mut *db)
+        .await?;
+    // One without a hash is of before the chain.
+    if let Some(hash) = last.hash {
+        sqlx::query!(
+            "UPDATE audit_chain SET before_id = ?1, before_hash = ?2 WHERE id = 1 AND before_id < ?1",
+            last.id,
+            hash,
+        )
+        .execute(db)
+        .await?;
+    }
     Ok(())
 }

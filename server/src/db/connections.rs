@@ -4,6 +4,10 @@
 //! comes back only after a commit or a rollback that succeeded; otherwise it is closed, and the next
 //! transaction opens another. Nothing waits without a bound: when the library's thread of a
 //! connection ends without memory, what is sent to it meanwhile is never answered.
+//!
+//! Each connection has a thread, which a disk that hangs keeps: one that is being opened or that was
+//! given up counts until its thread has ended, and there are [`SPARE_MAX`] more of them than may
+//! work. Beyond, nothing is opened.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -19,12 +23,16 @@ use super::failure;
 
 /// How long a request waits for a connection.
 pub(super) const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long whoever opens a connection waits for one that is being closed.
+const THREAD_TIMEOUT: Duration = Duration::from_secs(1);
 /// How long a transaction may take to begin: longer than SQLite waits for another process's lock.
 const BEGIN_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a commit may take, with its sync.
-const COMMIT_TIMEOUT: Duration = Duration::from_secs(15);
+pub(super) const COMMIT_TIMEOUT: Duration = Duration::from_secs(15);
 /// How long a rollback may take before its connection is closed instead.
 const ROLLBACK_TIMEOUT: Duration = Duration::from_secs(2);
+/// Connections whose threads may hang, beside those that work.
+const SPARE_MAX: u32 = 4;
 /// How long connections may take to come back and to close.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -38,20 +46,54 @@ pub(super) struct Connections {
 struct Inner {
     options: SqliteConnectOptions,
     connections_max: u32,
+    commit_max: Duration,
     permits: Arc<Semaphore>,
+    /// One for each thread that there may be.
+    threads: Arc<Semaphore>,
     idle: Mutex<Vec<Opened>>,
 }
 
 #[derive(Debug)]
 struct Opened {
-    connection: SqliteConnection,
+    /// There until it is dropped.
+    connection: Option<SqliteConnection>,
+    /// Given back when the connection's thread has ended.
+    thread: Option<OwnedSemaphorePermit>,
     at: Instant,
 }
 
 impl Opened {
+    fn connection(&mut self) -> Result<&mut SqliteConnection, sqlx::Error> {
+        self.connection.as_mut().ok_or(sqlx::Error::WorkerCrashed)
+    }
+
+    /// Closes it, and waits until its thread has ended.
+    async fn close(mut self) {
+        if let Some(connection) = self.connection.take() {
+            // It is gone either way.
+            let _ = connection.close().await;
+        }
+    }
+
     /// Whether a failure since it was opened may have spoiled it.
     fn is_spoiled(&self) -> bool {
         failure::is_older_than_last(self.at.elapsed())
+    }
+}
+
+impl Drop for Opened {
+    fn drop(&mut self) {
+        let (Some(connection), Some(thread)) = (self.connection.take(), self.thread.take()) else {
+            return;
+        };
+        // Without a runtime the process ends, and its threads with it.
+        if let Ok(runtime) = Handle::try_current() {
+            runtime.spawn(async move {
+                // It is gone either way.
+                let _ = connection.close().await;
+                drop(thread);
+            });
+        }
     }
 }
 
@@ -68,12 +110,16 @@ impl Connections {
     pub(super) async fn open(
         options: SqliteConnectOptions,
         connections_max: u32,
+        commit_max: Duration,
     ) -> Result<Self, sqlx::Error> {
         let permits = usize::try_from(connections_max).unwrap_or(Semaphore::MAX_PERMITS);
+        let spare = usize::try_from(SPARE_MAX).unwrap_or_default();
         let inner = Inner {
             options,
             connections_max,
+            commit_max,
             permits: Arc::new(Semaphore::new(permits)),
+            threads: Arc::new(Semaphore::new(permits.saturating_add(spare))),
             idle: Mutex::default(),
         };
         let first = inner.connect().await?;
@@ -100,7 +146,7 @@ impl Connections {
             None => self.inner.connect().await?,
         };
         // Whoever goes away meanwhile takes the connection along.
-        let beginning = sqlx::query(statement).execute(&mut opened.connection);
+        let beginning = sqlx::query(statement).execute(opened.connection()?);
         timeout(BEGIN_TIMEOUT, beginning)
             .await
             .map_err(|_elapsed| sqlx::Error::WorkerCrashed)??;
@@ -125,17 +171,15 @@ impl Connections {
             Some(opened) => opened,
             None => self.inner.connect().await?,
         };
-        let ran = sqlx::query(statement).execute(&mut opened.connection).await;
+        let ran = sqlx::query(statement).execute(opened.connection()?).await;
         // SQLite has answered, so the connection goes on.
         if matches!(ran, Ok(_) | Err(sqlx::Error::Database(_))) {
-            self.inner.idle().push(opened);
+            self.inner.give_back(opened);
         } else if !is_new {
             // Its thread had ended after the statement before.
             let mut opened = self.inner.connect().await?;
-            sqlx::query(statement)
-                .execute(&mut opened.connection)
-                .await?;
-            self.inner.idle().push(opened);
+            sqlx::query(statement).execute(opened.connection()?).await?;
+            self.inner.give_back(opened);
             return Ok(());
         }
         ran.map(|_done| ())
@@ -151,8 +195,8 @@ impl Connections {
             Some(opened) => opened,
             None => self.inner.connect().await?,
         };
-        let worked = work(&mut opened.connection).await;
-        self.inner.idle().push(opened);
+        let worked = work(opened.connection()?).await;
+        self.inner.give_back(opened);
         Ok(worked)
     }
 
@@ -161,6 +205,7 @@ impl Connections {
         let Inner {
             connections_max,
             permits,
+            threads,
             ..
         } = &*self.inner;
         // What does not come back is closed by whoever has it.
@@ -168,8 +213,12 @@ impl Connections {
         permits.close();
         let idle = std::mem::take(&mut *self.inner.idle());
         for opened in idle {
-            let _ = timeout(CLOSE_TIMEOUT, opened.connection.close()).await;
+            let _ = timeout(CLOSE_TIMEOUT, opened.close()).await;
         }
+        // The last one that closes brings the log into the file.
+        let all = threads.acquire_many(connections_max.saturating_add(SPARE_MAX));
+        let _ = timeout(CLOSE_TIMEOUT, all).await;
+        threads.close();
     }
 }
 
@@ -184,13 +233,38 @@ impl Inner {
         idle.pop()
     }
 
+    /// Takes a connection back that works.
+    fn give_back(&self, opened: Opened) {
+        if !self.permits.is_closed() {
+            self.idle().push(opened);
+        }
+    }
+
     async fn connect(&self) -> Result<Opened, sqlx::Error> {
+        let thread = Arc::clone(&self.threads).acquire_owned();
+        let thread = timeout(THREAD_TIMEOUT, thread)
+            .await
+            .map_err(|_elapsed| sqlx::Error::PoolTimedOut)?
+            .map_err(|_closed| sqlx::Error::PoolClosed)?;
         // It is as old as what it has read while it was opened.
         let at = Instant::now();
-        let connection = timeout(ACQUIRE_TIMEOUT, self.options.connect())
+        let options = self.options.clone();
+        #[expect(
+            clippy::disallowed_methods,
+            reason = "ends when the connection is open; whoever waits may go away, and its thread must be counted"
+        )]
+        let opening = tokio::spawn(async move {
+            let connection = options.connect().await?;
+            Ok(Opened {
+                connection: Some(connection),
+                thread: Some(thread),
+                at,
+            })
+        });
+        timeout(ACQUIRE_TIMEOUT, opening)
             .await
-            .map_err(|_elapsed| sqlx::Error::PoolTimedOut)??;
-        Ok(Opened { connection, at })
+            .map_err(|_elapsed| sqlx::Error::PoolTimedOut)?
+            .unwrap_or(Err(sqlx::Error::WorkerCrashed))
     }
 }
 
@@ -204,11 +278,11 @@ impl Lent {
         let Some(mut opened) = self.opened.take() else {
             return Err(sqlx::Error::WorkerCrashed);
         };
-        let committing = sqlx::query("COMMIT").execute(&mut opened.connection);
-        timeout(COMMIT_TIMEOUT, committing)
+        let committing = sqlx::query("COMMIT").execute(opened.connection()?);
+        timeout(self.inner.commit_max, committing)
             .await
             .map_err(|_elapsed| sqlx::Error::WorkerCrashed)??;
-        self.inner.idle().push(opened);
+        self.inner.give_back(opened);
         Ok(())
     }
 }
@@ -224,10 +298,15 @@ impl Drop for Lent {
         };
         let (inner, permit) = (Arc::clone(&self.inner), self.permit.take());
         runtime.spawn(async move {
-            let rolling_back = sqlx::query("ROLLBACK").execute(&mut opened.connection);
-            let is_over = matches!(timeout(ROLLBACK_TIMEOUT, rolling_back).await, Ok(Ok(_)));
+            let is_over = match opened.connection() {
+                Ok(connection) => {
+                    let rolling_back = sqlx::query("ROLLBACK").execute(connection);
+                    matches!(timeout(ROLLBACK_TIMEOUT, rolling_back).await, Ok(Ok(_)))
+                }
+                Err(_gone) => false,
+            };
             if is_over && !opened.is_spoiled() {
-                inner.idle().push(opened);
+                inner.give_back(opened);
             } else {
                 drop(opened);
             }
@@ -241,17 +320,15 @@ impl Deref for Lent {
 
     fn deref(&self) -> &SqliteConnection {
         let opened = self.opened.as_ref();
-        &opened
-            .expect("only a commit takes it, with the whole")
-            .connection
+        let connection = opened.and_then(|opened| opened.connection.as_ref());
+        connection.expect("only a commit takes it, with the whole")
     }
 }
 
 impl DerefMut for Lent {
     fn deref_mut(&mut self) -> &mut SqliteConnection {
         let opened = self.opened.as_mut();
-        &mut opened
-            .expect("only a commit takes it, with the whole")
-            .connection
+        let connection = opened.and_then(|opened| opened.connection.as_mut());
+        connection.expect("only a commit takes it, with the whole")
     }
 }

@@ -1,11 +1,13 @@
 //! Which robots have joined, and how often.
 
+use std::collections::BTreeSet;
+
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::enrolment::Enrolment;
 use tread_api::ids::{RobotId, SiteId};
 
-use super::{DbError, from_us, parse, to_us};
+use super::{DbError, from_us, parse, robots_text, to_us};
 
 struct Raw {
     site: String,
@@ -17,6 +19,7 @@ struct Raw {
     expires_at_us: i64,
     revoked_at_us: Option<i64>,
     revoked_by: Option<String>,
+    authority: Option<String>,
 }
 
 impl TryFrom<Raw> for Enrolment {
@@ -33,6 +36,7 @@ impl TryFrom<Raw> for Enrolment {
             expires_at: from_us(raw.expires_at_us)?,
             revoked_at: raw.revoked_at_us.map(from_us).transpose()?,
             revoked_by: raw.revoked_by,
+            authority: raw.authority,
         })
     }
 }
@@ -42,7 +46,7 @@ macro_rules! enrolments {
         sqlx::query_as!(
             Raw,
             r#"SELECT site, robot, number, enrolled_at_us, join_token, renewed_at_us,
-                   expires_at_us, revoked_at_us, revoked_by
+                   expires_at_us, revoked_at_us, revoked_by, authority
                FROM enrolments "# + $condition
             $(, $argument)*
         )
@@ -61,22 +65,26 @@ pub async fn all_newest(db: &mut SqliteConnection) -> Result<Vec<Enrolment>, DbE
     raw.into_iter().map(Enrolment::try_from).collect()
 }
 
-/// The newest enrolments of a site after a robot, by its name.
+/// The newest enrolments of a site after a robot, by its name, only of those that are named if any
+/// are.
 pub async fn list(
     db: &mut SqliteConnection,
-    site: &SiteId,
+    (site, named): (&SiteId, Option<&BTreeSet<RobotId>>),
     after: &str,
     limit: u32,
 ) -> Result<Vec<Enrolment>, DbError> {
+    let named = robots_text(named)?;
     let site = site.as_str();
     let raw = enrolments!(
         "AS present WHERE site = ?1 AND robot > ?2
              AND number = (SELECT MAX(number) FROM enrolments AS other
                  WHERE other.site = present.site AND other.robot = present.robot)
+             AND (?4 IS NULL OR robot IN (SELECT value FROM json_each(?4)))
          ORDER BY robot LIMIT ?3",
         site,
         after,
-        limit
+        limit,
+        named
     )
     .fetch_all(db)
     .await?;
@@ -119,8 +127,8 @@ pub async fn insert(db: &mut SqliteConnection, enrolment: &Enrolment) -> Result<
     let expires_at_us = to_us(enrolment.expires_at);
     sqlx::query!(
         "INSERT INTO enrolments (site, robot, number, enrolled_at_us, join_token, renewed_at_us,
-             expires_at_us)
-         VALUES (?, ?, ?, ?, ?, ?, ?)",
+             expires_at_us, authority)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
         site,
         robot,
         enrolment.number,
@@ -128,26 +136,31 @@ pub async fn insert(db: &mut SqliteConnection, enrolment: &Enrolment) -> Result<
         join_token,
         renewed_at_us,
         expires_at_us,
+        enrolment.authority,
     )
     .execute(db)
     .await?;
     Ok(())
 }
 
-/// Notes a renewal of an enrolment that is in force; false if it no longer is.
+/// Notes a renewal of an enrolment that is in force, and who signed the certificate that was shown
+/// for it; false if it no longer is.
 pub async fn renew(
     db: &mut SqliteConnection,
     (site, robot, number): (&SiteId, &RobotId, u32),
     at: Timestamp,
     expires_at: Timestamp,
+    authority: &str,
 ) -> Result<bool, DbError> {
     let (site, robot) = (site.as_str(), robot.as_str());
     let (at_us, expires_at_us) = (to_us(at), to_us(expires_at));
     let done = sqlx::query!(
-        "UPDATE enrolments SET renewed_at_us = MAX(?, renewed_at_us), expires_at_us = ?
+        "UPDATE enrolments SET renewed_at_us = MAX(?, renewed_at_us), expires_at_us = ?,
+             authority = ?
          WHERE site = ? AND robot = ? AND number = ? AND revoked_at_us IS NULL",
         at_us,
         expires_at_us,
+        authority,
         site,
         robot,
         number
@@ -155,6 +168,26 @@ pub async fn renew(
     .execute(db)
     .await?;
     Ok(done.rows_affected() == 1)
+}
+
+/// Notes who signed the certificate that a robot has shown, if its enrolment is in force.
+pub async fn note_authority(
+    db: &mut SqliteConnection,
+    (site, robot, number): (&SiteId, &RobotId, u32),
+    authority: &str,
+) -> Result<(), DbError> {
+    let (site, robot) = (site.as_str(), robot.as_str());
+    sqlx::query!(
+        "UPDATE enrolments SET authority = ?
+         WHERE site = ? AND robot = ? AND number = ? AND revoked_at_us IS NULL",
+        authority,
+        site,
+        robot,
+        number
+    )
+    .execute(db)
+    .await?;
+    Ok(())
 }
 
 /// Ends the enrolment that is in force, if one is.

@@ -4,8 +4,9 @@ use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::enrolment::JoinToken;
 use tread_api::ids::{JoinTokenId, RobotId};
+use tread_api::rights::Scope;
 
-use super::{DbError, from_us, parse, to_us};
+use super::{DbError, from_us, parse, scope_text, to_us};
 use crate::identity::secret::Fingerprint;
 
 struct Raw {
@@ -54,17 +55,23 @@ macro_rules! join_tokens {
     };
 }
 
-/// Join tokens older than one, newest first; dead ones too.
+/// Join tokens older than one for what is in a scope, newest first; dead ones too.
 pub async fn list(
     db: &mut SqliteConnection,
+    within: &Scope,
     before: Option<JoinTokenId>,
     limit: u32,
 ) -> Result<Vec<JoinToken>, DbError> {
     let before = before.map(|id| id.to_string());
+    let within = scope_text(within)?;
     let raw = join_tokens!(
-        "WHERE (?1 IS NULL OR id < ?1) ORDER BY id DESC LIMIT ?2",
+        "WHERE (?1 IS NULL OR id < ?1)
+           AND (?3 IS NULL OR site IN (SELECT value FROM json_each(?3))
+               OR site || '/' || robot IN (SELECT value FROM json_each(?3)))
+         ORDER BY id DESC LIMIT ?2",
         before,
-        limit
+        limit,
+        within
     )
     .fetch_all(db)
     .await?;

@@ -8,10 +8,13 @@
 use std::ffi::OsString;
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Read as _, Seek as _, Write as _};
+use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
 /// What is added to the name of the database.
 const LOCK_ENDING: &str = ".lock";
+/// Most links that are followed to a file: as many as Linux follows.
+const LINKS_MAX: u32 = 40;
 /// Most bytes that are read of whom holds the lock.
 const HOLDER_BYTES_MAX: u64 = 32;
 
@@ -28,6 +31,18 @@ pub enum LockError {
         path: PathBuf,
         /// ` (process N)`, if it is known.
         holder: String,
+    },
+    /// The file has other names, of which nobody knows who uses it by them. SQLite's log is beside
+    /// one of them only, so whoever opens another one damages it.
+    #[error(
+        "the database `{}` has {names} names (hard links), which damages it when it is used by \
+         two of them: remove the others, and copy it with `VACUUM INTO` instead", path.display()
+    )]
+    HardLinks {
+        /// Which database.
+        path: PathBuf,
+        /// How many names it has.
+        names: u64,
     },
     /// The lock's file cannot be made.
     #[error("cannot lock the database with `{}`", path.display())]
@@ -50,8 +65,15 @@ impl DatabaseLock {
     /// Locks a database, which need not exist yet.
     ///
     /// # Errors
-    /// [`LockError::InUse`] names the process that has it.
+    /// [`LockError::InUse`] names the process that has it; [`LockError::HardLinks`].
     pub fn take(database: &Path) -> Result<Self, LockError> {
+        let names = fs::metadata(database).map_or(1, |there| there.nlink());
+        if names > 1 {
+            return Err(LockError::HardLinks {
+                path: database.to_owned(),
+                names,
+            });
+        }
         let path = lock_path(database);
         let failed = |source| LockError::File {
             path: path.clone(),
@@ -62,6 +84,8 @@ impl DatabaseLock {
             .write(true)
             .create(true)
             .truncate(false)
+            // Whoever could open it could hold it.
+            .mode(0o600)
             .open(&path)
             .map_err(failed)?;
         match file.try_lock() {
@@ -83,20 +107,31 @@ impl DatabaseLock {
     }
 }
 
-/// Beside the file itself, wherever links lead to it.
+/// Beside the file itself, wherever links lead to it, also when it does not exist yet.
 fn lock_path(database: &Path) -> PathBuf {
-    let mut name = fs::canonicalize(database)
-        .unwrap_or_else(|_missing| {
-            let folder = database.parent().filter(|it| !it.as_os_str().is_empty());
-            let folder = fs::canonicalize(folder.unwrap_or(Path::new(".")));
-            match (folder, database.file_name()) {
-                (Ok(folder), Some(file)) => folder.join(file),
-                (Ok(_) | Err(_), _) => database.to_owned(),
-            }
-        })
-        .into_os_string();
+    let file = behind_links(database);
+    let folder = file.parent().filter(|it| !it.as_os_str().is_empty());
+    let folder = fs::canonicalize(folder.unwrap_or(Path::new(".")));
+    let file = match (folder, file.file_name()) {
+        (Ok(folder), Some(name)) => folder.join(name),
+        (Ok(_) | Err(_), _) => file,
+    };
+    let mut name = file.into_os_string();
     name.push(OsString::from(LOCK_ENDING));
     PathBuf::from(name)
+}
+
+/// What a chain of symbolic links leads to.
+fn behind_links(path: &Path) -> PathBuf {
+    let mut path = path.to_owned();
+    for _ in 0..LINKS_MAX {
+        let Ok(target) = fs::read_link(&path) else {
+            break;
+        };
+        let folder = path.parent().unwrap_or(Path::new(""));
+        path = folder.join(target);
+    }
+    path
 }
 
 fn holder(file: &mut File) -> String {
@@ -129,6 +164,41 @@ mod tests {
         assert!(DatabaseLock::take(&link).is_err());
         drop(first);
         DatabaseLock::take(&link).unwrap();
+    }
+
+    #[test]
+    fn a_link_to_a_database_that_does_not_exist_yet_leads_to_its_lock() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::create_dir(folder.path().join("deep")).unwrap();
+        let database = folder.path().join("deep/tread.db");
+        let (link, further) = (folder.path().join("link.db"), folder.path().join("more.db"));
+        std::os::unix::fs::symlink("deep/tread.db", &link).unwrap();
+        std::os::unix::fs::symlink(&link, &further).unwrap();
+        let by_link = DatabaseLock::take(&further).unwrap();
+        assert!(DatabaseLock::take(&database).is_err());
+        assert!(DatabaseLock::take(&link).is_err());
+        drop(by_link);
+        DatabaseLock::take(&database).unwrap();
+        // A link that leads to itself is no database, and no endless search.
+        let round = folder.path().join("round.db");
+        std::os::unix::fs::symlink(&round, &round).unwrap();
+        assert!(DatabaseLock::take(&round).is_ok());
+    }
+
+    #[test]
+    fn a_database_with_two_names_is_refused_by_both() {
+        let folder = tempfile::tempdir().unwrap();
+        let (first, second) = (folder.path().join("one.db"), folder.path().join("two.db"));
+        fs::write(&first, "").unwrap();
+        let held = DatabaseLock::take(&first).unwrap();
+        fs::hard_link(&first, &second).unwrap();
+        for name in [&first, &second] {
+            let refused = DatabaseLock::take(name).unwrap_err().to_string();
+            assert!(refused.contains("2 names"), "{refused}");
+        }
+        drop(held);
+        fs::remove_file(&first).unwrap();
+        DatabaseLock::take(&second).unwrap();
     }
 
     #[test]

@@ -9,10 +9,11 @@ use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
 use tread_api::mission::{
     Cause, DrivenPath, Mission, MissionQuality, MissionState, PlanSummary, Replacement,
 };
+use tread_api::rights::Scope;
 use tread_api::robot::MissionProgress;
 
 pub use self::standing::{Standing, in_hand, next_in_queues, open_of_robot, overdue};
-use super::{DbError, corrupt, from_json, from_us, parse, to_json, to_us, unsigned};
+use super::{DbError, corrupt, from_json, from_us, parse, scope_text, to_json, to_us, unsigned};
 
 /// A mission with the key of its robot.
 #[derive(Debug, Clone, PartialEq)]
@@ -179,6 +180,8 @@ pub struct MissionFilter {
     pub state: Option<MissionState>,
     /// Only those older than this one.
     pub before: Option<MissionId>,
+    /// Only those of what is in this scope.
+    pub within: Scope,
 }
 
 /// Missions, newest first, until there are `limit` or their trajectories pass `bytes_max`; and
@@ -194,15 +197,19 @@ pub async fn list(
     let state = filter.state.map(MissionState::as_str);
     let before = filter.before.map(|id| id.to_string());
     let limit_and_one = i64::from(limit) + 1;
+    let within = scope_text(&filter.within)?;
     let query = missions!(
         "WHERE (?1 IS NULL OR sites.id = ?1) AND (?2 IS NULL OR robots.id = ?2)
            AND (?3 IS NULL OR missions.state = ?3) AND (?4 IS NULL OR missions.id < ?4)
+           AND (?6 IS NULL OR sites.id IN (SELECT value FROM json_each(?6))
+               OR sites.id || '/' || robots.id IN (SELECT value FROM json_each(?6)))
          ORDER BY missions.id DESC LIMIT ?5",
         site,
         robot,
         state,
         before,
         limit_and_one,
+        within,
     );
     let mut found = query.fetch(db);
     let (mut rows, mut bytes) = (Vec::new(), 0);

@@ -17,6 +17,7 @@ pub mod idempotency;
 pub mod join_tokens;
 pub mod lock;
 pub mod missions;
+mod private;
 pub mod removed;
 pub mod robots;
 mod rows;
@@ -30,6 +31,7 @@ pub mod times;
 pub mod tokens;
 pub mod withdrawals;
 
+use std::collections::BTreeSet;
 use std::fmt::Display;
 use std::ops::{Deref, DerefMut};
 use std::panic::Location;
@@ -45,9 +47,12 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{AssertSqlSafe, SqliteConnection};
+use tokio::sync::{Notify, Semaphore};
 use tokio::time::Instant;
+use tread_api::ids::RobotId;
+use tread_api::rights::Scope;
 
-use self::connections::{Connections, Lent};
+use self::connections::{COMMIT_TIMEOUT, Connections, Lent};
 use self::failure::StorageFailure;
 use crate::metrics::{Histogram, Transactions};
 
@@ -73,8 +78,39 @@ const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 pub struct Tx {
     inner: Lent,
     noted: Noted,
-    /// What its commit counts up.
-    generation: Option<Arc<AtomicU64>>,
+    commits: Arc<Commits>,
+    /// Whether its commit counts as a generation.
+    is_counted: bool,
+}
+
+/// How a commit ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Outcome {
+    /// Everything is written, and lasts.
+    Written,
+    /// Nothing is written.
+    Nothing,
+    /// Nobody knows: SQLite did not answer in time, and may still write everything.
+    Unknown,
+}
+
+impl Outcome {
+    fn of(committed: &Result<(), sqlx::Error>) -> Self {
+        match committed {
+            Ok(()) => Self::Written,
+            // SQLite itself says that it did not commit.
+            Err(sqlx::Error::Database(_)) => Self::Nothing,
+            Err(_) => Self::Unknown,
+        }
+    }
+}
+
+/// What is counted of commits.
+#[derive(Debug, Default)]
+struct Commits {
+    generation: AtomicU64,
+    unknown: AtomicU64,
+    became_unknown: Notify,
 }
 
 /// Notes how long a transaction took when it is over.
@@ -97,25 +133,43 @@ impl Tx {
     /// Makes what was written last.
     ///
     /// # Errors
-    /// SQLite failed; nothing is written then.
+    /// SQLite failed; nothing is written then, or nobody knows.
     pub async fn commit(self) -> Result<(), sqlx::Error> {
+        self.commit_then(|_outcome| {}).await
+    }
+
+    /// The same, and then does what follows from how it ended. Both are one task of their own, so
+    /// neither is left out if whoever waits goes away.
+    ///
+    /// # Errors
+    /// As [`Tx::commit`].
+    pub async fn commit_then(
+        self,
+        then: impl FnOnce(Outcome) + Send + 'static,
+    ) -> Result<(), sqlx::Error> {
         let Self {
             inner,
             noted,
-            generation,
+            commits,
+            is_counted,
         } = self;
-        let Some(generation) = generation else {
-            let committed = inner.commit().await;
-            drop(noted);
-            return committed;
-        };
         #[expect(
             clippy::disallowed_methods,
-            reason = "ends with the commit; whoever waits for it may go away, and it must be counted"
+            reason = "ends with the commit; whoever waits for it may go away, and what follows it must not be left out"
         )]
         let committing = tokio::spawn(async move {
             let committed = inner.commit().await;
-            generation.fetch_add(1, Ordering::AcqRel);
+            let outcome = Outcome::of(&committed);
+            if is_counted {
+                commits.generation.fetch_add(1, Ordering::AcqRel);
+            }
+            if outcome == Outcome::Unknown {
+                commits.unknown.fetch_add(1, Ordering::AcqRel);
+            }
+            then(outcome);
+            if outcome == Outcome::Unknown {
+                commits.became_unknown.notify_one();
+            }
             drop(noted);
             committed
         });
@@ -154,6 +208,9 @@ pub enum DbError {
     /// A value does not fit into the database.
     #[error("a {0} does not fit into the database")]
     DoesNotFit(&'static str),
+    /// A commit ended of which nobody knows what became, and memory has not been read again since.
+    #[error("what became of a commit is not known yet")]
+    Unsettled,
 }
 
 impl From<sqlx::Error> for DbError {
@@ -168,6 +225,7 @@ impl DbError {
     pub fn failure(&self) -> Option<StorageFailure> {
         match self {
             Self::Sqlite(error) => StorageFailure::of(error),
+            Self::Unsettled => Some(StorageFailure::Connection),
             Self::Corrupt { .. } | Self::DoesNotFit(_) => None,
         }
     }
@@ -176,7 +234,7 @@ impl DbError {
     pub fn is_unique_violation(&self) -> bool {
         match self {
             Self::Sqlite(sqlx::Error::Database(error)) => error.is_unique_violation(),
-            Self::Sqlite(_) | Self::Corrupt { .. } | Self::DoesNotFit(_) => false,
+            Self::Sqlite(_) | Self::Corrupt { .. } | Self::DoesNotFit(_) | Self::Unsettled => false,
         }
     }
 }
@@ -221,7 +279,9 @@ pub struct Db {
     version: String,
     write_waits: Arc<Histogram>,
     transactions: Arc<Transactions>,
-    generation: Arc<AtomicU64>,
+    commits: Arc<Commits>,
+    /// Held by whoever asks the operating system about the disk.
+    asking_disk: Arc<Semaphore>,
 }
 
 impl Db {
@@ -230,6 +290,14 @@ impl Db {
     /// # Errors
     /// [`OpenError`] names file or folder.
     pub async fn open(path: &Path) -> Result<Self, OpenError> {
+        Self::open_with(path, COMMIT_TIMEOUT).await
+    }
+
+    /// The same, with a bound of one's own on how long a commit may take.
+    ///
+    /// # Errors
+    /// As [`Db::open`].
+    pub async fn open_with(path: &Path, commit_max: Duration) -> Result<Self, OpenError> {
         let folder = path
             .parent()
             .filter(|folder| !folder.as_os_str().is_empty());
@@ -240,6 +308,7 @@ impl Db {
             path: path.to_owned(),
             cause,
         };
+        private::keep(path).map_err(|cause| failed(cause.into()))?;
         let options = SqliteConnectOptions::new()
             .filename(path)
             .create_if_missing(true)
@@ -250,7 +319,9 @@ impl Db {
             .pragma("wal_autocheckpoint", WAL_PAGES.to_string());
         let cache = format!("-{WRITER_CACHE_KIB}");
         let of_writer = options.clone().pragma("cache_size", cache);
-        let writer = Connections::open(of_writer, 1).await.map_err(failed)?;
+        let writer = Connections::open(of_writer, 1, commit_max)
+            .await
+            .map_err(failed)?;
         let version = writer
             .with_first(async |connection| {
                 sqlx::query_scalar!(r#"SELECT sqlite_version() AS "version!: String""#)
@@ -273,10 +344,10 @@ impl Db {
             })?;
         // It has no transactions that could be left open, and is never replaced: while one
         // connection is open the log's index exists, which a full disk has no room for.
-        let checkpoints = Connections::open(options.clone(), 1)
+        let checkpoints = Connections::open(options.clone(), 1, commit_max)
             .await
             .map_err(failed)?;
-        let readers = Connections::open(options.read_only(true), READERS_MAX)
+        let readers = Connections::open(options.read_only(true), READERS_MAX, commit_max)
             .await
             .map_err(failed)?;
         Ok(Self {
@@ -287,14 +358,37 @@ impl Db {
             version,
             write_waits: Arc::default(),
             transactions: Arc::default(),
-            generation: Arc::default(),
+            commits: Arc::default(),
+            asking_disk: Arc::new(Semaphore::new(1)),
         })
     }
 
     /// Counts what was committed, but for uploads: what was read at a generation is as it was while
     /// that is the present one, if no upload changes it.
     pub fn generation(&self) -> u64 {
-        self.generation.load(Ordering::Acquire)
+        self.commits.generation.load(Ordering::Acquire)
+    }
+
+    /// How many commits ended of which nobody knows what became.
+    pub fn unknown_outcomes(&self) -> u64 {
+        self.commits.unknown.load(Ordering::Acquire)
+    }
+
+    /// Waits for the next commit of which nobody knows what became.
+    pub async fn outcome_unknown(&self) {
+        self.commits.became_unknown.notified().await;
+    }
+
+    /// Waits until every commit before has ended, in whatever way, and counts a generation: what was
+    /// read meanwhile may be of before.
+    ///
+    /// # Errors
+    /// The turn to write did not come in time, since one of them goes on or another process writes.
+    pub async fn await_commits(&self) -> Result<(), DbError> {
+        // SQLite lets nobody else begin to write as long as a transaction may still be committed.
+        drop(self.write().await?);
+        self.commits.generation.fetch_add(1, Ordering::AcqRel);
+        Ok(())
     }
 
     /// Version of the SQLite library.
@@ -315,7 +409,7 @@ impl Db {
             self.write_waits.note(asked_at.elapsed());
             let tx = self.timed(inner, begun, true);
             Ok(Tx {
-                generation: Some(Arc::clone(&self.generation)),
+                is_counted: true,
                 ..tx
             })
         }
@@ -331,7 +425,7 @@ impl Db {
         let writing = self.write();
         async move {
             Ok(Tx {
-                generation: None,
+                is_counted: false,
                 ..writing.await?
             })
         }
@@ -347,7 +441,8 @@ impl Db {
         Tx {
             inner,
             noted,
-            generation: None,
+            commits: Arc::clone(&self.commits),
+            is_counted: false,
         }
     }
 
@@ -433,9 +528,14 @@ impl Db {
 
     /// Free bytes on the disk of the file, if the operating system tells.
     pub async fn disk_free_bytes(&self) -> Option<u64> {
+        // It may wait for a disk that hangs: then nobody asks again until it has answered.
+        let asking = Arc::clone(&self.asking_disk).try_acquire_owned().ok()?;
         let path = self.path.clone();
-        // It may wait for a disk that hangs.
-        let asked = tokio::task::spawn_blocking(move || statvfs(&path));
+        let asked = tokio::task::spawn_blocking(move || {
+            let found = statvfs(&path);
+            drop(asking);
+            found
+        });
         let found = tokio::time::timeout(DISK_TIMEOUT, asked).await.ok()?;
         let found = found.ok()?.ok()?;
         Some(
@@ -497,6 +597,17 @@ fn to_json<T: Serialize>(what: &'static str, value: &T) -> Result<String, DbErro
 
 fn from_json<T: DeserializeOwned>(what: &'static str, text: &str) -> Result<T, DbError> {
     serde_json::from_str(text).map_err(|_error| corrupt(what, text))
+}
+
+/// What statements compare sites and robots with: `NULL` for everywhere.
+fn scope_text(scope: &Scope) -> Result<Option<String>, DbError> {
+    let names = scope.names();
+    names.map(|names| to_json("scope", &names)).transpose()
+}
+
+/// What statements compare robots of one site with: `NULL` for all.
+fn robots_text(robots: Option<&BTreeSet<RobotId>>) -> Result<Option<String>, DbError> {
+    robots.map(|robots| to_json("robots", robots)).transpose()
 }
 
 fn unsigned<T: TryFrom<i64>>(what: &'static str, value: i64) -> Result<T, DbError> {

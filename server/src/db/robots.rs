@@ -1,13 +1,16 @@
 //! Robots, their configurations, and the runs of their agents.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::ids::{BootId, ConfigurationId, RobotId, SiteId};
 use tread_api::robot::{Capabilities, MeasurementsTaken, RobotModel};
 
-use super::{DbError, from_json, from_us, parse, to_json, to_us, unsigned};
+use super::{DbError, from_json, from_us, parse, robots_text, to_json, to_us, unsigned};
+
+/// Runs of agents that are removed with each new one.
+const FORGET_MAX: u32 = 50;
 
 /// A robot as the database keeps it.
 #[derive(Debug, Clone)]
@@ -152,21 +155,25 @@ pub async fn pk_of(
     Ok(pk)
 }
 
-/// Robots of a site after an identifier, in alphabetical order; retired ones too if asked for.
+/// Robots of a site after an identifier, in alphabetical order, only those that are named if any are;
+/// retired ones too if asked for.
 pub async fn list(
     db: &mut SqliteConnection,
-    site_pk: i64,
+    (site_pk, named): (i64, Option<&BTreeSet<RobotId>>),
     after: &str,
     retired: bool,
     limit: u32,
 ) -> Result<Vec<RobotRow>, DbError> {
+    let named = robots_text(named)?;
     let rows = robots!(
-        "WHERE robots.site_pk = ? AND robots.id > ? AND (? OR robots.retired_at_us IS NULL)
-         ORDER BY robots.id LIMIT ?",
+        "WHERE robots.site_pk = ?1 AND robots.id > ?2 AND (?3 OR robots.retired_at_us IS NULL)
+           AND (?5 IS NULL OR robots.id IN (SELECT value FROM json_each(?5)))
+         ORDER BY robots.id LIMIT ?4",
         site_pk,
         after,
         retired,
         limit,
+        named,
     )
     .fetch_all(db)
     .await?;
@@ -190,11 +197,12 @@ pub struct Introduction<'hello> {
     pub at: Timestamp,
 }
 
-/// Writes down what a robot says of itself, and the run of its agent.
+/// Writes down what a robot says of itself, and the run of its agent, of which so many are kept.
 pub async fn introduce(
     db: &mut SqliteConnection,
     site_pk: i64,
     introduction: Introduction<'_>,
+    runs_kept: u32,
 ) -> Result<(), DbError> {
     let Introduction {
         id,
@@ -207,11 +215,11 @@ pub async fn introduce(
     let capabilities = to_json("capabilities", capabilities)?;
     let configuration = model.configuration().to_string();
     let model = to_json("robot model", model)?;
+    let configuration_pk = configuration_key(db, &configuration).await?;
     sqlx::query!(
-        "INSERT INTO configurations (id, model) VALUES (?1, ?2)
-         ON CONFLICT (id) DO UPDATE SET model = ?2 WHERE model IS NULL",
-        configuration,
+        "UPDATE configurations SET model = ? WHERE pk = ? AND model IS NULL",
         model,
+        configuration_pk,
     )
     .execute(&mut *db)
     .await?;
@@ -219,14 +227,14 @@ pub async fn introduce(
     let robot_pk = sqlx::query_scalar!(
         r#"INSERT INTO robots (site_pk, id, configuration_pk, agent_version, boot,
                first_seen_at_us, last_hello_at_us, capabilities)
-           VALUES (?1, ?2, (SELECT pk FROM configurations WHERE id = ?3), ?4, ?5, ?6, ?6, ?7)
+           VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?6, ?7)
            ON CONFLICT (site_pk, id) DO UPDATE SET configuration_pk = excluded.configuration_pk,
                agent_version = ?4, boot = ?5, capabilities = ?7,
                last_hello_at_us = MAX(?6, robots.last_hello_at_us)
            RETURNING pk AS "pk!""#,
         site_pk,
         id,
-        configuration,
+        configuration_pk,
         agent_version,
         boot_text,
         at_us,
@@ -234,46 +242,159 @@ pub async fn introduce(
     )
     .fetch_one(&mut *db)
     .await?;
-    boot_key(db, robot_pk, boot).await?;
+    boot_key(db, robot_pk, boot, runs_kept).await?;
     Ok(())
 }
 
-/// The key of one run of an agent, written down if it is new.
-pub async fn boot_key(
+/// The key of one run of an agent, if it is known.
+pub async fn find_boot(
     db: &mut SqliteConnection,
     robot_pk: i64,
     boot: BootId,
-) -> Result<i64, DbError> {
+) -> Result<Option<i64>, DbError> {
     let boot = boot.to_string();
-    sqlx::query!(
-        "INSERT INTO boots (robot_pk, id) VALUES (?, ?) ON CONFLICT DO NOTHING",
-        robot_pk,
-        boot,
-    )
-    .execute(&mut *db)
-    .await?;
     let found = sqlx::query_scalar!(
         r#"SELECT pk AS "pk!" FROM boots WHERE robot_pk = ? AND id = ?"#,
         robot_pk,
         boot,
     );
-    Ok(found.fetch_one(db).await?)
+    Ok(found.fetch_optional(db).await?)
 }
 
-/// The key of a configuration, written down without its model if it is new.
-pub async fn configuration_key(
+/// The key of one run of an agent, written down if it is new; of each robot so many are kept, and
+/// those of which raw measurements are kept.
+pub async fn boot_key(
     db: &mut SqliteConnection,
-    id: ConfigurationId,
+    robot_pk: i64,
+    boot: BootId,
+    kept: u32,
 ) -> Result<i64, DbError> {
-    let id = id.to_string();
+    if let Some(found) = find_boot(db, robot_pk, boot).await? {
+        return Ok(found);
+    }
+    let boot = boot.to_string();
+    let pk = sqlx::query_scalar!(
+        r#"INSERT INTO boots (robot_pk, id) VALUES (?, ?) RETURNING pk AS "pk!""#,
+        robot_pk,
+        boot,
+    );
+    let pk = pk.fetch_one(&mut *db).await?;
+    forget_runs(db, robot_pk, kept).await?;
+    Ok(pk)
+}
+
+/// Removes the oldest runs of a robot beyond so many, with what says which of their records came;
+/// runs of which measurements are kept stay, as does the one that said hello last.
+async fn forget_runs(db: &mut SqliteConnection, robot_pk: i64, kept: u32) -> Result<(), DbError> {
+    let over = sqlx::query_scalar!(
+        r#"SELECT boots.pk AS "pk!" FROM boots
+           WHERE boots.robot_pk = ?1
+             AND boots.pk <= (SELECT more.pk FROM boots AS more WHERE more.robot_pk = ?1
+                 ORDER BY more.pk DESC LIMIT 1 OFFSET ?2)
+             AND boots.id <> (SELECT robots.boot FROM robots WHERE robots.pk = ?1)
+             AND NOT EXISTS (SELECT 1 FROM segments WHERE segments.boot_pk = boots.pk)
+             AND NOT EXISTS (SELECT 1 FROM segments_aside
+                 WHERE segments_aside.boot_pk = boots.pk)
+           ORDER BY boots.pk LIMIT ?3"#,
+        robot_pk,
+        kept,
+        FORGET_MAX,
+    );
+    let over = over.fetch_all(&mut *db).await?;
+    if over.is_empty() {
+        return Ok(());
+    }
+    let over = to_json("boots", &over)?;
     sqlx::query!(
-        "INSERT INTO configurations (id) VALUES (?) ON CONFLICT DO NOTHING",
-        id
+        "DELETE FROM reports_seen WHERE boot_pk IN (SELECT value FROM json_each(?))",
+        over
     )
     .execute(&mut *db)
     .await?;
+    sqlx::query!(
+        "DELETE FROM segments_removed WHERE boot_pk IN (SELECT value FROM json_each(?))",
+        over
+    )
+    .execute(&mut *db)
+    .await?;
+    sqlx::query!(
+        "DELETE FROM boots WHERE pk IN (SELECT value FROM json_each(?))",
+        over
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// The key of a configuration, written down without its model if it is new. It takes the place of
+/// one that no robot has and that nobody measured with, if there is one.
+pub async fn configuration_key(db: &mut SqliteConnection, id: &str) -> Result<i64, DbError> {
     let found = sqlx::query_scalar!(r#"SELECT pk AS "pk!" FROM configurations WHERE id = ?"#, id);
-    Ok(found.fetch_one(db).await?)
+    if let Some(found) = found.fetch_optional(&mut *db).await? {
+        return Ok(found);
+    }
+    let taken = sqlx::query_scalar!(
+        r#"UPDATE configurations SET id = ?, model = NULL
+           WHERE pk = (SELECT free.pk FROM configurations AS free
+               WHERE NOT EXISTS (SELECT 1 FROM robots WHERE robots.configuration_pk = free.pk)
+                 AND NOT EXISTS (SELECT 1 FROM measured_configurations AS measured
+                     WHERE measured.configuration_pk = free.pk)
+               LIMIT 1)
+           RETURNING pk AS "pk!""#,
+        id
+    );
+    if let Some(taken) = taken.fetch_optional(&mut *db).await? {
+        return Ok(taken);
+    }
+    let new = sqlx::query_scalar!(
+        r#"INSERT INTO configurations (id) VALUES (?) RETURNING pk AS "pk!""#,
+        id
+    );
+    Ok(new.fetch_one(db).await?)
+}
+
+/// The key of a configuration that a robot has measured with.
+pub async fn measured_configuration(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+    id: ConfigurationId,
+) -> Result<Option<i64>, DbError> {
+    let id = id.to_string();
+    let found = sqlx::query_scalar!(
+        r#"SELECT configurations.pk AS "pk!" FROM measured_configurations AS measured
+           JOIN configurations ON configurations.pk = measured.configuration_pk
+           WHERE measured.robot_pk = ? AND configurations.id = ?"#,
+        robot_pk,
+        id,
+    );
+    Ok(found.fetch_optional(db).await?)
+}
+
+/// With how many configurations a robot has measured.
+pub async fn measured_count(db: &mut SqliteConnection, robot_pk: i64) -> Result<i64, DbError> {
+    let count = sqlx::query_scalar!(
+        r#"SELECT COUNT(*) AS "count!: i64" FROM measured_configurations WHERE robot_pk = ?"#,
+        robot_pk
+    );
+    Ok(count.fetch_one(db).await?)
+}
+
+/// Notes that a robot measures with a configuration; the key of the configuration.
+pub async fn note_measured(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+    id: ConfigurationId,
+) -> Result<i64, DbError> {
+    let configuration_pk = configuration_key(db, &id.to_string()).await?;
+    sqlx::query!(
+        "INSERT INTO measured_configurations (robot_pk, configuration_pk) VALUES (?, ?)
+         ON CONFLICT DO NOTHING",
+        robot_pk,
+        configuration_pk,
+    )
+    .execute(db)
+    .await?;
+    Ok(configuration_pk)
 }
 
 /// The names of all robots of all sites.

@@ -1,5 +1,6 @@
 //! Raw measurements, in the order of their commits.
 
+use std::collections::BTreeSet;
 use std::sync::LazyLock;
 
 use jiff::Timestamp;
@@ -9,7 +10,7 @@ use tread_api::friction::StoredSegment;
 use tread_api::ids::{RobotId, TerrainId};
 
 use super::rows::{Row, RowsStatement};
-use super::{DbError, from_json, from_us, parse, to_us, unsigned};
+use super::{DbError, from_json, from_us, parse, robots_text, to_us, unsigned};
 
 /// A measurement on its way into the database.
 #[derive(Debug)]
@@ -102,6 +103,8 @@ pub struct SegmentFilter {
     pub robot: Option<RobotId>,
     /// Only those on this terrain.
     pub terrain: Option<TerrainId>,
+    /// Only those of these robots.
+    pub robots: Option<BTreeSet<RobotId>>,
     /// Only those after this one.
     pub after: i64,
 }
@@ -223,6 +226,7 @@ pub async fn list(
 ) -> Result<Vec<StoredSegment>, DbError> {
     let robot = filter.robot.as_ref().map(RobotId::as_str);
     let terrain = filter.terrain.as_ref().map(TerrainId::as_str);
+    let named = robots_text(filter.robots.as_ref())?;
     // One statement per kind of filter, so that each uses its own index. A plus sign keeps a
     // column out of the choice of index.
     let raw = match (robot, terrain) {
@@ -230,12 +234,14 @@ pub async fn list(
             segments!(
                 "WHERE segments.robot_pk = (SELECT pk FROM robots WHERE site_pk = ?1 AND id = ?2)
                    AND segments.pk > ?3 AND (?4 IS NULL OR segments.terrain = ?4)
+                   AND (?6 IS NULL OR robots.id IN (SELECT value FROM json_each(?6)))
                  ORDER BY segments.pk LIMIT ?5",
                 site_pk,
                 robot,
                 filter.after,
                 terrain,
                 limit,
+                named,
             )
             .fetch_all(db)
             .await?
@@ -243,11 +249,13 @@ pub async fn list(
         (None, Some(terrain)) => {
             segments!(
                 "WHERE segments.site_pk = ?1 AND segments.terrain = ?2 AND segments.pk > ?3
+                   AND (?5 IS NULL OR robots.id IN (SELECT value FROM json_each(?5)))
                  ORDER BY segments.pk LIMIT ?4",
                 site_pk,
                 terrain,
                 filter.after,
                 limit,
+                named,
             )
             .fetch_all(db)
             .await?
@@ -255,10 +263,12 @@ pub async fn list(
         (None, None) => {
             segments!(
                 "WHERE +segments.site_pk = ?1 AND segments.pk > ?2
+                   AND (?4 IS NULL OR robots.id IN (SELECT value FROM json_each(?4)))
                  ORDER BY segments.pk LIMIT ?3",
                 site_pk,
                 filter.after,
                 limit,
+                named,
             )
             .fetch_all(db)
             .await?

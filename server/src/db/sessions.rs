@@ -78,6 +78,18 @@ pub async fn by_lookup(
     .transpose()
 }
 
+/// Every session that is valid at a time.
+pub async fn all_valid(
+    db: &mut SqliteConnection,
+    at: Timestamp,
+) -> Result<Vec<SessionId>, DbError> {
+    let at_us = to_us(at);
+    let ids = sqlx::query_scalar!("SELECT id FROM sessions WHERE expires_at_us > ?", at_us)
+        .fetch_all(db)
+        .await?;
+    ids.iter().map(|id| parse("session", id)).collect()
+}
+
 /// Ends a session.
 pub async fn delete(db: &mut SqliteConnection, id: SessionId) -> Result<(), DbError> {
     let id = id.to_string();

@@ -2,9 +2,10 @@
 
 use sqlx::SqliteConnection;
 use tread_api::ids::SiteId;
+use tread_api::rights::Scope;
 use tread_api::site::{GeoOrigin, Grid, Site};
 
-use super::{DbError, from_json, from_us, parse, to_json, to_us, unsigned};
+use super::{DbError, from_json, from_us, parse, scope_text, to_json, to_us, unsigned};
 
 /// A site with its key in the database.
 #[derive(Debug, Clone)]
@@ -110,21 +111,27 @@ pub async fn find(db: &mut SqliteConnection, id: &SiteId) -> Result<Option<SiteR
     raw.map(SiteRow::try_from).transpose()
 }
 
-/// Sites after an identifier, in alphabetical order.
+/// Sites of a scope after an identifier, in alphabetical order.
 pub async fn list(
     db: &mut SqliteConnection,
+    within: &Scope,
     after: &str,
     limit: u32,
 ) -> Result<Vec<SiteRow>, DbError> {
+    let within = scope_text(within)?;
     let rows = sqlx::query_as!(
         Raw,
         r#"SELECT pk AS "pk!", id, name, grid_revision, cell_m, terrain_revision, created_at_us,
                merged_before_h, origin,
                COALESCE((SELECT MAX(revision) FROM geofences WHERE site_pk = sites.pk), 0)
                    AS "geofence_revision!: i64"
-           FROM sites WHERE id > ? ORDER BY id LIMIT ?"#,
+           FROM sites
+           WHERE id > ?1 AND (?3 IS NULL OR id IN (
+               SELECT substr(value, 1, instr(value || '/', '/') - 1) FROM json_each(?3)))
+           ORDER BY id LIMIT ?2"#,
         after,
         limit,
+        within,
     )
     .fetch_all(db)
     .await?;

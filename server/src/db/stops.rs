@@ -1,11 +1,14 @@
-//! Stops of robots: wanted, confirmed, cleared.
+//! Stops of robots: wanted, confirmed, cleared or replaced.
+//!
+//! A robot has at most one open stop, which is neither; a unique index says so.
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::ids::{RobotId, SiteId, StopId};
+use tread_api::rights::Scope;
 use tread_api::stop::Stop;
 
-use super::{DbError, from_us, parse, to_json, to_us};
+use super::{DbError, from_us, parse, scope_text, to_json, to_us};
 
 struct Raw {
     id: String,
@@ -19,6 +22,7 @@ struct Raw {
     clear_asked_by: Option<String>,
     clear_asked_at_us: Option<i64>,
     cleared_at_us: Option<i64>,
+    replaced_by: Option<String>,
 }
 
 impl TryFrom<Raw> for Stop {
@@ -39,6 +43,7 @@ impl TryFrom<Raw> for Stop {
             clear_asked_by: raw.clear_asked_by,
             clear_asked_at: raw.clear_asked_at_us.map(from_us).transpose()?,
             cleared_at: raw.cleared_at_us.map(from_us).transpose()?,
+            replaced_by: raw.replaced_by.map(|id| parse("stop", &id)).transpose()?,
         })
     }
 }
@@ -49,7 +54,8 @@ macro_rules! stops {
             Raw,
             r#"SELECT stops.id, sites.id AS site, robots.id AS robot, stops.stopped_by,
                    stops.reason, stops.wanted_at_us, stops.confirmed_at_us, stops.standing_at_us,
-                   stops.clear_asked_by, stops.clear_asked_at_us, stops.cleared_at_us
+                   stops.clear_asked_by, stops.clear_asked_at_us, stops.cleared_at_us,
+                   stops.replaced_by
                FROM stops
                JOIN robots ON robots.pk = stops.robot_pk
                JOIN sites ON sites.pk = robots.site_pk "# + $condition
@@ -69,10 +75,12 @@ pub struct StopFilter {
     pub site: Option<SiteId>,
     /// Only those of robots of this name.
     pub robot: Option<RobotId>,
-    /// Only those that are not cleared.
+    /// Only open ones, at most one of each robot.
     pub in_force: bool,
     /// Only those older than this one.
     pub before: Option<StopId>,
+    /// Only those of what is in this scope.
+    pub within: Scope,
 }
 
 /// Stops, newest first.
@@ -84,34 +92,54 @@ pub async fn list(
     let site = filter.site.as_ref().map(SiteId::as_str);
     let robot = filter.robot.as_ref().map(RobotId::as_str);
     let before = filter.before.map(|id| id.to_string());
+    let within = scope_text(&filter.within)?;
     let raw = stops!(
         "WHERE (?1 IS NULL OR sites.id = ?1) AND (?2 IS NULL OR robots.id = ?2)
-           AND (?3 = FALSE OR stops.cleared_at_us IS NULL) AND (?4 IS NULL OR stops.id < ?4)
+           AND (?3 = FALSE OR (stops.cleared_at_us IS NULL AND stops.replaced_by IS NULL))
+           AND (?4 IS NULL OR stops.id < ?4)
+           AND (?6 IS NULL OR sites.id IN (SELECT value FROM json_each(?6))
+               OR sites.id || '/' || robots.id IN (SELECT value FROM json_each(?6)))
          ORDER BY stops.id DESC LIMIT ?5",
         site,
         robot,
         filter.in_force,
         before,
         limit,
+        within,
     )
     .fetch_all(db)
     .await?;
     rows(raw)
 }
 
-/// Stops that are not cleared, of robots that are not retired; oldest first, at most `limit`.
-pub async fn in_force(db: &mut SqliteConnection, limit: u32) -> Result<Vec<Stop>, DbError> {
+/// The open stop of each robot that has one and is not retired, oldest first.
+pub async fn in_force(db: &mut SqliteConnection) -> Result<Vec<Stop>, DbError> {
     let raw = stops!(
-        "WHERE stops.cleared_at_us IS NULL AND robots.retired_at_us IS NULL
-         ORDER BY stops.id LIMIT ?",
-        limit
+        "WHERE stops.cleared_at_us IS NULL AND stops.replaced_by IS NULL
+           AND robots.retired_at_us IS NULL
+         ORDER BY stops.id"
     )
     .fetch_all(db)
     .await?;
     rows(raw)
 }
 
-/// Whether a robot has a stop that is not cleared.
+/// A robot's open stop, unless it is retired.
+pub async fn in_force_of(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+) -> Result<Option<Stop>, DbError> {
+    let raw = stops!(
+        "WHERE stops.robot_pk = ? AND stops.cleared_at_us IS NULL AND stops.replaced_by IS NULL
+           AND robots.retired_at_us IS NULL",
+        robot_pk
+    )
+    .fetch_optional(db)
+    .await?;
+    raw.map(Stop::try_from).transpose()
+}
+
+/// Whether a robot has an open stop.
 pub async fn is_stopped(
     db: &mut SqliteConnection,
     site: &SiteId,
@@ -123,7 +151,8 @@ pub async fn is_stopped(
                SELECT 1 FROM stops
                JOIN robots ON robots.pk = stops.robot_pk
                JOIN sites ON sites.pk = robots.site_pk
-               WHERE sites.id = ? AND robots.id = ? AND stops.cleared_at_us IS NULL)
+               WHERE sites.id = ? AND robots.id = ? AND stops.cleared_at_us IS NULL
+                   AND stops.replaced_by IS NULL)
            AS "found!: bool""#,
         site,
         robot,
@@ -140,8 +169,11 @@ pub async fn find(db: &mut SqliteConnection, id: StopId) -> Result<Option<Stop>,
     raw.map(Stop::try_from).transpose()
 }
 
-/// Writes stops down; those of robots that are not known, and those that are there, are left out.
-pub async fn insert(db: &mut SqliteConnection, stops: &[Stop]) -> Result<(), DbError> {
+/// Writes stops down, at most one of each robot, and keeps so many of each robot; those of robots
+/// that are not known, and those that are there, are left out.
+///
+/// The newest of a robot is open, in whatever order they are written down.
+pub async fn insert(db: &mut SqliteConnection, stops: &[Stop], kept: u32) -> Result<(), DbError> {
     let entry = |stop: &Stop| {
         (
             stop.id.to_string(),
@@ -156,18 +188,99 @@ pub async fn insert(db: &mut SqliteConnection, stops: &[Stop]) -> Result<(), DbE
     let entries: Vec<_> = stops.iter().map(entry).collect();
     let entries = to_json("stops", &entries)?;
     sqlx::query!(
-        "INSERT INTO stops (id, robot_pk, stopped_by, reason, wanted_at_us, confirmed_at_us)
+        "UPDATE stops SET replaced_by = new.id
+         FROM (
+             SELECT entry.value ->> 0 AS id, robots.pk AS robot_pk, entry.value ->> 5 AS wanted_at_us
+             FROM json_each(?) AS entry
+             JOIN sites ON sites.id = entry.value ->> 1
+             JOIN robots ON robots.site_pk = sites.pk AND robots.id = entry.value ->> 2
+         ) AS new
+         WHERE stops.robot_pk = new.robot_pk AND stops.cleared_at_us IS NULL
+           AND stops.replaced_by IS NULL
+           AND (stops.wanted_at_us, stops.id) < (new.wanted_at_us, new.id)
+           AND NOT EXISTS (SELECT 1 FROM stops AS there WHERE there.id = new.id)",
+        entries,
+    )
+    .execute(&mut *db)
+    .await?;
+    sqlx::query!(
+        "INSERT INTO stops (id, robot_pk, stopped_by, reason, wanted_at_us, confirmed_at_us,
+             replaced_by)
          SELECT entry.value ->> 0, robots.pk, entry.value ->> 3, entry.value ->> 4,
-             entry.value ->> 5, entry.value ->> 6
+             entry.value ->> 5, entry.value ->> 6,
+             (SELECT newer.id FROM stops AS newer
+              WHERE newer.robot_pk = robots.pk AND newer.cleared_at_us IS NULL
+                AND newer.replaced_by IS NULL)
          FROM json_each(?) AS entry
          JOIN sites ON sites.id = entry.value ->> 1
          JOIN robots ON robots.site_pk = sites.pk AND robots.id = entry.value ->> 2
-         WHERE TRUE ON CONFLICT DO NOTHING",
+         WHERE TRUE ON CONFLICT (id) DO NOTHING",
         entries,
+    )
+    .execute(&mut *db)
+    .await?;
+    forget(db, &entries, kept).await
+}
+
+/// Removes the oldest stops of robots beyond so many; open ones stay.
+async fn forget(db: &mut SqliteConnection, entries: &str, kept: u32) -> Result<(), DbError> {
+    sqlx::query!(
+        "DELETE FROM stops WHERE id IN (
+             SELECT old.id FROM json_each(?1) AS entry
+             JOIN sites ON sites.id = entry.value ->> 1
+             JOIN robots ON robots.site_pk = sites.pk AND robots.id = entry.value ->> 2
+             JOIN stops AS old ON old.robot_pk = robots.pk
+             WHERE (old.cleared_at_us IS NOT NULL OR old.replaced_by IS NOT NULL)
+               AND (old.wanted_at_us, old.id) <= (
+                   SELECT more.wanted_at_us, more.id FROM stops AS more
+                   WHERE more.robot_pk = robots.pk
+                   ORDER BY more.wanted_at_us DESC, more.id DESC LIMIT 1 OFFSET ?2))",
+        entries,
+        kept,
     )
     .execute(db)
     .await?;
     Ok(())
+}
+
+/// Makes the stop that a robot shows its open one, whatever was open before: what is known of it
+/// stays, but that it had ended. One that is another robot's is left alone.
+pub async fn adopt(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+    stop: &Stop,
+    kept: u32,
+) -> Result<(), DbError> {
+    let id = stop.id.to_string();
+    let (wanted_at_us, confirmed_at_us) = (to_us(stop.wanted_at), stop.confirmed_at.map(to_us));
+    sqlx::query!(
+        "UPDATE stops SET replaced_by = ?1
+         WHERE robot_pk = ?2 AND cleared_at_us IS NULL AND replaced_by IS NULL AND id <> ?1
+           AND NOT EXISTS (SELECT 1 FROM stops AS foreign_one
+               WHERE foreign_one.id = ?1 AND foreign_one.robot_pk <> ?2)",
+        id,
+        robot_pk,
+    )
+    .execute(&mut *db)
+    .await?;
+    sqlx::query!(
+        "INSERT INTO stops (id, robot_pk, stopped_by, reason, wanted_at_us, confirmed_at_us)
+         VALUES (?1, ?2, ?3, ?4, ?5, ?6)
+         ON CONFLICT (id) DO UPDATE SET replaced_by = NULL, cleared_at_us = NULL,
+             clear_asked_by = NULL, clear_asked_at_us = NULL,
+             confirmed_at_us = MAX(?6, wanted_at_us)
+         WHERE robot_pk = ?2",
+        id,
+        robot_pk,
+        stop.by,
+        stop.reason,
+        wanted_at_us,
+        confirmed_at_us,
+    )
+    .execute(&mut *db)
+    .await?;
+    let named = to_json("stops", &[(&id, &stop.site, &stop.robot)])?;
+    forget(db, &named, kept).await
 }
 
 /// Notes that robots have confirmed; the first time counts.
@@ -188,11 +301,13 @@ pub async fn confirm(
     Ok(())
 }
 
-/// Notes that a robot was measured to stand; the first time counts.
+/// Notes that a robot was measured to stand, not before it confirmed; the first time counts.
 pub async fn stand(db: &mut SqliteConnection, id: StopId, at: Timestamp) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
-        "UPDATE stops SET standing_at_us = COALESCE(standing_at_us, ?) WHERE id = ?",
+        "UPDATE stops SET standing_at_us = COALESCE(standing_at_us,
+             MAX(?, wanted_at_us, COALESCE(confirmed_at_us, wanted_at_us)))
+         WHERE id = ?",
         at_us,
         id,
     )
@@ -215,30 +330,18 @@ pub async fn unconfirm(db: &mut SqliteConnection, id: StopId) -> Result<(), DbEr
     Ok(())
 }
 
-/// Notes that somebody asks to clear a robot's stops up to this one, in the order in which they
-/// were asked for or came to the robot: what it has confirmed came before what is cleared now.
+/// Notes that somebody asks to clear a stop.
 pub async fn ask_clear(
     db: &mut SqliteConnection,
     id: StopId,
     by: &str,
     at: Timestamp,
 ) -> Result<(), DbError> {
-    let id = id.to_string();
-    // All that are cleared together have one time, which is not before any of theirs.
-    let newest_us = sqlx::query_scalar!(
-        r#"SELECT COALESCE(MAX(MAX(wanted_at_us, COALESCE(confirmed_at_us, 0))), 0)
-               AS "newest!: i64"
-           FROM stops
-           WHERE cleared_at_us IS NULL AND robot_pk = (SELECT robot_pk FROM stops WHERE id = ?)"#,
-        id,
-    );
-    let at_us = to_us(at).max(newest_us.fetch_one(&mut *db).await?);
+    let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
-        "UPDATE stops SET clear_asked_by = ?1, clear_asked_at_us = ?2
-         WHERE robot_pk = (SELECT robot_pk FROM stops WHERE id = ?3)
-           AND (wanted_at_us <= (SELECT wanted_at_us FROM stops WHERE id = ?3)
-               OR confirmed_at_us <= ?2)
-           AND cleared_at_us IS NULL",
+        "UPDATE stops SET clear_asked_by = ?1,
+             clear_asked_at_us = MAX(?2, wanted_at_us, COALESCE(confirmed_at_us, wanted_at_us))
+         WHERE id = ?3 AND cleared_at_us IS NULL",
         by,
         at_us,
         id,
@@ -253,9 +356,7 @@ pub async fn refuse_clear(db: &mut SqliteConnection, id: StopId) -> Result<(), D
     let id = id.to_string();
     sqlx::query!(
         "UPDATE stops SET clear_asked_by = NULL, clear_asked_at_us = NULL
-         WHERE robot_pk = (SELECT robot_pk FROM stops WHERE id = ?1)
-           AND clear_asked_at_us = (SELECT clear_asked_at_us FROM stops WHERE id = ?1)
-           AND cleared_at_us IS NULL",
+         WHERE id = ? AND cleared_at_us IS NULL",
         id,
     )
     .execute(db)
@@ -263,16 +364,13 @@ pub async fn refuse_clear(db: &mut SqliteConnection, id: StopId) -> Result<(), D
     Ok(())
 }
 
-/// Notes that a robot has cleared this stop and all that were to be cleared with it.
+/// Notes that a robot has cleared a stop.
 pub async fn clear(db: &mut SqliteConnection, id: StopId, at: Timestamp) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
         "UPDATE stops SET cleared_at_us = MAX(?1, wanted_at_us,
              COALESCE(confirmed_at_us, wanted_at_us), COALESCE(clear_asked_at_us, wanted_at_us))
-         WHERE robot_pk = (SELECT robot_pk FROM stops WHERE id = ?2)
-           AND (id = ?2
-               OR clear_asked_at_us = (SELECT clear_asked_at_us FROM stops WHERE id = ?2))
-           AND cleared_at_us IS NULL",
+         WHERE id = ?2 AND cleared_at_us IS NULL",
         at_us,
         id,
     )

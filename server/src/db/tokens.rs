@@ -4,14 +4,17 @@ use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::identity::{Role, Token};
 use tread_api::ids::TokenId;
+use tread_api::rights::{Rights, Scope};
 
-use super::{DbError, corrupt, from_us, parse, to_us};
+use super::{DbError, corrupt, from_json, from_us, parse, scope_text, to_json, to_us};
 use crate::identity::secret::Fingerprint;
 
 struct Raw {
     id: String,
     name: String,
-    role: String,
+    role: Option<String>,
+    rights: Option<String>,
+    scope: Option<String>,
     created_at_us: i64,
     created_by: String,
     expires_at_us: i64,
@@ -23,14 +26,31 @@ pub(super) fn role(name: &str) -> Result<Role, DbError> {
     Role::from_name(name).ok_or_else(|| corrupt("role", name))
 }
 
+fn scope(text: &str) -> Result<Scope, DbError> {
+    let names: Vec<String> = from_json("scope", text)?;
+    let names = names.iter().map(String::as_str);
+    Scope::from_names(names).map_err(|_invalid| corrupt("scope", text))
+}
+
 impl TryFrom<Raw> for Token {
     type Error = DbError;
 
     fn try_from(raw: Raw) -> Result<Self, DbError> {
+        let role = raw.role.as_deref().map(role).transpose()?;
+        let rights = match (role, &raw.rights) {
+            (Some(role), None) => Rights::from(role),
+            (None, Some(rights)) => from_json("rights", rights)?,
+            (Some(_), Some(_)) | (None, None) => return Err(corrupt("token's rights", &raw.id)),
+        };
         Ok(Self {
             id: parse("token", &raw.id)?,
             name: raw.name,
-            role: role(&raw.role)?,
+            role,
+            rights,
+            sites: match &raw.scope {
+                Some(text) => scope(text)?,
+                None => Scope::EVERYWHERE,
+            },
             created_at: from_us(raw.created_at_us)?,
             created_by: raw.created_by,
             expires_at: from_us(raw.expires_at_us)?,
@@ -44,25 +64,34 @@ macro_rules! tokens {
     ($condition:tt $(, $argument:expr)* $(,)?) => {
         sqlx::query_as!(
             Raw,
-            r#"SELECT id, name, role, created_at_us, created_by, expires_at_us, revoked_at_us,
-                   last_used_at_us
+            r#"SELECT id, name, role, rights, scope, created_at_us, created_by, expires_at_us,
+                   revoked_at_us, last_used_at_us
                FROM tokens "# + $condition
             $(, $argument)*
         )
     };
 }
 
-/// Tokens older than one, newest first; dead ones too.
+/// Tokens older than one that hold nowhere outside a scope, newest first; dead ones too.
 pub async fn list(
     db: &mut SqliteConnection,
+    within: &Scope,
     before: Option<TokenId>,
     limit: u32,
 ) -> Result<Vec<Token>, DbError> {
     let before = before.map(|id| id.to_string());
+    let within = scope_text(within)?;
     let raw = tokens!(
-        "WHERE (?1 IS NULL OR id < ?1) ORDER BY id DESC LIMIT ?2",
+        "WHERE (?1 IS NULL OR id < ?1)
+           AND (?3 IS NULL OR (scope IS NOT NULL AND NOT EXISTS (
+               SELECT 1 FROM json_each(tokens.scope) AS own
+               WHERE own.value NOT IN (SELECT value FROM json_each(?3))
+                 AND substr(own.value, 1, instr(own.value || '/', '/') - 1)
+                     NOT IN (SELECT value FROM json_each(?3)))))
+         ORDER BY id DESC LIMIT ?2",
         before,
-        limit
+        limit,
+        within
     )
     .fetch_all(db)
     .await?;
@@ -93,12 +122,12 @@ pub async fn valid_by_name(
     raw.map(Token::try_from).transpose()
 }
 
-/// How many tokens are valid at a time, of all roles and of admins.
+/// How many tokens are valid at a time, all and those of admins everywhere.
 pub async fn valid_counts(db: &mut SqliteConnection, at: Timestamp) -> Result<(i64, i64), DbError> {
     let at_us = to_us(at);
     let row = sqlx::query!(
         r#"SELECT COUNT(*) AS "all_count!: i64",
-               COUNT(CASE WHEN role = 'admin' THEN 1 END) AS "admin_count!: i64"
+               COUNT(CASE WHEN role = 'admin' AND scope IS NULL THEN 1 END) AS "admin_count!: i64"
            FROM tokens WHERE revoked_at_us IS NULL AND expires_at_us > ?"#,
         at_us
     )
@@ -113,16 +142,23 @@ pub async fn insert(
     token: &Token,
     fingerprint: &Fingerprint,
 ) -> Result<(), DbError> {
-    let (id, role) = (token.id.to_string(), token.role.as_str());
+    let (id, role) = (token.id.to_string(), token.role.map(Role::as_str));
+    let rights = match token.role {
+        Some(_) => None,
+        None => Some(to_json("rights", &token.rights)?),
+    };
+    let scope = scope_text(&token.sites)?;
     let (lookup, hash) = (fingerprint.lookup(), fingerprint.as_bytes());
     let (created_at_us, expires_at_us) = (to_us(token.created_at), to_us(token.expires_at));
     sqlx::query!(
-        "INSERT INTO tokens (id, name, role, lookup, hash, created_at_us, created_by,
-             expires_at_us)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+        "INSERT INTO tokens (id, name, role, rights, scope, lookup, hash, created_at_us,
+             created_by, expires_at_us)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         id,
         token.name,
         role,
+        rights,
+        scope,
         lookup,
         hash,
         created_at_us,
@@ -204,6 +240,38 @@ pub struct Kept {
     pub hash: Vec<u8>,
     /// The token.
     pub token: Token,
+}
+
+/// Every token that is valid at a time; [`super::DbError`] of one row is that of all.
+pub async fn all_valid(db: &mut SqliteConnection, at: Timestamp) -> Result<Vec<Kept>, DbError> {
+    let at_us = to_us(at);
+    let rows = sqlx::query!(
+        "SELECT id, hash, name, role, rights, scope, created_at_us, created_by, expires_at_us,
+             revoked_at_us, last_used_at_us
+         FROM tokens WHERE revoked_at_us IS NULL AND expires_at_us > ?",
+        at_us
+    )
+    .fetch_all(db)
+    .await?;
+    let kept = rows.into_iter().map(|row| {
+        let token = Raw {
+            id: row.id,
+            name: row.name,
+            role: row.role,
+            rights: row.rights,
+            scope: row.scope,
+            created_at_us: row.created_at_us,
+            created_by: row.created_by,
+            expires_at_us: row.expires_at_us,
+            revoked_at_us: row.revoked_at_us,
+            last_used_at_us: row.last_used_at_us,
+        };
+        Ok(Kept {
+            hash: row.hash,
+            token: token.try_into()?,
+        })
+    });
+    kept.collect()
 }
 
 /// The token whose hash begins like this one.

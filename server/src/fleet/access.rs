@@ -1,6 +1,7 @@
 //! The access control of a router, made from the table of what robots do with which keys.
 //!
-//! A robot is who its certificate says. It may do with its own keys what the table says, hear
+//! A robot is who its certificate says; the gate lets no session pass whose user name is another.
+//! It may do with its own keys what the table says, hear
 //! what is for all robots of its site, and nothing else. Zenoh's rules match a message if their
 //! expression includes the message's key; so the server's own wildcards are let out to all, or
 //! else a robot would not know that somebody wants what it publishes, and would not send it.
@@ -9,16 +10,9 @@ use serde_json::{Value, json};
 use tread_api::access::{Act, Owner, ROBOT_KEYS, RobotKeys};
 use tread_api::ids::{RobotId, SiteId};
 
+use super::credentials::{PROBE_USER, user_of};
 use super::presence::RobotKey;
 use super::router::PROBE_KEY;
-
-/// The name in the certificate of the server's own look at its router. No robot's has no dot.
-pub(super) const PROBE_NAME: &str = "tread-probe";
-
-/// The name of a robot in the certificate that the gate shows to the router.
-pub(super) fn name_of((site, robot): &RobotKey) -> String {
-    format!("{robot}.{site}")
-}
 
 /// What is let in from a robot and out to it for one act, by zenoh's names.
 const fn messages(act: Act) -> (&'static [&'static str], &'static [&'static str]) {
@@ -95,11 +89,11 @@ pub(super) fn control(robots: &[RobotKey]) -> Value {
         of_site.extend(for_all.iter().cloned());
         let mut members = Vec::new();
         for key in robots.iter().filter(|(of, _robot)| of == site) {
-            let name = name_of(key);
+            let name = user_of(key);
             for act in Act::ALL {
                 rules.add_act(act, &own_keys(Owner::Robot, act, site, Some(&key.1)));
             }
-            subjects.push(json!({"id": name, "cert_common_names": [name]}));
+            subjects.push(json!({"id": name, "usernames": [name]}));
             policies.push(json!({"rules": rules.take_ids(), "subjects": [name]}));
             members.push(name);
         }
@@ -108,8 +102,8 @@ pub(super) fn control(robots: &[RobotKey]) -> Value {
     let probe = [PROBE_KEY.to_owned()];
     rules.add("ingress", &["query"], &probe);
     rules.add("egress", &["reply", "declare_queryable"], &probe);
-    subjects.push(json!({"id": PROBE_NAME, "cert_common_names": [PROBE_NAME]}));
-    policies.push(json!({"rules": rules.take_ids(), "subjects": [PROBE_NAME]}));
+    subjects.push(json!({"id": PROBE_USER, "usernames": [PROBE_USER]}));
+    policies.push(json!({"rules": rules.take_ids(), "subjects": [PROBE_USER]}));
     json!({
         "enabled": true,
         "default_permission": "deny",

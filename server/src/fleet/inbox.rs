@@ -1,7 +1,10 @@
 //! What robots send: zenoh's callbacks on one side, our tasks on the other.
 
+use std::time::Duration;
+
 use tokio::sync::mpsc;
 use tokio::sync::mpsc::error::TrySendError;
+use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
 use tread_api::keys::{self, Key};
@@ -12,6 +15,7 @@ use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait as _};
 
 use super::presence::{Heard, RobotKey};
+use super::rate_limits::{Kind, Place, RateLimits};
 use super::{requests, tokens};
 use crate::app::App;
 use crate::app::ingest::Upload;
@@ -24,6 +28,10 @@ const PRESENCE_WAITING_MAX: usize = 32_768;
 const STATES_WAITING_MAX: usize = 10_000;
 /// Introductions that wait.
 const HELLOS_WAITING_MAX: usize = 8_192;
+/// Most bytes of a state or a friction report.
+pub(super) const STATE_BYTES_MAX: usize = 256 * 1024;
+/// Time between two looks for tokens that came too fast.
+const LATE_TOKENS_EVERY: Duration = Duration::from_secs(1);
 /// Uploads that wait to be read.
 const UPLOADS_WAITING_MAX: usize = 512;
 
@@ -33,8 +41,16 @@ pub(super) struct Channels {
     app: App,
     presence: mpsc::Sender<TokenChange>,
     states: mpsc::Sender<Published>,
-    hellos: mpsc::Sender<Query>,
-    uploads: mpsc::Sender<Query>,
+    hellos: mpsc::Sender<Asked>,
+    uploads: mpsc::Sender<Asked>,
+    limits: RateLimits,
+}
+
+/// A query with its place among those of its robot, which it keeps until it is answered.
+#[derive(Debug)]
+pub(super) struct Asked {
+    pub(super) query: Query,
+    pub(super) place: Place,
 }
 
 #[derive(Debug)]
@@ -53,6 +69,7 @@ enum TokenChange {
 struct Published {
     key: String,
     payload: Vec<u8>,
+    _place: Place,
 }
 
 impl Channels {
@@ -73,9 +90,12 @@ impl Channels {
         queues.show("uploads", &uploads);
         queues.show("ingest", &uploads_out);
         let stop = || supervisor.stop_token();
-        supervisor.spawn_vital("presence", watch_presence(app.clone(), presence_in, stop()));
-        supervisor.spawn_vital("states", read_states(app.clone(), states_in, stop()));
-        let replies = requests::Replies::new(app.clone(), supervisor.clone());
+        let limits = RateLimits::default();
+        let watching = watch_presence(app.clone(), presence_in, limits.clone(), stop());
+        supervisor.spawn_vital("presence", watching);
+        let reading = read_states(app.clone(), states_in, limits.clone(), stop());
+        supervisor.spawn_vital("states", reading);
+        let replies = requests::Replies::new(app.clone(), limits.clone(), supervisor.clone());
         supervisor.spawn_vital(
             "hellos",
             requests::serve_hellos(replies.clone(), hellos_in, stop()),
@@ -88,13 +108,63 @@ impl Channels {
             states,
             hellos,
             uploads,
+            limits,
         }
     }
 }
 
 impl Channels {
+    /// Takes a place for a message on a key; without one it is dropped and counted.
+    fn admit(&self, key: &str, kind: Kind) -> Option<Place> {
+        let now = self.app.clock().elapsed();
+        let Some((site, robot)) = robot_of(key) else {
+            refuse_key(&self.app, key);
+            return None;
+        };
+        let place = self.limits.admit((site, robot), kind, now);
+        if place.is_none() {
+            self.app.counters().rate_limited.one();
+            self.log_rate_limited(key, now);
+        }
+        place
+    }
+
+    fn log_rate_limited(&self, key: &str, now: Duration) {
+        let Some(robot) = robot_of(key) else { return };
+        if let Some(repeats) = self.limits.log_refused(&robot, now) {
+            let (site, robot) = robot;
+            warn!(robot.id = %robot, repeats, "robot `{robot}` of site `{site}` sends more than its share");
+        }
+    }
+
+    /// A liveliness token appeared or is gone.
+    fn token(&self, key: &str, router: u64, appeared: bool) {
+        let Some(robot) = robot_of(key) else {
+            return refuse_key(&self.app, key);
+        };
+        let (place, now) = ((key.to_owned(), router), self.app.clock().elapsed());
+        let is_taken = if appeared {
+            self.limits.token_appeared(&robot, place, now)
+        } else {
+            self.limits.token_gone(&robot, &place)
+        };
+        if is_taken {
+            let change = TokenChange::Token {
+                key: key.to_owned(),
+                router,
+                appeared,
+            };
+            let dropped = &self.app.counters().presence_dropped;
+            hand_over(&self.presence, change, dropped);
+        } else if appeared {
+            self.app.counters().rate_limited.one();
+            self.log_rate_limited(key, now);
+        }
+    }
+
     /// Tells that a router is gone.
     pub(super) fn router_closed(&self, router: u64) {
+        self.limits.router_closed(router);
         let change = TokenChange::RouterClosed(router);
         hand_over(
             &self.presence,
@@ -117,7 +187,12 @@ pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> ze
     session
         .declare_queryable(keys::ALL_HELLOS)
         .complete(true)
-        .callback(move |query| hand_over(&to.hellos, query, &to.app.counters().hellos_dropped))
+        .callback(move |query| {
+            if let Some(place) = to.admit(query.key_expr().as_str(), Kind::Hello) {
+                let asked = Asked { query, place };
+                hand_over(&to.hellos, asked, &to.app.counters().hellos_dropped);
+            }
+        })
         .background()
         .wait()?;
     let to = channels.clone();
@@ -125,18 +200,32 @@ pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> ze
         .declare_queryable(keys::ALL_INGEST)
         .complete(true)
         .callback(move |query| {
-            hand_over(&to.uploads, query, &to.app.counters().ingest_dropped_busy);
+            if let Some(place) = to.admit(query.key_expr().as_str(), Kind::Upload) {
+                let asked = Asked { query, place };
+                hand_over(&to.uploads, asked, &to.app.counters().ingest_dropped_busy);
+            }
         })
         .background()
         .wait()?;
-    for key in [keys::ALL_STATES, keys::ALL_FRICTION] {
+    for (key, kind) in [
+        (keys::ALL_STATES, Kind::State),
+        (keys::ALL_FRICTION, Kind::Friction),
+    ] {
         let to = channels.clone();
         session
             .declare_subscriber(key)
             .callback(move |sample| {
+                let key = sample.key_expr().as_str();
+                let Some(place) = to.admit(key, kind) else {
+                    return;
+                };
+                if sample.payload().len() > STATE_BYTES_MAX {
+                    return to.app.counters().refused_malformed.one();
+                }
                 let published = Published {
-                    key: sample.key_expr().as_str().to_owned(),
+                    key: key.to_owned(),
                     payload: sample.payload().to_bytes().into_owned(),
+                    _place: place,
                 };
                 hand_over(&to.states, published, &to.app.counters().states_dropped);
             })
@@ -149,12 +238,8 @@ pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> ze
         .declare_subscriber(keys::ALL_ALIVE)
         .history(true)
         .callback(move |sample| {
-            let change = TokenChange::Token {
-                key: sample.key_expr().as_str().to_owned(),
-                router,
-                appeared: sample.kind() == SampleKind::Put,
-            };
-            hand_over(&to.presence, change, &to.app.counters().presence_dropped);
+            let appeared = sample.kind() == SampleKind::Put;
+            to.token(sample.key_expr().as_str(), router, appeared);
         })
         .background()
         .wait()
@@ -163,10 +248,24 @@ pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> ze
 async fn watch_presence(
     app: App,
     mut changes: mpsc::Receiver<TokenChange>,
+    limits: RateLimits,
     stop: CancellationToken,
 ) {
     let mut tokens = tokens::Tokens::default();
-    while let Some(change) = next(&mut changes, &stop).await {
+    let mut late = tokio::time::interval(LATE_TOKENS_EVERY);
+    late.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        let change = tokio::select! {
+            change = next(&mut changes, &stop) => change,
+            _ = late.tick() => {
+                for (key, router) in limits.late_tokens(app.clock().elapsed()) {
+                    appeared(&app, &mut tokens, &key, router).await;
+                    app.wake();
+                }
+                continue;
+            }
+        };
+        let Some(change) = change else { return };
         match change {
             TokenChange::Token {
                 key,
@@ -210,7 +309,12 @@ fn gone(app: &App, token: &str) {
     }
 }
 
-async fn read_states(app: App, mut published: mpsc::Receiver<Published>, stop: CancellationToken) {
+async fn read_states(
+    app: App,
+    mut published: mpsc::Receiver<Published>,
+    limits: RateLimits,
+    stop: CancellationToken,
+) {
     while let Some(message) = next(&mut published, &stop).await {
         let now = app.clock().elapsed();
         match Key::parse(&message.key) {
@@ -220,7 +324,7 @@ async fn read_states(app: App, mut published: mpsc::Receiver<Published>, stop: C
                 if !app.admits(&key).await {
                     continue;
                 }
-                if let Some(state) = read(&app, &message, named) {
+                if let Some(state) = read(&app, &limits, &key, &message, named) {
                     match app.presences().state(&key, state, now, app.clock().now()) {
                         Heard::News => app.wake(),
                         Heard::Nothing => {}
@@ -235,7 +339,7 @@ async fn read_states(app: App, mut published: mpsc::Receiver<Published>, stop: C
                 if !app.admits(&key).await {
                     continue;
                 }
-                if let Some(report) = read(&app, &message, named) {
+                if let Some(report) = read(&app, &limits, &key, &message, named) {
                     match app.presences().friction(&key, &report, now) {
                         Heard::News | Heard::Nothing => {}
                         Heard::Stranger => refuse_stranger(&app, &key),
@@ -262,32 +366,46 @@ pub(super) async fn next<T>(
 
 fn read<T: serde::de::DeserializeOwned>(
     app: &App,
+    limits: &RateLimits,
+    robot: &RobotKey,
     message: &Published,
     is_named: impl Fn(&T) -> bool,
 ) -> Option<T> {
     let counters = app.counters();
-    match wire::decode::<T>(&message.payload) {
+    let why = match wire::decode::<T>(&message.payload) {
         Ok(body) if is_named(&body) => {
             counters.states_received.one();
-            Some(body)
+            return Some(body);
         }
         Ok(_other_robot) => {
             counters.refused_impersonation.one();
-            warn!(
-                "a message on `{}` was refused: it names another robot",
-                message.key
-            );
-            None
+            "it names another robot".to_owned()
         }
         Err(error) => {
             count_refusal(app, &error);
-            warn!(
-                "a message on `{}` was refused: {}",
-                message.key,
-                explained(&error)
-            );
-            None
+            explained(&error)
         }
+    };
+    log_refusal(app, limits, robot, &message.key, &why);
+    None
+}
+
+/// Logs that a message was refused, now and then for each robot, with how often since.
+pub(super) fn log_refusal(app: &App, limits: &RateLimits, robot: &RobotKey, key: &str, why: &str) {
+    if let Some(repeats) = limits.log_refused(robot, app.clock().elapsed()) {
+        warn!(repeats, "a message on `{key}` was refused: {why}");
+    }
+}
+
+/// The robot whose key it is.
+fn robot_of(key: &str) -> Option<RobotKey> {
+    match Key::parse(key)? {
+        Key::State(site, robot)
+        | Key::Friction(site, robot)
+        | Key::Hello(site, robot)
+        | Key::Ingest(site, robot)
+        | Key::Alive(site, robot, _) => Some((site, robot)),
+        Key::Command(..) | Key::Teleop(..) | Key::Limit(..) | Key::Pulse(..) | Key::Map(..) => None,
     }
 }
 
@@ -314,5 +432,5 @@ fn refuse_stranger(app: &App, (site, robot): &RobotKey) {
 pub(super) fn refuse_key(app: &App, key: &str) {
     app.counters().refused_key.one();
     let key: String = key.chars().take(200).collect();
-    warn!("a message on `{key}` was refused: the key is none of Tread's");
+    debug!("a message on `{key}` was refused: the key is none of Tread's");
 }

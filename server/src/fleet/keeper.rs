@@ -1,8 +1,10 @@
 //! Keeps a router open that knows every robot of the fleet, and closes those that nobody needs.
 //!
 //! ```text
-//!  a robot joins ─► a new router beside the others ─► robots come to it as they reconnect
+//!  a robot joins, or another authority signs
+//!                ─► a new router beside the others ─► robots come to it as they reconnect
 //!                                                      (each at the latest when it renews)
+//!  an authority is retired ─► routers whose passwords derive from its key are closed
 //!  an older router without robots ─► closed
 //!  too many routers ─► the older one with the fewest robots is closed; they reconnect at once
 //! ```
@@ -10,16 +12,16 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::Mutex;
+use tokio::sync::{Mutex, watch};
 use tokio_util::sync::CancellationToken;
 use tracing::{error, info};
-use zenoh::Wait as _;
 
 use super::inbox::Channels;
 use super::opening::{self, Opener};
 use super::presence::RobotKey;
 use super::routers::{Router, Routers};
 use crate::app::App;
+use crate::authority::Trusted;
 
 /// Most routers at a time.
 const ROUTERS_MAX: usize = 4;
@@ -64,8 +66,12 @@ impl Keeper {
     /// Keeps the routers in order until the stop.
     pub(super) async fn run(self: Arc<Self>, stop: CancellationToken) {
         let mut joined = self.app.roll().changes();
+        let mut rotated = self.opener.authorities.as_ref().map(|it| it.changes());
         loop {
             joined.mark_unchanged();
+            if let Some(rotated) = &mut rotated {
+                rotated.mark_unchanged();
+            }
             {
                 let _turn = self.turn.lock().await;
                 self.let_everybody_in().await;
@@ -75,6 +81,7 @@ impl Keeper {
                 biased;
                 () = stop.cancelled() => return,
                 _ = joined.changed() => {}
+                () = changed(&mut rotated) => {}
                 () = tokio::time::sleep(LOOK_EVERY) => {}
             }
         }
@@ -86,16 +93,21 @@ impl Keeper {
             let newest = newest.as_ref();
             newest.is_some_and(|newest| newest.robots.contains(robot))
         };
-        if self.app.roll().robots().iter().all(knows) {
+        let trusted = self.opener.authorities.as_ref().map(|it| it.present());
+        let is_of_signing = newest.as_ref().is_some_and(|newest| {
+            let signing = trusted.as_ref().map(|it| it.signing().fingerprint());
+            newest.authority() == signing
+        });
+        if is_of_signing && self.app.roll().robots().iter().all(knows) {
             return;
         }
         match self.open().await {
             Ok(()) => {
                 self.app.counters().routers_opened.one();
-                info!("another zenoh router was opened, for the robots that joined");
+                info!("another zenoh router was opened");
             }
             // The next look tries again.
-            Err(failed) => error!("cannot open a router for the robots that joined: {failed}"),
+            Err(failed) => error!("cannot open another router: {failed}"),
         }
     }
 
@@ -107,11 +119,12 @@ impl Keeper {
         let mut left = all.len();
         let mut counted = Vec::new();
         for router in older {
-            counted.push((robots_on(router).await, router.number));
+            let counts = !self.is_of_retired(router);
+            counted.push((counts, robots_on(router).await, router.number));
         }
         counted.sort_unstable();
-        for (robot_count, number) in counted {
-            if robot_count > 0 && left <= ROUTERS_MAX {
+        for (counts, robot_count, number) in counted {
+            if counts && robot_count > 0 && left <= ROUTERS_MAX {
                 break;
             }
             self.close(number).await;
@@ -121,9 +134,30 @@ impl Keeper {
     }
 }
 
+impl Keeper {
+    /// Whether a router's passwords derive from the key of an authority that was retired.
+    fn is_of_retired(&self, router: &Router) -> bool {
+        let trusted = self.opener.authorities.as_ref().map(|it| it.present());
+        trusted.is_some_and(|trusted| {
+            let authority = router.authority();
+            !authority.is_some_and(|authority| trusted.is_trusted(authority))
+        })
+    }
+}
+
+/// Waits for the next start or end of a rotation.
+async fn changed(rotated: &mut Option<watch::Receiver<Arc<Trusted>>>) {
+    if let Some(rotated) = rotated
+        && rotated.changed().await.is_ok()
+    {
+        return;
+    }
+    std::future::pending::<()>().await;
+}
+
 /// How many sessions a router has.
-async fn robots_on(router: &Arc<Router>) -> usize {
-    let session = router.session.clone();
-    let counting = tokio::task::spawn_blocking(move || session.info().transports().wait().count());
+pub(super) async fn robots_on(router: &Arc<Router>) -> usize {
+    let router = Arc::clone(router);
+    let counting = tokio::task::spawn_blocking(move || router.session_count());
     counting.await.unwrap_or(0)
 }

@@ -10,8 +10,6 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use base64::Engine as _;
-use base64::prelude::BASE64_STANDARD;
 use jiff::{SignedDuration, Timestamp};
 use rcgen::{CertificateParams, KeyPair};
 use tokio::sync::mpsc;
@@ -21,12 +19,13 @@ use tread_api::ids::{JoinTokenId, RobotId, SiteId};
 use tread_api::keys;
 use zenoh::qos::CongestionControl;
 use zenoh::query::{ConsolidationMode, QueryTarget};
-use zenoh::{Config, Session, Wait as _};
+use zenoh::{Session, Wait as _};
 
+use super::test_client::{Shown, TestClient, TestSession};
 use super::{Fleet, Security};
 use crate::app::App;
 use crate::app::enrolment::Office;
-use crate::authority::{Authority, RobotName, RobotRequest};
+use crate::authority::{Authorities, Authority, RobotName, RobotRequest};
 use crate::clock::Clock;
 use crate::config::{FrictionConfig, StorageConfig};
 use crate::db::Db;
@@ -37,7 +36,7 @@ const HOUR: SignedDuration = SignedDuration::from_hours(1);
 
 /// Who does something with the keys of `rover-1`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Who {
+pub(super) enum Who {
     /// Its own certificate.
     Own,
     /// Another robot's of the same site.
@@ -68,15 +67,15 @@ const SAID_TIMES: u32 = 3;
 /// What was done, by whom, and on which key.
 type Cell = (&'static str, Act, Who);
 
-fn site() -> SiteId {
+pub(super) fn site() -> SiteId {
     "yard".parse().unwrap()
 }
 
-fn robot(name: &str) -> RobotId {
+pub(super) fn robot(name: &str) -> RobotId {
     name.parse().unwrap()
 }
 
-fn enrolment(name: &str, number: u32, is_revoked: bool) -> Enrolment {
+pub(super) fn enrolment(name: &str, number: u32, is_revoked: bool) -> Enrolment {
     Enrolment {
         site: site(),
         robot: robot(name),
@@ -87,21 +86,23 @@ fn enrolment(name: &str, number: u32, is_revoked: bool) -> Enrolment {
         expires_at: Timestamp::MAX,
         revoked_at: is_revoked.then_some(Timestamp::UNIX_EPOCH),
         revoked_by: is_revoked.then(|| "test".to_owned()),
+        authority: None,
     }
 }
 
 /// A fleet of two robots, one that was put out, and an authority that nobody knows.
-struct Rig {
-    app: App,
-    fleet: Fleet,
+pub(super) struct Rig {
+    pub(super) app: App,
+    pub(super) fleet: Fleet,
     authority: Arc<Authority>,
+    pub(super) authorities: Arc<Authorities>,
     stranger: Authority,
-    supervisor: Supervisor,
+    pub(super) supervisor: Supervisor,
     _folder: tempfile::TempDir,
 }
 
 impl Rig {
-    async fn start() -> Self {
+    pub(super) async fn start() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
         let clock = Clock::system();
@@ -113,8 +114,9 @@ impl Rig {
         );
         app.ensure_site(&site()).await.unwrap();
         let authority = Arc::new(Authority::generate("fleet", clock.now()).unwrap());
+        let authorities = Arc::new(Authorities::in_memory(Arc::clone(&authority)));
         let security = Security {
-            authority: Arc::clone(&authority),
+            authorities: Arc::clone(&authorities),
             names: Vec::new(),
         };
         let supervisor = Supervisor::new();
@@ -122,7 +124,7 @@ impl Rig {
         let opening = Fleet::open(address, Some(security), clock.clone(), supervisor.clone());
         let fleet = opening.unwrap();
         app.open_office(Office {
-            authority: Arc::clone(&authority),
+            authorities: Arc::clone(&authorities),
             lifetime: HOUR,
             port: fleet.address().port(),
         });
@@ -141,17 +143,18 @@ impl Rig {
             app,
             fleet,
             authority,
+            authorities,
             supervisor,
             _folder: folder,
         }
     }
 
     /// The router's own session, which sees everything.
-    fn witness(&self) -> Session {
+    pub(super) fn witness(&self) -> Session {
         self.fleet.routers.newest().unwrap().session.clone()
     }
 
-    fn certificate(&self, who: Who) -> Option<(String, KeyPair)> {
+    pub(super) fn certificate(&self, who: Who) -> Option<(String, KeyPair)> {
         let (authority, name, enrolment) = match who {
             Who::Own | Who::Expired => (&*self.authority, "rover-1", 2),
             Who::Foreign => (&*self.authority, "rover-2", 1),
@@ -178,38 +181,18 @@ impl Rig {
         Some((signed.certificate, key))
     }
 
+    /// What connects with a certificate.
+    pub(super) fn client(&self, who: Who) -> TestClient {
+        TestClient::new(
+            self.fleet.address(),
+            self.authority.certificate(),
+            self.certificate(who),
+        )
+    }
+
     /// Connects with a certificate, if the gate lets it.
-    async fn connect(&self, who: Who, wait_ms: u32) -> Option<Session> {
-        let text = |pem: &str| format!("\"{}\"", BASE64_STANDARD.encode(pem));
-        let mut settings = vec![
-            ("mode", "\"client\"".to_owned()),
-            (
-                "connect/endpoints",
-                format!("[\"{}\"]", self.fleet.endpoint()),
-            ),
-            ("connect/timeout_ms", wait_ms.to_string()),
-            ("scouting/multicast/enabled", "false".to_owned()),
-            ("scouting/gossip/enabled", "false".to_owned()),
-            (
-                "transport/link/tls/root_ca_certificate_base64",
-                text(self.authority.certificate_pem()),
-            ),
-        ];
-        if let Some((certificate, key)) = self.certificate(who) {
-            settings.push(("transport/link/tls/enable_mtls", "true".to_owned()));
-            settings.push((
-                "transport/link/tls/connect_certificate_base64",
-                text(&certificate),
-            ));
-            let key = text(&key.serialize_pem());
-            settings.push(("transport/link/tls/connect_private_key_base64", key));
-        }
-        let mut config = Config::default();
-        for (key, value) in settings {
-            config.insert_json5(key, &value).unwrap();
-        }
-        let opening = tokio::task::spawn_blocking(move || zenoh::open(config).wait());
-        opening.await.unwrap().ok()
+    pub(super) async fn connect(&self, who: Who, wait_ms: u32) -> Option<TestSession> {
+        self.client(who).open(&Shown::default(), wait_ms).await
     }
 }
 
@@ -318,7 +301,7 @@ fn signed(key: &str, payload: &[u8]) -> String {
 }
 
 /// Publishes without ever dropping anything: what does not arrive was not let through.
-fn put(session: &Session, key: String, payload: String) {
+pub(super) fn put(session: &Session, key: String, payload: String) {
     let putting = session.put(key, payload);
     let putting = putting.congestion_control(CongestionControl::Block);
     putting.wait().unwrap();
@@ -448,11 +431,8 @@ async fn every_key_with_every_certificate_allows_what_the_table_says_and_nothing
     let mut came = BTreeMap::new();
     for who in [Who::Own, Who::Foreign] {
         let session = rig.connect(who, 10_000).await.expect("the gate lets it in");
-        came.extend(try_all(&rig, who, &session).await);
-        tokio::task::spawn_blocking(move || session.close().wait())
-            .await
-            .unwrap()
-            .unwrap();
+        came.extend(try_all(&rig, who, &session.zenoh).await);
+        session.close().await;
     }
     for who in REFUSED {
         let counters = rig.app.counters();
@@ -472,6 +452,139 @@ async fn every_key_with_every_certificate_allows_what_the_table_says_and_nothing
         .filter(|((pattern, act, who), came)| **came != may(pattern, *act, *who))
         .collect();
     assert!(surprises.is_empty(), "{surprises:#?}");
+    rig.supervisor.stop().await.unwrap();
+    rig.fleet.close().await;
+}
+
+/// What `rover-2` shows to pass for `rover-1`, whose password and session id it has learned.
+async fn impersonations(rig: &Rig) -> Vec<(&'static str, Shown)> {
+    let learned = rig.client(Who::Own).credentials().await.unwrap();
+    let own = rig.client(Who::Foreign).credentials().await.unwrap();
+    assert_ne!(learned.password, own.password);
+    let user = || Shown {
+        user: Some(learned.user.clone()),
+        password: Some(learned.password.clone()),
+        ..Shown::default()
+    };
+    vec![
+        ("user and password", user()),
+        (
+            "user, password and session id",
+            Shown {
+                session_id: Some(learned.session_prefix.session_id(1)),
+                ..user()
+            },
+        ),
+        (
+            "session id",
+            Shown {
+                session_id: Some(learned.session_prefix.session_id(1)),
+                ..Shown::default()
+            },
+        ),
+        (
+            "password alone",
+            Shown {
+                password: Some(learned.password.clone()),
+                ..Shown::default()
+            },
+        ),
+        (
+            "the user of the server's own look",
+            Shown {
+                user: Some(super::credentials::PROBE_USER.to_owned()),
+                ..Shown::default()
+            },
+        ),
+        (
+            "no user at all",
+            Shown {
+                is_anonymous: true,
+                ..Shown::default()
+            },
+        ),
+        (
+            "another session's id",
+            Shown {
+                session_id: Some("8000000000000000deadbeefdeadbeef".to_owned()),
+                ..Shown::default()
+            },
+        ),
+        (
+            "the mode of a peer",
+            Shown {
+                mode: Some("peer"),
+                ..Shown::default()
+            },
+        ),
+        (
+            "the mode of a router",
+            Shown {
+                mode: Some("router"),
+                ..Shown::default()
+            },
+        ),
+    ]
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn another_robots_password_and_session_id_open_nothing() {
+    let rig = Rig::start().await;
+    for (what, shown) in impersonations(&rig).await {
+        let failed = rig.app.counters().gate_session_failed.get();
+        let opened = rig.client(Who::Foreign).open(&shown, 300).await;
+        // A peer's session opens without any router; it must not have reached this one.
+        let sessions = rig.witness().info().transports().wait().count();
+        assert_eq!(sessions, 0, "{what} opened a session");
+        drop(opened);
+        assert!(
+            rig.app.counters().gate_session_failed.get() > failed || what == "password alone",
+            "{what} was not counted"
+        );
+    }
+    let own = rig.connect(Who::Foreign, 10_000).await;
+    own.expect("the robot itself is let in still").close().await;
+    rig.supervisor.stop().await.unwrap();
+    rig.fleet.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_client_that_does_not_name_the_protocol_is_refused_before_anything_is_told() {
+    let rig = Rig::start().await;
+    for protocols in [vec![], vec![b"h2".to_vec()], vec![b"tread/1".to_vec()]] {
+        let failed = rig.app.counters().gate_tls_failed.get();
+        let mut client = rig.client(Who::Own);
+        client.protocols = protocols;
+        assert!(client.credentials().await.is_none());
+        assert!(rig.app.counters().gate_tls_failed.get() > failed);
+    }
+    rig.supervisor.stop().await.unwrap();
+    rig.fleet.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_opening_that_is_none_ends_the_link_and_harms_nobody() {
+    let rig = Rig::start().await;
+    let own = rig.connect(Who::Own, 10_000).await.unwrap();
+    // A length of which nothing follows, one above all bounds, garbage, an empty frame, and a
+    // message of an opened session.
+    for bytes in [
+        &[4_u8, 0, 0][..],
+        &[0xff, 0xff],
+        &[5, 0, 0x41, 0xff, 0xff, 0xff, 0xff],
+        &[0, 0],
+        &[1, 0, 0x04],
+    ] {
+        let failed = rig.app.counters().gate_session_failed.get();
+        let client = rig.client(Who::Foreign);
+        assert!(client.says_instead(bytes).await, "the link ended");
+        assert!(rig.app.counters().gate_session_failed.get() > failed);
+    }
+    let witness = Witness::of(rig.witness());
+    let key = keys::state(&site(), &robot("rover-1"));
+    put(&own.zenoh, key.clone(), "here".to_owned());
+    witness.published.waits_for(&signed(&key, b"here")).await;
+    own.close().await;
     rig.supervisor.stop().await.unwrap();
     rig.fleet.close().await;
 }

@@ -8,19 +8,25 @@
 mod access;
 mod changes;
 pub mod commands;
+mod credentials;
 mod gate;
 mod inbox;
 mod keeper;
+#[cfg(test)]
+mod link_tests;
 #[cfg(test)]
 mod matrix;
 mod opening;
 pub mod presence;
 mod publishers;
 mod pulse;
+mod rate_limits;
 mod requests;
 mod router;
 mod routers;
 pub mod teleop;
+#[cfg(test)]
+mod test_client;
 mod tokens;
 
 use std::net::{SocketAddr, TcpListener};
@@ -30,16 +36,17 @@ use std::time::Duration;
 
 use tokio::sync::{Mutex, mpsc};
 use tracing::info;
+use tread_api::wire::PAYLOAD_BYTES_MAX;
 
 use self::commands::{Commands, Network};
 use self::gate::Gate;
 use self::keeper::Keeper;
-use self::opening::{Inside, Opener, with_free_port};
+use self::opening::{Opener, with_free_port};
 use self::routers::Routers;
 use self::teleop::Teleop;
 use crate::app::App;
 use crate::app::ingest::Upload;
-use crate::authority::Authority;
+use crate::authority::Authorities;
 use crate::clock::Clock;
 use crate::supervisor::Supervisor;
 
@@ -55,6 +62,8 @@ const ACCEPT_PENDING_MAX: u32 = 1_000;
 const SEND_BUFFER_BYTES: u32 = 16 * 1024;
 /// Most bytes that are sent at once, for the same reason.
 const BATCH_BYTES: u32 = 8 * 1024;
+/// Most bytes of a message that is put together of fragments, with its key; zenoh would take 1 GiB.
+const MESSAGE_BYTES_MAX: usize = PAYLOAD_BYTES_MAX + 64 * 1024;
 /// How long the session may take to open, and to close.
 const SESSION_TIMEOUT: Duration = Duration::from_secs(10);
 
@@ -69,9 +78,6 @@ pub enum FleetError {
         /// What zenoh says.
         reason: String,
     },
-    /// There are no random numbers for keys.
-    #[error("cannot make the keys of the robots' port")]
-    Keys(#[source] rcgen::Error),
     /// The certificates of the robots' port cannot be used.
     #[error("cannot use the certificates of the robots' port")]
     Certificates(#[source] anyhow::Error),
@@ -99,7 +105,7 @@ pub enum FleetError {
 #[derive(Debug, Clone)]
 pub struct Security {
     /// Who must have signed a robot's certificate, and signs the port's.
-    pub authority: Arc<Authority>,
+    pub authorities: Arc<Authorities>,
     /// The names that robots know the port by.
     pub names: Vec<String>,
 }
@@ -130,7 +136,7 @@ impl Fleet {
     ) -> Result<Self, FleetError> {
         let routers = Arc::new(Routers::default());
         let is_tls = security.is_some();
-        let (address, inside, gate) = match security {
+        let (address, authorities, gate) = match security {
             None => {
                 let address = with_free_port(address)?;
                 // Asked here because the operating system's own words are clearer than zenoh's.
@@ -139,16 +145,15 @@ impl Fleet {
                 (address, None, None)
             }
             Some(security) => {
-                let inside = Inside::new(clock.clone()).map_err(FleetError::Keys)?;
-                let inside = Arc::new(inside);
-                let gate = Gate::open(address, security, clock, Arc::clone(&inside))?;
-                (gate.address(), Some(inside), Some(gate))
+                let authorities = Arc::clone(&security.authorities);
+                let gate = Gate::open(address, security, clock)?;
+                (gate.address(), Some(authorities), Some(gate))
             }
         };
         Ok(Self {
             opener: std::sync::Mutex::new(Some(Opener {
                 address,
-                inside,
+                authorities,
                 supervisor: supervisor.clone(),
                 next: AtomicU64::new(0),
             })),

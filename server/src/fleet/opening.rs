@@ -1,129 +1,38 @@
 //! How a router is opened: in the clear on this machine alone, or behind the gate.
 //!
-//! Behind the gate the router listens on the loopback, and demands of every connection a
-//! certificate by an authority that lives in this process's memory only. The gate shows one that
-//! names the robot whose own certificate it has checked, and the rules go by that name.
+//! Behind the gate the router listens on the loopback and demands a user name and a password of
+//! every session, and its rules go by the user name. TLS ends at the gate and begins in the agent:
+//! zenoh's own TLS link reads and writes one rustls stream from two tasks at once, which is
+//! undefined behaviour, and is not compiled in.
 
-use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use base64::Engine as _;
-use base64::prelude::BASE64_STANDARD;
-use rustls::pki_types::ServerName;
-use rustls::{ClientConfig, RootCertStore};
-use tokio_rustls::TlsConnector;
 use tracing::warn;
+use tread_api::tunnel::RouterCredentials;
 use zenoh::{Config, Session, Wait as _};
 
-use super::access::{PROBE_NAME, control, name_of};
+use super::access::control;
+use super::credentials::{CredentialDerivation, Dictionary};
 use super::inbox::{self, Channels};
 use super::presence::RobotKey;
 use super::router;
 use super::routers::Router;
 use super::{
-    ACCEPT_PENDING_MAX, BATCH_BYTES, FleetError, LEASE_MS, SEND_BUFFER_BYTES, SESSION_TIMEOUT,
-    SESSIONS_MAX,
+    ACCEPT_PENDING_MAX, BATCH_BYTES, FleetError, LEASE_MS, MESSAGE_BYTES_MAX, SEND_BUFFER_BYTES,
+    SESSION_TIMEOUT, SESSIONS_MAX,
 };
-use crate::authority::Authority;
-use crate::clock::Clock;
+use crate::authority::Authorities;
 use crate::supervisor::Supervisor;
-
-/// The way from the gate to a router.
-#[derive(Debug)]
-pub(super) struct Inside {
-    authority: Authority,
-    clock: Clock,
-}
-
-impl Inside {
-    /// Makes the authority for the time that this process lives.
-    ///
-    /// # Errors
-    /// The operating system gives no random numbers.
-    pub(super) fn new(clock: Clock) -> Result<Self, rcgen::Error> {
-        let authority = Authority::generate("Tread router", clock.machine_time())?;
-        Ok(Self { authority, clock })
-    }
-
-    /// What connects to a router as a robot.
-    ///
-    /// # Errors
-    /// There are no random numbers, or the certificate is not taken.
-    pub(super) fn connector(&self, robot: &RobotKey) -> anyhow::Result<TlsConnector> {
-        let identity = self
-            .authority
-            .client_identity(&name_of(robot), self.clock.machine_time())?;
-        let mut roots = RootCertStore::empty();
-        roots.add(self.authority.certificate().clone())?;
-        let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let config = ClientConfig::builder_with_provider(provider)
-            .with_safe_default_protocol_versions()?
-            .with_root_certificates(roots)
-            .with_client_auth_cert(identity.chain, identity.key)?;
-        Ok(TlsConnector::from(Arc::new(config)))
-    }
-
-    /// The name that routers have inside.
-    pub(super) fn router_name() -> ServerName<'static> {
-        ServerName::IpAddress(IpAddr::from(Ipv4Addr::LOCALHOST).into())
-    }
-
-    fn listen(&self, config: &mut Config, robots: &[RobotKey]) -> zenoh::Result<()> {
-        let identity = self
-            .authority
-            .port_identity(&[], self.clock.machine_time())?;
-        let settings = [
-            ("enable_mtls", "true".to_owned()),
-            (
-                "root_ca_certificate_base64",
-                text(self.authority.certificate_pem()),
-            ),
-            ("listen_certificate_base64", text(&identity.certificate_pem)),
-            ("listen_private_key_base64", text(&identity.key_pem)),
-        ];
-        for (key, value) in settings {
-            config.insert_json5(&format!("transport/link/tls/{key}"), &value)?;
-        }
-        config.insert_json5("access_control", &control(robots).to_string())
-    }
-
-    fn connect(&self, config: &mut Config) -> zenoh::Result<()> {
-        let identity = self
-            .authority
-            .client_identity(PROBE_NAME, self.clock.machine_time())?;
-        let settings = [
-            ("enable_mtls", "true".to_owned()),
-            ("verify_name_on_connect", "true".to_owned()),
-            (
-                "root_ca_certificate_base64",
-                text(self.authority.certificate_pem()),
-            ),
-            (
-                "connect_certificate_base64",
-                text(&identity.certificate_pem),
-            ),
-            ("connect_private_key_base64", text(&identity.key_pem)),
-        ];
-        for (key, value) in settings {
-            config.insert_json5(&format!("transport/link/tls/{key}"), &value)?;
-        }
-        Ok(())
-    }
-}
-
-/// PEM as zenoh's configuration has it: base64, as a JSON string.
-fn text(pem: &str) -> String {
-    format!("\"{}\"", BASE64_STANDARD.encode(pem))
-}
 
 /// Opens routers.
 #[derive(Debug)]
 pub(super) struct Opener {
     /// Where a router in the clear listens.
     pub(super) address: SocketAddr,
-    /// Behind the gate, the way to it.
-    pub(super) inside: Option<Arc<Inside>>,
+    /// Behind the gate, whose key the passwords of robots derive from.
+    pub(super) authorities: Option<Arc<Authorities>>,
     pub(super) supervisor: Supervisor,
     pub(super) next: AtomicU64,
 }
@@ -134,16 +43,27 @@ impl Opener {
     /// # Errors
     /// [`FleetError`].
     pub(super) async fn open(&self, robots: Vec<RobotKey>) -> Result<Arc<Router>, FleetError> {
-        let address = match self.inside {
+        let address = match self.authorities {
             Some(_) => with_free_port(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))?,
             None => self.address,
         };
         let failed = |reason: String| FleetError::Open { address, reason };
-        let (inside, supervisor) = (self.inside.clone(), &self.supervisor);
+        // Of the authority that signs now: what derives from a former one's key goes with its routers.
+        let signing = self
+            .authorities
+            .as_ref()
+            .map(|it| Arc::clone(it.present().signing()));
+        let credentials = signing.map(|signing| Arc::new(CredentialDerivation::new(&signing)));
+        let (needed, supervisor) = (credentials.clone(), &self.supervisor);
         let known = robots.clone();
         // Many rules take a while to read.
         let opening = supervisor.blocking(move || -> zenoh::Result<Session> {
-            let config = config(address, inside.as_deref(), &known)?;
+            let mut config = config(address)?;
+            // The dictionary lives until the router has read it.
+            let _dictionary = match &needed {
+                Some(credentials) => Some(demand(&mut config, credentials, &known)?),
+                None => None,
+            };
             zenoh::open(config).wait()
         });
         let session = tokio::time::timeout(SESSION_TIMEOUT, opening)
@@ -155,6 +75,7 @@ impl Opener {
             number: self.next.fetch_add(1, Ordering::Relaxed),
             session,
             address,
+            credentials,
             robots: robots.into_iter().collect(),
         }))
     }
@@ -204,21 +125,33 @@ pub(super) fn with_free_port(address: SocketAddr) -> Result<SocketAddr, FleetErr
         .map_err(|cause| FleetError::NoPort { address, cause })
 }
 
-fn config(
-    address: SocketAddr,
-    inside: Option<&Inside>,
+/// Makes a router demand users and passwords, and hold robots to their own keys.
+fn demand(
+    config: &mut Config,
+    credentials: &CredentialDerivation,
     robots: &[RobotKey],
-) -> zenoh::Result<Config> {
+) -> zenoh::Result<Dictionary> {
+    let dictionary = credentials.dictionary(robots)?;
+    let path = serde_json::Value::from(dictionary.path()).to_string();
+    config.insert_json5("transport/auth/usrpwd/dictionary_file", &path)?;
+    config.insert_json5("access_control", &control(robots).to_string())?;
+    Ok(dictionary)
+}
+
+fn config(address: SocketAddr) -> zenoh::Result<Config> {
     let mut config = Config::default();
-    let protocol = if inside.is_some() { "tls" } else { "tcp" };
     let settings = [
         ("mode", "\"router\"".to_owned()),
         (
             "listen/endpoints",
-            format!("[\"{protocol}/{address}#so_sndbuf={SEND_BUFFER_BYTES}\"]"),
+            format!("[\"tcp/{address}#so_sndbuf={SEND_BUFFER_BYTES}\"]"),
         ),
         ("transport/link/tx/batch_size", BATCH_BYTES.to_string()),
         ("transport/link/tx/lease", LEASE_MS.to_string()),
+        (
+            "transport/link/rx/max_message_size",
+            MESSAGE_BYTES_MAX.to_string(),
+        ),
         // Nothing is discovered and nothing is advertised.
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
@@ -234,34 +167,35 @@ fn config(
     for (key, value) in settings {
         config.insert_json5(key, &value)?;
     }
-    if let Some(inside) = inside {
-        inside.listen(&mut config, robots)?;
-    }
     Ok(config)
 }
 
 /// How a client on this machine connects to a router to look whether it answers.
 ///
 /// # Errors
-/// Zenoh refuses a setting, or there are no random numbers.
+/// Zenoh refuses a setting.
 pub(super) fn client_config(
     address: SocketAddr,
-    inside: Option<&Inside>,
+    credentials: Option<&RouterCredentials>,
     timeout_ms: u128,
 ) -> zenoh::Result<Config> {
     let mut config = Config::default();
-    let protocol = if inside.is_some() { "tls" } else { "tcp" };
     for (key, value) in [
         ("mode", "\"client\"".to_owned()),
-        ("connect/endpoints", format!("[\"{protocol}/{address}\"]")),
+        ("connect/endpoints", format!("[\"tcp/{address}\"]")),
         ("connect/timeout_ms", timeout_ms.to_string()),
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
     ] {
         config.insert_json5(key, &value)?;
     }
-    if let Some(inside) = inside {
-        inside.connect(&mut config)?;
+    if let Some(credentials) = credentials {
+        let text = |text: &str| serde_json::Value::from(text).to_string();
+        config.insert_json5("transport/auth/usrpwd/user", &text(&credentials.user))?;
+        config.insert_json5(
+            "transport/auth/usrpwd/password",
+            &text(&credentials.password),
+        )?;
     }
     Ok(config)
 }
@@ -277,7 +211,7 @@ mod tests {
             said.parse().unwrap()
         };
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, 7447));
-        let ours = config(address, None, &[]).unwrap();
+        let ours = config(address).unwrap();
         assert_eq!(sessions(&ours), SESSIONS_MAX);
         assert!(sessions(&Config::default()) < sessions(&ours));
     }

@@ -40,6 +40,7 @@ pub(super) async fn run(app: App, routers: Arc<Routers>, stop: CancellationToken
         beat += 1;
         let pulse = ServerPulse {
             server_time: app.clock().now(),
+            trust: app.trust_id(),
         };
         let Ok(payload) = wire::encode(&pulse) else {
             continue;

@@ -15,7 +15,8 @@ use tread_api::wire::{self, Refusal, RefusalCode};
 use zenoh::Wait as _;
 use zenoh::query::Query;
 
-use super::inbox::{count_refusal, explained, next, refuse_key};
+use super::inbox::{Asked, count_refusal, explained, log_refusal, next, refuse_key};
+use super::rate_limits::RateLimits;
 use crate::app::App;
 use crate::app::ingest::Upload;
 use crate::supervisor::Supervisor;
@@ -27,14 +28,16 @@ const REPLIES_MAX: usize = 384;
 #[derive(Debug, Clone)]
 pub(super) struct Replies {
     app: App,
+    limits: RateLimits,
     supervisor: Supervisor,
     slots: Arc<Semaphore>,
 }
 
 impl Replies {
-    pub(super) fn new(app: App, supervisor: Supervisor) -> Self {
+    pub(super) fn new(app: App, limits: RateLimits, supervisor: Supervisor) -> Self {
         Self {
             app,
+            limits,
             supervisor,
             slots: Arc::new(Semaphore::new(REPLIES_MAX)),
         }
@@ -42,7 +45,7 @@ impl Replies {
 
     /// Waits for the answer in a task of its own and sends it. Without a free slot the query is
     /// dropped: its robot sees no reply and asks again.
-    fn answer<T, F>(&self, query: Query, answering: F)
+    fn answer<T, F>(&self, Asked { query, place }: Asked, answering: F)
     where
         T: Serialize + Send + 'static,
         F: Future<Output = Result<T, Refusal>> + Send + 'static,
@@ -56,7 +59,7 @@ impl Replies {
             let answer = answering.await;
             // Sending blocks its thread when the robot's link is full.
             supervisor.blocking(move || send(&query, &answer)).await;
-            drop(slot);
+            drop((slot, place));
         });
     }
 
@@ -73,7 +76,8 @@ impl Replies {
             return None;
         };
         // No reply is no delivery: a robot that joins again has lost nothing.
-        if !self.app.admits(&(site.clone(), robot.clone())).await {
+        let of = (site.clone(), robot.clone());
+        if !self.app.admits(&of).await {
             return None;
         }
         let payload = query
@@ -103,7 +107,7 @@ impl Replies {
             }
         };
         if let Err(refusal) = &body {
-            warn!("a query on `{key}` was refused: {}", refusal.detail);
+            log_refusal(&self.app, &self.limits, &of, key, &refusal.detail);
         }
         Some((site, body))
     }
@@ -133,15 +137,18 @@ fn send<T: Serialize>(query: &Query, answer: &Result<T, Refusal>) {
 /// Answers introductions until the stop.
 pub(super) async fn serve_hellos(
     replies: Replies,
-    mut queries: mpsc::Receiver<Query>,
+    mut queries: mpsc::Receiver<Asked>,
     stop: CancellationToken,
 ) {
-    while let Some(query) = next(&mut queries, &stop).await {
-        let Some((site, hello)) = replies.read(&query, |hello: &Hello| &hello.robot).await else {
+    while let Some(asked) = next(&mut queries, &stop).await {
+        let Some((site, hello)) = replies
+            .read(&asked.query, |hello: &Hello| &hello.robot)
+            .await
+        else {
             continue;
         };
         let app = replies.app.clone();
-        replies.answer(query, async move {
+        replies.answer(asked, async move {
             let welcome = app.hello(&site, &hello?).await?;
             app.counters().hellos_answered.one();
             Ok(welcome)
@@ -152,12 +159,15 @@ pub(super) async fn serve_hellos(
 /// Hands uploads to the writer, and its answers back, until the stop.
 pub(super) async fn serve_uploads(
     replies: Replies,
-    mut queries: mpsc::Receiver<Query>,
+    mut queries: mpsc::Receiver<Asked>,
     writer: mpsc::Sender<Upload>,
     stop: CancellationToken,
 ) {
-    while let Some(query) = next(&mut queries, &stop).await {
-        let Some((site, batch)) = replies.read(&query, |batch: &Batch| &batch.robot).await else {
+    while let Some(asked) = next(&mut queries, &stop).await {
+        let Some((site, batch)) = replies
+            .read(&asked.query, |batch: &Batch| &batch.robot)
+            .await
+        else {
             continue;
         };
         let outcome = batch.and_then(|batch| {
@@ -172,7 +182,7 @@ pub(super) async fn serve_uploads(
                 busy("too many uploads are waiting")
             })
         });
-        replies.answer(query, async move {
+        replies.answer(asked, async move {
             let answered = outcome?;
             answered
                 .await

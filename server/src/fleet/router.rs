@@ -8,10 +8,11 @@ use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 use tracing::{error, warn};
+use tread_api::tunnel::RouterCredentials;
 use zenoh::{Session, Wait as _};
 
-use super::keeper::Keeper;
-use super::opening::{Inside, client_config};
+use super::keeper::{Keeper, robots_on};
+use super::opening::client_config;
 use super::routers::Router;
 use crate::supervisor::Supervisor;
 
@@ -71,7 +72,7 @@ pub(super) async fn watch(watch: Watch) {
         warn!("the zenoh router did not answer, {failures} of {FAILURES_MAX} times");
         if failures >= FAILURES_MAX && !watch.stop.is_cancelled() {
             failures = 0;
-            reopen(&watch.keeper, number).await;
+            reopen(&watch.keeper, newest.as_ref()).await;
         }
     }
 }
@@ -80,19 +81,29 @@ async fn looked_at(watch: &Watch, router: Option<&Arc<Router>>) -> bool {
     let Some(router) = router.map(Arc::clone) else {
         return false;
     };
-    let inside = watch.keeper.opener.inside.clone();
+    let credentials = router.credentials.as_ref();
+    let credentials = credentials.map(|derivation| derivation.of_probe());
     let looking = watch
         .supervisor
-        .blocking(move || probe(&router, inside.as_deref()));
+        .blocking(move || probe(&router, credentials.as_ref()));
     let looked = tokio::time::timeout(2 * PROBE_TIMEOUT, looking).await;
     matches!(looked, Ok(Some(true)))
 }
 
-async fn reopen(keeper: &Keeper, number: Option<u64>) {
+/// Opens another router in the place of one that does not answer. One that still carries robots stays:
+/// behind the gate beside the new one, until they have left it; in the clear, where there is but one
+/// address, as long as it carries them.
+async fn reopen(keeper: &Keeper, former: Option<&Arc<Router>>) {
     let _turn = keeper.turn.lock().await;
-    // In the clear there is but one address, which must be given up first.
-    if let Some(number) = number {
-        keeper.close(number).await;
+    if let Some(former) = former {
+        let robot_count = robots_on(former).await;
+        let is_behind_gate = former.credentials.is_some();
+        if robot_count == 0 {
+            keeper.close(former.number).await;
+        } else if !is_behind_gate {
+            error!("the zenoh router takes no connections; it stays for {robot_count} robots");
+            return;
+        }
     }
     match keeper.open().await {
         Ok(()) => {
@@ -105,9 +116,9 @@ async fn reopen(keeper: &Keeper, number: Option<u64>) {
 }
 
 /// Asks the router something over a connection of its own. Blocks its thread.
-fn probe(router: &Router, inside: Option<&Inside>) -> bool {
+fn probe(router: &Router, credentials: Option<&RouterCredentials>) -> bool {
     let asked = || -> zenoh::Result<bool> {
-        let config = client_config(router.address, inside, PROBE_TIMEOUT.as_millis())?;
+        let config = client_config(router.address, credentials, PROBE_TIMEOUT.as_millis())?;
         let session = zenoh::open(config).wait()?;
         let replies = session.get(PROBE_KEY).timeout(PROBE_TIMEOUT).wait()?;
         let answered = replies.recv().is_ok_and(|reply| reply.result().is_ok());
@@ -120,18 +131,82 @@ fn probe(router: &Router, inside: Option<&Inside>) -> bool {
 #[cfg(test)]
 mod tests {
     use std::net::{Ipv4Addr, SocketAddr};
+    use std::sync::atomic::AtomicU64;
 
-    use tokio::sync::mpsc;
+    use tokio::sync::{Mutex, mpsc};
     use zenoh::Wait as _;
 
     use super::super::Fleet;
+    use super::super::inbox::Channels;
+    use super::super::opening::{Opener, with_free_port};
     use super::*;
     use crate::app::App;
+    use crate::authority::{Authorities, Authority};
     use crate::clock::Clock;
     use crate::config::{FrictionConfig, StorageConfig};
     use crate::db::Db;
 
     const PATIENCE: Duration = Duration::from_secs(30);
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_router_that_carries_robots_is_not_closed_for_another() {
+        let folder = tempfile::tempdir().unwrap();
+        let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
+        let clock = Clock::system();
+        let app = App::new(
+            db,
+            clock.clone(),
+            FrictionConfig::default(),
+            StorageConfig::default(),
+        );
+        let supervisor = Supervisor::new();
+        let authority = Authority::generate("fleet", clock.now()).unwrap();
+        // Their channels must outlive the tasks that read them.
+        let mut keepers = Vec::new();
+        for authorities in [None, Some(Authorities::in_memory(Arc::new(authority)))] {
+            let is_behind_gate = authorities.is_some();
+            let address = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
+            let (uploads, _uploads_in) = mpsc::channel(1);
+            let keeper = Keeper {
+                app: app.clone(),
+                routers: Arc::default(),
+                opener: Opener {
+                    address: with_free_port(address).unwrap(),
+                    authorities: authorities.map(Arc::new),
+                    supervisor: supervisor.clone(),
+                    next: AtomicU64::new(0),
+                },
+                channels: Channels::new(&supervisor, &app, uploads),
+                turn: Mutex::new(()),
+            };
+            keeper.open().await.unwrap();
+            let router = keeper.routers.newest().unwrap();
+            let credentials = router.credentials.as_ref().map(|it| it.of_probe());
+            let config = client_config(router.address, credentials.as_ref(), 5_000).unwrap();
+            let opening = tokio::task::spawn_blocking(move || zenoh::open(config).wait());
+            let robot = opening.await.unwrap().unwrap();
+            assert_eq!(robots_on(&router).await, 1);
+            reopen(&keeper, Some(&router)).await;
+            assert_eq!(robots_on(&router).await, 1, "it carries on");
+            let open = keeper.routers.all().len();
+            assert_eq!(open, 1 + usize::from(is_behind_gate));
+            tokio::task::spawn_blocking(move || robot.close().wait())
+                .await
+                .unwrap()
+                .unwrap();
+            while robots_on(&router).await > 0 {
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+            reopen(&keeper, Some(&router)).await;
+            let numbers = keeper.routers.all();
+            assert!(numbers.iter().all(|open| open.number != router.number));
+            for router in keeper.routers.all() {
+                keeper.close(router.number).await;
+            }
+            keepers.push(keeper);
+        }
+        supervisor.stop().await.unwrap();
+    }
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
     async fn a_router_that_no_longer_answers_is_opened_again_and_takes_robots() {

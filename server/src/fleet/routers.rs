@@ -10,8 +10,9 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::watch;
-use zenoh::Session;
+use zenoh::{Session, Wait as _};
 
+use super::credentials::CredentialDerivation;
 use super::presence::RobotKey;
 
 /// One router.
@@ -23,8 +24,30 @@ pub(super) struct Router {
     pub(super) session: Session,
     /// Where it listens.
     pub(super) address: SocketAddr,
+    /// Behind the gate, what robots have to show.
+    pub(super) credentials: Option<Arc<CredentialDerivation>>,
     /// Whom its rules know.
     pub(super) robots: HashSet<RobotKey>,
+}
+
+impl Router {
+    /// The fingerprint of the authority from whose key its passwords derive.
+    pub(super) fn authority(&self) -> Option<&str> {
+        self.credentials
+            .as_ref()
+            .map(|derivation| derivation.authority())
+    }
+
+    /// How many sessions it has. Blocks its thread.
+    pub(super) fn session_count(&self) -> usize {
+        self.session.info().transports().wait().count()
+    }
+
+    /// Whether it has a session of this id. Blocks its thread.
+    pub(super) fn has_session(&self, session_id: u128) -> bool {
+        let mut transports = self.session.info().transports().wait();
+        transports.any(|one| u128::from_le_bytes(one.zid().to_le_bytes()) == session_id)
+    }
 }
 
 /// All routers, the newest last.

@@ -17,7 +17,7 @@ const THETA: f64 = 0.2;
 const SEED: u64 = 0x5EED_0001;
 
 /// Normally distributed random numbers (splitmix64, Box and Muller).
-struct Normal(u64);
+pub(super) struct Normal(pub(super) u64);
 
 impl Normal {
     fn uniform(&mut self) -> f64 {
@@ -29,7 +29,7 @@ impl Normal {
         (f64::from(bits) + 0.5) / 4_294_967_296.0
     }
 
-    fn next(&mut self) -> f64 {
+    pub(super) fn next(&mut self) -> f64 {
         let (left, right) = (self.uniform(), self.uniform());
         (-2.0 * left.ln()).sqrt() * (std::f64::consts::TAU * right).cos()
     }
@@ -41,7 +41,10 @@ fn coverage(robots: u32, visits: u32) -> [f64; 3] {
     let mut normal = Normal(SEED ^ u64::from(robots) << 32 ^ u64::from(visits));
     let mut held = [0; 3];
     let runs = VISITS / (robots * visits);
-    let config = FrictionConfig::default();
+    let config = FrictionConfig {
+        robot_bias_ratio: BIAS_RATIO,
+        ..FrictionConfig::default()
+    };
     for _ in 0..runs {
         let mut seen = Vec::new();
         let (mut information, mut weighted) = (0.0, 0.0);

@@ -5,14 +5,18 @@
 //! `Σ w_r θ_r / Σ w_r`, found by iterating: each robot's own θ there would make intervals too
 //! small. The variance of θ is `1 / Σ w_r`.
 //!
+//! A friction coefficient counts when a second robot has shown as much; of one robot alone up to
+//! [`MU_ALONE_MAX`]. No robot can raise the limits of others by its word.
+//!
 //! The ground changes. For a cell, the epochs are gone through from the newest back, and where one
 //! contradicts what is newer by more than [`CHANGE_DEVIATIONS`], it and all older ones are left
 //! out. An epoch whose newest telling pass contradicts its other ones counts with that pass alone. Bad news
-//! (more slip) is believed from the first pass, good news when a second one confirms it; until
-//! then the estimate is disputed.
+//! (more slip) is believed from the first pass, good news when a second one confirms it, which must
+//! be another robot's if several others say otherwise; until then the estimate is disputed.
 
 use tread_api::friction::{Information, NORMAL_95};
 
+use super::joined::{Room, joined};
 use super::sums::{Known, Sums};
 use crate::config::FrictionConfig;
 
@@ -23,12 +27,8 @@ pub const THETA_STD_DEV_MAX: f64 = 10.0;
 /// Standard deviations from which measurements contradict each other. With as many comparisons as
 /// a cell ever sees, one in ten thousand of them cuts off what was true.
 pub const CHANGE_DEVIATIONS: f64 = 4.5;
-/// Most rounds of the iteration for the common θ; it settles within about ten.
-const ROUNDS_MAX: u32 = 100;
-/// Relative change at which the common θ counts as settled.
-const SETTLED_RATIO: f64 = 1.0e-12;
-/// Normal quantile from which differences are called a dispute: one in a thousand by chance.
-const DISPUTE_QUANTILE: f64 = 3.090_232_306_167_813;
+/// Friction coefficient up to which one robot alone is believed.
+pub const MU_ALONE_MAX: f64 = 0.4;
 /// Microseconds of a second.
 const SECOND_US: f64 = 1.0e6;
 
@@ -204,14 +204,14 @@ pub fn fuse<R: Ord + Copy>(
 #[derive(Debug)]
 pub struct Fuser<R> {
     before: Vec<Seen<R>>,
-    robots: Vec<Word>,
+    room: Room,
 }
 
 impl<R> Default for Fuser<R> {
     fn default() -> Self {
         Self {
             before: Vec::new(),
-            robots: Vec::new(),
+            room: Room::default(),
         }
     }
 }
@@ -227,13 +227,6 @@ impl<R: Ord + Copy> Fuser<R> {
     ) -> Option<Fused> {
         fuse_in(self, seen, ground, config, now_us)
     }
-}
-
-/// What one robot says, with the variance that its own measurements leave.
-#[derive(Debug, Clone, Copy)]
-struct Word {
-    variance: f64,
-    value: f64,
 }
 
 /// Two revisions of a terrain that are one ground may both have a sum of one robot and epoch.
@@ -270,7 +263,7 @@ fn fuse_in<R: Ord + Copy>(
             .then_with(|| by_content(left, right))
     });
     let drift = config.drift_variance_per_s;
-    let words = &mut room.robots;
+    let words = &mut room.room;
     let (theta, spread) = joined(seen, words, |one| Some(one.theta), config, (now_us, drift))?;
     let std_dev = theta.std_dev * spread.widening();
     if std_dev > THETA_STD_DEV_MAX {
@@ -288,11 +281,7 @@ fn fuse_in<R: Ord + Copy>(
             value: theta.value.max(THETA_MIN),
             std_dev,
         },
-        mu_peak: seen
-            .iter()
-            .filter(recent)
-            .filter_map(|one| one.mu_peak)
-            .reduce(f64::max),
+        mu_peak: mu_shown(seen.iter().filter(recent)),
         track,
         rolling,
         passes,
@@ -301,6 +290,36 @@ fn fuse_in<R: Ord + Copy>(
         is_disputed: present.is_unconfirmed || spread.is_dispute(ground),
         changed_at_us: present.changed_at_us,
     })
+}
+
+/// The friction coefficient that two robots have shown, or one alone up to [`MU_ALONE_MAX`]; what
+/// is seen is sorted by robot.
+fn mu_shown<'seen, R: Ord + Copy + 'seen>(
+    seen: impl Iterator<Item = &'seen Seen<R>>,
+) -> Option<f64> {
+    let (mut largest, mut second): (Option<f64>, Option<f64>) = (None, None);
+    let mut of_robot: Option<(R, f64)> = None;
+    let mut note = |shown: Option<(R, f64)>| {
+        let Some((_, mu)) = shown else { return };
+        if largest.is_none_or(|largest| mu > largest) {
+            second = largest.replace(mu);
+        } else if second.is_none_or(|second| mu > second) {
+            second = Some(mu);
+        }
+    };
+    for one in seen {
+        let Some(mu) = one.mu_peak else { continue };
+        of_robot = match of_robot {
+            Some((robot, shown)) if robot == one.robot => Some((robot, shown.max(mu))),
+            before => {
+                note(before);
+                Some((one.robot, mu))
+            }
+        };
+    }
+    note(of_robot);
+    let alone = largest.map(|largest| largest.min(MU_ALONE_MAX));
+    alone.map(|alone| second.map_or(alone, |second| second.max(alone)))
 }
 
 /// Which of what was seen of a cell is of the ground as it is.
@@ -325,22 +344,30 @@ impl Present {
             return Self::default();
         };
         let witnesses: u64 = seen.iter().map(|one| one.passes).sum();
-        if witnesses > 1 {
+        let lone = lone_witness(seen, &older[kept..], config);
+        if witnesses > 1 && lone.is_none() {
             return Self {
                 is_unconfirmed: false,
                 changed_at_us: Some(changed_at_us),
             };
         }
-        // One pass against all before it. Without it, what was there stands as it stood.
+        // One pass or one robot against all before. Without it, what was there stands as it stood.
         let now = seen.first().map(|one| one.theta.value);
-        if let Some(first) = older.first_mut() {
-            match first.contradicted() {
-                Some((_newest, rest)) => *first = first.without_newest(rest),
-                None => {
-                    older.remove(0);
-                }
+        let mut index = 0;
+        older.retain_mut(|one| {
+            index += 1;
+            if lone == Some(one.robot) {
+                return false;
             }
-        }
+            if index > kept || lone.is_some() {
+                return true;
+            }
+            let rest = one.contradicted();
+            if let Some((_newest, rest)) = rest {
+                *one = one.without_newest(rest);
+            }
+            rest.is_some()
+        });
         let (kept, earlier_us) = keep_present(older, config);
         older.truncate(kept);
         let was = older.first().map(|one| one.theta.value);
@@ -358,6 +385,50 @@ impl Present {
             changed_at_us: earlier_us,
         }
     }
+}
+
+/// The one robot that says the ground is better while several others say it is worse. Its word alone
+/// confirms nothing, however often and in however many ways it says it: nothing of it counts then.
+fn lone_witness<R: Ord + Copy>(
+    kept: &[Seen<R>],
+    contradicted: &[Seen<R>],
+    config: &FrictionConfig,
+) -> Option<R> {
+    let (mut information, mut weighted) = (0.0, 0.0);
+    for one in kept {
+        information += one.theta.information;
+        weighted += one.theta.information * one.theta.value;
+    }
+    let now = Known {
+        information,
+        value: weighted / information,
+    };
+    let mut worse = contradicted
+        .iter()
+        .filter(|one| is_better(now, one.theta, config));
+    let first = worse.next()?;
+    // A robot of which all is kept contradicts itself, and nobody else.
+    let second = worse.find(|one| one.robot != first.robot)?;
+    let mut witnesses = kept
+        .iter()
+        .filter(|one| is_better(one.theta, first.theta, config))
+        .map(|one| one.robot);
+    let lone = witnesses.next()?;
+    let is_alone = witnesses.all(|robot| robot == lone);
+    let others = [first.robot, second.robot];
+    let is_of_others = others.contains(&lone)
+        && !worse.any(|one| one.robot != lone && !others.contains(&one.robot));
+    (is_alone && !is_of_others).then_some(lone)
+}
+
+/// Whether one word says significantly less slip than another, robots' biases included.
+fn is_better(one: Known, other: Known, config: &FrictionConfig) -> bool {
+    let information = one.information + other.information;
+    let common = (one.information * one.value + other.information * other.value) / information;
+    let variance = one.information.recip()
+        + other.information.recip()
+        + 2.0 * (config.robot_bias_ratio * common).powi(2);
+    other.value - one.value > CHANGE_DEVIATIONS * variance.sqrt()
 }
 
 /// How many of the newest agree, those that changed within their epoch cut down to their newest
@@ -412,123 +483,14 @@ fn keep_present<R: Ord + Copy>(
     (seen.len(), changed_at_us)
 }
 
-/// How far apart measurements lie, as sums of squares with their degrees of freedom.
-#[derive(Debug, Clone, Copy, Default)]
-struct Spread {
-    robots: u32,
-    between: f64,
-    within: f64,
-    within_freedom: u64,
-    scatter: f64,
-    scatter_freedom: u64,
-}
-
-impl Spread {
-    /// One robot's measurements of an area may differ from place to place; those of a cell may not.
-    fn is_dispute(&self, ground: Ground) -> bool {
-        let between = u64::from(self.robots.saturating_sub(1));
-        self.between > chi_square_bound(between)
-            || ground == Ground::Cell
-                && (self.within > chi_square_bound(self.within_freedom)
-                    || self.scatter > chi_square_bound(self.scatter_freedom))
-    }
-
-    /// Robots that differ by more than their bias may be trusted less, all of them.
-    fn widening(&self) -> f64 {
-        let freedom = u64::from(self.robots.saturating_sub(1));
-        if freedom > 0 && self.between > chi_square_bound(freedom) {
-            (self.between / as_f64(freedom)).sqrt().max(1.0)
-        } else {
-            1.0
-        }
-    }
-}
-
-/// What a sum of squares exceeds once in a thousand cases, by Wilson and Hilferty.
-fn chi_square_bound(freedom: u64) -> f64 {
-    if freedom == 0 {
-        return f64::INFINITY;
-    }
-    let freedom = as_f64(freedom);
-    let part = 2.0 / (9.0 * freedom);
-    freedom * (1.0 - part + DISPUTE_QUANTILE * part.sqrt()).powi(3)
-}
-
-#[expect(clippy::cast_precision_loss, reason = "counts and times below 2^53")]
-fn as_f64(count: u64) -> f64 {
-    count as f64
-}
-
 #[expect(clippy::cast_precision_loss, reason = "times below 2^53 µs until 2255")]
 pub(super) fn seconds(span_us: i64) -> f64 {
     span_us as f64 / SECOND_US
 }
 
 /// A robot's clock may run ahead; what it measured is at most new.
-fn age_s<R>(one: &Seen<R>, now_us: i64) -> f64 {
+pub(super) fn age_s<R>(one: &Seen<R>, now_us: i64) -> f64 {
     seconds(now_us - one.newest_at_us).max(0.0)
-}
-
-/// One value out of the epochs of robots, which are sorted by robot; `drift` is the growth of a
-/// measurement's variance with its age.
-fn joined<R: Ord + Copy>(
-    seen: &[Seen<R>],
-    robots: &mut Vec<Word>,
-    value_of: impl Fn(&Seen<R>) -> Option<Known>,
-    config: &FrictionConfig,
-    (now_us, drift): (i64, f64),
-) -> Option<(Estimate, Spread)> {
-    robots.clear();
-    let mut spread = Spread::default();
-    for epochs in seen.chunk_by(|left, right| left.robot == right.robot) {
-        let (mut information, mut weighted, mut square) = (0.0, 0.0, 0.0);
-        for one in epochs {
-            let Some(known) = value_of(one) else { continue };
-            let weight = (known.information.recip() + drift * age_s(one, now_us)).recip();
-            information += weight;
-            weighted += weight * known.value;
-            square += weight * known.value * known.value;
-            spread.within_freedom += 1;
-            spread.scatter += one.scatter;
-            spread.scatter_freedom += one.passes.saturating_sub(1);
-        }
-        if information > 0.0 {
-            let value = weighted / information;
-            spread.within += (square - weighted * value).max(0.0);
-            spread.within_freedom -= 1;
-            let variance = f64::recip(information);
-            robots.push(Word { variance, value });
-        }
-    }
-    let (mut value, mut information) = weighed(robots, 0.0)?;
-    for _ in 0..ROUNDS_MAX {
-        let bias_variance = (config.robot_bias_ratio * value).powi(2);
-        let (next, sum) = weighed(robots, bias_variance)?;
-        let change = (next - value).abs();
-        (value, information) = (next, sum);
-        if change <= SETTLED_RATIO * value.abs() {
-            break;
-        }
-    }
-    let bias_variance = (config.robot_bias_ratio * value).powi(2);
-    for robot in robots.iter() {
-        let weight = (bias_variance + robot.variance).recip();
-        spread.between += weight * (robot.value - value).powi(2);
-    }
-    spread.robots = u32::try_from(robots.len()).unwrap_or(u32::MAX);
-    let std_dev = information.sqrt().recip();
-    Some((Estimate { value, std_dev }, spread))
-}
-
-/// The mean of robots with this variance of their bias, and its information.
-fn weighed(robots: &[Word], bias_variance: f64) -> Option<(f64, f64)> {
-    let (mut sum, mut weighted) = (0.0, 0.0);
-    for robot in robots {
-        let weight = (bias_variance + robot.variance).recip();
-        sum += weight;
-        weighted += weight * robot.value;
-    }
-    (sum > 0.0).then(|| (weighted / sum, sum))
 }
 
 impl Estimate {

@@ -9,6 +9,7 @@ pub mod fixed;
 pub mod fuse;
 pub mod grip;
 pub mod index;
+mod joined;
 pub mod raster;
 pub mod sums;
 
@@ -58,5 +59,7 @@ impl Fused {
 
 #[cfg(test)]
 mod coverage;
+#[cfg(test)]
+mod liars;
 #[cfg(test)]
 mod tests;

@@ -11,7 +11,7 @@ use super::sums::{Pair, Pass};
 use super::*;
 use crate::config::FrictionConfig;
 
-const HOUR_S: i64 = 3_600;
+pub(super) const HOUR_S: i64 = 3_600;
 
 fn now() -> Timestamp {
     "2026-11-01T12:00:00Z".parse().unwrap()
@@ -48,7 +48,7 @@ pub(super) fn measured(theta: f64, std_dev: f64, age_s: i64) -> Sums {
     }
 }
 
-fn gripping(mu_peak: f64, sums: Sums) -> Sums {
+pub(super) fn gripping(mu_peak: f64, sums: Sums) -> Sums {
     let newest = Pass {
         mu_peak: Some(mu_peak),
         ..sums.newest
@@ -61,7 +61,7 @@ fn gripping(mu_peak: f64, sums: Sums) -> Sums {
 }
 
 /// Sums per robot and epoch, as the database keeps them, then fused.
-fn fused_as(
+pub(super) fn fused_as(
     parts: impl IntoIterator<Item = (u8, Sums)>,
     ground: Ground,
     config: &FrictionConfig,
@@ -80,7 +80,7 @@ fn fused_as(
     fuse(&mut seen, ground, config, at_us(0))
 }
 
-fn fused(
+pub(super) fn fused(
     parts: impl IntoIterator<Item = (u8, Sums)>,
     config: &FrictionConfig,
 ) -> Option<FusedFriction> {
@@ -111,8 +111,8 @@ fn nothing_measured_is_nothing_known() {
 fn what_tells_no_ground_from_another_is_unknown_until_enough_of_it_has_come() {
     let vague = measured(0.2, 1.5 * THETA_STD_DEV_MAX, 0);
     assert_eq!(fused([(1, vague)], &no_bias()), None);
-    let three = fused([1, 2, 3].map(|robot| (robot, vague)), &no_bias()).unwrap();
-    assert!(three.std_dev < THETA_STD_DEV_MAX, "{three:?}");
+    let four = fused([1, 2, 3, 4].map(|robot| (robot, vague)), &no_bias()).unwrap();
+    assert!(four.std_dev < THETA_STD_DEV_MAX, "{four:?}");
 }
 
 #[test]
@@ -153,8 +153,9 @@ fn one_robot_never_gets_surer_than_its_own_bias() {
     };
     let alone = fused([(1, measured(0.2, 1e-4, 0))], &config).unwrap();
     assert!(alone.std_dev >= 0.08 * 0.2, "{alone:?}");
-    let robots = (0..4).map(|robot| (robot, measured(0.2, 1e-4, 0)));
+    let robots = (0..5).map(|robot| (robot, measured(0.2, 1e-4, 0)));
     let many = fused(robots, &config).unwrap();
+    // Any one of the five may be wrong: they are as sure as four.
     assert!(
         (many.std_dev / alone.std_dev - 0.5).abs() < 1e-3,
         "{many:?}"
@@ -186,7 +187,10 @@ fn what_is_old_weighs_less_and_a_clock_that_runs_ahead_gains_nothing() {
 
 #[test]
 fn robots_that_differ_by_more_than_their_bias_dispute_the_ground_and_widen_its_interval() {
-    let config = FrictionConfig::default();
+    let config = FrictionConfig {
+        robot_bias_ratio: 0.08,
+        ..FrictionConfig::default()
+    };
     let parts = |second: f64| {
         (0..6).map(move |robot| {
             let theta = if robot % 2 == 0 { 0.2 } else { second };
@@ -281,9 +285,10 @@ fn better_grip_is_believed_when_a_second_pass_confirms_it() {
 fn friction_that_was_seen_expires() {
     let config = FrictionConfig::default();
     let seen = |age_s| gripping(0.7, measured(0.2, 0.01, age_s));
-    let young = fused([(1, seen(HOUR_S))], &config).unwrap();
+    let by_two = |age_s| [1, 2].map(|robot| (robot, seen(age_s)));
+    let young = fused(by_two(HOUR_S), &config).unwrap();
     assert_eq!(young.mu_peak_lower_bound, Some(0.7));
-    let old = fused([(1, seen(7 * HOUR_S))], &config).unwrap();
+    let old = fused(by_two(7 * HOUR_S), &config).unwrap();
     assert_eq!(old.mu_peak_lower_bound, None);
 }
 

@@ -9,6 +9,7 @@ use tread_api::robot::Alert;
 use utoipa::IntoParams;
 
 use super::extract::{Json, Path, Query, cursor, page_limit};
+use super::identity::guard::Subject;
 use super::problem::Problem;
 use crate::app::App;
 use crate::db::alerts::AlertFilter;
@@ -36,11 +37,12 @@ pub(super) struct AlertQuery {
 
 /// Alerts with their history, newest first.
 #[utoipa::path(get, path = "/v1/alerts", tag = "alerts", operation_id = "list_alerts",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     params(AlertQuery),
     responses((status = 200, body = Page<Alert>), (status = 400, body = ProblemBody)))]
 pub(super) async fn list(
     State(app): State<App>,
+    Subject(subject): Subject,
     Query(query): Query<AlertQuery>,
 ) -> Result<Json<Page<Alert>>, Problem> {
     let limit = page_limit(query.limit)?;
@@ -49,13 +51,14 @@ pub(super) async fn list(
         site: query.site,
         robot: query.robot,
         raised: query.raised,
+        within: subject.scope.clone(),
     };
     Ok(Json(app.alerts(&filter, limit).await?))
 }
 
 /// Notes that a person has seen an alert.
 #[utoipa::path(post, path = "/v1/alerts/{alert}/acknowledge", tag = "alerts",
-    security(("token" = ["operator"])),
+    security(("token" = ["acknowledge"])),
     operation_id = "acknowledge_alert", params(("alert" = AlertId, Path)),
     responses((status = 200, body = Alert), (status = 404, body = ProblemBody)))]
 pub(super) async fn acknowledge(

@@ -20,17 +20,20 @@ use axum::extract::State;
 use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade, close_code};
 use axum::response::Response;
 use futures_util::FutureExt as _;
+use serde_json::Value;
 use tokio::time::{Instant, MissedTickBehavior};
 use tokio_util::sync::CancellationToken;
 use tread_api::drive::{
-    DRIVE_FRAME_MAX, DRIVE_VIEW_PERIOD_MS, Drive, DriveRefusal, DriveRequest, DriveUpdate,
+    self, DRIVE_FRAME_MAX, DRIVE_VIEW_PERIOD_MS, Drive, DriveRefusal, DriveRequest, DriveUpdate,
     ReleaseCause,
 };
-use tread_api::identity::Role;
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::problem::{ProblemBody, ProblemType};
+use tread_api::rights::Right;
+use tread_api::stop::STOP_TEXT_MAX;
+use tread_api::text::cleaned;
 
-use super::extract::Path;
+use super::extract::{Path, parse_frame};
 use super::identity::guard::Subject;
 use super::problem::Problem;
 use crate::app::App;
@@ -54,9 +57,9 @@ const REFUSAL_PERIOD: Duration = Duration::from_millis(500);
 
 /// A WebSocket to watch a robot and to drive it: one JSON object in each text frame, `DriveRequest`
 /// from the client, `DriveUpdate` from the server. Whoever may read may watch and stop; to drive
-/// takes an operator.
+/// takes the right `drive`.
 #[utoipa::path(get, path = "/v1/sites/{site}/robots/{robot}/drive", tag = "safety",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "drive_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
     responses((status = 101, description = "The frames of the socket", body = DriveUpdate),
         (status = 400, body = ProblemBody), (status = 404, body = ProblemBody),
@@ -73,9 +76,9 @@ pub(super) async fn drive(
             .detail(format!("this is a WebSocket: {}", rejection.body_text()))
     })?;
     let session = app.begin_drive(&site, &robot).await?;
-    let slot = app.drive_slot()?;
+    let slot = app.drive_slot(&subject)?;
     // A socket is no idle connection that gives way to new ones.
-    let at_work = place.map(|Extension(place)| place.work());
+    let at_work = place.map(|Extension(place)| place.hold());
     let stop = session.stop_token();
     let upgrade = upgrade
         .max_frame_size(DRIVE_FRAME_MAX)
@@ -186,7 +189,7 @@ impl Connection {
                 DriveRequest::Release(_) => self.release().await?,
                 DriveRequest::Stop(words) => {
                     let words = StopWords {
-                        by: words.by.or_else(|| Some(self.subject.name.clone())),
+                        by: Some(self.subject.said_by(words.by.as_deref())),
                         reason: words.reason,
                     };
                     self.stop(words).await?;
@@ -214,10 +217,12 @@ impl Connection {
         };
         self.heard_at = Instant::now();
         match message {
-            Message::Text(text) => match serde_json::from_str(&text) {
+            Message::Text(text) => match parse_frame(&text) {
                 Ok(request) => Ok(Some(request)),
-                Err(error) if error.is_data() => refused(close_code::POLICY, error.to_string()),
                 Err(error) => {
+                    if let Some(words) = stop_of(&text) {
+                        return Ok(Some(DriveRequest::Stop(words)));
+                    }
                     // A variant that is not known is a syntax error to the parser.
                     let is_json = serde_json::from_str::<serde::de::IgnoredAny>(&text).is_ok();
                     let code = if is_json {
@@ -242,14 +247,18 @@ impl Connection {
     }
 
     async fn acquire(&mut self, name: &str, take: bool) -> Result<(), End> {
-        if self.subject.role < Role::Operator {
+        if !self.subject.rights.includes(Right::Drive) {
             let refused = DriveUpdate::Refused {
                 cause: DriveRefusal::Forbidden,
-                detail: "to drive takes a token of an operator".to_owned(),
+                detail: "to drive takes a token with the right `drive`".to_owned(),
             };
             return self.send(&refused).await;
         }
-        let update = match self.session.acquire(name, take).await {
+        let name = match name.trim() {
+            "" => String::new(),
+            name => self.subject.said_by(Some(name)),
+        };
+        let update = match self.session.acquire(&name, take).await {
             Ok(lease) => DriveUpdate::Leased(lease),
             Err(Refused { cause, detail }) => DriveUpdate::Refused { cause, detail },
         };
@@ -366,6 +375,21 @@ impl Connection {
         // Whether it was read does not matter any more.
         let _ = tokio::time::timeout(GOODBYE_MAX, answered).await;
     }
+}
+
+/// What can be read of a frame that asks for a stop, whatever else is wrong with it: a stop is not
+/// refused for its words.
+fn stop_of(text: &str) -> Option<drive::StopWords> {
+    let frame: serde_json::Map<String, Value> = serde_json::from_str(text).ok()?;
+    let words = frame.get("stop")?;
+    let text = |field: &str| {
+        let text = words.get(field)?.as_str()?;
+        Some(cleaned(text, STOP_TEXT_MAX))
+    };
+    Some(drive::StopWords {
+        by: text("by"),
+        reason: text("reason"),
+    })
 }
 
 fn signed_out() -> End {

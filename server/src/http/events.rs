@@ -18,9 +18,12 @@ use tread_api::problem::{ProblemBody, ProblemType};
 use utoipa::IntoParams;
 
 use super::extract::Query;
+use super::identity::guard::Subject;
 use super::problem::Problem;
 use crate::app::App;
 use crate::app::events::{EventFilter, Subscription};
+use crate::app::identity::Credential;
+use crate::app::shares::Place;
 
 /// Cuts the connection that a request came on.
 #[derive(Debug, Clone, Default)]
@@ -42,35 +45,43 @@ pub(super) struct EventQuery {
 
 /// Everything that changes, from a snapshot on or from where `Last-Event-ID` points.
 #[utoipa::path(get, path = "/v1/events", tag = "events", operation_id = "stream_events",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     params(EventQuery, ("last-event-id" = Option<String>, Header,
         description = "The id of the last event that was read")),
     responses((status = 200, content_type = "text/event-stream", body = event::Event),
         (status = 400, body = ProblemBody), (status = 409, body = ProblemBody)))]
 pub(super) async fn stream(
     State(app): State<App>,
+    Subject(subject): Subject,
     cut: Option<Extension<Cut>>,
     Query(query): Query<EventQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let filter = filter(&app, query).await?;
+    let filter = filter(&app, &subject, query).await?;
     let last = headers.get("last-event-id");
     let last = last.and_then(|last| last.to_str().ok());
     let cut = cut.map(|Extension(cut)| cut.0).unwrap_or_default();
+    let place = app.event_place(&subject)?;
     let subscription = app.subscribe(filter, last, cut).await?;
-    let events = stream::unfold(subscription, async |mut subscription: Subscription| {
+    let client = (subscription, place);
+    let events = stream::unfold(client, async |client: (Subscription, Place)| {
+        let (mut subscription, place) = client;
         let sent = subscription.next().await?;
         let mut event = Event::default().event(sent.name).data(&sent.text);
         if let Some(id) = &sent.id {
             event = event.id(id);
         }
-        Some((Ok::<_, Infallible>(event), subscription))
+        Some((Ok::<_, Infallible>(event), (subscription, place)))
     });
     let events = Sse::new(events).keep_alive(KeepAlive::default());
     Ok(events.into_response())
 }
 
-async fn filter(app: &App, query: EventQuery) -> Result<EventFilter, Problem> {
+async fn filter(
+    app: &App,
+    subject: &Credential,
+    query: EventQuery,
+) -> Result<EventFilter, Problem> {
     let refused = |field: &str, detail: String| {
         Problem::new(ProblemType::InvalidQuery)
             .detail(detail)
@@ -88,8 +99,9 @@ async fn filter(app: &App, query: EventQuery) -> Result<EventFilter, Problem> {
     })?;
     let filter = EventFilter {
         topics,
-        site: query.site,
+        site: query.site.or_else(|| subject.scope.only_site().cloned()),
         robots,
+        within: subject.scope.clone(),
     };
     match app.unknown_in(&filter).await? {
         Some((field, name)) => Err(refused(

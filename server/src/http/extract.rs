@@ -4,6 +4,7 @@
 //! ignore them, so that old and new versions work together; the types are the same.)
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use axum::body::Body;
 use axum::extract::{FromRequest, FromRequestParts, Request};
@@ -17,11 +18,16 @@ use serde_json::value::RawValue;
 use tread_api::page::{PAGE_LIMIT_DEFAULT, PAGE_LIMIT_MAX};
 use tread_api::problem::ProblemType;
 
-use super::identity::guard::AuditSlot;
+use super::identity::guard::{AuditSlot, Subject};
 use super::problem::Problem;
 
 /// Fields that are not known and are named in the answer.
 const UNKNOWN_FIELDS_NAMED_MAX: usize = 5;
+
+/// How long the body of a request with a credential may take to arrive.
+pub const BODY_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long the body of anybody else may take.
+pub const STRANGER_BODY_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Bytes of a body over the limit that are read and thrown away, so that a client that is still
 /// sending gets the answer instead of a broken connection.
@@ -46,7 +52,21 @@ impl<S: Send + Sync, T: DeserializeOwned + Serialize> FromRequest<S> for Json<T>
         let limit = request.extensions().get::<BodyLimit>().copied();
         let limit = limit.unwrap_or(BodyLimit(super::BODY_MAX));
         let slot = request.extensions().get::<AuditSlot>().cloned();
-        let body = read(request.into_body(), limit).await?;
+        let subject = request.extensions().get::<Subject>().cloned();
+        let within = match &subject {
+            Some(_) => BODY_TIMEOUT,
+            None => STRANGER_BODY_TIMEOUT,
+        };
+        let reading = read(request.into_body(), limit);
+        let body = tokio::time::timeout(within, reading).await;
+        let body = body.map_err(|_elapsed| {
+            let detail = format!("a body may take {} s to arrive here", within.as_secs());
+            Problem::new(ProblemType::BodyTimeout).detail(detail)
+        })??;
+        if subject.is_some_and(|Subject(subject)| subject.ended().is_cancelled()) {
+            return Err(Problem::new(ProblemType::Unauthenticated)
+                .detail("the token was revoked, or the session ended, before the body was here"));
+        }
         let parsed = parse(&body)?;
         if let Some(slot) = slot {
             slot.leave(&body);
@@ -78,7 +98,7 @@ fn is_json(headers: &HeaderMap) -> bool {
 }
 
 /// Reads a whole body, or what there is to discard of one that is too large.
-async fn read(body: Body, BodyLimit(limit): BodyLimit) -> Result<Vec<u8>, Problem> {
+pub(super) async fn read(body: Body, BodyLimit(limit): BodyLimit) -> Result<Vec<u8>, Problem> {
     let mut chunks = body.into_data_stream();
     let mut text = Vec::new();
     let mut discarded = 0;
@@ -153,6 +173,30 @@ fn parse<T: DeserializeOwned + Serialize>(body: &[u8]) -> Result<T, Problem> {
 /// A message of the parser without its line and column, which say nothing in a one-line body.
 fn without_place(message: &str) -> &str {
     message.split(" at line ").next().unwrap_or(message)
+}
+
+/// Reads a frame of a socket: as a body, and a list where an object belongs is refused.
+///
+/// # Errors
+/// The parser's, or a sentence about the list.
+pub(super) fn parse_frame<T: DeserializeOwned + Serialize>(text: &str) -> Result<T, BadFrame> {
+    let parsed: T = serde_json::from_str(text).map_err(BadFrame::Parser)?;
+    let meant = serde_json::to_vec(&parsed).unwrap_or_default();
+    match list_for_object(text.as_bytes(), &meant) {
+        None => Ok(parsed),
+        Some(_place) => Err(BadFrame::List),
+    }
+}
+
+/// Why a frame cannot be taken.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum BadFrame {
+    /// It does not parse.
+    #[error("{0}")]
+    Parser(serde_json::Error),
+    /// The parser would take it.
+    #[error("a list stands where an object belongs")]
+    List,
 }
 
 /// Refuses a list where an object belongs: the parser would take its entries for the fields in

@@ -13,7 +13,7 @@ use crate::app::App;
 
 /// Where the robots of a site may be. The `ETag` is the revision.
 #[utoipa::path(get, path = "/v1/sites/{site}/geofence", tag = "safety",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "get_geofence", params(("site" = SiteId, Path)),
     responses((status = 200, body = Geofence), (status = 404, body = ProblemBody)))]
 pub(super) async fn get(
@@ -25,7 +25,7 @@ pub(super) async fn get(
 
 /// Replaces where robots may be, with `If-Match` only if nobody else did meanwhile.
 #[utoipa::path(put, path = "/v1/sites/{site}/geofence", tag = "safety",
-    security(("token" = ["operator"])),
+    security(("token" = ["configure"])),
     operation_id = "replace_geofence", params(("site" = SiteId, Path),
         ("if-match" = Option<String>, Header, description = "The revision that is replaced")),
     request_body = ReplaceGeofence,

@@ -6,6 +6,7 @@ use tread_api::problem::{ProblemBody, ProblemType};
 use utoipa::ToSchema;
 
 use super::extract::Json;
+use super::identity::guard::Subject;
 use super::problem::Problem;
 use crate::app::App;
 use crate::app::storage::StorageCondition;
@@ -56,7 +57,7 @@ pub struct ServerStatus {
     pub sqlite_version: String,
     /// The storage as it was checked last.
     pub storage: StorageStatus,
-    /// Robots that are on the network now.
+    /// Robots that are on the network now, of those that the token is for.
     pub robots_present: usize,
     /// What it has counted since the start.
     pub counters: CounterValues,
@@ -88,15 +89,18 @@ pub(super) async fn readyz(State(app): State<App>) -> Result<Json<Health>, Probl
 
 /// Version, uptime and counters.
 #[utoipa::path(get, path = "/v1/server", tag = "server", operation_id = "get_server",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     responses((status = 200, body = ServerStatus)))]
-pub(super) async fn status(State(app): State<App>) -> Json<ServerStatus> {
+pub(super) async fn status(
+    State(app): State<App>,
+    Subject(subject): Subject,
+) -> Json<ServerStatus> {
     Json(ServerStatus {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         uptime_ms: u64::try_from(app.uptime().as_millis()).unwrap_or(u64::MAX),
         sqlite_version: app.db().sqlite_version().to_owned(),
         storage: app.storage_condition().into(),
-        robots_present: app.presences().present_count(),
+        robots_present: app.presences().present_count(&subject.scope),
         counters: app.counters().values(),
     })
 }

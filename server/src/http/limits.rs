@@ -13,7 +13,7 @@ use crate::app::App;
 
 /// The external limits that a robot says it has.
 #[utoipa::path(get, path = "/v1/sites/{site}/robots/{robot}/limits", tag = "safety",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "list_limits", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
     responses((status = 200, body = Page<LimitStatus>), (status = 404, body = ProblemBody)))]
 pub(super) async fn list(
@@ -25,7 +25,7 @@ pub(super) async fn list(
 
 /// Holds or slows a robot for a while; say it again before it ends.
 #[utoipa::path(put, path = "/v1/sites/{site}/robots/{robot}/limits/{holder}", tag = "safety",
-    security(("token" = ["operator"])),
+    security(("token" = ["hold"])),
     operation_id = "set_limit", params(("site" = SiteId, Path), ("robot" = RobotId, Path),
         ("holder" = HolderId, Path)),
     request_body = SetLimit,
@@ -43,7 +43,7 @@ pub(super) async fn set(
 
 /// Ends a holder's limit. A holder that the robot must hear holds it from then on.
 #[utoipa::path(delete, path = "/v1/sites/{site}/robots/{robot}/limits/{holder}", tag = "safety",
-    security(("token" = ["operator"])),
+    security(("token" = ["hold"])),
     operation_id = "end_limit", params(("site" = SiteId, Path), ("robot" = RobotId, Path),
         ("holder" = HolderId, Path)),
     responses((status = 204, description = "The robot has ended it"),

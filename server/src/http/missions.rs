@@ -11,6 +11,7 @@ use tread_api::trajectory::{CheckTrajectory, PlannedPath, TrajectoryCheck};
 use utoipa::IntoParams;
 
 use super::extract::{Json, Path, Query, cursor, page_limit};
+use super::identity::guard::Subject;
 use super::problem::Problem;
 use crate::app::App;
 use crate::app::missions::idempotency::KEY_LENGTH_MAX;
@@ -37,11 +38,12 @@ pub(super) struct MissionQuery {
 
 /// Missions, newest first.
 #[utoipa::path(get, path = "/v1/missions", tag = "missions", operation_id = "list_missions",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     params(MissionQuery),
     responses((status = 200, body = Page<Mission>), (status = 400, body = ProblemBody)))]
 pub(super) async fn list(
     State(app): State<App>,
+    Subject(subject): Subject,
     Query(query): Query<MissionQuery>,
 ) -> Result<Json<Page<Mission>>, Problem> {
     let limit = page_limit(query.limit)?;
@@ -50,17 +52,18 @@ pub(super) async fn list(
         site, robot, state, ..
     } = query;
     let filter = MissionFilter {
-        site,
+        site: site.or_else(|| subject.scope.only_site().cloned()),
         robot,
         state,
         before,
+        within: subject.scope.clone(),
     };
     Ok(Json(app.missions(&filter, limit).await?))
 }
 
 /// Asks a robot to drive a circle or waypoints. It waits in the robot's queue.
 #[utoipa::path(post, path = "/v1/missions", tag = "missions", operation_id = "create_mission",
-    security(("token" = ["operator"])),
+    security(("token" = ["dispatch"])),
     request_body = CreateMission,
     params(("idempotency-key" = Option<String>, Header,
         description = "The same request under the same key is answered the same, and done once")),
@@ -69,9 +72,11 @@ pub(super) async fn list(
         (status = 415, body = ProblemBody), (status = 422, body = ProblemBody)))]
 pub(super) async fn create(
     State(app): State<App>,
+    Subject(subject): Subject,
     headers: HeaderMap,
     Json(request): Json<CreateMission>,
 ) -> Result<(StatusCode, Json<Mission>), Problem> {
+    subject.check_robot(&request.site, &request.robot)?;
     let mission = match idempotency_key(&headers)? {
         Some(key) => app.create_mission_once(key, request).await?,
         None => app.create_mission(request).await?,
@@ -95,7 +100,7 @@ fn idempotency_key(headers: &HeaderMap) -> Result<Option<&str>, Problem> {
 
 /// One mission with its history.
 #[utoipa::path(get, path = "/v1/missions/{mission}", tag = "missions",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "get_mission", params(("mission" = MissionId, Path)),
     responses((status = 200, body = MissionDetail), (status = 404, body = ProblemBody)))]
 pub(super) async fn get(
@@ -108,7 +113,7 @@ pub(super) async fn get(
 /// Where the planner lays a mission: from where its robot planned it once it has taken it, and
 /// from the begin of its trajectory before.
 #[utoipa::path(get, path = "/v1/missions/{mission}/path", tag = "missions",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "get_planned_path", params(("mission" = MissionId, Path)),
     responses((status = 200, body = PlannedPath), (status = 404, body = ProblemBody),
         (status = 422, body = ProblemBody)))]
@@ -121,7 +126,7 @@ pub(super) async fn path(
 
 /// Wants a mission to end. One that waits ends at once, one in hand when its robot has answered.
 #[utoipa::path(post, path = "/v1/missions/{mission}/cancel", tag = "missions",
-    security(("token" = ["operator"])),
+    security(("token" = ["dispatch"])),
     operation_id = "cancel_mission", params(("mission" = MissionId, Path)),
     responses((status = 202, body = MissionDetail), (status = 404, body = ProblemBody),
         (status = 409, body = ProblemBody)))]
@@ -137,7 +142,7 @@ pub(super) async fn cancel(
 
 /// Wants a mission in hand to be held, the robot standing.
 #[utoipa::path(post, path = "/v1/missions/{mission}/pause", tag = "missions",
-    security(("token" = ["operator"])),
+    security(("token" = ["dispatch"])),
     operation_id = "pause_mission", params(("mission" = MissionId, Path)),
     responses((status = 202, body = MissionDetail), (status = 404, body = ProblemBody),
         (status = 409, body = ProblemBody)))]
@@ -153,7 +158,7 @@ pub(super) async fn pause(
 
 /// Wants a paused mission to go on.
 #[utoipa::path(post, path = "/v1/missions/{mission}/resume", tag = "missions",
-    security(("token" = ["operator"])),
+    security(("token" = ["dispatch"])),
     operation_id = "resume_mission", params(("mission" = MissionId, Path)),
     responses((status = 202, body = MissionDetail), (status = 404, body = ProblemBody),
         (status = 409, body = ProblemBody)))]
@@ -170,7 +175,7 @@ pub(super) async fn resume(
 /// Wants a mission to be another trajectory. What waits is changed at once, what is in hand when
 /// its robot holds the new revision whole; until then the old one is driven.
 #[utoipa::path(post, path = "/v1/missions/{mission}/replace", tag = "missions",
-    security(("token" = ["operator"])),
+    security(("token" = ["dispatch"])),
     operation_id = "replace_mission", params(("mission" = MissionId, Path)),
     request_body = ReplaceMission,
     responses((status = 202, body = MissionDetail), (status = 404, body = ProblemBody),
@@ -188,13 +193,15 @@ pub(super) async fn replace(
 
 /// Plans a trajectory for a robot without moving anything.
 #[utoipa::path(post, path = "/v1/trajectories/check", tag = "missions",
-    security(("token" = ["operator"])),
+    security(("token" = ["dispatch"])),
     operation_id = "check_trajectory", request_body = CheckTrajectory,
     responses((status = 200, body = TrajectoryCheck), (status = 404, body = ProblemBody),
         (status = 422, body = ProblemBody)))]
 pub(super) async fn check(
     State(app): State<App>,
+    Subject(subject): Subject,
     Json(request): Json<CheckTrajectory>,
 ) -> Result<Json<TrajectoryCheck>, Problem> {
+    subject.check_robot(&request.site, &request.robot)?;
     Ok(Json(app.check_trajectory(request).await?))
 }

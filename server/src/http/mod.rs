@@ -50,7 +50,7 @@ use utoipa_swagger_ui::SwaggerUi;
 use self::extract::BodyLimit;
 pub use self::identity::access::{Access, Needed, PUBLIC};
 use self::identity::guard::{self, Guard};
-use self::identity::{audit, browser, enrolment, session, tokens};
+use self::identity::{audit, authority, browser, enrolment, session, tokens};
 use self::problem::{Problem, Refused};
 use crate::app::App;
 use crate::identity::origin::Names;
@@ -74,7 +74,7 @@ const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
         title = "Tread",
         description = "Missions for skid-steered robots, and the friction that they measure.",
     ),
-    components(schemas(tread_api::drive::DriveRequest))
+    components(schemas(tread_api::drive::DriveRequest, tread_api::identity::AuditOrder,))
 )]
 struct Description;
 
@@ -101,7 +101,11 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(enrolment::revoke_token))
         .routes(routes!(enrolment::list))
         .routes(routes!(enrolment::revoke))
+        .routes(routes!(authority::get))
+        .routes(routes!(authority::start))
+        .routes(routes!(authority::finish))
         .routes(routes!(audit::list))
+        .routes(routes!(audit::chain))
         .routes(routes!(sites::list, sites::create))
         .routes(routes!(sites::get))
         .routes(routes!(sites::tie, sites::untie))

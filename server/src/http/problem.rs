@@ -77,6 +77,7 @@ const fn status(kind: ProblemType) -> StatusCode {
         | ProblemType::CrossesGeofence
         | ProblemType::RobotOutsideGeofence
         | ProblemType::IdempotencyKeyReused => StatusCode::UNPROCESSABLE_ENTITY,
+        ProblemType::BodyTimeout => StatusCode::REQUEST_TIMEOUT,
         ProblemType::BodyTooLarge => StatusCode::PAYLOAD_TOO_LARGE,
         ProblemType::UnsupportedMediaType => StatusCode::UNSUPPORTED_MEDIA_TYPE,
         ProblemType::NotAcceptable => StatusCode::NOT_ACCEPTABLE,
@@ -99,15 +100,20 @@ const fn status(kind: ProblemType) -> StatusCode {
         | ProblemType::StopNotCleared
         | ProblemType::IdempotencyKeyInFlight
         | ProblemType::RobotsDoNotJoin
+        | ProblemType::AuthorityRotation
+        | ProblemType::RobotsLeft
         | ProblemType::TooMany => StatusCode::CONFLICT,
         ProblemType::Unauthenticated => StatusCode::UNAUTHORIZED,
         ProblemType::Forbidden | ProblemType::ForeignOrigin => StatusCode::FORBIDDEN,
-        ProblemType::TooManyAttempts => StatusCode::TOO_MANY_REQUESTS,
+        ProblemType::TooManyAttempts | ProblemType::TooManyRequests => {
+            StatusCode::TOO_MANY_REQUESTS
+        }
         ProblemType::UnknownHost => StatusCode::MISDIRECTED_REQUEST,
         ProblemType::RequestTooLong => StatusCode::URI_TOO_LONG,
-        ProblemType::Timeout => StatusCode::GATEWAY_TIMEOUT,
         ProblemType::ChangedMeanwhile => StatusCode::PRECONDITION_FAILED,
-        ProblemType::Unavailable | ProblemType::RobotUnreachable => StatusCode::SERVICE_UNAVAILABLE,
+        ProblemType::Unavailable | ProblemType::Timeout | ProblemType::RobotUnreachable => {
+            StatusCode::SERVICE_UNAVAILABLE
+        }
         ProblemType::Internal => StatusCode::INTERNAL_SERVER_ERROR,
     }
 }
@@ -130,7 +136,10 @@ impl From<AppError> for Problem {
             AppError::RobotCannot { .. } => ProblemType::RobotCannot,
             AppError::UnknownAlert(_) => ProblemType::UnknownAlert,
             AppError::UnknownToken(_) | AppError::UnknownJoinToken(_) => ProblemType::UnknownToken,
+            AppError::OutsideScope(_) | AppError::BeyondRights(_) => ProblemType::Forbidden,
             AppError::NoAuthority => ProblemType::RobotsDoNotJoin,
+            AppError::Rotation(_) => ProblemType::AuthorityRotation,
+            AppError::RobotsLeft { .. } => ProblemType::RobotsLeft,
             AppError::UnknownStop(_) => ProblemType::UnknownStop,
             AppError::StopNotCleared { .. } => ProblemType::StopNotCleared,
             AppError::RobotUnreachable(_) => ProblemType::RobotUnreachable,
@@ -143,7 +152,7 @@ impl From<AppError> for Problem {
             AppError::TooMany { .. } => ProblemType::TooMany,
             AppError::Invalid { .. } => ProblemType::InvalidBody,
             AppError::InvalidQuery { .. } => ProblemType::InvalidQuery,
-            AppError::NoRandomness(_) | AppError::Unwritable(_) => {
+            AppError::NoRandomness(_) | AppError::Unwritable(_) | AppError::AuthorityFiles(_) => {
                 error!("a request failed: {app_error}");
                 ProblemType::Internal
             }
@@ -169,7 +178,9 @@ impl IntoResponse for Problem {
         response
             .headers_mut()
             .insert(header::CONTENT_TYPE, media_type);
-        if self.body.kind == ProblemType::Unavailable {
+        let is_of_now = status == StatusCode::SERVICE_UNAVAILABLE
+            || self.body.kind == ProblemType::TooManyRequests;
+        if is_of_now {
             let seconds = HeaderValue::from(RETRY_AFTER_S);
             response.headers_mut().insert(header::RETRY_AFTER, seconds);
         }

@@ -9,6 +9,7 @@ use tread_api::robot::{ChangeRobot, Robot};
 use utoipa::IntoParams;
 
 use super::extract::{Json, Path, Query, page_limit};
+use super::identity::guard::Subject;
 use super::problem::Problem;
 use crate::app::App;
 
@@ -29,24 +30,23 @@ pub(super) struct RobotQuery {
 
 /// The robots of a site, with their live state.
 #[utoipa::path(get, path = "/v1/sites/{site}/robots", tag = "robots",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "list_robots", params(("site" = SiteId, Path), RobotQuery),
     responses((status = 200, body = Page<Robot>), (status = 404, body = ProblemBody)))]
 pub(super) async fn list(
     State(app): State<App>,
+    Subject(subject): Subject,
     Path(site): Path<SiteId>,
     Query(query): Query<RobotQuery>,
 ) -> Result<Json<Page<Robot>>, Problem> {
     let limit = page_limit(query.limit)?;
-    Ok(Json(
-        app.robots(&site, query.cursor.as_deref(), query.retired, limit)
-            .await?,
-    ))
+    let (place, cursor) = ((&site, &subject.scope), query.cursor.as_deref());
+    Ok(Json(app.robots(place, cursor, query.retired, limit).await?))
 }
 
 /// One robot with its live state and the age of every value.
 #[utoipa::path(get, path = "/v1/sites/{site}/robots/{robot}", tag = "robots",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "get_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
     responses((status = 200, body = Robot), (status = 404, body = ProblemBody)))]
 pub(super) async fn get(
@@ -58,7 +58,7 @@ pub(super) async fn get(
 
 /// Renames a robot for people, retires it or takes it back. Retiring cancels all its missions.
 #[utoipa::path(patch, path = "/v1/sites/{site}/robots/{robot}", tag = "robots",
-    security(("token" = ["operator"])),
+    security(("token" = ["configure"])),
     operation_id = "change_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
     request_body = ChangeRobot,
     responses((status = 200, body = Robot), (status = 404, body = ProblemBody),

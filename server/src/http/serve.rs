@@ -1,7 +1,7 @@
 //! The accept loop. Ours, because half-sent headers must not hold a connection for ever, and
 //! because the number of connections has bounds (see [`crate::connections`]).
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
@@ -9,22 +9,24 @@ use std::time::Duration;
 
 use axum::Router;
 use axum::body::{Body, Bytes, HttpBody};
-use axum::http::Request;
+use axum::http::{HeaderName, Request};
 use hyper::body::{Frame, Incoming, SizeHint};
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::net::{TcpListener, TcpStream};
+use tokio::net::{TcpListener, TcpSocket, TcpStream};
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 use tower::ServiceExt as _;
 use tracing::{debug, warn};
 
 use super::events::Cut;
-use super::identity::guard::Peer;
+use super::identity::guard::{Peer, purpose_of_path};
 use super::tls::Tls;
 use crate::app::App;
 use crate::connections::{AtWork, BOUNDS, Connections, Slot};
+use crate::identity::address::TrustedProxies;
 use crate::supervisor::Supervisor;
 
 /// How long the first byte of a connection may take to arrive.
@@ -37,6 +39,14 @@ pub const HEADER_TIMEOUT: Duration = Duration::from_secs(10);
 const HEAD_MAX: usize = 64 * 1024;
 /// How long open requests may take after the stop.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(5);
+/// Where proxies say whom they ask for.
+const FORWARDED_FOR: HeaderName = HeaderName::from_static("x-forwarded-for");
+/// Connections that the system may keep until they are accepted: as many as may be open. One that finds
+/// no room there tries again after a second.
+const BACKLOG: u32 = 4_096;
+/// Connections that are accepted before those that were get to show who they are: in a rush that is longer
+/// than the room of the unproven, nobody is to be displaced unread.
+const ACCEPTED_AT_ONCE: usize = 16;
 /// Rest after the machine refused a connection, such as for want of file handles.
 const ACCEPT_REST: Duration = Duration::from_millis(100);
 
@@ -49,12 +59,33 @@ pub struct Serving {
     pub router: Router,
     /// TLS on it, if any.
     pub tls: Option<Arc<Tls>>,
+    /// Whose word on where a request comes from counts.
+    pub proxies: Arc<TrustedProxies>,
+}
+
+/// Listens on an address, with room for thousands who come at once.
+///
+/// # Errors
+/// The address is in use.
+pub fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
+    let socket = if address.is_ipv4() {
+        TcpSocket::new_v4()?
+    } else {
+        TcpSocket::new_v6()?
+    };
+    // A server that starts again may find connections of its former self.
+    socket.set_reuseaddr(true)?;
+    socket.bind(address)?;
+    socket.listen(BACKLOG)
 }
 
 /// Serves connections until the stop.
 pub async fn run(serving: Serving, app: App, supervisor: Supervisor, stop: CancellationToken) {
     let connections = Connections::new(BOUNDS);
-    loop {
+    for number in 1_usize.. {
+        if number.is_multiple_of(ACCEPTED_AT_ONCE) {
+            tokio::task::yield_now().await;
+        }
         let accepted = tokio::select! {
             biased;
             () = stop.cancelled() => return,
@@ -69,14 +100,18 @@ pub async fn run(serving: Serving, app: App, supervisor: Supervisor, stop: Cance
             }
         };
         let cut = CancellationToken::new();
-        let Some(admitted) = connections.admit(peer.ip(), cut.clone()) else {
+        let address = peer.ip().to_canonical();
+        let is_shared = address.is_loopback() || serving.proxies.contains(address);
+        let admitted = connections.admit_from(address, is_shared, cut.clone());
+        let Some(admitted) = admitted else {
             app.counters().http_connections_refused.one();
             continue;
         };
         let displaced = u64::try_from(admitted.displaced).unwrap_or_default();
         app.counters().http_connections_displaced.add(displaced);
         let connection = Connection {
-            peer,
+            peer: address,
+            proxies: Arc::clone(&serving.proxies),
             slot: admitted.slot,
             cut,
             router: serving.router.clone(),
@@ -90,7 +125,8 @@ pub async fn run(serving: Serving, app: App, supervisor: Supervisor, stop: Cance
 
 /// One connection.
 struct Connection {
-    peer: SocketAddr,
+    peer: IpAddr,
+    proxies: Arc<TrustedProxies>,
     slot: Arc<Slot>,
     cut: CancellationToken,
     router: Router,
@@ -139,19 +175,36 @@ impl Connection {
 
     async fn answer(self, stream: impl AsyncRead + AsyncWrite + Send + Unpin + 'static) {
         let Self {
-            peer, slot, cut, ..
+            peer,
+            proxies,
+            slot,
+            cut,
+            ..
         } = self;
+        let (app, router) = (self.app.clone(), self.router.clone());
         let service = tower::service_fn(move |request: Request<Incoming>| {
-            let at_work = slot.work();
-            let mut request = request.map(Body::new);
-            let extensions = request.extensions_mut();
-            // Whoever finds that the peer does not read may cut the connection.
-            extensions.insert(Cut(cut.clone()));
-            extensions.insert(Peer(peer));
-            extensions.insert(Arc::clone(&slot));
-            let answering = self.router.clone().oneshot(request);
+            let client = client_of(&request, peer, &proxies);
+            let (slot, cut, app) = (Arc::clone(&slot), cut.clone(), app.clone());
+            let router = router.clone();
             async move {
-                Ok::<_, std::convert::Infallible>(answering.await?.map(|body| {
+                let purpose = purpose_of_path(request.method(), request.uri().path());
+                let delay = slot.delay(purpose, Instant::now());
+                // It is no idle connection that may be cut for another one.
+                let waiting = slot.hold();
+                if !delay.is_zero() {
+                    tokio::time::sleep(delay).await;
+                }
+                let (at_work, displaced) = slot.begin((client != peer).then_some(client));
+                drop(waiting);
+                let displaced = u64::try_from(displaced).unwrap_or_default();
+                app.counters().http_connections_displaced.add(displaced);
+                let mut request = request.map(Body::new);
+                let extensions = request.extensions_mut();
+                // Whoever finds that the peer does not read may cut the connection.
+                extensions.insert(Cut(cut));
+                extensions.insert(Peer(client));
+                extensions.insert(slot);
+                Ok::<_, std::convert::Infallible>(router.oneshot(request).await?.map(|body| {
                     Body::new(Given {
                         body,
                         _at_work: at_work,
@@ -177,6 +230,16 @@ impl Connection {
             debug!("a connection broke: {error}");
         }
     }
+}
+
+/// Where a request comes from, as far as the proxies before this server are believed.
+fn client_of(request: &Request<Incoming>, peer: IpAddr, proxies: &TrustedProxies) -> IpAddr {
+    let forwarded = request.headers().get_all(FORWARDED_FOR).iter();
+    // What is no text is no address.
+    let forwarded: Vec<&str> = forwarded
+        .map(|value| value.to_str().unwrap_or("?"))
+        .collect();
+    proxies.client(peer, forwarded.into_iter())
 }
 
 /// An answer's body; its connection is at work until it has been given.

@@ -10,6 +10,7 @@ use tread_api::site::{CreateSite, GeoOrigin, Site};
 use utoipa::IntoParams;
 
 use super::extract::{Json, Path, Query, page_limit};
+use super::identity::guard::Subject;
 use super::problem::Problem;
 use crate::app::App;
 
@@ -26,20 +27,22 @@ pub(super) struct PageQuery {
 
 /// All sites.
 #[utoipa::path(get, path = "/v1/sites", tag = "sites", operation_id = "list_sites",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     params(PageQuery),
     responses((status = 200, body = Page<Site>), (status = 400, body = ProblemBody)))]
 pub(super) async fn list(
     State(app): State<App>,
+    Subject(subject): Subject,
     Query(query): Query<PageQuery>,
 ) -> Result<Json<Page<Site>>, Problem> {
     let limit = page_limit(query.limit)?;
-    Ok(Json(app.sites(query.cursor.as_deref(), limit).await?))
+    let cursor = query.cursor.as_deref();
+    Ok(Json(app.sites(&subject.scope, cursor, limit).await?))
 }
 
 /// One site.
 #[utoipa::path(get, path = "/v1/sites/{site}", tag = "sites", operation_id = "get_site",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     params(("site" = SiteId, Path)),
     responses((status = 200, body = Site), (status = 404, body = ProblemBody)))]
 pub(super) async fn get(
@@ -51,7 +54,7 @@ pub(super) async fn get(
 
 /// Makes a site.
 #[utoipa::path(post, path = "/v1/sites", tag = "sites", operation_id = "create_site",
-    security(("token" = ["admin"])),
+    security(("token" = ["administer"])),
     request_body = CreateSite,
     responses((status = 201, body = Site), (status = 409, body = ProblemBody),
         (status = 422, body = ProblemBody)))]
@@ -64,7 +67,7 @@ pub(super) async fn create(
 
 /// Says where on the earth a site's origin lies, so that its map can be given in WGS 84.
 #[utoipa::path(put, path = "/v1/sites/{site}/origin", tag = "sites", operation_id = "tie_site",
-    security(("token" = ["operator"])),
+    security(("token" = ["configure"])),
     params(("site" = SiteId, Path)), request_body = GeoOrigin,
     responses((status = 200, body = Site), (status = 404, body = ProblemBody),
         (status = 422, body = ProblemBody)))]
@@ -78,7 +81,7 @@ pub(super) async fn tie(
 
 /// Takes back where on the earth a site lies.
 #[utoipa::path(delete, path = "/v1/sites/{site}/origin", tag = "sites",
-    operation_id = "untie_site", security(("token" = ["operator"])),
+    operation_id = "untie_site", security(("token" = ["configure"])),
     params(("site" = SiteId, Path)),
     responses((status = 200, body = Site), (status = 404, body = ProblemBody)))]
 pub(super) async fn untie(

@@ -1,21 +1,95 @@
 //! Stops: of one robot, of all, their list and their clearing.
 //!
-//! A stop is the one request whose body may be missing or wrong: it stops all the same.
+//! A stop is the one request whose body may be missing or wrong: it stops all the same. What can be
+//! read of it counts, whatever the rest is, and whatever its `content-type`:
+//!
+//! | the body | stops |
+//! |---|---|
+//! | none, or not a JSON object, or one that does not arrive within [`STOP_BODY_TIMEOUT`] | all robots |
+//! | an object without `site`, or with `null` | all robots |
+//! | an object with a `site` that can be one | the robots of that site; 404 if it is not known, 403 if it is not the token's |
+//! | an object with any other `site` | none: 422 at once |
+//!
+//! All robots are those that the token is for.
+//!
+//! Whoever wrote a `site` meant some robots and not all, and nobody can tell which: to stop all of
+//! them would take the yards of others away, to stop none and say nothing would be worse. So the one
+//! who asks is told at once, as with a site that is not known. Everything else that cannot be read
+//! may be a cry for help, and stops everything.
 
-use axum::extract::State;
+use std::time::Duration;
+
+use axum::extract::{FromRequest, Request, State};
 use serde::Deserialize;
+use serde_json::{Map, Value};
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::page::Page;
-use tread_api::problem::ProblemBody;
-use tread_api::stop::{ClearStop, FleetStop, Stop, StopFleet, StopRobot};
+use tread_api::problem::{ProblemBody, ProblemType};
+use tread_api::stop::{ClearStop, FleetStop, STOP_TEXT_MAX, Stop, StopFleet, StopRobot};
+use tread_api::text::cleaned;
 use utoipa::IntoParams;
 
-use super::extract::{Json, Path, Query, cursor, page_limit};
-use super::identity::guard::Subject;
+use super::extract::{BodyLimit, Json, Path, Query, cursor, page_limit, read};
+use super::identity::guard::{AuditSlot, Subject};
 use super::problem::Problem;
 use crate::app::App;
+use crate::app::identity::Credential;
 use crate::app::stops::StopWords;
 use crate::db::stops::StopFilter;
+
+/// How long the body of a stop may take to arrive; then the stop goes without it.
+const STOP_BODY_TIMEOUT: Duration = Duration::from_millis(500);
+
+/// What can be read of the body of a stop.
+pub(super) struct StopBody(Map<String, Value>);
+
+impl<S: Send + Sync> FromRequest<S> for StopBody {
+    type Rejection = std::convert::Infallible;
+
+    async fn from_request(request: Request, _state: &S) -> Result<Self, Self::Rejection> {
+        let slot = request.extensions().get::<AuditSlot>().cloned();
+        let reading = read(request.into_body(), BodyLimit(super::BODY_MAX));
+        let arrived = tokio::time::timeout(STOP_BODY_TIMEOUT, reading).await;
+        let text = arrived.ok().and_then(Result::ok).unwrap_or_default();
+        let Ok(fields) = serde_json::from_slice(&text) else {
+            return Ok(Self(Map::new()));
+        };
+        if let Some(slot) = slot {
+            slot.leave(&text);
+        }
+        Ok(Self(fields))
+    }
+}
+
+impl StopBody {
+    fn text(&self, field: &str) -> Option<String> {
+        let text = self.0.get(field)?.as_str()?;
+        Some(cleaned(text, STOP_TEXT_MAX))
+    }
+
+    /// Who stops and why; the token's name stands before whatever name is given.
+    fn words(&self, subject: &Credential) -> StopWords {
+        StopWords {
+            by: Some(subject.said_by(self.text("by").as_deref())),
+            reason: self.text("reason"),
+        }
+    }
+
+    /// The one site whose robots are meant, if it is not all of them.
+    fn site(&self) -> Result<Option<SiteId>, Problem> {
+        let site = match self.0.get("site") {
+            None | Some(Value::Null) => return Ok(None),
+            Some(site) => site.as_str().and_then(|site| site.parse().ok()),
+        };
+        let unreadable = || {
+            let detail = "nothing was stopped: this is no site's identifier; leave `site` out, or \
+                          the whole body, to stop every robot";
+            let problem = Problem::new(ProblemType::InvalidBody).detail(detail);
+            problem.field("site")
+        };
+        site.map(Some).ok_or_else(unreadable)
+    }
+}
 
 /// Which stops, and which page of them.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
@@ -41,7 +115,7 @@ pub(super) struct StopQuery {
 /// Stops a robot, in any state and whoever drives it. Answers when the robot has confirmed, or
 /// after 300 ms: then it is told again until it does.
 #[utoipa::path(post, path = "/v1/sites/{site}/robots/{robot}/stop", tag = "safety",
-    security(("token" = ["viewer"])),
+    security(("token" = ["stop"])),
     operation_id = "stop_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
     request_body = Option<StopRobot>,
     responses((status = 200, body = Stop), (status = 404, body = ProblemBody)))]
@@ -49,35 +123,37 @@ pub(super) async fn stop(
     State(app): State<App>,
     Subject(subject): Subject,
     Path((site, robot)): Path<(SiteId, RobotId)>,
-    request: Result<Json<StopRobot>, Problem>,
+    body: StopBody,
 ) -> Result<Json<Stop>, Problem> {
-    let StopRobot { by, reason } = request.map(|Json(request)| request).unwrap_or_default();
-    let by = by.or_else(|| Some(subject.name.clone()));
-    let words = StopWords { by, reason };
+    let words = body.words(&subject);
     Ok(Json(app.stop_robot(&site, &robot, words).await?))
 }
 
-/// Stops every robot that has ever said hello, of all sites or of one.
+/// Stops every robot that has ever said hello and that the token is for, of all its sites or of one. A
+/// body that cannot be read
+/// stops all of them; one with a `site` that cannot be read stops none, and says so.
 #[utoipa::path(post, path = "/v1/stop", tag = "safety", operation_id = "stop_fleet",
-    security(("token" = ["viewer"])),
+    security(("token" = ["stop"])),
     request_body = Option<StopFleet>,
-    responses((status = 200, body = FleetStop), (status = 404, body = ProblemBody)))]
+    responses((status = 200, body = FleetStop), (status = 404, body = ProblemBody),
+        (status = 422, body = ProblemBody)))]
 pub(super) async fn stop_fleet(
     State(app): State<App>,
     Subject(subject): Subject,
-    request: Result<Json<StopFleet>, Problem>,
+    body: StopBody,
 ) -> Result<Json<FleetStop>, Problem> {
-    let request = request.map(|Json(request)| request).unwrap_or_default();
-    let StopFleet { site, by, reason } = request;
-    let by = by.or_else(|| Some(subject.name.clone()));
-    let words = StopWords { by, reason };
-    Ok(Json(app.stop_fleet(site.as_ref(), words).await?))
+    let (site, words) = (body.site()?, body.words(&subject));
+    if let Some(site) = &site {
+        subject.check_site(site)?;
+    }
+    let stopped = app.stop_fleet(&subject.scope, site.as_ref(), words);
+    Ok(Json(stopped.await?))
 }
 
 /// Clears a robot's newest stop, if the robot stands. Nothing starts by it: what the robot had in
 /// hand or in its queue is held until somebody resumes it.
 #[utoipa::path(post, path = "/v1/sites/{site}/robots/{robot}/stop/clear", tag = "safety",
-    security(("token" = ["operator"])),
+    security(("token" = ["clear_stop"])),
     operation_id = "clear_stop", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
     request_body = ClearStop,
     responses((status = 200, body = Stop), (status = 404, body = ProblemBody),
@@ -89,17 +165,18 @@ pub(super) async fn clear(
     Json(request): Json<ClearStop>,
 ) -> Result<Json<Stop>, Problem> {
     let ClearStop { stop, by } = request;
-    let by = by.or_else(|| Some(subject.name.clone()));
-    Ok(Json(app.clear_stop(&site, &robot, stop, by).await?))
+    let by = subject.said_by(by.as_deref());
+    Ok(Json(app.clear_stop(&site, &robot, stop, Some(by)).await?))
 }
 
 /// Stops, newest first.
 #[utoipa::path(get, path = "/v1/stops", tag = "safety", operation_id = "list_stops",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     params(StopQuery),
     responses((status = 200, body = Page<Stop>), (status = 400, body = ProblemBody)))]
 pub(super) async fn list(
     State(app): State<App>,
+    Subject(subject): Subject,
     Query(query): Query<StopQuery>,
 ) -> Result<Json<Page<Stop>>, Problem> {
     let limit = page_limit(query.limit)?;
@@ -115,6 +192,7 @@ pub(super) async fn list(
         robot,
         in_force,
         before,
+        within: subject.scope.clone(),
     };
     Ok(Json(app.stops(&filter, limit).await?))
 }

@@ -14,7 +14,7 @@ use crate::app::App;
 
 /// The terrains of a site.
 #[utoipa::path(get, path = "/v1/sites/{site}/terrains", tag = "terrains",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "list_terrains", params(("site" = SiteId, Path), PageQuery),
     responses((status = 200, body = Page<Terrain>), (status = 404, body = ProblemBody)))]
 pub(super) async fn list(
@@ -30,7 +30,7 @@ pub(super) async fn list(
 
 /// One terrain.
 #[utoipa::path(get, path = "/v1/sites/{site}/terrains/{terrain}", tag = "terrains",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "get_terrain", params(("site" = SiteId, Path), ("terrain" = TerrainId, Path)),
     responses((status = 200, body = Terrain), (status = 404, body = ProblemBody)))]
 pub(super) async fn get(
@@ -42,7 +42,7 @@ pub(super) async fn get(
 
 /// Draws a terrain.
 #[utoipa::path(post, path = "/v1/sites/{site}/terrains", tag = "terrains",
-    security(("token" = ["operator"])),
+    security(("token" = ["configure"])),
     operation_id = "create_terrain", params(("site" = SiteId, Path)),
     request_body = CreateTerrain,
     responses((status = 201, body = Terrain), (status = 404, body = ProblemBody),
@@ -60,7 +60,7 @@ pub(super) async fn create(
 
 /// Replaces a terrain.
 #[utoipa::path(put, path = "/v1/sites/{site}/terrains/{terrain}", tag = "terrains",
-    security(("token" = ["operator"])),
+    security(("token" = ["configure"])),
     operation_id = "replace_terrain",
     params(("site" = SiteId, Path), ("terrain" = TerrainId, Path)),
     request_body = ReplaceTerrain,
@@ -76,7 +76,7 @@ pub(super) async fn replace(
 
 /// Removes a terrain; what was measured on it stays.
 #[utoipa::path(delete, path = "/v1/sites/{site}/terrains/{terrain}", tag = "terrains",
-    security(("token" = ["operator"])),
+    security(("token" = ["configure"])),
     operation_id = "delete_terrain",
     params(("site" = SiteId, Path), ("terrain" = TerrainId, Path)),
     responses((status = 204), (status = 404, body = ProblemBody)))]

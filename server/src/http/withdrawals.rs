@@ -18,7 +18,7 @@ use crate::app::App;
 /// Takes what a robot measured in some hours off the map, for good: the map is then as if it had
 /// never come, and what comes late of these hours does not count either.
 #[utoipa::path(post, path = "/v1/sites/{site}/robots/{robot}/withdrawals", tag = "friction",
-    security(("token" = ["operator"])),
+    security(("token" = ["configure"])),
     operation_id = "withdraw_measurements",
     params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
     request_body = CreateWithdrawal,
@@ -36,18 +36,21 @@ pub(super) async fn create(
 
 /// What was taken off the map, the oldest first.
 #[utoipa::path(get, path = "/v1/sites/{site}/withdrawals", tag = "friction",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "list_withdrawals", params(("site" = SiteId, Path), PageQuery),
     responses((status = 200, body = Page<Withdrawal>), (status = 304),
         (status = 404, body = ProblemBody)))]
 pub(super) async fn list(
     State(app): State<App>,
+    Subject(subject): Subject,
     Path(site): Path<SiteId>,
     Query(query): Query<PageQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let limit = page_limit(query.limit)?;
     let after = cursor(query.cursor.as_deref())?;
-    let found = app.withdrawals(&site, after, limit).await?;
+    let found = app
+        .withdrawals((&site, &subject.scope), after, limit)
+        .await?;
     Ok(etag::json(&headers, &found))
 }

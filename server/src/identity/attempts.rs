@@ -6,13 +6,16 @@
 //!   └──────────────── an hour without a failure ◄──────────────────────────────────┘
 //! ```
 //!
-//! While locked nothing is looked up, so the answer is the same for a good and a bad token. Who is
-//! already signed in is not asked again and not locked out: a stranger cannot take the Stop button
-//! away from people by failing beside them.
+//! The lock changes the answer to what is wrong, and nothing else: a good token is let in from
+//! wherever it comes. So a stranger cannot take the Stop button away from people by failing beside
+//! them or behind the same proxy, after a restart either. What guessing costs the server is bounded
+//! by how many secrets are looked up at once ([`crate::app::identity`]).
 
 use std::collections::HashMap;
-use std::net::{IpAddr, Ipv6Addr};
+use std::net::IpAddr;
 use std::time::Duration;
+
+use super::address::network_of;
 
 /// Failures within [`WINDOW`] that lock.
 pub const FAILURES_MAX: u32 = 10;
@@ -39,13 +42,7 @@ pub enum Source {
 impl Source {
     /// The source of an address.
     pub fn of_address(address: IpAddr) -> Self {
-        Self::Address(match address.to_canonical() {
-            IpAddr::V6(address) => {
-                let network = u128::from(address) >> 64 << 64;
-                IpAddr::V6(Ipv6Addr::from(network))
-            }
-            address @ IpAddr::V4(_) => address,
-        })
+        Self::Address(network_of(address))
     }
 }
 

@@ -1,7 +1,7 @@
 //! Secrets of tokens, sessions and joining robots: 256 random bits, of which only the SHA-256 is kept.
 //!
 //! A secret reads `tread_<kind>_<64 hex digits><8 hex digits>`. The kind is `v`, `o` or `a` for a
-//! token of that role, `s` for a session and `j` for a join token; the last eight digits are a checksum. So a scanner
+//! token of that role, `t` for one with rights of its own, `s` for a session and `j` for a join token; the last eight digits are a checksum. So a scanner
 //! for leaked secrets knows one when it sees it, and a slip of the pen is refused without asking
 //! the database. The kind tells people what they hold; what it may do is in the database.
 
@@ -27,8 +27,8 @@ const PREFIX_DIGITS: usize = 8;
 /// What a secret is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// A token of that role.
-    Token(Role),
+    /// A token of that role, or with rights of its own.
+    Token(Option<Role>),
     /// A browser's session.
     Session,
     /// The joining of a robot.
@@ -36,19 +36,21 @@ pub enum Kind {
 }
 
 impl Kind {
-    const ALL: [Self; 5] = [
-        Self::Token(Role::Viewer),
-        Self::Token(Role::Operator),
-        Self::Token(Role::Admin),
+    const ALL: [Self; 6] = [
+        Self::Token(Some(Role::Viewer)),
+        Self::Token(Some(Role::Operator)),
+        Self::Token(Some(Role::Admin)),
+        Self::Token(None),
         Self::Session,
         Self::Join,
     ];
 
     const fn initial(self) -> char {
         match self {
-            Self::Token(Role::Viewer) => 'v',
-            Self::Token(Role::Operator) => 'o',
-            Self::Token(Role::Admin) => 'a',
+            Self::Token(Some(Role::Viewer)) => 'v',
+            Self::Token(Some(Role::Operator)) => 'o',
+            Self::Token(Some(Role::Admin)) => 'a',
+            Self::Token(None) => 't',
             Self::Session => 's',
             Self::Join => 'j',
         }
@@ -135,6 +137,11 @@ impl Secret {
 pub struct Fingerprint([u8; 32]);
 
 impl Fingerprint {
+    /// What the database keeps; `None` if it is none.
+    pub fn from_kept(hash: &[u8]) -> Option<Self> {
+        hash.try_into().ok().map(Self)
+    }
+
     /// All of it, for the database.
     pub fn as_bytes(&self) -> &[u8] {
         &self.0
@@ -217,7 +224,7 @@ mod tests {
 
     #[test]
     fn a_secret_has_its_kind_in_front_and_is_not_shown_by_accident() {
-        let secret = Secret::from_random(Kind::Token(Role::Operator), &[0xab; 32]);
+        let secret = Secret::from_random(Kind::Token(Some(Role::Operator)), &[0xab; 32]);
         assert!(secret.reveal().starts_with("tread_o_abab"));
         assert_eq!(secret.prefix(), "abababab");
         assert!(!format!("{secret:?}").contains("abab"));

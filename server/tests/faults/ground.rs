@@ -10,11 +10,12 @@ use tokio::sync::{Mutex, oneshot};
 use tread_api::friction::{Information, Segment};
 use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
 use tread_api::mission::CreateMission;
-use tread_api::robot::{Capabilities, RobotLimits, RobotModel};
+use tread_api::robot::{Capabilities, RobotModel};
 use tread_api::site::Cell;
 use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::{Batch, Receipt, Record, RecordContent};
 use tread_api::wire::{Refusal, RefusalCode};
+use tread_samples::rover;
 use tread_server::app::friction::{Area, Asked, CellsAsked};
 use tread_server::app::ingest::{Upload, Writer};
 use tread_server::app::{App, AppError};
@@ -52,33 +53,23 @@ pub(crate) fn boot() -> BootId {
 }
 
 fn model() -> RobotModel {
-    RobotModel {
-        name: "test rover".to_owned(),
-        tyres: "lugged".to_owned(),
-        mass_kg: 50.0,
-        track_width_m: 0.6,
-        wheelbase_m: 0.5,
-        wheel_radius_m: 0.15,
-        yaw_inertia_kg_m2: 3.0,
-        limits: RobotLimits {
-            linear_max_m_s: 2.0,
-            angular_max_rad_s: 1.5,
-            linear_acceleration_max_m_s2: 1.0,
-            lateral_acceleration_max_m_s2: 1.0,
-            linear_jerk_max_m_s3: 5.0,
-            wheel_speed_max_rad_s: 20.0,
-            wheel_acceleration_max_rad_s2: 50.0,
-        },
-    }
+    rover("test rover", "lugged")
 }
 
 impl Ground {
     pub(crate) async fn prepare() -> Self {
+        Self::prepare_with(Duration::from_secs(15)).await
+    }
+
+    /// The same, with a bound on how long a commit may take.
+    pub(crate) async fn prepare_with(commit_max: Duration) -> Self {
         // Syncs cost nothing in memory; what fails is the same.
         let memory = std::path::Path::new("/dev/shm");
         let folder = tempfile::tempdir_in(memory).or_else(|_| tempfile::tempdir());
         let folder = folder.unwrap();
-        let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
+        let db = Db::open_with(&folder.path().join("tread.db"), commit_max)
+            .await
+            .unwrap();
         let clock = Clock::manual(now());
         let app = App::new(
             db,
@@ -162,12 +153,36 @@ impl Ground {
             "{} foreign keys lead nowhere",
             broken.len()
         );
+        drop(tx);
+        let counted = self.segments_counted().await;
+        assert_eq!(counted, self.acknowledged.load(Ordering::Relaxed));
+        self.check_map().await;
+    }
+
+    /// Segments in the sums of the database.
+    pub(crate) async fn segments_counted(&self) -> u64 {
+        let mut tx = self.app.db().read().await.unwrap();
         let mut counted = 0;
         db::sums::each(&mut tx, |row| counted += row.sums.segments)
             .await
             .unwrap();
-        drop(tx);
-        assert_eq!(counted, self.acknowledged.load(Ordering::Relaxed));
+        counted
+    }
+
+    /// The map in memory is what the database says.
+    pub(crate) async fn check_map(&self) {
+        assert_eq!(
+            self.said(&self.app).await,
+            self.said_after_a_restart().await
+        );
+    }
+
+    /// Whether the map in memory is what the database says.
+    pub(crate) async fn is_map_right(&self) -> bool {
+        self.said(&self.app).await == self.said_after_a_restart().await
+    }
+
+    async fn said_after_a_restart(&self) -> String {
         let restarted = App::new(
             self.app.db().clone(),
             self.app.clock().clone(),
@@ -175,20 +190,27 @@ impl Ground {
             StorageConfig::default(),
         );
         restarted.load_map().await.unwrap();
-        let said = format!("{:?}", self.said(&self.app).await);
-        assert_eq!(said, format!("{:?}", self.said(&restarted).await));
+        self.said(&restarted).await
     }
 
-    async fn said(&self, app: &App) -> Vec<tread_api::friction::CellFriction> {
-        let cells = CellsAsked {
-            area: Area::new((None, None), (None, None)).unwrap(),
-            resolution_m: None,
-            cursor: None,
-            limit: 1_000,
-        };
-        let asked = Asked::default();
-        let page = app.friction_of_cells(&self.site, &asked, cells).await;
-        page.unwrap().items
+    /// The map now, and as it was in the middle of a day: that shows what is read as days.
+    async fn said(&self, app: &App) -> String {
+        let mut said = Vec::new();
+        for as_of in [None, Some(now() - Duration::from_hours(39))] {
+            let cells = CellsAsked {
+                area: Area::new((None, None), (None, None)).unwrap(),
+                resolution_m: None,
+                cursor: None,
+                limit: 1_000,
+            };
+            let asked = Asked {
+                as_of,
+                ..Asked::default()
+            };
+            let page = app.friction_of_cells(&self.site, &asked, cells).await;
+            said.push(page.unwrap().items);
+        }
+        format!("{said:?}")
     }
 }
 

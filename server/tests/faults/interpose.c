@@ -1,4 +1,5 @@
-/* Loaded before the C library: fails the n-th write, sync, read or allocation that SQLite makes.
+/* Loaded before the C library: fails the n-th write, sync, read or allocation that SQLite makes, or
+ * delays it.
  *
  * A file that both sides map says what is to fail; all numbers are 64-bit and little-endian:
  *   kind       which call (see `enum kind`), 0 for none
@@ -6,6 +7,9 @@
  *   lasting    not 0: all later ones fail too
  *   fired      how many have failed
  *   ready      written at the start: bit 0 loaded, bit 1 SQLite's allocator found
+ *   delay_ms   how long a slow sync takes
+ *
+ * What hangs goes on when something else is set.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -13,6 +17,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <link.h>
+#include <stdarg.h>
 #include <stdatomic.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -20,12 +25,13 @@
 #include <string.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
+#include <sys/statvfs.h>
 #include <unistd.h>
 
-enum kind { NONE, WRITE_FULL, WRITE_IO, SYNC_IO, READ_IO, READ_GARBAGE, NO_MEMORY };
+enum kind { NONE, WRITE_FULL, WRITE_IO, SYNC_IO, READ_IO, READ_GARBAGE, NO_MEMORY, SYNC_SLOW, HANG };
 
 struct control {
-    _Atomic uint64_t kind, countdown, lasting, fired, ready;
+    _Atomic uint64_t kind, countdown, lasting, fired, ready, delay_ms;
 };
 
 static struct control nothing;
@@ -53,8 +59,14 @@ static int is_database(int fd) {
 
 static int is_armed(void) { return atomic_load_explicit(&control->kind, memory_order_relaxed) != NONE; }
 
+static void hang(void) {
+    if (!fires(HANG)) return;
+    while (atomic_load(&control->kind) == HANG) usleep(5000);
+}
+
 static int write_fails(int fd) {
     if (!is_armed() || !is_database(fd)) return 0;
+    hang();
     if (fires(WRITE_FULL)) { errno = ENOSPC; return 1; }
     if (fires(WRITE_IO)) { errno = EIO; return 1; }
     return 0;
@@ -78,7 +90,10 @@ ssize_t pwrite64(int fd, const void *bytes, size_t count, off64_t at) {
 }
 
 static int sync_fails(int fd) {
-    if (!is_armed() || !is_database(fd) || !fires(SYNC_IO)) return 0;
+    if (!is_armed() || !is_database(fd)) return 0;
+    hang();
+    if (fires(SYNC_SLOW)) usleep(1000 * atomic_load(&control->delay_ms));
+    if (!fires(SYNC_IO)) return 0;
     errno = EIO;
     return 1;
 }
@@ -94,6 +109,7 @@ int fdatasync(int fd) {
 /* -2: the call itself; otherwise what it answers. */
 static ssize_t read_fails(int fd, void *bytes, size_t count) {
     if (!is_armed() || !is_database(fd)) return -2;
+    hang();
     if (fires(READ_IO)) { errno = EIO; return -1; }
     if (fires(READ_GARBAGE)) { memset(bytes, 0xff, count); return (ssize_t)count; }
     return -2;
@@ -112,6 +128,38 @@ ssize_t pread64(int fd, void *bytes, size_t count, off64_t at) {
     REAL(ssize_t, "pread64", int, void *, size_t, off64_t);
     ssize_t failed = read_fails(fd, bytes, count);
     return failed == -2 ? real(fd, bytes, count, at) : failed;
+}
+
+static void open_hangs(const char *path) {
+    if (is_armed() && path && strstr(path, ".db")) hang();
+}
+int open(const char *path, int flags, ...) {
+    REAL(int, "open", const char *, int, ...);
+    va_list more;
+    va_start(more, flags);
+    int mode = va_arg(more, int);
+    va_end(more);
+    open_hangs(path);
+    return real(path, flags, mode);
+}
+int open64(const char *path, int flags, ...) {
+    REAL(int, "open64", const char *, int, ...);
+    va_list more;
+    va_start(more, flags);
+    int mode = va_arg(more, int);
+    va_end(more);
+    open_hangs(path);
+    return real(path, flags, mode);
+}
+int statvfs(const char *path, struct statvfs *found) {
+    REAL(int, "statvfs", const char *, struct statvfs *);
+    open_hangs(path);
+    return real(path, found);
+}
+int statvfs64(const char *path, struct statvfs64 *found) {
+    REAL(int, "statvfs64", const char *, struct statvfs64 *);
+    open_hangs(path);
+    return real(path, found);
 }
 
 extern void *__libc_malloc(size_t);

@@ -5,9 +5,10 @@ use std::fs::{File, OpenOptions};
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::time::Duration;
 
 const CONTROL: &str = "TREAD_FAULT_CONTROL";
-const NUMBERS: usize = 5;
+const NUMBERS: usize = 6;
 
 /// What fails.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -18,9 +19,13 @@ pub(crate) enum Fault {
     ReadIo = 4,
     ReadGarbage = 5,
     NoMemory = 6,
+    SyncSlow = 7,
+    /// Whatever touches the database waits, until something else is set.
+    Hang = 8,
 }
 
 impl Fault {
+    /// Those that fail a call.
     pub(crate) const ALL: [Self; 6] = [
         Self::WriteFull,
         Self::WriteIo,
@@ -72,6 +77,12 @@ impl Interposer {
         self.set(2, u64::from(lasts));
         self.set(3, 0);
         self.set(0, fault as u64);
+    }
+
+    /// Lets the next sync take so long.
+    pub(crate) fn slow_down(&self, delay: Duration) {
+        self.set(5, u64::try_from(delay.as_millis()).unwrap());
+        self.arm(Fault::SyncSlow, 1, false);
     }
 
     /// Lets everything work again; how many calls have failed.

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use serde_json::Value;
-use tread_server::app::identity::FirstAdmin;
+use tread_server::app::identity::tokens::FirstAdmin;
 use tread_server::config::{FrictionConfig, RetentionConfig, StorageConfig, WebConfig};
 use tread_server::db::stops::StopFilter;
 use tread_server::{Config, RunningServer, Server};
@@ -198,6 +198,7 @@ fn config(folder: &std::path::Path) -> Config {
         storage: StorageConfig::default(),
         tls: None,
         robots: None,
+        audit: tread_server::config::AuditConfig::default(),
         web: WebConfig::default(),
     }
 }

@@ -7,6 +7,8 @@
 #[cfg(test)]
 mod ground;
 #[cfg(test)]
+mod hanging;
+#[cfg(test)]
 mod interposer;
 #[cfg(test)]
 mod lasting;
@@ -14,6 +16,8 @@ mod lasting;
 mod paths;
 #[cfg(test)]
 mod statements;
+#[cfg(test)]
+mod uncertain;
 
 #[cfg(test)]
 mod tests {
@@ -23,9 +27,11 @@ mod tests {
     use tread_server::app::AppError;
 
     use crate::ground::Ground;
+    use crate::hanging;
     use crate::interposer::{Fault, Interposer, run_with_faults};
     use crate::paths::{PATHS, WritePath};
     use crate::statements;
+    use crate::uncertain;
 
     /// How long a write may take, with a failure in it.
     const PATIENCE: Duration = Duration::from_secs(3);
@@ -136,6 +142,9 @@ mod tests {
             resumed.unwrap_or_else(|error| panic!("{what}: does not go on: {error:?}"));
             let read = ground.app.db().probe_tables().await;
             read.unwrap_or_else(|error| panic!("{what}: cannot be read: {error:?}"));
+            // Nobody may know what became of it.
+            let settled = ground.app.settle_outcomes().await;
+            settled.unwrap_or_else(|error| panic!("{what}: memory cannot be read: {error:?}"));
         }
         panic!("path `{}` never ends with {fault:?}", path.name);
     }
@@ -145,6 +154,42 @@ mod tests {
         let name = "tests::a_full_disk_stops_writes_alone_and_they_go_on_when_there_is_room";
         match Interposer::loaded() {
             Some(interposer) => crate::lasting::full_disk(&interposer),
+            None => run_with_faults(name),
+        }
+    }
+
+    #[test]
+    fn after_a_commit_of_unknown_outcome_memory_says_what_the_database_says() {
+        let name = "tests::after_a_commit_of_unknown_outcome_memory_says_what_the_database_says";
+        match Interposer::loaded() {
+            Some(interposer) => uncertain::run(&interposer, uncertain::unknown),
+            None => run_with_faults(name),
+        }
+    }
+
+    #[test]
+    fn a_disk_that_hangs_locks_nobody_out_and_makes_no_threads_pile_up() {
+        let name = "tests::a_disk_that_hangs_locks_nobody_out_and_makes_no_threads_pile_up";
+        match Interposer::loaded() {
+            Some(interposer) => uncertain::run(&interposer, hanging::disk),
+            None => run_with_faults(name),
+        }
+    }
+
+    #[test]
+    fn memory_follows_a_commit_that_nobody_waits_for() {
+        let name = "tests::memory_follows_a_commit_that_nobody_waits_for";
+        match Interposer::loaded() {
+            Some(interposer) => uncertain::run(&interposer, uncertain::dropped),
+            None => run_with_faults(name),
+        }
+    }
+
+    #[test]
+    fn a_token_is_refused_after_its_revocation_whoever_waits_and_whatever_is_heard_of_the_commit() {
+        let name = "tests::a_token_is_refused_after_its_revocation_whoever_waits_and_whatever_is_heard_of_the_commit";
+        match Interposer::loaded() {
+            Some(interposer) => uncertain::run(&interposer, uncertain::revoked),
             None => run_with_faults(name),
         }
     }

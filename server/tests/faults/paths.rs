@@ -51,6 +51,11 @@ fn later() -> Timestamp {
     now() + SignedDuration::from_hours(24)
 }
 
+/// Runs of a robot's agent that are kept.
+const RUNS_KEPT: u32 = 3;
+/// Stops of a robot that are kept.
+const STOPS_KEPT: u32 = 3;
+
 const LONG_AGO: Timestamp = Timestamp::UNIX_EPOCH;
 
 pub(crate) const PATHS: &[WritePath] = &[
@@ -106,16 +111,16 @@ pub(crate) const PATHS: &[WritePath] = &[
                     capabilities: &hello.capabilities,
                     at: now(),
                 };
-                db::robots::introduce(tx, ground.site_pk, introduction).await?;
+                db::robots::introduce(tx, ground.site_pk, introduction, RUNS_KEPT).await?;
                 db::robots::rename(tx, ground.robot_pk, &format!("rover {number}")).await?;
                 db::robots::set_retired(tx, ground.robot_pk, Some(now())).await?;
                 db::robots::set_retired(tx, ground.robot_pk, None).await?;
                 db::robots::count_refused(tx, ground.robot_pk, 1, "a test").await?;
                 db::attendance::set_present(tx, ground.robot_pk, true).await?;
                 let other = BootId::from_uuid(uuid(number));
-                db::robots::boot_key(tx, ground.robot_pk, other).await?;
+                db::robots::boot_key(tx, ground.robot_pk, other, RUNS_KEPT).await?;
                 let configuration: ConfigurationId = of(json!(format!("{number:032x}")));
-                db::robots::configuration_key(tx, configuration)
+                db::robots::note_measured(tx, ground.robot_pk, configuration)
                     .await
                     .map(|_| ())
             }))
@@ -183,7 +188,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                 let event = of(json!({"at": now(), "actor": "server", "from": "queued",
                     "to": "queued", "cause": "noted", "reason": "a test"}));
                 db::history::add_event(tx, id, &event).await?;
-                let boot_pk = db::robots::boot_key(tx, ground.robot_pk, boot()).await?;
+                let boot_pk = db::robots::boot_key(tx, ground.robot_pk, boot(), RUNS_KEPT).await?;
                 let seq = i64::try_from(number).unwrap_or_default();
                 db::history::note_report(tx, boot_pk, seq).await
             }))
@@ -206,7 +211,7 @@ pub(crate) const PATHS: &[WritePath] = &[
         prepare: nothing,
         act: |ground, number| {
             Box::pin(ground.write(async move |tx| {
-                let boot_pk = db::robots::boot_key(tx, ground.robot_pk, boot()).await?;
+                let boot_pk = db::robots::boot_key(tx, ground.robot_pk, boot(), RUNS_KEPT).await?;
                 let origin = Origin {
                     boot_pk,
                     seq: i64::try_from(10 * number + 5).unwrap_or_default(),
@@ -265,7 +270,8 @@ pub(crate) const PATHS: &[WritePath] = &[
                     of(json!({"code": "test-alert", "severity": "warning", "text": "a test"}));
                 db::alerts::raise(tx, ground.robot_pk, id, &report, now()).await?;
                 db::alerts::acknowledge(tx, id, now()).await?;
-                db::alerts::clear(tx, ground.robot_pk, &report.code, now()).await
+                db::alerts::clear(tx, ground.robot_pk, &report.code, now()).await?;
+                db::alerts::forget(tx, ground.robot_pk, 3).await
             }))
         },
     },
@@ -278,9 +284,10 @@ pub(crate) const PATHS: &[WritePath] = &[
                     "id": uuid(number), "site": ground.site, "robot": ground.robot, "by": "a test",
                     "reason": "a test", "wanted_at": now(), "confirmed_at": null,
                     "unconfirmed": false, "clear_asked_by": null, "clear_asked_at": null,
-                    "cleared_at": null,
+                    "cleared_at": null, "replaced_by": null,
                 }));
-                db::stops::insert(tx, std::slice::from_ref(&stop)).await?;
+                db::stops::insert(tx, std::slice::from_ref(&stop), STOPS_KEPT).await?;
+                db::stops::adopt(tx, ground.robot_pk, &stop, STOPS_KEPT).await?;
                 db::stops::confirm(tx, &[stop.id], now()).await?;
                 db::stops::stand(tx, stop.id, now()).await?;
                 db::stops::unconfirm(tx, stop.id).await?;
@@ -298,11 +305,11 @@ pub(crate) const PATHS: &[WritePath] = &[
             Box::pin(ground.write(async move |tx| {
                 let id = TokenId::from_uuid(uuid(number));
                 let token = of(json!({
-                    "id": id, "name": format!("token {number}"), "role": "viewer",
+                    "id": id, "name": format!("token {number}"), "role": "viewer", "rights": ["stop", "read"], "sites": null,
                     "created_at": now(), "created_by": "a test", "expires_at": later(),
                     "revoked_at": null, "last_used_at": null,
                 }));
-                let kind = Kind::Token(tread_api::identity::Role::Viewer);
+                let kind = Kind::Token(Some(tread_api::identity::Role::Viewer));
                 db::tokens::insert(tx, &token, &fingerprint(kind, number)).await?;
                 let session = NewSession {
                     id: SessionId::from_uuid(uuid(number)),
@@ -326,12 +333,15 @@ pub(crate) const PATHS: &[WritePath] = &[
         act: |ground, _number| {
             Box::pin(ground.write(async move |tx| {
                 let entry = of(json!({
-                    "id": 0, "at": now(), "who": "a test", "token": null, "role": null,
+                    "id": 0, "at": now(), "since": null, "count": 1, "who": "a test", "token": null, "role": null,
                     "address": "127.0.0.1", "method": "GET", "route": "/", "path": "/",
                     "status": 200, "request_id": "1", "what": null,
+                    "previous_hash": null, "hash": null,
                 }));
-                db::audit::insert(tx, &entry).await?;
-                db::audit::forget(tx, LONG_AGO, 100, 10).await
+                let entries = [entry];
+                db::audit::append(tx, &entries).await?;
+                db::audit::append(tx, &entries).await?;
+                db::audit::forget(tx, LONG_AGO, 1, 10).await
             }))
         },
     },
@@ -357,7 +367,8 @@ pub(crate) const PATHS: &[WritePath] = &[
                 }));
                 db::enrolments::insert(tx, &enrolment).await?;
                 let one = (&ground.site, &ground.robot, enrolment.number);
-                db::enrolments::renew(tx, one, now(), later()).await?;
+                db::enrolments::renew(tx, one, now(), later(), "former").await?;
+                db::enrolments::note_authority(tx, one, "next").await?;
                 db::enrolments::revoke(tx, (&ground.site, &ground.robot), "a test", now()).await
             }))
         },

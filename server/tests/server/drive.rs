@@ -1,8 +1,11 @@
 //! Driving by hand over the WebSocket: one driver, observers, and a robot that stands whenever
 //! anything about its driver is wrong.
 
+use std::time::Duration;
+
 use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::{Value, json};
+use sqlx::{Connection as _, SqliteConnection};
 use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::{ClientRequestBuilder, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async};
@@ -10,10 +13,12 @@ use tread_api::drive::{DriveRefusal, DriveUpdate, DriveView, ReleaseCause};
 use tread_api::geometry::Twist;
 use tread_api::identity::Role;
 use tread_api::mission::MissionState;
+use tread_api::rights::Right;
 use tread_api::safety::Lease;
 use tread_api::wire::safety::LeaseAction;
+use tread_server::app::teleop::SESSIONS_PER_IDENTITY_MAX;
 
-use crate::harness::{PATIENCE, Yard, eventually};
+use crate::harness::{PATIENCE, Yard, database, eventually};
 use crate::robot::Robot;
 
 fn request(yard: &Yard, robot: &str, token: &str) -> ClientRequestBuilder {
@@ -146,7 +151,7 @@ async fn a_driver_drives_in_robot_time_and_losing_the_driver_lets_the_robot_stan
     let mut driver = Socket::open(&yard, "rover-1").await;
     driver.view(|view| view.heard_age_ms.is_some()).await;
     let lease = driver.acquire("Ann").await;
-    assert_eq!((lease.epoch, lease.driver.name.as_str()), (1, "Ann"));
+    assert_eq!((lease.epoch, lease.driver.name.as_str()), (1, "tests: Ann"));
     driver.drive(0.4).await;
     driven_at(&robot, 0.4).await;
     let state = robot.state();
@@ -175,7 +180,7 @@ async fn a_driver_drives_in_robot_time_and_losing_the_driver_lets_the_robot_stan
 
     // The other one sees it, may not drive, and its end changes nothing.
     let seen = observer.view(|view| view.safety.lease.is_some()).await;
-    assert_eq!(seen.safety.lease.unwrap().driver.name, "Ann");
+    assert_eq!(seen.safety.lease.unwrap().driver.name, "tests: Ann");
     observer.drive(1.0).await;
     let refused = observer.update().await;
     assert!(matches!(
@@ -409,6 +414,21 @@ async fn a_viewer_watches_and_stops_but_does_not_drive_and_a_revoked_token_ends_
         ),
         "{refused:?}"
     );
+    let rights = [Right::Dispatch, Right::ClearStop];
+    let dispatcher = yard.limited("desk", &rights, &[]).await;
+    let mut desk = Socket::open_as(&yard, "rover-1", &dispatcher).await;
+    desk.send(&json!({"take": {"name": "Dan"}})).await;
+    let refused = desk.update().await;
+    assert!(
+        matches!(refused, DriveUpdate::Refused { .. }),
+        "{refused:?}"
+    );
+    let driver = yard
+        .limited("hands", &[Right::Drive], &["yard/rover-1"])
+        .await;
+    let mut hands = Socket::open_as(&yard, "rover-1", &driver).await;
+    hands.acquire("Ann").await;
+    hands.send(&json!({"release": {}})).await;
     socket.send(&json!({"stop": {}})).await;
     let DriveUpdate::Stopped(stop) = socket.update().await else {
         panic!("a viewer could not stop");
@@ -419,5 +439,102 @@ async fn a_viewer_watches_and_stops_but_does_not_drive_and_a_revoked_token_ends_
         .delete(yard.url(&format!("/v1/tokens/{}", viewer.token.id)));
     assert!(yard.send(revoke).await.0.is_success());
     assert_eq!(socket.closed().await, 1008);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn missions_are_held_for_a_driver_also_if_that_cannot_be_written_down_at_first() {
+    /// Longer than the server waits to write.
+    const LOCKED_FOR: Duration = Duration::from_secs(12);
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    let mut socket = Socket::open(&yard, "rover-1").await;
+    let path = format!("sqlite:{}", database(yard.folder.path()).display());
+    let mut other = SqliteConnection::connect(&path).await.unwrap();
+    sqlx::query("BEGIN IMMEDIATE")
+        .execute(&mut other)
+        .await
+        .unwrap();
+    socket.acquire("desk").await;
+    tokio::time::sleep(LOCKED_FOR).await;
+    assert!(!yard.mission(mission.id).await.mission.pause_wanted);
+    sqlx::query("ROLLBACK").execute(&mut other).await.unwrap();
+    eventually("the mission is held", async || {
+        let detail = yard.mission(mission.id).await;
+        if detail.mission.pause_wanted {
+            Ok(())
+        } else {
+            Err(detail)
+        }
+    })
+    .await;
+    drop(socket);
+    drop(robot);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_viewer_holds_its_share_of_the_sockets_and_no_more() {
+    let yard = Yard::start().await;
+    let _robot = Robot::join(&yard, "rover-1").await;
+    let viewer = yard.token("screen", Role::Viewer).await.secret;
+    let mut held = Vec::new();
+    for _ in 0..SESSIONS_PER_IDENTITY_MAX {
+        held.push(Socket::open_as(&yard, "rover-1", &viewer).await);
+    }
+    let refused = connect_async(request(&yard, "rover-1", &viewer)).await;
+    let said = refused.map(|_| ()).unwrap_err().to_string();
+    assert!(said.contains("409"), "{said}");
+    // Whoever drives is not concerned.
+    let _driver = Socket::open(&yard, "rover-1").await;
+    drop(held.pop());
+    eventually("the place is free again", async || {
+        let again = connect_async(request(&yard, "rover-1", &viewer)).await;
+        again.map(|_| ()).map_err(|error| error.to_string())
+    })
+    .await;
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_list_is_no_command_and_a_stop_is_one_whatever_is_wrong_with_it() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    for frame in [
+        json!({"drive": [1.0, 2.0, 250]}),
+        json!({"acquire": ["Ann"]}),
+        json!({"take": ["Ann"]}),
+        json!({"release": []}),
+        json!({"drive": {"linear_m_s": [1.0], "angular_rad_s": 0.0}}),
+        json!([{"release": {}}]),
+    ] {
+        let mut socket = Socket::open(&yard, "rover-1").await;
+        socket.send(&frame).await;
+        let update = socket.update().await;
+        assert!(
+            matches!(update, DriveUpdate::Ended { .. }),
+            "{frame}: {update:?}"
+        );
+    }
+    assert!(robot.leases().is_empty() && robot.drives().is_empty());
+    for (count, frame) in [
+        json!({"stop": [1, 2]}),
+        json!({"stop": {"reason": 5, "loud": true}}),
+        json!({"stop": {}, "drive": {}}),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let mut socket = Socket::open(&yard, "rover-1").await;
+        socket.send(&frame).await;
+        let update = socket.update().await;
+        assert!(
+            matches!(update, DriveUpdate::Stopped(_)),
+            "{frame}: {update:?}"
+        );
+        assert_eq!(robot.stops().len(), count + 1, "{frame}");
+    }
     yard.server.stop().await.unwrap();
 }

@@ -3,13 +3,17 @@
 use std::time::Duration;
 
 use reqwest::StatusCode;
+use serde_json::json;
+use tread_api::ids::MissionId;
+use tread_api::mission::{MissionEvent, MissionState};
 use tread_api::wire::ingest::MissionPhase;
+use tread_server::db;
 
-use crate::harness::Yard;
+use crate::harness::{Yard, time};
 use crate::robot::Robot;
 
 /// Reads events of a stream until one fits.
-async fn read_until(
+pub(crate) async fn read_until(
     response: &mut reqwest::Response,
     text: &mut String,
     is_it: impl Fn(&str) -> bool,
@@ -76,5 +80,55 @@ async fn events_begin_with_a_snapshot_follow_what_happens_and_resume() {
         assert_eq!(status, StatusCode::BAD_REQUEST, "{body}");
         assert!(body["detail"].as_str().unwrap().contains(named), "{body}");
     }
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_mission_that_does_not_read_keeps_no_other_from_being_told() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mut missions = Vec::new();
+    for _ in 0..8 {
+        missions.push(yard.create_mission(&robot.id).await.id);
+    }
+    yard.mission_becomes(missions[0], MissionState::Active)
+        .await;
+    let request = yard.client().get(yard.url("/v1/events?topics=missions"));
+    let mut stream = request.send().await.unwrap();
+    let mut text = String::new();
+    read_until(&mut stream, &mut text, |text| {
+        text.contains("event: snapshot_end")
+    })
+    .await;
+    let damaged = missions.remove(4);
+    let mut tx = yard.server.app().db().write().await.unwrap();
+    sqlx::query("UPDATE missions SET trajectory = '{' WHERE id = ?")
+        .bind(damaged.to_string())
+        .execute(&mut *tx)
+        .await
+        .unwrap();
+    let step: MissionEvent = serde_json::from_value(json!({
+        "at": time("2026-11-01T00:00:00Z"), "actor": "server", "from": "queued", "to": "queued",
+        "cause": "noted", "reason": "all of them move at once",
+    }))
+    .unwrap();
+    for &id in missions.iter().chain([&damaged]) {
+        db::history::add_event(&mut tx, id, &step).await.unwrap();
+    }
+    tx.commit().await.unwrap();
+    let mut text = String::new();
+    let is_told = |text: &str, kind: &str, id: MissionId| {
+        let mut events = text.split("\n\n");
+        events.any(|event| event.contains(kind) && event.contains(&id.to_string()))
+    };
+    read_until(&mut stream, &mut text, |text| {
+        let all = missions
+            .iter()
+            .all(|&id| is_told(text, "event: mission", id));
+        all && is_told(text, "event: step", damaged)
+    })
+    .await;
+    drop(stream);
+    drop(robot);
     yard.server.stop().await.unwrap();
 }

@@ -10,7 +10,7 @@ use tread_api::friction::{
     Segment, TerrainFriction, TerrainHistory, VisitSuggestion,
 };
 use tread_api::ids::ConfigurationId;
-use tread_api::page::{MapPage, Page};
+use tread_api::page::{DifferencePage, MapPage, Page};
 use tread_api::tile::Tile;
 use tread_api::wire::ingest::Record;
 use tread_server::friction::index::Normalisation;
@@ -175,9 +175,23 @@ async fn a_terrain_has_a_history_and_cells_differ_between_two_times() {
         iced
     });
     three.upload(numbered(iced)).await.unwrap();
-    let differences: Page<CellDifference> = yard
+    let differences: DifferencePage<CellDifference> = yard
         .get(&format!("{BASE}/difference?from={}", after_h(8)))
         .await;
+    // Within an hour nothing tells what came first, so it begins with the hour, and says so.
+    let from = differences.from.unwrap();
+    let rounded_by = after_h(8).duration_since(from);
+    assert!((0..3_600).contains(&rounded_by.as_secs()), "{from}");
+    assert_eq!(from.as_second() % 3_600, 0, "{from}");
+    let path = format!(
+        "{BASE}/difference?from={}",
+        from + SignedDuration::from_mins(20)
+    );
+    let within: DifferencePage<CellDifference> = yard.get(&path).await;
+    assert_eq!(
+        (within.from, within.items),
+        (Some(from), differences.items.clone())
+    );
     let [item] = differences.items.as_slice() else {
         panic!("only one cell was measured since: {differences:?}");
     };

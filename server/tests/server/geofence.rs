@@ -82,6 +82,25 @@ async fn a_geofence_reaches_the_robots_and_refuses_ways_that_leave_it_with_the_p
     assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{body}");
     let x_m = body["place"]["point"]["x_m"].as_f64().unwrap();
     assert!((-0.8..-0.3).contains(&x_m), "{body}");
+    // The mission itself is clear of the wall, but its robot comes from where its queue ends.
+    let way = |from: f64, to: f64| {
+        json!({"site": "yard", "robot": "rover-2", "trajectory": {"waypoints": {
+            "speed_m_s": 0.5, "points": [{"x_m": from, "y_m": 0}, {"x_m": to, "y_m": 0}]}}})
+    };
+    let second = Robot::join(&yard, "rover-2").await;
+    let (status, body) = yard.post(missions, &way(-8.0, -5.0)).await;
+    assert_eq!(status, StatusCode::CREATED, "{body}");
+    let mut beyond = way(3.0, 6.0);
+    for path in [missions, "/v1/trajectories/check"] {
+        let (status, body) = yard.post(path, &beyond).await;
+        assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{path}: {body}");
+        assert_eq!(body["type"], "/problems/crosses-geofence", "{path}: {body}");
+    }
+    // In place of what is queued it begins where it says.
+    beyond["start_policy"] = json!("replace");
+    let (status, body) = yard.post(missions, &beyond).await;
+    assert_eq!(status, StatusCode::CREATED, "{body}");
+    drop(second);
     eventually("the robot has the wall", async || {
         let sites = robot.sites();
         if sites.len() == count + 1 {

@@ -14,12 +14,14 @@ use tread_api::friction::{Information, Segment};
 use tread_api::identity::{CreateToken, CreatedToken, Role};
 use tread_api::ids::{MissionId, RobotId, SiteId};
 use tread_api::mission::{Mission, MissionDetail, MissionState};
-use tread_api::robot::{RobotLimits, RobotModel};
+use tread_api::rights::{Right, Scope};
+use tread_api::robot::RobotModel;
 use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, Record, RecordContent};
 use tread_api::wire::{self, Refusal};
-use tread_server::app::identity::FirstAdmin;
+use tread_samples::rover;
+use tread_server::app::identity::tokens::FirstAdmin;
 use tread_server::authority::Authority;
 use tread_server::clock::Clock;
 use tread_server::config::{FrictionConfig, RobotsConfig, StorageConfig, TlsFiles, WebConfig};
@@ -162,16 +164,28 @@ impl Yard {
 
     /// The secret of a new token.
     pub(crate) async fn token(&self, name: &str, role: Role) -> CreatedToken {
-        let request = CreateToken {
-            name: name.to_owned(),
-            role,
-            valid_days: None,
+        self.given(CreateToken::of_role(name, role)).await
+    }
+
+    /// The secret of a new token with rights of its own, for what each name says: `site` or
+    /// `site/robot`; everywhere without any.
+    pub(crate) async fn limited(&self, name: &str, rights: &[Right], places: &[&str]) -> String {
+        let scope = match places {
+            [] => Scope::EVERYWHERE,
+            places => Scope::from_names(places.iter().copied()).unwrap(),
         };
-        self.server
-            .app()
-            .create_token(request, "test")
-            .await
-            .unwrap()
+        let request = CreateToken {
+            role: None,
+            rights: Some(rights.to_vec()),
+            sites: scope.into(),
+            ..CreateToken::of_role(name, Role::Viewer)
+        };
+        self.given(request).await.secret
+    }
+
+    async fn given(&self, request: CreateToken) -> CreatedToken {
+        let app = self.server.app();
+        app.create_token(request, "test").await.unwrap()
     }
 
     /// Stops the server and starts another on the same database and network address.
@@ -268,10 +282,12 @@ pub(crate) fn config(folder: &Path, zenoh: &str) -> Config {
         storage: StorageConfig::default(),
         tls: None,
         robots: None,
+        audit: tread_server::config::AuditConfig::default(),
         web: WebConfig {
             hosts: vec!["tread.test".to_owned()],
             allowed_origins: vec!["https://dash.test".parse().unwrap()],
             behind_https: false,
+            trusted_proxies: Vec::new(),
         },
     }
 }
@@ -290,24 +306,7 @@ pub(crate) fn circle(robot: &RobotId) -> Value {
 }
 
 pub(crate) fn model() -> RobotModel {
-    RobotModel {
-        name: "test rover".to_owned(),
-        tyres: "lugged".to_owned(),
-        mass_kg: 50.0,
-        track_width_m: 0.6,
-        wheelbase_m: 0.5,
-        wheel_radius_m: 0.15,
-        yaw_inertia_kg_m2: 3.0,
-        limits: RobotLimits {
-            linear_max_m_s: 2.0,
-            angular_max_rad_s: 1.5,
-            linear_acceleration_max_m_s2: 1.0,
-            lateral_acceleration_max_m_s2: 1.0,
-            linear_jerk_max_m_s3: 5.0,
-            wheel_speed_max_rad_s: 20.0,
-            wheel_acceleration_max_rad_s2: 50.0,
-        },
-    }
+    rover("test rover", "lugged")
 }
 
 /// A measurement of θ 0.2 with a deviation of 0.01, an hour apart for each 3600 of `second`.

@@ -75,10 +75,19 @@ impl Writer {
         robot: &str,
         records: Vec<Record>,
     ) -> oneshot::Receiver<Result<Receipt, tread_api::wire::Refusal>> {
+        self.send(robot, boot(1), records).await
+    }
+
+    async fn send(
+        &self,
+        robot: &str,
+        boot: BootId,
+        records: Vec<Record>,
+    ) -> oneshot::Receiver<Result<Receipt, tread_api::wire::Refusal>> {
         let (answer, answered) = oneshot::channel();
         let batch = Batch {
             robot: robot.parse().unwrap(),
-            boot: boot(1),
+            boot,
             robot_time: None,
             records,
         };
@@ -94,6 +103,16 @@ impl Writer {
     /// Uploads, and waits for the answer.
     pub(crate) async fn upload_as(&self, robot: &str, records: Vec<Record>) -> Receipt {
         self.upload(robot, records).await.await.unwrap().unwrap()
+    }
+
+    /// The same as one run of its agent, with what it is refused.
+    pub(crate) async fn upload_of(
+        &self,
+        robot: &str,
+        boot: BootId,
+        records: Vec<Record>,
+    ) -> Result<Receipt, tread_api::wire::Refusal> {
+        self.send(robot, boot, records).await.await.unwrap()
     }
 
     pub(crate) async fn sums(&self) -> Vec<SumRow> {

@@ -6,6 +6,8 @@ mod alerts;
 #[cfg(test)]
 mod bad_input;
 #[cfg(test)]
+mod bounds;
+#[cfg(test)]
 mod clock;
 #[cfg(test)]
 mod control;
@@ -17,6 +19,8 @@ mod dry_run;
 mod events;
 #[cfg(test)]
 mod exports;
+#[cfg(test)]
+mod flood;
 #[cfg(test)]
 mod friction;
 #[cfg(test)]
@@ -45,6 +49,8 @@ mod page;
 mod pictures;
 #[cfg(test)]
 mod program;
+#[cfg(test)]
+mod request_bodies;
 #[cfg(test)]
 mod resources;
 #[cfg(test)]

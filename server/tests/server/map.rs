@@ -41,7 +41,9 @@ async fn upload_at(writer: &Writer, robot_time: Option<&str>, records: Vec<Recor
 }
 
 async fn aside(writer: &Writer) -> u64 {
-    let page = writer.app.robots(&site(), None, false, 10).await.unwrap();
+    let everywhere = tread_api::rights::Scope::EVERYWHERE;
+    let place = (&site(), &everywhere);
+    let page = writer.app.robots(place, None, false, 10).await.unwrap();
     page.items[0].measurements.aside
 }
 

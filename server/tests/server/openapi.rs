@@ -17,6 +17,41 @@ fn the_description_is_the_committed_one() {
     );
 }
 
+/// All references in a description.
+fn references(value: &serde_json::Value, found: &mut Vec<String>) {
+    match value {
+        serde_json::Value::Object(fields) => {
+            found.extend(
+                fields
+                    .get("$ref")
+                    .and_then(|to| to.as_str())
+                    .map(str::to_owned),
+            );
+            fields.values().for_each(|field| references(field, found));
+        }
+        serde_json::Value::Array(items) => items.iter().for_each(|item| references(item, found)),
+        serde_json::Value::Null
+        | serde_json::Value::Bool(_)
+        | serde_json::Value::Number(_)
+        | serde_json::Value::String(_) => {}
+    }
+}
+
+#[test]
+fn everything_that_the_description_refers_to_is_in_it() {
+    let description = serde_json::to_value(tread_server::http::openapi()).unwrap();
+    let mut found = Vec::new();
+    references(&description, &mut found);
+    assert!(found.len() > 100);
+    for reference in found {
+        let pointer = reference.trim_start_matches('#');
+        assert!(
+            description.pointer(pointer).is_some(),
+            "{reference} is missing"
+        );
+    }
+}
+
 #[test]
 fn every_operation_has_a_name_of_its_own() {
     let description = serde_json::to_value(tread_server::http::openapi()).unwrap();

@@ -4,7 +4,7 @@ use std::os::unix::fs::PermissionsExt as _;
 use std::process::{Command, Output, Stdio};
 use std::time::Duration;
 
-use crate::harness::{PATIENCE, client, eventually};
+use crate::harness::{PATIENCE, client, eventually, folder_of_the_crate};
 
 fn program(arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_tread-server"));
@@ -57,6 +57,8 @@ async fn the_program_starts_makes_its_database_and_stops_when_asked() {
     let folder = tempfile::tempdir().unwrap();
     let database = folder.path().join("tread.db");
     let log = std::fs::File::create(folder.path().join("log")).unwrap();
+    let config = folder.path().join("tread.toml");
+    std::fs::write(&config, "[audit]\nlog = true\n").unwrap();
     let arguments = [
         "--http=127.0.0.1:0",
         "--zenoh=127.0.0.1:0",
@@ -65,6 +67,7 @@ async fn the_program_starts_makes_its_database_and_stops_when_asked() {
     ];
     let mut child = program(&arguments)
         .arg(format!("--database={}", database.display()))
+        .arg(format!("--config={}", config.display()))
         .stderr(log)
         .spawn()
         .unwrap();
@@ -123,6 +126,19 @@ async fn the_program_starts_makes_its_database_and_stops_when_asked() {
         },
     )
     .await;
+    let creating = client(Some(newer.trim())).post(format!("{address}/v1/sites"));
+    let creating = creating.json(&serde_json::json!({"id": "annex"}));
+    assert_eq!(creating.send().await.unwrap().status(), 201);
+    eventually("the entry is in the log with its hash", async || {
+        let log = std::fs::read_to_string(folder.path().join("log")).unwrap();
+        let lines = log.lines().filter(|line| line.contains("tread_audit"));
+        let mut lines = lines.filter(|line| line.contains("annex"));
+        match lines.next() {
+            Some(line) if line.contains("\"hash\":\"") => Ok(()),
+            Some(_) | None => Err(log),
+        }
+    })
+    .await;
     let asked = Command::new("kill")
         .arg(child.id().to_string())
         .status()
@@ -131,4 +147,21 @@ async fn the_program_starts_makes_its_database_and_stops_when_asked() {
     let ended = tokio::task::spawn_blocking(move || child.wait().unwrap());
     let ended = tokio::time::timeout(PATIENCE + Duration::from_secs(10), ended).await;
     assert_eq!(ended.unwrap().unwrap().code(), Some(0));
+}
+
+#[test]
+fn a_release_checks_the_sums_of_our_own_crates_for_overflow() {
+    let manifest = folder_of_the_crate().join("../Cargo.toml");
+    let manifest: toml::Table = std::fs::read_to_string(manifest).unwrap().parse().unwrap();
+    let release = &manifest["profile"]["release"];
+    assert_eq!(release["overflow-checks"].as_bool(), Some(true));
+    let packages = release["package"].as_table().unwrap();
+    let members = manifest["workspace"]["members"].as_array().unwrap();
+    for member in members {
+        let name = format!("tread-{}", member.as_str().unwrap());
+        assert!(
+            !packages.contains_key(&name),
+            "{name} has a profile of its own"
+        );
+    }
 }

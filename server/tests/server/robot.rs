@@ -216,7 +216,8 @@ impl Robot {
         Self::join(yard, id.as_str()).await
     }
 
-    async fn hello(&self) -> Welcome {
+    /// Introduces itself until it is answered.
+    pub(crate) async fn hello(&self) -> Welcome {
         let hello = Hello {
             robot: self.id.clone(),
             boot: self.boot,

@@ -6,11 +6,12 @@ use std::time::Duration;
 use jiff::Timestamp;
 use reqwest::StatusCode;
 use serde_json::{Value, json};
+use tokio::io::AsyncWriteExt as _;
 use tokio::time::Instant;
 use tread_api::keys::Verb;
 use tread_api::mission::{Mission, MissionState};
 use tread_api::page::Page;
-use tread_api::robot::{Alert, AlertReport, MissionProgress, PauseCause, Severity};
+use tread_api::robot::{Alert, AlertReport, FAULT_TEXT_MAX, MissionProgress, PauseCause, Severity};
 use tread_api::safety::{StandingState, StandingStatus};
 use tread_api::stop::{FleetStop, Stop};
 use tread_api::wire::ingest::{MissionPhase, Record, RecordContent};
@@ -64,7 +65,7 @@ async fn a_stop_is_confirmed_shown_and_cleared_and_nothing_goes_on_by_itself() {
             heard[0].by.as_str(),
             heard[0].reason.as_str()
         ),
-        (stop.id, "Ann", "a child on the yard")
+        (stop.id, "tests: Ann", "a child on the yard")
     );
     let held = eventually("all missions are held", async || {
         let held = (
@@ -94,7 +95,7 @@ async fn a_stop_is_confirmed_shown_and_cleared_and_nothing_goes_on_by_itself() {
     assert_eq!(status, StatusCode::OK, "{body}");
     let cleared: Stop = serde_json::from_value(body).unwrap();
     assert!(cleared.cleared_at.is_some());
-    assert_eq!(cleared.clear_asked_by.as_deref(), Some("Bob"));
+    assert_eq!(cleared.clear_asked_by.as_deref(), Some("tests: Bob"));
 
     // The mission in hand ends; the queue does not move until somebody says so.
     robot.report(0, &driven, MissionPhase::Failed).await;
@@ -413,18 +414,18 @@ async fn a_clear_names_the_newest_stop_and_reaches_the_robot_or_nothing_is_clear
     let (status, body) = yard.post(CLEAR, &json!({"stop": second.id})).await;
     assert_eq!(status, StatusCode::SERVICE_UNAVAILABLE, "{body}");
     let page: Page<Stop> = yard.get("/v1/stops?in_force=true").await;
-    assert_eq!(page.items.len(), 2);
+    let ids: Vec<_> = page.items.iter().map(|stop| stop.id).collect();
+    assert_eq!(ids, [second.id]);
+    let page: Page<Stop> = yard.get("/v1/stops").await;
+    let replaced = page.items.iter().find(|stop| stop.id == first.id);
+    assert_eq!(replaced.unwrap().replaced_by, Some(second.id));
     let robot = Robot::join(&yard, "rover-1").await;
     // A robot that came back without the stop, although somebody had asked to clear it, has
     // cleared it as far as anyone knows; a clear now is harmless.
     let (status, body) = yard.post(CLEAR, &json!({"stop": second.id})).await;
     assert_eq!(status, StatusCode::OK, "{body}");
     let page: Page<Stop> = yard.get("/v1/stops?in_force=true").await;
-    assert!(
-        page.items.is_empty(),
-        "the older one is covered: {:?}",
-        page.items
-    );
+    assert!(page.items.is_empty(), "{:?}", page.items);
     drop(robot);
     yard.server.stop().await.unwrap();
 }
@@ -488,5 +489,156 @@ async fn a_stop_whose_body_is_wrong_or_missing_stops_all_the_same() {
         (status, body["type"].as_str()),
         (StatusCode::NOT_FOUND, Some("/problems/unknown-robot"))
     );
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_can_be_read_of_a_stop_counts_and_only_a_site_that_is_none_is_refused() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let ask = |media_type: &'static str, body: &'static str| {
+        let asked = yard.client().post(yard.url("/v1/stop"));
+        asked.header("content-type", media_type).body(body)
+    };
+    let json = "application/json";
+    for (media_type, body) in [
+        (json, r#"{"site": "Yard 1"}"#),
+        (json, r#"{"site": 7}"#),
+        (json, r#"{"site": ["yard"], "by": "Ann"}"#),
+        ("text/plain", r#"{"site": ""}"#),
+    ] {
+        let (status, said) = yard.send(ask(media_type, body)).await;
+        assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{body}: {said}");
+        assert_eq!(said["field"], "site", "{said}");
+        assert!(robot.stops().is_empty(), "{body}");
+    }
+    let (status, _) = yard.send(ask(json, r#"{"site": "elsewhere"}"#)).await;
+    assert_eq!(status, StatusCode::NOT_FOUND);
+    for (count, (media_type, body, reason)) in [
+        (json, "", "no reason was given"),
+        (json, r#"{"site": nul"#, "no reason was given"),
+        (
+            "application/x-www-form-urlencoded",
+            "site=yard",
+            "no reason was given",
+        ),
+        (json, r#"["yard", "Ann", "smoke"]"#, "no reason was given"),
+        (
+            json,
+            r#"{"site": null, "reason": "smoke", "reson": 1}"#,
+            "smoke",
+        ),
+        (
+            "text/plain",
+            r#"{"site": "yard", "by": 5, "reason": "a\u001b[2J\u202e\nb"}"#,
+            "a [2J  b",
+        ),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let (status, said) = yard.send(ask(media_type, body)).await;
+        assert_eq!(status, StatusCode::OK, "{body}: {said}");
+        let stop = &said["stops"][0];
+        assert_eq!(
+            (&stop["by"], &stop["reason"]),
+            (&json!("tests"), &json!(reason))
+        );
+        assert_eq!(robot.stops().len(), count + 1, "{body}");
+    }
+    // A body that does not come keeps no robot going.
+    let mut slow = tokio::net::TcpStream::connect(yard.server.http_address())
+        .await
+        .unwrap();
+    let head = format!(
+        "POST {STOP} HTTP/1.1\r\nhost: localhost\r\nauthorization: Bearer {}\r\n\
+         content-length: 100\r\n\r\n{{",
+        yard.admin()
+    );
+    slow.write_all(head.as_bytes()).await.unwrap();
+    let count = robot.stops().len();
+    eventually("the robot is stopped", async || match robot.stops().len() {
+        stops if stops > count => Ok(()),
+        stops => Err(stops),
+    })
+    .await;
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_a_robot_says_is_bounded_and_moves_no_cursor() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    robot.say(|state| state.fault = Some(format!("\u{1b}[2J{}", "x".repeat(200_000))));
+    let fault = eventually("the fault is shown", async || {
+        let (_, robot) = yard.get_value("/v1/sites/yard/robots/rover-1").await;
+        let fault = robot["live"]["fault"].as_str().map(str::to_owned);
+        fault.ok_or(robot)
+    })
+    .await;
+    assert!(fault.chars().count() <= FAULT_TEXT_MAX);
+    assert!(fault.starts_with("[2Jxx"), "{}", &fault[..20]);
+    for name in ["a\u{1b}[2Jb", "a\0b", "a\nb", "a\u{202e}b", "\u{2066}"] {
+        let path = "/v1/sites/yard/robots/rover-1";
+        let renamed = yard
+            .client()
+            .patch(yard.url(path))
+            .json(&json!({"name": name}));
+        let (status, said) = yard.send(renamed).await;
+        assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{said}");
+        for (path, body) in [
+            ("/v1/tokens", json!({"name": name, "role": "viewer"})),
+            ("/v1/sites", json!({"id": "field", "name": name})),
+        ] {
+            let (status, said) = yard.post(path, &body).await;
+            assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{path}: {said}");
+            assert_eq!(said["field"], "name", "{said}");
+        }
+    }
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_clear_of_what_a_robot_showed_last_does_not_end_a_newer_stop_that_it_has_not_heard() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let stop = async |by: &str| -> Stop {
+        let (status, body) = yard
+            .post("/v1/sites/yard/robots/rover-1/stop", &json!({"by": by}))
+            .await;
+        assert_eq!(status, StatusCode::OK, "{body}");
+        serde_json::from_value(body).unwrap()
+    };
+    let first = stop("Ann").await;
+    eventually("the robot shows its stop", async || {
+        let seen: tread_api::robot::Robot = yard.get("/v1/sites/yard/robots/rover-1").await;
+        let latch = seen.live.as_ref().and_then(|live| live.safety.stop.clone());
+        match latch {
+            Some(latch) if latch.id == first.id => Ok(()),
+            other => Err(other),
+        }
+    })
+    .await;
+    drop(robot);
+    let second = stop("Bob").await;
+    let (status, body) = yard
+        .post(CLEAR, &json!({"stop": first.id, "by": "Cid"}))
+        .await;
+    assert_ne!(status, StatusCode::OK, "{body}");
+    let open: Page<Stop> = yard.get("/v1/stops?in_force=true").await;
+    let [open] = open.items.as_slice() else {
+        panic!("one stop is open: {open:?}");
+    };
+    assert_eq!((open.id, open.confirmed_at), (second.id, None));
+    let robot = Robot::join(&yard, "rover-1").await;
+    eventually("the robot hears of the newer stop", async || {
+        let heard: Vec<_> = robot.stops().iter().map(|heard| heard.stop).collect();
+        if heard.contains(&second.id) {
+            Ok(())
+        } else {
+            Err(heard)
+        }
+    })
+    .await;
     yard.server.stop().await.unwrap();
 }

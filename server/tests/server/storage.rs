@@ -1,6 +1,6 @@
 //! A database of one server alone, and one that is damaged.
 
-use std::os::unix::fs::FileExt as _;
+use std::os::unix::fs::{FileExt as _, PermissionsExt as _};
 
 use reqwest::StatusCode;
 use sqlx::{Connection as _, SqliteConnection};
@@ -173,5 +173,43 @@ async fn a_database_that_another_process_holds_refuses_writes_until_it_is_let_go
     ready.await;
     yard.create_mission(&robot.id).await;
     drop(robot);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_files_of_the_database_are_its_owners_whatever_the_umask_is() {
+    // This test has a process of its own.
+    nix::sys::stat::umask(nix::sys::stat::Mode::empty());
+    let yard = Yard::start_joining_at(time("2026-11-01T00:00:00Z")).await;
+    let (status, _) = yard
+        .post("/v1/sites", &serde_json::json!({"id": "field"}))
+        .await;
+    assert_eq!(status, StatusCode::CREATED);
+    let mut seen = Vec::new();
+    let mut folders = vec![yard.folder.path().to_owned()];
+    while let Some(folder) = folders.pop() {
+        for file in std::fs::read_dir(folder).unwrap() {
+            let path = file.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+                continue;
+            }
+            let name = path.file_name().unwrap().to_string_lossy().into_owned();
+            let mode = std::fs::metadata(&path).unwrap().permissions().mode() & 0o777;
+            // The authority's certificate is for everybody.
+            let is_public = name == "ca.pem";
+            assert!(is_public || mode == 0o600, "{name} has the mode {mode:o}");
+            seen.push(name);
+        }
+    }
+    for name in [
+        "tread.db",
+        "tread.db-wal",
+        "tread.db-shm",
+        "tread.db.lock",
+        "ca.key",
+    ] {
+        assert!(seen.iter().any(|seen| seen == name), "{name}: {seen:?}");
+    }
     yard.server.stop().await.unwrap();
 }

@@ -18,7 +18,7 @@ use tread_api::ids::{MissionId, RobotId, SiteId};
 use tread_api::mission::{MissionDetail, MissionState};
 use tread_api::robot::{LinkState, Robot, RobotModel};
 use tread_api::trajectory::Trajectory;
-use tread_server::app::identity::FirstAdmin;
+use tread_server::app::identity::tokens::FirstAdmin;
 use tread_server::clock::Clock;
 use tread_server::config::ServerArgs;
 use tread_server::{Config, RunningServer, Server};

@@ -1,9 +1,15 @@
 //! Robots join, show certificates, renew them while they drive, and are put out.
 
 use std::path::Path;
+use std::time::Duration;
 
+use serde_json::json;
+use tread_agent::membership::Membership;
+use tread_api::enrolment::{AuthorityRotation, FleetAuthority};
+use tread_api::identity::AuditEntry;
 use tread_api::ids::RobotId;
 use tread_api::mission::MissionState;
+use tread_api::problem::ProblemType;
 use tread_api::robot::LinkState;
 use tread_tests::fleet::Fleet;
 use tread_tests::wait::{DRIVE, SHORT, eventually};
@@ -63,4 +69,176 @@ async fn a_robot_joins_drives_a_circle_renews_on_the_way_and_is_put_out() {
         .rest
         .mission_reaches(next, &[MissionState::Succeeded], DRIVE)
         .await;
+}
+
+/// Long enough that no robot renews by the time of its certificate within a test.
+const LONG_CERTIFICATE_S: u32 = 86_400;
+const ROTATION: &str = "/v1/authority/rotation";
+const FINISH: &str = "/v1/authority/rotation/finish";
+
+/// How many authorities a robot trusts, as its file says.
+fn trusted_by(fleet: &Fleet, robot: &RobotId) -> usize {
+    let joined = Membership::load(&fleet.robot_folder(robot)).expect("the file reads");
+    let joined = joined.expect("the robot has joined");
+    joined.authority.matches("BEGIN CERTIFICATE").count()
+}
+
+/// Waits until these robots are left of a rotation, and no others.
+async fn robots_left_are(fleet: &Fleet, expected: &[&RobotId]) {
+    let look = || fleet.rest.get::<FleetAuthority>("/v1/authority");
+    let names = |rotation: &AuthorityRotation| {
+        let left = rotation.left.iter().map(|left| left.robot.clone());
+        left.collect::<Vec<_>>()
+    };
+    let expected: Vec<RobotId> = expected.iter().map(|&robot| robot.clone()).collect();
+    let what = format!("{expected:?} are left");
+    eventually(&what, SHORT, look, |seen| {
+        seen.rotation.as_ref().map(names) == Some(expected.clone())
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_authority_is_rotated_under_a_robot_that_drives_and_one_that_comes_back_in_time() {
+    let mut fleet = secure_fleet(LONG_CERTIFICATE_S).await;
+    let [driving, away] = ["rover-1", "rover-2"].map(|name| name.parse::<RobotId>().unwrap());
+    for (robot, x_m) in [(&away, 20.0), (&driving, 0.0)] {
+        fleet.join(robot).await;
+        fleet.start_agent(robot, x_m).await;
+    }
+    fleet.kill_agent(&away);
+    let circle = fleet.rest.send(&driving, arc(0.0, 2.0)).await;
+    let active = [MissionState::Active];
+    fleet.rest.mission_reaches(circle, &active, SHORT).await;
+    let refused = ProblemType::AuthorityRotation;
+    fleet.rest.post_refused(FINISH, &json!({}), refused).await;
+    let before: FleetAuthority = fleet.rest.get("/v1/authority").await;
+    assert_eq!(before.rotation, None);
+
+    fleet.rest.post(ROTATION, &json!({})).await;
+    let refused = ProblemType::AuthorityRotation;
+    fleet.rest.post_refused(ROTATION, &json!({}), refused).await;
+    robots_left_are(&fleet, &[&away]).await;
+    assert_eq!(trusted_by(&fleet, &driving), 2);
+    assert_eq!(trusted_by(&fleet, &away), 1);
+
+    // As a power cut would, in the middle of it.
+    fleet.kill_server();
+    fleet.start_server().await;
+    robots_left_are(&fleet, &[&away]).await;
+    let during: FleetAuthority = fleet.rest.get("/v1/authority").await;
+    assert_ne!(during.signing, before.signing);
+    assert_eq!(during.rotation.unwrap().retiring, before.signing);
+    let refused = fleet
+        .rest
+        .post_refused(FINISH, &json!({}), ProblemType::RobotsLeft)
+        .await;
+    assert!(
+        refused["detail"].as_str().unwrap().contains("rover-2"),
+        "{refused}"
+    );
+
+    // It is brought over as soon as it is back, whenever it is cut off meanwhile.
+    fleet.spawn_agent(&away, 20.0);
+    let log = || async { fleet.log(away.as_str()) };
+    eventually("it begins to renew", SHORT, log, |log| {
+        log.contains("the server trusts other authorities")
+    })
+    .await;
+    fleet.kill_agent(&away);
+    fleet.start_agent(&away, 20.0).await;
+    robots_left_are(&fleet, &[]).await;
+    fleet.rest.post(FINISH, &json!({})).await;
+    let after: FleetAuthority = fleet.rest.get("/v1/authority").await;
+    assert_eq!((&after.signing, &after.rotation), (&during.signing, &None));
+    let audit = || fleet.rest.all::<AuditEntry>("/v1/audit");
+    eventually("both are in the audit log", SHORT, audit, |audit| {
+        let is_there = |path| audit.iter().any(|entry| entry.path == path);
+        is_there(ROTATION) && is_there(FINISH)
+    })
+    .await;
+    let trusted = || async { [&driving, &away].map(|robot| trusted_by(&fleet, robot)) };
+    eventually("nobody trusts the former", SHORT, trusted, |trusted| {
+        *trusted == [1, 1]
+    })
+    .await;
+
+    fleet.kill_server();
+    fleet.start_server().await;
+    for robot in [&driving, &away] {
+        fleet.robot_is_online(robot).await;
+    }
+    let driven = fleet
+        .rest
+        .mission_reaches(circle, &[MissionState::Succeeded], DRIVE)
+        .await;
+    let states: Vec<_> = driven.events.iter().map(|event| event.to).collect();
+    assert!(!states.contains(&MissionState::Failed), "{driven:#?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_robot_that_comes_back_after_its_authority_was_retired_is_told_of_and_joins_again() {
+    let mut fleet = secure_fleet(LONG_CERTIFICATE_S).await;
+    let [there, late] = ["rover-1", "rover-2"].map(|name| name.parse::<RobotId>().unwrap());
+    for (robot, x_m) in [(&late, 20.0), (&there, 0.0)] {
+        fleet.join(robot).await;
+        fleet.start_agent(robot, x_m).await;
+    }
+    fleet.kill_agent(&late);
+    fleet.rest.post(ROTATION, &json!({})).await;
+    robots_left_are(&fleet, &[&late]).await;
+    fleet.rest.post(FINISH, &json!({"force": true})).await;
+
+    fleet.spawn_agent(&late, 20.0);
+    let look = || fleet.rest.robot(&late);
+    let is_told = |robot: &tread_api::robot::Robot| {
+        let mut alerts = robot.alerts.iter();
+        alerts.any(|alert| alert.code.as_str() == "retired-authority")
+    };
+    eventually("people are told", SHORT, look, |seen| {
+        seen.as_ref()
+            .is_some_and(|seen| is_told(seen) && seen.link == LinkState::Offline)
+    })
+    .await;
+    let log = || async { fleet.log(late.as_str()) };
+    eventually("the robot says what to do", SHORT, log, |log| {
+        log.contains("Join again, by `tread-agent enroll`")
+    })
+    .await;
+    assert!(fleet.counter("gate_distrusted").await > 0);
+    assert!(fleet.counter("renewals_retired").await > 0);
+    fleet.robot_is_online(&there).await;
+
+    fleet.stop_agent(&late).await.unwrap();
+    fleet.join(&late).await;
+    fleet.start_agent(&late, 20.0).await;
+    let look = || fleet.rest.robot(&late);
+    eventually("the alert is over", SHORT, look, |seen| {
+        seen.as_ref().is_some_and(|seen| !is_told(seen))
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_link_that_fails_on_the_robot_itself_is_tried_again_until_it_can_be_made() {
+    let mut fleet = secure_fleet(LONG_CERTIFICATE_S).await;
+    let robot: RobotId = "rover-1".parse().unwrap();
+    fleet.join(&robot).await;
+    let folder = fleet.robot_folder(&robot);
+    let mut joined = Membership::load(&folder).unwrap().unwrap();
+    // No link can be made with this; the renewal, which mends it, is due in a few seconds.
+    "-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n"
+        .clone_into(&mut joined.authority);
+    let until_due = Duration::from_secs(u64::from(LONG_CERTIFICATE_S) * 2 / 3 - 4);
+    joined.issued_at -= until_due;
+    joined.save(&folder).unwrap();
+    fleet.spawn_agent(&robot, 0.0);
+    let log = || async { fleet.log(robot.as_str()) };
+    eventually("the link is tried again", SHORT, log, |log| {
+        log.matches("the fleet link failed; it is tried again")
+            .count()
+            >= 2
+    })
+    .await;
+    fleet.robot_is_online(&robot).await;
 }

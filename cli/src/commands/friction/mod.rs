@@ -62,7 +62,7 @@ pub(super) async fn run(
             reading,
         }) => {
             let read = client.cell_friction(site, area.area, resolution, reading.reading());
-            output.show(&read.await?, |cells| tables::cells(cells))?;
+            output.show(&read.await?, tables::cells)?;
         }
         Some(FrictionAction::Point { point, reading }) => {
             let read = client.point_friction(site, point, reading.reading());
@@ -91,7 +91,7 @@ pub(super) async fn run(
             models,
         }) => {
             let read = client.friction_difference(site, (from, to), area.area, models.reading());
-            output.show(&read.await?, |cells| tables::differences(cells))?;
+            output.show(&read.await?, tables::differences)?;
         }
         Some(FrictionAction::Visits {
             area,
@@ -99,7 +99,7 @@ pub(super) async fn run(
             reading,
         }) => {
             let page = client.visits(site, area, limit, reading.reading()).await?;
-            output.show(&page.items, |visits| tables::visits(visits))?;
+            output.show(&page.items, |visits| tables::visits(page.as_of, visits))?;
         }
         Some(FrictionAction::Map {
             png,

@@ -1,6 +1,7 @@
 //! Answers of the friction map as tables.
 
 use comfy_table::Table;
+use jiff::Timestamp;
 use tread_api::friction::{
     CellDifference, CellFriction, FusedFriction, ModelFriction, PathFriction, PointFriction,
     RobotContribution, TerrainFriction, TerrainHistory, VisitSuggestion, Withdrawal,
@@ -8,6 +9,7 @@ use tread_api::friction::{
 use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
 
+use crate::client::{Known, MapTimes};
 use crate::commands::terrains::class_name;
 use crate::output::{age, or_dash, render, table};
 
@@ -21,6 +23,19 @@ const FRICTION_COLUMNS: [&str; 7] = [
     "ROBOTS",
     "AGE",
 ];
+
+/// A table under the times that it is of, which the server rounds to the ends of its epochs.
+fn of_time(of: MapTimes, table: &str) -> String {
+    let as_of = of.as_of.map(|at| format!("{at:.0}"));
+    match (of.from, as_of) {
+        (None, None) => table.to_owned(),
+        (None, Some(as_of)) => format!("as of {as_of}\n{table}"),
+        (Some(from), as_of) => {
+            let to = as_of.unwrap_or_else(|| "now".to_owned());
+            format!("from {from:.0} to {to}\n{table}")
+        }
+    }
+}
 
 /// A table with these columns, and what is known behind them.
 fn friction_table(first: &[&str]) -> Table {
@@ -103,7 +118,8 @@ pub(super) fn terrains(terrains: &[TerrainFriction]) -> String {
             table.add_row(first.iter().cloned().chain(model_row(model)));
         }
     }
-    render(&table)
+    let as_of = terrains.first().and_then(|terrain| terrain.as_of);
+    of_time(MapTimes::as_of(as_of), &render(&table))
 }
 
 pub(super) fn history(history: &TerrainHistory) -> String {
@@ -126,17 +142,17 @@ pub(super) fn history(history: &TerrainHistory) -> String {
     )
 }
 
-pub(super) fn cells(cells: &[CellFriction]) -> String {
-    if cells.is_empty() {
-        return "no cell has been measured there yet".to_owned();
+pub(super) fn cells(Known { items, of }: &Known<CellFriction>) -> String {
+    if items.is_empty() {
+        return of_time(*of, "no cell has been measured there yet");
     }
     let mut table = friction_table(&["IX", "IY", "SIDE M", "TERRAIN"]);
-    for cell in cells {
+    for cell in items {
         let first = [cell.size_m.to_string(), terrain_name(cell.terrain.as_ref())];
         let row = place(cell.cell).into_iter().chain(first);
         table.add_row(row.chain(columns(Some(&cell.friction))));
     }
-    render(&table)
+    of_time(*of, &render(&table))
 }
 
 pub(super) fn point(point: &PointFriction) -> String {
@@ -145,7 +161,10 @@ pub(super) fn point(point: &PointFriction) -> String {
         Some(terrain) => format!("terrain {}, revision {}", terrain.id, terrain.revision),
         None => "no terrain is drawn there".to_owned(),
     };
-    let head = format!("cell {ix}, {iy}; {ground}");
+    let head = of_time(
+        MapTimes::as_of(point.as_of),
+        &format!("cell {ix}, {iy}; {ground}"),
+    );
     if point.models.is_empty() {
         return format!(
             "{head}\nno robot has measured this place yet: `tread friction` shows its terrain"
@@ -185,12 +204,13 @@ pub(super) fn path(path: &PathFriction) -> String {
             format!("{:.2}", piece.speed_m_s),
         ]);
     }
-    format!(
+    let said = format!(
         "{:.1} m, {:.0} % of it measured\n{}",
         path.length_m,
         1e2 * path.known_ratio,
         render(&table)
-    )
+    );
+    of_time(MapTimes::as_of(path.as_of), &said)
 }
 
 /// Whether a value says more than that somebody was there.
@@ -198,9 +218,9 @@ fn is_sure(friction: &FusedFriction) -> bool {
     friction.std_dev < friction.theta
 }
 
-pub(super) fn differences(cells: &[CellDifference]) -> String {
-    if cells.is_empty() {
-        return "nothing was measured there between these times".to_owned();
+pub(super) fn differences(Known { items, of }: &Known<CellDifference>) -> String {
+    if items.is_empty() {
+        return of_time(*of, "nothing was measured there between these times");
     }
     let mut table = table([
         "IX",
@@ -216,7 +236,7 @@ pub(super) fn differences(cells: &[CellDifference]) -> String {
         Some(_) => "unsure".to_owned(),
         None => "-".to_owned(),
     };
-    for cell in cells {
+    for cell in items {
         let change = match (&cell.before, &cell.after) {
             (Some(before), Some(after)) if !(is_sure(before) && is_sure(after)) => {
                 "unsure".to_owned()
@@ -239,12 +259,13 @@ pub(super) fn differences(cells: &[CellDifference]) -> String {
             or_dash(cell.deviations.map(|many| format!("{many:+.1}"))),
         ]);
     }
-    render(&table)
+    of_time(*of, &render(&table))
 }
 
-pub(super) fn visits(visits: &[VisitSuggestion]) -> String {
+pub(super) fn visits(as_of: Option<Timestamp>, visits: &[VisitSuggestion]) -> String {
+    let of = MapTimes::as_of(as_of);
     if visits.is_empty() {
-        return "no cell of this box would teach anything".to_owned();
+        return of_time(of, "no cell of this box would teach anything");
     }
     let mut table = table([
         "X M",
@@ -265,7 +286,7 @@ pub(super) fn visits(visits: &[VisitSuggestion]) -> String {
             if visit.disputed { "yes" } else { "no" }.to_owned(),
         ]);
     }
-    render(&table)
+    of_time(of, &render(&table))
 }
 
 pub(super) fn contributions(robots: &[RobotContribution]) -> String {
@@ -326,7 +347,11 @@ mod tests {
             "configuration": "8c8722f3-7240-59d0-bde2-495b2d9205b8", "deviations": null,
         }))
         .unwrap();
-        differences(&[cell]).lines().last().unwrap().to_owned()
+        let known = Known {
+            items: vec![cell],
+            of: MapTimes::default(),
+        };
+        differences(&known).lines().last().unwrap().to_owned()
     }
 
     #[test]

@@ -97,7 +97,7 @@ impl<'client> Feed<'client> {
             anyhow::ensure!(text.len() <= LINE_MAX, "an event is too long");
             while let Some(end) = text.windows(2).position(|pair| pair == b"\n\n") {
                 let block: Vec<u8> = text.drain(..end + 2).collect();
-                let (id, event) = read(&String::from_utf8_lossy(&block));
+                let (id, event) = read(self.client, &String::from_utf8_lossy(&block));
                 if id.is_some() {
                     self.last = id;
                 }
@@ -111,9 +111,9 @@ impl<'client> Feed<'client> {
 
 /// The id and the event of a block of lines; events of a newer server that are not known here are
 /// passed over.
-fn read(block: &str) -> (Option<String>, Option<Box<Event>>) {
+fn read(client: &Client, block: &str) -> (Option<String>, Option<Box<Event>>) {
     let field = |name: &str| block.lines().find_map(|line| line.strip_prefix(name));
-    let event = field("data: ").and_then(|text| serde_json::from_str(text).ok());
+    let event = field("data: ").and_then(|text| client.read(text.as_bytes()).ok());
     (field("id: ").map(str::to_owned), event.map(Box::new))
 }
 
@@ -123,11 +123,13 @@ mod tests {
 
     #[test]
     fn an_event_is_read_with_its_id_and_what_is_not_known_is_passed_over() {
+        let _first = rustls::crypto::ring::default_provider().install_default();
+        let client = Client::new("http://127.0.0.1:1", None, None).unwrap();
         let end = "event: snapshot_end\ndata: \"snapshot_end\"\nid: 5-7\n\n";
-        let (id, event) = read(end);
+        let (id, event) = read(&client, end);
         assert_eq!(id.as_deref(), Some("5-7"));
         assert_eq!(event.as_deref(), Some(&Event::SnapshotEnd));
-        assert_eq!(read(": keep-alive\n\n"), (None, None));
-        assert_eq!(read("data: {\"weather\":{}}\n\n"), (None, None));
+        assert_eq!(read(&client, ": keep-alive\n\n"), (None, None));
+        assert_eq!(read(&client, "data: {\"weather\":{}}\n\n"), (None, None));
     }
 }

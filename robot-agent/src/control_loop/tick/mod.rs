@@ -18,7 +18,7 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use tread_control::consistency::{Findings, Monitor};
-use tread_control::estimation::{Estimate, Estimator, SensorNoise};
+use tread_control::estimation::{Estimate, Estimator, EstimatorPrior, SensorNoise};
 use tread_control::gate::GateLimits;
 use tread_control::localisation::{Localisation, LocalisationNoise};
 use tread_control::measured::WheelSpeeds;
@@ -110,7 +110,8 @@ pub(crate) struct LoopCore {
 
 impl LoopCore {
     pub(crate) fn new(model: RobotModel, ends: LoopEnds) -> Self {
-        let estimator = Estimator::new(model, SensorNoise::default());
+        let prior = EstimatorPrior::default();
+        let estimator = Estimator::with_prior(model, SensorNoise::default(), prior);
         Self {
             model,
             limits: GateLimits::of(&model),
@@ -169,6 +170,14 @@ impl LoopCore {
     pub(crate) fn with_silent_after(mut self, silent_after: Duration) -> Self {
         self.silent_after = silent_after.min(SILENT_AFTER_MAX);
         self.limits.feedback_age_max_s = self.silent_after.as_secs_f64();
+        self
+    }
+
+    /// The same loop with what is known beforehand of its robot.
+    #[must_use]
+    pub(crate) fn with_prior(mut self, prior: EstimatorPrior) -> Self {
+        self.estimator = Estimator::with_prior(self.model, SensorNoise::default(), prior);
+        self.estimate = self.estimator.estimate();
         self
     }
 

@@ -5,7 +5,7 @@
 
 use std::time::Duration;
 
-use tread_control::consistency::{Consequence, Findings, Sample, Subject};
+use tread_control::consistency::{Consequence, Findings, Kind, Sample, Subject};
 use tread_control::gate::GateOutput;
 use tread_control::gate::hand::BLIND_MAX_M_S;
 use tread_control::measured::WheelSpeeds;
@@ -17,8 +17,11 @@ use crate::control_loop::seam::EndReason;
 use crate::control_loop::segments::Moment;
 use crate::drive::SensorSample;
 
-/// Longest time that a mission is held for sensors; then it fails.
-const SENSORS_HOLD_MAX: Duration = Duration::from_secs(10);
+/// Longest time that a mission is held for sensors; then it fails. A finding on the place that ends at
+/// rest, after 10 s, leaves time for the mission to go on.
+const SENSORS_HOLD_MAX: Duration = Duration::from_secs(15);
+/// The same where the position leapt: nobody drives on by a place that was believed meanwhile.
+const LEAPT_HOLD_MAX: Duration = Duration::from_secs(10);
 /// Fastest speed of a robot whose sensors contradict each other.
 const DOUBT_MAX_M_S: f64 = BLIND_MAX_M_S;
 
@@ -80,7 +83,13 @@ impl LoopCore {
         let is_held = self.must_hold() && self.active.is_some();
         self.sensors_hold_since = is_held.then(|| self.sensors_hold_since.unwrap_or(now));
         let since = self.sensors_hold_since;
-        let is_over = since.is_some_and(|since| now.saturating_sub(since) > SENSORS_HOLD_MAX);
+        let position = self.findings.about(Subject::Position);
+        let most = if position.is_some_and(|found| found.kind == Kind::Jumped) {
+            LEAPT_HOLD_MAX
+        } else {
+            SENSORS_HOLD_MAX
+        };
+        let is_over = since.is_some_and(|since| now.saturating_sub(since) > most);
         if let Some(active) = &mut self.active {
             active.hold(Hold::Sensors, is_held);
         }

@@ -8,6 +8,8 @@
 //!
 //! Two nodes that command one base take turns, so its wheels obey ours some of the time. The time
 //! for which they do not is therefore summed up, and what they obey takes [`PARDON`] of itself off.
+//! Wheels whose encoders are stuck, or whose drive is off, stand without a break instead: that shows
+//! in the time since they last did anything else, whatever came before.
 
 use std::time::Duration;
 
@@ -23,8 +25,9 @@ const FOR: Duration = Duration::from_millis(500);
 const PARDON: f64 = 0.5;
 /// Longest time for which one word of the wheels stands.
 const WORD_MAX: Duration = Duration::from_millis(100);
-/// Share of the time of disobedience for which wheels stand that do nothing else.
-const STANDS_SHARE: f64 = 0.7;
+/// How long wheels must stand without a break, so that it is no drive which another node halts now
+/// and then.
+const STANDS_FOR: Duration = Duration::from_millis(350);
 /// Share of its command below which a wheel counts as standing.
 const STANDING_SHARE: f64 = 0.1;
 /// How long they must obey again.
@@ -128,10 +131,8 @@ pub struct Obedience {
     present: (usize, Duration),
     /// For how long the wheels did not obey of late.
     disobeyed: Duration,
-    /// For how long of that they stood.
+    /// For how long they have stood without a break.
     stood: Duration,
-    /// For how long they obeyed since.
-    obeyed: Duration,
     /// Since when the wheels obey again.
     obeys_since: Option<Duration>,
     judged_at: Option<Duration>,
@@ -145,7 +146,6 @@ impl Default for Obedience {
             present: (0, Duration::ZERO),
             disobeyed: Duration::ZERO,
             stood: Duration::ZERO,
-            obeyed: Duration::ZERO,
             obeys_since: None,
             judged_at: None,
             verdict: Verdict::Obeys,
@@ -185,28 +185,28 @@ impl Obedience {
         let obeys = all.is_rest() || all.holds(measured);
         let judged_at = self.judged_at.replace(now).unwrap_or(now);
         let span = now.saturating_sub(judged_at).min(WORD_MAX);
+        let stands = !obeys && all.stands(measured);
+        self.stood = if stands {
+            self.stood + span
+        } else {
+            Duration::ZERO
+        };
         if self.verdict != Verdict::Obeys {
+            if self.stood >= STANDS_FOR {
+                self.verdict = Verdict::Stands;
+            }
             let since = obeys.then(|| self.obeys_since.unwrap_or(now));
             self.obeys_since = since;
             if since.is_some_and(|since| now.saturating_sub(since) >= AGAIN_FOR) {
                 self.verdict = Verdict::Obeys;
-                self.forgive();
+                (self.disobeyed, self.obeys_since) = (Duration::ZERO, None);
             }
         } else if obeys {
             self.disobeyed = self.disobeyed.saturating_sub(span.mul_f64(PARDON));
-            self.obeyed += span;
-            if self.disobeyed.is_zero() {
-                self.forgive();
-            }
         } else {
             self.disobeyed += span;
-            if all.stands(measured) {
-                self.stood += span;
-            }
             if self.disobeyed >= FOR {
-                let bound = FOR.mul_f64(1.0 - STANDS_SHARE);
-                let only_stood = self.stood >= FOR.mul_f64(STANDS_SHARE) && self.obeyed < bound;
-                self.verdict = if only_stood {
+                self.verdict = if self.stood >= STANDS_FOR {
                     Verdict::Stands
                 } else {
                     Verdict::MovesOtherwise
@@ -214,11 +214,6 @@ impl Obedience {
             }
         }
         self.verdict
-    }
-
-    fn forgive(&mut self) {
-        (self.disobeyed, self.stood) = (Duration::ZERO, Duration::ZERO);
-        (self.obeyed, self.obeys_since) = (Duration::ZERO, None);
     }
 }
 
@@ -310,6 +305,32 @@ mod tests {
         let (swapped, verdict) = run(500, |_| speeds(2.0, 8.0), |_| speeds(8.0, 2.0)).unwrap();
         assert!(swapped <= FOR + 2 * STEP, "{swapped:?}");
         assert_eq!(verdict, Verdict::MovesOtherwise);
+    }
+
+    #[test]
+    fn encoders_that_get_stuck_are_named_whatever_the_wheels_did_before() {
+        for before in [0, 10, 20] {
+            let mut obedience = Obedience::default();
+            let mut verdict = Verdict::Obeys;
+            // They obey, are blocked for a moment, obey for another, and get stuck.
+            for tick in 0..100 + before + 16 + 60 {
+                let now = tick * STEP;
+                let told = speeds(6.0, 6.0);
+                let measured = match tick {
+                    ..100 => told,
+                    _ if tick < 100 + before => speeds(1.0, 6.0),
+                    _ if tick < 100 + before + 16 => told,
+                    _ => speeds(0.0, 0.0),
+                };
+                obedience.command(now, told);
+                verdict = obedience.judge(now, measured);
+            }
+            assert_eq!(
+                verdict,
+                Verdict::Stands,
+                "after {before} ticks of another motion"
+            );
+        }
     }
 
     #[test]

@@ -1,8 +1,8 @@
 // Who is signed in, and how the page looks to them.
-import type { Role, Session } from '../api/schema';
+import type { Right, Session } from '../api/schema';
 import { Problem, ask, sentence, whenSignedOut } from '../api/client';
+import { may } from '../rights';
 
-const ROLES: Role[] = ['viewer', 'operator', 'admin'];
 const THEME_KEY = 'tread-theme';
 /** Kept while this browser should have a session, so that others are not asked in vain. */
 const SESSION_KEY = 'tread-session';
@@ -21,8 +21,9 @@ class SignedIn {
     whenSignedOut(() => this.end());
   }
 
-  may(role: Role): boolean {
-    return this.session !== null && ROLES.indexOf(this.session.role) >= ROLES.indexOf(role);
+  /** Whether they have a right; with a site, whether they have it for all of this site. */
+  may(right: Right, site?: string): boolean {
+    return may(this.session, right, site);
   }
 
   get name(): string {

@@ -26,11 +26,11 @@ pub(super) struct Start {
 
 /// Where a mission would stand among those of its robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Place {
-    pub(super) priority: i32,
-    pub(super) policy: StartPolicy,
+pub(in crate::app) struct Place {
+    pub(in crate::app) priority: i32,
+    pub(in crate::app) policy: StartPolicy,
     /// The mission whose place it takes, if any.
-    pub(super) replaces: Option<MissionId>,
+    pub(in crate::app) replaces: Option<MissionId>,
 }
 
 /// A mission that is driven before.

@@ -13,6 +13,7 @@
 
 mod outsiders;
 pub mod roll;
+mod rotation;
 
 use std::net::IpAddr;
 use std::sync::{Arc, OnceLock};
@@ -25,15 +26,19 @@ use tread_api::enrolment::{
 };
 use tread_api::ids::{JoinTokenId, RobotId, SiteId};
 use tread_api::page::Page;
+use tread_api::rights::Scope;
+use tread_api::robot::Alert;
 
 use self::outsiders::Outsiders;
-pub(super) use self::outsiders::REVOKED_ALERT;
+pub(super) use self::outsiders::{RETIRED_ALERT, REVOKED_ALERT};
 use self::roll::Roll;
+use self::rotation::Shown;
 use super::identity::new_secret;
 use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::{App, AppError, page, site_row};
-use crate::authority::{Authority, CertificateError, RobotName, RobotRequest};
-use crate::db::{self, DbError};
+use crate::authority::{Authorities, CertificateError, RobotName, RobotRequest, Trusted};
+use crate::connections::Purpose;
+use crate::db::{self, DbError, Outcome, Tx};
 use crate::identity::attempts::Source;
 use crate::identity::secret::{Kind, Secret};
 
@@ -49,8 +54,8 @@ const FORGET_MAX: u32 = 10;
 /// What the server signs robots' certificates with.
 #[derive(Debug)]
 pub struct Office {
-    /// The fleet's authority.
-    pub authority: Arc<Authority>,
+    /// The fleet's authority, and during a rotation two.
+    pub authorities: Arc<Authorities>,
     /// How long a robot's certificate is good for.
     pub lifetime: SignedDuration,
     /// The port that robots connect to.
@@ -63,6 +68,7 @@ pub(super) struct Membership {
     pub(super) roll: Arc<Roll>,
     office: OnceLock<Office>,
     outsiders: Outsiders,
+    shown: Shown,
 }
 
 /// Why a robot gets no certificate. Who asks is told no more than that.
@@ -101,6 +107,9 @@ pub enum EnrolError {
     /// The robot was put out of the fleet, or joined again.
     #[error("the enrolment was revoked")]
     Ended(RobotName),
+    /// The authority that signed its certificate was retired.
+    #[error("the authority of the certificate was retired")]
+    Retired(RobotName),
     /// There were too many failures; nothing was looked up.
     #[error("there were too many failed attempts; try again in {} s", .0.as_secs() + 1)]
     Locked(Duration),
@@ -139,6 +148,7 @@ impl EnrolError {
             | Self::Unknown
             | Self::Certificate(_)
             | Self::Ended(_)
+            | Self::Retired(_)
             | Self::Locked(_)
             | Self::Closed
             | Self::App(_) => None,
@@ -238,15 +248,26 @@ impl App {
         })
     }
 
-    /// Join tokens, newest first; dead ones too.
+    /// Join tokens for what is in a scope, newest first; dead ones too.
     pub async fn join_tokens(
         &self,
+        within: &Scope,
         before: Option<JoinTokenId>,
         limit: u32,
     ) -> Result<Page<JoinToken>, AppError> {
         let mut tx = self.db().read().await?;
-        let tokens = db::join_tokens::list(&mut tx, before, limit + 1).await?;
+        let tokens = db::join_tokens::list(&mut tx, within, before, limit + 1).await?;
         Ok(page(tokens, limit, |token| token.id.to_string()))
+    }
+
+    /// What a join token is for; `None` if it is not known.
+    pub async fn join_token_place(
+        &self,
+        id: JoinTokenId,
+    ) -> Result<Option<(SiteId, Option<RobotId>)>, AppError> {
+        let mut tx = self.db().read().await?;
+        let found = db::join_tokens::find(&mut tx, id).await?;
+        Ok(found.map(|token| (token.site, token.robot)))
     }
 
     /// Revokes a join token.
@@ -262,16 +283,17 @@ impl App {
         Ok(token)
     }
 
-    /// The newest enrolment of each robot of a site, by name.
+    /// The newest enrolment of each robot of a site in a scope, by name.
     pub async fn enrolments(
         &self,
-        site: &SiteId,
+        (site, within): (&SiteId, &Scope),
         after: &str,
         limit: u32,
     ) -> Result<Page<Enrolment>, AppError> {
         let mut tx = self.db().read().await?;
         site_row(&mut tx, site).await?;
-        let found = db::enrolments::list(&mut tx, site, after, limit + 1).await?;
+        let named = within.limit_of(site);
+        let found = db::enrolments::list(&mut tx, (site, named.as_ref()), after, limit + 1).await?;
         Ok(page(found, limit, |enrolment| enrolment.robot.to_string()))
     }
 
@@ -296,11 +318,27 @@ impl App {
             // Nobody misses it any more.
             ended = self.end_alert(&mut tx, robot_pk, ROBOT_LOST_ALERT).await?;
         }
-        tx.commit().await?;
-        self.show_alerts(ended.as_slice());
-        self.roll().note(&enrolment);
+        self.commit_enrolment(tx, &enrolment, ended.into_iter().collect())
+            .await?;
         tracing::warn!(robot.id = %robot, "robot `{robot}` of site `{site}` was put out by {revoked_by}");
         Ok(enrolment)
+    }
+
+    /// Commits, and then lets the roll and the events show it.
+    async fn commit_enrolment(
+        &self,
+        tx: Tx,
+        enrolment: &Enrolment,
+        alerts: Vec<Alert>,
+    ) -> Result<(), DbError> {
+        let (app, enrolment) = (self.clone(), enrolment.clone());
+        let committed = tx.commit_then(move |outcome| {
+            if outcome == Outcome::Written {
+                app.roll().note(&enrolment);
+                app.show_alerts(&alerts);
+            }
+        });
+        Ok(committed.await?)
     }
 
     /// A robot joins: its join token is used up, and whatever it had before counts no more.
@@ -320,21 +358,33 @@ impl App {
         if let Some(secret) = &secret {
             sources.push(Source::Prefix(secret.prefix().to_owned()));
         }
-        if let Some(left) = self.locked_for(&sources) {
-            return Err(EnrolError::Locked(left));
-        }
         let enrolled = match &secret {
-            Some(secret) => {
+            Some(secret) if self.is_join_token(secret).await? => {
                 self.enrol(office, secret, request.robot.as_ref(), &key)
                     .await
             }
+            Some(_) => Err(EnrolError::Unknown),
             None => Err(EnrolError::Malformed),
         };
         match &enrolled {
-            Ok(_) | Err(EnrolError::App(_)) => {}
-            Err(_refused) => self.failed(sources),
+            Ok(_) | Err(EnrolError::App(_)) => return enrolled,
+            Err(_refused) => {}
         }
+        if let Some(left) = self.locked_for(&sources) {
+            return Err(EnrolError::Locked(left));
+        }
+        self.failed(sources);
         enrolled
+    }
+
+    /// Whether a secret is a join token's, valid or not. What is none takes no turn of those who
+    /// write.
+    async fn is_join_token(&self, secret: &Secret) -> Result<bool, AppError> {
+        let _turn = self.look_up_turn(Purpose::Other).await?;
+        let mut tx = self.db().read().await?;
+        let fingerprint = secret.fingerprint();
+        let kept = db::join_tokens::by_lookup(&mut tx, &fingerprint).await?;
+        Ok(kept.is_some_and(|kept| fingerprint.matches(&kept.hash)))
     }
 
     async fn enrol(
@@ -386,7 +436,8 @@ impl App {
             robot: robot.clone(),
             enrolment: number,
         };
-        let certificate = office.sign(key, &name, self.clock().machine_time())?;
+        let trusted = office.authorities.present();
+        let certificate = office.sign(&trusted, key, &name, self.clock().machine_time())?;
         if !db::join_tokens::use_up(&mut tx, token.id, &robot, now).await? {
             return Err(EnrolError::Used(token.id));
         }
@@ -401,12 +452,11 @@ impl App {
             expires_at: certificate.expires_at,
             revoked_at: None,
             revoked_by: None,
+            authority: Some(trusted.signing().fingerprint().to_owned()),
         };
         db::enrolments::insert(&mut tx, &enrolment).await?;
         let ended = self.end_outsider(&mut tx, &enrolment).await?;
-        tx.commit().await?;
-        self.show_alerts(&ended);
-        self.roll().note(&enrolment);
+        self.commit_enrolment(tx, &enrolment, ended).await?;
         self.counters().robots_enrolled.one();
         let (site, robot) = (&enrolment.site, &enrolment.robot);
         tracing::info!(robot.id = %robot, "robot `{robot}` joined site `{site}`");
@@ -428,23 +478,32 @@ impl App {
         let office = self.office().ok_or(EnrolError::Closed)?;
         let key = RobotRequest::read(&request.certificate_request).map_err(EnrolError::Request)?;
         let now = self.clock().now();
-        let present = office
-            .authority
+        let trusted = office.authorities.present();
+        let present = trusted
             .read_robot(&request.certificate, now)
             .map_err(EnrolError::Certificate)?;
         let proven = present.check_proof(&request.certificate_request, proof);
         proven.map_err(EnrolError::Certificate)?;
         let name = present.name();
-        let certificate = office.sign(&key, name, self.clock().machine_time())?;
+        if present.is_retired() {
+            self.note_retired(name).await;
+            return Err(EnrolError::Retired(name.clone()));
+        }
+        let certificate = office.sign(&trusted, &key, name, self.clock().machine_time())?;
         let mut tx = self.db().write().await?;
         let enrolment = (&name.site, &name.robot, name.enrolment);
-        if !db::enrolments::renew(&mut tx, enrolment, now, certificate.expires_at).await? {
+        let expires_at = certificate.expires_at;
+        let issuer = present.issuer();
+        if !db::enrolments::renew(&mut tx, enrolment, now, expires_at, issuer).await? {
             drop(tx);
             let key = (name.site.clone(), name.robot.clone());
             self.note_outsider(&key).await;
             return Err(EnrolError::Ended(name.clone()));
         }
         tx.commit().await?;
+        self.membership()
+            .shown
+            .forget(&(name.site.clone(), name.robot.clone()));
         self.counters().certificates_renewed.one();
         Ok(certificate)
     }
@@ -453,11 +512,12 @@ impl App {
 impl Office {
     fn sign(
         &self,
+        trusted: &Trusted,
         key: &RobotRequest,
         name: &RobotName,
         now: Timestamp,
     ) -> Result<RobotCertificate, EnrolError> {
-        let signed = self.authority.sign(key, name, now, self.lifetime);
+        let signed = trusted.signing().sign(key, name, now, self.lifetime);
         let signed = signed.map_err(|cause| {
             tracing::error!("cannot sign a certificate: {cause:?}");
             EnrolError::App(AppError::NoRandomness(cause.to_string()))
@@ -467,7 +527,7 @@ impl Office {
             robot: name.robot.clone(),
             enrolment: name.enrolment,
             certificate: signed.certificate,
-            authority: self.authority.certificate_pem().to_owned(),
+            authority: trusted.bundle_pem(),
             lifetime_s: u64::try_from(self.lifetime.as_secs()).unwrap_or_default(),
             expires_at: signed.expires_at,
             port: self.port,

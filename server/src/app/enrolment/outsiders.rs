@@ -9,11 +9,14 @@ use tread_api::robot::{Alert, Severity};
 
 use super::roll::Standing;
 use crate::app::{App, AppError};
+use crate::authority::RobotName;
 use crate::db::{self, Tx};
 use crate::fleet::presence::RobotKey;
 
 /// What is raised about a robot that was put out and is still there.
 pub(in crate::app) const REVOKED_ALERT: &str = "revoked-robot";
+/// What is raised about a robot whose certificate is of an authority that was retired.
+pub(in crate::app) const RETIRED_ALERT: &str = "retired-authority";
 /// How often one robot is looked at, at the most.
 const NOTED_EVERY: Duration = Duration::from_mins(1);
 
@@ -57,19 +60,36 @@ impl App {
     /// Tells of a robot that was put out and is still there.
     pub async fn note_outsider(&self, key: &RobotKey) {
         let is_out = matches!(self.roll().standing(key), Some(Standing::Revoked(_)));
-        if !is_out {
-            return;
+        if is_out {
+            let text = "it was put out of the fleet and still tries to connect".to_owned();
+            self.tell(key, REVOKED_ALERT, text).await;
         }
+    }
+
+    /// Tells of a robot whose certificate is of an authority that was retired.
+    pub(super) async fn note_retired(&self, name: &RobotName) {
+        let key = (name.site.clone(), name.robot.clone());
+        if self.roll().is_in_force(&key, name.enrolment) {
+            let text =
+                "its certificate is of an authority that was retired; it must join again by a \
+                        join token that names it"
+                    .to_owned();
+            self.tell(&key, RETIRED_ALERT, text).await;
+        }
+    }
+
+    /// Logs what is said of a robot and raises an alert, not too often.
+    async fn tell(&self, key: &RobotKey, code: &'static str, text: String) {
         let outsiders = &self.membership().outsiders;
         if !outsiders.is_due(key, self.clock().elapsed()) {
             return;
         }
         let (site, robot) = key;
-        tracing::warn!(robot.id = %robot, "robot `{robot}` of site `{site}` was put out and still tries");
+        tracing::warn!(robot.id = %robot, "robot `{robot}` of site `{site}`: {text}");
         let (app, key) = (self.clone(), key.clone());
         let raising = async move {
-            if let Err(error) = db::limited(app.raise_outsider(&key)).await {
-                app.log_failure("raise an alert about a robot that was put out", &error);
+            if let Err(error) = db::limited(app.raise_outsider(&key, code, text)).await {
+                app.log_failure("raise an alert about a robot that may not connect", &error);
             }
         };
         match self.links() {
@@ -79,20 +99,22 @@ impl App {
         }
     }
 
-    async fn raise_outsider(&self, key: &RobotKey) -> Result<(), AppError> {
+    async fn raise_outsider(
+        &self,
+        key: &RobotKey,
+        code: &'static str,
+        text: String,
+    ) -> Result<(), AppError> {
         let mut tx = self.db().write().await?;
         let Some(robot_pk) = robot_pk(&mut tx, key).await? else {
             return Ok(());
         };
-        let text = "it was put out of the fleet and still tries to connect".to_owned();
-        let alert = (REVOKED_ALERT, Severity::Warning, text);
+        let alert = (code, Severity::Warning, text);
         let raised = self.begin_alert(&mut tx, robot_pk, alert).await?;
-        tx.commit().await?;
-        self.show_alerts(raised.as_slice());
-        Ok(())
+        Ok(self.commit_alerts(tx, raised.into_iter().collect()).await?)
     }
 
-    /// Ends the alert of a robot that has joined again.
+    /// Ends the alerts of a robot that has joined again.
     pub(super) async fn end_outsider(
         &self,
         tx: &mut Tx,
@@ -103,8 +125,11 @@ impl App {
         let Some(robot_pk) = robot_pk(tx, &key).await? else {
             return Ok(Vec::new());
         };
-        let ended = self.end_alert(tx, robot_pk, REVOKED_ALERT).await?;
-        Ok(ended.into_iter().collect())
+        let mut ended = Vec::new();
+        for code in [REVOKED_ALERT, RETIRED_ALERT] {
+            ended.extend(self.end_alert(tx, robot_pk, code).await?);
+        }
+        Ok(ended)
     }
 }
 

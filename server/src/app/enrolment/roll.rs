@@ -121,6 +121,7 @@ mod tests {
             expires_at: Timestamp::MAX,
             revoked_at: is_revoked.then_some(Timestamp::UNIX_EPOCH),
             revoked_by: is_revoked.then(|| "test".to_owned()),
+            authority: None,
         }
     }
 

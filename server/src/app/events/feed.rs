@@ -5,12 +5,13 @@ use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 use tread_api::event::{Event, Topic};
+use tread_api::ids::MissionId;
 use tread_api::robot::{Alert, Robot};
 
 use super::super::{App, AppError};
 use super::ROBOTS_MAX;
-use crate::db;
 use crate::db::robots::RobotRow;
+use crate::db::{self, DbError};
 use crate::fleet::presence::RobotKey;
 
 /// How often robots are looked at.
@@ -25,6 +26,7 @@ pub async fn run(app: App, stop: CancellationToken) {
     let mut feed = Feed {
         app: app.clone(),
         last_step: None,
+        moved: HashMap::new(),
         rows: HashMap::new(),
         rows_of: (0, None),
     };
@@ -48,6 +50,9 @@ type Rows = HashMap<RobotKey, (RobotRow, Vec<Alert>)>;
 struct Feed {
     app: App,
     last_step: Option<i64>,
+    /// Missions that have moved and have not been published since, and whether they have ended; at
+    /// most [`STEPS_MAX`] more than those of the last look.
+    moved: HashMap<MissionId, bool>,
     rows: Rows,
     /// The generation of the rows, and when they were read.
     rows_of: (u64, Option<Duration>),
@@ -70,34 +75,43 @@ impl Feed {
             self.last_step = Some(db::history::newest_step(&mut tx).await?);
             return Ok(());
         };
-        let steps = db::history::steps_after(&mut tx, last, STEPS_MAX).await?;
-        if u32::try_from(steps.len()).is_ok_and(|count| count == STEPS_MAX) {
+        // Those that could not be read before come first.
+        let room = if self.moved.is_empty() { STEPS_MAX } else { 0 };
+        let steps = db::history::steps_after(&mut tx, last, room).await?;
+        if u32::try_from(steps.len()).is_ok_and(|count| count >= STEPS_MAX) {
             self.app.announce();
         }
-        let mut moved = HashSet::new();
-        let mut ended = HashSet::new();
         for (pk, step) in steps {
             last = pk;
-            moved.insert(step.mission);
-            if step.step.to.is_terminal() && step.step.from != Some(step.step.to) {
-                ended.insert(step.mission);
-            }
+            let has_ended = step.step.to.is_terminal() && step.step.from != Some(step.step.to);
+            *self.moved.entry(step.mission).or_default() |= has_ended;
             let robot = (step.site.clone(), step.robot.clone());
             let event = Event::Step(Box::new(step));
             self.app.hub().publish(&event, Topic::Missions, robot);
         }
         // Published once, whatever becomes of the rest.
         self.last_step = Some(last);
+        let moved: Vec<MissionId> = self.moved.keys().copied().collect();
         for id in moved {
-            if let Some(row) = db::missions::find(&mut tx, id).await? {
-                if ended.contains(&id) {
-                    self.app.mission_durations().note(&row.mission);
+            let row = match db::missions::find(&mut tx, id).await {
+                Ok(row) => row,
+                // It will not read later either; its steps are told all the same.
+                Err(cause @ DbError::Corrupt { .. }) => {
+                    self.app
+                        .log_failure("read a mission that has moved", &cause);
+                    None
                 }
-                let mission = self.app.with_progress(row.mission);
-                let robot = (mission.site.clone(), mission.robot.clone());
-                let event = Event::Mission(Box::new(mission));
-                self.app.hub().publish(&event, Topic::Missions, robot);
+                Err(cause) => return Err(cause.into()),
+            };
+            let has_ended = self.moved.remove(&id).unwrap_or_default();
+            let Some(row) = row else { continue };
+            if has_ended {
+                self.app.mission_durations().note(&row.mission);
             }
+            let mission = self.app.with_progress(row.mission);
+            let robot = (mission.site.clone(), mission.robot.clone());
+            let event = Event::Mission(Box::new(mission));
+            self.app.hub().publish(&event, Topic::Missions, robot);
         }
         Ok(())
     }

@@ -12,6 +12,7 @@ use tracing::info;
 use tread_api::event::{Event, Topic};
 use tread_api::friction::MapChange;
 use tread_api::ids::{RobotId, SiteId};
+use tread_api::rights::Scope;
 use tread_api::robot::Alert;
 
 use super::snapshot::{SNAPSHOT_READ_MAX, Snapshots};
@@ -54,6 +55,8 @@ pub struct EventFilter {
     pub site: Option<SiteId>,
     /// Only these robots.
     pub robots: HashSet<RobotId>,
+    /// Only what is in this scope, and what is about the server.
+    pub within: Scope,
 }
 
 impl EventFilter {
@@ -62,7 +65,10 @@ impl EventFilter {
         let is_about = |about: &About| match about {
             (site, Some(robot)) => self.wants_robot(site, robot),
             // What is no robot's is of whoever asks for its topic or for everything.
-            (site, None) => self.site.as_ref().is_none_or(|wanted| wanted == site),
+            (site, None) => {
+                self.site.as_ref().is_none_or(|wanted| wanted == site)
+                    && self.within.includes_site(site)
+            }
         };
         of_topic && about.is_none_or(is_about)
     }
@@ -74,6 +80,7 @@ impl EventFilter {
     pub(super) fn wants_robot(&self, site: &SiteId, robot: &RobotId) -> bool {
         self.site.as_ref().is_none_or(|wanted| wanted == site)
             && (self.robots.is_empty() || self.robots.contains(robot))
+            && self.within.includes_robot(site, robot)
     }
 }
 

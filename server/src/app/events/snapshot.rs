@@ -11,6 +11,7 @@ use std::time::Duration;
 use tread_api::event::{Event, Topic};
 use tread_api::ids::{MissionId, SiteId};
 use tread_api::mission::Mission;
+use tread_api::rights;
 use tread_api::robot::Alert;
 
 use super::super::{App, AppError};
@@ -32,7 +33,7 @@ const MISSIONS_MAX: u32 = 1_000;
 /// Bytes of trajectories at which a snapshot stops naming ended missions.
 const MISSIONS_BYTES_MAX: usize = 4 * 1024 * 1024;
 
-/// Everything as it stood at one event, for all clients of the same topics and site.
+/// Everything as it stood at one event, for all clients of the same topics, site and scope.
 #[derive(Debug)]
 pub(super) struct Snapshot {
     /// The newest event that it holds already.
@@ -71,6 +72,7 @@ impl Reading {
 struct Scope {
     topics: HashSet<Topic>,
     site: Option<SiteId>,
+    within: rights::Scope,
 }
 
 /// A snapshot that somebody may be reading.
@@ -96,6 +98,7 @@ impl App {
         let scope = Scope {
             topics: filter.topics.clone(),
             site: filter.site.clone(),
+            within: filter.within.clone(),
         };
         let mut all = self.hub().snapshots.0.lock().await;
         all.retain(|built| built.snapshot.strong_count() > 0);
@@ -146,6 +149,7 @@ impl App {
             topics: scope.topics.clone(),
             site: scope.site.clone(),
             robots: HashSet::new(),
+            within: scope.within.clone(),
         };
         let covered = self.hub().newest();
         let mut events = vec![unnumbered(&Event::SnapshotBegin, None, None)];
@@ -216,6 +220,7 @@ impl App {
     ) -> Result<Vec<Mission>, AppError> {
         let of_site = MissionFilter {
             site: filter.site.clone(),
+            within: filter.within.clone(),
             ..MissionFilter::default()
         };
         let (mut rows, _more) =

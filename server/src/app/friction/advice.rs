@@ -7,6 +7,7 @@ use tread_api::friction::{RobotContribution, VisitSuggestion};
 use tread_api::geometry::Point;
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::page::{MapPage, Page};
+use tread_api::rights::Scope;
 use tread_api::site::Cell;
 
 use super::cells::Area;
@@ -74,20 +75,23 @@ impl App {
     /// What each robot has put into the map of a site, by name.
     pub async fn contributions(
         &self,
-        site: &SiteId,
+        (site, within): (&SiteId, &Scope),
         cursor: Option<&str>,
         limit: u32,
     ) -> Result<Page<RobotContribution>, AppError> {
         let reading = Reading::new(self, &Asked::default())?;
         let view = self.site_view(site).await?;
-        let after = cursor.map(str::to_owned);
+        let (after, named) = (cursor.map(str::to_owned), within.limit_of(site));
         let looking = move |app: &Self| {
             let (biases, contributions) = app.maps().look(&view.row, |map| {
                 (biases(map, &view, &reading), map.contributions())
             });
             let is_wanted = |found: &Contribution| {
                 let after = after.as_deref();
-                after.is_none_or(|after| found.robot.as_str() > after)
+                let is_named = named
+                    .as_ref()
+                    .is_none_or(|named| named.contains(&found.robot));
+                is_named && after.is_none_or(|after| found.robot.as_str() > after)
             };
             let time = |at: Result<Timestamp, _>| at.unwrap_or(Timestamp::MAX);
             let listed = contributions.into_iter().filter(is_wanted);

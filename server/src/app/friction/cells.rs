@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use tread_api::friction::{CellDifference, CellFriction, ModelFriction, PointFriction};
 use tread_api::geometry::{COORDINATE_MAX_M, Point};
 use tread_api::ids::{ConfigurationId, SiteId};
-use tread_api::page::MapPage;
+use tread_api::page::{DifferencePage, MapPage};
 use tread_api::site::{CELL_MAX_M, Cell, Grid};
 use tread_api::terrain::TerrainRef;
 
@@ -210,7 +210,7 @@ impl App {
         asked: &Asked,
         (from, to): (Timestamp, Option<Timestamp>),
         cells: CellsAsked<'_>,
-    ) -> Result<MapPage<CellDifference>, AppError> {
+    ) -> Result<DifferencePage<CellDifference>, AppError> {
         let asked = Asked {
             as_of: to,
             ..asked.clone()
@@ -242,9 +242,10 @@ impl App {
                     .items
                     .into_iter()
                     .flat_map(|cell| differences(map, cell, &early, &late));
-                MapPage {
+                DifferencePage {
                     items: items.collect(),
                     next_cursor: cells.next_cursor,
+                    from: early.as_of,
                     as_of: late.as_of,
                 }
             })

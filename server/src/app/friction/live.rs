@@ -9,6 +9,7 @@ use std::time::Duration;
 use tokio::sync::broadcast;
 use tokio_util::sync::CancellationToken;
 use tread_api::friction::{CellBox, MapChange};
+use tread_api::rights::Scope;
 
 use super::{App, AppError};
 use crate::db;
@@ -62,7 +63,7 @@ impl App {
 
     async fn tell_changes(&self, told: &mut HashMap<i64, Told>) -> Result<(), AppError> {
         let mut tx = self.db().read().await?;
-        let rows = db::sites::list(&mut tx, "", SITES_MAX).await?;
+        let rows = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         drop(tx);
         for row in rows {
             let present = Told {

@@ -1,14 +1,29 @@
 //! The audit log: written by one task beside the requests, so that none of them waits for it.
 //!
-//! Refused attempts are written too, but only so many: a stranger must not be able to push what
-//! people did out of the log.
+//! ```text
+//!                   ┌─ within the author's share ─► an entry of its own ─┐
+//!  request answered ┤                                                    ├─► one transaction, chained
+//!                   └─ beyond it ─► counted with its repeats ─ in time ──┘
+//! ```
+//!
+//! Nobody pushes what others did out of the log, and nobody fills the disk with it: each author has a
+//! share of entries, by the token; what is beyond it is not lost but counted, in one entry for all
+//! repeats of the same request in the same way answered. What is the same depends on what it is: of
+//! tokens, robots that join and sites each body is another request; of all else that succeeded each
+//! path is; refusals and sign-ins are the same when their route is.
 
-use std::sync::{Mutex, PoisonError};
+use std::collections::{HashMap, VecDeque};
+use std::fmt::Write as _;
+use std::hash::{DefaultHasher, Hash as _, Hasher as _};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
-use tokio::sync::mpsc;
+use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
+use tracing::{info, warn};
+use tread_api::audit::AuditChain;
 use tread_api::identity::AuditEntry;
 use tread_api::ids::TokenId;
 use tread_api::page::Page;
@@ -16,98 +31,304 @@ use tread_api::page::Page;
 use crate::app::{App, AppError, page};
 use crate::db;
 use crate::db::audit::AuditFilter;
+use crate::rate_limit::{Bucket, RateLimit};
 
 /// Entries that may wait for the writer.
 pub const WAITING_MAX: usize = 2_048;
+/// Most of them of one author.
+const WAITING_PER_AUTHOR_MAX: usize = 512;
 /// Entries that are written at once.
 const BATCH_MAX: usize = 256;
 /// How long the writer waits for more before it writes.
 const GATHER: Duration = Duration::from_millis(100);
+/// How often the writer looks for repeats that are due.
+const LOOK_FOR_REPEATS: Duration = Duration::from_secs(1);
+/// How long the last entries may take when the server stops.
+const FINISH_MAX: Duration = Duration::from_secs(5);
 /// Rest after the database failed.
 const RETRY_REST: Duration = Duration::from_secs(1);
-/// Entries that are kept.
-pub const ENTRIES_MAX: u32 = 200_000;
+/// Entries that are kept. Somebody who asks for as much as possible all the time has 2 880 of his
+/// own in a day, and needs half a year to push out what others did.
+pub const ENTRIES_MAX: u32 = 500_000;
 /// How long entries are kept.
 pub const KEPT: SignedDuration = SignedDuration::from_hours(400 * 24);
 /// Old entries that are forgotten with each batch.
 const FORGET_MAX: u32 = 1_000;
-/// Refused attempts that are written at once.
-const REFUSED_BURST: f64 = 60.0;
-/// Refused attempts that are written per second over longer times.
-const REFUSED_RATE_HZ: f64 = 1.0;
+/// Entries of its own that an author may have at once.
+pub const SHARE_BURST: u32 = 600;
+/// The same of all who have shown nothing valid, together.
+const STRANGERS_BURST: u32 = 60;
+/// The interval in which each may have one more.
+const SHARE_INTERVAL: Duration = Duration::from_secs(30);
+/// Authors whose shares are remembered; those beyond have what the ones forgotten had.
+const AUTHORS_MAX: usize = 4_096;
+/// How long repeats are counted before they are written, at first; then twice as long each time.
+pub const REPEATS_FIRST: Duration = Duration::from_mins(1);
+/// How long they are counted at the most.
+pub const REPEATS_MAX: Duration = Duration::from_hours(1);
+/// Kinds of requests of one author whose repeats are counted apart; of more only the route counts.
+const KINDS_PER_AUTHOR_MAX: usize = 256;
+/// Kinds of requests in all whose repeats are counted.
+const KINDS_MAX: usize = 16_384;
 
-/// What the writer is told.
-#[derive(Debug)]
-enum Note {
-    Entry(Box<AuditEntry>),
-    Used(TokenId, Timestamp),
+/// Who is behind an entry, as far as shares are concerned.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+enum Author {
+    Token(TokenId),
+    /// Robots that join or renew: they have shown something valid.
+    Joining,
+    Stranger,
 }
 
-/// How many refused attempts may be written now.
-#[derive(Debug)]
-struct Allowance {
-    left: f64,
-    counted_at: Duration,
-}
-
-impl Allowance {
-    fn take(&mut self, now: Duration) -> bool {
-        let passed_s = now.saturating_sub(self.counted_at).as_secs_f64();
-        self.left = (self.left + passed_s * REFUSED_RATE_HZ).min(REFUSED_BURST);
-        self.counted_at = now;
-        let may = self.left >= 1.0;
-        if may {
-            self.left -= 1.0;
+impl Author {
+    fn of(entry: &AuditEntry) -> Self {
+        match entry.token {
+            Some(token) => Self::Token(token),
+            None if entry.status < 400 => Self::Joining,
+            None => Self::Stranger,
         }
-        may
+    }
+
+    const fn limit(self) -> RateLimit {
+        let burst = match self {
+            Self::Token(_) | Self::Joining => SHARE_BURST,
+            Self::Stranger => STRANGERS_BURST,
+        };
+        RateLimit {
+            burst,
+            interval: SHARE_INTERVAL,
+        }
+    }
+}
+
+/// What repeats have in common.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct RequestKind {
+    author: Author,
+    method: String,
+    route: String,
+    status: u16,
+    /// The path, where it says what was changed.
+    path: Option<String>,
+    /// A hash of the body, where it does.
+    what: Option<u64>,
+}
+
+/// Routes whose bodies say who may do what.
+fn is_of_rights(route: &str) -> bool {
+    let begins = ["/v1/tokens", "/v1/join-tokens", "/v1/enrolments"];
+    begins.iter().any(|begin| route.starts_with(begin)) || route == "/v1/sites"
+}
+
+impl RequestKind {
+    /// As much as tells requests of this kind apart.
+    fn of(entry: &AuditEntry) -> Self {
+        let is_change = entry.status < 400 && entry.route != "/v1/session";
+        let what = (is_change && is_of_rights(&entry.route)).then(|| {
+            let mut hasher = DefaultHasher::new();
+            let text = entry.what.as_ref().map(ToString::to_string);
+            text.hash(&mut hasher);
+            hasher.finish()
+        });
+        Self {
+            path: is_change.then(|| entry.path.clone()),
+            what,
+            ..Self::of_route(entry)
+        }
+    }
+
+    /// The author, the route, and how it was answered.
+    fn of_route(entry: &AuditEntry) -> Self {
+        Self {
+            author: Author::of(entry),
+            method: entry.method.clone(),
+            route: entry.route.clone(),
+            status: entry.status,
+            path: None,
+            what: None,
+        }
+    }
+}
+
+/// Repeats that are being counted.
+#[derive(Debug)]
+struct Repeats {
+    /// The newest of them.
+    newest: AuditEntry,
+    since: Timestamp,
+    count: u64,
+    /// When they are written.
+    due_at: Duration,
+    /// How long they are counted.
+    span: Duration,
+}
+
+/// What an author may still have of its own, and has waiting.
+#[derive(Debug, Default)]
+struct Share {
+    bucket: Bucket,
+    waiting: usize,
+    kinds: usize,
+}
+
+impl Share {
+    fn take(&mut self, limit: RateLimit, now: Duration) -> bool {
+        self.waiting < WAITING_PER_AUTHOR_MAX && self.bucket.take(limit, now)
+    }
+}
+
+/// What waits for the writer, and what is counted.
+#[derive(Debug, Default)]
+struct Waiting {
+    entries: VecDeque<AuditEntry>,
+    repeats: HashMap<RequestKind, Repeats>,
+    shares: HashMap<Author, Share>,
+    uses: HashMap<TokenId, Timestamp>,
+}
+
+/// What became of an entry.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Taken {
+    Own,
+    Counted,
+    Dropped,
+}
+
+impl Waiting {
+    fn share(&mut self, author: Author) -> &mut Share {
+        if self.shares.len() >= AUTHORS_MAX && !self.shares.contains_key(&author) {
+            let has_none = |share: &Share| share.waiting == 0 && share.kinds == 0;
+            let idle = self.shares.iter().filter(|(_, share)| has_none(share));
+            let oldest = idle.min_by_key(|(_, share)| share.bucket.full_at());
+            if let Some(oldest) = oldest.map(|(author, _)| *author) {
+                self.shares.remove(&oldest);
+            }
+        }
+        self.shares.entry(author).or_default()
+    }
+
+    fn add(&mut self, entry: AuditEntry, now: Duration) -> Taken {
+        let author = Author::of(&entry);
+        let has_room = self.entries.len() < WAITING_MAX;
+        let share = self.share(author);
+        if has_room && share.take(author.limit(), now) {
+            share.waiting += 1;
+            self.entries.push_back(entry);
+            return Taken::Own;
+        }
+        self.count(entry, author, now)
+    }
+
+    /// Counts an entry with its repeats.
+    fn count(&mut self, entry: AuditEntry, author: Author, now: Duration) -> Taken {
+        let mut kind = RequestKind::of(&entry);
+        let is_new = !self.repeats.contains_key(&kind);
+        if is_new && self.share(author).kinds >= KINDS_PER_AUTHOR_MAX {
+            kind = RequestKind::of_route(&entry);
+        }
+        if let Some(repeats) = self.repeats.get_mut(&kind) {
+            if repeats.count == 0 {
+                repeats.since = entry.at;
+            }
+            repeats.count += entry.count;
+            repeats.newest = entry;
+            return Taken::Counted;
+        }
+        if self.repeats.len() >= KINDS_MAX {
+            return Taken::Dropped;
+        }
+        self.share(author).kinds += 1;
+        let repeats = Repeats {
+            since: entry.at,
+            count: entry.count,
+            newest: entry,
+            due_at: now + REPEATS_FIRST,
+            span: REPEATS_FIRST,
+        };
+        self.repeats.insert(kind, repeats);
+        Taken::Counted
+    }
+
+    /// The next entries to write: those that wait, then repeats that are due, or all of them.
+    fn next(&mut self, now: Duration, all: bool) -> Vec<AuditEntry> {
+        let mut next: Vec<AuditEntry> = Vec::new();
+        while next.len() < BATCH_MAX {
+            let Some(entry) = self.entries.pop_front() else {
+                break;
+            };
+            if let Some(share) = self.shares.get_mut(&Author::of(&entry)) {
+                share.waiting -= 1;
+            }
+            next.push(entry);
+        }
+        let due = self.repeats.iter();
+        let due = due.filter(|(_, repeats)| repeats.due_at <= now || (all && repeats.count > 0));
+        let room = BATCH_MAX - next.len();
+        let due: Vec<RequestKind> = due.map(|(kind, _)| kind.clone()).take(room).collect();
+        for kind in due {
+            let Some(repeats) = self.repeats.get_mut(&kind) else {
+                continue;
+            };
+            if repeats.count > 0 {
+                let since = (repeats.count > 1).then_some(repeats.since);
+                next.push(AuditEntry {
+                    since,
+                    count: repeats.count,
+                    ..repeats.newest.clone()
+                });
+                repeats.count = 0;
+                repeats.span = (2 * repeats.span).min(REPEATS_MAX);
+                repeats.due_at = now + repeats.span;
+            } else if repeats.due_at <= now {
+                self.repeats.remove(&kind);
+                if let Some(share) = self.shares.get_mut(&kind.author) {
+                    share.kinds -= 1;
+                }
+            }
+        }
+        next
     }
 }
 
 /// Where entries wait for the writer.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct AuditLog {
-    notes: mpsc::Sender<Note>,
-    written: Mutex<Option<mpsc::Receiver<Note>>>,
-    refused: Mutex<Allowance>,
+    waiting: Mutex<Waiting>,
+    added: Notify,
+    is_logged: AtomicBool,
 }
 
-impl Default for AuditLog {
-    fn default() -> Self {
-        let (notes, written) = mpsc::channel(WAITING_MAX);
-        Self {
-            notes,
-            written: Mutex::new(Some(written)),
-            refused: Mutex::new(Allowance {
-                left: REFUSED_BURST,
-                counted_at: Duration::ZERO,
-            }),
-        }
+impl AuditLog {
+    fn lock(&self) -> MutexGuard<'_, Waiting> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl App {
-    /// Puts an entry into the audit log, soon and without waiting. A refused attempt
-    /// (`is_change` false) may find that there were too many.
-    pub fn audit(&self, entry: AuditEntry, is_change: bool) {
+    /// Puts an entry into the audit log, soon and without waiting.
+    pub fn audit(&self, entry: AuditEntry) {
         let log = &self.identity().audit;
-        if !is_change {
-            let mut allowance = log.refused.lock().unwrap_or_else(PoisonError::into_inner);
-            if !allowance.take(self.clock().elapsed()) {
-                self.counters().audit_refusals_left_out.one();
-                return;
-            }
-        }
-        if log.notes.try_send(Note::Entry(Box::new(entry))).is_err() {
-            self.counters().audit_dropped.one();
+        let taken = log.lock().add(entry, self.clock().elapsed());
+        match taken {
+            Taken::Own => log.added.notify_one(),
+            Taken::Counted => self.counters().audit_repeats.one(),
+            Taken::Dropped => self.counters().audit_dropped.one(),
         }
     }
 
     pub(super) fn note_use(&self, token: TokenId, at: Timestamp) {
-        // Only the time of a token's last use is lost; the next use brings it again.
-        let _ = self.identity().audit.notes.try_send(Note::Used(token, at));
+        let log = &self.identity().audit;
+        log.lock().uses.insert(token, at);
+        log.added.notify_one();
     }
 
-    /// Entries of the audit log, newest first.
+    /// Whether each entry that is written from now on is a line of the server's log too.
+    pub fn log_audit(&self, is_logged: bool) {
+        let log = &self.identity().audit;
+        log.is_logged.store(is_logged, Ordering::Relaxed);
+    }
+
+    /// Entries of the audit log.
     pub async fn audit_log(
         &self,
         filter: &AuditFilter,
@@ -118,78 +339,239 @@ impl App {
         Ok(page(entries, limit, |entry| entry.id.to_string()))
     }
 
-    async fn write_notes(&self, notes: &[Note]) -> Result<(), AppError> {
+    /// What frames the chain of the audit log; `None` if it was removed.
+    pub async fn audit_chain(&self) -> Result<Option<AuditChain>, AppError> {
+        let mut tx = self.db().read().await?;
+        Ok(db::audit::chain(&mut tx).await?)
+    }
+
+    async fn write_audit(
+        &self,
+        entries: &[AuditEntry],
+        uses: &HashMap<TokenId, Timestamp>,
+    ) -> Result<(), AppError> {
         let mut tx = self.db().write().await?;
-        for note in notes {
-            match note {
-                Note::Entry(entry) => db::audit::insert(&mut tx, entry).await?,
-                Note::Used(token, at) => db::tokens::touch(&mut tx, *token, *at).await?,
-            }
+        let mut written = Vec::new();
+        if !entries.is_empty() {
+            written = db::audit::append(&mut tx, entries).await?;
+        }
+        for (token, at) in uses {
+            db::tokens::touch(&mut tx, *token, *at).await?;
         }
         if let Ok(before) = self.clock().now().checked_sub(KEPT) {
             db::audit::forget(&mut tx, before, ENTRIES_MAX, FORGET_MAX).await?;
         }
-        Ok(tx.commit().await?)
+        tx.commit().await?;
+        if self.identity().audit.is_logged.load(Ordering::Relaxed) {
+            written.iter().for_each(log_entry);
+        }
+        Ok(())
     }
 }
 
-/// Writes the audit log until the stop, and then what still waits.
-pub async fn run(app: App, stop: CancellationToken) {
-    let waiting = &app.identity().audit.written;
-    let waiting = waiting
-        .lock()
-        .unwrap_or_else(PoisonError::into_inner)
-        .take();
-    let Some(mut waiting) = waiting else {
-        return;
-    };
-    let mut notes = Vec::new();
-    loop {
-        let is_stopping = tokio::select! {
-            biased;
-            _ = waiting.recv_many(&mut notes, BATCH_MAX) => stop.is_cancelled(),
-            () = stop.cancelled() => true,
-        };
-        if !is_stopping {
-            let gathering = async {
-                while notes.len() < BATCH_MAX {
-                    let room = BATCH_MAX - notes.len();
-                    waiting.recv_many(&mut notes, room).await;
-                }
-            };
-            tokio::select! {
-                _ = tokio::time::timeout(GATHER, gathering) => {}
-                () = stop.cancelled() => {}
+/// Writes an entry as one line of the server's log.
+fn log_entry(entry: &AuditEntry) {
+    let hash = entry.hash.as_deref().unwrap_or_default();
+    info!(target: "tread_audit", entry = entry.id, hash, "{}", ascii_json(entry));
+}
+
+/// An entry as JSON in printable ASCII alone, so that nothing in it moves a terminal's cursor.
+fn ascii_json(entry: &AuditEntry) -> String {
+    let text = serde_json::to_string(entry).unwrap_or_default();
+    let mut ascii = String::with_capacity(text.len());
+    for letter in text.chars() {
+        if matches!(letter, ' '..='~') {
+            ascii.push(letter);
+        } else {
+            for unit in letter.encode_utf16(&mut [0; 2]) {
+                // Writing into a text cannot fail.
+                let _ = write!(ascii, "\\u{unit:04x}");
             }
         }
-        while let Err(error) = db::limited(app.write_notes(&notes)).await {
+    }
+    ascii
+}
+
+/// Writes the audit log until the stop.
+pub async fn run(app: App, stop: CancellationToken) {
+    let log = &app.identity().audit;
+    while !stop.is_cancelled() {
+        tokio::select! {
+            biased;
+            () = stop.cancelled() => {}
+            () = log.added.notified() => {
+                tokio::select! {
+                    () = tokio::time::sleep(GATHER) => {}
+                    () = stop.cancelled() => {}
+                }
+            }
+            () = tokio::time::sleep(LOOK_FOR_REPEATS) => {}
+        }
+        write_waiting(&app, &stop).await;
+    }
+}
+
+/// Writes what still waits and what is being counted, when nothing is answered any more.
+pub async fn finish(app: &App) {
+    let stop = CancellationToken::new();
+    stop.cancel();
+    if tokio::time::timeout(FINISH_MAX, write_waiting(app, &stop))
+        .await
+        .is_err()
+    {
+        warn!(
+            "the end of the audit log could not be written in {} s",
+            FINISH_MAX.as_secs()
+        );
+    }
+}
+
+/// Writes what waits and is due; after the stop all that there is, as far as the database takes it.
+async fn write_waiting(app: &App, stop: &CancellationToken) {
+    let log = &app.identity().audit;
+    loop {
+        let (entries, uses) = {
+            let mut waiting = log.lock();
+            let entries = waiting.next(app.clock().elapsed(), stop.is_cancelled());
+            (entries, std::mem::take(&mut waiting.uses))
+        };
+        if entries.is_empty() && uses.is_empty() {
+            return;
+        }
+        while let Err(error) = db::limited(app.write_audit(&entries, &uses)).await {
             app.log_failure("write entries of the audit log", &error);
             if stop.is_cancelled() {
+                let lost = entries.iter().map(|entry| entry.count).sum();
+                app.counters().audit_dropped.add(lost);
                 return;
             }
             tokio::time::sleep(RETRY_REST).await;
-        }
-        notes.clear();
-        if is_stopping && waiting.is_empty() {
-            return;
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
 
+    fn entry(token: Option<u128>, method: &str, path: &str, status: u16) -> AuditEntry {
+        let token = token.map(uuid::Uuid::from_u128);
+        serde_json::from_value(json!({
+            "id": 0, "at": "2026-11-22T09:00:00Z", "since": null, "count": 1, "who": null,
+            "token": token, "role": null, "address": "192.0.2.1", "method": method, "route": path,
+            "path": path, "status": status, "request_id": "", "what": null,
+            "previous_hash": null, "hash": null,
+        }))
+        .unwrap()
+    }
+
+    fn written(waiting: &mut Waiting, now: Duration, all: bool) -> Vec<AuditEntry> {
+        let mut written = Vec::new();
+        loop {
+            let next = waiting.next(now, all);
+            if next.is_empty() {
+                return written;
+            }
+            written.extend(next);
+        }
+    }
+
     #[test]
-    fn a_flood_of_refusals_leaves_room_for_what_people_did() {
-        let mut allowance = Allowance {
-            left: REFUSED_BURST,
-            counted_at: Duration::ZERO,
-        };
-        let hour_ms = 3_600_000;
-        let written = (0..hour_ms)
-            .filter(|&ms| allowance.take(Duration::from_millis(ms)))
-            .count();
-        assert!((3_600..=3_660).contains(&written), "{written}");
+    fn a_flood_of_one_author_is_counted_and_costs_others_nothing() {
+        let mut waiting = Waiting::default();
+        let mut log = Vec::new();
+        let mut changes = 0_u32;
+        let sign_out = entry(Some(7), "DELETE", "/v1/session", 204);
+        // A thousand a second for ten minutes, and an admin's change each second.
+        for ms in 0..600_000_u64 {
+            let now = Duration::from_millis(ms);
+            waiting.add(sign_out.clone(), now);
+            if ms % 1_000 == 0 {
+                let mut change = entry(Some(1), "POST", "/v1/tokens", 201);
+                change.what = Some(json!({"name": format!("desk-{changes}")}));
+                assert_ne!(waiting.add(change, now), Taken::Dropped);
+                changes += 1;
+            }
+            if ms % 100 == 0 {
+                log.extend(waiting.next(now, false));
+            }
+        }
+        log.extend(written(&mut waiting, Duration::from_mins(10), true));
+        let of_flood = log.iter().filter(|entry| entry.method == "DELETE");
+        let (rows, asked) = of_flood.fold((0, 0), |(rows, asked), entry| {
+            (rows + 1, asked + entry.count)
+        });
+        assert_eq!(asked, 600_000, "nothing is lost");
+        assert!(rows < 630, "{rows} entries of one author");
+        for number in 0..changes {
+            let name = json!({"name": format!("desk-{number}")});
+            let is_it = |entry: &&AuditEntry| entry.what.as_ref() == Some(&name);
+            assert_eq!(log.iter().filter(is_it).count(), 1, "{name}");
+        }
+    }
+
+    #[test]
+    fn strangers_share_little_and_repeats_are_written_ever_more_rarely() {
+        let mut waiting = Waiting::default();
+        let mut rows = 0;
+        let guess = entry(None, "GET", "/v1/sites", 401);
+        for second in 0..24 * 3_600 {
+            let now = Duration::from_secs(second);
+            for _ in 0..5 {
+                waiting.add(guess.clone(), now);
+            }
+            rows += waiting.next(now, false).len();
+        }
+        // The burst, the share of a day, and the counts.
+        assert!(rows <= 60 + 2_880 + 40, "{rows} entries in a day");
+    }
+
+    #[test]
+    fn while_nothing_is_written_different_changes_are_kept_apart() {
+        let mut waiting = Waiting::default();
+        let robots = KINDS_PER_AUTHOR_MAX + 50 + WAITING_PER_AUTHOR_MAX;
+        for number in 0..robots {
+            let path = format!("/v1/sites/yard/robots/rover-{number}/stop");
+            let mut stop = entry(Some(7), "POST", &path, 200);
+            "/v1/sites/{site}/robots/{robot}/stop".clone_into(&mut stop.route);
+            assert_ne!(waiting.add(stop, Duration::ZERO), Taken::Dropped);
+        }
+        let log = written(&mut waiting, Duration::ZERO, true);
+        let asked: u64 = log.iter().map(|entry| entry.count).sum();
+        assert_eq!(asked, u64::try_from(robots).unwrap());
+        assert_eq!(log.len(), WAITING_PER_AUTHOR_MAX + KINDS_PER_AUTHOR_MAX + 1);
+    }
+
+    #[test]
+    fn what_is_not_asked_again_is_forgotten() {
+        let mut waiting = Waiting::default();
+        for _ in 0..100 {
+            waiting.add(entry(None, "GET", "/v1/sites", 401), Duration::ZERO);
+        }
+        assert_eq!(waiting.repeats.len(), 1);
+        for minute in 0..10 {
+            waiting.next(Duration::from_mins(minute), false);
+        }
+        assert!(waiting.repeats.is_empty());
+        assert!(
+            waiting
+                .shares
+                .values()
+                .all(|share| share.kinds == 0 && share.waiting == 0)
+        );
+    }
+
+    #[test]
+    fn a_line_of_the_log_is_printable_ascii() {
+        let mut odd = entry(None, "GET", "/v1/\u{1b}[2J\u{202e}\n😀", 404);
+        odd.who = Some("\u{9b}".to_owned());
+        let line = ascii_json(&odd);
+        assert!(
+            line.chars().all(|letter| (' '..='~').contains(&letter)),
+            "{line}"
+        );
+        assert_eq!(serde_json::from_str::<AuditEntry>(&line).unwrap(), odd);
     }
 }

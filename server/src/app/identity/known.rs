@@ -4,7 +4,7 @@
 //! A look-up that began before something was ended must not be kept after it: each end raises the
 //! generation, and only what was looked up within the present one is kept.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -12,8 +12,10 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 use tokio_util::sync::CancellationToken;
 use tread_api::identity::{Role, Session};
-use tread_api::ids::{SessionId, TokenId};
+use tread_api::ids::{HolderId, RobotId, SessionId, SiteId, TokenId};
+use tread_api::rights::{Right, Rights, Scope};
 
+use crate::app::AppError;
 use crate::identity::secret::Fingerprint;
 
 /// Above so many, expired ones are dropped before another is kept. What is valid is bounded by
@@ -32,8 +34,12 @@ pub struct Credential {
     pub token: TokenId,
     /// The token's name.
     pub name: String,
+    /// Its role, if it has no rights of its own.
+    pub role: Option<Role>,
     /// What it may do.
-    pub role: Role,
+    pub rights: Rights,
+    /// Where it may do that.
+    pub scope: Scope,
     /// The browser's session, if it is one.
     pub session: Option<SessionId>,
     /// From when on it is refused.
@@ -56,6 +62,8 @@ impl Credential {
             token: token.id,
             name: token.name.clone(),
             role: token.role,
+            rights: token.rights,
+            scope: token.sites.clone(),
             session,
             expires_at,
             ended: CancellationToken::new(),
@@ -68,6 +76,11 @@ impl Credential {
     pub(super) fn is_fresh(&self, now: Duration) -> bool {
         let checked_ms = self.checked_ms.load(Ordering::Relaxed);
         to_ms(now).saturating_sub(checked_ms) < to_ms(FRESH)
+    }
+
+    /// Whether it was looked up last before a time.
+    fn is_older(&self, than: Duration) -> bool {
+        self.checked_ms.load(Ordering::Relaxed) < to_ms(than)
     }
 
     /// Notes that it was looked up and still holds.
@@ -86,9 +99,95 @@ impl Credential {
         Session {
             name: self.name.clone(),
             role: self.role,
+            rights: self.rights,
+            sites: self.scope.clone(),
             token: self.token,
             session: self.session,
             expires_at: self.expires_at,
+        }
+    }
+
+    /// Refuses a robot that it is not for.
+    ///
+    /// # Errors
+    /// [`AppError::OutsideScope`], as all of these.
+    pub fn check_robot(&self, site: &SiteId, robot: &RobotId) -> Result<(), AppError> {
+        self.check_in(self.scope.includes_robot(site, robot), || {
+            format!("is about robot `{robot}` of site `{site}`")
+        })
+    }
+
+    /// Refuses a name that no robot has that it is for.
+    ///
+    /// # Errors
+    /// As [`Self::check_robot`].
+    pub fn check_robot_name(&self, robot: &RobotId) -> Result<(), AppError> {
+        self.check_in(self.scope.includes_robot_name(robot), || {
+            format!("is about robot `{robot}`")
+        })
+    }
+
+    /// Refuses a site of which nothing is in its scope.
+    ///
+    /// # Errors
+    /// As [`Self::check_robot`].
+    pub fn check_site(&self, site: &SiteId) -> Result<(), AppError> {
+        self.check_in(self.scope.includes_site(site), || {
+            format!("is about site `{site}`")
+        })
+    }
+
+    /// Refuses a site of which not all is in its scope.
+    ///
+    /// # Errors
+    /// As [`Self::check_robot`].
+    pub fn check_whole_site(&self, site: &SiteId) -> Result<(), AppError> {
+        self.check_in(self.scope.includes_whole_site(site), || {
+            format!("is about all of site `{site}`")
+        })
+    }
+
+    /// Refuses a scope that is not within its own.
+    ///
+    /// # Errors
+    /// As [`Self::check_robot`].
+    pub fn check_scope(&self, scope: &Scope) -> Result<(), AppError> {
+        self.check_in(self.scope.includes(scope), || format!("is about {scope}"))
+    }
+
+    /// Refuses unless it is for everything.
+    ///
+    /// # Errors
+    /// As [`Self::check_robot`].
+    pub fn check_everywhere(&self) -> Result<(), AppError> {
+        self.check_in(self.scope.is_everywhere(), || {
+            "is about the whole server".to_owned()
+        })
+    }
+
+    fn check_in(&self, is_in: bool, what: impl FnOnce() -> String) -> Result<(), AppError> {
+        if is_in {
+            return Ok(());
+        }
+        let (name, own, what) = (&self.name, &self.scope, what());
+        let detail = format!("`{name}` is for {own} alone, and this {what}");
+        Err(AppError::OutsideScope(detail))
+    }
+
+    /// Whether it may set and end the limits of a holder: of the one named like the token, or of
+    /// any with the right to release what others hold.
+    pub fn may_hold_as(&self, holder: &HolderId) -> bool {
+        self.rights.includes(Right::ReleaseHold)
+            || (self.rights.includes(Right::Hold) && self.name == holder.as_str())
+    }
+
+    /// Who does something, for people: this token's name always, and behind it the name that its
+    /// holder gave, if it is another one. Nobody acts under a name alone that is not his token's.
+    pub fn said_by(&self, claimed: Option<&str>) -> String {
+        match claimed.map(str::trim) {
+            None | Some("") => self.name.clone(),
+            Some(claimed) if claimed == self.name => self.name.clone(),
+            Some(claimed) => format!("{}: {claimed}", self.name),
         }
     }
 
@@ -108,10 +207,77 @@ fn to_ms(time: Duration) -> u64 {
     u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
+/// First and longest wait after a look-up of who is known that failed or took too long; it doubles
+/// each time.
+const BACK_OFF_MIN: Duration = Duration::from_millis(500);
+const BACK_OFF_MAX: Duration = Duration::from_secs(16);
+/// What the database says is valid.
+#[derive(Debug, Default)]
+pub(super) struct Valid {
+    pub(super) tokens: Vec<(Fingerprint, Credential)>,
+    pub(super) token_ids: HashSet<TokenId>,
+    pub(super) sessions: HashSet<SessionId>,
+}
+
+impl Valid {
+    /// Takes in what another reading says is valid.
+    pub(super) fn join(&mut self, other: Self) {
+        self.tokens.extend(other.tokens);
+        self.token_ids.extend(other.token_ids);
+        self.sessions.extend(other.sessions);
+    }
+
+    fn contains(&self, known: &Credential) -> bool {
+        let has_session = known.session.is_none_or(|id| self.sessions.contains(&id));
+        has_session && self.token_ids.contains(&known.token)
+    }
+}
+
 /// All who are known.
 #[derive(Debug, Default)]
 pub(super) struct Known {
     inner: Mutex<Inner>,
+    rechecks: Mutex<Rechecks>,
+}
+
+/// Look-ups of who is known already: one at a time, and fewer while they fail.
+#[derive(Debug, Default)]
+struct Rechecks {
+    is_under_way: bool,
+    not_before: Duration,
+    wait: Duration,
+}
+
+/// The turn to look somebody up again; given back when it is dropped, as one that failed unless
+/// [`Recheck::succeeded`].
+#[derive(Debug)]
+pub(super) struct Recheck<'known> {
+    known: &'known Known,
+    began_at: Duration,
+    has_succeeded: bool,
+}
+
+impl Recheck<'_> {
+    /// The database has answered.
+    pub(super) fn succeeded(mut self) {
+        self.has_succeeded = true;
+    }
+}
+
+impl Drop for Recheck<'_> {
+    fn drop(&mut self) {
+        let mut rechecks = self.known.rechecks();
+        let wait = if self.has_succeeded {
+            Duration::ZERO
+        } else {
+            (rechecks.wait * 2).clamp(BACK_OFF_MIN, BACK_OFF_MAX)
+        };
+        *rechecks = Rechecks {
+            is_under_way: false,
+            not_before: self.began_at + wait,
+            wait,
+        };
+    }
 }
 
 #[derive(Debug, Default)]
@@ -123,6 +289,25 @@ struct Inner {
 impl Known {
     fn lock(&self) -> MutexGuard<'_, Inner> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn rechecks(&self) -> MutexGuard<'_, Rechecks> {
+        self.rechecks.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The turn to look up again who is known; `None` while somebody else does, or for a while after
+    /// it failed.
+    pub(super) fn recheck(&self, now: Duration) -> Option<Recheck<'_>> {
+        let mut rechecks = self.rechecks();
+        if rechecks.is_under_way || now < rechecks.not_before {
+            return None;
+        }
+        rechecks.is_under_way = true;
+        Some(Recheck {
+            known: self,
+            began_at: now,
+            has_succeeded: false,
+        })
     }
 
     pub(super) fn generation(&self) -> u64 {
@@ -161,6 +346,37 @@ impl Known {
         Some(Arc::clone(kept.or_insert_with(|| Arc::new(credential))))
     }
 
+    /// Whether somebody who was known before a time is no longer valid.
+    pub(super) fn any_gone(&self, valid: &Valid, before: Duration) -> bool {
+        let inner = self.lock();
+        let is_gone = |known: &Arc<Credential>| !valid.contains(known) && known.is_older(before);
+        inner.credentials.values().any(is_gone)
+    }
+
+    /// Knows what was read within a generation, from a time on: who is valid is known, who is not is
+    /// ended. What was read beside an end says nothing, and is read again soon.
+    pub(super) fn read_again(&self, valid: Valid, generation: u64, began_at: Duration) {
+        let mut inner = self.lock();
+        if inner.generation != generation {
+            return;
+        }
+        inner.credentials.retain(|_, known| {
+            let is_valid = valid.contains(known);
+            if is_valid {
+                known.checked(began_at);
+            }
+            let stays = is_valid || !known.is_older(began_at);
+            if !stays {
+                known.ended.cancel();
+            }
+            stays
+        });
+        for (fingerprint, credential) in valid.tokens {
+            let kept = inner.credentials.entry(fingerprint);
+            kept.or_insert_with(|| Arc::new(credential));
+        }
+    }
+
     /// Ends everybody of whom something holds: nothing they ask from now on is answered, and
     /// what they have open closes.
     pub(super) fn end(&self, whom: impl Fn(&Credential) -> bool) {
@@ -191,7 +407,9 @@ mod tests {
         let token = Token {
             id: TokenId::from_uuid(uuid::Uuid::from_u128(7)),
             name: "desk".to_owned(),
-            role: Role::Operator,
+            role: Some(Role::Operator),
+            rights: Role::Operator.into(),
+            sites: Scope::EVERYWHERE,
             created_at: time(0),
             created_by: "test".to_owned(),
             expires_at,
@@ -234,12 +452,93 @@ mod tests {
     }
 
     #[test]
+    fn what_is_no_longer_valid_ends_and_what_is_valid_is_known_without_being_shown() {
+        let known = Known::default();
+        let generation = known.generation();
+        let gone = known.keep(secret(1), credential(time(9)), generation, time(1));
+        let later = Duration::from_secs(1);
+        let valid = || {
+            let credential = credential(time(9));
+            let mut valid = Valid::default();
+            valid
+                .token_ids
+                .insert(TokenId::from_uuid(uuid::Uuid::from_u128(8)));
+            valid.tokens.push((
+                secret(2),
+                Credential {
+                    token: TokenId::from_uuid(uuid::Uuid::from_u128(8)),
+                    ..credential
+                },
+            ));
+            valid
+        };
+        assert!(known.any_gone(&valid(), later));
+        known.read_again(valid(), generation + 1, later);
+        assert!(
+            known.find(&secret(1), time(1)).is_some(),
+            "read in another generation"
+        );
+        known.read_again(valid(), generation, Duration::ZERO);
+        assert!(
+            known.find(&secret(1), time(1)).is_some(),
+            "looked up after the reading began"
+        );
+        known.read_again(valid(), generation, later);
+        assert!(gone.unwrap().ended().is_cancelled());
+        assert!(known.find(&secret(1), time(1)).is_none());
+        assert!(known.find(&secret(2), time(1)).is_some());
+    }
+
+    #[test]
     fn who_is_known_is_looked_up_again_after_a_while() {
         let known = credential(time(9));
         let seconds = Duration::from_secs;
         assert!(known.is_fresh(seconds(4)) && !known.is_fresh(seconds(5)));
         known.checked(seconds(5));
         assert!(known.is_fresh(seconds(9)) && !known.is_fresh(seconds(10)));
+    }
+
+    #[test]
+    fn one_is_looked_up_again_at_a_time_and_less_often_while_that_fails() {
+        let known = Known::default();
+        let first = known.recheck(Duration::ZERO).unwrap();
+        assert!(known.recheck(Duration::ZERO).is_none());
+        first.succeeded();
+        // A database that does not answer for an hour, asked every 100 ms.
+        let asked = (0..36_000_u64).map(|tenth| Duration::from_millis(100 * tenth));
+        let tries = asked.filter(|&now| known.recheck(now).is_some()).count();
+        assert!((200..300).contains(&tries), "{tries}");
+        let hour = Duration::from_hours(1) + BACK_OFF_MAX;
+        known.recheck(hour).unwrap().succeeded();
+        assert!(known.recheck(hour).is_some());
+    }
+
+    #[test]
+    fn whatever_name_is_given_the_tokens_stands_before_it() {
+        let desk = credential(time(9));
+        assert_eq!(desk.said_by(None), "desk");
+        assert_eq!(desk.said_by(Some(" ")), "desk");
+        assert_eq!(desk.said_by(Some("desk")), "desk");
+        assert_eq!(desk.said_by(Some("admin")), "desk: admin");
+    }
+
+    #[test]
+    fn who_may_hold_alone_holds_by_its_own_name_alone() {
+        let holder = |name: &str| -> HolderId { name.parse().unwrap() };
+        let operator = credential(time(9));
+        assert!(operator.may_hold_as(&holder("desk")) && operator.may_hold_as(&holder("gate")));
+        for (rights, own, others) in [
+            (vec![Right::Hold], true, false),
+            (vec![Right::ReleaseHold], true, true),
+            (vec![Right::Drive], false, false),
+        ] {
+            let limited = Credential {
+                rights: rights.into(),
+                ..credential(time(9))
+            };
+            assert_eq!(limited.may_hold_as(&holder("desk")), own);
+            assert_eq!(limited.may_hold_as(&holder("gate")), others);
+        }
     }
 
     #[test]

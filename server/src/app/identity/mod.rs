@@ -1,60 +1,79 @@
-//! Tokens and sessions: made, shown, ended.
+//! Who asks: tokens and sessions recognised, browser sessions opened and ended.
 //!
 //! ```text
 //!  secret shown ─► known in memory? ─yes────────────────────────────────────► who it is
 //!                     │ no
-//!                  address or prefix locked? ─yes─► come back later
-//!                     │ no
-//!                  reads, is kept, is valid? ─yes─► known from now on ──────► who it is
-//!                     │ no
-//!                  counted for the lock ─► refused, the same for every cause
+//!                  reads? ─yes─► its turn ─► kept and valid? ─yes─► known ───► who it is
+//!                     │ no                      │ no
+//!                  counted for the lock ◄───────┘
+//!                     └─► refused, the same for every cause; while locked: come back later
 //! ```
+//!
+//! What is valid is known from the start of the server, and read again every few seconds, so that
+//! what `tread-server init` revokes in its own process ends here too. So nobody who may come in
+//! needs a look-up but after `init`; look-ups take turns, of which a Stop has one of its own.
 
 pub mod audit;
 mod known;
+pub mod tokens;
 
 use std::net::IpAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
-use tread_api::identity::{
-    AuditEntry, CreateToken, CreatedToken, Role, TOKEN_DAYS_DEFAULT, TOKEN_DAYS_MAX,
-    TOKEN_NAME_MAX, Token,
-};
-use tread_api::ids::{SessionId, TokenId};
-use tread_api::page::Page;
+use tokio::sync::{Semaphore, SemaphorePermit};
+use tokio_util::sync::CancellationToken;
+use tread_api::identity::Token;
+use tread_api::ids::SessionId;
 
 use self::audit::AuditLog;
 pub use self::known::Credential;
-use self::known::Known;
-use super::{App, AppError, page};
+use self::known::{Known, Valid};
+use super::{App, AppError};
+use crate::connections::Purpose;
 use crate::db::sessions::NewSession;
 use crate::db::{self, DbError, Tx};
 use crate::identity::attempts::{Attempts, Source};
 use crate::identity::secret::{Fingerprint, Kind, RANDOM_BYTES, Secret};
 
-/// Most tokens that are valid at once.
-pub const TOKENS_MAX: usize = 1_000;
 /// Most sessions of one token; the oldest ends when another begins.
 pub const SESSIONS_PER_TOKEN_MAX: u32 = 20;
 /// How long a session lasts, at the most as long as its token.
 pub const SESSION_LASTS: SignedDuration = SignedDuration::from_hours(12);
-/// How long dead tokens are listed.
-const DEAD_KEPT: SignedDuration = SignedDuration::from_hours(400 * 24);
-/// Dead tokens that are forgotten with each new one.
-const FORGET_MAX: u32 = 10;
 /// How long a request waits for whoever is known to be looked up again.
 const RECHECK_MAX: Duration = Duration::from_millis(250);
 /// How often a look-up is repeated that something was ended during.
 const LOOK_UPS_MAX: u32 = 5;
+/// Secrets that are looked up at once: of four connections that read, strangers get two.
+const LOOK_UP_TURNS: usize = 2;
+/// The same of those who ask for a Stop.
+const STOP_LOOK_UP_TURNS: usize = 1;
+/// How long a secret waits for its turn to be looked up.
+const LOOK_UP_WAIT_MAX: Duration = Duration::from_secs(5);
+/// How often what is valid is read again.
+const READ_AGAIN: Duration = Duration::from_secs(2);
 
 /// What is remembered of who asks.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Identity {
     known: Known,
     attempts: Mutex<Attempts>,
     audit: AuditLog,
+    turns: Semaphore,
+    stop_turns: Semaphore,
+}
+
+impl Default for Identity {
+    fn default() -> Self {
+        Self {
+            known: Known::default(),
+            attempts: Mutex::default(),
+            audit: AuditLog::default(),
+            turns: Semaphore::new(LOOK_UP_TURNS),
+            stop_turns: Semaphore::new(STOP_LOOK_UP_TURNS),
+        }
+    }
 }
 
 /// How a secret was shown.
@@ -81,7 +100,7 @@ pub enum SignInError {
     /// It was revoked.
     #[error("the token is not valid")]
     Revoked,
-    /// There were too many failures; nothing was looked up.
+    /// It opens nothing, and there were too many such before.
     #[error("there were too many failed attempts; try again in {} s", .0.as_secs() + 1)]
     Locked(Duration),
     /// The database failed.
@@ -89,157 +108,7 @@ pub enum SignInError {
     Storage(#[from] DbError),
 }
 
-/// Asks for the first token of a server.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct FirstAdmin {
-    /// What people call it.
-    pub name: String,
-    /// Days until it is refused.
-    pub valid_days: u32,
-    /// Make it even if there is an admin, in place of a valid token of the same name.
-    pub force: bool,
-}
-
 impl App {
-    /// Makes a token.
-    ///
-    /// # Errors
-    /// An impossible name or time, a name that is taken, or too many tokens.
-    pub async fn create_token(
-        &self,
-        request: CreateToken,
-        created_by: &str,
-    ) -> Result<CreatedToken, AppError> {
-        let mut tx = self.db().write().await?;
-        let created = self.new_token(&mut tx, request, created_by).await?;
-        tx.commit().await?;
-        Ok(created)
-    }
-
-    /// Makes an admin's token where nobody is there to ask for it.
-    ///
-    /// # Errors
-    /// There is a valid admin's token, unless it is forced.
-    pub async fn create_first_admin(&self, first: FirstAdmin) -> Result<CreatedToken, AppError> {
-        let now = self.clock().now();
-        let mut tx = self.db().write().await?;
-        let (_, admin_count) = db::tokens::valid_counts(&mut tx, now).await?;
-        if admin_count > 0 && !first.force {
-            return Err(AppError::AlreadyExists {
-                what: "an admin's token",
-                id: "init".to_owned(),
-            });
-        }
-        let name = first.name.trim();
-        let replaced = db::tokens::valid_by_name(&mut tx, name, now).await?;
-        if let Some(replaced) = &replaced {
-            db::tokens::revoke(&mut tx, replaced.id, now).await?;
-        }
-        let request = CreateToken {
-            name: first.name,
-            role: Role::Admin,
-            valid_days: Some(first.valid_days),
-        };
-        let created = self.new_token(&mut tx, request, "init").await?;
-        let entry = AuditEntry {
-            id: 0,
-            at: now,
-            who: Some("init".to_owned()),
-            token: None,
-            role: None,
-            address: "this machine".to_owned(),
-            method: "RUN".to_owned(),
-            route: "tread-server init".to_owned(),
-            path: "tread-server init".to_owned(),
-            status: 201,
-            request_id: String::new(),
-            what: Some(serde_json::json!({"name": created.token.name, "role": "admin"})),
-        };
-        db::audit::insert(&mut tx, &entry).await?;
-        tx.commit().await?;
-        if let Some(replaced) = replaced {
-            self.identity()
-                .known
-                .end(|known| known.token == replaced.id);
-        }
-        Ok(created)
-    }
-
-    /// How many admins' tokens are valid.
-    pub async fn admin_count(&self) -> Result<i64, AppError> {
-        let mut tx = self.db().read().await?;
-        let counts = db::tokens::valid_counts(&mut tx, self.clock().now()).await?;
-        Ok(counts.1)
-    }
-
-    async fn new_token(
-        &self,
-        tx: &mut Tx,
-        request: CreateToken,
-        created_by: &str,
-    ) -> Result<CreatedToken, AppError> {
-        let now = self.clock().now();
-        let name = token_name(&request.name)?;
-        let expires_at = expiry(now, request.valid_days)?;
-        let (valid_count, _) = db::tokens::valid_counts(tx, now).await?;
-        if usize::try_from(valid_count).is_ok_and(|count| count >= TOKENS_MAX) {
-            return Err(AppError::TooMany {
-                what: "valid tokens",
-                count: TOKENS_MAX,
-            });
-        }
-        if db::tokens::valid_by_name(tx, &name, now).await?.is_some() {
-            return Err(AppError::AlreadyExists {
-                what: "token",
-                id: name,
-            });
-        }
-        let secret = new_secret(Kind::Token(request.role))?;
-        let token = Token {
-            id: TokenId::from_uuid(self.clock().mission_id().as_uuid()),
-            name,
-            role: request.role,
-            created_at: now,
-            created_by: created_by.to_owned(),
-            expires_at,
-            revoked_at: None,
-            last_used_at: None,
-        };
-        db::tokens::insert(tx, &token, &secret.fingerprint()).await?;
-        if let Ok(before) = now.checked_sub(DEAD_KEPT) {
-            db::tokens::forget_dead(tx, before, FORGET_MAX).await?;
-        }
-        Ok(CreatedToken {
-            token,
-            secret: secret.reveal().to_owned(),
-        })
-    }
-
-    /// Tokens, newest first; dead ones too.
-    pub async fn tokens(
-        &self,
-        before: Option<TokenId>,
-        limit: u32,
-    ) -> Result<Page<Token>, AppError> {
-        let mut tx = self.db().read().await?;
-        let tokens = db::tokens::list(&mut tx, before, limit + 1).await?;
-        Ok(page(tokens, limit, |token: &Token| token.id.to_string()))
-    }
-
-    /// Revokes a token: from now on it is refused, its sessions end, and what it has open closes.
-    ///
-    /// # Errors
-    /// [`AppError::UnknownToken`].
-    pub async fn revoke_token(&self, id: TokenId) -> Result<Token, AppError> {
-        let mut tx = self.db().write().await?;
-        db::tokens::revoke(&mut tx, id, self.clock().now()).await?;
-        let token = db::tokens::find(&mut tx, id).await?;
-        let token = token.ok_or(AppError::UnknownToken(id))?;
-        tx.commit().await?;
-        self.identity().known.end(|known| known.token == id);
-        Ok(token)
-    }
-
     /// Who shows a secret.
     ///
     /// # Errors
@@ -249,6 +118,7 @@ impl App {
         address: IpAddr,
         text: &str,
         shown: Shown,
+        purpose: Purpose,
     ) -> Result<Arc<Credential>, SignInError> {
         let secret = Secret::read(text).filter(|secret| match secret.kind() {
             Kind::Token(_) => shown == Shown::Token,
@@ -267,19 +137,76 @@ impl App {
                 .as_ref()
                 .map(|secret| Source::Prefix(secret.prefix().to_owned())),
         );
-        if let Some(left) = self.locked_for(&sources) {
-            return Err(SignInError::Locked(left));
-        }
         let found = match &secret {
-            Some(secret) => self.look_up(secret).await,
+            Some(secret) => {
+                let _turn = self.look_up_turn(purpose).await?;
+                self.look_up(secret).await
+            }
             None => Err(SignInError::Malformed),
         };
-        match &found {
-            Ok(credential) => self.used(credential),
-            Err(SignInError::Storage(_)) => {}
-            Err(_) => self.failed(sources),
+        match found {
+            Ok(credential) => {
+                self.used(&credential);
+                Ok(credential)
+            }
+            Err(error @ SignInError::Storage(_)) => Err(error),
+            Err(error) => {
+                if let Some(left) = self.locked_for(&sources) {
+                    return Err(SignInError::Locked(left));
+                }
+                self.failed(sources);
+                Err(error)
+            }
         }
-        found
+    }
+
+    /// Waits until a secret that is not known may be looked up.
+    pub(super) async fn look_up_turn(
+        &self,
+        purpose: Purpose,
+    ) -> Result<SemaphorePermit<'_>, DbError> {
+        let turns = match purpose {
+            Purpose::Stop => &self.identity().stop_turns,
+            Purpose::Other => &self.identity().turns,
+        };
+        let turn = tokio::time::timeout(LOOK_UP_WAIT_MAX, turns.acquire()).await;
+        let turn = turn.ok().and_then(Result::ok);
+        turn.ok_or(DbError::Sqlite(sqlx::Error::PoolTimedOut))
+    }
+
+    /// Reads which tokens and sessions are valid: tokens are known from now on, and who is known
+    /// and no longer valid is ended with what they have open.
+    ///
+    /// # Errors
+    /// The database failed; everything stays as it was.
+    pub async fn know_tokens(&self) -> Result<(), AppError> {
+        let known = &self.identity().known;
+        let (generation, began_at) = (known.generation(), self.clock().elapsed());
+        let mut valid = self.valid().await?;
+        if known.any_gone(&valid, began_at) {
+            // A row that was lost for want of memory reads as none, but not twice.
+            valid.join(self.valid().await?);
+        }
+        known.read_again(valid, generation, began_at);
+        Ok(())
+    }
+
+    async fn valid(&self) -> Result<Valid, AppError> {
+        let (now, elapsed) = (self.clock().now(), self.clock().elapsed());
+        let mut tx = self.db().read().await?;
+        let kept = db::tokens::all_valid(&mut tx, now).await?;
+        let sessions = db::sessions::all_valid(&mut tx, now).await?;
+        let mut valid = Valid::default();
+        for db::tokens::Kept { hash, token } in kept {
+            let expires_at = token.expires_at;
+            valid.token_ids.insert(token.id);
+            if let Some(fingerprint) = Fingerprint::from_kept(&hash) {
+                let credential = Credential::new(&token, None, expires_at, elapsed);
+                valid.tokens.push((fingerprint, credential));
+            }
+        }
+        valid.sessions.extend(sessions);
+        Ok(valid)
     }
 
     /// Who is known in memory, and still holds.
@@ -291,6 +218,9 @@ impl App {
         }
         // Who was let in before is let in while the database fails or is slow, for a Stop above
         // all: what is revoked here ends in memory, and elsewhere as soon as it can be read.
+        let Some(recheck) = known.recheck(self.clock().elapsed()) else {
+            return Some(credential);
+        };
         let check = || tokio::time::timeout(RECHECK_MAX, self.kept(secret));
         let mut checked = check().await;
         if matches!(&checked, Ok(Err(gone)) if !matches!(gone, SignInError::Storage(_))) {
@@ -298,12 +228,16 @@ impl App {
             checked = check().await;
         }
         match checked {
-            Ok(Ok(_)) => credential.checked(self.clock().elapsed()),
+            Ok(Ok(_)) => {
+                credential.checked(self.clock().elapsed());
+                recheck.succeeded();
+            }
             Ok(Err(SignInError::Storage(cause))) => {
                 self.log_failure("look up again who is signed in", &cause);
             }
             Err(_slow) => {}
             Ok(Err(_gone)) => {
+                recheck.succeeded();
                 known.end(|other| std::ptr::eq(other, &raw const *credential));
                 return None;
             }
@@ -400,15 +334,19 @@ impl App {
         for &id in &surplus {
             db::sessions::delete(&mut tx, id).await?;
         }
-        tx.commit().await?;
-        if !surplus.is_empty() {
+        let app = self.clone();
+        let ending = move |_outcome| {
             let is_surplus = |known: &Credential| {
                 known
                     .session
                     .is_some_and(|session| surplus.contains(&session))
             };
-            self.identity().known.end(is_surplus);
-        }
+            // To end nobody would only have look-ups repeated.
+            if !surplus.is_empty() {
+                app.identity().known.end(is_surplus);
+            }
+        };
+        tx.commit_then(ending).await?;
         let opened = self.look_up(&secret).await.map_err(|error| match error {
             SignInError::Storage(cause) => AppError::Storage(cause),
             SignInError::Malformed
@@ -424,9 +362,22 @@ impl App {
     pub async fn end_session(&self, id: SessionId) -> Result<(), AppError> {
         let mut tx = self.db().write().await?;
         db::sessions::delete(&mut tx, id).await?;
-        tx.commit().await?;
-        self.identity().known.end(|known| known.session == Some(id));
-        Ok(())
+        let app = self.clone();
+        let ending = move |_outcome| app.identity().known.end(|known| known.session == Some(id));
+        Ok(tx.commit_then(ending).await?)
+    }
+}
+
+/// Reads again and again what is valid, until the stop.
+pub async fn run(app: App, stop: CancellationToken) {
+    loop {
+        tokio::select! {
+            () = stop.cancelled() => return,
+            () = tokio::time::sleep(READ_AGAIN) => {}
+        }
+        if let Err(error) = db::limited(app.know_tokens()).await {
+            app.log_failure("read the valid tokens", &error);
+        }
     }
 }
 
@@ -461,30 +412,4 @@ pub(super) fn new_secret(kind: Kind) -> Result<Secret, AppError> {
     let mut random = [0; RANDOM_BYTES];
     getrandom::fill(&mut random).map_err(|error| AppError::NoRandomness(error.to_string()))?;
     Ok(Secret::from_random(kind, &random))
-}
-
-fn token_name(name: &str) -> Result<String, AppError> {
-    let trimmed = name.trim();
-    let is_visible = !trimmed.chars().any(char::is_control);
-    if trimmed.is_empty() || trimmed.chars().count() > TOKEN_NAME_MAX || !is_visible {
-        let detail = format!("a name has 1 to {TOKEN_NAME_MAX} visible characters");
-        return Err(AppError::Invalid {
-            field: "name",
-            detail,
-        });
-    }
-    Ok(trimmed.to_owned())
-}
-
-fn expiry(now: Timestamp, valid_days: Option<u32>) -> Result<Timestamp, AppError> {
-    let days = valid_days.unwrap_or(TOKEN_DAYS_DEFAULT);
-    if !(1..=TOKEN_DAYS_MAX).contains(&days) {
-        let detail = format!("valid_days must be 1 to {TOKEN_DAYS_MAX}, not {days}");
-        return Err(AppError::Invalid {
-            field: "valid_days",
-            detail,
-        });
-    }
-    let span = SignedDuration::from_hours(24 * i64::from(days));
-    Ok(now.checked_add(span).unwrap_or(Timestamp::MAX))
 }

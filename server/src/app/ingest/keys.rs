@@ -5,18 +5,35 @@ use std::collections::HashMap;
 use tread_api::ids::{BootId, ConfigurationId, RobotId, SiteId};
 use tread_api::site::Grid;
 
+use super::Upload;
 use crate::app::App;
+use crate::app::robots::RUNS_KEPT_MAX;
 use crate::db::{self, DbError, Tx};
+use crate::fleet::presence::RobotKey;
 
 /// Keys kept in memory before they are looked up afresh.
 const KEYS_MAX: usize = 100_000;
+
+/// Configurations that one robot may measure with: their sums are kept for ever.
+pub(super) const CONFIGURATIONS_MAX: i64 = 100;
+
+/// Whether a robot may measure with a configuration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Configured {
+    /// It may, and this is the configuration's key.
+    As(i64),
+    /// Not now: it had another new one a moment ago.
+    Later,
+    /// Never: it has measured with [`CONFIGURATIONS_MAX`] others.
+    Never,
+}
 
 /// Keys of the database that do not change once they are written.
 #[derive(Debug, Default)]
 pub(super) struct Keys {
     robots: HashMap<(SiteId, RobotId), RobotKeys>,
     boots: HashMap<(i64, BootId), i64>,
-    configurations: HashMap<ConfigurationId, i64>,
+    configurations: HashMap<(i64, ConfigurationId), i64>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -63,30 +80,48 @@ impl Keys {
         Ok(found)
     }
 
+    /// The key of a run; `None` while the robot begins too many.
     pub(super) async fn boot(
         &mut self,
+        app: &App,
         tx: &mut Tx,
+        upload: &Upload,
         robot_pk: i64,
-        boot: BootId,
-    ) -> Result<i64, DbError> {
-        if let Some(&found) = self.boots.get(&(robot_pk, boot)) {
-            return Ok(found);
+    ) -> Result<Option<i64>, DbError> {
+        let Upload { site, batch, .. } = upload;
+        if let Some(&found) = self.boots.get(&(robot_pk, batch.boot)) {
+            return Ok(Some(found));
         }
-        let key = db::robots::boot_key(tx, robot_pk, boot).await?;
-        self.boots.insert((robot_pk, boot), key);
-        Ok(key)
+        let found = db::robots::find_boot(tx, robot_pk, batch.boot).await?;
+        let named = (site.clone(), batch.robot.clone());
+        if found.is_none() && !app.may_begin_run(&named) {
+            return Ok(None);
+        }
+        let key = db::robots::boot_key(tx, robot_pk, batch.boot, RUNS_KEPT_MAX).await?;
+        self.boots.insert((robot_pk, batch.boot), key);
+        Ok(Some(key))
     }
 
+    /// The key of a configuration that a robot measures with.
     pub(super) async fn configuration(
         &mut self,
+        app: &App,
         tx: &mut Tx,
+        (named, robot_pk): (&RobotKey, i64),
         id: ConfigurationId,
-    ) -> Result<i64, DbError> {
-        if let Some(&found) = self.configurations.get(&id) {
-            return Ok(found);
+    ) -> Result<Configured, DbError> {
+        if let Some(&found) = self.configurations.get(&(robot_pk, id)) {
+            return Ok(Configured::As(found));
         }
-        let key = db::robots::configuration_key(tx, id).await?;
-        self.configurations.insert(id, key);
-        Ok(key)
+        let key = match db::robots::measured_configuration(tx, robot_pk, id).await? {
+            Some(found) => found,
+            None if db::robots::measured_count(tx, robot_pk).await? >= CONFIGURATIONS_MAX => {
+                return Ok(Configured::Never);
+            }
+            None if !app.may_change_configuration(named) => return Ok(Configured::Later),
+            None => db::robots::note_measured(tx, robot_pk, id).await?,
+        };
+        self.configurations.insert((robot_pk, id), key);
+        Ok(Configured::As(key))
     }
 }

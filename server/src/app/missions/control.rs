@@ -7,11 +7,13 @@ use jiff::Timestamp;
 use tread_api::ids::MissionId;
 use tread_api::mission::{
     Actor, Cause, Mission, MissionDetail, MissionEvent, MissionState, ReplaceMission, Replacement,
+    StartPolicy,
 };
 use tread_api::wire::command::Offer;
 
 use super::transitions::Change;
 use super::{Step, add_note, check_limits, take_step};
+use crate::app::check::StartPlace;
 use crate::app::{App, AppError};
 use crate::db::missions::{Facts, MissionRow};
 use crate::db::robots::RobotRow;
@@ -112,7 +114,12 @@ impl App {
         let row = open_row(&mut tx, id).await?;
         drop(tx);
         let robot = (&row.mission.site, &row.mission.robot);
-        self.check_fence(robot, &request.trajectory).await?;
+        let place = StartPlace {
+            priority: row.mission.priority,
+            policy: StartPolicy::Append,
+            replaces: Some(id),
+        };
+        self.check_fence(robot, &request.trajectory, place).await?;
         let mut tx = self.db().write().await?;
         let row = open_row(&mut tx, id).await?;
         let mission = &row.mission;

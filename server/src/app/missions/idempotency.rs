@@ -78,8 +78,7 @@ impl App {
         let is_new = db::idempotency::find(&mut tx, key).await?.is_none();
         drop(tx);
         if is_new {
-            let robot = (&request.site, &request.robot);
-            self.check_fence(robot, &request.trajectory).await?;
+            self.check_new(&request).await?;
         }
         let mut tx = self.db().write().await?;
         if let Some(given) = db::idempotency::find(&mut tx, key).await? {

@@ -8,7 +8,7 @@ pub(crate) mod reports;
 pub mod transitions;
 
 use jiff::Timestamp;
-use tread_api::ids::{MissionId, RobotId};
+use tread_api::ids::{MissionId, RobotId, SiteId};
 use tread_api::mission::{
     Actor, Cause, CreateMission, LINK_SILENCE_MAX_S, LINK_SILENCE_MIN_S, Mission, MissionDetail,
     MissionEvent, MissionState, PRIORITY_MAX, PRIORITY_MIN, REASON_LENGTH_MAX, StartPolicy,
@@ -19,6 +19,7 @@ use tread_api::trajectory::Trajectory;
 use tread_api::wire::command::Offer;
 
 use self::transitions::{Change, next};
+use super::check::StartPlace;
 use super::{App, AppError, check_named, site_row};
 use crate::db::missions::{Facts, MissionFilter, MissionRow, Standing};
 use crate::db::{self, DbError, Tx};
@@ -33,13 +34,23 @@ const EVENTS_MAX: u32 = 1_000;
 impl App {
     /// Asks a robot to drive something.
     pub async fn create_mission(&self, request: CreateMission) -> Result<Mission, AppError> {
-        let robot = (&request.site, &request.robot);
-        self.check_fence(robot, &request.trajectory).await?;
+        self.check_new(&request).await?;
         let mut tx = self.db().write().await?;
         let mission = self.enqueue(&mut tx, request).await?;
         tx.commit().await?;
         self.wake();
         Ok(mission)
+    }
+
+    /// Refuses a new mission that leaves the geofence from where its robot will begin it.
+    async fn check_new(&self, request: &CreateMission) -> Result<(), AppError> {
+        let place = StartPlace {
+            priority: request.priority,
+            policy: request.start_policy,
+            replaces: None,
+        };
+        let robot = (&request.site, &request.robot);
+        self.check_fence(robot, &request.trajectory, place).await
     }
 
     /// Writes a mission into its robot's queue, as its start policy says.
@@ -154,13 +165,29 @@ impl App {
         limit: u32,
     ) -> Result<Page<Mission>, AppError> {
         let mut tx = self.db().read().await?;
-        check_named(&mut tx, filter.site.as_ref(), filter.robot.as_ref()).await?;
+        check_named(
+            &mut tx,
+            filter.site.as_ref(),
+            filter.robot.as_ref(),
+            &filter.within,
+        )
+        .await?;
         let (rows, more) = db::missions::list(&mut tx, filter, limit, PAGE_BYTES_MAX).await?;
         let last = rows.last().filter(|_| more);
         let next_cursor = last.map(|row| row.mission.id.to_string());
         let with_progress = |row: MissionRow| self.with_progress(row.mission);
         let items = rows.into_iter().map(with_progress).collect();
         Ok(Page { items, next_cursor })
+    }
+
+    /// Whose mission it is; `None` if it is not known.
+    pub async fn mission_place(
+        &self,
+        id: MissionId,
+    ) -> Result<Option<(SiteId, RobotId)>, AppError> {
+        let mut tx = self.db().read().await?;
+        let found = db::missions::find(&mut tx, id).await?;
+        Ok(found.map(|row| (row.mission.site, row.mission.robot)))
     }
 
     /// One mission with its history.
@@ -361,5 +388,5 @@ pub(super) async fn add_note(
 }
 
 fn bounded(reason: &str) -> String {
-    reason.chars().take(REASON_LENGTH_MAX).collect()
+    tread_api::text::cleaned(reason, REASON_LENGTH_MAX)
 }

@@ -177,9 +177,7 @@ async fn write_down(
         Turn::Back => app.end_alert(&mut tx, row.pk, ROBOT_LOST_ALERT).await?,
         Turn::Came | Turn::Left | Turn::Lost => None,
     };
-    tx.commit().await?;
-    app.show_alerts(alert.as_slice());
-    Ok(())
+    Ok(app.commit_alerts(tx, alert.into_iter().collect()).await?)
 }
 
 fn lost_text(cause: Option<LinkCause>) -> String {

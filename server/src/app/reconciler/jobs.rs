@@ -53,8 +53,7 @@ pub(super) async fn settle(app: &App, mission: &Standing, change: Change) -> Res
         let ended = (mission.id, state, change.reason());
         alerts = app.alert_mission_end(&mut tx, robot_pk, ended).await?;
     }
-    tx.commit().await?;
-    app.show_alerts(&alerts);
+    app.commit_alerts(tx, alerts).await?;
     // The robot's next mission may go now.
     app.wake();
     Ok(())

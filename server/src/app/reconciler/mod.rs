@@ -18,6 +18,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::debug;
 use tread_api::ids::{MissionId, SiteId, StopId};
 use tread_api::mission::MissionState;
+use tread_api::rights::Scope;
 use tread_api::stop::Stop;
 
 use self::attendance::Attendance;
@@ -215,7 +216,7 @@ impl Reconciler {
         let mut tx = self.app.db().read().await?;
         let mut open = db::missions::in_hand(&mut tx).await?;
         open.extend(db::missions::next_in_queues(&mut tx).await?);
-        let sites = db::sites::list(&mut tx, "", SITES_MAX).await?;
+        let sites = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         drop(tx);
         self.forget_all_but(&open);
         self.disown_foreign(&open);

@@ -11,6 +11,7 @@ use jiff::Timestamp;
 use tread_api::ids::StopId;
 use tread_api::stop::Stop;
 
+use super::key_of;
 use crate::db::stops::StopFilter;
 use crate::fleet::presence::RobotKey;
 
@@ -18,10 +19,6 @@ use crate::fleet::presence::RobotKey;
 #[derive(Debug, Default)]
 pub(in crate::app) struct Unrecorded {
     stops: Mutex<HashMap<RobotKey, Stop>>,
-}
-
-fn key_of(stop: &Stop) -> RobotKey {
-    (stop.site.clone(), stop.robot.clone())
 }
 
 impl Unrecorded {
@@ -42,6 +39,19 @@ impl Unrecorded {
             (kept.id == stop.id).then(|| kept.clone())
         });
         newest.collect()
+    }
+
+    /// Whether a stop of a robot waits to be written down.
+    pub(super) fn has_of(&self, key: &RobotKey) -> bool {
+        self.lock().contains_key(key)
+    }
+
+    /// The stop that will take the place of this one once it is written down.
+    pub(super) fn successor_of(&self, stop: &Stop) -> Option<StopId> {
+        let kept = self.lock();
+        let newest = kept.get(&key_of(stop))?;
+        let is_newer = (newest.wanted_at, newest.id) > (stop.wanted_at, stop.id);
+        is_newer.then_some(newest.id)
     }
 
     /// Notes that robots have confirmed.
@@ -75,6 +85,7 @@ impl Unrecorded {
                     .as_ref()
                     .is_none_or(|robot| *robot == stop.robot)
                 && filter.before.is_none_or(|before| stop.id < before)
+                && filter.within.includes_robot(&stop.site, &stop.robot)
         });
         wanted.cloned().collect()
     }
@@ -100,6 +111,7 @@ mod tests {
             clear_asked_by: None,
             clear_asked_at: None,
             cleared_at: None,
+            replaced_by: None,
         }
     }
 

@@ -9,26 +9,15 @@ use std::collections::HashMap;
 use std::net::IpAddr;
 use std::time::Duration;
 
-/// Failures that an address may have at once.
-const BURST: f64 = 200.0;
-/// Failures that an address may have per second over longer times.
-const RATE_HZ: f64 = 20.0;
+use crate::rate_limit::{Bucket, RateLimit};
+
+/// Failures that an address may have.
+const LIMIT: RateLimit = RateLimit {
+    burst: 200,
+    interval: Duration::from_millis(50),
+};
 /// Addresses that are remembered.
 const ADDRESSES_MAX: usize = 4_096;
-
-#[derive(Debug, Clone, Copy)]
-struct Bucket {
-    /// Failures that count still.
-    count: f64,
-    counted_at: Duration,
-}
-
-impl Bucket {
-    fn at(self, now: Duration) -> f64 {
-        let passed_s = now.saturating_sub(self.counted_at).as_secs_f64();
-        (self.count - passed_s * RATE_HZ).max(0.0)
-    }
-}
 
 /// What is remembered of failures. Those from this machine do not count: whoever is on it has
 /// other means.
@@ -39,7 +28,7 @@ impl Failures {
     /// Whether an address has failed too often.
     pub(super) fn is_blocked(&self, address: IpAddr, now: Duration) -> bool {
         let bucket = self.0.get(&address.to_canonical());
-        bucket.is_some_and(|bucket| bucket.at(now) + 1.0 > BURST)
+        bucket.is_some_and(|bucket| !bucket.has_one(LIMIT, now))
     }
 
     /// A connection from an address has failed.
@@ -49,19 +38,14 @@ impl Failures {
             return;
         }
         if !self.0.contains_key(&address) && self.0.len() >= ADDRESSES_MAX {
-            self.0.retain(|_, bucket| bucket.at(now) > 0.0);
+            self.0.retain(|_, bucket| !bucket.is_full(now));
             if self.0.len() >= ADDRESSES_MAX {
                 // So many at once are no neighbours with a bad cable; the bounds on open
                 // connections hold against them.
                 return;
             }
         }
-        let count = self.0.get(&address).map_or(0.0, |bucket| bucket.at(now));
-        let bucket = Bucket {
-            count: (count + 1.0).min(BURST),
-            counted_at: now,
-        };
-        self.0.insert(address, bucket);
+        self.0.entry(address).or_default().take(LIMIT, now);
     }
 }
 
@@ -105,17 +89,18 @@ mod tests {
         #[test]
         fn over_a_long_time_no_more_failures_pass_than_allowed(gaps_ms in prop::collection::vec(0_u64..40, 1..2_000)) {
             let mut failures = Failures::default();
-            let (mut now_ms, mut passed) = (0, 0.0);
+            let (mut now_ms, mut passed) = (0, 0);
             for gap_ms in gaps_ms {
                 now_ms += gap_ms;
                 let now = Duration::from_millis(now_ms);
                 if !failures.is_blocked(address(1), now) {
                     failures.failed(address(1), now);
-                    passed += 1.0;
+                    passed += 1;
                 }
             }
-            let allowed = BURST + RATE_HZ * Duration::from_millis(now_ms).as_secs_f64();
-            prop_assert!(passed <= allowed + 1e-6, "{passed} of {allowed}");
+            let earned = u128::from(now_ms) / LIMIT.interval.as_millis();
+            let allowed = u128::from(LIMIT.burst) + earned;
+            prop_assert!(passed <= allowed, "{passed} of {allowed}");
         }
     }
 }

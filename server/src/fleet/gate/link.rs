@@ -4,18 +4,23 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use tokio::io::{AsyncRead, AsyncWrite, copy_bidirectional_with_sizes};
+use rustls::{AlertDescription, ServerConnection};
+use sha2::{Digest as _, Sha256};
+use socket2::SockRef;
+use tokio::io::AsyncWriteExt as _;
 use tokio::net::{TcpSocket, TcpStream};
-use tokio_rustls::{TlsAcceptor, client, server};
+use tokio_rustls::{TlsAcceptor, server};
 use tracing::{debug, info, warn};
+use tread_api::tunnel::{ALPN, RouterCredentials, splice};
 
 use super::Failures;
+use super::links::{CertificateHash, Entry, Links};
+use super::session::{Init, pass_opening, read_init};
 use crate::app::App;
 use crate::app::enrolment::roll::Standing;
-use crate::authority::{RobotName, named_in};
+use crate::authority::{Authorities, RobotName, named_in};
 use crate::connections::Slot;
 use crate::fleet::SEND_BUFFER_BYTES;
-use crate::fleet::opening::Inside;
 use crate::fleet::presence::RobotKey;
 use crate::fleet::routers::{Router, Routers};
 
@@ -27,6 +32,14 @@ const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
 const ROUTER_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long the router may take to take a connection.
 const INSIDE_TIMEOUT: Duration = Duration::from_secs(5);
+/// How long the opening of a robot's session may take.
+const OPENING_TIMEOUT: Duration = Duration::from_secs(5);
+/// Time between two looks whether the router has let go of a session.
+const SESSION_GONE_EVERY: Duration = Duration::from_millis(5);
+/// What the kernel takes of what it cannot send yet, bytes: it has lost its priority too.
+const NOT_SENT_BYTES_MAX: u32 = 4 * 1024;
+/// After this long without an answer to what was sent, the kernel gives a connection up.
+const UNANSWERED_MAX: Duration = Duration::from_secs(10);
 /// Bytes on their way within the gate, each way: what stands here has lost its priority.
 const BUFFER_BYTES: usize = 4 * 1024;
 /// Bytes of a connection that are looked at before anything else is done.
@@ -38,9 +51,10 @@ pub(super) struct Link {
     pub(super) peer: SocketAddr,
     pub(super) slot: Arc<Slot>,
     pub(super) acceptor: TlsAcceptor,
-    pub(super) inside: Arc<Inside>,
+    pub(super) authorities: Arc<Authorities>,
     pub(super) routers: Arc<Routers>,
     pub(super) failures: Arc<Mutex<Failures>>,
+    pub(super) links: Links,
 }
 
 /// Whether a connection may be the begin of TLS: a record of a handshake, whose first message is
@@ -54,43 +68,70 @@ fn may_be_tls(begin: &[u8]) -> bool {
         && fits(5, |byte| byte == 0x01)
 }
 
+/// A robot that has shown its certificate.
+struct Admitted {
+    robot: RobotKey,
+    name: RobotName,
+    /// Hash of the certificate.
+    certificate: CertificateHash,
+    /// The fingerprint of the authority that signed it.
+    issuer: String,
+    /// How long the certificate is good for.
+    left: Duration,
+    stream: server::TlsStream<TcpStream>,
+}
+
 impl Link {
     /// Serves the connection to its end.
     pub(super) async fn serve(self, stream: TcpStream) {
-        if let Err(error) = stream.set_nodelay(true) {
+        let socket = SockRef::from(&stream);
+        let set = socket
+            .set_tcp_nodelay(true)
+            .and_then(|()| socket.set_tcp_notsent_lowat(NOT_SENT_BYTES_MAX))
+            .and_then(|()| socket.set_tcp_user_timeout(Some(UNANSWERED_MAX)));
+        if let Err(error) = set {
             debug!("cannot send at once: {error}");
         }
-        let Some((robot, name, left, outside)) = self.let_in(stream).await else {
+        let Some(admitted) = self.let_in(stream).await else {
             return;
         };
+        let (robot, name, issuer) = (&admitted.robot, &admitted.name, &admitted.issuer);
         // From here on it is a robot's, and not displaced for others.
         let _at_work = self.slot.work();
         let counters = self.app.counters();
-        let inside = match self.enter(&robot).await {
-            Ok(inside) => inside,
-            Err(cause) => {
-                counters.gate_router_failed.one();
-                return warn!(robot.id = %robot.1, "the router did not take robot `{}`: {cause:#}", robot.1);
+        let entry = self.links.enter(robot.clone(), admitted.certificate);
+        let mut outside = admitted.stream;
+        let joined = async {
+            self.app.note_shown(robot, name.enrolment, issuer).await;
+            if let Some(inside) = self.open(robot, &entry, &mut outside).await
+                && let Err(error) = splice(outside, inside, BUFFER_BYTES).await
+            {
+                debug!("a robot's link broke: {error}");
             }
         };
         tokio::select! {
-            () = join(outside, inside) => {}
-            () = tokio::time::sleep(left) => {
+            () = joined => {}
+            () = entry.displaced() => {
+                counters.gate_displaced.one();
+                debug!(robot.id = %robot.1, "robot `{}` has newer links", robot.1);
+            }
+            () = tokio::time::sleep(admitted.left) => {
                 counters.gate_expired.one();
                 info!(robot.id = %robot.1, "the certificate of robot `{}` is over", robot.1);
             }
-            () = self.put_out(&robot, name.enrolment) => {
+            () = self.put_out(robot, name.enrolment) => {
                 counters.gate_revoked.one();
                 warn!(robot.id = %robot.1, "the link of robot `{}` was cut: it was put out", robot.1);
+            }
+            () = self.retired(issuer) => {
+                counters.gate_retired.one();
+                warn!(robot.id = %robot.1, "the link of robot `{}` was cut: the authority of its certificate was retired", robot.1);
             }
         }
     }
 
     /// Checks who it is: whom, and for how long.
-    async fn let_in(
-        &self,
-        stream: TcpStream,
-    ) -> Option<(RobotKey, RobotName, Duration, server::TlsStream<TcpStream>)> {
+    async fn let_in(&self, stream: TcpStream) -> Option<Admitted> {
         let counters = self.app.counters();
         let mut begin = [0; LOOKED_AT_BYTES];
         let first = tokio::time::timeout(FIRST_BYTE_TIMEOUT, stream.peek(&mut begin)).await;
@@ -104,11 +145,16 @@ impl Link {
             self.failed();
             return None;
         }
-        let handshake = self.acceptor.accept(stream);
+        // rustls would take 64 KiB of what the socket cannot, below all priorities.
+        let bound = |tls: &mut ServerConnection| tls.set_buffer_limit(Some(BUFFER_BYTES));
+        let handshake = self.acceptor.accept_with(stream, bound);
         let stream = match tokio::time::timeout(HANDSHAKE_TIMEOUT, handshake).await {
             Ok(Ok(stream)) => stream,
             Ok(Err(error)) => {
                 counters.gate_tls_failed.one();
+                if is_distrust(&error) {
+                    counters.gate_distrusted.one();
+                }
                 self.failed();
                 debug!("a handshake with {} failed: {error}", self.peer);
                 return None;
@@ -119,9 +165,27 @@ impl Link {
                 return None;
             }
         };
+        if stream.get_ref().1.alpn_protocol() != Some(ALPN) {
+            counters.gate_tls_failed.one();
+            self.failed();
+            debug!("{} speaks another version of the protocol", self.peer);
+            return None;
+        }
+        self.identify(stream).await
+    }
+
+    /// Whose certificate was shown, if it counts.
+    async fn identify(&self, stream: server::TlsStream<TcpStream>) -> Option<Admitted> {
+        let counters = self.app.counters();
+        let now = self.app.clock().now();
         let shown = stream.get_ref().1.peer_certificates();
-        let named = shown.and_then(|chain| chain.first()).map(named_in);
-        let Some(Ok((name, expires_at))) = named else {
+        let read = shown.and_then(|chain| chain.first()).and_then(|leaf| {
+            let (name, expires_at) = named_in(leaf).ok()?;
+            let trusted = self.authorities.present();
+            let issuer = trusted.issuer_of(leaf, now.min(expires_at))?.to_owned();
+            Some((name, expires_at, issuer, Sha256::digest(leaf).into()))
+        });
+        let Some((name, expires_at, issuer, certificate)) = read else {
             counters.gate_tls_failed.one();
             self.failed();
             return None;
@@ -139,9 +203,15 @@ impl Link {
             }
             return None;
         }
-        let left = expires_at.duration_since(self.app.clock().now());
-        let left = Duration::try_from(left).unwrap_or_default();
-        Some((robot, name, left, stream))
+        let left = expires_at.duration_since(now);
+        Some(Admitted {
+            robot,
+            name,
+            certificate,
+            issuer,
+            left: Duration::try_from(left).unwrap_or_default(),
+            stream,
+        })
     }
 
     fn failed(&self) {
@@ -149,28 +219,67 @@ impl Link {
         failures.failed(self.peer.ip(), self.app.clock().elapsed());
     }
 
-    /// Connects to the newest router as that robot.
-    async fn enter(&self, robot: &RobotKey) -> anyhow::Result<client::TlsStream<TcpStream>> {
-        let router = tokio::time::timeout(ROUTER_TIMEOUT, self.router_of(robot)).await?;
-        let connecting = async {
-            let socket = TcpSocket::new_v4()?;
-            socket.set_recv_buffer_size(SEND_BUFFER_BYTES)?;
-            let stream = socket.connect(router.address).await?;
-            stream.set_nodelay(true)?;
-            let connector = self.inside.connector(robot)?;
-            anyhow::Ok(connector.connect(Inside::router_name(), stream).await?)
+    /// Sends the robot its credentials and lets its session open at the newest router, as that robot:
+    /// the connection inside.
+    async fn open(
+        &self,
+        robot: &RobotKey,
+        entry: &Entry,
+        outside: &mut server::TlsStream<TcpStream>,
+    ) -> Option<TcpStream> {
+        let counters = self.app.counters();
+        let waiting = tokio::time::timeout(ROUTER_TIMEOUT, self.router_of(robot)).await;
+        let Ok((router, credentials)) = waiting else {
+            counters.gate_router_failed.one();
+            warn!(robot.id = %robot.1, "no router took robot `{}` in time", robot.1);
+            return None;
         };
-        tokio::time::timeout(INSIDE_TIMEOUT, connecting).await?
+        let begun = tokio::time::timeout(OPENING_TIMEOUT, begin(outside, &credentials)).await;
+        let init = match begun.map_err(anyhow::Error::from).flatten() {
+            Ok(init) => init,
+            Err(refused) => return self.not_opened(robot, &refused),
+        };
+        if entry.take_over(init.session_id).await {
+            let id = init.session_id;
+            let going = session_gone(&router, id);
+            if tokio::time::timeout(INSIDE_TIMEOUT, going).await.is_err() {
+                warn!(robot.id = %robot.1, "the former session of robot `{}` did not end", robot.1);
+            }
+        }
+        let connected = tokio::time::timeout(INSIDE_TIMEOUT, connect(&router)).await;
+        let mut inside = match connected.map_err(anyhow::Error::from).flatten() {
+            Ok(inside) => inside,
+            Err(cause) => {
+                counters.gate_router_failed.one();
+                warn!(robot.id = %robot.1, "the router did not take robot `{}`: {cause:#}", robot.1);
+                return None;
+            }
+        };
+        let opening = pass_opening(outside, &mut inside, &init, &credentials);
+        match tokio::time::timeout(OPENING_TIMEOUT, opening).await {
+            Ok(Ok(())) => Some(inside),
+            Ok(Err(refused)) => self.not_opened(robot, &refused.into()),
+            Err(elapsed) => self.not_opened(robot, &elapsed.into()),
+        }
     }
 
-    /// Waits for a router whose rules know the robot.
-    async fn router_of(&self, robot: &RobotKey) -> Arc<Router> {
+    fn not_opened<T>(&self, robot: &RobotKey, refused: &anyhow::Error) -> Option<T> {
+        self.app.counters().gate_session_failed.one();
+        debug!(robot.id = %robot.1, "the session of robot `{}` did not open: {refused:#}", robot.1);
+        None
+    }
+
+    /// Waits for a router whose rules know the robot, and says what the robot has to show there.
+    async fn router_of(&self, robot: &RobotKey) -> (Arc<Router>, RouterCredentials) {
         let mut changes = self.routers.changes();
         loop {
             changes.mark_unchanged();
             let newest = self.routers.newest();
-            if let Some(router) = newest.filter(|router| router.robots.contains(robot)) {
-                return router;
+            if let Some(router) = newest.filter(|router| router.robots.contains(robot))
+                && let Some(derivation) = &router.credentials
+            {
+                let credentials = derivation.of_robot(robot);
+                return (router, credentials);
             }
             if changes.changed().await.is_err() {
                 // The routers outlive every link; there is nothing to wait for.
@@ -188,16 +297,54 @@ impl Link {
             }
         }
     }
+
+    /// Waits until an authority is no longer trusted.
+    async fn retired(&self, issuer: &str) {
+        let mut changes = self.authorities.changes();
+        while self.authorities.present().is_trusted(issuer) {
+            if changes.changed().await.is_err() {
+                std::future::pending::<()>().await;
+            }
+        }
+    }
 }
 
-async fn join(
-    mut outside: impl AsyncRead + AsyncWrite + Unpin,
-    mut inside: impl AsyncRead + AsyncWrite + Unpin,
-) {
-    let copying =
-        copy_bidirectional_with_sizes(&mut outside, &mut inside, BUFFER_BYTES, BUFFER_BYTES);
-    if let Err(error) = copying.await {
-        debug!("a robot's link broke: {error}");
+/// Whether the other side does not trust the port's authority.
+fn is_distrust(error: &std::io::Error) -> bool {
+    let cause = error.get_ref().and_then(|cause| cause.downcast_ref());
+    matches!(
+        cause,
+        Some(rustls::Error::AlertReceived(AlertDescription::UnknownCA))
+    )
+}
+
+/// Sends the credentials and reads the begin of the session.
+async fn begin(
+    outside: &mut server::TlsStream<TcpStream>,
+    credentials: &RouterCredentials,
+) -> anyhow::Result<Init> {
+    outside.write_all(&credentials.to_bytes()?).await?;
+    outside.flush().await?;
+    Ok(read_init(outside, credentials).await?)
+}
+
+async fn connect(router: &Router) -> anyhow::Result<TcpStream> {
+    let socket = TcpSocket::new_v4()?;
+    socket.set_recv_buffer_size(SEND_BUFFER_BYTES)?;
+    let stream = socket.connect(router.address).await?;
+    stream.set_nodelay(true)?;
+    Ok(stream)
+}
+
+/// Waits until a router has let go of a session whose link has ended.
+async fn session_gone(router: &Arc<Router>, session_id: u128) {
+    loop {
+        let asked = Arc::clone(router);
+        let asking = tokio::task::spawn_blocking(move || asked.has_session(session_id));
+        if !asking.await.unwrap_or(false) {
+            return;
+        }
+        tokio::time::sleep(SESSION_GONE_EVERY).await;
     }
 }
 

@@ -6,18 +6,25 @@
 //!     │ begins like TLS? ─no─► closed
 //!     │ handshake with a certificate of the fleet's authority, in time? ─no─► closed
 //!     │ the certificate's enrolment in force? ─no─► closed, and people are told
+//!     │ more than four links of this robot? ─► its oldest goes
+//!     │ the gate sends the robot its user name and password
+//!     │ the session begins as a client, with an id of the robot's own? ─no─► closed
+//!     │ an older link of this session? ─► ends first, or the router would refuse the new one
+//!     │ only now a connection inside is made; the session opens as that user? ─no─► closed
 //!     ▼
 //!  joined to the router, as the robot that the certificate names, until either side ends, the
-//!  certificate is over, or the robot is put out of the fleet
+//!  certificate is over, its authority is retired, or the robot is put out of the fleet
 //! ```
 //!
-//! zenoh's own TLS listener sleeps for 0.1 s after each failed handshake, during which it takes
-//! nobody: twenty garbage connections a second lock every robot out. It also does not tell who
-//! failed, reads its certificate once, and cannot end one robot's link. So TLS ends here, many
-//! handshakes at a time, and a router sees connections that have been checked.
+//! zenoh's own TLS link is unsound: its reader and its writer use one rustls stream at the same
+//! time, which has aborted servers. Its listener also sleeps for 0.1 s after each failed handshake,
+//! does not tell who failed, reads its certificate once, and cannot end one robot's link. So TLS
+//! ends here, many handshakes at a time, and a router sees sessions that have been checked.
 
 mod failures;
 mod link;
+mod links;
+mod session;
 
 use std::net::{IpAddr, SocketAddr};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -32,14 +39,17 @@ use tokio::net::{TcpListener, TcpSocket};
 use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 use tracing::{error, warn};
+use tread_api::tunnel::ALPN;
 
 use self::failures::Failures;
 use self::link::Link;
-use super::opening::Inside;
+#[cfg(test)]
+pub(super) use self::links::LINKS_PER_ROBOT_MAX;
+use self::links::Links;
 use super::routers::Routers;
 use super::{FleetError, SEND_BUFFER_BYTES, SESSIONS_MAX, Security};
 use crate::app::App;
-use crate::authority::PORT_LASTS;
+use crate::authority::{PORT_LASTS, Trusted};
 use crate::clock::Clock;
 use crate::connections::{Bounds, Connections};
 use crate::supervisor::Supervisor;
@@ -63,7 +73,6 @@ pub(super) struct Gate {
     listener: TcpListener,
     address: SocketAddr,
     door: Door,
-    inside: Arc<Inside>,
 }
 
 /// What the port shows.
@@ -76,6 +85,7 @@ struct Door {
 struct Present {
     config: Arc<ServerConfig>,
     made_at: Timestamp,
+    trusted: Arc<Trusted>,
 }
 
 impl std::fmt::Debug for Door {
@@ -87,25 +97,34 @@ impl std::fmt::Debug for Door {
 impl Door {
     fn new(security: Security, clock: Clock) -> anyhow::Result<Self> {
         let made_at = clock.machine_time();
-        let config = Arc::new(server_config(&security, &clock)?);
+        let trusted = security.authorities.present();
+        let config = Arc::new(server_config(&trusted, &security.names, &clock)?);
         Ok(Self {
             security,
             clock,
-            present: Mutex::new(Present { config, made_at }),
+            present: Mutex::new(Present {
+                config,
+                made_at,
+                trusted,
+            }),
         })
     }
 
-    /// What makes TLS of a connection; the certificate is made anew in time.
+    /// What makes TLS of a connection; the certificate is made anew in time, and at once when another
+    /// authority is trusted or one no more. What a client kept of a session before is of no use then.
     fn acceptor(&self) -> TlsAcceptor {
         let now = self.clock.machine_time();
         let mut present = self.present.lock().unwrap_or_else(PoisonError::into_inner);
         let age = now.duration_since(present.made_at);
-        if age > PORT_LASTS / 3 || age < SignedDuration::ZERO {
-            match server_config(&self.security, &self.clock) {
+        let trusted = self.security.authorities.present();
+        let is_rotated = !Arc::ptr_eq(&trusted, &present.trusted);
+        if is_rotated || age > PORT_LASTS / 3 || age < SignedDuration::ZERO {
+            match server_config(&trusted, &self.security.names, &self.clock) {
                 Ok(config) => {
                     *present = Present {
                         config: Arc::new(config),
                         made_at: now,
+                        trusted,
                     };
                 }
                 Err(failed) => error!("the robots' port keeps its certificate: {failed:#}"),
@@ -127,20 +146,27 @@ impl TimeProvider for ServerTime {
     }
 }
 
-fn server_config(security: &Security, clock: &Clock) -> anyhow::Result<ServerConfig> {
+fn server_config(
+    trusted: &Trusted,
+    names: &[String],
+    clock: &Clock,
+) -> anyhow::Result<ServerConfig> {
     let now = clock.machine_time();
-    let identity = security.authority.port_identity(&security.names, now)?;
+    let identity = trusted.of_port().port_identity(names, now)?;
     let mut roots = RootCertStore::empty();
-    roots.add(security.authority.certificate().clone())?;
+    for authority in trusted.all() {
+        roots.add(authority.certificate().clone())?;
+    }
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let verifier =
         WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&provider))
             .build()?;
     let time = Arc::new(ServerTime(clock.clone()));
-    let config = ServerConfig::builder_with_details(provider, time)
+    let mut config = ServerConfig::builder_with_details(provider, time)
         .with_protocol_versions(&[&rustls::version::TLS13])?
         .with_client_cert_verifier(verifier)
         .with_single_cert(identity.chain, identity.key)?;
+    config.alpn_protocols = vec![ALPN.to_vec()];
     Ok(config)
 }
 
@@ -153,7 +179,6 @@ impl Gate {
         address: SocketAddr,
         security: Security,
         clock: Clock,
-        inside: Arc<Inside>,
     ) -> Result<Self, FleetError> {
         let door = Door::new(security, clock).map_err(FleetError::Certificates)?;
         let listener = listen(address).map_err(|cause| FleetError::InUse { address, cause })?;
@@ -164,7 +189,6 @@ impl Gate {
             listener,
             address,
             door,
-            inside,
         })
     }
 
@@ -183,6 +207,7 @@ impl Gate {
     ) {
         let connections = Connections::new(BOUNDS);
         let failures = Arc::new(Mutex::new(Failures::default()));
+        let links = Links::default();
         loop {
             let accepted = tokio::select! {
                 biased;
@@ -215,9 +240,10 @@ impl Gate {
                 peer,
                 slot: admitted.slot,
                 acceptor: self.door.acceptor(),
-                inside: Arc::clone(&self.inside),
+                authorities: Arc::clone(&self.door.security.authorities),
                 routers: Arc::clone(&routers),
                 failures: Arc::clone(&failures),
+                links: links.clone(),
             };
             let stop = stop.clone();
             supervisor.spawn_passing("robot's link", async move {
@@ -236,7 +262,11 @@ fn is_blocked(failures: &Mutex<Failures>, address: IpAddr, now: Duration) -> boo
     failures.is_blocked(address, now)
 }
 
-/// Listens with a small send buffer: what stands in it has lost its priority.
+/// Bytes of a robot that stand in the kernel at most: what stands there has lost its priority, so a
+/// robot whose outbox is long would confirm a Stop late.
+const RECEIVE_BUFFER_BYTES: u32 = 64 * 1024;
+
+/// Listens with small buffers: what stands in them has lost its priority.
 fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
     let socket = if address.is_ipv4() {
         TcpSocket::new_v4()?
@@ -246,6 +276,7 @@ fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
     // A server that starts again may find connections of its former self.
     socket.set_reuseaddr(true)?;
     socket.set_send_buffer_size(SEND_BUFFER_BYTES)?;
+    socket.set_recv_buffer_size(RECEIVE_BUFFER_BYTES)?;
     socket.bind(address)?;
     socket.listen(BACKLOG)
 }

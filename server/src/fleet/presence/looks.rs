@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use tread_api::ids::{MissionId, StopId};
+use tread_api::rights::Scope;
 use tread_api::robot::{LinkCause, LinkState};
 
 use super::{Presence, Presences, RobotKey, stop_of};
@@ -120,11 +121,14 @@ impl Presences {
         })
     }
 
-    /// How many robots are on the network.
-    pub fn present_count(&self) -> usize {
+    /// How many robots of a scope are on the network.
+    pub fn present_count(&self, within: &Scope) -> usize {
         self.lock()
-            .values()
-            .filter(|presence| presence.welcomed && !presence.tokens.is_empty())
+            .iter()
+            .filter(|((site, robot), presence)| {
+                let is_present = presence.welcomed && !presence.tokens.is_empty();
+                is_present && within.includes_robot(site, robot)
+            })
             .count()
     }
 }

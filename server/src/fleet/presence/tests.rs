@@ -106,7 +106,10 @@ fn of_a_robot_that_said_no_hello_nothing_is_kept() {
     let heard = presences.state(&key(), state(boot(1), 0), SECOND, wall());
     assert_eq!(heard, Heard::Stranger);
     presences.token_appeared(key(), boot(1), SECOND);
-    assert_eq!(presences.present_count(), 0);
+    assert_eq!(
+        presences.present_count(&tread_api::rights::Scope::EVERYWHERE),
+        0
+    );
     assert_eq!(
         presences.state(&key(), state(boot(1), 0), SECOND, wall()),
         Heard::Stranger

@@ -102,6 +102,15 @@ impl Changes {
         }
     }
 
+    /// Counts on from older changes, after which everything may have changed.
+    pub(super) fn follow(&mut self, before: &Self) {
+        self.newest = self.newest.max(before.newest);
+        for &block in before.blocks.keys() {
+            self.blocks.entry(block).or_default();
+        }
+        self.note_all();
+    }
+
     /// The number of the newest change.
     pub fn newest(&self) -> u64 {
         self.newest
@@ -182,6 +191,22 @@ mod tests {
                     prop_assert!(cells.len() - since > KEPT_MAX);
                 }
             }
+        }
+    }
+
+    #[test]
+    fn changes_that_follow_others_are_newer_also_where_nothing_is_left() {
+        let (here, gone) = (Cell { ix: 1, iy: 1 }, Cell { ix: 999, iy: 1 });
+        let mut before = Changes::default();
+        for cell in [here, gone, here] {
+            before.note(cell);
+        }
+        let mut after = Changes::default();
+        after.note(here);
+        after.follow(&before);
+        for cell in [here, gone] {
+            assert!(after.newest_of(Block::of(cell)) > before.newest());
+            assert_eq!(after.since(Block::of(cell), before.newest()), None);
         }
     }
 

@@ -241,6 +241,12 @@ impl SiteMap {
         self.changes.note_all();
     }
 
+    /// Takes the place of an older map of the same site: its changes are counted on from there, and
+    /// everything may have changed.
+    pub fn follow(&mut self, before: &Self) {
+        self.changes.follow(&before.changes);
+    }
+
     /// Hours before this one are read as days.
     pub fn merged_before_h(&self) -> i64 {
         self.merged_before_h

@@ -237,7 +237,7 @@ fn refused(error: PngError) -> AppError {
 /// pages that is sent while it is made. Headers say whose θ it is (`tread-configuration`), by which normalisation
 /// (`tread-normalisation`), both of pictures alone, and as of when (`tread-as-of`).
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/map", tag = "friction",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "get_friction_map", params(("site" = SiteId, Path), MapQuery),
     responses((status = 200, description = "The map in that format", content(
             (Vec<u8> = "image/png"), (MapPage<CellFriction> = "application/json"),

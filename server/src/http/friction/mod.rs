@@ -22,6 +22,7 @@ use self::map::say_as_of;
 use self::streamed::{CSV_MEDIA_TYPE, JSON_MEDIA_TYPE, PARQUET_MEDIA_TYPE, streamed};
 use super::etag;
 use super::extract::{Path, Query, cursor, page_limit};
+use super::identity::guard::Subject;
 use super::negotiate::{Offered, choose, offered};
 use super::problem::Problem;
 use super::sites::PageQuery;
@@ -69,7 +70,7 @@ fn asked(
 
 /// Friction of every terrain of a site.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains", tag = "friction",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "list_terrain_friction", params(("site" = SiteId, Path), ReadingQuery),
     responses((status = 200, body = Page<TerrainFriction>), (status = 304),
         (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
@@ -105,7 +106,7 @@ pub(super) struct OneQuery {
 
 /// Friction of one terrain, per robot model.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains/{terrain}", tag = "friction",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "get_terrain_friction",
     params(("site" = SiteId, Path), ("terrain" = TerrainId, Path), OneQuery),
     responses((status = 200, body = TerrainFriction), (status = 304),
@@ -141,7 +142,7 @@ pub(super) struct HistoryQuery {
 
 /// Friction of one terrain as it was known at equally spaced times.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains/{terrain}/history",
-    tag = "friction", security(("token" = ["viewer"])),
+    tag = "friction", security(("token" = ["read"])),
     operation_id = "get_terrain_history",
     params(("site" = SiteId, Path), ("terrain" = TerrainId, Path), HistoryQuery),
     responses((status = 200, body = TerrainHistory), (status = 304),
@@ -167,18 +168,19 @@ pub(super) async fn history(
 
 /// What each robot has put into the map.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/robots", tag = "friction",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "list_contributions", params(("site" = SiteId, Path), PageQuery),
     responses((status = 200, body = Page<RobotContribution>), (status = 304),
         (status = 404, body = ProblemBody)))]
 pub(super) async fn robots(
     State(app): State<App>,
+    Subject(subject): Subject,
     Path(site): Path<SiteId>,
     Query(query): Query<PageQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let limit = page_limit(query.limit)?;
-    let found = app.contributions(&site, query.cursor.as_deref(), limit);
+    let found = app.contributions((&site, &subject.scope), query.cursor.as_deref(), limit);
     Ok(etag::json(&headers, &found.await?))
 }
 
@@ -218,7 +220,7 @@ const SEGMENT_FORMATS: [Offered<SegmentFormat>; 3] = [
 
 /// Raw measurements in the order of their commits.
 #[utoipa::path(get, path = "/v1/sites/{site}/segments", tag = "friction",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "list_segments", params(("site" = SiteId, Path), SegmentQuery),
     responses((status = 200, description = "The measurements", content(
             (Page<StoredSegment> = "application/json"), (String = "text/csv"),
@@ -227,6 +229,7 @@ const SEGMENT_FORMATS: [Offered<SegmentFormat>; 3] = [
         (status = 406, body = ProblemBody)))]
 pub(super) async fn segments(
     State(app): State<App>,
+    Subject(subject): Subject,
     Path(site): Path<SiteId>,
     Query(query): Query<SegmentQuery>,
     headers: HeaderMap,
@@ -238,6 +241,7 @@ pub(super) async fn segments(
     let filter = SegmentFilter {
         robot,
         terrain,
+        robots: subject.scope.limit_of(&site),
         after,
     };
     let (media_type, writer) = match format {

@@ -10,7 +10,7 @@ use tread_api::friction::{
 };
 use tread_api::geometry::Point;
 use tread_api::ids::{ConfigurationId, SiteId};
-use tread_api::page::MapPage;
+use tread_api::page::{DifferencePage, MapPage};
 use tread_api::problem::ProblemBody;
 use utoipa::IntoParams;
 
@@ -20,6 +20,7 @@ use crate::app::App;
 use crate::app::friction::{Area, CellsAsked};
 use crate::http::etag;
 use crate::http::extract::{Json, Path, Query, page_limit};
+use crate::http::identity::guard::Subject;
 use crate::http::problem::Problem;
 
 /// Which cells, and which page of them.
@@ -54,7 +55,7 @@ pub(in crate::http) struct CellQuery {
 
 /// Friction per cell.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/cells", tag = "friction",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "list_cell_friction", params(("site" = SiteId, Path), CellQuery),
     responses((status = 200, body = MapPage<CellFriction>), (status = 304),
         (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
@@ -98,7 +99,7 @@ pub(in crate::http) struct PointQuery {
 
 /// Friction at a point, of the terrain under it alone.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/point", tag = "friction",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "get_point_friction", params(("site" = SiteId, Path), PointQuery),
     responses((status = 200, body = PointFriction), (status = 304),
         (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
@@ -119,7 +120,7 @@ pub(in crate::http) async fn point(
 
 /// Friction along a path, how sure it is, and the speed that follows for a robot.
 #[utoipa::path(post, path = "/v1/sites/{site}/friction/path", tag = "friction",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "ask_path_friction", params(("site" = SiteId, Path)),
     request_body = AskPath,
     responses((status = 200, body = PathFriction), (status = 304),
@@ -127,9 +128,11 @@ pub(in crate::http) async fn point(
 pub(in crate::http) async fn path(
     State(app): State<App>,
     Path(site): Path<SiteId>,
+    Subject(subject): Subject,
     headers: HeaderMap,
     Json(request): Json<AskPath>,
 ) -> Result<Response, Problem> {
+    subject.check_robot(&site, &request.robot)?;
     let found = app.friction_along(&site, request).await?;
     Ok(say_as_of(etag::json(&headers, &found), found.as_of))
 }
@@ -164,10 +167,10 @@ pub(in crate::http) struct DifferenceQuery {
 
 /// How cells that were measured between two times differ from the first to the second.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/difference", tag = "friction",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "list_friction_differences",
     params(("site" = SiteId, Path), DifferenceQuery),
-    responses((status = 200, body = MapPage<CellDifference>), (status = 304),
+    responses((status = 200, body = DifferencePage<CellDifference>), (status = 304),
         (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
 pub(in crate::http) async fn difference(
     State(app): State<App>,
@@ -216,7 +219,7 @@ pub(in crate::http) struct VisitQuery {
 
 /// Cells in which a visit would teach most about θ, the best first.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/visits", tag = "friction",
-    security(("token" = ["viewer"])),
+    security(("token" = ["read"])),
     operation_id = "list_visit_suggestions", params(("site" = SiteId, Path), VisitQuery),
     responses((status = 200, body = MapPage<VisitSuggestion>), (status = 304),
         (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]

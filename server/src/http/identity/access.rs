@@ -1,10 +1,10 @@
-//! The table of roles: method and route to what they need, read from the API's description.
+//! The table of rights: method and route to what they need, read from the API's description.
 
 use std::collections::HashMap;
 
 use axum::http::Method;
 use serde_json::Value;
-use tread_api::identity::Role;
+use tread_api::rights::Right;
 use utoipa::openapi::OpenApi;
 use utoipa::openapi::security::{ApiKey, ApiKeyValue, HttpAuthScheme, HttpBuilder, SecurityScheme};
 
@@ -25,7 +25,7 @@ pub const PUBLIC: [(&str, &str); 11] = [
     ("GET", "/docs/"),
     ("GET", "/docs/{*rest}"),
 ];
-/// The scheme that each route names with its role.
+/// The scheme that each route names with its right.
 const TOKEN_SCHEME: &str = "token";
 /// The same by a browser's cookie, added here.
 const SESSION_SCHEME: &str = "session";
@@ -35,8 +35,8 @@ const SESSION_SCHEME: &str = "session";
 pub enum Needed {
     /// Nothing.
     Nothing,
-    /// A token of this role or a stronger one.
-    Role(Role),
+    /// A token with this right.
+    Right(Right),
 }
 
 /// What every route needs.
@@ -46,7 +46,7 @@ pub struct Access {
 }
 
 impl Access {
-    /// Reads the table from the description. An operation that names no role and is not public
+    /// Reads the table from the description. An operation that names no right and is not public
     /// is left out, and so refused.
     pub fn of(openapi: &OpenApi) -> Self {
         let mut access = Self::default();
@@ -61,10 +61,10 @@ impl Access {
                 if PUBLIC.contains(&(&method, path)) {
                     continue;
                 }
-                if let Some(role) = role_of(operation) {
-                    access.insert(path, &method, Needed::Role(role));
+                if let Some(right) = right_of(operation) {
+                    access.insert(path, &method, Needed::Right(right));
                 } else {
-                    tracing::error!("{method} {path} names no role and is refused");
+                    tracing::error!("{method} {path} names no right and is refused");
                 }
             }
         }
@@ -112,14 +112,14 @@ impl Access {
     }
 }
 
-/// The role that an operation names; `None` unless it names exactly one that exists.
-fn role_of(operation: &Value) -> Option<Role> {
+/// The right that an operation names; `None` unless it names exactly one that exists.
+fn right_of(operation: &Value) -> Option<Right> {
     let requirements = operation["security"].as_array()?;
-    let roles = requirements
+    let rights = requirements
         .iter()
         .find_map(|requirement| requirement.get(TOKEN_SCHEME))?;
-    match roles.as_array()?.as_slice() {
-        [role] => Role::from_name(role.as_str()?),
+    match rights.as_array()?.as_slice() {
+        [right] => Right::from_name(right.as_str()?),
         _ => None,
     }
 }
@@ -129,8 +129,9 @@ pub(in crate::http) fn describe(openapi: &mut OpenApi) {
     let bearer = HttpBuilder::new()
         .scheme(HttpAuthScheme::Bearer)
         .description(Some(
-            "A token: `authorization: Bearer tread_…`. The roles that a route names are those \
-             that may ask for it; a stronger role includes the weaker ones.",
+            "A token: `authorization: Bearer tread_…`. The right that a route names is the one that \
+             it takes; a token has those of its role, or rights of its own, everywhere or for \
+             some sites and robots.",
         ))
         .build();
     let cookie = ApiKeyValue::with_description(
@@ -153,10 +154,10 @@ pub(in crate::http) fn describe(openapi: &mut OpenApi) {
         ];
         for operation in operations.into_iter().flatten() {
             let written = serde_json::to_value(&*operation).unwrap_or_default();
-            if let (Some(role), Some(security)) = (role_of(&written), &mut operation.security) {
+            if let (Some(right), Some(security)) = (right_of(&written), &mut operation.security) {
                 security.push(utoipa::openapi::SecurityRequirement::new(
                     SESSION_SCHEME,
-                    [role.as_str()],
+                    [right.as_str()],
                 ));
             }
         }
@@ -172,22 +173,22 @@ mod tests {
     }
 
     #[test]
-    fn an_operation_needs_exactly_one_role_that_exists() {
+    fn an_operation_needs_exactly_one_right_that_exists() {
         use serde_json::json;
         assert_eq!(
-            role_of(&operation(&json!([{"token": ["admin"]}]))),
-            Some(Role::Admin)
+            right_of(&operation(&json!([{"token": ["administer"]}]))),
+            Some(Right::Administer)
         );
         for wrong in [
             json!([]),
             json!(null),
             json!([{}]),
             json!([{"token": []}]),
-            json!([{"token": ["root"]}]),
-            json!([{"token": ["viewer", "admin"]}]),
-            json!([{"session": ["viewer"]}]),
+            json!([{"token": ["admin"]}]),
+            json!([{"token": ["read", "administer"]}]),
+            json!([{"session": ["read"]}]),
         ] {
-            assert_eq!(role_of(&operation(&wrong)), None, "{wrong}");
+            assert_eq!(right_of(&operation(&wrong)), None, "{wrong}");
         }
     }
 

@@ -2,9 +2,10 @@
 
 use axum::extract::State;
 use serde::Deserialize;
-use tread_api::identity::AuditEntry;
+use tread_api::audit::AuditChain;
+use tread_api::identity::{AuditEntry, AuditOrder};
 use tread_api::page::Page;
-use tread_api::problem::ProblemBody;
+use tread_api::problem::{ProblemBody, ProblemType};
 use utoipa::IntoParams;
 
 use crate::app::App;
@@ -23,15 +24,19 @@ pub(in crate::http) struct AuditQuery {
     #[serde(default)]
     #[param(required = false)]
     refused: bool,
-    /// `next_cursor` of the page before.
+    /// Which come first: `newest` when absent.
+    #[serde(default)]
+    #[param(required = false)]
+    order: AuditOrder,
+    /// `next_cursor` of the page before, which is the number of its last entry.
     cursor: Option<String>,
     /// Most entries of the page, 1 to 1000; 100 when absent.
     limit: Option<u32>,
 }
 
-/// Who changed what, from where, and who was refused; newest first.
+/// Who changed what, from where, and who was refused.
 #[utoipa::path(get, path = "/v1/audit", tag = "identity", operation_id = "list_audit",
-    security(("token" = ["admin"])), params(AuditQuery),
+    security(("token" = ["administer"])), params(AuditQuery),
     responses((status = 200, body = Page<AuditEntry>), (status = 400, body = ProblemBody)))]
 pub(in crate::http) async fn list(
     State(app): State<App>,
@@ -39,9 +44,21 @@ pub(in crate::http) async fn list(
 ) -> Result<Json<Page<AuditEntry>>, Problem> {
     let limit = page_limit(query.limit)?;
     let filter = AuditFilter {
-        before: cursor(query.cursor.as_deref())?,
+        order: query.order,
+        beyond: cursor(query.cursor.as_deref())?,
         who: query.who,
         refused: query.refused,
     };
     Ok(Json(app.audit_log(&filter, limit).await?))
+}
+
+/// What frames the chain of the audit log, for verifying it: the entries carry their hashes, and
+/// whoever reads them computes them again.
+#[utoipa::path(get, path = "/v1/audit/chain", tag = "identity", operation_id = "get_audit_chain",
+    security(("token" = ["administer"])),
+    responses((status = 200, body = AuditChain), (status = 404, body = ProblemBody)))]
+pub(in crate::http) async fn chain(State(app): State<App>) -> Result<Json<AuditChain>, Problem> {
+    let chain = app.audit_chain().await?;
+    let gone = || Problem::new(ProblemType::NotFound).detail("the record of the chain is gone");
+    Ok(Json(chain.ok_or_else(gone)?))
 }

@@ -35,21 +35,22 @@ pub(in crate::http) struct PageQuery {
 
 /// Join tokens, newest first, dead ones too. Secrets are told once and never again.
 #[utoipa::path(get, path = "/v1/join-tokens", tag = "identity", operation_id = "list_join_tokens",
-    security(("token" = ["admin"])), params(PageQuery),
+    security(("token" = ["administer"])), params(PageQuery),
     responses((status = 200, body = Page<JoinToken>), (status = 400, body = ProblemBody)))]
 pub(in crate::http) async fn list_tokens(
     State(app): State<App>,
+    Subject(subject): Subject,
     Query(query): Query<PageQuery>,
 ) -> Result<Json<Page<JoinToken>>, Problem> {
     let limit = page_limit(query.limit)?;
     let before = cursor(query.cursor.as_deref())?;
-    Ok(Json(app.join_tokens(before, limit).await?))
+    Ok(Json(app.join_tokens(&subject.scope, before, limit).await?))
 }
 
 /// Makes a token by which one robot may join once. Its secret is in this answer and nowhere else.
 #[utoipa::path(post, path = "/v1/join-tokens", tag = "identity",
     operation_id = "create_join_token",
-    security(("token" = ["admin"])), request_body = CreateJoinToken,
+    security(("token" = ["administer"])), request_body = CreateJoinToken,
     responses((status = 201, body = CreatedJoinToken), (status = 404, body = ProblemBody),
         (status = 409, body = ProblemBody), (status = 422, body = ProblemBody)))]
 pub(in crate::http) async fn create_token(
@@ -57,13 +58,17 @@ pub(in crate::http) async fn create_token(
     Subject(subject): Subject,
     Json(request): Json<CreateJoinToken>,
 ) -> Result<(StatusCode, Json<CreatedJoinToken>), Problem> {
+    match &request.robot {
+        Some(robot) => subject.check_robot(&request.site, robot)?,
+        None => subject.check_whole_site(&request.site)?,
+    }
     let created = app.create_join_token(request, &subject.name).await?;
     Ok((StatusCode::CREATED, Json(created)))
 }
 
 /// Revokes a join token: no robot joins by it any more.
 #[utoipa::path(delete, path = "/v1/join-tokens/{token}", tag = "identity",
-    operation_id = "revoke_join_token", security(("token" = ["admin"])),
+    operation_id = "revoke_join_token", security(("token" = ["administer"])),
     params(("token" = JoinTokenId, Path)),
     responses((status = 200, body = JoinToken), (status = 404, body = ProblemBody)))]
 pub(in crate::http) async fn revoke_token(
@@ -75,23 +80,25 @@ pub(in crate::http) async fn revoke_token(
 
 /// How each robot of a site stands that has ever joined: its newest enrolment.
 #[utoipa::path(get, path = "/v1/sites/{site}/enrolments", tag = "identity",
-    operation_id = "list_enrolments", security(("token" = ["viewer"])),
+    operation_id = "list_enrolments", security(("token" = ["read"])),
     params(("site" = SiteId, Path), PageQuery),
     responses((status = 200, body = Page<Enrolment>), (status = 404, body = ProblemBody)))]
 pub(in crate::http) async fn list(
     State(app): State<App>,
+    Subject(subject): Subject,
     Path(site): Path<SiteId>,
     Query(query): Query<PageQuery>,
 ) -> Result<Json<Page<Enrolment>>, Problem> {
     let limit = page_limit(query.limit)?;
     let after = query.cursor.unwrap_or_default();
-    Ok(Json(app.enrolments(&site, &after, limit).await?))
+    let place = (&site, &subject.scope);
+    Ok(Json(app.enrolments(place, &after, limit).await?))
 }
 
 /// Puts a robot out of the fleet: what it says counts no more, its link is cut, and it gets no
 /// certificate until it joins again by a token that names it.
 #[utoipa::path(delete, path = "/v1/sites/{site}/enrolments/{robot}", tag = "identity",
-    operation_id = "revoke_robot", security(("token" = ["admin"])),
+    operation_id = "revoke_robot", security(("token" = ["administer"])),
     params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
     responses((status = 200, body = Enrolment), (status = 404, body = ProblemBody)))]
 pub(in crate::http) async fn revoke(
@@ -114,8 +121,7 @@ pub(in crate::http) async fn enrol(
     peer: Option<Extension<Peer>>,
     Json(request): Json<EnrolRobot>,
 ) -> Response {
-    let address = peer.map(|Extension(Peer(peer))| peer.ip());
-    let address = address.unwrap_or([0, 0, 0, 0].into()).to_canonical();
+    let address = peer.map_or([0, 0, 0, 0].into(), |Extension(Peer(address))| address);
     match app.enrol_robot(address, &request).await {
         Ok(enrolled) => {
             let certificate = enrolled.certificate;
@@ -156,7 +162,7 @@ pub(in crate::http) async fn renew(
         }
         Err(error) => {
             let mut what = json!({"refused": error.to_string()});
-            if let EnrolError::Ended(name) = &error {
+            if let EnrolError::Ended(name) | EnrolError::Retired(name) = &error {
                 what["site"] = json!(name.site);
                 what["robot"] = json!(name.robot);
             }
@@ -192,6 +198,7 @@ fn refusal(app: &App, error: EnrolError) -> Response {
         }
         EnrolError::Certificate(_) => &counters.renewals_refused,
         EnrolError::Ended(_) => &counters.renewals_revoked,
+        EnrolError::Retired(_) => &counters.renewals_retired,
     };
     counter.one();
     Problem::new(ProblemType::Unauthenticated)

@@ -1,32 +1,37 @@
-//! The guard before every route: host, origin, token, role; then the audit log.
+//! The guard before every route: host, origin, token, right, site and robot; then the audit log.
 //!
 //! It works on what the router matched, so no handler can be reached past it. The answer to a
 //! token that is wrong, expired or revoked is one and the same.
 
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr};
 use std::sync::{Arc, OnceLock};
 
 use axum::body::Body;
 use axum::extract::{FromRequestParts, MatchedPath, Request, State};
 use axum::http::request::Parts;
-use axum::http::{HeaderMap, HeaderValue, Method, header};
+use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use futures_util::StreamExt as _;
 use serde_json::Value;
-use tread_api::identity::{AuditEntry, Role};
+use tread_api::identity::AuditEntry;
 use tread_api::problem::ProblemType;
+use tread_api::rights::Right;
 
 use super::access::{Access, Needed};
-use super::browser;
-use crate::app::App;
+use super::{browser, place};
 use crate::app::identity::{Credential, Shown, SignInError};
+use crate::app::{App, AppError};
+use crate::connections::{Purpose, Slot};
 use crate::counters::Counter;
 use crate::http::REQUEST_ID;
 use crate::http::problem::Problem;
 use crate::identity::origin::{Names, Provenance};
 use crate::identity::redact::redacted_text;
 
+/// The routes that stop robots.
+const STOP_ALL: &str = "/v1/stop";
+const STOP_ONE: &str = "/v1/sites/{site}/robots/{robot}/stop";
 /// Longest query of a request, bytes.
 const QUERY_MAX: usize = 4_096;
 /// Longest path of a request, bytes.
@@ -34,9 +39,10 @@ const PATH_MAX: usize = 2_048;
 /// Longest path and request id that the audit log keeps, in characters.
 const AUDIT_TEXT_MAX: usize = 200;
 
-/// Where a request came from, an extension set by the accept loop.
+/// Where a request came from, an extension set by the accept loop: the address of the other side,
+/// or of the client that a trusted proxy names.
 #[derive(Debug, Clone, Copy)]
-pub(in crate::http) struct Peer(pub(in crate::http) SocketAddr);
+pub(in crate::http) struct Peer(pub(in crate::http) IpAddr);
 
 /// Who asks: behind the guard there is always one, on all but the public routes.
 #[derive(Debug, Clone)]
@@ -163,7 +169,7 @@ impl Guard {
         method: &Method,
         headers: &HeaderMap,
         address: IpAddr,
-        needed: Role,
+        (needed, purpose): (Right, Purpose),
     ) -> Result<Arc<Credential>, Refusal> {
         let counters = self.app.counters();
         let Some((text, shown)) = shown(headers, self.names.is_tls) else {
@@ -174,7 +180,7 @@ impl Guard {
             return Err(refusal);
         };
         self.check_origin(method, headers, Some(shown))?;
-        let found = self.app.authenticate(address, text, shown).await;
+        let found = self.app.authenticate(address, text, shown, purpose).await;
         let credential = found.map_err(|error| {
             let mut response = sign_in_problem(&self.app, &error);
             if shown == Shown::Session && response.status() == 401 {
@@ -183,35 +189,65 @@ impl Guard {
             }
             Refusal::of(response)
         })?;
-        if credential.role.includes(needed) {
+        if credential.rights.includes(needed) {
             return Ok(credential);
         }
         let detail = format!(
-            "this needs the role {needed}, and `{}` is {}",
-            credential.name, credential.role
+            "this needs the right `{needed}`, and `{}` has {}",
+            credential.name, credential.rights
         );
-        let problem = Problem::new(ProblemType::Forbidden).detail(detail);
-        let mut refusal = Refusal::counted(&counters.refused_role, problem);
-        refusal.who = Some(credential);
-        Err(refusal)
+        Err(self.forbidden(credential, detail))
     }
 
-    fn note(
+    fn forbidden(&self, who: Arc<Credential>, detail: String) -> Refusal {
+        let problem = Problem::new(ProblemType::Forbidden).detail(detail);
+        let mut refusal = Refusal::counted(&self.app.counters().refused_role, problem);
+        refusal.who = Some(who);
+        refusal
+    }
+
+    /// Refuses what is about something that the token is not for.
+    async fn check_place(
         &self,
-        asked: Asked,
-        response: &Response,
-        who: Option<&Arc<Credential>>,
-        is_change: bool,
-    ) {
+        request: &mut Request,
+        needed: (&str, Right),
+        who: &Arc<Credential>,
+    ) -> Result<(), Refusal> {
+        if let Err(error) = place::check(&self.app, request, needed, who).await {
+            let is_outside = matches!(error, AppError::OutsideScope(_));
+            let mut refusal = Refusal::of(Problem::from(error).into_response());
+            refusal.who = Some(Arc::clone(who));
+            if is_outside {
+                self.app.counters().refused_scope.one();
+            }
+            return Err(refusal);
+        }
+        let holder = place::holder(request, needed.1).await;
+        match holder.filter(|holder| !who.may_hold_as(holder)) {
+            None => Ok(()),
+            Some(holder) => {
+                let (right, name) = (Right::ReleaseHold, &who.name);
+                let detail = format!(
+                    "this needs the right `{right}`: `{name}` sets and ends the limit of the \
+                     holder `{name}` alone, not that of `{holder}`"
+                );
+                Err(self.forbidden(Arc::clone(who), detail))
+            }
+        }
+    }
+
+    fn note(&self, asked: Asked, response: &Response, who: Option<&Arc<Credential>>) {
         let said = response.extensions().get::<Audited>();
         let said = said.map(|Audited(what)| what.clone());
         let left = asked.slot.0.get().cloned();
         let entry = AuditEntry {
             id: 0,
             at: self.app.clock().now(),
+            since: None,
+            count: 1,
             who: who.map(|who| who.name.clone()),
             token: who.map(|who| who.token),
-            role: who.map(|who| who.role),
+            role: who.and_then(|who| who.role),
             address: asked.address.to_string(),
             method: asked.method,
             route: asked.route,
@@ -219,8 +255,10 @@ impl Guard {
             status: response.status().as_u16(),
             request_id: asked.request_id,
             what: said.or(left).filter(|what| !what.is_null()),
+            previous_hash: None,
+            hash: None,
         };
-        self.app.audit(entry, is_change);
+        self.app.audit(entry);
     }
 }
 
@@ -272,7 +310,7 @@ pub(in crate::http) async fn stand(
         Ok(subject) => subject,
         Err(refusal) => {
             if refusal.is_audited {
-                guard.note(asked, &refusal.response, refusal.who.as_ref(), false);
+                guard.note(asked, &refusal.response, refusal.who.as_ref());
             }
             return *refusal.response;
         }
@@ -282,11 +320,14 @@ pub(in crate::http) async fn stand(
         request.extensions_mut().insert(asked.slot.clone());
     }
     let response = next.run(request).await;
+    if response.status() == StatusCode::FORBIDDEN && subject.is_some() {
+        // A handler has held the body against where the token's rights hold.
+        guard.app.counters().refused_scope.one();
+    }
     if is_change {
         let signed_in = response.extensions().get::<SignedIn>().cloned();
         let who = subject.clone().or(signed_in.map(|SignedIn(who)| who));
-        let is_change = who.is_some() || response.status().is_success();
-        guard.note(asked, &response, who.as_ref(), is_change);
+        guard.note(asked, &response, who.as_ref());
     }
     match subject {
         Some(subject) => end_with(&guard.app, subject, response),
@@ -306,10 +347,25 @@ impl Guard {
                 self.check_origin(request.method(), request.headers(), None)?;
                 Ok(None)
             }
-            Some(Needed::Role(needed)) => {
+            Some(Needed::Right(needed)) => {
                 let address = address(request);
                 let (method, headers) = (request.method(), request.headers());
-                let credential = self.check_subject(method, headers, address, needed).await?;
+                let purpose = purpose(method, route);
+                let checked = self.check_subject(method, headers, address, (needed, purpose));
+                let credential = checked.await?;
+                // From here on the connection is at work, whatever its body takes.
+                if let Some(slot) = request.extensions().get::<Arc<Slot>>()
+                    && let Err(full) = slot.prove(credential.token, purpose)
+                {
+                    let problem = Problem::new(ProblemType::TooManyRequests);
+                    let problem = problem.detail(full.to_string());
+                    let counter = &self.app.counters().http_requests_without_room;
+                    let mut refusal = Refusal::counted(counter, problem);
+                    (refusal.who, refusal.is_audited) = (Some(credential), false);
+                    return Err(refusal);
+                }
+                self.check_place(request, (route, needed), &credential)
+                    .await?;
                 request
                     .extensions_mut()
                     .insert(Subject(Arc::clone(&credential)));
@@ -406,8 +462,26 @@ fn shown(headers: &HeaderMap, is_tls: bool) -> Option<(&str, Shown)> {
 /// The address that a request came from.
 pub(super) fn address(request: &Request) -> IpAddr {
     let peer = request.extensions().get::<Peer>();
-    let address = peer.map_or(IpAddr::V4(Ipv4Addr::UNSPECIFIED), |Peer(peer)| peer.ip());
-    address.to_canonical()
+    peer.map_or(IpAddr::V4(Ipv4Addr::UNSPECIFIED), |Peer(address)| *address)
+}
+
+/// The same, before the router has matched: by the path alone.
+pub(in crate::http) fn purpose_of_path(method: &Method, path: &str) -> Purpose {
+    if method == Method::POST && path.starts_with("/v1/") && path.ends_with("/stop") {
+        Purpose::Stop
+    } else {
+        Purpose::Other
+    }
+}
+
+/// Whether a request is for a Stop, which has room of its own wherever others compete.
+fn purpose(method: &Method, route: &str) -> Purpose {
+    let is_stop = method == Method::POST && (route == STOP_ALL || route == STOP_ONE);
+    if is_stop {
+        Purpose::Stop
+    } else {
+        Purpose::Other
+    }
 }
 
 fn is_change(method: &Method) -> bool {

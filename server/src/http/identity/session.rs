@@ -12,6 +12,7 @@ use super::browser;
 use super::guard::{Peer, SignedIn, Subject, sign_in_problem, unauthenticated};
 use crate::app::identity::Shown;
 use crate::app::{App, AppError};
+use crate::connections::Purpose;
 use crate::http::extract::Json;
 use crate::http::problem::Problem;
 use crate::identity::origin::Names;
@@ -27,10 +28,9 @@ pub(in crate::http) async fn create(
     peer: Option<Extension<Peer>>,
     Json(request): Json<CreateSession>,
 ) -> Result<Response, Problem> {
-    let address = peer.map(|Extension(Peer(peer))| peer.ip());
-    let address = address.unwrap_or([0, 0, 0, 0].into()).to_canonical();
+    let address = peer.map_or([0, 0, 0, 0].into(), |Extension(Peer(address))| address);
     let found = app
-        .authenticate(address, request.token.trim(), Shown::Token)
+        .authenticate(address, request.token.trim(), Shown::Token, Purpose::Other)
         .await;
     let credential = match found {
         Ok(credential) => credential,
@@ -60,14 +60,14 @@ pub(in crate::http) async fn create(
 
 /// Who asks, by token or cookie.
 #[utoipa::path(get, path = "/v1/session", tag = "identity", operation_id = "get_session",
-    security(("token" = ["viewer"])), responses((status = 200, body = Session)))]
+    security(("token" = ["stop"])), responses((status = 200, body = Session)))]
 pub(in crate::http) async fn get(Subject(subject): Subject) -> Json<Session> {
     Json(subject.session())
 }
 
 /// Signs a browser out. A token stays valid: an admin revokes it.
 #[utoipa::path(delete, path = "/v1/session", tag = "identity", operation_id = "end_session",
-    security(("token" = ["viewer"])), responses((status = 204)))]
+    security(("token" = ["stop"])), responses((status = 204)))]
 pub(in crate::http) async fn end(
     State(app): State<App>,
     Extension(names): Extension<Arc<Names>>,

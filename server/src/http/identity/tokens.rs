@@ -25,22 +25,25 @@ pub(in crate::http) struct TokenQuery {
     limit: Option<u32>,
 }
 
-/// Tokens, newest first, dead ones too. Secrets are told once and never again.
+/// Tokens, newest first, dead ones too; only those that hold nowhere beyond the own one. Secrets are
+/// told once and never again.
 #[utoipa::path(get, path = "/v1/tokens", tag = "identity", operation_id = "list_tokens",
-    security(("token" = ["admin"])), params(TokenQuery),
+    security(("token" = ["administer"])), params(TokenQuery),
     responses((status = 200, body = Page<Token>), (status = 400, body = ProblemBody)))]
 pub(in crate::http) async fn list(
     State(app): State<App>,
+    Subject(subject): Subject,
     Query(query): Query<TokenQuery>,
 ) -> Result<Json<Page<Token>>, Problem> {
     let limit = page_limit(query.limit)?;
     let before = cursor(query.cursor.as_deref())?;
-    Ok(Json(app.tokens(before, limit).await?))
+    Ok(Json(app.tokens(&subject.scope, before, limit).await?))
 }
 
-/// Makes a token. Its secret is in this answer and nowhere else.
+/// Makes a token with a role or with rights of its own, everywhere or for some sites and robots; none
+/// has more than its maker. Its secret is in this answer and nowhere else.
 #[utoipa::path(post, path = "/v1/tokens", tag = "identity", operation_id = "create_token",
-    security(("token" = ["admin"])), request_body = CreateToken,
+    security(("token" = ["administer"])), request_body = CreateToken,
     responses((status = 201, body = CreatedToken), (status = 409, body = ProblemBody),
         (status = 422, body = ProblemBody)))]
 pub(in crate::http) async fn create(
@@ -48,13 +51,13 @@ pub(in crate::http) async fn create(
     Subject(subject): Subject,
     Json(request): Json<CreateToken>,
 ) -> Result<(StatusCode, Json<CreatedToken>), Problem> {
-    let created = app.create_token(request, &subject.name).await?;
+    let created = app.give_token(request, &subject).await?;
     Ok((StatusCode::CREATED, Json(created)))
 }
 
 /// Revokes a token: it is refused from now on, its sessions end, and its open streams close.
 #[utoipa::path(delete, path = "/v1/tokens/{token}", tag = "identity",
-    operation_id = "revoke_token", security(("token" = ["admin"])),
+    operation_id = "revoke_token", security(("token" = ["administer"])),
     params(("token" = TokenId, Path)),
     responses((status = 200, body = Token), (status = 404, body = ProblemBody)))]
 pub(in crate::http) async fn revoke(

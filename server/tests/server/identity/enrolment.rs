@@ -163,8 +163,11 @@ async fn guessing_join_tokens_locks_and_a_bad_request_says_nothing_about_its_tok
         let (status, _) = enrol(&yard, "nonsense", "rover-1", &key).await;
         assert_eq!(status, StatusCode::UNAUTHORIZED);
     }
-    let (status, answer) = enrol(&yard, good, "rover-1", &key).await;
+    let (status, answer) = enrol(&yard, "nonsense", "rover-1", &key).await;
     assert_eq!(status, StatusCode::TOO_MANY_REQUESTS, "{answer}");
+    // Behind the same address a good one is taken all the same.
+    let (status, answer) = enrol(&yard, good, "rover-1", &key).await;
+    assert_eq!(status, StatusCode::CREATED, "{answer}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

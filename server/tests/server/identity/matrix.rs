@@ -1,11 +1,12 @@
 //! Every route × everybody who may ask, generated from the description of the API. A route that
-//! is added later is in here without a word, and one without a role makes this fail.
+//! is added later is in here without a word, and one without a right makes this fail.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 use tread_api::identity::Role;
+use tread_api::rights::{Right, Rights};
 use tread_server::http::{Access, Needed, PUBLIC};
 use tread_server::identity::secret::{Kind, Secret};
 
@@ -27,7 +28,7 @@ const OPEN: [(&str, &str); 11] = [
     ("GET", "/docs/{*rest}"),
 ];
 /// What an operator may not ask for.
-const ADMINS_ONLY: [(&str, &str); 9] = [
+const ADMINS_ONLY: [(&str, &str); 12] = [
     ("GET", "/v1/tokens"),
     ("POST", "/v1/tokens"),
     ("DELETE", "/v1/tokens/{token}"),
@@ -35,24 +36,48 @@ const ADMINS_ONLY: [(&str, &str); 9] = [
     ("POST", "/v1/join-tokens"),
     ("DELETE", "/v1/join-tokens/{token}"),
     ("DELETE", "/v1/sites/{site}/enrolments/{robot}"),
+    ("POST", "/v1/authority/rotation"),
+    ("POST", "/v1/authority/rotation/finish"),
     ("GET", "/v1/audit"),
+    ("GET", "/v1/audit/chain"),
     ("POST", "/v1/sites"),
 ];
 
-/// Every operation of the description with the role that it names.
-fn operations() -> Vec<(Method, String, Value)> {
+/// One operation of the description.
+pub(super) struct Operation {
+    pub(super) method: Method,
+    pub(super) path: String,
+    security: Value,
+    /// The right that it names; `Stop`, which everybody has, where it names none.
+    pub(super) right: Right,
+    /// The names of its query's parameters.
+    pub(super) query: BTreeSet<String>,
+}
+
+/// Every operation of the description.
+pub(super) fn operations() -> Vec<Operation> {
     let description = serde_json::to_value(tread_server::http::openapi()).unwrap();
     let mut operations = Vec::new();
     for (path, methods) in description["paths"].as_object().unwrap() {
         for (method, operation) in methods.as_object().unwrap() {
-            let method = method.to_uppercase().parse().unwrap();
-            operations.push((method, path.clone(), operation["security"].clone()));
+            let security = operation["security"].clone();
+            let right = security[0]["token"][0].as_str().and_then(Right::from_name);
+            let parameters = operation["parameters"].as_array().into_iter().flatten();
+            let of_query = parameters.filter(|parameter| parameter["in"] == "query");
+            let name = |parameter: &Value| parameter["name"].as_str().unwrap().to_owned();
+            operations.push(Operation {
+                method: method.to_uppercase().parse().unwrap(),
+                path: path.clone(),
+                security,
+                right: right.unwrap_or(Right::Stop),
+                query: of_query.map(name).collect(),
+            });
         }
     }
     operations
 }
 
-fn is_open(method: &Method, path: &str) -> bool {
+pub(super) fn is_open(method: &Method, path: &str) -> bool {
     OPEN.contains(&(method.as_str(), path))
 }
 
@@ -73,41 +98,51 @@ fn filled(path: &str) -> String {
 }
 
 #[test]
-fn every_operation_names_one_role_or_is_on_the_named_list() {
+fn every_operation_names_one_right_or_is_on_the_named_list() {
     assert_eq!(PUBLIC, OPEN);
     let access = tread_server::http::access();
-    for (method, path, security) in operations() {
+    for operation in operations() {
+        let Operation {
+            method,
+            path,
+            security,
+            ..
+        } = operation;
         if is_open(&method, &path) {
             assert!(
                 security.is_null(),
-                "{method} {path} is public and names a role"
+                "{method} {path} is public and names a right"
             );
             continue;
         }
-        let role = security[0]["token"][0].as_str().and_then(Role::from_name);
-        let role = role.unwrap_or_else(|| panic!("{method} {path} names no role: {security}"));
+        let right = security[0]["token"][0].as_str().and_then(Right::from_name);
+        let right = right.unwrap_or_else(|| panic!("{method} {path} names no right: {security}"));
         assert_eq!(
             security,
-            json!([{"token": [role]}, {"session": [role]}]),
+            json!([{"token": [right]}, {"session": [right]}]),
             "{method} {path}"
         );
         let is_admins = ADMINS_ONLY.contains(&(method.as_str(), path.as_str()));
         assert_eq!(
-            role == Role::Admin,
+            right == Right::Administer,
             is_admins,
-            "{method} {path} is for {role}"
+            "{method} {path} takes {right}"
         );
         let needed = access.needed(&method, &path);
-        assert_eq!(needed, Some(Needed::Role(role)), "{method} {path}");
+        assert_eq!(needed, Some(Needed::Right(right)), "{method} {path}");
         let reads = method == Method::GET || path.ends_with("/friction/path");
         let is_anybodys = path == "/v1/session" || path.ends_with("/stop");
         if reads {
+            let viewer = Rights::from(Role::Viewer);
             assert!(
-                role == Role::Viewer || is_admins,
+                viewer.includes(right) || is_admins,
                 "{method} {path} is a read"
             );
-        } else if !is_anybodys {
-            assert!(role >= Role::Operator, "{method} {path} changes something");
+        } else if is_anybodys {
+            assert_eq!(right, Right::Stop, "{method} {path}");
+        } else {
+            let only_watches = Rights::from_iter([right]).only_watches();
+            assert!(!only_watches, "{method} {path} changes something");
         }
     }
     assert_eq!(Access::default().needed(&Method::GET, "/healthz"), None);
@@ -117,7 +152,7 @@ fn every_operation_names_one_role_or_is_on_the_named_list() {
 async fn answers(yard: &Yard, token: Option<&str>) -> BTreeMap<(String, String), StatusCode> {
     let client = client(token);
     let mut answers = BTreeMap::new();
-    for (method, path, _) in operations() {
+    for Operation { method, path, .. } in operations() {
         // Who signs out signs out; it is the last thing to be asked.
         if (&method, path.as_str()) == (&Method::DELETE, "/v1/session") {
             continue;
@@ -134,17 +169,31 @@ async fn answers(yard: &Yard, token: Option<&str>) -> BTreeMap<(String, String),
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn every_route_answers_every_role_as_its_description_says() {
+async fn every_route_answers_every_role_and_right_as_its_description_says() {
     let yard = Yard::start().await;
     let needed_by = tread_server::http::access();
+    let mut tokens = Vec::new();
     for role in Role::ALL {
         let token = yard.token(role.as_str(), role).await.secret;
+        tokens.push((role.to_string(), Rights::from(role), token));
+    }
+    for right in Right::ALL {
+        // Whoever may hold alone holds by the name of the token.
+        let name = if right == Right::Hold {
+            "nothing-of-that-name"
+        } else {
+            right.as_str()
+        };
+        let token = yard.limited(name, &[right], &[]).await;
+        tokens.push((right.to_string(), Rights::from_iter([right]), token));
+    }
+    for (role, rights, token) in tokens {
         for ((method, path), status) in answers(&yard, Some(&token)).await {
             let method: Method = method.parse().unwrap();
             let needed = needed_by.needed(&method, &path).unwrap();
             let may = match needed {
                 Needed::Nothing => true,
-                Needed::Role(needed) => role.includes(needed),
+                Needed::Right(needed) => rights.includes(needed),
             };
             let refused = status == StatusCode::FORBIDDEN || status == StatusCode::UNAUTHORIZED;
             if is_open(&method, &path) {
@@ -174,7 +223,7 @@ async fn no_route_is_open_to_a_token_that_is_missing_wrong_expired_or_revoked() 
         .unwrap();
     let days = std::time::Duration::from_hours(24 * 91);
     yard.server.app().clock().advance(days);
-    let wrong = Secret::from_random(Kind::Token(Role::Admin), &[7; 32]);
+    let wrong = Secret::from_random(Kind::Token(Some(Role::Admin)), &[7; 32]);
     let strangers = [
         ("nothing", None),
         ("garbage", Some("garbage")),
@@ -184,7 +233,7 @@ async fn no_route_is_open_to_a_token_that_is_missing_wrong_expired_or_revoked() 
     ];
     let mut said = BTreeMap::new();
     for (who, token) in strangers {
-        for (method, path, _) in operations() {
+        for Operation { method, path, .. } in operations() {
             // Before the lock comes: that answer would hide the one that is looked for.
             yard.server
                 .app()

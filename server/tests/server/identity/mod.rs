@@ -1,9 +1,10 @@
-//! Who may do what: the table of roles, tokens, browsers, the audit log, connections, TLS, and joining robots.
+//! Who may do what: the table of rights, tokens, browsers, the audit log, connections, TLS, and joining robots.
 
 mod audit;
 mod browsers;
 mod connections;
 mod enrolment;
 mod matrix;
+mod rights;
 mod tls;
 mod tokens;

@@ -5,9 +5,15 @@ use std::time::Duration;
 use reqwest::StatusCode;
 use serde_json::{Value, json};
 use tread_api::identity::Role;
+use tread_server::app::App;
+use tread_server::app::identity::tokens::FirstAdmin;
+use tread_server::clock::Clock;
+use tread_server::config::{FrictionConfig, StorageConfig};
+use tread_server::db::Db;
 use tread_server::identity::attempts::{FAILURES_MAX, LOCK_FIRST};
+use tread_server::identity::secret::{Kind, Secret};
 
-use crate::harness::{PATIENCE, Yard, client, eventually, time};
+use crate::harness::{PATIENCE, Yard, client, database, eventually, time};
 
 async fn ask(yard: &Yard, token: &str) -> (StatusCode, Value) {
     yard.send(client(Some(token)).get(yard.url("/v1/sites")))
@@ -160,24 +166,103 @@ async fn failures_lock_the_address_for_strangers_and_for_nobody_who_is_signed_in
         .parse()
         .unwrap();
     assert!((1..=LOCK_FIRST.as_secs() + 1).contains(&wait_s));
-    let (status, good) = ask(&yard, &fresh).await;
-    assert_eq!(
-        status,
-        StatusCode::TOO_MANY_REQUESTS,
-        "a good token shows while locked"
-    );
-    let (_, bad) = ask(&yard, "tread_a_guess").await;
-    assert_eq!(good, bad);
+    let wrong = Secret::from_random(Kind::Token(Some(Role::Admin)), &[7; 32]);
+    let (status, _) = ask(&yard, wrong.reveal()).await;
+    assert_eq!(status, StatusCode::TOO_MANY_REQUESTS);
     assert_eq!(
         ask(&yard, &working).await.0,
         StatusCode::OK,
         "who works goes on working"
     );
+    assert_eq!(
+        ask(&yard, &fresh).await.0,
+        StatusCode::OK,
+        "and who begins, begins"
+    );
     yard.server
         .app()
         .clock()
         .advance(LOCK_FIRST + Duration::from_secs(1));
-    assert_eq!(ask(&yard, &fresh).await.0, StatusCode::OK);
-    assert!(yard.server.app().counters().values().refused_locked >= 3);
+    assert_eq!(
+        ask(&yard, "tread_a_guess").await.0,
+        StatusCode::UNAUTHORIZED
+    );
+    assert!(yard.server.app().counters().values().refused_locked >= 2);
+    yard.server.stop().await.unwrap();
+}
+
+/// Fails from this machine's address until it is locked.
+async fn lock_this_address(yard: &Yard) {
+    for _ in 0..FAILURES_MAX {
+        let (status, _) = ask(yard, "tread_a_guess").await;
+        assert_eq!(status, StatusCode::UNAUTHORIZED);
+    }
+    let (status, _) = ask(yard, "tread_a_guess").await;
+    assert_eq!(status, StatusCode::TOO_MANY_REQUESTS);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn after_a_restart_wrong_tokens_keep_nobody_from_stopping_or_signing_in() {
+    let yard = Yard::start().await;
+    let viewer = yard.token("screen", Role::Viewer).await.secret;
+    let sign_in = |yard: &Yard| {
+        let body = json!({"token": viewer});
+        client(None).post(yard.url("/v1/session")).json(&body)
+    };
+    let answer = sign_in(&yard).send().await.unwrap();
+    let cookie = answer.headers()["set-cookie"].to_str().unwrap();
+    let cookie = cookie.split(';').next().unwrap().to_owned();
+    let yard = yard.restart().await;
+    lock_this_address(&yard).await;
+    // By token and by cookie, on connections of their own, while the address is locked.
+    let by_token = client(Some(&viewer)).post(yard.url("/v1/stop"));
+    assert_eq!(yard.send(by_token).await.0, StatusCode::OK);
+    let by_cookie = client(None)
+        .post(yard.url("/v1/stop"))
+        .header("cookie", cookie)
+        .header("sec-fetch-site", "same-origin");
+    assert_eq!(yard.send(by_cookie).await.0, StatusCode::OK);
+    assert_eq!(yard.send(sign_in(&yard)).await.0, StatusCode::CREATED);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_token_of_another_process_is_let_in_while_the_address_is_locked() {
+    let yard = Yard::start().await;
+    lock_this_address(&yard).await;
+    let made = init(&yard, "elsewhere").await;
+    let stop = client(Some(&made)).post(yard.url("/v1/stop"));
+    assert_eq!(yard.send(stop).await.0, StatusCode::OK);
+    yard.server.stop().await.unwrap();
+}
+
+/// Makes an admin's token as `tread-server init --force` does, on a connection of its own.
+async fn init(yard: &Yard, name: &str) -> String {
+    let db = Db::open(&database(yard.folder.path())).await.unwrap();
+    let (friction, storage) = (FrictionConfig::default(), StorageConfig::default());
+    let app = App::new(db, Clock::system(), friction, storage);
+    let admin = FirstAdmin {
+        name: name.to_owned(),
+        valid_days: 1,
+        force: true,
+    };
+    let secret = app.create_first_admin(admin).await.unwrap().secret;
+    app.db().close().await;
+    secret
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_token_that_init_replaces_ends_with_its_streams() {
+    let yard = Yard::start().await;
+    let replaced = client(Some(yard.admin()));
+    let mut stream = replaced.get(yard.url("/v1/events")).send().await.unwrap();
+    assert!(stream.chunk().await.unwrap().is_some(), "the stream begins");
+    let made = init(&yard, "tests").await;
+    let ends = async { while let Ok(Some(_)) = stream.chunk().await {} };
+    tokio::time::timeout(PATIENCE, ends)
+        .await
+        .expect("the stream ends with its token");
+    assert_eq!(ask(&yard, yard.admin()).await.0, StatusCode::UNAUTHORIZED);
+    assert_eq!(ask(&yard, &made).await.0, StatusCode::OK);
     yard.server.stop().await.unwrap();
 }

@@ -10,10 +10,10 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
-use tread_agent::fleet::session_config;
 use tread_agent::membership::Membership;
 use tread_api::ids::RobotId;
 use tread_tests::fleet::Fleet;
+use tread_tests::light_robot::open_secure_session;
 use tread_tests::report::{Check, figure};
 use tread_tests::wait::{SHORT, eventually};
 use zenoh::Wait as _;
@@ -119,11 +119,9 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
 
 /// Connects as the robot and leaves again: milliseconds until the session was open.
 async fn connect(fleet: &Fleet, joined: &Membership) -> anyhow::Result<f64> {
-    let config = session_config(&fleet.zenoh_endpoint(), Some(joined))?;
     let began = Instant::now();
-    let opened = tokio::task::spawn_blocking(move || zenoh::open(config).wait()).await?;
+    let (session, _tunnel) = open_secure_session(&fleet.zenoh_endpoint(), joined).await?;
     let took = began.elapsed();
-    let session = opened.map_err(|error| anyhow::anyhow!("the robot was not let in: {error}"))?;
     tokio::task::spawn_blocking(move || session.close().wait())
         .await?
         .map_err(|error| anyhow::anyhow!("the session did not close: {error}"))?;

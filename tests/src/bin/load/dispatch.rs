@@ -32,6 +32,9 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &mut Fleet) -> anyhow:
     let mut agents = Vec::new();
     for number in 0..arguments.agents {
         let robot: RobotId = format!("driver-{number}").parse()?;
+        if arguments.tls {
+            fleet.join(&robot).await;
+        }
         fleet.start_agent(&robot, f64::from(number) * 20.0).await;
         agents.push(robot);
     }
@@ -98,7 +101,7 @@ async fn one_mission(fleet: &Fleet, robot: &RobotId) -> anyhow::Result<Duration>
 async fn publish_states(arguments: &Arguments, fleet: &Fleet) -> anyhow::Result<JoinSet<()>> {
     let period = period_of(arguments.state_rate_hz);
     let mut publishing = JoinSet::new();
-    for mut robot in start_light_robots(fleet, arguments.robots).await? {
+    for mut robot in start_light_robots(fleet, arguments.robots, arguments.tls).await? {
         publishing.spawn(async move {
             let mut states = tokio::time::interval(period);
             states.set_missed_tick_behavior(MissedTickBehavior::Skip);

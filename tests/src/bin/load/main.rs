@@ -23,6 +23,9 @@ use tread_tests::process::node;
 
 use crate::report::Details;
 
+/// How long certificates are good for: longer than any measurement.
+const CERTIFICATE_S: u32 = 86_400;
+
 /// Measures what one server carries.
 #[derive(Debug, Parser)]
 #[command(name = "load")]
@@ -48,6 +51,9 @@ pub(crate) struct Arguments {
     /// Missions sent to each of them
     #[arg(long, default_value_t = 25, value_parser = clap::value_parser!(u32).range(1..=1_000))]
     missions: u32,
+    /// Connect all robots by TLS with certificates of their own
+    #[arg(long)]
+    tls: bool,
     /// Print one JSON object instead of a table
     #[arg(long)]
     json: bool,
@@ -57,8 +63,12 @@ pub(crate) struct Arguments {
 async fn main() -> anyhow::Result<ExitCode> {
     let arguments = Arguments::parse();
     let node = node()?;
-    let mut fleet = Fleet::start_with(&node).await;
-    let robots = start_light_robots(&fleet, arguments.robots).await?;
+    let mut fleet = if arguments.tls {
+        Fleet::start_secure_with(&node, CERTIFICATE_S).await
+    } else {
+        Fleet::start_with(&node).await
+    };
+    let robots = start_light_robots(&fleet, arguments.robots, arguments.tls).await?;
     let ingest = ingest::measure(&arguments, &mut fleet, robots).await?;
     let dispatch = dispatch::measure(&arguments, &mut fleet).await?;
     let details = Details {
@@ -73,6 +83,7 @@ async fn main() -> anyhow::Result<ExitCode> {
 pub(crate) async fn start_light_robots(
     fleet: &Fleet,
     count: u32,
+    tls: bool,
 ) -> anyhow::Result<Vec<LightRobot>> {
     const AT_ONCE: u32 = 20;
     let endpoint = fleet.zenoh_endpoint();
@@ -83,7 +94,13 @@ pub(crate) async fn start_light_robots(
             let endpoint = endpoint.clone();
             let site = fleet.site();
             let id = format!("light-{number}").parse()?;
-            starting.spawn(async move { LightRobot::start(&endpoint, &site, id).await });
+            if tls {
+                let membership = fleet.membership(&id).await;
+                starting
+                    .spawn(async move { LightRobot::start_secure(&endpoint, &membership).await });
+            } else {
+                starting.spawn(async move { LightRobot::start(&endpoint, &site, id).await });
+            }
         }
         while let Some(started) = starting.join_next().await {
             robots.push(started??);

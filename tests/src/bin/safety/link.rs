@@ -1,8 +1,10 @@
-//! How old drive commands are at a robot behind a narrow link that bulk fills.
+//! How old drive commands are at a robot behind a narrow link that bulk fills: messages to the robot
+//! in the clear, and by TLS the robot's own full outbox.
 //!
 //! The commands go the whole way: WebSocket, server, zenoh, link, agent. What the robot says of
 //! their age is by the server's estimate of the robot's clock, which only makes them look older.
 
+use std::path::Path;
 use std::time::Duration;
 
 use anyhow::Context;
@@ -11,10 +13,13 @@ use tokio::net::TcpStream;
 use tokio::time::{Instant, MissedTickBehavior};
 use tokio_tungstenite::tungstenite::{ClientRequestBuilder, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async};
+use tread_agent::RunningAgent;
+use tread_agent::outbox::{Limits, Outbox};
 use tread_api::drive::{Drive, DriveRequest, DriveUpdate, DriverName};
+use tread_api::ids::{BootId, RobotId};
 use tread_api::keys;
 use tread_tests::fleet::{Fleet, SITE};
-use tread_tests::light_robot::open_session;
+use tread_tests::light_robot::{LightRobot, open_session};
 use tread_tests::relay::Relay;
 use tread_tests::report::{Check, figure, quantile};
 use zenoh::qos::CongestionControl;
@@ -26,6 +31,10 @@ use crate::robots::{name, start};
 const NUMBER: u32 = 901;
 /// What the link carries, bytes a second.
 const LINK_BYTES_PER_S: f64 = 1e6;
+/// What the slow link carries, bytes a second: 1 Mbit/s.
+const SLOW_LINK_BYTES_PER_S: f64 = 125e3;
+/// Records in the outbox at the begin.
+const OUTBOX_RECORDS: usize = 60_000;
 /// Bulk that is offered to it, bytes a second and in each message.
 const BULK_BYTES_PER_S: f64 = 2e6;
 const BULK_MESSAGE_BYTES: usize = 4_096;
@@ -72,6 +81,112 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
         }
     });
 
+    let driven = drive(&mut socket, &agent, arguments.seconds).await?;
+    filling.shutdown().await;
+    agent.stop().await;
+    // Each bulk message that arrives is one limit that the robot refuses.
+    #[expect(clippy::cast_precision_loss, reason = "a message's length")]
+    let carried =
+        figure(driven.limits_refused) * BULK_MESSAGE_BYTES as f64 / figure(arguments.seconds);
+    let mut checks = vec![Check::at_least(
+        "link: bulk carried, share of the link",
+        0.7,
+        carried / LINK_BYTES_PER_S,
+    )];
+    checks.extend(driven.checks("link"));
+    Ok(checks)
+}
+
+/// The same by TLS, while the robot uploads its full outbox.
+pub(crate) async fn measure_tls(
+    arguments: &Arguments,
+    fleet: &Fleet,
+) -> anyhow::Result<Vec<Check>> {
+    let folder = tempfile::tempdir()?;
+    let relay = Relay::start_narrow(fleet.zenoh_address(), SLOW_LINK_BYTES_PER_S).await?;
+    let robot = name(NUMBER)?;
+    let filled = fill_outbox(fleet, &robot, folder.path()).await?;
+    let mut membership = fleet.membership(&robot).await;
+    membership.endpoint = format!("tls/{}", relay.address());
+    membership.save(&folder.path().join(robot.as_str()))?;
+    let agent = start(NUMBER, &membership.endpoint, folder.path())?;
+    fleet.robot_is_online(&robot).await;
+    let mut socket = acquire(fleet).await?;
+    let before = agent.state().outbox.pending;
+    let driven = drive(&mut socket, &agent, arguments.seconds).await?;
+    let after = agent.state().outbox.pending;
+    agent.stop().await;
+    let uploaded = figure(before) - figure(after);
+    let mut checks = vec![
+        Check::at_least(
+            "slow link by TLS: records in the outbox",
+            1.0,
+            figure(filled),
+        ),
+        Check::at_least(
+            "slow link by TLS: records uploaded meanwhile",
+            1.0,
+            uploaded,
+        ),
+        Check::at_least(
+            "slow link by TLS: records left at the end",
+            1.0,
+            figure(after),
+        ),
+    ];
+    checks.extend(driven.checks("slow link by TLS"));
+    Ok(checks)
+}
+
+/// Fills a robot's outbox with more than the link carries meanwhile; how many records that are.
+async fn fill_outbox(fleet: &Fleet, robot: &RobotId, folder: &Path) -> anyhow::Result<u64> {
+    let like: RobotId = "light".parse()?;
+    let membership = fleet.membership(&like).await;
+    let mut source = LightRobot::start_secure(&fleet.zenoh_endpoint(), &membership).await?;
+    let folder = folder.join(robot.as_str()).join("outbox");
+    let boot = BootId::from_uuid(uuid::Uuid::new_v4());
+    let outbox = Outbox::open(&folder, Limits::default(), robot.clone(), boot)?;
+    let mut records = 0;
+    for record in source.next_batch(OUTBOX_RECORDS).records {
+        outbox.append(&record.content)?;
+        records += 1;
+    }
+    outbox.sync()?;
+    Ok(records)
+}
+
+/// What came of driving for a while.
+struct Driven {
+    ages_ms: Vec<f64>,
+    sent: u64,
+    accepted: u64,
+    limits_refused: u64,
+}
+
+impl Driven {
+    fn checks(mut self, link: &str) -> [Check; 3] {
+        [
+            Check::at_most(
+                format!("{link}: command age at the robot, p50, ms"),
+                AGE_MAX_MS,
+                quantile(&mut self.ages_ms, 0.5),
+            ),
+            Check::at_most(
+                format!("{link}: command age at the robot, p99, ms"),
+                AGE_MAX_MS,
+                quantile(&mut self.ages_ms, 0.99),
+            ),
+            Check::at_least(
+                format!("{link}: drive commands that arrived, share"),
+                ARRIVED_MIN,
+                figure(self.accepted) / figure(self.sent),
+            ),
+        ]
+    }
+}
+
+/// Drives the robot for so long, after a while in which the bulk fills the link.
+async fn drive(socket: &mut Socket, agent: &RunningAgent, seconds: u64) -> anyhow::Result<Driven> {
     let counted = || {
         let state = agent.state();
         let refused = state.safety.limits_refused;
@@ -90,10 +205,10 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
         angular_rad_s: 0.2,
         for_ms: Some(400),
     });
-    while began.elapsed() < FILL + Duration::from_secs(arguments.seconds) {
+    while began.elapsed() < FILL + Duration::from_secs(seconds) {
         tokio::select! {
             _ = ticks.tick() => {
-                send(&mut socket, &drive).await?;
+                send(socket, &drive).await?;
                 if began.elapsed() > FILL {
                     let ((accepted, oldest_ms), refused) = counted();
                     before.get_or_insert((accepted, refused));
@@ -108,34 +223,12 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
     }
     let ((accepted, _), refused) = counted();
     let before = before.unwrap_or_default();
-    filling.shutdown().await;
-    agent.stop().await;
-    let seconds = figure(arguments.seconds);
-    // Each bulk message that arrives is one limit that the robot refuses.
-    #[expect(clippy::cast_precision_loss, reason = "a message's length")]
-    let carried = figure(refused - before.1) * BULK_MESSAGE_BYTES as f64 / seconds;
-    Ok(vec![
-        Check::at_least(
-            "link: bulk carried, share of the link",
-            0.7,
-            carried / LINK_BYTES_PER_S,
-        ),
-        Check::at_most(
-            "link: command age at the robot, p50, ms",
-            AGE_MAX_MS,
-            quantile(&mut ages_ms, 0.5),
-        ),
-        Check::at_most(
-            "link: command age at the robot, p99, ms",
-            AGE_MAX_MS,
-            quantile(&mut ages_ms, 0.99),
-        ),
-        Check::at_least(
-            "link: drive commands that arrived, share",
-            ARRIVED_MIN,
-            figure(accepted - before.0) / figure(sent),
-        ),
-    ])
+    Ok(Driven {
+        ages_ms,
+        sent,
+        accepted: accepted - before.0,
+        limits_refused: refused - before.1,
+    })
 }
 
 async fn acquire(fleet: &Fleet) -> anyhow::Result<Socket> {

@@ -10,6 +10,7 @@
 //!    a robot gives only when its target is zero and the stop is on its disk.
 //! 4. **foreign**: stale, expired, old and foreign drive commands over real zenoh to a real agent.
 //! 5. **link**: how old drive commands are at a robot while bulk saturates its narrow link.
+//! 6. **slow link by TLS**: the same at 1 Mbit/s while the robot uploads a full outbox.
 
 mod foreign;
 mod link;
@@ -23,6 +24,9 @@ use tread_agent::bench::{hand_trials, lease_model};
 use tread_tests::fleet::Fleet;
 use tread_tests::process::node;
 use tread_tests::report::{self, Check, figure};
+
+/// How long certificates are good for: longer than any measurement.
+const CERTIFICATE_S: u32 = 86_400;
 
 /// Measures whether stopping depends on luck.
 #[derive(Debug, Parser)]
@@ -67,6 +71,9 @@ async fn main() -> anyhow::Result<ExitCode> {
     let fleet = Fleet::start_with(&node).await;
     checks.extend(foreign::measure(&arguments, &fleet).await?);
     checks.extend(link::measure(&arguments, &fleet).await?);
+    drop(fleet);
+    let fleet = Fleet::start_secure_with(&node, CERTIFICATE_S).await;
+    checks.extend(link::measure_tls(&arguments, &fleet).await?);
     report::tell(arguments.json, &checks)
 }
 

@@ -1,0 +1,189 @@
+//! The speed ahead, and to the left: wheels, odometry over ground, and position fixes.
+
+use super::axis::{Axis, Tolerance, finding, kind_of};
+use super::wheels::{self, WHEELS, WITNESSED};
+use super::witnesses::{Nearer, Witnesses};
+use super::{BODY, RAISE_FIX_S, RAISE_FROZEN_S, RAISE_SLIP_S, Recent, Verdicts, View};
+use crate::consistency::fixes::Seen;
+use crate::consistency::history::Means;
+use crate::consistency::{Kind, Subject};
+
+const AXIS: Axis = Axis::Ahead;
+/// What a position may differ by from odometry, wheels and command, which say the same.
+const ALONE: Tolerance = Tolerance {
+    share_ahead: 0.08,
+    ..WITNESSED
+};
+/// By how much wheels must be nearer to the fixes than odometry is, beside noise.
+const WITNESSED_MIN_M_S: f64 = 0.03;
+/// Share of the fixes' noise that is let be then.
+const ALONE_NOISE_RATIO: f64 = 0.75;
+/// Span that says how fast it is now, seconds.
+const INSTANT_S: f64 = 0.1;
+/// Share of what odometry says above the wheels that fixes must show to second it.
+const SECONDED: f64 = 0.4;
+/// Delay of odometry that is let be, seconds.
+const ODOMETRY_LAG_S: f64 = 0.1;
+/// Speed to the left, beside its noise, that fixes may show: metres per second, a share of the
+/// speed, and metres per radian of turn.
+const LEFT: (f64, f64, f64) = (0.12, 0.4, 0.5);
+
+/// Looks at the speed; whether nothing contradicts.
+pub(super) fn look(
+    view: &View<'_>,
+    recent: &Recent,
+    is_turn_clean: bool,
+    verdicts: &mut Verdicts,
+) -> bool {
+    let mut is_seen = false;
+    let mut error_m_s = None;
+    // Dead reckoning by a gyro that is wrong says nothing of where ahead is.
+    for seen in view.seen().filter(|_| view.uses.gyro) {
+        let Some(means) = view.history.means(seen.from_s, seen.to_s) else {
+            continue;
+        };
+        is_seen = true;
+        error_m_s = error_m_s.or(Some(seen.ahead_error_m_s));
+        let wheels = means.wheels.linear_m_s;
+        let position = wheels + seen.ahead_error_m_s;
+        if let Some(odometry) = means.odometry_m_s.filter(|_| view.uses.odometry)
+            && !agrees_with_position(view, recent, seen, &means, odometry)
+        {
+            blame(view, seen, &means, odometry, verdicts);
+            return false;
+        }
+        if !view.uses.wheels {
+            continue;
+        }
+        let commanded = view.commanded(seen);
+        let (slack, share) = wheels::slack(view, AXIS, wheels, position, &commanded);
+        let noise = share * seen.noise_m_s + 0.3 * recent.ahead_change;
+        if seen.ahead_error_m_s.abs() > slack + noise {
+            let odometry = means.odometry_m_s.filter(|_| view.uses.odometry);
+            let is_seconded = odometry
+                .is_some_and(|said| (said - wheels).abs() <= AXIS.slack(WITNESSED, said, wheels));
+            if is_seconded {
+                // Not the wheels then: odometry and fixes will be told apart.
+                return false;
+            }
+            wheels::against_body(view, position, wheels, &commanded, AXIS, verdicts);
+            return false;
+        }
+        if is_turn_clean && moves_laterally(seen, &means, position, wheels) {
+            let (subject, left) = (Subject::WheelsAndMotion, seen.left_error_m_s);
+            let found = finding(subject, Kind::Inconsistent, 0.0, left, AXIS);
+            verdicts.contradict(found, RAISE_SLIP_S);
+            return false;
+        }
+    }
+    let odometry = recent.means.odometry_m_s;
+    let Some(odometry) = odometry.filter(|_| view.uses.odometry && view.uses.wheels) else {
+        return true;
+    };
+    let (wheels, commanded) = (recent.means.wheels.linear_m_s, &recent.commanded);
+    let (slack, _) = wheels::slack(view, AXIS, wheels, odometry, commanded);
+    if (odometry - wheels).abs() <= slack + recent.ahead_change {
+        return true;
+    }
+    if AXIS.obeys(wheels, commanded) {
+        if view.repeats.odometry.is_frozen() {
+            let found = finding(Subject::Odometry, Kind::Frozen, odometry, wheels, AXIS);
+            verdicts.contradict(found, RAISE_FROZEN_S);
+            return false;
+        }
+        if is_seen {
+            // Slip, or odometry: the fixes will say which.
+            return false;
+        }
+    }
+    // Motors at their limit and odometry that says too much look like wheels that say too little.
+    let off = odometry - wheels;
+    let is_seconded = error_m_s.is_none_or(|error| error * off.signum() > SECONDED * off.abs());
+    if view.is_saturated(recent.means.wheels, commanded) && !is_seconded {
+        return false;
+    }
+    wheels::against_body(view, odometry, wheels, commanded, AXIS, verdicts);
+    false
+}
+
+/// Whether odometry and fixes say the same over a span.
+fn agrees_with_position(
+    view: &View<'_>,
+    recent: &Recent,
+    seen: &Seen,
+    means: &Means,
+    odometry: f64,
+) -> bool {
+    let wheels = means.wheels.linear_m_s;
+    let position = wheels + seen.ahead_error_m_s;
+    let at = |at_s: f64| {
+        let means = view.history.means(at_s - INSTANT_S, at_s);
+        means.map_or(wheels, |means| means.wheels.linear_m_s)
+    };
+    let span_s = seen.to_s - seen.from_s;
+    let lag = ODOMETRY_LAG_S * (at(seen.to_s) - at(seen.from_s)).abs() / span_s;
+    let change = 0.3 * recent.ahead_change;
+    // A robot that slides and turns goes ahead by what it slid to the left before.
+    let turned = (means.gyro_rad_s.abs() * span_s).min(1.0);
+    let noise_m_s = seen.odometry_noise_m_s + turned * seen.left_error_m_s.abs();
+    let most = AXIS.slack(BODY, odometry, position) + noise_m_s + change + lag;
+    if seen.odometry_error_m_s.abs() > most {
+        return false;
+    }
+    if !view.uses.wheels {
+        return true;
+    }
+    // Wheels say the same as odometry, and the position more: no slip does that.
+    let is_alone = (odometry - wheels).abs() <= AXIS.slack(ALONE, odometry, wheels) + change
+        && position.abs() > odometry.abs()
+        && seen.odometry_error_m_s.abs()
+            > AXIS.slack(ALONE, odometry, position) + ALONE_NOISE_RATIO * noise_m_s + change + lag;
+    let is_witnessed = (odometry - wheels).abs()
+        > AXIS.slack(WITNESSED, odometry, wheels) + change + lag
+        && seen.odometry_error_m_s.abs() - seen.ahead_error_m_s.abs()
+            > WITNESSED_MIN_M_S + noise_m_s;
+    !(is_witnessed || is_alone)
+}
+
+/// Odometry and fixes contradict each other: names the wrong one, or both.
+fn blame(view: &View<'_>, seen: &Seen, means: &Means, odometry: f64, verdicts: &mut Verdicts) {
+    let wheels = means.wheels.linear_m_s;
+    let position = wheels + seen.ahead_error_m_s;
+    let commanded = view.commanded(seen);
+    let witnesses = Witnesses {
+        by_wheels: view.uses.wheels.then_some((
+            (seen.odometry_error_m_s - seen.ahead_error_m_s).abs(),
+            seen.ahead_error_m_s.abs(),
+        )),
+        slack: AXIS.slack(WHEELS, wheels, odometry.abs().min(position.abs())),
+        noise: seen.noise_m_s,
+        by_command: (!view.is_saturated(means.wheels, &commanded)).then_some((
+            AXIS.off_command(odometry, &commanded),
+            AXIS.off_command(position, &commanded),
+        )),
+    };
+    let repeats = view.repeats;
+    let found = match witnesses.side() {
+        Some(Nearer::First) => {
+            let kind = kind_of(position, odometry, repeats.position.is_frozen());
+            finding(Subject::Position, kind, position, odometry, AXIS)
+        }
+        Some(Nearer::Second) => {
+            let kind = kind_of(odometry, position, repeats.odometry.is_frozen());
+            finding(Subject::Odometry, kind, odometry, position, AXIS)
+        }
+        None => {
+            let kind = Kind::Inconsistent;
+            finding(Subject::Motion, kind, odometry, position, AXIS)
+        }
+    };
+    verdicts.contradict(found, RAISE_FIX_S);
+}
+
+/// Whether fixes say that the robot goes where it does not look.
+fn moves_laterally(seen: &Seen, means: &Means, position_m_s: f64, wheels_m_s: f64) -> bool {
+    let (own_m_s, share, lever_m) = LEFT;
+    let speed_m_s = position_m_s.abs().max(wheels_m_s.abs());
+    let slack = own_m_s + share * speed_m_s + lever_m * means.gyro_rad_s.abs() + seen.noise_m_s;
+    seen.left_error_m_s.abs() > slack
+}

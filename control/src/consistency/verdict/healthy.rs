@@ -1,0 +1,78 @@
+//! Which channels are shown to be right: by motion, by no longer being what was found, or at rest.
+
+use super::axis::Axis;
+use super::{Recent, Verdicts, View};
+use crate::consistency::{Kind, Subject, Unit};
+
+/// Motion that shows whether a channel agrees, radians and metres per second.
+const EXCITED: f64 = 0.1;
+/// The same of the place.
+const EXCITED_PLACE: f64 = 0.2;
+
+/// Says which channels agree, where nothing contradicts anything.
+pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
+    let standing = |subject: Subject| view.tracks[subject as usize].standing;
+    let means = &recent.means;
+    let (gyro, wheels) = (means.gyro_rad_s, means.wheels);
+    let turns = gyro.abs() >= EXCITED && wheels.angular_rad_s.abs() >= EXCITED;
+    let goes = wheels.linear_m_s.abs() >= EXCITED;
+    let has_fixes = view.seen().next().is_some();
+    // What was wrong at rest is right where it agrees at rest.
+    let was_at_rest = |subject: Subject| {
+        standing(subject).is_some_and(|found| {
+            found.kind == Kind::Inconsistent && found.predicted.abs() < EXCITED
+        })
+    };
+    let was_frozen =
+        |subject: Subject| standing(subject).is_some_and(|found| found.kind == Kind::Frozen);
+    let (repeats, uses) = (view.repeats, &view.uses);
+    let gyro_lives = was_frozen(Subject::Gyro) && !repeats.gyro.is_frozen();
+    if uses.gyro && (turns || gyro_lives || was_at_rest(Subject::Gyro)) {
+        verdicts.agree(Subject::Gyro);
+    }
+    let obeys = Axis::Ahead.obeys(wheels.linear_m_s, &recent.commanded)
+        && Axis::Turn.obeys(wheels.angular_rad_s, &recent.commanded);
+    let wheels_live = was_frozen(Subject::Wheels) && !repeats.wheels.is_frozen();
+    if uses.wheels && obeys && (goes || turns || wheels_live || was_at_rest(Subject::Wheels)) {
+        verdicts.agree(Subject::Wheels);
+    }
+    let position = standing(Subject::Position);
+    let has_jumped = position.is_some_and(|found| found.kind == Kind::Jumped);
+    let position_lives = was_frozen(Subject::Position) && !repeats.position.is_frozen();
+    // A motion of the kind in which it was found shows a place; turning shows no scale.
+    let shows_place = |subject: Subject| {
+        let is_large = |speed: f64| speed.abs() >= EXCITED_PLACE;
+        let goes = is_large(wheels.linear_m_s);
+        let turns = is_large(gyro) && is_large(wheels.angular_rad_s);
+        match view.tracks[subject as usize].found.map(|found| found.unit) {
+            Some(Unit::MetresPerSecond) => goes,
+            Some(Unit::RadiansPerSecond) => turns,
+            Some(Unit::Metres | Unit::Radians | Unit::MetresPerSecondSquared) | None => {
+                goes || turns
+            }
+        }
+    };
+    if has_fixes && (shows_place(Subject::Position) || position_lives || has_jumped) {
+        verdicts.agree(Subject::Position);
+    }
+    let odometry_lives = was_frozen(Subject::Odometry) && !repeats.odometry.is_frozen();
+    if uses.odometry
+        && means.odometry_m_s.is_some()
+        && (goes || odometry_lives || was_at_rest(Subject::Odometry))
+    {
+        verdicts.agree(Subject::Odometry);
+    }
+    if has_fixes && shows_place(Subject::Motion) {
+        verdicts.agree(Subject::Motion);
+    }
+    verdicts.agree(Subject::WheelsAndMotion);
+    // What was frozen and still repeats itself is not shown to be right by standing still. A source that
+    // only says the same while the robot stands may be; motion will show it at once.
+    let is_heard = uses.position && view.seen.iter().any(Option::is_some);
+    if is_heard && view.stands {
+        if !(was_frozen(Subject::Position) && repeats.position.is_repeating()) {
+            verdicts.agree_at_rest(Subject::Position);
+        }
+        verdicts.agree_at_rest(Subject::Motion);
+    }
+}

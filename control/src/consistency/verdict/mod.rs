@@ -1,0 +1,265 @@
+//! Who contradicts whom, and who is wrong.
+//!
+//! A channel that a finding names says nothing of the others: they are judged without it, and it is
+//! compared with them for its own sake alone, to see whether its finding may end.
+
+mod ahead;
+mod axis;
+mod healthy;
+mod position;
+mod turn;
+mod wheels;
+mod witnesses;
+
+use super::fixes::{Jump, Seen};
+use super::history::{Commanded, History, Means};
+use super::turn_gain::TurnGain;
+use super::{AllRepeats, Finding, Subject, Track};
+use crate::geometry::Twist;
+use crate::robot::RobotModel;
+use axis::{Axis, Tolerance};
+
+/// Span over which fast channels are compared, seconds.
+const RECENT_S: f64 = 0.3;
+/// How long a command may take to show, seconds.
+const COMMAND_LAG_S: f64 = 0.3;
+/// Share of the fixes' noise by which one channel must be nearer to them than another.
+const WITNESS_NOISE_RATIO: f64 = 0.8;
+/// What two channels of the body may differ by, above their noise.
+const BODY: Tolerance = Tolerance {
+    own_rad_s: 0.02,
+    own_m_s: 0.06,
+    share_turn: 0.12,
+    share_ahead: 0.12,
+};
+/// Share of the commanded speed below which motors may be at their limit.
+const SATURATED: f64 = 0.95;
+/// How long contradictions must last, seconds: of fast channels, of fixes, where slip is one
+/// explanation, and of a frozen channel.
+const RAISE_FAST_S: f64 = 0.3;
+const RAISE_FIX_S: f64 = 0.15;
+const RAISE_SLIP_S: f64 = 0.6;
+const RAISE_FROZEN_S: f64 = 0.1;
+
+/// Which channels are compared.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[expect(clippy::struct_excessive_bools, reason = "each is one channel")]
+pub(super) struct Uses {
+    gyro: bool,
+    wheels: bool,
+    odometry: bool,
+    position: bool,
+}
+
+impl Uses {
+    /// Channels that no finding names.
+    fn believed(tracks: &[Track]) -> Self {
+        let is_right = |subject: Subject| tracks[subject as usize].standing.is_none();
+        Self {
+            gyro: is_right(Subject::Gyro),
+            wheels: is_right(Subject::Wheels),
+            odometry: is_right(Subject::Odometry),
+            position: is_right(Subject::Position),
+        }
+    }
+
+    /// The same with one that a finding names, if there is a finding about it.
+    fn with(self, subject: Subject) -> Option<Self> {
+        let mut with = self;
+        match subject {
+            Subject::Gyro => with.gyro = true,
+            Subject::Wheels => with.wheels = true,
+            Subject::Odometry => with.odometry = true,
+            Subject::Position => with.position = true,
+            Subject::Accelerometer
+            | Subject::LeftWheels
+            | Subject::RightWheels
+            | Subject::WheelsAndMotion
+            | Subject::Motion => {}
+        }
+        (with != self).then_some(with)
+    }
+}
+
+/// What is looked at.
+#[derive(Clone, Copy)]
+pub(super) struct View<'a> {
+    pub(super) model: &'a RobotModel,
+    pub(super) history: &'a History,
+    pub(super) seen: &'a [Option<Seen>],
+    pub(super) jump: Option<Jump>,
+    pub(super) repeats: &'a AllRepeats,
+    pub(super) tracks: &'a [Track],
+    pub(super) turn_gain: TurnGain,
+    /// Whether the robot stands by command and wheels, and the fixes with it.
+    pub(super) stands: bool,
+    pub(super) uses: Uses,
+}
+
+impl<'a> View<'a> {
+    /// The same with the channels that no finding names.
+    pub(super) fn with_believed(self) -> Self {
+        let uses = Uses::believed(self.tracks);
+        Self { uses, ..self }
+    }
+
+    /// What fixes say of each span, the shortest first; those that repeat themselves say nothing.
+    fn seen(&self) -> impl Iterator<Item = &'a Seen> {
+        let is_used = self.uses.position && !self.repeats.position.is_repeating();
+        self.seen.iter().flatten().filter(move |_| is_used)
+    }
+
+    /// What was commanded for a span.
+    fn commanded(&self, seen: &Seen) -> Commanded {
+        self.history
+            .commanded(seen.from_s - COMMAND_LAG_S, seen.to_s)
+    }
+
+    /// Whether the motors may reach less than is asked of them.
+    fn is_saturated(&self, wheels: Twist, commanded: &Commanded) -> bool {
+        let rim = |twist| {
+            let wheels = self.model.wheel_speeds_from_twist(twist);
+            wheels.magnitude_max_rad_s()
+        };
+        let most = rim(commanded.least).max(rim(commanded.most));
+        rim(wheels) < SATURATED * most
+    }
+
+    fn recent_means(&self) -> Option<Means> {
+        let now_s = self.history.now().at_s;
+        self.history.means(now_s - RECENT_S, now_s)
+    }
+}
+
+/// What is found in one bin, by subject.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Verdicts {
+    against: [Option<(Finding, f64)>; Subject::ALL.len()],
+    agrees: [bool; Subject::ALL.len()],
+    rests: [bool; Subject::ALL.len()],
+    still: [bool; Subject::ALL.len()],
+}
+
+impl Verdicts {
+    pub(super) fn contradict(&mut self, finding: Finding, raise_s: f64) {
+        self.against[finding.subject as usize].get_or_insert((finding, raise_s));
+    }
+
+    pub(super) fn agree(&mut self, subject: Subject) {
+        self.agrees[subject as usize] = true;
+    }
+
+    fn agree_at_rest(&mut self, subject: Subject) {
+        self.rests[subject as usize] = true;
+    }
+
+    /// Whether channels that are believed contradict nobody.
+    pub(super) fn is_consistent(&self) -> bool {
+        self.against.iter().all(Option::is_none)
+    }
+
+    pub(super) fn of(&self, subject: Subject) -> Verdict {
+        let at = subject as usize;
+        match self.against[at] {
+            Some((finding, raise_s)) => Verdict::Against(finding, raise_s),
+            None if self.still[at] => Verdict::StillAgainst,
+            None if self.agrees[at] => Verdict::Agrees,
+            None if self.rests[at] => Verdict::AgreesAtRest,
+            None => Verdict::Nothing,
+        }
+    }
+}
+
+/// What is found of one subject in one bin.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Verdict {
+    /// It contradicts, and after so many seconds of that a finding stands.
+    Against(Finding, f64),
+    /// It contradicts, and a finding stands already.
+    StillAgainst,
+    /// It is shown to be right.
+    Agrees,
+    /// It says what a robot that stands would make it say.
+    AgreesAtRest,
+    /// Nothing shows what it is like.
+    Nothing,
+}
+
+impl Verdict {
+    /// The same, which lets a finding stand as soon as it contradicts.
+    pub(super) fn at_once(self) -> Self {
+        match self {
+            Self::Against(finding, _) => Self::Against(finding, 0.0),
+            Self::StillAgainst | Self::Agrees | Self::AgreesAtRest | Self::Nothing => self,
+        }
+    }
+}
+
+struct Recent {
+    means: Means,
+    turn_change: f64,
+    ahead_change: f64,
+    commanded: Commanded,
+}
+
+impl Recent {
+    fn of(view: &View<'_>) -> Option<Self> {
+        let now_s = view.history.now().at_s;
+        let middle_s = now_s - 0.5 * RECENT_S;
+        let halves = (
+            view.history.means(now_s - RECENT_S, middle_s),
+            view.history.means(middle_s, now_s),
+        );
+        let change = |axis: Axis| match halves {
+            (Some(early), Some(late)) => (axis.of(late.wheels) - axis.of(early.wheels)).abs(),
+            _ => 0.0,
+        };
+        Some(Self {
+            means: view.recent_means()?,
+            turn_change: change(Axis::Turn),
+            ahead_change: change(Axis::Ahead),
+            commanded: view
+                .history
+                .commanded(now_s - RECENT_S - COMMAND_LAG_S, now_s),
+        })
+    }
+}
+
+/// Looks at everything.
+pub(super) fn judge(view: &View<'_>, verdicts: &mut Verdicts) {
+    let Some(recent) = Recent::of(view) else {
+        return;
+    };
+    compare(view, &recent, verdicts);
+    for subject in Subject::ALL {
+        let Some(uses) = view.uses.with(subject) else {
+            continue;
+        };
+        let mut own = Verdicts::default();
+        let view = View { uses, ..*view };
+        compare(&view, &recent, &mut own);
+        if own.is_consistent() {
+            verdicts.agrees[subject as usize] = own.agrees[subject as usize];
+            verdicts.rests[subject as usize] = own.rests[subject as usize];
+        } else {
+            verdicts.still[subject as usize] = true;
+        }
+    }
+}
+
+/// Compares the channels that are used.
+fn compare(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
+    if view.uses.position {
+        position::jumped(view, verdicts);
+        position::frozen(view, recent, verdicts);
+    }
+    wheels::frozen_base(view, recent, verdicts);
+    if view.uses.wheels {
+        wheels::locked(view, verdicts);
+    }
+    let is_turn_clean = turn::look(view, recent, verdicts);
+    let is_ahead_clean = ahead::look(view, recent, is_turn_clean, verdicts);
+    if is_turn_clean && is_ahead_clean && verdicts.is_consistent() {
+        healthy::look(view, recent, verdicts);
+    }
+}

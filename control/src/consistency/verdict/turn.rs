@@ -1,0 +1,145 @@
+//! The turn rate: gyro, wheels, and the heading of position fixes.
+
+use super::axis::{Axis, Tolerance, finding, kind_of};
+use super::wheels::{self, WHEELS, WITNESSED};
+use super::witnesses::{Nearer, Witnesses};
+use super::{
+    BODY, RAISE_FAST_S, RAISE_FIX_S, RAISE_FROZEN_S, RAISE_SLIP_S, Recent, Verdicts, View,
+    WITNESS_NOISE_RATIO,
+};
+use crate::consistency::fixes::Seen;
+use crate::consistency::history::Means;
+use crate::consistency::{Kind, Subject};
+
+const AXIS: Axis = Axis::Turn;
+
+/// By how much the wheels must be nearer to the heading than the gyro is, beside noise: more than a
+/// usual offset of the gyro.
+const WITNESSED_MIN_RAD_S: f64 = 0.04;
+/// What wheels may differ by from the body once their gain is known.
+const LEARNED: Tolerance = Tolerance {
+    share_turn: 0.14,
+    ..WHEELS
+};
+
+/// Looks at the turn rate; whether nothing contradicts.
+pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) -> bool {
+    let mut agreed = None;
+    for seen in view.seen() {
+        let Some(means) = view.history.means(seen.from_s, seen.to_s) else {
+            continue;
+        };
+        let heading = means.gyro_rad_s + seen.turn_error_rad_s;
+        if view.uses.gyro && !agrees_with_heading(view, recent, seen, &means) {
+            blame(view, seen, &means, verdicts);
+            return false;
+        }
+        agreed = agreed.or(Some((heading, seen, means)));
+    }
+    if !view.uses.wheels {
+        return true;
+    }
+    if !view.uses.gyro {
+        return agreed.is_none_or(|(heading, seen, means)| {
+            let wheels = means.wheels.angular_rad_s;
+            let commanded = view.commanded(seen);
+            let (slack, share) = wheels::slack(view, AXIS, wheels, heading, &commanded);
+            let slack = slack + share * seen.wheels_noise_rad_s + recent.turn_change;
+            let is_clean = (heading - wheels).abs() <= slack;
+            if !is_clean {
+                wheels::against_body(view, heading, wheels, &commanded, AXIS, verdicts);
+            }
+            is_clean
+        });
+    }
+    let is_frozen = view.repeats.gyro.is_frozen();
+    let (gyro, wheels) = (recent.means.gyro_rad_s, recent.means.wheels.angular_rad_s);
+    let (slack, _) = wheels::slack(view, AXIS, wheels, gyro, &recent.commanded);
+    if (gyro - wheels).abs() <= slack + recent.turn_change {
+        return true;
+    }
+    let obeys = AXIS.obeys(wheels, &recent.commanded);
+    if is_frozen && obeys && !view.repeats.wheels.is_frozen() {
+        let found = finding(Subject::Gyro, Kind::Frozen, gyro, wheels, AXIS);
+        verdicts.contradict(found, RAISE_FROZEN_S);
+        return false;
+    }
+    let is_opposite = kind_of(gyro, wheels, false) == Kind::Inverted;
+    match agreed {
+        // Fixes of the same span see the same contradiction: two channels of the body agree.
+        Some((heading, _, means)) => {
+            let wheels = means.wheels.angular_rad_s;
+            let (slack, _) = wheels::slack(view, AXIS, wheels, heading, &recent.commanded);
+            if (heading - wheels).abs() <= slack {
+                return false;
+            }
+            wheels::against_body(view, gyro, wheels, &recent.commanded, AXIS, verdicts);
+        }
+        None if view.seen().next().is_some() => {}
+        None if is_opposite && obeys => {
+            let found = finding(Subject::Gyro, Kind::Inverted, gyro, wheels, AXIS);
+            verdicts.contradict(found, RAISE_FAST_S);
+        }
+        None => wheels::against_body(view, gyro, wheels, &recent.commanded, AXIS, verdicts),
+    }
+    false
+}
+
+/// Whether the gyro and the heading of fixes say the same over a span.
+fn agrees_with_heading(view: &View<'_>, recent: &Recent, seen: &Seen, means: &Means) -> bool {
+    let gyro = means.gyro_rad_s;
+    let heading = gyro + seen.turn_error_rad_s;
+    let slack = |tolerance: Tolerance, other: f64| AXIS.slack(tolerance, gyro, other);
+    let most = slack(BODY, heading) + seen.noise_rad_s + 0.3 * recent.turn_change;
+    if seen.turn_error_rad_s.abs() > most {
+        return false;
+    }
+    let wheels = means.wheels.angular_rad_s;
+    let is_witnessed = view.uses.wheels
+        && (gyro - wheels).abs() > slack(WITNESSED, wheels) + recent.turn_change
+        && seen.turn_error_rad_s.abs() - seen.wheels_turn_error_rad_s.abs()
+            > WITNESSED_MIN_RAD_S + WITNESS_NOISE_RATIO * seen.noise_rad_s;
+    !is_witnessed
+}
+
+/// Gyro and heading contradict each other: names the wrong one, or both.
+fn blame(view: &View<'_>, seen: &Seen, means: &Means, verdicts: &mut Verdicts) {
+    let (gyro, wheels) = (means.gyro_rad_s, means.wheels.angular_rad_s);
+    let heading = gyro + seen.turn_error_rad_s;
+    let commanded = view.commanded(seen);
+    // What the wheels say, on this ground by this robot.
+    let gain = view.turn_gain.known();
+    let by_gain = (1.0 - gain.unwrap_or(1.0)) * wheels;
+    let tolerance = if gain.is_some() { LEARNED } else { WHEELS };
+    let witnesses = Witnesses {
+        by_wheels: view.uses.wheels.then_some((
+            (seen.turn_error_rad_s - seen.wheels_turn_error_rad_s + by_gain).abs(),
+            (seen.wheels_turn_error_rad_s + by_gain).abs(),
+        )),
+        slack: AXIS.slack(tolerance, wheels, gyro.abs().min(heading.abs())),
+        noise: seen.wheels_noise_rad_s,
+        by_command: (!view.is_saturated(means.wheels, &commanded)).then_some((
+            AXIS.off_command(gyro, &commanded),
+            AXIS.off_command(heading, &commanded),
+        )),
+    };
+    let repeats = view.repeats;
+    match witnesses.side() {
+        // Fixes and wheels are both slow where a turn begins: blaming the fixes takes longer.
+        Some(Nearer::First) => {
+            let kind = kind_of(heading, gyro, repeats.position.is_frozen());
+            let found = finding(Subject::Position, kind, heading, gyro, AXIS);
+            verdicts.contradict(found, RAISE_SLIP_S);
+        }
+        Some(Nearer::Second) => {
+            let kind = kind_of(gyro, heading, repeats.gyro.is_frozen());
+            let found = finding(Subject::Gyro, kind, gyro, heading, AXIS);
+            verdicts.contradict(found, RAISE_FIX_S);
+        }
+        None => {
+            let kind = Kind::Inconsistent;
+            let found = finding(Subject::Motion, kind, gyro, heading, AXIS);
+            verdicts.contradict(found, RAISE_FIX_S);
+        }
+    }
+}

@@ -1,0 +1,229 @@
+//! Wheels that contradict the body: their sensor, slip, or a side that stands.
+
+use super::axis::{Axis, NEARER, Tolerance, finding, kind_of};
+use super::{RAISE_FAST_S, RAISE_FROZEN_S, RAISE_SLIP_S, Recent, Verdicts, View};
+use crate::consistency::history::Commanded;
+use crate::consistency::{Finding, Kind, Subject, Unit};
+use crate::geometry::Twist;
+use crate::measured::WheelSpeeds;
+
+/// What wheels and body may differ by: wheels slip, and scrub in turns.
+pub(super) const WHEELS: Tolerance = Tolerance {
+    own_rad_s: 0.08,
+    own_m_s: 0.06,
+    share_turn: 0.28,
+    share_ahead: 0.16,
+};
+/// The same where the command, or another channel of the body, says as well that one is wrong.
+pub(super) const WITNESSED: Tolerance = Tolerance {
+    own_rad_s: 0.06,
+    own_m_s: 0.05,
+    share_turn: 0.15,
+    share_ahead: 0.12,
+};
+/// The same where wheels say more than they are commanded.
+const ABOVE: Tolerance = Tolerance {
+    own_rad_s: 0.06,
+    own_m_s: 0.05,
+    share_turn: 0.15,
+    share_ahead: 0.1,
+};
+/// Shares of the fixes' noise that are let be where the command says as well that wheels are wrong.
+const SENSOR_NOISE_RATIO: f64 = 0.6;
+const ABOVE_NOISE_RATIO: f64 = 0.5;
+/// Change of the command, radians and metres per second and a share of it, that shows in the word of
+/// wheels that turn, and how long it may take to show, seconds.
+const HELD_MIN: f64 = 0.08;
+const HELD_SHARE: f64 = 0.1;
+const HELD_LAG_S: f64 = 0.25;
+/// Span in which a side that stands shows, seconds.
+const LOCKED_SPAN_S: f64 = 0.2;
+/// How long a side's command may take to show, seconds.
+const LOCKED_LAG_S: f64 = 0.3;
+/// A wheel stands below this share of its command and goes above that one.
+const LOCKED: (f64, f64) = (0.2, 0.5);
+/// Slowest command by which a locked wheel shows, metres per second.
+const LOCKED_MIN_M_S: f64 = 0.16;
+/// How long the sensor of wheels, and a locked side, must show, seconds.
+const RAISE_SENSOR_S: f64 = 0.2;
+const RAISE_LOCKED_S: f64 = 0.3;
+const RAISE_REPEATING_S: f64 = 0.5;
+
+/// Wheels and gyro that both repeat themselves while the wheels are to do something else: a base that
+/// says the same for ever. A gyro with noise would not.
+pub(super) fn frozen_base(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
+    let are_used = view.uses.wheels && view.uses.gyro;
+    if !(are_used && view.repeats.wheels.is_frozen() && view.repeats.gyro.is_frozen()) {
+        return;
+    }
+    for axis in [Axis::Ahead, Axis::Turn] {
+        let wheels = axis.of(recent.means.wheels);
+        let commanded = &recent.commanded;
+        if !axis.obeys(wheels, commanded) {
+            let (least, most) = (axis.of(commanded.least), axis.of(commanded.most));
+            let predicted = if wheels < least { least } else { most };
+            let found = finding(Subject::Wheels, Kind::Frozen, wheels, predicted, axis);
+            verdicts.contradict(found, RAISE_FAST_S);
+            return;
+        }
+    }
+}
+
+/// What wheels and body may differ by, and the share of the body's noise that comes to it.
+pub(super) fn slack(
+    view: &View<'_>,
+    axis: Axis,
+    wheels: f64,
+    body: f64,
+    commanded: &Commanded,
+) -> (f64, f64) {
+    if axis.is_above(wheels, body, commanded) {
+        (axis.slack(ABOVE, wheels, body), ABOVE_NOISE_RATIO)
+    } else if axis.is_of_sensor(wheels, body, commanded) || is_held(view, axis) {
+        (axis.slack(WITNESSED, wheels, body), SENSOR_NOISE_RATIO)
+    } else {
+        (axis.slack(WHEELS, wheels, body), 1.0)
+    }
+}
+
+/// Whether the wheels repeat their word while they are commanded this and that: what no wheel that
+/// turns does. Wheels at rest may.
+fn is_held(view: &View<'_>, axis: Axis) -> bool {
+    let repeats = &view.repeats.wheels;
+    let Some(since) = repeats.since().filter(|_| repeats.is_frozen()) else {
+        return false;
+    };
+    let history = view.history;
+    let commanded = history.commanded(since.as_secs_f64(), history.now().at_s - HELD_LAG_S);
+    let (least, most) = (axis.of(commanded.least), axis.of(commanded.most));
+    let is_at_rest = view
+        .recent_means()
+        .is_none_or(|means| means.wheels == Twist::default());
+    !is_at_rest && most - least > HELD_MIN + HELD_SHARE * least.abs().max(most.abs())
+}
+
+/// How long the sensor of the wheels must show.
+fn sensor_raise_s(view: &View<'_>) -> f64 {
+    let repeats = &view.repeats.wheels;
+    if repeats.is_frozen() {
+        RAISE_FROZEN_S
+    } else if repeats.is_repeating() {
+        // A moment later it is known whether they are frozen.
+        RAISE_REPEATING_S
+    } else {
+        RAISE_SENSOR_S
+    }
+}
+
+/// Wheels that contradict the body: their sensor, or slip.
+pub(super) fn against_body(
+    view: &View<'_>,
+    body: f64,
+    wheels: f64,
+    commanded: &Commanded,
+    axis: Axis,
+    verdicts: &mut Verdicts,
+) {
+    let is_frozen = view.repeats.wheels.is_frozen();
+    // Motors that reach less than is asked of them turn less as well.
+    let most_rad_s = (commanded.least.angular_rad_s.abs()).max(commanded.most.angular_rad_s.abs());
+    let is_saturated = axis == Axis::Turn
+        && !is_frozen
+        && wheels.abs() < most_rad_s
+        && view
+            .recent_means()
+            .is_some_and(|recent| view.is_saturated(recent.wheels, commanded));
+    let kind = kind_of(wheels, body, is_frozen);
+    let is_of_sensor = axis.is_of_sensor(wheels, body, commanded) && !is_saturated;
+    if is_of_sensor || is_held(view, axis) {
+        let found = finding(Subject::Wheels, kind, wheels, body, axis);
+        verdicts.contradict(found, sensor_raise_s(view));
+    } else {
+        let subject = Subject::WheelsAndMotion;
+        let found = finding(subject, Kind::Inconsistent, wheels, body, axis);
+        verdicts.contradict(found, RAISE_SLIP_S);
+    }
+}
+
+/// A side that stands though it is commanded to turn, while the other one turns: by the gyro, which
+/// turns as the wheels say if it truly stands, and as commanded if only its encoder does.
+pub(super) fn locked(view: &View<'_>, verdicts: &mut Verdicts) {
+    let model = view.model;
+    let now_s = view.history.now().at_s;
+    let Some(means) = view.history.means(now_s - LOCKED_SPAN_S, now_s) else {
+        return;
+    };
+    let measured = model.wheel_speeds_from_twist(means.wheels);
+    let commanded = view
+        .history
+        .commanded(now_s - LOCKED_SPAN_S - LOCKED_LAG_S, now_s);
+    let sides = |of: fn(WheelSpeeds) -> f64| {
+        // The slowest that this side was commanded, by both ends of what both motions were.
+        let corner = |linear: Twist, angular: Twist| Twist {
+            linear_m_s: linear.linear_m_s,
+            angular_rad_s: angular.angular_rad_s,
+        };
+        let (least, most) = (commanded.least, commanded.most);
+        let corners = [least, corner(least, most), corner(most, least), most];
+        let speeds = corners.map(|twist| of(model.wheel_speeds_from_twist(twist)));
+        let is_one_way =
+            speeds.iter().all(|speed| *speed > 0.0) || speeds.iter().all(|speed| *speed < 0.0);
+        let slowest = speeds.into_iter().fold(f64::INFINITY, |least, speed| {
+            if speed.abs() < least.abs() {
+                speed
+            } else {
+                least
+            }
+        });
+        (of(measured), if is_one_way { slowest } else { 0.0 })
+    };
+    let (left, right) = (
+        sides(|wheels| wheels.left_rad_s),
+        sides(|wheels| wheels.right_rad_s),
+    );
+    let least_rad_s = LOCKED_MIN_M_S / model.wheel_radius_m();
+    let (stands, goes) = LOCKED;
+    for (subject, side, other) in [
+        (Subject::LeftWheels, left, right),
+        (Subject::RightWheels, right, left),
+    ] {
+        let (measured, commanded) = side;
+        let is_told = commanded.abs() >= least_rad_s;
+        let other_goes =
+            other.1.abs() < least_rad_s || other.0 * other.1.signum() >= goes * other.1.abs();
+        let is_shown = other_goes && view.uses.gyro && !view.repeats.gyro.is_frozen();
+        if is_told && is_shown && measured.abs() <= stands * commanded.abs() {
+            let lever_m = if subject == Subject::LeftWheels {
+                -model.effective_track_m()
+            } else {
+                model.effective_track_m()
+            };
+            let by_wheels = means.wheels.angular_rad_s;
+            let missing = (commanded - measured) * model.wheel_radius_m() / lever_m;
+            let (off_wheels, off_told) = (
+                (means.gyro_rad_s - by_wheels).abs(),
+                (means.gyro_rad_s - by_wheels - missing).abs(),
+            );
+            let finding = Finding {
+                subject,
+                kind: Kind::Locked,
+                observed: measured,
+                predicted: commanded,
+                unit: Unit::RadiansPerSecond,
+            };
+            if off_wheels < NEARER * off_told {
+                verdicts.contradict(finding, RAISE_LOCKED_S);
+            } else if off_told < NEARER * off_wheels {
+                let is_frozen = view.repeats.wheels.is_frozen();
+                let found = Finding {
+                    subject: Subject::Wheels,
+                    kind: kind_of(measured, commanded, is_frozen),
+                    ..finding
+                };
+                verdicts.contradict(found, sensor_raise_s(view));
+            }
+        } else if is_told && measured * commanded.signum() >= goes * commanded.abs() {
+            verdicts.agree(subject);
+        }
+    }
+}

@@ -1,0 +1,82 @@
+//! A robot of the rough world as the agent's base.
+
+use std::time::Duration;
+
+use tread_agent::bench::SteppedDrive;
+use tread_agent::drive::{Drive, Feedback};
+use tread_control::geometry::Pose;
+use tread_control::measured::WheelSpeeds;
+use tread_control::robot::RobotModel;
+
+use super::plant::{Plant, STEP_S};
+use super::sensors::{SAMPLE_PERIOD, SensorSpec, Sensors};
+use super::spec::Deviations;
+use crate::random::Random;
+
+/// A robot of the rough world.
+#[derive(Debug, Clone)]
+pub struct RoughDrive {
+    plant: Plant,
+    sensors: Sensors,
+    command: WheelSpeeds,
+    waiting: Feedback,
+    simulated_to: Option<Duration>,
+    steps_per_sample: u32,
+}
+
+impl RoughDrive {
+    /// A robot at rest at a pose; none if the model's wheels are no rectangle.
+    pub fn new(
+        model: &RobotModel,
+        deviations: Deviations,
+        sensors: SensorSpec,
+        start: Pose,
+        random: Random,
+    ) -> Option<Self> {
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a small whole number"
+        )]
+        let steps_per_sample = (SAMPLE_PERIOD.as_secs_f64() / STEP_S).round() as u32;
+        Some(Self {
+            plant: Plant::new(model, deviations, start)?,
+            sensors: Sensors::new(sensors, model, random),
+            command: WheelSpeeds::default(),
+            waiting: Feedback::default(),
+            simulated_to: None,
+            steps_per_sample,
+        })
+    }
+
+    /// What it truly is and does.
+    pub fn plant(&self) -> &Plant {
+        &self.plant
+    }
+}
+
+impl SteppedDrive for RoughDrive {
+    fn advance(&mut self, now: Duration) {
+        let from = self
+            .simulated_to
+            .unwrap_or_else(|| now.saturating_sub(SAMPLE_PERIOD));
+        let mut at = from;
+        while at + SAMPLE_PERIOD <= now {
+            at += SAMPLE_PERIOD;
+            let means = self.plant.advance(self.command, self.steps_per_sample);
+            self.sensors
+                .sample(&self.plant, &means, at, &mut self.waiting);
+        }
+        self.simulated_to = Some(at);
+    }
+}
+
+impl Drive for RoughDrive {
+    fn read(&mut self, _: Duration) -> Feedback {
+        std::mem::take(&mut self.waiting)
+    }
+
+    fn write(&mut self, command: WheelSpeeds) {
+        self.command = command;
+    }
+}

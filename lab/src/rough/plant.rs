@@ -1,0 +1,413 @@
+//! The body, its wheels and its motors, from Newton's laws.
+//!
+//! State in the body frame at the centre of mass: speed ahead and to the left, turn rate; per side
+//! the wheels' speed (front and rear are coupled by a chain, as on the makes of [`super::spec`]);
+//! per contact the deflection of the tyre as a slip vector s, which follows
+//! `ℓ ṡ = v_slip − |rω| s`. Its force is `N μ(|s|) s/|s|`, with the wheel's own load N: the loads are
+//! those of a rigid body on four equal springs. Gravity acts along the slope. Motors give torque,
+//! limited in size, by a proportional-integral speed servo; rotors, gears and rolling resistance take
+//! their part of it before it reaches the contact.
+
+use nalgebra::{Matrix3, Vector3};
+use tread_control::geometry::{Pose, wrap_angle_rad};
+use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
+use tread_control::robot::RobotModel;
+
+use super::spec::Deviations;
+
+/// Gravity, metres per second squared.
+pub const GRAVITY_M_S2: f64 = 9.806_65;
+/// Integration step, seconds: a hundredth of the fastest oscillation of a contact.
+pub const STEP_S: f64 = 5.0e-4;
+/// Largest deflection of a contact, as a slip; far beyond every curve's peak.
+const DEFLECTION_MAX: f64 = 3.0;
+/// Rim speed below which tread rubber damps contacts, metres per second.
+const DAMPED_BELOW_M_S: f64 = 0.1;
+/// Damping ratio of a contact at standstill.
+const DAMPING_RATIO: f64 = 0.2;
+/// Rim speed over which rolling resistance turns its sign, metres per second.
+const RESISTANCE_TURNS_M_S: f64 = 0.01;
+/// Time over which loads follow the forces: tyres have some give upright too, seconds.
+const LOAD_LAG_S: f64 = 0.02;
+
+/// A wheel's contact.
+#[derive(Debug, Clone, Copy, Default)]
+struct Contact {
+    /// From the centre of mass, metres.
+    x_m: f64,
+    y_m: f64,
+    side: usize,
+    /// Deflection as a slip, ahead and to the left.
+    deflection: [f64; 2],
+    load_n: f64,
+    slip_m_s: f64,
+}
+
+/// The true state, where the agent's model has its own: at the centre of the wheels.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct State {
+    /// Pose of the centre of the wheels, site frame.
+    pub pose: Pose,
+    /// Its speed ahead, metres per second.
+    pub ahead_m_s: f64,
+    /// Its speed to the left, metres per second.
+    pub left_m_s: f64,
+    /// Turn rate, radians per second.
+    pub yaw_rate_rad_s: f64,
+}
+
+/// Means over one call of [`Plant::advance`].
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Means {
+    /// Turn rate, radians per second.
+    pub yaw_rate_rad_s: f64,
+    /// Acceleration of the centre of mass, without gravity.
+    pub acceleration: BodyAcceleration,
+    /// Wheel speeds.
+    pub wheel_speeds: WheelSpeeds,
+    /// Torques of the motors, per side.
+    pub torques: WheelTorques,
+}
+
+/// A robot of the rough world.
+#[derive(Debug, Clone)]
+pub struct Plant {
+    spec: Deviations,
+    mass_kg: f64,
+    inertia_kg_m2: f64,
+    side_inertia_kg_m2: f64,
+    center_m: [f64; 3],
+    radius_m: [f64; 2],
+    contacts: [Contact; 4],
+    load_of_moments: Matrix3<f64>,
+    /// Sums of the contacts' forces, for the loads: ahead and left, newtons.
+    load_force_n: [f64; 2],
+    speed_m_s: [f64; 2],
+    yaw_rate_rad_s: f64,
+    /// Of the centre of mass.
+    pose: Pose,
+    wheels_rad_s: [f64; 2],
+    integral_n_m: [f64; 2],
+    motor_n_m: [f64; 2],
+    /// How far the wheels have turned, radians.
+    turned_rad: [f64; 2],
+}
+
+impl Plant {
+    /// A robot at rest, with its wheels' centre at a pose; none if four loads are no rectangle.
+    pub fn new(model: &RobotModel, spec: Deviations, start: Pose) -> Option<Self> {
+        let (track_m, base_m) = (model.track_width_m(), model.wheelbase_m());
+        let mass_kg = model.mass_kg() * (1.0 + spec.payload_ratio);
+        let center_m = [
+            spec.center_ahead_ratio * base_m,
+            spec.center_left_ratio * track_m,
+            spec.center_height_ratio * track_m,
+        ];
+        let nominal_m = model.wheel_radius_m();
+        let radius_m = spec.radius_ratio.map(|ratio| ratio * nominal_m);
+        let contact = |front: f64, left: f64| Contact {
+            x_m: 0.5 * front * base_m - center_m[0],
+            y_m: 0.5 * left * track_m - center_m[1],
+            side: usize::from(left < 0.0),
+            ..Contact::default()
+        };
+        let contacts = [
+            contact(1.0, 1.0),
+            contact(-1.0, 1.0),
+            contact(1.0, -1.0),
+            contact(-1.0, -1.0),
+        ];
+        // Loads c₀ + c₁x + c₂y whose sum and moments are given.
+        let moments: Matrix3<f64> = contacts
+            .iter()
+            .map(|contact| {
+                let row = Vector3::new(1.0, contact.x_m, contact.y_m);
+                row * row.transpose()
+            })
+            .sum();
+        let (sin, cos) = start.heading_rad.sin_cos();
+        let mut plant = Self {
+            mass_kg,
+            inertia_kg_m2: model.yaw_inertia_kg_m2()
+                * spec.inertia_ratio
+                * (1.0 + spec.payload_ratio),
+            side_inertia_kg_m2: spec.rotor_ratio * 0.5 * model.mass_kg() * nominal_m.powi(2),
+            center_m,
+            radius_m,
+            contacts,
+            load_of_moments: moments.try_inverse()?,
+            load_force_n: [0.0; 2],
+            speed_m_s: [0.0; 2],
+            yaw_rate_rad_s: 0.0,
+            pose: Pose {
+                x_m: start.x_m + cos * center_m[0] - sin * center_m[1],
+                y_m: start.y_m + sin * center_m[0] + cos * center_m[1],
+                heading_rad: start.heading_rad,
+            },
+            wheels_rad_s: [0.0; 2],
+            integral_n_m: [0.0; 2],
+            motor_n_m: [0.0; 2],
+            turned_rad: [0.0; 2],
+            spec,
+        };
+        plant.bear(1.0);
+        Some(plant)
+    }
+
+    /// What it is.
+    pub fn spec(&self) -> &Deviations {
+        &self.spec
+    }
+
+    /// How far each side's wheels have turned, radians.
+    pub fn turned_rad(&self) -> [f64; 2] {
+        self.turned_rad
+    }
+
+    /// The state of the wheels' centre.
+    pub fn state(&self) -> State {
+        let (sin, cos) = self.pose.heading_rad.sin_cos();
+        let [x_m, y_m, _] = self.center_m;
+        State {
+            pose: Pose {
+                x_m: self.pose.x_m - cos * x_m + sin * y_m,
+                y_m: self.pose.y_m - sin * x_m - cos * y_m,
+                heading_rad: self.pose.heading_rad,
+            },
+            ahead_m_s: self.speed_m_s[0] + self.yaw_rate_rad_s * y_m,
+            left_m_s: self.speed_m_s[1] - self.yaw_rate_rad_s * x_m,
+            yaw_rate_rad_s: self.yaw_rate_rad_s,
+        }
+    }
+
+    /// How far it leans from level, radians.
+    pub fn tilt_rad(&self) -> f64 {
+        let [x_rad, y_rad] = self.spec.slope_rad;
+        x_rad.tan().hypot(y_rad.tan()).atan()
+    }
+
+    /// Share of the greatest slip of its contacts over the curve's peak slip.
+    pub fn slip_over_peak(&self) -> f64 {
+        let slips = self.contacts.iter();
+        let slips = slips.map(|contact| contact.deflection[0].hypot(contact.deflection[1]));
+        slips.fold(0.0, f64::max) / self.spec.curve.peak_slip()
+    }
+
+    /// Gravity over mass in the body frame: ahead, left, and into the ground.
+    fn gravity_m_s2(&self) -> [f64; 3] {
+        let [x_rad, y_rad] = self.spec.slope_rad;
+        let (rise_x, rise_y) = (x_rad.tan(), y_rad.tan());
+        let upright = (1.0 + rise_x.powi(2) + rise_y.powi(2)).sqrt().recip();
+        let (sin, cos) = self.pose.heading_rad.sin_cos();
+        let down = [
+            -rise_x * upright * GRAVITY_M_S2,
+            -rise_y * upright * GRAVITY_M_S2,
+        ];
+        [
+            cos * down[0] + sin * down[1],
+            -sin * down[0] + cos * down[1],
+            upright * GRAVITY_M_S2,
+        ]
+    }
+
+    /// Loads that carry the body against the moments of the contacts' forces, a share of the way.
+    fn bear(&mut self, share: f64) {
+        let height_m = self.center_m[2];
+        let weight_n = self.mass_kg * self.gravity_m_s2()[2];
+        let moments = Vector3::new(
+            weight_n,
+            -height_m * self.load_force_n[0],
+            -height_m * self.load_force_n[1],
+        );
+        let plane = self.load_of_moments * moments;
+        for contact in &mut self.contacts {
+            let load_n = plane[0] + plane[1] * contact.x_m + plane[2] * contact.y_m;
+            contact.load_n += share * (load_n.max(0.0) - contact.load_n);
+        }
+    }
+
+    /// Torques of the motors for commanded wheel speeds.
+    fn command(&mut self, command: [f64; 2]) {
+        for (side, target_rad_s) in command.into_iter().enumerate() {
+            let radius_m = self.radius_m[side];
+            let inertia = 0.5 * self.mass_kg * radius_m.powi(2) + self.side_inertia_kg_m2;
+            let gain = inertia / self.spec.servo_lag_s;
+            let error = target_rad_s - self.wheels_rad_s[side];
+            let most = self.spec.motor_limit_mu * 0.5 * self.mass_kg * GRAVITY_M_S2 * radius_m;
+            let wanted = gain * error + self.integral_n_m[side];
+            let torque = wanted.clamp(-most, most);
+            // The integral rests while the motor gives all it can.
+            if (wanted - torque).abs() < f64::EPSILON {
+                let rate = gain / (4.0 * self.spec.servo_lag_s);
+                self.integral_n_m[side] += rate * error * STEP_S;
+            }
+            self.motor_n_m[side] = torque;
+        }
+    }
+
+    /// Forces of the contacts on the body, ahead and left each, newtons.
+    fn forces(&mut self) -> [[f64; 2]; 4] {
+        let curve = self.spec.curve;
+        let damping =
+            2.0 * DAMPING_RATIO * (curve.stiffness * self.spec.relaxation_m / GRAVITY_M_S2).sqrt();
+        self.contacts.map(|contact| {
+            let slip = contact.deflection[0].hypot(contact.deflection[1]);
+            let mu_over_slip = curve.mu_over_slip(slip, contact.slip_m_s);
+            let rim_m_s = (self.wheels_rad_s[contact.side] * self.radius_m[contact.side]).abs();
+            let damped =
+                damping * (1.0 - rim_m_s / DAMPED_BELOW_M_S).max(0.0) / self.spec.relaxation_m;
+            let velocity = slip_velocity(
+                &contact,
+                self.speed_m_s,
+                self.yaw_rate_rad_s,
+                self.wheels_rad_s[contact.side] * self.radius_m[contact.side],
+            );
+            let most_n = curve.mu_peak * contact.load_n;
+            let mut force = [0, 1].map(|axis| {
+                let gives = velocity[axis] - rim_m_s * contact.deflection[axis];
+                contact.load_n * (mu_over_slip * contact.deflection[axis] + damped * gives)
+            });
+            let size_n = force[0].hypot(force[1]);
+            if size_n > most_n {
+                force = force.map(|part| part * most_n / size_n);
+            }
+            force
+        })
+    }
+
+    fn step(&mut self, command: [f64; 2], sums: &mut Sums) {
+        self.command(command);
+        let forces = self.forces();
+        let (mut force, mut moment, mut side_n) = ([0.0; 2], 0.0, [0.0; 2]);
+        let mut side_load_n = [0.0; 2];
+        for (contact, [ahead_n, left_n]) in self.contacts.iter().zip(forces) {
+            force[0] += ahead_n;
+            force[1] += left_n;
+            moment += contact.x_m * left_n - contact.y_m * ahead_n;
+            side_n[contact.side] += ahead_n;
+            side_load_n[contact.side] += contact.load_n;
+        }
+        let share = STEP_S / LOAD_LAG_S;
+        for (slow_n, now_n) in self.load_force_n.iter_mut().zip(force) {
+            *slow_n += share * (now_n - *slow_n);
+        }
+        self.bear(share);
+        let gravity = self.gravity_m_s2();
+        let acceleration = [
+            force[0] / self.mass_kg + gravity[0],
+            force[1] / self.mass_kg + gravity[1],
+        ];
+        let yaw_rate = self.yaw_rate_rad_s;
+        let [ahead, left] = self.speed_m_s;
+        self.speed_m_s = [
+            ahead + STEP_S * (acceleration[0] + left * yaw_rate),
+            left + STEP_S * (acceleration[1] - ahead * yaw_rate),
+        ];
+        self.yaw_rate_rad_s += STEP_S * moment / self.inertia_kg_m2;
+        for side in 0..2 {
+            let (radius_m, speed) = (self.radius_m[side], self.wheels_rad_s[side]);
+            let contact_n_m = side_n[side] * radius_m;
+            let turns = (speed * radius_m / RESISTANCE_TURNS_M_S).tanh();
+            let resistance =
+                self.spec.rolling_resistance_ratio * side_load_n[side] * radius_m * turns;
+            let lost = self.spec.gear_loss_ratio * contact_n_m.abs() * turns;
+            let driving = self.motor_n_m[side] - contact_n_m - resistance - lost;
+            self.wheels_rad_s[side] += STEP_S * driving / self.side_inertia_kg_m2;
+            self.turned_rad[side] += STEP_S * self.wheels_rad_s[side];
+        }
+        self.deflect();
+        let (sin, cos) = self.pose.heading_rad.sin_cos();
+        let [ahead, left] = self.speed_m_s;
+        self.pose = Pose {
+            x_m: self.pose.x_m + STEP_S * (cos * ahead - sin * left),
+            y_m: self.pose.y_m + STEP_S * (sin * ahead + cos * left),
+            heading_rad: wrap_angle_rad(self.pose.heading_rad + STEP_S * self.yaw_rate_rad_s),
+        };
+        sums.add(self, acceleration);
+    }
+
+    fn deflect(&mut self) {
+        let length_m = self.spec.relaxation_m;
+        let (speed, yaw_rate) = (self.speed_m_s, self.yaw_rate_rad_s);
+        for contact in &mut self.contacts {
+            let rim_m_s = self.wheels_rad_s[contact.side] * self.radius_m[contact.side];
+            let velocity = slip_velocity(contact, speed, yaw_rate, rim_m_s);
+            contact.slip_m_s = velocity[0].hypot(velocity[1]);
+            let share = STEP_S / length_m;
+            for (axis, deflection) in contact.deflection.iter_mut().enumerate() {
+                *deflection =
+                    (*deflection + share * velocity[axis]) / (1.0 + share * rim_m_s.abs());
+            }
+            let size = contact.deflection[0].hypot(contact.deflection[1]);
+            // A deflection beyond what friction bears slides on.
+            let most = if rim_m_s.abs() < DAMPED_BELOW_M_S {
+                self.spec.curve.peak_slip().min(DEFLECTION_MAX)
+            } else {
+                DEFLECTION_MAX
+            };
+            if size > most {
+                contact.deflection = contact.deflection.map(|part| part * most / size);
+            }
+        }
+    }
+
+    /// Moves on by so many steps under commanded wheel speeds; means over that time.
+    pub fn advance(&mut self, command: WheelSpeeds, steps: u32) -> Means {
+        let mut sums = Sums::default();
+        for _ in 0..steps {
+            self.step([command.left_rad_s, command.right_rad_s], &mut sums);
+        }
+        sums.means()
+    }
+}
+
+/// Speed of a contact's patch over the ground, turned round: ahead and left.
+fn slip_velocity(contact: &Contact, speed: [f64; 2], yaw_rate: f64, rim_m_s: f64) -> [f64; 2] {
+    [
+        rim_m_s - (speed[0] - yaw_rate * contact.y_m),
+        -(speed[1] + yaw_rate * contact.x_m),
+    ]
+}
+
+#[derive(Debug, Default)]
+struct Sums {
+    count: f64,
+    yaw_rate: f64,
+    acceleration: [f64; 2],
+    wheels: [f64; 2],
+    torques: [f64; 2],
+}
+
+impl Sums {
+    fn add(&mut self, plant: &Plant, acceleration: [f64; 2]) {
+        self.count += 1.0;
+        self.yaw_rate += plant.yaw_rate_rad_s;
+        let add = |sums: &mut [f64; 2], values: [f64; 2]| {
+            for (sum, value) in sums.iter_mut().zip(values) {
+                *sum += value;
+            }
+        };
+        add(&mut self.acceleration, acceleration);
+        add(&mut self.wheels, plant.wheels_rad_s);
+        add(&mut self.torques, plant.motor_n_m);
+    }
+
+    fn means(&self) -> Means {
+        let count = self.count.max(1.0);
+        Means {
+            yaw_rate_rad_s: self.yaw_rate / count,
+            acceleration: BodyAcceleration {
+                ahead_m_s2: self.acceleration[0] / count,
+                left_m_s2: self.acceleration[1] / count,
+            },
+            wheel_speeds: WheelSpeeds {
+                left_rad_s: self.wheels[0] / count,
+                right_rad_s: self.wheels[1] / count,
+            },
+            torques: WheelTorques {
+                left_n_m: self.torques[0] / count,
+                right_n_m: self.torques[1] / count,
+            },
+        }
+    }
+}

@@ -1,0 +1,145 @@
+//! One drive of one robot, closed-loop, and what its agent said of the ground.
+
+use std::time::Duration;
+
+use tread_agent::bench::Bench;
+use tread_api::friction::ThetaEstimate;
+use tread_api::geometry::Point;
+use tread_api::trajectory::{
+    Circle, Direction, Trajectory, TrajectoryOptions, Waypoint, Waypoints,
+};
+use tread_control::estimation::EstimatorPrior;
+use tread_control::geometry::Pose;
+
+use super::drive::RoughDrive;
+use super::sensors::SensorSpec;
+use super::spec::{Deviations, Make};
+use crate::random::Random;
+
+/// Times after the start of the mission at which the agent is asked, seconds.
+pub const ASKED_AT_S: [u64; 4] = [10, 20, 40, 60];
+/// How long the robot may take to know where it is.
+const SETTLES: Duration = Duration::from_secs(2);
+/// Speed of the courses, metres per second.
+const SPEED_M_S: f64 = 0.6;
+/// Points of a lap of the figure-8.
+const POINTS_PER_LAP: u32 = 24;
+/// Laps of the figure-8: more than a minute of it.
+const LAPS: u32 = 3;
+
+/// What is driven.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Course {
+    /// A lemniscate, 8 m long and 4 m wide.
+    Figure8,
+    /// A circle of 2 m.
+    Circle,
+}
+
+impl Course {
+    /// For people.
+    pub fn text(self) -> &'static str {
+        match self {
+            Self::Figure8 => "figure-8",
+            Self::Circle => "circle",
+        }
+    }
+
+    fn trajectory(self) -> Trajectory {
+        let options = TrajectoryOptions::default();
+        match self {
+            Self::Circle => Trajectory::Circle(Circle {
+                center: Point { x_m: 0.0, y_m: 2.0 },
+                radius_m: 2.0,
+                speed_m_s: Some(SPEED_M_S),
+                period_s: None,
+                direction: Direction::CounterClockwise,
+                turns: 4.0,
+                options,
+            }),
+            Self::Figure8 => {
+                let points = 0..=POINTS_PER_LAP * LAPS;
+                let waypoint = |index: u32| {
+                    let angle =
+                        std::f64::consts::TAU * f64::from(index) / f64::from(POINTS_PER_LAP);
+                    Waypoint {
+                        x_m: 4.0 * angle.sin(),
+                        y_m: 2.0 * (2.0 * angle).sin(),
+                        heading_rad: None,
+                        speed_m_s: None,
+                    }
+                };
+                Trajectory::Waypoints(Waypoints {
+                    points: points.map(waypoint).collect(),
+                    speed_m_s: SPEED_M_S,
+                    options,
+                })
+            }
+        }
+    }
+}
+
+/// A drive.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Trial {
+    /// The robot.
+    pub make: Make,
+    /// How it and its ground differ from the agent's model.
+    pub deviations: Deviations,
+    /// What it is measured with.
+    pub sensors: SensorSpec,
+    /// What it drives.
+    pub course: Course,
+    /// What its noise is made from.
+    pub seed: u64,
+    /// How the agent's estimator is configured for the robot and its tyres.
+    pub prior: EstimatorPrior,
+}
+
+/// What came of a drive.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Outcome {
+    /// What the agent said of θ at [`ASKED_AT_S`].
+    pub said: [Option<ThetaEstimate>; ASKED_AT_S.len()],
+    /// The true θ.
+    pub truth: f64,
+    /// Share of the time in which a contact slipped beyond half the slip of the peak.
+    pub beyond_half_peak: f64,
+}
+
+/// Drives; an error if the robot, its pose or its plan cannot be.
+///
+/// # Errors
+/// A sentence on what cannot be.
+pub fn run(trial: &Trial) -> anyhow::Result<Outcome> {
+    let model = trial.make.model()?;
+    let random = Random::new(trial.seed);
+    let drive = RoughDrive::new(
+        &model,
+        trial.deviations,
+        trial.sensors,
+        Pose::default(),
+        random,
+    )
+    .ok_or_else(|| anyhow::anyhow!("the wheels of {} are no rectangle", trial.make.name))?;
+    let mut bench = Bench::with_drive(drive, model).with_prior(trial.prior);
+    bench.run_for(SETTLES);
+    bench.begin(1, &trial.course.trajectory(), None)?;
+    let (mut ticks, mut beyond) = (0_u32, 0_u32);
+    let mut said = [None; ASKED_AT_S.len()];
+    let mut driven_ticks = 0;
+    for (said, asked_at_s) in said.iter_mut().zip(ASKED_AT_S) {
+        for _ in driven_ticks..asked_at_s * 100 {
+            bench.tick();
+            ticks += 1;
+            beyond += u32::from(bench.drive().plant().slip_over_peak() > 0.5);
+        }
+        driven_ticks = asked_at_s * 100;
+        *said = bench.theta();
+    }
+    Ok(Outcome {
+        said,
+        truth: trial.deviations.curve.theta(),
+        beyond_half_peak: f64::from(beyond) / f64::from(ticks.max(1)),
+    })
+}

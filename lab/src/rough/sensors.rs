@@ -1,0 +1,224 @@
+//! Sensors as data sheets describe them: counts, drift, delay, outliers.
+//!
+//! Joint states and inertial data come at 100 Hz, as the makes' drivers send them. Encoders count;
+//! the gyro's offset walks; positions come late, wander slowly and are wrong now and then.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use tread_agent::drive::{Feedback, SensorSample};
+use tread_control::geometry::{Pose, wrap_angle_rad};
+use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
+use tread_control::robot::RobotModel;
+
+use super::plant::{GRAVITY_M_S2, Means, Plant};
+use crate::random::Random;
+
+/// Time between two samples of the fast sensors.
+pub const SAMPLE_PERIOD: Duration = Duration::from_millis(10);
+/// Time over which a position's slow error changes, seconds.
+const POSITION_WANDERS_S: f64 = 20.0;
+/// How far an outlier is off, metres.
+const OUTLIER_M: f64 = 1.0;
+
+/// How good a robot's sensors are; one standard deviation each unless said otherwise.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SensorSpec {
+    /// Encoder counts per turn of a wheel.
+    pub counts_per_turn: f64,
+    /// Gyro, radians per second per sample.
+    pub gyro_rad_s: f64,
+    /// Its offset at the start, radians per second.
+    pub gyro_offset_rad_s: f64,
+    /// How its offset walks, radians per second per root second.
+    pub gyro_walk_rad_s: f64,
+    /// Accelerometer, metres per second squared per sample.
+    pub acceleration_m_s2: f64,
+    /// Its offset, metres per second squared.
+    pub acceleration_offset_m_s2: f64,
+    /// Torque, as a friction coefficient of one side.
+    pub torque_mu: f64,
+    /// Whether torque is measured.
+    pub has_torque: bool,
+    /// Speed over ground, metres per second.
+    pub body_speed_m_s: f64,
+    /// Time between two speeds over ground.
+    pub body_speed_period: Duration,
+    /// Position, per axis, metres.
+    pub position_m: f64,
+    /// Heading of a position, radians.
+    pub heading_rad: f64,
+    /// Slow error of a position, per axis, metres.
+    pub position_wander_m: f64,
+    /// Time between two positions.
+    pub position_period: Duration,
+    /// How late they come.
+    pub position_delay: Duration,
+    /// Share of positions that are off by a metre.
+    pub outlier_share: f64,
+}
+
+impl SensorSpec {
+    /// Poses of 2 cm at 10 Hz that come 50 ms late, and inertial data of a small MEMS unit.
+    pub fn usual(has_torque: bool) -> Self {
+        Self {
+            counts_per_turn: 16_384.0,
+            gyro_rad_s: 0.003,
+            gyro_offset_rad_s: 0.002,
+            gyro_walk_rad_s: 1.0e-4,
+            acceleration_m_s2: 0.05,
+            acceleration_offset_m_s2: 0.02,
+            torque_mu: 0.01,
+            has_torque,
+            body_speed_m_s: 0.02,
+            body_speed_period: Duration::from_millis(100),
+            position_m: 0.02,
+            heading_rad: 0.01,
+            position_wander_m: 0.01,
+            position_period: Duration::from_millis(100),
+            position_delay: Duration::from_millis(50),
+            outlier_share: 0.0,
+        }
+    }
+
+    /// The sensors of one robot of the population.
+    pub fn drawn(random: &mut Random, has_torque: bool) -> Self {
+        let rate_hz = random.one_of(&[5_u32, 10, 20]).unwrap_or(10);
+        Self {
+            counts_per_turn: random.log_uniform(4_096.0, 80_000.0),
+            gyro_walk_rad_s: random.log_uniform(3.0e-5, 3.0e-4),
+            position_m: random.log_uniform(0.005, 0.03),
+            position_period: Duration::from_secs(1) / rate_hz,
+            position_delay: Duration::from_millis(10) * random.one_of(&[2, 5, 10]).unwrap_or(5),
+            outlier_share: random.one_of(&[0.0, 0.002]).unwrap_or(0.0),
+            ..Self::usual(has_torque)
+        }
+    }
+}
+
+/// The sensors of one robot.
+#[derive(Debug, Clone)]
+pub struct Sensors {
+    spec: SensorSpec,
+    random: Random,
+    gyro_offset_rad_s: f64,
+    acceleration_offset: [f64; 2],
+    wander_m: [f64; 2],
+    counts: [f64; 2],
+    torque_noise_n_m: f64,
+    next_speed_at: Duration,
+    next_position_at: Duration,
+    late: VecDeque<(Duration, SensorSample)>,
+}
+
+impl Sensors {
+    /// Sensors on a robot of that model.
+    pub fn new(spec: SensorSpec, model: &RobotModel, mut random: Random) -> Self {
+        let load_n = 0.5 * model.mass_kg() * GRAVITY_M_S2;
+        Self {
+            gyro_offset_rad_s: random.normal(spec.gyro_offset_rad_s),
+            acceleration_offset: [
+                random.normal(spec.acceleration_offset_m_s2),
+                random.normal(spec.acceleration_offset_m_s2),
+            ],
+            wander_m: [
+                random.normal(spec.position_wander_m),
+                random.normal(spec.position_wander_m),
+            ],
+            counts: [0.0; 2],
+            torque_noise_n_m: spec.torque_mu * load_n * model.wheel_radius_m(),
+            next_speed_at: Duration::ZERO,
+            next_position_at: Duration::ZERO,
+            late: VecDeque::new(),
+            spec,
+            random,
+        }
+    }
+
+    fn wheels(&mut self, plant: &Plant) -> WheelSpeeds {
+        let per_rad = self.spec.counts_per_turn / std::f64::consts::TAU;
+        let counts = plant.turned_rad().map(|turned| (turned * per_rad).floor());
+        let before = std::mem::replace(&mut self.counts, counts);
+        let speed =
+            |side: usize| (counts[side] - before[side]) / per_rad / SAMPLE_PERIOD.as_secs_f64();
+        WheelSpeeds {
+            left_rad_s: speed(0),
+            right_rad_s: speed(1),
+        }
+    }
+
+    fn position(&mut self, truth: Pose) -> Pose {
+        let spec = self.spec;
+        let period_s = spec.position_period.as_secs_f64();
+        let keeps = (-period_s / POSITION_WANDERS_S).exp();
+        let fresh = (1.0 - keeps * keeps).sqrt() * spec.position_wander_m;
+        for wander_m in &mut self.wander_m {
+            *wander_m = keeps * *wander_m + self.random.normal(fresh);
+        }
+        let mut off_m = [
+            self.wander_m[0] + self.random.normal(spec.position_m),
+            self.wander_m[1] + self.random.normal(spec.position_m),
+        ];
+        if self.random.chance(spec.outlier_share) {
+            let angle = self.random.uniform(0.0, std::f64::consts::TAU);
+            off_m[0] += OUTLIER_M * angle.cos();
+            off_m[1] += OUTLIER_M * angle.sin();
+        }
+        Pose {
+            x_m: truth.x_m + off_m[0],
+            y_m: truth.y_m + off_m[1],
+            heading_rad: wrap_angle_rad(truth.heading_rad + self.random.normal(spec.heading_rad)),
+        }
+    }
+
+    /// What the sensors say at `at`, after a time over which the plant's means are these.
+    pub fn sample(&mut self, plant: &Plant, means: &Means, at: Duration, to: &mut Feedback) {
+        let (spec, truth) = (self.spec, plant.state());
+        self.gyro_offset_rad_s += self
+            .random
+            .normal(spec.gyro_walk_rad_s * SAMPLE_PERIOD.as_secs_f64().sqrt());
+        let body_speed_m_s = (at >= self.next_speed_at).then(|| {
+            self.next_speed_at = at + spec.body_speed_period;
+            truth.ahead_m_s + self.random.normal(spec.body_speed_m_s)
+        });
+        let scale = plant.spec().torque_scale;
+        let noise_n_m = self.torque_noise_n_m;
+        let wheel_torques = spec.has_torque.then(|| WheelTorques {
+            left_n_m: scale[0] * means.torques.left_n_m + self.random.normal(noise_n_m),
+            right_n_m: scale[1] * means.torques.right_n_m + self.random.normal(noise_n_m),
+        });
+        let offset = self.acceleration_offset;
+        to.push(SensorSample {
+            at,
+            yaw_rate_rad_s: Some(
+                means.yaw_rate_rad_s + self.gyro_offset_rad_s + self.random.normal(spec.gyro_rad_s),
+            ),
+            acceleration: Some(BodyAcceleration {
+                ahead_m_s2: means.acceleration.ahead_m_s2
+                    + offset[0]
+                    + self.random.normal(spec.acceleration_m_s2),
+                left_m_s2: means.acceleration.left_m_s2
+                    + offset[1]
+                    + self.random.normal(spec.acceleration_m_s2),
+            }),
+            wheel_speeds: Some(self.wheels(plant)),
+            wheel_torques,
+            body_speed_m_s,
+            tilt_rad: Some(plant.tilt_rad()),
+            position: None,
+            position_noise: None,
+        });
+        if at >= self.next_position_at {
+            self.next_position_at = at + spec.position_period;
+            let fix = SensorSample {
+                at,
+                position: Some(self.position(truth.pose)),
+                ..SensorSample::default()
+            };
+            self.late.push_back((at + spec.position_delay, fix));
+        }
+        while let Some((_, fix)) = self.late.pop_front_if(|(due, _)| *due <= at) {
+            to.push(fix);
+        }
+    }
+}

@@ -1,0 +1,188 @@
+//! What a robot of the rough world is, beside the model with which its agent is configured.
+
+use tread_control::robot::{Limits, RobotModel, RobotModelError, RobotModelSpec};
+
+use super::curve::{Curve, Shape};
+use crate::random::Random;
+
+/// A make of robot, from its description package and data sheet.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Make {
+    /// Its name.
+    pub name: &'static str,
+    mass_kg: f64,
+    track_m: f64,
+    wheelbase_m: f64,
+    wheel_radius_m: f64,
+    /// Length and width of its body, metres.
+    body_m: (f64, f64),
+}
+
+/// Masses, wheels and body sizes as in `husky_description`, `jackal_description` and
+/// `warthog_description` of Clearpath Robotics and their data sheets; the first is the robot of
+/// Yi et al. (2007), whose body is taken for as large as its track and wheelbase with the wheels.
+pub const MAKES: [Make; 4] = [
+    Make {
+        name: "paper",
+        mass_kg: 5.0,
+        track_m: 0.43,
+        wheelbase_m: 0.28,
+        wheel_radius_m: 0.08,
+        body_m: (0.44, 0.48),
+    },
+    Make {
+        name: "Jackal",
+        mass_kg: 17.0,
+        track_m: 0.376,
+        wheelbase_m: 0.262,
+        wheel_radius_m: 0.098,
+        body_m: (0.508, 0.43),
+    },
+    Make {
+        name: "Husky",
+        mass_kg: 50.0,
+        track_m: 0.571,
+        wheelbase_m: 0.512,
+        wheel_radius_m: 0.165,
+        body_m: (0.99, 0.67),
+    },
+    Make {
+        name: "Warthog",
+        mass_kg: 280.0,
+        track_m: 1.125,
+        wheelbase_m: 0.916,
+        wheel_radius_m: 0.27,
+        body_m: (1.52, 1.38),
+    },
+];
+
+impl Make {
+    /// What an integrator writes into the agent's configuration: the data sheet, and the inertia of
+    /// a plate of the body's size.
+    ///
+    /// # Errors
+    /// [`RobotModelError`], if a figure of the table is no size.
+    pub fn model(&self) -> Result<RobotModel, RobotModelError> {
+        let (length_m, width_m) = self.body_m;
+        RobotModel::try_from(RobotModelSpec {
+            mass_kg: self.mass_kg,
+            track_width_m: self.track_m,
+            wheelbase_m: self.wheelbase_m,
+            wheel_radius_m: self.wheel_radius_m,
+            yaw_inertia_kg_m2: self.mass_kg * (length_m.powi(2) + width_m.powi(2)) / 12.0,
+            limits: Limits {
+                wheel_speed_max_rad_s: 1.6 / self.wheel_radius_m,
+                wheel_acceleration_max_rad_s2: 4.8 / self.wheel_radius_m,
+                linear_max_m_s: 1.0,
+                angular_max_rad_s: 1.5,
+                linear_acceleration_max_m_s2: 0.8,
+                linear_jerk_max_m_s3: 4.0,
+                lateral_acceleration_max_m_s2: 1.0,
+            },
+        })
+    }
+}
+
+/// What makes a robot and its ground differ from the agent's model, and from our simulator.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Deviations {
+    /// Payload over the mass of the agent's model; it sits at the centre of mass.
+    pub payload_ratio: f64,
+    /// Yaw inertia over that of the agent's model, beside the payload's share.
+    pub inertia_ratio: f64,
+    /// Centre of mass ahead of the centre of the wheels, over the wheelbase.
+    pub center_ahead_ratio: f64,
+    /// Centre of mass to the left of it, over the track.
+    pub center_left_ratio: f64,
+    /// Height of the centre of mass over the track.
+    pub center_height_ratio: f64,
+    /// Relaxation length of the contacts, metres.
+    pub relaxation_m: f64,
+    /// Rise of the ground along the site's axes, radians.
+    pub slope_rad: [f64; 2],
+    /// Measured over true torque, left and right.
+    pub torque_scale: [f64; 2],
+    /// Inertia of a side's rotors and wheels at the rim over half the mass.
+    pub rotor_ratio: f64,
+    /// Torque lost in the gears over that which they transmit.
+    pub gear_loss_ratio: f64,
+    /// Rolling resistance over load.
+    pub rolling_resistance_ratio: f64,
+    /// True over nominal rolling radius, left and right.
+    pub radius_ratio: [f64; 2],
+    /// Time constant of the speed servo, seconds.
+    pub servo_lag_s: f64,
+    /// Most force of the motors at the rim of a side, over its load.
+    pub motor_limit_mu: f64,
+    /// Ground and tyre.
+    pub curve: Curve,
+}
+
+impl Deviations {
+    /// As near to our simulator as this world can be: nothing differs but the plant and the sensors.
+    pub fn none(stiffness: f64) -> Self {
+        Self {
+            payload_ratio: 0.0,
+            inertia_ratio: 1.0,
+            center_ahead_ratio: 0.0,
+            center_left_ratio: 0.0,
+            center_height_ratio: 0.3,
+            relaxation_m: 2.0e-3,
+            slope_rad: [0.0; 2],
+            torque_scale: [1.0; 2],
+            rotor_ratio: 0.01,
+            gear_loss_ratio: 0.0,
+            rolling_resistance_ratio: 0.01,
+            radius_ratio: [1.0; 2],
+            servo_lag_s: 0.05,
+            motor_limit_mu: 1.5,
+            curve: Curve {
+                shape: Shape::Linear,
+                stiffness,
+                mu_peak: 0.6_f64.min(0.9 * stiffness),
+            },
+        }
+    }
+
+    /// One robot of the population.
+    ///
+    /// Payload up to what data sheets allow for daily use (0 to 30 %); relaxation lengths of small
+    /// pneumatic and solid tyres (1 to 10 cm: Pacejka, ch. 5); torque constants within 3 % and 2 %
+    /// per side (motor data sheets state ± 5 to 10 % at most); slopes of yards and fields (2° one
+    /// standard deviation per axis, at most 6°).
+    pub fn drawn(random: &mut Random) -> Self {
+        let stiffness = random.one_of(&[0.7, 3.0, 12.0]).unwrap_or(3.0);
+        let shape = random.one_of(&Shape::ALL).unwrap_or(Shape::Linear);
+        let scale = 1.0 + random.normal(0.03);
+        let slope_max = 6.0_f64.to_radians();
+        let mut slope = || {
+            let rad = random.normal(2.0_f64.to_radians());
+            rad.clamp(-slope_max, slope_max)
+        };
+        let slope_rad = [slope(), slope()];
+        Self {
+            payload_ratio: random.uniform(0.0, 0.3),
+            inertia_ratio: random.uniform(0.8, 1.25),
+            center_ahead_ratio: random.uniform(-0.05, 0.05),
+            center_left_ratio: random.uniform(-0.03, 0.03),
+            center_height_ratio: random.uniform(0.2, 0.5),
+            relaxation_m: random.log_uniform(0.01, 0.1),
+            slope_rad,
+            torque_scale: [
+                scale * (1.0 + random.normal(0.02)),
+                scale * (1.0 + random.normal(0.02)),
+            ],
+            rotor_ratio: random.uniform(0.01, 0.1),
+            gear_loss_ratio: random.uniform(0.0, 0.03),
+            rolling_resistance_ratio: random.uniform(0.01, 0.04),
+            radius_ratio: [1.0 + random.normal(0.005), 1.0 + random.normal(0.005)],
+            servo_lag_s: random.log_uniform(0.02, 0.1),
+            motor_limit_mu: random.uniform(0.8, 1.5),
+            curve: Curve {
+                shape,
+                stiffness,
+                mu_peak: random.uniform(0.3, 0.9).min(0.9 * stiffness),
+            },
+        }
+    }
+}

@@ -1,0 +1,112 @@
+//! `[estimation]` of `robot.toml`, checked: what is known beforehand of the robot and its tyres.
+
+use std::ops::RangeInclusive;
+
+use tread_control::estimation::{EstimatorPrior, ModelUncertainty, TyrePrior};
+
+use super::ConfigError;
+use super::file::EstimationFile;
+
+/// Standard deviations of mass and inertia, shares.
+const RATIO_RANGE: RangeInclusive<f64> = 0.0..=1.0;
+/// Curvature of tyres and its standard deviation, per friction coefficient.
+const CURVATURE_RANGE: RangeInclusive<f64> = 0.0..=10.0;
+/// Friction coefficient up to which tyres rise as they are known to.
+const MU_RANGE: RangeInclusive<f64> = 0.05..=10.0;
+
+/// What is known; defaults where nothing is said.
+///
+/// # Errors
+/// [`ConfigError::OutOfRange`].
+pub(super) fn checked(file: EstimationFile) -> Result<EstimatorPrior, ConfigError> {
+    let within = |key, value: Option<f64>, default: f64, range: RangeInclusive<f64>| {
+        let value = value.unwrap_or(default);
+        if range.contains(&value) {
+            return Ok(value);
+        }
+        let problem = format!("{value} is not within {} to {}", range.start(), range.end());
+        Err(ConfigError::OutOfRange { key, problem })
+    };
+    let EstimatorPrior { tyres, model } = EstimatorPrior::default();
+    let mass = "estimation.mass_std_dev_ratio";
+    let inertia = "estimation.inertia_std_dev_ratio";
+    let curvature = "estimation.tyre_curvature";
+    let std_dev = "estimation.tyre_curvature_std_dev";
+    Ok(EstimatorPrior {
+        tyres: TyrePrior {
+            curvature: within(
+                curvature,
+                file.tyre_curvature,
+                tyres.curvature,
+                CURVATURE_RANGE,
+            )?,
+            curvature_std_dev: within(
+                std_dev,
+                file.tyre_curvature_std_dev,
+                tyres.curvature_std_dev,
+                CURVATURE_RANGE,
+            )?,
+            mu_max: file
+                .tyre_mu_max
+                .map(|mu_max| within("estimation.tyre_mu_max", Some(mu_max), mu_max, MU_RANGE))
+                .transpose()?,
+            ..tyres
+        },
+        model: ModelUncertainty {
+            mass_ratio: within(mass, file.mass_std_dev_ratio, model.mass_ratio, RATIO_RANGE)?,
+            inertia_ratio: within(
+                inertia,
+                file.inertia_std_dev_ratio,
+                model.inertia_ratio,
+                RATIO_RANGE,
+            )?,
+        },
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_not_said_is_that_of_a_robot_known_by_its_data_sheet_and_bounds_are_checked() {
+        let default = checked(EstimationFile::default()).unwrap();
+        assert_eq!(default, EstimatorPrior::default());
+        let weighed = EstimationFile {
+            mass_std_dev_ratio: Some(0.0),
+            tyre_mu_max: Some(0.7),
+            ..EstimationFile::default()
+        };
+        let prior = checked(weighed).unwrap();
+        assert_eq!(
+            (prior.model.mass_ratio, prior.tyres.mu_max),
+            (0.0, Some(0.7))
+        );
+        for (file, key) in [
+            (
+                EstimationFile {
+                    inertia_std_dev_ratio: Some(f64::NAN),
+                    ..weighed
+                },
+                "estimation.inertia_std_dev_ratio",
+            ),
+            (
+                EstimationFile {
+                    tyre_curvature: Some(-0.1),
+                    ..weighed
+                },
+                "estimation.tyre_curvature",
+            ),
+            (
+                EstimationFile {
+                    tyre_mu_max: Some(0.0),
+                    ..weighed
+                },
+                "estimation.tyre_mu_max",
+            ),
+        ] {
+            let refused = checked(file).unwrap_err().to_string();
+            assert!(refused.contains(key), "{refused}");
+        }
+    }
+}

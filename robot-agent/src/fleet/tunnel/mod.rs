@@ -1,0 +1,339 @@
+//! The TLS tunnel to the server's robot port. TLS is outside, zenoh inside.
+//!
+//! ```text
+//!  zenoh session ──TCP on the loopback──► tunnel ──TLS, the robot's certificate──► robot port
+//! ```
+//!
+//! zenoh's own TLS link reads and writes one rustls stream from two tasks at once, which is
+//! undefined behaviour. So zenoh speaks plain TCP to a port of this process, and each of its
+//! connections is joined to a TLS connection of its own. Other programs on the robot can reach the
+//! local port too: nothing is dialled for a connection that does not begin with the session id,
+//! whose lower half is random and known to this process alone, and the router asks for a password.
+//! Connections that have not shown it have places of their own.
+
+mod dial;
+#[cfg(test)]
+mod tests;
+
+use std::collections::VecDeque;
+use std::io;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::{Arc, PoisonError};
+use std::time::Duration;
+
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::{TcpListener, TcpSocket, TcpStream};
+use tokio::sync::{Mutex, Semaphore};
+use tokio::task::JoinSet;
+use tokio_util::sync::CancellationToken;
+use tracing::{debug, warn};
+use tread_api::tunnel::{RouterCredentials, splice};
+
+pub use self::dial::DialError;
+use self::dial::{Connection, Dialer};
+use super::session::{self, SessionUser};
+use super::{LinkError, Note, Noted};
+use crate::membership::Membership;
+
+/// How long a local connection may take to send its first message; zenoh sends it at once.
+const FIRST_MESSAGE_TIMEOUT: Duration = Duration::from_millis(500);
+/// Most bytes of the first message.
+const FIRST_MESSAGE_BYTES_MAX: u16 = 1_024;
+/// Bytes of the length in front of zenoh's messages on a stream.
+const MESSAGE_LENGTH_BYTES: usize = 2;
+/// Most connections of the session at a time. It has one, and for a moment a second.
+const CONNECTIONS_MAX: usize = 16;
+/// Most local connections at a time that have not shown the session id yet; the newest stay. They have
+/// their places apart, so that no other program on the robot takes those of the session.
+const STRANGERS_MAX: usize = 16;
+/// Time between two lines of the log about other programs at the local port, which say how many came.
+const STRANGERS_LOG_EVERY: Duration = Duration::from_mins(1);
+/// Connections that the kernel keeps until they are accepted.
+const BACKLOG: u32 = 16;
+/// Receive buffer of the local port, and bytes on their way within the tunnel, each way: what
+/// stands in them has lost its priority.
+const RECEIVE_BUFFER_BYTES: u32 = 4 * 1024;
+const COPY_BUFFER_BYTES: usize = 4 * 1024;
+/// First pause after a failed try to connect, and the longest.
+const RETRY_FIRST: Duration = Duration::from_millis(100);
+const RETRY_MAX: Duration = Duration::from_millis(300);
+/// The longest pause while the server's authority is one that this robot does not trust. Each try counts
+/// as a failure of its address at the server, which other robots may share.
+const DISTRUSTED_RETRY_MAX: Duration = Duration::from_secs(10);
+/// Rest after the machine refused to accept a connection.
+const ACCEPT_REST: Duration = Duration::from_millis(100);
+
+/// An open tunnel. It closes when it is dropped.
+#[derive(Debug)]
+pub struct Tunnel {
+    local: SocketAddr,
+    user: SessionUser,
+    stale: CancellationToken,
+    _tasks: JoinSet<()>,
+}
+
+/// What the connections of one tunnel share.
+struct Shared {
+    dialer: Dialer,
+    credentials: RouterCredentials,
+    /// The session id as it stands in the session's first message.
+    session_id: [u8; 16],
+    /// The connection by which the credentials came; the first one of the session takes it.
+    ready: Mutex<Option<Connection>>,
+    /// Places of the session's connections.
+    places: Semaphore,
+    strangers: StrangersLog,
+    stale: CancellationToken,
+}
+
+/// Counts other programs at the local port, and says now and then how many came.
+#[derive(Default)]
+struct StrangersLog(std::sync::Mutex<StrangersCount>);
+
+#[derive(Default)]
+struct StrangersCount {
+    count: u64,
+    told_at: Option<tokio::time::Instant>,
+}
+
+impl StrangersLog {
+    /// Another one came; how many since the last line, if one is due.
+    fn came(&self, now: tokio::time::Instant) -> Option<u64> {
+        let mut counted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        counted.count += 1;
+        let is_due = counted
+            .told_at
+            .is_none_or(|told_at| now.duration_since(told_at) >= STRANGERS_LOG_EVERY);
+        if !is_due {
+            return None;
+        }
+        counted.told_at = Some(now);
+        Some(std::mem::take(&mut counted.count))
+    }
+
+    fn note(&self) {
+        if let Some(count) = self.came(tokio::time::Instant::now()) {
+            warn!(
+                count,
+                "other programs connected to the tunnel's local port; they were closed"
+            );
+        }
+    }
+}
+
+/// Checks that a text is an endpoint of the robots' port.
+///
+/// # Errors
+/// [`LinkError::Endpoint`].
+pub(super) fn check_endpoint(endpoint: &str) -> Result<(), LinkError> {
+    dial::check_endpoint(endpoint)
+}
+
+impl Tunnel {
+    /// Connects, however long that takes. Dropped before it is done, it leaves nothing behind.
+    ///
+    /// # Errors
+    /// [`LinkError`]: the endpoint is none, the certificate cannot be used, or the machine gives
+    /// no port or random numbers.
+    pub async fn open(endpoint: &str, membership: &Membership) -> Result<Self, LinkError> {
+        let nobody: Note = Arc::new(|_noted| {});
+        Self::open_noting(endpoint, membership, &nobody).await
+    }
+
+    /// The same, and notes when the server shows a certificate that the robot does not trust.
+    ///
+    /// # Errors
+    /// As [`Tunnel::open`].
+    pub(super) async fn open_noting(
+        endpoint: &str,
+        membership: &Membership,
+        note: &Note,
+    ) -> Result<Self, LinkError> {
+        let dialer = Dialer::new(endpoint, membership)?;
+        let mut pause = RETRY_FIRST;
+        let mut is_distrusted = false;
+        let (connection, credentials) = loop {
+            match dialer.dial(&[]).await {
+                Ok(dialled) => break dialled,
+                Err(cause) => {
+                    debug!(
+                        error = &cause as &dyn std::error::Error,
+                        "no tunnel yet: {cause}"
+                    );
+                    if matches!(cause, DialError::Distrusted(_)) && !is_distrusted {
+                        is_distrusted = true;
+                        warn!(
+                            "the server at {endpoint} shows a certificate of another authority than \
+                             this robot trusts; it is tried again"
+                        );
+                        note(Noted::Distrusted);
+                    }
+                    tokio::time::sleep(pause).await;
+                    pause = next_pause(pause, &cause);
+                }
+            }
+        };
+        let (_, lower) = uuid::Uuid::new_v4().as_u64_pair();
+        let user = SessionUser {
+            session_id: credentials.session_prefix.session_id(lower),
+            user: credentials.user.clone(),
+            password: credentials.password.clone(),
+        };
+        let number = u128::from_str_radix(&user.session_id, 16).unwrap_or_default();
+        let listener = listen().map_err(LinkError::LocalPort)?;
+        let local = listener.local_addr().map_err(LinkError::LocalPort)?;
+        let stale = CancellationToken::new();
+        let shared = Arc::new(Shared {
+            dialer,
+            credentials,
+            session_id: number.to_le_bytes(),
+            ready: Mutex::new(Some(connection)),
+            places: Semaphore::new(CONNECTIONS_MAX),
+            strangers: StrangersLog::default(),
+            stale: stale.clone(),
+        });
+        let mut tasks = JoinSet::new();
+        tasks.spawn(serve(listener, shared));
+        Ok(Self {
+            local,
+            user,
+            stale,
+            _tasks: tasks,
+        })
+    }
+
+    /// How a session through this tunnel is opened.
+    ///
+    /// # Errors
+    /// zenoh refuses its configuration.
+    pub fn session_config(&self) -> Result<zenoh::Config, LinkError> {
+        session::through_tunnel(self.local, &self.user)
+    }
+
+    /// Waits until a session through this tunnel can no longer connect: the server has other
+    /// credentials for this robot. Another tunnel gets them.
+    pub async fn stale(&self) {
+        self.stale.cancelled().await;
+    }
+}
+
+/// The pause after another failed try.
+fn next_pause(pause: Duration, cause: &DialError) -> Duration {
+    let longest = match cause {
+        DialError::Distrusted(_) => DISTRUSTED_RETRY_MAX,
+        DialError::Unreachable(_) | DialError::TooSlow | DialError::NotUnderstood => RETRY_MAX,
+    };
+    (2 * pause).min(longest)
+}
+
+/// Listens on the loopback with a small receive buffer.
+fn listen() -> io::Result<TcpListener> {
+    let socket = TcpSocket::new_v4()?;
+    socket.set_recv_buffer_size(RECEIVE_BUFFER_BYTES)?;
+    socket.bind(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))?;
+    socket.listen(BACKLOG)
+}
+
+async fn serve(listener: TcpListener, shared: Arc<Shared>) {
+    // However this ends, the owner opens another tunnel.
+    let _stale = shared.stale.clone().drop_guard();
+    let mut connections = JoinSet::new();
+    // Those that have not shown the session id, the oldest first.
+    let mut strangers: VecDeque<CancellationToken> = VecDeque::new();
+    while !shared.stale.is_cancelled() {
+        let accepted = tokio::select! {
+            accepted = listener.accept() => accepted,
+            () = shared.stale.cancelled() => return,
+        };
+        while connections.try_join_next().is_some() {}
+        strangers.retain(|known| !known.is_cancelled());
+        match accepted {
+            Ok((local, _peer)) => {
+                if strangers.len() >= STRANGERS_MAX
+                    && let Some(oldest) = strangers.pop_front()
+                {
+                    oldest.cancel();
+                }
+                let known = CancellationToken::new();
+                strangers.push_back(known.clone());
+                connections.spawn(take(local, Arc::clone(&shared), known));
+            }
+            Err(cause) => {
+                warn!("the tunnel's local port cannot accept: {cause}");
+                tokio::time::sleep(ACCEPT_REST).await;
+            }
+        }
+    }
+}
+
+/// Takes a local connection: the session's is joined with the server, any other closed. `known` is
+/// cancelled when its place among those that have shown nothing is free, or is taken from it.
+async fn take(mut local: TcpStream, shared: Arc<Shared>, known: CancellationToken) {
+    if let Err(cause) = local.set_nodelay(true) {
+        debug!("cannot send at once: {cause}");
+    }
+    let reading = tokio::time::timeout(FIRST_MESSAGE_TIMEOUT, read_message(&mut local));
+    let read = tokio::select! {
+        read = reading => read,
+        () = known.cancelled() => return shared.strangers.note(),
+    };
+    known.cancel();
+    let has_id = |bytes: &[u8]| *bytes == shared.session_id;
+    let first = match read {
+        Ok(Ok(first)) if first.windows(shared.session_id.len()).any(has_id) => first,
+        Ok(_) | Err(_) => return shared.strangers.note(),
+    };
+    let Ok(_place) = shared.places.try_acquire() else {
+        return warn!("the session has too many connections");
+    };
+    join(local, &shared, first).await;
+}
+
+/// Joins one connection of the session with one to the server, until either of them ends.
+async fn join(local: TcpStream, shared: &Shared, first: Vec<u8>) {
+    let ready = shared.ready.lock().await.take();
+    let connected = match ready {
+        Some(mut connection) => connection
+            .write_all(&first)
+            .await
+            .map(|()| connection)
+            .map_err(DialError::from),
+        None => reconnect(shared, &first).await,
+    };
+    let remote = match connected {
+        Ok(remote) => remote,
+        Err(cause) => {
+            return debug!(
+                error = &cause as &dyn std::error::Error,
+                "the server is not reached: {cause}"
+            );
+        }
+    };
+    if let Err(cause) = splice(local, remote, COPY_BUFFER_BYTES).await {
+        debug!("the tunnel's connection broke: {cause}");
+    }
+}
+
+/// Connects again; the first message is sent along, since the credentials are most likely the same.
+async fn reconnect(shared: &Shared, first: &[u8]) -> Result<Connection, DialError> {
+    let (connection, credentials) = shared.dialer.dial(first).await?;
+    if credentials != shared.credentials {
+        shared.stale.cancel();
+        return Err(DialError::NotUnderstood);
+    }
+    Ok(connection)
+}
+
+/// The first message, with its length in front.
+async fn read_message(local: &mut TcpStream) -> io::Result<Vec<u8>> {
+    let length = local.read_u16_le().await?;
+    if length > FIRST_MESSAGE_BYTES_MAX {
+        return Err(io::ErrorKind::InvalidData.into());
+    }
+    let mut message = vec![0; MESSAGE_LENGTH_BYTES + usize::from(length)];
+    message[..MESSAGE_LENGTH_BYTES].copy_from_slice(&length.to_le_bytes());
+    local
+        .read_exact(&mut message[MESSAGE_LENGTH_BYTES..])
+        .await?;
+    Ok(message)
+}

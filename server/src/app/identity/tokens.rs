@@ -1,0 +1,286 @@
+//! Tokens: made, listed and revoked.
+
+use jiff::{SignedDuration, Timestamp};
+use tread_api::identity::{
+    AuditEntry, CreateToken, CreatedToken, Role, TOKEN_DAYS_DEFAULT, TOKEN_DAYS_MAX,
+    TOKEN_NAME_MAX, Token,
+};
+use tread_api::ids::TokenId;
+use tread_api::page::Page;
+use tread_api::rights::{Right, Rights, Scope};
+
+use super::{Credential, new_secret};
+use crate::app::{App, AppError, page, people_line, site_row};
+use crate::db::{self, Tx};
+use crate::identity::secret::Kind;
+
+/// Most tokens that are valid at once.
+pub const TOKENS_MAX: usize = 1_000;
+/// How long dead tokens are listed.
+const DEAD_KEPT: SignedDuration = SignedDuration::from_hours(400 * 24);
+/// Dead tokens that are forgotten with each new one.
+const FORGET_MAX: u32 = 10;
+
+/// Ends in memory whoever is known by a token, when it is dropped: after a commit, or when there is
+/// none. Whoever is not revoked in the database is known again once it was looked up.
+struct Ending(App, TokenId);
+
+impl Drop for Ending {
+    fn drop(&mut self) {
+        let Self(app, id) = self;
+        app.identity().known.end(|known| known.token == *id);
+    }
+}
+
+/// Asks for the first token of a server.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FirstAdmin {
+    /// What people call it.
+    pub name: String,
+    /// Days until it is refused.
+    pub valid_days: u32,
+    /// Make it even if there is an admin, in place of a valid token of the same name.
+    pub force: bool,
+}
+
+impl App {
+    /// Makes a token for somebody, who gives no rights that he has not himself.
+    ///
+    /// # Errors
+    /// It would have more rights than its maker, or hold where he has none; and those of
+    /// [`Self::create_token`].
+    pub async fn give_token(
+        &self,
+        request: CreateToken,
+        giver: &Credential,
+    ) -> Result<CreatedToken, AppError> {
+        let (rights, sites) = (rights_of(&request)?, sites_of(&request)?);
+        if !giver.rights.includes_all(rights) {
+            let own = giver.rights;
+            let detail = format!(
+                "nobody gives rights that he has not: `{}` has {own}",
+                giver.name
+            );
+            return Err(AppError::BeyondRights(detail));
+        }
+        if rights.includes(Right::Hold) && !giver.rights.includes(Right::ReleaseHold) {
+            let detail = "a token may end the limits of programs of its own name: whoever gives the right \
+                          `hold` needs `release_hold`";
+            return Err(AppError::BeyondRights(detail.to_owned()));
+        }
+        if !giver.scope.includes(&sites) {
+            let own = &giver.scope;
+            let detail = format!(
+                "`{}` is for {own} alone, and nobody gives rights where he has none: name these, or \
+                 some of them, as `sites`",
+                giver.name
+            );
+            return Err(AppError::BeyondRights(detail));
+        }
+        let mut tx = self.db().write().await?;
+        // His own may have been revoked since his request began.
+        let now = self.clock().now();
+        let own = db::tokens::find(&mut tx, giver.token).await?;
+        let holds = own.is_some_and(|own| own.revoked_at.is_none() && own.expires_at > now);
+        if !holds || giver.ended().is_cancelled() {
+            return Err(AppError::BeyondRights(format!(
+                "`{}` holds no longer",
+                giver.name
+            )));
+        }
+        let created = self.new_token(&mut tx, request, &giver.name).await?;
+        tx.commit().await?;
+        Ok(created)
+    }
+
+    /// Makes a token.
+    ///
+    /// # Errors
+    /// An impossible name or time, a name that is taken, a site that is not known, or too many
+    /// tokens.
+    pub async fn create_token(
+        &self,
+        request: CreateToken,
+        created_by: &str,
+    ) -> Result<CreatedToken, AppError> {
+        let mut tx = self.db().write().await?;
+        let created = self.new_token(&mut tx, request, created_by).await?;
+        tx.commit().await?;
+        Ok(created)
+    }
+
+    /// Makes an admin's token where nobody is there to ask for it.
+    ///
+    /// # Errors
+    /// There is a valid admin's token, unless it is forced.
+    pub async fn create_first_admin(&self, first: FirstAdmin) -> Result<CreatedToken, AppError> {
+        let now = self.clock().now();
+        let mut tx = self.db().write().await?;
+        let (_, admin_count) = db::tokens::valid_counts(&mut tx, now).await?;
+        if admin_count > 0 && !first.force {
+            return Err(AppError::AlreadyExists {
+                what: "an admin's token",
+                id: "init".to_owned(),
+            });
+        }
+        let name = first.name.trim();
+        let replaced = db::tokens::valid_by_name(&mut tx, name, now).await?;
+        if let Some(replaced) = &replaced {
+            db::tokens::revoke(&mut tx, replaced.id, now).await?;
+        }
+        let request = CreateToken {
+            valid_days: Some(first.valid_days),
+            ..CreateToken::of_role(first.name, Role::Admin)
+        };
+        let created = self.new_token(&mut tx, request, "init").await?;
+        let entry = AuditEntry {
+            id: 0,
+            at: now,
+            since: None,
+            count: 1,
+            who: Some("init".to_owned()),
+            token: None,
+            role: None,
+            address: "this machine".to_owned(),
+            method: "RUN".to_owned(),
+            route: "tread-server init".to_owned(),
+            path: "tread-server init".to_owned(),
+            status: 201,
+            request_id: String::new(),
+            what: Some(serde_json::json!({"name": created.token.name, "role": "admin"})),
+            previous_hash: None,
+            hash: None,
+        };
+        db::audit::append(&mut tx, std::slice::from_ref(&entry)).await?;
+        let ending = replaced.map(|replaced| Ending(self.clone(), replaced.id));
+        tx.commit_then(move |_outcome| drop(ending)).await?;
+        Ok(created)
+    }
+
+    /// How many admins' tokens are valid.
+    pub async fn admin_count(&self) -> Result<i64, AppError> {
+        let mut tx = self.db().read().await?;
+        let counts = db::tokens::valid_counts(&mut tx, self.clock().now()).await?;
+        Ok(counts.1)
+    }
+
+    async fn new_token(
+        &self,
+        tx: &mut Tx,
+        request: CreateToken,
+        created_by: &str,
+    ) -> Result<CreatedToken, AppError> {
+        let now = self.clock().now();
+        let name = people_line("name", &request.name, TOKEN_NAME_MAX)?;
+        let expires_at = expiry(now, request.valid_days)?;
+        let (valid_count, _) = db::tokens::valid_counts(tx, now).await?;
+        if usize::try_from(valid_count).is_ok_and(|count| count >= TOKENS_MAX) {
+            return Err(AppError::TooMany {
+                what: "valid tokens",
+                count: TOKENS_MAX,
+            });
+        }
+        if db::tokens::valid_by_name(tx, &name, now).await?.is_some() {
+            return Err(AppError::AlreadyExists {
+                what: "token",
+                id: name,
+            });
+        }
+        let (rights, sites) = (rights_of(&request)?, sites_of(&request)?);
+        for site in sites.sites().into_iter().flatten() {
+            site_row(tx, site).await?;
+        }
+        let secret = new_secret(Kind::Token(request.role))?;
+        let token = Token {
+            id: TokenId::from_uuid(self.clock().mission_id().as_uuid()),
+            name,
+            role: request.role,
+            rights,
+            sites,
+            created_at: now,
+            created_by: created_by.to_owned(),
+            expires_at,
+            revoked_at: None,
+            last_used_at: None,
+        };
+        db::tokens::insert(tx, &token, &secret.fingerprint()).await?;
+        if let Ok(before) = now.checked_sub(DEAD_KEPT) {
+            db::tokens::forget_dead(tx, before, FORGET_MAX).await?;
+        }
+        Ok(CreatedToken {
+            token,
+            secret: secret.reveal().to_owned(),
+        })
+    }
+
+    /// Tokens that hold nowhere outside a scope, newest first; dead ones too.
+    pub async fn tokens(
+        &self,
+        within: &Scope,
+        before: Option<TokenId>,
+        limit: u32,
+    ) -> Result<Page<Token>, AppError> {
+        let mut tx = self.db().read().await?;
+        let tokens = db::tokens::list(&mut tx, within, before, limit + 1).await?;
+        Ok(page(tokens, limit, |token: &Token| token.id.to_string()))
+    }
+
+    /// Where a token holds; `None` if it is not known.
+    pub async fn token_scope(&self, id: TokenId) -> Result<Option<Scope>, AppError> {
+        let mut tx = self.db().read().await?;
+        Ok(db::tokens::find(&mut tx, id)
+            .await?
+            .map(|token| token.sites))
+    }
+
+    /// Revokes a token: from now on it is refused, its sessions end, and what it has open closes.
+    ///
+    /// # Errors
+    /// [`AppError::UnknownToken`]. Whatever fails, what the token has open closes, and it is looked
+    /// up again.
+    pub async fn revoke_token(&self, id: TokenId) -> Result<Token, AppError> {
+        let ending = Ending(self.clone(), id);
+        let mut tx = self.db().write().await?;
+        db::tokens::revoke(&mut tx, id, self.clock().now()).await?;
+        let token = db::tokens::find(&mut tx, id).await?;
+        let token = token.ok_or(AppError::UnknownToken(id))?;
+        tx.commit_then(move |_outcome| drop(ending)).await?;
+        Ok(token)
+    }
+}
+
+/// What a token is to do.
+fn rights_of(request: &CreateToken) -> Result<Rights, AppError> {
+    let wrong = |detail: &str| AppError::Invalid {
+        field: "rights",
+        detail: detail.to_owned(),
+    };
+    match (request.role, &request.rights) {
+        (Some(role), None) => Ok(role.into()),
+        (None, Some(rights)) if !rights.is_empty() => Ok(rights.iter().copied().collect()),
+        (None, Some(_)) => Err(wrong("name at least one right")),
+        (None, None) => Err(wrong("give the token a `role`, or `rights`")),
+        (Some(_), Some(_)) => Err(wrong("a token has a `role` or `rights`, not both")),
+    }
+}
+
+/// Where a token is to hold.
+fn sites_of(request: &CreateToken) -> Result<Scope, AppError> {
+    Scope::try_from(request.sites.clone()).map_err(|invalid| AppError::Invalid {
+        field: "sites",
+        detail: invalid.to_string(),
+    })
+}
+
+fn expiry(now: Timestamp, valid_days: Option<u32>) -> Result<Timestamp, AppError> {
+    let days = valid_days.unwrap_or(TOKEN_DAYS_DEFAULT);
+    if !(1..=TOKEN_DAYS_MAX).contains(&days) {
+        let detail = format!("valid_days must be 1 to {TOKEN_DAYS_MAX}, not {days}");
+        return Err(AppError::Invalid {
+            field: "valid_days",
+            detail,
+        });
+    }
+    let span = SignedDuration::from_hours(24 * i64::from(days));
+    Ok(now.checked_add(span).unwrap_or(Timestamp::MAX))
+}

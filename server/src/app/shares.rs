@@ -1,0 +1,138 @@
+//! Places of which there are only so many, each identity its share, so that nobody takes them all.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use tread_api::ids::TokenId;
+use tread_api::rights::Rights;
+
+use super::AppError;
+use super::identity::Credential;
+
+/// How many places there are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Bounds {
+    /// In all.
+    pub all: usize,
+    /// For those who may only watch and stop, all together: the rest is for those who work.
+    pub viewers: usize,
+    /// For one token, with its sessions.
+    pub each: usize,
+}
+
+#[derive(Debug, Default)]
+struct Taken {
+    all: usize,
+    viewers: usize,
+    by_token: HashMap<TokenId, usize>,
+}
+
+/// Who has how many places.
+#[derive(Debug, Clone)]
+pub struct Shares {
+    bounds: Bounds,
+    taken: Arc<Mutex<Taken>>,
+}
+
+impl Shares {
+    /// Nobody has any.
+    pub fn new(bounds: Bounds) -> Self {
+        let taken = Arc::default();
+        Self { bounds, taken }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Taken> {
+        self.taken.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// How many are taken.
+    pub fn taken(&self) -> usize {
+        self.lock().all
+    }
+
+    /// Takes a place until the result is dropped.
+    ///
+    /// # Errors
+    /// [`AppError::TooMany`] if all are taken, those for viewers are, or this token has its share.
+    pub fn take(&self, of: &Credential, what: &'static str) -> Result<Place, AppError> {
+        self.place(of.token, of.rights, what)
+    }
+
+    fn place(&self, of: TokenId, rights: Rights, what: &'static str) -> Result<Place, AppError> {
+        let Bounds { all, viewers, each } = self.bounds;
+        let is_viewer = rights.only_watches();
+        let mut taken = self.lock();
+        let own = taken.by_token.get(&of).copied().unwrap_or(0);
+        let too_many = |count| Err(AppError::TooMany { what, count });
+        if taken.all >= all {
+            return too_many(all);
+        }
+        if is_viewer && taken.viewers >= viewers {
+            return too_many(viewers);
+        }
+        if own >= each {
+            return too_many(each);
+        }
+        taken.all += 1;
+        taken.viewers += usize::from(is_viewer);
+        taken.by_token.insert(of, own + 1);
+        drop(taken);
+        let shares = self.clone();
+        Ok(Place {
+            shares,
+            token: of,
+            is_viewer,
+        })
+    }
+}
+
+/// One place, taken.
+#[derive(Debug)]
+pub struct Place {
+    shares: Shares,
+    token: TokenId,
+    is_viewer: bool,
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let mut taken = self.shares.lock();
+        taken.all -= 1;
+        taken.viewers -= usize::from(self.is_viewer);
+        if let Some(own) = taken.by_token.get_mut(&self.token) {
+            *own -= 1;
+            if *own == 0 {
+                taken.by_token.remove(&self.token);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tread_api::identity::Role;
+
+    use super::*;
+
+    #[test]
+    fn nobody_takes_more_than_a_share_and_viewers_leave_room_for_operators() {
+        let shares = Shares::new(Bounds {
+            all: 10,
+            viewers: 6,
+            each: 4,
+        });
+        let token = |number| TokenId::from_uuid(uuid::Uuid::from_u128(number));
+        let place = |number, role| shares.place(token(number), Rights::from(role), "places");
+        let mut held: Vec<_> = (0..20)
+            .filter_map(|_| place(1, Role::Viewer).ok())
+            .collect();
+        assert_eq!(held.len(), 4);
+        held.extend((0..20).filter_map(|number| place(2 + number % 4, Role::Viewer).ok()));
+        assert_eq!(held.len(), 6);
+        held.extend((0..20).filter_map(|number| place(9 + number % 4, Role::Operator).ok()));
+        assert_eq!((held.len(), shares.taken()), (10, 10));
+        held.clear();
+        assert_eq!(shares.taken(), 0);
+        assert!(shares.lock().by_token.is_empty());
+    }
+}

@@ -1,0 +1,181 @@
+//! Open stops, held against what robots show, in each pass of the reconciler.
+
+use std::collections::BTreeMap;
+
+use jiff::{SignedDuration, Timestamp};
+use tracing::warn;
+use tread_api::ids::StopId;
+use tread_api::safety::StandingState;
+use tread_api::stop::Stop;
+use tread_api::wire::state::RobotState;
+
+use super::judge::{Open, Shown, Verdict, judge};
+use super::{alerted, key_of};
+use crate::app::allowance::Kind;
+use crate::app::{App, AppError};
+use crate::db::{self, Tx};
+use crate::fleet::presence::{Presence, RobotKey};
+
+/// What is to be done about stops.
+#[derive(Debug, Default)]
+struct Tending {
+    again: Vec<Stop>,
+    /// Those of `again` that their robots had confirmed.
+    lost: Vec<Stop>,
+    cleared: Vec<StopId>,
+    standing: Vec<StopId>,
+    /// Robots whose own stop becomes the open one.
+    adopted: Vec<RobotKey>,
+    /// Robots whose alert may be over, or is missing.
+    alerts: Vec<RobotKey>,
+}
+
+impl App {
+    /// Compares open stops with what robots show, and gives those to be sent again.
+    pub(in crate::app) async fn tend_stops(&self) -> Result<Vec<Stop>, AppError> {
+        let Tending {
+            lost,
+            cleared,
+            standing,
+            adopted,
+            alerts,
+            again,
+        } = self.look_at_stops().await?;
+        let is_idle = lost.is_empty() && cleared.is_empty() && standing.is_empty();
+        if is_idle && adopted.is_empty() && alerts.is_empty() {
+            return Ok(again);
+        }
+        let writing = async {
+            let mut tx = self.db().write().await?;
+            // Not before: the turn to write may have come late.
+            let now = self.clock().now();
+            for stop in &lost {
+                db::stops::unconfirm(&mut tx, stop.id).await?;
+            }
+            for id in standing {
+                db::stops::stand(&mut tx, id, now).await?;
+            }
+            for id in cleared {
+                db::stops::clear(&mut tx, id, now).await?;
+            }
+            for key in adopted {
+                self.adopt_shown_stop(&mut tx, &key).await?;
+            }
+            let mut shown = Vec::new();
+            for key in alerts {
+                shown.extend(self.settle_alert(&mut tx, &key, true).await?);
+            }
+            self.commit_alerts(tx, shown).await?;
+            for stop in &lost {
+                let robot = &stop.robot;
+                warn!(robot.id = %robot, "robot `{robot}` no longer shows its stop; it is told again");
+                self.counters().stops_lost.one();
+            }
+            Ok::<(), AppError>(())
+        };
+        // Robots are told again also while nothing can be written.
+        if let Err(error) = writing.await {
+            self.log_failure("write down what became of stops", &error);
+        }
+        Ok(again)
+    }
+
+    async fn look_at_stops(&self) -> Result<Tending, AppError> {
+        let mut tx = self.db().read().await?;
+        let mut robots: BTreeMap<RobotKey, Option<Stop>> = BTreeMap::new();
+        for (key, _latch) in self.presences().shown_stops() {
+            robots.insert(key, None);
+        }
+        for stop in db::stops::in_force(&mut tx).await? {
+            robots.insert(key_of(&stop), Some(self.with_confirmation(stop)));
+        }
+        let mut alerted = alerted(&mut tx).await?;
+        let mut tending = Tending::default();
+        for (key, stop) in robots {
+            let presence = self.presences().get(&key);
+            let shown = match presence.state() {
+                Some(state) => self.shown(&mut tx, state, &presence, stop.as_ref()).await?,
+                None => None,
+            };
+            let is_alerted = alerted.remove(&key);
+            let is_unconfirmed = |stop: &Stop| stop.confirmed_at.is_none();
+            if is_alerted && !stop.as_ref().is_some_and(is_unconfirmed) {
+                tending.alerts.push(key.clone());
+            }
+            let open = stop.as_ref().map(|stop| Open {
+                id: stop.id,
+                is_overdue: stop.unconfirmed,
+                confirmed_at: stop.confirmed_at,
+                clear_asked_at: stop.clear_asked_at,
+            });
+            let verdict = judge(open, shown);
+            let Some(stop) = stop else {
+                if verdict == Verdict::Adopt && self.may_adopt(&key) {
+                    tending.adopted.push(key);
+                }
+                continue;
+            };
+            let is_shown = shown.is_some_and(|shown| shown.latch == Some(stop.id));
+            let standing = presence.state().and_then(|state| state.safety.standing);
+            let stands = standing.is_some_and(|seen| seen.state == StandingState::Standing);
+            if is_shown && stands && stop.standing_at.is_none() {
+                tending.standing.push(stop.id);
+            }
+            match verdict {
+                Verdict::Tell => {
+                    // Whoever is there is told, and that raises the alert if it does not confirm.
+                    if !is_alerted && !presence.is_there(self.clock().elapsed()) {
+                        tending.alerts.push(key);
+                    }
+                    tending.again.push(stop);
+                }
+                Verdict::Lost => {
+                    tending.again.push(stop.clone());
+                    tending.lost.push(stop);
+                }
+                Verdict::Cleared => tending.cleared.push(stop.id),
+                Verdict::Adopt if self.may_adopt(&key) => tending.adopted.push(key),
+                Verdict::Nothing | Verdict::Adopt => {}
+            }
+        }
+        // Robots of which nothing is open any more.
+        tending.alerts.extend(alerted);
+        tending.again.sort_by_key(|stop| stop.id);
+        Ok(tending)
+    }
+
+    fn may_adopt(&self, key: &RobotKey) -> bool {
+        let now = self.clock().elapsed();
+        self.allowances().take(key, Kind::Stop, now)
+    }
+
+    /// What a robot shows of stops; `None` if that says nothing.
+    async fn shown(
+        &self,
+        tx: &mut Tx,
+        state: &RobotState,
+        presence: &Presence,
+        open: Option<&Stop>,
+    ) -> Result<Option<Shown>, AppError> {
+        let age = presence.state_age(self.clock().elapsed());
+        let age = SignedDuration::try_from(age.unwrap_or_default());
+        let age = age.unwrap_or(SignedDuration::MAX);
+        let at = self.clock().now().checked_sub(age);
+        let latch = state.safety.stop.as_ref().map(|latch| latch.id);
+        let other = latch.filter(|&latch| open.is_none_or(|open| open.id != latch));
+        let known = match other {
+            Some(other) => db::stops::find(tx, other).await?,
+            None => None,
+        };
+        // It is open, of a robot that was retired.
+        let is_open = |stop: &Stop| stop.cleared_at.is_none() && stop.replaced_by.is_none();
+        if known.as_ref().is_some_and(is_open) {
+            return Ok(None);
+        }
+        Ok(Some(Shown {
+            latch,
+            ended_at: known.and_then(|stop| stop.cleared_at),
+            at: at.unwrap_or(Timestamp::MIN),
+        }))
+    }
+}

@@ -1,0 +1,80 @@
+//! The files of the database are its owner's alone: whoever reads them sees what the fleet does, and
+//! whoever writes them makes tokens.
+
+use std::ffi::OsString;
+use std::fs::{self, OpenOptions, Permissions};
+use std::io;
+use std::os::unix::fs::{OpenOptionsExt as _, PermissionsExt as _};
+use std::path::{Path, PathBuf};
+
+use tracing::warn;
+
+/// Read and written by its owner.
+const OWNERS: u32 = 0o600;
+/// What of a mode concerns others.
+const OF_OTHERS: u32 = 0o077;
+/// What SQLite adds to the name of the database for the files beside it. It gives them the mode of
+/// the database.
+const ENDINGS: [&str; 4] = ["", "-wal", "-shm", "-journal"];
+
+fn beside(path: &Path, ending: &str) -> PathBuf {
+    let mut name = OsString::from(path);
+    name.push(ending);
+    name.into()
+}
+
+/// Makes the file of the database if it is missing, for its owner alone, and takes the files that
+/// there are away from others.
+///
+/// # Errors
+/// The file cannot be made.
+pub(super) fn keep(path: &Path) -> io::Result<()> {
+    let mut options = OpenOptions::new();
+    options
+        .write(true)
+        .create(true)
+        .truncate(false)
+        .mode(OWNERS);
+    options.open(path)?;
+    for ending in ENDINGS {
+        let file = beside(path, ending);
+        let Ok(found) = fs::metadata(&file) else {
+            continue;
+        };
+        if found.permissions().mode() & OF_OTHERS == 0 {
+            continue;
+        }
+        // A file that is another user's works all the same.
+        match fs::set_permissions(&file, Permissions::from_mode(OWNERS)) {
+            Ok(()) => warn!(
+                "others could use `{}`; now its owner alone can",
+                file.display()
+            ),
+            Err(error) => warn!("others can use `{}`: {error}", file.display()),
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_others_could_read_is_taken_away_from_them() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tread.db");
+        for ending in ENDINGS {
+            fs::write(beside(&path, ending), "").unwrap();
+            fs::set_permissions(beside(&path, ending), Permissions::from_mode(0o644)).unwrap();
+        }
+        keep(&path).unwrap();
+        for ending in ENDINGS {
+            let mode = fs::metadata(beside(&path, ending))
+                .unwrap()
+                .permissions()
+                .mode();
+            assert_eq!(mode & 0o777, OWNERS, "{ending}");
+        }
+    }
+}

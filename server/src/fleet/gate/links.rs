@@ -1,0 +1,190 @@
+//! The links of each robot, of which the newest few stay.
+//!
+//! A robot has one session and for a moment a second. Without a bound one robot's certificate would
+//! open as many links as there is room for, and lock the others out.
+
+use std::collections::{HashMap, VecDeque};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use tokio_util::sync::CancellationToken;
+
+use crate::fleet::presence::RobotKey;
+
+/// Most links of one robot. Two agents under one name are noticed and shown, so both get in.
+pub(in crate::fleet) const LINKS_PER_ROBOT_MAX: usize = 4;
+
+/// The SHA-256 of a certificate.
+pub(super) type CertificateHash = [u8; 32];
+
+type OfRobots = HashMap<RobotKey, VecDeque<OneLink>>;
+
+/// All robots' links.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Links(Arc<Mutex<Table>>);
+
+#[derive(Debug, Default)]
+struct Table {
+    next: u64,
+    of_robots: OfRobots,
+}
+
+#[derive(Debug)]
+struct OneLink {
+    number: u64,
+    certificate: CertificateHash,
+    /// The zenoh session on it, once it has begun to open.
+    session_id: Option<u128>,
+    displaced: CancellationToken,
+    ended: CancellationToken,
+}
+
+/// A link among those of its robot; it leaves when it is dropped.
+#[derive(Debug)]
+pub(super) struct Entry {
+    links: Links,
+    robot: RobotKey,
+    number: u64,
+    displaced: CancellationToken,
+    ended: CancellationToken,
+}
+
+impl Links {
+    fn lock(&self) -> MutexGuard<'_, Table> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Adds a link of a robot; its oldest one goes if it has too many.
+    pub(super) fn enter(&self, robot: RobotKey, certificate: CertificateHash) -> Entry {
+        let (displaced, ended) = (CancellationToken::new(), CancellationToken::new());
+        let mut table = self.lock();
+        table.next += 1;
+        let number = table.next;
+        let own = table.of_robots.entry(robot.clone()).or_default();
+        own.push_back(OneLink {
+            number,
+            certificate,
+            session_id: None,
+            displaced: displaced.clone(),
+            ended: ended.clone(),
+        });
+        let staying = |link: &&OneLink| !link.displaced.is_cancelled();
+        if own.iter().filter(staying).count() > LINKS_PER_ROBOT_MAX
+            && let Some(oldest) = own.iter().find(staying)
+        {
+            oldest.displaced.cancel();
+        }
+        drop(table);
+        let links = self.clone();
+        Entry {
+            links,
+            robot,
+            number,
+            displaced,
+            ended,
+        }
+    }
+}
+
+impl Entry {
+    /// Waits until newer links of the robot have taken its place.
+    pub(super) async fn displaced(&self) {
+        self.displaced.cancelled().await;
+    }
+
+    /// Takes a session over from older links: a robot whose network failed comes back before the
+    /// server misses it, and the router would refuse a second link of the same session. They end, and
+    /// are waited for. Only links of the very same certificate count: whoever shows another one is
+    /// another agent, whatever it says. Whether there was one.
+    pub(super) async fn take_over(&self, session_id: u128) -> bool {
+        let mut older = Vec::new();
+        {
+            let mut table = self.links.lock();
+            let Some(own) = table.of_robots.get_mut(&self.robot) else {
+                return false;
+            };
+            let Some(this) = own.iter_mut().find(|link| link.number == self.number) else {
+                return false;
+            };
+            this.session_id = Some(session_id);
+            let certificate = this.certificate;
+            for link in own.iter().filter(|link| link.number < self.number) {
+                if link.session_id == Some(session_id) && link.certificate == certificate {
+                    link.displaced.cancel();
+                    older.push(link.ended.clone());
+                }
+            }
+        }
+        for ended in &older {
+            ended.cancelled().await;
+        }
+        !older.is_empty()
+    }
+}
+
+impl Drop for Entry {
+    fn drop(&mut self) {
+        self.ended.cancel();
+        let mut table = self.links.lock();
+        let Some(own) = table.of_robots.get_mut(&self.robot) else {
+            return;
+        };
+        own.retain(|link| link.number != self.number);
+        if own.is_empty() {
+            table.of_robots.remove(&self.robot);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn robot(name: &str) -> RobotKey {
+        ("yard".parse().unwrap(), name.parse().unwrap())
+    }
+
+    #[test]
+    fn of_a_robots_links_the_newest_stay_and_others_lose_none() {
+        let links = Links::default();
+        let other = links.enter(robot("rover-2"), [0; 32]);
+        let all: Vec<Entry> = (0..100)
+            .map(|_| links.enter(robot("rover-1"), [0; 32]))
+            .collect();
+        let stay = |entry: &&Entry| !entry.displaced.is_cancelled();
+        assert_eq!(all.iter().filter(stay).count(), LINKS_PER_ROBOT_MAX);
+        assert!(
+            all[100 - LINKS_PER_ROBOT_MAX..]
+                .iter()
+                .all(|entry| stay(&entry))
+        );
+        assert!(stay(&&other));
+        drop(all);
+        assert_eq!(links.lock().of_robots.len(), 1);
+        let again = links.enter(robot("rover-1"), [0; 32]);
+        assert!(stay(&&again));
+        drop((other, again));
+        assert!(links.lock().of_robots.is_empty());
+    }
+
+    #[tokio::test]
+    async fn a_session_goes_to_the_newest_link_of_the_same_certificate_alone() {
+        let links = Links::default();
+        let rover = || robot("rover-1");
+        let (older, others) = (
+            links.enter(rover(), [1; 32]),
+            [links.enter(rover(), [2; 32]), links.enter(rover(), [1; 32])],
+        );
+        assert!(!older.take_over(7).await);
+        for (other, session_id) in others.iter().zip([7, 8]) {
+            assert!(!other.take_over(session_id).await);
+        }
+        let newest = links.enter(rover(), [1; 32]);
+        let mut taking = Box::pin(newest.take_over(7));
+        let waiting = tokio::time::timeout(std::time::Duration::from_millis(1), &mut taking).await;
+        assert!(waiting.is_err(), "the older one has not ended");
+        assert!(older.displaced.is_cancelled());
+        drop(older);
+        assert!(taking.await);
+        assert!(others.iter().all(|other| !other.displaced.is_cancelled()));
+    }
+}

@@ -1,0 +1,159 @@
+//! What the gate demands of the opening of a zenoh session before it lets the rest pass unread.
+//!
+//! ```text
+//!  robot ── InitSyn: client, own session id ──► router
+//!        ◄──────────── InitAck ────────────────
+//!        ── OpenSyn: own user name ───────────►
+//! ```
+//!
+//! Each message is one frame: its length (two bytes, little-endian) and its bytes. The router reads
+//! one message of each of the first two frames with the same codec that is used here, so it sees
+//! what was checked. It checks the password itself.
+
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
+use tread_api::tunnel::RouterCredentials;
+use zenoh_buffers::reader::HasReader as _;
+use zenoh_codec::{RCodec as _, Zenoh080};
+use zenoh_protocol::common::ZExtUnknown;
+use zenoh_protocol::common::extension::ZExtBody;
+use zenoh_protocol::common::iext::ID_MASK;
+use zenoh_protocol::core::WhatAmI;
+use zenoh_protocol::transport::{InitSyn, OpenSyn, TransportBody, TransportMessage};
+
+/// Most bytes of a frame in the opening. The largest is the router's, with its cookie.
+const FRAME_BYTES_MAX: u16 = 4 * 1024;
+/// Zenoh's number of user name and password among the ways to authenticate.
+const USER_PASSWORD_ID: u8 = 0x2;
+
+/// Why a session is not let to the router.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum OpeningRefused {
+    /// The link broke, or its other end closed it.
+    #[error("the link ended while the session opened")]
+    Ended(#[from] std::io::Error),
+    /// A frame is longer than any of an opening.
+    #[error("a frame of {0} bytes is no part of an opening")]
+    TooLong(u16),
+    /// Another message stands where one was due.
+    #[error("the message is not the {0} that is due")]
+    NotDue(&'static str),
+    /// It says to be a router or a peer.
+    #[error("a session that opens as {0} and not as client")]
+    NotClient(WhatAmI),
+    /// The id of the session is not one of this robot.
+    #[error("a session id that is not this robot's")]
+    ForeignId,
+    /// The user is not this robot.
+    #[error("a user name that is not this robot's")]
+    ForeignUser,
+}
+
+/// The first message of a session, checked.
+#[derive(Debug)]
+pub(super) struct Init {
+    /// The session's id.
+    pub(super) session_id: u128,
+    frame: Vec<u8>,
+}
+
+/// Reads and checks the first message of a session. Nothing is asked of the router before it is there:
+/// it has few places for sessions that are about to open.
+///
+/// # Errors
+/// [`OpeningRefused`].
+pub(super) async fn read_init(
+    robot: &mut (impl AsyncRead + Unpin),
+    credentials: &RouterCredentials,
+) -> Result<Init, OpeningRefused> {
+    let frame = read_frame(robot).await?;
+    let session_id = check_init(&frame, credentials)?;
+    Ok(Init { session_id, frame })
+}
+
+/// Lets the opening of a session pass between robot and router.
+///
+/// # Errors
+/// [`OpeningRefused`]; what the router has seen by then does not open a session.
+pub(super) async fn pass_opening(
+    robot: &mut (impl AsyncRead + AsyncWrite + Unpin),
+    router: &mut (impl AsyncRead + AsyncWrite + Unpin),
+    init: &Init,
+    credentials: &RouterCredentials,
+) -> Result<(), OpeningRefused> {
+    write_frame(router, &init.frame).await?;
+    let answer = read_frame(router).await?;
+    write_frame(robot, &answer).await?;
+    let frame = read_frame(robot).await?;
+    check_open(&frame, credentials)?;
+    write_frame(router, &frame).await
+}
+
+async fn read_frame(from: &mut (impl AsyncRead + Unpin)) -> Result<Vec<u8>, OpeningRefused> {
+    let length = from.read_u16_le().await?;
+    if length > FRAME_BYTES_MAX {
+        return Err(OpeningRefused::TooLong(length));
+    }
+    let mut frame = vec![0; usize::from(length)];
+    from.read_exact(&mut frame).await?;
+    Ok(frame)
+}
+
+async fn write_frame(
+    to: &mut (impl AsyncWrite + Unpin),
+    frame: &[u8],
+) -> Result<(), OpeningRefused> {
+    // It was read with a length of two bytes.
+    let length = u16::try_from(frame.len()).unwrap_or(u16::MAX);
+    let whole = [&length.to_le_bytes()[..], frame].concat();
+    to.write_all(&whole).await?;
+    to.flush().await?;
+    Ok(())
+}
+
+/// The one message of a frame.
+fn message(frame: &[u8]) -> Option<TransportBody> {
+    let mut reader = frame.reader();
+    let message: TransportMessage = Zenoh080::new().read(&mut reader).ok()?;
+    reader.is_empty().then_some(message.body)
+}
+
+fn check_init(frame: &[u8], credentials: &RouterCredentials) -> Result<u128, OpeningRefused> {
+    let Some(TransportBody::InitSyn(InitSyn { whatami, zid, .. })) = message(frame) else {
+        return Err(OpeningRefused::NotDue("InitSyn"));
+    };
+    if whatami != WhatAmI::Client {
+        return Err(OpeningRefused::NotClient(whatami));
+    }
+    let session_id = u128::from_le_bytes(zid.to_le_bytes());
+    if !credentials.session_prefix.is_of(session_id) {
+        return Err(OpeningRefused::ForeignId);
+    }
+    Ok(session_id)
+}
+
+fn check_open(frame: &[u8], credentials: &RouterCredentials) -> Result<(), OpeningRefused> {
+    let Some(TransportBody::OpenSyn(open)) = message(frame) else {
+        return Err(OpeningRefused::NotDue("OpenSyn"));
+    };
+    match user_in(&open) {
+        Some(user) if user == credentials.user.as_bytes() => Ok(()),
+        _ => Err(OpeningRefused::ForeignUser),
+    }
+}
+
+/// The user that a session opens as; `None` unless it shows exactly one.
+fn user_in(open: &OpenSyn) -> Option<Vec<u8>> {
+    let shown = open.ext_auth.as_ref()?;
+    let codec = Zenoh080::new();
+    let shown: Vec<ZExtUnknown> = codec.read(&mut shown.value.reader()).ok()?;
+    let [ZExtUnknown { id, body }] = &shown[..] else {
+        return None;
+    };
+    let ZExtBody::ZBuf(value) = body else {
+        return None;
+    };
+    if id & ID_MASK != USER_PASSWORD_ID {
+        return None;
+    }
+    codec.read(&mut value.reader()).ok()
+}
