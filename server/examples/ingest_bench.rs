@@ -123,7 +123,7 @@ impl Bench {
             .enable_all()
             .build()?;
         let db = runtime.block_on(Db::open(database))?;
-        let app = App::new(
+        let app = App::without_robots(
             db,
             Clock::system(),
             FrictionConfig::default(),

@@ -124,7 +124,7 @@ fn bytes_per_sum(robots: &[RobotId]) -> anyhow::Result<(f64, f64)> {
 
 /// The sums of the same map in a database; SQLite makes them itself, which is faster.
 async fn fill(db: &Db, epoch_h: i64) -> anyhow::Result<()> {
-    let mut tx = db.write().await?;
+    let mut tx = db.write("test").await?;
     // θ in quarters of a unit of information times θ, so that everything is whole.
     sqlx::query(
         "WITH RECURSIVE places (place) AS
@@ -256,7 +256,7 @@ async fn asked(
 /// A server without a network, with a million cells.
 async fn server(folder: &Path, robots: &[RobotId]) -> anyhow::Result<(App, String)> {
     let db = Db::open(&folder.join("map.db")).await?;
-    let app = App::new(
+    let app = App::without_robots(
         db,
         Clock::system(),
         FrictionConfig::default(),

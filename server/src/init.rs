@@ -59,7 +59,7 @@ pub(crate) async fn run(args: InitArgs) -> anyhow::Result<()> {
         None => false,
     };
     let db = Db::open(&config.database).await?;
-    let app = App::new(db, clock, config.friction, config.storage);
+    let app = App::without_robots(db, clock, config.friction, config.storage);
     let first = FirstAdmin {
         name: args.name,
         valid_days: args.valid_days,

@@ -43,7 +43,7 @@ use tread_api::startup::give_zenoh_threads;
 use self::app::enrolment::Office;
 use self::app::identity::audit;
 use self::app::{
-    App, Links, checkpoints, events, ingest, memory, merging, reconciler, retention, storage,
+    App, Dependencies, checkpoints, events, ingest, memory, merging, reconciler, retention, storage,
 };
 use self::authority::Authorities;
 use self::clock::Clock;
@@ -96,45 +96,36 @@ impl Server {
         // Not before: a rotation that was cut short is completed here, by one server alone.
         let security = config.robots.as_ref().map(security).transpose()?;
         let db = Db::open(&config.database).await?;
-        let app = App::new(db, clock, config.friction, config.storage);
-        app.declare(config.normalisations);
+        let supervisor = Supervisor::new();
+        let stop = || supervisor.stop_token();
+        let (of_fleet, fleet_clock) = (security.clone(), clock.clone());
+        let fleet = Fleet::open(config.zenoh, of_fleet, fleet_clock, supervisor.clone())?;
+        let office = |security: Security, robots: &RobotsConfig| Office {
+            authorities: security.authorities,
+            lifetime: SignedDuration::from_secs(robots.certificate_s.into()),
+            port: fleet.address().port(),
+        };
+        let app = App::new(Dependencies {
+            db,
+            clock,
+            friction: config.friction,
+            storage: config.storage,
+            normalisations: config.normalisations,
+            robots: fleet.robot_link(),
+            enrolment: security
+                .zip(config.robots.as_ref())
+                .map(|(security, robots)| office(security, robots)),
+        });
         app.log_audit(config.audit.log);
         remember(&app, &config.site).await?;
         let listener = http::serve::listen(config.http)
             .with_context(|| format!("cannot listen for HTTP on {}", config.http))?;
         let http_address = listener.local_addr()?;
 
-        let supervisor = Supervisor::new();
-        let stop = || supervisor.stop_token();
-        let fleet = Fleet::open(
-            config.zenoh,
-            security.clone(),
-            app.clock().clone(),
-            supervisor.clone(),
-        )?;
-        if let (Some(security), Some(robots)) = (security, &config.robots) {
-            app.open_office(Office {
-                authorities: security.authorities,
-                lifetime: SignedDuration::from_secs(robots.certificate_s.into()),
-                port: fleet.address().port(),
-            });
-        }
-        app.connect(Links {
-            commands: fleet.commands(&app),
-            teleop: fleet.teleop(),
-            supervisor: supervisor.clone(),
-            stop_confirm_max: app::stops::STOP_CONFIRM_MAX,
-        });
         let (uploads, uploads_in) = mpsc::channel(ingest::UPLOADS_WAITING_MAX);
         supervisor.spawn_vital("ingest", ingest::run(app.clone(), uploads_in, stop()));
         fleet.listen(&app, uploads).await?;
-        let reconciling = reconciler::run(
-            app.clone(),
-            fleet.commands(&app),
-            supervisor.clone(),
-            stop(),
-        );
-        supervisor.spawn_vital("reconciler", reconciling);
+        supervisor.spawn_vital("reconciler", reconciler::run(app.clone(), stop()));
         supervisor.spawn_vital("events", events::run(app.clone(), stop()));
         look_after_database(&app, &supervisor);
         let telling = app::friction::live::run(app.clone(), stop());

@@ -16,9 +16,9 @@ use super::missions::reports::Taken;
 use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::stops::UNCONFIRMED_ALERT;
 use super::{App, AppError, check_named, page};
-use crate::db::alerts::AlertFilter;
+use crate::app::presence::RobotKey;
+pub use crate::db::alerts::AlertFilter;
 use crate::db::{self, DbError, Outcome};
-use crate::fleet::presence::RobotKey;
 
 /// The alert of a mission that failed.
 pub(super) const MISSION_FAILED_ALERT: &str = "mission-failed";
@@ -36,7 +36,7 @@ const OWN_ALERTS: [&str; 5] = [
 impl App {
     /// Alerts, newest first.
     pub async fn alerts(&self, filter: &AlertFilter, limit: u32) -> Result<Page<Alert>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("alerts").await?;
         check_named(
             &mut tx,
             filter.site.as_ref(),
@@ -52,7 +52,7 @@ impl App {
 
     /// Whose alert it is; `None` for one about the server itself, and if it is not known.
     pub async fn alert_place(&self, id: AlertId) -> Result<Option<RobotKey>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("alerts").await?;
         let found = db::alerts::find(&mut tx, id).await?;
         Ok(found.and_then(|alert| alert.robot_key()))
     }
@@ -63,7 +63,7 @@ impl App {
             self.hub().alert(&alert);
             return Ok(alert);
         }
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("alerts").await?;
         db::alerts::acknowledge(&mut tx, id, self.clock().now()).await?;
         let found = db::alerts::find(&mut tx, id).await?;
         let mut alert = found.ok_or(AppError::UnknownAlert(id))?;
@@ -101,7 +101,7 @@ impl App {
     /// False for a robot that is not known yet, or that raises too many of late.
     async fn sync_alerts_of(&self, key: &RobotKey, said: &[AlertReport]) -> Result<bool, AppError> {
         let said = &said[..said.len().min(ALERTS_MAX)];
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("alerts").await?;
         let Some(site) = db::sites::find(&mut tx, &key.0).await? else {
             return Ok(false);
         };
@@ -131,7 +131,7 @@ impl App {
             return Ok(has_all);
         }
         let mut changed = Vec::new();
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("alerts").await?;
         for alert in gone {
             db::alerts::clear(&mut tx, robot.pk, &alert.code, now).await?;
             changed.push(alert.id);

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use tread_api::ids::AlertCode;
 
-use crate::fleet::presence::RobotKey;
+use crate::app::presence::RobotKey;
 use crate::rate_limit::{Bucket, RateLimit};
 
 /// Alerts of one code: a robot that raises and ends one all the time leaves room for the others.

@@ -1,5 +1,6 @@
 //! Dry runs: what a trajectory would ask of a robot, planned by the robot's own planner.
 
+mod drawn;
 mod start;
 
 use std::ops::RangeInclusive;
@@ -20,9 +21,9 @@ use tread_control::plan::{Plan, PlanError, PlanOptions, Slowed, SlowedBy};
 use tread_control::robot::{self, RobotModelError, RobotModelSpec};
 use tread_control::trajectory as planned;
 
+pub(super) use self::drawn::drawn;
 pub(super) use self::start::Place as StartPlace;
 use self::start::{Start, after, earlier};
-use super::planned_path::way;
 use super::{App, AppError, site_row};
 use crate::db;
 
@@ -62,7 +63,7 @@ impl App {
                 detail: format!("theta must be {least} to {most}, not {theta}"),
             });
         }
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("check").await?;
         let site_pk = site_row(&mut tx, &site).await?.pk;
         let row = db::robots::find(&mut tx, site_pk, &robot).await?;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
@@ -125,7 +126,7 @@ impl App {
         trajectory: &Trajectory,
         place: start::Place,
     ) -> Result<(), AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("check").await?;
         let Some(site_row) = db::sites::find(&mut tx, site).await? else {
             return Ok(());
         };
@@ -301,7 +302,7 @@ fn check(
             relative_sd: expected.relative_std_dev,
             first_after_s: expected.first_after_s,
         },
-        path: way(plan, trajectory),
+        path: drawn(plan, trajectory),
     })
 }
 

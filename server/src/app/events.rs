@@ -8,6 +8,7 @@
 
 mod feed;
 mod hub;
+mod sent;
 mod snapshot;
 
 use std::collections::{HashSet, VecDeque};
@@ -20,10 +21,10 @@ use tread_api::event::{Event, StreamEnd};
 use tread_api::ids::RobotId;
 
 pub use self::feed::{FEED_PERIOD, run};
-pub use self::hub::{
-    CLIENT_BUFFER, CLIENT_BYTES_MAX, EventFilter, Hub, KEPT_BYTES_MAX, KEPT_EVENTS_MAX, Sent,
-};
-use self::hub::{Client, unnumbered};
+use self::hub::Client;
+pub use self::hub::{CLIENT_BUFFER, CLIENT_BYTES_MAX, Hub, KEPT_BYTES_MAX, KEPT_EVENTS_MAX};
+use self::sent::unnumbered;
+pub use self::sent::{EventFilter, Sent};
 use self::snapshot::Reading;
 pub use self::snapshot::SNAPSHOT_BYTES_MAX;
 use super::identity::Credential;
@@ -185,7 +186,7 @@ impl App {
         &self,
         filter: &EventFilter,
     ) -> Result<Option<(&'static str, String)>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("events").await?;
         if let Some(site) = &filter.site
             && db::sites::find(&mut tx, site).await?.is_none()
         {

@@ -17,7 +17,7 @@ const ROBOTS_MAX: u32 = 10_000;
 impl App {
     /// A site's geofence.
     pub async fn geofence(&self, site: &SiteId) -> Result<Geofence, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("geofence").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         Ok(db::geofences::present(&mut tx, site_pk).await?)
     }
@@ -34,7 +34,7 @@ impl App {
         expected: Option<u64>,
     ) -> Result<Geofence, AppError> {
         let ReplaceGeofence { keep_in, keep_out } = request;
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("geofence").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         let before = db::geofences::present(&mut tx, site_pk).await?;
         if let Some(expected) = expected.filter(|expected| *expected != before.revision) {

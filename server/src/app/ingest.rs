@@ -260,7 +260,7 @@ impl Writer {
         let mut tally = Tally::default();
         let app = self.app.clone();
         let turn = app.map_turn_to_change().await?;
-        let mut tx = app.db().write_uploads().await?;
+        let mut tx = app.db().write_uploads("ingest").await?;
         let now = self.app.clock().now();
         for (index, upload) in group.iter().enumerate() {
             let batch = &upload.batch;

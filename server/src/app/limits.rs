@@ -13,8 +13,8 @@ use tread_api::wire::command::Outcome;
 use tread_api::wire::safety::ExternalLimit;
 
 use super::{App, AppError, site_row};
+use crate::app::presence::RobotKey;
 use crate::db;
-use crate::fleet::presence::RobotKey;
 
 /// Longest limit, milliseconds.
 const FOR_MAX_MS: u64 = LIMIT_AHEAD_MAX_US / 1_000;
@@ -75,7 +75,6 @@ impl App {
         self.known_robot(site, robot).await?;
         let key: RobotKey = (site.clone(), robot.clone());
         let unreachable = || AppError::RobotUnreachable(robot.clone());
-        let links = self.links().ok_or_else(unreachable)?;
         let now = self.clock().elapsed();
         let clock = self.presences().get(&key).robot_clock_us(now);
         let (boot, clock_us) = clock.ok_or_else(unreachable)?;
@@ -94,7 +93,7 @@ impl App {
             field: "linear_max_m_s",
             detail,
         })?;
-        let answer = links.commands.send(&key, Verb::Limit, &command).await;
+        let answer = self.commands().send(&key, Verb::Limit, &command).await;
         let Some(answer) = answer else {
             self.counters().commands_unanswered.one();
             return Err(unreachable());
@@ -113,7 +112,7 @@ impl App {
         if self.presences().is_known(&(site.clone(), robot.clone())) {
             return Ok(());
         }
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("limits").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         let found = db::robots::find(&mut tx, site_pk, robot).await?;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());

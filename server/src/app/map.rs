@@ -198,7 +198,7 @@ impl App {
     /// The database failed; memory is as it was.
     pub(super) async fn load_map_again(&self, ended: u64) -> Result<(), DbError> {
         let mut order = Arc::clone(&self.maps().order).lock_owned().await;
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("map").await?;
         let read = read_maps(&mut tx).await?;
         self.removed().extend(db::removed::boots(&mut tx).await?);
         drop(tx);

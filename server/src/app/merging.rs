@@ -52,7 +52,7 @@ impl App {
     /// The database failed.
     pub async fn move_horizons(&self) -> Result<(), AppError> {
         let horizon_h = bucket_h(epoch_h(self.clock().now()) - HOURS_KEPT, i64::MAX);
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("merging").await?;
         let sites = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         drop(tx);
         for site in sites {
@@ -60,7 +60,7 @@ impl App {
                 continue;
             }
             let turn = self.map_turn_to_change().await?;
-            let mut tx = self.db().write().await?;
+            let mut tx = self.db().write("merging").await?;
             db::sites::merge_before(&mut tx, site.pk, horizon_h).await?;
             let change = MapChange::MergeBefore(Box::new(site), horizon_h);
             turn.commit(tx, change, Vec::new()).await?;
@@ -73,14 +73,14 @@ impl App {
     /// # Errors
     /// The database failed.
     pub async fn merge_some(&self, limit: u32) -> Result<bool, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("merging").await?;
         let row = db::sums::one_unmerged(&mut tx).await?;
         drop(tx);
         let Some((robot_pk, horizon_h)) = row else {
             return Ok(false);
         };
         let turn = self.map_turn_to_change().await?;
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("merging").await?;
         let rows = db::sums::unmerged(&mut tx, robot_pk, horizon_h, limit).await?;
         let mut days: BTreeMap<SumKey, Sums> = BTreeMap::new();
         for row in rows {

@@ -15,10 +15,13 @@ pub mod limits;
 mod map;
 pub mod memory;
 pub mod merging;
+pub mod metrics;
 pub mod missions;
 mod planned_path;
+pub mod presence;
 pub mod reconciler;
 pub mod retention;
+pub mod robot_link;
 pub mod robots;
 pub mod segments;
 pub mod shares;
@@ -29,8 +32,8 @@ pub mod teleop;
 pub mod terrains;
 pub mod withdrawals;
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use tokio::sync::{Notify, Semaphore, SemaphorePermit};
@@ -39,14 +42,16 @@ use tread_api::rights::Scope;
 use uuid::Uuid;
 
 use self::allowance::Allowances;
-use self::enrolment::Membership;
+use self::enrolment::{Membership, Office};
 pub use self::error::AppError;
 use self::events::Hub;
 use self::friction::{MapNews, Pictures, Views};
 use self::identity::Identity;
 use self::map::Maps;
 use self::missions::idempotency::InFlight;
+use self::presence::Presences;
 use self::retention::Removed;
+use self::robot_link::{Commands, RobotLink};
 use self::shares::Shares;
 use self::stops::Unrecorded;
 use self::storage::Storage;
@@ -54,13 +59,11 @@ use self::teleop::Holds;
 use crate::clock::Clock;
 use crate::config::{FrictionConfig, StorageConfig};
 use crate::counters::Counters;
+pub use crate::db::DbError;
 use crate::db::sites::SiteRow;
 use crate::db::{self, Db, Tx};
-use crate::fleet::commands::Commands;
-use crate::fleet::presence::Presences;
-use crate::fleet::teleop::Teleop;
 use crate::friction::index::Normalisation;
-use crate::metrics::{MissionDurations, Queues, Refusals, Requests};
+use crate::metrics::Metrics;
 use crate::supervisor::Supervisor;
 
 /// Everything that use cases work on; clones are handles to the same.
@@ -76,6 +79,8 @@ struct Inner {
     friction: FrictionConfig,
     counters: Counters,
     presences: Arc<Presences>,
+    robots: RobotLink,
+    commands: Commands,
     /// Wakes the reconciler: what is wanted, or what is, has changed.
     changed: Notify,
     /// Wakes the feed of events.
@@ -86,17 +91,13 @@ struct Inner {
     identity: Identity,
     maps: Maps,
     membership: Membership,
-    requests: Requests,
-    refusals: Refusals,
-    queues: Queues,
-    mission_durations: MissionDurations,
+    metrics: Metrics,
     /// Counts changes of what is kept of robots.
     robots_generation: AtomicU64,
     /// Tells this run of the server from any other.
     run_id: Uuid,
     started_at: Duration,
-    links: OnceLock<Links>,
-    normalisations: OnceLock<Vec<Arc<Normalisation>>>,
+    normalisations: Vec<Arc<Normalisation>>,
     map_readers: Semaphore,
     pictures: Pictures,
     views: Views,
@@ -110,24 +111,40 @@ struct Inner {
     event_shares: Shares,
 }
 
-/// What use cases reach robots by, once the network is open.
-#[derive(Debug, Clone)]
-pub struct Links {
-    /// Commands with answers.
-    pub commands: Commands,
-    /// Drive commands, which have none.
-    pub teleop: Teleop,
-    /// Starts what goes on after a request was answered.
-    pub supervisor: Supervisor,
-    /// How long whoever asked for a stop waits for its confirmation: [`stops::STOP_CONFIRM_MAX`],
-    /// but where time is simulated.
-    pub stop_confirm_max: Duration,
+/// What use cases work with.
+#[derive(Debug)]
+pub struct Dependencies {
+    /// The database.
+    pub db: Db,
+    /// The clock.
+    pub clock: Clock,
+    /// How measurements are fused.
+    pub friction: FrictionConfig,
+    /// When the storage counts as failing.
+    pub storage: StorageConfig,
+    /// How robot models may be joined.
+    pub normalisations: Vec<Normalisation>,
+    /// How robots are reached.
+    pub robots: RobotLink,
+    /// By what robots join; without it whoever reaches the network may speak.
+    pub enrolment: Option<Office>,
 }
 
 impl App {
-    /// The server's use cases on this database and clock.
-    pub fn new(db: Db, clock: Clock, friction: FrictionConfig, storage: StorageConfig) -> Self {
+    /// The server's use cases.
+    pub fn new(dependencies: Dependencies) -> Self {
+        let Dependencies {
+            db,
+            clock,
+            friction,
+            storage,
+            normalisations,
+            robots,
+            enrolment,
+        } = dependencies;
         let started_at = clock.elapsed();
+        let presences = Arc::default();
+        let commands = Commands::new(Arc::clone(&robots.commands), Arc::clone(&presences));
         let hub = Hub::new(clock.now());
         let run_id = clock.mission_id().as_uuid();
         let inner = Inner {
@@ -135,7 +152,9 @@ impl App {
             clock,
             friction,
             counters: Counters::default(),
-            presences: Arc::default(),
+            presences,
+            robots,
+            commands,
             changed: Notify::new(),
             announced: Notify::new(),
             hub,
@@ -143,16 +162,12 @@ impl App {
             checks: Semaphore::new(check::CHECKS_MAX),
             identity: Identity::default(),
             maps: Maps::default(),
-            membership: Membership::default(),
-            requests: Requests::default(),
-            refusals: Refusals::default(),
-            queues: Queues::default(),
-            mission_durations: MissionDurations::default(),
+            membership: Membership::new(enrolment),
+            metrics: Metrics::default(),
             robots_generation: AtomicU64::new(1),
             run_id,
             started_at,
-            links: OnceLock::new(),
-            normalisations: OnceLock::new(),
+            normalisations: normalisations.into_iter().map(Arc::new).collect(),
             map_readers: Semaphore::new(friction::READERS_MAX),
             pictures: Pictures::default(),
             views: Views::default(),
@@ -170,23 +185,41 @@ impl App {
         }
     }
 
-    /// Gives the use cases the way to the robots; the first time counts.
-    pub fn connect(&self, links: Links) {
-        let _ = self.inner.links.set(links);
-    }
-
-    /// Declares how robot models may be joined; the first time counts.
-    pub fn declare(&self, normalisations: Vec<Normalisation>) {
-        let normalisations = normalisations.into_iter().map(Arc::new).collect();
-        let _ = self.inner.normalisations.set(normalisations);
+    /// Use cases that reach no robot, for programs that work on the database alone.
+    pub fn without_robots(
+        db: Db,
+        clock: Clock,
+        friction: FrictionConfig,
+        storage: StorageConfig,
+    ) -> Self {
+        Self::new(Dependencies {
+            db,
+            clock,
+            friction,
+            storage,
+            normalisations: Vec::new(),
+            robots: RobotLink::unconnected(Supervisor::new()),
+            enrolment: None,
+        })
     }
 
     fn normalisations(&self) -> &[Arc<Normalisation>] {
-        self.inner.normalisations.get().map_or(&[], Vec::as_slice)
+        &self.inner.normalisations
     }
 
-    fn links(&self) -> Option<&Links> {
-        self.inner.links.get()
+    /// Sends commands to robots.
+    fn commands(&self) -> &Commands {
+        &self.inner.commands
+    }
+
+    /// How robots are reached.
+    fn robot_link(&self) -> &RobotLink {
+        &self.inner.robots
+    }
+
+    /// Runs what goes on after a request was answered.
+    fn supervisor(&self) -> &Supervisor {
+        &self.inner.robots.supervisor
     }
 
     /// The database.
@@ -237,24 +270,9 @@ impl App {
         &self.inner.hub
     }
 
-    /// Requests by route.
-    pub fn requests(&self) -> &Requests {
-        &self.inner.requests
-    }
-
-    /// Answers that refuse, by reason.
-    pub fn refusals(&self) -> &Refusals {
-        &self.inner.refusals
-    }
-
-    /// Queues whose depths are shown.
-    pub fn queues(&self) -> &Queues {
-        &self.inner.queues
-    }
-
-    /// How long missions took.
-    pub fn mission_durations(&self) -> &MissionDurations {
-        &self.inner.mission_durations
+    /// Where durations, refusals and queues are recorded.
+    pub fn metrics(&self) -> &Metrics {
+        &self.inner.metrics
     }
 
     fn maps(&self) -> &Maps {
@@ -342,7 +360,7 @@ impl App {
     /// # Errors
     /// The database failed.
     pub async fn continue_time(&self) -> Result<(), AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("mod").await?;
         let newest = db::times::newest(&mut tx).await?;
         let newest_id = db::times::newest_id(&mut tx).await?;
         self.clock().continue_after(newest, newest_id);

@@ -83,7 +83,7 @@ impl App {
         let now = self.clock().now();
         let kept = SignedDuration::from_hours(i64::from(config.segments_days) * DAY_H);
         let before = now.checked_sub(kept).unwrap_or(jiff::Timestamp::MIN);
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("retention").await?;
         let Some(last) = db::removed::last_key(&mut tx).await? else {
             return Ok(0);
         };
@@ -98,7 +98,7 @@ impl App {
         }
         // Uploads wait their turn: none is between its look at the names and its commit.
         let turn = self.map_turn_to_change().await?;
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("retention").await?;
         db::removed::remove(&mut tx, &rows).await?;
         let boots = rows.iter().map(|row| row.boot_pk).collect();
         turn.commit(tx, MapChange::Remove(boots), Vec::new())

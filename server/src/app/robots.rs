@@ -18,9 +18,9 @@ use super::missions::transitions::Change;
 use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::terrains::site_definition;
 use super::{App, AppError, name_or, page, site_row};
+use crate::app::presence::RobotKey;
 use crate::db::robots::{Introduction, RobotRow};
 use crate::db::{self, Outcome};
-use crate::fleet::presence::RobotKey;
 
 /// Runs of one robot's agent that are kept; older ones only as long as their raw measurements are.
 pub(super) const RUNS_KEPT_MAX: u32 = 500;
@@ -46,7 +46,7 @@ impl App {
         retired: bool,
         limit: u32,
     ) -> Result<Page<Robot>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("robots").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         let (after, named) = (cursor.unwrap_or_default(), within.limit_of(site));
         let rows = db::robots::list(
@@ -67,7 +67,7 @@ impl App {
 
     /// One robot with its live state.
     pub async fn robot(&self, site: &SiteId, id: &RobotId) -> Result<Robot, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("robots").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         let row = db::robots::find(&mut tx, site_pk, id).await?;
         let unknown = || AppError::UnknownRobot(site.clone(), id.clone());
@@ -84,7 +84,7 @@ impl App {
         change: ChangeRobot,
     ) -> Result<Robot, AppError> {
         let now = self.clock().now();
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("robots").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         let unknown = || AppError::UnknownRobot(site.clone(), id.clone());
         let found = db::robots::find(&mut tx, site_pk, id).await?;
@@ -150,7 +150,7 @@ impl App {
     /// # Errors
     /// The database failed.
     pub async fn know_robots(&self) -> Result<(), AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("robots").await?;
         for key in db::robots::names(&mut tx).await? {
             self.presences().know(key);
         }
@@ -201,7 +201,7 @@ impl App {
         hello: &Hello,
     ) -> Result<Option<Result<Welcome, &'static str>>, AppError> {
         let now = self.clock().now();
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("robots").await?;
         let Some(row) = db::sites::find(&mut tx, site).await? else {
             return Ok(None);
         };

@@ -6,7 +6,7 @@ use tread_api::page::Page;
 
 use super::{App, AppError, page, site_row};
 use crate::db;
-use crate::db::segments::SegmentFilter;
+pub use crate::db::segments::SegmentFilter;
 
 impl App {
     /// Measurements of a site in the order of their commits.
@@ -16,7 +16,7 @@ impl App {
         filter: &SegmentFilter,
         limit: u32,
     ) -> Result<Page<StoredSegment>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("segments").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         let segments = db::segments::list(&mut tx, site_pk, filter, limit + 1).await?;
         Ok(page(segments, limit, |segment| segment.id.to_string()))

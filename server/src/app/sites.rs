@@ -21,7 +21,7 @@ impl App {
         cursor: Option<&str>,
         limit: u32,
     ) -> Result<Page<Site>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("sites").await?;
         let rows = db::sites::list(&mut tx, within, cursor.unwrap_or_default(), limit + 1).await?;
         let sites = rows.into_iter().map(|row| row.site).collect();
         Ok(page(sites, limit, |site: &Site| site.id.to_string()))
@@ -29,14 +29,14 @@ impl App {
 
     /// The names of all sites.
     pub(crate) async fn all_sites(&self) -> Result<Vec<SiteId>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("sites").await?;
         let rows = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         Ok(rows.into_iter().map(|row| row.site.id).collect())
     }
 
     /// One site.
     pub async fn site(&self, id: &SiteId) -> Result<Site, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("sites").await?;
         Ok(site_row(&mut tx, id).await?.site)
     }
 
@@ -68,7 +68,7 @@ impl App {
             origin,
             created_at: self.clock().now(),
         };
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("sites").await?;
         let present = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX)
             .await?
             .len();
@@ -90,7 +90,7 @@ impl App {
 
     /// Says where on the earth a site lies, or that nobody knows.
     pub async fn tie_site(&self, id: &SiteId, origin: Option<GeoOrigin>) -> Result<Site, AppError> {
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("sites").await?;
         let row = site_row(&mut tx, id).await?;
         db::sites::set_origin(&mut tx, row.pk, origin).await?;
         tx.commit().await?;

@@ -27,7 +27,7 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::{mpsc, oneshot, watch};
-use tracing::{error, info, warn};
+use tracing::{info, warn};
 use tread_api::ids::{RobotId, SiteId, StopId};
 use tread_api::keys::Verb;
 use tread_api::page::Page;
@@ -43,9 +43,9 @@ pub(super) use self::delivery::{Told, tell};
 pub(super) use self::unrecorded::Unrecorded;
 use super::missions::control::hold_all;
 use super::{App, AppError, page, site_row};
-use crate::db::stops::StopFilter;
+use crate::app::presence::RobotKey;
+pub use crate::db::stops::StopFilter;
 use crate::db::{self, Tx};
-use crate::fleet::presence::RobotKey;
 
 /// How long a robot may take to confirm before the stop is shown as unconfirmed.
 pub const STOP_CONFIRM_MAX: Duration = Duration::from_millis(STOP_CONFIRM_MAX_MS);
@@ -111,7 +111,7 @@ impl App {
         // What is in memory decides, so that a slow database does not delay a stop.
         if !self.presences().is_known(&key) {
             let looking_up = async {
-                let mut tx = self.db().read().await?;
+                let mut tx = self.db().read("stops").await?;
                 let site_pk = site_row(&mut tx, site).await?.pk;
                 let found = db::robots::find(&mut tx, site_pk, robot).await?;
                 let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
@@ -141,7 +141,7 @@ impl App {
         let keys: Vec<RobotKey> = known.into_iter().filter(wanted).collect();
         if let (Some(site), true) = (site, keys.is_empty()) {
             let looking_up = async {
-                let mut tx = self.db().read().await?;
+                let mut tx = self.db().read("stops").await?;
                 site_row(&mut tx, site).await.map(|_known| ())
             };
             looked_up(looking_up).await?;
@@ -178,22 +178,16 @@ impl App {
             replaced_by: None,
         };
         let mut stops: Vec<Stop> = keys.into_iter().map(stop).collect();
-        let Some(links) = self.links() else {
-            error!("a stop was asked for before the network was open");
-            return stops;
-        };
         self.unrecorded().extend(&stops);
         let (tell, confirmations) = mpsc::channel(stops.len().max(1));
         let (recorded, is_recorded) = watch::channel(false);
         for stop in &stops {
             let outgoing = Outgoing {
                 app: self.clone(),
-                links: links.clone(),
                 stop: stop.clone(),
                 recorded: is_recorded.clone(),
             };
-            links
-                .supervisor
+            self.supervisor()
                 .spawn_passing("stop", outgoing.deliver(tell.clone()));
         }
         drop(tell);
@@ -202,11 +196,11 @@ impl App {
         let settling = Settling {
             app: self.clone(),
             stops: stops.clone(),
-            stop: links.supervisor.stop_token(),
-            confirm_max: links.stop_confirm_max,
+            stop: self.supervisor().stop_token(),
+            confirm_max: self.robot_link().stop_confirm_max,
         };
         let settling = settling.run(confirmations, shown, recorded);
-        links.supervisor.spawn_passing("stops", settling);
+        self.supervisor().spawn_passing("stops", settling);
         // It answers within the bound; without it nothing is confirmed.
         let confirmed = seen.await.unwrap_or_default();
         for stop in &mut stops {
@@ -230,7 +224,7 @@ impl App {
     ) -> Result<Stop, AppError> {
         let by = words(by, SOMEBODY);
         let key = (site.clone(), robot.clone());
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("stops").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
         let row = db::robots::find(&mut tx, site_pk, robot).await?;
@@ -248,14 +242,13 @@ impl App {
         db::stops::ask_clear(&mut tx, id, &by, self.clock().now()).await?;
         tx.commit().await?;
         let unreachable = || AppError::RobotUnreachable(robot.clone());
-        let links = self.links().ok_or_else(unreachable)?;
         let command = ClearStop { stop: id, by };
-        let answer = links.commands.send(&key, Verb::Clear, &command).await;
+        let answer = self.commands().send(&key, Verb::Clear, &command).await;
         let Some(answer) = answer else {
             self.counters().commands_unanswered.one();
             return Err(unreachable());
         };
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("stops").await?;
         if let Outcome::Refused { detail, .. } = answer.outcome {
             db::stops::refuse_clear(&mut tx, id).await?;
             tx.commit().await?;
@@ -274,7 +267,7 @@ impl App {
 
     /// Stops, newest first.
     pub async fn stops(&self, filter: &StopFilter, limit: u32) -> Result<Page<Stop>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("stops").await?;
         // Looked at first: one that is written down meanwhile is in both.
         let mut stops = self.unrecorded().list(filter);
         for mut stop in db::stops::list(&mut tx, filter, limit + 1).await? {
@@ -295,7 +288,7 @@ impl App {
 
     /// The open stop of each robot that has one.
     pub(crate) async fn stops_in_force(&self) -> Result<Vec<Stop>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("stops").await?;
         let stops = db::stops::in_force(&mut tx).await?;
         let shown = stops.into_iter().map(|stop| self.with_confirmation(stop));
         Ok(shown.collect())
@@ -388,7 +381,7 @@ impl App {
         confirmed: &[(StopId, Timestamp)],
     ) -> Result<(), AppError> {
         let ids: Vec<StopId> = confirmed.iter().map(|(id, _)| *id).collect();
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("stops").await?;
         db::stops::confirm(&mut tx, &ids, self.clock().now()).await?;
         let alerted = alerted(&mut tx).await?;
         let is_over = |stop: &&Stop| ids.contains(&stop.id) && alerted.contains(&key_of(stop));
@@ -402,7 +395,7 @@ impl App {
     /// Writes down that a stop was in force on its robot and has been cleared there, with one that
     /// came later there.
     pub(super) async fn note_over(&self, stop: &Stop) -> Result<(), AppError> {
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("stops").await?;
         db::stops::end(&mut tx, stop.id, self.clock().now()).await?;
         let ended = self.settle_alert(&mut tx, &key_of(stop), false).await?;
         self.commit_alerts(tx, ended.into_iter().collect()).await?;
@@ -412,7 +405,7 @@ impl App {
 
     /// Raises the alert of robots that have not confirmed.
     pub(super) async fn note_unconfirmed(&self, stops: &[&Stop]) -> Result<(), AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("stops").await?;
         let open = db::stops::in_force(&mut tx).await?;
         let open: HashSet<StopId> = open.into_iter().map(|stop| stop.id).collect();
         let alerted = alerted(&mut tx).await?;
@@ -425,7 +418,7 @@ impl App {
             return Ok(());
         }
         let mut alerts = Vec::new();
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("stops").await?;
         for stop in missing {
             alerts.extend(self.settle_alert(&mut tx, &key_of(stop), true).await?);
         }

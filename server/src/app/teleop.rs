@@ -28,12 +28,12 @@ use uuid::Uuid;
 
 use super::identity::Credential;
 use super::missions::control::hold_all;
+use super::robot_link::DrivePublisher;
 use super::shares::{Bounds, Place};
 use super::stops::StopWords;
-use super::{App, AppError, Links};
+use super::{App, AppError};
+use crate::app::presence::RobotKey;
 use crate::db;
-use crate::fleet::presence::RobotKey;
-use crate::fleet::teleop::Line;
 
 /// Most drive connections at once.
 pub const SESSIONS_MAX: usize = 512;
@@ -117,7 +117,7 @@ struct Held {
     lease: Lease,
     boot: BootId,
     since: Duration,
-    line: Line,
+    publisher: Box<dyn DrivePublisher>,
     next_seq: u64,
 }
 
@@ -125,7 +125,6 @@ struct Held {
 #[derive(Debug)]
 pub struct Session {
     app: App,
-    links: Links,
     key: RobotKey,
     client: Uuid,
     held: Option<Held>,
@@ -140,12 +139,9 @@ impl App {
     /// The robot has never said hello, or the network is not open.
     pub async fn begin_drive(&self, site: &SiteId, robot: &RobotId) -> Result<Session, AppError> {
         self.known_robot(site, robot).await?;
-        let unreachable = || AppError::RobotUnreachable(robot.clone());
-        let links = self.links().ok_or_else(unreachable)?.clone();
         Ok(Session {
             app: self.clone(),
-            _attended: links.supervisor.attend(),
-            links,
+            _attended: self.supervisor().attend(),
             key: (site.clone(), robot.clone()),
             client: Uuid::new_v4(),
             held: None,
@@ -168,7 +164,7 @@ impl App {
 
     /// Holds everything that a robot has in hand or in its queue while somebody drives it.
     async fn hold_for_driver(&self, key: &RobotKey, name: &str) -> Result<(), AppError> {
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("teleop").await?;
         if let Some(robot_pk) = db::robots::pk_of(&mut tx, &key.0, &key.1).await? {
             let reason = format!("`{name}` drives the robot by hand");
             hold_all(&mut tx, robot_pk, &reason, self.clock().now()).await?;
@@ -187,7 +183,7 @@ impl Session {
 
     /// Cancelled when the server stops.
     pub fn stop_token(&self) -> CancellationToken {
-        self.links.supervisor.stop_token()
+        self.app.supervisor().stop_token()
     }
 
     /// Ends the session: a robot that it drives is told to stand, and the lease is given back.
@@ -224,7 +220,7 @@ impl Session {
             action,
             holder: driver.clone(),
         };
-        let answer = self.links.commands.send(&self.key, Verb::Lease, &command);
+        let answer = self.app.commands().send(&self.key, Verb::Lease, &command);
         let Some(answer) = answer.await else {
             self.app.counters().commands_unanswered.one();
             let detail = "the robot does not answer";
@@ -261,8 +257,8 @@ impl Session {
             held.lease = lease.clone();
             return Ok(lease);
         }
-        let line = self.links.teleop.open(&self.key).await;
-        let Some(line) = line else {
+        let publisher = self.app.robot_link().drive.open(&self.key).await;
+        let Some(publisher) = publisher else {
             self.give_back(lease);
             let detail = "the network to the robot is not open";
             return Err(refused(DriveRefusal::Unreachable, detail));
@@ -273,7 +269,7 @@ impl Session {
             lease: lease.clone(),
             boot: answer.boot,
             since: self.app.clock().elapsed(),
-            line,
+            publisher,
             next_seq: 1,
         });
         self.hold_missions(name.clone()).await;
@@ -285,12 +281,12 @@ impl Session {
     async fn hold_missions(&self, name: String) {
         let (app, key) = (self.app.clone(), self.key.clone());
         let (written, is_written) = oneshot::channel();
-        let ending = self.links.supervisor.stop_token();
+        let ending = self.app.supervisor().stop_token();
         // Whoever tries already does it once more.
         if !app.holds().ask(&key) {
             return;
         }
-        self.links.supervisor.spawn_passing("hold", async move {
+        self.app.supervisor().spawn_passing("hold", async move {
             while app.holds().is_asked(&key) {
                 if let Err(error) = db::limited(app.hold_for_driver(&key, &name)).await {
                     app.log_failure("write down that missions are held for a driver", &error);
@@ -353,7 +349,7 @@ impl Session {
         };
         held.next_seq += 1;
         self.app.counters().drive_commands_sent.one();
-        if held.line.send(&command) {
+        if held.publisher.publish(&command) {
             Ok(())
         } else {
             let detail = "the network to the robot is not open";
@@ -376,9 +372,9 @@ impl Session {
 
     /// Tells the robot in the background that a lease is over.
     fn give_back(&self, lease: Lease) {
-        let (app, links, key) = (self.app.clone(), self.links.clone(), self.key.clone());
-        let ending = links.supervisor.stop_token();
-        let supervisor = links.supervisor.clone();
+        let (app, key) = (self.app.clone(), self.key.clone());
+        let ending = app.supervisor().stop_token();
+        let supervisor = app.supervisor().clone();
         supervisor.spawn_passing("release", async move {
             let command = LeaseCommand {
                 request: Uuid::new_v4(),
@@ -386,7 +382,7 @@ impl Session {
                 holder: lease.driver,
             };
             for _ in 0..RELEASE_TRIES {
-                let answer = links.commands.send(&key, Verb::Lease, &command).await;
+                let answer = app.commands().send(&key, Verb::Lease, &command).await;
                 if answer.is_some() || ending.is_cancelled() {
                     return;
                 }

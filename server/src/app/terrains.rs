@@ -18,7 +18,7 @@ impl App {
         cursor: Option<&str>,
         limit: u32,
     ) -> Result<Page<Terrain>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("terrains").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         let mut terrains = db::terrains::list(&mut tx, site_pk).await?;
         terrains.retain(|terrain| cursor.is_none_or(|cursor| terrain.id.as_str() > cursor));
@@ -27,7 +27,7 @@ impl App {
 
     /// One terrain.
     pub async fn terrain(&self, site: &SiteId, id: &TerrainId) -> Result<Terrain, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("terrains").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         let terrain = db::terrains::find(&mut tx, site_pk, id).await?;
         terrain.ok_or_else(|| AppError::UnknownTerrain(site.clone(), id.clone()))
@@ -47,7 +47,7 @@ impl App {
             layer,
         } = request;
         let name = name_or(name, id.as_str())?;
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("terrains").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         if db::terrains::find(&mut tx, site_pk, &id).await?.is_some() {
             return Err(AppError::AlreadyExists {
@@ -89,7 +89,7 @@ impl App {
             layer,
         } = request;
         let name = name_or(name, id.as_str())?;
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("terrains").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         if db::terrains::find(&mut tx, site_pk, id).await?.is_none() {
             return Err(AppError::UnknownTerrain(site.clone(), id.clone()));
@@ -123,7 +123,7 @@ impl App {
 
     /// Removes a terrain; what was measured on it stays.
     pub async fn delete_terrain(&self, site: &SiteId, id: &TerrainId) -> Result<(), AppError> {
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("terrains").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         if !db::terrains::delete(&mut tx, site_pk, id).await? {
             return Err(AppError::UnknownTerrain(site.clone(), id.clone()));

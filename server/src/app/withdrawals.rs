@@ -38,7 +38,7 @@ impl App {
         let reason = people_line("reason", &reason, REASON_LENGTH_MAX)?;
         let now = self.clock().now();
         let turn = self.map_turn_to_change().await?;
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("withdrawals").await?;
         let site_row = site_row(&mut tx, site).await?;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
         let found = db::robots::find(&mut tx, site_row.pk, robot).await?;
@@ -78,7 +78,7 @@ impl App {
         cursor: Option<i64>,
         limit: u32,
     ) -> Result<Page<Withdrawal>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("withdrawals").await?;
         let site_row = site_row(&mut tx, site).await?;
         let robots = db::robots::of_site_by_key(&mut tx, site_row.pk).await?;
         let rows = db::withdrawals::all(&mut tx).await?;

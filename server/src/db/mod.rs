@@ -34,7 +34,6 @@ pub mod withdrawals;
 use std::collections::BTreeSet;
 use std::fmt::Display;
 use std::ops::{Deref, DerefMut};
-use std::panic::Location;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
@@ -54,7 +53,7 @@ use tread_api::rights::Scope;
 
 use self::connections::{COMMIT_TIMEOUT, Connections, Lent};
 use self::failure::StorageFailure;
-use crate::metrics::{Histogram, Transactions};
+use crate::metrics::DatabaseMetrics;
 
 /// Oldest SQLite that is free of the bug that can lose a WAL.
 pub const SQLITE_VERSION_MIN: (u32, u32, u32) = (3, 51, 3);
@@ -116,8 +115,8 @@ struct Commits {
 /// Notes how long a transaction took when it is over.
 #[derive(Debug)]
 struct Noted {
-    transactions: Arc<Transactions>,
-    begun: &'static Location<'static>,
+    metrics: DatabaseMetrics,
+    kind: &'static str,
     writes: bool,
     began_at: Instant,
 }
@@ -125,7 +124,7 @@ struct Noted {
 impl Drop for Noted {
     fn drop(&mut self) {
         let took = self.began_at.elapsed();
-        self.transactions.note(self.begun, self.writes, took);
+        self.metrics.transaction(self.kind, self.writes, took);
     }
 }
 
@@ -277,8 +276,7 @@ pub struct Db {
     /// Brings the log into the file beside the writer.
     checkpoints: Connections,
     version: String,
-    write_waits: Arc<Histogram>,
-    transactions: Arc<Transactions>,
+    metrics: DatabaseMetrics,
     commits: Arc<Commits>,
     /// Held by whoever asks the operating system about the disk.
     asking_disk: Arc<Semaphore>,
@@ -356,8 +354,7 @@ impl Db {
             path: path.to_owned(),
             checkpoints,
             version,
-            write_waits: Arc::default(),
-            transactions: Arc::default(),
+            metrics: DatabaseMetrics::default(),
             commits: Arc::default(),
             asking_disk: Arc::new(Semaphore::new(1)),
         })
@@ -386,7 +383,7 @@ impl Db {
     /// The turn to write did not come in time, since one of them goes on or another process writes.
     pub async fn await_commits(&self) -> Result<(), DbError> {
         // SQLite lets nobody else begin to write as long as a transaction may still be committed.
-        drop(self.write().await?);
+        drop(self.write("refresh").await?);
         self.commits.generation.fetch_add(1, Ordering::AcqRel);
         Ok(())
     }
@@ -397,22 +394,19 @@ impl Db {
     }
 
     /// Begins to write; waits for its turn. Await nothing but the database before the commit.
+    /// `kind` names the use case in the metrics.
     ///
     /// # Errors
     /// The turn did not come in time, or SQLite failed.
-    #[track_caller]
-    pub fn write(&self) -> impl Future<Output = Result<Tx, DbError>> + use<'_> {
-        let begun = Location::caller();
-        async move {
-            let asked_at = Instant::now();
-            let inner = self.writer.begin("BEGIN IMMEDIATE").await?;
-            self.write_waits.note(asked_at.elapsed());
-            let tx = self.timed(inner, begun, true);
-            Ok(Tx {
-                is_counted: true,
-                ..tx
-            })
-        }
+    pub async fn write(&self, kind: &'static str) -> Result<Tx, DbError> {
+        let asked_at = Instant::now();
+        let inner = self.writer.begin("BEGIN IMMEDIATE").await?;
+        self.metrics.write_wait(asked_at.elapsed());
+        let tx = self.timed(inner, kind, true);
+        Ok(Tx {
+            is_counted: true,
+            ..tx
+        })
     }
 
     /// The same for what robots upload, measurements and reports of missions, which
@@ -420,21 +414,17 @@ impl Db {
     ///
     /// # Errors
     /// The turn did not come in time, or SQLite failed.
-    #[track_caller]
-    pub fn write_uploads(&self) -> impl Future<Output = Result<Tx, DbError>> + use<'_> {
-        let writing = self.write();
-        async move {
-            Ok(Tx {
-                is_counted: false,
-                ..writing.await?
-            })
-        }
+    pub async fn write_uploads(&self, kind: &'static str) -> Result<Tx, DbError> {
+        Ok(Tx {
+            is_counted: false,
+            ..self.write(kind).await?
+        })
     }
 
-    fn timed(&self, inner: Lent, begun: &'static Location<'static>, writes: bool) -> Tx {
+    fn timed(&self, inner: Lent, kind: &'static str, writes: bool) -> Tx {
         let noted = Noted {
-            transactions: Arc::clone(&self.transactions),
-            begun,
+            metrics: self.metrics.clone(),
+            kind,
             writes,
             began_at: Instant::now(),
         };
@@ -446,27 +436,18 @@ impl Db {
         }
     }
 
-    /// How long transactions took.
-    pub fn transactions(&self) -> &Transactions {
-        &self.transactions
+    /// What the database measures of itself.
+    pub fn metrics(&self) -> &DatabaseMetrics {
+        &self.metrics
     }
 
-    /// How long writers waited for their turn.
-    pub fn write_waits(&self) -> &Histogram {
-        &self.write_waits
-    }
-
-    /// Begins to read one snapshot.
+    /// Begins to read one snapshot. `kind` names the use case in the metrics.
     ///
     /// # Errors
     /// No connection became free in time, or SQLite failed.
-    #[track_caller]
-    pub fn read(&self) -> impl Future<Output = Result<Tx, DbError>> + use<'_> {
-        let begun = Location::caller();
-        async move {
-            let inner = self.readers.begin("BEGIN").await?;
-            Ok(self.timed(inner, begun, false))
-        }
+    pub async fn read(&self, kind: &'static str) -> Result<Tx, DbError> {
+        let inner = self.readers.begin("BEGIN").await?;
+        Ok(self.timed(inner, kind, false))
     }
 
     /// Brings what is in the log into the file, as far as nobody reads it there; whoever writes
@@ -484,7 +465,7 @@ impl Db {
     /// # Errors
     /// The database cannot be written.
     pub async fn probe_write(&self) -> Result<(), DbError> {
-        let mut tx = self.write_uploads().await?;
+        let mut tx = self.write_uploads("storage").await?;
         // A number in the file's header that nobody else uses; the page is written each time.
         sqlx::query("PRAGMA user_version = 1")
             .execute(&mut *tx)
@@ -497,7 +478,7 @@ impl Db {
     /// # Errors
     /// A table cannot be read.
     pub async fn probe_tables(&self) -> Result<(), DbError> {
-        let mut tx = self.read().await?;
+        let mut tx = self.read("storage").await?;
         let tables: Vec<(String,)> =
             sqlx::query_as("SELECT name FROM sqlite_schema WHERE type = 'table'")
                 .fetch_all(&mut *tx)
@@ -519,7 +500,7 @@ impl Db {
     /// # Errors
     /// The database cannot be read.
     pub async fn quick_check(&self) -> Result<Option<String>, DbError> {
-        let mut tx = self.read().await?;
+        let mut tx = self.read("storage").await?;
         let (finding,): (String,) = sqlx::query_as("PRAGMA quick_check(1)")
             .fetch_one(&mut *tx)
             .await?;
@@ -638,7 +619,7 @@ mod tests {
     async fn the_file_is_made_with_the_settings_that_keep_commits() {
         let folder = tempfile::tempdir().unwrap();
         let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
-        let mut tx = db.write().await.unwrap();
+        let mut tx = db.write("db").await.unwrap();
         let setting = async |tx: &mut Tx, name: &'static str| -> String {
             let row: (String,) = sqlx::query_as(name).fetch_one(&mut **tx).await.unwrap();
             row.0
@@ -650,7 +631,7 @@ mod tests {
         let keys = "SELECT CAST(foreign_keys AS TEXT) FROM pragma_foreign_keys";
         assert_eq!(setting(&mut tx, keys).await, "1");
         drop(tx);
-        let mut reading = db.read().await.unwrap();
+        let mut reading = db.read("db").await.unwrap();
         let refused = sqlx::query("DELETE FROM sites")
             .execute(&mut *reading)
             .await;
@@ -662,8 +643,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let db = Db::open(&folder.path().join("some.db")).await.unwrap();
         let before = db.generation();
-        drop(db.write().await.unwrap());
-        let mut committing = Box::pin(db.write().await.unwrap().commit());
+        drop(db.write("db").await.unwrap());
+        let mut committing = Box::pin(db.write("db").await.unwrap().commit());
         assert!(futures_util::FutureExt::now_or_never(&mut committing).is_none());
         drop(committing);
         let counted = async {
@@ -675,7 +656,12 @@ mod tests {
             .await
             .unwrap();
         assert_eq!(db.generation(), before + 1);
-        db.write_uploads().await.unwrap().commit().await.unwrap();
+        db.write_uploads("db")
+            .await
+            .unwrap()
+            .commit()
+            .await
+            .unwrap();
         assert_eq!(db.generation(), before + 1);
     }
 }

@@ -11,8 +11,8 @@ use tread_api::access::{Act, Owner, ROBOT_KEYS, RobotKeys};
 use tread_api::ids::{RobotId, SiteId};
 
 use super::credentials::{PROBE_USER, user_of};
-use super::presence::RobotKey;
-use super::router::PROBE_KEY;
+use super::probe::PROBE_KEY;
+use crate::app::presence::RobotKey;
 
 /// What is let in from a robot and out to it for one act, by zenoh's names.
 const fn messages(act: Act) -> (&'static [&'static str], &'static [&'static str]) {

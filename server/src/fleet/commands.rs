@@ -1,10 +1,8 @@
 //! Commands to robots: zenoh queries with an application answer.
 
-use std::pin::Pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use serde::Serialize;
 use tokio::sync::oneshot;
 use tracing::{debug, warn};
 use tread_api::ids::BootId;
@@ -16,93 +14,31 @@ use zenoh::Wait as _;
 use zenoh::qos::Priority;
 use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 
-use super::presence::{Presences, RobotKey};
 use super::routers::Routers;
+use crate::app::presence::RobotKey;
+use crate::app::robot_link::{Answering, CommandTransport};
 use crate::supervisor::Supervisor;
 
 /// How long a robot may take to answer.
-pub const COMMAND_TIMEOUT: Duration = Duration::from_millis(800);
+const COMMAND_TIMEOUT: Duration = Duration::from_millis(800);
 /// How long the query itself may take beyond that before it counts as not delivered.
 const MARGIN: Duration = Duration::from_millis(200);
 
-/// An answer on its way.
-pub type Carrying = Pin<Box<dyn Future<Output = Option<Answer>> + Send>>;
-
-/// Carries one command to a robot and its answer back; `None` is not delivered, as far as anyone
-/// knows. The network of a fleet is one, a simulated network in a test another.
-pub trait Carrier: std::fmt::Debug + Send + Sync {
-    /// Carries a payload to what answers at a robot's verb: to that run of its agent alone, or to
-    /// whatever runs under its name.
-    fn carry(
-        &self,
-        robot: &RobotKey,
-        run: Option<BootId>,
-        verb: Verb,
-        payload: Vec<u8>,
-    ) -> Carrying;
-}
-
-/// Sends commands to robots; clones send through the same carrier.
-#[derive(Debug, Clone)]
-pub struct Commands {
-    carrier: Arc<dyn Carrier>,
-    presences: Arc<Presences>,
-}
-
-impl Commands {
-    /// Commands through a carrier; `presences` tell which run of an agent is the present one.
-    pub fn new(carrier: Arc<dyn Carrier>, presences: Arc<Presences>) -> Self {
-        Self { carrier, presences }
-    }
-
-    /// Sends one command to a robot's present run and waits for its answer.
-    ///
-    /// `None` as for [`Commands::send_to`].
-    pub async fn send<T: Serialize>(
-        &self,
-        robot: &RobotKey,
-        verb: Verb,
-        command: &T,
-    ) -> Option<Answer> {
-        let present = self.presences.get(robot).boot();
-        let run = present.map(|(boot, _since)| boot);
-        self.send_to(robot, run, verb, command).await
-    }
-
-    /// Sends one command to one run of a robot's agent, or to all under its name, and waits for
-    /// the first answer.
-    ///
-    /// `None` means not delivered, as far as anyone knows: no robot answered in time, or its
-    /// answer does not read. The same may be sent again without harm.
-    pub async fn send_to<T: Serialize>(
-        &self,
-        robot: &RobotKey,
-        run: Option<BootId>,
-        verb: Verb,
-        command: &T,
-    ) -> Option<Answer> {
-        let payload = wire::encode(command)
-            .inspect_err(|error| warn!("cannot write a command for `{}`: {error}", robot.1))
-            .ok()?;
-        self.carrier.carry(robot, run, verb, payload).await
-    }
-}
-
-/// The fleet's network as a carrier.
+/// Sends commands as queries through all routers of this server.
 #[derive(Debug)]
-pub(super) struct Network {
+pub(super) struct ZenohCommands {
     pub(super) routers: Arc<Routers>,
     pub(super) supervisor: Supervisor,
 }
 
-impl Carrier for Network {
-    fn carry(
+impl CommandTransport for ZenohCommands {
+    fn send(
         &self,
         (site, robot): &RobotKey,
         run: Option<BootId>,
         verb: Verb,
         payload: Vec<u8>,
-    ) -> Carrying {
+    ) -> Answering {
         let mut key = keys::command(site, robot, verb);
         if let Some(boot) = run {
             key = keys::to_run(&key, boot);

@@ -15,7 +15,7 @@ use nix::sys::memfd::{MFdFlags, memfd_create};
 use ring::hmac;
 use tread_api::tunnel::{RouterCredentials, SessionPrefix};
 
-use super::presence::RobotKey;
+use crate::app::presence::RobotKey;
 use crate::authority::Authority;
 
 /// The user of the server's own look at its router. No robot's has no dot.

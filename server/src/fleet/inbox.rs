@@ -8,17 +8,17 @@ use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
 use tread_api::keys::{self, Key};
+use tread_api::wire;
 use tread_api::wire::state::{FrictionReport, RobotState};
-use tread_api::wire::{self, WireError};
-use zenoh::query::Query;
 use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait as _};
 
-use super::presence::{Heard, RobotKey};
 use super::rate_limits::{Kind, Place, RateLimits};
+use super::received::{Asked, count_refusal, explained, log_refusal, next, refuse_key};
 use super::{requests, tokens};
 use crate::app::App;
 use crate::app::ingest::Upload;
+use crate::app::presence::{Heard, RobotKey};
 use crate::counters::Counter;
 use crate::supervisor::Supervisor;
 
@@ -44,13 +44,6 @@ pub(super) struct Channels {
     hellos: mpsc::Sender<Asked>,
     uploads: mpsc::Sender<Asked>,
     limits: RateLimits,
-}
-
-/// A query with its place among those of its robot, which it keeps until it is answered.
-#[derive(Debug)]
-pub(super) struct Asked {
-    pub(super) query: Query,
-    pub(super) place: Place,
 }
 
 #[derive(Debug)]
@@ -83,7 +76,7 @@ impl Channels {
         let (states, states_in) = mpsc::channel(STATES_WAITING_MAX);
         let (hellos, hellos_in) = mpsc::channel(HELLOS_WAITING_MAX);
         let (uploads, uploads_in) = mpsc::channel(UPLOADS_WAITING_MAX);
-        let queues = app.queues();
+        let queues = app.metrics().queues();
         queues.show("presence", &presence);
         queues.show("states", &states);
         queues.show("hellos", &hellos);
@@ -259,7 +252,7 @@ async fn watch_presence(
             change = next(&mut changes, &stop) => change,
             _ = late.tick() => {
                 for (key, router) in limits.late_tokens(app.clock().elapsed()) {
-                    appeared(&app, &mut tokens, &key, router).await;
+                    appeared(&app, &mut tokens, &key, router);
                     app.wake();
                 }
                 continue;
@@ -271,7 +264,7 @@ async fn watch_presence(
                 key,
                 router,
                 appeared: true,
-            } => appeared(&app, &mut tokens, &key, router).await,
+            } => appeared(&app, &mut tokens, &key, router),
             TokenChange::Token { key, router, .. } => {
                 if tokens.gone(&key, router) {
                     gone(&app, &key);
@@ -287,12 +280,12 @@ async fn watch_presence(
     }
 }
 
-async fn appeared(app: &App, tokens: &mut tokens::Tokens, token: &str, router: u64) {
+fn appeared(app: &App, tokens: &mut tokens::Tokens, token: &str, router: u64) {
     let Some(Key::Alive(site, robot, boot)) = Key::parse(token) else {
         return refuse_key(app, token);
     };
     let key = (site, robot);
-    if !app.admits(&key).await || !tokens.appeared(token, router) {
+    if !app.admits(&key) || !tokens.appeared(token, router) {
         return;
     }
     let (site, robot) = &key;
@@ -321,7 +314,7 @@ async fn read_states(
             Some(Key::State(site, robot)) => {
                 let named = |state: &RobotState| state.robot == robot;
                 let key: RobotKey = (site, robot.clone());
-                if !app.admits(&key).await {
+                if !app.admits(&key) {
                     continue;
                 }
                 if let Some(state) = read(&app, &limits, &key, &message, named) {
@@ -336,7 +329,7 @@ async fn read_states(
             Some(Key::Friction(site, robot)) => {
                 let named = |report: &FrictionReport| report.robot == robot;
                 let key: RobotKey = (site, robot.clone());
-                if !app.admits(&key).await {
+                if !app.admits(&key) {
                     continue;
                 }
                 if let Some(report) = read(&app, &limits, &key, &message, named) {
@@ -349,18 +342,6 @@ async fn read_states(
             }
             Some(_) | None => refuse_key(&app, &message.key),
         }
-    }
-}
-
-/// The next message, until the stop.
-pub(super) async fn next<T>(
-    channel: &mut mpsc::Receiver<T>,
-    stop: &CancellationToken,
-) -> Option<T> {
-    tokio::select! {
-        biased;
-        () = stop.cancelled() => None,
-        message = channel.recv() => message,
     }
 }
 
@@ -390,13 +371,6 @@ fn read<T: serde::de::DeserializeOwned>(
     None
 }
 
-/// Logs that a message was refused, now and then for each robot, with how often since.
-pub(super) fn log_refusal(app: &App, limits: &RateLimits, robot: &RobotKey, key: &str, why: &str) {
-    if let Some(repeats) = limits.log_refused(robot, app.clock().elapsed()) {
-        warn!(repeats, "a message on `{key}` was refused: {why}");
-    }
-}
-
 /// The robot whose key it is.
 fn robot_of(key: &str) -> Option<RobotKey> {
     match Key::parse(key)? {
@@ -409,28 +383,8 @@ fn robot_of(key: &str) -> Option<RobotKey> {
     }
 }
 
-/// Counts what does not read.
-pub(super) fn count_refusal(app: &App, error: &WireError) {
-    match error {
-        WireError::TooLarge(_) | WireError::Malformed(_) => app.counters().refused_malformed.one(),
-        WireError::Version(_) => app.counters().refused_version.one(),
-    }
-}
-
-/// An error with its cause, on one line.
-pub(super) fn explained(error: &WireError) -> String {
-    wire::Refusal::from(error).detail
-}
-
 /// Counts and logs a message of a robot that is not known.
 fn refuse_stranger(app: &App, (site, robot): &RobotKey) {
     app.counters().refused_unknown_robot.one();
     debug!("a message of robot `{robot}` of site `{site}` was refused: it has not said hello");
-}
-
-/// Counts and logs a key that is none of ours.
-pub(super) fn refuse_key(app: &App, key: &str) {
-    app.counters().refused_key.one();
-    let key: String = key.chars().take(200).collect();
-    debug!("a message on `{key}` was refused: the key is none of Tread's");
 }

@@ -18,9 +18,9 @@ use tracing::{error, info};
 
 use super::inbox::Channels;
 use super::opening::{self, Opener};
-use super::presence::RobotKey;
 use super::routers::{Router, Routers};
 use crate::app::App;
+use crate::app::presence::RobotKey;
 use crate::authority::Trusted;
 
 /// Most routers at a time.

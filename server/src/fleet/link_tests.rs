@@ -128,7 +128,10 @@ async fn an_authority_that_is_retired_takes_its_links_passwords_and_routers_with
         rig.fleet.routers.all().len() == 1
     })
     .await;
-    assert!(rig.app.counters().gate_retired.get() >= 2);
+    until("both links are counted", async || {
+        rig.app.counters().gate_retired.get() >= 2
+    })
+    .await;
     // The port shows the new authority, which this client does not know.
     assert!(client.credentials().await.is_none());
     drop(another);

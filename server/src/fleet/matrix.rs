@@ -23,8 +23,8 @@ use zenoh::{Session, Wait as _};
 
 use super::test_client::{Shown, TestClient, TestSession};
 use super::{Fleet, Security};
-use crate::app::App;
 use crate::app::enrolment::Office;
+use crate::app::{App, Dependencies};
 use crate::authority::{Authorities, Authority, RobotName, RobotRequest};
 use crate::clock::Clock;
 use crate::config::{FrictionConfig, StorageConfig};
@@ -106,13 +106,6 @@ impl Rig {
         let folder = tempfile::tempdir().unwrap();
         let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
         let clock = Clock::system();
-        let app = App::new(
-            db,
-            clock.clone(),
-            FrictionConfig::default(),
-            StorageConfig::default(),
-        );
-        app.ensure_site(&site()).await.unwrap();
         let authority = Arc::new(Authority::generate("fleet", clock.now()).unwrap());
         let authorities = Arc::new(Authorities::in_memory(Arc::clone(&authority)));
         let security = Security {
@@ -123,11 +116,20 @@ impl Rig {
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
         let opening = Fleet::open(address, Some(security), clock.clone(), supervisor.clone());
         let fleet = opening.unwrap();
-        app.open_office(Office {
-            authorities: Arc::clone(&authorities),
-            lifetime: HOUR,
-            port: fleet.address().port(),
+        let app = App::new(Dependencies {
+            db,
+            clock: clock.clone(),
+            friction: FrictionConfig::default(),
+            storage: StorageConfig::default(),
+            normalisations: Vec::new(),
+            robots: fleet.robot_link(),
+            enrolment: Some(Office {
+                authorities: Arc::clone(&authorities),
+                lifetime: HOUR,
+                port: fleet.address().port(),
+            }),
         });
+        app.ensure_site(&site()).await.unwrap();
         for (name, number, is_revoked) in [
             ("rover-1", 2, false),
             ("rover-2", 1, false),

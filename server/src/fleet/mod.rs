@@ -7,7 +7,7 @@
 
 mod access;
 mod changes;
-pub mod commands;
+mod commands;
 mod credentials;
 mod gate;
 mod inbox;
@@ -17,14 +17,15 @@ mod link_tests;
 #[cfg(test)]
 mod matrix;
 mod opening;
-pub mod presence;
+mod probe;
 mod publishers;
 mod pulse;
 mod rate_limits;
+mod received;
 mod requests;
 mod router;
 mod routers;
-pub mod teleop;
+mod teleop;
 #[cfg(test)]
 mod test_client;
 mod tokens;
@@ -38,14 +39,16 @@ use tokio::sync::{Mutex, mpsc};
 use tracing::info;
 use tread_api::wire::PAYLOAD_BYTES_MAX;
 
-use self::commands::{Commands, Network};
+use self::commands::ZenohCommands;
 use self::gate::Gate;
 use self::keeper::Keeper;
 use self::opening::{Opener, with_free_port};
 use self::routers::Routers;
-use self::teleop::Teleop;
+use self::teleop::ZenohDrive;
 use crate::app::App;
 use crate::app::ingest::Upload;
+use crate::app::robot_link::RobotLink;
+use crate::app::stops::STOP_CONFIRM_MAX;
 use crate::authority::Authorities;
 use crate::clock::Clock;
 use crate::supervisor::Supervisor;
@@ -177,18 +180,21 @@ impl Fleet {
         format!("{protocol}/{}", self.address)
     }
 
-    /// The way to command the robots that an app knows.
-    pub fn commands(&self, app: &App) -> Commands {
-        let network = Network {
-            routers: Arc::clone(&self.routers),
-            supervisor: self.supervisor.clone(),
-        };
-        Commands::new(Arc::new(network), Arc::clone(app.presences()))
-    }
-
-    /// The way of drive commands.
-    pub fn teleop(&self) -> Teleop {
-        Teleop::new(Arc::clone(&self.routers), self.supervisor.clone())
+    /// How use cases reach the robots of this network; they do as soon as it listens.
+    pub fn robot_link(&self) -> RobotLink {
+        let (routers, supervisor) = (&self.routers, &self.supervisor);
+        RobotLink {
+            commands: Arc::new(ZenohCommands {
+                routers: Arc::clone(routers),
+                supervisor: supervisor.clone(),
+            }),
+            drive: Arc::new(ZenohDrive {
+                routers: Arc::clone(routers),
+                supervisor: supervisor.clone(),
+            }),
+            supervisor: supervisor.clone(),
+            stop_confirm_max: STOP_CONFIRM_MAX,
+        }
     }
 
     /// Opens the router and begins to listen to robots, to beat the pulse and to look after the

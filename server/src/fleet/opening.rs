@@ -16,13 +16,13 @@ use zenoh::{Config, Session, Wait as _};
 use super::access::control;
 use super::credentials::{CredentialDerivation, Dictionary};
 use super::inbox::{self, Channels};
-use super::presence::RobotKey;
-use super::router;
+use super::probe;
 use super::routers::Router;
 use super::{
     ACCEPT_PENDING_MAX, BATCH_BYTES, FleetError, LEASE_MS, MESSAGE_BYTES_MAX, SEND_BUFFER_BYTES,
     SESSION_TIMEOUT, SESSIONS_MAX,
 };
+use crate::app::presence::RobotKey;
 use crate::authority::Authorities;
 use crate::supervisor::Supervisor;
 
@@ -93,7 +93,7 @@ impl Opener {
         let (number, address) = (router.number, router.address);
         let declaring = self.supervisor.blocking(move || {
             inbox::declare(&session, &channels, number)?;
-            router::declare_probe(&session)
+            probe::declare_probe(&session)
         });
         let reason = match declaring.await {
             Some(Ok(())) => return Ok(()),

@@ -9,7 +9,7 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use super::presence::RobotKey;
+use crate::app::presence::RobotKey;
 use crate::rate_limit::{Bucket, RateLimit};
 
 /// Robots that are kept track of; those that have been quiet are forgotten first.

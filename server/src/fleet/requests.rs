@@ -15,8 +15,8 @@ use tread_api::wire::{self, Refusal, RefusalCode};
 use zenoh::Wait as _;
 use zenoh::query::Query;
 
-use super::inbox::{Asked, count_refusal, explained, log_refusal, next, refuse_key};
 use super::rate_limits::RateLimits;
+use super::received::{Asked, count_refusal, explained, log_refusal, next, refuse_key};
 use crate::app::App;
 use crate::app::ingest::Upload;
 use crate::supervisor::Supervisor;
@@ -65,7 +65,7 @@ impl Replies {
 
     /// Reads a query's body, and checks that it names the robot of its key, and that this one may
     /// speak.
-    async fn read<T: DeserializeOwned>(
+    fn read<T: DeserializeOwned>(
         &self,
         query: &Query,
         robot_of: impl Fn(&T) -> &RobotId,
@@ -77,7 +77,7 @@ impl Replies {
         };
         // No reply is no delivery: a robot that joins again has lost nothing.
         let of = (site.clone(), robot.clone());
-        if !self.app.admits(&of).await {
+        if !self.app.admits(&of) {
             return None;
         }
         let payload = query
@@ -141,10 +141,7 @@ pub(super) async fn serve_hellos(
     stop: CancellationToken,
 ) {
     while let Some(asked) = next(&mut queries, &stop).await {
-        let Some((site, hello)) = replies
-            .read(&asked.query, |hello: &Hello| &hello.robot)
-            .await
-        else {
+        let Some((site, hello)) = replies.read(&asked.query, |hello: &Hello| &hello.robot) else {
             continue;
         };
         let app = replies.app.clone();
@@ -164,10 +161,7 @@ pub(super) async fn serve_uploads(
     stop: CancellationToken,
 ) {
     while let Some(asked) = next(&mut queries, &stop).await {
-        let Some((site, batch)) = replies
-            .read(&asked.query, |batch: &Batch| &batch.robot)
-            .await
-        else {
+        let Some((site, batch)) = replies.read(&asked.query, |batch: &Batch| &batch.robot) else {
             continue;
         };
         let outcome = batch.and_then(|batch| {

@@ -9,34 +9,20 @@ use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 use tracing::{error, warn};
 use tread_api::tunnel::RouterCredentials;
-use zenoh::{Session, Wait as _};
+use zenoh::Wait as _;
 
 use super::keeper::{Keeper, robots_on};
 use super::opening::client_config;
+use super::probe::PROBE_KEY;
 use super::routers::Router;
 use crate::supervisor::Supervisor;
 
-/// The key that the router answers itself on.
-pub(super) const PROBE_KEY: &str = "tread/self/probe";
 /// Time between two looks.
 pub(super) const PROBE_PERIOD: Duration = Duration::from_secs(10);
 /// How long one look may take, connection and all.
 const PROBE_TIMEOUT: Duration = Duration::from_secs(3);
 /// Looks in a row without an answer after which the router is opened again.
 const FAILURES_MAX: u32 = 3;
-
-/// Declares what the look asks. Blocks its thread.
-pub(super) fn declare_probe(session: &Session) -> zenoh::Result<()> {
-    session
-        .declare_queryable(PROBE_KEY)
-        .complete(true)
-        .callback(|query| {
-            // A full link drops the answer; the look counts that as none.
-            let _ = query.reply(PROBE_KEY, [1_u8]).wait();
-        })
-        .background()
-        .wait()
-}
 
 /// What the watch works on.
 pub(super) struct Watch {
@@ -153,7 +139,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
         let clock = Clock::system();
-        let app = App::new(
+        let app = App::without_robots(
             db,
             clock.clone(),
             FrictionConfig::default(),
@@ -212,7 +198,7 @@ mod tests {
     async fn a_router_that_no_longer_answers_is_opened_again_and_takes_robots() {
         let folder = tempfile::tempdir().unwrap();
         let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
-        let app = App::new(
+        let app = App::without_robots(
             db,
             Clock::system(),
             FrictionConfig::default(),

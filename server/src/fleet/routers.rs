@@ -13,7 +13,7 @@ use tokio::sync::watch;
 use zenoh::{Session, Wait as _};
 
 use super::credentials::CredentialDerivation;
-use super::presence::RobotKey;
+use crate::app::presence::RobotKey;
 
 /// One router.
 #[derive(Debug)]

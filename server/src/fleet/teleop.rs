@@ -11,35 +11,36 @@ use zenoh::Wait as _;
 use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
 
-use super::presence::RobotKey;
 use super::routers::Routers;
+use crate::app::presence::RobotKey;
+use crate::app::robot_link::{DrivePublisher, DriveTransport, Opening};
 use crate::supervisor::Supervisor;
 
-/// Opens lines to robots; clones open them through the same network.
-#[derive(Debug, Clone)]
-pub struct Teleop {
-    routers: Arc<Routers>,
-    supervisor: Supervisor,
+/// Opens publishers of drive commands on all routers of this server.
+#[derive(Debug)]
+pub(super) struct ZenohDrive {
+    pub(super) routers: Arc<Routers>,
+    pub(super) supervisor: Supervisor,
 }
 
-/// The way of drive commands to one robot, by whichever router it comes to be on.
+/// Publishes to one robot, by whichever router it comes to be on.
 #[derive(Debug)]
-pub struct Line {
+struct RobotPublisher {
     routers: Arc<Routers>,
     key: String,
-    ways: Mutex<Ways>,
+    declared: Mutex<Declared>,
 }
 
 /// One publisher on each router that was open at some version of their list.
 #[derive(Debug)]
-struct Ways {
+struct Declared {
     version: u64,
     publishers: Vec<Publisher<'static>>,
 }
 
-impl Ways {
+impl Declared {
     /// Declares the publishers. Blocks its thread, for a moment.
-    fn declare(routers: &Routers, key: &str) -> zenoh::Result<Self> {
+    fn on(routers: &Routers, key: &str) -> zenoh::Result<Self> {
         let version = routers.version();
         let declare = |session: &zenoh::Session| {
             session
@@ -59,62 +60,50 @@ impl Ways {
     }
 }
 
-impl Teleop {
-    pub(super) fn new(routers: Arc<Routers>, supervisor: Supervisor) -> Self {
-        Self {
-            routers,
-            supervisor,
-        }
-    }
-
-    /// Without a network: no line can be opened.
-    pub fn without_network(supervisor: Supervisor) -> Self {
-        Self {
-            routers: Arc::default(),
-            supervisor,
-        }
-    }
-
-    /// Opens the line to a robot; `None` if the network refuses.
-    pub async fn open(&self, (site, robot): &RobotKey) -> Option<Line> {
-        // Where the network is simulated, or a router is being opened again, there is no line.
-        self.routers.newest()?;
-        let key = keys::teleop(site, robot);
-        let (routers, of) = (Arc::clone(&self.routers), key.clone());
-        // Declaring blocks its thread.
-        let declared = self
-            .supervisor
-            .blocking(move || Ways::declare(&routers, &of));
-        match declared.await? {
-            Ok(ways) => Some(Line {
-                routers: Arc::clone(&self.routers),
-                key,
-                ways: Mutex::new(ways),
-            }),
-            Err(error) => {
-                warn!("cannot open the line of drive commands to `{robot}`: {error}");
-                None
+impl DriveTransport for ZenohDrive {
+    fn open(&self, (site, robot): &RobotKey) -> Opening {
+        let (key, robot) = (keys::teleop(site, robot), robot.clone());
+        let (routers, supervisor) = (Arc::clone(&self.routers), self.supervisor.clone());
+        Box::pin(async move {
+            // While a router is being opened again there is no network.
+            routers.newest()?;
+            let (on, of) = (Arc::clone(&routers), key.clone());
+            // Declaring blocks its thread.
+            let declared = supervisor.blocking(move || Declared::on(&on, &of));
+            match declared.await? {
+                Ok(declared) => {
+                    let declared = Mutex::new(declared);
+                    let publisher = RobotPublisher {
+                        routers,
+                        key,
+                        declared,
+                    };
+                    Some(Box::new(publisher) as Box<dyn DrivePublisher>)
+                }
+                Err(error) => {
+                    warn!("cannot publish drive commands to `{robot}`: {error}");
+                    None
+                }
             }
-        }
+        })
     }
 }
 
-impl Line {
-    /// Sends a command; it takes a millisecond at most, a few when there is a new router. Whether
-    /// the network took it.
-    pub fn send(&self, command: &DriveCommand) -> bool {
+impl DrivePublisher for RobotPublisher {
+    /// Takes a millisecond at most, a few when there is a new router.
+    fn publish(&self, command: &DriveCommand) -> bool {
         let Ok(payload) = wire::encode(command) else {
             return false;
         };
-        let mut ways = self.ways.lock().unwrap_or_else(PoisonError::into_inner);
-        if ways.version != self.routers.version() {
-            match Ways::declare(&self.routers, &self.key) {
-                Ok(present) => *ways = present,
+        let mut declared = self.declared.lock().unwrap_or_else(PoisonError::into_inner);
+        if declared.version != self.routers.version() {
+            match Declared::on(&self.routers, &self.key) {
+                Ok(present) => *declared = present,
                 Err(error) => debug!("cannot declare drive commands on a new router: {error}"),
             }
         }
         let mut is_taken = false;
-        for publisher in &ways.publishers {
+        for publisher in &declared.publishers {
             match publisher.put(payload.clone()).wait() {
                 Ok(()) => is_taken = true,
                 Err(error) => debug!("a drive command did not go out: {error}"),

@@ -12,7 +12,7 @@ use super::extract::{Json, Path, Query, cursor, page_limit};
 use super::identity::guard::Subject;
 use super::problem::Problem;
 use crate::app::App;
-use crate::db::alerts::AlertFilter;
+use crate::app::alerts::AlertFilter;
 
 /// Which alerts, and which page of them.
 #[derive(Debug, Clone, Deserialize, IntoParams)]

@@ -14,8 +14,8 @@ use super::extract::{Json, Path, Query, cursor, page_limit};
 use super::identity::guard::Subject;
 use super::problem::Problem;
 use crate::app::App;
+use crate::app::missions::MissionFilter;
 use crate::app::missions::idempotency::KEY_LENGTH_MAX;
-use crate::db::missions::MissionFilter;
 
 /// Which missions, and which page of them.
 #[derive(Debug, Clone, Deserialize, IntoParams)]

@@ -53,6 +53,7 @@ use self::identity::guard::{self, Guard};
 use self::identity::{audit, authority, browser, enrolment, session, tokens};
 use self::problem::{Problem, Refused};
 use crate::app::App;
+use crate::app::metrics::MEDIA_TYPE;
 use crate::identity::origin::Names;
 
 /// Largest body of `POST /v1/missions`: a path of the most waypoints.
@@ -238,9 +239,8 @@ pub fn metrics_router(app: App) -> Router {
 }
 
 async fn metrics(State(app): State<App>) -> Result<Response, Problem> {
-    let text = app.metrics().await;
-    let media_type = "text/plain; version=0.0.4";
-    Ok(([(axum::http::header::CONTENT_TYPE, media_type)], text).into_response())
+    let text = app.metrics_text().await;
+    Ok(([(axum::http::header::CONTENT_TYPE, MEDIA_TYPE)], text).into_response())
 }
 
 /// Notes how long each route takes.
@@ -252,9 +252,9 @@ async fn measure(State(app): State<App>, request: Request, next: Next) -> Respon
     let response = next.run(request).await;
     let took = app.clock().elapsed().saturating_sub(asked_at);
     let status = response.status().as_u16();
-    app.requests().note(&method, &route, status, took);
+    app.metrics().request(&method, &route, status, took);
     if let Some(Refused(kind)) = response.extensions().get() {
-        app.refusals().note(*kind);
+        app.metrics().request_refused(*kind);
     }
     response
 }

@@ -7,7 +7,7 @@ use tracing::error;
 use tread_api::problem::{PROBLEM_MEDIA_TYPE, ProblemBody, ProblemType};
 
 use crate::app::AppError;
-use crate::db::DbError;
+use crate::app::DbError;
 
 /// When a client should ask again after the server could not do its work, seconds.
 const RETRY_AFTER_S: u32 = 5;

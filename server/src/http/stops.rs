@@ -34,8 +34,8 @@ use super::identity::guard::{AuditSlot, Subject};
 use super::problem::Problem;
 use crate::app::App;
 use crate::app::identity::Credential;
+use crate::app::stops::StopFilter;
 use crate::app::stops::StopWords;
-use crate::db::stops::StopFilter;
 
 /// How long the body of a stop may take to arrive; then the stop goes without it.
 const STOP_BODY_TIMEOUT: Duration = Duration::from_millis(500);

@@ -71,7 +71,7 @@ impl Ground {
             .await
             .unwrap();
         let clock = Clock::manual(now());
-        let app = App::new(
+        let app = App::without_robots(
             db,
             clock,
             FrictionConfig::default(),
@@ -82,7 +82,7 @@ impl Ground {
         app.ensure_site(&site).await.unwrap();
         app.hello(&site, &hello(&robot, 1)).await.unwrap();
         let mission = app.create_mission(mission(&site, &robot)).await.unwrap();
-        let mut tx = app.db().read().await.unwrap();
+        let mut tx = app.db().read("test").await.unwrap();
         let site_pk = db::sites::find(&mut tx, &site).await.unwrap().unwrap().pk;
         let robot_pk = db::robots::pk_of(&mut tx, &site, &robot).await.unwrap();
         drop(tx);
@@ -104,7 +104,7 @@ impl Ground {
         &self,
         what: impl AsyncFnOnce(&mut Tx) -> Result<(), DbError>,
     ) -> Result<(), AppError> {
-        let mut tx = self.app.db().write().await?;
+        let mut tx = self.app.db().write("test").await?;
         what(&mut tx).await?;
         Ok(tx.commit().await?)
     }
@@ -143,7 +143,7 @@ impl Ground {
     /// The database is whole, holds what was acknowledged, and the map in memory is what it says.
     pub(crate) async fn check(&self) {
         assert_eq!(self.app.db().quick_check().await.unwrap(), None);
-        let mut tx = self.app.db().read().await.unwrap();
+        let mut tx = self.app.db().read("test").await.unwrap();
         let broken = sqlx::query("PRAGMA foreign_key_check")
             .fetch_all(&mut *tx)
             .await
@@ -161,7 +161,7 @@ impl Ground {
 
     /// Segments in the sums of the database.
     pub(crate) async fn segments_counted(&self) -> u64 {
-        let mut tx = self.app.db().read().await.unwrap();
+        let mut tx = self.app.db().read("test").await.unwrap();
         let mut counted = 0;
         db::sums::each(&mut tx, |row| counted += row.sums.segments)
             .await
@@ -183,7 +183,7 @@ impl Ground {
     }
 
     async fn said_after_a_restart(&self) -> String {
-        let restarted = App::new(
+        let restarted = App::without_robots(
             self.app.db().clone(),
             self.app.clock().clone(),
             FrictionConfig::default(),

@@ -148,7 +148,7 @@ async fn fill_and_empty(interposer: &Interposer) {
     };
     let recorded = async {
         loop {
-            let mut tx = server.app().db().read().await.unwrap();
+            let mut tx = server.app().db().read("test").await.unwrap();
             let found = tread_server::db::stops::list(&mut tx, &filter, 10)
                 .await
                 .unwrap();

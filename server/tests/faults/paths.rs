@@ -417,7 +417,7 @@ pub(crate) const PATHS: &[WritePath] = &[
 ];
 
 async fn open_missions(ground: &Ground) -> Result<Vec<MissionId>, AppError> {
-    let mut tx = ground.app.db().read().await?;
+    let mut tx = ground.app.db().read("test").await?;
     let open = db::missions::open_of_robot(&mut tx, ground.robot_pk).await?;
     let others = open.into_iter().map(|one| one.id);
     Ok(others.filter(|id| *id != ground.mission).collect())

@@ -20,6 +20,7 @@ use tread_api::wire::RefusalCode;
 use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::Record;
 use tread_server::app::App;
+use tread_server::app::stops::StopWords;
 use tread_server::db;
 use tread_server::db::stops::StopFilter;
 use uuid::Uuid;
@@ -199,7 +200,7 @@ async fn alerts_of_unconfirmed_stops_are_what_the_stops_say() {
     // As if the one could not be written down, and the other were left over from a stop that was
     // replaced.
     let code: AlertCode = "stop-unconfirmed".parse().unwrap();
-    let mut tx = app.db().write().await.unwrap();
+    let mut tx = app.db().write("test").await.unwrap();
     let pk = async |tx: &mut db::Tx, robot: &str| {
         let found = db::robots::pk_of(tx, &site(), &robot.parse().unwrap()).await;
         found.unwrap().unwrap()
@@ -228,7 +229,7 @@ async fn alerts_of_unconfirmed_stops_are_what_the_stops_say() {
 }
 
 async fn count(writer: &Writer, what: &'static str) -> i64 {
-    let mut tx = writer.app.db().read().await.unwrap();
+    let mut tx = writer.app.db().read("test").await.unwrap();
     let (count,): (i64,) = sqlx::query_as(what).fetch_one(&mut *tx).await.unwrap();
     count
 }
@@ -266,7 +267,7 @@ async fn a_robot_begins_few_runs_and_those_of_which_nothing_is_kept_are_forgotte
     let later = writer.upload_of("rover-1", boot(9_999), one(1)).await;
     assert_eq!(later.unwrap().committed, 1);
 
-    let mut tx = writer.app.db().write().await.unwrap();
+    let mut tx = writer.app.db().write("test").await.unwrap();
     let robot = "rover-2".parse().unwrap();
     let robot_pk = db::robots::pk_of(&mut tx, &site(), &robot).await;
     let robot_pk = robot_pk.unwrap().unwrap();
@@ -383,7 +384,7 @@ async fn a_robot_raises_few_alerts_and_the_oldest_that_are_over_are_forgotten() 
         }
     })
     .await;
-    let mut tx = app.db().write().await.unwrap();
+    let mut tx = app.db().write("test").await.unwrap();
     let robot_pk = db::robots::pk_of(&mut tx, &site(), &robot.id).await;
     let robot_pk = robot_pk.unwrap().unwrap();
     db::alerts::forget(&mut tx, robot_pk, 5).await.unwrap();
@@ -405,7 +406,7 @@ async fn a_stop_does_not_stand_before_it_was_confirmed_in_whatever_order_that_is
         "clear_asked_by": null, "clear_asked_at": null, "cleared_at": null,
     }))
     .unwrap();
-    let mut tx = writer.app.db().write().await.unwrap();
+    let mut tx = writer.app.db().write("test").await.unwrap();
     db::stops::insert(&mut tx, std::slice::from_ref(&stop), 10)
         .await
         .unwrap();
@@ -420,7 +421,7 @@ async fn a_stop_does_not_stand_before_it_was_confirmed_in_whatever_order_that_is
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_stop_that_is_written_down_late_is_history_and_of_history_the_newest_is_kept() {
     let writer = Writer::start().await;
-    let mut tx = writer.app.db().write().await.unwrap();
+    let mut tx = writer.app.db().write("test").await.unwrap();
     let stop = |number: u32, second: u32| -> Stop {
         serde_json::from_value(json!({
             "id": Uuid::from_u128(u128::from(number)), "site": "yard", "robot": "rover-1",
@@ -564,4 +565,19 @@ async fn of_several_open_stops_of_a_robot_the_newest_stays_open() {
         .await
         .unwrap();
     assert_eq!(measured, [(2, 1)]);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_is_recorded_and_shown_unconfirmed_while_no_robot_is_reached() {
+    let writer = Writer::start().await;
+    let (site, robot) = (site(), "rover-1".parse().unwrap());
+    let asked = writer.app.stop_robot(&site, &robot, StopWords::default());
+    let stop = asked.await.unwrap();
+    assert!(stop.unconfirmed, "{stop:?}");
+    eventually("the database has the stop", async || {
+        let mut tx = writer.app.db().read("test").await.unwrap();
+        let found = db::stops::find(&mut tx, stop.id).await;
+        found.unwrap().ok_or("not yet")
+    })
+    .await;
 }

@@ -101,7 +101,7 @@ async fn a_mission_that_does_not_read_keeps_no_other_from_being_told() {
     })
     .await;
     let damaged = missions.remove(4);
-    let mut tx = yard.server.app().db().write().await.unwrap();
+    let mut tx = yard.server.app().db().write("test").await.unwrap();
     sqlx::query("UPDATE missions SET trajectory = '{' WHERE id = ?")
         .bind(damaged.to_string())
         .execute(&mut *tx)

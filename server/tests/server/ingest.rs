@@ -39,7 +39,7 @@ impl Writer {
         let folder = tempfile::tempdir().unwrap();
         let db = Db::open(&database(folder.path())).await.unwrap();
         let clock = Clock::manual(time("2026-11-01T00:00:00Z"));
-        let app = App::new(
+        let app = App::without_robots(
             db,
             clock,
             FrictionConfig::default(),
@@ -116,7 +116,7 @@ impl Writer {
     }
 
     pub(crate) async fn sums(&self) -> Vec<SumRow> {
-        let mut tx = self.app.db().read().await.unwrap();
+        let mut tx = self.app.db().read("test").await.unwrap();
         let mut rows = Vec::new();
         let taken = db::sums::each(&mut tx, |row| rows.push(row)).await;
         taken.unwrap();
@@ -353,7 +353,7 @@ async fn times_of_a_wrong_clock_are_put_right_and_nothing_of_it_is_lost() {
         };
         writer.uploads.send(upload).await.unwrap();
         assert_eq!(answered.await.unwrap().unwrap().committed, 1);
-        let mut tx = writer.app.db().read().await.unwrap();
+        let mut tx = writer.app.db().read("test").await.unwrap();
         let text: String = sqlx::query_scalar("SELECT measurement FROM segments WHERE seq = ?")
             .bind(i64::from(number))
             .fetch_one(&mut *tx)

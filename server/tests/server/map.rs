@@ -243,7 +243,7 @@ async fn a_robot_that_is_withdrawn_leaves_the_map_as_if_it_had_never_come() {
 /// What a server has in memory that starts now on the same database.
 pub(crate) async fn restarted(app: &App) -> App {
     let config = FrictionConfig::default();
-    let restarted = App::new(
+    let restarted = App::without_robots(
         app.db().clone(),
         app.clock().clone(),
         config,
@@ -287,7 +287,7 @@ async fn old_hours_are_merged_into_days_and_a_kill_on_the_way_changes_nothing_th
     let mut rounds = 0;
     loop {
         // What a server would say that was killed here and started again.
-        let restarted = App::new(
+        let restarted = App::without_robots(
             app.db().clone(),
             app.clock().clone(),
             FrictionConfig::default(),

@@ -33,7 +33,7 @@ async fn a_second_server_on_the_same_database_is_refused_until_the_first_has_sto
 /// Overwrites the page that a table or an index begins at.
 async fn damage(yard: &Yard, table: &'static str) {
     let db = yard.server.app().db();
-    let mut tx = db.read().await.unwrap();
+    let mut tx = db.read("test").await.unwrap();
     let (page,): (i64,) = sqlx::query_as("SELECT rootpage FROM sqlite_schema WHERE name = ?")
         .bind(table)
         .fetch_one(&mut *tx)

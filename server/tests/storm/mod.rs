@@ -15,7 +15,7 @@ mod safety;
 mod samples;
 
 use std::collections::HashSet;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -30,15 +30,15 @@ use tread_api::wire::ingest::MissionPhase;
 use tread_api::wire::state::RobotState;
 use tread_server::app::ingest::{Upload, Writer};
 use tread_server::app::reconciler::Reconciler;
-use tread_server::app::{App, AppError};
+use tread_server::app::robot_link::RobotLink;
+use tread_server::app::{App, AppError, Dependencies};
 use tread_server::clock::Clock;
 use tread_server::config::{FrictionConfig, StorageConfig};
 use tread_server::db::Db;
-use tread_server::fleet::commands::Commands;
 use tread_server::supervisor::Supervisor;
 
 use self::dice::Dice;
-use self::network::{LATE_MAX, Late, Network, Shared, World, with};
+use self::network::{LATE_MAX, Late, Shared, World, with};
 use self::reference::Reference;
 use self::robot::Robot;
 use self::samples::{circle, model};
@@ -64,14 +64,16 @@ struct Storm {
     boots: u64,
 }
 
-async fn app_on(path: &std::path::Path, clock: &Clock, site: &SiteId) -> App {
-    let db = Db::open(path).await.expect("the database opens");
-    let app = App::new(
-        db,
-        clock.clone(),
-        FrictionConfig::default(),
-        StorageConfig::default(),
-    );
+async fn app_on(path: &Path, clock: &Clock, site: &SiteId, robots: RobotLink) -> App {
+    let app = App::new(Dependencies {
+        db: Db::open(path).await.expect("the database opens"),
+        clock: clock.clone(),
+        friction: FrictionConfig::default(),
+        storage: StorageConfig::default(),
+        normalisations: Vec::new(),
+        robots,
+        enrolment: None,
+    });
     app.ensure_site(site).await.expect("the site is made");
     app
 }
@@ -111,14 +113,10 @@ impl Storm {
             wrong: None,
         }));
         let supervisor = Supervisor::new();
-        let app = app_on(&path, &clock, &site).await;
-        let commands = Commands::new(
-            Arc::new(Network(Arc::clone(&world))),
-            Arc::clone(app.presences()),
-        );
-        safety::connect(&app, commands.clone(), &supervisor);
+        let robots = safety::robot_link(&world, &supervisor);
+        let app = app_on(&path, &clock, &site, robots).await;
         let mut storm = Self {
-            reconciler: Reconciler::new(app.clone(), commands, supervisor.clone()),
+            reconciler: Reconciler::new(app.clone()),
             writer: Writer::new(app.clone()),
             world,
             clock,
@@ -370,14 +368,10 @@ impl Storm {
 
     async fn restart_server(&mut self) {
         self.app.db().close().await;
-        self.app = app_on(&self.path, &self.clock, &self.site).await;
+        let robots = safety::robot_link(&self.world, &self.supervisor);
+        self.app = app_on(&self.path, &self.clock, &self.site, robots).await;
         self.writer = Writer::new(self.app.clone());
-        let commands = Commands::new(
-            Arc::new(Network(Arc::clone(&self.world))),
-            Arc::clone(self.app.presences()),
-        );
-        safety::connect(&self.app, commands.clone(), &self.supervisor);
-        self.reconciler = Reconciler::new(self.app.clone(), commands, self.supervisor.clone());
+        self.reconciler = Reconciler::new(self.app.clone());
         for index in 0..ROBOTS {
             if with(&self.world, |world| world.robots[index].linked) {
                 self.greet(index).await;

@@ -8,8 +8,8 @@ use tread_api::keys::Verb;
 use tread_api::wire;
 use tread_api::wire::command::{Offer, Pause};
 use tread_api::wire::state::RobotState;
-use tread_server::fleet::commands::{Carrier, Carrying};
-use tread_server::fleet::presence::RobotKey;
+use tread_server::app::presence::RobotKey;
+use tread_server::app::robot_link::{Answering, CommandTransport};
 
 use super::dice::Dice;
 use super::robot::Robot;
@@ -68,14 +68,14 @@ pub(super) fn with<T>(world: &Shared, act: impl FnOnce(&mut World) -> T) -> T {
 #[derive(Debug)]
 pub(super) struct Network(pub(super) Shared);
 
-impl Carrier for Network {
-    fn carry(
+impl CommandTransport for Network {
+    fn send(
         &self,
         (_, robot): &RobotKey,
         run: Option<BootId>,
         verb: Verb,
         payload: Vec<u8>,
-    ) -> Carrying {
+    ) -> Answering {
         let answer = with(&self.0, |world| {
             world.check_sent(verb, &payload);
             let index = world.robots.iter().position(|here| here.id == *robot)?;

@@ -16,7 +16,7 @@ pub(super) struct Reference {
 impl Reference {
     /// Reads what the server wrote, and checks it.
     pub(super) async fn follow(&mut self, db: &Db) -> Result<(), String> {
-        let mut tx = db.read().await.map_err(|error| error.to_string())?;
+        let mut tx = db.read("test").await.map_err(|error| error.to_string())?;
         let steps = db::history::steps_after(&mut tx, self.last_step, 10_000).await;
         drop(tx);
         for (pk, step) in steps.map_err(|error| error.to_string())? {

@@ -1,5 +1,6 @@
 //! People who stop robots, clear their stops, and drive them by hand in the middle of it all.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use tread_api::ids::MissionId;
@@ -8,16 +9,14 @@ use tread_api::safety::Driver;
 use tread_api::stop::Stop;
 use tread_api::wire;
 use tread_api::wire::safety::{LeaseAction, LeaseCommand};
+use tread_server::app::robot_link::{CommandTransport as _, RobotLink};
 use tread_server::app::stops::StopWords;
-use tread_server::app::{App, Links};
 use tread_server::db;
 use tread_server::db::stops::StopFilter;
-use tread_server::fleet::commands::{Carrier as _, Commands};
-use tread_server::fleet::teleop::Teleop;
 use tread_server::supervisor::Supervisor;
 use uuid::Uuid;
 
-use super::network::{Network, with};
+use super::network::{Network, Shared, with};
 use super::{Storm, allowed};
 
 /// Stops that are looked at; a storm has fewer robots.
@@ -27,14 +26,13 @@ const SETTLING_LOOKS_MAX: usize = 10_000;
 /// An answer is there at once or never.
 const CONFIRM_MAX: Duration = Duration::from_millis(1);
 
-/// Gives the use cases the way to the simulated robots.
-pub(super) fn connect(app: &App, commands: Commands, supervisor: &Supervisor) {
-    app.connect(Links {
-        commands,
-        teleop: Teleop::without_network(supervisor.clone()),
-        supervisor: supervisor.clone(),
+/// How the use cases reach the simulated robots.
+pub(super) fn robot_link(world: &Shared, supervisor: &Supervisor) -> RobotLink {
+    RobotLink {
+        commands: Arc::new(Network(Arc::clone(world))),
         stop_confirm_max: CONFIRM_MAX,
-    });
+        ..RobotLink::unconnected(supervisor.clone())
+    }
 }
 
 fn text(error: impl std::fmt::Debug) -> String {
@@ -62,7 +60,7 @@ impl Storm {
     /// Waits until a stop is written down with what became of it: that is done beside the answer.
     async fn is_settled(&self, stop: &Stop) -> Result<(), String> {
         for _ in 0..SETTLING_LOOKS_MAX {
-            let mut tx = self.app.db().read().await.map_err(text)?;
+            let mut tx = self.app.db().read("test").await.map_err(text)?;
             let found = db::stops::find(&mut tx, stop.id).await.map_err(text)?;
             let alerts = db::alerts::raised(&mut tx, STOPS_MAX).await.map_err(text)?;
             drop(tx);
@@ -126,7 +124,7 @@ impl Storm {
         let payload = wire::encode(&command).expect("it can be written");
         let network = Network(std::sync::Arc::clone(&self.world));
         // It is carried when it is called; nobody waits for the answer.
-        drop(network.carry(&(self.site.clone(), robot), None, Verb::Lease, payload));
+        drop(network.send(&(self.site.clone(), robot), None, Verb::Lease, payload));
     }
 
     /// Somebody lets a mission go on.

@@ -16,7 +16,7 @@ pub mod roll;
 mod rotation;
 
 use std::net::IpAddr;
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
@@ -63,12 +63,28 @@ pub struct Office {
 }
 
 /// What is known of robots that have joined.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Membership {
     pub(super) roll: Arc<Roll>,
-    office: OnceLock<Office>,
+    office: Option<Office>,
     outsiders: Outsiders,
     shown: Shown,
+}
+
+impl Membership {
+    /// With an authority only robots that have joined may speak.
+    pub(super) fn new(office: Option<Office>) -> Self {
+        let roll = Arc::<Roll>::default();
+        if office.is_some() {
+            roll.close();
+        }
+        Self {
+            roll,
+            office,
+            outsiders: Outsiders::default(),
+            shown: Shown::default(),
+        }
+    }
 }
 
 /// Why a robot gets no certificate. Who asks is told no more than that.
@@ -171,15 +187,8 @@ impl App {
         &self.membership().roll
     }
 
-    /// From now on robots join by this authority, and only those that have joined may speak; the
-    /// first time counts.
-    pub fn open_office(&self, office: Office) {
-        let _ = self.membership().office.set(office);
-        self.roll().close();
-    }
-
     fn office(&self) -> Option<&Office> {
-        self.membership().office.get()
+        self.membership().office.as_ref()
     }
 
     /// Learns from the database who has joined.
@@ -187,7 +196,7 @@ impl App {
     /// # Errors
     /// The database failed.
     pub async fn know_enrolments(&self) -> Result<(), AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("enrolment").await?;
         for enrolment in db::enrolments::all_newest(&mut tx).await? {
             self.roll().note(&enrolment);
         }
@@ -216,7 +225,7 @@ impl App {
         }
         let now = self.clock().now();
         let span = SignedDuration::from_mins(i64::from(minutes));
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("enrolment").await?;
         site_row(&mut tx, &request.site).await?;
         let valid_count = db::join_tokens::valid_count(&mut tx, now).await?;
         if usize::try_from(valid_count).is_ok_and(|count| count >= JOIN_TOKENS_MAX) {
@@ -255,7 +264,7 @@ impl App {
         before: Option<JoinTokenId>,
         limit: u32,
     ) -> Result<Page<JoinToken>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("enrolment").await?;
         let tokens = db::join_tokens::list(&mut tx, within, before, limit + 1).await?;
         Ok(page(tokens, limit, |token| token.id.to_string()))
     }
@@ -265,7 +274,7 @@ impl App {
         &self,
         id: JoinTokenId,
     ) -> Result<Option<(SiteId, Option<RobotId>)>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("enrolment").await?;
         let found = db::join_tokens::find(&mut tx, id).await?;
         Ok(found.map(|token| (token.site, token.robot)))
     }
@@ -275,7 +284,7 @@ impl App {
     /// # Errors
     /// [`AppError::UnknownJoinToken`].
     pub async fn revoke_join_token(&self, id: JoinTokenId) -> Result<JoinToken, AppError> {
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("enrolment").await?;
         db::join_tokens::revoke(&mut tx, id, self.clock().now()).await?;
         let found = db::join_tokens::find(&mut tx, id).await?;
         let token = found.ok_or(AppError::UnknownJoinToken(id))?;
@@ -290,7 +299,7 @@ impl App {
         after: &str,
         limit: u32,
     ) -> Result<Page<Enrolment>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("enrolment").await?;
         site_row(&mut tx, site).await?;
         let named = within.limit_of(site);
         let found = db::enrolments::list(&mut tx, (site, named.as_ref()), after, limit + 1).await?;
@@ -308,7 +317,7 @@ impl App {
         robot: &RobotId,
         revoked_by: &str,
     ) -> Result<Enrolment, AppError> {
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("enrolment").await?;
         db::enrolments::revoke(&mut tx, (site, robot), revoked_by, self.clock().now()).await?;
         let found = db::enrolments::newest(&mut tx, site, robot).await?;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
@@ -381,7 +390,7 @@ impl App {
     /// write.
     async fn is_join_token(&self, secret: &Secret) -> Result<bool, AppError> {
         let _turn = self.look_up_turn(Purpose::Other).await?;
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("enrolment").await?;
         let fingerprint = secret.fingerprint();
         let kept = db::join_tokens::by_lookup(&mut tx, &fingerprint).await?;
         Ok(kept.is_some_and(|kept| fingerprint.matches(&kept.hash)))
@@ -395,7 +404,7 @@ impl App {
         key: &RobotRequest,
     ) -> Result<Enrolled, EnrolError> {
         let now = self.clock().now();
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("enrolment").await?;
         let fingerprint = secret.fingerprint();
         let kept = db::join_tokens::by_lookup(&mut tx, &fingerprint).await?;
         let kept = kept.filter(|kept| fingerprint.matches(&kept.hash));
@@ -486,18 +495,18 @@ impl App {
         proven.map_err(EnrolError::Certificate)?;
         let name = present.name();
         if present.is_retired() {
-            self.note_retired(name).await;
+            self.note_retired(name);
             return Err(EnrolError::Retired(name.clone()));
         }
         let certificate = office.sign(&trusted, &key, name, self.clock().machine_time())?;
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("enrolment").await?;
         let enrolment = (&name.site, &name.robot, name.enrolment);
         let expires_at = certificate.expires_at;
         let issuer = present.issuer();
         if !db::enrolments::renew(&mut tx, enrolment, now, expires_at, issuer).await? {
             drop(tx);
             let key = (name.site.clone(), name.robot.clone());
-            self.note_outsider(&key).await;
+            self.note_outsider(&key);
             return Err(EnrolError::Ended(name.clone()));
         }
         tx.commit().await?;

@@ -8,10 +8,10 @@ use tread_api::enrolment::Enrolment;
 use tread_api::robot::{Alert, Severity};
 
 use super::roll::Standing;
+use crate::app::presence::RobotKey;
 use crate::app::{App, AppError};
 use crate::authority::RobotName;
 use crate::db::{self, Tx};
-use crate::fleet::presence::RobotKey;
 
 /// What is raised about a robot that was put out and is still there.
 pub(in crate::app) const REVOKED_ALERT: &str = "revoked-robot";
@@ -43,14 +43,14 @@ impl Outsiders {
 
 impl App {
     /// Whether a message of a robot counts; counts and tells of it if not.
-    pub async fn admits(&self, key: &RobotKey) -> bool {
+    pub fn admits(&self, key: &RobotKey) -> bool {
         if self.roll().may_speak(key) {
             return true;
         }
         match self.roll().standing(key) {
             Some(_) => {
                 self.counters().refused_revoked_robot.one();
-                self.note_outsider(key).await;
+                self.note_outsider(key);
             }
             None => self.counters().refused_unenrolled_robot.one(),
         }
@@ -58,28 +58,28 @@ impl App {
     }
 
     /// Tells of a robot that was put out and is still there.
-    pub async fn note_outsider(&self, key: &RobotKey) {
+    pub fn note_outsider(&self, key: &RobotKey) {
         let is_out = matches!(self.roll().standing(key), Some(Standing::Revoked(_)));
         if is_out {
             let text = "it was put out of the fleet and still tries to connect".to_owned();
-            self.tell(key, REVOKED_ALERT, text).await;
+            self.tell(key, REVOKED_ALERT, text);
         }
     }
 
     /// Tells of a robot whose certificate is of an authority that was retired.
-    pub(super) async fn note_retired(&self, name: &RobotName) {
+    pub(super) fn note_retired(&self, name: &RobotName) {
         let key = (name.site.clone(), name.robot.clone());
         if self.roll().is_in_force(&key, name.enrolment) {
             let text =
                 "its certificate is of an authority that was retired; it must join again by a \
                         join token that names it"
                     .to_owned();
-            self.tell(&key, RETIRED_ALERT, text).await;
+            self.tell(&key, RETIRED_ALERT, text);
         }
     }
 
     /// Logs what is said of a robot and raises an alert, not too often.
-    async fn tell(&self, key: &RobotKey, code: &'static str, text: String) {
+    fn tell(&self, key: &RobotKey, code: &'static str, text: String) {
         let outsiders = &self.membership().outsiders;
         if !outsiders.is_due(key, self.clock().elapsed()) {
             return;
@@ -92,11 +92,8 @@ impl App {
                 app.log_failure("raise an alert about a robot that may not connect", &error);
             }
         };
-        match self.links() {
-            // Whoever reads the messages of all robots does not wait for the database.
-            Some(links) => links.supervisor.spawn_passing("outsider", raising),
-            None => raising.await,
-        }
+        // Whoever reads the messages of all robots does not wait for the database.
+        self.supervisor().spawn_passing("outsider", raising);
     }
 
     async fn raise_outsider(
@@ -105,7 +102,7 @@ impl App {
         code: &'static str,
         text: String,
     ) -> Result<(), AppError> {
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("enrolment").await?;
         let Some(robot_pk) = robot_pk(&mut tx, key).await? else {
             return Ok(());
         };

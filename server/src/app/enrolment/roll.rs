@@ -7,7 +7,7 @@ use std::sync::{PoisonError, RwLock};
 use tokio::sync::watch;
 use tread_api::enrolment::Enrolment;
 
-use crate::fleet::presence::RobotKey;
+use crate::app::presence::RobotKey;
 
 /// What a robot's newest enrolment says of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

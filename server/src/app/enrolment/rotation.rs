@@ -11,10 +11,10 @@ use tracing::{info, warn};
 use tread_api::enrolment::{AuthorityRotation, FleetAuthority, RobotLeft, TrustId};
 use tread_api::robot::LinkState;
 
+use crate::app::presence::RobotKey;
 use crate::app::{App, AppError};
 use crate::authority::{Authorities, RotationError, Trusted};
 use crate::db;
-use crate::fleet::presence::RobotKey;
 
 /// Most robots that are listed as left.
 const LEFT_LISTED_MAX: usize = 1_000;
@@ -90,7 +90,7 @@ impl App {
 
     /// How many robots have shown a certificate of an authority, and who has not.
     async fn moved_and_left(&self, signing: &str) -> Result<(usize, Vec<RobotLeft>), AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("enrolment").await?;
         let newest = db::enrolments::all_newest(&mut tx).await?;
         drop(tx);
         let now = self.clock().elapsed();
@@ -162,7 +162,7 @@ impl App {
             return;
         }
         let writing = async {
-            let mut tx = self.db().write().await?;
+            let mut tx = self.db().write("enrolment").await?;
             let one = (&robot.0, &robot.1, enrolment);
             db::enrolments::note_authority(&mut tx, one, authority).await?;
             tx.commit().await?;

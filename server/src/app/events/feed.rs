@@ -10,9 +10,9 @@ use tread_api::robot::{Alert, Robot};
 
 use super::super::{App, AppError};
 use super::ROBOTS_MAX;
+use crate::app::presence::RobotKey;
 use crate::db::robots::RobotRow;
 use crate::db::{self, DbError};
-use crate::fleet::presence::RobotKey;
 
 /// How often robots are looked at.
 pub const FEED_PERIOD: Duration = Duration::from_millis(100);
@@ -69,7 +69,7 @@ impl Feed {
     }
 
     async fn steps(&mut self) -> Result<(), AppError> {
-        let mut tx = self.app.db().read().await?;
+        let mut tx = self.app.db().read("events").await?;
         let Some(mut last) = self.last_step else {
             // What was before the start is in every snapshot.
             self.last_step = Some(db::history::newest_step(&mut tx).await?);
@@ -106,7 +106,7 @@ impl Feed {
             let has_ended = self.moved.remove(&id).unwrap_or_default();
             let Some(row) = row else { continue };
             if has_ended {
-                self.app.mission_durations().note(&row.mission);
+                self.app.record_duration(&row.mission);
             }
             let mission = self.app.with_progress(row.mission);
             let robot = (mission.site.clone(), mission.robot.clone());
@@ -164,7 +164,7 @@ impl Feed {
     }
 
     async fn read_rows(&self) -> Result<Rows, AppError> {
-        let mut tx = self.app.db().read().await?;
+        let mut tx = self.app.db().read("events").await?;
         let mut rows = Rows::new();
         for row in db::robots::all(&mut tx, ROBOTS_MAX).await? {
             let key = (row.site.clone(), row.id.clone());

@@ -1,6 +1,6 @@
 //! The clients of the feed with their bounded buffers, and the newest events.
 
-use std::collections::{HashMap, HashSet, VecDeque};
+use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -11,12 +11,11 @@ use tokio_util::sync::CancellationToken;
 use tracing::info;
 use tread_api::event::{Event, Topic};
 use tread_api::friction::MapChange;
-use tread_api::ids::{RobotId, SiteId};
-use tread_api::rights::Scope;
 use tread_api::robot::Alert;
 
+use super::sent::{About, EventFilter, Sent, unnumbered};
 use super::snapshot::{SNAPSHOT_READ_MAX, Snapshots};
-use crate::fleet::presence::RobotKey;
+use crate::app::presence::RobotKey;
 
 /// Events that wait for one client.
 pub const CLIENT_BUFFER: usize = 4_096;
@@ -28,61 +27,6 @@ pub const KEPT_EVENTS_MAX: usize = 8_192;
 pub const KEPT_BYTES_MAX: usize = 32 * 1024 * 1024;
 /// How long a client that was dropped may take to read its end.
 const LINGER: Duration = Duration::from_secs(5);
-
-/// One event, ready to be sent.
-#[derive(Debug)]
-pub struct Sent {
-    /// What a client gives back as `Last-Event-ID`; `None` within a snapshot.
-    pub id: Option<String>,
-    /// Its name.
-    pub name: &'static str,
-    /// Its body, JSON on one line.
-    pub text: String,
-    pub(super) seq: u64,
-    pub(super) topic: Option<Topic>,
-    pub(super) about: Option<About>,
-}
-
-/// What an event is about: a robot of a site, or the site as a whole.
-pub(super) type About = (SiteId, Option<RobotId>);
-
-/// What a client wants to hear of; what is empty lets everything through.
-#[derive(Debug, Clone, Default)]
-pub struct EventFilter {
-    /// Only these topics.
-    pub topics: HashSet<Topic>,
-    /// Only this site.
-    pub site: Option<SiteId>,
-    /// Only these robots.
-    pub robots: HashSet<RobotId>,
-    /// Only what is in this scope, and what is about the server.
-    pub within: Scope,
-}
-
-impl EventFilter {
-    pub(super) fn lets_through(&self, topic: Option<Topic>, about: Option<&About>) -> bool {
-        let of_topic = topic.is_none_or(|topic| self.wants(topic));
-        let is_about = |about: &About| match about {
-            (site, Some(robot)) => self.wants_robot(site, robot),
-            // What is no robot's is of whoever asks for its topic or for everything.
-            (site, None) => {
-                self.site.as_ref().is_none_or(|wanted| wanted == site)
-                    && self.within.includes_site(site)
-            }
-        };
-        of_topic && about.is_none_or(is_about)
-    }
-
-    pub(super) fn wants(&self, topic: Topic) -> bool {
-        self.topics.is_empty() || self.topics.contains(&topic)
-    }
-
-    pub(super) fn wants_robot(&self, site: &SiteId, robot: &RobotId) -> bool {
-        self.site.as_ref().is_none_or(|wanted| wanted == site)
-            && (self.robots.is_empty() || self.robots.contains(robot))
-            && self.within.includes_robot(site, robot)
-    }
-}
 
 /// The clients, and the newest events.
 #[derive(Debug)]
@@ -286,16 +230,5 @@ impl Hub {
         let missed = state.kept.iter().filter(|event| event.seq > seq);
         let wanted = missed.filter(|event| filter.lets_through(event.topic, event.about.as_ref()));
         Some(wanted.cloned().collect())
-    }
-}
-
-pub(super) fn unnumbered(event: &Event, topic: Option<Topic>, about: Option<About>) -> Sent {
-    Sent {
-        id: None,
-        name: event.name(),
-        text: serde_json::to_string(event).unwrap_or_default(),
-        seq: 0,
-        topic,
-        about,
     }
 }

@@ -16,11 +16,11 @@ use tread_api::robot::Alert;
 
 use super::super::{App, AppError};
 use super::ROBOTS_MAX;
-use super::hub::{EventFilter, Sent, unnumbered};
+use super::sent::{EventFilter, Sent, unnumbered};
+use crate::app::presence::RobotKey;
 use crate::db;
 use crate::db::alerts::AlertFilter;
 use crate::db::missions::MissionFilter;
-use crate::fleet::presence::RobotKey;
 
 /// How old a snapshot may be that another client gets too.
 const SHARED_FOR: Duration = Duration::from_millis(100);
@@ -157,7 +157,7 @@ impl App {
             let about = robot.map(|(site, robot)| (site, Some(robot)));
             events.push(unnumbered(event, Some(topic), about));
         };
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("events").await?;
         let alerts = db::alerts::raised(&mut tx, ROBOTS_MAX).await?;
         if filter.wants(Topic::Robots) {
             let mut of_robots: HashMap<RobotKey, Vec<Alert>> = HashMap::new();

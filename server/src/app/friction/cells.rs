@@ -113,7 +113,7 @@ impl App {
         } = cells;
         let reading = Reading::new(self, asked)?;
         let after = cursor.map(read_cursor).transpose()?;
-        let row = site_row(&mut self.db().read().await?, site).await?;
+        let row = site_row(&mut self.db().read("friction").await?, site).await?;
         let reading = reading.of_site(self, &row);
         let grid = row.site.grid;
         let factor = factor(&grid, resolution_m)?;
@@ -223,7 +223,7 @@ impl App {
             });
         }
         let after = cells.cursor.map(read_cursor).transpose()?;
-        let row = site_row(&mut self.db().read().await?, site).await?;
+        let row = site_row(&mut self.db().read("friction").await?, site).await?;
         let late = late.of_site(self, &row);
         let early = late.at(from).of_site(self, &row);
         let early_us = early.now_us;

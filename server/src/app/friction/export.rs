@@ -64,7 +64,7 @@ impl App {
         ) -> Result<Box<dyn Writer<CellFriction>>, TableError>,
     ) -> Result<CellExport, AppError> {
         let reading = Reading::new(self, &asked.asked)?;
-        let row = site_row(&mut self.db().read().await?, site).await?;
+        let row = site_row(&mut self.db().read("friction").await?, site).await?;
         let reading = reading.of_site(self, &row);
         let grid = row.site.grid;
         let factor = factor(&grid, asked.resolution_m)?;
@@ -103,7 +103,7 @@ impl App {
         filter: SegmentFilter,
         writer: Box<dyn Writer<StoredSegment>>,
     ) -> Result<SegmentExport, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("friction").await?;
         let row = site_row(&mut tx, site).await?;
         let extent = db::segments::extent(&mut tx, row.pk, &filter).await?;
         let state = format!("{extent:?} {filter:?} {site}");
@@ -194,7 +194,7 @@ impl SegmentExport {
     pub async fn next(self) -> Result<Option<(Vec<u8>, Self)>, AppError> {
         let mut found = Vec::new();
         if matches!(self.stage, Stage::Entries) {
-            let mut tx = self.app.db().read().await?;
+            let mut tx = self.app.db().read("friction").await?;
             found = db::segments::list(&mut tx, self.site_pk, &self.filter, SEGMENTS_PIECE).await?;
         }
         let app = self.app.clone();

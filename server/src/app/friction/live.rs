@@ -62,7 +62,7 @@ impl App {
     }
 
     async fn tell_changes(&self, told: &mut HashMap<i64, Told>) -> Result<(), AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("friction").await?;
         let rows = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         drop(tx);
         for row in rows {

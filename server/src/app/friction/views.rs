@@ -63,7 +63,7 @@ impl App {
         if let Some(view) = self.views().sites.find(generation, site) {
             return Ok(view);
         }
-        let view = SiteView::read(&mut self.db().read().await?, site).await?;
+        let view = SiteView::read(&mut self.db().read("friction").await?, site).await?;
         Ok(self.views().sites.keep(generation, site.clone(), view))
     }
 
@@ -78,7 +78,8 @@ impl App {
         if let Some(row) = self.views().robots.find(generation, &key) {
             return Ok(Some(row));
         }
-        let found = db::robots::find(&mut *self.db().read().await?, site_pk, robot).await?;
+        let found =
+            db::robots::find(&mut *self.db().read("friction").await?, site_pk, robot).await?;
         Ok(found.map(|row| self.views().robots.keep(generation, key, row)))
     }
 }

@@ -30,7 +30,7 @@ use tread_api::page::Page;
 
 use crate::app::{App, AppError, page};
 use crate::db;
-use crate::db::audit::AuditFilter;
+pub use crate::db::audit::AuditFilter;
 use crate::rate_limit::{Bucket, RateLimit};
 
 /// Entries that may wait for the writer.
@@ -334,14 +334,14 @@ impl App {
         filter: &AuditFilter,
         limit: u32,
     ) -> Result<Page<AuditEntry>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("identity").await?;
         let entries = db::audit::list(&mut tx, filter, limit + 1).await?;
         Ok(page(entries, limit, |entry| entry.id.to_string()))
     }
 
     /// What frames the chain of the audit log; `None` if it was removed.
     pub async fn audit_chain(&self) -> Result<Option<AuditChain>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("identity").await?;
         Ok(db::audit::chain(&mut tx).await?)
     }
 
@@ -350,7 +350,7 @@ impl App {
         entries: &[AuditEntry],
         uses: &HashMap<TokenId, Timestamp>,
     ) -> Result<(), AppError> {
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("identity").await?;
         let mut written = Vec::new();
         if !entries.is_empty() {
             written = db::audit::append(&mut tx, entries).await?;

@@ -193,7 +193,7 @@ impl App {
 
     async fn valid(&self) -> Result<Valid, AppError> {
         let (now, elapsed) = (self.clock().now(), self.clock().elapsed());
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("identity").await?;
         let kept = db::tokens::all_valid(&mut tx, now).await?;
         let sessions = db::sessions::all_valid(&mut tx, now).await?;
         let mut valid = Valid::default();
@@ -249,7 +249,7 @@ impl App {
     async fn kept(&self, secret: &Secret) -> Result<Credential, SignInError> {
         let (now, elapsed) = (self.clock().now(), self.clock().elapsed());
         let fingerprint = secret.fingerprint();
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("identity").await?;
         let (token, session, expires_at) = match secret.kind() {
             Kind::Token(_) => token_of(&mut tx, &fingerprint).await?,
             Kind::Session => session_of(&mut tx, &fingerprint).await?,
@@ -321,7 +321,7 @@ impl App {
             created_at: now,
             expires_at: lasts_until.min(credential.expires_at),
         };
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("identity").await?;
         let valid = db::tokens::find(&mut tx, credential.token).await?;
         let valid = valid.filter(|token| token.revoked_at.is_none());
         if valid.is_none() {
@@ -360,7 +360,7 @@ impl App {
 
     /// Ends a browser's session.
     pub async fn end_session(&self, id: SessionId) -> Result<(), AppError> {
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("identity").await?;
         db::sessions::delete(&mut tx, id).await?;
         let app = self.clone();
         let ending = move |_outcome| app.identity().known.end(|known| known.session == Some(id));

@@ -77,7 +77,7 @@ impl App {
             );
             return Err(AppError::BeyondRights(detail));
         }
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("identity").await?;
         // His own may have been revoked since his request began.
         let now = self.clock().now();
         let own = db::tokens::find(&mut tx, giver.token).await?;
@@ -103,7 +103,7 @@ impl App {
         request: CreateToken,
         created_by: &str,
     ) -> Result<CreatedToken, AppError> {
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("identity").await?;
         let created = self.new_token(&mut tx, request, created_by).await?;
         tx.commit().await?;
         Ok(created)
@@ -115,7 +115,7 @@ impl App {
     /// There is a valid admin's token, unless it is forced.
     pub async fn create_first_admin(&self, first: FirstAdmin) -> Result<CreatedToken, AppError> {
         let now = self.clock().now();
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("identity").await?;
         let (_, admin_count) = db::tokens::valid_counts(&mut tx, now).await?;
         if admin_count > 0 && !first.force {
             return Err(AppError::AlreadyExists {
@@ -159,7 +159,7 @@ impl App {
 
     /// How many admins' tokens are valid.
     pub async fn admin_count(&self) -> Result<i64, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("identity").await?;
         let counts = db::tokens::valid_counts(&mut tx, self.clock().now()).await?;
         Ok(counts.1)
     }
@@ -220,14 +220,14 @@ impl App {
         before: Option<TokenId>,
         limit: u32,
     ) -> Result<Page<Token>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("identity").await?;
         let tokens = db::tokens::list(&mut tx, within, before, limit + 1).await?;
         Ok(page(tokens, limit, |token: &Token| token.id.to_string()))
     }
 
     /// Where a token holds; `None` if it is not known.
     pub async fn token_scope(&self, id: TokenId) -> Result<Option<Scope>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("identity").await?;
         Ok(db::tokens::find(&mut tx, id)
             .await?
             .map(|token| token.sites))
@@ -240,7 +240,7 @@ impl App {
     /// up again.
     pub async fn revoke_token(&self, id: TokenId) -> Result<Token, AppError> {
         let ending = Ending(self.clone(), id);
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("identity").await?;
         db::tokens::revoke(&mut tx, id, self.clock().now()).await?;
         let token = db::tokens::find(&mut tx, id).await?;
         let token = token.ok_or(AppError::UnknownToken(id))?;

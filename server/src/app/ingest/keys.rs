@@ -7,9 +7,9 @@ use tread_api::site::Grid;
 
 use super::Upload;
 use crate::app::App;
+use crate::app::presence::RobotKey;
 use crate::app::robots::RUNS_KEPT_MAX;
 use crate::db::{self, DbError, Tx};
-use crate::fleet::presence::RobotKey;
 
 /// Keys kept in memory before they are looked up afresh.
 const KEYS_MAX: usize = 100_000;

@@ -22,7 +22,7 @@ use crate::db::{self, DbError, Tx};
 impl App {
     /// Wants a mission to end: one that waits ends at once, one in hand when its robot says so.
     pub async fn cancel_mission(&self, id: MissionId) -> Result<MissionDetail, AppError> {
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("missions").await?;
         let row = open_row(&mut tx, id).await?;
         if row.mission.state != MissionState::Cancelling {
             let step = Step {
@@ -53,7 +53,7 @@ impl App {
         } else {
             ("resumed", Cause::ResumeRequested)
         };
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("missions").await?;
         let row = open_row(&mut tx, id).await?;
         let mission = &row.mission;
         let state = mission.state;
@@ -110,7 +110,7 @@ impl App {
         request: ReplaceMission,
     ) -> Result<MissionDetail, AppError> {
         let asked = "replaced";
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("missions").await?;
         let row = open_row(&mut tx, id).await?;
         drop(tx);
         let robot = (&row.mission.site, &row.mission.robot);
@@ -120,7 +120,7 @@ impl App {
             replaces: Some(id),
         };
         self.check_fence(robot, &request.trajectory, place).await?;
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("missions").await?;
         let row = open_row(&mut tx, id).await?;
         let mission = &row.mission;
         let robot = robot_of(&mut tx, &row).await?;

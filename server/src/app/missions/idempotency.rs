@@ -74,13 +74,13 @@ impl App {
         };
         let written = serde_json::to_vec(&request).unwrap_or_default();
         let request_hash = Uuid::new_v5(&REQUESTS, &written);
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("missions").await?;
         let is_new = db::idempotency::find(&mut tx, key).await?.is_none();
         drop(tx);
         if is_new {
             self.check_new(&request).await?;
         }
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("missions").await?;
         if let Some(given) = db::idempotency::find(&mut tx, key).await? {
             if given.request_hash != request_hash {
                 return Err(AppError::KeyReused);

@@ -21,7 +21,8 @@ use tread_api::wire::command::Offer;
 use self::transitions::{Change, next};
 use super::check::StartPlace;
 use super::{App, AppError, check_named, site_row};
-use crate::db::missions::{Facts, MissionFilter, MissionRow, Standing};
+pub use crate::db::missions::MissionFilter;
+use crate::db::missions::{Facts, MissionRow, Standing};
 use crate::db::{self, DbError, Tx};
 
 /// Bytes of trajectories after which a page of missions ends, however many it has.
@@ -35,7 +36,7 @@ impl App {
     /// Asks a robot to drive something.
     pub async fn create_mission(&self, request: CreateMission) -> Result<Mission, AppError> {
         self.check_new(&request).await?;
-        let mut tx = self.db().write().await?;
+        let mut tx = self.db().write("missions").await?;
         let mission = self.enqueue(&mut tx, request).await?;
         tx.commit().await?;
         self.wake();
@@ -164,7 +165,7 @@ impl App {
         filter: &MissionFilter,
         limit: u32,
     ) -> Result<Page<Mission>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("missions").await?;
         check_named(
             &mut tx,
             filter.site.as_ref(),
@@ -185,14 +186,14 @@ impl App {
         &self,
         id: MissionId,
     ) -> Result<Option<(SiteId, RobotId)>, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("missions").await?;
         let found = db::missions::find(&mut tx, id).await?;
         Ok(found.map(|row| (row.mission.site, row.mission.robot)))
     }
 
     /// One mission with its history.
     pub async fn mission(&self, id: MissionId) -> Result<MissionDetail, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("missions").await?;
         self.mission_detail(&mut tx, id).await
     }
 

@@ -16,9 +16,9 @@ use std::time::Duration;
 
 use tread_api::robot::{LinkCause, Severity};
 
+use crate::app::presence::RobotKey;
 use crate::app::{App, AppError};
 use crate::db;
-use crate::fleet::presence::RobotKey;
 
 /// The alert of a robot that was present and is no longer.
 pub(in crate::app) const ROBOT_LOST_ALERT: &str = "robot-lost";
@@ -138,7 +138,7 @@ impl Attendance {
 }
 
 async fn expected(app: &App) -> Result<HashMap<RobotKey, Seen>, AppError> {
-    let mut tx = app.db().read().await?;
+    let mut tx = app.db().read("reconciler").await?;
     let expected = db::attendance::all(&mut tx, ROBOT_LOST_ALERT).await?;
     let seen = |robot: db::attendance::Expected| {
         let seen = Seen {
@@ -158,7 +158,7 @@ async fn write_down(
     cause: Option<LinkCause>,
 ) -> Result<(), AppError> {
     let (site, robot) = key;
-    let mut tx = app.db().write().await?;
+    let mut tx = app.db().write("reconciler").await?;
     let Some(site_row) = db::sites::find(&mut tx, site).await? else {
         return Ok(());
     };

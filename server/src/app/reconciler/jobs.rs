@@ -11,13 +11,12 @@ use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome, Pau
 use crate::app::missions::reports::adopt;
 use crate::app::missions::transitions::Change;
 use crate::app::missions::{Step, add_note, take_step};
+use crate::app::presence::{DuplicateAgent, RobotKey};
 use crate::app::stops::{Told, tell};
 use crate::app::terrains::site_definition;
 use crate::app::{App, AppError};
 use crate::db;
 use crate::db::missions::{Facts, MissionRow, Standing};
-use crate::fleet::commands::Commands;
-use crate::fleet::presence::{Rival, RobotKey};
 
 /// How a command went.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -44,7 +43,7 @@ pub(super) async fn settle(app: &App, mission: &Standing, change: Change) -> Res
         progress: last_progress(app, mission),
         ..Facts::default()
     };
-    let mut tx = app.db().write().await?;
+    let mut tx = app.db().write("reconciler").await?;
     let step = server_step(app, change, None, facts);
     let mut alerts = Vec::new();
     if let Some(state) = take_step(&mut tx, mission, step).await?
@@ -98,13 +97,9 @@ fn start_within_ms(app: &App, row: &MissionRow) -> Option<u64> {
 }
 
 /// Offers a mission and writes down the answer.
-pub(super) async fn offer(
-    app: App,
-    commands: Commands,
-    standing: Standing,
-) -> Result<Finished, AppError> {
+pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppError> {
     if standing.state == MissionState::Queued {
-        let mut tx = app.db().write().await?;
+        let mut tx = app.db().write("reconciler").await?;
         let step = server_step(&app, Change::Offer, None, Facts::default());
         match take_step(&mut tx, &standing, step).await {
             Ok(Some(_)) => {
@@ -117,7 +112,7 @@ pub(super) async fn offer(
             Err(error) => return Err(error.into()),
         }
     }
-    let mut tx = app.db().read().await?;
+    let mut tx = app.db().read("reconciler").await?;
     let row = db::missions::find(&mut tx, standing.id).await?;
     drop(tx);
     // Cancelled meanwhile.
@@ -139,7 +134,7 @@ pub(super) async fn offer(
     };
     app.counters().offers_sent.one();
     let key = (mission.site, mission.robot);
-    let Some(answer) = commands.send(&key, Verb::Offer, &command).await else {
+    let Some(answer) = app.commands().send(&key, Verb::Offer, &command).await else {
         app.counters().commands_unanswered.one();
         return Ok(Finished::Again);
     };
@@ -184,7 +179,7 @@ async fn take_offer_answer(
             }
         }
     };
-    let mut tx = app.db().write().await?;
+    let mut tx = app.db().write("reconciler").await?;
     // Read afresh: the robot's own report or a cancellation may have come first.
     if let Some(row) = db::missions::find(&mut tx, id).await? {
         let step = Step {
@@ -202,12 +197,8 @@ async fn take_offer_answer(
 }
 
 /// Offers a new revision of a mission in hand and writes down the answer.
-pub(super) async fn replace(
-    app: App,
-    commands: Commands,
-    standing: Standing,
-) -> Result<Finished, AppError> {
-    let mut tx = app.db().read().await?;
+pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, AppError> {
+    let mut tx = app.db().read("reconciler").await?;
     let row = db::missions::find(&mut tx, standing.id).await?;
     drop(tx);
     let Some(row) = row.filter(|row| !row.mission.state.is_terminal()) else {
@@ -231,11 +222,11 @@ pub(super) async fn replace(
     };
     app.counters().offers_sent.one();
     let key = (row.mission.site.clone(), row.mission.robot.clone());
-    let Some(answer) = commands.send(&key, Verb::Offer, &command).await else {
+    let Some(answer) = app.commands().send(&key, Verb::Offer, &command).await else {
         app.counters().commands_unanswered.one();
         return Ok(Finished::Again);
     };
-    let mut tx = app.db().write().await?;
+    let mut tx = app.db().write("reconciler").await?;
     let row = db::missions::find(&mut tx, standing.id).await?;
     let as_sent = |row: &MissionRow| {
         let hash = row.mission.replacement.as_ref().map(|next| next.plan_hash);
@@ -285,7 +276,7 @@ pub(super) async fn replace(
 
 /// Makes the revision that the robot shows the one that counts.
 pub(super) async fn adopt_shown(app: &App, standing: &Standing) -> Result<(), AppError> {
-    let mut tx = app.db().write().await?;
+    let mut tx = app.db().write("reconciler").await?;
     if let Some(row) = db::missions::find(&mut tx, standing.id).await? {
         adopt(&mut tx, &row, Actor::Robot, app.clock().now()).await?;
         tx.commit().await?;
@@ -295,20 +286,15 @@ pub(super) async fn adopt_shown(app: &App, standing: &Standing) -> Result<(), Ap
 }
 
 /// Tells a robot to hold a mission or to drive on.
-pub(super) async fn hold(
-    app: App,
-    commands: Commands,
-    standing: Standing,
-    held: bool,
-) -> Result<Finished, AppError> {
+pub(super) async fn hold(app: App, standing: Standing, held: bool) -> Result<Finished, AppError> {
     let (mission, (revision, _)) = (standing.id, standing.content);
     let key = (standing.site.clone(), standing.robot.clone());
     let answer = if held {
         let command = Pause { mission, revision };
-        commands.send(&key, Verb::Pause, &command).await
+        app.commands().send(&key, Verb::Pause, &command).await
     } else {
         let command = Resume { mission, revision };
-        commands.send(&key, Verb::Resume, &command).await
+        app.commands().send(&key, Verb::Resume, &command).await
     };
     let Some(answer) = answer else {
         app.counters().commands_unanswered.one();
@@ -333,17 +319,13 @@ pub(super) async fn hold(
 }
 
 /// Tells a robot to end a mission and writes down the answer.
-pub(super) async fn cancel(
-    app: App,
-    commands: Commands,
-    mission: Standing,
-) -> Result<Finished, AppError> {
+pub(super) async fn cancel(app: App, mission: Standing) -> Result<Finished, AppError> {
     let command = Cancel {
         mission: mission.id,
         reason: mission.reason.clone().unwrap_or_default(),
     };
     let key = (mission.site.clone(), mission.robot.clone());
-    let Some(answer) = commands.send(&key, Verb::Cancel, &command).await else {
+    let Some(answer) = app.commands().send(&key, Verb::Cancel, &command).await else {
         app.counters().commands_unanswered.one();
         return Ok(Finished::Again);
     };
@@ -363,7 +345,7 @@ pub(super) async fn cancel(
             return Ok(Finished::Again);
         }
     };
-    let mut tx = app.db().write().await?;
+    let mut tx = app.db().write("reconciler").await?;
     if let Some(row) = db::missions::find(&mut tx, mission.id).await? {
         let reason = detail.or(row.mission.reason.as_deref());
         let standing = (&row.mission).into();
@@ -390,11 +372,10 @@ pub(super) async fn cancel(
 /// Tells a robot to end a mission that is none of its open ones here.
 pub(super) async fn disown(
     app: App,
-    commands: Commands,
     key: RobotKey,
     mission: MissionId,
 ) -> Result<Finished, AppError> {
-    let mut tx = app.db().read().await?;
+    let mut tx = app.db().read("reconciler").await?;
     let row = db::missions::find(&mut tx, mission).await?;
     drop(tx);
     let own = row.filter(|row| (&row.mission.site, &row.mission.robot) == (&key.0, &key.1));
@@ -413,7 +394,12 @@ pub(super) async fn disown(
     );
     app.counters().missions_disowned.one();
     let command = Cancel { mission, reason };
-    if commands.send(&key, Verb::Cancel, &command).await.is_none() {
+    if app
+        .commands()
+        .send(&key, Verb::Cancel, &command)
+        .await
+        .is_none()
+    {
         app.counters().commands_unanswered.one();
     }
     // Its next states show whether it has ended; if not, it is told again.
@@ -421,8 +407,8 @@ pub(super) async fn disown(
 }
 
 /// Tells an agent that runs under another one's name to end the mission that it drives.
-pub(super) async fn end_rival(app: App, commands: Commands, rival: Rival) -> Finished {
-    let Rival { key, boot, mission } = rival;
+pub(super) async fn end_duplicate_agent(app: App, duplicate: DuplicateAgent) -> Finished {
+    let DuplicateAgent { key, boot, mission } = duplicate;
     let Some(mission) = mission else {
         return Finished::Settled;
     };
@@ -434,7 +420,9 @@ pub(super) async fn end_rival(app: App, commands: Commands, rival: Rival) -> Fin
     app.counters().missions_disowned.one();
     let reason = "another agent has taken this robot's name".to_owned();
     let command = Cancel { mission, reason };
-    let answer = commands.send_to(&key, Some(boot), Verb::Cancel, &command);
+    let answer = app
+        .commands()
+        .send_to(&key, Some(boot), Verb::Cancel, &command);
     if answer.await.is_none() {
         app.counters().commands_unanswered.one();
     }
@@ -443,12 +431,8 @@ pub(super) async fn end_rival(app: App, commands: Commands, rival: Rival) -> Fin
 }
 
 /// Tells a robot again to stop, and writes down that it has confirmed.
-pub(super) async fn stop_again(
-    app: App,
-    commands: Commands,
-    stop: Stop,
-) -> Result<Finished, AppError> {
-    match tell(&app, &commands, &stop).await {
+pub(super) async fn stop_again(app: App, stop: Stop) -> Result<Finished, AppError> {
+    match tell(&app, &stop).await {
         Told::Confirmed => {
             let confirmed = (stop.id, app.clock().now());
             app.note_confirmed(&[stop], &[confirmed]).await?;
@@ -463,18 +447,14 @@ pub(super) async fn stop_again(
 }
 
 /// Brings a robot its site's terrains.
-pub(super) async fn push_site(
-    app: App,
-    commands: Commands,
-    key: RobotKey,
-) -> Result<Finished, AppError> {
-    let mut tx = app.db().read().await?;
+pub(super) async fn push_site(app: App, key: RobotKey) -> Result<Finished, AppError> {
+    let mut tx = app.db().read("reconciler").await?;
     let definition = site_definition(&mut tx, &key.0).await?;
     drop(tx);
     let Some(definition) = definition else {
         return Ok(Finished::Settled);
     };
-    match commands.send(&key, Verb::Site, &definition).await {
+    match app.commands().send(&key, Verb::Site, &definition).await {
         // Its next state shows the new revision; if not, it is sent again.
         Some(Answer {
             outcome: Outcome::Done | Outcome::Accepted { .. } | Outcome::Leased { .. },

@@ -23,17 +23,15 @@ use tread_api::stop::Stop;
 
 use self::attendance::Attendance;
 use self::jobs::{
-    Finished, adopt_shown, cancel, disown, end_rival, hold, offer, push_site, replace, settle,
-    stop_again,
+    Finished, adopt_shown, cancel, disown, end_duplicate_agent, hold, offer, push_site, replace,
+    settle, stop_again,
 };
 use self::needs::{Memory, Need, Now, Silence, decide, is_absent, is_heard, is_held_otherwise};
 use super::missions::transitions::Change;
 use super::{App, AppError};
+use crate::app::presence::{DuplicateAgent, RobotKey};
 use crate::db;
 use crate::db::missions::Standing;
-use crate::fleet::commands::Commands;
-use crate::fleet::presence::{Rival, RobotKey};
-use crate::supervisor::Supervisor;
 
 /// How often it looks although nothing woke it.
 pub const PERIOD: Duration = Duration::from_millis(500);
@@ -65,7 +63,7 @@ enum Job {
     Hold(MissionId, bool),
     Cancel(MissionId),
     Disown(RobotKey),
-    EndRival(RobotKey),
+    EndDuplicateAgent(RobotKey),
     Site(RobotKey),
 }
 
@@ -76,8 +74,8 @@ struct Retry {
 }
 
 /// Runs until the stop.
-pub async fn run(app: App, commands: Commands, supervisor: Supervisor, stop: CancellationToken) {
-    let mut reconciler = Reconciler::new(app.clone(), commands, supervisor);
+pub async fn run(app: App, stop: CancellationToken) {
+    let mut reconciler = Reconciler::new(app.clone());
     loop {
         if let Err(error) = db::limited(reconciler.pass()).await {
             app.log_failure("reconcile missions", &error);
@@ -98,8 +96,6 @@ pub async fn run(app: App, commands: Commands, supervisor: Supervisor, stop: Can
 #[derive(Debug)]
 pub struct Reconciler {
     app: App,
-    commands: Commands,
-    supervisor: Supervisor,
     finished: mpsc::Sender<(Job, Finished)>,
     finishing: mpsc::Receiver<(Job, Finished)>,
     under_way: HashSet<Job>,
@@ -114,12 +110,10 @@ pub struct Reconciler {
 
 impl Reconciler {
     /// A reconciler that remembers nothing yet.
-    pub fn new(app: App, commands: Commands, supervisor: Supervisor) -> Self {
+    pub fn new(app: App) -> Self {
         let (finished, finishing) = mpsc::channel(COMMANDS_MAX + STOPS_UNDER_WAY_MAX);
         Self {
             app,
-            commands,
-            supervisor,
             finished,
             finishing,
             under_way: HashSet::new(),
@@ -185,7 +179,7 @@ impl Reconciler {
                 | Job::Hold(..)
                 | Job::Cancel(_)
                 | Job::Disown(_)
-                | Job::EndRival(_)
+                | Job::EndDuplicateAgent(_)
                 | Job::Site(_) => RETRY_MAX,
             };
             let wait = match (how, before) {
@@ -210,10 +204,10 @@ impl Reconciler {
     pub async fn pass(&mut self) -> Result<(), AppError> {
         self.stop_again().await;
         self.expire().await?;
-        self.end_rivals();
+        self.end_duplicate_agents();
         self.app.sync_alerts().await?;
         self.attendance.look(&self.app).await?;
-        let mut tx = self.app.db().read().await?;
+        let mut tx = self.app.db().read("reconciler").await?;
         let mut open = db::missions::in_hand(&mut tx).await?;
         open.extend(db::missions::next_in_queues(&mut tx).await?);
         let sites = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
@@ -239,8 +233,8 @@ impl Reconciler {
             });
             let job = Job::Site(key.clone());
             if lags && self.is_due(&job) {
-                let (app, commands) = (self.app.clone(), self.commands.clone());
-                self.start(job, push_site(app, commands, key));
+                let app = self.app.clone();
+                self.start(job, push_site(app, key));
             } else if !lags {
                 self.retries.remove(&job);
             }
@@ -266,15 +260,15 @@ impl Reconciler {
             // Any sign of life will do, also that of an agent whose loop stands still.
             let is_there = presence.is_there(self.app.clock().elapsed());
             if is_there && self.is_due(&job) {
-                let (app, commands) = (self.app.clone(), self.commands.clone());
-                self.start(job, stop_again(app, commands, stop));
+                let app = self.app.clone();
+                self.start(job, stop_again(app, stop));
             }
         }
     }
 
     async fn expire(&self) -> Result<(), AppError> {
         let now = self.app.clock().now();
-        let mut tx = self.app.db().read().await?;
+        let mut tx = self.app.db().read("reconciler").await?;
         let overdue = db::missions::overdue(&mut tx, now, EXPIRE_MAX).await?;
         drop(tx);
         for mission in overdue {
@@ -291,19 +285,23 @@ impl Reconciler {
             Job::Offer(id) | Job::Replace(id) | Job::Hold(id, _) | Job::Cancel(id) => {
                 open.contains(id)
             }
-            Job::Disown(_) | Job::EndRival(_) | Job::Site(_) | Job::Stop(_) => true,
+            Job::Disown(_) | Job::EndDuplicateAgent(_) | Job::Site(_) | Job::Stop(_) => true,
         });
     }
 
     /// Finds agents that drive a mission under the name of another one, and tells them to end it.
-    fn end_rivals(&mut self) {
-        let rivals = self.app.presences().take_rivals(self.app.clock().elapsed());
+    fn end_duplicate_agents(&mut self) {
+        let duplicates = self
+            .app
+            .presences()
+            .take_duplicate_agents(self.app.clock().elapsed());
         let driving = |key: &RobotKey| {
-            let of_key = |rival: &&Rival| rival.key == *key && rival.mission.is_some();
-            rivals.iter().find(of_key)
+            let of_key =
+                |duplicate: &&DuplicateAgent| duplicate.key == *key && duplicate.mission.is_some();
+            duplicates.iter().find(of_key)
         };
         self.retries.retain(|job, _| match job {
-            Job::EndRival(key) => driving(key).is_some(),
+            Job::EndDuplicateAgent(key) => driving(key).is_some(),
             Job::Offer(_)
             | Job::Replace(_)
             | Job::Hold(..)
@@ -312,13 +310,13 @@ impl Reconciler {
             | Job::Site(_)
             | Job::Stop(_) => true,
         });
-        for rival in rivals {
-            let job = Job::EndRival(rival.key.clone());
-            if rival.mission.is_some() && self.is_due(&job) {
-                let (app, commands) = (self.app.clone(), self.commands.clone());
+        for duplicate in duplicates {
+            let job = Job::EndDuplicateAgent(duplicate.key.clone());
+            if duplicate.mission.is_some() && self.is_due(&job) {
+                let app = self.app.clone();
                 self.start(
                     job,
-                    async move { Ok(end_rival(app, commands, rival).await) },
+                    async move { Ok(end_duplicate_agent(app, duplicate).await) },
                 );
             }
         }
@@ -351,8 +349,8 @@ impl Reconciler {
         for (key, id) in due {
             let job = Job::Disown(key.clone());
             if self.is_due(&job) {
-                let (app, commands) = (self.app.clone(), self.commands.clone());
-                self.start(job, disown(app, commands, key, id));
+                let app = self.app.clone();
+                self.start(job, disown(app, key, id));
             }
         }
         let foreign = &self.foreign;
@@ -362,7 +360,7 @@ impl Reconciler {
             | Job::Replace(_)
             | Job::Hold(..)
             | Job::Cancel(_)
-            | Job::EndRival(_)
+            | Job::EndDuplicateAgent(_)
             | Job::Site(_)
             | Job::Stop(_) => true,
         });
@@ -378,7 +376,7 @@ impl Reconciler {
         let silent = self.app.presences().get(&key).silent_for(clock.elapsed());
         let silent = SignedDuration::try_from(silent.unwrap_or_default()).unwrap_or_default();
         let since = (!heard).then(|| clock.now().checked_sub(silent).unwrap_or(clock.now()));
-        let mut tx = self.app.db().write().await?;
+        let mut tx = self.app.db().write("reconciler").await?;
         db::missions::set_silence(&mut tx, mission.id, since).await?;
         tx.commit().await?;
         mission.silent_since = since;
@@ -401,7 +399,7 @@ impl Reconciler {
             .then(|| memory.differs_from.unwrap_or(now.elapsed));
         memory.silence = Silence::of(&mission, memory.silence, now);
         let memory = *memory;
-        let (app, commands) = (self.app.clone(), self.commands.clone());
+        let app = self.app.clone();
         let need = decide(&mission, &presence, memory, now);
         // What is wanted anew later does not wait for what was wanted before.
         for (held, wanted) in [(true, Need::Pause), (false, Need::Resume)] {
@@ -416,20 +414,20 @@ impl Reconciler {
             Need::Replace => {
                 let job = Job::Replace(mission.id);
                 if self.is_due(&job) {
-                    self.start(job, replace(app, commands, mission));
+                    self.start(job, replace(app, mission));
                 }
             }
             Need::Pause | Need::Resume => {
                 let held = mission.pause_wanted;
                 let job = Job::Hold(mission.id, held);
                 if self.is_due(&job) {
-                    self.start(job, hold(app, commands, mission, held));
+                    self.start(job, hold(app, mission, held));
                 }
             }
             Need::Offer => {
                 let job = Job::Offer(mission.id);
                 if self.is_due(&job) {
-                    self.start(job, offer(app, commands, mission));
+                    self.start(job, offer(app, mission));
                 }
             }
             Need::Cancel => {
@@ -444,7 +442,7 @@ impl Reconciler {
                 ];
                 let is_clear = !before.iter().any(|job| self.under_way.contains(job));
                 if is_clear && self.is_due(&job) {
-                    self.start(job, cancel(app, commands, mission));
+                    self.start(job, cancel(app, mission));
                 }
             }
         }
@@ -478,7 +476,7 @@ impl Reconciler {
             finished: self.finished.clone(),
         };
         let app = self.app.clone();
-        self.supervisor.spawn_passing("command", async move {
+        self.app.supervisor().spawn_passing("command", async move {
             let mut report = report;
             match db::limited(work).await {
                 Ok(how) => report.how = how,

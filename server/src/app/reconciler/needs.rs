@@ -7,8 +7,8 @@ use tread_api::mission::{LinkPolicy, MissionState};
 use tread_api::robot::{LinkState, MissionProgress};
 
 use crate::app::missions::transitions::Change;
+use crate::app::presence::Presence;
 use crate::db::missions::Standing;
-use crate::fleet::presence::Presence;
 
 /// How long the records of an earlier run may take to arrive before a mission counts as lost.
 pub(super) const RESTART_GRACE: Duration = Duration::from_secs(3);

@@ -12,9 +12,8 @@ use tread_api::stop::Stop;
 use tread_api::wire::command::{Answer, OfferRefusal, Outcome};
 use tread_api::wire::safety::Stop as StopCommand;
 
-use super::super::{App, AppError, Links};
+use super::super::{App, AppError};
 use crate::db;
-use crate::fleet::commands::Commands;
 
 /// What a robot has said to a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -28,7 +27,7 @@ pub(in crate::app) enum Told {
 }
 
 /// Tells a robot to stop.
-pub(in crate::app) async fn tell(app: &App, commands: &Commands, stop: &Stop) -> Told {
+pub(in crate::app) async fn tell(app: &App, stop: &Stop) -> Told {
     let command = StopCommand {
         stop: stop.id,
         by: stop.by.clone(),
@@ -39,7 +38,10 @@ pub(in crate::app) async fn tell(app: &App, commands: &Commands, stop: &Stop) ->
     app.counters().stops_sent.one();
     // Whatever runs under the robot's name stops; only its present run can confirm.
     let present = app.presences().get(&key).boot().map(|(boot, _since)| boot);
-    let answer = commands.send_to(&key, None, Verb::Stop, &command).await;
+    let answer = app
+        .commands()
+        .send_to(&key, None, Verb::Stop, &command)
+        .await;
     let confirms = |answer: &Answer| present.is_none_or(|boot| boot == answer.boot);
     match answer.filter(confirms).map(|answer| answer.outcome) {
         Some(Outcome::Refused {
@@ -61,7 +63,6 @@ pub(in crate::app) async fn tell(app: &App, commands: &Commands, stop: &Stop) ->
 /// A stop on its way to its robot.
 pub(super) struct Outgoing {
     pub(super) app: App,
-    pub(super) links: Links,
     pub(super) stop: Stop,
     pub(super) recorded: watch::Receiver<bool>,
 }
@@ -70,10 +71,10 @@ impl Outgoing {
     /// Sends until the robot has confirmed, or the database has the stop: then the reconciler goes
     /// on.
     pub(super) async fn deliver(self, tell_of: mpsc::Sender<(StopId, Timestamp)>) {
-        let ending = self.links.supervisor.stop_token();
+        let ending = self.app.supervisor().stop_token();
         let unrecorded = self.app.unrecorded();
         loop {
-            let told = tell(&self.app, &self.links.commands, &self.stop).await;
+            let told = tell(&self.app, &self.stop).await;
             if told != Told::Unconfirmed {
                 // What is over was in force; the reconciler hears that it is over. Nobody listens
                 // only when the server stops.
@@ -165,7 +166,7 @@ impl Settling {
             return true;
         }
         let writing = async {
-            let mut tx = self.app.db().write().await?;
+            let mut tx = self.app.db().write("stops").await?;
             self.app.record_stops(&mut tx, stops).await?;
             tx.commit().await?;
             Ok::<(), AppError>(())

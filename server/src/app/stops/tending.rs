@@ -12,9 +12,9 @@ use tread_api::wire::state::RobotState;
 use super::judge::{Open, Shown, Verdict, judge};
 use super::{alerted, key_of};
 use crate::app::allowance::Kind;
+use crate::app::presence::{Presence, RobotKey};
 use crate::app::{App, AppError};
 use crate::db::{self, Tx};
-use crate::fleet::presence::{Presence, RobotKey};
 
 /// What is to be done about stops.
 #[derive(Debug, Default)]
@@ -46,7 +46,7 @@ impl App {
             return Ok(again);
         }
         let writing = async {
-            let mut tx = self.db().write().await?;
+            let mut tx = self.db().write("stops").await?;
             // Not before: the turn to write may have come late.
             let now = self.clock().now();
             for stop in &lost {
@@ -81,7 +81,7 @@ impl App {
     }
 
     async fn look_at_stops(&self) -> Result<Tending, AppError> {
-        let mut tx = self.db().read().await?;
+        let mut tx = self.db().read("stops").await?;
         let mut robots: BTreeMap<RobotKey, Option<Stop>> = BTreeMap::new();
         for (key, _latch) in self.presences().shown_stops() {
             robots.insert(key, None);

@@ -12,8 +12,8 @@ use tread_api::ids::StopId;
 use tread_api::stop::Stop;
 
 use super::key_of;
+use crate::app::presence::RobotKey;
 use crate::db::stops::StopFilter;
-use crate::fleet::presence::RobotKey;
 
 /// The newest unrecorded stop of each robot.
 #[derive(Debug, Default)]

@@ -18,10 +18,10 @@ use super::links::{CertificateHash, Entry, Links};
 use super::session::{Init, pass_opening, read_init};
 use crate::app::App;
 use crate::app::enrolment::roll::Standing;
+use crate::app::presence::RobotKey;
 use crate::authority::{Authorities, RobotName, named_in};
 use crate::connections::Slot;
 use crate::fleet::SEND_BUFFER_BYTES;
-use crate::fleet::presence::RobotKey;
 use crate::fleet::routers::{Router, Routers};
 
 /// How long the first byte may take.
@@ -171,11 +171,11 @@ impl Link {
             debug!("{} speaks another version of the protocol", self.peer);
             return None;
         }
-        self.identify(stream).await
+        self.identify(stream)
     }
 
     /// Whose certificate was shown, if it counts.
-    async fn identify(&self, stream: server::TlsStream<TcpStream>) -> Option<Admitted> {
+    fn identify(&self, stream: server::TlsStream<TcpStream>) -> Option<Admitted> {
         let counters = self.app.counters();
         let now = self.app.clock().now();
         let shown = stream.get_ref().1.peer_certificates();
@@ -199,7 +199,7 @@ impl Link {
             );
             // Its successor may be well; people are told only of one that has none.
             if self.app.roll().standing(&robot) == Some(Standing::Revoked(name.enrolment)) {
-                self.app.note_outsider(&robot).await;
+                self.app.note_outsider(&robot);
             }
             return None;
         }

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio_util::sync::CancellationToken;
 
-use crate::fleet::presence::RobotKey;
+use crate::app::presence::RobotKey;
 
 /// Most links of one robot. Two agents under one name are noticed and shown, so both get in.
 pub(in crate::fleet) const LINKS_PER_ROBOT_MAX: usize = 4;

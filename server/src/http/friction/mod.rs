@@ -27,8 +27,8 @@ use super::negotiate::{Offered, choose, offered};
 use super::problem::Problem;
 use super::sites::PageQuery;
 use crate::app::friction::{Asked, SegmentExport};
+use crate::app::segments::SegmentFilter;
 use crate::app::{App, AppError};
-use crate::db::segments::SegmentFilter;
 use crate::formats::table::{self, segments};
 
 /// Longest step of a history, seconds: a year.

@@ -9,7 +9,7 @@ use tread_api::problem::{ProblemBody, ProblemType};
 use utoipa::IntoParams;
 
 use crate::app::App;
-use crate::db::audit::AuditFilter;
+use crate::app::identity::audit::AuditFilter;
 use crate::http::extract::{Json, Query, cursor, page_limit};
 use crate::http::problem::Problem;
 

@@ -242,14 +242,14 @@ async fn whoever_changes_a_row_of_the_database_is_found_by_its_number() {
         Ok(u64::try_from(written.len()).unwrap())
     );
     // The oldest go, and the rest is verified all the same.
-    let mut tx = yard.server.app().db().write().await.unwrap();
+    let mut tx = yard.server.app().db().write("test").await.unwrap();
     let long_ago = Timestamp::UNIX_EPOCH;
     db::audit::forget(&mut tx, long_ago, 10, 100).await.unwrap();
     tx.commit().await.unwrap();
     assert_eq!(verified(&yard).await, Ok(10));
 
     let change = async |statement: &'static str| {
-        let mut tx = yard.server.app().db().write().await.unwrap();
+        let mut tx = yard.server.app().db().write("test").await.unwrap();
         sqlx::query(statement).execute(&mut *tx).await.unwrap();
         tx.commit().await.unwrap();
         verified(&yard).await

@@ -97,7 +97,7 @@ impl Ground {
             "revoked_at": null,
         }));
         let fingerprint = Secret::from_random(Kind::Join, &[7; 32]).fingerprint();
-        let mut tx = yard.server.app().db().write().await.unwrap();
+        let mut tx = yard.server.app().db().write("test").await.unwrap();
         db::join_tokens::insert(&mut tx, &kept.unwrap(), &fingerprint)
             .await
             .unwrap();

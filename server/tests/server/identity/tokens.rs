@@ -240,7 +240,7 @@ async fn a_token_of_another_process_is_let_in_while_the_address_is_locked() {
 async fn init(yard: &Yard, name: &str) -> String {
     let db = Db::open(&database(yard.folder.path())).await.unwrap();
     let (friction, storage) = (FrictionConfig::default(), StorageConfig::default());
-    let app = App::new(db, Clock::system(), friction, storage);
+    let app = App::without_robots(db, Clock::system(), friction, storage);
     let admin = FirstAdmin {
         name: name.to_owned(),
         valid_days: 1,

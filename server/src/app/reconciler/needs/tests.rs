@@ -6,7 +6,7 @@ use tread_api::wire::state::RobotState;
 use uuid::Uuid;
 
 use super::*;
-use crate::fleet::presence::Presences;
+use crate::app::presence::Presences;
 
 const ELAPSED: Duration = Duration::from_secs(100);
 const JUST: Duration = Duration::from_millis(99_900);

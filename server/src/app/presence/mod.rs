@@ -1,8 +1,8 @@
 //! Who is on the network now, and what each robot said last. In memory; ages by our own clock.
 
+mod duplicate_agent;
 mod looks;
 mod news;
-mod rivals;
 
 use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -15,10 +15,10 @@ use tread_api::robot::{Aged, LinkCause, LinkState, MissionProgress, RobotLive};
 use tread_api::safety::StandingState;
 use tread_api::wire::state::{FrictionReport, RobotState};
 
+pub use self::duplicate_agent::DuplicateAgent;
+use self::duplicate_agent::OtherRun;
 pub use self::looks::{Attending, Held};
 use self::news::Shown;
-use self::rivals::OtherRun;
-pub use self::rivals::Rival;
 
 /// How long after its last heartbeat a robot counts as online: three of them at 5 Hz.
 pub const ONLINE_TIMEOUT: Duration = Duration::from_millis(700);

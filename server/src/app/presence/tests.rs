@@ -88,7 +88,7 @@ fn a_blip_of_the_token_is_no_restart_and_a_straggler_of_the_old_run_changes_noth
         Heard::Other
     );
     assert_eq!(presences.get(&key()).boot(), Some((boot(2), 3 * SECOND)));
-    assert!(presences.take_rivals(4 * SECOND).is_empty());
+    assert!(presences.take_duplicate_agents(4 * SECOND).is_empty());
 }
 
 #[test]

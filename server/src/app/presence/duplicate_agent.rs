@@ -13,15 +13,15 @@ use super::{Presence, Presences, RobotKey};
 
 /// How long two agents must have spoken under one name before that is said aloud: what was under
 /// way when an agent was replaced has long arrived then.
-const RIVAL_AFTER: Duration = Duration::from_secs(1);
+const DUPLICATE_AFTER: Duration = Duration::from_secs(1);
 /// How long after its last heartbeat a second agent under a robot's name counts as gone.
-const RIVAL_GONE: Duration = Duration::from_secs(3);
+const DUPLICATE_GONE: Duration = Duration::from_secs(3);
 /// The code of the alert of two agents under one name.
-const RIVAL_ALERT: &str = "two-agents";
+const DUPLICATE_ALERT: &str = "two-agents";
 
 /// A second agent that speaks under a robot's name.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Rival {
+pub struct DuplicateAgent {
     /// Whose name it has.
     pub key: RobotKey,
     /// Its run.
@@ -40,13 +40,13 @@ pub(super) struct OtherRun {
     ticks: u64,
     mission: Option<MissionId>,
     /// Whether it has spoken for longer than what may have been under way.
-    is_rival: bool,
+    is_duplicate: bool,
 }
 
 impl Presence {
     pub(super) fn forget_other(&mut self) {
         let other = self.other.take();
-        self.alerts_changed |= other.is_some_and(|other| other.is_rival);
+        self.alerts_changed |= other.is_some_and(|other| other.is_duplicate);
     }
 
     /// Notes a state of another run than the present one, while that is alive.
@@ -58,18 +58,18 @@ impl Presence {
             heard_at: now,
             ticks,
             mission: state.mission.map(|mission| mission.id),
-            is_rival: false,
+            is_duplicate: false,
         };
         match &mut self.other {
             Some(other) if other.boot == state.boot => {
                 if ticks <= other.ticks {
                     return;
                 }
-                let is_sure = now.saturating_sub(other.since) >= RIVAL_AFTER;
-                self.alerts_changed |= is_sure && !other.is_rival;
+                let is_sure = now.saturating_sub(other.since) >= DUPLICATE_AFTER;
+                self.alerts_changed |= is_sure && !other.is_duplicate;
                 *other = OtherRun {
                     since: other.since,
-                    is_rival: is_sure || other.is_rival,
+                    is_duplicate: is_sure || other.is_duplicate,
                     ..fresh
                 };
             }
@@ -80,11 +80,11 @@ impl Presence {
     }
 
     /// What the server itself says needs attention.
-    pub(super) fn rival_alert(&self) -> Option<AlertReport> {
-        let other = self.other.filter(|other| other.is_rival)?;
+    pub(super) fn duplicate_agent_alert(&self) -> Option<AlertReport> {
+        let other = self.other.filter(|other| other.is_duplicate)?;
         let (present, _since) = self.boot?;
         Some(AlertReport {
-            code: RIVAL_ALERT.parse().ok()?,
+            code: DUPLICATE_ALERT.parse().ok()?,
             severity: Severity::Critical,
             text: format!(
                 "two agents run under this name: boot {present} counts as the robot, boot {} is \
@@ -98,24 +98,24 @@ impl Presence {
 impl Presences {
     /// The agents that speak under the name of another one, after those that have gone silent are
     /// forgotten.
-    pub fn take_rivals(&self, now: Duration) -> Vec<Rival> {
+    pub fn take_duplicate_agents(&self, now: Duration) -> Vec<DuplicateAgent> {
         let mut robots = self.lock();
-        let mut rivals = Vec::new();
+        let mut duplicates = Vec::new();
         for (key, presence) in robots.iter_mut() {
             let Some(other) = presence.other else {
                 continue;
             };
-            if now.saturating_sub(other.heard_at) > RIVAL_GONE {
+            if now.saturating_sub(other.heard_at) > DUPLICATE_GONE {
                 presence.forget_other();
-            } else if other.is_rival {
-                rivals.push(Rival {
+            } else if other.is_duplicate {
+                duplicates.push(DuplicateAgent {
                     key: key.clone(),
                     boot: other.boot,
                     mission: other.mission,
                 });
             }
         }
-        rivals
+        duplicates
     }
 }
 
@@ -138,17 +138,17 @@ mod tests {
         assert_eq!(says(1, 8, SECOND), Heard::Other);
         // A straggler that is told twice is no second agent.
         assert_eq!(says(1, 8, 3 * SECOND), Heard::Other);
-        assert!(presences.take_rivals(3 * SECOND).is_empty());
+        assert!(presences.take_duplicate_agents(3 * SECOND).is_empty());
         assert_eq!(says(1, 9, 3 * SECOND), Heard::Other);
-        let rivals = presences.take_rivals(3 * SECOND);
-        assert_eq!(rivals.len(), 1);
-        assert_eq!(rivals[0].boot, boot(1));
+        let duplicates = presences.take_duplicate_agents(3 * SECOND);
+        assert_eq!(duplicates.len(), 1);
+        assert_eq!(duplicates[0].boot, boot(1));
         let (_, alerts) = presences.take_alert_changes().remove(0);
         for number in [1, 2] {
             assert!(alerts[0].text.contains(&boot(number).to_string()));
         }
         assert!(presences.take_alert_changes().is_empty());
-        assert!(presences.take_rivals(7 * SECOND).is_empty());
+        assert!(presences.take_duplicate_agents(7 * SECOND).is_empty());
         let (_, alerts) = presences.take_alert_changes().remove(0);
         assert!(alerts.is_empty(), "{alerts:?}");
     }

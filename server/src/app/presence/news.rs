@@ -37,7 +37,11 @@ impl Presences {
         let taken = changed.filter_map(|(key, presence)| {
             // Without a state of the present run nobody knows what the robot itself says.
             let own = presence.state()?.alerts.clone();
-            let alerts = presence.rival_alert().into_iter().chain(own).collect();
+            let alerts = presence
+                .duplicate_agent_alert()
+                .into_iter()
+                .chain(own)
+                .collect();
             presence.alerts_changed = false;
             Some((key.clone(), alerts))
         });

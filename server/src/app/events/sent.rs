@@ -1,0 +1,73 @@
+//! Events as they are sent, and which of them a client wants.
+
+use std::collections::HashSet;
+
+use tread_api::event::{Event, Topic};
+use tread_api::ids::{RobotId, SiteId};
+use tread_api::rights::Scope;
+
+/// One event, ready to be sent.
+#[derive(Debug)]
+pub struct Sent {
+    /// What a client gives back as `Last-Event-ID`; `None` within a snapshot.
+    pub id: Option<String>,
+    /// Its name.
+    pub name: &'static str,
+    /// Its body, JSON on one line.
+    pub text: String,
+    pub(super) seq: u64,
+    pub(super) topic: Option<Topic>,
+    pub(super) about: Option<About>,
+}
+
+/// What an event is about: a robot of a site, or the site as a whole.
+pub(super) type About = (SiteId, Option<RobotId>);
+
+/// What a client wants to hear of; what is empty lets everything through.
+#[derive(Debug, Clone, Default)]
+pub struct EventFilter {
+    /// Only these topics.
+    pub topics: HashSet<Topic>,
+    /// Only this site.
+    pub site: Option<SiteId>,
+    /// Only these robots.
+    pub robots: HashSet<RobotId>,
+    /// Only what is in this scope, and what is about the server.
+    pub within: Scope,
+}
+
+impl EventFilter {
+    pub(super) fn lets_through(&self, topic: Option<Topic>, about: Option<&About>) -> bool {
+        let of_topic = topic.is_none_or(|topic| self.wants(topic));
+        let is_about = |about: &About| match about {
+            (site, Some(robot)) => self.wants_robot(site, robot),
+            // What is no robot's is of whoever asks for its topic or for everything.
+            (site, None) => {
+                self.site.as_ref().is_none_or(|wanted| wanted == site)
+                    && self.within.includes_site(site)
+            }
+        };
+        of_topic && about.is_none_or(is_about)
+    }
+
+    pub(super) fn wants(&self, topic: Topic) -> bool {
+        self.topics.is_empty() || self.topics.contains(&topic)
+    }
+
+    pub(super) fn wants_robot(&self, site: &SiteId, robot: &RobotId) -> bool {
+        self.site.as_ref().is_none_or(|wanted| wanted == site)
+            && (self.robots.is_empty() || self.robots.contains(robot))
+            && self.within.includes_robot(site, robot)
+    }
+}
+
+pub(super) fn unnumbered(event: &Event, topic: Option<Topic>, about: Option<About>) -> Sent {
+    Sent {
+        id: None,
+        name: event.name(),
+        text: serde_json::to_string(event).unwrap_or_default(),
+        seq: 0,
+        topic,
+        about,
+    }
+}

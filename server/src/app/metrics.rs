@@ -1,0 +1,290 @@
+//! All metrics of the server in the `OpenMetrics` format: what was recorded while it worked
+//! ([`crate::metrics`]), and what is looked up when somebody asks.
+
+use std::sync::atomic::AtomicU64;
+use std::time::Duration;
+
+use prometheus_client::encoding::EncodeLabelSet;
+use prometheus_client::encoding::text::encode;
+use prometheus_client::metrics::counter::{ConstCounter, Counter};
+use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
+use prometheus_client::registry::{Registry, Unit};
+use tread_api::mission::{Mission, MissionState};
+
+use super::friction::KnownGround;
+use super::{App, AppError};
+use crate::db;
+use crate::db::failure::{self, StorageFailure};
+use crate::metrics::Refusal;
+
+/// The media type of the text.
+pub const MEDIA_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+/// Most terrains and robot models that have series of their own.
+pub const TERRAIN_SERIES_MAX: usize = 500;
+
+/// Reasons to refuse whoever asks over HTTP, before the request is looked at.
+const OF_CLIENTS: [&str; 11] = [
+    "host",
+    "locked",
+    "no_token",
+    "origin",
+    "role",
+    "scope",
+    "token_expired",
+    "token_malformed",
+    "token_revoked",
+    "token_unknown",
+    "too_long",
+];
+
+/// Values that are looked up, by one label.
+type Gauges<V = &'static str> = Family<[(&'static str, V); 1], Gauge<u64, AtomicU64>>;
+/// Counts that are looked up, by one label.
+type Counts = Family<[(&'static str, &'static str); 1], Counter>;
+
+/// A terrain and a robot model.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct OfTerrain {
+    site: String,
+    terrain: String,
+    configuration: String,
+}
+
+/// One number of what is known of a terrain.
+type NumberOf = fn(&KnownGround) -> f64;
+
+fn count(of: usize) -> u64 {
+    u64::try_from(of).unwrap_or(u64::MAX)
+}
+
+impl App {
+    /// All metrics as text; those that come from the database are missing while it cannot be read.
+    pub async fn metrics_text(&self) -> String {
+        let mut registry = Registry::default();
+        self.register_storage(&mut registry);
+        // What is in memory is shown also while the database cannot be read.
+        for registered in [
+            self.register_fleet(&mut registry).await,
+            self.register_terrains(&mut registry).await,
+        ] {
+            if let Err(error) = registered {
+                self.log_failure("read metrics", &error);
+            }
+        }
+        self.register_clients(&mut registry);
+        self.register_clock(&mut registry);
+        let uptime = ConstGauge::new(self.uptime().as_secs_f64());
+        let help = "Time since the start";
+        registry.register_with_unit("tread_uptime", help, Unit::Seconds, uptime);
+        let refusals = self.register_counters(&mut registry);
+        self.metrics().register(&mut registry, refusals);
+        self.db().metrics().register(&mut registry);
+        let mut text = String::new();
+        if let Err(error) = encode(&mut text, &registry) {
+            self.log_failure("write metrics", &error);
+        }
+        text
+    }
+
+    /// Records how long a mission took that has ended; one that never began has no duration.
+    pub(super) fn record_duration(&self, mission: &Mission) {
+        if let (Some(began), Some(ended)) = (mission.started_at, mission.ended_at) {
+            let took = Duration::try_from(ended.duration_since(began)).unwrap_or_default();
+            self.metrics().mission(mission.state, took);
+        }
+    }
+
+    /// What the storage was found to be.
+    fn register_storage(&self, registry: &mut Registry) {
+        let condition = self.storage_condition();
+        let gauges = [
+            (
+                "tread_storage_writable",
+                Some(u64::from(condition.unwritable.is_none())),
+                "Whether the database takes writes",
+            ),
+            (
+                "tread_storage_damaged",
+                Some(u64::from(condition.damaged.is_some())),
+                "Whether the database is known to be damaged",
+            ),
+            (
+                "tread_storage_disk_low",
+                Some(u64::from(condition.is_disk_low)),
+                "Whether less is free on the disk of the database than configured",
+            ),
+            (
+                "tread_storage_disk_free_bytes",
+                condition.disk_free_bytes,
+                "Free bytes on the disk of the database",
+            ),
+        ];
+        for (name, value, help) in gauges {
+            if let Some(value) = value {
+                registry.register(name, help, ConstGauge::new(value));
+            }
+        }
+        let failures = Counts::default();
+        for failure in StorageFailure::ALL {
+            let counter = failures.get_or_create(&[("kind", failure.as_str())]);
+            counter.inc_by(failure::count(failure));
+        }
+        let help = "Failures of the storage, by kind";
+        registry.register("tread_storage_failures", help, failures);
+    }
+
+    /// What the machine's clock did.
+    fn register_clock(&self, registry: &mut Registry) {
+        // So that a step shows although nothing else asked for the time.
+        self.clock().now();
+        let steps = self.clock().steps();
+        let counts = Counts::default();
+        for (direction, count) in [("back", steps.back), ("forward", steps.forward)] {
+            counts
+                .get_or_create(&[("direction", direction)])
+                .inc_by(count);
+        }
+        let help = "Steps of the machine's clock";
+        registry.register("tread_clock_steps", help, counts);
+        let ahead = ConstGauge::new(steps.ahead.as_secs_f64());
+        let help = "How far the server's time is ahead of the machine's clock, which was set back";
+        registry.register_with_unit("tread_clock_ahead", help, Unit::Seconds, ahead);
+    }
+
+    /// Missions, robots and stops.
+    async fn register_fleet(&self, registry: &mut Registry) -> Result<(), AppError> {
+        let now = self.clock().elapsed();
+        let robots = Gauges::default();
+        for (link, number) in self.presences().link_counts(now) {
+            let gauge = robots.get_or_create(&[("link", link.as_str())]);
+            gauge.set(count(number));
+        }
+        registry.register("tread_robots", "Robots by link state", robots);
+        let reduced = Gauges::<String>::default();
+        for (cause, number) in self.presences().gate_causes(now) {
+            reduced
+                .get_or_create(&[("cause", cause)])
+                .set(count(number));
+        }
+        let help = "Robots that are heard and slowed down, by the strictest cause";
+        registry.register("tread_robots_reduced", help, reduced);
+        let mut tx = self.db().read("metrics").await?;
+        let counts = db::missions::counts(&mut tx).await?;
+        drop(tx);
+        let missions = Gauges::default();
+        for state in MissionState::ALL {
+            let found = counts.iter().find(|(of, _)| *of == state);
+            let number = found.map_or(0, |(_, number)| *number);
+            missions
+                .get_or_create(&[("state", state.as_str())])
+                .set(number);
+        }
+        registry.register("tread_missions", "Missions by state", missions);
+        let stops = self.stops_in_force().await?;
+        let open = stops.iter().filter(|stop| stop.unconfirmed).count();
+        let in_force = ConstGauge::new(count(stops.len()));
+        registry.register(
+            "tread_stops_in_force",
+            "Stops that are not cleared",
+            in_force,
+        );
+        let help = "Stops that their robots have not confirmed within 300 ms";
+        registry.register(
+            "tread_stops_unconfirmed",
+            help,
+            ConstGauge::new(count(open)),
+        );
+        Ok(())
+    }
+
+    /// What is known of terrains.
+    async fn register_terrains(&self, registry: &mut Registry) -> Result<(), AppError> {
+        let (known, left_out) = self.known_of_terrains(TERRAIN_SERIES_MAX).await?;
+        let gauges: [(&str, NumberOf, &str); 3] = [
+            (
+                "tread_terrain_theta",
+                |known| known.theta,
+                "Slip per friction coefficient of each terrain that was measured, by robot model",
+            ),
+            (
+                "tread_terrain_theta_std_dev",
+                |known| known.std_dev,
+                "Standard deviation of tread_terrain_theta",
+            ),
+            (
+                "tread_terrain_age_seconds",
+                |known| known.age_s,
+                "Age of the newest measurement of each terrain",
+            ),
+        ];
+        for (name, value_of, help) in gauges {
+            let family = Family::<OfTerrain, Gauge<f64, AtomicU64>>::default();
+            for known in &known {
+                let of = OfTerrain {
+                    site: known.site.to_string(),
+                    terrain: known.terrain.to_string(),
+                    configuration: known.configuration.to_string(),
+                };
+                family.get_or_create(&of).set(value_of(known));
+            }
+            registry.register(name, help, family);
+        }
+        let help = "Terrains and robot models beyond those that have series of their own";
+        let left_out = ConstGauge::new(count(left_out));
+        registry.register("tread_terrain_series_left_out", help, left_out);
+        Ok(())
+    }
+
+    /// Those who teleoperate and those who read events.
+    fn register_clients(&self, registry: &mut Registry) {
+        let gauges = [
+            (
+                "tread_drive_clients",
+                self.drive_clients(),
+                "Drive sockets that are open",
+            ),
+            (
+                "tread_event_clients",
+                self.hub().client_count(),
+                "Event clients",
+            ),
+            (
+                "tread_event_buffer_longest",
+                self.hub().longest_buffer(),
+                "Most events that wait for one client",
+            ),
+        ];
+        for (name, value, help) in gauges {
+            registry.register(name, help, ConstGauge::new(count(value)));
+        }
+        let dropped = ConstCounter::new(self.hub().dropped_count());
+        let help = "Event clients that read too slowly";
+        registry.register("tread_event_clients_dropped", help, dropped);
+    }
+
+    /// The counters of `GET /v1/server`; returns those that count what was refused.
+    fn register_counters(&self, registry: &mut Registry) -> Vec<(Refusal, u64)> {
+        let counters = serde_json::to_value(self.counters().values()).unwrap_or_default();
+        let mut refusals = Vec::new();
+        for (counter, value) in counters.as_object().into_iter().flatten() {
+            let value = value.as_u64().unwrap_or_default();
+            let name = format!("tread_{counter}");
+            registry.register(name, "See GET /v1/server", ConstCounter::new(value));
+            let of_message = counter.strip_prefix("refused_");
+            let of_record = ["records_refused", "reports_foreign", "missions_disowned"];
+            let listed = of_record
+                .contains(&counter.as_str())
+                .then_some(counter.as_str());
+            if let Some(reason) = of_message.or(listed) {
+                let is_client = OF_CLIENTS.contains(&reason);
+                let of = Refusal {
+                    of: if is_client { "client" } else { "robot" },
+                    reason: reason.to_owned(),
+                };
+                refusals.push((of, value));
+            }
+        }
+        refusals
+    }
+}

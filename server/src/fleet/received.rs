@@ -1,0 +1,58 @@
+//! What is common to everything that robots send: queries with their place, the next message, and
+//! what is said of a message that is refused.
+
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+use tracing::{debug, warn};
+use tread_api::wire::{self, WireError};
+use zenoh::query::Query;
+
+use super::rate_limits::{Place, RateLimits};
+use crate::app::App;
+use crate::app::presence::RobotKey;
+
+/// A query with its place among those of its robot, which it keeps until it is answered.
+#[derive(Debug)]
+pub(super) struct Asked {
+    pub(super) query: Query,
+    pub(super) place: Place,
+}
+
+/// The next message, until the stop.
+pub(super) async fn next<T>(
+    channel: &mut mpsc::Receiver<T>,
+    stop: &CancellationToken,
+) -> Option<T> {
+    tokio::select! {
+        biased;
+        () = stop.cancelled() => None,
+        message = channel.recv() => message,
+    }
+}
+
+/// Logs that a message was refused, now and then for each robot, with how often since.
+pub(super) fn log_refusal(app: &App, limits: &RateLimits, robot: &RobotKey, key: &str, why: &str) {
+    if let Some(repeats) = limits.log_refused(robot, app.clock().elapsed()) {
+        warn!(repeats, "a message on `{key}` was refused: {why}");
+    }
+}
+
+/// Counts what does not read.
+pub(super) fn count_refusal(app: &App, error: &WireError) {
+    match error {
+        WireError::TooLarge(_) | WireError::Malformed(_) => app.counters().refused_malformed.one(),
+        WireError::Version(_) => app.counters().refused_version.one(),
+    }
+}
+
+/// An error with its cause, on one line.
+pub(super) fn explained(error: &WireError) -> String {
+    wire::Refusal::from(error).detail
+}
+
+/// Counts and logs a key that is none of ours.
+pub(super) fn refuse_key(app: &App, key: &str) {
+    app.counters().refused_key.one();
+    let key: String = key.chars().take(200).collect();
+    debug!("a message on `{key}` was refused: the key is none of Tread's");
+}

@@ -1,0 +1,339 @@
+//! Dependencies point one way. This reads what every module names of its own crate, and fails on a
+//! direction that `ARCHITECTURE.md` forbids and on modules that need each other.
+//!
+//! A folder counts as one module among its siblings; what a parent and its children name of each
+//! other does not count. Code that is compiled for tests alone does not either.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use syn::visit::Visit;
+
+/// Crates whose modules are read.
+const CRATES: [&str; 7] = [
+    "api",
+    "cli",
+    "control",
+    "lab",
+    "robot-agent",
+    "ros2",
+    "server",
+];
+
+/// Crates of this workspace that a crate may depend on, tests aside.
+const CRATE_RULES: [(&str, &[&str]); 5] = [
+    ("api", &[]),
+    ("control", &[]),
+    ("ros2", &[]),
+    ("robot-agent", &["tread-api", "tread-control", "tread-ros2"]),
+    ("server", &["tread-api", "tread-control"]),
+];
+
+/// Modules of the server that a module must not name.
+const SERVER_RULES: [(&str, &[&str]); 12] = [
+    ("app", &["http", "fleet"]),
+    ("authority", &["app", "db", "fleet", "http"]),
+    ("clock", &["app", "db", "fleet", "http"]),
+    ("config", &["app", "db", "fleet", "http"]),
+    ("connections", &["app", "db", "fleet", "http"]),
+    ("counters", &["app", "db", "fleet", "http"]),
+    ("db", &["app", "fleet", "http"]),
+    ("fleet", &["db", "http"]),
+    ("formats", &["app", "db", "fleet", "http"]),
+    ("friction", &["app", "db", "fleet", "http"]),
+    ("http", &["db", "fleet"]),
+    ("metrics", &["app", "db", "fleet", "http"]),
+];
+
+/// Modules that still need each other, by crate and parent. A line goes when its cycle is gone;
+/// none is added.
+const KNOWN_CYCLES: &[(&str, &str, &[&str])] = &[
+    ("api", "", &["identity", "mission", "rights", "trajectory"]),
+    ("cli", "commands", &["missions", "waiting"]),
+    ("cli", "commands::watch", &["picture", "screen"]),
+    ("control", "estimation", &["offsets", "regression", "sums"]),
+    (
+        "robot-agent",
+        "",
+        &[
+            "agent",
+            "base",
+            "config",
+            "control_loop",
+            "drive",
+            "recording",
+            "safety",
+            "sim",
+        ],
+    ),
+    ("robot-agent", "control_loop", &["active", "origin", "seam"]),
+    ("robot-agent", "drive::ros2", &["notices", "refusal"]),
+    (
+        "robot-agent",
+        "outbox",
+        &["bounded_file", "damage", "head_file", "recovery", "store"],
+    ),
+    ("robot-agent", "recording", &["read", "replay", "words"]),
+    ("server", "", &["config", "friction"]),
+    ("server", "friction", &["fuse", "joined"]),
+    ("server", "http", &["extract", "identity"]),
+];
+
+/// What one module names.
+#[derive(Debug, Default)]
+struct Module {
+    names: BTreeSet<Vec<String>>,
+}
+
+type Modules = BTreeMap<Vec<String>, Module>;
+
+/// Collects the paths within the crate that a module's items name.
+struct Names<'module> {
+    module: &'module [String],
+    found: BTreeSet<Vec<String>>,
+}
+
+impl Names<'_> {
+    fn add(&mut self, path: &[String]) {
+        let Some(first) = path.first() else { return };
+        let absolute = match first.as_str() {
+            "crate" => path[1..].to_vec(),
+            "self" => [self.module, &path[1..]].concat(),
+            "super" => {
+                let ups = path.iter().take_while(|part| *part == "super").count();
+                let depth = self.module.len().saturating_sub(ups);
+                [&self.module[..depth], &path[ups..]].concat()
+            }
+            _ => return,
+        };
+        self.found.insert(absolute);
+    }
+
+    fn add_tree(&mut self, before: &mut Vec<String>, tree: &syn::UseTree) {
+        match tree {
+            syn::UseTree::Path(path) => {
+                before.push(path.ident.to_string());
+                self.add_tree(before, &path.tree);
+                before.pop();
+            }
+            syn::UseTree::Name(name) => {
+                self.add(&[&before[..], &[name.ident.to_string()]].concat());
+            }
+            syn::UseTree::Rename(name) => {
+                self.add(&[&before[..], &[name.ident.to_string()]].concat());
+            }
+            syn::UseTree::Glob(_) => self.add(before),
+            syn::UseTree::Group(group) => {
+                for tree in &group.items {
+                    self.add_tree(before, tree);
+                }
+            }
+        }
+    }
+}
+
+fn is_for_tests(attributes: &[syn::Attribute]) -> bool {
+    attributes.iter().any(|attribute| {
+        attribute.path().is_ident("cfg")
+            && attribute
+                .parse_args::<syn::Ident>()
+                .is_ok_and(|condition| condition == "test")
+    })
+}
+
+impl<'ast> Visit<'ast> for Names<'_> {
+    fn visit_item_use(&mut self, item: &'ast syn::ItemUse) {
+        if !is_for_tests(&item.attrs) {
+            self.add_tree(&mut Vec::new(), &item.tree);
+        }
+    }
+
+    fn visit_item_mod(&mut self, item: &'ast syn::ItemMod) {
+        // Modules in a file of their own are read there; those in braces are for tests.
+        let _ = item;
+    }
+
+    fn visit_path(&mut self, path: &'ast syn::Path) {
+        let parts: Vec<String> = path
+            .segments
+            .iter()
+            .map(|part| part.ident.to_string())
+            .collect();
+        self.add(&parts);
+        syn::visit::visit_path(self, path);
+    }
+}
+
+/// Reads a module's file and those of its children.
+fn read(file: &Path, folder: &Path, module: &[String], modules: &mut Modules) {
+    let text =
+        fs::read_to_string(file).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
+    let parsed =
+        syn::parse_file(&text).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
+    let mut names = Names {
+        module,
+        found: BTreeSet::new(),
+    };
+    names.visit_file(&parsed);
+    modules.insert(module.to_vec(), Module { names: names.found });
+    for item in &parsed.items {
+        let syn::Item::Mod(child) = item else {
+            continue;
+        };
+        if child.content.is_some() || is_for_tests(&child.attrs) {
+            continue;
+        }
+        let name = child.ident.to_string();
+        let beside = folder.join(format!("{name}.rs"));
+        let below = folder.join(&name);
+        let within = below.join("mod.rs");
+        let file = if beside.exists() { beside } else { within };
+        read(&file, &below, &[module, &[name]].concat(), modules);
+    }
+}
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
+}
+
+fn modules_of(name: &str) -> Modules {
+    let folder = root().join(name).join("src");
+    let mut modules = Modules::new();
+    for main in ["lib.rs", "main.rs"] {
+        let file = folder.join(main);
+        if file.exists() {
+            read(&file, &folder, &[], &mut modules);
+        }
+    }
+    modules
+}
+
+/// Which module each module names, by full paths.
+fn edges(modules: &Modules) -> BTreeSet<(Vec<String>, Vec<String>)> {
+    let mut edges = BTreeSet::new();
+    for (from, module) in modules {
+        for named in &module.names {
+            let lengths = (1..=named.len()).rev();
+            let to = lengths.map(|length| &named[..length]);
+            if let Some(to) = to.into_iter().find(|path| modules.contains_key(*path)) {
+                edges.insert((from.clone(), to.to_vec()));
+            }
+        }
+    }
+    edges
+}
+
+/// Siblings that need each other, by their parent: name → what it names, for those in a cycle.
+fn cycles(modules: &Modules) -> BTreeMap<String, BTreeSet<String>> {
+    let mut siblings: BTreeMap<Vec<String>, BTreeMap<String, BTreeSet<String>>> = BTreeMap::new();
+    for (from, to) in edges(modules) {
+        let shared = from
+            .iter()
+            .zip(&to)
+            .take_while(|(one, other)| one == other)
+            .count();
+        if shared < from.len() && shared < to.len() {
+            let of = siblings.entry(from[..shared].to_vec()).or_default();
+            of.entry(from[shared].clone())
+                .or_default()
+                .insert(to[shared].clone());
+        }
+    }
+    let mut found = BTreeMap::new();
+    for (parent, graph) in siblings {
+        let reaches = |from: &String| {
+            let mut seen = BTreeSet::new();
+            let mut waiting: Vec<&String> = graph.get(from).into_iter().flatten().collect();
+            while let Some(next) = waiting.pop() {
+                if seen.insert(next.clone()) {
+                    waiting.extend(graph.get(next).into_iter().flatten());
+                }
+            }
+            seen
+        };
+        let within: BTreeSet<String> = graph
+            .keys()
+            .filter(|name| reaches(name).contains(*name))
+            .cloned()
+            .collect();
+        if !within.is_empty() {
+            found.insert(parent.join("::"), within);
+        }
+    }
+    found
+}
+
+#[test]
+fn no_crate_depends_on_one_that_it_must_not_know() {
+    for (name, allowed) in CRATE_RULES {
+        let manifest = fs::read_to_string(root().join(name).join("Cargo.toml")).unwrap();
+        let manifest: toml::Table = manifest.parse().unwrap();
+        let dependencies = manifest.get("dependencies").and_then(toml::Value::as_table);
+        for dependency in dependencies.into_iter().flat_map(toml::Table::keys) {
+            let is_ours = dependency.starts_with("tread-");
+            assert!(
+                !is_ours || allowed.contains(&dependency.as_str()),
+                "{name} must not depend on {dependency}"
+            );
+        }
+    }
+}
+
+#[test]
+fn the_layers_of_the_server_name_only_those_below_them() {
+    let edges = edges(&modules_of("server"));
+    let mut wrong = Vec::new();
+    for (layer, forbidden) in SERVER_RULES {
+        for (from, to) in &edges {
+            let is_of = from.first().is_some_and(|first| first == layer);
+            let is_wrong = to
+                .first()
+                .is_some_and(|first| forbidden.contains(&first.as_str()));
+            if is_of && is_wrong {
+                wrong.push(format!("{} → {}", from.join("::"), to.join("::")));
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+#[test]
+fn no_modules_need_each_other() {
+    let mut known: BTreeMap<(String, String), BTreeSet<String>> = BTreeMap::new();
+    for (name, parent, within) in KNOWN_CYCLES {
+        let within = within.iter().map(|name| (*name).to_owned()).collect();
+        known.insert(((*name).to_owned(), (*parent).to_owned()), within);
+    }
+    let mut found = BTreeMap::new();
+    for name in CRATES {
+        for (parent, within) in cycles(&modules_of(name)) {
+            found.insert((name.to_owned(), parent), within);
+        }
+    }
+    assert_eq!(
+        found, known,
+        "left: the cycles that there are; right: those that are known"
+    );
+}
+
+#[test]
+fn a_cycle_is_found_and_parents_do_not_count() {
+    let module = |names: &[&str]| Module {
+        names: names
+            .iter()
+            .map(|name| name.split("::").map(str::to_owned).collect())
+            .collect(),
+    };
+    let path = |name: &str| -> Vec<String> { name.split("::").map(str::to_owned).collect() };
+    let modules = Modules::from([
+        (Vec::new(), module(&["a", "b"])),
+        (path("a"), module(&["a::x::Thing", "b::Thing"])),
+        (path("a::x"), module(&["a::Thing", "c"])),
+        (path("b"), module(&["c::Thing"])),
+        (path("c"), module(&["a::x"])),
+    ]);
+    let within = ["a", "b", "c"].map(str::to_owned);
+    let expected = BTreeMap::from([(String::new(), BTreeSet::from(within))]);
+    assert_eq!(cycles(&modules), expected);
+}
