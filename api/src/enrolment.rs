@@ -223,11 +223,21 @@ pub struct FleetAuthority {
     pub signing: String,
     /// The rotation that is under way.
     pub rotation: Option<AuthorityRotation>,
+    /// False while the disk has not confirmed that the former authority is retired. It is, and a power
+    /// cut before this is true may undo it; the server asks the disk again by itself.
+    pub on_disk: bool,
+    /// How many robots must join again: what they showed last was signed by an authority that was retired.
+    pub robots_to_join: u32,
+    /// The first of them, at most 1000.
+    pub to_join: Vec<RobotLeft>,
 }
 
 /// A rotation of the fleet's authority: both are trusted, and the new one signs.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct AuthorityRotation {
+    /// Its name, which finishing it takes.
+    #[schema(value_type = String)]
+    pub id: TrustId,
     /// SHA-256 of the certificate of the authority that is to be retired.
     pub retiring: String,
     /// When the rotation was started.
@@ -242,7 +252,7 @@ pub struct AuthorityRotation {
     pub left: Vec<RobotLeft>,
 }
 
-/// A robot that still holds a certificate of the authority that is to be retired.
+/// A robot that still holds a certificate of an authority that is to be retired, or was.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct RobotLeft {
     /// The site.
@@ -256,11 +266,22 @@ pub struct RobotLeft {
 }
 
 /// Finishes a rotation.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct FinishRotation {
+    /// Which one: the `id` that its start has answered.
+    #[schema(value_type = String)]
+    pub rotation: TrustId,
     /// Retire the former authority though robots still hold certificates of it; they must join again.
     #[serde(default)]
     pub force: bool,
+}
+
+/// Puts another authority in the place of the present one, at once.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct ReplaceAuthority {
+    /// The `signing` of the authority that is to be replaced, so that nobody replaces another one than
+    /// he has looked at.
+    pub signing: String,
 }
 
 #[cfg(test)]

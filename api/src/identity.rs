@@ -8,8 +8,8 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use crate::ids::{SessionId, TokenId};
-use crate::rights::{Right, Rights, Scope, SiteScope};
+use crate::ids::{PersonId, SessionId, TokenId};
+use crate::rights::{Grant, Right, Rights, Scope, SiteScope};
 
 /// Most days that a token may be valid.
 pub const TOKEN_DAYS_MAX: u32 = 1_826;
@@ -72,6 +72,7 @@ impl FromStr for Role {
 
 /// A token as it is listed: everything but its secret, which nobody keeps.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(from = "TokenAnswer")]
 pub struct Token {
     /// Its identifier, for revoking it; no secret.
     pub id: TokenId,
@@ -95,6 +96,44 @@ pub struct Token {
     pub revoked_at: Option<Timestamp>,
     /// When it was used last, to within ten minutes.
     pub last_used_at: Option<Timestamp>,
+}
+
+/// A token as servers of any version tell it: before there were rights, the role said all, and a token
+/// held everywhere.
+#[derive(Deserialize)]
+struct TokenAnswer {
+    id: TokenId,
+    name: String,
+    role: Option<Role>,
+    rights: Option<Rights>,
+    #[serde(default)]
+    sites: Scope,
+    created_at: Timestamp,
+    created_by: String,
+    expires_at: Timestamp,
+    revoked_at: Option<Timestamp>,
+    last_used_at: Option<Timestamp>,
+}
+
+impl From<TokenAnswer> for Token {
+    fn from(answer: TokenAnswer) -> Self {
+        Self {
+            id: answer.id,
+            name: answer.name,
+            role: answer.role,
+            rights: rights_of(answer.rights, answer.role),
+            sites: answer.sites,
+            created_at: answer.created_at,
+            created_by: answer.created_by,
+            expires_at: answer.expires_at,
+            revoked_at: answer.revoked_at,
+            last_used_at: answer.last_used_at,
+        }
+    }
+}
+
+fn rights_of(rights: Option<Rights>, role: Option<Role>) -> Rights {
+    rights.or(role.map(Rights::from)).unwrap_or_default()
 }
 
 /// Asks for a new token, with a role or with rights of its own.
@@ -163,25 +202,131 @@ impl fmt::Debug for CreateSession {
     }
 }
 
+/// A session as servers of any version tell it.
+#[derive(Deserialize)]
+struct SessionAnswer {
+    name: String,
+    role: Option<Role>,
+    rights: Option<Rights>,
+    #[serde(default)]
+    sites: Scope,
+    grants: Option<Vec<Grant>>,
+    token: Option<TokenId>,
+    person: Option<Person>,
+    session: Option<SessionId>,
+    expires_at: Timestamp,
+}
+
+impl From<SessionAnswer> for Session {
+    fn from(answer: SessionAnswer) -> Self {
+        let rights = rights_of(answer.rights, answer.role);
+        let sites = answer.sites;
+        let whole = || Grant {
+            rights,
+            sites: sites.clone(),
+        };
+        Self {
+            name: answer.name,
+            role: answer.role,
+            rights,
+            grants: answer.grants.unwrap_or_else(|| vec![whole()]),
+            sites,
+            token: answer.token,
+            person: answer.person,
+            session: answer.session,
+            expires_at: answer.expires_at,
+        }
+    }
+}
+
+/// Somebody who signed in at an OpenID provider.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
+pub struct Person {
+    /// The person here: of issuer and subject, the same at each sign-in.
+    pub id: PersonId,
+    /// The provider, by its issuer.
+    pub issuer: String,
+    /// The person there, the claim `sub`: it stays when names and addresses change.
+    pub subject: String,
+}
+
 /// Who asks.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(from = "SessionAnswer")]
 pub struct Session {
-    /// The name of the token that was shown.
+    /// The name of the token that was shown, or of the person who signed in.
     pub name: String,
-    /// Its role; `null` if it has rights of its own.
+    /// The role; `null` for a token with rights of its own, and a person who has more than one
+    /// role or such rights.
     pub role: Option<Role>,
-    /// What it may do.
+    /// What may be done at all of `sites`. Somebody with several `grants` may do more at some of them.
     #[schema(value_type = Vec<Right>)]
     pub rights: Rights,
-    /// Where it may do that; `null` for everywhere.
+    /// Where it may be done; `null` for everywhere.
     #[schema(value_type = Option<Vec<SiteScope>>)]
     pub sites: Scope,
-    /// The token.
-    pub token: TokenId,
+    /// All that may be done, each with where: whatever any one of these allows. One, unless a person is in
+    /// groups that have different rights at different sites.
+    #[schema(required = true)]
+    pub grants: Vec<Grant>,
+    /// The token; `null` for a person who signed in at the provider.
+    #[schema(required = true)]
+    pub token: Option<TokenId>,
+    /// Who signed in at the provider; `null` for a token.
+    #[schema(required = true)]
+    pub person: Option<Person>,
     /// The browser's session, if it is one.
     pub session: Option<SessionId>,
     /// From when on it is refused.
     pub expires_at: Timestamp,
+}
+
+/// How people may sign in.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct SignInWays {
+    /// With a token: always.
+    pub token: bool,
+    /// At an OpenID provider; `null` if none is configured.
+    pub oidc: Option<OidcSignIn>,
+}
+
+/// The sign-in at an OpenID provider.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct OidcSignIn {
+    /// What people call the provider.
+    pub label: String,
+    /// Where a browser is sent to sign in.
+    pub path: String,
+    /// Whether the provider could be asked; the server goes on trying.
+    pub available: bool,
+}
+
+/// The end of a session.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct SignedOut {
+    /// Where a browser is sent to sign out at the provider too.
+    pub provider: String,
+}
+
+/// A person's session, as it is listed.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct PersonSession {
+    /// Its identifier, for ending it; no secret.
+    pub id: SessionId,
+    /// The person's name when they signed in.
+    pub name: String,
+    /// Who it is.
+    pub person: Person,
+    /// The groups that rights come from.
+    pub groups: Vec<String>,
+    /// What may be done, and where.
+    pub grants: Vec<Grant>,
+    /// When they signed in.
+    pub created_at: Timestamp,
+    /// From when on it is refused.
+    pub expires_at: Timestamp,
+    /// When it was used last, to within ten minutes.
+    pub last_used_at: Option<Timestamp>,
 }
 
 /// One line of the audit log: somebody changed something, or was refused.
@@ -196,10 +341,14 @@ pub struct AuditEntry {
     /// How many requests it stands for. Repeats of the same request, in the same way answered, are
     /// one entry when their author has asked for very many.
     pub count: u64,
-    /// The name of the token that was shown; `null` for a request without a good one.
+    /// The name of the token that was shown or of the person; `null` for a request without a good one.
     pub who: Option<String>,
     /// That token.
     pub token: Option<TokenId>,
+    /// The person who had signed in at an OpenID provider, if it was one.
+    // Left out when there is none, so that entries of before there were people keep their hashes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub person: Option<Person>,
     /// Its role; `null` too for one with rights of its own.
     pub role: Option<Role>,
     /// The address of the other side, or of the client that a trusted proxy names.
@@ -242,6 +391,32 @@ mod tests {
         for role in Role::ALL {
             assert_eq!(role.as_str().parse(), Ok(role));
         }
+    }
+
+    #[test]
+    fn what_a_server_without_rights_tells_reads_as_its_role_everywhere() {
+        let id = "0192f0c1-2b3c-7d4e-8f50-617283940a1b";
+        let session = serde_json::json!({
+            "name": "desk", "role": "operator", "token": id, "session": null,
+            "expires_at": "2027-01-01T00:00:00Z",
+        });
+        let session: Session = serde_json::from_value(session).unwrap();
+        assert_eq!(session.rights, Rights::from(Role::Operator));
+        assert!(session.sites.is_everywhere());
+        let token = serde_json::json!({
+            "id": id, "name": "desk", "role": "viewer", "created_at": "2026-01-01T00:00:00Z",
+            "created_by": "Ann", "expires_at": "2027-01-01T00:00:00Z", "revoked_at": null,
+            "last_used_at": null,
+        });
+        let token: Token = serde_json::from_value(token).unwrap();
+        assert_eq!(token.rights, Rights::from(Role::Viewer));
+        // What is told is never widened by the role.
+        let mut told = serde_json::to_value(&token).unwrap();
+        told["rights"] = serde_json::json!([]);
+        told["sites"] = serde_json::json!([{"site": "yard"}]);
+        let token: Token = serde_json::from_value(told).unwrap();
+        assert_eq!(token.rights, Rights::default());
+        assert!(!token.sites.is_everywhere());
     }
 
     #[test]

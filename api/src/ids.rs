@@ -162,6 +162,11 @@ uuid_id! {
     SessionId
 }
 uuid_id! {
+    /// A person who signs in at an OpenID provider: the version 5 UUID of the provider's issuer and
+    /// the person's subject there, so it stays whatever else the provider says of them.
+    PersonId
+}
+uuid_id! {
     /// A stop: a version 7 UUID, so that ids sort by time.
     StopId
 }
@@ -181,6 +186,15 @@ uuid_id! {
     ///
     /// See [`crate::wire::command::Offer::plan_hash_of`].
     PlanHash
+}
+
+impl PersonId {
+    /// The person of that subject at the provider of that issuer.
+    pub fn of(issuer: &str, subject: &str) -> Self {
+        // The length keeps every pair of texts apart from every other pair.
+        let name = format!("person {} {issuer} {subject}", issuer.len());
+        Self(Uuid::new_v5(&DERIVED_NAMESPACE, name.as_bytes()))
+    }
 }
 
 /// The name space of all version 5 UUIDs made here; changing it changes every derived id.
@@ -206,6 +220,20 @@ mod tests {
             too_long.as_str(),
         ] {
             assert!(bad.parse::<RobotId>().is_err(), "`{bad}` was taken");
+        }
+    }
+
+    #[test]
+    fn a_person_is_an_issuer_and_a_subject_there() {
+        let anna = PersonId::of("https://login.test", "anna");
+        assert_eq!(anna, PersonId::of("https://login.test", "anna"));
+        for (issuer, subject) in [
+            ("https://login.test", "bert"),
+            ("https://login.test/", "anna"),
+            ("https://login.test anna", ""),
+            ("https://login.tes", "t anna"),
+        ] {
+            assert_ne!(anna, PersonId::of(issuer, subject), "{issuer} {subject}");
         }
     }
 

@@ -93,6 +93,12 @@ pub enum ProblemType {
     UnknownHost,
     #[serde(rename = "/problems/unknown-token")]
     UnknownToken,
+    #[serde(rename = "/problems/unknown-session")]
+    UnknownSession,
+    #[serde(rename = "/problems/sign-in-failed")]
+    SignInFailed,
+    #[serde(rename = "/problems/sign-in-refused")]
+    SignInRefused,
     #[serde(rename = "/problems/request-too-long")]
     RequestTooLong,
     #[serde(rename = "/problems/robots-do-not-join")]
@@ -113,7 +119,7 @@ pub enum ProblemType {
 
 impl ProblemType {
     /// Every kind.
-    pub const ALL: [Self; 48] = [
+    pub const ALL: [Self; 51] = [
         Self::MalformedBody,
         Self::InvalidBody,
         Self::UnknownField,
@@ -154,6 +160,9 @@ impl ProblemType {
         Self::ForeignOrigin,
         Self::UnknownHost,
         Self::UnknownToken,
+        Self::UnknownSession,
+        Self::SignInFailed,
+        Self::SignInRefused,
         Self::RequestTooLong,
         Self::RobotsDoNotJoin,
         Self::AuthorityRotation,
@@ -207,6 +216,9 @@ impl ProblemType {
             Self::ForeignOrigin => "Another site's page may not ask for this",
             Self::UnknownHost => "This server does not go by that name",
             Self::UnknownToken => "The token is not known",
+            Self::UnknownSession => "The session is not known",
+            Self::SignInFailed => "The sign-in has failed",
+            Self::SignInRefused => "You may do nothing here",
             Self::RequestTooLong => "The path or query is too long",
             Self::RobotsDoNotJoin => "Robots do not join this server",
             Self::AuthorityRotation => "The authority's rotation does not allow this",

@@ -125,6 +125,18 @@ impl Rights {
         self.0 & other.0 == other.0
     }
 
+    /// The rights that are in it or in another.
+    #[must_use]
+    pub const fn union(self, other: Self) -> Self {
+        Self(self.0 | other.0)
+    }
+
+    /// The rights that are in it and in another.
+    #[must_use]
+    pub const fn intersection(self, other: Self) -> Self {
+        Self(self.0 & other.0)
+    }
+
     /// Whether it is for looking and stopping alone.
     pub const fn only_watches(self) -> bool {
         self.0 & !(Right::Stop.bit() | Right::Read.bit()) == 0
@@ -203,6 +215,17 @@ pub struct SiteScope {
 #[serde(try_from = "Option<Vec<SiteScope>>", into = "Option<Vec<SiteScope>>")]
 pub struct Scope(Option<BTreeMap<SiteId, Option<BTreeSet<RobotId>>>>);
 
+/// Rights for some places. Of several, any one that has the right and the place suffices.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
+pub struct Grant {
+    /// What may be done.
+    #[schema(value_type = Vec<Right>)]
+    pub rights: Rights,
+    /// Where; `null` for everywhere.
+    #[schema(value_type = Option<Vec<SiteScope>>)]
+    pub sites: Scope,
+}
+
 /// Why a list of sites is no scope.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidScope {
@@ -263,6 +286,27 @@ impl Scope {
             None => self.includes_whole_site(site),
             Some(robots) => robots.iter().all(|robot| self.includes_robot(site, robot)),
         })
+    }
+
+    /// What is in it or in another. It is for asking what is in it, and may be larger than what a
+    /// token may be limited to.
+    #[must_use]
+    pub fn union(&self, other: &Self) -> Self {
+        let (Some(own), Some(others)) = (&self.0, &other.0) else {
+            return Self::EVERYWHERE;
+        };
+        let mut sites = own.clone();
+        for (site, robots) in others {
+            let Some(present) = sites.get_mut(site) else {
+                sites.insert(site.clone(), robots.clone());
+                continue;
+            };
+            match (present.as_mut(), robots) {
+                (Some(present), Some(robots)) => present.extend(robots.iter().cloned()),
+                (Some(_) | None, _) => *present = None,
+            }
+        }
+        Self(Some(sites))
     }
 
     /// The sites in it; `None` for everywhere.
@@ -453,6 +497,19 @@ mod tests {
         assert!(!limited.includes(&scope(&["yard"])));
         assert_eq!(scope(&["yard/rover-1"]).only_site(), Some(&yard));
         assert_eq!(limited.only_site(), None);
+    }
+
+    #[test]
+    fn a_union_of_scopes_has_what_is_in_either_and_nothing_else() {
+        let union = |one: &[&str], other: &[&str]| scope(one).union(&scope(other));
+        assert_eq!(
+            union(&["yard/rover-1", "park"], &["yard/rover-2", "field"]),
+            scope(&["yard/rover-1", "yard/rover-2", "park", "field"])
+        );
+        assert_eq!(union(&["yard/rover-1"], &["yard"]), scope(&["yard"]));
+        assert_eq!(union(&["yard"], &["yard/rover-1"]), scope(&["yard"]));
+        let all = scope(&["yard"]).union(&Scope::EVERYWHERE);
+        assert!(all.is_everywhere() && Scope::EVERYWHERE.union(&scope(&["yard"])) == all);
     }
 
     #[test]

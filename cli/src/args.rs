@@ -18,8 +18,8 @@ use tread_api::ids::{RobotId, SiteId};
 use self::identity::Showing;
 pub(crate) use self::identity::{
     AuditAction, AuditArguments, AuthorityAction, AuthorityArguments, JoinTokenAction,
-    JoinTokenArguments, Noted, PlainArguments, RobotArguments, RobotsAction, TokensAction,
-    TokensArguments,
+    JoinTokenArguments, Noted, PlainArguments, RobotArguments, RobotsAction, SessionsAction,
+    SessionsArguments, TokensAction, TokensArguments,
 };
 pub(crate) use self::map::{
     FrictionAction, FrictionArguments, SitesAction, SitesArguments, TerrainsAction,
@@ -175,6 +175,8 @@ pub(crate) enum RemoteCommand {
     Token(PlainArguments),
     /// List tokens, make or revoke one
     Tokens(TokensArguments),
+    /// List sessions of people who signed in at the provider, or end some
+    Sessions(SessionsArguments),
     /// Show the fleet's authority, or rotate it: start, status and finish
     Authority(AuthorityArguments),
     /// Show, export or verify who changed what, and who was refused
@@ -198,6 +200,7 @@ impl RemoteCommand {
             | Self::Whoami(arguments)
             | Self::Token(arguments) => &arguments.connection,
             Self::Tokens(arguments) => &arguments.connection,
+            Self::Sessions(arguments) => &arguments.connection,
             Self::Authority(arguments) => &arguments.connection,
             Self::Audit(arguments) => &arguments.connection,
             Self::Stop(arguments) => &arguments.connection,

@@ -3,6 +3,8 @@
 //! An unknown key, an impossible value or an address beyond this machine stops the start, with a
 //! sentence that names file, line and key.
 
+pub mod oidc;
+
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -11,6 +13,7 @@ use clap::{Args, ValueEnum};
 use serde::Deserialize;
 use tread_api::ids::{ConfigurationId, SiteId};
 
+use self::oidc::{OidcConfig, OidcConfigError};
 use crate::authority::is_port_name;
 use crate::friction::index::Normalisation;
 use crate::identity::address::Network;
@@ -94,6 +97,8 @@ pub struct Config {
     /// How robots join and show who they are; without it they connect in the clear, on this
     /// machine alone.
     pub robots: Option<RobotsConfig>,
+    /// How people sign in at an OpenID provider; without it with tokens alone.
+    pub oidc: Option<OidcConfig>,
 }
 
 /// How robots join and show who they are.
@@ -339,6 +344,7 @@ struct File {
     #[serde(default)]
     audit: AuditConfig,
     robots: Option<RobotsConfig>,
+    oidc: Option<OidcConfig>,
 }
 
 /// Why the server cannot start with this configuration.
@@ -373,6 +379,9 @@ pub enum ConfigError {
         /// What was given.
         value: f64,
     },
+    /// The sign-in of people at a provider cannot be as it is written.
+    #[error(transparent)]
+    Oidc(#[from] OidcConfigError),
     /// A name of the robots' port is none.
     #[error("`robots.names` has `{0}`, which is neither a host name nor an address")]
     PortName(String),
@@ -430,6 +439,7 @@ impl Config {
             web: file.web,
             audit: file.audit,
             robots: file.robots,
+            oidc: file.oidc,
         };
         config.check()?;
         Ok(config)
@@ -463,6 +473,9 @@ impl Config {
         }
         if let Some(robots) = &self.robots {
             robots.check()?;
+        }
+        if let Some(oidc) = &self.oidc {
+            oidc.check(&self.names())?;
         }
         self.retention.check()?;
         self.storage.check()?;
@@ -513,7 +526,7 @@ fn read(path: &Path) -> Result<File, ConfigError> {
 mod tests {
     use super::*;
 
-    fn load(text: &str) -> Result<Config, ConfigError> {
+    pub(super) fn load(text: &str) -> Result<Config, ConfigError> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("tread.toml");
         std::fs::write(&path, text).unwrap();

@@ -90,6 +90,8 @@ counters! {
     renewals_refused,
     /// Renewals refused because the robot was put out of the fleet, or joined again.
     renewals_revoked,
+    /// Renewals refused because this server did not give the certificate, or gave it long ago.
+    renewals_not_issued,
     /// Renewals refused because the certificate was of an authority that was retired.
     renewals_retired,
     /// Connections to the robots' port.

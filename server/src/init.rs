@@ -1,5 +1,8 @@
+//! What is done beside a server, by whoever can write its database.
+//!
 //! `tread-server init`: the first admin's token of a server, and the fleet's authority if robots
-//! are to join.
+//! are to join. `tread-server forget-certificates`: the next certificate that each robot shows for a
+//! renewal counts.
 //!
 //! Whoever can write the database may make one; the server need not run, and may. The token is
 //! told once: on standard output, or into a file that only its owner can read.
@@ -17,7 +20,7 @@ use crate::app::{App, AppError};
 use crate::authority::{Authority, AuthorityError, NEXT_CERTIFICATE_FILE};
 use crate::clock::Clock;
 use crate::config::{Config, ServerArgs};
-use crate::db::Db;
+use crate::db::{self, Db, DbError};
 
 /// Arguments of `tread-server init`.
 #[derive(Debug, Clone, Args)]
@@ -41,6 +44,42 @@ pub(crate) struct InitArgs {
     /// Make one though there is an admin; a valid token of the same name is revoked
     #[arg(long)]
     force: bool,
+}
+
+/// Arguments of `tread-server forget-certificates`.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ForgetArgs {
+    /// Configuration file of the server, TOML
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Database file
+    #[arg(long, value_name = "FILE")]
+    database: Option<PathBuf>,
+}
+
+/// Forgets which certificates robots have: a database out of a backup does not know those that were
+/// given since.
+///
+/// # Errors
+/// The database cannot be written.
+pub(crate) async fn forget(args: ForgetArgs) -> anyhow::Result<()> {
+    let config = Config::load(&ServerArgs {
+        config: args.config,
+        database: args.database,
+        ..ServerArgs::default()
+    })?;
+    let database = Db::open(&config.database).await?;
+    let forgetting = async {
+        let mut tx = database.write("init").await?;
+        let count = db::enrolments::forget_certificates(&mut tx).await?;
+        tx.commit().await?;
+        Ok::<_, DbError>(count)
+    };
+    let forgotten = forgetting.await;
+    database.close().await;
+    let count = forgotten.context("cannot write the database")?;
+    eprintln!("of {count} robots the next certificate that they show for a renewal counts");
+    Ok(())
 }
 
 /// Makes the token and tells it.

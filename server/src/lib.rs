@@ -2,7 +2,8 @@
 //! robots measure, and gives it back.
 //!
 //! * [`http`] knows HTTP and no SQL; [`app`] holds the use cases; [`db`] knows SQL and decides
-//!   nothing; [`fleet`] is the only module that calls zenoh; [`friction`] is pure.
+//!   nothing; [`fleet`] is the only module that calls zenoh, [`oidc`] the only one that asks the OpenID
+//!   provider; [`friction`] is pure.
 //! * [`Server::start`] runs everything inside a program of one's own; [`run_from_args`] is
 //!   the whole program, until a signal.
 
@@ -21,6 +22,7 @@ pub mod identity;
 mod init;
 mod logging;
 pub mod metrics;
+pub mod oidc;
 mod rate_limit;
 pub mod supervisor;
 
@@ -117,6 +119,9 @@ impl Server {
                 .map(|(security, robots)| office(security, robots)),
         });
         app.log_audit(config.audit.log);
+        if let Some(oidc) = &config.oidc {
+            app.admit_people(oidc)?;
+        }
         remember(&app, &config.site).await?;
         let listener = http::serve::listen(config.http)
             .with_context(|| format!("cannot listen for HTTP on {}", config.http))?;
@@ -134,6 +139,8 @@ impl Server {
         supervisor.spawn_vital("retention", removing);
         supervisor.spawn_vital("audit", audit::run(app.clone(), stop()));
         supervisor.spawn_vital("tokens", app::identity::run(app.clone(), stop()));
+        let finding = app::identity::people::run(app.clone(), stop());
+        supervisor.spawn_vital("provider", finding);
         let router = http::router(app.clone(), names);
         if let Some(tls) = &tls {
             supervisor.spawn_vital("certificate", http::tls::watch(Arc::clone(tls), stop()));
@@ -266,6 +273,8 @@ struct Command {
 enum Action {
     /// Make the first admin's token of a server, and tell it this once
     Init(init::InitArgs),
+    /// Take the next certificate that each robot shows, as after a backup of the database was restored
+    ForgetCertificates(init::ForgetArgs),
 }
 
 /// The whole program with these arguments, the first of which is its name.
@@ -282,7 +291,8 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
         }
     };
     let ended = match command.action {
-        Some(Action::Init(args)) => run_init(args),
+        Some(Action::Init(args)) => run_beside_server(init::run(args)),
+        Some(Action::ForgetCertificates(args)) => run_beside_server(init::forget(args)),
         None => run(&command.server),
     };
     match ended {
@@ -304,11 +314,11 @@ fn raise_file_limit() {
     }
 }
 
-fn run_init(args: init::InitArgs) -> anyhow::Result<()> {
+fn run_beside_server(command: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()?;
-    runtime.block_on(init::run(args))
+    runtime.block_on(command)
 }
 
 /// The whole program: configuration, logging, server, until a signal or a failure.

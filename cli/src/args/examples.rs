@@ -31,7 +31,7 @@ const EXAMPLES: &[(&str, &str)] = &[
     ("robots", "  tread robots\n  tread robots rover-1"),
     (
         "robots join-token",
-        "  tread robots join-token --name rover-1 --expires 1h > token",
+        "  tread robots join-token --name rover-1 --expires 1h > token\n  tread robots join-token --all --expires 8h",
     ),
     ("robots join-token list", "  tread robots join-token list"),
     (
@@ -44,7 +44,11 @@ const EXAMPLES: &[(&str, &str)] = &[
     ("authority start", "  tread authority start"),
     (
         "authority finish",
-        "  tread authority finish\n  tread authority finish --force",
+        "  tread authority finish 3f0c8a5e91d2b746\n  tread authority finish 3f0c8a5e91d2b746 --force",
+    ),
+    (
+        "authority replace",
+        "  tread authority replace\n  tread authority replace --yes --json",
     ),
     (
         "robots rename",
@@ -188,6 +192,12 @@ const EXAMPLES: &[(&str, &str)] = &[
     (
         "tokens revoke",
         "  tread tokens revoke 0192f0c1-2b3c-7d4e-8f50-617283940a1b",
+    ),
+    ("sessions", "  tread sessions"),
+    ("sessions list", "  tread sessions list --json"),
+    (
+        "sessions end",
+        "  tread sessions end 0192f0c1-2b3c-7d4e-8f50-617283940a1b",
     ),
     ("audit", "  tread audit --refused"),
     ("audit export", "  tread audit export --output audit.jsonl"),

@@ -4,9 +4,9 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use clap::{Args, Subcommand};
-use tread_api::enrolment::JOIN_MINUTES_MAX;
+use tread_api::enrolment::{JOIN_MINUTES_MAX, TrustId};
 use tread_api::identity::{Role, TOKEN_DAYS_DEFAULT, TOKEN_DAYS_MAX};
-use tread_api::ids::{JoinTokenId, RobotId, TokenId};
+use tread_api::ids::{JoinTokenId, RobotId, SessionId, TokenId};
 use tread_api::rights::Right;
 
 use super::{Connection, duration};
@@ -67,6 +67,26 @@ pub(crate) enum TokensAction {
 }
 
 #[derive(Debug, Args)]
+pub(crate) struct SessionsArguments {
+    #[command(subcommand)]
+    pub(crate) action: Option<SessionsAction>,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum SessionsAction {
+    /// List who is signed in at the provider, newest first
+    List,
+    /// End sessions: they are refused from now on, and what they have open closes
+    End {
+        /// The sessions' identifiers, as `tread sessions` lists them
+        #[arg(required = true, value_name = "SESSION")]
+        sessions: Vec<SessionId>,
+    },
+}
+
+#[derive(Debug, Args)]
 pub(crate) struct AuthorityArguments {
     #[command(subcommand)]
     pub(crate) action: Option<AuthorityAction>,
@@ -80,12 +100,27 @@ pub(crate) enum AuthorityAction {
     Status,
     /// Start a rotation: another authority signs from now on, and both are trusted until it is finished
     Start,
-    /// Finish the rotation: the former authority is retired; refused while robots are left
+    /// Finish a rotation: the former authority is retired; refused while robots are left
     Finish {
+        /// The rotation, as `start` and `status` show it
+        #[arg(value_parser = rotation)]
+        rotation: TrustId,
         /// Finish it though robots are left; each of them must join again
         #[arg(long)]
         force: bool,
     },
+    /// Replace an authority whose key was stolen: nothing that it has signed counts any more, and every
+    /// robot must join again
+    Replace {
+        /// Do not ask
+        #[arg(long)]
+        yes: bool,
+    },
+}
+
+fn rotation(text: &str) -> Result<TrustId, String> {
+    let wrong = |_| "a rotation is 16 hexadecimal digits, as `tread authority` shows it".to_owned();
+    text.parse().map_err(wrong)
 }
 
 #[derive(Debug, Args)]
@@ -93,7 +128,7 @@ pub(crate) enum AuthorityAction {
 pub(crate) struct AuditArguments {
     #[command(subcommand)]
     pub(crate) action: Option<AuditAction>,
-    /// Only what was asked with the token of this name
+    /// Only what was asked with the token, or by the person, of this name
     #[arg(long)]
     pub(crate) who: Option<String>,
     /// Only what was refused or failed
@@ -187,6 +222,9 @@ pub(crate) struct JoinTokenArguments {
     /// The robot that it is for; without it any may join that is new to the site
     #[arg(long, value_name = "ROBOT")]
     pub(crate) name: Option<RobotId>,
+    /// One for each robot of all sites that must join again because its authority was retired
+    #[arg(long, conflicts_with = "name")]
+    pub(crate) all: bool,
     /// How long it may be used, such as `30m` or `1h`, at most a day
     #[arg(long, value_name = "TIME", default_value = "1h", value_parser = join_time)]
     pub(crate) expires: u32,

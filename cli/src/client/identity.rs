@@ -1,11 +1,13 @@
 //! Who asks, and who is of the fleet.
 
+use reqwest::Method;
 use tread_api::audit::AuditChain;
 use tread_api::enrolment::{
     CreateJoinToken, CreatedJoinToken, Enrolment, FinishRotation, FleetAuthority, JoinToken,
+    ReplaceAuthority,
 };
-use tread_api::identity::{AuditEntry, CreateToken, CreatedToken, Session, Token};
-use tread_api::ids::{JoinTokenId, RobotId, SiteId, TokenId};
+use tread_api::identity::{AuditEntry, CreateToken, CreatedToken, PersonSession, Session, Token};
+use tread_api::ids::{JoinTokenId, RobotId, SessionId, SiteId, TokenId};
 use tread_api::page::{PAGE_LIMIT_MAX, Page};
 
 use super::{Client, ClientError};
@@ -29,6 +31,17 @@ impl Client {
 
     pub(crate) async fn revoke_token(&self, token: TokenId) -> Result<Token, ClientError> {
         self.delete(&format!("/v1/tokens/{token}")).await
+    }
+
+    /// Sessions of people, newest first.
+    pub(crate) async fn sessions(&self) -> Result<Vec<PersonSession>, ClientError> {
+        self.all("/v1/sessions").await
+    }
+
+    /// Ends somebody's session.
+    pub(crate) async fn end_session(&self, session: SessionId) -> Result<(), ClientError> {
+        let request = self.request(Method::DELETE, &format!("/v1/sessions/{session}"));
+        self.answered(request).await.map(|_done| ())
     }
 
     /// Makes a token by which a robot may join.
@@ -84,6 +97,14 @@ impl Client {
         request: &FinishRotation,
     ) -> Result<FleetAuthority, ClientError> {
         self.post("/v1/authority/rotation/finish", request).await
+    }
+
+    /// Replaces the fleet's authority.
+    pub(crate) async fn replace_authority(
+        &self,
+        request: &ReplaceAuthority,
+    ) -> Result<FleetAuthority, ClientError> {
+        self.post("/v1/authority/replace", request).await
     }
 
     /// A page of the audit log, the oldest first, after the entry of this number.

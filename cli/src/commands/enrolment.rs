@@ -2,7 +2,7 @@
 
 use std::process::ExitCode;
 
-use tread_api::enrolment::{CreateJoinToken, Enrolment, JoinToken};
+use tread_api::enrolment::{CreateJoinToken, CreatedJoinToken, Enrolment, JoinToken};
 use tread_api::robot::{ChangeRobot, Robot};
 
 use crate::args::{JoinTokenAction, JoinTokenArguments, RobotArguments, RobotsAction};
@@ -68,6 +68,7 @@ async fn join_token(
     output: Output,
 ) -> anyhow::Result<()> {
     match &arguments.action {
+        None if arguments.all => join_tokens_of_all(arguments.expires, client, output).await?,
         None => {
             let request = CreateJoinToken {
                 site: arguments.connection.site.clone(),
@@ -98,6 +99,58 @@ async fn join_token(
         }
     }
     Ok(())
+}
+
+/// Makes a join token for each robot that must join again.
+async fn join_tokens_of_all(
+    valid_minutes: u32,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<()> {
+    let authority = client.authority().await?;
+    let mut made = Vec::new();
+    for robot in &authority.to_join {
+        let request = CreateJoinToken {
+            site: robot.site.clone(),
+            robot: Some(robot.robot.clone()),
+            valid_minutes: Some(valid_minutes),
+        };
+        match client.create_join_token(&request).await {
+            Ok(created) => made.push(created),
+            Err(failed) => {
+                // Those that were made are told nowhere else.
+                output.show(&made, |made| secrets(made))?;
+                return Err(failed.into());
+            }
+        }
+    }
+    if made.is_empty() && !output.is_json() {
+        note("no robot must join again");
+        return Ok(());
+    }
+    output.show(&made, |made| secrets(made))?;
+    let listed = u32::try_from(made.len()).unwrap_or(u32::MAX);
+    let more = authority.robots_to_join.saturating_sub(listed);
+    if more > 0 && !output.is_json() {
+        note(&format!(
+            "{more} more robots must join again: ask once more when these have joined"
+        ));
+    }
+    Ok(())
+}
+
+fn secrets(made: &[CreatedJoinToken]) -> String {
+    let mut table = table(["SITE", "ROBOT", "UNTIL", "JOIN TOKEN"]);
+    for created in made {
+        let token = &created.join_token;
+        table.add_row([
+            token.site.to_string(),
+            or_dash(token.robot.as_ref()),
+            format!("{:.0}", token.expires_at),
+            created.secret.clone(),
+        ]);
+    }
+    render(&table)
 }
 
 fn listed(tokens: &[JoinToken]) -> String {

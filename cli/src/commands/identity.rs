@@ -1,14 +1,14 @@
-//! `tread login`, `logout`, `whoami`, `token` and `tokens`.
+//! `tread login`, `logout`, `whoami`, `token`, `tokens` and `sessions`.
 
 use std::io::{IsTerminal as _, Read as _};
 use std::process::ExitCode;
 
 use anyhow::{Context as _, ensure};
 use serde_json::json;
-use tread_api::identity::{CreateToken, Role, Session, Token};
-use tread_api::rights::{Rights, Scope};
+use tread_api::identity::{CreateToken, PersonSession, Role, Session, Token};
+use tread_api::rights::{Grant, Rights, Scope};
 
-use crate::args::{Connection, TokensAction, TokensArguments};
+use crate::args::{Connection, SessionsAction, TokensAction, TokensArguments};
 use crate::client::Client;
 use crate::credentials::{self, Store};
 use crate::output::{Output, line, note, or_dash, render, table};
@@ -167,6 +167,60 @@ fn list(tokens: &[Token]) -> String {
             format!("{:.0}", token.expires_at),
             or_dash(token.last_used_at.map(|at| format!("{at:.0}"))),
             or_dash(token.revoked_at.map(|at| format!("{at:.0}"))),
+        ]);
+    }
+    render(&table)
+}
+
+/// Lists or ends sessions of people.
+pub(super) async fn sessions(
+    action: Option<SessionsAction>,
+    client: &Client,
+    output: Output,
+) -> anyhow::Result<ExitCode> {
+    match action {
+        None | Some(SessionsAction::List) => {
+            output.show(&client.sessions().await?, |sessions| signed_in(sessions))?;
+        }
+        Some(SessionsAction::End { sessions }) => {
+            for &session in &sessions {
+                client.end_session(session).await?;
+            }
+            output.show(&json!({"ended": sessions}), |_| {
+                "ended; whom the provider still lets in can sign in again".to_owned()
+            })?;
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn signed_in(sessions: &[PersonSession]) -> String {
+    let mut table = table([
+        "SESSION",
+        "NAME",
+        "SUBJECT",
+        "GROUPS",
+        "MAY",
+        "SINCE",
+        "UNTIL",
+        "LAST USED",
+    ]);
+    for session in sessions {
+        let may = session.grants.iter().map(|Grant { rights, sites }| {
+            let role = Role::ALL
+                .into_iter()
+                .find(|&role| Rights::from(role) == *rights);
+            format!("{} for {sites}", what(role, *rights))
+        });
+        table.add_row([
+            session.id.to_string(),
+            session.name.clone(),
+            session.person.subject.clone(),
+            session.groups.join(", "),
+            may.collect::<Vec<_>>().join("; "),
+            format!("{:.0}", session.created_at),
+            format!("{:.0}", session.expires_at),
+            or_dash(session.last_used_at.map(|at| format!("{at:.0}"))),
         ]);
     }
     render(&table)

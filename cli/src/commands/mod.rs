@@ -46,6 +46,9 @@ pub(crate) async fn run(command: RemoteCommand, output: Output) -> anyhow::Resul
         RemoteCommand::Logout(_) => identity::logout(&client, output),
         RemoteCommand::Token(_) => identity::token(&client),
         RemoteCommand::Tokens(arguments) => identity::tokens(arguments, &client, output).await,
+        RemoteCommand::Sessions(arguments) => {
+            identity::sessions(arguments.action, &client, output).await
+        }
         RemoteCommand::Authority(arguments) => {
             authority::run(arguments.action.as_ref(), &client, output).await
         }

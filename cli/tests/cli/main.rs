@@ -5,6 +5,7 @@
     reason = "what the helpers of a test cannot do fails the test"
 )]
 
+mod authority;
 mod drive;
 mod manual;
 mod operator;

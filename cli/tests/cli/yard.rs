@@ -47,6 +47,7 @@ impl Yard {
                 key: at("key.pem"),
             }),
             robots: None,
+            oidc: None,
             audit: tread_server::config::AuditConfig::default(),
             web: WebConfig::default(),
         });

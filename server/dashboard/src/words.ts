@@ -1,4 +1,5 @@
 // Every word of the page. A translation is another object of this shape.
+import { rightsOf } from './rights';
 import type {
   BindingLimit,
   Cause,
@@ -127,11 +128,13 @@ export const words = {
     token: 'Token',
     hint: 'A token begins with tread_. The demo prints the file that holds the admin’s.',
     submit: 'Sign in',
+    provider: (label: string) => `Sign in with ${label}`,
+    unavailable: 'It does not answer at the moment.',
     again: 'Your sign-in has ended. Sign in again; what you drew is kept.',
     out: 'Sign out',
     as: (name: string, what: string) => `${name}, ${what}`,
   },
-  rights: (session: Session) => (session.role ? role[session.role] : session.rights.join(', ')),
+  rights: (session: Session) => (session.role ? role[session.role] : rightsOf(session).join(', ')),
   standing,
   limitNames: limit,
   header: {

@@ -11,7 +11,7 @@ use tread_api::page::Page;
 use tread_api::robot::{ALERT_TEXT_MAX, ALERTS_MAX, Alert, AlertReport, Severity};
 use tread_api::wire::ingest::MissionReport;
 
-use super::enrolment::{RETIRED_ALERT, REVOKED_ALERT};
+use super::enrolment::{RETIRED_ALERT, REVOKED_ALERT, UNISSUED_ALERT};
 use super::missions::reports::Taken;
 use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::stops::UNCONFIRMED_ALERT;
@@ -25,10 +25,11 @@ pub(super) const MISSION_FAILED_ALERT: &str = "mission-failed";
 /// Alerts of one robot that are kept; the oldest that have cleared go first.
 const KEPT_MAX: u32 = 500;
 /// Alerts that the server raises and ends, whatever the robot says.
-const OWN_ALERTS: [&str; 5] = [
+const OWN_ALERTS: [&str; 6] = [
     UNCONFIRMED_ALERT,
     REVOKED_ALERT,
     RETIRED_ALERT,
+    UNISSUED_ALERT,
     ROBOT_LOST_ALERT,
     MISSION_FAILED_ALERT,
 ];

@@ -2,7 +2,7 @@
 
 use tread_api::geometry::Point;
 use tread_api::ids::{
-    AlertId, JoinTokenId, MissionId, RobotId, SiteId, StopId, TerrainId, TokenId,
+    AlertId, JoinTokenId, MissionId, RobotId, SessionId, SiteId, StopId, TerrainId, TokenId,
 };
 use tread_api::mission::MissionState;
 use tread_api::trajectory::Place;
@@ -96,6 +96,9 @@ pub enum AppError {
     /// No token of that identifier.
     #[error("token `{0}` is not known")]
     UnknownToken(TokenId),
+    /// No session of that identifier.
+    #[error("session `{0}` is not known")]
+    UnknownSession(SessionId),
     /// No join token of that identifier.
     #[error("join token `{0}` is not known")]
     UnknownJoinToken(JoinTokenId),
@@ -123,7 +126,7 @@ pub enum AppError {
         first: String,
     },
     /// The authority's files cannot be written.
-    #[error("the files of the fleet's authority cannot be written")]
+    #[error("the files of the fleet's authority cannot be written: {}", .0.what_became())]
     AuthorityFiles(#[source] AuthorityError),
     /// The operating system gives no random numbers.
     #[error("the operating system gives no random numbers: {0}")]
@@ -276,6 +279,7 @@ impl AppError {
             | Self::Impossible { .. }
             | Self::UnknownAlert(_)
             | Self::UnknownToken(_)
+            | Self::UnknownSession(_)
             | Self::UnknownJoinToken(_)
             | Self::NoAuthority
             | Self::Rotation(_)

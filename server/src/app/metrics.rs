@@ -1,4 +1,4 @@
-//! All metrics of the server in the `OpenMetrics` format: what was recorded while it worked
+//! All metrics of the server in the OpenMetrics format: what was recorded while it worked
 //! ([`crate::metrics`]), and what is looked up when somebody asks.
 
 use std::sync::atomic::AtomicU64;

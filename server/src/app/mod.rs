@@ -217,6 +217,11 @@ impl App {
         &self.inner.robots
     }
 
+    /// Starts something that ends by itself, beside a request.
+    pub fn pass_by(&self, name: &'static str, task: impl Future<Output = ()> + Send + 'static) {
+        self.supervisor().spawn_passing(name, task);
+    }
+
     /// Runs what goes on after a request was answered.
     fn supervisor(&self) -> &Supervisor {
         &self.inner.robots.supervisor

@@ -3,11 +3,11 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use tread_api::ids::TokenId;
 use tread_api::rights::Rights;
 
 use super::AppError;
 use super::identity::Credential;
+use crate::identity::subject::SubjectId;
 
 /// How many places there are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -16,7 +16,7 @@ pub struct Bounds {
     pub all: usize,
     /// For those who may only watch and stop, all together: the rest is for those who work.
     pub viewers: usize,
-    /// For one token, with its sessions.
+    /// For one token or person, with their sessions.
     pub each: usize,
 }
 
@@ -24,7 +24,7 @@ pub struct Bounds {
 struct Taken {
     all: usize,
     viewers: usize,
-    by_token: HashMap<TokenId, usize>,
+    by_subject: HashMap<SubjectId, usize>,
 }
 
 /// Who has how many places.
@@ -53,16 +53,16 @@ impl Shares {
     /// Takes a place until the result is dropped.
     ///
     /// # Errors
-    /// [`AppError::TooMany`] if all are taken, those for viewers are, or this token has its share.
+    /// [`AppError::TooMany`] if all are taken, those for viewers are, or this token or person has its share.
     pub fn take(&self, of: &Credential, what: &'static str) -> Result<Place, AppError> {
-        self.place(of.token, of.rights, what)
+        self.place(of.subject, of.rights, what)
     }
 
-    fn place(&self, of: TokenId, rights: Rights, what: &'static str) -> Result<Place, AppError> {
+    fn place(&self, of: SubjectId, rights: Rights, what: &'static str) -> Result<Place, AppError> {
         let Bounds { all, viewers, each } = self.bounds;
         let is_viewer = rights.only_watches();
         let mut taken = self.lock();
-        let own = taken.by_token.get(&of).copied().unwrap_or(0);
+        let own = taken.by_subject.get(&of).copied().unwrap_or(0);
         let too_many = |count| Err(AppError::TooMany { what, count });
         if taken.all >= all {
             return too_many(all);
@@ -75,12 +75,12 @@ impl Shares {
         }
         taken.all += 1;
         taken.viewers += usize::from(is_viewer);
-        taken.by_token.insert(of, own + 1);
+        taken.by_subject.insert(of, own + 1);
         drop(taken);
         let shares = self.clone();
         Ok(Place {
             shares,
-            token: of,
+            subject: of,
             is_viewer,
         })
     }
@@ -90,7 +90,7 @@ impl Shares {
 #[derive(Debug)]
 pub struct Place {
     shares: Shares,
-    token: TokenId,
+    subject: SubjectId,
     is_viewer: bool,
 }
 
@@ -99,10 +99,10 @@ impl Drop for Place {
         let mut taken = self.shares.lock();
         taken.all -= 1;
         taken.viewers -= usize::from(self.is_viewer);
-        if let Some(own) = taken.by_token.get_mut(&self.token) {
+        if let Some(own) = taken.by_subject.get_mut(&self.subject) {
             *own -= 1;
             if *own == 0 {
-                taken.by_token.remove(&self.token);
+                taken.by_subject.remove(&self.subject);
             }
         }
     }
@@ -121,7 +121,10 @@ mod tests {
             viewers: 6,
             each: 4,
         });
-        let token = |number| TokenId::from_uuid(uuid::Uuid::from_u128(number));
+        let token = |number| {
+            let id = tread_api::ids::TokenId::from_uuid(uuid::Uuid::from_u128(number));
+            SubjectId::Token(id)
+        };
         let place = |number, role| shares.place(token(number), Rights::from(role), "places");
         let mut held: Vec<_> = (0..20)
             .filter_map(|_| place(1, Role::Viewer).ok())
@@ -133,6 +136,6 @@ mod tests {
         assert_eq!((held.len(), shares.taken()), (10, 10));
         held.clear();
         assert_eq!(shares.taken(), 0);
-        assert!(shares.lock().by_token.is_empty());
+        assert!(shares.lock().by_subject.is_empty());
     }
 }

@@ -7,12 +7,20 @@
 //!  start   next.key, next.json ── next.pem ◄─ from here on the next authority signs
 //!  finish  ca.pem → retired-….pem ◄─ from here on the former is retired
 //!          next.key → ca.key (its key is gone), next.pem → ca.pem, next.json removed
+//!  replace replacing.key ── replacing.pem ◄─ from here on all others are retired
+//!          ca.pem and next.pem → retired-….pem, next.key and next.json removed,
+//!          replacing.key → ca.key, replacing.pem → ca.pem
 //! ```
+//!
+//! A step is done when the folder shows it, and kept when the disk has confirmed it. What retires an
+//! authority counts from when it is done: to trust it again would be worse. What makes one begins only
+//! when it is kept: a power cut must not take an authority away that has signed.
 
 use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io::{self, Write as _};
 use std::os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _, PermissionsExt as _};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use jiff::Timestamp;
 use rustls::pki_types::CertificateDer;
@@ -20,7 +28,7 @@ use rustls::pki_types::pem::PemObject as _;
 use serde::{Deserialize, Serialize};
 use tracing::{error, warn};
 
-use super::Authority;
+use super::{Authority, fingerprint};
 
 /// The authority's certificate, in its folder.
 pub const CERTIFICATE_FILE: &str = "ca.pem";
@@ -32,6 +40,12 @@ pub const NEXT_CERTIFICATE_FILE: &str = "next.pem";
 const NEXT_KEY_FILE: &str = "next.key";
 /// Who started the rotation, and when.
 const ROTATION_FILE: &str = "next.json";
+/// The certificate and the key of the authority that replaces all others.
+const REPLACING_CERTIFICATE_FILE: &str = "replacing.pem";
+const REPLACING_KEY_FILE: &str = "replacing.key";
+/// Others may read a certificate, and its owner alone a key.
+const CERTIFICATE_MODE: u32 = 0o644;
+const KEY_MODE: u32 = 0o600;
 /// What the certificate of a retired authority is called, around the begin of its fingerprint.
 const RETIRED_PREFIX: &str = "retired-";
 const RETIRED_SUFFIX: &str = ".pem";
@@ -40,12 +54,16 @@ const RETIRED_DIGITS: usize = 16;
 /// Most retired authorities that are read, the newest by the time of their retirement.
 const RETIRED_MAX: usize = 8;
 /// The files of a rotation that was never complete.
-const INCOMPLETE: [&str; 4] = [
+const INCOMPLETE_ROTATION: [&str; 5] = [
     NEXT_KEY_FILE,
     ROTATION_FILE,
     "next.key.new",
     "next.json.new",
+    "next.pem.new",
 ];
+/// The files of a replacement that was never complete.
+const INCOMPLETE_REPLACEMENT: [&str; 3] =
+    [REPLACING_KEY_FILE, "replacing.key.new", "replacing.pem.new"];
 
 /// Why the authority cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -71,6 +89,18 @@ pub enum AuthorityError {
         #[source]
         cause: io::Error,
     },
+    /// A file was written, the disk has not confirmed it, and it could not be removed for certain.
+    #[error(
+        "cannot write `{}`, nor take it back for certain",
+        path.display()
+    )]
+    NotTakenBack {
+        /// Which file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        cause: io::Error,
+    },
     /// Others than the owner can read the key.
     #[error("others can read `{}`: make it `chmod 600`, and a new authority if they may have", .0.display())]
     Open(PathBuf),
@@ -83,6 +113,23 @@ pub enum AuthorityError {
         #[source]
         cause: rcgen::Error,
     },
+}
+
+impl AuthorityError {
+    /// What became of a change that was asked for.
+    pub fn what_became(&self) -> &'static str {
+        match self {
+            Self::NotTakenBack { .. } => {
+                "nothing has changed, but it could not be taken back for certain, and the next start \
+                 of the server may find it done"
+            }
+            Self::Exists(_)
+            | Self::Unreadable { .. }
+            | Self::Unwritable { .. }
+            | Self::Open(_)
+            | Self::Unusable { .. } => "nothing has changed",
+        }
+    }
 }
 
 impl Authority {
@@ -105,8 +152,8 @@ impl Authority {
                 cause,
             })?;
         let key_pem = authority.issuer.key().serialize_pem();
-        write(&key, 0o600, &key_pem).map_err(unwritable(&key))?;
-        let written = write(&certificate, 0o644, &authority.certificate_pem);
+        write(&key, KEY_MODE, &key_pem).map_err(unwritable(&key))?;
+        let written = write(&certificate, CERTIFICATE_MODE, &authority.certificate_pem);
         written.map_err(unwritable(&certificate))?;
         Ok(authority)
     }
@@ -149,113 +196,297 @@ pub(super) struct Kept {
     pub(super) retired: Vec<CertificateDer<'static>>,
 }
 
+/// Whether the disk has confirmed what the folder shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Settled {
+    /// It has.
+    Yes,
+    /// It has not: a power cut may undo the last step. [`Folder::settle`] asks again.
+    NotYet,
+}
+
+/// Makes sure that what was changed in a folder is on the disk.
+type Sync = Arc<dyn Fn(&Path) -> io::Result<()> + Send + std::marker::Sync>;
+
+/// The folder of the authority. Only the server that owns it may change it.
+#[derive(Clone)]
+pub(super) struct Folder {
+    path: PathBuf,
+    sync: Sync,
+}
+
+impl std::fmt::Debug for Folder {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.debug_tuple("Folder").field(&self.path).finish()
+    }
+}
+
 /// One change of the folder; each is there whole or not at all.
 #[derive(Debug)]
 enum Step {
-    Write(&'static str, String),
+    Write(&'static str, u32, String),
     Rename(&'static str, String),
     Remove(&'static str),
 }
 
 impl Step {
-    /// Does it; once more does no harm.
-    fn apply(&self, folder: &Path) -> Result<(), AuthorityError> {
-        let (name, done) = match self {
-            Self::Write(name, text) => (name, replace(folder, name, text)),
-            Self::Rename(name, to) => (name, rename(&folder.join(name), &folder.join(to))),
-            Self::Remove(name) => (name, remove(&folder.join(name))),
-        };
-        done.and_then(|()| File::open(folder)?.sync_all())
-            .map_err(unwritable(&folder.join(name)))
+    fn name(&self) -> &'static str {
+        match self {
+            Self::Write(name, ..) | Self::Rename(name, _) | Self::Remove(name) => name,
+        }
+    }
+
+    /// Does it, so that the folder shows it; once more does no harm.
+    fn take(&self, folder: &Path) -> io::Result<()> {
+        match self {
+            Self::Write(name, mode, text) => replace(folder, name, *mode, text),
+            Self::Rename(name, to) => rename(&folder.join(name), &folder.join(to)),
+            Self::Remove(name) => remove(&folder.join(name)),
+        }
     }
 }
 
 /// What starts a rotation. With the last of the steps it has begun.
 fn starting(next: &Authority, started: &Started) -> io::Result<Vec<Step>> {
     let started = serde_json::to_string_pretty(started)?;
+    let (key, certificate) = (next.issuer.key().serialize_pem(), &next.certificate_pem);
     Ok(vec![
-        Step::Write(NEXT_KEY_FILE, next.issuer.key().serialize_pem()),
-        Step::Write(ROTATION_FILE, started),
-        Step::Write(NEXT_CERTIFICATE_FILE, next.certificate_pem.clone()),
+        Step::Write(NEXT_KEY_FILE, KEY_MODE, key),
+        Step::Write(ROTATION_FILE, KEY_MODE, started),
+        Step::Write(NEXT_CERTIFICATE_FILE, CERTIFICATE_MODE, certificate.clone()),
     ])
 }
 
-/// What finishes a rotation. With the first of the steps it is decided, and [`recover`] does the
-/// others if the server does not come to it.
+/// What finishes a rotation. With the first of the steps it is decided, and [`Folder::recover`] does
+/// the others if the server does not come to it.
 fn finishing(former: &Authority) -> Vec<Step> {
-    let digits = &former.fingerprint[..RETIRED_DIGITS];
-    let retired = format!("{RETIRED_PREFIX}{digits}{RETIRED_SUFFIX}");
     vec![
-        Step::Rename(CERTIFICATE_FILE, retired),
+        Step::Rename(CERTIFICATE_FILE, retired_name(&former.fingerprint)),
         Step::Rename(NEXT_KEY_FILE, KEY_FILE.to_owned()),
         Step::Rename(NEXT_CERTIFICATE_FILE, CERTIFICATE_FILE.to_owned()),
         Step::Remove(ROTATION_FILE),
     ]
 }
 
-/// Starts a rotation in the folder.
-///
-/// # Errors
-/// It cannot be written; as far as that is possible, it is as before.
-pub(super) fn start(
-    folder: &Path,
-    next: &Authority,
-    started: &Started,
-) -> Result<(), AuthorityError> {
-    // A finish may have been decided that the disk refused to complete.
-    recover(folder)?;
-    let steps = starting(next, started).map_err(unwritable(&folder.join(ROTATION_FILE)))?;
-    for step in steps {
-        if let Err(failed) = step.apply(folder) {
-            let _ = Step::Remove(NEXT_CERTIFICATE_FILE).apply(folder);
-            return Err(failed);
-        }
-    }
-    Ok(())
+/// What decides a replacement: with the last of the steps.
+fn replacing(next: &Authority) -> Vec<Step> {
+    let (key, certificate) = (next.issuer.key().serialize_pem(), &next.certificate_pem);
+    vec![
+        Step::Write(REPLACING_KEY_FILE, KEY_MODE, key),
+        Step::Write(
+            REPLACING_CERTIFICATE_FILE,
+            CERTIFICATE_MODE,
+            certificate.clone(),
+        ),
+    ]
 }
 
-/// Finishes a rotation in the folder.
-///
-/// # Errors
-/// It cannot be written, and is not decided.
-pub(super) fn finish(folder: &Path, former: &Authority) -> Result<(), AuthorityError> {
-    let mut steps = finishing(former).into_iter();
-    if let Some(decided) = steps.next() {
-        decided.apply(folder)?;
-    }
-    for step in steps {
-        if let Err(failed) = step.apply(folder) {
-            error!(
-                error = &failed as &dyn std::error::Error,
-                "the files of the authorities are not all in their places; the next start of the \
-                 server completes it"
-            );
-            break;
-        }
-    }
-    Ok(())
+/// What completes a replacement, out of the fingerprints of those that it retires.
+fn completing_replacement(present: Option<&str>, next: Option<&str>) -> Vec<Step> {
+    let retire =
+        |file: &'static str, fingerprint: &str| Step::Rename(file, retired_name(fingerprint));
+    let mut steps = Vec::new();
+    steps.extend(next.map(|next| retire(NEXT_CERTIFICATE_FILE, next)));
+    steps.extend([Step::Remove(NEXT_KEY_FILE), Step::Remove(ROTATION_FILE)]);
+    steps.extend(present.map(|present| retire(CERTIFICATE_FILE, present)));
+    steps.extend([
+        Step::Rename(REPLACING_KEY_FILE, KEY_FILE.to_owned()),
+        Step::Rename(REPLACING_CERTIFICATE_FILE, CERTIFICATE_FILE.to_owned()),
+    ]);
+    steps
 }
 
-/// Completes what an earlier run of the server had decided, and takes back what it had not. Only the
-/// server that owns the folder may call it.
-pub(super) fn recover(folder: &Path) -> Result<(), AuthorityError> {
-    let is_there = |name: &str| folder.join(name).exists();
-    if is_there(NEXT_CERTIFICATE_FILE) && !is_there(CERTIFICATE_FILE) {
-        if is_there(NEXT_KEY_FILE) {
-            Step::Rename(NEXT_KEY_FILE, KEY_FILE.to_owned()).apply(folder)?;
-        }
-        Step::Rename(NEXT_CERTIFICATE_FILE, CERTIFICATE_FILE.to_owned()).apply(folder)?;
-    }
-    if !is_there(NEXT_CERTIFICATE_FILE) {
-        for name in INCOMPLETE.into_iter().filter(|name| is_there(name)) {
-            Step::Remove(name).apply(folder)?;
-        }
-    }
-    Ok(())
+fn retired_name(fingerprint: &str) -> String {
+    let digits = fingerprint.get(..RETIRED_DIGITS).unwrap_or(fingerprint);
+    format!("{RETIRED_PREFIX}{digits}{RETIRED_SUFFIX}")
 }
 
-/// Reads the folder, after [`recover`].
-pub(super) fn read(folder: &Path) -> Result<Kept, AuthorityError> {
+impl Folder {
+    pub(super) fn new(path: &Path) -> Self {
+        Self {
+            path: path.to_owned(),
+            sync: Arc::new(|path| File::open(path)?.sync_all()),
+        }
+    }
+
+    fn unwritable(&self, name: &str) -> impl FnOnce(io::Error) -> AuthorityError + use<> {
+        unwritable(&self.path.join(name))
+    }
+
+    fn has(&self, name: &str) -> bool {
+        self.path.join(name).exists()
+    }
+
+    /// The fingerprint of the certificate in a file; `None` without one.
+    fn fingerprint_in(&self, name: &str) -> Option<String> {
+        let certificate = CertificateDer::from_pem_file(self.path.join(name)).ok()?;
+        Some(fingerprint(&certificate))
+    }
+
+    /// Does a step and waits until the disk has it.
+    fn apply(&self, step: &Step) -> Result<(), AuthorityError> {
+        let done = step.take(&self.path).and_then(|()| (self.sync)(&self.path));
+        done.map_err(self.unwritable(step.name()))
+    }
+
+    /// Does what begins something. If the last step is not known to be kept it is taken back: nothing
+    /// must be done by what a power cut may undo.
+    fn begin(&self, steps: &[Step]) -> Result<(), AuthorityError> {
+        let Some((deciding, preparing)) = steps.split_last() else {
+            return Ok(());
+        };
+        for step in preparing {
+            self.apply(step)?;
+        }
+        let Err(failed) = self.apply(deciding) else {
+            return Ok(());
+        };
+        match self.take_back(deciding.name()) {
+            Ok(()) => Err(failed),
+            Err(cause) => {
+                let path = self.path.join(deciding.name());
+                Err(AuthorityError::NotTakenBack { path, cause })
+            }
+        }
+    }
+
+    fn take_back(&self, name: &str) -> io::Result<()> {
+        // Either the rename has failed, and there is nothing, or the disk has not confirmed it.
+        remove(&self.path.join(name))?;
+        (self.sync)(&self.path)
+    }
+
+    /// Does what is left of something that is decided; the next start of the server does it otherwise.
+    fn complete(&self, steps: &[Step]) {
+        for step in steps {
+            if let Err(failed) = self.apply(step) {
+                error!(
+                    error = &failed as &dyn std::error::Error,
+                    "the files of the authorities are not all in their places; the next start of \
+                     the server completes it"
+                );
+                break;
+            }
+        }
+    }
+
+    /// Completes what the disk refused to complete, and removes what was taken back in vain: whatever
+    /// signs here and is none of those that are trusted.
+    fn tidy(&self, is_trusted: impl Fn(&str) -> bool) -> Result<(), AuthorityError> {
+        for name in [REPLACING_CERTIFICATE_FILE, NEXT_CERTIFICATE_FILE] {
+            let known = self.fingerprint_in(name).is_some_and(|it| is_trusted(&it));
+            if self.has(name) && !known {
+                self.apply(&Step::Remove(name))?;
+            }
+        }
+        self.recover()
+    }
+
+    /// Starts a rotation.
+    ///
+    /// # Errors
+    /// It cannot be written; as far as that is possible, it is as before.
+    pub(super) fn start(
+        &self,
+        next: &Authority,
+        started: &Started,
+        is_trusted: impl Fn(&str) -> bool,
+    ) -> Result<(), AuthorityError> {
+        self.tidy(is_trusted)?;
+        let steps = starting(next, started).map_err(self.unwritable(ROTATION_FILE))?;
+        self.begin(&steps)
+    }
+
+    /// Finishes a rotation. It is decided as soon as the folder shows it, kept by the disk or not.
+    ///
+    /// # Errors
+    /// The folder is as it was.
+    pub(super) fn finish(&self, former: &Authority) -> Result<Settled, AuthorityError> {
+        let steps = finishing(former);
+        let Some((deciding, rest)) = steps.split_first() else {
+            return Ok(Settled::Yes);
+        };
+        let decided = deciding.take(&self.path);
+        decided.map_err(self.unwritable(deciding.name()))?;
+        if let Err(cause) = (self.sync)(&self.path) {
+            // The others must not come to the disk before it: key and certificate would not be of
+            // each other.
+            error!("the disk has not confirmed that the former authority is retired: {cause}");
+            return Ok(Settled::NotYet);
+        }
+        self.complete(rest);
+        Ok(Settled::Yes)
+    }
+
+    /// Puts an authority in the place of all others.
+    ///
+    /// # Errors
+    /// It cannot be written; as far as that is possible, it is as before.
+    pub(super) fn replace(
+        &self,
+        next: &Authority,
+        is_trusted: impl Fn(&str) -> bool,
+    ) -> Result<(), AuthorityError> {
+        self.tidy(is_trusted)?;
+        self.begin(&replacing(next))?;
+        self.complete(&self.rest_of_replacement());
+        Ok(())
+    }
+
+    fn rest_of_replacement(&self) -> Vec<Step> {
+        let present = self.fingerprint_in(CERTIFICATE_FILE);
+        let next = self.fingerprint_in(NEXT_CERTIFICATE_FILE);
+        completing_replacement(present.as_deref(), next.as_deref())
+    }
+
+    /// Asks the disk again for what it has not confirmed, and completes what waits for it.
+    ///
+    /// # Errors
+    /// It still does not confirm it.
+    pub(super) fn settle(&self) -> Result<(), AuthorityError> {
+        (self.sync)(&self.path).map_err(unwritable(&self.path))?;
+        self.recover()
+    }
+
+    /// Completes what an earlier run of the server had decided, and takes back what it had not.
+    ///
+    /// # Errors
+    /// The folder cannot be written.
+    pub(super) fn recover(&self) -> Result<(), AuthorityError> {
+        if self.has(REPLACING_CERTIFICATE_FILE) {
+            for step in self.rest_of_replacement() {
+                self.apply(&step)?;
+            }
+        }
+        self.remove_all(&INCOMPLETE_REPLACEMENT)?;
+        if self.has(NEXT_CERTIFICATE_FILE) && !self.has(CERTIFICATE_FILE) {
+            if self.has(NEXT_KEY_FILE) {
+                self.apply(&Step::Rename(NEXT_KEY_FILE, KEY_FILE.to_owned()))?;
+            }
+            let certificate = CERTIFICATE_FILE.to_owned();
+            self.apply(&Step::Rename(NEXT_CERTIFICATE_FILE, certificate))?;
+        }
+        if !self.has(NEXT_CERTIFICATE_FILE) {
+            self.remove_all(&INCOMPLETE_ROTATION)?;
+        }
+        Ok(())
+    }
+
+    fn remove_all(&self, names: &[&'static str]) -> Result<(), AuthorityError> {
+        let mut there = names.iter().filter(|name| self.has(name));
+        there.try_for_each(|name| self.apply(&Step::Remove(name)))
+    }
+
+    /// Reads it, after [`Self::recover`].
+    ///
+    /// # Errors
+    /// There is no authority, others can read a key, or it cannot be used.
+    pub(super) fn read(&self) -> Result<Kept, AuthorityError> {
+        read(&self.path)
+    }
+}
+
+fn read(folder: &Path) -> Result<Kept, AuthorityError> {
     let present = Authority::load(folder)?;
     let next = if folder.join(NEXT_CERTIFICATE_FILE).exists() {
         let next = load(folder, NEXT_CERTIFICATE_FILE, NEXT_KEY_FILE)?;
@@ -307,7 +538,7 @@ fn unreadable(path: &Path) -> impl FnOnce(io::Error) -> AuthorityError {
     move |cause| AuthorityError::Unreadable { path, cause }
 }
 
-fn unwritable(path: &Path) -> impl FnOnce(io::Error) -> AuthorityError {
+fn unwritable(path: &Path) -> impl FnOnce(io::Error) -> AuthorityError + use<> {
     let path = path.to_owned();
     move |cause| AuthorityError::Unwritable { path, cause }
 }
@@ -320,11 +551,11 @@ fn write(path: &Path, mode: u32, text: &str) -> io::Result<()> {
     file.sync_all()
 }
 
-/// Replaces a file that only its owner can read.
-fn replace(folder: &Path, name: &str, text: &str) -> io::Result<()> {
+/// Replaces a file.
+fn replace(folder: &Path, name: &str, mode: u32, text: &str) -> io::Result<()> {
     let new = folder.join(format!("{name}.new"));
     remove(&new)?;
-    write(&new, 0o600, text)?;
+    write(&new, mode, text)?;
     fs::rename(new, folder.join(name))
 }
 
@@ -346,10 +577,11 @@ fn rename(from: &Path, to: &Path) -> io::Result<()> {
 #[cfg(test)]
 mod tests {
     use std::os::unix::fs::PermissionsExt as _;
+    use std::sync::atomic::{AtomicUsize, Ordering};
 
     use proptest::prelude::*;
 
-    use super::super::Authorities;
+    use super::super::{Authorities, RotationError};
     use super::*;
 
     fn now() -> Timestamp {
@@ -371,6 +603,18 @@ mod tests {
         names
     }
 
+    fn apply_all(folder: &Path, steps: &[Step]) {
+        let folder = Folder::new(folder);
+        for step in steps {
+            folder.apply(step).unwrap();
+        }
+    }
+
+    fn mode(folder: &Path, name: &str) -> u32 {
+        let metadata = fs::metadata(folder.join(name)).unwrap();
+        metadata.permissions().mode() & 0o777
+    }
+
     #[test]
     fn a_crash_between_any_two_steps_leaves_the_rotation_started_or_not_and_finished_or_not() {
         for steps_done in 0..=7 {
@@ -381,9 +625,7 @@ mod tests {
             let mut steps = starting(&next, &started()).unwrap();
             steps.extend(finishing(&former));
             assert_eq!(steps.len(), 7);
-            for step in &steps[..steps_done] {
-                step.apply(&folder).unwrap();
-            }
+            apply_all(&folder, &steps[..steps_done]);
             // A half-written file of the step that did not come to its end.
             fs::write(folder.join("next.key.new"), "half").unwrap();
             // Twice: the recovery itself may be cut short and is done again.
@@ -397,27 +639,153 @@ mod tests {
                 };
                 assert_eq!(all, expected, "after {steps_done} steps");
             }
-            let private = |name: &str| {
-                let mode = fs::metadata(folder.join(name))
-                    .unwrap()
-                    .permissions()
-                    .mode();
-                assert_eq!(mode & 0o077, 0, "{name} after {steps_done} steps");
-            };
-            private(KEY_FILE);
+            assert_eq!(mode(&folder, KEY_FILE), 0o600);
+            assert_eq!(mode(&folder, CERTIFICATE_FILE), 0o644);
             if steps_done == 3 {
-                private(NEXT_KEY_FILE);
+                assert_eq!(mode(&folder, NEXT_KEY_FILE), 0o600);
                 continue;
             }
             // Nothing is left beside what is in force, above all no other key.
             let mut expected = vec![KEY_FILE.to_owned(), CERTIFICATE_FILE.to_owned()];
             if steps_done > 3 {
-                let digits = &former.fingerprint[..RETIRED_DIGITS];
-                expected.push(format!("retired-{digits}.pem"));
+                expected.push(retired_name(&former.fingerprint));
                 let key = fs::read_to_string(folder.join(KEY_FILE)).unwrap();
                 assert_eq!(key, next.issuer.key().serialize_pem());
             }
             assert_eq!(names(&folder), expected, "after {steps_done} steps");
+        }
+    }
+
+    #[test]
+    fn a_crash_between_any_two_steps_leaves_the_authority_replaced_or_not_in_a_rotation_too() {
+        for (is_rotating, steps_done) in (0..=8).flat_map(|done| [(false, done), (true, done)]) {
+            let folder = tempfile::tempdir().unwrap();
+            let folder = folder.path().join("authority");
+            let former = Authority::create(&folder, now()).unwrap();
+            let (next, last) = (
+                Authority::generate("next", now()).unwrap(),
+                Authority::generate("last", now()).unwrap(),
+            );
+            let mut trusted_before = vec![former.fingerprint()];
+            if is_rotating {
+                apply_all(&folder, &starting(&next, &started()).unwrap());
+                trusted_before.insert(0, next.fingerprint());
+            }
+            let mut steps = replacing(&last);
+            let of_next = is_rotating.then_some(&*next.fingerprint);
+            steps.extend(completing_replacement(Some(&former.fingerprint), of_next));
+            assert_eq!(steps.len(), 7 + usize::from(is_rotating));
+            let steps_done = steps_done.min(steps.len());
+            apply_all(&folder, &steps[..steps_done]);
+            for _ in 0..2 {
+                let trusted = Authorities::load(&folder).unwrap().present();
+                let all: Vec<&str> = trusted.all().map(|one| one.fingerprint()).collect();
+                let expected = match steps_done {
+                    0..=1 => trusted_before.clone(),
+                    _ => vec![last.fingerprint()],
+                };
+                assert_eq!(all, expected, "after {steps_done} steps");
+            }
+            if steps_done < 2 {
+                assert!(!names(&folder).iter().any(|name| name.contains("replacing")));
+                continue;
+            }
+            let mut expected = vec![KEY_FILE.to_owned(), CERTIFICATE_FILE.to_owned()];
+            expected.extend(trusted_before.iter().map(|one| retired_name(one)));
+            expected.sort();
+            assert_eq!(names(&folder), expected, "after {steps_done} steps");
+            let key = fs::read_to_string(folder.join(KEY_FILE)).unwrap();
+            assert_eq!(key, last.issuer.key().serialize_pem());
+            assert_eq!(mode(&folder, KEY_FILE), 0o600);
+        }
+    }
+
+    /// A disk that confirms so many changes, fails for some, and confirms all after them.
+    fn failing(path: &Path, confirmed: usize, failures: usize) -> Folder {
+        let asked = AtomicUsize::new(0);
+        let sync = move |path: &Path| {
+            let asked = asked.fetch_add(1, Ordering::Relaxed);
+            if (confirmed..confirmed + failures).contains(&asked) {
+                return Err(io::Error::from_raw_os_error(5));
+            }
+            File::open(path)?.sync_all()
+        };
+        Folder {
+            path: path.to_owned(),
+            sync: Arc::new(sync),
+        }
+    }
+
+    #[test]
+    fn a_finish_that_the_disk_does_not_confirm_counts_says_so_and_is_completed_later() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("authority");
+        let former = Authority::create(&path, now()).unwrap();
+        // Three of the start; then the one that decides the finish fails, and the next asking too.
+        let authorities = Authorities::load_from(failing(&path, 3, 2)).unwrap();
+        let during = authorities.start("admin", now()).unwrap();
+        let next = during.signing().fingerprint();
+        let after = authorities.finish(during.id()).unwrap();
+        assert!(!after.is_trusted(former.fingerprint()) && after.is_trusted(next));
+        assert!(!authorities.is_settled());
+        // A power cut that undoes the rename must find key and certificate of each other.
+        let undone = tempfile::tempdir().unwrap();
+        for name in names(&path) {
+            fs::copy(path.join(&name), undone.path().join(name)).unwrap();
+        }
+        let retired = undone.path().join(retired_name(former.fingerprint()));
+        fs::rename(retired, undone.path().join(CERTIFICATE_FILE)).unwrap();
+        let undone = Authorities::load(undone.path()).unwrap().present();
+        assert_eq!(undone.id(), during.id());
+
+        assert!(authorities.settle().is_err());
+        assert!(!authorities.is_settled());
+        authorities.settle().unwrap();
+        assert!(authorities.is_settled());
+        let mut expected = vec![KEY_FILE.to_owned(), CERTIFICATE_FILE.to_owned()];
+        expected.push(retired_name(former.fingerprint()));
+        assert_eq!(names(&path), expected);
+        let again = Authorities::load(&path).unwrap().present();
+        assert_eq!(again.id(), after.id());
+    }
+
+    #[test]
+    fn what_begins_and_is_not_confirmed_is_taken_back_and_can_be_asked_for_again() {
+        for is_replacement in [false, true] {
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("authority");
+            let former = Authority::create(&path, now()).unwrap();
+            let prepared = if is_replacement { 1 } else { 2 };
+            for failures in [1, 2] {
+                let authorities =
+                    Authorities::load_from(failing(&path, prepared, failures)).unwrap();
+                let refused = if is_replacement {
+                    authorities.replace(former.fingerprint(), now())
+                } else {
+                    authorities.start("admin", now())
+                };
+                let refused = refused.unwrap_err();
+                let is_taken_back = !matches!(
+                    refused,
+                    RotationError::Files(AuthorityError::NotTakenBack { .. })
+                );
+                assert_eq!(is_taken_back, failures == 1, "{refused:?}");
+                assert!(authorities.is_settled());
+                let trusted = authorities.present();
+                assert_eq!(trusted.signing().fingerprint(), former.fingerprint());
+                // The folder shows the same.
+                let shown = Authorities::load(&path).unwrap().present();
+                assert_eq!(shown.id(), trusted.id());
+            }
+            let authorities = Authorities::load(&path).unwrap();
+            // What could not be taken back is not mistaken for what is begun now.
+            let stale = Authority::generate("stale", now()).unwrap();
+            apply_all(&path, &starting(&stale, &started()).unwrap());
+            apply_all(&path, &replacing(&stale));
+            authorities.start("admin", now()).unwrap();
+            let again = Authorities::load(&path).unwrap().present();
+            assert_eq!(again.id(), authorities.present().id());
+            assert!(!again.is_trusted(stale.fingerprint()));
         }
     }
 
@@ -450,7 +818,7 @@ mod tests {
         /// Starts, finishes and restarts in any order.
         #[test]
         fn whatever_is_asked_for_one_authority_signs_at_most_two_are_trusted_and_the_disk_says_so(
-            asked in prop::collection::vec(0_u8..3, 1..12),
+            asked in prop::collection::vec(0_u8..4, 1..12),
         ) {
             let folder = tempfile::tempdir().unwrap();
             let folder = folder.path().join("authority");
@@ -461,15 +829,23 @@ mod tests {
                 let was_under_way = before.retiring().is_some();
                 match asked {
                     0 => prop_assert_eq!(authorities.start("admin", now()).is_ok(), !was_under_way),
-                    1 => prop_assert_eq!(authorities.finish().is_ok(), was_under_way),
+                    1 => prop_assert_eq!(authorities.finish(before.id()).is_ok(), was_under_way),
+                    2 => {
+                        let replaced = authorities.replace(before.signing().fingerprint(), now());
+                        let replaced = replaced.unwrap();
+                        prop_assert!(!before.all().any(|one| replaced.is_trusted(one.fingerprint())));
+                    }
                     _ => authorities = Authorities::load(&folder).unwrap(),
                 }
                 let present = authorities.present();
                 prop_assert_eq!(present.all().count(), 1 + usize::from(present.retiring().is_some()));
                 prop_assert!(present.is_trusted(present.of_port().fingerprint()));
-                // No step leaves a robot that was brought over before without a common authority.
-                prop_assert!(present.is_trusted(before.signing().fingerprint()));
-                prop_assert!(before.is_trusted(present.of_port().fingerprint()));
+                // But for a replacement no step leaves a robot that was brought over before without a
+                // common authority.
+                if asked != 2 {
+                    prop_assert!(present.is_trusted(before.signing().fingerprint()));
+                    prop_assert!(before.is_trusted(present.of_port().fingerprint()));
+                }
                 prop_assert_eq!(Authorities::load(&folder).unwrap().present().id(), present.id());
             }
         }

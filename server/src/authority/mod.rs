@@ -7,6 +7,7 @@
 //! name reads back one way only, and what a robot had before it joined again counts no more.
 
 mod file;
+mod issued;
 mod rotation;
 
 use std::fmt::Write as _;
@@ -30,6 +31,7 @@ use webpki::{EndEntityCert, KeyUsage};
 use x509_parser::prelude::{FromDer as _, X509Certificate};
 
 pub use self::file::{AuthorityError, CERTIFICATE_FILE, KEY_FILE, NEXT_CERTIFICATE_FILE};
+pub use self::issued::Issued;
 pub use self::rotation::{Authorities, Retiring, RotationError, RotationRefused, Trusted};
 
 /// How long the authority lasts.
@@ -105,6 +107,8 @@ pub enum CertificateError {
 pub struct Signed {
     /// PEM.
     pub certificate: String,
+    /// Its SHA-256, in hexadecimal digits.
+    pub fingerprint: String,
     /// From when on it is refused.
     pub expires_at: Timestamp,
 }
@@ -252,6 +256,7 @@ impl Authority {
             .map_err(CertificateError::Signing)?;
         Ok(Signed {
             certificate: signed.pem(),
+            fingerprint: fingerprint(signed.der()),
             expires_at,
         })
     }
@@ -300,6 +305,11 @@ impl PresentCertificate {
     /// Whom it names.
     pub fn name(&self) -> &RobotName {
         &self.name
+    }
+
+    /// Its SHA-256, in hexadecimal digits.
+    pub fn fingerprint(&self) -> String {
+        fingerprint(&self.certificate)
     }
 
     /// The fingerprint of the authority that signed it.

@@ -8,9 +8,17 @@
 //! accept, and those that know both. Each renewal brings a robot both authorities and a certificate
 //! of B. From the finish on the port shows one of B. A key that is new for the fleet is in use as soon
 //! as it is there: B signs, and what is derived from the authority's key derives from B's.
+//!
+//! ```text
+//!  A is trusted, or A and B are ──replace──► C signs, C alone is trusted
+//! ```
+//!
+//! A replacement is for a key that was stolen: no certificate of before opens anything, and every robot
+//! joins again.
 
-use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use jiff::Timestamp;
 use rustls::pki_types::CertificateDer;
@@ -19,7 +27,7 @@ use tokio::sync::watch;
 use tread_api::enrolment::TrustId;
 use webpki::EndEntityCert;
 
-use super::file::{self, Started};
+use super::file::{Folder, Settled, Started};
 use super::{
     Authority, AuthorityError, CertificateError, PresentCertificate, RENEWAL_GRACE, fingerprint,
     is_signed_by, later, named_in,
@@ -34,6 +42,28 @@ pub enum RotationRefused {
     /// None is under way.
     #[error("no rotation of the authority is under way")]
     None,
+    /// Another one is under way.
+    #[error(
+        "rotation `{named}` is not the one that is under way, which is `{under_way}`: look at that one \
+         first"
+    )]
+    Other {
+        /// The one that was named.
+        named: TrustId,
+        /// The one that is under way.
+        under_way: TrustId,
+    },
+    /// Another authority signs.
+    #[error(
+        "authority `{named}` is not the one that signs, which is `{signing}`: somebody else has \
+         rotated or replaced it"
+    )]
+    OtherAuthority {
+        /// The one that was named.
+        named: String,
+        /// The one that signs.
+        signing: String,
+    },
 }
 
 /// Why a rotation was not started or finished.
@@ -111,7 +141,12 @@ impl Trusted {
         self.all().map(|one| one.certificate_pem()).collect()
     }
 
-    /// The name of what robots are to trust.
+    /// Whether an authority was ever retired.
+    pub fn has_retired(&self) -> bool {
+        !self.retired.is_empty()
+    }
+
+    /// The name of what robots are to trust, and so of the rotation that is under way.
     pub fn id(&self) -> TrustId {
         TrustId::of(self.all().map(|one| one.certificate().as_ref()))
     }
@@ -135,11 +170,38 @@ impl Trusted {
         })
     }
 
+    /// Refuses unless this rotation is under way.
+    ///
+    /// # Errors
+    /// None is, or another one.
+    pub fn check_rotation(&self, named: TrustId) -> Result<(), RotationRefused> {
+        let under_way = self.id();
+        if self.retiring.is_none() {
+            Err(RotationRefused::None)
+        } else if named == under_way {
+            Ok(())
+        } else {
+            Err(RotationRefused::Other { named, under_way })
+        }
+    }
+
+    fn check_signing(&self, named: &str) -> Result<(), RotationRefused> {
+        let signing = self.signing.fingerprint();
+        if named.eq_ignore_ascii_case(signing) {
+            return Ok(());
+        }
+        Err(RotationRefused::OtherAuthority {
+            named: named.to_owned(),
+            signing: signing.to_owned(),
+        })
+    }
+
     /// What the end of the rotation makes of this.
     ///
     /// # Errors
-    /// None is under way.
-    fn finished(&self) -> Result<Self, RotationRefused> {
+    /// None is under way, or another one.
+    fn finished(&self, rotation: TrustId) -> Result<Self, RotationRefused> {
+        self.check_rotation(rotation)?;
         let retiring = self.retiring.as_ref().ok_or(RotationRefused::None)?;
         let mut retired = self.retired.clone();
         retired.push(retiring.authority.certificate().clone());
@@ -148,6 +210,17 @@ impl Trusted {
             retiring: None,
             retired,
         })
+    }
+
+    /// What a replacement by another authority makes of this.
+    fn replaced(&self, next: Arc<Authority>) -> Self {
+        let mut retired = self.retired.clone();
+        retired.extend(self.all().map(|one| one.certificate().clone()));
+        Self {
+            signing: next,
+            retiring: None,
+            retired,
+        }
     }
 
     /// The fingerprint of the authority that signed a robot's certificate; `None` unless it is trusted.
@@ -199,10 +272,12 @@ impl Trusted {
 #[derive(Debug)]
 pub struct Authorities {
     /// Where they are kept; `None` for those in memory only.
-    folder: Option<PathBuf>,
+    folder: Option<Folder>,
     present: watch::Sender<Arc<Trusted>>,
     /// One change at a time.
     turn: Mutex<()>,
+    /// Whether the disk has not confirmed yet that an authority is retired.
+    is_unsettled: AtomicBool,
 }
 
 impl Authorities {
@@ -211,11 +286,12 @@ impl Authorities {
         Self::new(None, Trusted::one(authority))
     }
 
-    fn new(folder: Option<PathBuf>, trusted: Trusted) -> Self {
+    fn new(folder: Option<Folder>, trusted: Trusted) -> Self {
         Self {
             folder,
             present: watch::Sender::new(Arc::new(trusted)),
             turn: Mutex::new(()),
+            is_unsettled: AtomicBool::new(false),
         }
     }
 
@@ -224,8 +300,12 @@ impl Authorities {
     /// # Errors
     /// There is none, others can read a key, or it cannot be used.
     pub fn load(folder: &Path) -> Result<Self, AuthorityError> {
-        file::recover(folder)?;
-        let kept = file::read(folder)?;
+        Self::load_from(Folder::new(folder))
+    }
+
+    pub(super) fn load_from(folder: Folder) -> Result<Self, AuthorityError> {
+        folder.recover()?;
+        let kept = folder.read()?;
         let mut trusted = Trusted::one(Arc::new(kept.present));
         trusted.retired = kept.retired;
         let trusted = match kept.next {
@@ -240,7 +320,7 @@ impl Authorities {
                 retired: trusted.retired,
             },
         };
-        Ok(Self::new(Some(folder.to_owned()), trusted))
+        Ok(Self::new(Some(folder), trusted))
     }
 
     /// Who is trusted now.
@@ -253,39 +333,86 @@ impl Authorities {
         self.present.subscribe()
     }
 
+    fn take_turn(&self) -> MutexGuard<'_, ()> {
+        self.turn.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// Starts a rotation: makes the next authority, which signs from now on. Blocks.
     ///
     /// # Errors
     /// One is under way, or the folder cannot be written; nothing has changed then.
     pub fn start(&self, by: &str, now: Timestamp) -> Result<Arc<Trusted>, RotationError> {
-        let _turn = self.turn.lock().unwrap_or_else(PoisonError::into_inner);
-        let next = Arc::new(Authority::generate(
-            &format!("Tread fleet since {now:.0}"),
-            now,
-        )?);
+        let _turn = self.take_turn();
+        let next = next_authority(now)?;
         let started = Started {
             at: now,
             by: by.to_owned(),
         };
-        let trusted = self.present().started(Arc::clone(&next), started.clone())?;
+        let present = self.present();
+        let trusted = present.started(Arc::clone(&next), started.clone())?;
         if let Some(folder) = &self.folder {
-            file::start(folder, &next, &started)?;
+            let is_trusted = |fingerprint: &str| present.is_trusted(fingerprint);
+            folder.start(&next, &started, is_trusted)?;
+            self.note_settled(Settled::Yes);
         }
         Ok(self.show(trusted))
     }
 
-    /// Finishes a rotation: the former authority is no longer trusted, and its key is removed. Blocks.
+    /// Finishes a rotation: the former authority is no longer trusted, and its key is removed. It is
+    /// decided as soon as the folder shows it; [`Self::is_settled`] says whether the disk has it. Blocks.
     ///
     /// # Errors
-    /// None is under way, or the folder cannot be written.
-    pub fn finish(&self) -> Result<Arc<Trusted>, RotationError> {
-        let _turn = self.turn.lock().unwrap_or_else(PoisonError::into_inner);
+    /// None is under way, another one than was named is, or the folder cannot be written; nothing has
+    /// changed then.
+    pub fn finish(&self, rotation: TrustId) -> Result<Arc<Trusted>, RotationError> {
+        let _turn = self.take_turn();
         let present = self.present();
-        let trusted = present.finished()?;
+        let trusted = present.finished(rotation)?;
         if let (Some(folder), Some(retiring)) = (&self.folder, present.retiring()) {
-            file::finish(folder, &retiring.authority)?;
+            self.note_settled(folder.finish(&retiring.authority)?);
         }
         Ok(self.show(trusted))
+    }
+
+    /// Puts another authority in the place of all that are trusted, whether a rotation is under way or
+    /// not: from now on no certificate of before opens anything. Blocks.
+    ///
+    /// # Errors
+    /// Another authority than was named signs, or the folder cannot be written; nothing has changed then.
+    pub fn replace(&self, signing: &str, now: Timestamp) -> Result<Arc<Trusted>, RotationError> {
+        let _turn = self.take_turn();
+        let present = self.present();
+        present.check_signing(signing)?;
+        let next = next_authority(now)?;
+        let trusted = present.replaced(Arc::clone(&next));
+        if let Some(folder) = &self.folder {
+            folder.replace(&next, |fingerprint| present.is_trusted(fingerprint))?;
+            self.note_settled(Settled::Yes);
+        }
+        Ok(self.show(trusted))
+    }
+
+    /// Whether the disk has all that was decided.
+    pub fn is_settled(&self) -> bool {
+        !self.is_unsettled.load(Ordering::Relaxed)
+    }
+
+    fn note_settled(&self, settled: Settled) {
+        let is_unsettled = settled == Settled::NotYet;
+        self.is_unsettled.store(is_unsettled, Ordering::Relaxed);
+    }
+
+    /// Asks the disk again for what it has not confirmed. Blocks.
+    ///
+    /// # Errors
+    /// It still does not confirm it.
+    pub fn settle(&self) -> Result<(), AuthorityError> {
+        let _turn = self.take_turn();
+        if let Some(folder) = self.folder.as_ref().filter(|_| !self.is_settled()) {
+            folder.settle()?;
+            self.note_settled(Settled::Yes);
+        }
+        Ok(())
     }
 
     fn show(&self, trusted: Trusted) -> Arc<Trusted> {
@@ -293,4 +420,9 @@ impl Authorities {
         self.present.send_replace(Arc::clone(&trusted));
         trusted
     }
+}
+
+fn next_authority(now: Timestamp) -> Result<Arc<Authority>, rcgen::Error> {
+    let name = format!("Tread fleet since {now:.0}");
+    Ok(Arc::new(Authority::generate(&name, now)?))
 }

@@ -173,7 +173,21 @@ fn during_a_rotation_certificates_of_both_count_and_afterwards_those_of_the_form
     let bundle = during.bundle_pem();
     assert_eq!(CertificateDer::pem_slice_iter(bundle.as_bytes()).count(), 2);
     assert_ne!(during.id(), before.id());
-    let after = authorities.finish().unwrap();
+    let refused = authorities.finish(before.id());
+    assert!(
+        matches!(
+            refused,
+            Err(RotationError::Refused(RotationRefused::Other { .. }))
+        ),
+        "{refused:?}"
+    );
+    assert_eq!(authorities.present().id(), during.id());
+    let after = authorities.finish(during.id()).unwrap();
+    let refused = authorities.finish(during.id());
+    assert!(matches!(
+        refused,
+        Err(RotationError::Refused(RotationRefused::None))
+    ));
     assert_eq!(after.of_port().fingerprint(), next.fingerprint());
     let read = after.read_robot(&of_former, now()).unwrap();
     assert!(read.is_retired());
@@ -182,6 +196,43 @@ fn during_a_rotation_certificates_of_both_count_and_afterwards_those_of_the_form
     assert_eq!(after.issuer_of(&der, now()), None);
     assert!(!after.read_robot(&of_next, now()).unwrap().is_retired());
     assert_eq!(after.bundle_pem(), next.certificate_pem());
+}
+
+#[test]
+fn a_replacement_trusts_nobody_of_before_in_a_rotation_or_not_and_names_whom_it_replaces() {
+    for is_rotating in [false, true] {
+        let former = Arc::new(Authority::generate("fleet", now()).unwrap());
+        let authorities = Authorities::in_memory(Arc::clone(&former));
+        if is_rotating {
+            authorities.start("admin", now()).unwrap();
+            let refused = authorities.replace(former.fingerprint(), now());
+            assert!(
+                matches!(
+                    refused,
+                    Err(RotationError::Refused(
+                        RotationRefused::OtherAuthority { .. }
+                    ))
+                ),
+                "{refused:?}"
+            );
+        }
+        let before = authorities.present();
+        let signing = before.signing().fingerprint().to_owned();
+        let after = authorities.replace(&signing, now()).unwrap();
+        assert_eq!(after.all().count(), 1);
+        assert_eq!(after.of_port().fingerprint(), after.signing().fingerprint());
+        let key = KeyPair::generate().unwrap();
+        for one in before.all() {
+            let of_before = signed(one, &key);
+            assert!(after.read_robot(&of_before, now()).unwrap().is_retired());
+            let der = CertificateDer::from_pem_slice(of_before.as_bytes()).unwrap();
+            assert_eq!(after.issuer_of(&der, now()), None);
+            assert!(!after.is_trusted(one.fingerprint()));
+        }
+        // A second one who has looked at the same does not replace the next.
+        assert!(authorities.replace(&signing, now()).is_err());
+        assert_eq!(authorities.present().id(), after.id());
+    }
 }
 
 proptest! {

@@ -26,10 +26,10 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
-use tread_api::ids::TokenId;
 
 use self::table::{Entry, Phase, Table};
 use crate::identity::address::network_of;
+use crate::identity::subject::SubjectId;
 use crate::rate_limit::Bucket;
 
 /// How many connections there may be.
@@ -253,7 +253,7 @@ impl Slot {
     /// # Errors
     /// [`Full`], which a Stop meets only when [`STOPS_MAX`] others are being answered beyond it, or
     /// [`STOPS_PER_IDENTITY_MAX`] of the same token.
-    pub fn prove(&self, identity: TokenId, purpose: Purpose) -> Result<(), Full> {
+    pub fn prove(&self, identity: SubjectId, purpose: Purpose) -> Result<(), Full> {
         let mut table = self.connections.lock();
         if !table.entries.contains_key(&self.id) {
             // It was cut; what is answered nobody reads.

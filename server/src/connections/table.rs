@@ -6,9 +6,9 @@ use std::net::IpAddr;
 use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
-use tread_api::ids::TokenId;
 
 use super::{Bounds, Full, PER_IDENTITY_MAX, Purpose, STOPS_MAX, STOPS_PER_IDENTITY_MAX};
+use crate::identity::subject::SubjectId;
 use crate::rate_limit::{Bucket, RateLimit};
 
 /// Requests of one token, with its sessions, on all of its connections: a dashboard serves a thousand
@@ -42,10 +42,10 @@ pub(super) struct Entry {
     /// Whether many clients come from there: this machine, or a trusted proxy.
     pub(super) is_shared: bool,
     /// Whose share it is of, while it is not unproven.
-    pub(super) identity: Option<TokenId>,
+    pub(super) identity: Option<SubjectId>,
     pub(super) phase: Phase,
     /// Who showed a credential on it last.
-    pub(super) known: Option<TokenId>,
+    pub(super) known: Option<SubjectId>,
     /// The rate of requests on it that are of nobody known, or stop robots.
     pub(super) rate: Bucket,
     /// Requests that are being answered.
@@ -70,9 +70,9 @@ pub(super) struct Table {
     pub(super) stopping: usize,
     pub(super) proven_per_address: Counts<IpAddr>,
     pub(super) unproven_per_address: Counts<IpAddr>,
-    pub(super) proven_per_identity: Counts<TokenId>,
-    pub(super) stopping_per_identity: Counts<TokenId>,
-    rates: HashMap<TokenId, Bucket>,
+    pub(super) proven_per_identity: Counts<SubjectId>,
+    pub(super) stopping_per_identity: Counts<SubjectId>,
+    rates: HashMap<SubjectId, Bucket>,
 }
 
 impl Table {
@@ -168,7 +168,7 @@ impl Table {
     }
 
     /// Gives a connection its phase, as of that identity.
-    pub(super) fn set(&mut self, id: u64, phase: Phase, identity: Option<TokenId>) {
+    pub(super) fn set(&mut self, id: u64, phase: Phase, identity: Option<SubjectId>) {
         let since = self.number();
         self.count_out(id);
         if let Some(entry) = self.entries.get_mut(&id) {
@@ -230,7 +230,7 @@ impl Table {
     pub(super) fn room_for(
         &mut self,
         id: u64,
-        identity: TokenId,
+        identity: SubjectId,
         bounds: &Bounds,
     ) -> Result<(), Full> {
         let share = self.proven_per_identity.get(&identity);
@@ -251,7 +251,7 @@ impl Table {
     }
 
     /// Whether a Stop of an identity has a turn beyond the room of all others.
-    pub(super) fn has_room_for_stop(&self, identity: TokenId) -> bool {
+    pub(super) fn has_room_for_stop(&self, identity: SubjectId) -> bool {
         let own = self.stopping_per_identity.get(&identity).copied();
         self.stopping < STOPS_MAX && own.unwrap_or(0) < STOPS_PER_IDENTITY_MAX
     }

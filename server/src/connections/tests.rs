@@ -35,8 +35,10 @@ fn half_open_connections_displace_their_own_kind_and_nobody_at_work() {
     assert!(!honest_cut.is_cancelled());
 }
 
-fn token(number: u128) -> TokenId {
-    TokenId::from_uuid(uuid::Uuid::from_u128(number))
+fn token(number: u128) -> SubjectId {
+    SubjectId::Token(tread_api::ids::TokenId::from_uuid(uuid::Uuid::from_u128(
+        number,
+    )))
 }
 
 #[test]

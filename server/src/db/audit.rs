@@ -17,6 +17,7 @@ struct Raw {
     count: i64,
     who: Option<String>,
     token_id: Option<String>,
+    person: Option<String>,
     role: Option<String>,
     address: String,
     method: String,
@@ -35,6 +36,7 @@ impl TryFrom<Raw> for AuditEntry {
     fn try_from(raw: Raw) -> Result<Self, DbError> {
         let token = raw.token_id.as_deref();
         let what = raw.what.as_deref();
+        let person = raw.person.as_deref();
         Ok(Self {
             id: unsigned("number", raw.id)?,
             at: from_us(raw.at_us)?,
@@ -42,6 +44,9 @@ impl TryFrom<Raw> for AuditEntry {
             count: unsigned("count", raw.count)?,
             who: raw.who,
             token: token.map(|id| parse("token", id)).transpose()?,
+            person: person
+                .map(|person| from_json("person", person))
+                .transpose()?,
             role: raw.role.as_deref().map(role).transpose()?,
             address: raw.address,
             method: raw.method,
@@ -81,8 +86,8 @@ pub async fn list(
         match filter.order {
             AuditOrder::Newest => sqlx::query_as!(
                 Raw,
-                r#"SELECT id, at_us, since_us, count, who, token_id, role, address, method, route,
-                       path, status, request_id, what, previous_hash, hash
+                r#"SELECT id, at_us, since_us, count, who, token_id, person, role, address, method,
+                       route, path, status, request_id, what, previous_hash, hash
                    FROM audit
                    WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR who = ?2)
                      AND (?3 = FALSE OR status >= 400)
@@ -96,8 +101,8 @@ pub async fn list(
             .await?,
             AuditOrder::Oldest => sqlx::query_as!(
                 Raw,
-                r#"SELECT id, at_us, since_us, count, who, token_id, role, address, method, route,
-                       path, status, request_id, what, previous_hash, hash
+                r#"SELECT id, at_us, since_us, count, who, token_id, person, role, address, method,
+                       route, path, status, request_id, what, previous_hash, hash
                    FROM audit
                    WHERE (?1 IS NULL OR id > ?1) AND (?2 IS NULL OR who = ?2)
                      AND (?3 = FALSE OR status >= 400)
@@ -189,18 +194,21 @@ async fn insert(db: &mut SqliteConnection, entry: &AuditEntry) -> Result<(), DbE
     let status = i64::from(entry.status);
     let token = entry.token.map(|id: TokenId| id.to_string());
     let role = entry.role.map(Role::as_str);
+    let person = entry.person.as_ref();
+    let person = person.map(|person| to_json("person", person)).transpose()?;
     let what = entry.what.as_ref().map(|what| to_json("body", what));
     let what = what.transpose()?;
     sqlx::query!(
-        "INSERT INTO audit (id, at_us, since_us, count, who, token_id, role, address, method, route,
-             path, status, request_id, what, previous_hash, hash)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        "INSERT INTO audit (id, at_us, since_us, count, who, token_id, person, role, address, method,
+             route, path, status, request_id, what, previous_hash, hash)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         id,
         at_us,
         since_us,
         count,
         entry.who,
         token,
+        person,
         role,
         entry.address,
         entry.method,

@@ -7,7 +7,8 @@ use sqlx::SqliteConnection;
 use tread_api::enrolment::Enrolment;
 use tread_api::ids::{RobotId, SiteId};
 
-use super::{DbError, from_us, parse, robots_text, to_us};
+use super::{DbError, from_json, from_us, parse, robots_text, to_json, to_us};
+use crate::authority::Issued;
 
 struct Raw {
     site: String,
@@ -118,8 +119,13 @@ pub async fn robot_count(db: &mut SqliteConnection) -> Result<i64, DbError> {
     Ok(row.count)
 }
 
-/// Writes an enrolment down.
-pub async fn insert(db: &mut SqliteConnection, enrolment: &Enrolment) -> Result<(), DbError> {
+/// Writes an enrolment down, with the certificate that the robot gets.
+pub async fn insert(
+    db: &mut SqliteConnection,
+    enrolment: &Enrolment,
+    issued: &Issued,
+) -> Result<(), DbError> {
+    let certificates = to_json("certificates", issued)?;
     let (site, robot) = (enrolment.site.as_str(), enrolment.robot.as_str());
     let join_token = enrolment.join_token.to_string();
     let enrolled_at_us = to_us(enrolment.enrolled_at);
@@ -127,8 +133,8 @@ pub async fn insert(db: &mut SqliteConnection, enrolment: &Enrolment) -> Result<
     let expires_at_us = to_us(enrolment.expires_at);
     sqlx::query!(
         "INSERT INTO enrolments (site, robot, number, enrolled_at_us, join_token, renewed_at_us,
-             expires_at_us, authority)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+             expires_at_us, authority, certificates)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
         site,
         robot,
         enrolment.number,
@@ -137,30 +143,88 @@ pub async fn insert(db: &mut SqliteConnection, enrolment: &Enrolment) -> Result<
         renewed_at_us,
         expires_at_us,
         enrolment.authority,
+        certificates,
     )
     .execute(db)
     .await?;
     Ok(())
 }
 
-/// Notes a renewal of an enrolment that is in force, and who signed the certificate that was shown
-/// for it; false if it no longer is.
+/// Which certificates of an enrolment count for a renewal.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Counting {
+    /// None: the enrolment is not in force.
+    None,
+    /// Any of an authority that is trusted: nothing is kept of them.
+    Any,
+    /// These.
+    These(Issued),
+}
+
+/// Which certificates of an enrolment count for a renewal.
+pub async fn counting(
+    db: &mut SqliteConnection,
+    (site, robot, number): (&SiteId, &RobotId, u32),
+) -> Result<Counting, DbError> {
+    let (site, robot) = (site.as_str(), robot.as_str());
+    let row = sqlx::query!(
+        "SELECT certificates FROM enrolments
+         WHERE site = ? AND robot = ? AND number = ? AND revoked_at_us IS NULL",
+        site,
+        robot,
+        number
+    )
+    .fetch_optional(db)
+    .await?;
+    Ok(match row.map(|row| row.certificates) {
+        None => Counting::None,
+        Some(None) => Counting::Any,
+        Some(Some(text)) => Counting::These(from_json("certificates", &text)?),
+    })
+}
+
+/// Forgets which certificates count for a renewal: the next one of each robot does, as long as an
+/// authority that is trusted has signed it. How many enrolments that changed.
+pub async fn forget_certificates(db: &mut SqliteConnection) -> Result<u64, DbError> {
+    let done = sqlx::query!(
+        "UPDATE enrolments SET certificates = NULL
+         WHERE certificates IS NOT NULL AND revoked_at_us IS NULL"
+    )
+    .execute(db)
+    .await?;
+    Ok(done.rows_affected())
+}
+
+/// A renewal.
+#[derive(Debug, Clone, Copy)]
+pub struct Renewal<'renewal> {
+    /// When it was asked for.
+    pub at: Timestamp,
+    /// When the next certificate ends.
+    pub expires_at: Timestamp,
+    /// The fingerprint of the authority that signed the certificate which was shown for it.
+    pub authority: &'renewal str,
+    /// The certificates that count from now on.
+    pub issued: &'renewal Issued,
+}
+
+/// Notes a renewal of an enrolment that is in force; false if it no longer is.
 pub async fn renew(
     db: &mut SqliteConnection,
     (site, robot, number): (&SiteId, &RobotId, u32),
-    at: Timestamp,
-    expires_at: Timestamp,
-    authority: &str,
+    renewal: Renewal<'_>,
 ) -> Result<bool, DbError> {
     let (site, robot) = (site.as_str(), robot.as_str());
-    let (at_us, expires_at_us) = (to_us(at), to_us(expires_at));
+    let (at_us, expires_at_us) = (to_us(renewal.at), to_us(renewal.expires_at));
+    let certificates = to_json("certificates", renewal.issued)?;
     let done = sqlx::query!(
         "UPDATE enrolments SET renewed_at_us = MAX(?, renewed_at_us), expires_at_us = ?,
-             authority = ?
+             authority = ?, certificates = ?
          WHERE site = ? AND robot = ? AND number = ? AND revoked_at_us IS NULL",
         at_us,
         expires_at_us,
-        authority,
+        renewal.authority,
+        certificates,
         site,
         robot,
         number

@@ -1,10 +1,11 @@
-//! Answers that were given under an idempotency key.
+//! Answers that were given under an idempotency key of a token or person.
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use uuid::Uuid;
 
 use super::{DbError, parse, to_us};
+use crate::identity::subject::SubjectId;
 
 /// An answer that was given under a key.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -15,11 +16,24 @@ pub struct Given {
     pub answer: String,
 }
 
-/// What was answered under a key.
-pub async fn find(db: &mut SqliteConnection, key: &str) -> Result<Option<Given>, DbError> {
+/// A key, with whoever sends it.
+pub type OwnKey<'key> = (SubjectId, &'key str);
+
+/// What was answered to somebody under a key; or to whoever sent the same request under it, before keys
+/// had owners.
+pub async fn find(
+    db: &mut SqliteConnection,
+    (owner, key): OwnKey<'_>,
+    request_hash: Uuid,
+) -> Result<Option<Given>, DbError> {
+    let (owner, request_hash) = (owner.to_string(), request_hash.to_string());
     let row = sqlx::query!(
-        "SELECT request_hash, answer FROM idempotency_keys WHERE key = ?",
-        key
+        "SELECT request_hash, answer FROM idempotency_keys
+         WHERE key = ?1 AND (owner = ?2 OR (owner = '' AND request_hash = ?3))
+         ORDER BY owner DESC LIMIT 1",
+        key,
+        owner,
+        request_hash
     )
     .fetch_optional(db)
     .await?;
@@ -35,14 +49,16 @@ pub async fn find(db: &mut SqliteConnection, key: &str) -> Result<Option<Given>,
 /// Keeps an answer under its key.
 pub async fn insert(
     db: &mut SqliteConnection,
-    key: &str,
+    (owner, key): OwnKey<'_>,
     given: &Given,
     at: Timestamp,
 ) -> Result<(), DbError> {
     let (request_hash, at_us) = (given.request_hash.to_string(), to_us(at));
+    let owner = owner.to_string();
     sqlx::query!(
-        "INSERT INTO idempotency_keys (key, request_hash, answer, created_at_us)
-         VALUES (?, ?, ?, ?)",
+        "INSERT INTO idempotency_keys (owner, key, request_hash, answer, created_at_us)
+         VALUES (?, ?, ?, ?, ?)",
+        owner,
         key,
         request_hash,
         given.answer,
@@ -61,8 +77,8 @@ pub async fn forget_before(
 ) -> Result<(), DbError> {
     let before_us = to_us(before);
     sqlx::query!(
-        "DELETE FROM idempotency_keys WHERE key IN (
-             SELECT key FROM idempotency_keys WHERE created_at_us < ? LIMIT ?)",
+        "DELETE FROM idempotency_keys WHERE (owner, key) IN (
+             SELECT owner, key FROM idempotency_keys WHERE created_at_us < ? LIMIT ?)",
         before_us,
         limit,
     )

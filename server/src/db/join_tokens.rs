@@ -101,6 +101,26 @@ pub async fn valid_count(db: &mut SqliteConnection, at: Timestamp) -> Result<i64
     Ok(row.count)
 }
 
+/// How many could be used at a time that are for what is in a scope.
+pub async fn valid_count_within(
+    db: &mut SqliteConnection,
+    within: &Scope,
+    at: Timestamp,
+) -> Result<i64, DbError> {
+    let (within, at_us) = (scope_text(within)?, to_us(at));
+    let row = sqlx::query!(
+        r#"SELECT COUNT(*) AS "count!: i64" FROM join_tokens
+           WHERE used_at_us IS NULL AND revoked_at_us IS NULL AND expires_at_us > ?1
+             AND (?2 IS NULL OR site IN (SELECT value FROM json_each(?2))
+                 OR site || '/' || robot IN (SELECT value FROM json_each(?2)))"#,
+        at_us,
+        within
+    )
+    .fetch_one(db)
+    .await?;
+    Ok(row.count)
+}
+
 /// Keeps a new join token.
 pub async fn insert(
     db: &mut SqliteConnection,

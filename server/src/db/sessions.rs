@@ -1,32 +1,57 @@
-//! Sessions of browsers, each of one token.
+//! Sessions of browsers, each of a token, or of a person who signed in at an OpenID provider.
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
-use tread_api::ids::{SessionId, TokenId};
+use tread_api::identity::Person;
+use tread_api::ids::{PersonId, SessionId, TokenId};
 
-use super::{DbError, from_us, parse, to_us};
+use super::{DbError, corrupt, from_json, from_us, parse, to_json, to_us};
 use crate::identity::secret::Fingerprint;
+
+/// A person as a session keeps them.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SignedIn {
+    /// Who it is.
+    pub person: Person,
+    /// Their name when they signed in.
+    pub name: String,
+    /// The groups that gave them rights then.
+    pub groups: Vec<String>,
+}
+
+/// Whose a session is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Owner {
+    /// Of the token that it was opened with.
+    Token(TokenId),
+    /// Of a person.
+    Person(SignedIn),
+}
 
 /// A session as it is kept.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Kept {
     /// The session.
     pub id: SessionId,
-    /// The token it was opened with.
-    pub token: TokenId,
+    /// Whose it is.
+    pub owner: Owner,
     /// The hash of its secret.
     pub hash: Vec<u8>,
+    /// When it was opened.
+    pub created_at: Timestamp,
     /// From when on it is refused.
     pub expires_at: Timestamp,
+    /// When a person's was used last.
+    pub last_used_at: Option<Timestamp>,
 }
 
 /// A session about to be kept.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NewSession {
     /// The session.
     pub id: SessionId,
-    /// The token it was opened with.
-    pub token: TokenId,
+    /// Whose it is.
+    pub owner: Owner,
     /// The hash of its secret.
     pub fingerprint: Fingerprint,
     /// When it was opened.
@@ -35,16 +60,90 @@ pub struct NewSession {
     pub expires_at: Timestamp,
 }
 
+struct Raw {
+    id: String,
+    token_id: Option<String>,
+    person_id: Option<String>,
+    issuer: Option<String>,
+    subject: Option<String>,
+    name: Option<String>,
+    groups: Option<String>,
+    hash: Vec<u8>,
+    created_at_us: i64,
+    expires_at_us: i64,
+    last_used_at_us: Option<i64>,
+}
+
+impl TryFrom<Raw> for Kept {
+    type Error = DbError;
+
+    fn try_from(raw: Raw) -> Result<Self, DbError> {
+        let owner = match (&raw.token_id, &raw.person_id) {
+            (Some(token), None) => Owner::Token(parse("token", token)?),
+            (None, Some(person)) => {
+                let missing = || corrupt("session's person", &raw.id);
+                let groups = raw.groups.as_deref().ok_or_else(missing)?;
+                Owner::Person(SignedIn {
+                    person: Person {
+                        id: parse("person", person)?,
+                        issuer: raw.issuer.ok_or_else(missing)?,
+                        subject: raw.subject.ok_or_else(missing)?,
+                    },
+                    name: raw.name.ok_or_else(missing)?,
+                    groups: from_json("groups", groups)?,
+                })
+            }
+            (Some(_), Some(_)) | (None, None) => return Err(corrupt("session's owner", &raw.id)),
+        };
+        Ok(Self {
+            id: parse("session", &raw.id)?,
+            owner,
+            hash: raw.hash,
+            created_at: from_us(raw.created_at_us)?,
+            expires_at: from_us(raw.expires_at_us)?,
+            last_used_at: raw.last_used_at_us.map(from_us).transpose()?,
+        })
+    }
+}
+
+macro_rules! sessions {
+    ($condition:tt $(, $argument:expr)* $(,)?) => {
+        sqlx::query_as!(
+            Raw,
+            r#"SELECT id, token_id, person_id, issuer, subject, name, groups, hash, created_at_us,
+                   expires_at_us, last_used_at_us
+               FROM sessions "# + $condition
+            $(, $argument)*
+        )
+    };
+}
+
 /// Keeps a new session.
 pub async fn insert(db: &mut SqliteConnection, session: &NewSession) -> Result<(), DbError> {
-    let (id, token) = (session.id.to_string(), session.token.to_string());
+    let id = session.id.to_string();
+    let (token, signed_in) = match &session.owner {
+        Owner::Token(token) => (Some(token.to_string()), None),
+        Owner::Person(signed_in) => (None, Some(signed_in)),
+    };
+    let person = signed_in.map(|signed_in| signed_in.person.id.to_string());
+    let issuer = signed_in.map(|signed_in| &signed_in.person.issuer);
+    let subject = signed_in.map(|signed_in| &signed_in.person.subject);
+    let name = signed_in.map(|signed_in| &signed_in.name);
+    let groups = signed_in.map(|signed_in| to_json("groups", &signed_in.groups));
+    let groups = groups.transpose()?;
     let (lookup, hash) = (session.fingerprint.lookup(), session.fingerprint.as_bytes());
     let (created_at_us, expires_at_us) = (to_us(session.created_at), to_us(session.expires_at));
     sqlx::query!(
-        "INSERT INTO sessions (id, token_id, lookup, hash, created_at_us, expires_at_us)
-         VALUES (?, ?, ?, ?, ?, ?)",
+        "INSERT INTO sessions (id, token_id, person_id, issuer, subject, name, groups, lookup, hash,
+             created_at_us, expires_at_us)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         id,
         token,
+        person,
+        issuer,
+        subject,
+        name,
+        groups,
         lookup,
         hash,
         created_at_us,
@@ -61,21 +160,69 @@ pub async fn by_lookup(
     fingerprint: &Fingerprint,
 ) -> Result<Option<Kept>, DbError> {
     let lookup = fingerprint.lookup();
-    let row = sqlx::query!(
-        "SELECT id, token_id, hash, expires_at_us FROM sessions WHERE lookup = ?",
-        lookup
+    let raw = sessions!("WHERE lookup = ?", lookup)
+        .fetch_optional(db)
+        .await?;
+    raw.map(Kept::try_from).transpose()
+}
+
+/// The session of that identifier.
+pub async fn find(db: &mut SqliteConnection, id: SessionId) -> Result<Option<Kept>, DbError> {
+    let id = id.to_string();
+    let raw = sessions!("WHERE id = ?", id).fetch_optional(db).await?;
+    raw.map(Kept::try_from).transpose()
+}
+
+/// Which sessions of people to list.
+#[derive(Debug, Clone)]
+pub struct OfPeople<'filter> {
+    /// Those of this provider.
+    pub issuer: &'filter str,
+    /// Only those that have rights from these groups alone.
+    pub groups: &'filter [&'filter str],
+    /// Only those that are valid at this time.
+    pub at: Timestamp,
+    /// Only those before this one.
+    pub before: Option<SessionId>,
+}
+
+/// Sessions of people, newest first.
+pub async fn list(
+    db: &mut SqliteConnection,
+    filter: &OfPeople<'_>,
+    limit: u32,
+) -> Result<Vec<Kept>, DbError> {
+    let at_us = to_us(filter.at);
+    let before = filter.before.map(|id| id.to_string());
+    let groups = to_json("groups", &filter.groups)?;
+    let raw = sessions!(
+        "WHERE issuer = ?1 AND expires_at_us > ?2 AND (?3 IS NULL OR id < ?3)
+           AND NOT EXISTS (
+               SELECT 1 FROM json_each(sessions.groups) AS own
+               WHERE own.value NOT IN (SELECT value FROM json_each(?4)))
+         ORDER BY id DESC LIMIT ?5",
+        filter.issuer,
+        at_us,
+        before,
+        groups,
+        limit,
     )
-    .fetch_optional(db)
+    .fetch_all(db)
     .await?;
-    row.map(|row| {
-        Ok(Kept {
-            id: parse("session", &row.id)?,
-            token: parse("token", &row.token_id)?,
-            hash: row.hash,
-            expires_at: from_us(row.expires_at_us)?,
-        })
-    })
-    .transpose()
+    raw.into_iter().map(Kept::try_from).collect()
+}
+
+/// How many sessions people have that are valid at a time.
+pub async fn count_of_people(db: &mut SqliteConnection, at: Timestamp) -> Result<i64, DbError> {
+    let at_us = to_us(at);
+    let row = sqlx::query!(
+        r#"SELECT COUNT(*) AS "count!: i64" FROM sessions
+           WHERE person_id IS NOT NULL AND expires_at_us > ?"#,
+        at_us
+    )
+    .fetch_one(db)
+    .await?;
+    Ok(row.count)
 }
 
 /// Every session that is valid at a time.
@@ -88,6 +235,21 @@ pub async fn all_valid(
         .fetch_all(db)
         .await?;
     ids.iter().map(|id| parse("session", id)).collect()
+}
+
+/// Notes when a person's session was used last.
+pub async fn touch(db: &mut SqliteConnection, id: SessionId, at: Timestamp) -> Result<(), DbError> {
+    let (id, at_us) = (id.to_string(), to_us(at));
+    sqlx::query!(
+        "UPDATE sessions SET last_used_at_us =
+             MAX(?, created_at_us, COALESCE(last_used_at_us, created_at_us))
+         WHERE id = ? AND person_id IS NOT NULL",
+        at_us,
+        id
+    )
+    .execute(db)
+    .await?;
+    Ok(())
 }
 
 /// Ends a session.
@@ -108,19 +270,76 @@ pub async fn forget_expired(db: &mut SqliteConnection, at: Timestamp) -> Result<
     Ok(())
 }
 
-/// The oldest sessions of a token beyond the newest `kept`.
+/// The oldest sessions of a token or person beyond the newest `kept`.
 pub async fn surplus(
     db: &mut SqliteConnection,
-    token: TokenId,
+    (token, person): (Option<TokenId>, Option<PersonId>),
     kept: u32,
 ) -> Result<Vec<SessionId>, DbError> {
-    let token = token.to_string();
+    let token = token.map(|id| id.to_string());
+    let person = person.map(|id| id.to_string());
     let ids = sqlx::query_scalar!(
-        "SELECT id FROM sessions WHERE token_id = ? ORDER BY id DESC LIMIT -1 OFFSET ?",
+        "SELECT id FROM sessions WHERE token_id = ? OR person_id = ?
+         ORDER BY id DESC LIMIT -1 OFFSET ?",
         token,
+        person,
         kept
     )
     .fetch_all(db)
     .await?;
     ids.iter().map(|id| parse("session", id)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use sqlx::ConnectOptions as _;
+    use sqlx::Connection as _;
+    use sqlx::migrate::Migrator;
+    use sqlx::sqlite::SqliteConnectOptions;
+
+    use super::*;
+    use crate::db::Db;
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn sessions_of_before_there_were_people_stay() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tread.db");
+        let options = SqliteConnectOptions::new().filename(&path);
+        let mut old = options.create_if_missing(true).connect().await.unwrap();
+        let all = sqlx::migrate!("../migrations");
+        let before = all.iter().filter(|step| step.version < 20_261_122_163_000);
+        let before = Migrator {
+            migrations: before.cloned().collect::<Vec<_>>().into(),
+            ..Migrator::DEFAULT
+        };
+        before.run(&mut old).await.unwrap();
+        let (id, token) = (
+            "0192f0c1-2b3c-7d4e-8f50-617283940a1b",
+            "0192f0c1-2b3c-7d4e-8f50-617283940a1c",
+        );
+        for statement in [
+            format!(
+                "INSERT INTO tokens (id, name, role, lookup, hash, created_at_us, created_by, expires_at_us)
+                 VALUES ('{token}', 'desk', 'viewer', x'0101010101010101', zeroblob(32), 1, 'test', 9)"
+            ),
+            format!(
+                "INSERT INTO sessions (id, token_id, lookup, hash, created_at_us, expires_at_us)
+                 VALUES ('{id}', '{token}', x'0202020202020202', zeroblob(32), 2, 8)"
+            ),
+        ] {
+            sqlx::raw_sql(sqlx::AssertSqlSafe(statement))
+                .execute(&mut old)
+                .await
+                .unwrap();
+        }
+        old.close().await.unwrap();
+        let db = Db::open(&path).await.unwrap();
+        let mut tx = db.read("db").await.unwrap();
+        let kept = find(&mut tx, id.parse().unwrap()).await.unwrap().unwrap();
+        assert_eq!(kept.owner, Owner::Token(token.parse().unwrap()));
+        assert_eq!(kept.expires_at.as_microsecond(), 8);
+        assert_eq!(kept.created_at.as_microsecond(), 2);
+        drop(tx);
+        db.close().await;
+    }
 }

@@ -136,6 +136,29 @@ pub async fn valid_counts(db: &mut SqliteConnection, at: Timestamp) -> Result<(i
     Ok((row.all_count, row.admin_count))
 }
 
+/// How many tokens are valid at a time that hold nowhere outside a scope.
+pub async fn valid_count_within(
+    db: &mut SqliteConnection,
+    within: &Scope,
+    at: Timestamp,
+) -> Result<i64, DbError> {
+    let (within, at_us) = (scope_text(within)?, to_us(at));
+    let row = sqlx::query!(
+        r#"SELECT COUNT(*) AS "count!: i64" FROM tokens
+           WHERE revoked_at_us IS NULL AND expires_at_us > ?1
+             AND (?2 IS NULL OR (scope IS NOT NULL AND NOT EXISTS (
+                 SELECT 1 FROM json_each(tokens.scope) AS own
+                 WHERE own.value NOT IN (SELECT value FROM json_each(?2))
+                   AND substr(own.value, 1, instr(own.value || '/', '/') - 1)
+                       NOT IN (SELECT value FROM json_each(?2)))))"#,
+        at_us,
+        within
+    )
+    .fetch_one(db)
+    .await?;
+    Ok(row.count)
+}
+
 /// Keeps a new token.
 pub async fn insert(
     db: &mut SqliteConnection,

@@ -121,7 +121,8 @@ async fn an_authority_that_is_retired_takes_its_links_passwords_and_routers_with
     assert_ne!(during.password, before.password);
     assert_ne!(during.session_prefix, before.session_prefix);
     let another = rig.connect(Who::Foreign, 10_000).await.unwrap();
-    rig.authorities.finish().unwrap();
+    let rotation = rig.authorities.present().id();
+    rig.authorities.finish(rotation).unwrap();
     let ended = tokio::time::timeout(CUT_MAX, session.link_ended()).await;
     assert!(ended.is_ok(), "the link ends at once");
     until("its router is closed", async || {

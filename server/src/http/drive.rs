@@ -89,6 +89,7 @@ pub(super) async fn drive(
             socket,
             session,
             subject,
+            robot: (site, robot),
             heard_at: Instant::now(),
             ping_due: Instant::now(),
             pinged_at: None,
@@ -114,6 +115,7 @@ struct Connection {
     socket: WebSocket,
     session: Session,
     subject: Arc<Credential>,
+    robot: (SiteId, RobotId),
     heard_at: Instant,
     ping_due: Instant,
     /// When the ping went out that is not answered yet.
@@ -247,7 +249,8 @@ impl Connection {
     }
 
     async fn acquire(&mut self, name: &str, take: bool) -> Result<(), End> {
-        if !self.subject.rights.includes(Right::Drive) {
+        let (site, robot) = &self.robot;
+        if !self.subject.may_at(Right::Drive, site, robot) {
             let refused = DriveUpdate::Refused {
                 cause: DriveRefusal::Forbidden,
                 detail: "to drive takes a token with the right `drive`".to_owned(),

@@ -27,7 +27,7 @@ use crate::app::shares::Place;
 
 /// Cuts the connection that a request came on.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Cut(pub(super) CancellationToken);
+pub(in crate::http) struct Cut(pub(in crate::http) CancellationToken);
 
 /// What a client wants to hear of.
 #[derive(Debug, Clone, Deserialize, IntoParams)]

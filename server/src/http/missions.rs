@@ -66,7 +66,7 @@ pub(super) async fn list(
     security(("token" = ["dispatch"])),
     request_body = CreateMission,
     params(("idempotency-key" = Option<String>, Header,
-        description = "The same request under the same key is answered the same, and done once")),
+        description = "The same request with the same token under the same key is answered the same, and done once")),
     responses((status = 201, body = Mission), (status = 404, body = ProblemBody),
         (status = 409, body = ProblemBody), (status = 413, body = ProblemBody),
         (status = 415, body = ProblemBody), (status = 422, body = ProblemBody)))]
@@ -78,7 +78,10 @@ pub(super) async fn create(
 ) -> Result<(StatusCode, Json<Mission>), Problem> {
     subject.check_robot(&request.site, &request.robot)?;
     let mission = match idempotency_key(&headers)? {
-        Some(key) => app.create_mission_once(key, request).await?,
+        Some(key) => {
+            app.create_mission_once((subject.subject, key), request)
+                .await?
+        }
         None => app.create_mission(request).await?,
     };
     Ok((StatusCode::CREATED, Json(mission)))

@@ -50,7 +50,7 @@ use utoipa_swagger_ui::SwaggerUi;
 use self::extract::BodyLimit;
 pub use self::identity::access::{Access, Needed, PUBLIC};
 use self::identity::guard::{self, Guard};
-use self::identity::{audit, authority, browser, enrolment, session, tokens};
+use self::identity::{audit, authority, browser, enrolment, session, sessions, sign_in, tokens};
 use self::problem::{Problem, Refused};
 use crate::app::App;
 use crate::app::metrics::MEDIA_TYPE;
@@ -87,6 +87,9 @@ fn routes() -> OpenApiRouter<App> {
         .layer(Extension(BodyLimit(MISSION_BODY_MAX)));
     let session = OpenApiRouter::new()
         .routes(routes!(session::create, session::get, session::end))
+        .routes(routes!(sign_in::ways))
+        .routes(routes!(sign_in::begin))
+        .routes(routes!(sign_in::finish))
         .layer(Extension(BodyLimit(SIGN_IN_BODY_MAX)));
     let joining = OpenApiRouter::new()
         .routes(routes!(enrolment::enrol))
@@ -98,6 +101,8 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(health::status))
         .routes(routes!(tokens::list, tokens::create))
         .routes(routes!(tokens::revoke))
+        .routes(routes!(sessions::list))
+        .routes(routes!(sessions::end))
         .routes(routes!(enrolment::list_tokens, enrolment::create_token))
         .routes(routes!(enrolment::revoke_token))
         .routes(routes!(enrolment::list))
@@ -105,6 +110,7 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(authority::get))
         .routes(routes!(authority::start))
         .routes(routes!(authority::finish))
+        .routes(routes!(authority::replace))
         .routes(routes!(audit::list))
         .routes(routes!(audit::chain))
         .routes(routes!(sites::list, sites::create))

@@ -151,6 +151,36 @@ async fn file(request: Request) -> Response {
     )
 }
 
+/// A refusal as a page for people: no style and no script, and a way back.
+pub(in crate::http) fn plain(response: Response, title: &str, detail: &str) -> Response {
+    let (title, detail) = (escaped(title), escaped(detail));
+    let text = format!(
+        "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><title>{title}</title>\
+         <meta name=\"viewport\" content=\"width=device-width\"></head><body><main><h1>{title}</h1>\
+         <p>{detail}.</p><p><a href=\"/\">Back to the sign-in</a></p></main></body></html>"
+    );
+    let (mut parts, _problem) = response.into_parts();
+    let media_type = HeaderValue::from_static("text/html; charset=utf-8");
+    parts.headers.insert(header::CONTENT_TYPE, media_type);
+    parts.headers.remove(header::CONTENT_LENGTH);
+    Response::from_parts(parts, Body::from(text))
+}
+
+fn escaped(text: &str) -> String {
+    let mut escaped = String::with_capacity(text.len());
+    for letter in text.chars() {
+        match letter {
+            '&' => escaped.push_str("&amp;"),
+            '<' => escaped.push_str("&lt;"),
+            '>' => escaped.push_str("&gt;"),
+            '"' => escaped.push_str("&quot;"),
+            '\'' => escaped.push_str("&#39;"),
+            letter => escaped.push(letter),
+        }
+    }
+    escaped
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -174,6 +204,16 @@ mod tests {
         ] {
             assert_eq!(takes_gzip(&asking(encodings)), takes, "{encodings}");
         }
+    }
+
+    #[test]
+    fn what_a_page_says_is_text() {
+        let said = "<script>alert('a' & \"b\")</script>";
+        let text = escaped(said);
+        assert_eq!(
+            text,
+            "&lt;script&gt;alert(&#39;a&#39; &amp; &quot;b&quot;)&lt;/script&gt;"
+        );
     }
 
     #[test]

@@ -70,7 +70,8 @@ const fn status(kind: ProblemType) -> StatusCode {
         ProblemType::MalformedBody
         | ProblemType::InvalidPath
         | ProblemType::InvalidQuery
-        | ProblemType::InvalidHeader => StatusCode::BAD_REQUEST,
+        | ProblemType::InvalidHeader
+        | ProblemType::SignInFailed => StatusCode::BAD_REQUEST,
         ProblemType::InvalidBody
         | ProblemType::UnknownField
         | ProblemType::BeyondLimits
@@ -88,6 +89,7 @@ const fn status(kind: ProblemType) -> StatusCode {
         | ProblemType::UnknownMission
         | ProblemType::UnknownAlert
         | ProblemType::UnknownToken
+        | ProblemType::UnknownSession
         | ProblemType::UnknownStop => StatusCode::NOT_FOUND,
         ProblemType::MethodNotAllowed => StatusCode::METHOD_NOT_ALLOWED,
         ProblemType::AlreadyExists
@@ -104,7 +106,9 @@ const fn status(kind: ProblemType) -> StatusCode {
         | ProblemType::RobotsLeft
         | ProblemType::TooMany => StatusCode::CONFLICT,
         ProblemType::Unauthenticated => StatusCode::UNAUTHORIZED,
-        ProblemType::Forbidden | ProblemType::ForeignOrigin => StatusCode::FORBIDDEN,
+        ProblemType::Forbidden | ProblemType::ForeignOrigin | ProblemType::SignInRefused => {
+            StatusCode::FORBIDDEN
+        }
         ProblemType::TooManyAttempts | ProblemType::TooManyRequests => {
             StatusCode::TOO_MANY_REQUESTS
         }
@@ -136,6 +140,7 @@ impl From<AppError> for Problem {
             AppError::RobotCannot { .. } => ProblemType::RobotCannot,
             AppError::UnknownAlert(_) => ProblemType::UnknownAlert,
             AppError::UnknownToken(_) | AppError::UnknownJoinToken(_) => ProblemType::UnknownToken,
+            AppError::UnknownSession(_) => ProblemType::UnknownSession,
             AppError::OutsideScope(_) | AppError::BeyondRights(_) => ProblemType::Forbidden,
             AppError::NoAuthority => ProblemType::RobotsDoNotJoin,
             AppError::Rotation(_) => ProblemType::AuthorityRotation,

@@ -198,6 +198,7 @@ fn config(folder: &std::path::Path) -> Config {
         storage: StorageConfig::default(),
         tls: None,
         robots: None,
+        oidc: None,
         audit: tread_server::config::AuditConfig::default(),
         web: WebConfig::default(),
     }

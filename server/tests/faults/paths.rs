@@ -7,18 +7,21 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
-use tread_api::ids::{AlertId, BootId, ConfigurationId, MissionId, SessionId, TokenId};
+use tread_api::ids::{AlertId, BootId, ConfigurationId, MissionId, PersonId, SessionId, TokenId};
 use tread_api::mission::{Cause, MissionState, Replacement};
 use tread_server::app::AppError;
+use tread_server::authority::Issued;
 use tread_server::config::RetentionConfig;
 use tread_server::db;
 use tread_server::db::aside::Origin;
+use tread_server::db::enrolments::Renewal;
 use tread_server::db::idempotency::Given;
 use tread_server::db::missions::Facts;
 use tread_server::db::robots::Introduction;
-use tread_server::db::sessions::NewSession;
+use tread_server::db::sessions::{NewSession, OfPeople, Owner, SignedIn};
 use tread_server::db::withdrawals::WithdrawalRow;
 use tread_server::identity::secret::{Fingerprint, Kind, Secret};
+use tread_server::identity::subject::SubjectId;
 
 use crate::ground::{Ground, boot, hello, mission, now, segment, uuid};
 
@@ -45,6 +48,10 @@ fn fingerprint(kind: Kind, number: u64) -> Fingerprint {
     let mut random = [0; 32];
     random[..8].copy_from_slice(&number.to_le_bytes());
     Secret::from_random(kind, &random).fingerprint()
+}
+
+fn token(number: u64) -> TokenId {
+    TokenId::from_uuid(uuid(number))
 }
 
 fn later() -> Timestamp {
@@ -133,7 +140,8 @@ pub(crate) const PATHS: &[WritePath] = &[
             Box::pin(async move {
                 let request = mission(&ground.site, &ground.robot);
                 let key = format!("key-{number}");
-                ground.app.create_mission_once(&key, request).await?;
+                let own = (SubjectId::Token(token(7)), &*key);
+                ground.app.create_mission_once(own, request).await?;
                 ground
                     .write(async |tx| db::idempotency::forget_before(tx, LONG_AGO, 10).await)
                     .await
@@ -313,17 +321,54 @@ pub(crate) const PATHS: &[WritePath] = &[
                 db::tokens::insert(tx, &token, &fingerprint(kind, number)).await?;
                 let session = NewSession {
                     id: SessionId::from_uuid(uuid(number)),
-                    token: id,
+                    owner: Owner::Token(id),
                     fingerprint: fingerprint(Kind::Session, number),
                     created_at: now(),
                     expires_at: later(),
                 };
                 db::sessions::insert(tx, &session).await?;
                 db::sessions::forget_expired(tx, LONG_AGO).await?;
+                db::sessions::surplus(tx, (Some(id), None), 20).await?;
                 db::sessions::delete(tx, session.id).await?;
                 db::tokens::touch(tx, id, now()).await?;
                 db::tokens::revoke(tx, id, now()).await?;
                 db::tokens::forget_dead(tx, LONG_AGO, 10).await
+            }))
+        },
+    },
+    WritePath {
+        name: "session of a person",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(ground.write(async move |tx| {
+                let issuer = "https://login.test";
+                let subject = format!("person {number}");
+                let signed_in = SignedIn {
+                    person: of(json!({
+                        "id": PersonId::of(issuer, &subject), "issuer": issuer, "subject": subject,
+                    })),
+                    name: "anna".to_owned(),
+                    groups: vec!["operators".to_owned()],
+                };
+                let session = NewSession {
+                    id: SessionId::from_uuid(uuid(number)),
+                    owner: Owner::Person(signed_in),
+                    fingerprint: fingerprint(Kind::Session, number),
+                    created_at: now(),
+                    expires_at: later(),
+                };
+                let filter = OfPeople {
+                    issuer,
+                    groups: &["operators"],
+                    at: LONG_AGO,
+                    before: None,
+                };
+                db::sessions::count_of_people(tx, LONG_AGO).await?;
+                db::sessions::insert(tx, &session).await?;
+                db::sessions::touch(tx, session.id, now()).await?;
+                db::sessions::list(tx, &filter, 10).await?;
+                db::sessions::find(tx, session.id).await?;
+                db::sessions::delete(tx, session.id).await
             }))
         },
     },
@@ -365,9 +410,17 @@ pub(crate) const PATHS: &[WritePath] = &[
                     "enrolled_at": now(), "join_token": token.id, "renewed_at": now(),
                     "expires_at": later(), "revoked_at": null, "revoked_by": null,
                 }));
-                db::enrolments::insert(tx, &enrolment).await?;
+                let issued = Issued::one(format!("certificate {number}"));
+                db::enrolments::insert(tx, &enrolment, &issued).await?;
                 let one = (&ground.site, &ground.robot, enrolment.number);
-                db::enrolments::renew(tx, one, now(), later(), "former").await?;
+                let renewal = Renewal {
+                    at: now(),
+                    expires_at: later(),
+                    authority: "former",
+                    issued: &issued,
+                };
+                db::enrolments::renew(tx, one, renewal).await?;
+                db::enrolments::forget_certificates(tx).await?;
                 db::enrolments::note_authority(tx, one, "next").await?;
                 db::enrolments::revoke(tx, (&ground.site, &ground.robot), "a test", now()).await
             }))
@@ -405,7 +458,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                     answer: "{}".to_owned(),
                 };
                 let key = format!("alone-{number}");
-                db::idempotency::insert(tx, &key, &given, now()).await
+                db::idempotency::insert(tx, (SubjectId::Token(token(7)), &key), &given, now()).await
             }))
         },
     },

@@ -115,6 +115,14 @@ impl Yard {
         Self::of(folder, server.await.unwrap()).await
     }
 
+    /// A server on the machine's clock, with a configuration of one's own.
+    pub(crate) async fn start_configured(change: impl FnOnce(&mut Config, &Path)) -> Self {
+        let folder = Arc::new(tempfile::tempdir().unwrap());
+        let mut config = config(folder.path(), "127.0.0.1:0");
+        change(&mut config, folder.path());
+        Self::of(folder, Server::start(config).await.unwrap()).await
+    }
+
     /// The same, and robots may join it.
     pub(crate) async fn start_joining_at(wall: Timestamp) -> Self {
         let folder = Arc::new(tempfile::tempdir().unwrap());
@@ -282,6 +290,7 @@ pub(crate) fn config(folder: &Path, zenoh: &str) -> Config {
         storage: StorageConfig::default(),
         tls: None,
         robots: None,
+        oidc: None,
         audit: tread_server::config::AuditConfig::default(),
         web: WebConfig {
             hosts: vec!["tread.test".to_owned()],

@@ -42,6 +42,8 @@ mod missions;
 #[cfg(test)]
 mod network;
 #[cfg(test)]
+mod oidc;
+#[cfg(test)]
 mod openapi;
 #[cfg(test)]
 mod page;

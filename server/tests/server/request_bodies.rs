@@ -96,7 +96,11 @@ fn examples() -> Vec<(&'static str, Value)> {
             "withdraw_measurements",
             json!({"from": "2026-01-01T00:00:00Z", "to": "2026-01-01T01:00:00Z", "reason": "a test"}),
         ),
-        ("finish_authority_rotation", json!({"force": false})),
+        (
+            "finish_authority_rotation",
+            json!({"rotation": "0011223344556677", "force": false}),
+        ),
+        ("replace_authority", json!({"signing": "00"})),
         ("create_terrain", new_terrain),
         ("replace_terrain", terrain),
         (

@@ -12,10 +12,13 @@ pub(super) enum Needs {
 use Needs::{Admin, Nothing, Operator, Viewer};
 
 /// Every operation but those that only read; those are a viewer's unless they stand here.
-const TABLE: [(&str, &str, Needs); 42] = [
+const TABLE: [(&str, &str, Needs); 48] = [
     ("GET", "/healthz", Nothing),
     ("GET", "/readyz", Nothing),
     ("POST", "/v1/session", Nothing),
+    ("GET", "/v1/sign-in", Nothing),
+    ("GET", "/v1/sign-in/oidc", Nothing),
+    ("GET", "/v1/sign-in/oidc/callback", Nothing),
     ("POST", "/v1/enrolments", Nothing),
     ("POST", "/v1/enrolments/renew", Nothing),
     ("DELETE", "/v1/session", Viewer),
@@ -58,11 +61,14 @@ const TABLE: [(&str, &str, Needs); 42] = [
     ("DELETE", "/v1/sites/{site}/terrains/{terrain}", Operator),
     ("POST", "/v1/authority/rotation", Admin),
     ("POST", "/v1/authority/rotation/finish", Admin),
+    ("POST", "/v1/authority/replace", Admin),
     ("GET", "/v1/audit", Admin),
     ("GET", "/v1/audit/chain", Admin),
     ("GET", "/v1/tokens", Admin),
     ("POST", "/v1/tokens", Admin),
     ("DELETE", "/v1/tokens/{token}", Admin),
+    ("GET", "/v1/sessions", Admin),
+    ("DELETE", "/v1/sessions/{session}", Admin),
     ("GET", "/v1/join-tokens", Admin),
     ("POST", "/v1/join-tokens", Admin),
     ("DELETE", "/v1/join-tokens/{token}", Admin),

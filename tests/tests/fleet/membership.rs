@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::Duration;
 
-use serde_json::json;
+use serde_json::{Value, json};
 use tread_agent::membership::Membership;
 use tread_api::enrolment::{AuthorityRotation, FleetAuthority};
 use tread_api::identity::AuditEntry;
@@ -75,12 +75,34 @@ async fn a_robot_joins_drives_a_circle_renews_on_the_way_and_is_put_out() {
 const LONG_CERTIFICATE_S: u32 = 86_400;
 const ROTATION: &str = "/v1/authority/rotation";
 const FINISH: &str = "/v1/authority/rotation/finish";
+const REPLACE: &str = "/v1/authority/replace";
 
 /// How many authorities a robot trusts, as its file says.
 fn trusted_by(fleet: &Fleet, robot: &RobotId) -> usize {
     let joined = Membership::load(&fleet.robot_folder(robot)).expect("the file reads");
     let joined = joined.expect("the robot has joined");
     joined.authority.matches("BEGIN CERTIFICATE").count()
+}
+
+/// What finishes the rotation that is under way.
+async fn finish_of_rotation(fleet: &Fleet) -> Value {
+    let authority: FleetAuthority = fleet.rest.get("/v1/authority").await;
+    let rotation = authority.rotation.expect("a rotation is under way");
+    json!({"rotation": rotation.id})
+}
+
+/// Waits until these robots must join again, and no others.
+async fn must_join(fleet: &Fleet, expected: &[&RobotId]) {
+    let look = || fleet.rest.get::<FleetAuthority>("/v1/authority");
+    let what = format!("{expected:?} must join again");
+    eventually(&what, SHORT, look, |seen| {
+        seen.to_join
+            .iter()
+            .map(|robot| &robot.robot)
+            .eq(expected.iter().copied())
+            && seen.robots_to_join as usize == expected.len()
+    })
+    .await;
 }
 
 /// Waits until these robots are left of a rotation, and no others.
@@ -111,11 +133,20 @@ async fn the_authority_is_rotated_under_a_robot_that_drives_and_one_that_comes_b
     let active = [MissionState::Active];
     fleet.rest.mission_reaches(circle, &active, SHORT).await;
     let refused = ProblemType::AuthorityRotation;
-    fleet.rest.post_refused(FINISH, &json!({}), refused).await;
+    let nothing = json!({"rotation": "0011223344556677"});
+    fleet.rest.post_refused(FINISH, &nothing, refused).await;
     let before: FleetAuthority = fleet.rest.get("/v1/authority").await;
     assert_eq!(before.rotation, None);
 
     fleet.rest.post(ROTATION, &json!({})).await;
+    let finish = finish_of_rotation(&fleet).await;
+    let other = ProblemType::AuthorityRotation;
+    let refused = fleet.rest.post_refused(FINISH, &nothing, other).await;
+    let detail = refused["detail"].as_str().unwrap();
+    assert!(
+        detail.contains("`0011223344556677` is not the one that is under way"),
+        "{detail}"
+    );
     let refused = ProblemType::AuthorityRotation;
     fleet.rest.post_refused(ROTATION, &json!({}), refused).await;
     robots_left_are(&fleet, &[&away]).await;
@@ -131,7 +162,7 @@ async fn the_authority_is_rotated_under_a_robot_that_drives_and_one_that_comes_b
     assert_eq!(during.rotation.unwrap().retiring, before.signing);
     let refused = fleet
         .rest
-        .post_refused(FINISH, &json!({}), ProblemType::RobotsLeft)
+        .post_refused(FINISH, &finish, ProblemType::RobotsLeft)
         .await;
     assert!(
         refused["detail"].as_str().unwrap().contains("rover-2"),
@@ -148,7 +179,7 @@ async fn the_authority_is_rotated_under_a_robot_that_drives_and_one_that_comes_b
     fleet.kill_agent(&away);
     fleet.start_agent(&away, 20.0).await;
     robots_left_are(&fleet, &[]).await;
-    fleet.rest.post(FINISH, &json!({})).await;
+    fleet.rest.post(FINISH, &finish).await;
     let after: FleetAuthority = fleet.rest.get("/v1/authority").await;
     assert_eq!((&after.signing, &after.rotation), (&during.signing, &None));
     let audit = || fleet.rest.all::<AuditEntry>("/v1/audit");
@@ -187,7 +218,10 @@ async fn a_robot_that_comes_back_after_its_authority_was_retired_is_told_of_and_
     fleet.kill_agent(&late);
     fleet.rest.post(ROTATION, &json!({})).await;
     robots_left_are(&fleet, &[&late]).await;
-    fleet.rest.post(FINISH, &json!({"force": true})).await;
+    let mut finish = finish_of_rotation(&fleet).await;
+    finish["force"] = json!(true);
+    fleet.rest.post(FINISH, &finish).await;
+    must_join(&fleet, &[&late]).await;
 
     fleet.spawn_agent(&late, 20.0);
     let look = || fleet.rest.robot(&late);
@@ -217,6 +251,52 @@ async fn a_robot_that_comes_back_after_its_authority_was_retired_is_told_of_and_
         seen.as_ref().is_some_and(|seen| !is_told(seen))
     })
     .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn after_a_replacement_no_robot_of_before_gets_in_until_it_has_joined_again() {
+    let mut fleet = secure_fleet(LONG_CERTIFICATE_S).await;
+    let [first, second] = ["rover-1", "rover-2"].map(|name| name.parse::<RobotId>().unwrap());
+    for (robot, x_m) in [(&first, 0.0), (&second, 20.0)] {
+        fleet.join(robot).await;
+        fleet.start_agent(robot, x_m).await;
+    }
+    let before: FleetAuthority = fleet.rest.get("/v1/authority").await;
+    let replace = json!({"signing": before.signing});
+    fleet.rest.post(REPLACE, &replace).await;
+    for robot in [&first, &second] {
+        let look = || fleet.rest.robot(robot);
+        eventually(
+            "its link is cut, and people are told",
+            SHORT,
+            look,
+            |seen| {
+                seen.as_ref().is_some_and(|seen| {
+                    let mut alerts = seen.alerts.iter();
+                    let is_told = alerts.any(|alert| alert.code.as_str() == "retired-authority");
+                    is_told && seen.link == LinkState::Offline
+                })
+            },
+        )
+        .await;
+    }
+    must_join(&fleet, &[&first, &second]).await;
+    let after: FleetAuthority = fleet.rest.get("/v1/authority").await;
+    assert_ne!(after.signing, before.signing);
+    assert!(after.rotation.is_none() && after.on_disk);
+    assert!(fleet.counter("gate_distrusted").await > 0);
+    assert!(fleet.counter("renewals_retired").await > 0);
+    // Whoever has looked at the same does not replace the next one too.
+    let refused = ProblemType::AuthorityRotation;
+    fleet.rest.post_refused(REPLACE, &replace, refused).await;
+
+    // As a power cut would.
+    fleet.kill_server();
+    fleet.start_server().await;
+    fleet.stop_agent(&first).await.unwrap();
+    fleet.join(&first).await;
+    fleet.start_agent(&first, 0.0).await;
+    must_join(&fleet, &[&second]).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -211,7 +211,8 @@ impl Tunnel {
     }
 
     /// Waits until a session through this tunnel can no longer connect: the server has other
-    /// credentials for this robot. Another tunnel gets them.
+    /// credentials for this robot, or shows a certificate that the robot does not trust. Another tunnel
+    /// gets them, or tells of it.
     pub async fn stale(&self) {
         self.stale.cancelled().await;
     }
@@ -316,7 +317,13 @@ async fn join(local: TcpStream, shared: &Shared, first: Vec<u8>) {
 
 /// Connects again; the first message is sent along, since the credentials are most likely the same.
 async fn reconnect(shared: &Shared, first: &[u8]) -> Result<Connection, DialError> {
-    let (connection, credentials) = shared.dialer.dial(first).await?;
+    let dialled = shared.dialer.dial(first).await;
+    if matches!(dialled, Err(DialError::Distrusted(_))) {
+        // The session cannot come back by what this tunnel trusts. Opening another one tells of it, so
+        // that the robot asks for a certificate of the authority that there is now.
+        shared.stale.cancel();
+    }
+    let (connection, credentials) = dialled?;
     if credentials != shared.credentials {
         shared.stale.cancel();
         return Err(DialError::NotUnderstood);

@@ -1,16 +1,20 @@
 // Who is signed in, and how the page looks to them.
-import type { Right, Session } from '../api/schema';
+import type { OidcSignIn, Right, Session, SignInWays, SignedOut } from '../api/schema';
 import { Problem, ask, sentence, whenSignedOut } from '../api/client';
 import { may } from '../rights';
 
 const THEME_KEY = 'tread-theme';
 /** Kept while this browser should have a session, so that others are not asked in vain. */
 const SESSION_KEY = 'tread-session';
+/** With this the server sends a browser here that has signed in at the provider. */
+const SIGNED_IN = '#signed-in';
 
 export type Theme = 'light' | 'dark';
 
 class SignedIn {
   session = $state<Session | null>(null);
+  /** The provider that people may sign in at, if there is one. */
+  oidc = $state<OidcSignIn | null>(null);
   /** Whether the server was asked already. */
   isKnown = $state(false);
   /** Somebody was signed in on this page and no longer is. */
@@ -33,6 +37,10 @@ class SignedIn {
   /** Asks whether this browser has a session. */
   async look(): Promise<void> {
     this.problem = null;
+    if (location.hash === SIGNED_IN) {
+      localStorage.setItem(SESSION_KEY, 'yes');
+      history.replaceState(null, '', location.pathname);
+    }
     if (localStorage.getItem(SESSION_KEY)) {
       try {
         this.session = await ask<Session>('/v1/session');
@@ -42,6 +50,16 @@ class SignedIn {
       }
     }
     this.isKnown = true;
+    if (!this.session) await this.lookForWays();
+  }
+
+  /** Asks how people may sign in; a token is a way whatever the answer. */
+  async lookForWays(): Promise<void> {
+    try {
+      this.oidc = (await ask<SignInWays>('/v1/sign-in')).oidc ?? null;
+    } catch {
+      this.oidc = null;
+    }
   }
 
   async signIn(token: string): Promise<void> {
@@ -58,9 +76,11 @@ class SignedIn {
   async signOut(): Promise<void> {
     this.problem = null;
     try {
-      await ask('/v1/session', { method: 'DELETE' });
+      const out = await ask<SignedOut | undefined>('/v1/session', { method: 'DELETE' });
       localStorage.removeItem(SESSION_KEY);
       this.session = null;
+      if (out) location.assign(out.provider);
+      else await this.lookForWays();
     } catch (error) {
       this.problem = sentence(error);
     }
@@ -71,6 +91,7 @@ class SignedIn {
     this.problem = null;
     localStorage.removeItem(SESSION_KEY);
     this.session = null;
+    void this.lookForWays();
   }
 }
 

@@ -30,20 +30,27 @@ use tread_api::rights::Scope;
 use tread_api::robot::Alert;
 
 use self::outsiders::Outsiders;
-pub(super) use self::outsiders::{RETIRED_ALERT, REVOKED_ALERT};
+pub(super) use self::outsiders::{RETIRED_ALERT, REVOKED_ALERT, UNISSUED_ALERT};
 use self::roll::Roll;
 use self::rotation::Shown;
 use super::identity::new_secret;
+use super::identity::quota::Quota;
 use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::{App, AppError, page, site_row};
-use crate::authority::{Authorities, CertificateError, RobotName, RobotRequest, Trusted};
+use crate::authority::{Authorities, CertificateError, Issued, RobotName, RobotRequest, Trusted};
 use crate::connections::Purpose;
+use crate::db::enrolments::{Counting, Renewal};
 use crate::db::{self, DbError, Outcome, Tx};
 use crate::identity::attempts::Source;
 use crate::identity::secret::{Kind, Secret};
 
 /// Most join tokens that can be used at once.
-pub const JOIN_TOKENS_MAX: usize = 1_000;
+const JOIN_TOKENS: Quota = Quota {
+    what: "valid join tokens",
+    all: 1_000,
+    reserved: 100,
+    share: 300,
+};
 /// Most robots that may ever join.
 pub const ROBOTS_MAX: usize = 10_000;
 /// How long dead join tokens are listed.
@@ -126,6 +133,9 @@ pub enum EnrolError {
     /// The authority that signed its certificate was retired.
     #[error("the authority of the certificate was retired")]
     Retired(RobotName),
+    /// This server has not given the certificate, or has given others since.
+    #[error("this server did not give the certificate, or gave it long ago")]
+    NotIssued(RobotName),
     /// There were too many failures; nothing was looked up.
     #[error("there were too many failed attempts; try again in {} s", .0.as_secs() + 1)]
     Locked(Duration),
@@ -165,6 +175,7 @@ impl EnrolError {
             | Self::Certificate(_)
             | Self::Ended(_)
             | Self::Retired(_)
+            | Self::NotIssued(_)
             | Self::Locked(_)
             | Self::Closed
             | Self::App(_) => None,
@@ -210,7 +221,7 @@ impl App {
     pub async fn create_join_token(
         &self,
         request: CreateJoinToken,
-        created_by: &str,
+        (created_by, within): (&str, &Scope),
     ) -> Result<CreatedJoinToken, AppError> {
         if self.office().is_none() {
             return Err(AppError::NoAuthority);
@@ -228,12 +239,8 @@ impl App {
         let mut tx = self.db().write("enrolment").await?;
         site_row(&mut tx, &request.site).await?;
         let valid_count = db::join_tokens::valid_count(&mut tx, now).await?;
-        if usize::try_from(valid_count).is_ok_and(|count| count >= JOIN_TOKENS_MAX) {
-            return Err(AppError::TooMany {
-                what: "valid join tokens",
-                count: JOIN_TOKENS_MAX,
-            });
-        }
+        let of_maker = db::join_tokens::valid_count_within(&mut tx, within, now).await?;
+        JOIN_TOKENS.check(within, valid_count, of_maker)?;
         let secret = new_secret(Kind::Join)?;
         let join_token = JoinToken {
             id: JoinTokenId::from_uuid(self.clock().mission_id().as_uuid()),
@@ -446,7 +453,8 @@ impl App {
             enrolment: number,
         };
         let trusted = office.authorities.present();
-        let certificate = office.sign(&trusted, key, &name, self.clock().machine_time())?;
+        let (certificate, fingerprint) =
+            office.sign(&trusted, key, &name, self.clock().machine_time())?;
         if !db::join_tokens::use_up(&mut tx, token.id, &robot, now).await? {
             return Err(EnrolError::Used(token.id));
         }
@@ -463,7 +471,7 @@ impl App {
             revoked_by: None,
             authority: Some(trusted.signing().fingerprint().to_owned()),
         };
-        db::enrolments::insert(&mut tx, &enrolment).await?;
+        db::enrolments::insert(&mut tx, &enrolment, &Issued::one(fingerprint)).await?;
         let ended = self.end_outsider(&mut tx, &enrolment).await?;
         self.commit_enrolment(tx, &enrolment, ended).await?;
         self.counters().robots_enrolled.one();
@@ -498,18 +506,36 @@ impl App {
             self.note_retired(name);
             return Err(EnrolError::Retired(name.clone()));
         }
-        let certificate = office.sign(&trusted, &key, name, self.clock().machine_time())?;
+        let (certificate, next) = office.sign(&trusted, &key, name, self.clock().machine_time())?;
         let mut tx = self.db().write("enrolment").await?;
         let enrolment = (&name.site, &name.robot, name.enrolment);
-        let expires_at = certificate.expires_at;
-        let issuer = present.issuer();
-        if !db::enrolments::renew(&mut tx, enrolment, now, expires_at, issuer).await? {
+        let (shown, mut ended) = (present.fingerprint(), Vec::new());
+        let counting = match db::enrolments::counting(&mut tx, enrolment).await? {
+            Counting::None => {
+                drop(tx);
+                let key = (name.site.clone(), name.robot.clone());
+                self.note_outsider(&key);
+                return Err(EnrolError::Ended(name.clone()));
+            }
+            Counting::Any => {
+                ended = self.end_unissued(&mut tx, name).await?;
+                Issued::one(shown.clone())
+            }
+            Counting::These(issued) => issued,
+        };
+        let Some(issued) = counting.renewed(&shown, next) else {
             drop(tx);
-            let key = (name.site.clone(), name.robot.clone());
-            self.note_outsider(&key);
-            return Err(EnrolError::Ended(name.clone()));
-        }
-        tx.commit().await?;
+            self.note_unissued(name);
+            return Err(EnrolError::NotIssued(name.clone()));
+        };
+        let renewal = Renewal {
+            at: now,
+            expires_at: certificate.expires_at,
+            authority: present.issuer(),
+            issued: &issued,
+        };
+        db::enrolments::renew(&mut tx, enrolment, renewal).await?;
+        self.commit_alerts(tx, ended).await?;
         self.membership()
             .shown
             .forget(&(name.site.clone(), name.robot.clone()));
@@ -519,19 +545,20 @@ impl App {
 }
 
 impl Office {
+    /// Signs a certificate, and says its fingerprint.
     fn sign(
         &self,
         trusted: &Trusted,
         key: &RobotRequest,
         name: &RobotName,
         now: Timestamp,
-    ) -> Result<RobotCertificate, EnrolError> {
+    ) -> Result<(RobotCertificate, String), EnrolError> {
         let signed = trusted.signing().sign(key, name, now, self.lifetime);
         let signed = signed.map_err(|cause| {
             tracing::error!("cannot sign a certificate: {cause:?}");
             EnrolError::App(AppError::NoRandomness(cause.to_string()))
         })?;
-        Ok(RobotCertificate {
+        let certificate = RobotCertificate {
             site: name.site.clone(),
             robot: name.robot.clone(),
             enrolment: name.enrolment,
@@ -540,6 +567,7 @@ impl Office {
             lifetime_s: u64::try_from(self.lifetime.as_secs()).unwrap_or_default(),
             expires_at: signed.expires_at,
             port: self.port,
-        })
+        };
+        Ok((certificate, signed.fingerprint))
     }
 }

@@ -17,6 +17,8 @@ use crate::db::{self, Tx};
 pub(in crate::app) const REVOKED_ALERT: &str = "revoked-robot";
 /// What is raised about a robot whose certificate is of an authority that was retired.
 pub(in crate::app) const RETIRED_ALERT: &str = "retired-authority";
+/// What is raised about a robot as which a certificate was shown that this server did not give.
+pub(in crate::app) const UNISSUED_ALERT: &str = "unknown-certificate";
 /// How often one robot is looked at, at the most.
 const NOTED_EVERY: Duration = Duration::from_mins(1);
 
@@ -78,6 +80,31 @@ impl App {
         }
     }
 
+    /// Tells of a certificate that this server did not give: somebody else can sign, or somebody has an
+    /// old copy of what the robot has.
+    pub(super) fn note_unissued(&self, name: &RobotName) {
+        let key = (name.site.clone(), name.robot.clone());
+        let text = "a certificate was shown for a renewal that this server did not give, or gave long ago: \
+                    the authority's key may be stolen, or an old copy of the robot's disk or of the \
+                    server's database is in use"
+            .to_owned();
+        self.tell(&key, UNISSUED_ALERT, text);
+    }
+
+    /// Ends the alert about such a certificate of a robot.
+    pub(super) async fn end_unissued(
+        &self,
+        tx: &mut Tx,
+        name: &RobotName,
+    ) -> Result<Vec<Alert>, AppError> {
+        let key = (name.site.clone(), name.robot.clone());
+        let Some(robot_pk) = robot_pk(tx, &key).await? else {
+            return Ok(Vec::new());
+        };
+        let ended = self.end_alert(tx, robot_pk, UNISSUED_ALERT).await?;
+        Ok(ended.into_iter().collect())
+    }
+
     /// Logs what is said of a robot and raises an alert, not too often.
     fn tell(&self, key: &RobotKey, code: &'static str, text: String) {
         let outsiders = &self.membership().outsiders;
@@ -123,7 +150,7 @@ impl App {
             return Ok(Vec::new());
         };
         let mut ended = Vec::new();
-        for code in [REVOKED_ALERT, RETIRED_ALERT] {
+        for code in [REVOKED_ALERT, RETIRED_ALERT, UNISSUED_ALERT] {
             ended.extend(self.end_alert(tx, robot_pk, code).await?);
         }
         Ok(ended)

@@ -3,12 +3,17 @@
 //!
 //! A robot counts as brought over when it has shown a certificate of the new authority at the robots'
 //! port, or for a renewal. That one was signed for it is not enough: the answer may have been lost.
+//! What it has shown says too which robots must join again after their authority was retired.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use tracing::{info, warn};
-use tread_api::enrolment::{AuthorityRotation, FleetAuthority, RobotLeft, TrustId};
+use tread_api::enrolment::{
+    AuthorityRotation, Enrolment, FinishRotation, FleetAuthority, ReplaceAuthority, RobotLeft,
+    TrustId,
+};
 use tread_api::robot::LinkState;
 
 use crate::app::presence::RobotKey;
@@ -20,6 +25,8 @@ use crate::db;
 const LEFT_LISTED_MAX: usize = 1_000;
 /// Most robots that a refusal names.
 const LEFT_NAMED_MAX: usize = 10;
+/// How often the disk is asked again whether it has what was decided.
+const SETTLE_EVERY: Duration = Duration::from_secs(5);
 
 /// Whose certificate each robot showed last, as far as it is written down; so that it is written once.
 #[derive(Debug, Default)]
@@ -67,51 +74,66 @@ impl App {
 
     async fn describe(&self, trusted: &Trusted) -> Result<FleetAuthority, AppError> {
         let signing = trusted.signing().fingerprint().to_owned();
-        let Some(retiring) = trusted.retiring() else {
-            let rotation = None;
-            return Ok(FleetAuthority { signing, rotation });
-        };
-        let (moved, mut left) = self.moved_and_left(&signing).await?;
-        let robots_left = left.len();
-        left.truncate(LEFT_LISTED_MAX);
-        let rotation = AuthorityRotation {
-            retiring: retiring.authority.fingerprint().to_owned(),
-            started_at: retiring.started_at,
-            started_by: retiring.started_by.clone(),
-            robots_moved: u32::try_from(moved).unwrap_or(u32::MAX),
-            robots_left: u32::try_from(robots_left).unwrap_or(u32::MAX),
-            left,
-        };
-        Ok(FleetAuthority {
+        let mut described = FleetAuthority {
             signing,
-            rotation: Some(rotation),
-        })
-    }
-
-    /// How many robots have shown a certificate of an authority, and who has not.
-    async fn moved_and_left(&self, signing: &str) -> Result<(usize, Vec<RobotLeft>), AppError> {
-        let mut tx = self.db().read("enrolment").await?;
-        let newest = db::enrolments::all_newest(&mut tx).await?;
-        drop(tx);
-        let now = self.clock().elapsed();
-        let mut moved = 0;
-        let mut left = Vec::new();
-        for enrolment in newest.into_iter().filter(|it| it.revoked_at.is_none()) {
-            if enrolment.authority.as_deref() == Some(signing) {
-                moved += 1;
-                continue;
-            }
-            let key = (enrolment.site, enrolment.robot);
-            let online = self.presences().get(&key).link(now) == LinkState::Online;
-            let (site, robot) = key;
-            left.push(RobotLeft {
-                site,
-                robot,
-                renewed_at: enrolment.renewed_at,
-                online,
+            rotation: None,
+            on_disk: self.authorities()?.is_settled(),
+            robots_to_join: 0,
+            to_join: Vec::new(),
+        };
+        if trusted.retiring().is_none() && !trusted.has_retired() {
+            return Ok(described);
+        }
+        let in_force = self.in_force().await?;
+        if let Some(retiring) = trusted.retiring() {
+            let (moved, left) = self.moved_and_left(&in_force, trusted);
+            let (robots_left, left) = counted(left);
+            described.rotation = Some(AuthorityRotation {
+                id: trusted.id(),
+                retiring: retiring.authority.fingerprint().to_owned(),
+                started_at: retiring.started_at,
+                started_by: retiring.started_by.clone(),
+                robots_moved: u32::try_from(moved).unwrap_or(u32::MAX),
+                robots_left,
+                left,
             });
         }
-        Ok((moved, left))
+        if trusted.has_retired() {
+            let must_join = |enrolment: &&Enrolment| must_join(enrolment, trusted);
+            let to_join = in_force.iter().filter(must_join);
+            let to_join = to_join.map(|it| self.robot_left(it)).collect();
+            (described.robots_to_join, described.to_join) = counted(to_join);
+        }
+        Ok(described)
+    }
+
+    /// The enrolments that are in force.
+    async fn in_force(&self) -> Result<Vec<Enrolment>, AppError> {
+        let mut tx = self.db().read("enrolment").await?;
+        let mut newest = db::enrolments::all_newest(&mut tx).await?;
+        newest.retain(|enrolment| enrolment.revoked_at.is_none());
+        Ok(newest)
+    }
+
+    /// How many robots have shown a certificate of the authority that signs, and who has not.
+    fn moved_and_left(&self, in_force: &[Enrolment], trusted: &Trusted) -> (usize, Vec<RobotLeft>) {
+        let signing = Some(trusted.signing().fingerprint());
+        let has_moved = |enrolment: &&Enrolment| enrolment.authority.as_deref() == signing;
+        let (moved, left): (Vec<_>, Vec<_>) = in_force.iter().partition(has_moved);
+        let left = left.into_iter().map(|it| self.robot_left(it)).collect();
+        (moved.len(), left)
+    }
+
+    fn robot_left(&self, enrolment: &Enrolment) -> RobotLeft {
+        let key = (enrolment.site.clone(), enrolment.robot.clone());
+        let online = self.presences().get(&key).link(self.clock().elapsed()) == LinkState::Online;
+        let (site, robot) = key;
+        RobotLeft {
+            site,
+            robot,
+            renewed_at: enrolment.renewed_at,
+            online,
+        }
     }
 
     /// Starts a rotation of the fleet's authority.
@@ -133,12 +155,20 @@ impl App {
     /// no certificate of the new one must join again.
     ///
     /// # Errors
-    /// None is under way, robots are left and it is not forced, or the files cannot be written.
-    pub async fn finish_rotation(&self, force: bool, by: &str) -> Result<FleetAuthority, AppError> {
+    /// None is under way or another one, robots are left and it is not forced, or the files cannot be
+    /// written.
+    pub async fn finish_rotation(
+        &self,
+        request: &FinishRotation,
+        by: &str,
+    ) -> Result<FleetAuthority, AppError> {
         let authorities = Arc::clone(self.authorities()?);
-        let present = authorities.present();
-        if present.retiring().is_some() && !force {
-            let (_moved, left) = self.moved_and_left(present.signing().fingerprint()).await?;
+        let (rotation, present) = (request.rotation, authorities.present());
+        present
+            .check_rotation(rotation)
+            .map_err(AppError::Rotation)?;
+        if !request.force {
+            let (_moved, left) = self.moved_and_left(&self.in_force().await?, &present);
             if !left.is_empty() {
                 return Err(AppError::RobotsLeft {
                     count: left.len(),
@@ -146,24 +176,87 @@ impl App {
                 });
             }
         }
-        let finishing = tokio::task::spawn_blocking(move || authorities.finish());
+        let finishing = tokio::task::spawn_blocking(move || authorities.finish(rotation));
         let trusted = ended(finishing.await)?;
         warn!("{by} has finished the rotation of the fleet's authority; the former one is retired");
+        self.settle_authorities();
         self.describe(&trusted).await
     }
 
-    /// Notes during a rotation whose certificate a robot has shown at the robots' port.
+    /// Puts another authority in the place of all that are trusted: no certificate of before opens
+    /// anything from now on, and every robot must join again.
+    ///
+    /// # Errors
+    /// Robots do not join this server, another authority than was named signs, or the files cannot be
+    /// written.
+    pub async fn replace_authority(
+        &self,
+        request: &ReplaceAuthority,
+        by: &str,
+    ) -> Result<FleetAuthority, AppError> {
+        let authorities = Arc::clone(self.authorities()?);
+        let (signing, now) = (request.signing.clone(), self.clock().machine_time());
+        let replacing = tokio::task::spawn_blocking(move || authorities.replace(&signing, now));
+        let trusted = ended(replacing.await)?;
+        let signing = trusted.signing().fingerprint();
+        warn!(
+            "{by} has replaced the fleet's authority; `{signing}` signs now, and every robot must join \
+             again"
+        );
+        self.describe(&trusted).await
+    }
+
+    /// Asks the disk again and again for what it has not confirmed, until it does.
+    fn settle_authorities(&self) {
+        let Ok(authorities) = self.authorities() else {
+            return;
+        };
+        if authorities.is_settled() {
+            return;
+        }
+        let (authorities, stop) = (Arc::clone(authorities), self.supervisor().stop_token());
+        self.supervisor().spawn_passing("authorities", async move {
+            while !authorities.is_settled() {
+                tokio::select! {
+                    () = stop.cancelled() => return,
+                    () = tokio::time::sleep(SETTLE_EVERY) => {}
+                }
+                let asked = Arc::clone(&authorities);
+                let settling = tokio::task::spawn_blocking(move || asked.settle());
+                match settling.await {
+                    Ok(Ok(())) => {
+                        info!("the disk has confirmed that the former authority is retired");
+                    }
+                    Ok(Err(failed)) => warn!(
+                        error = &failed as &dyn std::error::Error,
+                        "the disk still has not confirmed that the former authority is retired"
+                    ),
+                    Err(panicked) => warn!("the disk was not asked again: {panicked}"),
+                }
+            }
+        });
+    }
+
+    /// Notes whose certificate a robot has shown at the robots' port, once there was a rotation.
     pub async fn note_shown(&self, robot: &RobotKey, enrolment: u32, authority: &str) {
-        let is_rotating = self
-            .authorities()
-            .is_ok_and(|authorities| authorities.present().retiring().is_some());
+        let matters = self.authorities().is_ok_and(|authorities| {
+            let present = authorities.present();
+            present.retiring().is_some() || present.has_retired()
+        });
         let shown = &self.membership().shown;
-        if !is_rotating || shown.is_written(robot, enrolment, authority) {
+        if !matters || shown.is_written(robot, enrolment, authority) {
             return;
         }
         let writing = async {
-            let mut tx = self.db().write("enrolment").await?;
             let one = (&robot.0, &robot.1, enrolment);
+            // All robots come back after a restart, and few of them show anything new.
+            let mut tx = self.db().read("enrolment").await?;
+            let newest = db::enrolments::newest(&mut tx, &robot.0, &robot.1).await?;
+            drop(tx);
+            if newest.is_some_and(|newest| newest.authority.as_deref() == Some(authority)) {
+                return Ok(());
+            }
+            let mut tx = self.db().write("enrolment").await?;
             db::enrolments::note_authority(&mut tx, one, authority).await?;
             tx.commit().await?;
             Ok(())
@@ -192,6 +285,22 @@ fn ended(
         Ok(Err(RotationError::Key(failed))) => Err(AppError::NoRandomness(failed.to_string())),
         Err(panicked) => Err(AppError::NoRandomness(panicked.to_string())),
     }
+}
+
+/// Whether a robot must join again. One that has shown nothing since that is noted has not shown a
+/// certificate of the new authority before the former one was retired.
+fn must_join(enrolment: &Enrolment, trusted: &Trusted) -> bool {
+    match &enrolment.authority {
+        Some(shown) => !trusted.is_trusted(shown),
+        None => trusted.retiring().is_none(),
+    }
+}
+
+/// How many there are, and the first of them.
+fn counted(mut robots: Vec<RobotLeft>) -> (u32, Vec<RobotLeft>) {
+    let count = u32::try_from(robots.len()).unwrap_or(u32::MAX);
+    robots.truncate(LEFT_LISTED_MAX);
+    (count, robots)
 }
 
 /// The first of those that are left, for people.

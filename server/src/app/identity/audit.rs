@@ -7,7 +7,7 @@
 //! ```
 //!
 //! Nobody pushes what others did out of the log, and nobody fills the disk with it: each author has a
-//! share of entries, by the token; what is beyond it is not lost but counted, in one entry for all
+//! share of entries, by the token or the person; what is beyond it is not lost but counted, in one entry for all
 //! repeats of the same request in the same way answered. What is the same depends on what it is: of
 //! tokens, robots that join and sites each body is another request; of all else that succeeded each
 //! path is; refusals and sign-ins are the same when their route is.
@@ -25,7 +25,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 use tread_api::audit::AuditChain;
 use tread_api::identity::AuditEntry;
-use tread_api::ids::TokenId;
+use tread_api::ids::{PersonId, SessionId, TokenId};
 use tread_api::page::Page;
 
 use crate::app::{App, AppError, page};
@@ -75,6 +75,7 @@ const KINDS_MAX: usize = 16_384;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 enum Author {
     Token(TokenId),
+    Person(PersonId),
     /// Robots that join or renew: they have shown something valid.
     Joining,
     Stranger,
@@ -82,16 +83,17 @@ enum Author {
 
 impl Author {
     fn of(entry: &AuditEntry) -> Self {
-        match entry.token {
-            Some(token) => Self::Token(token),
-            None if entry.status < 400 => Self::Joining,
-            None => Self::Stranger,
+        match (entry.token, &entry.person) {
+            (Some(token), _) => Self::Token(token),
+            (None, Some(person)) => Self::Person(person.id),
+            (None, None) if entry.status < 400 => Self::Joining,
+            (None, None) => Self::Stranger,
         }
     }
 
     const fn limit(self) -> RateLimit {
         let burst = match self {
-            Self::Token(_) | Self::Joining => SHARE_BURST,
+            Self::Token(_) | Self::Person(_) | Self::Joining => SHARE_BURST,
             Self::Stranger => STRANGERS_BURST,
         };
         RateLimit {
@@ -116,14 +118,24 @@ struct RequestKind {
 
 /// Routes whose bodies say who may do what.
 fn is_of_rights(route: &str) -> bool {
-    let begins = ["/v1/tokens", "/v1/join-tokens", "/v1/enrolments"];
+    let begins = [
+        "/v1/tokens",
+        "/v1/join-tokens",
+        "/v1/enrolments",
+        "/v1/sessions",
+    ];
     begins.iter().any(|begin| route.starts_with(begin)) || route == "/v1/sites"
+}
+
+/// Routes by which people sign in and out.
+fn is_sign_in(route: &str) -> bool {
+    route == "/v1/session" || route.starts_with("/v1/sign-in")
 }
 
 impl RequestKind {
     /// As much as tells requests of this kind apart.
     fn of(entry: &AuditEntry) -> Self {
-        let is_change = entry.status < 400 && entry.route != "/v1/session";
+        let is_change = entry.status < 400 && !is_sign_in(&entry.route);
         let what = (is_change && is_of_rights(&entry.route)).then(|| {
             let mut hasher = DefaultHasher::new();
             let text = entry.what.as_ref().map(ToString::to_string);
@@ -177,13 +189,20 @@ impl Share {
     }
 }
 
+/// What notes when it was used last.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) enum Used {
+    Token(TokenId),
+    Session(SessionId),
+}
+
 /// What waits for the writer, and what is counted.
 #[derive(Debug, Default)]
 struct Waiting {
     entries: VecDeque<AuditEntry>,
     repeats: HashMap<RequestKind, Repeats>,
     shares: HashMap<Author, Share>,
-    uses: HashMap<TokenId, Timestamp>,
+    uses: HashMap<Used, Timestamp>,
 }
 
 /// What became of an entry.
@@ -316,9 +335,9 @@ impl App {
         }
     }
 
-    pub(super) fn note_use(&self, token: TokenId, at: Timestamp) {
+    pub(super) fn note_use(&self, used: Used, at: Timestamp) {
         let log = &self.identity().audit;
-        log.lock().uses.insert(token, at);
+        log.lock().uses.insert(used, at);
         log.added.notify_one();
     }
 
@@ -348,15 +367,18 @@ impl App {
     async fn write_audit(
         &self,
         entries: &[AuditEntry],
-        uses: &HashMap<TokenId, Timestamp>,
+        uses: &HashMap<Used, Timestamp>,
     ) -> Result<(), AppError> {
         let mut tx = self.db().write("identity").await?;
         let mut written = Vec::new();
         if !entries.is_empty() {
             written = db::audit::append(&mut tx, entries).await?;
         }
-        for (token, at) in uses {
-            db::tokens::touch(&mut tx, *token, *at).await?;
+        for (used, at) in uses {
+            match *used {
+                Used::Token(token) => db::tokens::touch(&mut tx, token, *at).await?,
+                Used::Session(session) => db::sessions::touch(&mut tx, session, *at).await?,
+            }
         }
         if let Ok(before) = self.clock().now().checked_sub(KEPT) {
             db::audit::forget(&mut tx, before, ENTRIES_MAX, FORGET_MAX).await?;

@@ -11,12 +11,15 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 use tokio_util::sync::CancellationToken;
-use tread_api::identity::{Role, Session};
+use tread_api::identity::{Person, Role, Session};
 use tread_api::ids::{HolderId, RobotId, SessionId, SiteId, TokenId};
-use tread_api::rights::{Right, Rights, Scope};
+use tread_api::rights::{Grant, Right, Rights, Scope};
 
 use crate::app::AppError;
+use crate::db::sessions::SignedIn;
+use crate::identity::grants::Grants;
 use crate::identity::secret::Fingerprint;
+use crate::identity::subject::SubjectId;
 
 /// Above so many, expired ones are dropped before another is kept. What is valid is bounded by
 /// the bounds on tokens and sessions.
@@ -30,16 +33,20 @@ const FRESH: Duration = Duration::from_secs(5);
 /// Somebody who has shown a good secret.
 #[derive(Debug)]
 pub struct Credential {
-    /// The token that was shown, or that the session was opened with.
-    pub token: TokenId,
-    /// The token's name.
+    /// The token that was shown or that the session was opened with, or the person.
+    pub subject: SubjectId,
+    /// Who signed in at the provider, if it is no token.
+    pub person: Option<Person>,
+    /// The token's name, or the person's.
     pub name: String,
     /// Its role, if it has no rights of its own.
     pub role: Option<Role>,
-    /// What it may do.
+    /// What it may do: at all of `scope`, see [`Self::for_right`].
     pub rights: Rights,
     /// Where it may do that.
     pub scope: Scope,
+    /// All that it may do.
+    grants: Grants,
     /// The browser's session, if it is one.
     pub session: Option<SessionId>,
     /// From when on it is refused.
@@ -57,19 +64,80 @@ impl Credential {
         expires_at: Timestamp,
         checked_at: Duration,
     ) -> Self {
+        let grants = Grants::of_token(token.role, token.rights, token.sites.clone());
         let touched = token.last_used_at;
         Self {
-            token: token.id,
+            subject: SubjectId::Token(token.id),
+            person: None,
             name: token.name.clone(),
             role: token.role,
             rights: token.rights,
             scope: token.sites.clone(),
+            grants,
             session,
             expires_at,
             ended: CancellationToken::new(),
             touched_us: AtomicI64::new(touched.map_or(i64::MIN, Timestamp::as_microsecond)),
             checked_ms: AtomicU64::new(to_ms(checked_at)),
         }
+    }
+
+    /// A person's session.
+    pub(super) fn of_person(
+        signed_in: SignedIn,
+        grants: Grants,
+        (session, expires_at): (SessionId, Timestamp),
+        (touched, checked_at): (Option<Timestamp>, Duration),
+    ) -> Self {
+        let Grant { rights, sites } = grants.in_common();
+        Self {
+            subject: SubjectId::Person(signed_in.person.id),
+            person: Some(signed_in.person),
+            name: signed_in.name,
+            role: grants.role(),
+            rights,
+            scope: sites,
+            grants,
+            session: Some(session),
+            expires_at,
+            ended: CancellationToken::new(),
+            touched_us: AtomicI64::new(touched.map_or(i64::MIN, Timestamp::as_microsecond)),
+            checked_ms: AtomicU64::new(to_ms(checked_at)),
+        }
+    }
+
+    /// Whoever it is, as far as a request goes that needs a right: with the places of the grants that
+    /// have this right, and the rights that hold at all of these. `None` if no grant has it.
+    pub fn for_right(self: &Arc<Self>, right: Right) -> Option<Arc<Self>> {
+        if !self.grants.are_several() {
+            return self.rights.includes(right).then(|| Arc::clone(self));
+        }
+        let Grant { rights, sites } = self.grants.for_right(right)?;
+        Some(Arc::new(Self {
+            subject: self.subject,
+            person: self.person.clone(),
+            name: self.name.clone(),
+            role: self.role,
+            rights,
+            scope: sites,
+            grants: self.grants.clone(),
+            session: self.session,
+            expires_at: self.expires_at,
+            ended: self.ended.clone(),
+            touched_us: AtomicI64::new(self.touched_us.load(Ordering::Relaxed)),
+            checked_ms: AtomicU64::new(self.checked_ms.load(Ordering::Relaxed)),
+        }))
+    }
+
+    /// Whether it may do something to a robot, whatever the right of the request.
+    pub fn may_at(&self, right: Right, site: &SiteId, robot: &RobotId) -> bool {
+        self.grants.includes_at(right, site, robot)
+    }
+
+    /// All rights that it has somewhere, for people.
+    pub fn all_rights(&self) -> Rights {
+        let grants = self.grants.as_slice().iter();
+        grants.fold(Rights::default(), |all, grant| all.union(grant.rights))
     }
 
     /// Whether it was looked up a moment ago.
@@ -101,7 +169,9 @@ impl Credential {
             role: self.role,
             rights: self.rights,
             sites: self.scope.clone(),
-            token: self.token,
+            grants: self.grants.as_slice().to_vec(),
+            token: self.subject.token(),
+            person: self.person.clone(),
             session: self.session,
             expires_at: self.expires_at,
         }
@@ -174,11 +244,20 @@ impl Credential {
         Err(AppError::OutsideScope(detail))
     }
 
-    /// Whether it may set and end the limits of a holder: of the one named like the token, or of
-    /// any with the right to release what others hold.
+    /// Whether it may set and end the limits of a holder: of its own, or of any with the right to
+    /// release what others hold.
     pub fn may_hold_as(&self, holder: &HolderId) -> bool {
         self.rights.includes(Right::ReleaseHold)
-            || (self.rights.includes(Right::Hold) && self.name == holder.as_str())
+            || (self.rights.includes(Right::Hold) && self.own_holder() == holder.as_str())
+    }
+
+    /// The name of its own limits: a token's name. A person may be called like a token, so it is their
+    /// identifier.
+    pub fn own_holder(&self) -> String {
+        match &self.person {
+            None => self.name.clone(),
+            Some(person) => person.id.to_string(),
+        }
     }
 
     /// Who does something, for people: this token's name always, and behind it the name that its
@@ -229,7 +308,8 @@ impl Valid {
 
     fn contains(&self, known: &Credential) -> bool {
         let has_session = known.session.is_none_or(|id| self.sessions.contains(&id));
-        has_session && self.token_ids.contains(&known.token)
+        let token = known.subject.token();
+        has_session && token.is_none_or(|token| self.token_ids.contains(&token))
     }
 }
 
@@ -466,7 +546,7 @@ mod tests {
             valid.tokens.push((
                 secret(2),
                 Credential {
-                    token: TokenId::from_uuid(uuid::Uuid::from_u128(8)),
+                    subject: SubjectId::Token(TokenId::from_uuid(uuid::Uuid::from_u128(8))),
                     ..credential
                 },
             ));

@@ -15,10 +15,13 @@
 
 pub mod audit;
 mod known;
+pub mod people;
+pub(super) mod quota;
+pub mod sessions;
 pub mod tokens;
 
 use std::net::IpAddr;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
@@ -27,18 +30,20 @@ use tokio_util::sync::CancellationToken;
 use tread_api::identity::Token;
 use tread_api::ids::SessionId;
 
-use self::audit::AuditLog;
+use self::audit::{AuditLog, Used};
 pub use self::known::Credential;
 use self::known::{Known, Valid};
+use self::people::People;
 use super::{App, AppError};
 use crate::connections::Purpose;
-use crate::db::sessions::NewSession;
+use crate::db::sessions::Owner;
 use crate::db::{self, DbError, Tx};
 use crate::identity::attempts::{Attempts, Source};
 use crate::identity::secret::{Fingerprint, Kind, RANDOM_BYTES, Secret};
+use crate::identity::subject::SubjectId;
 
-/// Most sessions of one token; the oldest ends when another begins.
-pub const SESSIONS_PER_TOKEN_MAX: u32 = 20;
+/// Most sessions of one token or person; the oldest ends when another begins.
+pub const SESSIONS_EACH_MAX: u32 = 20;
 /// How long a session lasts, at the most as long as its token.
 pub const SESSION_LASTS: SignedDuration = SignedDuration::from_hours(12);
 /// How long a request waits for whoever is known to be looked up again.
@@ -62,6 +67,7 @@ pub(super) struct Identity {
     audit: AuditLog,
     turns: Semaphore,
     stop_turns: Semaphore,
+    people: OnceLock<People>,
 }
 
 impl Default for Identity {
@@ -72,6 +78,7 @@ impl Default for Identity {
             audit: AuditLog::default(),
             turns: Semaphore::new(LOOK_UP_TURNS),
             stop_turns: Semaphore::new(STOP_LOOK_UP_TURNS),
+            people: OnceLock::new(),
         }
     }
 }
@@ -252,7 +259,24 @@ impl App {
         let mut tx = self.db().read("identity").await?;
         let (token, session, expires_at) = match secret.kind() {
             Kind::Token(_) => token_of(&mut tx, &fingerprint).await?,
-            Kind::Session => session_of(&mut tx, &fingerprint).await?,
+            Kind::Session => {
+                let kept = db::sessions::by_lookup(&mut tx, &fingerprint).await?;
+                let kept = kept.filter(|kept| fingerprint.matches(&kept.hash));
+                let kept = kept.ok_or(SignInError::Unknown)?;
+                match kept.owner {
+                    Owner::Token(token) => {
+                        let token = db::tokens::find(&mut tx, token).await?;
+                        let token = token.ok_or(SignInError::Unknown)?;
+                        let expires_at = kept.expires_at.min(token.expires_at);
+                        (token, Some(kept.id), expires_at)
+                    }
+                    Owner::Person(_) if kept.expires_at <= now => return Err(SignInError::Expired),
+                    Owner::Person(_) => {
+                        let person = self.person_of(kept, elapsed);
+                        return person.ok_or(SignInError::Unknown);
+                    }
+                }
+            }
             // It lets robots join and opens nothing.
             Kind::Join => return Err(SignInError::Unknown),
         };
@@ -268,7 +292,12 @@ impl App {
     fn used(&self, credential: &Credential) {
         let now = self.clock().now();
         if credential.touch(now) {
-            self.note_use(credential.token, now);
+            let used = match (credential.subject, credential.session) {
+                (SubjectId::Token(token), _) => Used::Token(token),
+                (SubjectId::Person(_), Some(session)) => Used::Session(session),
+                (SubjectId::Person(_), None) => return,
+            };
+            self.note_use(used, now);
         }
     }
 
@@ -302,70 +331,6 @@ impl App {
         }
         Err(SignInError::Unknown)
     }
-
-    /// Opens a session for a browser that has shown a token, and tells its secret.
-    ///
-    /// # Errors
-    /// The database failed, or the operating system gives no random numbers.
-    pub async fn open_session(
-        &self,
-        credential: &Credential,
-    ) -> Result<(Arc<Credential>, Secret), AppError> {
-        let now = self.clock().now();
-        let secret = new_secret(Kind::Session)?;
-        let lasts_until = now.checked_add(SESSION_LASTS).unwrap_or(Timestamp::MAX);
-        let session = NewSession {
-            id: SessionId::from_uuid(self.clock().mission_id().as_uuid()),
-            token: credential.token,
-            fingerprint: secret.fingerprint(),
-            created_at: now,
-            expires_at: lasts_until.min(credential.expires_at),
-        };
-        let mut tx = self.db().write("identity").await?;
-        let valid = db::tokens::find(&mut tx, credential.token).await?;
-        let valid = valid.filter(|token| token.revoked_at.is_none());
-        if valid.is_none() {
-            return Err(AppError::UnknownToken(credential.token));
-        }
-        db::sessions::forget_expired(&mut tx, now).await?;
-        db::sessions::insert(&mut tx, &session).await?;
-        let surplus =
-            db::sessions::surplus(&mut tx, credential.token, SESSIONS_PER_TOKEN_MAX).await?;
-        for &id in &surplus {
-            db::sessions::delete(&mut tx, id).await?;
-        }
-        let app = self.clone();
-        let ending = move |_outcome| {
-            let is_surplus = |known: &Credential| {
-                known
-                    .session
-                    .is_some_and(|session| surplus.contains(&session))
-            };
-            // To end nobody would only have look-ups repeated.
-            if !surplus.is_empty() {
-                app.identity().known.end(is_surplus);
-            }
-        };
-        tx.commit_then(ending).await?;
-        let opened = self.look_up(&secret).await.map_err(|error| match error {
-            SignInError::Storage(cause) => AppError::Storage(cause),
-            SignInError::Malformed
-            | SignInError::Unknown
-            | SignInError::Expired
-            | SignInError::Revoked
-            | SignInError::Locked(_) => AppError::UnknownToken(credential.token),
-        })?;
-        Ok((opened, secret))
-    }
-
-    /// Ends a browser's session.
-    pub async fn end_session(&self, id: SessionId) -> Result<(), AppError> {
-        let mut tx = self.db().write("identity").await?;
-        db::sessions::delete(&mut tx, id).await?;
-        let app = self.clone();
-        let ending = move |_outcome| app.identity().known.end(|known| known.session == Some(id));
-        Ok(tx.commit_then(ending).await?)
-    }
 }
 
 /// Reads again and again what is valid, until the stop.
@@ -391,20 +356,6 @@ async fn token_of(
     let token = kept.ok_or(SignInError::Unknown)?.token;
     let expires_at = token.expires_at;
     Ok((token, None, expires_at))
-}
-
-/// The session of a secret with its token, and when the first of them expires.
-async fn session_of(
-    tx: &mut Tx,
-    fingerprint: &Fingerprint,
-) -> Result<(Token, Option<SessionId>, Timestamp), SignInError> {
-    let kept = db::sessions::by_lookup(tx, fingerprint).await?;
-    let kept = kept.filter(|kept| fingerprint.matches(&kept.hash));
-    let session = kept.ok_or(SignInError::Unknown)?;
-    let token = db::tokens::find(tx, session.token).await?;
-    let token = token.ok_or(SignInError::Unknown)?;
-    let expires_at = session.expires_at.min(token.expires_at);
-    Ok((token, Some(session.id), expires_at))
 }
 
 /// A new secret of the operating system's random numbers: the only place that makes one.

@@ -9,13 +9,21 @@ use tread_api::ids::TokenId;
 use tread_api::page::Page;
 use tread_api::rights::{Right, Rights, Scope};
 
+use super::quota::Quota;
+use super::sessions::still_holds;
 use super::{Credential, new_secret};
 use crate::app::{App, AppError, page, people_line, site_row};
 use crate::db::{self, Tx};
 use crate::identity::secret::Kind;
+use crate::identity::subject::SubjectId;
 
 /// Most tokens that are valid at once.
-pub const TOKENS_MAX: usize = 1_000;
+const TOKENS: Quota = Quota {
+    what: "valid tokens",
+    all: 1_000,
+    reserved: 100,
+    share: 100,
+};
 /// How long dead tokens are listed.
 const DEAD_KEPT: SignedDuration = SignedDuration::from_hours(400 * 24);
 /// Dead tokens that are forgotten with each new one.
@@ -28,7 +36,8 @@ struct Ending(App, TokenId);
 impl Drop for Ending {
     fn drop(&mut self) {
         let Self(app, id) = self;
-        app.identity().known.end(|known| known.token == *id);
+        let revoked = SubjectId::Token(*id);
+        app.identity().known.end(|known| known.subject == revoked);
     }
 }
 
@@ -80,15 +89,15 @@ impl App {
         let mut tx = self.db().write("identity").await?;
         // His own may have been revoked since his request began.
         let now = self.clock().now();
-        let own = db::tokens::find(&mut tx, giver.token).await?;
-        let holds = own.is_some_and(|own| own.revoked_at.is_none() && own.expires_at > now);
+        let holds = still_holds(&mut tx, giver, now).await?;
         if !holds || giver.ended().is_cancelled() {
             return Err(AppError::BeyondRights(format!(
                 "`{}` holds no longer",
                 giver.name
             )));
         }
-        let created = self.new_token(&mut tx, request, &giver.name).await?;
+        let maker = (&*giver.name, &giver.scope);
+        let created = self.new_token(&mut tx, request, maker).await?;
         tx.commit().await?;
         Ok(created)
     }
@@ -104,7 +113,8 @@ impl App {
         created_by: &str,
     ) -> Result<CreatedToken, AppError> {
         let mut tx = self.db().write("identity").await?;
-        let created = self.new_token(&mut tx, request, created_by).await?;
+        let maker = (created_by, &Scope::EVERYWHERE);
+        let created = self.new_token(&mut tx, request, maker).await?;
         tx.commit().await?;
         Ok(created)
     }
@@ -132,7 +142,8 @@ impl App {
             valid_days: Some(first.valid_days),
             ..CreateToken::of_role(first.name, Role::Admin)
         };
-        let created = self.new_token(&mut tx, request, "init").await?;
+        let maker = ("init", &Scope::EVERYWHERE);
+        let created = self.new_token(&mut tx, request, maker).await?;
         let entry = AuditEntry {
             id: 0,
             at: now,
@@ -140,6 +151,7 @@ impl App {
             count: 1,
             who: Some("init".to_owned()),
             token: None,
+            person: None,
             role: None,
             address: "this machine".to_owned(),
             method: "RUN".to_owned(),
@@ -168,18 +180,14 @@ impl App {
         &self,
         tx: &mut Tx,
         request: CreateToken,
-        created_by: &str,
+        (created_by, within): (&str, &Scope),
     ) -> Result<CreatedToken, AppError> {
         let now = self.clock().now();
         let name = people_line("name", &request.name, TOKEN_NAME_MAX)?;
         let expires_at = expiry(now, request.valid_days)?;
         let (valid_count, _) = db::tokens::valid_counts(tx, now).await?;
-        if usize::try_from(valid_count).is_ok_and(|count| count >= TOKENS_MAX) {
-            return Err(AppError::TooMany {
-                what: "valid tokens",
-                count: TOKENS_MAX,
-            });
-        }
+        let of_maker = db::tokens::valid_count_within(tx, within, now).await?;
+        TOKENS.check(within, valid_count, of_maker)?;
         if db::tokens::valid_by_name(tx, &name, now).await?.is_some() {
             return Err(AppError::AlreadyExists {
                 what: "token",

@@ -1,5 +1,5 @@
 //! `Idempotency-Key`: the same request under the same key gets the same answer, also after a
-//! restart of the server.
+//! restart of the server. A key belongs to the token or person that sends it.
 //!
 //! The answer is written in the transaction of the mission that it tells of, so there is never
 //! one without the other. Keys are kept for [`KEPT`].
@@ -14,7 +14,8 @@ use uuid::Uuid;
 
 use crate::app::{App, AppError};
 use crate::db;
-use crate::db::idempotency::Given;
+use crate::db::idempotency::{Given, OwnKey};
+use crate::identity::subject::SubjectId;
 
 /// Longest key, in characters.
 pub const KEY_LENGTH_MAX: usize = 200;
@@ -28,11 +29,11 @@ const REQUESTS: Uuid = Uuid::from_u128(0x2d6c_35ab_0f1e_4a8e_9f64_7a0c_9b5e_11d3
 /// The keys whose requests are being answered.
 #[derive(Debug, Default)]
 pub(in crate::app) struct InFlight {
-    keys: Mutex<HashSet<String>>,
+    keys: Mutex<HashSet<(SubjectId, String)>>,
 }
 
 impl InFlight {
-    fn lock(&self) -> MutexGuard<'_, HashSet<String>> {
+    fn lock(&self) -> MutexGuard<'_, HashSet<(SubjectId, String)>> {
         self.keys.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -40,15 +41,14 @@ impl InFlight {
 /// Holds a key while its request is being answered.
 struct Holding<'app> {
     in_flight: &'app InFlight,
-    key: String,
+    key: (SubjectId, String),
 }
 
 impl<'app> Holding<'app> {
-    fn of(in_flight: &'app InFlight, key: &str) -> Option<Self> {
-        in_flight.lock().insert(key.to_owned()).then(|| Self {
-            in_flight,
-            key: key.to_owned(),
-        })
+    fn of(in_flight: &'app InFlight, (owner, key): OwnKey<'_>) -> Option<Self> {
+        let key = (owner, key.to_owned());
+        let is_first = in_flight.lock().insert(key.clone());
+        is_first.then_some(Self { in_flight, key })
     }
 }
 
@@ -59,14 +59,14 @@ impl Drop for Holding<'_> {
 }
 
 impl App {
-    /// Asks a robot to drive something, once for each key.
+    /// Asks a robot to drive something, once for each key of a token or person.
     ///
     /// # Errors
     /// [`AppError::KeyInFlight`] while the same key is being answered, [`AppError::KeyReused`] if
     /// it was used for another request, and all of [`App::create_mission`].
     pub async fn create_mission_once(
         &self,
-        key: &str,
+        key: OwnKey<'_>,
         request: CreateMission,
     ) -> Result<Mission, AppError> {
         let Some(_holding) = Holding::of(self.keys_in_flight(), key) else {
@@ -75,13 +75,15 @@ impl App {
         let written = serde_json::to_vec(&request).unwrap_or_default();
         let request_hash = Uuid::new_v5(&REQUESTS, &written);
         let mut tx = self.db().read("missions").await?;
-        let is_new = db::idempotency::find(&mut tx, key).await?.is_none();
+        let is_new = db::idempotency::find(&mut tx, key, request_hash)
+            .await?
+            .is_none();
         drop(tx);
         if is_new {
             self.check_new(&request).await?;
         }
         let mut tx = self.db().write("missions").await?;
-        if let Some(given) = db::idempotency::find(&mut tx, key).await? {
+        if let Some(given) = db::idempotency::find(&mut tx, key, request_hash).await? {
             if given.request_hash != request_hash {
                 return Err(AppError::KeyReused);
             }

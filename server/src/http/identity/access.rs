@@ -12,12 +12,15 @@ use super::browser::COOKIE;
 use crate::http::page;
 
 /// What anybody may ask for: this list and nothing else.
-pub const PUBLIC: [(&str, &str); 11] = [
+pub const PUBLIC: [(&str, &str); 14] = [
     ("GET", page::ROOT),
     ("GET", page::FILES),
     ("GET", "/healthz"),
     ("GET", "/readyz"),
     ("POST", "/v1/session"),
+    ("GET", "/v1/sign-in"),
+    ("GET", "/v1/sign-in/oidc"),
+    ("GET", "/v1/sign-in/oidc/callback"),
     ("POST", "/v1/enrolments"),
     ("POST", "/v1/enrolments/renew"),
     ("GET", "/openapi.json"),
@@ -136,7 +139,8 @@ pub(in crate::http) fn describe(openapi: &mut OpenApi) {
         .build();
     let cookie = ApiKeyValue::with_description(
         COOKIE,
-        "A browser's session, from `POST /v1/session`; `__Host-` stands before its name under TLS.",
+        "A browser's session, from `POST /v1/session` or a sign-in at the provider; `__Host-` stands \
+         before its name under TLS.",
     );
     let components = openapi.components.get_or_insert_default();
     components.add_security_scheme(TOKEN_SCHEME, SecurityScheme::Http(bearer));

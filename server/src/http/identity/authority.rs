@@ -2,7 +2,7 @@
 
 use axum::extract::State;
 use axum::http::StatusCode;
-use tread_api::enrolment::{FinishRotation, FleetAuthority};
+use tread_api::enrolment::{FinishRotation, FleetAuthority, ReplaceAuthority};
 use tread_api::problem::ProblemBody;
 
 use super::guard::Subject;
@@ -10,8 +10,8 @@ use crate::app::App;
 use crate::http::extract::Json;
 use crate::http::problem::Problem;
 
-/// Show the fleet's authority and, during a rotation, which robots still hold certificates of the
-/// former one.
+/// Show the fleet's authority, during a rotation which robots still hold certificates of the former
+/// one, and which must join again.
 #[utoipa::path(get, path = "/v1/authority", tag = "identity", operation_id = "get_authority",
     security(("token" = ["read"])),
     responses((status = 200, body = FleetAuthority), (status = 409, body = ProblemBody)))]
@@ -20,7 +20,7 @@ pub(in crate::http) async fn get(State(app): State<App>) -> Result<Json<FleetAut
 }
 
 /// Start a rotation of the fleet's authority: another one signs from now on, both are trusted, and
-/// robots get certificates of the new one as they are on the network.
+/// robots get certificates of the new one as they are on the network. The answer names the rotation.
 #[utoipa::path(post, path = "/v1/authority/rotation", tag = "identity",
     operation_id = "start_authority_rotation", security(("token" = ["administer"])),
     responses((status = 201, body = FleetAuthority), (status = 409, body = ProblemBody)))]
@@ -32,7 +32,7 @@ pub(in crate::http) async fn start(
     Ok((StatusCode::CREATED, Json(started)))
 }
 
-/// Finish the rotation: the former authority is retired. While robots hold certificates of it this is
+/// Finish a rotation, by its name: the former authority is retired. While robots hold certificates of it this is
 /// refused and names them, unless it is forced; they must join again then.
 #[utoipa::path(post, path = "/v1/authority/rotation/finish", tag = "identity",
     operation_id = "finish_authority_rotation", security(("token" = ["administer"])),
@@ -44,6 +44,22 @@ pub(in crate::http) async fn finish(
     Subject(subject): Subject,
     Json(request): Json<FinishRotation>,
 ) -> Result<Json<FleetAuthority>, Problem> {
-    let finished = app.finish_rotation(request.force, &subject.name).await?;
+    let finished = app.finish_rotation(&request, &subject.name).await?;
     Ok(Json(finished))
+}
+
+/// Replace an authority whose key was stolen: another one signs, no certificate of before opens anything
+/// or is renewed, and every robot must join again.
+#[utoipa::path(post, path = "/v1/authority/replace", tag = "identity",
+    operation_id = "replace_authority", security(("token" = ["administer"])),
+    request_body = ReplaceAuthority,
+    responses((status = 200, body = FleetAuthority), (status = 409, body = ProblemBody),
+        (status = 422, body = ProblemBody)))]
+pub(in crate::http) async fn replace(
+    State(app): State<App>,
+    Subject(subject): Subject,
+    Json(request): Json<ReplaceAuthority>,
+) -> Result<Json<FleetAuthority>, Problem> {
+    let replaced = app.replace_authority(&request, &subject.name).await?;
+    Ok(Json(replaced))
 }

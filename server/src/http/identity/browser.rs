@@ -26,33 +26,63 @@ const POLICY_OF_PAGES: &str = "default-src 'none'; script-src 'self'; \
 /// For how long browsers are to come by TLS only: a year.
 const ONLY_TLS: &str = "max-age=31536000";
 
-fn cookie_name(is_tls: bool) -> String {
+/// Name of the cookie of a sign-in that is under way at the provider.
+const SIGN_IN_COOKIE: &str = "tread_sign_in";
+
+fn name_of(cookie: &str, is_tls: bool) -> String {
     let prefix = if is_tls { "__Host-" } else { "" };
-    format!("{prefix}{COOKIE}")
+    format!("{prefix}{cookie}")
 }
 
-fn cookie(is_tls: bool, value: &str, lasts_s: i64) -> HeaderValue {
+fn cookie((name, same_site): (&str, &str), is_tls: bool, value: &str, lasts_s: i64) -> HeaderValue {
     let secure = if is_tls { "; Secure" } else { "" };
-    let name = cookie_name(is_tls);
-    let text =
-        format!("{name}={value}; Path=/; HttpOnly; SameSite=Strict; Max-Age={lasts_s}{secure}");
+    let name = name_of(name, is_tls);
+    let text = format!(
+        "{name}={value}; Path=/; HttpOnly; SameSite={same_site}; Max-Age={lasts_s}{secure}"
+    );
     // Names and secrets are letters and digits.
     HeaderValue::try_from(text).unwrap_or_else(|_| HeaderValue::from_static(""))
 }
 
 /// Gives a browser its session.
 pub(super) fn give_cookie(headers: &mut HeaderMap, is_tls: bool, secret: &str, lasts_s: i64) {
-    headers.append(header::SET_COOKIE, cookie(is_tls, secret, lasts_s));
+    let session = cookie((COOKIE, "Strict"), is_tls, secret, lasts_s);
+    headers.append(header::SET_COOKIE, session);
 }
 
 /// Takes a browser's session away.
 pub(super) fn take_cookie(headers: &mut HeaderMap, is_tls: bool) {
-    headers.append(header::SET_COOKIE, cookie(is_tls, "", 0));
+    give_cookie(headers, is_tls, "", 0);
+}
+
+/// Gives a browser what it shows when it comes back from the provider. That is a navigation from
+/// another site, with which browsers send no `Strict` cookie.
+pub(super) fn give_sign_in_cookie(
+    headers: &mut HeaderMap,
+    is_tls: bool,
+    value: &str,
+    lasts_s: i64,
+) {
+    let pending = cookie((SIGN_IN_COOKIE, "Lax"), is_tls, value, lasts_s);
+    headers.append(header::SET_COOKIE, pending);
 }
 
 /// The session that a browser shows.
 pub(super) fn shown_cookie(headers: &HeaderMap, is_tls: bool) -> Option<&str> {
-    let name = cookie_name(is_tls);
+    shown(COOKIE, headers, is_tls)
+}
+
+/// What a browser shows that comes back from the provider.
+pub(super) fn shown_sign_in_cookie(headers: &HeaderMap, is_tls: bool) -> Option<&str> {
+    shown(SIGN_IN_COOKIE, headers, is_tls)
+}
+
+fn shown<'headers>(
+    name: &str,
+    headers: &'headers HeaderMap,
+    is_tls: bool,
+) -> Option<&'headers str> {
+    let name = name_of(name, is_tls);
     let pairs = headers.get_all(header::COOKIE).into_iter();
     pairs
         .filter_map(|value| value.to_str().ok())

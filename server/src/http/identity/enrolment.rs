@@ -62,7 +62,8 @@ pub(in crate::http) async fn create_token(
         Some(robot) => subject.check_robot(&request.site, robot)?,
         None => subject.check_whole_site(&request.site)?,
     }
-    let created = app.create_join_token(request, &subject.name).await?;
+    let maker = (&*subject.name, &subject.scope);
+    let created = app.create_join_token(request, maker).await?;
     Ok((StatusCode::CREATED, Json(created)))
 }
 
@@ -162,7 +163,10 @@ pub(in crate::http) async fn renew(
         }
         Err(error) => {
             let mut what = json!({"refused": error.to_string()});
-            if let EnrolError::Ended(name) | EnrolError::Retired(name) = &error {
+            if let EnrolError::Ended(name)
+            | EnrolError::Retired(name)
+            | EnrolError::NotIssued(name) = &error
+            {
                 what["site"] = json!(name.site);
                 what["robot"] = json!(name.robot);
             }
@@ -199,6 +203,7 @@ fn refusal(app: &App, error: EnrolError) -> Response {
         EnrolError::Certificate(_) => &counters.renewals_refused,
         EnrolError::Ended(_) => &counters.renewals_revoked,
         EnrolError::Retired(_) => &counters.renewals_retired,
+        EnrolError::NotIssued(_) => &counters.renewals_not_issued,
     };
     counter.one();
     Problem::new(ProblemType::Unauthenticated)

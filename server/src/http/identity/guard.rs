@@ -4,16 +4,20 @@
 //! token that is wrong, expired or revoked is one and the same.
 
 use std::net::{IpAddr, Ipv4Addr};
+use std::pin::Pin;
 use std::sync::{Arc, OnceLock};
+use std::task::{Context, Poll};
 
-use axum::body::Body;
+use axum::body::{Body, Bytes, HttpBody};
 use axum::extract::{FromRequestParts, MatchedPath, Request, State};
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use futures_util::StreamExt as _;
+use hyper::body::{Frame, SizeHint};
 use serde_json::Value;
+use tokio_util::sync::{CancellationToken, DropGuard};
 use tread_api::identity::AuditEntry;
 use tread_api::problem::ProblemType;
 use tread_api::rights::Right;
@@ -25,6 +29,7 @@ use crate::app::{App, AppError};
 use crate::connections::{Purpose, Slot};
 use crate::counters::Counter;
 use crate::http::REQUEST_ID;
+use crate::http::events::Cut;
 use crate::http::problem::Problem;
 use crate::identity::origin::{Names, Provenance};
 use crate::identity::redact::redacted_text;
@@ -189,12 +194,13 @@ impl Guard {
             }
             Refusal::of(response)
         })?;
-        if credential.rights.includes(needed) {
+        if let Some(credential) = credential.for_right(needed) {
             return Ok(credential);
         }
         let detail = format!(
             "this needs the right `{needed}`, and `{}` has {}",
-            credential.name, credential.rights
+            credential.name,
+            credential.all_rights()
         );
         Err(self.forbidden(credential, detail))
     }
@@ -222,14 +228,13 @@ impl Guard {
             }
             return Err(refusal);
         }
-        let holder = place::holder(request, needed.1).await;
-        match holder.filter(|holder| !who.may_hold_as(holder)) {
+        match place::others_holder(request, needed.1, who).await {
             None => Ok(()),
             Some(holder) => {
-                let (right, name) = (Right::ReleaseHold, &who.name);
+                let (right, name, own) = (Right::ReleaseHold, &who.name, who.own_holder());
                 let detail = format!(
                     "this needs the right `{right}`: `{name}` sets and ends the limit of the \
-                     holder `{name}` alone, not that of `{holder}`"
+                     holder `{own}` alone, not that of `{holder}`"
                 );
                 Err(self.forbidden(Arc::clone(who), detail))
             }
@@ -246,7 +251,8 @@ impl Guard {
             since: None,
             count: 1,
             who: who.map(|who| who.name.clone()),
-            token: who.map(|who| who.token),
+            token: who.and_then(|who| who.subject.token()),
+            person: who.and_then(|who| who.person.clone()),
             role: who.and_then(|who| who.role),
             address: asked.address.to_string(),
             method: asked.method,
@@ -316,6 +322,7 @@ pub(in crate::http) async fn stand(
         }
     };
     let is_change = is_change(request.method());
+    let cut = request.extensions().get::<Cut>().cloned();
     if is_change {
         request.extensions_mut().insert(asked.slot.clone());
     }
@@ -324,13 +331,15 @@ pub(in crate::http) async fn stand(
         // A handler has held the body against where the token's rights hold.
         guard.app.counters().refused_scope.one();
     }
-    if is_change {
+    // Who comes back from the provider is signed in without a change being asked for.
+    let is_told = response.extensions().get::<Audited>().is_some();
+    if is_change || is_told {
         let signed_in = response.extensions().get::<SignedIn>().cloned();
         let who = subject.clone().or(signed_in.map(|SignedIn(who)| who));
         guard.note(asked, &response, who.as_ref());
     }
     match subject {
-        Some(subject) => end_with(&guard.app, subject, response),
+        Some(subject) => end_with(&guard.app, subject, cut, response),
         None => response,
     }
 }
@@ -355,7 +364,7 @@ impl Guard {
                 let credential = checked.await?;
                 // From here on the connection is at work, whatever its body takes.
                 if let Some(slot) = request.extensions().get::<Arc<Slot>>()
-                    && let Err(full) = slot.prove(credential.token, purpose)
+                    && let Err(full) = slot.prove(credential.subject, purpose)
                 {
                     let problem = Problem::new(ProblemType::TooManyRequests);
                     let problem = problem.detail(full.to_string());
@@ -390,10 +399,12 @@ impl Guard {
     }
 }
 
-/// Ends a stream of events with the token or session that asked for it.
-fn end_with(app: &App, subject: Arc<Credential>, response: Response) -> Response {
-    let media_type = response.headers().get(header::CONTENT_TYPE);
-    if media_type.is_none_or(|media_type| media_type != "text/event-stream") {
+/// Ends what goes on after the head of the answer with the token or session that asked for it: a stream
+/// of events closes, and the connection of a download is cut, so that nobody takes a part for the whole.
+fn end_with(app: &App, subject: Arc<Credential>, cut: Option<Cut>, response: Response) -> Response {
+    let body = response.body();
+    if body.is_end_stream() || body.size_hint().exact().is_some() {
+        // It was made as a whole before.
         return response;
     }
     let left = subject.expires_at.duration_since(app.clock().now());
@@ -405,7 +416,56 @@ fn end_with(app: &App, subject: Arc<Credential>, response: Response) -> Response
             () = tokio::time::sleep(left) => {}
         }
     };
-    response.map(|body| Body::from_stream(body.into_data_stream().take_until(Box::pin(over))))
+    let media_type = response.headers().get(header::CONTENT_TYPE);
+    if media_type.is_some_and(|media_type| media_type == "text/event-stream") {
+        let until = |body: Body| body.into_data_stream().take_until(Box::pin(over));
+        return response.map(|body| Body::from_stream(until(body)));
+    }
+    // Whoever reads slowly has nothing asked of the body meanwhile, so it is watched from beside.
+    let given = CancellationToken::new();
+    let guard = given.clone().drop_guard();
+    app.pass_by("download", async move {
+        tokio::select! {
+            () = given.cancelled() => {}
+            () = over => {
+                if let Some(Cut(cut)) = cut {
+                    cut.cancel();
+                }
+            }
+        }
+    });
+    response.map(|body| {
+        Body::new(Download {
+            body,
+            _given: guard,
+        })
+    })
+}
+
+/// The body of a download, which tells when it has been given or given up.
+struct Download {
+    body: Body,
+    _given: DropGuard,
+}
+
+impl HttpBody for Download {
+    type Data = Bytes;
+    type Error = axum::Error;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
+        Pin::new(&mut self.body).poll_frame(context)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
 }
 
 /// The answer to a secret that opens nothing; counts the cause.

@@ -13,4 +13,6 @@ pub(super) mod enrolment;
 pub(super) mod guard;
 mod place;
 pub(super) mod session;
+pub(super) mod sessions;
+pub(super) mod sign_in;
 pub(super) mod tokens;

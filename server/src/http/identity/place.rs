@@ -5,7 +5,7 @@
 //! | a robot | this robot |
 //! | a site, to read it | the site or some of its robots: lists show these alone |
 //! | a site, to change it | the whole site |
-//! | a mission, an alert, a token | the robot that it is of, or all that the token holds for |
+//! | a mission, an alert, a token, a session | the robot that it is of, or all that the token holds for |
 //! | none of these | to be on [`CHECKED_BY_HANDLERS`]; else a token for everything |
 //!
 //! Sites and robots in the query are held against it here, those in bodies by the handlers.
@@ -13,7 +13,9 @@
 use axum::RequestExt as _;
 use axum::extract::{RawPathParams, Request};
 use axum::http::Method;
-use tread_api::ids::{AlertId, HolderId, JoinTokenId, MissionId, RobotId, SiteId, TokenId};
+use tread_api::ids::{
+    AlertId, HolderId, JoinTokenId, MissionId, RobotId, SessionId, SiteId, TokenId,
+};
 use tread_api::rights::Right;
 
 use crate::app::identity::Credential;
@@ -22,7 +24,7 @@ use crate::http::extract::Query;
 
 /// Routes without a site that show or do only what is in the scope of whoever asks: their handlers
 /// see to that.
-pub(super) const CHECKED_BY_HANDLERS: [(&str, &str); 15] = [
+pub(super) const CHECKED_BY_HANDLERS: [(&str, &str); 16] = [
     ("GET", "/v1/alerts"),
     ("GET", "/v1/events"),
     ("GET", "/v1/join-tokens"),
@@ -32,6 +34,7 @@ pub(super) const CHECKED_BY_HANDLERS: [(&str, &str); 15] = [
     ("GET", "/v1/server"),
     ("GET", "/v1/session"),
     ("DELETE", "/v1/session"),
+    ("GET", "/v1/sessions"),
     ("GET", "/v1/sites"),
     ("POST", "/v1/stop"),
     ("GET", "/v1/stops"),
@@ -48,6 +51,7 @@ struct Named {
     mission: Option<MissionId>,
     alert: Option<AlertId>,
     token: Option<String>,
+    session: Option<SessionId>,
 }
 
 /// Refuses what is outside a token's scope.
@@ -94,6 +98,13 @@ pub(super) async fn check(
         Named {
             token: Some(token), ..
         } => check_token(app, route, &token, who).await,
+        Named {
+            session: Some(session),
+            ..
+        } => match app.session_scope(session).await? {
+            Some(scope) => who.check_scope(&scope),
+            None => Ok(()),
+        },
         _ if is_held_by_handler(request.method(), route) => Ok(()),
         _ => who.check_everywhere(),
     }
@@ -122,20 +133,29 @@ async fn named(request: &mut Request) -> Named {
             "mission" => named.mission = value.parse().ok(),
             "alert" => named.alert = value.parse().ok(),
             "token" => named.token = Some(value.to_owned()),
+            "session" => named.session = value.parse().ok(),
             _ => {}
         }
     }
     named
 }
 
-/// The holder whose limit a request sets or ends.
-pub(super) async fn holder(request: &mut Request, right: Right) -> Option<HolderId> {
+/// The holder whose limit a request sets or ends, if that is not for whoever asks.
+pub(super) async fn others_holder(
+    request: &mut Request,
+    right: Right,
+    who: &Credential,
+) -> Option<HolderId> {
     if right != Right::Hold {
         return None;
     }
+    let Named { site, robot, .. } = named(request).await;
     let params = request.extract_parts::<RawPathParams>().await.ok()?;
     let mut holders = params.iter().filter(|(name, _)| *name == "holder");
-    holders.next()?.1.parse().ok()
+    let holder: HolderId = holders.next()?.1.parse().ok()?;
+    let may_release = |(site, robot)| who.may_at(Right::ReleaseHold, &site, &robot);
+    let is_own = who.may_hold_as(&holder) || site.zip(robot).is_some_and(may_release);
+    (!is_own).then_some(holder)
 }
 
 async fn check_query(

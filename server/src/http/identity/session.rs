@@ -5,7 +5,7 @@ use std::sync::Arc;
 use axum::extract::{Extension, State};
 use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
-use tread_api::identity::{CreateSession, Session};
+use tread_api::identity::{CreateSession, Session, SignedOut};
 use tread_api::problem::ProblemBody;
 
 use super::browser;
@@ -65,18 +65,24 @@ pub(in crate::http) async fn get(Subject(subject): Subject) -> Json<Session> {
     Json(subject.session())
 }
 
-/// Signs a browser out. A token stays valid: an admin revokes it.
+/// Signs a browser out. A token stays valid: an admin revokes it. Whoever signed in at a provider is
+/// told where to sign out there too, if it has such a place.
 #[utoipa::path(delete, path = "/v1/session", tag = "identity", operation_id = "end_session",
-    security(("token" = ["stop"])), responses((status = 204)))]
+    security(("token" = ["stop"])),
+    responses((status = 200, body = SignedOut), (status = 204)))]
 pub(in crate::http) async fn end(
     State(app): State<App>,
     Extension(names): Extension<Arc<Names>>,
     Subject(subject): Subject,
 ) -> Result<Response, Problem> {
+    let provider = app.sign_out_at_provider(&subject);
     if let Some(session) = subject.session {
         app.end_session(session).await?;
     }
-    let mut response = StatusCode::NO_CONTENT.into_response();
+    let mut response = match provider {
+        Some(provider) => Json(SignedOut { provider }).into_response(),
+        None => StatusCode::NO_CONTENT.into_response(),
+    };
     browser::take_cookie(response.headers_mut(), names.is_tls);
     Ok(response)
 }

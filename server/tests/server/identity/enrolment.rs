@@ -4,13 +4,22 @@ use std::time::Duration;
 
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
+use jiff::SignedDuration;
 use rcgen::{CertificateParams, KeyPair, SigningKey as _};
 use reqwest::StatusCode;
 use serde_json::{Value, json};
 use tread_api::enrolment::renewal_message;
+use tread_api::ids::BootId;
+use tread_api::robot::Capabilities;
+use tread_samples::rover;
+use tread_server::authority::{Authority, Issued, RobotName, RobotRequest};
+use tread_server::db;
+use tread_server::db::enrolments::Renewal;
+use tread_server::db::robots::Introduction;
 use tread_server::identity::attempts::FAILURES_MAX;
+use uuid::Uuid;
 
-use crate::harness::{Yard, client, eventually, time};
+use crate::harness::{Yard, client, eventually, site, time};
 
 fn request(key: &KeyPair) -> String {
     let params = CertificateParams::default();
@@ -48,7 +57,17 @@ async fn joined(yard: &Yard, robot: &str, key: &KeyPair) -> String {
 }
 
 async fn renew(yard: &Yard, certificate: &str, present: &KeyPair) -> (StatusCode, Value) {
-    let next = request(&KeyPair::generate().unwrap());
+    let next = KeyPair::generate().unwrap();
+    renew_with(yard, certificate, present, &next).await
+}
+
+async fn renew_with(
+    yard: &Yard,
+    certificate: &str,
+    present: &KeyPair,
+    next: &KeyPair,
+) -> (StatusCode, Value) {
+    let next = request(next);
     let proof = present.sign(&renewal_message(&next)).unwrap();
     let body = json!({
         "certificate": certificate, "certificate_request": next,
@@ -215,6 +234,118 @@ async fn a_certificate_is_renewed_by_its_key_until_its_robot_is_put_out_or_joins
         yard.send(yard.client().delete(path)).await.0,
         StatusCode::NOT_FOUND
     );
+}
+
+/// Lets the server know a robot, as if it had said hello.
+async fn introduce(yard: &Yard, robot: &str) {
+    let id = robot.parse().unwrap();
+    let introduction = Introduction {
+        id: &id,
+        boot: BootId::from_uuid(Uuid::from_u128(1)),
+        agent_version: "0.0.1",
+        model: &rover("test rover", "lugged"),
+        capabilities: &Capabilities::default(),
+        at: yard.server.app().clock().now(),
+    };
+    let mut tx = yard.server.app().db().write("test").await.unwrap();
+    let site = db::sites::find(&mut tx, &site()).await.unwrap().unwrap();
+    let introduced = db::robots::introduce(&mut tx, site.pk, introduction, 3).await;
+    introduced.unwrap();
+    tx.commit().await.unwrap();
+}
+
+/// A certificate that a thief of the authority's key makes.
+fn forged(yard: &Yard, robot: &str, key: &KeyPair) -> String {
+    let stolen = Authority::load(&yard.folder.path().join("authority")).unwrap();
+    let request = RobotRequest::read(&request(key)).unwrap();
+    let name = RobotName {
+        site: "yard".parse().unwrap(),
+        robot: robot.parse().unwrap(),
+        enrolment: 1,
+    };
+    let now = yard.server.app().clock().now();
+    let signed = stolen.sign(&request, &name, now, SignedDuration::from_hours(24));
+    signed.unwrap().certificate
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_certificate_that_a_thief_of_the_key_makes_is_not_exchanged_for_one_at_any_time() {
+    let yard = yard().await;
+    introduce(&yard, "rover-1").await;
+    let (key, thief) = (KeyPair::generate().unwrap(), KeyPair::generate().unwrap());
+    let certificate = joined(&yard, "rover-1", &key).await;
+    let forged = forged(&yard, "rover-1", &thief);
+    let (status, refused) = renew(&yard, &forged, &thief).await;
+    assert_eq!(status, StatusCode::UNAUTHORIZED, "{refused}");
+    let (status, started) = yard.post("/v1/authority/rotation", &json!({})).await;
+    assert_eq!(status, StatusCode::CREATED, "{started}");
+    let (status, refused) = renew(&yard, &forged, &thief).await;
+    assert_eq!(status, StatusCode::UNAUTHORIZED, "{refused}");
+    assert_eq!(yard.counters().await.renewals_not_issued, 2);
+    eventually("people are told", async || {
+        let (_, alerts) = yard.get_value("/v1/alerts").await;
+        let mut items = alerts["items"].as_array().unwrap().iter();
+        let told =
+            items.any(|it| it["code"] == "unknown-certificate" && it["cleared_at"].is_null());
+        if told { Ok(()) } else { Err(alerts) }
+    })
+    .await;
+    eventually("it is in the audit log", async || {
+        let (_, log) = yard.get_value("/v1/audit?refused=true").await;
+        let text = log.to_string();
+        let is_there = text.contains("did not give the certificate") && text.contains("rover-1");
+        if is_there { Ok(()) } else { Err(log) }
+    })
+    .await;
+
+    // The robot itself is brought over, though an answer is lost: it shows the one before.
+    assert_eq!(renew(&yard, &certificate, &key).await.0, StatusCode::OK);
+    let next_key = KeyPair::generate().unwrap();
+    let (status, next) = renew_with(&yard, &certificate, &key, &next_key).await;
+    assert_eq!(status, StatusCode::OK, "{next}");
+    let next = next["certificate"].as_str().unwrap();
+    assert_eq!(renew(&yard, next, &next_key).await.0, StatusCode::OK);
+    // Now it has shown the newer one, and whoever has an old copy of it gets nothing.
+    let (status, refused) = renew(&yard, &certificate, &key).await;
+    assert_eq!(status, StatusCode::UNAUTHORIZED, "{refused}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn after_a_backup_was_restored_the_next_certificate_of_each_robot_can_be_made_to_count() {
+    let yard = yard().await;
+    let (key, next_key) = (KeyPair::generate().unwrap(), KeyPair::generate().unwrap());
+    let certificate = joined(&yard, "rover-1", &key).await;
+    let (_, next) = renew_with(&yard, &certificate, &key, &next_key).await;
+    let next = next["certificate"].as_str().unwrap().to_owned();
+    // The robot has the next one, and the database is from before that renewal.
+    let db = yard.server.app().db().clone();
+    let mut tx = db.write("test").await.unwrap();
+    let robot = (&"yard".parse().unwrap(), &"rover-1".parse().unwrap(), 1);
+    let now = yard.server.app().clock().now();
+    let issued = Issued::one("another".to_owned());
+    let renewal = Renewal {
+        at: now,
+        expires_at: now + SignedDuration::from_hours(1),
+        authority: "any",
+        issued: &issued,
+    };
+    assert!(
+        db::enrolments::renew(&mut tx, robot, renewal)
+            .await
+            .unwrap()
+    );
+    tx.commit().await.unwrap();
+    let (status, refused) = renew(&yard, &next, &next_key).await;
+    assert_eq!(status, StatusCode::UNAUTHORIZED, "{refused}");
+
+    // As `tread-server forget-certificates` does, beside the server.
+    let mut tx = db.write("test").await.unwrap();
+    let count = db::enrolments::forget_certificates(&mut tx).await.unwrap();
+    tx.commit().await.unwrap();
+    assert_eq!(count, 1);
+    assert_eq!(renew(&yard, &next, &next_key).await.0, StatusCode::OK);
+    let (status, refused) = renew(&yard, &certificate, &key).await;
+    assert_eq!(status, StatusCode::UNAUTHORIZED, "{refused}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

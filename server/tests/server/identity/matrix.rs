@@ -14,12 +14,15 @@ use crate::harness::{Yard, client};
 
 /// What anybody may ask for. It stands here a second time, so that a change of the server's list
 /// is a change of this test.
-const OPEN: [(&str, &str); 11] = [
+const OPEN: [(&str, &str); 14] = [
     ("GET", "/"),
     ("GET", "/page/{file}"),
     ("GET", "/healthz"),
     ("GET", "/readyz"),
     ("POST", "/v1/session"),
+    ("GET", "/v1/sign-in"),
+    ("GET", "/v1/sign-in/oidc"),
+    ("GET", "/v1/sign-in/oidc/callback"),
     ("POST", "/v1/enrolments"),
     ("POST", "/v1/enrolments/renew"),
     ("GET", "/openapi.json"),
@@ -28,16 +31,19 @@ const OPEN: [(&str, &str); 11] = [
     ("GET", "/docs/{*rest}"),
 ];
 /// What an operator may not ask for.
-const ADMINS_ONLY: [(&str, &str); 12] = [
+const ADMINS_ONLY: [(&str, &str); 15] = [
     ("GET", "/v1/tokens"),
     ("POST", "/v1/tokens"),
     ("DELETE", "/v1/tokens/{token}"),
+    ("GET", "/v1/sessions"),
+    ("DELETE", "/v1/sessions/{session}"),
     ("GET", "/v1/join-tokens"),
     ("POST", "/v1/join-tokens"),
     ("DELETE", "/v1/join-tokens/{token}"),
     ("DELETE", "/v1/sites/{site}/enrolments/{robot}"),
     ("POST", "/v1/authority/rotation"),
     ("POST", "/v1/authority/rotation/finish"),
+    ("POST", "/v1/authority/replace"),
     ("GET", "/v1/audit"),
     ("GET", "/v1/audit/chain"),
     ("POST", "/v1/sites"),
@@ -88,7 +94,9 @@ fn filled(path: &str) -> String {
         filled.push('/');
         filled.push_str(match part {
             "{site}" => "yard",
-            "{mission}" | "{alert}" | "{token}" => "0192f0c1-2b3c-7d4e-8f50-617283940a1b",
+            "{mission}" | "{alert}" | "{token}" | "{session}" => {
+                "0192f0c1-2b3c-7d4e-8f50-617283940a1b"
+            }
             "{*rest}" => "index.html",
             other if other.starts_with('{') => "nothing-of-that-name",
             other => other,

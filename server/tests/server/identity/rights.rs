@@ -20,12 +20,13 @@ use crate::harness::{Yard, circle, client, eventually, measured, segment, time};
 use crate::robot::Robot;
 
 /// What takes a token for everything.
-const SERVER_WIDE: [(&str, &str); 6] = [
+const SERVER_WIDE: [(&str, &str); 7] = [
     ("GET", "/v1/audit"),
     ("GET", "/v1/audit/chain"),
     ("GET", "/v1/authority"),
     ("POST", "/v1/authority/rotation"),
     ("POST", "/v1/authority/rotation/finish"),
+    ("POST", "/v1/authority/replace"),
     ("POST", "/v1/sites"),
 ];
 /// What is about whoever asks, or about the server, and nothing of a site.
@@ -35,11 +36,12 @@ const OWN: [(&str, &str); 3] = [
     ("GET", "/v1/server"),
 ];
 /// Lists of all sites, which show what the token is for.
-const LISTS: [(&str, &str); 7] = [
+const LISTS: [(&str, &str); 8] = [
     ("GET", "/v1/alerts"),
     ("GET", "/v1/events"),
     ("GET", "/v1/join-tokens"),
     ("GET", "/v1/missions"),
+    ("GET", "/v1/sessions"),
     ("GET", "/v1/sites"),
     ("GET", "/v1/stops"),
     ("GET", "/v1/tokens"),
@@ -54,8 +56,9 @@ struct Ground {
     mission: String,
     alert: String,
     join_token: String,
-    /// Of a token for everything.
+    /// Of a token for everything, and of its browser.
     token: String,
+    session: String,
 }
 
 impl Ground {
@@ -102,7 +105,12 @@ impl Ground {
             .await
             .unwrap();
         tx.commit().await.unwrap();
-        let token = yard.token("for everything", Role::Viewer).await.token.id;
+        let made = yard.token("for everything", Role::Viewer).await;
+        let token = made.token.id;
+        let asked = client(None).post(yard.url("/v1/session"));
+        let asked = asked.json(&json!({"token": made.secret}));
+        let (_, session) = yard.send(asked).await;
+        let session = session["session"].as_str().unwrap().to_owned();
         Self {
             first,
             second,
@@ -110,6 +118,7 @@ impl Ground {
             alert,
             join_token: join_token.to_string(),
             token: token.to_string(),
+            session,
             yard,
         }
     }
@@ -127,6 +136,7 @@ impl Ground {
             ("{mission}", &self.mission),
             ("{alert}", &self.alert),
             ("{token}", token),
+            ("{session}", &self.session),
             ("{terrain}", "gravel"),
             ("{holder}", "gate"),
         ];
@@ -492,6 +502,107 @@ async fn nobody_gives_more_than_he_has() {
             assert_eq!(yard.send(revoked).await.0, StatusCode::OK);
         }
     }
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn whoever_administers_a_site_revokes_every_token_that_holds_there_alone_and_no_other() {
+    let yard = Yard::start().await;
+    let clerk = yard.limited("clerk", &[Right::Administer], &["yard"]).await;
+    yard.limited("of the yard", &Right::ALL, &["yard"]).await;
+    yard.limited("of a robot", &Right::ALL, &["yard/rover-1"])
+        .await;
+    let made = yard.post("/v1/sites", &json!({"id": "field"})).await;
+    assert!(made.0.is_success(), "{made:?}");
+    yard.limited("of both", &[Right::Read], &["yard", "field"])
+        .await;
+    yard.limited("of all", &[Right::Read], &[]).await;
+    let (_, listed) = yard.get_value("/v1/tokens?limit=100").await;
+    let revoke = async |token: &str, name: &str| {
+        let mut items = listed["items"].as_array().unwrap().iter();
+        let found = items.find(|it| it["name"] == name).unwrap();
+        let path = format!("/v1/tokens/{}", found["id"].as_str().unwrap());
+        let asked = client(Some(token)).delete(yard.url(&path));
+        yard.send(asked).await.0.as_u16()
+    };
+    // More rights protect from nobody who administers the place: taking away is what an incident needs.
+    for (name, status) in [
+        ("of both", 403),
+        ("of all", 403),
+        ("tests", 403),
+        ("of a robot", 200),
+        ("of the yard", 200),
+    ] {
+        assert_eq!(revoke(&clerk, name).await, status, "{name}");
+    }
+    let clerk_of_all = yard
+        .limited("clerk of all", &[Right::Administer], &[])
+        .await;
+    assert_eq!(revoke(&clerk_of_all, "tests").await, 200);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_admin_of_a_site_uses_up_its_share_of_tokens_and_nobody_elses() {
+    let yard = Yard::start().await;
+    let made = yard.post("/v1/sites", &json!({"id": "field"})).await;
+    assert!(made.0.is_success(), "{made:?}");
+    let of_yard = yard.limited("yard", &Right::ALL, &["yard"]).await;
+    let of_field = yard.limited("field", &Right::ALL, &["field"]).await;
+    let give = async |token: &str, name: String, site: &str| {
+        let body = json!({"name": name, "role": "admin", "sites": [{"site": site}]});
+        let asked = client(Some(token)).post(yard.url("/v1/tokens")).json(&body);
+        yard.send(asked).await
+    };
+    // Whom it makes an admin of the site shares with it.
+    let mut maker = of_yard;
+    for number in 1..100 {
+        let (status, made) = give(&maker, format!("number {number}"), "yard").await;
+        assert_eq!(status, StatusCode::CREATED, "{number}: {made}");
+        if number == 50 {
+            maker = made["secret"].as_str().unwrap().to_owned();
+        }
+    }
+    let (status, refused) = give(&maker, "one more".to_owned(), "yard").await;
+    assert_eq!(status, StatusCode::CONFLICT, "{refused}");
+    assert_eq!(refused["type"], "/problems/too-many", "{refused}");
+    for (maker, site) in [(&*of_field, "field"), (yard.admin(), "yard")] {
+        let (status, made) = give(maker, format!("by another in {site}"), site).await;
+        assert_eq!(status, StatusCode::CREATED, "{made}");
+    }
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_a_token_has_used_as_an_idempotency_key_is_told_to_no_other_and_blocks_none() {
+    let yard = Yard::start().await;
+    let mut robots = Vec::new();
+    let mut tokens = Vec::new();
+    for name in ["rover-1", "rover-2"] {
+        robots.push(Robot::join(&yard, name).await);
+        let place = format!("yard/{name}");
+        let rights = [Right::Dispatch, Right::Read];
+        tokens.push(yard.limited(name, &rights, &[&place]).await);
+    }
+    let send = async |token: &str, robot: &Robot| {
+        let asked = client(Some(token)).post(yard.url("/v1/missions"));
+        let asked = asked.header("idempotency-key", "monday");
+        yard.send(asked.json(&circle(&robot.id))).await
+    };
+    let (status, first) = send(&tokens[0], &robots[0]).await;
+    assert_eq!(status, StatusCode::CREATED, "{first}");
+    let (status, second) = send(&tokens[1], &robots[1]).await;
+    assert_eq!(status, StatusCode::CREATED, "{second}");
+    assert_eq!(second["robot"], "rover-2");
+    for (number, made) in [first, second].iter().enumerate() {
+        let (_, again) = send(&tokens[number], &robots[number]).await;
+        assert_eq!(again["id"], made["id"], "{again}");
+    }
+    // Its own key is for one request alone, as before.
+    let (status, refused) = send(yard.admin(), &robots[0]).await;
+    assert_eq!(status, StatusCode::CREATED, "{refused}");
+    let (status, refused) = send(yard.admin(), &robots[1]).await;
+    assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{refused}");
     yard.server.stop().await.unwrap();
 }
 

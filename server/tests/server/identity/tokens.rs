@@ -4,6 +4,8 @@ use std::time::Duration;
 
 use reqwest::StatusCode;
 use serde_json::{Value, json};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::{TcpSocket, TcpStream};
 use tread_api::identity::Role;
 use tread_server::app::App;
 use tread_server::app::identity::tokens::FirstAdmin;
@@ -13,7 +15,8 @@ use tread_server::db::Db;
 use tread_server::identity::attempts::{FAILURES_MAX, LOCK_FIRST};
 use tread_server::identity::secret::{Kind, Secret};
 
-use crate::harness::{PATIENCE, Yard, client, database, eventually, time};
+use crate::harness::{PATIENCE, Yard, client, database, eventually, measured, segment, time};
+use crate::robot::Robot;
 
 async fn ask(yard: &Yard, token: &str) -> (StatusCode, Value) {
     yard.send(client(Some(token)).get(yard.url("/v1/sites")))
@@ -127,6 +130,71 @@ async fn a_revoked_token_is_refused_at_once_and_its_streams_close() {
     tokio::time::timeout(PATIENCE, ends)
         .await
         .expect("the stream ends with its token");
+    yard.server.stop().await.unwrap();
+}
+
+/// How soon what is open is cut.
+const CUT_MAX: Duration = Duration::from_secs(1);
+/// Far more measurements than stand in the buffers between the server and a client that does not read.
+const MEASUREMENTS: u64 = 12_000;
+
+/// Begins a download by a client that takes little at a time: what it has read until there is a part.
+async fn slow_download(yard: &Yard, path: &str, secret: &str) -> (TcpStream, usize) {
+    let socket = TcpSocket::new_v4().unwrap();
+    socket.set_recv_buffer_size(16 * 1024).unwrap();
+    let mut stream = socket.connect(yard.server.http_address()).await.unwrap();
+    let head = format!(
+        "GET {path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {secret}\r\n\
+         Connection: close\r\n\r\n"
+    );
+    stream.write_all(head.as_bytes()).await.unwrap();
+    let mut begin = vec![0; 4_096];
+    let read = stream.read(&mut begin).await.unwrap();
+    assert!(begin.starts_with(b"HTTP/1.1 200"), "{path}");
+    (stream, read)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_downloads_of_a_revoked_token_are_cut_and_nobody_takes_a_part_for_the_whole() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    for batch in 0..MEASUREMENTS / 1_000 {
+        let numbers = batch * 1_000..(batch + 1) * 1_000;
+        let drive = numbers.map(|seq| {
+            let ix = i32::try_from(seq % 100).unwrap();
+            let iy = i32::try_from(seq / 100).unwrap();
+            measured(seq, segment((ix, iy), 0.2, i64::try_from(seq).unwrap()))
+        });
+        robot.upload(drive.collect()).await.unwrap();
+    }
+    for path in [
+        "/v1/sites/yard/segments?format=csv",
+        "/v1/sites/yard/friction/map?format=csv",
+    ] {
+        let whole = yard.client().get(yard.url(path)).send().await.unwrap();
+        let whole = whole.bytes().await.unwrap().len();
+        let made = yard.token(path, Role::Viewer).await;
+        let (mut stream, mut read) = slow_download(&yard, path, &made.secret).await;
+        let url = yard.url(&format!("/v1/tokens/{}", made.token.id));
+        let (status, _) = yard.send(yard.client().delete(url)).await;
+        assert_eq!(status, StatusCode::OK);
+        // What stands in buffers is its own; after it nothing comes.
+        let mut piece = vec![0; 64 * 1024];
+        let rest = async {
+            while let Ok(more @ 1..) = stream.read(&mut piece).await {
+                read += more;
+            }
+        };
+        let ended = tokio::time::timeout(CUT_MAX, rest).await;
+        assert!(ended.is_ok(), "{path}: it goes on");
+        assert!(read < whole, "{path}: {read} of {whole} bytes");
+        // Whoever is not revoked gets all of it, with its end.
+        let made = yard.token(&format!("{path} whole"), Role::Viewer).await;
+        let (mut stream, mut read) = slow_download(&yard, path, &made.secret).await;
+        let mut last = Vec::new();
+        read += stream.read_to_end(&mut last).await.unwrap();
+        assert!(read >= whole && last.ends_with(b"0\r\n\r\n"), "{path}");
+    }
     yard.server.stop().await.unwrap();
 }
 

@@ -1,0 +1,480 @@
+//! People who sign in at an OpenID provider: sent there, taken back, given what their groups give.
+//!
+//! ```text
+//!  browser ─► begin ─► provider ─► browser ─► finish ─► code for ID token ─► groups ─► session
+//!               │ cookie                        ▲ cookie            │            │
+//!               └──────── kept by the browser ──┘                   ▼            ▼ none is mapped
+//!                                                             not believed    refused
+//! ```
+//!
+//! Nothing is kept of a sign-in that is under way ([`crate::identity::pending`]). The provider is asked
+//! only by browsers in which one began, and by few at a time.
+
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::net::IpAddr;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use jiff::{SignedDuration, Timestamp};
+use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
+use tokio_util::sync::CancellationToken;
+use tracing::info;
+use tread_api::identity::{OidcSignIn, Person};
+use tread_api::ids::{PersonId, SessionId};
+use tread_api::rights::{Grant, Scope};
+use tread_api::text::cleaned;
+
+use super::Credential;
+use crate::app::{App, AppError};
+use crate::config::oidc::OidcConfig;
+use crate::db;
+use crate::db::sessions::{Kept, Owner, SignedIn};
+use crate::identity::address::network_of;
+use crate::identity::claims::{NAME_MAX, groups, shown_name};
+use crate::identity::grants::Grants;
+use crate::identity::pending::{Pending, PendingKey, RANDOM_BYTES};
+use crate::identity::secret::Secret;
+use crate::oidc::{ExchangeError, Provider, SignedInThere};
+
+/// Where a browser is sent to sign in.
+pub const BEGIN: &str = "/v1/sign-in/oidc";
+/// Codes that the provider is asked about at once.
+const EXCHANGES_MAX: usize = 16;
+/// The same of one address; a whole /64 for IPv6.
+const EXCHANGES_PER_NETWORK_MAX: usize = 4;
+/// How long a code waits for its turn.
+const EXCHANGE_WAIT_MAX: Duration = Duration::from_secs(2);
+/// Longest code that is taken, bytes.
+const CODE_MAX: usize = 2_048;
+/// Sign-ins that succeeded and are remembered, so that none does so twice. A provider takes a code once;
+/// this is for one that does not.
+const USED_MAX: usize = 4_096;
+/// ID tokens that are kept for signing out at the provider.
+const ID_TOKENS_MAX: usize = 1_000;
+/// First and longest rest between attempts to find the provider.
+const FIND_AGAIN_MIN: Duration = Duration::from_secs(1);
+const FIND_AGAIN_MAX: Duration = Duration::from_secs(30);
+/// How often a provider that is known is asked again who it is.
+const LOOK_AGAIN: Duration = Duration::from_hours(1);
+
+/// Why somebody is not signed in.
+#[derive(Debug, thiserror::Error)]
+pub enum PersonError {
+    /// There is no provider.
+    #[error("people sign in with tokens here: the configuration has no `[oidc]`")]
+    NotConfigured,
+    /// The provider does not answer.
+    #[error("the provider cannot be asked now; try again later, or sign in with a token")]
+    Unavailable,
+    /// Too many are being signed in.
+    #[error("too many people are being signed in; try again")]
+    Busy,
+    /// It did not begin here.
+    #[error(
+        "this sign-in did not begin in this browser, or began more than 10 minutes ago, or has been \
+         used; begin it again"
+    )]
+    NotBegun,
+    /// The provider signs them in no further.
+    #[error("the provider has not signed you in: {0}")]
+    Declined(String),
+    /// The provider's answer is not believed. Why is in the log alone.
+    #[error("the provider's answer cannot be used; the server's log says why")]
+    NotBelieved,
+    /// They are in no group that gives anything.
+    #[error(
+        "`{name}` is signed in at the provider, but is in no group that may do anything here; ask \
+         whoever runs this server"
+    )]
+    NoGroup {
+        /// What they are called.
+        name: String,
+        /// Who they are.
+        person: Box<Person>,
+    },
+    /// It failed here.
+    #[error(transparent)]
+    Failed(#[from] AppError),
+}
+
+/// The beginning of a sign-in.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Begun {
+    /// Where the browser is sent.
+    pub location: String,
+    /// What it keeps.
+    pub cookie: String,
+}
+
+/// What the provider sends a browser back with.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Answer {
+    /// The state of the sign-in.
+    pub state: String,
+    /// The code, if it signed them in.
+    pub code: Option<String>,
+    /// Why not, if it did not.
+    pub error: Option<String>,
+    /// The provider that says so (RFC 9207), if it does.
+    pub issuer: Option<String>,
+}
+
+/// The sign-in at a provider, as configured.
+#[derive(Debug)]
+pub struct People {
+    provider: Provider,
+    grants: BTreeMap<String, Grant>,
+    groups_claim: String,
+    name_claim: Option<String>,
+    label: String,
+    session_lasts: SignedDuration,
+    key: PendingKey,
+    turns: Arc<Semaphore>,
+    networks: Mutex<HashMap<IpAddr, Arc<Semaphore>>>,
+    used: Mutex<Used>,
+    id_tokens: Mutex<IdTokens>,
+    /// Somebody wants to sign in, and the provider is not known.
+    wanted: Notify,
+}
+
+/// States of sign-ins that succeeded, the oldest first.
+#[derive(Debug, Default)]
+struct Used {
+    states: HashSet<String>,
+    order: VecDeque<String>,
+}
+
+/// ID tokens of sessions, the oldest first.
+#[derive(Debug, Default)]
+struct IdTokens {
+    of: HashMap<SessionId, String>,
+    order: VecDeque<SessionId>,
+}
+
+impl People {
+    fn new(config: &OidcConfig, app: &App) -> anyhow::Result<Self> {
+        let mut random = [0; RANDOM_BYTES];
+        getrandom::fill(&mut random).map_err(|error| AppError::NoRandomness(error.to_string()))?;
+        Ok(Self {
+            provider: Provider::new(config, app.clock().clone())?,
+            grants: config.grants()?,
+            groups_claim: config.groups_claim.clone(),
+            name_claim: config.name_claim.clone(),
+            label: config.label.trim().to_owned(),
+            session_lasts: SignedDuration::from_hours(config.session_hours.into()),
+            key: PendingKey::from_random(&random),
+            turns: Arc::new(Semaphore::new(EXCHANGES_MAX)),
+            networks: Mutex::default(),
+            used: Mutex::default(),
+            id_tokens: Mutex::default(),
+            wanted: Notify::new(),
+        })
+    }
+
+    /// The provider, as it names itself.
+    pub(super) fn issuer(&self) -> &str {
+        self.provider.issuer()
+    }
+
+    /// The groups that give nothing outside a scope.
+    pub(super) fn groups_within(&self, within: &Scope) -> Vec<&str> {
+        let grants = self.grants.iter();
+        let within = grants.filter(|(_, grant)| within.includes(&grant.sites));
+        within.map(|(name, _)| name.as_str()).collect()
+    }
+
+    /// What somebody's groups give by the configuration in force; `None` if that is nothing, or another
+    /// provider signed them in.
+    pub(super) fn grants_of(&self, signed_in: &SignedIn) -> Option<Grants> {
+        if signed_in.person.issuer != self.issuer() {
+            return None;
+        }
+        let groups = signed_in.groups.iter();
+        Grants::of_groups(groups.filter_map(|group| self.grants.get(group)))
+    }
+
+    /// The turn to ask the provider about a code, of which each address has a few.
+    async fn turn(&self, address: IpAddr) -> Option<[OwnedSemaphorePermit; 2]> {
+        let own = {
+            let mut networks = self.networks.lock().unwrap_or_else(PoisonError::into_inner);
+            // Whoever holds or awaits a turn has a handle; the others need no memory.
+            networks.retain(|_, turns| Arc::strong_count(turns) > 1);
+            let own = networks.entry(network_of(address));
+            let new = || Arc::new(Semaphore::new(EXCHANGES_PER_NETWORK_MAX));
+            Arc::clone(own.or_insert_with(new))
+        };
+        let turns = async {
+            let own = own.acquire_owned().await.ok()?;
+            let all = Arc::clone(&self.turns).acquire_owned().await.ok()?;
+            Some([own, all])
+        };
+        let turns = tokio::time::timeout(EXCHANGE_WAIT_MAX, turns).await;
+        turns.ok().flatten()
+    }
+
+    /// Whether the provider is known; if not, it is looked for soon.
+    fn is_found(&self) -> bool {
+        let is_known = self.provider.is_known();
+        if !is_known {
+            self.wanted.notify_one();
+        }
+        is_known
+    }
+
+    fn is_used(&self, state: &str) -> bool {
+        let used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
+        used.states.contains(state)
+    }
+
+    /// Notes that a sign-in succeeded; whether it is the first time.
+    fn use_up(&self, state: &str) -> bool {
+        let mut used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
+        if !used.states.insert(state.to_owned()) {
+            return false;
+        }
+        used.order.push_back(state.to_owned());
+        while used.order.len() > USED_MAX {
+            if let Some(oldest) = used.order.pop_front() {
+                used.states.remove(&oldest);
+            }
+        }
+        true
+    }
+
+    fn keep_id_token(&self, session: SessionId, id_token: String) {
+        let mut kept = self
+            .id_tokens
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        kept.of.insert(session, id_token);
+        kept.order.push_back(session);
+        while kept.order.len() > ID_TOKENS_MAX {
+            if let Some(oldest) = kept.order.pop_front() {
+                kept.of.remove(&oldest);
+            }
+        }
+    }
+
+    pub(super) fn forget_id_tokens(&self, sessions: &[SessionId]) {
+        let mut kept = self
+            .id_tokens
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        for session in sessions {
+            kept.of.remove(session);
+        }
+        kept.order.retain(|session| !sessions.contains(session));
+    }
+
+    fn id_token(&self, session: SessionId) -> Option<String> {
+        let kept = self
+            .id_tokens
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        kept.of.get(&session).cloned()
+    }
+
+    fn signed_in(&self, there: &SignedInThere) -> Result<SignedIn, PersonError> {
+        let (subject, claims) = (&there.subject, &there.claims);
+        let issuer = self.issuer().to_owned();
+        let person = Person {
+            id: PersonId::of(&issuer, subject),
+            issuer,
+            subject: subject.clone(),
+        };
+        let name = shown_name(claims, self.name_claim.as_deref(), subject);
+        let named: HashSet<&str> = groups(claims, &self.groups_claim).into_iter().collect();
+        let mapped = self.grants.keys();
+        let mapped = mapped.filter(|group| named.contains(group.as_str()));
+        let mapped: Vec<String> = mapped.cloned().collect();
+        if mapped.is_empty() {
+            let person = Box::new(person);
+            return Err(PersonError::NoGroup { name, person });
+        }
+        Ok(SignedIn {
+            person,
+            name,
+            groups: mapped,
+        })
+    }
+}
+
+impl App {
+    /// Lets people sign in at a provider; the first time counts.
+    ///
+    /// # Errors
+    /// A file that the configuration names cannot be used.
+    pub fn admit_people(&self, config: &OidcConfig) -> anyhow::Result<()> {
+        let people = People::new(config, self)?;
+        let _ = self.identity().people.set(people);
+        Ok(())
+    }
+
+    pub(super) fn people(&self) -> Option<&People> {
+        self.identity().people.get()
+    }
+
+    /// How people sign in at a provider, if they can.
+    pub fn oidc_sign_in(&self) -> Option<OidcSignIn> {
+        let people = self.people()?;
+        Some(OidcSignIn {
+            label: people.label.clone(),
+            path: BEGIN.to_owned(),
+            available: people.is_found(),
+        })
+    }
+
+    /// A person's session as whoever shows its secret; `None` if its groups give nothing.
+    pub(super) fn person_of(&self, kept: Kept, checked_at: Duration) -> Option<Credential> {
+        let Owner::Person(signed_in) = kept.owner else {
+            return None;
+        };
+        let grants = self.people()?.grants_of(&signed_in)?;
+        let session = (kept.id, kept.expires_at);
+        let times = (kept.last_used_at, checked_at);
+        Some(Credential::of_person(signed_in, grants, session, times))
+    }
+
+    /// Begins a sign-in at the provider.
+    ///
+    /// # Errors
+    /// There is no provider, or it is not known yet.
+    pub fn begin_sign_in(&self) -> Result<Begun, PersonError> {
+        let people = self.people().ok_or(PersonError::NotConfigured)?;
+        let mut random = [0; RANDOM_BYTES];
+        getrandom::fill(&mut random).map_err(|error| AppError::NoRandomness(error.to_string()))?;
+        let pending = Pending::begin(&people.key, &random, self.clock().now());
+        let Some(location) = people.provider.sign_in_url(&pending) else {
+            people.wanted.notify_one();
+            self.log_failure("sign people in", &ExchangeError::Unknown);
+            return Err(PersonError::Unavailable);
+        };
+        let cookie = pending.cookie().to_owned();
+        Ok(Begun { location, cookie })
+    }
+
+    /// Ends a sign-in: the browser comes back from the provider with what it kept.
+    ///
+    /// # Errors
+    /// [`PersonError`].
+    pub async fn finish_sign_in(
+        &self,
+        address: IpAddr,
+        cookie: Option<&str>,
+        answer: &Answer,
+    ) -> Result<(Arc<Credential>, Secret), PersonError> {
+        let people = self.people().ok_or(PersonError::NotConfigured)?;
+        let now = self.clock().now();
+        let pending = cookie
+            .and_then(|cookie| Pending::resume(&people.key, cookie, &answer.state, now))
+            .filter(|pending| !people.is_used(&pending.state))
+            .ok_or(PersonError::NotBegun)?;
+        if let Some(issuer) = &answer.issuer
+            && issuer != people.issuer()
+        {
+            return Err(PersonError::NotBegun);
+        }
+        let code = match (&answer.code, &answer.error) {
+            (Some(code), None) if code.len() <= CODE_MAX => code,
+            (_, Some(error)) => return Err(PersonError::Declined(cleaned(error, NAME_MAX))),
+            (_, None) => return Err(PersonError::NotBegun),
+        };
+        let turn = people.turn(address).await.ok_or(PersonError::Busy)?;
+        let there = people.provider.exchange(code, &pending).await;
+        drop(turn);
+        let there = there.map_err(|error| match error {
+            ExchangeError::Unknown | ExchangeError::Unanswered(_) => {
+                self.log_failure("sign people in", &error);
+                PersonError::Unavailable
+            }
+            ExchangeError::Refused(_) | ExchangeError::Invalid(_) | ExchangeError::UserInfo(_) => {
+                self.log_failure("believe the OpenID provider", &error);
+                PersonError::NotBelieved
+            }
+        })?;
+        if !people.use_up(&pending.state) {
+            return Err(PersonError::NotBegun);
+        }
+        let mut signed_in = people.signed_in(&there)?;
+        signed_in.name = self.unlike_tokens(signed_in.name, &there.subject).await?;
+        let expires_at = now.checked_add(people.session_lasts);
+        let expires_at = expires_at.unwrap_or(Timestamp::MAX);
+        let opened = self.open_session_of(Owner::Person(signed_in), expires_at);
+        let (credential, secret) = opened.await?.ok_or(PersonError::NotBelieved)?;
+        if let (Some(session), Some(id_token)) = (credential.session, there.id_token) {
+            people.keep_id_token(session, id_token);
+        }
+        Ok((credential, secret))
+    }
+
+    /// A name that no valid token has: people may choose theirs, and are not to be taken for a program.
+    async fn unlike_tokens(&self, name: String, subject: &str) -> Result<String, AppError> {
+        let mut tx = self.db().read("identity").await?;
+        let taken = db::tokens::valid_by_name(&mut tx, &name, self.clock().now()).await?;
+        Ok(match taken {
+            None => name,
+            Some(_) => format!("{name} ({})", cleaned(subject, NAME_MAX)),
+        })
+    }
+
+    /// Where a browser is sent to sign out at the provider too, for a person's session that is about to end.
+    pub fn sign_out_at_provider(&self, who: &Credential) -> Option<String> {
+        let (people, session) = (self.people()?, who.session?);
+        who.person.as_ref()?;
+        let id_token = people.id_token(session);
+        people.provider.sign_out_url(id_token.as_deref())
+    }
+}
+
+/// Finds the provider, and looks now and then whether it says something else, until the stop.
+pub async fn run(app: App, stop: CancellationToken) {
+    let Some(people) = app.people() else {
+        return stop.cancelled().await;
+    };
+    let mut rest = FIND_AGAIN_MIN;
+    loop {
+        let was_known = people.provider.is_known();
+        let found = tokio::select! {
+            found = people.provider.discover() => found,
+            () = stop.cancelled() => return,
+        };
+        let wait = match found {
+            Ok(()) => {
+                if !was_known {
+                    info!("people can sign in at {}", people.issuer());
+                }
+                rest = FIND_AGAIN_MIN;
+                LOOK_AGAIN
+            }
+            Err(error) => {
+                app.log_failure("find the OpenID provider", &error);
+                let wait = rest;
+                rest = (2 * rest).min(FIND_AGAIN_MAX);
+                wait
+            }
+        };
+        let wanted = async {
+            // Never without a rest, however many want to.
+            tokio::time::sleep(FIND_AGAIN_MIN).await;
+            people.wanted.notified().await;
+        };
+        tokio::select! {
+            () = tokio::time::sleep(wait) => {}
+            () = wanted => {}
+            () = stop.cancelled() => return,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::app::identity::SESSION_LASTS;
+    use crate::config::oidc::SESSION_HOURS_RANGE;
+
+    #[test]
+    fn a_person_is_signed_in_for_no_longer_than_a_token() {
+        let most = i64::from(*SESSION_HOURS_RANGE.end());
+        assert_eq!(SignedDuration::from_hours(most), SESSION_LASTS);
+    }
+}

@@ -1,0 +1,155 @@
+//! How the provider is asked: by TLS with ring, within bounds, and never sent elsewhere.
+
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::Path;
+use std::pin::Pin;
+use std::time::Duration;
+
+use openidconnect::{AsyncHttpClient, HttpRequest, HttpResponse};
+use reqwest::{Certificate, Url, redirect};
+
+use super::ProviderError;
+use crate::identity::claims::Claims;
+
+/// How long the provider may take for one answer. A sign-in asks up to three times, within
+/// [`crate::http::REQUEST_TIMEOUT`].
+pub(super) const ANSWER_MAX: Duration = Duration::from_secs(4);
+/// How long a connection to it may take.
+const CONNECT_MAX: Duration = Duration::from_secs(3);
+/// Largest answer that is read, bytes.
+pub(super) const BODY_MAX: usize = 1024 * 1024;
+/// Connections that are kept for the next question.
+const IDLE_MAX: usize = 4;
+
+/// Why the provider gave no answer.
+#[derive(Debug, thiserror::Error)]
+pub enum HttpError {
+    /// It cannot be reached, or took too long.
+    #[error("the request failed")]
+    Failed(#[from] reqwest::Error),
+    /// It answered too much.
+    #[error("the answer has more than {BODY_MAX} bytes")]
+    TooLarge,
+    /// It answered with another status than success.
+    #[error("it answered with status {0}")]
+    Status(u16),
+    /// It answered something else than an object of JSON.
+    #[error("the answer is no object of JSON")]
+    NoObject,
+    /// It cannot be written as an answer.
+    #[error("the answer is none")]
+    NoAnswer,
+}
+
+/// A client for the provider alone.
+#[derive(Debug, Clone)]
+pub(super) struct HttpClient(reqwest::Client);
+
+impl HttpClient {
+    /// A client that trusts the authorities in a file, or those of the machine.
+    pub(super) fn new(authorities: Option<&Path>) -> Result<Self, ProviderError> {
+        // The first call counts; all install the same.
+        let _first = rustls::crypto::ring::default_provider().install_default();
+        let mut builder = reqwest::Client::builder()
+            .connect_timeout(CONNECT_MAX)
+            .timeout(ANSWER_MAX)
+            .pool_max_idle_per_host(IDLE_MAX)
+            // Whoever redirects a request with a secret or a code would get it.
+            .redirect(redirect::Policy::none())
+            .user_agent(concat!("tread-server/", env!("CARGO_PKG_VERSION")));
+        if let Some(file) = authorities {
+            let text = std::fs::read(file).map_err(|cause| ProviderError::Unreadable {
+                path: file.to_owned(),
+                cause,
+            })?;
+            let found = Certificate::from_pem_bundle(&text);
+            let found = found.map_err(|cause| ProviderError::Authority {
+                path: file.to_owned(),
+                cause,
+            })?;
+            builder = builder.tls_certs_only(found);
+        }
+        builder.build().map(Self).map_err(ProviderError::Client)
+    }
+
+    async fn answer(&self, request: reqwest::Request) -> Result<HttpResponse, HttpError> {
+        let mut response = self.0.execute(request).await?;
+        let mut body = Vec::new();
+        while let Some(chunk) = response.chunk().await? {
+            if body.len() + chunk.len() > BODY_MAX {
+                return Err(HttpError::TooLarge);
+            }
+            body.extend_from_slice(&chunk);
+        }
+        let mut answer = HttpResponse::new(body);
+        *answer.status_mut() = response.status();
+        *answer.headers_mut() = std::mem::take(response.headers_mut());
+        Ok(answer)
+    }
+
+    /// What the provider says of a person at its user info endpoint.
+    pub(super) async fn claims(&self, url: &Url, access_token: &str) -> Result<Claims, HttpError> {
+        let asked = self.0.get(url.clone()).bearer_auth(access_token);
+        let asked = asked.header("accept", "application/json").build()?;
+        let answer = self.answer(asked).await?;
+        if !answer.status().is_success() {
+            return Err(HttpError::Status(answer.status().as_u16()));
+        }
+        serde_json::from_slice(answer.body()).map_err(|_error| HttpError::NoObject)
+    }
+}
+
+impl<'client> AsyncHttpClient<'client> for HttpClient {
+    type Error = HttpError;
+    type Future = Pin<Box<dyn Future<Output = Result<HttpResponse, HttpError>> + Send + 'client>>;
+
+    fn call(&'client self, request: HttpRequest) -> Self::Future {
+        Box::pin(async move {
+            let request = reqwest::Request::try_from(request)?;
+            self.answer(request).await
+        })
+    }
+}
+
+/// The client secret in a file that nobody else can read.
+pub(super) fn read_secret(file: &Path) -> Result<String, ProviderError> {
+    let unreadable = |cause| ProviderError::Unreadable {
+        path: file.to_owned(),
+        cause,
+    };
+    let mode = std::fs::metadata(file).map_err(unreadable)?.permissions();
+    if mode.mode() & 0o077 != 0 {
+        return Err(ProviderError::Open(file.to_owned()));
+    }
+    let text = std::fs::read_to_string(file).map_err(unreadable)?;
+    let secret = text.lines().next().unwrap_or_default().trim();
+    if secret.is_empty() {
+        return Err(ProviderError::NoSecret(file.to_owned()));
+    }
+    Ok(secret.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::Permissions;
+
+    use super::*;
+
+    #[test]
+    fn the_client_secret_is_the_first_line_of_a_file_that_only_its_owner_can_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("secret");
+        let error = read_secret(&file).unwrap_err();
+        assert!(matches!(error, ProviderError::Unreadable { .. }));
+        std::fs::write(&file, " geheim \nrest").unwrap();
+        std::fs::set_permissions(&file, Permissions::from_mode(0o640)).unwrap();
+        assert!(matches!(read_secret(&file), Err(ProviderError::Open(_))));
+        std::fs::set_permissions(&file, Permissions::from_mode(0o600)).unwrap();
+        assert_eq!(read_secret(&file).unwrap(), "geheim");
+        std::fs::write(&file, "\n").unwrap();
+        assert!(matches!(
+            read_secret(&file),
+            Err(ProviderError::NoSecret(_))
+        ));
+    }
+}

@@ -1,0 +1,396 @@
+//! The OpenID provider: found, asked and believed. The only module that speaks with it.
+//!
+//! ```text
+//!  start ─► unknown ──discovery──► known ──every hour, or a key that is not known──► known anew
+//!              └──── fails: again after 1 s, 2 s, … at most 30 s ────┘ (what was known stays)
+//! ```
+//!
+//! The authorization code flow with PKCE (RFC 7636). The protocol's messages and the signatures are those
+//! of the crate `openidconnect`; what an ID token must say is in [`verify`].
+
+mod http;
+pub mod verify;
+
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::time::Duration;
+
+use openidconnect::core::{
+    CoreAuthenticationFlow, CoreClient, CoreClientAuthMethod, CoreErrorResponseType, CoreJsonWebKey,
+};
+use openidconnect::{
+    AuthType, AuthorizationCode, ClientId, ClientSecret, CsrfToken, DiscoveryError, EndSessionUrl,
+    EndpointMaybeSet, EndpointNotSet, EndpointSet, IssuerUrl, JsonWebKeySet, LogoutRequest, Nonce,
+    OAuth2TokenResponse as _, PkceCodeChallenge, PkceCodeVerifier, PostLogoutRedirectUrl,
+    ProviderMetadataWithLogout, RedirectUrl, RequestTokenError, Scope, StandardErrorResponse,
+    TokenResponse as _, UserInfoUrl,
+};
+
+use self::http::{HttpClient, HttpError};
+use self::verify::{Expected, InvalidIdToken};
+use crate::clock::Clock;
+use crate::config::oidc::OidcConfig;
+use crate::identity::claims::{Claims, claim};
+use crate::identity::pending::Pending;
+
+/// The provider's keys are asked for again this often at the most, however many ID tokens are signed by a
+/// key that is not known.
+pub const KEYS_REFRESH_INTERVAL: Duration = Duration::from_secs(10);
+/// Longest ID token that is kept for the sign-out, bytes.
+const ID_TOKEN_MAX: usize = 16 * 1_024;
+
+/// Why the provider cannot be made ready at the start.
+#[derive(Debug, thiserror::Error)]
+pub enum ProviderError {
+    /// A file cannot be read.
+    #[error("cannot read `{}` of `[oidc]`", path.display())]
+    Unreadable {
+        /// Which file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        cause: std::io::Error,
+    },
+    /// Others can read the secret.
+    #[error("others can read `{}`: give the client secret the mode 0600", .0.display())]
+    Open(PathBuf),
+    /// There is no secret in the file.
+    #[error("`{}` has no client secret in its first line", .0.display())]
+    NoSecret(PathBuf),
+    /// The certificates to trust are none.
+    #[error("`{}` has no certificates that can be used", path.display())]
+    Authority {
+        /// Which file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        cause: reqwest::Error,
+    },
+    /// An address of the configuration is none.
+    #[error("`{0}` of `[oidc]` is no address")]
+    Address(String),
+    /// There can be no client at all.
+    #[error("cannot prepare for asking the OpenID provider")]
+    Client(#[source] reqwest::Error),
+}
+
+/// Why the provider is not known.
+#[derive(Debug, thiserror::Error)]
+pub enum DiscoverError {
+    /// It did not say who it is.
+    #[error("the provider does not say how to sign in")]
+    Discovery(#[source] Box<DiscoveryError<HttpError>>),
+    /// What it says would be asked in the clear.
+    #[error("the provider names the endpoint `{0}`, which is not `https`")]
+    ClearText(String),
+    /// It has no endpoint for codes.
+    #[error("the provider names no token endpoint")]
+    NoTokenEndpoint,
+}
+
+/// Why a code of the provider signs nobody in.
+#[derive(Debug, thiserror::Error)]
+pub enum ExchangeError {
+    /// The provider is not known yet.
+    #[error("the OpenID provider is not known yet")]
+    Unknown,
+    /// It did not answer.
+    #[error("the OpenID provider does not answer")]
+    Unanswered(#[source] Box<dyn std::error::Error + Send + Sync>),
+    /// It takes the code from nobody, or not from us.
+    #[error("the OpenID provider refuses the code: {0}")]
+    Refused(String),
+    /// What it answered cannot be believed.
+    #[error("the OpenID provider's answer cannot be believed")]
+    Invalid(#[source] InvalidIdToken),
+    /// Its word on the person is about another one, or none at all.
+    #[error("the OpenID provider's word on the person cannot be used: {0}")]
+    UserInfo(String),
+}
+
+/// Whom the provider has signed in.
+#[derive(Clone, PartialEq)]
+pub struct SignedInThere {
+    /// The person there.
+    pub subject: String,
+    /// What it says of them.
+    pub claims: Claims,
+    /// The ID token as it came, for the sign-out; `None` if it is very long.
+    pub id_token: Option<String>,
+}
+
+type Client = CoreClient<
+    EndpointSet,
+    EndpointNotSet,
+    EndpointNotSet,
+    EndpointNotSet,
+    EndpointMaybeSet,
+    EndpointMaybeSet,
+>;
+
+/// The OpenID provider of the configuration.
+pub struct Provider {
+    issuer: IssuerUrl,
+    client_id: ClientId,
+    secret: Option<ClientSecret>,
+    redirect: RedirectUrl,
+    signed_out: PostLogoutRedirectUrl,
+    scopes: Vec<Scope>,
+    groups_claim: String,
+    http: HttpClient,
+    clock: Clock,
+    known: RwLock<Option<Arc<ProviderMetadataWithLogout>>>,
+    keys_asked_at: Mutex<Option<Duration>>,
+}
+
+impl std::fmt::Debug for Provider {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let issuer = self.issuer.as_str();
+        formatter
+            .debug_struct("Provider")
+            .field("issuer", &issuer)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Provider {
+    /// The provider of a configuration; asks it nothing yet.
+    ///
+    /// # Errors
+    /// A file that the configuration names cannot be used.
+    pub fn new(config: &OidcConfig, clock: Clock) -> Result<Self, ProviderError> {
+        let address = |text: String| move |_error| ProviderError::Address(text);
+        let issuer = config.issuer.clone();
+        let (redirect, public) = (config.redirect_uri(), format!("{}/", config.public_url));
+        let secret = config.client_secret_file.as_deref();
+        let secret = secret.map(http::read_secret).transpose()?;
+        // The scope `openid` is added by the crate.
+        let scopes = config.scopes.iter().filter(|scope| *scope != "openid");
+        Ok(Self {
+            issuer: IssuerUrl::new(issuer.clone()).map_err(address(issuer))?,
+            client_id: ClientId::new(config.client_id.clone()),
+            secret: secret.map(ClientSecret::new),
+            redirect: RedirectUrl::new(redirect.clone()).map_err(address(redirect))?,
+            signed_out: PostLogoutRedirectUrl::new(public.clone()).map_err(address(public))?,
+            scopes: scopes.cloned().map(Scope::new).collect(),
+            groups_claim: config.groups_claim.clone(),
+            http: HttpClient::new(config.ca.as_deref())?,
+            clock,
+            known: RwLock::default(),
+            keys_asked_at: Mutex::default(),
+        })
+    }
+
+    /// Who it is, as it names itself.
+    pub fn issuer(&self) -> &str {
+        self.issuer.as_str()
+    }
+
+    /// Asks the provider who it is and for its keys.
+    ///
+    /// # Errors
+    /// [`DiscoverError`]; what was known before stays.
+    pub async fn discover(&self) -> Result<(), DiscoverError> {
+        let found = ProviderMetadataWithLogout::discover_async(self.issuer.clone(), &self.http);
+        let found = found
+            .await
+            .map_err(|error| DiscoverError::Discovery(Box::new(error)))?;
+        let sign_out = &found.additional_metadata().end_session_endpoint;
+        let token = found.token_endpoint();
+        let token = token.ok_or(DiscoverError::NoTokenEndpoint)?;
+        let endpoints = [
+            Some(found.authorization_endpoint().url()),
+            Some(token.url()),
+            Some(found.jwks_uri().url()),
+            found.userinfo_endpoint().map(UserInfoUrl::url),
+            sign_out.as_ref().map(EndSessionUrl::url),
+        ];
+        let is_tls = self.issuer.url().scheme() == "https";
+        let in_the_clear = |url: &&reqwest::Url| url.scheme() != "https" && is_tls;
+        if let Some(url) = endpoints.into_iter().flatten().find(in_the_clear) {
+            return Err(DiscoverError::ClearText(url.to_string()));
+        }
+        self.keep(found);
+        Ok(())
+    }
+
+    fn keep(&self, found: ProviderMetadataWithLogout) {
+        let mut known = self.known.write().unwrap_or_else(PoisonError::into_inner);
+        *known = Some(Arc::new(found));
+    }
+
+    fn metadata(&self) -> Option<Arc<ProviderMetadataWithLogout>> {
+        let known = self.known.read().unwrap_or_else(PoisonError::into_inner);
+        known.clone()
+    }
+
+    /// Whether people can be sent to it.
+    pub fn is_known(&self) -> bool {
+        self.metadata().is_some()
+    }
+
+    fn client(&self, metadata: &ProviderMetadataWithLogout) -> Client {
+        let methods = metadata.token_endpoint_auth_methods_supported();
+        let takes = |method| methods.is_some_and(|methods| methods.contains(&method));
+        let (basic, post) = (
+            takes(CoreClientAuthMethod::ClientSecretBasic),
+            takes(CoreClientAuthMethod::ClientSecretPost),
+        );
+        let client = CoreClient::from_provider_metadata(
+            metadata.clone(),
+            self.client_id.clone(),
+            self.secret.clone(),
+        );
+        let how = if post && !basic {
+            AuthType::RequestBody
+        } else {
+            AuthType::BasicAuth
+        };
+        client
+            .set_auth_type(how)
+            .set_redirect_uri(self.redirect.clone())
+    }
+
+    /// Where a browser is sent to sign in; `None` while the provider is not known.
+    pub fn sign_in_url(&self, pending: &Pending) -> Option<String> {
+        let client = self.client(&*self.metadata()?);
+        let (state, nonce) = (pending.state.clone(), pending.nonce.clone());
+        let verifier = PkceCodeVerifier::new(pending.verifier.clone());
+        let request = client
+            .authorize_url(
+                CoreAuthenticationFlow::AuthorizationCode,
+                || CsrfToken::new(state),
+                || Nonce::new(nonce),
+            )
+            .set_pkce_challenge(PkceCodeChallenge::from_code_verifier_sha256(&verifier))
+            .add_scopes(self.scopes.iter().cloned());
+        Some(request.url().0.into())
+    }
+
+    /// Where a browser is sent to sign out there too; `None` if the provider has no such place.
+    pub fn sign_out_url(&self, id_token: Option<&str>) -> Option<String> {
+        let metadata = self.metadata()?;
+        let endpoint = metadata.additional_metadata().end_session_endpoint.clone();
+        let request = LogoutRequest::from(endpoint?)
+            .set_client_id(self.client_id.clone())
+            .set_post_logout_redirect_uri(self.signed_out.clone());
+        let id_token = id_token.and_then(|text| text.parse::<verify::IdToken>().ok());
+        let request = match &id_token {
+            Some(id_token) => request.set_id_token_hint(id_token),
+            None => request,
+        };
+        Some(request.http_get_url().into())
+    }
+
+    /// Gives the provider a code and learns whom it has signed in.
+    ///
+    /// # Errors
+    /// [`ExchangeError`].
+    pub async fn exchange(
+        &self,
+        code: &str,
+        pending: &Pending,
+    ) -> Result<SignedInThere, ExchangeError> {
+        let metadata = self.metadata().ok_or(ExchangeError::Unknown)?;
+        let client = self.client(&metadata);
+        let asked = client
+            .exchange_code(AuthorizationCode::new(code.to_owned()))
+            .map_err(|error| ExchangeError::Unanswered(Box::new(error)))?
+            .set_pkce_verifier(PkceCodeVerifier::new(pending.verifier.clone()));
+        let answer = asked.request_async(&self.http).await.map_err(refused)?;
+        let id_token = answer
+            .id_token()
+            .ok_or(ExchangeError::Invalid(InvalidIdToken::Missing))?;
+        let access_token = answer.access_token();
+        let expected = |keys| Expected {
+            issuer: &self.issuer,
+            client_id: &self.client_id,
+            nonce: &pending.nonce,
+            access_token,
+            now: self.clock.now(),
+            keys,
+        };
+        let mut believed = verify::claims(id_token, &expected(metadata.jwks()));
+        if let Err(InvalidIdToken::Signature(_)) = &believed
+            && let Some(keys) = self.fresh_keys(&metadata).await
+        {
+            believed = verify::claims(id_token, &expected(&keys));
+        }
+        let (subject, mut claims) = believed.map_err(ExchangeError::Invalid)?;
+        if claim(&claims, &self.groups_claim).is_none()
+            && let Some(endpoint) = metadata.userinfo_endpoint()
+        {
+            let said = self.http.claims(endpoint.url(), access_token.secret());
+            let said = said.await;
+            let said = said.map_err(|error| ExchangeError::Unanswered(Box::new(error)))?;
+            claims = with_user_info(claims, said, &subject)?;
+        }
+        let id_token = id_token.to_string();
+        Ok(SignedInThere {
+            subject,
+            claims,
+            id_token: (id_token.len() <= ID_TOKEN_MAX).then_some(id_token),
+        })
+    }
+
+    /// The provider's keys, asked for anew; `None` if that was done a moment ago, or fails.
+    async fn fresh_keys(
+        &self,
+        metadata: &ProviderMetadataWithLogout,
+    ) -> Option<JsonWebKeySet<CoreJsonWebKey>> {
+        let now = self.clock.elapsed();
+        {
+            let asked_at = self.keys_asked_at.lock();
+            let mut asked_at = asked_at.unwrap_or_else(PoisonError::into_inner);
+            let is_recent = |at: Duration| now.saturating_sub(at) < KEYS_REFRESH_INTERVAL;
+            if asked_at.is_some_and(is_recent) {
+                // Somebody else may have brought them meanwhile.
+                return self.metadata().map(|known| known.jwks().clone());
+            }
+            *asked_at = Some(now);
+        }
+        let keys = JsonWebKeySet::fetch_async(metadata.jwks_uri(), &self.http);
+        match keys.await {
+            Ok(keys) => {
+                self.keep(metadata.clone().set_jwks(keys.clone()));
+                Some(keys)
+            }
+            Err(error) => {
+                tracing::warn!("cannot ask the OpenID provider for its keys: {error}");
+                None
+            }
+        }
+    }
+}
+
+/// The claims of an ID token with those that only the user info has; it must be about the same person.
+fn with_user_info(
+    mut claims: Claims,
+    said: Claims,
+    subject: &str,
+) -> Result<Claims, ExchangeError> {
+    if said.get("sub").and_then(serde_json::Value::as_str) != Some(subject) {
+        let detail = "its user info is about somebody else".to_owned();
+        return Err(ExchangeError::UserInfo(detail));
+    }
+    for (name, value) in said {
+        claims.entry(name).or_insert(value);
+    }
+    Ok(claims)
+}
+
+type TokenError = RequestTokenError<HttpError, StandardErrorResponse<CoreErrorResponseType>>;
+
+/// Whether the provider refuses the code, or cannot say.
+fn refused(error: TokenError) -> ExchangeError {
+    match error {
+        RequestTokenError::ServerResponse(said) => {
+            let said = serde_json::to_value(said.error()).unwrap_or_default();
+            let said = said.as_str().unwrap_or_default();
+            ExchangeError::Refused(tread_api::text::cleaned(said, 80))
+        }
+        error @ (RequestTokenError::Request(_)
+        | RequestTokenError::Parse(..)
+        | RequestTokenError::Other(_)) => ExchangeError::Unanswered(Box::new(error)),
+    }
+}

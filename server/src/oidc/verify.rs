@@ -1,0 +1,302 @@
+//! What an ID token must say to be believed (OpenID Connect Core 1.0, 3.1.3.7).
+//!
+//! | | |
+//! |---|---|
+//! | signature | by one of the provider's keys, with RSA, ECDSA or EdDSA; never by a shared secret, never none |
+//! | `iss` | the provider |
+//! | `aud` | this client alone; `azp`, if there, too |
+//! | `exp`, `iat` | not over, not of the future, with [`LEEWAY`] for clocks that differ |
+//! | `nonce` | the one of this sign-in |
+//! | `at_hash` | if there, that of the access token that came along |
+
+use base64::Engine as _;
+use base64::engine::general_purpose::URL_SAFE_NO_PAD;
+use chrono::DateTime;
+use jiff::{SignedDuration, Timestamp};
+use openidconnect::core::{
+    CoreGenderClaim, CoreJsonWebKey, CoreJweContentEncryptionAlgorithm, CoreJwsSigningAlgorithm,
+};
+use openidconnect::{
+    AccessToken, AccessTokenHash, ClaimsVerificationError, ClientId, EmptyAdditionalClaims,
+    IdTokenVerifier, IssuerUrl, JsonWebKeySet, Nonce,
+};
+
+use crate::identity::claims::{Claims, SUBJECT_MAX};
+
+/// How far the provider's clock and ours may differ.
+pub const LEEWAY: SignedDuration = SignedDuration::from_secs(60);
+
+/// An ID token as it came.
+pub type IdToken = openidconnect::IdToken<
+    EmptyAdditionalClaims,
+    CoreGenderClaim,
+    CoreJweContentEncryptionAlgorithm,
+    CoreJwsSigningAlgorithm,
+>;
+
+/// What an ID token is held against.
+#[derive(Debug, Clone, Copy)]
+pub struct Expected<'expected> {
+    /// The provider.
+    pub issuer: &'expected IssuerUrl,
+    /// This client.
+    pub client_id: &'expected ClientId,
+    /// The nonce of the sign-in.
+    pub nonce: &'expected str,
+    /// The access token that came along.
+    pub access_token: &'expected AccessToken,
+    /// The time.
+    pub now: Timestamp,
+    /// The provider's keys.
+    pub keys: &'expected JsonWebKeySet<CoreJsonWebKey>,
+}
+
+/// Why an ID token is not believed.
+#[derive(Debug, thiserror::Error)]
+pub enum InvalidIdToken {
+    /// There is none.
+    #[error("there is no ID token in the answer")]
+    Missing,
+    /// It is signed by a key that is not known, or not rightly.
+    #[error("the ID token's signature does not hold")]
+    Signature(#[source] ClaimsVerificationError),
+    /// It says something else than it must.
+    #[error("the ID token does not say what it must")]
+    Claims(#[source] ClaimsVerificationError),
+    /// It was made for another access token.
+    #[error("the ID token's `at_hash` is not that of the access token")]
+    AccessToken,
+    /// It is for another client.
+    #[error("the ID token's `azp` is another client")]
+    Party,
+    /// Its subject is no name of anybody.
+    #[error("the ID token's `sub` is empty or too long")]
+    Subject,
+    /// It does not read.
+    #[error("the ID token's claims do not read")]
+    Unreadable,
+}
+
+const ALGORITHMS: [CoreJwsSigningAlgorithm; 9] = [
+    CoreJwsSigningAlgorithm::RsaSsaPkcs1V15Sha256,
+    CoreJwsSigningAlgorithm::RsaSsaPkcs1V15Sha384,
+    CoreJwsSigningAlgorithm::RsaSsaPkcs1V15Sha512,
+    CoreJwsSigningAlgorithm::RsaSsaPssSha256,
+    CoreJwsSigningAlgorithm::RsaSsaPssSha384,
+    CoreJwsSigningAlgorithm::RsaSsaPssSha512,
+    CoreJwsSigningAlgorithm::EcdsaP256Sha256,
+    CoreJwsSigningAlgorithm::EcdsaP384Sha384,
+    CoreJwsSigningAlgorithm::EdDsa,
+];
+
+/// Whom an ID token is about, and what it says of them.
+///
+/// # Errors
+/// [`InvalidIdToken`].
+pub fn claims(
+    id_token: &IdToken,
+    expected: &Expected<'_>,
+) -> Result<(String, Claims), InvalidIdToken> {
+    let at = |time: Timestamp| {
+        let time = DateTime::from_timestamp(time.as_second(), 0);
+        time.unwrap_or(DateTime::UNIX_EPOCH)
+    };
+    let earliest = expected.now.saturating_sub(LEEWAY).unwrap_or(expected.now);
+    let latest = expected.now.saturating_add(LEEWAY).unwrap_or(expected.now);
+    let (earliest, latest) = (at(earliest), at(latest));
+    let verifier = IdTokenVerifier::new_public_client(
+        expected.client_id.clone(),
+        expected.issuer.clone(),
+        expected.keys.clone(),
+    )
+    .set_allowed_algs(ALGORITHMS)
+    .set_time_fn(move || earliest)
+    .set_issue_time_verifier_fn(move |issued| {
+        if issued <= latest {
+            Ok(())
+        } else {
+            Err(format!("it was issued at {issued}, which is yet to come"))
+        }
+    });
+    let nonce = Nonce::new(expected.nonce.to_owned());
+    let said = id_token.claims(&verifier, &nonce).map_err(|error| {
+        if matches!(error, ClaimsVerificationError::SignatureVerification(_)) {
+            InvalidIdToken::Signature(error)
+        } else {
+            InvalidIdToken::Claims(error)
+        }
+    })?;
+    if let Some(hash) = said.access_token_hash() {
+        let signed = id_token.signing_alg().ok();
+        let key = id_token.signing_key(&verifier).ok();
+        let own = signed.zip(key).and_then(|(algorithm, key)| {
+            AccessTokenHash::from_token(expected.access_token, algorithm, key).ok()
+        });
+        if own.as_ref() != Some(hash) {
+            return Err(InvalidIdToken::AccessToken);
+        }
+    }
+    if let Some(party) = said.authorized_party()
+        && party != expected.client_id
+    {
+        return Err(InvalidIdToken::Party);
+    }
+    let subject = said.subject().as_str();
+    if subject.is_empty() || subject.chars().count() > SUBJECT_MAX {
+        return Err(InvalidIdToken::Subject);
+    }
+    let claims = payload(id_token).ok_or(InvalidIdToken::Unreadable)?;
+    Ok((subject.to_owned(), claims))
+}
+
+/// All claims of an ID token, out of the very bytes that are signed.
+fn payload(id_token: &IdToken) -> Option<Claims> {
+    let text = id_token.to_string();
+    let payload = URL_SAFE_NO_PAD.decode(text.split('.').nth(1)?).ok()?;
+    serde_json::from_slice(&payload).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use openidconnect::JsonWebKeyId;
+    use ring::signature::{Ed25519KeyPair, KeyPair as _};
+    use serde_json::{Value, json};
+
+    use super::*;
+
+    const NOW_S: i64 = 1_800_000_000;
+    const ISSUER: &str = "https://login.test";
+
+    /// A key of a provider, and what it signs.
+    struct Signer {
+        pair: Ed25519KeyPair,
+        public: CoreJsonWebKey,
+    }
+
+    impl Signer {
+        fn new(seed: u8, kid: &str) -> Self {
+            let pair = Ed25519KeyPair::from_seed_unchecked(&[seed; 32]).unwrap();
+            let public = pair.public_key().as_ref().to_vec();
+            let kid = Some(JsonWebKeyId::new(kid.to_owned()));
+            let curve = openidconnect::core::CoreJsonCurveType::Ed25519;
+            let public = CoreJsonWebKey::new_okp(public, curve, kid);
+            Self { pair, public }
+        }
+
+        fn sign(&self, header: &Value, claims: &Value) -> IdToken {
+            let part = |value: &Value| URL_SAFE_NO_PAD.encode(value.to_string());
+            let text = format!("{}.{}", part(header), part(claims));
+            let signature = self.pair.sign(text.as_bytes());
+            let signature = URL_SAFE_NO_PAD.encode(signature.as_ref());
+            format!("{text}.{signature}").parse().unwrap()
+        }
+    }
+
+    fn good() -> Value {
+        json!({"iss": ISSUER, "aud": "tread", "sub": "anna", "nonce": "n", "iat": NOW_S,
+               "exp": NOW_S + 300, "groups": ["ops"]})
+    }
+
+    fn look(token: &IdToken, signer: &Signer) -> Result<(String, Claims), InvalidIdToken> {
+        let keys = JsonWebKeySet::new(vec![signer.public.clone()]);
+        claims(
+            token,
+            &Expected {
+                issuer: &IssuerUrl::new(ISSUER.to_owned()).unwrap(),
+                client_id: &ClientId::new("tread".to_owned()),
+                nonce: "n",
+                access_token: &AccessToken::new("access".to_owned()),
+                now: Timestamp::from_second(NOW_S).unwrap(),
+                keys: &keys,
+            },
+        )
+    }
+
+    fn with(changes: &Value) -> Value {
+        let mut claims = good();
+        let fields = claims.as_object_mut().unwrap();
+        for (name, value) in changes.as_object().unwrap() {
+            fields.insert(name.clone(), value.clone());
+        }
+        claims
+    }
+
+    const HEADER: &str = r#"{"alg": "EdDSA", "kid": "1"}"#;
+
+    fn header() -> Value {
+        serde_json::from_str(HEADER).unwrap()
+    }
+
+    #[test]
+    fn a_good_id_token_says_who_and_all_that_it_has() {
+        let signer = Signer::new(1, "1");
+        let (subject, claims) = look(&signer.sign(&header(), &good()), &signer).unwrap();
+        assert_eq!(subject, "anna");
+        assert_eq!(claims["groups"], json!(["ops"]));
+        for fine in [
+            with(&json!({"exp": NOW_S - 59, "iat": NOW_S - 400})),
+            with(&json!({"iat": NOW_S + 60})),
+            with(&json!({"azp": "tread"})),
+            with(&json!({"aud": ["tread"]})),
+        ] {
+            look(&signer.sign(&header(), &fine), &signer).unwrap();
+        }
+    }
+
+    #[test]
+    fn whatever_is_not_as_it_must_be_is_not_believed() {
+        let signer = Signer::new(1, "1");
+        for wrong in [
+            json!({"iss": "https://login.test/"}),
+            json!({"aud": "another"}),
+            json!({"aud": ["tread", "another"]}),
+            json!({"azp": "another"}),
+            json!({"nonce": "m"}),
+            json!({"nonce": null}),
+            json!({"exp": NOW_S - 61}),
+            json!({"iat": NOW_S + 61}),
+            json!({"at_hash": "AAAAAAAAAAAAAAAAAAAAAA"}),
+            json!({"sub": ""}),
+            json!({"sub": "x".repeat(SUBJECT_MAX + 1)}),
+        ] {
+            let token = signer.sign(&header(), &with(&wrong));
+            assert!(look(&token, &signer).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn only_the_providers_own_signatures_count() {
+        let (signer, other) = (Signer::new(1, "1"), Signer::new(2, "1"));
+        let is_signature =
+            |token: &IdToken| matches!(look(token, &signer), Err(InvalidIdToken::Signature(_)));
+        assert!(is_signature(&other.sign(&header(), &good())));
+        for header in [
+            json!({"alg": "EdDSA", "kid": "2"}),
+            json!({"alg": "HS256", "kid": "1"}),
+            json!({"alg": "RS256", "kid": "1"}),
+            json!({"alg": "none"}),
+        ] {
+            assert!(is_signature(&signer.sign(&header, &good())), "{header}");
+        }
+        let text = signer.sign(&header(), &good()).to_string();
+        let mut parts: Vec<&str> = text.split('.').collect();
+        let admin = URL_SAFE_NO_PAD.encode(with(&json!({"groups": ["admins"]})).to_string());
+        parts[1] = &admin;
+        assert!(is_signature(&parts.join(".").parse().unwrap()));
+    }
+
+    #[test]
+    fn at_hash_is_that_of_the_access_token_that_came_along() {
+        let signer = Signer::new(1, "1");
+        let hash = |token: &str| {
+            let token = AccessToken::new(token.to_owned());
+            let algorithm = CoreJwsSigningAlgorithm::EdDsa;
+            AccessTokenHash::from_token(&token, &algorithm, &signer.public).unwrap()
+        };
+        let token_of =
+            |hash: AccessTokenHash| signer.sign(&header(), &with(&json!({"at_hash": hash})));
+        look(&token_of(hash("access")), &signer).unwrap();
+        let other = look(&token_of(hash("another")), &signer);
+        assert!(matches!(other, Err(InvalidIdToken::AccessToken)));
+    }
+}
