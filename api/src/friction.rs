@@ -33,6 +33,20 @@ impl Information {
     }
 }
 
+/// What the error of a segment's θ is made of: an independent part, which averages out over segments,
+/// and common parts, which do not.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ThetaErrors {
+    /// Information 1/σ² on θ of the independent part alone.
+    pub independent_information: f64,
+    /// Standard deviation, as a share of θ, of the error that all segments of one robot have in
+    /// common: its mass, yaw inertia and torque constants.
+    pub robot_ratio: f64,
+    /// Standard deviation, as a share of θ, of the error that all robots on the same tyres have in
+    /// common: how the tyres' force bends with slip.
+    pub tyre_ratio: f64,
+}
+
 /// Largest friction coefficient that a segment may name. Rubber on dry concrete has about 1; no
 /// wheel on any ground that robots drive on has more than this.
 pub const MU_PEAK_MAX: f64 = 1.5;
@@ -56,8 +70,12 @@ pub struct Segment {
     /// The terrain under the robot; absent where none is drawn.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub terrain: Option<TerrainRef>,
-    /// θ, slip per friction coefficient.
+    /// θ, slip per friction coefficient. For who adds up segments and knows nothing of common errors:
+    /// it claims no more than the sum of a robot's segments keeps.
     pub theta: Information,
+    /// What the error of θ is made of; absent from an older agent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub theta_errors: Option<ThetaErrors>,
     /// Ratio of effective to geometric track, where turning showed it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub effective_track_ratio: Option<Information>,
@@ -79,6 +97,11 @@ pub struct Segment {
 pub const THETA_MAX: f64 = 50.0;
 /// Most information that one segment may claim, from a deviation of 10⁻⁵.
 pub const INFORMATION_MAX: f64 = 1.0e10;
+/// Largest common error that a segment may name, as a share of θ.
+pub const COMMON_RATIO_MAX: f64 = 10.0;
+/// How far apart the tyres' errors of two measurements on the same tyres may be, as a share of either:
+/// one standard deviation. They are the same where tyres slip alike, and grow with the slip.
+pub const TYRE_DIFFERENCE_SHARE: f64 = 0.5;
 /// Most samples that one segment may claim.
 pub const SAMPLES_MAX: u32 = 10_000_000;
 
@@ -119,6 +142,16 @@ impl Segment {
                 && self.theta.weighted > 0.0
                 && information(&self.theta, THETA_MAX),
             "theta",
+        )?;
+        let ratio = 0.0..=COMMON_RATIO_MAX;
+        check(
+            self.theta_errors.is_none_or(|errors| {
+                errors.independent_information > 0.0
+                    && errors.independent_information <= INFORMATION_MAX
+                    && ratio.contains(&errors.robot_ratio)
+                    && ratio.contains(&errors.tyre_ratio)
+            }),
+            "theta_errors",
         )?;
         let track = self.effective_track_ratio.as_ref();
         check(

@@ -3,7 +3,10 @@
 mod common;
 
 use common::{LOOP_S, SimRobot, curve};
-use tread_control::estimation::{SensorNoise, SensorSample, UpdateOutcome, expected_accuracy};
+use tread_control::estimation::{
+    Estimator, EstimatorPrior, SegmentStatistics, SensorNoise, SensorSample, UpdateOutcome,
+    expected_accuracy,
+};
 use tread_control::follower::{Follower, FollowerConfig, FollowerStatus};
 use tread_control::geometry::{Point, Pose, Twist};
 use tread_control::plan::Plan;
@@ -495,4 +498,46 @@ fn cells_of_a_mission_fuse_to_an_honest_interval() {
     eprintln!("fused {held} of {runs}, live {live_held} of {live}, RMS {rms}");
     assert!(held * 100 >= runs * 90 && live_held * 100 >= live * 90);
     assert!(live * 10 >= runs * 9 && rms < 0.06);
+}
+
+#[test]
+fn a_segment_tells_its_own_error_apart_from_those_it_shares_with_others() {
+    let drives = [(8.0, 0.6, 0.0), (8.0, 0.6, 0.3), (8.0, 0.6, -0.3)];
+    let segments = |prior: EstimatorPrior| {
+        let mut robot = SimRobot::new(Pose::default(), 2.0, 7, true);
+        robot.estimator = Estimator::with_prior(robot.model, robot.noise, prior);
+        drive(&mut robot, &drives);
+        robot.estimator.close_segment();
+        let mut segments = Vec::new();
+        for _ in 0..8 {
+            drive(&mut robot, &[(3.0, 0.6, 0.3), (3.0, 0.6, -0.3)]);
+            segments.push(robot.estimator.close_segment());
+        }
+
+        let said = robot.estimator.estimate().theta.unwrap();
+        let parts = said.own_std_dev.hypot(said.common.std_dev());
+        assert!((parts / said.std_dev - 1.0).abs() < 0.02, "{said:?}");
+        segments
+    };
+    let sum = |segments: &[SegmentStatistics], of: fn(&SegmentStatistics) -> f64| {
+        segments.iter().map(of).sum::<f64>()
+    };
+    let unknown = segments(EstimatorPrior::default());
+    let own = sum(&unknown, |segment| segment.own_information);
+    let claimed = sum(&unknown, |segment| segment.theta_information);
+    assert!(own > 20.0 * claimed, "{own} of its own, {claimed} claimed");
+    for segment in &unknown {
+        let common = segment.common_ratio;
+        assert!(segment.theta().is_some(), "none is dropped: {segment:?}");
+        assert!((0.12..0.2).contains(&common.robot), "{common:?}");
+        assert!((0.01..0.5).contains(&common.tyres), "{common:?}");
+    }
+    let known = segments(EstimatorPrior::exact());
+    let own = sum(&known, |segment| segment.own_information);
+    let claimed = sum(&known, |segment| segment.theta_information);
+    assert!(own >= claimed, "{own} and {claimed}");
+    for segment in &known {
+        let common = segment.common_ratio;
+        assert!(common.robot < 0.05 && common.tyres < 0.01, "{common:?}");
+    }
 }

@@ -8,7 +8,9 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::Duration;
 
 use tracing::{error, info, warn};
-use tread_api::friction::{Information, MU_PEAK_MAX, SAMPLES_MAX, Segment};
+use tread_api::friction::{
+    COMMON_RATIO_MAX, INFORMATION_MAX, Information, MU_PEAK_MAX, SAMPLES_MAX, Segment, ThetaErrors,
+};
 use tread_api::ids::ConfigurationId;
 use tread_api::robot::MissionProgress;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
@@ -181,6 +183,11 @@ fn segment_of(closed: &ClosedSegment, configuration: ConfigurationId) -> Segment
             information: statistics.theta_information,
             weighted: statistics.theta_weighted,
         },
+        theta_errors: (statistics.own_information > 0.0).then(|| ThetaErrors {
+            independent_information: statistics.own_information.min(INFORMATION_MAX),
+            robot_ratio: statistics.common_ratio.robot.min(COMMON_RATIO_MAX),
+            tyre_ratio: statistics.common_ratio.tyres.min(COMMON_RATIO_MAX),
+        }),
         effective_track_ratio: (track.information > 0.0).then_some(track),
         rolling_resistance: (rolling.information > 0.0).then_some(rolling),
         // The server refuses a segment that names more, which noise alone can show.

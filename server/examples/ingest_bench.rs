@@ -92,6 +92,7 @@ fn template(clock: &Clock) -> anyhow::Result<Segment> {
             information: 1.0,
             weighted: 1.0,
         },
+        theta_errors: None,
         effective_track_ratio: Some(Information {
             information: 331.234_567,
             weighted: 560.1,

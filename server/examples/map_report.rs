@@ -77,6 +77,7 @@ fn segment(configuration: ConfigurationId, cell: Cell, robot: u32, at: jiff::Tim
             information: 2_500.0,
             weighted: 2_500.0 * theta,
         },
+        theta_errors: None,
         effective_track_ratio: None,
         rolling_resistance: None,
         mu_peak_lower_bound: Some(0.3),

@@ -308,6 +308,7 @@ impl LightRobot {
                 information,
                 weighted: information * theta,
             },
+            theta_errors: None,
             effective_track_ratio: None,
             rolling_resistance: None,
             mu_peak_lower_bound: Some(0.3),

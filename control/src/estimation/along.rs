@@ -100,6 +100,7 @@ pub(super) struct AlongFilter {
     last_share_m_s: f64,
     last_duration_s: f64,
     last_gyro_rad_s: f64,
+    last_ahead_m_s2: f64,
     standing: u32,
     started: bool,
 }
@@ -117,6 +118,7 @@ impl AlongFilter {
             last_share_m_s: 0.0,
             last_duration_s: 0.0,
             last_gyro_rad_s: 0.0,
+            last_ahead_m_s2: 0.0,
             standing: 0,
             started: false,
         }
@@ -173,10 +175,18 @@ impl AlongFilter {
         };
         self.predict(&step, ahead_m_s2, gyro_rad_s, noise, sideways);
         let mut rows: Rows = [None; 3];
+        let gained_m_s2 = ahead_m_s2 - std::mem::replace(&mut self.last_ahead_m_s2, ahead_m_s2);
         let is_standing = (step.rim_m_s / count).abs() < STANDING_M_S;
         self.standing = if is_standing { self.standing + 1 } else { 0 };
         if step.usable >= count {
-            rows[0] = self.wheels(&step, ahead_m_s2, gyro_rad_s, model, noise, bound);
+            rows[0] = self.wheels(
+                &step,
+                (ahead_m_s2, gained_m_s2),
+                gyro_rad_s,
+                model,
+                noise,
+                bound,
+            );
         }
         if self.standing >= STANDING_STEPS {
             rows[1] = Some(self.observe(Regressors::zeros(), 0.0, STANDING_NOISE_M_S.powi(2), 0.0));
@@ -247,7 +257,7 @@ impl AlongFilter {
     fn wheels(
         &mut self,
         step: &Step,
-        ahead_m_s2: f64,
+        (ahead_m_s2, gained_m_s2): (f64, f64),
         gyro_rad_s: f64,
         model: &RobotModel,
         noise: &SensorNoise,
@@ -269,6 +279,8 @@ impl AlongFilter {
         regressors[index::THETA] = force_m_s;
         regressors[index::RADIUS_OFFSET] = harmonic_m_s;
         regressors[index::RADIUS_DIFFERENCE] = 0.25 * rim_difference_m_s;
+        let rate_1_s = gained_m_s2 / step.duration_s / GRAVITY_M_S2;
+        regressors[index::RELAXATION] = rate_1_s;
         let turn = Turn {
             rim_m_s: harmonic_m_s.abs(),
             rim_difference_m_s,
@@ -307,6 +319,8 @@ impl AlongFilter {
         bend[0] += more[0];
         bend[1] += more[1];
         row.bend = bend;
+        row.rate_noise =
+            2.0 * (noise.accelerometer_m_s2 / GRAVITY_M_S2 / step.duration_s).powi(2) / count;
         Some(row)
     }
 
@@ -334,6 +348,7 @@ impl AlongFilter {
             bend: [0.0; 3],
             common_noise: Regressors::zeros(),
             ramp_noise: 0.0,
+            rate_noise: 0.0,
         }
     }
 }

@@ -16,6 +16,8 @@ const STRAIGHT_SLIP_MAX: f64 = 0.01;
 /// Change of speed within a block, as a share, beyond which a body speed taken somewhere in it is
 /// not set against the block's mean force.
 const STEADY_SHARE: f64 = 0.05;
+/// Share of a block over which its force's beginning and end are averaged.
+const ENDS_SHARE: f64 = 0.25;
 
 /// Force regressors of a block.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -33,6 +35,66 @@ pub(super) struct Force {
     bend: [f64; 2],
     /// Covariance of the difference's with the response.
     slip_noise: [f64; 2],
+    rate: Rate,
+}
+
+/// How fast the sides' forces and rims change within a block, left and right.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Rate {
+    /// Friction coefficients, per second.
+    mu: [f64; 2],
+    /// The rims' acceleration over gravity, times their speed, metres per second.
+    rim_m_s: [f64; 2],
+    /// Variance of the difference of the former.
+    difference_noise: f64,
+}
+
+/// Sums over the first and the last part of a block.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Ends {
+    samples: [f64; 2],
+    time_s: [f64; 2],
+    mu: [[f64; 2]; 2],
+    rim_m_s: [[f64; 2]; 2],
+}
+
+impl Ends {
+    /// Which part of a block a sample is of, if any; its middle is at this time.
+    fn of(time_s: f64, dt_s: f64) -> Option<usize> {
+        if time_s + 0.5 * dt_s <= ENDS_SHARE * BLOCK_S + 1.0e-6 {
+            Some(0)
+        } else if time_s - 0.5 * dt_s >= (1.0 - ENDS_SHARE) * BLOCK_S - 1.0e-6 {
+            Some(1)
+        } else {
+            None
+        }
+    }
+
+    fn add(&mut self, end: usize, time_s: f64, mu: [f64; 2], rim_m_s: [f64; 2]) {
+        self.samples[end] += 1.0;
+        self.time_s[end] += time_s;
+        for side in 0..2 {
+            self.mu[end][side] += mu[side];
+            self.rim_m_s[end][side] += rim_m_s[side];
+        }
+    }
+
+    fn rate(&self, torque_mu: f64, sides_m_s: [f64; 2]) -> Rate {
+        let [first, last] = self.samples;
+        let apart_s = self.time_s[1] / last - self.time_s[0] / first;
+        if !apart_s.is_finite() || apart_s <= 0.0 {
+            return Rate::default();
+        }
+        let rate =
+            |of: &[[f64; 2]; 2], side: usize| (of[1][side] / last - of[0][side] / first) / apart_s;
+        Rate {
+            mu: [0, 1].map(|side| rate(&self.mu, side)),
+            rim_m_s: [0, 1]
+                .map(|side| rate(&self.rim_m_s, side) / GRAVITY_M_S2 * sides_m_s[side].abs()),
+            difference_noise: 2.0 * torque_mu.powi(2) * (first.recip() + last.recip())
+                / (apart_s * apart_s),
+        }
+    }
 }
 
 /// What is known about θ when a block is judged.
@@ -132,6 +194,8 @@ impl Block {
             regressors[index::CURVATURE_SQUARE],
         ] = force.difference_bent;
         regressors[index::RESISTANCE] = -self.rim_difference_m_s;
+        regressors[index::RELAXATION] = force.rate.mu[1] - force.rate.mu[0];
+        regressors[index::ROTORS] = -(force.rate.rim_m_s[1] - force.rate.rim_m_s[0]);
         let mut common_noise = Regressors::zeros();
         common_noise[index::RADIUS_OFFSET] = self.rim_difference_noise;
         common_noise[index::RESISTANCE] = -self.rim_difference_noise;
@@ -147,6 +211,7 @@ impl Block {
             bend: [force.bend[0], force.bend[1], 0.0],
             common_noise,
             ramp_noise: 0.0,
+            rate_noise: force.rate.difference_noise,
         })
     }
 
@@ -168,6 +233,8 @@ impl Block {
             regressors[index::CURVATURE_SQUARE],
         ] = force.mean_bent;
         regressors[index::RESISTANCE] = -self.rim_mean_m_s;
+        regressors[index::RELAXATION] = 0.5 * (force.rate.mu[1] + force.rate.mu[0]);
+        regressors[index::ROTORS] = -0.5 * (force.rate.rim_m_s[1] + force.rate.rim_m_s[0]);
         Some(Row {
             regressors,
             response: slip_m_s,
@@ -176,6 +243,7 @@ impl Block {
             bend: [force.bend[0], force.bend[1], 0.0],
             common_noise: Regressors::zeros(),
             ramp_noise: 0.0,
+            rate_noise: 0.25 * force.rate.difference_noise,
         })
     }
 
@@ -211,6 +279,7 @@ pub(super) struct BlockBuilder {
     /// Mean rim speed minus body speed where the latter was new.
     slip_m_s: f64,
     window: TurnWindow,
+    ends: Ends,
 }
 
 /// What blocks are made with.
@@ -261,6 +330,11 @@ impl BlockBuilder {
             let scale = 1.0 / (radius_m * model.side_load_n());
             let (left_mu, right_mu) = (torques.left_n_m * scale, torques.right_n_m * scale);
             self.with_torque += 1;
+            let time_s = self.duration_s - 0.5 * dt_s;
+            if let Some(end) = Ends::of(time_s, dt_s) {
+                self.ends
+                    .add(end, time_s, [left_mu, right_mu], [left_m_s, right_m_s]);
+            }
             self.left_mu += left_mu;
             self.right_mu += right_mu;
             self.left_force_m_s += left_mu * left_m_s.abs();
@@ -417,6 +491,7 @@ impl BlockBuilder {
             mean_bent: curvatures.split(bent_sides.map(|[left, right]| 0.5 * (left + right))),
             bend: curvatures.split(nodes.map(|curvature| bent(1.0, sides.mean, curvature))),
             slip_noise: curvatures.split(nodes.map(slip_noise)),
+            rate: self.ends.rate(noise.torque_mu, [left_m_s, right_m_s]),
         }
     }
 }
@@ -443,6 +518,10 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
     regressors[index::TRACK] = track_m * (model.effective_track_ratio() - 1.0) * means.turn_rad_s;
     regressors[index::GYRO_OFFSET] = -model.effective_track_m();
     regressors[index::AHEAD_OFFSET] = -theta * means.rim_difference_m_s / GRAVITY_M_S2;
+    regressors[index::RELAXATION] = inertia * means.turn_jerk_rad_s3;
+    let jerk_noise = (4.0 * inertia / means.duration_s.powi(2)).powi(2)
+        * noise.gyro_rad_s.powi(2)
+        * (2.0 / means.ramp_samples + 4.0 / means.middle_samples);
     // The side that slips more carries less; what that adds to the balance is odd in the turn.
     let rim_noise_m_s = noise.wheel_speed_rad_s * model.wheel_radius_m();
     let gyro_noise = noise.gyro_rad_s.powi(2);
@@ -493,5 +572,35 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
         bend,
         common_noise,
         ramp_noise,
+        rate_noise: jerk_noise,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn the_rate_of_a_straight_rise_is_its_slope(
+            samples in 8_u32..80, from in -0.5..0.5_f64, slope in -2.0..2.0_f64, rim in 0.2..2.0_f64,
+        ) {
+            let mut ends = Ends::default();
+            let dt_s = BLOCK_S / f64::from(samples);
+            for sample in 0..samples {
+                let time_s = (f64::from(sample) + 0.5) * dt_s;
+                if let Some(end) = Ends::of(time_s, dt_s) {
+                    let mu = from + slope * time_s;
+                    ends.add(end, time_s, [mu, -mu], [rim, rim + slope * time_s]);
+                }
+            }
+            let rate = ends.rate(0.01, [rim, rim]);
+            prop_assert!((rate.mu[0] - slope).abs() < 1.0e-9 && (rate.mu[1] + slope).abs() < 1.0e-9);
+            prop_assert!(rate.rim_m_s[0].abs() < 1.0e-9);
+            prop_assert!((rate.rim_m_s[1] - slope / GRAVITY_M_S2 * rim).abs() < 1.0e-9);
+            prop_assert!(rate.difference_noise > 0.0);
+        }
     }
 }

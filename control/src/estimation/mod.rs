@@ -3,10 +3,12 @@
 //! This is the figure that reaches the map; it never mixes with θ̂ of the loop. Per side, in the
 //! linear range, `λ = θ μ` holds exactly under combined slip: slip is regressed on force, from
 //! *measured* wheel speed, gyro, accelerometer, body speed and wheel torque. Every row is linear in
-//! nine parameters: θ; what is the robot's own, namely `δ_c` and `δ_d` (the shares by which nominal
+//! eleven parameters: θ; what is the robot's own, namely `δ_c` and `δ_d` (the shares by which nominal
 //! radii are too large, mean and right minus left), the effective track, the gyro's and the
-//! accelerometer's offset and the latter's scale; θf, rolling resistance f in measured torques; and
-//! θκ, the bend of a curved tyre. In metres per second, u rim speeds:
+//! accelerometer's offset and the latter's scale; θf, rolling resistance f in measured torques;
+//! θκ, the bend of a curved tyre; θℓ, the contacts' relaxation length, times the force's rate; and θj,
+//! the inertia of rotors and wheels over the mass, whose torque no contact carries. Without the last
+//! three, in metres per second, u rim speeds:
 //!
 //! ```text
 //! with wheel torque
@@ -45,14 +47,14 @@ use change::ChangeDetector;
 use excitation::Excitation;
 pub use expectation::{ExpectedAccuracy, expected_accuracy};
 use offsets::OffsetKnowledge;
-use regression::{Solution, SolveInput, solve};
+use regression::{Shared, Solution, SolveInput, solve};
 use rows::Row;
 pub use segment::SegmentStatistics;
 use segment::{Claims, SegmentTheta};
 use sums::Sums;
 pub use types::{
-    Estimate, EstimatorPrior, ModelUncertainty, SensorNoise, SensorSample, ThetaMeasurement,
-    TyrePrior, UpdateOutcome, ValueWithDeviation,
+    CommonError, Estimate, EstimatorPrior, ModelUncertainty, SensorNoise, SensorSample,
+    ThetaMeasurement, TyrePrior, UpdateOutcome, ValueWithDeviation,
 };
 
 /// Time over which samples are averaged, seconds.
@@ -78,6 +80,10 @@ const THETA_MOST_FIRST: f64 = 2.0;
 /// Share of θ that rows on accelerations leave out: products of θ with what is learned meanwhile.
 /// One error of all of a robot's segments; with torque that of the torque constants is.
 pub const MODEL_RATIO: f64 = 1.5e-3;
+/// Most of a segment's own variance that it may share with the segments before.
+const OFFSETS_SHARE_MAX: f64 = 0.9;
+/// Standard deviations to either side of a 95 % interval.
+const NORMAL_95: f64 = 1.96;
 /// Longest time between two samples over which anything is averaged, seconds.
 const GAP_MAX_S: f64 = 0.1;
 /// Samples in a row that are refused because the wheels' speed leapt.
@@ -97,7 +103,7 @@ pub struct Estimator {
     offsets: OffsetKnowledge,
     /// Blocks of this ground in segments that are closed.
     ground: Sums,
-    /// What their sum promises on θ.
+    /// What their sum promises on θ, with the tyres' error inside.
     claims: Claims,
     /// Blocks of the open segment that are certain to be of this ground.
     segment: Sums,
@@ -304,18 +310,16 @@ impl Estimator {
         let solution = self.solve(&sums, None);
         self.measured = solution.filter(|solution| self.is_measurement(solution, &sums));
         let theta = self.measured.map(|solution| {
-            // Errors of the torque constants scale the forces; each side has its own, and the
-            // force difference holds half of each. Errors of the radii cancel: the torque reads
-            // too high by what the rim speed beside it reads too low.
-            let gain = if sums.has_torque() {
-                let constants = self.noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2;
-                constants.hypot(self.uncertainty.mass_ratio)
-            } else {
-                MODEL_RATIO.hypot(self.uncertainty.inertia_ratio)
-            };
+            let scale = self.load_scale(&sums);
+            let robot = self.gain_ratio(&sums) * solution.theta;
             ThetaMeasurement {
-                theta: solution.theta,
-                std_dev: (solution.variance + (gain * solution.theta).powi(2)).sqrt(),
+                theta: scale * solution.theta,
+                std_dev: scale * (solution.variance + robot * robot).sqrt(),
+                own_std_dev: scale * solution.own_variance().sqrt(),
+                common: CommonError {
+                    robot: scale * robot,
+                    tyres: scale * solution.tyre_std_dev(),
+                },
                 effective_samples: sums.effective_samples(),
                 duration_s: sums.duration_s,
             }
@@ -324,8 +328,10 @@ impl Estimator {
             found.theta.max(0.0) + 2.0 * found.variance.max(0.0).sqrt()
         });
         self.bound = ThetaBound {
-            theta: theta.map(|found| found.theta),
-            slip_max: theta.map_or(f64::INFINITY, |found| self.tyres.slip_max(found.theta)),
+            theta: self.measured.map(|found| found.theta),
+            slip_max: self
+                .measured
+                .map_or(f64::INFINITY, |found| self.slip_max(&found, &sums)),
             theta_weights: solution
                 .filter(|found| found.variance > 0.0 && found.variance.sqrt() < found.theta)
                 .map_or(THETA_FIRST, |found| {
@@ -359,11 +365,45 @@ impl Estimator {
         };
     }
 
+    /// What θ is multiplied by since the robot weighs more than its model: the same torque is less
+    /// friction then. Accelerations are forces over the true mass.
+    fn load_scale(&self, sums: &Sums) -> f64 {
+        if sums.has_torque() {
+            1.0 + self.uncertainty.payload_ratio
+        } else {
+            1.0
+        }
+    }
+
+    /// Largest slip at which tyres rise as they are known to, on ground of this θ. Without torque
+    /// nothing but θ tells what friction that slip takes, so it counts as small as it may be.
+    fn slip_max(&self, solution: &Solution, sums: &Sums) -> f64 {
+        let doubt = if sums.has_torque() {
+            0.0
+        } else {
+            let robot = self.gain_ratio(sums) * solution.theta;
+            NORMAL_95 * (solution.variance + robot * robot).sqrt()
+        };
+        self.tyres.slip_max((solution.theta - doubt).max(0.0))
+    }
+
+    /// Standard deviation of the error that scales all of a robot's θ, as a share.
+    fn gain_ratio(&self, sums: &Sums) -> f64 {
+        // Errors of the torque constants scale the forces; each side has its own, and the force
+        // difference holds half of each. Errors of the radii cancel: the torque reads too high by
+        // what the rim speed beside it reads too low.
+        if sums.has_torque() {
+            let constants = self.noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2;
+            constants.hypot(self.uncertainty.mass_ratio)
+        } else {
+            MODEL_RATIO.hypot(self.uncertainty.inertia_ratio)
+        }
+    }
+
     /// Whether the force varied enough, and the slip behind it was that of the rise which is known.
     /// Before θ was known, blocks of more slip than that may have come in.
     fn is_measurement(&self, solution: &Solution, sums: &Sums) -> bool {
-        solution.is_measurement(sums.blocks)
-            && sums.slip_rms() <= self.tyres.slip_max(solution.theta)
+        solution.is_measurement(sums.blocks) && sums.slip_rms() <= self.slip_max(solution, sums)
     }
 
     fn accelerometer_offset_mu(&self) -> f64 {
@@ -375,6 +415,7 @@ impl Estimator {
     ///
     /// What is not known of the robot itself is the same error in all segments, so that their sum
     /// would promise too much: each claims as much as the sum of this ground's segments can keep.
+    /// The errors that no drive averages out are told apart from it as [`CommonError`].
     pub fn close_segment(&mut self) -> SegmentStatistics {
         let segment = self.segment.plus(&self.pending);
         let before = self
@@ -402,16 +443,32 @@ impl Estimator {
             solve(&segment, input).filter(|found| found.is_informative(ground.theta))
         });
         let theta = solution.map(|found| {
-            let shared = before.map_or(0.0, |before| before.shared_with(&found, &offsets, &tyres));
+            let shared = before.map_or_else(Shared::default, |before| {
+                before.shared_with(&found, &offsets, &tyres)
+            });
+            // An error that grows with θ is a share of the θ that is known best.
+            let theta = ground.map_or(found.theta, |ground| ground.theta);
+            let scale = self.load_scale(&segment);
+            let square = scale * scale;
+            // What it shares with those before is the robot's own error: told, and not added up.
+            let own_variance = found.own_variance();
+            let of_offsets = shared.own.clamp(0.0, OFFSETS_SHARE_MAX * own_variance);
             SegmentTheta {
-                theta: found.theta,
-                information: self.claims.add(found.variance, shared),
+                theta: scale * found.theta,
+                information: self
+                    .claims
+                    .add(square * found.variance, square * shared.all),
+                own_information: (square * (own_variance - of_offsets)).recip(),
+                common_ratio: CommonError {
+                    robot: self.gain_ratio(&segment).hypot(of_offsets.sqrt() / theta),
+                    tyres: found.tyre_std_dev() / theta,
+                },
             }
         });
         let statistics = SegmentStatistics::of(
             &segment,
             &offsets,
-            theta.filter(|found| found.information > 0.0),
+            theta.filter(|found| found.own_information > 0.0),
             self.accelerometer_offset_mu(),
         );
         self.ground = whole;

@@ -2,7 +2,7 @@
 
 use nalgebra::{SMatrix, SVector};
 
-use super::regression::{Normal, inflation};
+use super::regression::{Normal, drive_known, inflation};
 use super::rows::{OFFSETS, ParameterMatrix, Parameters, Tangent, index};
 use super::sums::Sums;
 use super::{SensorNoise, THETA_FIRST, THETA_RANGE, TyrePrior, ValueWithDeviation};
@@ -82,7 +82,8 @@ impl OffsetKnowledge {
         let theta = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
         let channels = sums.channels();
         let tangent = Tangent::at(theta, found.at(theta));
-        let normal = Normal::of(&channels, theta, tangent, tyres).with_resistance(self, theta);
+        let normal =
+            Normal::of(&channels, theta, tangent, (tyres, 1.0)).with_resistance(self, theta);
         let Some((matrix, right)) = self.without_ground(&normal) else {
             return *self;
         };
@@ -94,6 +95,9 @@ impl OffsetKnowledge {
         parameters.fixed_rows_mut::<OFFSETS>(1).copy_from(&offsets);
         parameters[index::THETA] = theta;
         parameters[index::CURVATURE] = found.curvature;
+        for (parameter, mean, _) in drive_known(tyres) {
+            parameters[parameter] = theta * mean;
+        }
         let inflation = inflation(&channels, &parameters, theta, tangent);
         let information = self.information + matrix / inflation;
         if information.cholesky().is_none() {
@@ -114,6 +118,8 @@ impl OffsetKnowledge {
     ) -> Option<(SMatrix<f64, OFFSETS, OFFSETS>, SVector<f64, OFFSETS>)> {
         let mut matrix = normal.matrix;
         let mut right = normal.right;
+        take_out(index::ROTORS, &mut matrix, &mut right);
+        take_out(index::RELAXATION, &mut matrix, &mut right);
         take_out(index::CURVATURE, &mut matrix, &mut right);
         // A corrected square below its own noise is not known to be smaller than that noise, and it
         // is no smaller than what the other regressors explain of it: rows whose force hardly varies

@@ -32,6 +32,10 @@ const BEND_SHARE: f64 = 0.04;
 const BEND_SHARE_TORQUE: f64 = 0.05;
 /// Most of a variance that neighbouring rows may take from it.
 const NEIGHBOURS_SHARE_MAX: f64 = 0.9;
+/// Relative change of how much larger residuals are at which the search for it ends.
+const INFLATION_SETTLED: f64 = 0.1;
+/// Least share of a variance that is the estimate's own.
+const OWN_SHARE_MIN: f64 = 0.01;
 /// Least standard deviation of θκ, so that the matrix stays regular.
 const CURVATURE_STD_DEV_MIN: f64 = 2.0e-4;
 
@@ -43,6 +47,8 @@ pub(super) struct Normal {
     excess: f64,
     /// Standard deviation of the noise in the corrected `M₁₁`.
     pub(super) noise_std_dev: f64,
+    /// Information on θκ that was there before.
+    curvature_weight: f64,
 }
 
 impl Normal {
@@ -51,20 +57,21 @@ impl Normal {
         channels: &[&Channel],
         theta: f64,
         tangent: Tangent,
-        tyres: &TyrePrior,
+        (tyres, inflation): (&TyrePrior, f64),
     ) -> Self {
         let mut normal = Self {
             matrix: ParameterMatrix::zeros(),
             right: Parameters::zeros(),
             excess: 0.0,
             noise_std_dev: 0.0,
+            curvature_weight: tyres.curvature_std_dev.max(CURVATURE_STD_DEV_MIN).powi(-2),
         };
         let mut noise_variance = 0.0;
         for channel in channels {
             if channel.count < 1.0 {
                 continue;
             }
-            let spread = channel.spread(theta);
+            let spread = channel.spread(theta) * inflation;
             let force_noise = channel.force_variance();
             normal.matrix += channel.corrected_square(tangent) / spread;
             normal.right += channel.corrected_product(tangent) / spread;
@@ -73,9 +80,14 @@ impl Normal {
             noise_variance += 2.0 * channel.count * (force_noise / spread).powi(2);
         }
         normal.noise_std_dev = noise_variance.sqrt();
-        let known = tyres.curvature_std_dev.max(CURVATURE_STD_DEV_MIN).powi(-2);
+        let known = normal.curvature_weight;
         normal.matrix[(index::CURVATURE, index::CURVATURE)] += known;
         normal.right[index::CURVATURE] += known * tyres.curvature;
+        for (parameter, mean, std_dev) in drive_known(tyres) {
+            let known = (theta * std_dev).powi(-2);
+            normal.matrix[(parameter, parameter)] += known;
+            normal.right[parameter] += known * theta * mean;
+        }
         normal
     }
 
@@ -96,6 +108,22 @@ impl Normal {
         right += offsets.weighted;
         self
     }
+}
+
+/// What is known of relaxation and rotors: which parameter over θ, its mean and standard deviation.
+pub(super) fn drive_known(tyres: &TyrePrior) -> [(usize, f64, f64); 2] {
+    [
+        (
+            index::RELAXATION,
+            tyres.relaxation_m,
+            tyres.relaxation_std_dev_m.max(1.0e-5),
+        ),
+        (
+            index::ROTORS,
+            tyres.rotor_ratio,
+            tyres.rotor_std_dev_ratio.max(1.0e-5),
+        ),
+    ]
 }
 
 /// How much larger the residuals are than the assumed noise; never below one.
@@ -176,20 +204,26 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
     let channels = sums.channels();
     let mut theta_weights = input.theta_given.unwrap_or(input.theta_start);
     let mut tyres = *input.tyres;
+    let mut inflated = 1.0;
+    let is_exact = input.tyres.unexplained_ratio <= 0.0;
     for round in 1..=ROUNDS {
         let tangent = Tangent::at(theta_weights, tyres.at(theta_weights));
-        let normal = Normal::of(&channels, theta_weights, tangent, input.tyres)
+        let normal = Normal::of(&channels, theta_weights, tangent, (input.tyres, inflated))
             .with_resistance(input.offsets, theta_weights)
             .with_offsets(input.offsets);
         let covariance = normal.matrix.cholesky()?.inverse();
         let parameters = covariance * normal.right;
         let theta = parameters[index::THETA];
         let next = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
-        tyres = learned_tyres(&parameters, &covariance, input.tyres);
+        if input.theta_given.is_none() {
+            tyres = learned_tyres(&parameters, &covariance, input.tyres);
+        }
+        // Where residuals are larger than the noise explains, rows say less beside what was known.
+        let inflation = inflation(&channels, &parameters, theta_weights, tangent);
+        let is_weighed = is_exact || (inflation - inflated).abs() <= INFLATION_SETTLED * inflated;
         let is_settled = (next - theta_weights).abs() < CONVERGED * theta_weights
             && Tangent::at(next, tyres.at(next)).is_near(tangent);
-        if input.theta_given.is_some() || round == ROUNDS || is_settled {
-            let inflation = inflation(&channels, &parameters, theta_weights, tangent);
+        if round == ROUNDS || is_weighed && (input.theta_given.is_some() || is_settled) {
             let base = covariance[(index::THETA, index::THETA)];
             let (theta, scale) = if sums.has_torque() {
                 (theta, 0.0)
@@ -214,23 +248,38 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
             } else {
                 BEND_SHARE
             };
-            let missed =
-                share * parameters[index::THETA] * bend_ratio(&channels, tangent, curvature);
+            let bent = share * parameters[index::THETA] * bend_ratio(&channels, tangent, curvature);
+            // What residuals show beyond the noise is no noise: it does not average out.
+            let unexplained = input.tyres.unexplained_ratio
+                * parameters[index::THETA]
+                * (1.0 - inflated.recip()).sqrt();
+            // Of an exact model, what residuals show is that the noise is larger than assumed.
+            let noisier = if is_exact { inflation } else { 1.0 };
+            let missed = bent.hypot(unexplained);
             return Some(Solution {
                 theta,
                 parameters,
-                covariance: covariance * inflation,
-                inflation,
+                covariance: covariance * noisier,
+                noisier,
                 of_theta,
                 tangent,
-                variance: (base + scaled + neighbours) * inflation
+                variance: (base + scaled + neighbours * inflated) * noisier
                     + base * base * normal.excess
                     + missed * missed,
                 missed,
+                tyre_variance: (direction[index::CURVATURE] * normal.curvature_weight.sqrt())
+                    .powi(2)
+                    * noisier
+                    + missed * missed,
                 significance: 1.0 / (base * normal.noise_std_dev.max(f64::MIN_POSITIVE)),
             });
         }
-        theta_weights = next;
+        if !is_exact {
+            inflated = inflation;
+        }
+        if input.theta_given.is_none() {
+            theta_weights = next;
+        }
     }
     None
 }
@@ -264,14 +313,25 @@ pub(super) struct Solution {
     significance: f64,
     parameters: Parameters,
     covariance: ParameterMatrix,
-    /// Share of the covariance by which residuals were larger than assumed.
-    inflation: f64,
+    /// Share by which the covariance was enlarged beside what was known.
+    noisier: f64,
     /// How θ follows from the parameters.
     of_theta: Parameters,
     /// θκ² as it was reckoned with.
     tangent: Tangent,
     /// What rows to second order may miss of curved tyres, in θ; alike everywhere.
     missed: f64,
+    /// The part of the variance that comes from what was not known of the tyres.
+    tyre_variance: f64,
+}
+
+/// What two estimates of θ have in common, as the covariance of their errors.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Shared {
+    /// Whatever it comes from.
+    pub(super) all: f64,
+    /// Without what one error of the tyres explains, as large in each as it says of itself.
+    pub(super) own: f64,
 }
 
 impl Solution {
@@ -285,15 +345,37 @@ impl Solution {
         later: &Self,
         offsets: &OffsetKnowledge,
         tyres: &TyrePrior,
-    ) -> f64 {
+    ) -> Shared {
         let mine = self.covariance * self.of_theta;
-        let its = later.covariance * later.of_theta / later.inflation;
+        let its = later.covariance * later.of_theta / later.noisier;
         let followed = offsets.information * its.fixed_rows::<OFFSETS>(1);
         let of_offsets = followed.dot(&mine.fixed_rows::<OFFSETS>(1));
         // What moves θκ moves the later θ by as much as its prior weighs.
         let width = tyres.curvature_std_dev.max(CURVATURE_STD_DEV_MIN);
         let of_curvature = its[index::CURVATURE] / (width * width) * mine[index::CURVATURE];
-        of_offsets + of_curvature + self.missed * later.missed
+        let of_drive: f64 = drive_known(tyres)
+            .iter()
+            .map(|&(parameter, _, std_dev)| {
+                its[parameter] / (self.theta * std_dev).powi(2) * mine[parameter]
+            })
+            .sum();
+        let of_offsets = of_offsets + of_drive;
+        let of_tyres = of_curvature + self.missed * later.missed;
+        let explained = self.tyre_std_dev() * later.tyre_std_dev();
+        Shared {
+            all: of_offsets + of_tyres,
+            own: of_offsets + (of_tyres - explained).max(0.0),
+        }
+    }
+
+    /// Standard deviation of the error that comes from what was not known of the tyres.
+    pub(super) fn tyre_std_dev(&self) -> f64 {
+        self.tyre_variance.sqrt()
+    }
+
+    /// Variance of θ without that of the tyres.
+    pub(super) fn own_variance(&self) -> f64 {
+        (self.variance - self.tyre_variance).max(OWN_SHARE_MIN * self.variance)
     }
 
     /// Whether the force varied enough, apart from the offsets, to call this a measurement.

@@ -5,7 +5,7 @@ use nalgebra::{SMatrix, SVector};
 use super::types::Curvature;
 
 /// Number of parameters.
-pub(super) const PARAMETERS: usize = 9;
+pub(super) const PARAMETERS: usize = 11;
 /// Number of the parameters that all segments of a ground share, which follow θ: the robot's own,
 /// and the rolling resistance.
 pub(super) const OFFSETS: usize = 7;
@@ -41,12 +41,16 @@ pub(super) mod index {
     pub(in crate::estimation) const RESISTANCE: usize = 7;
     /// θκ, θ times the tyre's curvature per slip.
     pub(in crate::estimation) const CURVATURE: usize = 8;
+    /// θℓ, θ times the contacts' relaxation length, metres: a force that rises takes slip of its own.
+    pub(in crate::estimation) const RELAXATION: usize = 9;
+    /// θj, θ times the inertia of the rotors and wheels over the mass: torque that no contact carries.
+    pub(in crate::estimation) const ROTORS: usize = 10;
     /// θκ², a regressor's place only, as all that follow.
-    pub(in crate::estimation) const CURVATURE_SQUARE: usize = 9;
+    pub(in crate::estimation) const CURVATURE_SQUARE: usize = 11;
     /// κ.
-    pub(in crate::estimation) const CURVATURE_ALONE: usize = 10;
+    pub(in crate::estimation) const CURVATURE_ALONE: usize = 12;
     /// θ²κ.
-    pub(in crate::estimation) const THETA_CURVATURE: usize = 11;
+    pub(in crate::estimation) const THETA_CURVATURE: usize = 13;
 }
 
 /// The regressors that have the force's noise.
@@ -163,6 +167,8 @@ pub(super) struct Row {
     /// The part of the force's variance that is the gyro's over two ramps, each shared with a
     /// neighbouring row with the other sign.
     pub(super) ramp_noise: f64,
+    /// Variance of the force's rate, the regressor of θℓ.
+    pub(super) rate_noise: f64,
 }
 
 impl Row {
@@ -176,6 +182,7 @@ impl Row {
             bend: [0.0; 3],
             common_noise: Regressors::zeros(),
             ramp_noise: 0.0,
+            rate_noise: 0.0,
         }
     }
 }
@@ -194,6 +201,8 @@ pub(super) struct Channel {
     neighbours: RegressorMatrix,
     /// Sum of the response's variances.
     response_noise: f64,
+    /// Sum of the variances of the force's rate.
+    rate_noise: f64,
 }
 
 impl Default for Channel {
@@ -207,6 +216,7 @@ impl Default for Channel {
             common_noise: Regressors::zeros(),
             neighbours: RegressorMatrix::zeros(),
             response_noise: 0.0,
+            rate_noise: 0.0,
         }
     }
 }
@@ -222,6 +232,7 @@ impl Channel {
         self.force_noise += shares * shares.transpose() * row.force_noise;
         self.common_noise += row.common_noise;
         self.response_noise += row.spread;
+        self.rate_noise += row.rate_noise;
     }
 
     /// Notes that a row that was added stands next to another one: they share a ramp.
@@ -243,6 +254,7 @@ impl Channel {
             force_noise,
             bend: row.bend,
             ramp_noise: 0.0,
+            rate_noise: row.rate_noise * (scale * scale),
         });
     }
 
@@ -256,6 +268,7 @@ impl Channel {
             common_noise: self.common_noise + other.common_noise,
             neighbours: self.neighbours + other.neighbours,
             response_noise: self.response_noise + other.response_noise,
+            rate_noise: self.rate_noise + other.rate_noise,
         }
     }
 
@@ -277,6 +290,7 @@ impl Channel {
     /// `Σ xxᵀ` without the force's noise.
     pub(super) fn corrected_square(&self, tangent: Tangent) -> ParameterMatrix {
         let mut square = self.square;
+        square[(index::RELAXATION, index::RELAXATION)] -= self.rate_noise;
         for (row, row_of) in FORCED.into_iter().enumerate() {
             for (column, column_of) in FORCED.into_iter().enumerate() {
                 square[(row_of, column_of)] -= self.force_noise[(row, column)];

@@ -2,17 +2,23 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::CommonError;
 use super::offsets::OffsetKnowledge;
 use super::sums::Sums;
 
 /// Additive statistics of one segment. `Λ = 1/σ²` of segments add up, and so do `Λθ`.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct SegmentStatistics {
-    /// Information on θ, Λ = 1/σ²; 0 when there is none. It holds the offsets' deviation, but not
-    /// the error of the torque constants, which is the same in all segments of a robot.
+    /// Information on θ, Λ = 1/σ²; 0 when there is none. It holds the offsets' deviation and the
+    /// tyres', but not the robot's common error: for who sums up segments and knows nothing of
+    /// common errors. Where the tyres are not known, later segments of one ground say next to nothing.
     pub theta_information: f64,
     /// Λθ.
     pub theta_weighted: f64,
+    /// Information on θ without the common errors, which do not add up.
+    pub own_information: f64,
+    /// The common errors, over θ.
+    pub common_ratio: CommonError,
     /// Blocks in the linear range.
     pub samples: u64,
     /// Their time, seconds.
@@ -32,11 +38,19 @@ pub struct SegmentStatistics {
     pub saturation_ratio: f64,
 }
 
+/// Least share of its own information that a segment claims, so that nobody drops it.
+const CLAIM_MIN_RATIO: f64 = 1.0e-6;
+
 /// θ of one segment alone, and the information that it may claim.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SegmentTheta {
     pub(super) theta: f64,
+    /// With the tyres' error inside.
     pub(super) information: f64,
+    /// Without the common errors.
+    pub(super) own_information: f64,
+    /// The common errors, over θ.
+    pub(super) common_ratio: CommonError,
 }
 
 /// What the segments of one ground promise together.
@@ -84,7 +98,11 @@ impl SegmentStatistics {
         theta: Option<SegmentTheta>,
         accelerometer_offset_mu: f64,
     ) -> Self {
-        let information = theta.map_or(0.0, |found| found.information);
+        let information = theta.map_or(0.0, |found| {
+            found
+                .information
+                .max(CLAIM_MIN_RATIO * found.own_information)
+        });
         let track = sums.effective_track(offsets);
         let track_information = track.map_or(0.0, |track| track.std_dev.powi(-2));
         let rolling = sums.rolling_resistance(accelerometer_offset_mu);
@@ -92,6 +110,8 @@ impl SegmentStatistics {
         Self {
             theta_information: information,
             theta_weighted: theta.map_or(0.0, |found| information * found.theta),
+            own_information: theta.map_or(0.0, |found| found.own_information),
+            common_ratio: theta.map_or_else(CommonError::default, |found| found.common_ratio),
             samples: sums.blocks,
             duration_s: sums.duration_s,
             mu_peak_lower_bound: sums.mu_peak(),

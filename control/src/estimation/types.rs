@@ -62,6 +62,22 @@ pub struct TyrePrior {
     /// Largest friction coefficient at which the rise is as above, somewhat less than the least peak
     /// that the tyres may have; none if only slip limits it.
     pub mu_max: Option<f64>,
+    /// Mean of the contacts' relaxation length, metres: the way over which force follows slip.
+    #[serde(default)]
+    pub relaxation_m: f64,
+    /// Its standard deviation, metres.
+    #[serde(default)]
+    pub relaxation_std_dev_m: f64,
+    /// Mean inertia of what turns with the tyres, at their rim, over the robot's mass.
+    #[serde(default)]
+    pub rotor_ratio: f64,
+    /// Its standard deviation.
+    #[serde(default)]
+    pub rotor_std_dev_ratio: f64,
+    /// Error of θ, as a share, where nearly all of the residuals is what rows do not know. Where it is
+    /// 0 the model counts as exact, and residuals beyond the noise as more noise.
+    #[serde(default)]
+    pub unexplained_ratio: f64,
 }
 
 /// How far a robot may differ from its model, one standard deviation each as a share. These are
@@ -70,6 +86,9 @@ pub struct TyrePrior {
 pub struct ModelUncertainty {
     /// Mass, which measured torques are taken over.
     pub mass_ratio: f64,
+    /// By how much more than its model it weighs on average. Robots are loaded, not lightened.
+    #[serde(default)]
+    pub payload_ratio: f64,
     /// Yaw inertia over mass, which turns are taken over where torque is not measured.
     pub inertia_ratio: f64,
 }
@@ -79,6 +98,7 @@ impl Default for ModelUncertainty {
     fn default() -> Self {
         Self {
             mass_ratio: 0.12,
+            payload_ratio: 0.1,
             inertia_ratio: 0.15,
         }
     }
@@ -89,19 +109,29 @@ impl ModelUncertainty {
     pub fn exact() -> Self {
         Self {
             mass_ratio: 0.0,
+            payload_ratio: 0.0,
             inertia_ratio: 0.0,
         }
     }
 }
 
 /// What is known beforehand of a robot and its tyres. The default fits one of which only the data
-/// sheet is known, on tyres that rise straight.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+/// sheet is known, on tyres of which nothing is.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct EstimatorPrior {
     /// Its tyres.
     pub tyres: TyrePrior,
     /// How far it may differ from its model.
     pub model: ModelUncertainty,
+}
+
+impl Default for EstimatorPrior {
+    fn default() -> Self {
+        Self {
+            tyres: TyrePrior::unknown(),
+            model: ModelUncertainty::default(),
+        }
+    }
 }
 
 impl EstimatorPrior {
@@ -124,12 +154,18 @@ pub(super) struct Curvature {
 }
 
 impl TyrePrior {
-    /// Tyres of which nothing is known: straight, or as bent as a brush of a peak of 0.3.
+    /// Tyres of which nothing is known: straight, or as bent as a brush of a peak of 0.3, with the
+    /// relaxation lengths of small tyres, and the rotors of geared motors.
     pub fn unknown() -> Self {
         Self {
             curvature: 0.5,
             curvature_std_dev: 0.5,
             mu_max: Some(0.6),
+            relaxation_m: 0.04,
+            relaxation_std_dev_m: 0.03,
+            rotor_ratio: 0.05,
+            rotor_std_dev_ratio: 0.04,
+            unexplained_ratio: 0.1,
             ..Self::default()
         }
     }
@@ -156,6 +192,11 @@ impl Default for TyrePrior {
             curvature: 0.0,
             curvature_std_dev: 0.0,
             mu_max: None,
+            relaxation_m: 0.0,
+            relaxation_std_dev_m: 0.0,
+            rotor_ratio: 0.0,
+            rotor_std_dev_ratio: 0.0,
+            unexplained_ratio: 0.0,
         }
     }
 }
@@ -179,13 +220,34 @@ pub struct SensorSample {
     pub wheel_torques: Option<WheelTorques>,
 }
 
+/// Standard deviations of the errors of θ that no drive of a robot on one ground averages out.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct CommonError {
+    /// Of what is the robot's: mass, yaw inertia, torque constants, and of a segment what is left unknown
+    /// of radii and sensor offsets. One error of all that it measures.
+    pub robot: f64,
+    /// Of the tyres' curvature. One error of all robots on these tyres, where they slip alike.
+    pub tyres: f64,
+}
+
+impl CommonError {
+    /// Both together.
+    pub fn std_dev(&self) -> f64 {
+        self.robot.hypot(self.tyres)
+    }
+}
+
 /// What is known about the ground under the robot now.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ThetaMeasurement {
     /// θ = 1/K.
     pub theta: f64,
-    /// Its standard deviation, with that of the offsets and the torque constant.
+    /// Its standard deviation, with that of the offsets and of all common errors.
     pub std_dev: f64,
+    /// Standard deviation without the common errors: that of a robot compared with itself.
+    pub own_std_dev: f64,
+    /// The common errors.
+    pub common: CommonError,
     /// Blocks that carry the measurement, weighed by their share of its information.
     pub effective_samples: f64,
     /// Time that was used, seconds.

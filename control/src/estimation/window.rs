@@ -82,6 +82,8 @@ struct Part {
     ramp: [f64; 2],
     ramp_share: [f64; 2],
     ramp_samples: f64,
+    /// Gyro in the window's middle, radians per second, and of how many samples.
+    middle: [f64; 2],
 }
 
 /// Means over one window.
@@ -97,6 +99,9 @@ pub(super) struct TurnMeans {
     pub(super) ahead_mu: f64,
     pub(super) turn_rad_s: f64,
     pub(super) turn_acceleration_rad_s2: f64,
+    /// By how much that rises in the window's time, and the samples of its middle.
+    pub(super) turn_jerk_rad_s3: f64,
+    pub(super) middle_samples: f64,
     /// `u_R − u_L`, metres per second; driving in reverse it is that of the mirrored robot.
     pub(super) rim_difference_m_s: f64,
     /// `(u_R + u_L)/2`, metres per second, negative in reverse.
@@ -166,6 +171,13 @@ impl TurnWindow {
             ahead_mu: mean(part.ahead_mu),
             turn_rad_s: mean(part.turn),
             turn_acceleration_rad_s2: (rates[1] - rates[0]) / block_s,
+            turn_jerk_rad_s3: if part.middle[1] > 0.0 {
+                4.0 * (rates[0] + rates[1] - 2.0 * part.middle[0] / part.middle[1])
+                    / (block_s * block_s)
+            } else {
+                0.0
+            },
+            middle_samples: part.middle[1].max(1.0),
             rim_difference_m_s: mean(part.rim_difference),
             rim_mean_m_s: mean(part.rim_mean),
             swing: part.swing(),
@@ -218,6 +230,10 @@ impl Part {
         let arm_m = model.effective_track_m() - track_m * tight * tight;
         let ahead_m_s2 = rims.sign * acceleration.ahead_m_s2;
         let weight_s = share * dt_s;
+        if (time_s - 0.5 * (BLOCK_S + RAMP_S)).abs() <= 0.5 * RAMP_S {
+            self.middle[0] += sample.gyro_rad_s;
+            self.middle[1] += 1.0;
+        }
         self.weight_s += weight_s;
         self.samples += share;
         self.slip += weight_s * (turning_m_s - sample.gyro_rad_s * arm_m);

@@ -1,7 +1,7 @@
 //! `rough`: whether what agents say of the ground holds on robots unlike their own simulator.
 //!
 //! `cargo run --release -p tread-lab --bin rough -- [--runs N] [--seed N] [--only TEXT]
-//! [--tyres-unknown] [--json]`
+//! [--tyres-straight] [--json]`
 //!
 //! Every robot is configured with its data sheet and drives in the rough world. A line is one way of
 //! being different, or the population, in which everything differs at once. Printed are the share of
@@ -42,9 +42,9 @@ struct Arguments {
     /// Only lines whose name contains this
     #[arg(long, default_value = "")]
     only: String,
-    /// Configure agents for unknown tyres, instead of the default
+    /// Configure agents for tyres that rise straight at once, instead of the default
     #[arg(long)]
-    tyres_unknown: bool,
+    tyres_straight: bool,
     /// Print one JSON object instead of a table
     #[arg(long)]
     json: bool,
@@ -53,8 +53,8 @@ struct Arguments {
 impl Arguments {
     fn prior(&self) -> EstimatorPrior {
         let mut prior = EstimatorPrior::default();
-        if self.tyres_unknown {
-            prior.tyres = TyrePrior::unknown();
+        if self.tyres_straight {
+            prior.tyres = TyrePrior::default();
         }
         prior
     }

@@ -11,6 +11,8 @@ use super::file::EstimationFile;
 const RATIO_RANGE: RangeInclusive<f64> = 0.0..=1.0;
 /// Curvature of tyres and its standard deviation, per friction coefficient.
 const CURVATURE_RANGE: RangeInclusive<f64> = 0.0..=10.0;
+/// Relaxation length of tyres and its standard deviation, metres.
+const RELAXATION_RANGE_M: RangeInclusive<f64> = 0.0..=1.0;
 /// Friction coefficient up to which tyres rise as they are known to.
 const MU_RANGE: RangeInclusive<f64> = 0.05..=10.0;
 
@@ -49,11 +51,42 @@ pub(super) fn checked(file: EstimationFile) -> Result<EstimatorPrior, ConfigErro
             mu_max: file
                 .tyre_mu_max
                 .map(|mu_max| within("estimation.tyre_mu_max", Some(mu_max), mu_max, MU_RANGE))
-                .transpose()?,
+                .transpose()?
+                .or(tyres.mu_max),
+            relaxation_m: within(
+                "estimation.tyre_relaxation_m",
+                file.tyre_relaxation_m,
+                tyres.relaxation_m,
+                RELAXATION_RANGE_M,
+            )?,
+            relaxation_std_dev_m: within(
+                "estimation.tyre_relaxation_std_dev_m",
+                file.tyre_relaxation_std_dev_m,
+                tyres.relaxation_std_dev_m,
+                RELAXATION_RANGE_M,
+            )?,
+            rotor_ratio: within(
+                "estimation.rotor_ratio",
+                file.rotor_ratio,
+                tyres.rotor_ratio,
+                RATIO_RANGE,
+            )?,
+            rotor_std_dev_ratio: within(
+                "estimation.rotor_std_dev_ratio",
+                file.rotor_std_dev_ratio,
+                tyres.rotor_std_dev_ratio,
+                RATIO_RANGE,
+            )?,
             ..tyres
         },
         model: ModelUncertainty {
             mass_ratio: within(mass, file.mass_std_dev_ratio, model.mass_ratio, RATIO_RANGE)?,
+            payload_ratio: within(
+                "estimation.payload_ratio",
+                file.payload_ratio,
+                model.payload_ratio,
+                RATIO_RANGE,
+            )?,
             inertia_ratio: within(
                 inertia,
                 file.inertia_std_dev_ratio,

@@ -37,6 +37,11 @@ pub(super) struct EstimationFile {
     pub(super) tyre_curvature: Option<f64>,
     pub(super) tyre_curvature_std_dev: Option<f64>,
     pub(super) tyre_mu_max: Option<f64>,
+    pub(super) tyre_relaxation_m: Option<f64>,
+    pub(super) tyre_relaxation_std_dev_m: Option<f64>,
+    pub(super) rotor_ratio: Option<f64>,
+    pub(super) rotor_std_dev_ratio: Option<f64>,
+    pub(super) payload_ratio: Option<f64>,
 }
 
 /// `[recording]` in `robot.toml`.

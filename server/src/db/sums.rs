@@ -34,7 +34,7 @@ pub struct SumKey {
 }
 
 /// Numbers of a row.
-const COLUMNS: usize = 31;
+const COLUMNS: usize = 35;
 
 static ADD: LazyLock<RowsStatement> = LazyLock::new(|| {
     RowsStatement::new(
@@ -43,14 +43,15 @@ static ADD: LazyLock<RowsStatement> = LazyLock::new(|| {
              weighted_lo, square_hi, square_lo, track_information_hi, track_information_lo,
              track_weighted_hi, track_weighted_lo, rolling_information_hi, rolling_information_lo,
              rolling_weighted_hi, rolling_weighted_lo, segments, samples, mu_peak, newest_at_us,
-             newest_information, newest_weighted, newest_mu, pass_at_us)",
+             newest_information, newest_weighted, newest_mu, pass_at_us, robot_error_hi,
+             robot_error_lo, tyre_error_hi, tyre_error_lo)",
         COLUMNS,
         &added(),
     )
 });
 
 /// Numbers in fixed point, each in two halves.
-const FIXED: [&str; 7] = [
+const FIXED: [&str; 9] = [
     "information",
     "weighted",
     "square",
@@ -58,6 +59,8 @@ const FIXED: [&str; 7] = [
     "track_weighted",
     "rolling_information",
     "rolling_weighted",
+    "robot_error",
+    "tyre_error",
 ];
 /// What is kept of the pass that is kept by itself.
 const PASS: [&str; 4] = [
@@ -138,6 +141,10 @@ fn bind(row: &mut Row<'_>, (key, sums): &(&SumKey, &Sums)) -> Result<(), DbError
         .add(newest.theta.map(|theta| theta.weighted))?
         .add(newest.mu_peak)?
         .add(newest.ended_at_us)?;
+    for fixed in [sums.robot_error, sums.tyre_error] {
+        let (hi, lo) = fixed.halves().ok_or(DbError::DoesNotFit("sum"))?;
+        row.add(hi)?.add(lo)?;
+    }
     Ok(())
 }
 
@@ -192,6 +199,10 @@ struct Raw {
     newest_weighted: Option<f64>,
     newest_mu: Option<f64>,
     pass_at_us: i64,
+    robot_error_hi: i64,
+    robot_error_lo: i64,
+    tyre_error_hi: i64,
+    tyre_error_lo: i64,
 }
 
 impl TryFrom<Raw> for SumRow {
@@ -227,6 +238,8 @@ impl TryFrom<Raw> for SumRow {
                 weighted: fixed(raw.weighted_hi, raw.weighted_lo),
             },
             theta_square: fixed(raw.square_hi, raw.square_lo),
+            robot_error: fixed(raw.robot_error_hi, raw.robot_error_lo),
+            tyre_error: fixed(raw.tyre_error_hi, raw.tyre_error_lo),
             track: Pair {
                 information: fixed(raw.track_information_hi, raw.track_information_lo),
                 weighted: fixed(raw.track_weighted_hi, raw.track_weighted_lo),
@@ -262,7 +275,7 @@ pub async fn each(db: &mut SqliteConnection, mut take: impl FnMut(SumRow)) -> Re
                track_weighted_hi, track_weighted_lo, rolling_information_hi,
                rolling_information_lo, rolling_weighted_hi, rolling_weighted_lo, segments,
                samples, mu_peak, newest_at_us, newest_information, newest_weighted, newest_mu,
-               pass_at_us
+               pass_at_us, robot_error_hi, robot_error_lo, tyre_error_hi, tyre_error_lo
            FROM cell_sums"#,
     )
     .fetch(db);
@@ -301,7 +314,7 @@ pub async fn unmerged(
                track_weighted_hi, track_weighted_lo, rolling_information_hi,
                rolling_information_lo, rolling_weighted_hi, rolling_weighted_lo, segments,
                samples, mu_peak, newest_at_us, newest_information, newest_weighted, newest_mu,
-               pass_at_us
+               pass_at_us, robot_error_hi, robot_error_lo, tyre_error_hi, tyre_error_lo
            FROM cell_sums WHERE robot_pk = ?1 AND epoch_h < ?2 AND epoch_h % 24 <> 0
            LIMIT ?3"#,
         robot_pk,

@@ -5,6 +5,12 @@
 //! `Σ w_r θ_r / Σ w_r`, found by iterating: each robot's own θ there would make intervals too
 //! small. The variance of θ is `1 / Σ w_r`.
 //!
+//! `Λ_e` is the information of independent errors. What a robot says of the error that all its
+//! segments have in common takes the place of `s_b` where it is more; that which all robots on the same
+//! tyres have in common, `t·θ`, is added to the deviation once and never averages out. Among three
+//! robots or more no robot's bias counts as less than the median, and `t` is the median, so that
+//! no robot is heavier or makes the interval wider by what it says of its errors.
+//!
 //! A friction coefficient counts when a second robot has shown as much; of one robot alone up to
 //! [`MU_ALONE_MAX`]. No robot can raise the limits of others by its word.
 //!
@@ -14,9 +20,9 @@
 //! (more slip) is believed from the first pass, good news when a second one confirms it, which must
 //! be another robot's if several others say otherwise; until then the estimate is disputed.
 
-use tread_api::friction::{Information, NORMAL_95};
+use tread_api::friction::{Information, NORMAL_95, TYRE_DIFFERENCE_SHARE};
 
-use super::joined::{Room, joined};
+use super::joined::{Room, Said, joined};
 use super::sums::{Known, Sums};
 use crate::config::FrictionConfig;
 
@@ -39,8 +45,13 @@ pub struct Seen<R> {
     pub robot: R,
     /// First hour of the epoch.
     pub epoch_h: i64,
-    /// θ.
+    /// θ, with its independent error.
     pub theta: Known,
+    /// Standard deviation of the error that the robot has everywhere, as a share of θ; 0 if it does
+    /// not tell.
+    pub robot_ratio: f64,
+    /// The same of the error that all robots on its tyres have.
+    pub tyre_ratio: f64,
     /// Σ Λ·(θ − mean)² of the passes, which is χ² with one degree less than passes.
     pub scatter: f64,
     /// How many passes.
@@ -68,6 +79,8 @@ impl<R> Seen<R> {
             robot,
             epoch_h,
             theta,
+            robot_ratio: sums.robot_error.to_f64() / theta.information,
+            tyre_ratio: sums.tyre_error.to_f64() / theta.information,
             scatter: scatter.max(0.0),
             passes: sums.segments,
             newest_at_us: sums.newest_at_us,
@@ -103,9 +116,22 @@ impl<R> Seen<R> {
             information,
             value: weighted / information,
         };
-        let variance = newest.information.recip() + information.recip();
+        let variance = newest.information.recip()
+            + information.recip()
+            + (self.tyre_difference_ratio() * self.theta.value).powi(2);
         ((newest.value - before.value).abs() > CHANGE_DEVIATIONS * variance.sqrt())
             .then_some((newest, before))
+    }
+
+    /// Deviation of this robot's bias as a share of θ: what it says of itself, and no less than what
+    /// is reckoned with.
+    pub(super) fn bias_ratio(&self, config: &FrictionConfig) -> f64 {
+        self.robot_ratio.max(config.robot_bias_ratio)
+    }
+
+    /// By how much the tyres' errors of two measurements like this one differ, as a share of θ.
+    fn tyre_difference_ratio(&self) -> f64 {
+        TYRE_DIFFERENCE_SHARE * self.tyre_ratio
     }
 
     fn with_newest_alone(mut self, newest: Known) -> Self {
@@ -264,14 +290,28 @@ fn fuse_in<R: Ord + Copy>(
     });
     let drift = config.drift_variance_per_s;
     let words = &mut room.room;
-    let (theta, spread) = joined(seen, words, |one| Some(one.theta), config, (now_us, drift))?;
+    let said = |one: &Seen<R>| {
+        Some(Said {
+            known: one.theta,
+            bias_ratio: one.bias_ratio(config),
+            tyre_ratio: one.tyre_ratio,
+        })
+    };
+    let (theta, spread) = joined(seen, words, said, (now_us, drift))?;
     let std_dev = theta.std_dev * spread.widening();
     if std_dev > THETA_STD_DEV_MAX {
         return None;
     }
     let mut layer = |value_of: fn(&Seen<R>) -> Option<Known>| {
         let is_known = seen.iter().any(|one| value_of(one).is_some());
-        let joined = is_known.then(|| joined(seen, words, value_of, config, (now_us, 0.0)));
+        let said = |one: &Seen<R>| {
+            value_of(one).map(|known| Said {
+                known,
+                bias_ratio: config.robot_bias_ratio,
+                tyre_ratio: 0.0,
+            })
+        };
+        let joined = is_known.then(|| joined(seen, words, said, (now_us, 0.0)));
         joined.flatten().map(|joined| joined.0)
     };
     let (track, rolling) = (layer(|one| one.track), layer(|one| one.rolling));
@@ -394,24 +434,20 @@ fn lone_witness<R: Ord + Copy>(
     contradicted: &[Seen<R>],
     config: &FrictionConfig,
 ) -> Option<R> {
-    let (mut information, mut weighted) = (0.0, 0.0);
+    let mut now = Word::default();
     for one in kept {
-        information += one.theta.information;
-        weighted += one.theta.information * one.theta.value;
+        now.add(Word::of(one, one.theta, config));
     }
-    let now = Known {
-        information,
-        value: weighted / information,
-    };
     let mut worse = contradicted
         .iter()
-        .filter(|one| is_better(now, one.theta, config));
+        .filter(|one| now.is_better(&Word::of(one, one.theta, config)));
     let first = worse.next()?;
+    let against = Word::of(first, first.theta, config);
     // A robot of which all is kept contradicts itself, and nobody else.
     let second = worse.find(|one| one.robot != first.robot)?;
     let mut witnesses = kept
         .iter()
-        .filter(|one| is_better(one.theta, first.theta, config))
+        .filter(|one| Word::of(one, one.theta, config).is_better(&against))
         .map(|one| one.robot);
     let lone = witnesses.next()?;
     let is_alone = witnesses.all(|robot| robot == lone);
@@ -421,14 +457,58 @@ fn lone_witness<R: Ord + Copy>(
     (is_alone && !is_of_others).then_some(lone)
 }
 
-/// Whether one word says significantly less slip than another, robots' biases included.
-fn is_better(one: Known, other: Known, config: &FrictionConfig) -> bool {
-    let information = one.information + other.information;
-    let common = (one.information * one.value + other.information * other.value) / information;
-    let variance = one.information.recip()
-        + other.information.recip()
-        + 2.0 * (config.robot_bias_ratio * common).powi(2);
-    other.value - one.value > CHANGE_DEVIATIONS * variance.sqrt()
+/// θ of one or several measurements, with what it takes to compare them: sums of information, and of
+/// information times θ, the robots' bias and the tyres' error, both as shares of θ.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Word {
+    information: f64,
+    weighted: f64,
+    bias: f64,
+    tyre: f64,
+}
+
+impl Word {
+    fn of<R>(one: &Seen<R>, theta: Known, config: &FrictionConfig) -> Self {
+        Self {
+            information: theta.information,
+            weighted: theta.information * theta.value,
+            bias: theta.information * one.bias_ratio(config),
+            tyre: theta.information * one.tyre_ratio,
+        }
+    }
+
+    fn add(&mut self, other: Self) {
+        self.information += other.information;
+        self.weighted += other.weighted;
+        self.bias += other.bias;
+        self.tyre += other.tyre;
+    }
+
+    fn value(&self) -> f64 {
+        self.weighted / self.information
+    }
+
+    /// How far their difference may be off if nothing has changed, as a variance: without the robots'
+    /// biases where both are of one robot.
+    fn difference_variance(&self, other: &Self, is_one_robot: bool) -> f64 {
+        // If nothing has changed, robots differ by a share of the θ that they have in common, which
+        // is nearest to what is known best, not of the larger one.
+        let common = (self.weighted + other.weighted) / (self.information + other.information);
+        let (mine, its) = (self.information, other.information);
+        let bias = if is_one_robot {
+            0.0
+        } else {
+            (self.bias / mine).powi(2) + (other.bias / its).powi(2)
+        };
+        let tyre = TYRE_DIFFERENCE_SHARE * (self.tyre / mine).max(other.tyre / its);
+        mine.recip() + its.recip() + (bias + tyre * tyre) * common * common
+    }
+
+    /// Whether it says significantly less slip than another, robots' biases included.
+    fn is_better(&self, other: &Self) -> bool {
+        let variance = self.difference_variance(other, false);
+        other.value() - self.value() > CHANGE_DEVIATIONS * variance.sqrt()
+    }
 }
 
 /// How many of the newest agree, those that changed within their epoch cut down to their newest
@@ -439,30 +519,19 @@ fn keep_present<R: Ord + Copy>(
 ) -> (usize, Option<i64>) {
     let mut changed_at_us = None;
     let mut oldest_kept_us = None;
-    // Λ and Λ·θ of what is kept, and whose it is while it is one robot's.
-    let (mut information, mut weighted) = (0.0_f64, 0.0_f64);
+    // What is kept, and whose it is while it is one robot's.
+    let mut kept = Word::default();
     let mut only: Option<R> = None;
     let mut newest_kept_us = 0;
     for (index, one) in seen.iter_mut().enumerate() {
         let mixed = one.contradicted();
-        let word = mixed.map_or(one.theta, |(newest, _before)| newest);
-        if information > 0.0 {
-            let mean = weighted / information;
-            let bias = if only == Some(one.robot) {
-                0.0
-            } else {
-                // If nothing has changed, robots differ by a share of the θ that they have in
-                // common, which is nearest to what is known best, not of the larger one.
-                let common =
-                    (weighted + word.information * word.value) / (information + word.information);
-                2.0 * (config.robot_bias_ratio * common).powi(2)
-            };
+        let theta = mixed.map_or(one.theta, |(newest, _before)| newest);
+        let word = Word::of(one, theta, config);
+        if kept.information > 0.0 {
             let apart_s = seconds(newest_kept_us - one.newest_at_us);
-            let variance = information.recip()
-                + word.information.recip()
-                + bias
+            let variance = kept.difference_variance(&word, only == Some(one.robot))
                 + config.drift_variance_per_s * apart_s;
-            if (word.value - mean).abs() > CHANGE_DEVIATIONS * variance.sqrt() {
+            if (word.value() - kept.value()).abs() > CHANGE_DEVIATIONS * variance.sqrt() {
                 return (index, oldest_kept_us.or(changed_at_us));
             }
             if only != Some(one.robot) {
@@ -477,8 +546,7 @@ fn keep_present<R: Ord + Copy>(
             *one = one.with_newest_alone(newest);
             changed_at_us = Some(one.newest_at_us);
         }
-        information += word.information;
-        weighted += word.information * word.value;
+        kept.add(word);
     }
     (seen.len(), changed_at_us)
 }

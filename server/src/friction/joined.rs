@@ -11,7 +11,6 @@ use tread_api::friction::NORMAL_95;
 
 use super::fuse::{Estimate, Ground, Seen, age_s};
 use super::sums::Known;
-use crate::config::FrictionConfig;
 
 /// Most rounds of the iteration for the common θ; it settles within about ten.
 const ROUNDS_MAX: u32 = 100;
@@ -27,6 +26,18 @@ const GROUP_CHI_SQUARE_MAX: f64 = 4.0;
 pub(super) struct Room {
     robots: Vec<Word>,
     groups: Vec<Group>,
+    ratios: Vec<f64>,
+}
+
+/// What one robot says in one epoch.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Said {
+    /// The value, with its independent error.
+    pub(super) known: Known,
+    /// Deviation of the robot's bias as a share of the value.
+    pub(super) bias_ratio: f64,
+    /// Deviation of the error that all robots on its tyres have, as a share of the value.
+    pub(super) tyre_ratio: f64,
 }
 
 /// What one robot says, with the variance that its own measurements leave.
@@ -34,6 +45,15 @@ pub(super) struct Room {
 struct Word {
     variance: f64,
     value: f64,
+    bias_ratio: f64,
+    tyre_ratio: f64,
+}
+
+impl Word {
+    /// Its weight beside other robots, about their common value.
+    fn weight(&self, common: f64) -> f64 {
+        ((self.bias_ratio * common).powi(2) + self.variance).recip()
+    }
 }
 
 /// How far apart measurements lie, as sums of squares with their degrees of freedom.
@@ -90,21 +110,29 @@ fn as_f64(count: u64) -> f64 {
 /// measurement's variance with its age.
 pub(super) fn joined<R: Ord + Copy>(
     seen: &[Seen<R>],
-    Room { robots, groups }: &mut Room,
-    value_of: impl Fn(&Seen<R>) -> Option<Known>,
-    config: &FrictionConfig,
+    Room {
+        robots,
+        groups,
+        ratios,
+    }: &mut Room,
+    said_of: impl Fn(&Seen<R>) -> Option<Said>,
     (now_us, drift): (i64, f64),
 ) -> Option<(Estimate, Spread)> {
     robots.clear();
     let mut spread = Spread::default();
     for epochs in seen.chunk_by(|left, right| left.robot == right.robot) {
         let (mut information, mut weighted, mut square) = (0.0, 0.0, 0.0);
+        // One robot's biases of two epochs are one, so their deviations add up, not their squares.
+        let (mut bias, mut tyre) = (0.0, 0.0);
         for one in epochs {
-            let Some(known) = value_of(one) else { continue };
+            let Some(said) = said_of(one) else { continue };
+            let known = said.known;
             let weight = (known.information.recip() + drift * age_s(one, now_us)).recip();
             information += weight;
             weighted += weight * known.value;
             square += weight * known.value * known.value;
+            bias += weight * said.bias_ratio;
+            tyre += weight * said.tyre_ratio;
             spread.within_freedom += 1;
             spread.scatter += one.scatter;
             spread.scatter_freedom += one.passes.saturating_sub(1);
@@ -114,7 +142,12 @@ pub(super) fn joined<R: Ord + Copy>(
             spread.within += (square - weighted * value).max(0.0);
             spread.within_freedom -= 1;
             let variance = f64::recip(information);
-            robots.push(Word { variance, value });
+            robots.push(Word {
+                variance,
+                value,
+                bias_ratio: bias / information,
+                tyre_ratio: tyre / information,
+            });
         }
     }
     // Who knows next to nothing is no check on the others.
@@ -124,24 +157,24 @@ pub(super) fn joined<R: Ord + Copy>(
     }
     spread.robots = u32::try_from(robots.len()).unwrap_or(u32::MAX);
     if robots.len() >= ROBUST_ROBOTS_MIN {
-        return Some(hull_of_groups(robots, groups, spread, config));
+        return Some(hull_of_groups(robots, (groups, ratios), spread));
     }
     let (mut value, mut information) = weighed(robots, 0.0)?;
     for _ in 0..ROUNDS_MAX {
-        let bias_variance = (config.robot_bias_ratio * value).powi(2);
-        let (next, sum) = weighed(robots, bias_variance)?;
+        let (next, sum) = weighed(robots, value)?;
         let change = (next - value).abs();
         (value, information) = (next, sum);
         if change <= SETTLED_RATIO * value.abs() {
             break;
         }
     }
-    let bias_variance = (config.robot_bias_ratio * value).powi(2);
+    let mut tyre_ratio = 0.0;
     for robot in robots.iter() {
-        let weight = (bias_variance + robot.variance).recip();
+        let weight = robot.weight(value);
         spread.between += weight * (robot.value - value).powi(2);
+        tyre_ratio += weight * robot.tyre_ratio / information;
     }
-    let std_dev = information.sqrt().recip();
+    let std_dev = information.sqrt().recip().hypot(tyre_ratio * value);
     Some((Estimate { value, std_dev }, spread))
 }
 
@@ -160,8 +193,8 @@ struct Group {
 }
 
 impl Group {
-    fn plus(self, robot: &Word, bias_variance: f64, origin: f64) -> Self {
-        let weight = (bias_variance + robot.variance).recip();
+    fn plus(self, robot: &Word, origin: f64) -> Self {
+        let weight = robot.weight(origin);
         let value = robot.value - origin;
         Self {
             weight: self.weight + weight,
@@ -187,9 +220,8 @@ impl Group {
 /// the best.
 fn hull_of_groups(
     robots: &mut [Word],
-    behind: &mut Vec<Group>,
+    (behind, ratios): (&mut Vec<Group>, &mut Vec<f64>),
     mut spread: Spread,
-    config: &FrictionConfig,
 ) -> (Estimate, Spread) {
     robots.sort_unstable_by(|left, right| {
         let by_value = left.value.total_cmp(&right.value);
@@ -202,12 +234,23 @@ fn hull_of_groups(
     } else {
         f64::midpoint(robots[middle - 1].value, robots[middle].value)
     };
-    let bias_variance = (config.robot_bias_ratio * median).powi(2);
+    // Nor does one that claims to have hardly any bias, or tyres of which nobody knows anything.
+    let mut middle_of = |ratio_of: fn(&Word) -> f64| {
+        ratios.clear();
+        ratios.extend(robots.iter().map(ratio_of));
+        let middle = (ratios.len() - 1) / 2;
+        *ratios.select_nth_unstable_by(middle, f64::total_cmp).1
+    };
+    let bias_ratio = middle_of(|robot| robot.bias_ratio);
+    let tyre_ratio = middle_of(|robot| robot.tyre_ratio);
+    for robot in robots.iter_mut() {
+        robot.bias_ratio = robot.bias_ratio.max(bias_ratio);
+    }
     // What comes behind each robot; with what comes before it that is all but that robot.
     behind.clear();
     behind.resize(robots.len() + 1, Group::default());
     for (index, robot) in robots.iter().enumerate().rev() {
-        behind[index] = behind[index + 1].plus(robot, bias_variance, median);
+        behind[index] = behind[index + 1].plus(robot, median);
     }
     spread.between = behind[0].chi_square();
     let mut before = Group::default();
@@ -215,7 +258,7 @@ fn hull_of_groups(
     for (index, left_out) in robots.iter().enumerate() {
         behind[index] = before.and(behind[index + 1]);
         least = least.min(behind[index].chi_square());
-        before = before.plus(left_out, bias_variance, median);
+        before = before.plus(left_out, median);
     }
     let groups = &behind[..robots.len()];
     let freedom = u64::from(spread.robots.saturating_sub(2));
@@ -236,18 +279,19 @@ fn hull_of_groups(
         let half = NORMAL_95 * widening * group.weight.sqrt().recip();
         (low, high) = (low.min(mean - half), high.max(mean + half));
     }
+    let value = f64::midpoint(low, high);
     let estimate = Estimate {
-        value: f64::midpoint(low, high),
-        std_dev: (high - low) / (2.0 * NORMAL_95),
+        value,
+        std_dev: ((high - low) / (2.0 * NORMAL_95)).hypot(tyre_ratio * value),
     };
     (estimate, spread)
 }
 
-/// The mean of robots with this variance of their bias, and its information.
-fn weighed(robots: &[Word], bias_variance: f64) -> Option<(f64, f64)> {
+/// The mean of robots whose biases are shares of this value, and its information.
+fn weighed(robots: &[Word], common: f64) -> Option<(f64, f64)> {
     let (mut sum, mut weighted) = (0.0, 0.0);
     for robot in robots {
-        let weight = (bias_variance + robot.variance).recip();
+        let weight = robot.weight(common);
         sum += weight;
         weighted += weight * robot.value;
     }

@@ -58,6 +58,8 @@ impl Fused {
 }
 
 #[cfg(test)]
+mod common;
+#[cfg(test)]
 mod coverage;
 #[cfg(test)]
 mod liars;

@@ -100,6 +100,18 @@ impl Pass {
     }
 }
 
+/// θ with the information of its independent error; all of it where the robot tells nothing apart.
+fn independent(segment: &Segment) -> Information {
+    let theta = segment.theta;
+    let Some((errors, value)) = segment.theta_errors.zip(theta.value()) else {
+        return theta;
+    };
+    Information {
+        information: errors.independent_information,
+        weighted: errors.independent_information * value,
+    }
+}
+
 /// Bits that compare as the numbers do.
 fn ordered(value: f64) -> i64 {
     let bits = value.to_bits().cast_signed();
@@ -113,6 +125,10 @@ pub struct Sums {
     pub theta: Pair,
     /// Σ Λ·θ², which tells how far the measurements differ among themselves.
     pub theta_square: Fixed,
+    /// Σ Λ times the common error of the robot, as a share of θ.
+    pub robot_error: Fixed,
+    /// Σ Λ times the common error of the tyres, as a share of θ.
+    pub tyre_error: Fixed,
     /// Ratio of effective to geometric track.
     pub track: Pair,
     /// Rolling resistance coefficient.
@@ -132,7 +148,10 @@ pub struct Sums {
 impl Sums {
     /// The statistics of one segment; `None` if its numbers leave the range of fixed point.
     pub fn of(segment: &Segment) -> Option<Self> {
-        let theta = segment.theta;
+        // What a robot has in common with itself or with its like does not add up: it is kept beside
+        // what does, and told only once for all.
+        let errors = segment.theta_errors;
+        let theta = independent(segment);
         let square = if theta.information > 0.0 {
             theta.weighted * theta.weighted / theta.information
         } else {
@@ -145,6 +164,12 @@ impl Sums {
         Some(Self {
             theta: Pair::of(&theta)?,
             theta_square: Fixed::from_f64(square)?,
+            robot_error: Fixed::from_f64(
+                errors.map_or(0.0, |errors| theta.information * errors.robot_ratio),
+            )?,
+            tyre_error: Fixed::from_f64(
+                errors.map_or(0.0, |errors| theta.information * errors.tyre_ratio),
+            )?,
             track: pair(&segment.effective_track_ratio)?,
             rolling: pair(&segment.rolling_resistance)?,
             segments: 1,
@@ -163,6 +188,8 @@ impl Sums {
     pub fn add(&mut self, other: &Self) {
         self.theta.add(&other.theta);
         self.theta_square += other.theta_square;
+        self.robot_error += other.robot_error;
+        self.tyre_error += other.tyre_error;
         self.track.add(&other.track);
         self.rolling.add(&other.rolling);
         self.segments += other.segments;

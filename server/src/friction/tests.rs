@@ -31,6 +31,8 @@ pub(super) fn measured(theta: f64, std_dev: f64, age_s: i64) -> Sums {
             weighted: fixed(information * theta),
         },
         theta_square: fixed(information * theta * theta),
+        robot_error: Fixed::default(),
+        tyre_error: Fixed::default(),
         track: Pair::default(),
         rolling: Pair::default(),
         segments: 1,

@@ -7,7 +7,7 @@ use jiff::Timestamp;
 use serde_json::json;
 use tempfile::TempDir;
 use tokio::sync::{Mutex, oneshot};
-use tread_api::friction::{Information, Segment};
+use tread_api::friction::{Information, Segment, ThetaErrors};
 use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
 use tread_api::mission::CreateMission;
 use tread_api::robot::{Capabilities, RobotModel};
@@ -259,6 +259,11 @@ pub(crate) fn segment(number: u64) -> Record {
                 information: 1e4,
                 weighted: 2e3 + f64::from(small),
             },
+            theta_errors: (number % 2 == 1).then_some(ThetaErrors {
+                independent_information: 1e4,
+                robot_ratio: 0.12,
+                tyre_ratio: 0.1,
+            }),
             effective_track_ratio: None,
             rolling_resistance: None,
             mu_peak_lower_bound: Some(0.4),

@@ -339,6 +339,7 @@ pub(crate) fn segment(cell: (i32, i32), theta: f64, second: i64) -> Segment {
             information: 1e4,
             weighted: 1e4 * theta,
         },
+        theta_errors: None,
         effective_track_ratio: None,
         rolling_resistance: None,
         mu_peak_lower_bound: Some(0.4),

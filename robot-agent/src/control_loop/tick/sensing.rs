@@ -3,6 +3,7 @@
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use tread_api::friction::TYRE_DIFFERENCE_SHARE;
 use tread_control::estimation::{SensorNoise, SensorSample};
 use tread_control::localisation::{FixOutcome, PositionFix};
 use tread_control::paper::BodyVelocity;
@@ -149,9 +150,11 @@ impl LoopCore {
     /// What is known of the ground: what was measured, and what the map knows of the cell. The
     /// estimator itself never hears of the map.
     pub(super) fn ground(&self, prior: &Prior) -> GroundRecord {
+        // What is wrong in all that this robot measures is right for itself: its law feeds slip
+        // forward by the same mass, inertia and tyres.
         let measured = self.estimate.theta.map(|measured| ThetaKnowledge {
             theta: measured.theta,
-            std_dev: measured.std_dev,
+            std_dev: measured.own_std_dev,
         });
         let site = self.site.as_ref();
         let mapped = site.zip(self.localisation.pose()).and_then(|(site, pose)| {
@@ -183,10 +186,13 @@ impl LoopCore {
             cell: segment.cell,
             measured: ThetaKnowledge {
                 theta,
-                std_dev: statistics.theta_information.sqrt().recip(),
+                std_dev: statistics.own_information.sqrt().recip(),
             },
             expected,
-            robot_bias_ratio: prior.robot_bias_ratio(),
+            robot_bias_ratio: prior
+                .robot_bias_ratio()
+                .max(statistics.common_ratio.robot)
+                .hypot(TYRE_DIFFERENCE_SHARE * statistics.common_ratio.tyres),
         };
         active.compare(&comparison);
         self.surface.note(comparison);

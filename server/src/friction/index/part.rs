@@ -24,8 +24,8 @@ pub(super) struct PartKey {
 /// Sums as they are kept in memory: the same numbers in less room.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Part {
-    hi: [i64; 7],
-    lo: [u32; 7],
+    hi: [i64; 9],
+    lo: [u32; 9],
     pub(super) key: PartKey,
     segments: u32,
     /// A friction coefficient in steps, plus one; 0 for none.
@@ -55,8 +55,8 @@ fn unpack_mu(steps: u32) -> Option<f64> {
 impl Part {
     pub(super) fn new(key: PartKey, sums: &Sums) -> Self {
         let mut part = Self {
-            hi: [0; 7],
-            lo: [0; 7],
+            hi: [0; 9],
+            lo: [0; 9],
             key,
             segments: u32::try_from(sums.segments).unwrap_or(u32::MAX),
             mu_peak: pack_mu(sums.mu_peak),
@@ -74,6 +74,8 @@ impl Part {
             sums.track.weighted,
             sums.rolling.information,
             sums.rolling.weighted,
+            sums.robot_error,
+            sums.tyre_error,
         ];
         for (index, fixed) in fixed.into_iter().enumerate() {
             // Beyond this the database has refused the sum.
@@ -93,6 +95,8 @@ impl Part {
         Sums {
             theta: pair(0),
             theta_square: fixed(2),
+            robot_error: fixed(7),
+            tyre_error: fixed(8),
             track: pair(3),
             rolling: pair(5),
             segments: u64::from(self.segments),
@@ -144,6 +148,8 @@ impl Part {
             robot,
             epoch_h: i64::from(self.key.epoch_h),
             theta,
+            robot_ratio: number(7) / theta.information,
+            tyre_ratio: number(8) / theta.information,
             scatter: scatter.max(0.0),
             passes: u64::from(self.segments),
             newest_at_us: self.newest_at_us,
@@ -185,12 +191,14 @@ mod tests {
     proptest! {
         #[test]
         fn what_a_part_has_seen_is_what_its_sums_have_seen_to_the_bit(
-            numbers in prop::array::uniform7(fixed()), segments in 1_u64..9, mu in prop::option::of(0.0_f64..3.0),
+            numbers in prop::array::uniform9(fixed()), segments in 1_u64..9, mu in prop::option::of(0.0_f64..3.0),
         ) {
             let pair = |index: usize| Pair { information: numbers[index], weighted: numbers[index + 1] };
             let sums = Sums {
                 theta: pair(0),
                 theta_square: numbers[2],
+                robot_error: numbers[7],
+                tyre_error: numbers[8],
                 track: pair(3),
                 rolling: pair(5),
                 segments,
