@@ -2,7 +2,6 @@
 //! [rights](crate::rights).
 
 use std::fmt;
-use std::str::FromStr;
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -10,6 +9,7 @@ use utoipa::ToSchema;
 
 use crate::ids::{PersonId, SessionId, TokenId};
 use crate::rights::{Grant, Right, Rights, Scope, SiteScope};
+pub use crate::rights::{InvalidRole, Role};
 
 /// Most days that a token may be valid.
 pub const TOKEN_DAYS_MAX: u32 = 1_826;
@@ -17,58 +17,6 @@ pub const TOKEN_DAYS_MAX: u32 = 1_826;
 pub const TOKEN_DAYS_DEFAULT: u32 = 90;
 /// Longest name of a token, in characters.
 pub const TOKEN_NAME_MAX: usize = 80;
-
-/// A named bundle of rights; each role has those of the ones before it.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
-)]
-#[serde(rename_all = "snake_case")]
-pub enum Role {
-    /// Sees everything but tokens and the audit log, and may stop robots.
-    Viewer,
-    /// Gives missions, draws terrains, drives robots: every right but `administer`.
-    Operator,
-    /// Makes sites, gives and revokes tokens, reads the audit log: every right.
-    Admin,
-}
-
-impl Role {
-    /// Every role, the weakest first.
-    pub const ALL: [Self; 3] = [Self::Viewer, Self::Operator, Self::Admin];
-
-    /// The name on the wire.
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::Viewer => "viewer",
-            Self::Operator => "operator",
-            Self::Admin => "admin",
-        }
-    }
-
-    /// The role of that name.
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|role| role.as_str() == name)
-    }
-}
-
-impl fmt::Display for Role {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.write_str(self.as_str())
-    }
-}
-
-/// Why a text is no role.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("a role is `viewer`, `operator` or `admin`")]
-pub struct InvalidRole;
-
-impl FromStr for Role {
-    type Err = InvalidRole;
-
-    fn from_str(text: &str) -> Result<Self, InvalidRole> {
-        Self::from_name(text).ok_or(InvalidRole)
-    }
-}
 
 /// A token as it is listed: everything but its secret, which nobody keeps.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]

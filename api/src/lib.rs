@@ -29,6 +29,7 @@ pub mod rights;
 pub mod robot;
 pub mod safety;
 pub mod site;
+pub mod start_policy;
 pub mod startup;
 pub mod stop;
 pub mod terrain;

@@ -10,6 +10,7 @@ pub use self::event::{Actor, Cause, MissionEvent};
 use crate::geometry::{Point, Pose};
 use crate::ids::{BootId, MissionId, PlanHash, RobotId, SiteId};
 use crate::robot::MissionProgress;
+pub use crate::start_policy::StartPolicy;
 use crate::trajectory::Trajectory;
 
 /// Longest reason or detail in a mission's history, in characters.
@@ -127,19 +128,6 @@ pub struct CreateMission {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 1.0, maximum = 86_400.0)]
     pub lost_after_s: Option<f64>,
-}
-
-/// What becomes of a robot's other missions when one is asked for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum StartPolicy {
-    /// The new one waits for its turn.
-    #[default]
-    Append,
-    /// The others are cancelled: the one in hand, and all that wait.
-    Replace,
-    /// The new one is refused if the robot has any other that has not ended.
-    Refuse,
 }
 
 /// What a robot does with its mission when it no longer hears the server.

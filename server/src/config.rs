@@ -16,6 +16,7 @@ use tread_api::ids::{ConfigurationId, SiteId};
 use self::oidc::{OidcConfig, OidcConfigError};
 use crate::authority::is_port_name;
 use crate::friction::index::Normalisation;
+pub use crate::friction::weights::FrictionConfig;
 use crate::identity::address::Network;
 use crate::identity::origin::{Names, Origin};
 
@@ -243,51 +244,26 @@ impl StorageConfig {
     }
 }
 
-/// How measurements of several robots and times are weighed.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct FrictionConfig {
-    /// Standard deviation of one robot's own bias as a share of θ, `s_b`; 0 to 1.
-    pub robot_bias_ratio: f64,
-    /// Growth of a measurement's variance with its age, `q`, θ² per second; not negative.
-    pub drift_variance_per_s: f64,
-    /// How long a friction coefficient that was seen says something of the ground, seconds; 1 to
-    /// 10⁹.
-    pub mu_peak_age_max_s: f64,
-}
-
-impl Default for FrictionConfig {
-    fn default() -> Self {
-        Self {
-            robot_bias_ratio: 0.08,
-            // A deviation of 0.02 after a day: a tenth of θ on ordinary ground.
-            drift_variance_per_s: 4.6e-9,
-            mu_peak_age_max_s: 6.0 * 3_600.0,
+/// Refuses weights that make no sense.
+fn check_friction(friction: FrictionConfig) -> Result<(), ConfigError> {
+    let FrictionConfig {
+        robot_bias_ratio,
+        drift_variance_per_s,
+        mu_peak_age_max_s,
+    } = friction;
+    let ratio = ("0 to 1", 0.0..=1.0);
+    let span = ("1 to 1e9", 1.0..=1.0e9);
+    for (key, value, (range, bounds)) in [
+        ("friction.robot_bias_ratio", robot_bias_ratio, ratio.clone()),
+        ("friction.drift_variance_per_s", drift_variance_per_s, ratio),
+        ("friction.mu_peak_age_max_s", mu_peak_age_max_s, span),
+    ] {
+        // TOML can say `nan`, which no range contains.
+        if !bounds.contains(&value) {
+            return Err(ConfigError::OutOfRange { key, range, value });
         }
     }
-}
-
-impl FrictionConfig {
-    fn check(&self) -> Result<(), ConfigError> {
-        let Self {
-            robot_bias_ratio,
-            drift_variance_per_s,
-            mu_peak_age_max_s,
-        } = *self;
-        let ratio = ("0 to 1", 0.0..=1.0);
-        let span = ("1 to 1e9", 1.0..=1.0e9);
-        for (key, value, (range, bounds)) in [
-            ("friction.robot_bias_ratio", robot_bias_ratio, ratio.clone()),
-            ("friction.drift_variance_per_s", drift_variance_per_s, ratio),
-            ("friction.mu_peak_age_max_s", mu_peak_age_max_s, span),
-        ] {
-            // TOML can say `nan`, which no range contains.
-            if !bounds.contains(&value) {
-                return Err(ConfigError::OutOfRange { key, range, value });
-            }
-        }
-        Ok(())
-    }
+    Ok(())
 }
 
 /// One normalisation of the configuration file.
@@ -479,7 +455,7 @@ impl Config {
         }
         self.retention.check()?;
         self.storage.check()?;
-        self.friction.check()
+        check_friction(self.friction)
     }
 }
 

@@ -6,7 +6,7 @@ use utoipa::ToSchema;
 use super::Trajectory;
 use crate::geometry::{Point, Pose};
 use crate::ids::{MissionId, RobotId, SiteId};
-use crate::mission::StartPolicy;
+use crate::start_policy::StartPolicy;
 
 /// The body of `POST /v1/trajectories/check`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]

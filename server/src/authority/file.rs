@@ -1,7 +1,7 @@
 //! The authority on the disk: certificate and key, in a folder of their own.
 //!
 //! A rotation adds the next authority, and each of its steps replaces or renames one file, so that a
-//! crash between any two of them leaves what [`recover`] completes or takes back:
+//! crash between any two of them leaves what [`Folder::recover`] completes or takes back:
 //!
 //! ```text
 //!  start   next.key, next.json ── next.pem ◄─ from here on the next authority signs

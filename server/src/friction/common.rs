@@ -5,8 +5,8 @@ use tread_api::friction::{Information, NORMAL_95, ThetaErrors};
 use super::coverage::Normal;
 use super::fixed::Fixed;
 use super::tests::{at_us, fused_as, measured};
+use super::weights::FrictionConfig;
 use super::*;
-use crate::config::FrictionConfig;
 
 const THETA: f64 = 0.2;
 /// Independent deviation of one segment.

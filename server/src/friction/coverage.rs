@@ -3,8 +3,8 @@
 use tread_api::friction::NORMAL_95;
 
 use super::tests::{at_us, measured};
+use super::weights::FrictionConfig;
 use super::*;
-use crate::config::FrictionConfig;
 
 /// Visits of all runs of a fleet. `examples/map_report` does the same with more of them.
 const VISITS: u32 = 500_000;

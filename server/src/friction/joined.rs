@@ -9,7 +9,7 @@
 
 use tread_api::friction::NORMAL_95;
 
-use super::fuse::{Estimate, Ground, Seen, age_s};
+use super::seen::{Estimate, Ground, Seen, age_s};
 use super::sums::Known;
 
 /// Most rounds of the iteration for the common θ; it settles within about ten.

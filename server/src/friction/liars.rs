@@ -6,8 +6,8 @@ use tread_api::friction::NORMAL_95;
 use super::coverage::Normal;
 use super::fuse::MU_ALONE_MAX;
 use super::tests::{HOUR_S, at_us, fused, fused_as, gripping, measured};
+use super::weights::FrictionConfig;
 use super::*;
-use crate::config::FrictionConfig;
 
 const THETA: f64 = 0.2;
 /// Deviation of a robot's own bias as a share of θ, as the map assumes it.

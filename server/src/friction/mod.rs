@@ -11,13 +11,16 @@ pub mod grip;
 pub mod index;
 mod joined;
 pub mod raster;
+mod seen;
 pub mod sums;
+pub mod weights;
 
 use jiff::Timestamp;
 use tread_api::friction::{FrictionBounds, FusedFriction, NORMAL_90, ValueEstimate};
 
-pub use self::fuse::{Estimate, Fused, Fuser, Ground, Seen, fuse};
+pub use self::fuse::{Fused, Fuser, fuse};
 pub use self::raster::Raster;
+pub use self::seen::{Estimate, Ground, Seen};
 pub use self::sums::{Sums, bucket_h, epoch_h};
 
 impl Fused {
@@ -50,7 +53,7 @@ impl Fused {
             segments: self.passes,
             robots: self.robots,
             newest_at: time(self.newest_at_us),
-            age_s: fuse::seconds(now_us - self.newest_at_us).max(0.0),
+            age_s: seen::seconds(now_us - self.newest_at_us).max(0.0),
             disputed: self.is_disputed,
             changed_at: self.changed_at_us.map(time),
         }

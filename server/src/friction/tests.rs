@@ -8,8 +8,8 @@ use tread_api::friction::Information;
 use super::fixed::Fixed;
 use super::fuse::THETA_STD_DEV_MAX;
 use super::sums::{Pair, Pass};
+use super::weights::FrictionConfig;
 use super::*;
-use crate::config::FrictionConfig;
 
 pub(super) const HOUR_S: i64 = 3_600;
 

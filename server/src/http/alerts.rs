@@ -9,8 +9,8 @@ use tread_api::robot::Alert;
 use utoipa::IntoParams;
 
 use super::extract::{Json, Path, Query, cursor, page_limit};
-use super::identity::guard::Subject;
 use super::problem::Problem;
+use super::subject::Subject;
 use crate::app::App;
 use crate::app::alerts::AlertFilter;
 

@@ -34,8 +34,8 @@ use tread_api::stop::STOP_TEXT_MAX;
 use tread_api::text::cleaned;
 
 use super::extract::{Path, parse_frame};
-use super::identity::guard::Subject;
 use super::problem::Problem;
+use super::subject::Subject;
 use crate::app::App;
 use crate::app::identity::Credential;
 use crate::app::stops::StopWords;

@@ -18,8 +18,8 @@ use tread_api::problem::{ProblemBody, ProblemType};
 use utoipa::IntoParams;
 
 use super::extract::Query;
-use super::identity::guard::Subject;
 use super::problem::Problem;
+use super::subject::Subject;
 use crate::app::App;
 use crate::app::events::{EventFilter, Subscription};
 use crate::app::identity::Credential;

@@ -18,8 +18,8 @@ use serde_json::value::RawValue;
 use tread_api::page::{PAGE_LIMIT_DEFAULT, PAGE_LIMIT_MAX};
 use tread_api::problem::ProblemType;
 
-use super::identity::guard::{AuditSlot, Subject};
 use super::problem::Problem;
+use super::subject::{AuditSlot, Subject};
 
 /// Fields that are not known and are named in the answer.
 const UNKNOWN_FIELDS_NAMED_MAX: usize = 5;

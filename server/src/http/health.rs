@@ -6,8 +6,8 @@ use tread_api::problem::{ProblemBody, ProblemType};
 use utoipa::ToSchema;
 
 use super::extract::Json;
-use super::identity::guard::Subject;
 use super::problem::Problem;
+use super::subject::Subject;
 use crate::app::App;
 use crate::app::storage::StorageCondition;
 use crate::counters::CounterValues;

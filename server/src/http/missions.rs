@@ -11,8 +11,8 @@ use tread_api::trajectory::{CheckTrajectory, PlannedPath, TrajectoryCheck};
 use utoipa::IntoParams;
 
 use super::extract::{Json, Path, Query, cursor, page_limit};
-use super::identity::guard::Subject;
 use super::problem::Problem;
+use super::subject::Subject;
 use crate::app::App;
 use crate::app::missions::MissionFilter;
 use crate::app::missions::idempotency::KEY_LENGTH_MAX;

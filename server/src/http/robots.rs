@@ -9,8 +9,8 @@ use tread_api::robot::{ChangeRobot, Robot};
 use utoipa::IntoParams;
 
 use super::extract::{Json, Path, Query, page_limit};
-use super::identity::guard::Subject;
 use super::problem::Problem;
+use super::subject::Subject;
 use crate::app::App;
 
 /// Which robots, and which page of them.

@@ -2,15 +2,13 @@
 //! because the number of connections has bounds (see [`crate::connections`]).
 
 use std::net::{IpAddr, SocketAddr};
-use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::Router;
-use axum::body::{Body, Bytes, HttpBody};
+use axum::body::Body;
 use axum::http::{HeaderName, Request};
-use hyper::body::{Frame, Incoming, SizeHint};
+use hyper::body::Incoming;
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
@@ -22,10 +20,11 @@ use tower::ServiceExt as _;
 use tracing::{debug, warn};
 
 use super::events::Cut;
+use super::guarded::Guarded;
 use super::identity::guard::{Peer, purpose_of_path};
 use super::tls::Tls;
 use crate::app::App;
-use crate::connections::{AtWork, BOUNDS, Connections, Slot};
+use crate::connections::{BOUNDS, Connections, Slot};
 use crate::identity::address::TrustedProxies;
 use crate::supervisor::Supervisor;
 
@@ -204,12 +203,10 @@ impl Connection {
                 extensions.insert(Cut(cut));
                 extensions.insert(Peer(client));
                 extensions.insert(slot);
-                Ok::<_, std::convert::Infallible>(router.oneshot(request).await?.map(|body| {
-                    Body::new(Given {
-                        body,
-                        _at_work: at_work,
-                    })
-                }))
+                let answer = router.oneshot(request).await?;
+                // The connection is at work until its answer has been given.
+                let answer = answer.map(|body| Guarded::body(body, at_work));
+                Ok::<_, std::convert::Infallible>(answer)
             }
         });
         let connection = http1::Builder::new()
@@ -240,30 +237,4 @@ fn client_of(request: &Request<Incoming>, peer: IpAddr, proxies: &TrustedProxies
         .map(|value| value.to_str().unwrap_or("?"))
         .collect();
     proxies.client(peer, forwarded.into_iter())
-}
-
-/// An answer's body; its connection is at work until it has been given.
-struct Given {
-    body: Body,
-    _at_work: AtWork,
-}
-
-impl HttpBody for Given {
-    type Data = Bytes;
-    type Error = axum::Error;
-
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        Pin::new(&mut self.body).poll_frame(context)
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
-    }
 }

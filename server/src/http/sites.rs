@@ -10,8 +10,8 @@ use tread_api::site::{CreateSite, GeoOrigin, Site};
 use utoipa::IntoParams;
 
 use super::extract::{Json, Path, Query, page_limit};
-use super::identity::guard::Subject;
 use super::problem::Problem;
+use super::subject::Subject;
 use crate::app::App;
 
 /// Which page of a list.

@@ -30,8 +30,8 @@ use tread_api::text::cleaned;
 use utoipa::IntoParams;
 
 use super::extract::{BodyLimit, Json, Path, Query, cursor, page_limit, read};
-use super::identity::guard::{AuditSlot, Subject};
 use super::problem::Problem;
+use super::subject::{AuditSlot, Subject};
 use crate::app::App;
 use crate::app::identity::Credential;
 use crate::app::stops::StopFilter;

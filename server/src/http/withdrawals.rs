@@ -10,9 +10,9 @@ use tread_api::problem::ProblemBody;
 
 use super::etag;
 use super::extract::{Json, Path, Query, cursor, page_limit};
-use super::identity::guard::Subject;
 use super::problem::Problem;
 use super::sites::PageQuery;
+use super::subject::Subject;
 use crate::app::App;
 
 /// Takes what a robot measured in some hours off the map, for good: the map is then as if it had

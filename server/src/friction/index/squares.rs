@@ -8,7 +8,7 @@ use tread_api::terrain::TerrainRef;
 use super::changes::{BLOCK_CELLS, Block};
 use super::part::{Part, PartKey};
 use super::{Choice, HOUR_S, SiteMap, Sums, place};
-use crate::config::FrictionConfig;
+use crate::friction::weights::FrictionConfig;
 use crate::friction::{Fused, Fuser, Ground, Seen};
 
 /// The number of ground on which no terrain is drawn.

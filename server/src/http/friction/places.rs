@@ -20,8 +20,8 @@ use crate::app::App;
 use crate::app::friction::{Area, CellsAsked};
 use crate::http::etag;
 use crate::http::extract::{Json, Path, Query, page_limit};
-use crate::http::identity::guard::Subject;
 use crate::http::problem::Problem;
+use crate::http::subject::Subject;
 
 /// Which cells, and which page of them.
 #[derive(Debug, Clone, Deserialize, IntoParams)]

@@ -5,10 +5,10 @@ use axum::http::StatusCode;
 use tread_api::enrolment::{FinishRotation, FleetAuthority, ReplaceAuthority};
 use tread_api::problem::ProblemBody;
 
-use super::guard::Subject;
 use crate::app::App;
 use crate::http::extract::Json;
 use crate::http::problem::Problem;
+use crate::http::subject::Subject;
 
 /// Show the fleet's authority, during a rotation which robots still hold certificates of the former
 /// one, and which must join again.

@@ -16,11 +16,12 @@ use tread_api::page::Page;
 use tread_api::problem::{ProblemBody, ProblemType};
 use utoipa::IntoParams;
 
-use super::guard::{Audited, Peer, Subject, locked};
+use super::guard::{Audited, Peer, locked};
 use crate::app::enrolment::EnrolError;
 use crate::app::{App, AppError};
 use crate::http::extract::{Json, Path, Query, cursor, page_limit};
 use crate::http::problem::Problem;
+use crate::http::subject::Subject;
 
 /// Which page of a list.
 #[derive(Debug, Clone, Deserialize, IntoParams)]

@@ -4,20 +4,16 @@
 //! token that is wrong, expired or revoked is one and the same.
 
 use std::net::{IpAddr, Ipv4Addr};
-use std::pin::Pin;
-use std::sync::{Arc, OnceLock};
-use std::task::{Context, Poll};
+use std::sync::Arc;
 
-use axum::body::{Body, Bytes, HttpBody};
-use axum::extract::{FromRequestParts, MatchedPath, Request, State};
-use axum::http::request::Parts;
+use axum::body::{Body, HttpBody as _};
+use axum::extract::{MatchedPath, Request, State};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use futures_util::StreamExt as _;
-use hyper::body::{Frame, SizeHint};
 use serde_json::Value;
-use tokio_util::sync::{CancellationToken, DropGuard};
+use tokio_util::sync::CancellationToken;
 use tread_api::identity::AuditEntry;
 use tread_api::problem::ProblemType;
 use tread_api::rights::Right;
@@ -30,9 +26,10 @@ use crate::connections::{Purpose, Slot};
 use crate::counters::Counter;
 use crate::http::REQUEST_ID;
 use crate::http::events::Cut;
+use crate::http::guarded::Guarded;
 use crate::http::problem::Problem;
+use crate::http::subject::{AuditSlot, Subject};
 use crate::identity::origin::{Names, Provenance};
-use crate::identity::redact::redacted_text;
 
 /// The routes that stop robots.
 const STOP_ALL: &str = "/v1/stop";
@@ -48,31 +45,6 @@ const AUDIT_TEXT_MAX: usize = 200;
 /// or of the client that a trusted proxy names.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::http) struct Peer(pub(in crate::http) IpAddr);
-
-/// Who asks: behind the guard there is always one, on all but the public routes.
-#[derive(Debug, Clone)]
-pub(in crate::http) struct Subject(pub(in crate::http) Arc<Credential>);
-
-impl<S: Send + Sync> FromRequestParts<S> for Subject {
-    type Rejection = Problem;
-
-    async fn from_request_parts(parts: &mut Parts, _state: &S) -> Result<Self, Problem> {
-        let subject = parts.extensions.get::<Self>().cloned();
-        subject.ok_or_else(|| Problem::new(ProblemType::Unauthenticated))
-    }
-}
-
-/// Where the body of a change is left for the audit log.
-#[derive(Debug, Clone, Default)]
-pub(in crate::http) struct AuditSlot(Arc<OnceLock<Value>>);
-
-impl AuditSlot {
-    /// Leaves a body, without its secrets.
-    pub(in crate::http) fn leave(&self, body: &[u8]) {
-        // The first one is the request's; there is no second.
-        let _ = self.0.set(redacted_text(body));
-    }
-}
 
 /// Who signed in with this request, an extension of the answer.
 #[derive(Debug, Clone)]
@@ -244,7 +216,7 @@ impl Guard {
     fn note(&self, asked: Asked, response: &Response, who: Option<&Arc<Credential>>) {
         let said = response.extensions().get::<Audited>();
         let said = said.map(|Audited(what)| what.clone());
-        let left = asked.slot.0.get().cloned();
+        let left = asked.slot.left().cloned();
         let entry = AuditEntry {
             id: 0,
             at: self.app.clock().now(),
@@ -434,38 +406,7 @@ fn end_with(app: &App, subject: Arc<Credential>, cut: Option<Cut>, response: Res
             }
         }
     });
-    response.map(|body| {
-        Body::new(Download {
-            body,
-            _given: guard,
-        })
-    })
-}
-
-/// The body of a download, which tells when it has been given or given up.
-struct Download {
-    body: Body,
-    _given: DropGuard,
-}
-
-impl HttpBody for Download {
-    type Data = Bytes;
-    type Error = axum::Error;
-
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        Pin::new(&mut self.body).poll_frame(context)
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
-    }
+    response.map(|body| Guarded::body(body, guard))
 }
 
 /// The answer to a secret that opens nothing; counts the cause.

@@ -3,7 +3,7 @@
 //! One source: each route's `#[utoipa::path]` says `security(("token" = ["dispatch"]))`.
 //! [`access`] reads the table from the document, [`guard`] enforces it on whatever matched, and
 //! refuses what the document does not mention, and, by [`place`], what is about a site or robot that
-//! the token is not for. Handlers find who asks as a [`guard::Subject`].
+//! the token is not for. Handlers find who asks as a [`crate::http::subject::Subject`].
 
 pub(super) mod access;
 pub(super) mod audit;

@@ -9,12 +9,13 @@ use tread_api::identity::{CreateSession, Session, SignedOut};
 use tread_api::problem::ProblemBody;
 
 use super::browser;
-use super::guard::{Peer, SignedIn, Subject, sign_in_problem, unauthenticated};
+use super::guard::{Peer, SignedIn, sign_in_problem, unauthenticated};
 use crate::app::identity::Shown;
 use crate::app::{App, AppError};
 use crate::connections::Purpose;
 use crate::http::extract::Json;
 use crate::http::problem::Problem;
+use crate::http::subject::Subject;
 use crate::identity::origin::Names;
 
 /// Signs a browser in: the answer sets a cookie, and says who it is.

@@ -9,10 +9,10 @@ use tread_api::page::Page;
 use tread_api::problem::ProblemBody;
 use utoipa::IntoParams;
 
-use super::guard::Subject;
 use crate::app::App;
 use crate::http::extract::{Json, Path, Query, cursor, page_limit};
 use crate::http::problem::Problem;
+use crate::http::subject::Subject;
 
 /// Which page of the tokens.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
