@@ -238,6 +238,13 @@ fn hull_of_groups(
     let mut middle_of = |ratio_of: fn(&Word) -> f64| {
         ratios.clear();
         ratios.extend(robots.iter().map(ratio_of));
+        // Most fleets say the same of all their robots.
+        if ratios
+            .iter()
+            .all(|ratio| ratio.to_bits() == ratios[0].to_bits())
+        {
+            return ratios[0];
+        }
         let middle = (ratios.len() - 1) / 2;
         *ratios.select_nth_unstable_by(middle, f64::total_cmp).1
     };
