@@ -178,8 +178,12 @@ pub async fn find(db: &mut SqliteConnection, id: SessionId) -> Result<Option<Kep
 pub struct OfPeople<'filter> {
     /// Those of this provider.
     pub issuer: &'filter str,
-    /// Only those that have rights from these groups alone.
-    pub groups: &'filter [&'filter str],
+    /// Groups that give rights within the places that are looked at.
+    pub within: &'filter [&'filter str],
+    /// Groups that give rights elsewhere: none of whom is in one of them.
+    pub elsewhere: &'filter [&'filter str],
+    /// Also those who are in no group that gives rights any more.
+    pub any: bool,
     /// Only those that are valid at this time.
     pub at: Timestamp,
     /// Only those before this one.
@@ -194,17 +198,23 @@ pub async fn list(
 ) -> Result<Vec<Kept>, DbError> {
     let at_us = to_us(filter.at);
     let before = filter.before.map(|id| id.to_string());
-    let groups = to_json("groups", &filter.groups)?;
+    let within = to_json("groups", &filter.within)?;
+    let elsewhere = to_json("groups", &filter.elsewhere)?;
     let raw = sessions!(
         "WHERE issuer = ?1 AND expires_at_us > ?2 AND (?3 IS NULL OR id < ?3)
            AND NOT EXISTS (
                SELECT 1 FROM json_each(sessions.groups) AS own
-               WHERE own.value NOT IN (SELECT value FROM json_each(?4)))
-         ORDER BY id DESC LIMIT ?5",
+               WHERE own.value IN (SELECT value FROM json_each(?4)))
+           AND (?5 OR EXISTS (
+               SELECT 1 FROM json_each(sessions.groups) AS own
+               WHERE own.value IN (SELECT value FROM json_each(?6))))
+         ORDER BY id DESC LIMIT ?7",
         filter.issuer,
         at_us,
         before,
-        groups,
+        elsewhere,
+        filter.any,
+        within,
         limit,
     )
     .fetch_all(db)
@@ -299,6 +309,7 @@ mod tests {
 
     use super::*;
     use crate::db::Db;
+    use crate::identity::secret::{Kind, RANDOM_BYTES, Secret};
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
     async fn sessions_of_before_there_were_people_stay() {
@@ -339,6 +350,65 @@ mod tests {
         assert_eq!(kept.owner, Owner::Token(token.parse().unwrap()));
         assert_eq!(kept.expires_at.as_microsecond(), 8);
         assert_eq!(kept.created_at.as_microsecond(), 2);
+        drop(tx);
+        db.close().await;
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn somebody_whose_group_gives_nothing_any_more_is_listed_by_the_others() {
+        let folder = tempfile::tempdir().unwrap();
+        let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
+        let mut tx = db.write("test").await.unwrap();
+        let issuer = "https://login.test";
+        for (number, groups) in [
+            (1, vec!["admins", "night"]),
+            (2, vec!["night"]),
+            (3, vec!["yard"]),
+        ] {
+            let subject = format!("person {number}");
+            let id = PersonId::of(issuer, &subject);
+            let signed_in = SignedIn {
+                person: Person {
+                    id,
+                    issuer: issuer.to_owned(),
+                    subject,
+                },
+                name: "anna".to_owned(),
+                groups: groups.into_iter().map(str::to_owned).collect(),
+            };
+            let session = NewSession {
+                id: format!("0192f0c1-2b3c-7d4e-8f50-61728394000{number}")
+                    .parse()
+                    .unwrap(),
+                owner: Owner::Person(signed_in),
+                fingerprint: Secret::from_random(Kind::Session, &[number; RANDOM_BYTES])
+                    .fingerprint(),
+                created_at: Timestamp::UNIX_EPOCH,
+                expires_at: Timestamp::from_second(1_000).unwrap(),
+            };
+            insert(&mut tx, &session).await.unwrap();
+        }
+        // `night` was taken out of the table.
+        for (within, elsewhere, any, expected) in [
+            (&["admins", "yard"][..], &[][..], true, &[3, 2, 1][..]),
+            (&["yard"], &["admins"], false, &[3]),
+            (&[], &["admins", "yard"], false, &[]),
+        ] {
+            let filter = OfPeople {
+                issuer,
+                within,
+                elsewhere,
+                any,
+                at: Timestamp::UNIX_EPOCH,
+                before: None,
+            };
+            let kept = list(&mut tx, &filter, 10).await.unwrap();
+            let listed = kept.iter().map(|kept| {
+                let text = kept.id.to_string();
+                text[text.len() - 1..].parse::<u8>().unwrap()
+            });
+            assert_eq!(listed.collect::<Vec<_>>(), expected, "{within:?}");
+        }
         drop(tx);
         db.close().await;
     }

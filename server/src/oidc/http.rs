@@ -46,8 +46,9 @@ pub enum HttpError {
 pub(super) struct HttpClient(reqwest::Client);
 
 impl HttpClient {
-    /// A client that trusts the authorities in a file, or those of the machine.
-    pub(super) fn new(authorities: Option<&Path>) -> Result<Self, ProviderError> {
+    /// A client that trusts the authorities in a file, or those of the machine. A provider in the clear
+    /// is on this machine, and is not asked through a proxy.
+    pub(super) fn new(authorities: Option<&Path>, is_tls: bool) -> Result<Self, ProviderError> {
         // The first call counts; all install the same.
         let _first = rustls::crypto::ring::default_provider().install_default();
         let mut builder = reqwest::Client::builder()
@@ -57,6 +58,9 @@ impl HttpClient {
             // Whoever redirects a request with a secret or a code would get it.
             .redirect(redirect::Policy::none())
             .user_agent(concat!("tread-server/", env!("CARGO_PKG_VERSION")));
+        if !is_tls {
+            builder = builder.no_proxy();
+        }
         if let Some(file) = authorities {
             let text = std::fs::read(file).map_err(|cause| ProviderError::Unreadable {
                 path: file.to_owned(),

@@ -174,7 +174,7 @@ impl Provider {
             signed_out: PostLogoutRedirectUrl::new(public.clone()).map_err(address(public))?,
             scopes: scopes.cloned().map(Scope::new).collect(),
             groups_claim: config.groups_claim.clone(),
-            http: HttpClient::new(config.ca.as_deref())?,
+            http: HttpClient::new(config.ca.as_deref(), config.issuer.starts_with("https:"))?,
             clock,
             known: RwLock::default(),
             keys_asked_at: Mutex::default(),
@@ -206,7 +206,11 @@ impl Provider {
             sign_out.as_ref().map(EndSessionUrl::url),
         ];
         let is_tls = self.issuer.url().scheme() == "https";
-        let in_the_clear = |url: &&reqwest::Url| url.scheme() != "https" && is_tls;
+        let host = self.issuer.url().host_str();
+        // A provider in the clear is on this machine, and so is what it names.
+        let is_safe =
+            |url: &reqwest::Url| url.scheme() == "https" || !is_tls && url.host_str() == host;
+        let in_the_clear = |url: &&reqwest::Url| !is_safe(url);
         if let Some(url) = endpoints.into_iter().flatten().find(in_the_clear) {
             return Err(DiscoverError::ClearText(url.to_string()));
         }
@@ -323,7 +327,7 @@ impl Provider {
             let said = self.http.claims(endpoint.url(), access_token.secret());
             let said = said.await;
             let said = said.map_err(|error| ExchangeError::Unanswered(Box::new(error)))?;
-            claims = with_user_info(claims, said, &subject)?;
+            claims = with_user_info((claims, said), &subject, &self.groups_claim)?;
         }
         let id_token = id_token.to_string();
         Ok(SignedInThere {
@@ -365,16 +369,25 @@ impl Provider {
 
 /// The claims of an ID token with those that only the user info has; it must be about the same person.
 fn with_user_info(
-    mut claims: Claims,
-    said: Claims,
+    (mut claims, said): (Claims, Claims),
     subject: &str,
+    groups_claim: &str,
 ) -> Result<Claims, ExchangeError> {
     if said.get("sub").and_then(serde_json::Value::as_str) != Some(subject) {
         let detail = "its user info is about somebody else".to_owned();
         return Err(ExchangeError::UserInfo(detail));
     }
+    // The ID token may have an object of this name that lacks the groups.
+    let leads_to_groups = |name: &str| {
+        let rest = groups_claim.strip_prefix(name);
+        rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+    };
     for (name, value) in said {
-        claims.entry(name).or_insert(value);
+        if leads_to_groups(&name) {
+            claims.insert(name, value);
+        } else {
+            claims.entry(name).or_insert(value);
+        }
     }
     Ok(claims)
 }
@@ -392,5 +405,28 @@ fn refused(error: TokenError) -> ExchangeError {
         error @ (RequestTokenError::Request(_)
         | RequestTokenError::Parse(..)
         | RequestTokenError::Other(_)) => ExchangeError::Unanswered(Box::new(error)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn groups_of_the_user_info_count_where_the_id_token_has_none() {
+        let claims = |value| serde_json::from_value::<Claims>(value).unwrap();
+        let own = || claims(json!({"sub": "7", "name": "Anna", "realm_access": {"other": 1}}));
+        let said = || {
+            claims(json!({
+                "sub": "7", "name": "Bert", "realm_access": {"roles": ["night"]}, "realm": 3,
+            }))
+        };
+        let both = with_user_info((own(), said()), "7", "realm_access.roles").unwrap();
+        let groups = claim(&both, "realm_access.roles");
+        assert_eq!(groups, Some(&json!(["night"])));
+        assert_eq!(both["name"], "Anna", "the signed one counts");
+        assert!(with_user_info((own(), said()), "8", "realm_access.roles").is_err());
     }
 }

@@ -359,7 +359,9 @@ pub(crate) const PATHS: &[WritePath] = &[
                 };
                 let filter = OfPeople {
                     issuer,
-                    groups: &["operators"],
+                    within: &["operators"],
+                    elsewhere: &[],
+                    any: false,
                     at: LONG_AGO,
                     before: None,
                 };

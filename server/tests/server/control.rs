@@ -4,13 +4,14 @@ use std::time::Duration;
 
 use reqwest::StatusCode;
 use serde_json::{Value, json};
+use tread_api::identity::Role;
 use tread_api::keys::Verb;
 use tread_api::mission::{Cause, Mission, MissionDetail, MissionState};
 use tread_api::robot::{LinkCause, LinkState, Robot as ShownRobot};
 use tread_api::wire::command::OfferRefusal;
 use tread_api::wire::ingest::MissionPhase;
 
-use crate::harness::{Yard, circle, eventually};
+use crate::harness::{Yard, circle, client, eventually};
 use crate::robot::{Mood, Robot};
 
 async fn act(yard: &Yard, mission: &Mission, verb: &str, body: &Value) -> (StatusCode, Value) {
@@ -286,8 +287,11 @@ async fn one_key_makes_one_mission_also_after_a_restart() {
     let robot = Robot::join(&yard, "rover-1").await;
     let robot_id = robot.id.clone();
     drop(robot);
+    // A key belongs to its token, and the admin of the tests has another after a restart.
+    let token = yard.token("desk", Role::Operator).await.secret;
+    let client = client(Some(&token));
     let send = async |yard: &Yard, key: &str, body: &Value| {
-        let request = yard.client().post(yard.url("/v1/missions"));
+        let request = client.post(yard.url("/v1/missions"));
         yard.send(request.header("idempotency-key", key).json(body))
             .await
     };

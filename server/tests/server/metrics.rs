@@ -55,6 +55,8 @@ async fn missions_refusals_queues_and_transactions_are_measured() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn alert_rules_and_dashboard_name_only_metrics_that_exist() {
     let yard = Yard::start().await;
+    // Of requests there is nothing before the first one.
+    assert_eq!(yard.get_value("/v1/sites").await.0, StatusCode::OK);
     let text = page(&yard).await;
     let mut exist = BTreeSet::new();
     for line in text.lines() {

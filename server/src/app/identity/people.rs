@@ -176,11 +176,17 @@ impl People {
         self.provider.issuer()
     }
 
-    /// The groups that give nothing outside a scope.
-    pub(super) fn groups_within(&self, within: &Scope) -> Vec<&str> {
-        let grants = self.grants.iter();
-        let within = grants.filter(|(_, grant)| within.includes(&grant.sites));
-        within.map(|(name, _)| name.as_str()).collect()
+    /// The groups that give nothing outside a scope, and those that do.
+    pub(super) fn groups_by_scope(&self, within: &Scope) -> (Vec<&str>, Vec<&str>) {
+        let is_within = |name: &&str| {
+            let grant = self
+                .grants
+                .iter()
+                .find(|(known, _)| known.as_str() == *name);
+            grant.is_some_and(|(_, grant)| within.includes(&grant.sites))
+        };
+        let names = self.grants.keys().map(String::as_str);
+        names.partition(is_within)
     }
 
     /// What somebody's groups give by the configuration in force; `None` if that is nothing, or another

@@ -65,19 +65,19 @@ impl App {
             }
         }
         db::sessions::forget_expired(&mut tx, now).await?;
+        db::sessions::insert(&mut tx, &session).await?;
+        let surplus = db::sessions::surplus(&mut tx, (token, person), SESSIONS_EACH_MAX).await?;
+        for &id in &surplus {
+            db::sessions::delete(&mut tx, id).await?;
+        }
         if person.is_some() {
             let count = db::sessions::count_of_people(&mut tx, now).await?;
-            if usize::try_from(count).is_ok_and(|count| count >= SESSIONS_OF_PEOPLE_MAX) {
+            if usize::try_from(count).is_ok_and(|count| count > SESSIONS_OF_PEOPLE_MAX) {
                 return Err(AppError::TooMany {
                     what: "sessions of people",
                     count: SESSIONS_OF_PEOPLE_MAX,
                 });
             }
-        }
-        db::sessions::insert(&mut tx, &session).await?;
-        let surplus = db::sessions::surplus(&mut tx, (token, person), SESSIONS_EACH_MAX).await?;
-        for &id in &surplus {
-            db::sessions::delete(&mut tx, id).await?;
         }
         let app = self.clone();
         let ending = move |_outcome| {
@@ -129,10 +129,13 @@ impl App {
         let Some(people) = self.people() else {
             return Ok(page(Vec::new(), limit, |_: &PersonSession| String::new()));
         };
-        let groups = people.groups_within(within);
+        let (groups, elsewhere) = people.groups_by_scope(within);
         let filter = OfPeople {
             issuer: people.issuer(),
-            groups: &groups,
+            within: &groups,
+            elsewhere: &elsewhere,
+            // Whoever administers everything sees those too whose groups were taken out of the table.
+            any: within.is_everywhere(),
             at: self.clock().now(),
             before,
         };

@@ -6,11 +6,12 @@ use std::io::{BufRead as _, BufReader};
 use std::net::TcpListener;
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
+use std::time::Duration;
 
 use reqwest::{Response, StatusCode, Url, header, redirect};
 use serde_json::json;
 
-use crate::harness::{PATIENCE, Yard, folder_of_the_crate};
+use crate::harness::{Yard, folder_of_the_crate};
 
 /// Where the provider believes the server to be; browsers of the tests go to where it is.
 pub(super) const PUBLIC: &str = "http://127.0.0.1:8420";
@@ -41,6 +42,9 @@ pub(super) fn free_port() -> u16 {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     listener.local_addr().unwrap().port()
 }
+
+/// How long the provider may take to start: it reads hundreds of files, which may be on a cold disk.
+const START_MAX: Duration = Duration::from_secs(40);
 
 /// A provider at work; its process ends with it.
 pub(super) struct Provider {
@@ -77,7 +81,8 @@ impl Provider {
             lines.any(|line| line == "ready")
         });
         let provider = Self { process };
-        let ready = tokio::time::timeout(PATIENCE, ready).await.unwrap();
+        let ready = tokio::time::timeout(START_MAX, ready).await;
+        let ready = ready.expect("the provider starts");
         assert!(ready.unwrap(), "the provider has ended");
         provider
     }
