@@ -4,8 +4,8 @@ use std::ops::RangeInclusive;
 
 use tread_control::estimation::{EstimatorPrior, ModelUncertainty, TyrePrior};
 
-use super::ConfigError;
 use super::file::EstimationFile;
+use super::{ConfigError, DriveConfig};
 
 /// Standard deviations of mass and inertia, shares.
 const RATIO_RANGE: RangeInclusive<f64> = 0.0..=1.0;
@@ -16,11 +16,29 @@ const RELAXATION_RANGE_M: RangeInclusive<f64> = 0.0..=1.0;
 /// Friction coefficient up to which tyres rise as they are known to.
 const MU_RANGE: RangeInclusive<f64> = 0.05..=10.0;
 
+/// What is known of a base where nothing is said.
+pub(super) fn default_of(drive: &DriveConfig) -> EstimatorPrior {
+    match drive {
+        // It carries nothing, and its tyres rise straight.
+        DriveConfig::Simulated(_) => EstimatorPrior {
+            tyres: TyrePrior::default(),
+            model: ModelUncertainty {
+                payload_ratio: 0.0,
+                ..ModelUncertainty::default()
+            },
+        },
+        DriveConfig::Ros2(_) => EstimatorPrior::default(),
+    }
+}
+
 /// What is known; defaults where nothing is said.
 ///
 /// # Errors
 /// [`ConfigError::OutOfRange`].
-pub(super) fn checked(file: EstimationFile) -> Result<EstimatorPrior, ConfigError> {
+pub(super) fn checked(
+    file: EstimationFile,
+    default: EstimatorPrior,
+) -> Result<EstimatorPrior, ConfigError> {
     let within = |key, value: Option<f64>, default: f64, range: RangeInclusive<f64>| {
         let value = value.unwrap_or(default);
         if range.contains(&value) {
@@ -29,7 +47,7 @@ pub(super) fn checked(file: EstimationFile) -> Result<EstimatorPrior, ConfigErro
         let problem = format!("{value} is not within {} to {}", range.start(), range.end());
         Err(ConfigError::OutOfRange { key, problem })
     };
-    let EstimatorPrior { tyres, model } = EstimatorPrior::default();
+    let EstimatorPrior { tyres, model } = default;
     let mass = "estimation.mass_std_dev_ratio";
     let inertia = "estimation.inertia_std_dev_ratio";
     let curvature = "estimation.tyre_curvature";
@@ -103,14 +121,14 @@ mod tests {
 
     #[test]
     fn what_is_not_said_is_that_of_a_robot_known_by_its_data_sheet_and_bounds_are_checked() {
-        let default = checked(EstimationFile::default()).unwrap();
+        let default = checked(EstimationFile::default(), EstimatorPrior::default()).unwrap();
         assert_eq!(default, EstimatorPrior::default());
         let weighed = EstimationFile {
             mass_std_dev_ratio: Some(0.0),
             tyre_mu_max: Some(0.7),
             ..EstimationFile::default()
         };
-        let prior = checked(weighed).unwrap();
+        let prior = checked(weighed, EstimatorPrior::default()).unwrap();
         assert_eq!(
             (prior.model.mass_ratio, prior.tyres.mu_max),
             (0.0, Some(0.7))
@@ -138,7 +156,9 @@ mod tests {
                 "estimation.tyre_mu_max",
             ),
         ] {
-            let refused = checked(file).unwrap_err().to_string();
+            let refused = checked(file, EstimatorPrior::default())
+                .unwrap_err()
+                .to_string();
             assert!(refused.contains(key), "{refused}");
         }
     }

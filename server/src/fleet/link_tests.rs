@@ -237,6 +237,12 @@ async fn a_message_above_its_bound_is_dropped_and_the_next_one_is_heard() {
     let refused = counters.refused_malformed.get();
     publish(MESSAGE_BYTES_MAX + 1).await;
     session.close().await;
+    // The router reads what was sent to its end, and meanwhile takes no other session of this identifier.
+    let router = rig.fleet.routers.newest().unwrap();
+    until("the former session is gone", async || {
+        sessions_on(&router).await == 0
+    })
+    .await;
     let again = rig.connect(Who::Own, 10_000).await.unwrap();
     put(&again.zenoh, key.clone(), "x".to_owned());
     until("a new session is heard", async || {

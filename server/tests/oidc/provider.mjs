@@ -23,7 +23,7 @@ const people = {
 };
 
 const isTls = certificate !== null;
-const issuer = `${isTls ? 'https' : 'http'}://localhost:${port}`;
+const issuer = `${isTls ? 'https' : 'http'}://127.0.0.1:${port}`;
 const jwk = (type, options, alg) => ({
   ...generateKeyPairSync(type, options).privateKey.export({ format: 'jwk' }),
   kid: randomUUID(),
@@ -105,4 +105,4 @@ const listener = (request, response) => {
 const server = isTls
   ? createTlsServer({ cert: readFileSync(certificate), key: readFileSync(key) }, listener)
   : createServer(listener);
-server.listen(port, 'localhost', () => console.log('ready'));
+server.listen(port, '127.0.0.1', () => console.log('ready'));

@@ -41,7 +41,7 @@ fn config(port: u16, folder: &Path) -> OidcConfig {
         ),
     ];
     OidcConfig {
-        issuer: format!("http://localhost:{port}"),
+        issuer: format!("http://127.0.0.1:{port}"),
         client_id: "tread".to_owned(),
         client_secret_file: Some(secret),
         public_url: PUBLIC.parse().unwrap(),
@@ -149,7 +149,7 @@ async fn somebody_signs_in_does_what_the_groups_give_and_signs_out() {
     assert_eq!(session["person"]["subject"], "id-anna");
     assert_eq!(
         session["person"]["issuer"],
-        format!("http://localhost:{port}")
+        format!("http://127.0.0.1:{port}")
     );
 
     // What the groups give, and no more.
@@ -176,7 +176,7 @@ async fn somebody_signs_in_does_what_the_groups_give_and_signs_out() {
     let out = body(out).await;
     let out = out["provider"].as_str().unwrap();
     assert!(
-        out.starts_with(&format!("http://localhost:{port}/session/end?")),
+        out.starts_with(&format!("http://127.0.0.1:{port}/session/end?")),
         "{out}"
     );
     assert!(
@@ -187,7 +187,7 @@ async fn somebody_signs_in_does_what_the_groups_give_and_signs_out() {
     let form = browser.get(out).await.text().await.unwrap();
     let field = form.split_once("name=\"xsrf\" value=\"").expect(&form).1;
     let field = field.split_once('"').unwrap().0;
-    let confirm = format!("http://localhost:{port}/session/end/confirm");
+    let confirm = format!("http://127.0.0.1:{port}/session/end/confirm");
     let left = browser
         .post(&confirm, &format!("xsrf={field}&logout=yes"))
         .await;
@@ -199,7 +199,7 @@ async fn somebody_signs_in_does_what_the_groups_give_and_signs_out() {
 async fn a_public_client_takes_es256_a_nested_claim_of_the_user_info_and_an_own_authority() {
     let port = free_port();
     let folder = tempfile::tempdir().unwrap();
-    let made = rcgen::generate_simple_self_signed(["localhost".to_owned()]).unwrap();
+    let made = rcgen::generate_simple_self_signed(["127.0.0.1".to_owned()]).unwrap();
     let (certificate, key) = (
         folder.path().join("cert.pem"),
         folder.path().join("key.pem"),
@@ -215,7 +215,7 @@ async fn a_public_client_takes_es256_a_nested_claim_of_the_user_info_and_an_own_
     let _provider = Provider::start(port, &kind).await;
     let yard = Yard::start_configured(|config, folder| {
         config.oidc = Some(OidcConfig {
-            issuer: format!("https://localhost:{port}"),
+            issuer: format!("https://127.0.0.1:{port}"),
             client_secret_file: None,
             groups_claim: "realm_access.roles".to_owned(),
             name_claim: Some("email".to_owned()),
