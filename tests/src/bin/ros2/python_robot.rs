@@ -7,6 +7,11 @@ use std::process::{Child, ChildStdin, Command, Stdio};
 use anyhow::Context;
 use tread_tests::ports::free_address;
 
+/// What is known of it: it carries nothing, on tyres that rise straight.
+const KNOWN: &str = "[estimation]\npayload_ratio = 0.0\ntyre_curvature = 0.0\n\
+                     tyre_curvature_std_dev = 0.0\ntyre_mu_max = 10.0\ntyre_relaxation_m = 0.0\n\
+                     tyre_relaxation_std_dev_m = 0.0\nrotor_ratio = 0.0\nrotor_std_dev_ratio = 0.0\n";
+
 /// The robot's domain.
 pub(crate) const DOMAIN: u32 = 7;
 
@@ -79,7 +84,7 @@ impl PythonRobot {
             pose,
         } = more;
         format!(
-            "{model}[drive]\nkind = \"ros2\"\n[drive.ros2]\n\
+            "{KNOWN}{model}[drive]\nkind = \"ros2\"\n[drive.ros2]\n\
              endpoint = \"{}\"\ndomain = {DOMAIN}\nbus = \"{bus}\"\n\
              namespace = \"/rover\"\n\
              [drive.ros2.joints]\n\
