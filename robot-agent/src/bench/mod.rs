@@ -252,7 +252,8 @@ impl Bench {
         let model = RobotModel::yi2007();
         let individual = Individual::of_seed(seed);
         let drive = SimulatedDrive::new(scenario, model, start, individual, SimMode::Explicit)?;
-        Ok(Self::with_drive(drive, model))
+        // A simulated robot is as its model says.
+        Ok(Self::with_drive(drive, model).with_prior(EstimatorPrior::exact()))
     }
 
     /// Records from now on, before the first tick.
@@ -268,7 +269,7 @@ impl Bench {
             blind_within_fence: false,
             silent_after: SILENT_AFTER_MAX,
             rate_hz: PERIOD.as_secs_f64().recip(),
-            prior: EstimatorPrior::default(),
+            prior: EstimatorPrior::exact(),
         };
         let (taker, notes) = notes();
         self.core.note_to(Some(taker));

@@ -19,14 +19,8 @@ const MU_RANGE: RangeInclusive<f64> = 0.05..=10.0;
 /// What is known of a base where nothing is said.
 pub(super) fn default_of(drive: &DriveConfig) -> EstimatorPrior {
     match drive {
-        // It carries nothing, and its tyres rise straight.
-        DriveConfig::Simulated(_) => EstimatorPrior {
-            tyres: TyrePrior::default(),
-            model: ModelUncertainty {
-                payload_ratio: 0.0,
-                ..ModelUncertainty::default()
-            },
-        },
+        // It is as its model says.
+        DriveConfig::Simulated(_) => EstimatorPrior::exact(),
         DriveConfig::Ros2(_) => EstimatorPrior::default(),
     }
 }

@@ -1,6 +1,6 @@
 // An OpenID provider that is not ours (oidc-provider, certified by the OpenID Foundation), for the tests:
 // people without passwords, chosen by `login_hint`. Each start has keys of its own.
-import { generateKeyPairSync, randomUUID } from 'node:crypto';
+import { createPrivateKey, generateKeyPairSync, randomUUID } from 'node:crypto';
 import { readFileSync } from 'node:fs';
 import { createServer } from 'node:http';
 import { createServer as createTlsServer } from 'node:https';
@@ -24,12 +24,14 @@ const people = {
 
 const isTls = certificate !== null;
 const issuer = `${isTls ? 'https' : 'http'}://127.0.0.1:${port}`;
-const jwk = (type, options, alg) => ({
-  ...generateKeyPairSync(type, options).privateKey.export({ format: 'jwk' }),
-  kid: randomUUID(),
-  use: 'sig',
-  alg,
-});
+// By way of PEM: the export of a freshly made key object as JWK hangs in one start of twenty (Node.js 20),
+// when the collector takes away what made it, which shares its lock.
+const jwk = (type, options, alg) => {
+  const privateKeyEncoding = { type: 'pkcs8', format: 'pem' };
+  const publicKeyEncoding = { type: 'spki', format: 'pem' };
+  const { privateKey } = generateKeyPairSync(type, { ...options, privateKeyEncoding, publicKeyEncoding });
+  return { ...createPrivateKey(privateKey).export({ format: 'jwk' }), kid: randomUUID(), use: 'sig', alg };
+};
 
 const provider = new Provider(issuer, {
   clients: [
