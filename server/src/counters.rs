@@ -109,6 +109,8 @@ counters! {
     gate_full,
     /// Connections to the robots' port ended to make room for new ones before their handshake.
     gate_displaced,
+    /// Connections of robots that declared liveliness tokens without end, cut or refused for a while.
+    gate_cut_off,
     /// Connections of robots that were put out of the fleet, or have joined again since.
     gate_revoked,
     /// Connections of robots ended because their certificate was over.

@@ -13,7 +13,8 @@ use tread_api::wire::state::{FrictionReport, RobotState};
 use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait as _};
 
-use super::rate_limits::{Kind, Place, RateLimits};
+use super::gate::{CUT_OFF, Links};
+use super::rate_limits::{Appeared, Kind, Place, RateLimits};
 use super::received::{Asked, count_refusal, explained, log_refusal, next, refuse_key};
 use super::{requests, tokens};
 use crate::app::App;
@@ -44,6 +45,7 @@ pub(super) struct Channels {
     hellos: mpsc::Sender<Asked>,
     uploads: mpsc::Sender<Asked>,
     limits: RateLimits,
+    links: Links,
 }
 
 #[derive(Debug)]
@@ -71,6 +73,7 @@ impl Channels {
         supervisor: &Supervisor,
         app: &App,
         uploads_out: mpsc::Sender<Upload>,
+        links: Links,
     ) -> Self {
         let (presence, presence_in) = mpsc::channel(PRESENCE_WAITING_MAX);
         let (states, states_in) = mpsc::channel(STATES_WAITING_MAX);
@@ -102,6 +105,7 @@ impl Channels {
             hellos,
             uploads,
             limits,
+            links,
         }
     }
 }
@@ -137,7 +141,14 @@ impl Channels {
         };
         let (place, now) = ((key.to_owned(), router), self.app.clock().elapsed());
         let is_taken = if appeared {
-            self.limits.token_appeared(&robot, place, now)
+            match self.limits.token_appeared(&robot, place, now) {
+                Appeared::Taken => true,
+                Appeared::Refused => false,
+                Appeared::Excessive => {
+                    self.cut_off(&robot, now);
+                    false
+                }
+            }
         } else {
             self.limits.token_gone(&robot, &place)
         };
@@ -152,6 +163,18 @@ impl Channels {
         } else if appeared {
             self.app.counters().rate_limited.one();
             self.log_rate_limited(key, now);
+        }
+    }
+
+    /// The router keeps every token, and gets slow for all robots.
+    fn cut_off(&self, robot: &RobotKey, now: Duration) {
+        if self.links.cut_off(robot, now) {
+            let (site, robot) = robot;
+            warn!(
+                robot.id = %robot,
+                "robot `{robot}` of site `{site}` declares liveliness tokens without end: its links are cut for {} s",
+                CUT_OFF.as_secs()
+            );
         }
     }
 

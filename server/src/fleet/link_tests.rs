@@ -5,8 +5,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::time::Instant;
+use tread_api::ids::BootId;
 use tread_api::keys;
 use tread_api::tunnel::SessionPrefix;
+use uuid::Uuid;
+use zenoh::Wait as _;
 
 use super::MESSAGE_BYTES_MAX;
 use super::gate::LINKS_PER_ROBOT_MAX;
@@ -21,6 +24,8 @@ const CUT_MAX: Duration = Duration::from_secs(1);
 /// How long a session may try to open, milliseconds: less than the lease of one that stands.
 const OPEN_MS: u32 = 2_000;
 const LOOK_EVERY: Duration = Duration::from_millis(5);
+/// Liveliness tokens of a robot that floods.
+const TOKENS: usize = 2_000;
 
 async fn until(what: &str, mut holds: impl AsyncFnMut() -> bool) {
     let waiting = async {
@@ -211,6 +216,41 @@ async fn of_a_robots_links_the_newest_four_stay_at_the_router() {
     .await;
     let other = rig.connect(Who::Foreign, 10_000).await;
     other.expect("others are not concerned").close().await;
+    end(rig).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_robot_that_declares_liveliness_tokens_without_end_is_cut_off_for_a_while() {
+    let rig = Rig::start().await;
+    let mut session = rig.connect(Who::Own, 10_000).await.unwrap();
+    let mut other = rig.connect(Who::Foreign, 10_000).await.unwrap();
+    let zenoh = session.zenoh.clone();
+    let declaring = tokio::task::spawn_blocking(move || {
+        let token = || {
+            let boot = BootId::from_uuid(Uuid::new_v4());
+            let key = keys::alive(&site(), &robot("rover-1"), boot);
+            zenoh.liveliness().declare_token(key).wait()
+        };
+        (0..TOKENS).map_while(|_| token().ok()).collect::<Vec<_>>()
+    });
+    let ended = tokio::time::timeout(PATIENCE, session.link_ended()).await;
+    ended.expect("its link is cut");
+    let counters = rig.app.counters();
+    assert!(counters.gate_cut_off.get() >= 1);
+    drop(declaring.await.unwrap());
+    // What it had declared goes with its session, and it does not come back at once.
+    until("its session ends", async || {
+        sessions_on(&rig.fleet.routers.newest().unwrap()).await == 1
+    })
+    .await;
+    assert!(rig.connect(Who::Own, 300).await.is_none());
+    let undisturbed = tokio::time::timeout(LOOK_EVERY, other.link_ended()).await;
+    assert!(undisturbed.is_err(), "others are not concerned");
+    until("it is let in again", async || {
+        rig.connect(Who::Own, OPEN_MS).await.is_some()
+    })
+    .await;
+    other.close().await;
     end(rig).await;
 }
 

@@ -207,11 +207,12 @@ impl Fleet {
         let Some(opener) = opener else {
             return Ok(());
         };
+        let links = gate::Links::default();
         let keeper = Arc::new(Keeper {
             app: app.clone(),
             routers: Arc::clone(&self.routers),
             opener,
-            channels: inbox::Channels::new(&self.supervisor, app, uploads),
+            channels: inbox::Channels::new(&self.supervisor, app, uploads, links.clone()),
             turn: Mutex::new(()),
         });
         keeper.open().await?;
@@ -225,7 +226,7 @@ impl Fleet {
             let keeping = Arc::clone(&keeper).run(stop());
             self.supervisor.spawn_vital("routers", keeping);
             let (routers, supervisor) = (Arc::clone(&self.routers), self.supervisor.clone());
-            let running = gate.run(app.clone(), routers, supervisor, stop());
+            let running = gate.run(app.clone(), routers, links, supervisor, stop());
             self.supervisor.spawn_vital("gate", running);
         }
         let watching = router::watch(router::Watch {

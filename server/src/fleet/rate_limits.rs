@@ -3,7 +3,9 @@
 //! A robot that sends more than its limit loses its own messages, before they take room from
 //! anybody else's. A limit is a rate with a burst, and a number of messages that may wait or be
 //! answered at the same time. Liveliness tokens are bounded in number too; of those that come too
-//! fast the newest few are taken up later, so that a robot that calms down is seen.
+//! fast the newest few are taken up later, so that a robot that calms down is seen. The router keeps
+//! every token all the same, and thousands of them slow every robot's messages down: a robot with
+//! far too many loses its link.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -18,6 +20,13 @@ const ROBOTS_MAX: usize = 50_000;
 const TOKENS_MAX: usize = 16;
 /// Tokens of one robot that are taken up later.
 const LATE_TOKENS_MAX: usize = 4;
+/// Tokens of one robot that one router may have, and that may appear at once; one more each second.
+/// An agent declares one each time it connects.
+const TOKENS_BEARABLE: u32 = 128;
+const TOKENS_APPEARING: RateLimit = RateLimit {
+    burst: TOKENS_BEARABLE,
+    interval: Duration::from_secs(1),
+};
 /// Least time between two log lines on one robot's refused messages.
 const LOG_EVERY: Duration = Duration::from_secs(10);
 
@@ -96,10 +105,24 @@ impl Used {
 /// A token on a router.
 pub(super) type TokenPlace = (String, u64);
 
+/// What becomes of a token that appeared.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Appeared {
+    /// It is taken up.
+    Taken,
+    /// It is not, or later.
+    Refused,
+    /// It is not, and its robot has so many that others suffer: its links are to be cut.
+    Excessive,
+}
+
 #[derive(Debug, Default)]
 struct Robot {
     used: [Used; Kind::COUNT],
     tokens: Vec<TokenPlace>,
+    /// How many each router has, whether taken up or not.
+    declared: HashMap<u64, u32>,
+    appearing: Bucket,
     late: VecDeque<TokenPlace>,
     logged_at: Option<Duration>,
     unlogged: u64,
@@ -115,9 +138,18 @@ impl Robot {
         let is_idle = |used: &Used| used.waiting == 0 && used.bucket.is_full(now);
         let logs_again = |at| now.saturating_sub(at) >= LOG_EVERY;
         self.tokens.is_empty()
+            && self.declared.is_empty()
+            && self.appearing.is_full(now)
             && self.late.is_empty()
             && self.logged_at.is_none_or(logs_again)
             && self.used.iter().all(is_idle)
+    }
+
+    /// Counts a token that is on a router, and says whether that is more than others can bear.
+    fn declared(&mut self, router: u64, now: Duration) -> bool {
+        let there = self.declared.entry(router).or_default();
+        *there += 1;
+        *there > TOKENS_BEARABLE || !self.appearing.take(TOKENS_APPEARING, now)
     }
 
     /// Takes a token up, if there is room and it does not come too fast.
@@ -198,32 +230,34 @@ impl RateLimits {
         })
     }
 
-    /// A token of a robot appeared; whether it is taken up now.
+    /// A token of a robot appeared.
     pub(super) fn token_appeared(
         &self,
         robot: &RobotKey,
         place: TokenPlace,
         now: Duration,
-    ) -> bool {
+    ) -> Appeared {
         let closed = self.closed.lock().unwrap_or_else(PoisonError::into_inner);
         if closed.contains(&place.1) {
             // It was on its way when the router closed, and would keep its place for ever.
-            return false;
+            return Appeared::Refused;
         }
-        let taken = self.with(robot, now, |known| {
-            if known.tokens.contains(&place) {
-                return true;
+        let appeared = self.with(robot, now, |known| {
+            let is_excessive = known.declared(place.1, now);
+            if known.tokens.contains(&place) || known.take_token(&place, now) {
+                return Appeared::Taken;
             }
-            let is_taken = known.take_token(&place, now);
-            if !is_taken {
-                if known.late.len() >= LATE_TOKENS_MAX {
-                    known.late.pop_front();
-                }
-                known.late.push_back(place);
+            if known.late.len() >= LATE_TOKENS_MAX {
+                known.late.pop_front();
             }
-            is_taken
+            known.late.push_back(place);
+            if is_excessive {
+                Appeared::Excessive
+            } else {
+                Appeared::Refused
+            }
         });
-        taken.unwrap_or(false)
+        appeared.unwrap_or(Appeared::Refused)
     }
 
     /// A token of a robot is gone; whether it had been taken up.
@@ -233,6 +267,12 @@ impl RateLimits {
             return false;
         };
         known.late.retain(|late| late != place);
+        if let Some(there) = known.declared.get_mut(&place.1) {
+            *there -= 1;
+            if *there == 0 {
+                known.declared.remove(&place.1);
+            }
+        }
         let before = known.tokens.len();
         known.tokens.retain(|token| token != place);
         known.tokens.len() < before
@@ -248,6 +288,7 @@ impl RateLimits {
         for known in self.lock().values_mut() {
             known.tokens.retain(|(_, on)| *on != router);
             known.late.retain(|(_, on)| *on != router);
+            known.declared.remove(&router);
         }
     }
 
@@ -347,8 +388,13 @@ mod tests {
         let rover = robot("rover-1");
         let place = |number: u32| (number.to_string(), 0);
         let appear = |number, at| limits.token_appeared(&rover, place(number), at);
-        let taken = (0..23_000).filter(|&number| appear(number, ms(0))).count();
-        assert_eq!(taken, TOKENS_MAX);
+        let appeared: Vec<Appeared> = (0..23_000).map(|number| appear(number, ms(0))).collect();
+        let count = |which| appeared.iter().filter(|&&one| one == which).count();
+        assert_eq!(count(Appeared::Taken), TOKENS_MAX);
+        assert_eq!(
+            count(Appeared::Excessive),
+            23_000 - TOKENS_BEARABLE as usize
+        );
         assert!(
             limits.late_tokens(ms(60_000)).is_empty(),
             "there is no room"
@@ -358,7 +404,44 @@ mod tests {
         }
         assert_eq!(limits.late_tokens(ms(60_001)).len(), LATE_TOKENS_MAX);
         assert!(limits.token_gone(&rover, &place(22_999)));
-        assert!(limits.token_appeared(&robot("rover-2"), place(1), ms(0)));
+        let other = limits.token_appeared(&robot("rover-2"), place(1), ms(0));
+        assert_eq!(other, Appeared::Taken);
+    }
+
+    proptest! {
+        #[test]
+        fn a_robot_that_reconnects_once_a_second_is_never_cut_however_its_tokens_come_and_go(
+            lives in prop::collection::vec((0_u64..2, 1_u64..90), 1..600),
+        ) {
+            let limits = RateLimits::default();
+            let rover = robot("rover-1");
+            let mut there = VecDeque::new();
+            for (number, (router, seconds)) in lives.into_iter().enumerate() {
+                let now = ms(1_000 * number as u64);
+                while there.front().is_some_and(|&(until, _)| until <= number as u64) {
+                    let (_, place) = there.pop_front().unwrap();
+                    limits.token_gone(&rover, &place);
+                }
+                let place = (number.to_string(), router);
+                let appeared = limits.token_appeared(&rover, place.clone(), now);
+                prop_assert_ne!(appeared, Appeared::Excessive);
+                let latest = there.back().map_or(0, |&(until, _)| until);
+                there.push_back((latest.max(number as u64 + seconds), place));
+            }
+        }
+
+        #[test]
+        fn tokens_that_stay_are_excessive_beyond_their_bound_however_slowly_they_come(
+            gap_s in 1_u64..100,
+        ) {
+            let limits = RateLimits::default();
+            for number in 0..=u64::from(TOKENS_BEARABLE) {
+                let place = (number.to_string(), 0);
+                let appeared = limits.token_appeared(&robot("rover-1"), place, ms(1_000 * gap_s * number));
+                let is_beyond = number == u64::from(TOKENS_BEARABLE);
+                prop_assert_eq!(appeared == Appeared::Excessive, is_beyond);
+            }
+        }
     }
 
     #[test]
@@ -373,7 +456,7 @@ mod tests {
                 limits.token_gone(&rover, &place);
             }
         }
-        assert_eq!(last, Some(false), "it came too fast");
+        assert_eq!(last, Some(Appeared::Excessive), "it came too fast");
         assert!(limits.late_tokens(ms(500)).is_empty());
         assert_eq!(limits.late_tokens(ms(1_500)), [("199".to_owned(), 0)]);
         assert!(limits.token_gone(&rover, &("199".to_owned(), 0)));
@@ -386,10 +469,12 @@ mod tests {
         let rover = robot("rover-1");
         limits.router_closed(0);
         for number in 0..100 {
-            assert!(!limits.token_appeared(&rover, (number.to_string(), 0), ms(0)));
+            let appeared = limits.token_appeared(&rover, (number.to_string(), 0), ms(0));
+            assert_eq!(appeared, Appeared::Refused);
         }
         assert!(limits.late_tokens(ms(60_000)).is_empty());
-        assert!(limits.token_appeared(&rover, ("present".to_owned(), 1), ms(60_000)));
+        let present = limits.token_appeared(&rover, ("present".to_owned(), 1), ms(60_000));
+        assert_eq!(present, Appeared::Taken);
     }
 
     #[test]

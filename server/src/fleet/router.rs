@@ -123,6 +123,7 @@ mod tests {
     use zenoh::Wait as _;
 
     use super::super::Fleet;
+    use super::super::gate::Links;
     use super::super::inbox::Channels;
     use super::super::opening::{Opener, with_free_port};
     use super::*;
@@ -162,7 +163,7 @@ mod tests {
                     supervisor: supervisor.clone(),
                     next: AtomicU64::new(0),
                 },
-                channels: Channels::new(&supervisor, &app, uploads),
+                channels: Channels::new(&supervisor, &app, uploads, Links::default()),
                 turn: Mutex::new(()),
             };
             keeper.open().await.unwrap();

@@ -41,6 +41,15 @@ pub(crate) struct Plan {
     pub(crate) seconds: u64,
     /// Where to say what was done.
     pub(crate) report: PathBuf,
+    /// Parts of the names of floods that are left out.
+    pub(crate) without: Vec<String>,
+}
+
+impl Plan {
+    /// Whether the flood of that name is sent.
+    pub(super) fn has(&self, flood: &str) -> bool {
+        !self.without.iter().any(|part| flood.contains(part))
+    }
 }
 
 /// What a flood has done.

@@ -35,6 +35,8 @@ const WORK_EVERY: Duration = Duration::from_millis(500);
 const CHANGES_MAX: u64 = 400;
 /// Least time between two changes of the admin.
 const CHANGE_EVERY: Duration = Duration::from_millis(200);
+/// How long a stop may take without being listed.
+const SLOW_STOP_MS: f64 = 50.0;
 /// Longest wait for any answer.
 const ANSWER_MAX: Duration = Duration::from_secs(10);
 
@@ -53,6 +55,8 @@ pub(super) struct Change {
 pub(super) struct Worked {
     /// How long stops over new connections took, ms.
     pub(super) stops_ms: Vec<f64>,
+    /// Those that took long: when they began, seconds, and how long they took, ms.
+    pub(super) slow_stops: Vec<(f64, f64)>,
     /// Stops without an answer, or that the robot did not confirm, and why.
     pub(super) failed_stops: Vec<String>,
     /// How old the other robot's state was, ms.
@@ -187,6 +191,7 @@ async fn stop(http: SocketAddr, operator: String, (worked, is_over): Begun) {
         "POST /v1/sites/{SITE}/robots/{HONEST_ROBOT}/stop HTTP/1.1\r\nhost: {http}\r\n\
          authorization: Bearer {operator}\r\nconnection: close\r\ncontent-length: 0\r\n\r\n"
     );
+    let started = Instant::now();
     let mut rounds = Rounds::new(STOP_EVERY, is_over);
     while rounds.next().await.is_some() {
         let begun = Instant::now();
@@ -200,6 +205,11 @@ async fn stop(http: SocketAddr, operator: String, (worked, is_over): Begun) {
         };
         note(&worked, |worked| {
             worked.stops_ms.push(took_ms);
+            if took_ms > SLOW_STOP_MS {
+                worked
+                    .slow_stops
+                    .push((begun.duration_since(started).as_secs_f64(), took_ms));
+            }
             worked.failed_stops.extend(failure);
         });
     }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use futures_util::future::BoxFuture;
 use futures_util::{SinkExt as _, StreamExt as _};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
@@ -37,15 +38,33 @@ const OPENED_HZ: f64 = 1_000.0;
 /// Drive sockets that a viewer opens.
 const SOCKETS: u32 = 600;
 
+/// What the floods are called.
+const CHANGES: &str = "changes by a viewer, pipelined";
+const SIGN_INS: &str = "sign-ins byte by byte, by strangers";
+const TOKENS: &str = "wrong tokens from one address";
+const STOPS: &str = "stops of 200 absent robots by a viewer";
+const OPENED: &str = "connections opened and closed";
+const DRIVES: &str = "drive sockets by a viewer";
+
 /// Starts all floods over HTTP.
 pub(super) fn spawn(floods: &mut JoinSet<Outcome>, plan: &Plan, until: Instant) {
     let Plan { http, viewer, .. } = plan;
-    floods.spawn(pipelined_changes(*http, viewer.clone(), until));
-    floods.spawn(slow_sign_ins(*http, until));
-    floods.spawn(wrong_tokens(*http, until));
-    floods.spawn(stops(*http, viewer.clone(), until));
-    floods.spawn(opened_and_closed(*http, until));
-    floods.spawn(drive_sockets(plan.clone(), until));
+    let floods_by_name: [(&str, BoxFuture<'static, Outcome>); _] = [
+        (
+            CHANGES,
+            Box::pin(pipelined_changes(*http, viewer.clone(), until)),
+        ),
+        (SIGN_INS, Box::pin(slow_sign_ins(*http, until))),
+        (TOKENS, Box::pin(wrong_tokens(*http, until))),
+        (STOPS, Box::pin(stops(*http, viewer.clone(), until))),
+        (OPENED, Box::pin(opened_and_closed(*http, until))),
+        (DRIVES, Box::pin(drive_sockets(plan.clone(), until))),
+    ];
+    for (name, flood) in floods_by_name {
+        if plan.has(name) {
+            floods.spawn(flood);
+        }
+    }
 }
 
 /// Counts the answers on a connection until it ends: all, and those of a 5xx.
@@ -111,7 +130,7 @@ async fn pipelined_changes(http: SocketAddr, viewer: String, until: Instant) -> 
     }
     while connections.join_next().await.is_some() {}
     Outcome {
-        flood: "changes by a viewer, pipelined",
+        flood: CHANGES,
         of: "answered",
         count: answers.load(Ordering::Relaxed),
         wanted_per_s: Some(PIPELINED_HZ),
@@ -154,7 +173,7 @@ async fn slow_sign_ins(http: SocketAddr, until: Instant) -> Outcome {
     }
     while connections.join_next().await.is_some() {}
     Outcome {
-        flood: "sign-ins byte by byte, by strangers",
+        flood: SIGN_INS,
         of: "opened",
         count: opened.load(Ordering::Relaxed),
         wanted_per_s: None,
@@ -211,7 +230,7 @@ async fn wrong_tokens(http: SocketAddr, until: Instant) -> Outcome {
         }
     }
     Outcome {
-        flood: "wrong tokens from one address",
+        flood: TOKENS,
         of: "asked",
         count,
         wanted_per_s: Some(WRONG_TOKENS_HZ),
@@ -246,7 +265,7 @@ async fn stops(http: SocketAddr, viewer: String, until: Instant) -> Outcome {
     }
     while asking.join_next().await.is_some() {}
     Outcome {
-        flood: "stops of 200 absent robots by a viewer",
+        flood: STOPS,
         of: "asked",
         count: pace.done(),
         wanted_per_s: Some(STOPS_HZ),
@@ -268,7 +287,7 @@ async fn opened_and_closed(http: SocketAddr, until: Instant) -> Outcome {
         }
     }
     Outcome {
-        flood: "connections opened and closed",
+        flood: OPENED,
         of: "opened",
         count: opened,
         wanted_per_s: Some(OPENED_HZ),
@@ -318,7 +337,7 @@ async fn drive_sockets(plan: Plan, until: Instant) -> Outcome {
     }
     while sockets.join_next().await.is_some() {}
     Outcome {
-        flood: "drive sockets by a viewer",
+        flood: DRIVES,
         of: "asked for",
         count: opened.load(Ordering::Relaxed) + refused.load(Ordering::Relaxed),
         wanted_per_s: None,

@@ -41,6 +41,8 @@ pub(super) struct Facts {
     seconds: f64,
     floods: Vec<Done>,
     server: Used,
+    /// Stops that took long: when, seconds, and how long, ms.
+    slow_stops: Vec<(f64, f64)>,
     /// The first of what failed.
     failures: Vec<String>,
     #[serde(skip)]
@@ -159,6 +161,7 @@ impl Facts {
             seconds,
             floods,
             server,
+            slow_stops: worked.slow_stops.clone(),
             failures,
             checks,
             timed,

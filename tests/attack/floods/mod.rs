@@ -55,6 +55,9 @@ pub(crate) struct Arguments {
     /// have machines of their own
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u8).range(0..=19))]
     nice: u8,
+    /// Leave out floods whose names have this in them, to see what each one costs
+    #[arg(long, value_name = "PART")]
+    without: Vec<String>,
     /// Judge what does not depend on the machine's speed alone: a short run, built for debugging
     #[arg(long)]
     untimed: bool,
@@ -153,6 +156,7 @@ pub(crate) async fn run(arguments: &Arguments, json: bool) -> anyhow::Result<Exi
         robots: memberships,
         seconds: arguments.seconds,
         report: fleet.file("floods.json"),
+        without: arguments.without.clone(),
     };
     let operator = token(&fleet, "operator").await?;
     let honest = Honest::begin(&fleet, &operator, &quiet, arguments.seconds).await?;

@@ -95,6 +95,9 @@ impl Flood {
 pub(super) async fn connect(plan: &Plan) -> anyhow::Result<Vec<(Flood, LightRobot)>> {
     let mut connected = Vec::new();
     for (flood, membership) in Flood::ALL.into_iter().zip(&plan.robots) {
+        if !plan.has(flood.words().0) {
+            continue;
+        }
         let robot = LightRobot::start_secure(&plan.endpoint, membership).await?;
         connected.push((flood, robot));
     }

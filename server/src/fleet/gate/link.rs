@@ -99,7 +99,8 @@ impl Link {
         // From here on it is a robot's, and not displaced for others.
         let _at_work = self.slot.work();
         let counters = self.app.counters();
-        let entry = self.links.enter(robot.clone(), admitted.certificate);
+        let now = self.app.clock().elapsed();
+        let entry = self.links.enter(robot.clone(), admitted.certificate, now);
         let mut outside = admitted.stream;
         let joined = async {
             self.app.note_shown(robot, name.enrolment, issuer).await;
@@ -115,6 +116,7 @@ impl Link {
                 counters.gate_displaced.one();
                 debug!(robot.id = %robot.1, "robot `{}` has newer links", robot.1);
             }
+            () = entry.cut_off() => counters.gate_cut_off.one(),
             () = tokio::time::sleep(admitted.left) => {
                 counters.gate_expired.one();
                 info!(robot.id = %robot.1, "the certificate of robot `{}` is over", robot.1);

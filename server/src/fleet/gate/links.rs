@@ -1,10 +1,12 @@
 //! The links of each robot, of which the newest few stay.
 //!
 //! A robot has one session and for a moment a second. Without a bound one robot's certificate would
-//! open as many links as there is room for, and lock the others out.
+//! open as many links as there is room for, and lock the others out. A robot that burdens the router
+//! with what cannot be refused there is cut off for a while.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 
@@ -13,6 +15,10 @@ use crate::app::presence::RobotKey;
 /// Most links of one robot. Two agents under one name are noticed and shown, so both get in.
 pub(in crate::fleet) const LINKS_PER_ROBOT_MAX: usize = 4;
 
+/// How long a robot that was cut off stays out: its session ends meanwhile, and what it had declared
+/// goes.
+pub(in crate::fleet) const CUT_OFF: Duration = Duration::from_secs(10);
+
 /// The SHA-256 of a certificate.
 pub(super) type CertificateHash = [u8; 32];
 
@@ -20,12 +26,14 @@ type OfRobots = HashMap<RobotKey, VecDeque<OneLink>>;
 
 /// All robots' links.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Links(Arc<Mutex<Table>>);
+pub(in crate::fleet) struct Links(Arc<Mutex<Table>>);
 
 #[derive(Debug, Default)]
 struct Table {
     next: u64,
     of_robots: OfRobots,
+    /// Robots that were cut off, and until when.
+    cut_off: HashMap<RobotKey, Duration>,
 }
 
 #[derive(Debug)]
@@ -35,6 +43,7 @@ struct OneLink {
     /// The zenoh session on it, once it has begun to open.
     session_id: Option<u128>,
     displaced: CancellationToken,
+    cut_off: CancellationToken,
     ended: CancellationToken,
 }
 
@@ -45,6 +54,7 @@ pub(super) struct Entry {
     robot: RobotKey,
     number: u64,
     displaced: CancellationToken,
+    cut_off: CancellationToken,
     ended: CancellationToken,
 }
 
@@ -53,10 +63,29 @@ impl Links {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Adds a link of a robot; its oldest one goes if it has too many.
-    pub(super) fn enter(&self, robot: RobotKey, certificate: CertificateHash) -> Entry {
-        let (displaced, ended) = (CancellationToken::new(), CancellationToken::new());
+    /// Cuts a robot's links, and keeps it out for [`CUT_OFF`]; whether it was not out already.
+    pub(in crate::fleet) fn cut_off(&self, robot: &RobotKey, now: Duration) -> bool {
         let mut table = self.lock();
+        table.cut_off.retain(|_, until| *until > now);
+        let is_news = table.cut_off.insert(robot.clone(), now + CUT_OFF).is_none();
+        for link in table.of_robots.get(robot).into_iter().flatten() {
+            link.cut_off.cancel();
+        }
+        is_news
+    }
+
+    /// Adds a link of a robot; its oldest one goes if it has too many.
+    pub(super) fn enter(
+        &self,
+        robot: RobotKey,
+        certificate: CertificateHash,
+        now: Duration,
+    ) -> Entry {
+        let [displaced, cut_off, ended] = std::array::from_fn(|_| CancellationToken::new());
+        let mut table = self.lock();
+        if table.cut_off.get(&robot).is_some_and(|until| *until > now) {
+            cut_off.cancel();
+        }
         table.next += 1;
         let number = table.next;
         let own = table.of_robots.entry(robot.clone()).or_default();
@@ -65,6 +94,7 @@ impl Links {
             certificate,
             session_id: None,
             displaced: displaced.clone(),
+            cut_off: cut_off.clone(),
             ended: ended.clone(),
         });
         let staying = |link: &&OneLink| !link.displaced.is_cancelled();
@@ -80,12 +110,18 @@ impl Links {
             robot,
             number,
             displaced,
+            cut_off,
             ended,
         }
     }
 }
 
 impl Entry {
+    /// Waits until the robot is cut off.
+    pub(super) async fn cut_off(&self) {
+        self.cut_off.cancelled().await;
+    }
+
     /// Waits until newer links of the robot have taken its place.
     pub(super) async fn displaced(&self) {
         self.displaced.cancelled().await;
@@ -146,9 +182,9 @@ mod tests {
     #[test]
     fn of_a_robots_links_the_newest_stay_and_others_lose_none() {
         let links = Links::default();
-        let other = links.enter(robot("rover-2"), [0; 32]);
+        let other = links.enter(robot("rover-2"), [0; 32], Duration::ZERO);
         let all: Vec<Entry> = (0..100)
-            .map(|_| links.enter(robot("rover-1"), [0; 32]))
+            .map(|_| links.enter(robot("rover-1"), [0; 32], Duration::ZERO))
             .collect();
         let stay = |entry: &&Entry| !entry.displaced.is_cancelled();
         assert_eq!(all.iter().filter(stay).count(), LINKS_PER_ROBOT_MAX);
@@ -160,7 +196,7 @@ mod tests {
         assert!(stay(&&other));
         drop(all);
         assert_eq!(links.lock().of_robots.len(), 1);
-        let again = links.enter(robot("rover-1"), [0; 32]);
+        let again = links.enter(robot("rover-1"), [0; 32], Duration::ZERO);
         assert!(stay(&&again));
         drop((other, again));
         assert!(links.lock().of_robots.is_empty());
@@ -171,14 +207,17 @@ mod tests {
         let links = Links::default();
         let rover = || robot("rover-1");
         let (older, others) = (
-            links.enter(rover(), [1; 32]),
-            [links.enter(rover(), [2; 32]), links.enter(rover(), [1; 32])],
+            links.enter(rover(), [1; 32], Duration::ZERO),
+            [
+                links.enter(rover(), [2; 32], Duration::ZERO),
+                links.enter(rover(), [1; 32], Duration::ZERO),
+            ],
         );
         assert!(!older.take_over(7).await);
         for (other, session_id) in others.iter().zip([7, 8]) {
             assert!(!other.take_over(session_id).await);
         }
-        let newest = links.enter(rover(), [1; 32]);
+        let newest = links.enter(rover(), [1; 32], Duration::ZERO);
         let mut taking = Box::pin(newest.take_over(7));
         let waiting = tokio::time::timeout(std::time::Duration::from_millis(1), &mut taking).await;
         assert!(waiting.is_err(), "the older one has not ended");
@@ -186,5 +225,23 @@ mod tests {
         drop(older);
         assert!(taking.await);
         assert!(others.iter().all(|other| !other.displaced.is_cancelled()));
+    }
+
+    #[test]
+    fn a_robot_that_is_cut_off_loses_all_links_and_gets_none_for_a_while_and_others_keep_theirs() {
+        let links = Links::default();
+        let at = Duration::from_secs;
+        let enter = |name, now| links.enter(robot(name), [0; 32], now);
+        let (own, other) = (enter("rover-1", at(0)), enter("rover-2", at(0)));
+        assert!(links.cut_off(&robot("rover-1"), at(1)));
+        assert!(
+            !links.cut_off(&robot("rover-1"), at(2)),
+            "it was out already"
+        );
+        assert!(own.cut_off.is_cancelled() && !other.cut_off.is_cancelled());
+        let just_before = Duration::from_millis(1_999) + CUT_OFF;
+        assert!(enter("rover-1", just_before).cut_off.is_cancelled());
+        assert!(!enter("rover-1", at(2) + CUT_OFF).cut_off.is_cancelled());
+        assert!(!enter("rover-2", at(2)).cut_off.is_cancelled());
     }
 }

@@ -6,6 +6,7 @@
 //!     │ begins like TLS? ─no─► closed
 //!     │ handshake with a certificate of the fleet's authority, in time? ─no─► closed
 //!     │ the certificate's enrolment in force? ─no─► closed, and people are told
+//!     │ cut off a short time ago? ─► its end
 //!     │ more than four links of this robot? ─► its oldest goes
 //!     │ the gate sends the robot its user name and password
 //!     │ the session begins as a client, with an id of the robot's own? ─no─► closed
@@ -45,7 +46,7 @@ use self::failures::Failures;
 use self::link::Link;
 #[cfg(test)]
 pub(super) use self::links::LINKS_PER_ROBOT_MAX;
-use self::links::Links;
+pub(super) use self::links::{CUT_OFF, Links};
 use super::routers::Routers;
 use super::{FleetError, SEND_BUFFER_BYTES, SESSIONS_MAX, Security};
 use crate::app::App;
@@ -202,12 +203,12 @@ impl Gate {
         self,
         app: App,
         routers: Arc<Routers>,
+        links: Links,
         supervisor: Supervisor,
         stop: CancellationToken,
     ) {
         let connections = Connections::new(BOUNDS);
         let failures = Arc::new(Mutex::new(Failures::default()));
-        let links = Links::default();
         loop {
             let accepted = tokio::select! {
                 biased;
