@@ -42,7 +42,7 @@ use tracing::{info, warn};
 use tread_api::ids::SiteId;
 use tread_api::startup::give_zenoh_threads;
 
-use self::app::enrolment::Office;
+use self::app::enrolment::EnrolmentService;
 use self::app::identity::audit;
 use self::app::{
     App, Dependencies, checkpoints, events, ingest, memory, merging, reconciler, retention, storage,
@@ -102,7 +102,7 @@ impl Server {
         let stop = || supervisor.stop_token();
         let (of_fleet, fleet_clock) = (security.clone(), clock.clone());
         let fleet = Fleet::open(config.zenoh, of_fleet, fleet_clock, supervisor.clone())?;
-        let office = |security: Security, robots: &RobotsConfig| Office {
+        let enrolment_service = |security: Security, robots: &RobotsConfig| EnrolmentService {
             authorities: security.authorities,
             lifetime: SignedDuration::from_secs(robots.certificate_s.into()),
             port: fleet.address().port(),
@@ -116,7 +116,7 @@ impl Server {
             robots: fleet.robot_link(),
             enrolment: security
                 .zip(config.robots.as_ref())
-                .map(|(security, robots)| office(security, robots)),
+                .map(|(security, robots)| enrolment_service(security, robots)),
         });
         app.log_audit(config.audit.log);
         if let Some(oidc) = &config.oidc {

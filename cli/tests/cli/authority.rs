@@ -17,12 +17,12 @@ use tread_server::{Config, RunningServer, Server};
 use crate::yard::{ROBOT, Ran};
 
 /// A server that robots join.
-struct Office {
+struct ServerWithRobots {
     folder: TempDir,
     server: RunningServer,
 }
 
-impl Office {
+impl ServerWithRobots {
     async fn start() -> Self {
         let _first = rustls::crypto::ring::default_provider().install_default();
         let folder = tempfile::tempdir().unwrap();
@@ -102,32 +102,32 @@ impl Office {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_rotation_is_finished_by_its_name_and_a_stolen_authority_replaced_after_a_question() {
-    let office = Office::start().await;
+    let running = ServerWithRobots::start().await;
     let request = CreateJoinToken {
         site: "yard".parse().unwrap(),
         robot: None,
         valid_minutes: None,
     };
-    let app = office.server.app();
+    let app = running.server.app();
     let made = app.create_join_token(request, ("tests", &Scope::EVERYWHERE));
-    office.join(made.await.unwrap().secret).await;
+    running.join(made.await.unwrap().secret).await;
 
-    let started = office.json(&["authority", "start"]).await;
+    let started = running.json(&["authority", "start"]).await;
     let rotation = started["rotation"]["id"].as_str().unwrap();
-    let shown = office.run(&["authority"]).await;
+    let shown = running.run(&["authority"]).await;
     assert!(shown.text.contains(rotation), "{}", shown.text);
-    let nameless = office.run(&["authority", "finish"]).await;
+    let nameless = running.run(&["authority", "finish"]).await;
     assert_eq!(nameless.code, Some(2), "{}", nameless.errors);
     let another = ["authority", "finish", "0011223344556677", "--force"];
-    let another = office.run(&another).await;
+    let another = running.run(&another).await;
     assert_eq!(another.code, Some(6), "{}", another.errors);
     assert!(another.errors.contains(rotation), "{}", another.errors);
-    let left = office.run(&["authority", "finish", rotation]).await;
+    let left = running.run(&["authority", "finish", rotation]).await;
     assert_eq!(left.code, Some(6), "{}", left.errors);
 
     // Without a terminal nobody can be asked, and nothing is done.
-    let before = office.json(&["authority"]).await;
-    let refused = office.run(&["authority", "replace"]).await;
+    let before = running.json(&["authority"]).await;
+    let refused = running.run(&["authority", "replace"]).await;
     assert_eq!(refused.code, Some(1), "{}", refused.errors);
     assert!(
         refused.errors.contains("yard/rover-1"),
@@ -136,30 +136,30 @@ async fn a_rotation_is_finished_by_its_name_and_a_stolen_authority_replaced_afte
     );
     assert!(refused.errors.contains("--yes"), "{}", refused.errors);
     assert_eq!(
-        office.json(&["authority"]).await["signing"],
+        running.json(&["authority"]).await["signing"],
         before["signing"]
     );
 
-    let replaced = office.run(&["authority", "replace", "--yes"]).await;
+    let replaced = running.run(&["authority", "replace", "--yes"]).await;
     assert_eq!(replaced.code, Some(0), "{}", replaced.errors);
     assert!(
         replaced.text.contains("must join again: 1"),
         "{}",
         replaced.text
     );
-    let after = office.json(&["authority"]).await;
+    let after = running.json(&["authority"]).await;
     assert_ne!(after["signing"], before["signing"]);
     assert_eq!(after["rotation"], Value::Null);
     assert_eq!(after["to_join"][0]["robot"], ROBOT);
-    let tokens = office.json(&["robots", "join-token", "--all"]).await;
+    let tokens = running.json(&["robots", "join-token", "--all"]).await;
     let token = &tokens.as_array().unwrap()[0];
     assert_eq!(token["join_token"]["robot"], ROBOT);
-    office
+    running
         .join(token["secret"].as_str().unwrap().to_owned())
         .await;
-    let after = office.json(&["authority"]).await;
+    let after = running.json(&["authority"]).await;
     assert_eq!(after["robots_to_join"], 0);
-    let nobody = office.run(&["robots", "join-token", "--all"]).await;
+    let nobody = running.run(&["robots", "join-token", "--all"]).await;
     assert!(nobody.errors.contains("no robot must join again"));
-    office.server.stop().await.unwrap();
+    running.server.stop().await.unwrap();
 }

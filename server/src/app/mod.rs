@@ -42,7 +42,7 @@ use tread_api::rights::Scope;
 use uuid::Uuid;
 
 use self::allowance::Allowances;
-use self::enrolment::{Membership, Office};
+use self::enrolment::{EnrolmentService, Membership};
 pub use self::error::AppError;
 use self::events::Hub;
 use self::friction::{MapNews, Pictures, Views};
@@ -127,7 +127,7 @@ pub struct Dependencies {
     /// How robots are reached.
     pub robots: RobotLink,
     /// By what robots join; without it whoever reaches the network may speak.
-    pub enrolment: Option<Office>,
+    pub enrolment: Option<EnrolmentService>,
 }
 
 impl App {

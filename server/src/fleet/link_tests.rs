@@ -77,7 +77,9 @@ async fn a_robot_that_is_put_out_is_cut_off_within_a_second_and_cannot_come_back
     let mut session = rig.connect(Who::Own, 10_000).await.unwrap();
     let router = rig.fleet.routers.newest().unwrap();
     assert_eq!(sessions_on(&router).await, 1);
-    rig.app.roll().note(&enrolment("rover-1", 2, true));
+    rig.app
+        .enrolment_registry()
+        .note(&enrolment("rover-1", 2, true));
     let took = cut(&mut session, &router).await;
     assert!(took < CUT_MAX, "it took {took:?}");
     assert_eq!(rig.app.counters().gate_revoked.get(), 1);
@@ -92,14 +94,18 @@ async fn a_robot_on_a_router_that_was_since_replaced_is_cut_off_too() {
     let rig = Rig::start().await;
     let mut session = rig.connect(Who::Own, 10_000).await.unwrap();
     let former = rig.fleet.routers.newest().unwrap();
-    rig.app.roll().note(&enrolment("rover-4", 1, false));
+    rig.app
+        .enrolment_registry()
+        .note(&enrolment("rover-4", 1, false));
     let number = former.number;
     until("another router is open", async || {
         rig.fleet.routers.newest().unwrap().number != number
     })
     .await;
     assert_eq!(sessions_on(&former).await, 1, "it stays where it is");
-    rig.app.roll().note(&enrolment("rover-1", 2, true));
+    rig.app
+        .enrolment_registry()
+        .note(&enrolment("rover-1", 2, true));
     let took = cut(&mut session, &former).await;
     assert!(took < CUT_MAX, "it took {took:?}");
     assert!(rig.connect(Who::Own, 300).await.is_none());

@@ -23,7 +23,7 @@ use zenoh::{Session, Wait as _};
 
 use super::test_client::{Shown, TestClient, TestSession};
 use super::{Fleet, Security};
-use crate::app::enrolment::Office;
+use crate::app::enrolment::EnrolmentService;
 use crate::app::{App, Dependencies};
 use crate::authority::{Authorities, Authority, RobotName, RobotRequest};
 use crate::clock::Clock;
@@ -123,7 +123,7 @@ impl Rig {
             storage: StorageConfig::default(),
             normalisations: Vec::new(),
             robots: fleet.robot_link(),
-            enrolment: Some(Office {
+            enrolment: Some(EnrolmentService {
                 authorities: Arc::clone(&authorities),
                 lifetime: HOUR,
                 port: fleet.address().port(),
@@ -135,7 +135,8 @@ impl Rig {
             ("rover-2", 1, false),
             ("rover-3", 1, true),
         ] {
-            app.roll().note(&enrolment(name, number, is_revoked));
+            app.enrolment_registry()
+                .note(&enrolment(name, number, is_revoked));
         }
         let (uploads, uploads_in) = mpsc::channel(1);
         drop(uploads_in);

@@ -11,7 +11,6 @@ mod commands;
 mod credentials;
 mod gate;
 mod inbox;
-mod keeper;
 #[cfg(test)]
 mod link_tests;
 #[cfg(test)]
@@ -24,6 +23,7 @@ mod rate_limits;
 mod received;
 mod requests;
 mod router;
+mod router_pool;
 mod routers;
 mod teleop;
 #[cfg(test)]
@@ -41,8 +41,8 @@ use tread_api::wire::PAYLOAD_BYTES_MAX;
 
 use self::commands::ZenohCommands;
 use self::gate::Gate;
-use self::keeper::Keeper;
 use self::opening::{Opener, with_free_port};
+use self::router_pool::RouterPool;
 use self::routers::Routers;
 use self::teleop::ZenohDrive;
 use crate::app::App;
@@ -208,14 +208,14 @@ impl Fleet {
             return Ok(());
         };
         let links = gate::Links::default();
-        let keeper = Arc::new(Keeper {
+        let pool = Arc::new(RouterPool {
             app: app.clone(),
             routers: Arc::clone(&self.routers),
             opener,
             channels: inbox::Channels::new(&self.supervisor, app, uploads, links.clone()),
             turn: Mutex::new(()),
         });
-        keeper.open().await?;
+        pool.open().await?;
         let stop = || self.supervisor.stop_token();
         let pulse = pulse::run(app.clone(), Arc::clone(&self.routers), stop());
         self.supervisor.spawn_vital("pulse", pulse);
@@ -223,14 +223,14 @@ impl Fleet {
         self.supervisor.spawn_vital("changes", changes);
         let gate = self.gate.lock().ok().and_then(|mut gate| gate.take());
         if let Some(gate) = gate {
-            let keeping = Arc::clone(&keeper).run(stop());
+            let keeping = Arc::clone(&pool).run(stop());
             self.supervisor.spawn_vital("routers", keeping);
             let (routers, supervisor) = (Arc::clone(&self.routers), self.supervisor.clone());
             let running = gate.run(app.clone(), routers, links, supervisor, stop());
             self.supervisor.spawn_vital("gate", running);
         }
         let watching = router::watch(router::Watch {
-            keeper,
+            pool,
             supervisor: self.supervisor.clone(),
             period: self.probe_period,
             stop: stop(),

@@ -11,9 +11,9 @@ use tracing::{error, warn};
 use tread_api::tunnel::RouterCredentials;
 use zenoh::Wait as _;
 
-use super::keeper::{Keeper, robots_on};
 use super::opening::client_config;
 use super::probe::PROBE_KEY;
+use super::router_pool::{RouterPool, robots_on};
 use super::routers::Router;
 use crate::supervisor::Supervisor;
 
@@ -26,7 +26,7 @@ const FAILURES_MAX: u32 = 3;
 
 /// What the watch works on.
 pub(super) struct Watch {
-    pub(super) keeper: Arc<Keeper>,
+    pub(super) pool: Arc<RouterPool>,
     pub(super) supervisor: Supervisor,
     /// Time between two looks.
     pub(super) period: Duration,
@@ -43,7 +43,7 @@ pub(super) async fn watch(watch: Watch) {
             () = watch.stop.cancelled() => return,
             () = tokio::time::sleep(watch.period) => {}
         }
-        let newest = watch.keeper.routers.newest();
+        let newest = watch.pool.routers.newest();
         let number = newest.as_ref().map(|router| router.number);
         if number != seen {
             (seen, failures) = (number, 0);
@@ -53,12 +53,12 @@ pub(super) async fn watch(watch: Watch) {
             continue;
         }
         failures += 1;
-        let counters = watch.keeper.app.counters();
+        let counters = watch.pool.app.counters();
         counters.router_probes_failed.one();
         warn!("the zenoh router did not answer, {failures} of {FAILURES_MAX} times");
         if failures >= FAILURES_MAX && !watch.stop.is_cancelled() {
             failures = 0;
-            reopen(&watch.keeper, newest.as_ref()).await;
+            reopen(&watch.pool, newest.as_ref()).await;
         }
     }
 }
@@ -79,21 +79,21 @@ async fn looked_at(watch: &Watch, router: Option<&Arc<Router>>) -> bool {
 /// Opens another router in the place of one that does not answer. One that still carries robots stays:
 /// behind the gate beside the new one, until they have left it; in the clear, where there is but one
 /// address, as long as it carries them.
-async fn reopen(keeper: &Keeper, former: Option<&Arc<Router>>) {
-    let _turn = keeper.turn.lock().await;
+async fn reopen(pool: &RouterPool, former: Option<&Arc<Router>>) {
+    let _turn = pool.turn.lock().await;
     if let Some(former) = former {
         let robot_count = robots_on(former).await;
         let is_behind_gate = former.credentials.is_some();
         if robot_count == 0 {
-            keeper.close(former.number).await;
+            pool.close(former.number).await;
         } else if !is_behind_gate {
             error!("the zenoh router takes no connections; it stays for {robot_count} robots");
             return;
         }
     }
-    match keeper.open().await {
+    match pool.open().await {
         Ok(()) => {
-            keeper.app.counters().router_reopened.one();
+            pool.app.counters().router_reopened.one();
             warn!("the zenoh router was opened again");
         }
         // There is none now, so the next looks fail too and it is tried again.
@@ -149,12 +149,12 @@ mod tests {
         let supervisor = Supervisor::new();
         let authority = Authority::generate("fleet", clock.now()).unwrap();
         // Their channels must outlive the tasks that read them.
-        let mut keepers = Vec::new();
+        let mut pools = Vec::new();
         for authorities in [None, Some(Authorities::in_memory(Arc::new(authority)))] {
             let is_behind_gate = authorities.is_some();
             let address = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
             let (uploads, _uploads_in) = mpsc::channel(1);
-            let keeper = Keeper {
+            let pool = RouterPool {
                 app: app.clone(),
                 routers: Arc::default(),
                 opener: Opener {
@@ -166,16 +166,16 @@ mod tests {
                 channels: Channels::new(&supervisor, &app, uploads, Links::default()),
                 turn: Mutex::new(()),
             };
-            keeper.open().await.unwrap();
-            let router = keeper.routers.newest().unwrap();
+            pool.open().await.unwrap();
+            let router = pool.routers.newest().unwrap();
             let credentials = router.credentials.as_ref().map(|it| it.of_probe());
             let config = client_config(router.address, credentials.as_ref(), 5_000).unwrap();
             let opening = tokio::task::spawn_blocking(move || zenoh::open(config).wait());
             let robot = opening.await.unwrap().unwrap();
             assert_eq!(robots_on(&router).await, 1);
-            reopen(&keeper, Some(&router)).await;
+            reopen(&pool, Some(&router)).await;
             assert_eq!(robots_on(&router).await, 1, "it carries on");
-            let open = keeper.routers.all().len();
+            let open = pool.routers.all().len();
             assert_eq!(open, 1 + usize::from(is_behind_gate));
             tokio::task::spawn_blocking(move || robot.close().wait())
                 .await
@@ -184,13 +184,13 @@ mod tests {
             while robots_on(&router).await > 0 {
                 tokio::time::sleep(Duration::from_millis(20)).await;
             }
-            reopen(&keeper, Some(&router)).await;
-            let numbers = keeper.routers.all();
+            reopen(&pool, Some(&router)).await;
+            let numbers = pool.routers.all();
             assert!(numbers.iter().all(|open| open.number != router.number));
-            for router in keeper.routers.all() {
-                keeper.close(router.number).await;
+            for router in pool.routers.all() {
+                pool.close(router.number).await;
             }
-            keepers.push(keeper);
+            pools.push(pool);
         }
         supervisor.stop().await.unwrap();
     }

@@ -11,8 +11,8 @@
 //!
 //! What fails is told alike, whatever the cause; the cause is for the audit log and the counters.
 
-mod outsiders;
-pub mod roll;
+pub mod registry;
+mod revoked_robots;
 mod rotation;
 
 use std::net::IpAddr;
@@ -29,9 +29,9 @@ use tread_api::page::Page;
 use tread_api::rights::Scope;
 use tread_api::robot::Alert;
 
-use self::outsiders::Outsiders;
-pub(super) use self::outsiders::{RETIRED_ALERT, REVOKED_ALERT, UNISSUED_ALERT};
-use self::roll::Roll;
+use self::registry::EnrolmentRegistry;
+use self::revoked_robots::RevokedRobots;
+pub(super) use self::revoked_robots::{RETIRED_ALERT, REVOKED_ALERT, UNISSUED_ALERT};
 use self::rotation::Shown;
 use super::identity::new_secret;
 use super::identity::quota::Quota;
@@ -60,7 +60,7 @@ const FORGET_MAX: u32 = 10;
 
 /// What the server signs robots' certificates with.
 #[derive(Debug)]
-pub struct Office {
+pub struct EnrolmentService {
     /// The fleet's authority, and during a rotation two.
     pub authorities: Arc<Authorities>,
     /// How long a robot's certificate is good for.
@@ -72,23 +72,23 @@ pub struct Office {
 /// What is known of robots that have joined.
 #[derive(Debug)]
 pub(super) struct Membership {
-    pub(super) roll: Arc<Roll>,
-    office: Option<Office>,
-    outsiders: Outsiders,
+    pub(super) registry: Arc<EnrolmentRegistry>,
+    service: Option<EnrolmentService>,
+    revoked_robots: RevokedRobots,
     shown: Shown,
 }
 
 impl Membership {
     /// With an authority only robots that have joined may speak.
-    pub(super) fn new(office: Option<Office>) -> Self {
-        let roll = Arc::<Roll>::default();
-        if office.is_some() {
-            roll.close();
+    pub(super) fn new(service: Option<EnrolmentService>) -> Self {
+        let registry = Arc::<EnrolmentRegistry>::default();
+        if service.is_some() {
+            registry.close();
         }
         Self {
-            roll,
-            office,
-            outsiders: Outsiders::default(),
+            registry,
+            service,
+            revoked_robots: RevokedRobots::default(),
             shown: Shown::default(),
         }
     }
@@ -194,12 +194,12 @@ pub struct Enrolled {
 
 impl App {
     /// Which robots are of the fleet.
-    pub fn roll(&self) -> &Arc<Roll> {
-        &self.membership().roll
+    pub fn enrolment_registry(&self) -> &Arc<EnrolmentRegistry> {
+        &self.membership().registry
     }
 
-    fn office(&self) -> Option<&Office> {
-        self.membership().office.as_ref()
+    fn service(&self) -> Option<&EnrolmentService> {
+        self.membership().service.as_ref()
     }
 
     /// Learns from the database who has joined.
@@ -209,7 +209,7 @@ impl App {
     pub async fn know_enrolments(&self) -> Result<(), AppError> {
         let mut tx = self.db().read("enrolment").await?;
         for enrolment in db::enrolments::all_newest(&mut tx).await? {
-            self.roll().note(&enrolment);
+            self.enrolment_registry().note(&enrolment);
         }
         Ok(())
     }
@@ -223,7 +223,7 @@ impl App {
         request: CreateJoinToken,
         (created_by, within): (&str, &Scope),
     ) -> Result<CreatedJoinToken, AppError> {
-        if self.office().is_none() {
+        if self.service().is_none() {
             return Err(AppError::NoAuthority);
         }
         let minutes = request.valid_minutes.unwrap_or(JOIN_MINUTES_DEFAULT);
@@ -340,7 +340,7 @@ impl App {
         Ok(enrolment)
     }
 
-    /// Commits, and then lets the roll and the events show it.
+    /// Commits, and then lets the registry and the events show it.
     async fn commit_enrolment(
         &self,
         tx: Tx,
@@ -350,7 +350,7 @@ impl App {
         let (app, enrolment) = (self.clone(), enrolment.clone());
         let committed = tx.commit_then(move |outcome| {
             if outcome == Outcome::Written {
-                app.roll().note(&enrolment);
+                app.enrolment_registry().note(&enrolment);
                 app.show_alerts(&alerts);
             }
         });
@@ -366,7 +366,7 @@ impl App {
         address: IpAddr,
         request: &EnrolRobot,
     ) -> Result<Enrolled, EnrolError> {
-        let office = self.office().ok_or(EnrolError::Closed)?;
+        let service = self.service().ok_or(EnrolError::Closed)?;
         // Whether the request reads says nothing about the token, so it is looked at first.
         let key = RobotRequest::read(&request.certificate_request).map_err(EnrolError::Request)?;
         let secret = Secret::read(&request.token).filter(|secret| secret.kind() == Kind::Join);
@@ -376,7 +376,7 @@ impl App {
         }
         let enrolled = match &secret {
             Some(secret) if self.is_join_token(secret).await? => {
-                self.enrol(office, secret, request.robot.as_ref(), &key)
+                self.enrol(service, secret, request.robot.as_ref(), &key)
                     .await
             }
             Some(_) => Err(EnrolError::Unknown),
@@ -405,7 +405,7 @@ impl App {
 
     async fn enrol(
         &self,
-        office: &Office,
+        service: &EnrolmentService,
         secret: &Secret,
         robot: Option<&RobotId>,
         key: &RobotRequest,
@@ -452,9 +452,9 @@ impl App {
             robot: robot.clone(),
             enrolment: number,
         };
-        let trusted = office.authorities.present();
+        let trusted = service.authorities.present();
         let (certificate, fingerprint) =
-            office.sign(&trusted, key, &name, self.clock().machine_time())?;
+            service.sign(&trusted, key, &name, self.clock().machine_time())?;
         if !db::join_tokens::use_up(&mut tx, token.id, &robot, now).await? {
             return Err(EnrolError::Used(token.id));
         }
@@ -492,10 +492,10 @@ impl App {
         request: &RenewCertificate,
         proof: &[u8],
     ) -> Result<RobotCertificate, EnrolError> {
-        let office = self.office().ok_or(EnrolError::Closed)?;
+        let service = self.service().ok_or(EnrolError::Closed)?;
         let key = RobotRequest::read(&request.certificate_request).map_err(EnrolError::Request)?;
         let now = self.clock().now();
-        let trusted = office.authorities.present();
+        let trusted = service.authorities.present();
         let present = trusted
             .read_robot(&request.certificate, now)
             .map_err(EnrolError::Certificate)?;
@@ -506,7 +506,8 @@ impl App {
             self.note_retired(name);
             return Err(EnrolError::Retired(name.clone()));
         }
-        let (certificate, next) = office.sign(&trusted, &key, name, self.clock().machine_time())?;
+        let (certificate, next) =
+            service.sign(&trusted, &key, name, self.clock().machine_time())?;
         let mut tx = self.db().write("enrolment").await?;
         let enrolment = (&name.site, &name.robot, name.enrolment);
         let (shown, mut ended) = (present.fingerprint(), Vec::new());
@@ -544,7 +545,7 @@ impl App {
     }
 }
 
-impl Office {
+impl EnrolmentService {
     /// Signs a certificate, and says its fingerprint.
     fn sign(
         &self,

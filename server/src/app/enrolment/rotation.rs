@@ -53,8 +53,8 @@ impl Shown {
 
 impl App {
     fn authorities(&self) -> Result<&Arc<Authorities>, AppError> {
-        self.office()
-            .map(|office| &office.authorities)
+        self.service()
+            .map(|service| &service.authorities)
             .ok_or(AppError::NoAuthority)
     }
 

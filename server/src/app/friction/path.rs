@@ -67,8 +67,8 @@ impl App {
             let drawn = Drawn::new(&view.terrains);
             let near = drawn_near(&drawn, &cut);
             let mut pieces: Vec<PathPiece> = app.maps().look(&view.row, |map| {
-                let mut eye = Eye::new(map, (&view, &drawn, &near), &reading);
-                let piece = |cut: &Cut| described(cut, eye.known_at(cut).as_ref());
+                let mut reader = CellReader::new(map, (&view, &drawn, &near), &reading);
+                let piece = |cut: &Cut| described(cut, reader.known_at(cut).as_ref());
                 cut.iter().map(piece).collect()
             });
             set_speeds(&mut pieces, &cut, length_m, &found.model);
@@ -127,10 +127,10 @@ impl App {
         let near = near(cut, &view.row.site.grid);
         let around = drawn_near(&drawn, cut.iter().chain(&near));
         self.maps().look(&view.row, |map| {
-            let mut eye = Eye::new(map, (view, &drawn, &around), reading);
+            let mut reader = CellReader::new(map, (view, &drawn, &around), reading);
             let mut grounds: BTreeMap<u16, f64> = BTreeMap::new();
             for place in cut.iter().chain(&near) {
-                let Some(known) = eye.known_at(place).filter(is_measured) else {
+                let Some(known) = reader.known_at(place).filter(is_measured) else {
                     continue;
                 };
                 let mu = grip_mu(Some(&known));
@@ -138,7 +138,7 @@ impl App {
                 *least = least.min(mu);
             }
             for cut in cut {
-                let (cell, known) = (cut.cell, eye.known_at(cut));
+                let (cell, known) = (cut.cell, reader.known_at(cut));
                 let ground = around.ground_at(cut.middle);
                 let least_mu = grounds.get(&ground).copied().unwrap_or(f64::INFINITY);
                 let mu = grip_mu(known.as_ref()).min(least_mu);
@@ -154,7 +154,7 @@ impl App {
                     continue;
                 }
                 let has_one_ground = map.cell(cell, reading.choice()).len() == 1;
-                let told = eye
+                let told = reader
                     .known_at(place)
                     .filter(|known| has_one_ground && is_measured(known));
                 if let Some(known) = told {
@@ -392,7 +392,7 @@ fn drawn_near<'view, 'cut>(
 }
 
 /// Looks at one place of the map after another.
-struct Eye<'map> {
+struct CellReader<'map> {
     map: &'map SiteMap,
     near: &'map Near<'map>,
     lens: Lens,
@@ -400,7 +400,7 @@ struct Eye<'map> {
     room: Room,
 }
 
-impl<'map> Eye<'map> {
+impl<'map> CellReader<'map> {
     fn new(
         map: &'map SiteMap,
         (view, drawn, near): (&'map SiteView, &Drawn<'_>, &'map Near<'map>),

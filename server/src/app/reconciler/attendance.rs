@@ -168,7 +168,7 @@ async fn write_down(
     let is_there = matches!(turn, Turn::Came | Turn::Back);
     db::attendance::set_present(&mut tx, row.pk, is_there).await?;
     // Nobody misses a robot that was retired or put out of the fleet.
-    let is_missed = row.retired_at.is_none() && app.roll().may_speak(key);
+    let is_missed = row.retired_at.is_none() && app.enrolment_registry().may_speak(key);
     let alert = match turn {
         Turn::Lost if is_missed => {
             let alert = (ROBOT_LOST_ALERT, Severity::Critical, lost_text(cause));

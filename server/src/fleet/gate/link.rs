@@ -17,7 +17,7 @@ use super::Failures;
 use super::links::{CertificateHash, Entry, Links};
 use super::session::{Init, pass_opening, read_init};
 use crate::app::App;
-use crate::app::enrolment::roll::Standing;
+use crate::app::enrolment::registry::Standing;
 use crate::app::presence::RobotKey;
 use crate::authority::{Authorities, RobotName, named_in};
 use crate::connections::Slot;
@@ -193,14 +193,20 @@ impl Link {
             return None;
         };
         let robot = (name.site.clone(), name.robot.clone());
-        if !self.app.roll().is_in_force(&robot, name.enrolment) {
+        if !self
+            .app
+            .enrolment_registry()
+            .is_in_force(&robot, name.enrolment)
+        {
             counters.gate_revoked.one();
             debug!(
                 "{} showed a certificate that is no longer in force",
                 self.peer
             );
             // Its successor may be well; people are told only of one that has none.
-            if self.app.roll().standing(&robot) == Some(Standing::Revoked(name.enrolment)) {
+            if self.app.enrolment_registry().standing(&robot)
+                == Some(Standing::Revoked(name.enrolment))
+            {
                 self.app.note_outsider(&robot);
             }
             return None;
@@ -292,8 +298,8 @@ impl Link {
 
     /// Waits until the robot is put out, or has joined again.
     async fn put_out(&self, robot: &RobotKey, enrolment: u32) {
-        let mut changes = self.app.roll().changes();
-        while self.app.roll().is_in_force(robot, enrolment) {
+        let mut changes = self.app.enrolment_registry().changes();
+        while self.app.enrolment_registry().is_in_force(robot, enrolment) {
             if changes.changed().await.is_err() {
                 std::future::pending::<()>().await;
             }

@@ -30,7 +30,7 @@ const LOOK_EVERY: Duration = Duration::from_secs(5);
 
 /// What opening, replacing and closing routers works on.
 #[derive(Debug)]
-pub(super) struct Keeper {
+pub(super) struct RouterPool {
     pub(super) app: App,
     pub(super) routers: Arc<Routers>,
     pub(super) opener: Opener,
@@ -39,13 +39,13 @@ pub(super) struct Keeper {
     pub(super) turn: Mutex<()>,
 }
 
-impl Keeper {
+impl RouterPool {
     /// Opens a router for all robots of the fleet, beside those that are open.
     ///
     /// # Errors
     /// [`super::FleetError`].
     pub(super) async fn open(&self) -> Result<(), super::FleetError> {
-        let robots = self.app.roll().robots();
+        let robots = self.app.enrolment_registry().robots();
         let router = self.opener.open(robots).await?;
         if let Err(failed) = self.opener.declare(&router, &self.channels).await {
             opening::close(router.session.clone()).await;
@@ -65,7 +65,7 @@ impl Keeper {
 
     /// Keeps the routers in order until the stop.
     pub(super) async fn run(self: Arc<Self>, stop: CancellationToken) {
-        let mut joined = self.app.roll().changes();
+        let mut joined = self.app.enrolment_registry().changes();
         let mut rotated = self.opener.authorities.as_ref().map(|it| it.changes());
         loop {
             joined.mark_unchanged();
@@ -98,7 +98,7 @@ impl Keeper {
             let signing = trusted.as_ref().map(|it| it.signing().fingerprint());
             newest.authority() == signing
         });
-        if is_of_signing && self.app.roll().robots().iter().all(knows) {
+        if is_of_signing && self.app.enrolment_registry().robots().iter().all(knows) {
             return;
         }
         match self.open().await {
@@ -134,7 +134,7 @@ impl Keeper {
     }
 }
 
-impl Keeper {
+impl RouterPool {
     /// Whether a router's passwords derive from the key of an authority that was retired.
     fn is_of_retired(&self, router: &Router) -> bool {
         let trusted = self.opener.authorities.as_ref().map(|it| it.present());

@@ -7,7 +7,7 @@ use std::time::Duration;
 use tread_api::enrolment::Enrolment;
 use tread_api::robot::{Alert, Severity};
 
-use super::roll::Standing;
+use super::registry::Standing;
 use crate::app::presence::RobotKey;
 use crate::app::{App, AppError};
 use crate::authority::RobotName;
@@ -24,9 +24,9 @@ const NOTED_EVERY: Duration = Duration::from_mins(1);
 
 /// When each was noted last; no more than robots have ever joined.
 #[derive(Debug, Default)]
-pub(super) struct Outsiders(Mutex<HashMap<RobotKey, Duration>>);
+pub(super) struct RevokedRobots(Mutex<HashMap<RobotKey, Duration>>);
 
-impl Outsiders {
+impl RevokedRobots {
     fn is_due(&self, key: &RobotKey, now: Duration) -> bool {
         let mut noted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let last = noted.get(key);
@@ -46,10 +46,10 @@ impl Outsiders {
 impl App {
     /// Whether a message of a robot counts; counts and tells of it if not.
     pub fn admits(&self, key: &RobotKey) -> bool {
-        if self.roll().may_speak(key) {
+        if self.enrolment_registry().may_speak(key) {
             return true;
         }
-        match self.roll().standing(key) {
+        match self.enrolment_registry().standing(key) {
             Some(_) => {
                 self.counters().refused_revoked_robot.one();
                 self.note_outsider(key);
@@ -61,7 +61,10 @@ impl App {
 
     /// Tells of a robot that was put out and is still there.
     pub fn note_outsider(&self, key: &RobotKey) {
-        let is_out = matches!(self.roll().standing(key), Some(Standing::Revoked(_)));
+        let is_out = matches!(
+            self.enrolment_registry().standing(key),
+            Some(Standing::Revoked(_))
+        );
         if is_out {
             let text = "it was put out of the fleet and still tries to connect".to_owned();
             self.tell(key, REVOKED_ALERT, text);
@@ -71,7 +74,7 @@ impl App {
     /// Tells of a robot whose certificate is of an authority that was retired.
     pub(super) fn note_retired(&self, name: &RobotName) {
         let key = (name.site.clone(), name.robot.clone());
-        if self.roll().is_in_force(&key, name.enrolment) {
+        if self.enrolment_registry().is_in_force(&key, name.enrolment) {
             let text =
                 "its certificate is of an authority that was retired; it must join again by a \
                         join token that names it"
@@ -107,8 +110,8 @@ impl App {
 
     /// Logs what is said of a robot and raises an alert, not too often.
     fn tell(&self, key: &RobotKey, code: &'static str, text: String) {
-        let outsiders = &self.membership().outsiders;
-        if !outsiders.is_due(key, self.clock().elapsed()) {
+        let revoked_robots = &self.membership().revoked_robots;
+        if !revoked_robots.is_due(key, self.clock().elapsed()) {
             return;
         }
         let (site, robot) = key;
@@ -145,7 +148,7 @@ impl App {
         enrolment: &Enrolment,
     ) -> Result<Vec<Alert>, AppError> {
         let key = (enrolment.site.clone(), enrolment.robot.clone());
-        self.membership().outsiders.forget(&key);
+        self.membership().revoked_robots.forget(&key);
         let Some(robot_pk) = robot_pk(tx, &key).await? else {
             return Ok(Vec::new());
         };

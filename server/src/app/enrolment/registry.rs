@@ -28,14 +28,14 @@ impl Standing {
 
 /// All robots that have ever joined.
 #[derive(Debug)]
-pub struct Roll {
+pub struct EnrolmentRegistry {
     robots: RwLock<HashMap<RobotKey, Standing>>,
     /// Whether only robots that have joined may speak.
     is_closed: AtomicBool,
     changes: watch::Sender<u64>,
 }
 
-impl Default for Roll {
+impl Default for EnrolmentRegistry {
     fn default() -> Self {
         Self {
             robots: RwLock::default(),
@@ -45,7 +45,7 @@ impl Default for Roll {
     }
 }
 
-impl Roll {
+impl EnrolmentRegistry {
     /// From now on only robots that have joined may speak.
     pub(super) fn close(&self) {
         self.is_closed.store(true, Ordering::Relaxed);
@@ -131,29 +131,33 @@ mod tests {
         let news = [(1, false), (1, true), (2, false), (2, true)];
         for first in 0..news.len() {
             for turn in 0..news.len() {
-                let roll = Roll::default();
+                let registry = EnrolmentRegistry::default();
                 let mut order = news.to_vec();
                 order.rotate_left(turn);
                 order.swap(0, first);
                 for (number, is_revoked) in order {
-                    roll.note(&enrolment(number, is_revoked));
+                    registry.note(&enrolment(number, is_revoked));
                 }
-                assert_eq!(roll.standing(&key), Some(Standing::Revoked(2)));
-                assert!(!roll.may_speak(&key));
+                assert_eq!(registry.standing(&key), Some(Standing::Revoked(2)));
+                assert!(!registry.may_speak(&key));
             }
         }
     }
 
     #[test]
     fn a_stranger_may_speak_until_the_roll_is_closed() {
-        let roll = Roll::default();
+        let registry = EnrolmentRegistry::default();
         let key: RobotKey = ("yard".parse().unwrap(), "rover-1".parse().unwrap());
-        assert!(roll.may_speak(&key) && !roll.is_in_force(&key, 1));
-        roll.close();
-        assert!(!roll.may_speak(&key));
-        let changes = roll.changes();
-        roll.note(&enrolment(1, false));
+        assert!(registry.may_speak(&key) && !registry.is_in_force(&key, 1));
+        registry.close();
+        assert!(!registry.may_speak(&key));
+        let changes = registry.changes();
+        registry.note(&enrolment(1, false));
         assert!(changes.has_changed().unwrap());
-        assert!(roll.may_speak(&key) && roll.is_in_force(&key, 1) && !roll.is_in_force(&key, 2));
+        assert!(
+            registry.may_speak(&key)
+                && registry.is_in_force(&key, 1)
+                && !registry.is_in_force(&key, 2)
+        );
     }
 }
