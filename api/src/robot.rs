@@ -328,7 +328,7 @@ pub struct MeasurementsTaken {
     /// Why the last of them was.
     pub refused_why: Option<String>,
     /// How many are from a time that has not come, and wait until the clock of their run is known.
-    pub aside: u64,
+    pub deferred: u64,
 }
 
 /// What a robot said last, each value with its age.
@@ -420,7 +420,7 @@ pub struct OutboxStatus {
     pub pending: u64,
     /// Records lost since the store was made, because it was full.
     pub dropped: u64,
-    /// Records that the server refused, kept aside.
+    /// Records that the server refused, moved to the dead letters.
     pub refused: u64,
 }
 

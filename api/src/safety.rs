@@ -305,7 +305,7 @@ mod tests {
     use crate::geometry::Point;
 
     #[test]
-    fn a_geofence_larger_than_a_tick_can_look_at_is_refused() {
+    fn a_geofence_too_large_for_a_tick_is_refused() {
         let corners = [(0.0, 0.0), (4.0, 0.0), (0.0, 3.0)];
         let corners = corners.map(|(x_m, y_m)| Point { x_m, y_m }).to_vec();
         let polygon = Polygon::new(corners).unwrap();

@@ -32,11 +32,11 @@ pub const SPEED_MAX_M_S: f64 = 50.0;
 pub const TURNS_MIN: f64 = 0.05;
 /// Most turns of a circle.
 pub const TURNS_MAX: f64 = 1_000.0;
-/// Deepest wiggle of the speed, as a share of it.
+/// Deepest variation of the speed (excitation), as a share of it.
 pub const EXCITATION_DEPTH_MAX: f64 = 0.8;
-/// Shortest period of a wiggle, seconds.
+/// Shortest period of an excitation, seconds.
 pub const EXCITATION_PERIOD_MIN_S: f64 = 1.0;
-/// Longest period of a wiggle, seconds.
+/// Longest period of an excitation, seconds.
 pub const EXCITATION_PERIOD_MAX_S: f64 = 20.0;
 
 /// A path to drive, as a user asks for it.
@@ -123,13 +123,13 @@ pub struct TrajectoryOptions {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0.01, maximum = 50.0)]
     pub approach_speed_m_s: Option<f64>,
-    /// A wiggle of the speed along the path, so that friction can be measured without torque
+    /// A variation of the speed (excitation) along the path, so that friction can be measured without torque
     /// sensing.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub excitation: Option<Excitation>,
 }
 
-/// A wiggle of the speed: it falls by the depth and comes back, and never exceeds what was asked.
+/// A variation of the speed (excitation): it falls by the depth and comes back, and never exceeds what was asked.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Excitation {
     /// By which share the speed falls at most; less where the robot's limits leave less.
@@ -260,8 +260,8 @@ mod tests {
         };
         let plain: Trajectory = serde_json::from_value(circle(json!({}))).unwrap();
         assert!(!serde_json::to_string(&plain).unwrap().contains("options"));
-        let wiggle = serde_json::from_value::<Trajectory>(circle(json!({"excitation": {}})));
-        let asked = wiggle.unwrap().options().excitation;
+        let excitation = serde_json::from_value::<Trajectory>(circle(json!({"excitation": {}})));
+        let asked = excitation.unwrap().options().excitation;
         assert_eq!(asked, Some(Excitation::default()));
         for (options, field) in [
             (json!({"excitation": {"depth_ratio": 0.9}}), "depth_ratio"),

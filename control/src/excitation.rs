@@ -1,4 +1,4 @@
-//! A bounded wiggle of the speed along a path, so that a base without torque sensing can measure θ.
+//! A bounded variation of the speed along a path, so that a base without torque sensing can measure θ.
 //!
 //! Friction shows only where something accelerates. The plan's time is run through at the pace
 //! `w(t) = 1 − ½A(1 − cos Ωt)`, so `τ(t) = (1 − ½A)t + (A/2Ω) sin Ωt`: the speed falls to `1 − A` of
@@ -9,15 +9,15 @@ use std::f64::consts::TAU;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Deepest wiggle, share of the speed.
+/// Deepest excitation, share of the speed.
 pub const DEPTH_MAX: f64 = 0.8;
 /// Shortest period, seconds.
 pub const PERIOD_MIN_S: f64 = 1.0;
 /// Longest period, seconds.
 pub const PERIOD_MAX_S: f64 = 20.0;
-/// Share of the acceleration limit that a wiggle may take.
+/// Share of the acceleration limit that an excitation may take.
 const ACCELERATION_SHARE: f64 = 0.5;
-/// Share of the jerk limit that the wiggle alone may take.
+/// Share of the jerk limit that the excitation alone may take.
 const JERK_SHARE: f64 = 0.35;
 /// Share of the jerk limit that its product with the plan's acceleration may take.
 const CROSS_JERK_SHARE: f64 = 0.25;
@@ -42,7 +42,7 @@ impl Default for ExcitationSpec {
     }
 }
 
-/// Why a wiggle was refused.
+/// Why an excitation was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum ExcitationError {
     /// The depth is not above zero, or too deep.
@@ -53,7 +53,7 @@ pub enum ExcitationError {
     Period(f64),
 }
 
-/// What a robot's limits leave for a wiggle.
+/// What a robot's limits leave for an excitation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Room {
     /// Fastest speed of the plan, metres per second.
@@ -64,7 +64,7 @@ pub(crate) struct Room {
     pub(crate) jerk_m_s3: f64,
 }
 
-/// A checked wiggle, as deep as the limits let it be.
+/// A checked excitation, as deep as the limits let it be.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Excitation {
     depth: f64,
@@ -83,7 +83,7 @@ pub(crate) struct Warp {
 }
 
 impl Excitation {
-    /// Checks a wiggle and lessens its depth to what the limits leave.
+    /// Checks an excitation and lessens its depth to what the limits leave.
     pub(crate) fn within(spec: ExcitationSpec, room: Room) -> Result<Self, ExcitationError> {
         if !(spec.depth_ratio > 0.0 && spec.depth_ratio <= DEPTH_MAX) {
             return Err(ExcitationError::Depth(spec.depth_ratio));
@@ -113,7 +113,7 @@ impl Excitation {
         TAU / self.rate_rad_s
     }
 
-    /// Hardest acceleration by the wiggle alone at a speed, metres per second squared.
+    /// Hardest acceleration by the excitation alone at a speed, metres per second squared.
     pub fn acceleration_m_s2(&self, speed_m_s: f64) -> f64 {
         0.5 * self.depth * self.rate_rad_s * speed_m_s
     }
@@ -162,20 +162,20 @@ mod tests {
         ) {
             let room = Room { speed_m_s: 0.6, acceleration_m_s2: 50.0, jerk_m_s3: 5_000.0 };
             let spec = ExcitationSpec { depth_ratio, period_s };
-            let wiggle = Excitation::within(spec, room).unwrap();
+            let excitation = Excitation::within(spec, room).unwrap();
             let slope = |value: &dyn Fn(f64) -> f64| {
                 (value(time_s + 1.0e-4) - value(time_s - 1.0e-4)) / 2.0e-4
             };
-            let found = wiggle.warp(time_s);
+            let found = excitation.warp(time_s);
             prop_assert!(found.pace > 1.0 - DEPTH_MAX - 1.0e-9 && found.pace <= 1.0 + 1.0e-12);
-            prop_assert!((slope(&|t| wiggle.warp(t).plan_s) - found.pace).abs() < 1.0e-6);
-            prop_assert!((slope(&|t| wiggle.warp(t).pace) - found.pace_rate_1_s).abs() < 1.0e-4);
-            prop_assert!((wiggle.time_s(found.plan_s) - time_s).abs() < 1.0e-6);
+            prop_assert!((slope(&|t| excitation.warp(t).plan_s) - found.pace).abs() < 1.0e-6);
+            prop_assert!((slope(&|t| excitation.warp(t).pace) - found.pace_rate_1_s).abs() < 1.0e-4);
+            prop_assert!((excitation.time_s(found.plan_s) - time_s).abs() < 1.0e-6);
         }
     }
 
     #[test]
-    fn a_wiggle_out_of_range_is_refused_by_name() {
+    fn an_excitation_out_of_range_is_refused_by_name() {
         let room = Room {
             speed_m_s: 0.6,
             acceleration_m_s2: 0.8,

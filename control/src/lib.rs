@@ -6,7 +6,7 @@
 //!
 //! * Words: [`geometry`], [`robot`], [`friction`], [`measured`].
 //! * Planning (may allocate): [`trajectory`] is what is asked for, [`path`] its geometry,
-//!   [`profile`] its timing, [`excitation`] a wiggle of it, [`plan`] all, from where the robot stands.
+//!   [`profile`] its timing, [`excitation`] a variation of it, [`plan`] all, from where the robot stands.
 //! * Driving (one call per tick): [`mod@reference`] walks along the plan, [`tracking`] turns errors
 //!   into wheel speeds, [`follower`] runs one mission, [`mod@gate`] has the last word within [`twist_limits`], [`fence`] says
 //!   how fast a robot may be where it is.

@@ -1,4 +1,4 @@
-//! What a plan and a mission may be asked beside the trajectory: approach speed, grip, wiggle,
+//! What a plan and a mission may be asked beside the trajectory: approach speed, grip, excitation,
 //! speed limit under way.
 
 use proptest::prelude::*;
@@ -54,7 +54,7 @@ fn peaks(plan: &Plan) -> [f64; 3] {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 24, ..ProptestConfig::default() })]
     #[test]
-    fn a_wiggle_stays_on_the_path_and_within_every_limit(
+    fn an_excitation_stays_on_the_path_and_within_every_limit(
         depth_ratio in 0.05..0.8_f64, period_s in 1.0..12.0_f64,
     ) {
         let excitation = Some(ExcitationSpec { depth_ratio, period_s });
@@ -79,13 +79,13 @@ proptest! {
 }
 
 #[test]
-fn a_wiggle_is_off_by_default_and_excites_when_asked_for() {
+fn an_excitation_is_off_by_default_and_excites_when_asked_for() {
     let still = planned(&circle(), on_circle(), &PlanOptions::default());
     let options = PlanOptions {
         excitation: Some(ExcitationSpec::default()),
         ..PlanOptions::default()
     };
-    let wiggling = planned(&circle(), on_circle(), &options);
+    let excited = planned(&circle(), on_circle(), &options);
     let power = |plan: &Plan| {
         (0_u32..300)
             .map(|step| {
@@ -97,8 +97,8 @@ fn a_wiggle_is_off_by_default_and_excites_when_asked_for() {
             / 300.0
     };
     assert!(still.excitation().is_none() && power(&still) < 1.0e-12);
-    assert!(power(&wiggling).sqrt() > 0.1, "{}", power(&wiggling).sqrt());
-    assert!(wiggling.duration_s() > 1.1 * still.duration_s());
+    assert!(power(&excited).sqrt() > 0.1, "{}", power(&excited).sqrt());
+    assert!(excited.duration_s() > 1.1 * still.duration_s());
 }
 
 fn on_circle() -> Pose {
@@ -233,11 +233,11 @@ fn options_that_are_no_numbers_are_refused() {
             depth_ratio: bad,
             period_s: 3.0,
         });
-        let wiggle = PlanOptions {
+        let excitation = PlanOptions {
             excitation,
             ..PlanOptions::default()
         };
-        assert!(matches!(refused(wiggle), PlanError::Excitation(_)));
+        assert!(matches!(refused(excitation), PlanError::Excitation(_)));
     }
 }
 

@@ -25,7 +25,7 @@ use crate::base::Base;
 use crate::clock::{SharedClock, SystemClock};
 use crate::config::AgentConfig;
 use crate::control_loop::BRAKING_MAX;
-use crate::control_loop::seam::{AgentEnds, LoopEnds, Shared, seam};
+use crate::control_loop::channels::{AgentEnds, LoopEnds, Shared, loop_channels};
 use crate::control_loop::tick::LoopCore;
 use crate::dispatcher::Dispatcher;
 use crate::drive::simulated::SimulatedDriveError;
@@ -131,7 +131,7 @@ impl Agent {
             boot,
         };
 
-        let (loop_ends, ends) = seam();
+        let (loop_ends, ends) = loop_channels();
         let AgentEnds {
             commands,
             events,
@@ -245,7 +245,7 @@ fn loop_core(
     let (taker, notes) = notes();
     let writing = supervisor.spawn_thread(part, move || writer.run(&notes));
     let writing = writing.map_err(|source| StartError::Thread { part, source })?;
-    core.note_to(Some(taker));
+    core.record_to(Some(taker));
     Ok((core, Some(writing)))
 }
 

@@ -8,8 +8,8 @@ use tread_api::robot::{ALERT_TEXT_MAX, AlertReport, OutboxStatus, Severity};
 use tread_control::consistency::{Consequence, Finding, Findings, Kind, Subject};
 use tread_control::geometry::Point;
 
+use crate::control_loop::channels::Fault;
 use crate::control_loop::overrun::{Overrun, WINDOW_TICKS};
-use crate::control_loop::seam::Fault;
 use crate::control_loop::standing::{Shown, StandingReport};
 use crate::control_loop::surface::Comparison;
 use crate::drive::Battery;

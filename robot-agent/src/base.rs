@@ -1,4 +1,4 @@
-//! What the agent drives: the base behind the drive's seam, and the threads around it.
+//! What the agent drives: the base behind the drive interface, and the threads around it.
 
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -10,7 +10,7 @@ use crate::agent::StartError;
 use crate::clock::SharedClock;
 use crate::config::{AgentConfig, DriveConfig, SimulatedConfig};
 use crate::control_loop;
-use crate::control_loop::seam::Shared;
+use crate::control_loop::channels::Shared;
 use crate::control_loop::tick::LoopCore;
 use crate::drive::Drive;
 use crate::drive::ros2::Ros2Drive;

@@ -30,8 +30,8 @@ use tread_control::robot::RobotModel;
 
 use crate::clock::SharedClock;
 use crate::control_loop::active::Hold;
+use crate::control_loop::channels::{GivenPlan, Job, LoopCommand, Shared};
 use crate::control_loop::origin::JobOrigin;
-use crate::control_loop::seam::{GivenPlan, Job, LoopCommand, Shared};
 use crate::control_loop::site_view::SiteView;
 use crate::fleet::{Commands, IncomingCommand};
 use crate::geometry::wire_pose;
@@ -318,7 +318,7 @@ impl Dispatcher {
             (mode, _) => {
                 let fault = snapshot
                     .fault
-                    .map_or("", super::control_loop::seam::Fault::text);
+                    .map_or("", super::control_loop::channels::Fault::text);
                 return refused(
                     OfferRefusal::NotReady,
                     format!("the robot is {mode:?} {fault}"),

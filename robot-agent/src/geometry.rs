@@ -138,9 +138,9 @@ pub fn plan_options(asked: &trajectory::Trajectory) -> PlanOptions<'static> {
     let options = asked.options();
     PlanOptions {
         approach_speed_m_s: options.approach_speed_m_s,
-        excitation: options.excitation.map(|wiggle| ExcitationSpec {
-            depth_ratio: wiggle.depth_ratio,
-            period_s: wiggle.period_s,
+        excitation: options.excitation.map(|excitation| ExcitationSpec {
+            depth_ratio: excitation.depth_ratio,
+            period_s: excitation.period_s,
         }),
         grip_mu: None,
         grip: None,

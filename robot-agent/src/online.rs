@@ -12,7 +12,7 @@ use tread_api::robot::Capabilities;
 use tread_api::wire::hello::Hello;
 
 use crate::config::AgentConfig;
-use crate::control_loop::seam::Shared;
+use crate::control_loop::channels::Shared;
 use crate::dispatcher::Dispatcher;
 use crate::fleet::uploader::{self, Backoff};
 use crate::fleet::{self, COMMANDS_MAX, FleetLink, Identity, Listeners, Note, Noted};

@@ -14,8 +14,8 @@ use crate::agent::{Agent, RunningAgent};
 use crate::config::{AgentConfig, Flags, LogFormat};
 use crate::doctor::{self, DoctorArgs};
 use crate::enroll::{self, EnrollArgs};
+use crate::recording::report::{self, ReplayArgs};
 use crate::recording::salvage::{self, RecoverArgs};
-use crate::recording::told::{self, ReplayArgs};
 
 /// Drives one robot and measures its ground.
 #[derive(Debug, Parser)]
@@ -64,7 +64,7 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
             Ok(false) => return ExitCode::FAILURE,
             Err(cause) => Err(cause),
         },
-        Some(Action::Replay(args)) => match told::run(&args) {
+        Some(Action::Replay(args)) => match report::run(&args) {
             Ok(true) => Ok(()),
             Ok(false) => return ExitCode::FAILURE,
             Err(cause) => Err(cause),

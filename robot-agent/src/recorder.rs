@@ -15,7 +15,7 @@ use tread_api::ids::ConfigurationId;
 use tread_api::robot::MissionProgress;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
 
-use crate::control_loop::seam::{ClosedSegment, LoopEvent};
+use crate::control_loop::channels::{ClosedSegment, LoopEvent};
 use crate::knowledge::Missions;
 use crate::outbox::Outbox;
 

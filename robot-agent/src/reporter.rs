@@ -15,7 +15,7 @@ use tread_control::gate::GateCause;
 
 use crate::alerts::{Alerts, Causes};
 use crate::clock::SharedClock;
-use crate::control_loop::seam::{Shared, Snapshot};
+use crate::control_loop::channels::{Shared, Snapshot};
 use crate::control_loop::standing::StandingReport;
 use crate::drive::ros2::notices::{ForeignCommands, Notice, Noticing};
 use crate::drive::ros2::refusal::{Counts, Dropping};

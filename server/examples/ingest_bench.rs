@@ -79,7 +79,7 @@ fn template(clock: &Clock) -> anyhow::Result<Segment> {
     let now = clock.now();
     Ok(Segment {
         configuration: model().configuration(),
-        mission: Some(clock.mission_id()),
+        mission: Some(clock.new_id()),
         started_at: now,
         ended_at: now,
         grid_revision: 1,

@@ -31,7 +31,7 @@ use tread_server::app::ingest::{self, UPLOADS_WAITING_MAX, Upload};
 use tread_server::clock::Clock;
 use tread_server::config::{FrictionConfig, StorageConfig};
 use tread_server::db::Db;
-use tread_server::friction::index::{BLOCK_SQUARES, Labelled, SiteMap, Square};
+use tread_server::friction::index::{CELLS_PER_BLOCK, CellSummary, Labelled, SiteMap};
 use tread_server::friction::{Sums, epoch_h};
 use tread_server::http;
 use tread_server::identity::origin::Names;
@@ -118,7 +118,7 @@ fn bytes_per_sum(robots: &[RobotId]) -> anyhow::Result<(f64, f64)> {
     let change = region.change();
     let held = change.bytes_allocated - change.bytes_deallocated;
     let blocks = map.changes().blocks().count();
-    let squares = blocks * BLOCK_SQUARES * (size_of::<Square>() + size_of::<u16>());
+    let squares = blocks * CELLS_PER_BLOCK * (size_of::<CellSummary>() + size_of::<u16>());
     let sums = map.part_count();
     Ok((ratio(held, sums), ratio(held + squares, sums)))
 }

@@ -14,7 +14,6 @@ use std::time::{Duration, Instant};
 
 use jiff::{SignedDuration, Timestamp};
 use tracing::{info, warn};
-use tread_api::ids::MissionId;
 use uuid::{ContextV7, Uuid};
 
 pub use self::floor::{ClockSteps, STEP_BACK_HELD_MAX, STEP_NOTED_MIN};
@@ -210,16 +209,16 @@ impl Clock {
         }
     }
 
-    /// A new mission's identifier; they sort by creation, also within one microsecond, and also
-    /// while the machine's clock is behind.
-    pub fn mission_id(&self) -> MissionId {
+    /// A new identifier, a version 7 UUID; they sort by creation, also within one microsecond, and
+    /// also while the machine's clock is behind.
+    pub fn new_id<T: From<Uuid>>(&self) -> T {
         let now = self.now();
         let identifiers = lock(&self.identifiers);
         let now = now.max(identifiers.not_before);
         let seconds = u64::try_from(now.as_second()).unwrap_or(0);
         let nanos = u32::try_from(now.subsec_nanosecond()).unwrap_or(0);
         let timestamp = uuid::Timestamp::from_unix(&identifiers.context, seconds, nanos);
-        MissionId::from_uuid(Uuid::new_v7(timestamp))
+        T::from(Uuid::new_v7(timestamp))
     }
 }
 
@@ -256,6 +255,8 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 #[cfg(test)]
 mod tests {
+    use tread_api::ids::MissionId;
+
     use super::*;
 
     #[test]
@@ -284,9 +285,9 @@ mod tests {
     #[test]
     fn neither_time_nor_identifiers_go_back_when_the_machines_clock_does() {
         let clock = Clock::manual("2026-11-01T00:00:00Z".parse().unwrap());
-        let before = (clock.now(), clock.mission_id());
+        let before = (clock.now(), clock.new_id::<MissionId>());
         clock.step(SignedDuration::from_hours(-1));
-        let held = (clock.now(), clock.mission_id());
+        let held = (clock.now(), clock.new_id::<MissionId>());
         assert!(held > before, "{held:?} {before:?}");
         assert_eq!(
             clock.machine_time(),
@@ -298,24 +299,26 @@ mod tests {
         // Two days are not waited for, and identifiers sort all the same.
         clock.step(SignedDuration::from_hours(-48));
         assert!(clock.now() < before.0);
-        assert!(clock.mission_id() > held.1);
+        assert!(clock.new_id::<MissionId>() > held.1);
     }
 
     #[test]
     fn a_new_run_takes_up_after_the_newest_time_and_identifier() {
         let wall: Timestamp = "2026-11-01T00:00:00Z".parse().unwrap();
-        let last = Clock::manual(wall + SignedDuration::from_hours(100)).mission_id();
+        let last = Clock::manual(wall + SignedDuration::from_hours(100)).new_id::<MissionId>();
         let clock = Clock::manual(wall);
         let newest = wall + SignedDuration::from_mins(5);
         clock.continue_after(Some(newest), Some(last.as_uuid()));
         assert_eq!(clock.now(), newest);
-        assert!(clock.mission_id() > last);
+        assert!(clock.new_id::<MissionId>() > last);
     }
 
     #[test]
     fn mission_ids_sort_by_creation_even_while_the_clock_stands() {
         let clock = Clock::manual("2026-11-01T00:00:00Z".parse().unwrap());
-        let ids: Vec<String> = (0..1_000).map(|_| clock.mission_id().to_string()).collect();
+        let ids: Vec<String> = (0..1_000)
+            .map(|_| clock.new_id::<MissionId>().to_string())
+            .collect();
         assert!(ids.is_sorted());
         assert_eq!(
             ids.iter().collect::<std::collections::BTreeSet<_>>().len(),

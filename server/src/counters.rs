@@ -35,8 +35,8 @@ counters! {
     records_duplicate,
     /// Records that can never be taken: impossible numbers, or not this robot's mission.
     records_refused,
-    /// Segments from a time that had not come, put aside until their run's clock is known.
-    segments_aside,
+    /// Segments from a time that had not come, deferred until their run's clock is known.
+    segments_deferred,
     /// Raw segments removed after their time; what they said stays on the map.
     segments_removed,
     /// Mission reports taken.

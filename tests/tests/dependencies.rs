@@ -66,7 +66,11 @@ const KNOWN_CYCLES: &[(&str, &str, &[&str])] = &[
             "sim",
         ],
     ),
-    ("robot-agent", "control_loop", &["active", "origin", "seam"]),
+    (
+        "robot-agent",
+        "control_loop",
+        &["active", "channels", "origin"],
+    ),
     ("robot-agent", "drive::ros2", &["notices", "refusal"]),
     (
         "robot-agent",

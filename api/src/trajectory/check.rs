@@ -82,7 +82,7 @@ pub struct TrajectoryCheck {
     /// Where a limit makes the robot slower than it was asked to be, in driving order; at most
     /// [`BINDINGS_MAX`].
     pub bindings: Vec<Binding>,
-    /// How deep the wiggle of the speed is that was asked for, as a share of the speed: less than
+    /// How deep the variation of the speed (excitation) is that was asked for, as a share of the speed: less than
     /// asked where the robot's limits leave less.
     pub excitation_depth_ratio: Option<f64>,
     /// How well friction would be measured.

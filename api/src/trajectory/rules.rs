@@ -44,10 +44,10 @@ pub enum InvalidTrajectory {
     /// The speed on the way to the trajectory is out of range.
     #[error("approach_speed_m_s must be {SPEED_MIN_M_S} to {SPEED_MAX_M_S}, not {0}")]
     ApproachSpeed(f64),
-    /// The wiggle's depth is out of range.
+    /// The excitation's depth is out of range.
     #[error("excitation.depth_ratio must be above 0, at most {EXCITATION_DEPTH_MAX}, not {0}")]
     ExcitationDepth(f64),
-    /// The wiggle's period is out of range.
+    /// The excitation's period is out of range.
     #[error(
         "excitation.period_s must be {EXCITATION_PERIOD_MIN_S} to {EXCITATION_PERIOD_MAX_S}, not {0}"
     )]

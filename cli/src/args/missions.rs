@@ -59,7 +59,7 @@ pub(crate) struct Order {
     /// Speed on the way to the trajectory, metres per second; the trajectory's own when absent
     #[arg(long, value_name = "M/S", value_parser = finite, allow_negative_numbers = true)]
     pub(crate) approach_speed: Option<f64>,
-    /// Wiggle the speed, so that a base without torque sensing can measure friction
+    /// Excitation the speed, so that a base without torque sensing can measure friction
     #[arg(long)]
     pub(crate) excite: bool,
     /// Swap this mission for the new trajectory instead of queueing another

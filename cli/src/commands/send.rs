@@ -124,7 +124,7 @@ fn demands(checked: &TrajectoryCheck) -> String {
         )
     }));
     if let Some(depth_ratio) = checked.excitation_depth_ratio {
-        lines.push(format!("the speed wiggles by {:.0} %", 1e2 * depth_ratio));
+        lines.push(format!("the speed varies by {:.0} %", 1e2 * depth_ratio));
     }
     let measurement = checked.measurement;
     let sensing = if measurement.wheel_torque {

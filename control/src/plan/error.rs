@@ -64,7 +64,7 @@ pub enum PlanError {
     /// The path is longer than [`LENGTH_MAX_M`].
     #[error("the path is {0} m long, above the limit of {LENGTH_MAX_M} m")]
     TooLong(f64),
-    /// The wiggle that was asked for is out of its range.
+    /// The excitation that was asked for is out of its range.
     #[error("the excitation cannot be driven")]
     Excitation(#[from] ExcitationError),
 }

@@ -48,8 +48,8 @@ impl Shares {
     }
 }
 
-/// The wiggle that the limits leave room for, and limits without that room.
-pub(super) fn wiggled(
+/// The excitation that the limits leave room for, and limits without that room.
+pub(super) fn with_excitation(
     spec: ExcitationSpec,
     nodes: &mut [NodeLimits],
     jerk_m_s3: &mut f64,

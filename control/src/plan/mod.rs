@@ -25,7 +25,7 @@ pub use error::PlanError;
 pub use grip::{GripMap, GripSquare};
 pub use slowed::{SLOWED_MAX, Slowed, SlowedBy};
 
-use limits::{Blame, NodeBounds, Shares, WHEEL_SHARE, node_limits, wiggled};
+use limits::{Blame, NodeBounds, Shares, WHEEL_SHARE, node_limits, with_excitation};
 use slowed::{CellBounds, Stretches};
 
 /// Most waypoints of a path.
@@ -57,7 +57,7 @@ const GRID_MIN: usize = 16;
 pub struct PlanOptions<'map> {
     /// Speed on the way to the trajectory, metres per second; the trajectory's own when absent.
     pub approach_speed_m_s: Option<f64>,
-    /// A wiggle of the speed, so that θ can be measured without torque.
+    /// A variation of the speed (excitation), so that θ can be measured without torque.
     pub excitation: Option<ExcitationSpec>,
     /// Lower bound of the ground's peak friction coefficient, above zero: accelerations stay within
     /// what it can give. Without it only the robot's own limits hold.
@@ -379,7 +379,7 @@ impl Plan {
         let mut nodes: Vec<NodeLimits> = bounds.iter().map(|node| node.limits).collect();
         let mut jerk_m_s3 = model.limits().linear_jerk_max_m_s3;
         let excitation = match options.excitation {
-            Some(spec) => Some(wiggled(spec, &mut nodes, &mut jerk_m_s3)?),
+            Some(spec) => Some(with_excitation(spec, &mut nodes, &mut jerk_m_s3)?),
             None => None,
         };
         // On unknown ground the way to the trajectory is bounded by a cautious grip already, and
@@ -412,7 +412,7 @@ impl Plan {
                 .max(sample.acceleration_m_s2.abs());
             plan.peak_lateral_m_s2 = plan.peak_lateral_m_s2.max(turn_rad_s * sample.speed_m_s);
             plan.peak_angular_rad_s = plan.peak_angular_rad_s.max(turn_rad_s);
-            // A wiggle is asked for and slows nothing: the timing without it is looked at.
+            // An excitation is asked for and slows nothing: the timing without it is looked at.
             let timing = plan.profile.sample(plan.profile.duration_s() * share);
             let node = ((timing.arc_m / cell_m) as usize).min(cells);
             let cell = CellBounds {
@@ -434,7 +434,7 @@ impl Plan {
                 pace: 1.0,
                 pace_rate_1_s: 0.0,
             },
-            |wiggle| wiggle.warp(time_s),
+            |excitation| excitation.warp(time_s),
         );
         let timing = self.profile.sample(warp.plan_s);
         PlanSample {
@@ -452,7 +452,7 @@ impl Plan {
         self.stretches.as_slice()
     }
 
-    /// The wiggle of the speed, if there is one, as deep as the limits left it.
+    /// The variation of the speed (excitation), if there is one, as deep as the limits left it.
     pub fn excitation(&self) -> Option<&Excitation> {
         self.excitation.as_ref()
     }
@@ -481,7 +481,8 @@ impl Plan {
     /// Time from rest to rest when nothing slows the robot, without turning on the spot, seconds.
     pub fn duration_s(&self) -> f64 {
         let own_s = self.profile.duration_s();
-        self.excitation.map_or(own_s, |wiggle| wiggle.time_s(own_s))
+        self.excitation
+            .map_or(own_s, |excitation| excitation.time_s(own_s))
     }
 
     /// Direction in which the path leaves the start, radians.

@@ -202,7 +202,7 @@ impl Tracker {
     ) -> TrackerOutput {
         let config = self.config;
         let knowledge = knowledge.filter(|known| known.confidence() > 0.0);
-        self.heed(knowledge, dt_s);
+        self.apply_knowledge(knowledge, dt_s);
         let theta = self.theta;
         let density = self.noise.update(measured, dt_s);
         let middle = config.noise_middle_m_sqrt_s.powi(2);
@@ -273,7 +273,7 @@ impl Tracker {
     }
 
     /// What was adapted under a θ that is now contradicted says nothing: χ̂ goes back to one.
-    fn heed(&mut self, knowledge: Option<ThetaKnowledge>, dt_s: f64) {
+    fn apply_knowledge(&mut self, knowledge: Option<ThetaKnowledge>, dt_s: f64) {
         if let Some(now) = knowledge {
             let anchor = *self.known.get_or_insert(now);
             self.forgets |= anchor.contradicts(now);

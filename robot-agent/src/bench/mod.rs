@@ -32,11 +32,11 @@ use uuid::Uuid;
 
 use crate::clock::{ManualClock, SharedClock};
 use crate::control_loop::active::Hold;
+use crate::control_loop::channels::{
+    AgentEnds, ClosedSegment, EndReason, Job, LoopCommand, LoopEvent, loop_channels,
+};
 use crate::control_loop::driven::Driven;
 use crate::control_loop::origin::JobOrigin;
-use crate::control_loop::seam::{
-    AgentEnds, ClosedSegment, EndReason, Job, LoopCommand, LoopEvent, seam,
-};
 use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;
 use crate::control_loop::tick::LoopCore;
@@ -272,7 +272,7 @@ impl Bench {
             prior: EstimatorPrior::exact(),
         };
         let (taker, notes) = notes();
-        self.core.note_to(Some(taker));
+        self.core.record_to(Some(taker));
         let clock = Arc::clone(&self.clock) as SharedClock;
         let writer = RecordWriter::new(config, head, self.model, clock);
         self.record = Some((writer, notes));
@@ -282,7 +282,7 @@ impl Bench {
 impl<D: SteppedDrive> Bench<D> {
     /// A base, driven by an agent that is configured with this model.
     pub fn with_drive(drive: D, model: RobotModel) -> Self {
-        let (loop_ends, ends) = seam();
+        let (loop_ends, ends) = loop_channels();
         let clock = Arc::new(ManualClock::new(Timestamp::UNIX_EPOCH));
         clock.advance(START_AT);
         let safety = Safety::open(
@@ -343,7 +343,7 @@ impl<D: SteppedDrive> Bench<D> {
     /// Ends the record; notes that found no room.
     pub fn end_record(&mut self) -> u64 {
         self.write_record();
-        self.core.note_to(None);
+        self.core.record_to(None);
         let Some((mut writer, notes)) = self.record.take() else {
             return 0;
         };

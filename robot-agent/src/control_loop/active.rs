@@ -19,9 +19,9 @@ use tread_control::measured::{Measured, WheelSpeeds};
 use tread_control::robot::RobotModel;
 use tread_control::tracking::ThetaKnowledge;
 
+use super::channels::{EndReason, Job};
 use super::driven::TickRecord;
 use super::prior::Prior;
-use super::seam::{EndReason, Job};
 use super::surface::Comparison;
 
 /// Speeds below which a held robot counts as standing, m/s and rad/s.

@@ -9,7 +9,7 @@ use tread_control::geometry::Pose;
 use tread_control::plan::Plan;
 use tread_control::robot::RobotModel;
 
-use super::seam::{EndReason, LoopCommand};
+use super::channels::{EndReason, LoopCommand};
 use crate::bench::{Bench, site_of};
 use crate::geometry::control_trajectory;
 use crate::sim::scenario::Scenario;

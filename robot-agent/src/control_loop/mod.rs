@@ -1,9 +1,10 @@
 //! The loop thread: a fixed rate, absolute deadlines, and nothing that could hold it up.
 //!
 //! It owns the drive and all control state ([`tick`]). Comms live elsewhere and talk to it
-//! through [`seam`]: a dead network never stalls it. It does no I/O but the drive's.
+//! through [`channels`]: a dead network never stalls it. It does no I/O but the drive's.
 
 pub(crate) mod active;
+pub(crate) mod channels;
 pub(crate) mod driven;
 mod gain;
 pub(crate) mod origin;
@@ -12,7 +13,6 @@ pub(crate) mod overrun;
 mod pace;
 pub(crate) mod prior;
 mod progress;
-pub(crate) mod seam;
 pub(crate) mod segments;
 pub(crate) mod site_view;
 pub(crate) mod slip;
@@ -54,7 +54,7 @@ pub(crate) fn run(
         if pace.begin(began) {
             core.note_overrun();
         }
-        let stop = core.is_told_to_stop();
+        let stop = core.stop_requested();
         let now = Moment {
             monotonic: began,
             wall: clock.wall(),

@@ -13,9 +13,9 @@ use tread_control::geometry::Pose;
 use tread_control::plan::{Plan, PlanOptions};
 use tread_control::robot::RobotModel;
 
+use super::channels::Job;
 use super::driven::Driven;
 use super::prior::Prior;
-use super::seam::Job;
 use crate::geometry::{control_trajectory, plan_options};
 
 /// What was asked for, where the robot stood, and what was known then.

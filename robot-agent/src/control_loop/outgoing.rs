@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::mpsc::{SyncSender, TrySendError};
 
-use super::seam::{LoopEvent, Shared};
+use super::channels::{LoopEvent, Shared};
 
 /// Mission events that may wait for room in the channel; one mission at a time makes a few.
 const UNSENT_MAX: usize = 32;

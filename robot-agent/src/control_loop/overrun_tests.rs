@@ -15,8 +15,8 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
+use super::channels::{EndReason, loop_channels};
 use super::overrun::{LATE_AFTER, LATE_MAX, Overrun, RELEASE_AFTER};
-use super::seam::{EndReason, seam};
 use super::tests::{LINE, ORIGIN, bench_at, one_ground, site_of};
 use super::tick::LoopCore;
 use crate::bench::{Bench, PERIOD, boot};
@@ -190,7 +190,7 @@ const BUSY_FOR: Duration = Duration::from_millis(1_500);
 fn a_loop_on_a_busy_machine_obeys_in_its_next_tick_and_notices_each_late_one() {
     let clock: SharedClock = SystemClock::shared();
     let model = RobotModel::yi2007();
-    let (loop_ends, ends) = seam();
+    let (loop_ends, ends) = loop_channels();
     let shared = Arc::clone(&ends.shared);
     let folder = tempfile::tempdir().unwrap();
     let safety = Safety::open(

@@ -5,7 +5,7 @@ use std::time::Duration;
 use tread_api::site::Cell;
 use tread_api::wire::command::{CellPrior, PathPrior};
 
-use super::seam::EndReason;
+use super::channels::EndReason;
 use super::tests::{CIRCLE, LINE, ORIGIN, bench_at, one_ground, site_of};
 use crate::bench::Bench;
 

@@ -17,7 +17,7 @@ use tread_api::ids::MissionId;
 use tread_api::site::Cell;
 use tread_control::estimation::Estimator;
 
-use super::seam::ClosedSegment;
+use super::channels::ClosedSegment;
 use super::site_view::SiteView;
 
 /// Longest segment.

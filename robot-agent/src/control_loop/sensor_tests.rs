@@ -11,7 +11,7 @@ use tread_control::gate::GateCause;
 use tread_control::geometry::Pose;
 use uuid::Uuid;
 
-use super::seam::EndReason;
+use super::channels::EndReason;
 use super::tests::{CIRCLE, LINE, ORIGIN, bench_at, one_ground, site_of};
 use crate::bench::{Bench, PERIOD};
 use crate::drive::simulated::{Individual, SimMode, SimulatedDrive};

@@ -11,7 +11,7 @@ use tread_api::wire::hello::SiteDefinition;
 use tread_api::wire::ingest::MissionPhase;
 use tread_control::geometry::Pose;
 
-use super::seam::{EVENTS_MAX, EndReason, Fault, LoopCommand};
+use super::channels::{EVENTS_MAX, EndReason, Fault, LoopCommand};
 use super::site_view::SiteView;
 use crate::bench::Bench;
 use crate::sim::scenario::Scenario;

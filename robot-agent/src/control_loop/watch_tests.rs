@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
+use super::channels::EndReason;
 use super::prior_tests::everywhere;
-use super::seam::EndReason;
 use super::tests::{LINE, ORIGIN, bench_at, site_of};
 use crate::bench::Bench;
 use crate::sim::scenario::Scenario;

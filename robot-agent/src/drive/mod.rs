@@ -1,4 +1,4 @@
-//! The seam to a base: what is read from it and written to it once per tick.
+//! The interface to a base: what is read from it and written to it once per tick.
 //!
 //! A drive hands over every sensor sample since the last tick (up to [`SAMPLES_MAX`]), so that the
 //! estimator sees all of a 200 Hz sensor in a 100 Hz loop. Neither call may block or allocate.

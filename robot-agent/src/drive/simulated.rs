@@ -1,4 +1,4 @@
-//! A simulated base behind the drive's seam.
+//! A simulated base behind the drive interface.
 //!
 //! It has no thread of its own: reading moves it on to the present time in steps of its sensors'
 //! period, under the last command, so that a loop that comes late finds the robot farther on.

@@ -166,7 +166,7 @@ async fn upload_next(
             Ok(Next::TryLater)
         }
         // The server cannot read the batch. Find the record that it stumbles over, so that the
-        // others pass, and set it aside.
+        // others pass, and move it to the dead letters.
         Err(cause) => match sent.batch.records.as_slice() {
             [only] => {
                 let refusal = RefusedRecord {

@@ -1,4 +1,4 @@
-//! Damaged bytes of the outbox's files, kept aside for people.
+//! Damaged bytes of the outbox's files, kept for people.
 //!
 //! Each piece is a line of JSON that says where the bytes were, and then the bytes themselves.
 

@@ -140,7 +140,7 @@ proptest! {
 }
 
 #[test]
-fn a_flipped_bit_costs_one_record_of_sixty_eight_which_is_counted_kept_aside_and_said() {
+fn a_flipped_bit_costs_one_record_of_sixty_eight_which_is_counted_kept_and_said() {
     for hit in [0, 34, 67] {
         let folder = TempDir::new().unwrap();
         let outbox = open(folder.path(), 1).unwrap();

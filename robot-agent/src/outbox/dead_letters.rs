@@ -1,4 +1,4 @@
-//! Records that the server will never take, kept aside for people: one JSON object a line.
+//! Records that the server will never take, kept for people: one JSON object a line.
 
 use std::io;
 use std::path::Path;

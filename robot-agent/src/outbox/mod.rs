@@ -209,9 +209,9 @@ impl Outbox {
                 through_ordinal = name.ordinal;
             }
             if let Some((name, content, cause)) = unreadable.filter(|_| records.is_empty()) {
-                // Written by another version of the agent: set aside, so that the head moves on.
+                // Written by another version of the agent: moved to the dead letters, so that the head moves on.
                 let text = String::from_utf8_lossy(&content);
-                self.set_aside(name.boot, name.seq, &cause, &text)?;
+                self.dead_letter(name.boot, name.seq, &cause, &text)?;
                 locked(&self.shared.store).settle(name.ordinal, 1);
                 continue;
             }
@@ -244,7 +244,7 @@ impl Outbox {
                 continue;
             };
             let content = serde_json::to_string(&record.content).map_err(OutboxError::Content)?;
-            self.set_aside(sent.batch.boot, record.seq, &refusal.reason, &content)?;
+            self.dead_letter(sent.batch.boot, record.seq, &refusal.reason, &content)?;
             refused += 1;
         }
         locked(&self.shared.store).settle(sent.through_ordinal, refused);
@@ -252,14 +252,14 @@ impl Outbox {
         Ok(())
     }
 
-    fn set_aside(
+    fn dead_letter(
         &self,
         boot: BootId,
         seq: u64,
         reason: &str,
         content: &str,
     ) -> Result<(), OutboxError> {
-        warn!(%boot, seq, reason, "record {seq} was refused and set aside");
+        warn!(%boot, seq, reason, "record {seq} was refused and moved to the dead letters");
         locked(&self.shared.dead_letters).write(boot, seq, reason, content)?;
         Ok(())
     }

@@ -3,7 +3,7 @@
 //! | what stands behind the last intact frame | it is |
 //! |---|---|
 //! | bytes at the end of a file, and no record is missing | torn by a crash: cut off |
-//! | anything else | damage: the bytes are kept aside, intact frames behind it are read |
+//! | anything else | damage: the bytes are kept, intact frames behind it are read |
 //!
 //! What is missing is counted by ordinals: a head says how many records waited when it was written,
 //! and ordinals have no gap behind that.
@@ -29,7 +29,7 @@ const EIO: i32 = 5;
 pub(super) struct Recovery {
     /// Bytes of a frame that a crash left unfinished, cut off.
     pub(super) torn_bytes: u64,
-    /// Bytes that are damaged, kept aside.
+    /// Bytes that are damaged, kept for people.
     pub(super) damaged_bytes: u64,
     /// Records that should be there and are not.
     pub(super) lost_records: u64,

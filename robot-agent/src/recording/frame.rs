@@ -13,8 +13,8 @@ use tread_control::geometry::{Pose, Twist};
 use tread_control::measured::WheelSpeeds;
 
 use crate::control_loop::active::Hold;
+use crate::control_loop::channels::{Fault, LoopCommand};
 use crate::control_loop::origin::JobOrigin;
-use crate::control_loop::seam::{Fault, LoopCommand};
 use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;
 use crate::drive::{Battery, Feedback, StatedNoise};
@@ -29,7 +29,7 @@ pub(crate) struct TickInputs {
     pub(crate) now: Moment,
     /// When what a driver wants was judged, and what else carries its own end.
     pub(crate) judged: Duration,
-    pub(crate) is_told_to_stop: bool,
+    pub(crate) stop_requested: bool,
     /// Commands that it took, noted before it.
     pub(crate) commands: u32,
     pub(crate) feedback: Feedback,

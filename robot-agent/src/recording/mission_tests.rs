@@ -11,10 +11,10 @@ use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
 use super::replay::replay;
+use super::report;
 use super::tests::{SECOND, bench, config, files};
-use super::told;
 use crate::bench::Bench;
-use crate::control_loop::seam::{EndReason, LoopCommand};
+use crate::control_loop::channels::{EndReason, LoopCommand};
 use crate::geometry::control_trajectory;
 
 const LINE: &str = r#"{"waypoints":{"speed_m_s":0.8,
@@ -59,7 +59,7 @@ fn recorded(live: impl FnOnce(&mut Bench, MissionId, &Plan)) {
     let ticks = bench.ends.shared.snapshot().ticks;
     assert_eq!(bench.end_record(), 0, "nothing was lost on the way");
     let found = replay(&files(folder.path())).unwrap();
-    assert!(told::holds(&found), "{}", told::text(&found));
+    assert!(report::holds(&found), "{}", report::text(&found));
     assert_eq!((found.ticks, found.differing), (ticks, 0));
     assert!(found.driving_ticks > 250, "{}", found.driving_ticks);
 }

@@ -7,13 +7,13 @@
 //! controller and estimator on it again, and beside them the same in messages of ROS ([`views`]),
 //! for Foxglove and ROS's tools. A disk that is full or dead costs the record alone.
 
+mod codec;
 pub(crate) mod frame;
 mod read;
 pub(crate) mod replay;
+pub(crate) mod report;
 pub(crate) mod salvage;
-pub(crate) mod told;
 pub(crate) mod views;
-mod words;
 mod writer;
 
 use std::path::PathBuf;

@@ -10,7 +10,7 @@ use mcap::sans_io::LinearReaderOptions;
 use serde::de::DeserializeOwned;
 use tread_api::ids::BootId;
 
-use super::{CommandMessage, FORMAT, FORMATS_READ, RunHead, SafetyMessage, topics, words};
+use super::{CommandMessage, FORMAT, FORMATS_READ, RunHead, SafetyMessage, codec, topics};
 
 /// Largest piece of a file that is looked at, bytes.
 const PIECE_BYTES_MAX: usize = 256 * 1024 * 1024;
@@ -99,7 +99,7 @@ impl Raw {
         let json = if self.is_json {
             &self.bytes[..]
         } else {
-            let text = words::text_of(&self.bytes);
+            let text = codec::text_of(&self.bytes);
             text.map_err(|refused| part.malformed(&self.topic, refused))?
                 .as_bytes()
         };

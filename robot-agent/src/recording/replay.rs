@@ -17,9 +17,9 @@ use tread_ros2::messages::tread::{LoopSample, LoopTick, tick_bits};
 
 use super::frame::{Note, Notes, TickFrame, notes};
 use super::read::{Entry, ReadError, Run};
-use super::{CommandMessage, CommandRecord, FORMAT, RunHead, VERSION, words};
+use super::{CommandMessage, CommandRecord, FORMAT, RunHead, VERSION, codec};
+use crate::control_loop::channels::{AgentEnds, COMMANDS_MAX, Job, LoopCommand, loop_channels};
 use crate::control_loop::origin::JobOrigin;
-use crate::control_loop::seam::{AgentEnds, COMMANDS_MAX, Job, LoopCommand, seam};
 use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;
 use crate::control_loop::tick::LoopCore;
@@ -151,7 +151,7 @@ pub(crate) fn replay(files: &[PathBuf]) -> Result<Replayed, ReplayError> {
 impl Player {
     fn new(head: RunHead) -> Result<Self, ReplayError> {
         let model = control_model(&head.model)?;
-        let (loop_ends, ends) = seam();
+        let (loop_ends, ends) = loop_channels();
         let (taker, notes) = notes();
         let mut core = LoopCore::new(model, loop_ends)
             .with_blind_within_fence(head.blind_within_fence)
@@ -163,7 +163,7 @@ impl Player {
         {
             core = core.with_period(period);
         }
-        core.note_to(Some(taker));
+        core.record_to(Some(taker));
         Ok(Self {
             model,
             core,
@@ -194,7 +194,7 @@ impl Player {
             return self.tick(bytes);
         }
         let tick = self.last_tick + 1;
-        let bytes = words::from_format_1(bytes).map_err(|refused| ReplayError::Malformed {
+        let bytes = codec::from_format_1(bytes).map_err(|refused| ReplayError::Malformed {
             tick,
             problem: refused.to_string(),
         })?;
@@ -226,18 +226,18 @@ impl Player {
         };
         let has = |bit: u32| recorded.present & bit != 0;
         let mut base = RecordedBase {
-            feedback: words::feedback_of(&recorded)
+            feedback: codec::feedback_of(&recorded)
                 .ok_or_else(|| malformed("it has too many samples".to_owned()))?,
             is_silent: has(tick_bits::BASE_SILENT),
-            noise: words::noise_of(&recorded),
-            battery: words::battery_of(&recorded),
+            noise: codec::noise_of(&recorded),
+            battery: codec::battery_of(&recorded),
         };
         let shared = &self.ends.shared;
         shared.safety.show(recorded.stop, &self.view);
         let silence = Duration::from_nanos(recorded.server_silence_ns);
         shared.show_server_silence(now.monotonic, silence);
         let judged = Duration::from_nanos(recorded.judged_ns);
-        let stop = has(tick_bits::TOLD_TO_STOP);
+        let stop = has(tick_bits::STOP_REQUESTED);
         self.core.tick_by(now, &|| judged, stop, &mut base);
         // What the loop hands back is freed.
         self.ends.events.try_iter().for_each(drop);
@@ -282,7 +282,7 @@ impl Player {
     }
 
     fn compare(&mut self, recorded: &LoopTick<'_>, recorded_bytes: &[u8], frame: &TickFrame) {
-        let replayed = words::tick_message(frame, &mut self.samples);
+        let replayed = codec::tick_message(frame, &mut self.samples);
         encode(&replayed, &mut self.bytes);
         if self.bytes == recorded_bytes {
             return;
@@ -294,7 +294,7 @@ impl Player {
             self.found.told.push(DifferingTick {
                 tick: recorded.number,
                 after_s: after.as_secs_f64(),
-                differences: words::differences(recorded, &replayed),
+                differences: codec::differences(recorded, &replayed),
             });
         }
     }

@@ -21,7 +21,7 @@ use tread_ros2::cdr::decode;
 use tread_ros2::messages::tread::LoopTick;
 
 use super::writer::{channel_numbered, options, ros_channel};
-use super::{topics, words};
+use super::{codec, topics};
 
 /// Length of the magic at a file's begin and end.
 const MAGIC_BYTES: usize = 8;
@@ -250,7 +250,7 @@ fn write(
 fn tick_number(data: &[u8]) -> Option<u64> {
     let tick: Result<LoopTick<'_>, _> = decode(data);
     tick.map(|tick| tick.number).ok().or_else(|| {
-        let earlier = words::from_format_1(data).ok()?;
+        let earlier = codec::from_format_1(data).ok()?;
         let tick: LoopTick<'_> = decode(&earlier).ok()?;
         Some(tick.number)
     })

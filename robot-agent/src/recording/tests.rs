@@ -21,7 +21,7 @@ use uuid::Uuid;
 
 use super::read::ReadError;
 use super::replay::{ReplayError, Replayed, replay};
-use super::{RecordingConfig, RunHead, told, topics, words};
+use super::{RecordingConfig, RunHead, codec, report, topics};
 use crate::bench::{Bench, boot, site_of};
 use crate::sim::scenario::Scenario;
 
@@ -133,10 +133,10 @@ fn with_head(file: &Path, change: impl Fn(&mut RunHead)) -> PathBuf {
         if topic != topics::RUN {
             return Some(bytes.to_vec());
         }
-        let mut head: RunHead = serde_json::from_str(words::text_of(bytes).unwrap()).unwrap();
+        let mut head: RunHead = serde_json::from_str(codec::text_of(bytes).unwrap()).unwrap();
         change(&mut head);
         let mut changed = Vec::new();
-        words::text_message(&serde_json::to_string(&head).unwrap(), &mut changed);
+        codec::text_message(&serde_json::to_string(&head).unwrap(), &mut changed);
         Some(changed)
     })
 }
@@ -266,7 +266,7 @@ fn a_day_with_all_that_happens_runs_again_to_the_bit() {
     let mut parts = files(folder.path());
     assert!(parts.len() > 3, "{} files", parts.len());
     let found = replay(&parts).unwrap();
-    assert!(told::holds(&found), "{}", told::text(&found));
+    assert!(report::holds(&found), "{}", report::text(&found));
     assert_eq!((found.ticks, found.differing), (ticks, 0));
     assert!(found.driving_ticks > 600, "{}", found.driving_ticks);
     assert_eq!(found.torn, None);
@@ -282,7 +282,7 @@ fn a_day_with_all_that_happens_runs_again_to_the_bit() {
         }))
     ));
     let begin = replay(&[first]).unwrap();
-    assert!(begin.ticks > 0 && begin.ticks < ticks && told::holds(&begin));
+    assert!(begin.ticks > 0 && begin.ticks < ticks && report::holds(&begin));
 }
 
 #[test]
@@ -299,7 +299,7 @@ fn a_record_in_which_the_loop_was_late_and_interrupted_runs_again_to_the_bit() {
     bench.run_for(SECOND);
     assert_eq!(bench.end_record(), 0);
     let found = replayed(&files(folder.path()).remove(0));
-    assert!(told::holds(&found), "{}", told::text(&found));
+    assert!(report::holds(&found), "{}", report::text(&found));
     assert!(found.ticks > 1_000 && found.driving_ticks > 500);
 }
 
@@ -312,12 +312,12 @@ fn a_record_of_format_1_still_runs_again_to_the_bit() {
     let earlier = rewritten_in(&file, Some("json"), None, |topic, bytes| {
         Some(match topic {
             topics::RUN => {
-                let text = words::text_of(bytes).unwrap();
+                let text = codec::text_of(bytes).unwrap();
                 let mut head: RunHead = serde_json::from_str(text).unwrap();
                 head.format = 1;
                 serde_json::to_vec(&head).unwrap()
             }
-            topics::COMMAND | topics::SAFETY => words::text_of(bytes).unwrap().as_bytes().to_vec(),
+            topics::COMMAND | topics::SAFETY => codec::text_of(bytes).unwrap().as_bytes().to_vec(),
             topics::TICK => {
                 let tick: LoopTick<'_> = decode(bytes).unwrap();
                 bytes[..tick_bytes_in_format_1(&tick)].to_vec()
@@ -327,7 +327,7 @@ fn a_record_of_format_1_still_runs_again_to_the_bit() {
     });
     let found = replayed(&earlier);
     assert_eq!(found.head.format, 1);
-    assert!(told::holds(&found), "{}", told::text(&found));
+    assert!(report::holds(&found), "{}", report::text(&found));
     assert_eq!(found.ticks, ticks);
 }
 
@@ -341,7 +341,7 @@ fn tick_bytes_in_format_1(tick: &LoopTick<'_>) -> usize {
 fn a_record_with_one_input_changed_by_a_millionth_differs_from_there_on() {
     let folder = TempDir::new().unwrap();
     let file = short(folder.path());
-    assert!(told::holds(&replayed(&file)));
+    assert!(report::holds(&replayed(&file)));
     let changed = with_tick(&file, 300, |tick, into| {
         let mut samples: Vec<_> = tick.samples.iter().collect();
         let speed = &mut samples[0].wheel_left_rad_s;
@@ -354,14 +354,14 @@ fn a_record_with_one_input_changed_by_a_millionth_differs_from_there_on() {
         true
     });
     let found = replayed(&changed);
-    assert!(!told::holds(&found));
+    assert!(!report::holds(&found));
     assert!(
         found.told[0].tick >= 300 && found.told[0].tick < 310,
         "{:?}",
         found.told[0]
     );
     assert!(found.differing > 50, "{}", found.differing);
-    let text = told::text(&found);
+    let text = report::text(&found);
     assert!(text.contains("ticks differ from the record"), "{text}");
 }
 
@@ -384,7 +384,7 @@ fn a_changed_output_is_told_with_both_figures() {
     };
     assert_eq!(difference.name, "command left, rad/s");
     assert_eq!(difference.recorded.to_bits(), 77.5_f64.to_bits());
-    let object = told::object(&found);
+    let object = report::object(&found);
     assert_eq!(object["checks"][1]["holds"], false, "{object}");
 }
 
@@ -452,8 +452,8 @@ fn what_cannot_be_run_again_is_refused_in_words_that_say_why() {
     );
     let other = with_head(&file, |head| head.version = "0.0.1".to_owned());
     let found = replayed(&other);
-    assert!(told::holds(&found) && found.is_of_another_version());
-    assert!(told::text(&found).contains("recorded by tread-agent 0.0.1"));
+    assert!(report::holds(&found) && found.is_of_another_version());
+    assert!(report::text(&found).contains("recorded by tread-agent 0.0.1"));
     let nothing = folder.path().join("nothing.mcap");
     fs::write(&nothing, b"no record at all").unwrap();
     let refused = replay(&[nothing]).err().unwrap().to_string();
@@ -469,7 +469,7 @@ fn nothing_behind_a_gap_is_called_a_difference() {
     let without = with_tick(&file, 200, |_, _| false);
     let found = replayed(&without);
     assert_eq!((found.ticks, found.differing), (199, 0));
-    assert!(!told::holds(&found));
+    assert!(!report::holds(&found));
     let gap = found.gap.unwrap();
     assert!(gap.contains("ticks 200 to 201"), "{gap}");
     let silent = rewritten(&file, Some(topics::COMMAND), |_, bytes| {

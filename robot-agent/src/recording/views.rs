@@ -16,7 +16,7 @@ use tread_ros2::messages::{
 };
 
 use super::frame::TickFrame;
-use crate::control_loop::seam::Fault;
+use crate::control_loop::channels::Fault;
 use crate::drive::SensorSample;
 
 /// The frame of everything that has a place.

@@ -31,7 +31,7 @@ use tread_ros2::messages::{
 
 use super::frame::{Note, NotedCommand, Notes, TickFrame};
 use super::{
-    CommandMessage, CommandRecord, RecordingConfig, RunHead, SafetyMessage, topics, views, words,
+    CommandMessage, CommandRecord, RecordingConfig, RunHead, SafetyMessage, codec, topics, views,
 };
 use crate::clock::SharedClock;
 use crate::control_loop::origin::JobOrigin;
@@ -191,7 +191,7 @@ impl OpenRecord {
     ) -> Result<(), McapError> {
         let text = serde_json::to_string(message).map_err(io::Error::from)?;
         let mut bytes = Vec::with_capacity(text.len());
-        words::text_message(&text, &mut bytes);
+        codec::text_message(&text, &mut bytes);
         self.write(topic, wall_ns, &bytes)
     }
 }
@@ -412,7 +412,7 @@ impl RecordWriter {
             open.write_text(topics::SAFETY, wall_ns, &message)?;
             self.view = Some(inputs.view);
         }
-        let tick = words::tick_message(frame, &mut self.samples);
+        let tick = codec::tick_message(frame, &mut self.samples);
         encode(&tick, &mut self.bytes);
         open.write(topics::TICK, wall_ns, &self.bytes)?;
         self.write_views(open, frame, wall_ns)?;

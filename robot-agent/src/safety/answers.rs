@@ -11,7 +11,7 @@ use super::operator::{LeaseAnswer, LeaseRefusal};
 use super::stop::ClearRefusal;
 use super::{NotCleared, Safety};
 use crate::clock::SharedClock;
-use crate::control_loop::seam::Shared;
+use crate::control_loop::channels::Shared;
 
 /// Oldest word of the loop by which a robot counts as standing.
 const STANDS_AGE_MAX: Duration = Duration::from_millis(500);

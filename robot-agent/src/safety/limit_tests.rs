@@ -9,7 +9,7 @@ use tread_control::robot::RobotModel;
 
 use super::tests::{Hand, limit};
 use crate::bench::{Bench, PERIOD, site_of};
-use crate::control_loop::seam::EndReason;
+use crate::control_loop::channels::EndReason;
 use crate::drive::SensorSample;
 use crate::sim::scenario::Scenario;
 

@@ -20,7 +20,7 @@ use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
 use crate::bench::{Bench, boot, site_of};
-use crate::control_loop::seam::EndReason;
+use crate::control_loop::channels::EndReason;
 use crate::drive::simulated::COMMAND_TIMEOUT;
 use crate::sim::scenario::Scenario;
 

@@ -11,7 +11,7 @@ use std::time::Duration;
 use tracing::{error, info};
 
 use crate::clock::SharedClock;
-use crate::control_loop::seam::Shared;
+use crate::control_loop::channels::Shared;
 
 /// Time between two looks.
 pub(crate) const LOOK_EVERY: Duration = Duration::from_millis(100);

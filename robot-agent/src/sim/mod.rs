@@ -1,7 +1,7 @@
 //! The simulated robot: the free four-wheel plant on a scenario's ground, with its sensors.
 //!
 //! It stands where a real base would: behind [`crate::drive::Drive`]. Nothing of the truth passes
-//! that seam except through the sensors; [`trace`] keeps it for reports. [`time`] lets several
+//! that interface except through the sensors; [`trace`] keeps it for reports. [`time`] lets several
 //! robots of one process go through a time of their own.
 
 pub mod battery;

@@ -292,7 +292,7 @@ async fn a_robot_whose_clock_is_wrong_by_years_starts_in_time_and_names_its_cloc
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_wiggle_and_a_slower_approach_are_planned_as_asked() {
+async fn an_excitation_and_a_slower_approach_are_planned_as_asked() {
     let rig = Rig::new();
     let server = rig.serve();
     let agent = rig.agent();

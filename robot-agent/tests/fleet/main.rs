@@ -296,7 +296,7 @@ async fn a_lost_receipt_makes_duplicates_and_nothing_is_lost() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_record_that_the_server_cannot_read_is_set_aside_and_the_others_pass() {
+async fn a_record_that_the_server_cannot_read_becomes_a_dead_letter_and_the_others_pass() {
     let rig = Rig::new();
     let server = rig.serve();
     server.refuses_starts.store(true, Ordering::SeqCst);

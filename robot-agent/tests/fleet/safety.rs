@@ -373,7 +373,7 @@ async fn a_required_program_that_falls_silent_holds_the_robot_until_it_is_heard_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_welcome_with_a_geofence_that_no_tick_can_look_at_leaves_the_robot_standing() {
+async fn a_welcome_with_a_geofence_too_large_for_a_tick_leaves_the_robot_standing() {
     let rig = Rig::new();
     let corners = [(0.0, 0.0), (9.0, 0.0), (9.0, 9.0), (0.0, 9.0)];
     let corners = corners.map(|(x_m, y_m)| Point { x_m, y_m });

@@ -34,7 +34,7 @@ pub mod sample_bits {
 /// What is there, or true, of a [`LoopTick`].
 pub mod tick_bits {
     /// The agent was told to stop.
-    pub const TOLD_TO_STOP: u32 = 1;
+    pub const STOP_REQUESTED: u32 = 1;
     /// The drive itself took the base for silent.
     pub const BASE_SILENT: u32 = 1 << 1;
     /// What the base says of its gyro's noise.

@@ -283,7 +283,7 @@ export const words = {
     undo: 'Undo',
     clear: 'Start over',
     options: 'Options',
-    excite: 'Wiggle the speed, to measure friction without torque sensing',
+    excite: 'Excitation the speed, to measure friction without torque sensing',
     priority: 'Priority',
     startPolicy: 'If the robot has other missions',
     append: 'wait for them',

@@ -257,7 +257,7 @@ impl App {
         report: &AlertReport,
         now: Timestamp,
     ) -> Result<AlertId, DbError> {
-        let id = AlertId::from_uuid(self.clock().mission_id().as_uuid());
+        let id = self.clock().new_id::<AlertId>();
         let report = AlertReport {
             text: report.text.chars().take(ALERT_TEXT_MAX).collect(),
             ..report.clone()

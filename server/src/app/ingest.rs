@@ -32,7 +32,7 @@ use self::prepared::{Prepared, Ready, Skew, prepared};
 use super::App;
 use super::map::{Folded, MapChange};
 use super::missions::reports::{Foreign, Reporting, Taken, take_report};
-use crate::db::aside::Origin;
+use crate::db::deferred_segments::Origin;
 use crate::db::segments::{Inserted, NewSegment};
 use crate::db::sums::SumKey;
 use crate::db::withdrawals::WithdrawalRow;
@@ -49,7 +49,7 @@ const GROUP_INTERVAL: Duration = Duration::from_millis(40);
 /// Integers on the wire and in JSON stay exact below this.
 const SEQ_MAX: u64 = 1 << 53;
 /// Measurements of one robot that may wait for the clock of their run.
-const ASIDE_MAX: u64 = 10_000;
+const DEFERRED_MAX: u64 = 10_000;
 /// Measurements that one upload may take out of waiting.
 const RELEASED_MAX: u32 = 500;
 
@@ -129,7 +129,7 @@ struct Tally {
     segments: u64,
     reports: u64,
     foreign: u64,
-    aside: u64,
+    deferred: u64,
     /// Alerts that began or ended with missions.
     alerts: Vec<Alert>,
 }
@@ -215,7 +215,7 @@ impl Writer {
         counters.segments_committed.add(tally.segments);
         counters.mission_reports_committed.add(tally.reports);
         counters.reports_foreign.add(tally.foreign);
-        counters.segments_aside.add(tally.aside);
+        counters.segments_deferred.add(tally.deferred);
         if tally.reports > 0 {
             self.app.wake();
         }
@@ -322,10 +322,10 @@ impl Writer {
                                     robot_pk,
                                 };
                                 let times = (segment.ended_at, now);
-                                match put_aside(&mut tx, origin, times, &measurement).await? {
+                                match defer(&mut tx, origin, times, &measurement).await? {
                                     Ok(true) => {
                                         receipt.committed += 1;
-                                        tally.aside += 1;
+                                        tally.deferred += 1;
                                     }
                                     Ok(false) => receipt.duplicates += 1,
                                     Err(reason) => refuse(reason),
@@ -571,9 +571,13 @@ async fn released(
     grid: &Grid,
     skew: Skew,
 ) -> Result<Vec<((i64, i64), Box<Ready>)>, DbError> {
-    let waiting = db::aside::take(tx, boot_pk, skew.latest_us(), RELEASED_MAX).await?;
-    let ready = |aside: db::aside::Aside| match prepared(&aside.segment, grid, skew) {
-        Ok(Prepared::Ready(ready)) => Some(((boot_pk, aside.seq), ready)),
+    let waiting = db::deferred_segments::take(tx, boot_pk, skew.latest_us(), RELEASED_MAX).await?;
+    let ready = |waiting: db::deferred_segments::DeferredSegment| match prepared(
+        &waiting.segment,
+        grid,
+        skew,
+    ) {
+        Ok(Prepared::Ready(ready)) => Some(((boot_pk, waiting.seq), ready)),
         // It was possible when it came, and its time is none of the future now.
         Ok(Prepared::Ahead(_)) | Err(_) => None,
     };
@@ -582,19 +586,25 @@ async fn released(
 
 /// Keeps a segment from the future until the clock of its run is known; whether it is new, or why
 /// it cannot be kept.
-async fn put_aside(
+async fn defer(
     tx: &mut Tx,
     origin: Origin,
     (ended_at, now): (Timestamp, Timestamp),
     measurement: &RawValue,
 ) -> Result<Result<bool, String>, DbError> {
-    if db::aside::count(tx, origin.robot_pk).await? >= ASIDE_MAX {
+    if db::deferred_segments::count(tx, origin.robot_pk).await? >= DEFERRED_MAX {
         return Ok(Err(format!(
-            "{ASIDE_MAX} of this robot's measurements already wait for their clock"
+            "{DEFERRED_MAX} of this robot's measurements already wait for their clock"
         )));
     }
     let times = (ended_at.as_microsecond(), now.as_microsecond());
-    Ok(Ok(db::aside::put(tx, origin, times, measurement).await?))
+    Ok(Ok(db::deferred_segments::put(
+        tx,
+        origin,
+        times,
+        measurement,
+    )
+    .await?))
 }
 
 /// Takes a report unless it was taken before; `None` says that it was.

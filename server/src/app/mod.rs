@@ -146,7 +146,7 @@ impl App {
         let presences = Arc::default();
         let commands = Commands::new(Arc::clone(&robots.commands), Arc::clone(&presences));
         let hub = Hub::new(clock.now());
-        let run_id = clock.mission_id().as_uuid();
+        let run_id = clock.new_id::<Uuid>();
         let inner = Inner {
             db,
             clock,

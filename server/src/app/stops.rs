@@ -163,7 +163,7 @@ impl App {
         let by = words(said.by, SOMEBODY);
         let reason = words(said.reason, "no reason was given");
         let stop = |(site, robot): RobotKey| Stop {
-            id: StopId::from_uuid(self.clock().mission_id().as_uuid()),
+            id: self.clock().new_id::<StopId>(),
             site,
             robot,
             by: by.clone(),

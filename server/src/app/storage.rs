@@ -279,7 +279,7 @@ impl App {
                 let Ok(code) = code.parse() else { return };
                 error!("{text}");
                 let alert = Alert {
-                    id: AlertId::from_uuid(self.clock().mission_id().as_uuid()),
+                    id: self.clock().new_id::<AlertId>(),
                     site: None,
                     robot: None::<RobotId>,
                     code,

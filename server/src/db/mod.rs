@@ -5,10 +5,10 @@
 //! survives a power cut.
 
 pub mod alerts;
-pub mod aside;
 pub mod attendance;
 pub mod audit;
 mod connections;
+pub mod deferred_segments;
 pub mod enrolments;
 pub mod failure;
 pub mod geofences;

@@ -58,7 +58,7 @@ struct Raw {
     last_hello_at_us: i64,
     segments_refused: i64,
     segments_refused_why: Option<String>,
-    segments_aside: i64,
+    segments_deferred: i64,
 }
 
 impl TryFrom<Raw> for RobotRow {
@@ -81,7 +81,7 @@ impl TryFrom<Raw> for RobotRow {
             measurements: MeasurementsTaken {
                 refused: unsigned("count", raw.segments_refused)?,
                 refused_why: raw.segments_refused_why,
-                aside: unsigned("count", raw.segments_aside)?,
+                deferred: unsigned("count", raw.segments_deferred)?,
             },
         })
     }
@@ -97,8 +97,8 @@ macro_rules! robots {
                    robots.agent_version, robots.boot, robots.first_seen_at_us,
                    robots.last_hello_at_us, robots.segments_refused,
                    robots.segments_refused_why,
-                   (SELECT COUNT(*) FROM segments_aside a WHERE a.robot_pk = robots.pk)
-                       AS "segments_aside!: i64"
+                   (SELECT COUNT(*) FROM deferred_segments a WHERE a.robot_pk = robots.pk)
+                       AS "segments_deferred!: i64"
                FROM robots
                JOIN sites ON sites.pk = robots.site_pk
                JOIN configurations ON configurations.pk = robots.configuration_pk "# + $condition,
@@ -293,8 +293,8 @@ async fn forget_runs(db: &mut SqliteConnection, robot_pk: i64, kept: u32) -> Res
                  ORDER BY more.pk DESC LIMIT 1 OFFSET ?2)
              AND boots.id <> (SELECT robots.boot FROM robots WHERE robots.pk = ?1)
              AND NOT EXISTS (SELECT 1 FROM segments WHERE segments.boot_pk = boots.pk)
-             AND NOT EXISTS (SELECT 1 FROM segments_aside
-                 WHERE segments_aside.boot_pk = boots.pk)
+             AND NOT EXISTS (SELECT 1 FROM deferred_segments
+                 WHERE deferred_segments.boot_pk = boots.pk)
            ORDER BY boots.pk LIMIT ?3"#,
         robot_pk,
         kept,

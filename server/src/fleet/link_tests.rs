@@ -12,9 +12,9 @@ use uuid::Uuid;
 use zenoh::Wait as _;
 
 use super::MESSAGE_BYTES_MAX;
+use super::access_tests::{Rig, Who, enrolment, put, robot, site};
 use super::gate::LINKS_PER_ROBOT_MAX;
 use super::inbox::STATE_BYTES_MAX;
-use super::matrix::{Rig, Who, enrolment, put, robot, site};
 use super::routers::Router;
 use super::test_client::{Shown, TestSession};
 

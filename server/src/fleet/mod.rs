@@ -6,6 +6,8 @@
 //! channels, and what does not fit is counted and dropped. Robots send again what matters.
 
 mod access;
+#[cfg(test)]
+mod access_tests;
 mod changes;
 mod commands;
 mod credentials;
@@ -13,8 +15,6 @@ mod gate;
 mod inbox;
 #[cfg(test)]
 mod link_tests;
-#[cfg(test)]
-mod matrix;
 mod opening;
 mod probe;
 mod publishers;

@@ -11,7 +11,7 @@
 use tread_control::robot::RobotModel;
 
 use crate::friction::Raster;
-use crate::friction::index::SquareKnown;
+use crate::friction::index::KnownCell;
 
 /// The media type of the picture.
 pub const PGM_MEDIA_TYPE: &str = "image/x-portable-graymap";
@@ -56,7 +56,7 @@ pub fn pgm(raster: &Raster, scale: SpeedScale) -> Vec<u8> {
     for row in raster.rows().rev() {
         bytes.extend(row.iter().map(|square| {
             let value = value(
-                speed_m_s(SquareKnown::grip_mu(square.known().as_ref()), scale),
+                speed_m_s(KnownCell::grip_mu(square.known().as_ref()), scale),
                 scale,
             );
             255 - u8::try_from((u32::from(value) * 255 + 50) / 100).unwrap_or(u8::MAX)

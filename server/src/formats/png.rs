@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use super::font;
 use super::palette::{HATCHED, Rgb, THETA_HIGH, THETA_LOW, UNSURE, cividis, colour, doubt, share};
 use crate::friction::Raster;
-use crate::friction::index::SquareKnown;
+use crate::friction::index::KnownCell;
 
 /// The media type.
 pub const MEDIA_TYPE: &str = "image/png";
@@ -123,7 +123,7 @@ pub fn encode(raster: &Raster, scale: Option<usize>) -> Result<Vec<u8>, PngError
     write(&canvas, raster)
 }
 
-fn draw(canvas: &mut Canvas, (x, y): (usize, usize), scale: usize, known: &SquareKnown) {
+fn draw(canvas: &mut Canvas, (x, y): (usize, usize), scale: usize, known: &KnownCell) {
     let relative = known.std_dev / known.theta;
     let ink = colour(share(known.theta), doubt(relative));
     canvas.fill((x, y), (scale, scale), ink);

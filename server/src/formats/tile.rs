@@ -3,11 +3,11 @@
 use tread_api::tile::{Tile, TileSquare};
 
 use crate::friction::Raster;
-use crate::friction::index::Square;
+use crate::friction::index::CellSummary;
 
 /// The tile as bytes.
 pub fn encode(raster: &Raster) -> Vec<u8> {
-    let square = |square: &Square| {
+    let square = |square: &CellSummary| {
         square.known().map(|known| TileSquare {
             theta: known.theta,
             std_dev: known.std_dev,

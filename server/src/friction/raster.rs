@@ -6,7 +6,7 @@ use tread_api::ids::ConfigurationId;
 use tread_api::site::{Cell, Site};
 
 use super::grip::grip_mu;
-use super::index::{Square, SquareKnown};
+use super::index::{CellSummary, KnownCell};
 
 /// The map as squares.
 #[derive(Debug, Clone, PartialEq)]
@@ -30,12 +30,12 @@ pub struct Raster {
     /// Side of a square, metres.
     pub size_m: f64,
     /// Row by row from the lowest y, each from the lowest x.
-    pub squares: Vec<Square>,
+    pub squares: Vec<CellSummary>,
 }
 
 impl Raster {
     /// What is known of each row from the lowest y up.
-    pub fn rows(&self) -> impl DoubleEndedIterator<Item = &[Square]> {
+    pub fn rows(&self) -> impl DoubleEndedIterator<Item = &[CellSummary]> {
         self.squares.chunks_exact(self.columns.max(1))
     }
 
@@ -50,7 +50,7 @@ impl Raster {
     /// Leaves out rows and columns at the rim of which nothing is known.
     #[must_use]
     pub fn trimmed(mut self) -> Self {
-        let is_known = |square: &Square| square.known().is_some();
+        let is_known = |square: &CellSummary| square.known().is_some();
         let (mut low, mut high) = ((usize::MAX, usize::MAX), (0, 0));
         for (row, squares) in self.rows().enumerate() {
             let Some(first) = squares.iter().position(is_known) else {
@@ -69,7 +69,8 @@ impl Raster {
             };
         }
         let kept = self.rows().skip(low.1).take(high.1 - low.1 + 1);
-        let squares: Vec<Square> = kept.flat_map(|row| &row[low.0..=high.0]).copied().collect();
+        let squares: Vec<CellSummary> =
+            kept.flat_map(|row| &row[low.0..=high.0]).copied().collect();
         let index = |place: usize| i32::try_from(place).unwrap_or(i32::MAX);
         self.first.ix = self.first.ix.saturating_add(index(low.0));
         self.first.iy = self.first.iy.saturating_add(index(low.1));
@@ -79,7 +80,7 @@ impl Raster {
     }
 }
 
-impl SquareKnown {
+impl KnownCell {
     /// Friction coefficient to plan with; the cautious one where nothing is known.
     pub fn grip_mu(known: Option<&Self>) -> f64 {
         let upper = |known: &Self| known.theta + NORMAL_90 * known.std_dev;

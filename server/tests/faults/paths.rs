@@ -13,7 +13,7 @@ use tread_server::app::AppError;
 use tread_server::authority::Issued;
 use tread_server::config::RetentionConfig;
 use tread_server::db;
-use tread_server::db::aside::Origin;
+use tread_server::db::deferred_segments::Origin;
 use tread_server::db::enrolments::Renewal;
 use tread_server::db::idempotency::Given;
 use tread_server::db::missions::Facts;
@@ -228,8 +228,11 @@ pub(crate) const PATHS: &[WritePath] = &[
                 };
                 let measurement = serde_json::value::RawValue::from_string("{}".to_owned());
                 let at_us = later().as_microsecond();
-                db::aside::put(tx, origin, (at_us, at_us), &measurement.unwrap()).await?;
-                db::aside::take(tx, boot_pk, 0, 10).await.map(|_| ())
+                db::deferred_segments::put(tx, origin, (at_us, at_us), &measurement.unwrap())
+                    .await?;
+                db::deferred_segments::take(tx, boot_pk, 0, 10)
+                    .await
+                    .map(|_| ())
             }))
         },
     },

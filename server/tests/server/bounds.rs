@@ -213,7 +213,7 @@ async fn alerts_of_unconfirmed_stops_are_what_the_stops_say() {
         severity: Severity::Critical,
         text: "left over".to_owned(),
     };
-    let id = tread_api::ids::AlertId::from_uuid(app.clock().mission_id().as_uuid());
+    let id = app.clock().new_id::<tread_api::ids::AlertId>();
     db::alerts::raise(&mut tx, free, id, &report, now)
         .await
         .unwrap();

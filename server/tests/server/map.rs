@@ -40,11 +40,11 @@ async fn upload_at(writer: &Writer, robot_time: Option<&str>, records: Vec<Recor
     answered.await.unwrap().unwrap()
 }
 
-async fn aside(writer: &Writer) -> u64 {
+async fn deferred(writer: &Writer) -> u64 {
     let everywhere = tread_api::rights::Scope::EVERYWHERE;
     let place = (&site(), &everywhere);
     let page = writer.app.robots(place, None, false, 10).await.unwrap();
-    page.items[0].measurements.aside
+    page.items[0].measurements.deferred
 }
 
 fn cells_of(rows: &[CellFriction]) -> Vec<i32> {
@@ -71,7 +71,7 @@ async fn a_segment_from_the_future_waits_until_the_clock_of_its_run_is_known() {
     let receipt = upload_at(&writer, Some("2026-11-01T00:00:00Z"), vec![ahead(2, 60)]).await;
     assert_eq!(receipt.committed, 1);
     assert_eq!(writer.sums().await, []);
-    assert_eq!(aside(&writer).await, 3);
+    assert_eq!(deferred(&writer).await, 3);
 
     let receipt = upload_at(&writer, Some("2026-11-06T00:00:00Z"), vec![ahead(3, 60)]).await;
     assert_eq!((receipt.committed, receipt.duplicates), (1, 0));
@@ -84,7 +84,7 @@ async fn a_segment_from_the_future_waits_until_the_clock_of_its_run_is_known() {
     );
     let receipt = upload_at(&writer, None, vec![ahead(1, 60)]).await;
     assert_eq!((receipt.committed, receipt.duplicates), (0, 1), "known");
-    assert_eq!(aside(&writer).await, 0);
+    assert_eq!(deferred(&writer).await, 0);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -16,7 +16,7 @@ use super::sensors::sensors_max_m_s;
 use super::{LoopCore, STANDING, age_s};
 use crate::control_loop::BRAKING_MAX;
 use crate::control_loop::active::{Active, Hold};
-use crate::control_loop::seam::{EndReason, Fault, GateSnapshot};
+use crate::control_loop::channels::{EndReason, Fault, GateSnapshot};
 use crate::safety::{LoopView, microseconds};
 
 /// What the guard knows between two ticks.
@@ -88,7 +88,7 @@ pub(super) struct Wanted {
 
 impl LoopCore {
     /// Looks at stops, leases and limits, and holds the mission in hand where they ask for it.
-    pub(super) fn look_at_safety(&mut self, now: Duration) {
+    pub(super) fn check_safety(&mut self, now: Duration) {
         if let Some(watch) = &mut self.overrun {
             watch.note(now);
         }
@@ -281,7 +281,7 @@ impl LoopCore {
     }
 
     /// What must not last for ever: the server's silence, and waiting for a revision.
-    pub(super) fn mind_bounds(&mut self, now: Duration) {
+    pub(super) fn check_bounds(&mut self, now: Duration) {
         let Some(active) = &mut self.active else {
             self.replacement_until = None;
             return;

@@ -25,11 +25,11 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 
 use super::active::Active;
+use super::channels::{EndReason, LoopEnds, Shared};
 use super::gain::GroundRecord;
 use super::outgoing::Outgoing;
 use super::overrun::{Overrun, OverrunWatch};
 use super::progress::ProgressWatch;
-use super::seam::{EndReason, LoopEnds, Shared};
 use super::segments::{Moment, SegmentCutter};
 use super::site_view::{Footing, SiteView};
 use super::slip::SlipMeter;
@@ -189,7 +189,7 @@ impl LoopCore {
     }
 
     /// From now on it notes what it takes and gives, or no longer.
-    pub(crate) fn note_to(&mut self, notes: Option<NoteTaker>) {
+    pub(crate) fn record_to(&mut self, notes: Option<NoteTaker>) {
         self.notes = notes;
     }
 
@@ -231,8 +231,8 @@ impl LoopCore {
         self.measure_slip(now.monotonic, dt_s);
         self.take_commands(now, stop);
         self.cut_segments(now, ground_changed, dt_s);
-        self.look_at_safety(now.monotonic);
-        self.mind_bounds(now.monotonic);
+        self.check_safety(now.monotonic);
+        self.check_bounds(now.monotonic);
         let fault = self.fault(now.monotonic);
         self.hold_for_base(now.monotonic, fault);
         self.hold_for_sensors(now);
@@ -244,7 +244,7 @@ impl LoopCore {
         self.command = gated.wheel_speeds;
         drive.write(self.command);
         self.note_written();
-        self.look_at_standing(now.monotonic, &gated);
+        self.check_standstill(now.monotonic, &gated);
         self.record(dt_s, ground_changed, gated.cause);
         if stop {
             self.end_mission(now, EndReason::AgentStopped);
@@ -282,7 +282,7 @@ impl LoopCore {
     }
 
     /// Whether the rest of the agent wants the loop to end.
-    pub(crate) fn is_told_to_stop(&self) -> bool {
+    pub(crate) fn stop_requested(&self) -> bool {
         self.ends.shared.stop.load(Ordering::Relaxed)
     }
 

@@ -2,7 +2,7 @@
 
 use super::LoopCore;
 use super::guard::Wanted;
-use crate::control_loop::seam::Snapshot;
+use crate::control_loop::channels::Snapshot;
 use crate::control_loop::segments::Moment;
 use crate::drive::Feedback;
 use crate::recording::frame::{TickFrame, TickInputs, TickOutputs};
@@ -28,7 +28,7 @@ impl LoopCore {
             inputs: TickInputs {
                 now,
                 judged,
-                is_told_to_stop: stop,
+                stop_requested: stop,
                 commands: notes.commands(),
                 feedback: *feedback,
                 is_base_silent: self.is_base_silent,

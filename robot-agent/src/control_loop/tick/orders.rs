@@ -9,8 +9,8 @@ use tread_control::measured::WheelSpeeds;
 
 use super::LoopCore;
 use crate::control_loop::active::{Active, Hold, News, progress_of};
+use crate::control_loop::channels::{COMMANDS_MAX, EndReason, Fault, Job, LoopCommand, LoopEvent};
 use crate::control_loop::driven::TickRecord;
-use crate::control_loop::seam::{COMMANDS_MAX, EndReason, Fault, Job, LoopCommand, LoopEvent};
 use crate::control_loop::segments::Moment;
 
 /// Longest that a mission is held for a revision that does not come.

@@ -11,9 +11,9 @@ use tread_control::tracking::ThetaKnowledge;
 
 use super::{LoopCore, TICK_MAX_S, age_s};
 use crate::control_loop::active::Hold;
+use crate::control_loop::channels::{ClosedSegment, Fault, LoopEvent, Shared};
 use crate::control_loop::gain::GroundRecord;
 use crate::control_loop::prior::{Prior, told};
-use crate::control_loop::seam::{ClosedSegment, Fault, LoopEvent, Shared};
 use crate::control_loop::segments::{CutInput, Moment, Place};
 use crate::control_loop::site_view::Footing;
 use crate::control_loop::surface::Comparison;
@@ -58,7 +58,7 @@ impl LoopCore {
                 // Only what can be used counts as a word of the base: one that says nothing but
                 // nonsense is as good as silent.
                 self.last_sample = Some(sample.at);
-                self.mind_gap(sample.at);
+                self.check_gap(sample.at);
                 self.reckoned_to = self.reckoned_to.max(Some(sample.at));
                 self.measured_wheels = wheel_speeds;
                 if dt_s > 0.0 {
@@ -87,7 +87,7 @@ impl LoopCore {
                 }
             }
             if let Some(pose) = sample.position {
-                self.mind_gap(sample.at);
+                self.check_gap(sample.at);
                 self.progress.note_fix(pose.point());
                 // A position takes longer to be found than the motion since.
                 let fix = PositionFix {
@@ -113,7 +113,7 @@ impl LoopCore {
 
     /// Where the robot went while its wheels were not heard, nobody knows: without this, what its
     /// position says afterwards would be refused as a jump.
-    fn mind_gap(&mut self, at: Duration) {
+    fn check_gap(&mut self, at: Duration) {
         let Some(reckoned_to) = self.reckoned_to else {
             return;
         };

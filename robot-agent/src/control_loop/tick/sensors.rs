@@ -13,7 +13,7 @@ use tread_control::measured::WheelSpeeds;
 use super::LoopCore;
 use super::sensing::BODY_SPEED_AGE_MAX;
 use crate::control_loop::active::Hold;
-use crate::control_loop::seam::EndReason;
+use crate::control_loop::channels::EndReason;
 use crate::control_loop::segments::Moment;
 use crate::drive::SensorSample;
 
@@ -100,7 +100,7 @@ impl LoopCore {
     }
 
     /// Tells the monitor what the wheels are commanded, and looks whether a robot that is to stand does.
-    pub(super) fn look_at_standing(&mut self, now: Duration, gated: &GateOutput) {
+    pub(super) fn check_standstill(&mut self, now: Duration, gated: &GateOutput) {
         self.monitor.command(self.command);
         let is_new = |at: Duration| now.saturating_sub(at) <= BODY_SPEED_AGE_MAX;
         let (wheels, gyro) = (Subject::Wheels, Subject::Gyro);

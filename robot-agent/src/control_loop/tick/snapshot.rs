@@ -10,7 +10,7 @@ use tread_control::tracking::TrackingErrors;
 
 use super::{LoopCore, age_s};
 use crate::control_loop::active::Active;
-use crate::control_loop::seam::{Fault, Snapshot};
+use crate::control_loop::channels::{Fault, Snapshot};
 use crate::control_loop::site_view::Footing;
 use crate::drive::Battery;
 

@@ -29,7 +29,7 @@ use super::outward::{LOOK_EVERY, Outward, Word};
 use super::refusal::Counts;
 use super::settings::{BusMode, BusSettings, Ros2Settings, Scheme};
 use crate::clock::SharedClock;
-use crate::control_loop::seam::Shared;
+use crate::control_loop::channels::Shared;
 use crate::fleet::{LinkError, zenoh_failed};
 
 /// Longest row of tries to connect before the thread looks whether it is to end, milliseconds.

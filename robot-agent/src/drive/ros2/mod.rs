@@ -1,4 +1,4 @@
-//! A ROS 2 robot behind the drive's seam: read and commanded over zenoh, with no ROS on this side.
+//! A ROS 2 robot behind the drive interface: read and commanded over zenoh, with no ROS on this side.
 //!
 //! ```text
 //! bus ─callback─► inlet (key, attachment, CDR, values, stamp) ─channel─► assemble ─► loop

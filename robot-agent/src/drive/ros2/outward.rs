@@ -18,7 +18,7 @@ use tread_ros2::names::Name;
 
 use super::refusal::Counts;
 use super::settings::OutwardSettings;
-use crate::control_loop::seam::{GivenPlan, Shared, Snapshot};
+use crate::control_loop::channels::{GivenPlan, Shared, Snapshot};
 use crate::recording::views::{PATH_POINTS_MAX, header, path, poses_of, state};
 
 /// Time between two looks.
@@ -122,8 +122,8 @@ impl Outward {
     /// Says what is due to be said.
     pub(crate) fn step(&mut self, now: Duration, wall_ns: i64, mut say: impl FnMut(Word, &[u8])) {
         let snapshot = self.shared.snapshot();
-        let is_new = self.look_at_mission(&snapshot);
-        self.look_at_place(&snapshot);
+        let is_new = self.update_mission(&snapshot);
+        self.update_place(&snapshot);
         let is_due = |said: Duration| now.saturating_sub(said) >= SAY_EVERY;
         if !is_new && !self.said.is_none_or(is_due) {
             return;
@@ -142,7 +142,7 @@ impl Outward {
     }
 
     /// Whether another plan is driven than before.
-    fn look_at_mission(&mut self, snapshot: &Snapshot) -> bool {
+    fn update_mission(&mut self, snapshot: &Snapshot) -> bool {
         let driven = snapshot.mission.map(|now| (now.id, now.revision));
         if driven == self.mission {
             return false;
@@ -169,7 +169,7 @@ impl Outward {
         true
     }
 
-    fn look_at_place(&mut self, snapshot: &Snapshot) {
+    fn update_place(&mut self, snapshot: &Snapshot) {
         let Some((pose, _)) = snapshot.pose else {
             return;
         };

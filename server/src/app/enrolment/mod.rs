@@ -243,7 +243,7 @@ impl App {
         JOIN_TOKENS.check(within, valid_count, of_maker)?;
         let secret = new_secret(Kind::Join)?;
         let join_token = JoinToken {
-            id: JoinTokenId::from_uuid(self.clock().mission_id().as_uuid()),
+            id: self.clock().new_id::<JoinTokenId>(),
             site: request.site,
             robot: request.robot,
             created_at: now,

@@ -258,7 +258,7 @@ impl App {
 pub(super) fn of_square(
     map: &SiteMap,
     reading: &Reading,
-    (cell, parts): Square,
+    (cell, parts): CellGroup,
     size_m: f64,
 ) -> Vec<CellFriction> {
     let (groups, ground) = match parts {
@@ -362,7 +362,7 @@ fn check_count(area: &Area, resolution_m: Option<f64>) -> Result<(), AppError> {
 }
 
 /// A square and the cells of the grid in it that hold anything; none where it is a cell itself.
-pub(super) type Square = (Cell, Option<Vec<Cell>>);
+pub(super) type CellGroup = (Cell, Option<Vec<Cell>>);
 
 /// Squares that hold anything, row by row.
 pub(super) fn squares(
@@ -371,7 +371,7 @@ pub(super) fn squares(
     (min, max): (Cell, Cell),
     after: Option<Cell>,
     wanted: usize,
-) -> Vec<Square> {
+) -> Vec<CellGroup> {
     if factor == 1 {
         let cells = map.cells_in(min, max, after).take(wanted);
         return cells.map(|cell| (cell, None)).collect();
@@ -384,7 +384,7 @@ pub(super) fn squares(
         ix: first(square).ix.saturating_add(factor - 1),
         iy: first(square).iy.saturating_add(factor - 1),
     };
-    let mut found: Vec<Square> = Vec::new();
+    let mut found: Vec<CellGroup> = Vec::new();
     let mut row = after.map_or(min.iy, |after| after.iy.max(min.iy));
     while row <= max.iy && found.len() < wanted {
         // The next row of the grid with anything in it tells the next row of squares.

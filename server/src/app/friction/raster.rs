@@ -15,7 +15,7 @@ use super::cells::{Area, factor};
 use super::drawn::Drawn;
 use super::{App, AppError, Asked, Reading, SiteView};
 use crate::friction::Raster;
-use crate::friction::index::{BLOCK_SQUARES, Block, Lens, Room, SiteMap, Square};
+use crate::friction::index::{Block, CELLS_PER_BLOCK, CellSummary, Lens, Room, SiteMap};
 
 /// Most squares of one picture.
 pub const SQUARES_MAX: u64 = 1 << 20;
@@ -49,7 +49,7 @@ struct Kept {
     terrain_revision: u64,
     now_us: i64,
     grounds: Arc<[u16]>,
-    squares: Arc<Vec<Square>>,
+    squares: Arc<Vec<CellSummary>>,
     used: u64,
 }
 
@@ -104,13 +104,13 @@ impl Frame<'_> {
         let grid = self.view.row.site.grid;
         let (low, high) = (grid.center_of(block.first()), grid.center_of(block.last()));
         let near = self.drawn.near(low, high);
-        let places = 0..u16::try_from(BLOCK_SQUARES).unwrap_or(u16::MAX);
+        let places = 0..u16::try_from(CELLS_PER_BLOCK).unwrap_or(u16::MAX);
         places
             .map(|place| near.ground_at(grid.center_of(block.cell(place))))
             .collect()
     }
 
-    fn block(&self, app: &App, block: Block) -> Arc<Vec<Square>> {
+    fn block(&self, app: &App, block: Block) -> Arc<Vec<CellSummary>> {
         let (row, reading) = (&self.view.row, self.reading);
         // What is asked of another time is made for this once.
         let key = reading.as_of.is_none().then(|| BlockKey {
@@ -135,7 +135,10 @@ impl Frame<'_> {
                     let places = map.changes().since(block, kept.change);
                     (kept.squares, places)
                 }
-                None => (Arc::new(vec![Square::default(); BLOCK_SQUARES]), None),
+                None => (
+                    Arc::new(vec![CellSummary::default(); CELLS_PER_BLOCK]),
+                    None,
+                ),
             };
             if newest > 0 {
                 let lens = self.lens(map);
@@ -160,10 +163,10 @@ impl Frame<'_> {
     }
 
     /// The squares of a box of cells, row by row.
-    fn cells(&self, app: &App, (min, max): (Cell, Cell)) -> Vec<Square> {
+    fn cells(&self, app: &App, (min, max): (Cell, Cell)) -> Vec<CellSummary> {
         let columns = usize::try_from(max.ix - min.ix + 1).unwrap_or_default();
         let rows = usize::try_from(max.iy - min.iy + 1).unwrap_or_default();
-        let mut squares = vec![Square::default(); columns * rows];
+        let mut squares = vec![CellSummary::default(); columns * rows];
         let (low, high) = (Block::of(min), Block::of(max));
         for row in low.row..=high.row {
             for column in low.column..=high.column {
@@ -184,7 +187,7 @@ impl Frame<'_> {
     }
 
     /// The same of squares of several cells, which are made for this once.
-    fn merged(&self, app: &App, (min, max): (Cell, Cell), factor: i32) -> Vec<Square> {
+    fn merged(&self, app: &App, (min, max): (Cell, Cell), factor: i32) -> Vec<CellSummary> {
         let grid = self.view.row.site.grid;
         let coarse = Grid {
             cell_m: grid.cell_m * f64::from(factor),
@@ -293,7 +296,7 @@ impl App {
         raster.columns = usize::try_from(columns).unwrap_or_default();
         raster.rows = usize::try_from(rows).unwrap_or_default();
         raster.squares = match configuration {
-            None => vec![Square::default(); raster.columns * raster.rows],
+            None => vec![CellSummary::default(); raster.columns * raster.rows],
             Some(configuration) => {
                 let frame = Frame {
                     view,

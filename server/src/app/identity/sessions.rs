@@ -51,7 +51,7 @@ impl App {
             Owner::Person(signed_in) => (None, Some(signed_in.person.id)),
         };
         let session = NewSession {
-            id: SessionId::from_uuid(self.clock().mission_id().as_uuid()),
+            id: self.clock().new_id::<SessionId>(),
             owner,
             fingerprint: secret.fingerprint(),
             created_at: now,

@@ -200,7 +200,7 @@ impl App {
         }
         let secret = new_secret(Kind::Token(request.role))?;
         let token = Token {
-            id: TokenId::from_uuid(self.clock().mission_id().as_uuid()),
+            id: self.clock().new_id::<TokenId>(),
             name,
             role: request.role,
             rights,

@@ -75,7 +75,7 @@ impl App {
             return Err(AppError::RobotRetired(robot));
         }
         check_limits(&robot, &robot_row.model.limits, &trajectory)?;
-        let (id, revision, created_at) = (self.clock().mission_id(), 1, self.clock().now());
+        let (id, revision, created_at) = (self.clock().new_id(), 1, self.clock().now());
         if let Some(latest) = latest_start.filter(|latest| *latest <= created_at) {
             let detail = format!("latest_start {latest} has passed: it would never start");
             return Err(AppError::Invalid {

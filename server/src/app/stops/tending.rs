@@ -40,7 +40,7 @@ impl App {
             adopted,
             alerts,
             again,
-        } = self.look_at_stops().await?;
+        } = self.check_stops().await?;
         let is_idle = lost.is_empty() && cleared.is_empty() && standing.is_empty();
         if is_idle && adopted.is_empty() && alerts.is_empty() {
             return Ok(again);
@@ -80,7 +80,7 @@ impl App {
         Ok(again)
     }
 
-    async fn look_at_stops(&self) -> Result<Tending, AppError> {
+    async fn check_stops(&self) -> Result<Tending, AppError> {
         let mut tx = self.db().read("stops").await?;
         let mut robots: BTreeMap<RobotKey, Option<Stop>> = BTreeMap::new();
         for (key, _latch) in self.presences().shown_stops() {

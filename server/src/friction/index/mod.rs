@@ -7,7 +7,7 @@
 mod changes;
 mod names;
 mod part;
-mod squares;
+mod summaries;
 
 use std::collections::BTreeMap;
 use std::ops::Bound;
@@ -20,7 +20,7 @@ use tread_api::terrain::TerrainRef;
 pub use self::changes::{BLOCK_CELLS, Block, Changes};
 use self::names::{Names, Number};
 use self::part::{Part, PartKey};
-pub use self::squares::{At, BLOCK_SQUARES, GROUND_NONE, Lens, Room, Square, SquareKnown};
+pub use self::summaries::{At, CELLS_PER_BLOCK, CellSummary, GROUND_NONE, KnownCell, Lens, Room};
 use super::sums::{DAY_H, bucket_h};
 use super::{Seen, Sums};
 

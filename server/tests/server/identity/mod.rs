@@ -4,7 +4,7 @@ mod audit;
 mod browsers;
 mod connections;
 mod enrolment;
-mod matrix;
+mod every_route;
 mod rights;
 mod tls;
 mod tokens;

@@ -14,7 +14,7 @@ use tread_server::db;
 use tread_server::identity::secret::{Kind, Secret};
 use uuid::Uuid;
 
-use super::matrix::{is_open, operations};
+use super::every_route::{is_open, operations};
 use crate::events::read_until;
 use crate::harness::{Yard, circle, client, eventually, measured, segment, time};
 use crate::robot::Robot;

@@ -17,8 +17,8 @@ use super::super::settings::{BusMode, Ros2Settings};
 use super::super::tests as drive_tests;
 use super::*;
 use crate::clock::{SharedClock, SystemClock};
+use crate::control_loop::channels::Fault;
 use crate::control_loop::hold_tests::driving;
-use crate::control_loop::seam::Fault;
 
 /// Longest wait for what is to be heard.
 const WAIT_MAX: Duration = Duration::from_secs(10);
@@ -161,8 +161,8 @@ fn a_way_keeps_its_newest_points_and_no_more_than_it_may() {
             pose: Some((pose, Duration::ZERO)),
             ..Snapshot::default()
         };
-        outward.look_at_place(&snapshot);
-        outward.look_at_place(&snapshot);
+        outward.update_place(&snapshot);
+        outward.update_place(&snapshot);
     }
     let words = said(&mut outward, Duration::ZERO);
     let driven = points(&words, Word::Driven);

@@ -20,7 +20,7 @@ const DISPUTED: u32 = 1 << 31;
 
 /// What is known of a cell or of several, in 16 bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Square {
+pub struct CellSummary {
     /// 0, which no θ is, where nothing is known.
     theta: f32,
     std_dev: f32,
@@ -32,7 +32,7 @@ pub struct Square {
 
 /// What a square knows.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SquareKnown {
+pub struct KnownCell {
     /// θ.
     pub theta: f64,
     /// Its standard deviation.
@@ -45,7 +45,7 @@ pub struct SquareKnown {
     pub is_disputed: bool,
 }
 
-impl Square {
+impl CellSummary {
     /// The same of a fused estimate.
     #[expect(
         clippy::cast_possible_truncation,
@@ -63,8 +63,8 @@ impl Square {
     }
 
     /// What it knows, if anything.
-    pub fn known(&self) -> Option<SquareKnown> {
-        (self.theta > 0.0).then(|| SquareKnown {
+    pub fn known(&self) -> Option<KnownCell> {
+        (self.theta > 0.0).then(|| KnownCell {
             theta: f64::from(self.theta),
             std_dev: f64::from(self.std_dev),
             mu_peak: (self.mu_peak >= 0.0).then(|| f64::from(self.mu_peak)),
@@ -148,10 +148,10 @@ impl SiteMap {
         grounds: &[u16],
         lens: &Lens,
         at: At<'_>,
-        squares: &mut [Square],
+        squares: &mut [CellSummary],
     ) {
         if places.is_none() {
-            squares.fill(Square::default());
+            squares.fill(CellSummary::default());
         }
         let mut room = Room::default();
         let mut put = |place: u16, parts: &[Part]| {
@@ -183,7 +183,7 @@ impl SiteMap {
         (ground, lens): (u16, &Lens),
         at: At<'_>,
         room: &mut Room,
-    ) -> Square {
+    ) -> CellSummary {
         let mut sums: std::collections::BTreeMap<PartKey, Sums> = std::collections::BTreeMap::new();
         for cell in self.cells_in(min, max, None) {
             for part in self.cells.get(&place(cell)).into_iter().flatten() {
@@ -203,7 +203,7 @@ impl SiteMap {
             .fuser
             .fuse(&mut room.seen, Ground::Area, at.config, at.now_us)
             .map(|fused| fused.with_uninformative(room.uninformative_passes));
-        fused.map_or_else(Square::default, |fused| Square::of(&fused))
+        fused.map_or_else(CellSummary::default, |fused| CellSummary::of(&fused))
     }
 
     /// What a cell says of the ground with that number.
@@ -230,9 +230,15 @@ impl SiteMap {
         Some(known.with_uninformative(room.uninformative_passes))
     }
 
-    fn square(&self, parts: &[Part], which: (u16, &Lens), at: At<'_>, room: &mut Room) -> Square {
+    fn square(
+        &self,
+        parts: &[Part],
+        which: (u16, &Lens),
+        at: At<'_>,
+        room: &mut Room,
+    ) -> CellSummary {
         let fused = self.fuse_parts(parts, which, at, room);
-        fused.map_or_else(Square::default, |fused| Square::of(&fused))
+        fused.map_or_else(CellSummary::default, |fused| CellSummary::of(&fused))
     }
 
     fn gather(&self, parts: &[Part], (ground, lens): (u16, &Lens), room: &mut Room) {
@@ -280,7 +286,7 @@ impl SiteMap {
 }
 
 /// Cells of a block.
-pub const BLOCK_SQUARES: usize = (BLOCK_CELLS * BLOCK_CELLS).cast_unsigned() as usize;
+pub const CELLS_PER_BLOCK: usize = (BLOCK_CELLS * BLOCK_CELLS).cast_unsigned() as usize;
 
 #[cfg(test)]
 mod tests {
@@ -288,7 +294,7 @@ mod tests {
 
     #[test]
     fn a_square_takes_16_bytes() {
-        assert_eq!(size_of::<Square>(), 16);
-        assert_eq!(Square::default().known(), None);
+        assert_eq!(size_of::<CellSummary>(), 16);
+        assert_eq!(CellSummary::default().known(), None);
     }
 }

@@ -8,7 +8,7 @@ use super::{DbError, from_json, unsigned};
 
 /// A measurement that waits.
 #[derive(Debug, Clone)]
-pub struct Aside {
+pub struct DeferredSegment {
     /// Its number within its run.
     pub seq: i64,
     /// The measurement, with the times of the robot's clock.
@@ -28,7 +28,7 @@ pub struct Origin {
     pub robot_pk: i64,
 }
 
-/// Puts a measurement aside; `false` if it is there or on the map already.
+/// Defers a measurement; `false` if it is there or on the map already.
 pub async fn put(
     db: &mut SqliteConnection,
     origin: Origin,
@@ -43,7 +43,7 @@ pub async fn put(
     } = origin;
     let text = measurement.get();
     let done = sqlx::query!(
-        "INSERT INTO segments_aside
+        "INSERT INTO deferred_segments
              (boot_pk, seq, site_pk, robot_pk, ended_at_us, received_at_us, measurement)
          SELECT ?1, ?2, ?3, ?4, ?5, ?6, ?7
          WHERE NOT EXISTS (SELECT 1 FROM segments WHERE boot_pk = ?1 AND seq = ?2)
@@ -66,7 +66,7 @@ pub async fn put(
 /// How many of a robot's measurements wait.
 pub async fn count(db: &mut SqliteConnection, robot_pk: i64) -> Result<u64, DbError> {
     let count = sqlx::query_scalar!(
-        r#"SELECT COUNT(*) AS "count!: i64" FROM segments_aside WHERE robot_pk = ?"#,
+        r#"SELECT COUNT(*) AS "count!: i64" FROM deferred_segments WHERE robot_pk = ?"#,
         robot_pk
     );
     unsigned("count", count.fetch_one(db).await?)
@@ -78,10 +78,10 @@ pub async fn take(
     boot_pk: i64,
     ended_before_us: i64,
     limit: u32,
-) -> Result<Vec<Aside>, DbError> {
+) -> Result<Vec<DeferredSegment>, DbError> {
     let rows = sqlx::query!(
-        r#"DELETE FROM segments_aside WHERE boot_pk = ?1 AND seq IN (
-               SELECT seq FROM segments_aside WHERE boot_pk = ?1 AND ended_at_us <= ?2
+        r#"DELETE FROM deferred_segments WHERE boot_pk = ?1 AND seq IN (
+               SELECT seq FROM deferred_segments WHERE boot_pk = ?1 AND ended_at_us <= ?2
                ORDER BY seq LIMIT ?3)
            RETURNING seq AS "seq!", measurement AS "measurement!""#,
         boot_pk,
@@ -92,7 +92,7 @@ pub async fn take(
     .await?;
     rows.into_iter()
         .map(|row| {
-            Ok(Aside {
+            Ok(DeferredSegment {
                 seq: row.seq,
                 segment: from_json("measurement", &row.measurement)?,
             })

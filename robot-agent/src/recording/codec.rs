@@ -13,7 +13,7 @@ use tread_ros2::messages::tread::{LoopSample, LoopTick, sample_bits, tick_bits};
 
 use super::frame::TickFrame;
 use super::replay::Difference;
-use crate::control_loop::seam::Fault;
+use crate::control_loop::channels::Fault;
 use crate::drive::{Battery, Feedback, SAMPLES_MAX, SensorSample, StatedNoise};
 
 /// Largest text that is read: a site of many polygons, a prior of many cells.
@@ -200,7 +200,7 @@ pub(super) fn tick_message<'room>(
         number: frame.number,
         monotonic_ns: nanoseconds(inputs.now.monotonic),
         wall_ns: i64::try_from(inputs.now.wall.as_nanosecond()).unwrap_or(i64::MAX),
-        present: bit(tick_bits::TOLD_TO_STOP, inputs.is_told_to_stop)
+        present: bit(tick_bits::STOP_REQUESTED, inputs.stop_requested)
             | bit(tick_bits::BASE_SILENT, inputs.is_base_silent)
             | bit(tick_bits::NOISE_GYRO, noise.gyro_rad_s.is_some())
             | bit(

@@ -398,7 +398,7 @@ pub(crate) struct AgentEnds {
 }
 
 /// Everything that passes between the loop and the rest.
-pub(crate) fn seam() -> (LoopEnds, AgentEnds) {
+pub(crate) fn loop_channels() -> (LoopEnds, AgentEnds) {
     let (command_sender, command_receiver) = sync_channel(COMMANDS_MAX);
     let (event_sender, event_receiver) = sync_channel(EVENTS_MAX);
     let shared = Arc::new(Shared::default());
