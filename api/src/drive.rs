@@ -29,9 +29,9 @@ pub const DRIVE_VIEW_PERIOD_MS: u64 = 100;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum DriveRequest {
-    /// Have the lease, if nobody else has it.
+    /// Take the lease, if nobody else has it.
     Acquire(DriverName),
-    /// Have the lease, whoever has it now.
+    /// Take the lease, whoever has it now.
     Take(DriverName),
     /// Give the lease back; the robot's target is zero at once.
     Release(Nothing),
@@ -172,9 +172,9 @@ pub struct DriveView {
     pub mission: Option<MissionProgress>,
     /// Its stop, its lease, what reduces it.
     pub safety: SafetyStatus,
-    /// Age of drive commands at the robot, as it says, and this socket's way to the server and
-    /// back, milliseconds; `null` while one of the two is not known.
+    /// Age of drive commands at the robot, as it reports, plus this socket's round-trip time,
+    /// milliseconds; `null` while one of the two is not known.
     pub latency_ms: Option<f64>,
-    /// This socket's way to the server and back, milliseconds.
+    /// Round-trip time of this socket, milliseconds.
     pub socket_ms: Option<f64>,
 }

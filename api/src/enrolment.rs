@@ -64,7 +64,7 @@ pub struct CreateJoinToken {
     pub valid_minutes: Option<u32>,
 }
 
-/// A new join token with its secret, which is told this once.
+/// A new join token with its secret, which is shown only here.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct CreatedJoinToken {
     /// The token.
@@ -153,12 +153,13 @@ pub struct Enrolment {
     pub renewed_at: Timestamp,
     /// From when on its present certificate is refused.
     pub expires_at: Timestamp,
-    /// When it was put out of the fleet, or joined again.
+    /// When it was revoked, or replaced because the robot joined again.
     pub revoked_at: Option<Timestamp>,
     /// Who did that.
     pub revoked_by: Option<String>,
-    /// SHA-256 of the authority that signed the certificate which the robot showed last; during a
-    /// rotation it tells who was brought over. `null` for one that has shown none since this is noted.
+    /// SHA-256 of the authority that signed the certificate which the robot presented last; during
+    /// a rotation it shows which robots have moved to the new one. `null` for a robot that has
+    /// presented none since this is recorded.
     #[serde(default)]
     pub authority: Option<String>,
 }
@@ -279,8 +280,8 @@ pub struct FinishRotation {
 /// Puts another authority in the place of the present one, at once.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct ReplaceAuthority {
-    /// The `signing` of the authority that is to be replaced, so that nobody replaces another one than
-    /// he has looked at.
+    /// The `signing` of the authority to replace, so that a client replaces only the one that it
+    /// has seen.
     pub signing: String,
 }
 

@@ -186,14 +186,14 @@ pub struct LiveFriction {
     pub theta_measured: Option<ThetaEstimate>,
     /// Whether the motion of late carried information on θ.
     pub excited: bool,
-    /// How much the wheels slip along their way; `null` while they hardly turn or change their
-    /// speed, and from an older agent.
+    /// Longitudinal slip of the wheels; `null` while they hardly turn or change their speed, and
+    /// from an older agent.
     #[serde(default)]
     pub slip: Option<SideSlip>,
 }
 
-/// Slip of the two sides' wheels along their way, equation (3) of the paper: what the rim goes
-/// faster than the ground below it passes, over the speed of the rim; −1 to 1, positive drives.
+/// Longitudinal slip of the wheels of each side, equation (3) of the paper: rim speed minus ground
+/// speed, over the rim speed; −1 to 1, positive when driving.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct SideSlip {
     /// Left wheels.
@@ -202,7 +202,7 @@ pub struct SideSlip {
     pub right_ratio: f64,
 }
 
-/// θ with its deviation.
+/// θ with its standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ThetaEstimate {
     /// θ = 1/K, slip per friction coefficient.
@@ -230,7 +230,7 @@ impl ThetaEstimate {
 pub struct FusedFriction {
     /// θ = 1/K, slip per friction coefficient.
     pub theta: f64,
-    /// Standard deviation of θ, with the robots' own biases and the age of what they measured.
+    /// Standard deviation of θ, including the robots' own biases and the age of their measurements.
     pub std_dev: f64,
     /// Lower end of the 95 % interval of θ.
     pub theta_low_95: f64,
@@ -247,8 +247,8 @@ pub struct FusedFriction {
     pub effective_track_ratio: Option<ValueEstimate>,
     /// Rolling resistance coefficient; `null` where no torque showed it.
     pub rolling_resistance: Option<ValueEstimate>,
-    /// Segments that were ever measured here, also those that told nothing of θ and those from
-    /// before the ground changed: how often it was visited.
+    /// Segments that were ever measured here, including those without information on θ and those
+    /// from before the ground changed: how often it was visited.
     pub segments: u64,
     /// Robots behind the estimate.
     pub robots: u32,
@@ -311,7 +311,7 @@ pub struct ModelFriction {
     pub model: String,
     /// What is known; `null` when nothing is.
     pub friction: Option<FusedFriction>,
-    /// What ground of this class is like elsewhere, where nobody has measured this one.
+    /// Friction of other terrains of this class, where this one has not been measured.
     #[serde(default)]
     pub prior: Option<ClassPrior>,
     /// The declared normalisation that brought other models' measurements to this one's θ, if any.
@@ -326,7 +326,7 @@ pub struct ClassPrior {
     pub class: TerrainClass,
     /// θ to expect.
     pub theta: f64,
-    /// Its standard deviation, with how terrains of one class differ.
+    /// Its standard deviation, including how terrains of one class differ.
     pub std_dev: f64,
     /// Terrains that it was learned from.
     pub terrains: u32,
@@ -396,7 +396,7 @@ pub struct PathFriction {
     pub configuration: ConfigurationId,
     /// The normalisation that was used, if any.
     pub normalisation: Option<String>,
-    /// Share of the length on which somebody has measured, 0 to 1.
+    /// Share of the length on which friction was measured, 0 to 1.
     pub known_ratio: f64,
     /// Pieces of the path, each in one cell, in order.
     pub pieces: Vec<PathPiece>,
@@ -422,8 +422,8 @@ pub struct PathPiece {
     /// Friction coefficient to plan with: the larger of what was shown of late and a cautious
     /// value, within what keeps the wheels' slip in the linear range at `theta_upper_95`.
     pub grip_mu: f64,
-    /// Speed that follows at its begin, metres per second: curves and stopping with that grip and
-    /// the robot's limits, the robot standing at the end of the path.
+    /// Speed at its start, metres per second, from the curves, the traction limit and the robot's
+    /// limits; the robot stands at the end of the path.
     pub speed_m_s: f64,
 }
 
@@ -456,8 +456,8 @@ pub struct VisitSuggestion {
     pub center: Point,
     /// The terrain; `null` where none is drawn.
     pub terrain: Option<TerrainRef>,
-    /// By what factor a visit would shrink the standard deviation of θ, as its natural logarithm;
-    /// for unknown ground that of an expectation from nothing.
+    /// Factor by which a visit would shrink the standard deviation of θ, as its natural logarithm;
+    /// for unknown ground relative to the prior.
     pub gain: f64,
     /// Standard deviation of θ over θ now; `null` when nothing is known.
     pub relative_deviation: Option<f64>,
@@ -561,7 +561,7 @@ pub struct Withdrawal {
 pub struct MapChange {
     /// The site.
     pub site: SiteId,
-    /// When this was told.
+    /// Time of this message.
     pub at: Timestamp,
     /// Revision of the grid that the cells are of.
     pub grid_revision: u32,

@@ -101,7 +101,7 @@ pub enum InvalidPolygon {
     TooSmall,
 }
 
-/// A simple polygon: corners in order, either way round, the last side closes it by itself.
+/// A simple polygon: corners in order, in either direction; the last side closes it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(try_from = "Vec<Point>", into = "Vec<Point>")]
 #[schema(value_type = Vec<Point>, min_items = 3, max_items = 1000)]

@@ -18,7 +18,7 @@ pub const TOKEN_DAYS_DEFAULT: u32 = 90;
 /// Longest name of a token, in characters.
 pub const TOKEN_NAME_MAX: usize = 80;
 
-/// A token as it is listed: everything but its secret, which nobody keeps.
+/// A token as it is listed: everything but its secret, which is not stored.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(from = "TokenAnswer")]
 pub struct Token {
@@ -117,12 +117,12 @@ impl CreateToken {
     }
 }
 
-/// A new token with its secret, which is told this once.
+/// A new token with its secret, which is shown only here.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct CreatedToken {
     /// The token.
     pub token: Token,
-    /// What its holder sends as `authorization: Bearer …`.
+    /// The value to send as `authorization: Bearer …`.
     pub secret: String,
 }
 
@@ -187,7 +187,7 @@ impl From<SessionAnswer> for Session {
     }
 }
 
-/// Somebody who signed in at an OpenID provider.
+/// A person who signed in at an OpenID provider.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 pub struct Person {
     /// The person here: of issuer and subject, the same at each sign-in.
@@ -207,7 +207,8 @@ pub struct Session {
     /// The role; `null` for a token with rights of its own, and a person who has more than one
     /// role or such rights.
     pub role: Option<Role>,
-    /// What may be done at all of `sites`. Somebody with several `grants` may do more at some of them.
+    /// Rights that hold at all of `sites`. A person with several `grants` may have more at some of
+    /// them.
     #[schema(value_type = Vec<Right>)]
     pub rights: Rights,
     /// Where it may be done; `null` for everywhere.
@@ -277,7 +278,7 @@ pub struct PersonSession {
     pub last_used_at: Option<Timestamp>,
 }
 
-/// One line of the audit log: somebody changed something, or was refused.
+/// An entry of the audit log: a change, or a request that was refused.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct AuditEntry {
     /// Its number; they grow with time.
@@ -286,8 +287,8 @@ pub struct AuditEntry {
     pub at: Timestamp,
     /// When the first of several was answered; `null` for one.
     pub since: Option<Timestamp>,
-    /// How many requests it stands for. Repeats of the same request, in the same way answered, are
-    /// one entry when their author has asked for very many.
+    /// Number of requests. Repeats of a request with the same answer share one entry when their
+    /// author sends very many.
     pub count: u64,
     /// The name of the token that was shown or of the person; `null` for a request without a good one.
     pub who: Option<String>,

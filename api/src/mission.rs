@@ -137,7 +137,7 @@ pub enum LinkPolicy {
     /// It goes on to the end of the mission.
     #[default]
     Continue,
-    /// It brakes along its path and ends the mission as failed, after so long a silence.
+    /// It brakes along its path and ends the mission as failed after this long without contact.
     StopAfter {
         /// The silence, seconds, [`LINK_SILENCE_MIN_S`] to [`LINK_SILENCE_MAX_S`].
         #[schema(minimum = 1.0, maximum = 86_400.0)]
@@ -258,26 +258,26 @@ pub struct MissionQuality {
     pub cross_track_max_m: f64,
     /// Share of the ticks in which a wheel was at its limit, 0 to 1.
     pub saturated_ratio: f64,
-    /// How often the ground gave way: changes of friction, and slip beyond the model.
+    /// Number of sudden losses of traction: changes of friction, and slip beyond the model.
     pub slip_events: u32,
     /// Share of the ticks in which the safety gate reduced the command, 0 to 1.
     pub gate_reduced_ratio: f64,
     /// How often the safety gate began to hold the robot.
     pub gate_stops: u32,
-    /// θ along the way, at most [`THETA_SAMPLES_MAX`].
+    /// θ along the driven path, at most [`THETA_SAMPLES_MAX`].
     pub theta: Vec<ThetaSample>,
-    /// What the map's word was worth; absent when the map knew nothing along the way.
+    /// Value of the map's prior for this mission; absent when the map knew nothing along the path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prior: Option<PriorGain>,
 }
 
-/// What the map's word was worth on a mission: how much of the way the robot knew its ground for
-/// it, and how true it was.
+/// Value of the map's prior for a mission: on how much of the path it gave the robot θ, and how
+/// accurate it was.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct PriorGain {
     /// Friction coefficient that the plan was made with.
     pub grip_mu: f64,
-    /// Share of the way driven over cells of which the map knew θ, 0 to 1.
+    /// Share of the driven path on cells with known θ, 0 to 1.
     pub known_ratio: f64,
     /// Time in which θ was known to [`THETA_SURE_RATIO`], seconds.
     pub sure_s: f64,
@@ -292,8 +292,8 @@ pub struct PriorGain {
     pub cells_contradicted: u32,
     /// Mean of measured over expected θ, less one; `null` without any cell.
     pub difference_ratio: Option<f64>,
-    /// Root mean square of the differences over their standard deviations: about 1 where map and
-    /// robot are as sure as they say; `null` without any cell.
+    /// Root mean square of the differences over their standard deviations: about 1 where the stated
+    /// uncertainties are right; `null` without any cell.
     pub difference_rms: Option<f64>,
 }
 

@@ -250,7 +250,7 @@ pub struct ProblemBody {
     /// The mission's present state, where that is what forbids it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub state: Option<MissionState>,
-    /// Where along the way it cannot be driven.
+    /// Where along the path it cannot be driven.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub place: Option<Place>,
 }

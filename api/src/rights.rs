@@ -66,7 +66,7 @@ pub const SCOPE_SITES_MAX: usize = 100;
 /// Most robots that it may be limited to, of all its sites.
 pub const SCOPE_ROBOTS_MAX: usize = 1_000;
 
-/// One thing that somebody may do. Each route of the API needs one.
+/// A right. Each route of the API needs one.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
 )]

@@ -141,7 +141,7 @@ pub struct Capabilities {
     /// It latches stops, keeps to geofences and takes external limits.
     #[serde(default)]
     pub stop: bool,
-    /// It can be driven by hand.
+    /// It can be teleoperated.
     #[serde(default)]
     pub teleop: bool,
     /// Rate of the control loop, Hz.
@@ -290,7 +290,7 @@ impl<T> Aged<T> {
 pub struct Robot {
     /// The robot's identifier within its site.
     pub id: RobotId,
-    /// Its name for people; the identifier until somebody renames it.
+    /// Display name; the identifier until it is renamed.
     pub name: String,
     /// When it was retired, if it was.
     pub retired_at: Option<Timestamp>,
@@ -340,8 +340,8 @@ pub struct RobotLive {
     pub heard_age_ms: u64,
     /// The robot's own wall clock in that state; it may be wrong.
     pub robot_time: Timestamp,
-    /// How far the robot's wall clock is ahead of the server's, milliseconds, less than a
-    /// heartbeat's way through the network off. Both may be wrong.
+    /// Offset of the robot's wall clock from the server's, milliseconds, to within the network
+    /// latency of a heartbeat. Both may be wrong.
     pub clock_offset_ms: i64,
     /// What the agent is doing.
     pub mode: RobotMode,
@@ -380,8 +380,8 @@ pub struct MissionProgress {
     pub length_m: f64,
     /// Distance from the path, metres, positive to its left.
     pub cross_track_m: f64,
-    /// Whether it stands, held until somebody resumes it; it may still brake for that while this is
-    /// false.
+    /// Whether the robot stands with the mission on hold until it is resumed; while this is false
+    /// it may still be braking.
     #[serde(default)]
     pub paused: bool,
     /// What holds it so; absent while nothing does. It is here while the robot still brakes.
@@ -438,7 +438,7 @@ pub struct LoopStatus {
     /// Commands refused since the start: they did not parse, or were of another version.
     #[serde(default)]
     pub commands_refused: u64,
-    /// Segments lost since the start, because nobody took them from the loop in time.
+    /// Segments lost since the start, because they were not taken from the control loop in time.
     #[serde(default)]
     pub lost_segments: u64,
     /// Measurements since the start that belong to no cell, for want of a site or a position.

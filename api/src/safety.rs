@@ -43,7 +43,7 @@ pub struct StopLatch {
     pub since: Timestamp,
 }
 
-/// Who wants to drive by hand.
+/// Who wants to teleoperate the robot.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Driver {
     /// One connection of one driver.
@@ -53,7 +53,7 @@ pub struct Driver {
     pub name: String,
 }
 
-/// A lease of driving by hand, as the robot gave it.
+/// A teleoperation lease, as the robot granted it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Lease {
     /// Rises with every lease that is given, and never falls in a run of the agent.
@@ -62,7 +62,7 @@ pub struct Lease {
     pub driver: Driver,
 }
 
-/// Why a command was reduced on its way to the wheels; later ones are stricter.
+/// Why a command was reduced before it reached the wheels; later values are stricter.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
 )]
@@ -139,11 +139,11 @@ pub struct DriveCounts {
     pub foreign: u64,
     /// Refused: not newer than one taken before.
     pub out_of_order: u64,
-    /// Refused: past their end, or their end too far ahead.
+    /// Refused: past their expiry, or with an expiry too far in the future.
     pub expired: u64,
 }
 
-/// Driving by hand, as the robot sees it.
+/// Teleoperation, as the robot reports it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct DriveStatus {
     /// Age of drive commands on arrival, milliseconds, the worst of late; `null` without one.
@@ -159,13 +159,14 @@ pub struct DriveStatus {
 pub struct LimitStatus {
     /// Who limits.
     pub holder: HolderId,
-    /// Whether the robot must hear this holder to move; it holds while that one is silent.
+    /// Whether the robot must hear this owner to move; it stays on hold while the owner is silent.
     pub required: bool,
-    /// Whether the robot is held now: because it was said, or because a required holder is silent.
+    /// Whether the robot is on hold now: because the owner asked, or because a required owner is
+    /// silent.
     pub hold: bool,
     /// Fastest speed, m/s, if one was said.
     pub linear_max_m_s: Option<f64>,
-    /// Time until it ends, milliseconds; `null` for a required holder that is silent.
+    /// Time until it expires, milliseconds; `null` for a required owner that is silent.
     pub ends_in_ms: Option<u64>,
 }
 
@@ -202,10 +203,10 @@ pub struct SafetyStatus {
     /// The stop in force.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stop: Option<StopLatch>,
-    /// Who drives by hand.
+    /// Who teleoperates the robot.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub lease: Option<Lease>,
-    /// Driving by hand; absent before the first lease.
+    /// Teleoperation; absent before the first lease.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub drive: Option<DriveStatus>,
     /// The gate.

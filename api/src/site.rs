@@ -159,7 +159,7 @@ pub struct Site {
     /// Counts changes of the site's geofence.
     #[serde(default)]
     pub geofence_revision: u64,
-    /// Where on the earth the site lies, if somebody has said so.
+    /// Position of the site on the earth, if it was set.
     #[serde(default)]
     pub origin: Option<GeoOrigin>,
     /// When the site was made.

@@ -93,7 +93,8 @@ pub struct Stop {
     /// position; `null` until then. A robot that does not stand in time raises the alert
     /// `does-not-stand`.
     pub standing_at: Option<Timestamp>,
-    /// Whether the robot has not confirmed within 300 ms. It is told again until it does.
+    /// Whether the robot has not confirmed within 300 ms. The server repeats the stop until it
+    /// does.
     pub unconfirmed: bool,
     /// Who asked last to clear it.
     pub clear_asked_by: Option<String>,
@@ -112,7 +113,7 @@ pub struct Stop {
 pub struct FleetStop {
     /// How many robots had confirmed when the answer was made.
     pub confirmed: usize,
-    /// How many had not; they are told again until they do.
+    /// How many had not; the server repeats the stop until they do.
     pub unconfirmed: usize,
     /// The stops.
     pub stops: Vec<Stop>,

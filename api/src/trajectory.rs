@@ -49,7 +49,7 @@ pub enum Trajectory {
     Waypoints(Waypoints),
 }
 
-/// Which way round a circle is driven, seen from above.
+/// Direction of travel on a circle, seen from above.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Direction {
@@ -76,7 +76,7 @@ pub struct Circle {
     /// Time for one turn, seconds; give this or `speed_m_s`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub period_s: Option<f64>,
-    /// Which way round; counter-clockwise when absent.
+    /// Direction of travel; counter-clockwise when absent.
     #[serde(default)]
     pub direction: Direction,
     /// How many turns; one when absent.
@@ -119,17 +119,19 @@ pub struct Waypoints {
 /// What a robot may do beside following its trajectory.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct TrajectoryOptions {
-    /// Speed on the way to the trajectory, metres per second; the trajectory's own when absent.
+    /// Speed of the approach to the trajectory, metres per second; the trajectory's own when
+    /// absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0.01, maximum = 50.0)]
     pub approach_speed_m_s: Option<f64>,
-    /// A variation of the speed (excitation) along the path, so that friction can be measured without torque
-    /// sensing.
+    /// Excitation, a variation of the speed along the path, so that friction can be measured
+    /// without torque sensing.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub excitation: Option<Excitation>,
 }
 
-/// A variation of the speed (excitation): it falls by the depth and comes back, and never exceeds what was asked.
+/// Excitation, a periodic variation of the speed: the speed falls by the depth and recovers, and
+/// never exceeds what was asked.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Excitation {
     /// By which share the speed falls at most; less where the robot's limits leave less.

@@ -35,7 +35,7 @@ counters! {
     records_duplicate,
     /// Records that can never be taken: impossible numbers, or not this robot's mission.
     records_refused,
-    /// Segments from a time that had not come, deferred until their run's clock is known.
+    /// Segments with times in the future, deferred until their run's clock is known.
     segments_deferred,
     /// Raw segments removed after their time; what they said stays on the map.
     segments_removed,
@@ -66,7 +66,7 @@ counters! {
     /// States and friction reports of another run of the agent than the one that said hello last:
     /// stragglers, or a second agent under the robot's name.
     refused_other_run,
-    /// Messages of robots that were put out of the fleet.
+    /// Messages of robots whose enrolment was revoked.
     refused_revoked_robot,
     /// Messages of robots that have not joined, where only those that have may speak.
     refused_unenrolled_robot,
@@ -88,7 +88,7 @@ counters! {
     join_token_other_robot,
     /// Renewals refused: no certificate of this fleet, over for too long, or without its key.
     renewals_refused,
-    /// Renewals refused because the robot was put out of the fleet, or joined again.
+    /// Renewals refused because the robot's enrolment was revoked, or it joined again.
     renewals_revoked,
     /// Renewals refused because this server did not give the certificate, or gave it long ago.
     renewals_not_issued,
@@ -111,7 +111,7 @@ counters! {
     gate_displaced,
     /// Connections of robots that declared liveliness tokens without end, cut or refused for a while.
     gate_cut_off,
-    /// Connections of robots that were put out of the fleet, or have joined again since.
+    /// Connections of robots whose enrolment was revoked, or that have joined again since.
     gate_revoked,
     /// Connections of robots ended because their certificate was over.
     gate_expired,
@@ -139,7 +139,7 @@ counters! {
     replies_dropped,
     /// Reports on missions that are none of their robot's, or of other content; without effect.
     reports_foreign,
-    /// Robots told to end a mission that is none of their open ones here.
+    /// Robots that were commanded to end a mission which the server does not have as open.
     missions_disowned,
     /// Times that the router was opened again because it no longer answered.
     router_reopened,
@@ -153,7 +153,7 @@ counters! {
     stops_sent,
     /// Stops that their robots had not confirmed within 300 ms.
     stops_unconfirmed,
-    /// Stops that robots no longer showed although nobody had cleared them; sent again.
+    /// Stops that robots no longer reported although they had not been cleared; sent again.
     stops_lost,
     /// Drive commands sent to robots.
     drive_commands_sent,
@@ -161,7 +161,8 @@ counters! {
     drive_commands_replaced,
     /// Drive sockets closed because a frame was malformed, too large or not allowed.
     drive_frames_refused,
-    /// Drivers whose socket was lost while they had the lease; their robots were told to stand.
+    /// Drivers whose socket was lost while they had the lease; their robots were commanded to
+    /// stand.
     drivers_lost,
     /// HTTP connections refused because too many were open.
     http_connections_refused,

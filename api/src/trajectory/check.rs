@@ -49,8 +49,8 @@ pub struct ExpectedMeasurement {
     pub theta_assumed: f64,
     /// Whether the base measures wheel torque.
     pub wheel_torque: bool,
-    /// Standard deviation of θ at the end, as a share of θ; `null` where the trajectory excites
-    /// too little for a measurement.
+    /// Expected standard deviation of θ at the end, as a ratio of θ; `null` where the trajectory
+    /// excites too little for a measurement.
     pub relative_sd: Option<f64>,
     /// Driving time until the first measurement, seconds.
     pub first_after_s: Option<f64>,
@@ -65,29 +65,29 @@ pub struct TrajectoryCheck {
     pub start_source: StartSource,
     /// The mission whose expected end `start` is, if it is one.
     pub after_mission: Option<MissionId>,
-    /// Length with the way to its start, metres.
+    /// Length including the approach, metres.
     pub length_m: f64,
-    /// Length of the way to its start, metres.
+    /// Length of the approach, metres.
     pub approach_length_m: f64,
     /// Time from rest to rest when nothing slows the robot, seconds.
     pub duration_s: f64,
     /// Fastest speed, m/s.
     pub speed_peak_m_s: f64,
-    /// Hardest acceleration or braking along the path, m/s².
+    /// Highest longitudinal acceleration or braking, m/s².
     pub linear_acceleration_peak_m_s2: f64,
-    /// Hardest acceleration across the path, m/s².
+    /// Highest lateral acceleration, m/s².
     pub lateral_acceleration_peak_m_s2: f64,
     /// Fastest turn, rad/s.
     pub angular_peak_rad_s: f64,
     /// Where a limit makes the robot slower than it was asked to be, in driving order; at most
     /// [`BINDINGS_MAX`].
     pub bindings: Vec<Binding>,
-    /// How deep the variation of the speed (excitation) is that was asked for, as a share of the speed: less than
-    /// asked where the robot's limits leave less.
+    /// Depth of the requested excitation, as a ratio of the speed: less than requested where the
+    /// robot's limits leave less.
     pub excitation_depth_ratio: Option<f64>,
     /// How well friction would be measured.
     pub measurement: ExpectedMeasurement,
-    /// Where it would be driven, the way to its start with it.
+    /// The path that would be driven, including the approach.
     pub path: PlannedPath,
 }
 
@@ -108,10 +108,10 @@ pub enum StartSource {
 /// Most points of a planned path.
 pub const PLANNED_POINTS_MAX: usize = 1_000;
 
-/// The smooth way that the planner lays.
+/// The smooth path that the planner computes.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct PlannedPath {
-    /// Way from each point to the next, metres, along the path.
+    /// Distance between consecutive points, metres, along the path.
     pub step_m: f64,
     /// Points in driving order, at most [`PLANNED_POINTS_MAX`]. Further turns of a circle go where
     /// the first one went and are left out.

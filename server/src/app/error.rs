@@ -243,7 +243,7 @@ impl AppError {
         }
     }
 
-    /// Where along the way it cannot be driven.
+    /// Where along the path it cannot be driven.
     pub fn place(&self) -> Option<Place> {
         if let Self::Impossible { place, .. } = *self {
             place

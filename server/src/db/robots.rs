@@ -25,7 +25,7 @@ pub struct RobotRow {
     pub model: RobotModel,
     /// The identifier of that model and those tyres.
     pub configuration: ConfigurationId,
-    /// Its name for people; the identifier until somebody renames it.
+    /// Display name; the identifier until it is renamed.
     pub name: String,
     /// When it was retired, if it was.
     pub retired_at: Option<Timestamp>,

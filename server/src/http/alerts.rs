@@ -35,7 +35,7 @@ pub(super) struct AlertQuery {
     limit: Option<u32>,
 }
 
-/// Alerts with their history, newest first.
+/// List alerts with their history, newest first.
 #[utoipa::path(get, path = "/v1/alerts", tag = "alerts", operation_id = "list_alerts",
     security(("token" = ["read"])),
     params(AlertQuery),
@@ -56,7 +56,7 @@ pub(super) async fn list(
     Ok(Json(app.alerts(&filter, limit).await?))
 }
 
-/// Notes that a person has seen an alert.
+/// Acknowledge an alert.
 #[utoipa::path(post, path = "/v1/alerts/{alert}/acknowledge", tag = "alerts",
     security(("token" = ["acknowledge"])),
     operation_id = "acknowledge_alert", params(("alert" = AlertId, Path)),

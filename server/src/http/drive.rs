@@ -55,9 +55,10 @@ const DRAIN_MAX: usize = 64;
 /// Least time between two refusals of drive commands for the same cause: a driver sends many.
 const REFUSAL_PERIOD: Duration = Duration::from_millis(500);
 
-/// A WebSocket to watch a robot and to drive it: one JSON object in each text frame, `DriveRequest`
-/// from the client, `DriveUpdate` from the server. Whoever may read may watch and stop; to drive
-/// takes the right `drive`.
+/// Watch and drive a robot over a WebSocket.
+///
+/// Each text frame holds one JSON object: `DriveRequest` from the client, `DriveUpdate` from the
+/// server. With the right to read a client may watch and stop; driving needs the right `drive`.
 #[utoipa::path(get, path = "/v1/sites/{site}/robots/{robot}/drive", tag = "safety",
     security(("token" = ["read"])),
     operation_id = "drive_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),

@@ -43,7 +43,9 @@ pub(super) struct EventQuery {
     robots: Option<String>,
 }
 
-/// Everything that changes, from a snapshot on or from where `Last-Event-ID` points.
+/// Stream events.
+///
+/// Starts with a snapshot, or after the event that `Last-Event-ID` names.
 #[utoipa::path(get, path = "/v1/events", tag = "events", operation_id = "stream_events",
     security(("token" = ["read"])),
     params(EventQuery, ("last-event-id" = Option<String>, Header,

@@ -11,7 +11,9 @@ use super::extract::{Json, Path};
 use super::problem::Problem;
 use crate::app::App;
 
-/// Where the robots of a site may be. The `ETag` is the revision.
+/// Get the geofence of a site.
+///
+/// The `ETag` is the revision.
 #[utoipa::path(get, path = "/v1/sites/{site}/geofence", tag = "safety",
     security(("token" = ["read"])),
     operation_id = "get_geofence", params(("site" = SiteId, Path)),
@@ -23,7 +25,9 @@ pub(super) async fn get(
     Ok(tagged(app.geofence(&site).await?))
 }
 
-/// Replaces where robots may be, with `If-Match` only if nobody else did meanwhile.
+/// Replace the geofence of a site.
+///
+/// With `If-Match`, only if the revision is still that one.
 #[utoipa::path(put, path = "/v1/sites/{site}/geofence", tag = "safety",
     security(("token" = ["configure"])),
     operation_id = "replace_geofence", params(("site" = SiteId, Path),

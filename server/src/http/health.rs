@@ -28,7 +28,7 @@ pub struct StorageStatus {
     pub unwritable: Option<String>,
     /// What is damaged, if anything is.
     pub damaged: Option<String>,
-    /// Free bytes on the disk of the database; null if the operating system does not tell.
+    /// Free bytes on the disk of the database; `null` if the operating system does not report them.
     pub disk_free_bytes: Option<u64>,
     /// Whether that is below `storage.disk_free_min_mib`.
     pub disk_low: bool,
@@ -69,14 +69,15 @@ fn ok() -> Json<Health> {
     })
 }
 
-/// Whether the process answers.
+/// Check that the process answers.
 #[utoipa::path(get, path = "/healthz", tag = "server", responses((status = 200, body = Health)))]
 pub(super) async fn healthz() -> Json<Health> {
     ok()
 }
 
-/// Whether the server can work: the database takes a write, and no damage of it is known. The answer
-/// may be a second old.
+/// Check that the server can work.
+///
+/// The database takes a write, and no damage of it is known. The answer may be a second old.
 #[utoipa::path(get, path = "/readyz", tag = "server",
     responses((status = 200, body = Health), (status = 503, body = ProblemBody)))]
 pub(super) async fn readyz(State(app): State<App>) -> Result<Json<Health>, Problem> {
@@ -87,7 +88,7 @@ pub(super) async fn readyz(State(app): State<App>) -> Result<Json<Health>, Probl
     }
 }
 
-/// Version, uptime and counters.
+/// Get the server's version, uptime and counters.
 #[utoipa::path(get, path = "/v1/server", tag = "server", operation_id = "get_server",
     security(("token" = ["read"])),
     responses((status = 200, body = ServerStatus)))]

@@ -11,7 +11,7 @@ use super::extract::{Json, Path};
 use super::problem::Problem;
 use crate::app::App;
 
-/// The external limits that a robot says it has.
+/// List the external limits that a robot reports.
 #[utoipa::path(get, path = "/v1/sites/{site}/robots/{robot}/limits", tag = "safety",
     security(("token" = ["read"])),
     operation_id = "list_limits", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
@@ -23,7 +23,9 @@ pub(super) async fn list(
     Ok(Json(app.limits(&site, &robot).await?))
 }
 
-/// Holds or slows a robot for a while; say it again before it ends.
+/// Hold or slow a robot for a while.
+///
+/// Repeat the request before the limit expires to keep it.
 #[utoipa::path(put, path = "/v1/sites/{site}/robots/{robot}/limits/{holder}", tag = "safety",
     security(("token" = ["hold"])),
     operation_id = "set_limit", params(("site" = SiteId, Path), ("robot" = RobotId, Path),
@@ -41,7 +43,9 @@ pub(super) async fn set(
     Ok(StatusCode::NO_CONTENT)
 }
 
-/// Ends a holder's limit. A holder that the robot must hear holds it from then on.
+/// End an external limit.
+///
+/// A required owner of a limit that falls silent holds the robot from then on.
 #[utoipa::path(delete, path = "/v1/sites/{site}/robots/{robot}/limits/{holder}", tag = "safety",
     security(("token" = ["hold"])),
     operation_id = "end_limit", params(("site" = SiteId, Path), ("robot" = RobotId, Path),

@@ -36,7 +36,7 @@ pub(super) struct MissionQuery {
     limit: Option<u32>,
 }
 
-/// Missions, newest first.
+/// List missions, newest first.
 #[utoipa::path(get, path = "/v1/missions", tag = "missions", operation_id = "list_missions",
     security(("token" = ["read"])),
     params(MissionQuery),
@@ -61,7 +61,9 @@ pub(super) async fn list(
     Ok(Json(app.missions(&filter, limit).await?))
 }
 
-/// Asks a robot to drive a circle or waypoints. It waits in the robot's queue.
+/// Create a mission: a robot drives a circle or waypoints.
+///
+/// It waits in the robot's queue.
 #[utoipa::path(post, path = "/v1/missions", tag = "missions", operation_id = "create_mission",
     security(("token" = ["dispatch"])),
     request_body = CreateMission,
@@ -101,7 +103,7 @@ fn idempotency_key(headers: &HeaderMap) -> Result<Option<&str>, Problem> {
     })
 }
 
-/// One mission with its history.
+/// Get a mission with its history.
 #[utoipa::path(get, path = "/v1/missions/{mission}", tag = "missions",
     security(("token" = ["read"])),
     operation_id = "get_mission", params(("mission" = MissionId, Path)),
@@ -113,8 +115,10 @@ pub(super) async fn get(
     Ok(Json(app.mission(mission).await?))
 }
 
-/// Where the planner lays a mission: from where its robot planned it once it has taken it, and
-/// from the begin of its trajectory before.
+/// Get the planned path of a mission.
+///
+/// It starts where the robot planned it once the robot has accepted the mission, before that at the
+/// start of the trajectory.
 #[utoipa::path(get, path = "/v1/missions/{mission}/path", tag = "missions",
     security(("token" = ["read"])),
     operation_id = "get_planned_path", params(("mission" = MissionId, Path)),
@@ -127,7 +131,9 @@ pub(super) async fn path(
     Ok(Json(app.planned_path(mission).await?))
 }
 
-/// Wants a mission to end. One that waits ends at once, one in hand when its robot has answered.
+/// Cancel a mission.
+///
+/// A queued mission ends at once, an active one when its robot has answered.
 #[utoipa::path(post, path = "/v1/missions/{mission}/cancel", tag = "missions",
     security(("token" = ["dispatch"])),
     operation_id = "cancel_mission", params(("mission" = MissionId, Path)),
@@ -143,7 +149,7 @@ pub(super) async fn cancel(
     ))
 }
 
-/// Wants a mission in hand to be held, the robot standing.
+/// Pause an active mission; the robot stands.
 #[utoipa::path(post, path = "/v1/missions/{mission}/pause", tag = "missions",
     security(("token" = ["dispatch"])),
     operation_id = "pause_mission", params(("mission" = MissionId, Path)),
@@ -159,7 +165,7 @@ pub(super) async fn pause(
     ))
 }
 
-/// Wants a paused mission to go on.
+/// Resume a paused mission.
 #[utoipa::path(post, path = "/v1/missions/{mission}/resume", tag = "missions",
     security(("token" = ["dispatch"])),
     operation_id = "resume_mission", params(("mission" = MissionId, Path)),
@@ -175,8 +181,10 @@ pub(super) async fn resume(
     ))
 }
 
-/// Wants a mission to be another trajectory. What waits is changed at once, what is in hand when
-/// its robot holds the new revision whole; until then the old one is driven.
+/// Replace a mission's trajectory.
+///
+/// A queued mission changes at once. An active one changes when its robot has received the whole
+/// revision; until then the robot drives the earlier one.
 #[utoipa::path(post, path = "/v1/missions/{mission}/replace", tag = "missions",
     security(("token" = ["dispatch"])),
     operation_id = "replace_mission", params(("mission" = MissionId, Path)),
@@ -194,7 +202,7 @@ pub(super) async fn replace(
     ))
 }
 
-/// Plans a trajectory for a robot without moving anything.
+/// Plan a trajectory for a robot without moving it.
 #[utoipa::path(post, path = "/v1/trajectories/check", tag = "missions",
     security(("token" = ["dispatch"])),
     operation_id = "check_trajectory", request_body = CheckTrajectory,

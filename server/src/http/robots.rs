@@ -28,7 +28,7 @@ pub(super) struct RobotQuery {
     limit: Option<u32>,
 }
 
-/// The robots of a site, with their live state.
+/// List the robots of a site with their live state.
 #[utoipa::path(get, path = "/v1/sites/{site}/robots", tag = "robots",
     security(("token" = ["read"])),
     operation_id = "list_robots", params(("site" = SiteId, Path), RobotQuery),
@@ -44,7 +44,7 @@ pub(super) async fn list(
     Ok(Json(app.robots(place, cursor, query.retired, limit).await?))
 }
 
-/// One robot with its live state and the age of every value.
+/// Get a robot with its live state and the age of every value.
 #[utoipa::path(get, path = "/v1/sites/{site}/robots/{robot}", tag = "robots",
     security(("token" = ["read"])),
     operation_id = "get_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
@@ -56,7 +56,9 @@ pub(super) async fn get(
     Ok(Json(app.robot(&site, &robot).await?))
 }
 
-/// Renames a robot for people, retires it or takes it back. Retiring cancels all its missions.
+/// Rename, retire or restore a robot.
+///
+/// Retiring cancels all its missions.
 #[utoipa::path(patch, path = "/v1/sites/{site}/robots/{robot}", tag = "robots",
     security(("token" = ["configure"])),
     operation_id = "change_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),

@@ -25,7 +25,7 @@ pub(super) struct PageQuery {
     pub(super) limit: Option<u32>,
 }
 
-/// All sites.
+/// List sites.
 #[utoipa::path(get, path = "/v1/sites", tag = "sites", operation_id = "list_sites",
     security(("token" = ["read"])),
     params(PageQuery),
@@ -40,7 +40,7 @@ pub(super) async fn list(
     Ok(Json(app.sites(&subject.scope, cursor, limit).await?))
 }
 
-/// One site.
+/// Get a site.
 #[utoipa::path(get, path = "/v1/sites/{site}", tag = "sites", operation_id = "get_site",
     security(("token" = ["read"])),
     params(("site" = SiteId, Path)),
@@ -52,7 +52,7 @@ pub(super) async fn get(
     Ok(Json(app.site(&site).await?))
 }
 
-/// Makes a site.
+/// Create a site.
 #[utoipa::path(post, path = "/v1/sites", tag = "sites", operation_id = "create_site",
     security(("token" = ["administer"])),
     request_body = CreateSite,
@@ -65,7 +65,7 @@ pub(super) async fn create(
     Ok((StatusCode::CREATED, Json(app.create_site(request).await?)))
 }
 
-/// Says where on the earth a site's origin lies, so that its map can be given in WGS 84.
+/// Set the position of a site's origin on the earth, so that its map can be given in WGS 84.
 #[utoipa::path(put, path = "/v1/sites/{site}/origin", tag = "sites", operation_id = "tie_site",
     security(("token" = ["configure"])),
     params(("site" = SiteId, Path)), request_body = GeoOrigin,
@@ -79,7 +79,7 @@ pub(super) async fn tie(
     Ok(Json(app.tie_site(&site, Some(origin)).await?))
 }
 
-/// Takes back where on the earth a site lies.
+/// Remove the position of a site's origin on the earth.
 #[utoipa::path(delete, path = "/v1/sites/{site}/origin", tag = "sites",
     operation_id = "untie_site", security(("token" = ["configure"])),
     params(("site" = SiteId, Path)),

@@ -112,8 +112,10 @@ pub(super) struct StopQuery {
     limit: Option<u32>,
 }
 
-/// Stops a robot, in any state and whoever drives it. Answers when the robot has confirmed, or
-/// after 300 ms: then it is told again until it does.
+/// Stop a robot, in any state and whoever drives it.
+///
+/// Answers when the robot has confirmed, or after 300 ms; the server then repeats the stop until
+/// the robot confirms.
 #[utoipa::path(post, path = "/v1/sites/{site}/robots/{robot}/stop", tag = "safety",
     security(("token" = ["stop"])),
     operation_id = "stop_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
@@ -129,9 +131,10 @@ pub(super) async fn stop(
     Ok(Json(app.stop_robot(&site, &robot, words).await?))
 }
 
-/// Stops every robot that has ever said hello and that the token is for, of all its sites or of one. A
-/// body that cannot be read
-/// stops all of them; one with a `site` that cannot be read stops none, and says so.
+/// Stop all robots, of one site or of all sites within the token's scope.
+///
+/// Includes every robot that was ever connected. A body that cannot be parsed stops all of them;
+/// one whose `site` cannot be parsed stops none and is refused.
 #[utoipa::path(post, path = "/v1/stop", tag = "safety", operation_id = "stop_fleet",
     security(("token" = ["stop"])),
     request_body = Option<StopFleet>,
@@ -150,8 +153,9 @@ pub(super) async fn stop_fleet(
     Ok(Json(stopped.await?))
 }
 
-/// Clears a robot's newest stop, if the robot stands. Nothing starts by it: what the robot had in
-/// hand or in its queue is held until somebody resumes it.
+/// Clear a robot's newest stop, if the robot stands.
+///
+/// Nothing starts: its active and queued missions stay on hold until they are resumed.
 #[utoipa::path(post, path = "/v1/sites/{site}/robots/{robot}/stop/clear", tag = "safety",
     security(("token" = ["clear_stop"])),
     operation_id = "clear_stop", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
@@ -169,7 +173,7 @@ pub(super) async fn clear(
     Ok(Json(app.clear_stop(&site, &robot, stop, Some(by)).await?))
 }
 
-/// Stops, newest first.
+/// List stops, newest first.
 #[utoipa::path(get, path = "/v1/stops", tag = "safety", operation_id = "list_stops",
     security(("token" = ["read"])),
     params(StopQuery),

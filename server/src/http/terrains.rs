@@ -12,7 +12,7 @@ use super::problem::Problem;
 use super::sites::PageQuery;
 use crate::app::App;
 
-/// The terrains of a site.
+/// List the terrains of a site.
 #[utoipa::path(get, path = "/v1/sites/{site}/terrains", tag = "terrains",
     security(("token" = ["read"])),
     operation_id = "list_terrains", params(("site" = SiteId, Path), PageQuery),
@@ -28,7 +28,7 @@ pub(super) async fn list(
     ))
 }
 
-/// One terrain.
+/// Get a terrain.
 #[utoipa::path(get, path = "/v1/sites/{site}/terrains/{terrain}", tag = "terrains",
     security(("token" = ["read"])),
     operation_id = "get_terrain", params(("site" = SiteId, Path), ("terrain" = TerrainId, Path)),
@@ -40,7 +40,7 @@ pub(super) async fn get(
     Ok(Json(app.terrain(&site, &terrain).await?))
 }
 
-/// Draws a terrain.
+/// Create a terrain.
 #[utoipa::path(post, path = "/v1/sites/{site}/terrains", tag = "terrains",
     security(("token" = ["configure"])),
     operation_id = "create_terrain", params(("site" = SiteId, Path)),
@@ -58,7 +58,7 @@ pub(super) async fn create(
     ))
 }
 
-/// Replaces a terrain.
+/// Replace a terrain.
 #[utoipa::path(put, path = "/v1/sites/{site}/terrains/{terrain}", tag = "terrains",
     security(("token" = ["configure"])),
     operation_id = "replace_terrain",
@@ -74,7 +74,7 @@ pub(super) async fn replace(
     Ok(Json(app.replace_terrain(&site, &terrain, request).await?))
 }
 
-/// Removes a terrain; what was measured on it stays.
+/// Delete a terrain; its measurements stay.
 #[utoipa::path(delete, path = "/v1/sites/{site}/terrains/{terrain}", tag = "terrains",
     security(("token" = ["configure"])),
     operation_id = "delete_terrain",

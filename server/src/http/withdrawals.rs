@@ -15,8 +15,10 @@ use super::sites::PageQuery;
 use super::subject::Subject;
 use crate::app::App;
 
-/// Takes what a robot measured in some hours off the map, for good: the map is then as if it had
-/// never come, and what comes late of these hours does not count either.
+/// Withdraw a robot's measurements of a period from the map.
+///
+/// This is final: the map is as if they had never arrived, and measurements of that period that
+/// arrive later are ignored.
 #[utoipa::path(post, path = "/v1/sites/{site}/robots/{robot}/withdrawals", tag = "friction",
     security(("token" = ["configure"])),
     operation_id = "withdraw_measurements",
@@ -34,7 +36,7 @@ pub(super) async fn create(
     Ok((StatusCode::CREATED, Json(withdrawal.await?)))
 }
 
-/// What was taken off the map, the oldest first.
+/// List withdrawals of measurements, oldest first.
 #[utoipa::path(get, path = "/v1/sites/{site}/withdrawals", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "list_withdrawals", params(("site" = SiteId, Path), PageQuery),

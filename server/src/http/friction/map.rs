@@ -232,10 +232,13 @@ fn refused(error: PngError) -> AppError {
     }
 }
 
-/// The map of one robot model, as a picture with a legend, a compact binary tile or a speed mask
-/// for Nav2; or all that is known of every cell, per ground and robot model, as a list without
-/// pages that is sent while it is made. Headers say whose θ it is (`tread-configuration`), by which normalisation
-/// (`tread-normalisation`), both of pictures alone, and as of when (`tread-as-of`).
+/// Get the friction map.
+///
+/// As a picture with a legend, a compact binary tile or a speed mask for Nav2, each for one robot
+/// model; or as a list of everything known of every cell, per ground and robot model, without
+/// pages, sent while it is made. Headers say for which robot model θ is (`tread-configuration`) and
+/// how it was normalised (`tread-normalisation`), both for pictures only, and the time of the map
+/// (`tread-as-of`).
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/map", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "get_friction_map", params(("site" = SiteId, Path), MapQuery),

@@ -68,7 +68,7 @@ fn asked(
     }
 }
 
-/// Friction of every terrain of a site.
+/// List friction of every terrain of a site.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "list_terrain_friction", params(("site" = SiteId, Path), ReadingQuery),
@@ -104,7 +104,7 @@ pub(super) struct OneQuery {
     normalisation: Option<String>,
 }
 
-/// Friction of one terrain, per robot model.
+/// Get friction of a terrain, per robot model.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains/{terrain}", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "get_terrain_friction",
@@ -140,7 +140,7 @@ pub(super) struct HistoryQuery {
     normalisation: Option<String>,
 }
 
-/// Friction of one terrain as it was known at equally spaced times.
+/// Get the history of a terrain's friction at equally spaced times.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains/{terrain}/history",
     tag = "friction", security(("token" = ["read"])),
     operation_id = "get_terrain_history",
@@ -166,7 +166,7 @@ pub(super) async fn history(
     Ok(etag::json(&headers, &found.await?))
 }
 
-/// What each robot has put into the map.
+/// List what each robot contributed to the map.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/robots", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "list_contributions", params(("site" = SiteId, Path), PageQuery),
@@ -218,7 +218,7 @@ const SEGMENT_FORMATS: [Offered<SegmentFormat>; 3] = [
     offered("parquet", PARQUET_MEDIA_TYPE, SegmentFormat::Parquet),
 ];
 
-/// Raw measurements in the order of their commits.
+/// List raw measurements in the order of their commits.
 #[utoipa::path(get, path = "/v1/sites/{site}/segments", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "list_segments", params(("site" = SiteId, Path), SegmentQuery),

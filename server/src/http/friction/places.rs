@@ -53,7 +53,7 @@ pub(in crate::http) struct CellQuery {
     limit: Option<u32>,
 }
 
-/// Friction per cell.
+/// List friction per cell.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/cells", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "list_cell_friction", params(("site" = SiteId, Path), CellQuery),
@@ -97,7 +97,7 @@ pub(in crate::http) struct PointQuery {
     normalisation: Option<String>,
 }
 
-/// Friction at a point, of the terrain under it alone.
+/// Get friction at a point, of the terrain there only.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/point", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "get_point_friction", params(("site" = SiteId, Path), PointQuery),
@@ -118,7 +118,7 @@ pub(in crate::http) async fn point(
     Ok(say_as_of(etag::json(&headers, &found), found.as_of))
 }
 
-/// Friction along a path, how sure it is, and the speed that follows for a robot.
+/// Get friction along a path, its uncertainty, and the speed that follows for a robot.
 #[utoipa::path(post, path = "/v1/sites/{site}/friction/path", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "ask_path_friction", params(("site" = SiteId, Path)),
@@ -165,7 +165,7 @@ pub(in crate::http) struct DifferenceQuery {
     limit: Option<u32>,
 }
 
-/// How cells that were measured between two times differ from the first to the second.
+/// List how friction per cell differs between two times.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/difference", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "list_friction_differences",
@@ -217,7 +217,7 @@ pub(in crate::http) struct VisitQuery {
     limit: Option<u32>,
 }
 
-/// Cells in which a visit would teach most about θ, the best first.
+/// List the cells in which a visit would improve θ most, best first.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/visits", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "list_visit_suggestions", params(("site" = SiteId, Path), VisitQuery),

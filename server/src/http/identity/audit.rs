@@ -34,7 +34,7 @@ pub(in crate::http) struct AuditQuery {
     limit: Option<u32>,
 }
 
-/// Who changed what, from where, and who was refused.
+/// List the audit log: who changed what, from where, and who was refused.
 #[utoipa::path(get, path = "/v1/audit", tag = "identity", operation_id = "list_audit",
     security(("token" = ["administer"])), params(AuditQuery),
     responses((status = 200, body = Page<AuditEntry>), (status = 400, body = ProblemBody)))]
@@ -52,8 +52,9 @@ pub(in crate::http) async fn list(
     Ok(Json(app.audit_log(&filter, limit).await?))
 }
 
-/// What frames the chain of the audit log, for verifying it: the entries carry their hashes, and
-/// whoever reads them computes them again.
+/// Get the ends of the audit log's hash chain.
+///
+/// To verify the chain, compute the hashes of the entries again and compare them.
 #[utoipa::path(get, path = "/v1/audit/chain", tag = "identity", operation_id = "get_audit_chain",
     security(("token" = ["administer"])),
     responses((status = 200, body = AuditChain), (status = 404, body = ProblemBody)))]

@@ -10,8 +10,10 @@ use crate::http::extract::Json;
 use crate::http::problem::Problem;
 use crate::http::subject::Subject;
 
-/// Show the fleet's authority, during a rotation which robots still hold certificates of the former
-/// one, and which must join again.
+/// Get the fleet's certificate authority.
+///
+/// During a rotation the answer names the robots that still hold certificates of the former
+/// authority, and those that must join again.
 #[utoipa::path(get, path = "/v1/authority", tag = "identity", operation_id = "get_authority",
     security(("token" = ["read"])),
     responses((status = 200, body = FleetAuthority), (status = 409, body = ProblemBody)))]
@@ -19,8 +21,10 @@ pub(in crate::http) async fn get(State(app): State<App>) -> Result<Json<FleetAut
     Ok(Json(app.fleet_authority().await?))
 }
 
-/// Start a rotation of the fleet's authority: another one signs from now on, both are trusted, and
-/// robots get certificates of the new one as they are on the network. The answer names the rotation.
+/// Start a rotation of the certificate authority.
+///
+/// The new authority signs from now on, both are trusted, and robots get certificates of the new
+/// one while they are connected. The answer names the rotation.
 #[utoipa::path(post, path = "/v1/authority/rotation", tag = "identity",
     operation_id = "start_authority_rotation", security(("token" = ["administer"])),
     responses((status = 201, body = FleetAuthority), (status = 409, body = ProblemBody)))]
@@ -32,8 +36,10 @@ pub(in crate::http) async fn start(
     Ok((StatusCode::CREATED, Json(started)))
 }
 
-/// Finish a rotation, by its name: the former authority is retired. While robots hold certificates of it this is
-/// refused and names them, unless it is forced; they must join again then.
+/// Finish a rotation of the certificate authority.
+///
+/// The former authority is retired. The server refuses this while robots hold certificates of it,
+/// and names them, unless `force` is given; those robots must join again.
 #[utoipa::path(post, path = "/v1/authority/rotation/finish", tag = "identity",
     operation_id = "finish_authority_rotation", security(("token" = ["administer"])),
     request_body = FinishRotation,
@@ -48,8 +54,10 @@ pub(in crate::http) async fn finish(
     Ok(Json(finished))
 }
 
-/// Replace an authority whose key was stolen: another one signs, no certificate of before opens anything
-/// or is renewed, and every robot must join again.
+/// Replace a certificate authority whose key was stolen.
+///
+/// A new authority signs from now on. No earlier certificate opens a connection or is renewed, and
+/// every robot must join again.
 #[utoipa::path(post, path = "/v1/authority/replace", tag = "identity",
     operation_id = "replace_authority", security(("token" = ["administer"])),
     request_body = ReplaceAuthority,

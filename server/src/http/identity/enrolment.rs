@@ -34,7 +34,9 @@ pub(in crate::http) struct PageQuery {
     limit: Option<u32>,
 }
 
-/// Join tokens, newest first, dead ones too. Secrets are told once and never again.
+/// List join tokens, newest first, with those that are no longer valid.
+///
+/// Secrets are shown only when a token is created.
 #[utoipa::path(get, path = "/v1/join-tokens", tag = "identity", operation_id = "list_join_tokens",
     security(("token" = ["administer"])), params(PageQuery),
     responses((status = 200, body = Page<JoinToken>), (status = 400, body = ProblemBody)))]
@@ -48,7 +50,9 @@ pub(in crate::http) async fn list_tokens(
     Ok(Json(app.join_tokens(&subject.scope, before, limit).await?))
 }
 
-/// Makes a token by which one robot may join once. Its secret is in this answer and nowhere else.
+/// Create a join token, with which one robot may join once.
+///
+/// The answer is the only place that has its secret.
 #[utoipa::path(post, path = "/v1/join-tokens", tag = "identity",
     operation_id = "create_join_token",
     security(("token" = ["administer"])), request_body = CreateJoinToken,
@@ -68,7 +72,7 @@ pub(in crate::http) async fn create_token(
     Ok((StatusCode::CREATED, Json(created)))
 }
 
-/// Revokes a join token: no robot joins by it any more.
+/// Revoke a join token.
 #[utoipa::path(delete, path = "/v1/join-tokens/{token}", tag = "identity",
     operation_id = "revoke_join_token", security(("token" = ["administer"])),
     params(("token" = JoinTokenId, Path)),
@@ -80,7 +84,7 @@ pub(in crate::http) async fn revoke_token(
     Ok(Json(app.revoke_join_token(token).await?))
 }
 
-/// How each robot of a site stands that has ever joined: its newest enrolment.
+/// List the newest enrolment of every robot of a site.
 #[utoipa::path(get, path = "/v1/sites/{site}/enrolments", tag = "identity",
     operation_id = "list_enrolments", security(("token" = ["read"])),
     params(("site" = SiteId, Path), PageQuery),
@@ -97,8 +101,10 @@ pub(in crate::http) async fn list(
     Ok(Json(app.enrolments(place, &after, limit).await?))
 }
 
-/// Puts a robot out of the fleet: what it says counts no more, its link is cut, and it gets no
-/// certificate until it joins again by a token that names it.
+/// Revoke a robot's enrolment.
+///
+/// The server ignores its messages, cuts its connection and gives it no certificate until it joins
+/// again with a token that names it.
 #[utoipa::path(delete, path = "/v1/sites/{site}/enrolments/{robot}", tag = "identity",
     operation_id = "revoke_robot", security(("token" = ["administer"])),
     params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
@@ -111,8 +117,10 @@ pub(in crate::http) async fn revoke(
     Ok(Json(app.revoke_robot(&site, &robot, &subject.name).await?))
 }
 
-/// A robot joins, by a join token, which is used up. Anybody may ask; a token that is wrong, over,
-/// used, revoked or for another robot is answered with the same bytes.
+/// Enrol a robot with a join token.
+///
+/// The token is used up. Needs no credentials; a token that is wrong, expired, used, revoked or for
+/// another robot gets the same answer, byte for byte.
 #[utoipa::path(post, path = "/v1/enrolments", tag = "identity", operation_id = "enrol_robot",
     request_body = EnrolRobot,
     responses((status = 201, body = RobotCertificate), (status = 401, body = ProblemBody),
@@ -144,9 +152,10 @@ pub(in crate::http) async fn enrol(
     }
 }
 
-/// A robot of the fleet gets its next certificate: it proves that it has the key of the present
-/// one, and its request that it has the next. Anybody may ask; whatever does not count is answered
-/// with the same bytes.
+/// Renew a robot's certificate.
+///
+/// The request proves that the robot has the keys of its present and of its next certificate. Needs
+/// no credentials; every refusal gets the same answer, byte for byte.
 #[utoipa::path(post, path = "/v1/enrolments/renew", tag = "identity",
     operation_id = "renew_certificate", request_body = RenewCertificate,
     responses((status = 200, body = RobotCertificate), (status = 401, body = ProblemBody),

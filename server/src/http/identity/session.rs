@@ -18,7 +18,9 @@ use crate::http::problem::Problem;
 use crate::http::subject::Subject;
 use crate::identity::origin::Names;
 
-/// Signs a browser in: the answer sets a cookie, and says who it is.
+/// Sign a browser in with a token.
+///
+/// The answer sets a cookie and contains the identity.
 #[utoipa::path(post, path = "/v1/session", tag = "identity", operation_id = "create_session",
     request_body = CreateSession,
     responses((status = 201, body = Session), (status = 401, body = ProblemBody),
@@ -59,15 +61,17 @@ pub(in crate::http) async fn create(
     Ok(response)
 }
 
-/// Who asks, by token or cookie.
+/// Get the caller's identity, by token or cookie.
 #[utoipa::path(get, path = "/v1/session", tag = "identity", operation_id = "get_session",
     security(("token" = ["stop"])), responses((status = 200, body = Session)))]
 pub(in crate::http) async fn get(Subject(subject): Subject) -> Json<Session> {
     Json(subject.session())
 }
 
-/// Signs a browser out. A token stays valid: an admin revokes it. Whoever signed in at a provider is
-/// told where to sign out there too, if it has such a place.
+/// Sign a browser out.
+///
+/// The token stays valid until an admin revokes it. For a session of the OpenID provider, the
+/// answer contains the provider's sign-out address, if it has one.
 #[utoipa::path(delete, path = "/v1/session", tag = "identity", operation_id = "end_session",
     security(("token" = ["stop"])),
     responses((status = 200, body = SignedOut), (status = 204)))]

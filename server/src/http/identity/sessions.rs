@@ -25,8 +25,10 @@ pub(in crate::http) struct SessionQuery {
     limit: Option<u32>,
 }
 
-/// Sessions of people who signed in at the provider, newest first; only those that hold nowhere beyond
-/// the own one. Sessions of tokens end with their token.
+/// List sessions of people who signed in at the OpenID provider, newest first.
+///
+/// Contains only sessions whose rights are within the caller's. Sessions of tokens end with their
+/// token.
 #[utoipa::path(get, path = "/v1/sessions", tag = "identity", operation_id = "list_sessions",
     security(("token" = ["administer"])), params(SessionQuery),
     responses((status = 200, body = Page<PersonSession>), (status = 400, body = ProblemBody)))]
@@ -41,8 +43,10 @@ pub(in crate::http) async fn list(
     Ok(Json(listed.await?))
 }
 
-/// Ends somebody's session: it is refused from now on, and its open streams close. Whom the provider
-/// still lets in can sign in again.
+/// End a person's session.
+///
+/// The session is refused from now on, and its open streams close. A person whom the provider still
+/// admits can sign in again.
 #[utoipa::path(delete, path = "/v1/sessions/{session}", tag = "identity",
     operation_id = "end_session_of", security(("token" = ["administer"])),
     params(("session" = SessionId, Path)),

@@ -28,7 +28,7 @@ use crate::identity::pending::SIGN_IN_LASTS;
 /// Where a browser is sent that has signed in: the mark tells the page to ask who it is.
 const SIGNED_IN: &str = "/#signed-in";
 
-/// How people may sign in here.
+/// Get the ways to sign in.
 #[utoipa::path(get, path = "/v1/sign-in", tag = "identity", operation_id = "get_sign_in_ways",
     responses((status = 200, body = SignInWays)))]
 pub(in crate::http) async fn ways(State(app): State<App>) -> Json<SignInWays> {
@@ -38,7 +38,7 @@ pub(in crate::http) async fn ways(State(app): State<App>) -> Json<SignInWays> {
     })
 }
 
-/// Sends a browser to the provider to sign in.
+/// Start a sign-in at the OpenID provider.
 #[utoipa::path(get, path = "/v1/sign-in/oidc", tag = "identity", operation_id = "begin_sign_in",
     responses((status = 303), (status = 404, body = ProblemBody), (status = 503, body = ProblemBody)))]
 pub(in crate::http) async fn begin(
@@ -73,7 +73,9 @@ pub(in crate::http) struct AnswerQuery {
     iss: Option<String>,
 }
 
-/// Takes a browser back from the provider: a session begins, and the browser is sent to the page.
+/// Finish a sign-in at the OpenID provider.
+///
+/// Starts a session and sends the browser to the page.
 #[utoipa::path(get, path = "/v1/sign-in/oidc/callback", tag = "identity",
     operation_id = "finish_sign_in", params(AnswerQuery),
     responses((status = 303), (status = 400, body = ProblemBody), (status = 403, body = ProblemBody),

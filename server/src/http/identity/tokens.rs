@@ -25,8 +25,10 @@ pub(in crate::http) struct TokenQuery {
     limit: Option<u32>,
 }
 
-/// Tokens, newest first, dead ones too; only those that hold nowhere beyond the own one. Secrets are
-/// told once and never again.
+/// List tokens, newest first, with those that are no longer valid.
+///
+/// Contains only tokens whose rights are within the caller's. Secrets are shown only when a token
+/// is created.
 #[utoipa::path(get, path = "/v1/tokens", tag = "identity", operation_id = "list_tokens",
     security(("token" = ["administer"])), params(TokenQuery),
     responses((status = 200, body = Page<Token>), (status = 400, body = ProblemBody)))]
@@ -40,8 +42,10 @@ pub(in crate::http) async fn list(
     Ok(Json(app.tokens(&subject.scope, before, limit).await?))
 }
 
-/// Makes a token with a role or with rights of its own, everywhere or for some sites and robots; none
-/// has more than its maker. Its secret is in this answer and nowhere else.
+/// Create a token with a role or with rights of its own, everywhere or for some sites and robots.
+///
+/// A token never has more rights than its creator. The answer is the only place that has its
+/// secret.
 #[utoipa::path(post, path = "/v1/tokens", tag = "identity", operation_id = "create_token",
     security(("token" = ["administer"])), request_body = CreateToken,
     responses((status = 201, body = CreatedToken), (status = 409, body = ProblemBody),
@@ -55,7 +59,9 @@ pub(in crate::http) async fn create(
     Ok((StatusCode::CREATED, Json(created)))
 }
 
-/// Revokes a token: it is refused from now on, its sessions end, and its open streams close.
+/// Revoke a token.
+///
+/// The token is refused from now on, its sessions end, and its open streams close.
 #[utoipa::path(delete, path = "/v1/tokens/{token}", tag = "identity",
     operation_id = "revoke_token", security(("token" = ["administer"])),
     params(("token" = TokenId, Path)),
