@@ -421,7 +421,7 @@ pub struct PathPiece {
     pub disputed: bool,
     /// Friction coefficient to plan with: the larger of what was shown of late and a cautious
     /// value, within what keeps the wheels' slip in the linear range at `theta_upper_95`.
-    pub grip_mu: f64,
+    pub traction_limit_mu: f64,
     /// Speed at its start, metres per second, from the curves, the traction limit and the robot's
     /// limits; the robot stands at the end of the path.
     pub speed_m_s: f64,
@@ -441,7 +441,7 @@ pub struct CellDifference {
     /// What was known at the second time.
     pub after: Option<FusedFriction>,
     /// Difference of θ in its own standard deviations; `null` unless both are known.
-    pub deviations: Option<f64>,
+    pub z_score: Option<f64>,
     /// The normalisation that was used, if any.
     #[serde(default)]
     pub normalisation: Option<String>,
@@ -460,7 +460,7 @@ pub struct VisitSuggestion {
     /// for unknown ground relative to the prior.
     pub gain: f64,
     /// Standard deviation of θ over θ now; `null` when nothing is known.
-    pub relative_deviation: Option<f64>,
+    pub relative_std_dev: Option<f64>,
     /// The normalisation that was used, if any.
     #[serde(default)]
     pub normalisation: Option<String>,

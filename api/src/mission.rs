@@ -276,7 +276,8 @@ pub struct MissionQuality {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct PriorGain {
     /// Friction coefficient that the plan was made with.
-    pub grip_mu: f64,
+    #[serde(alias = "grip_mu")]
+    pub traction_limit_mu: f64,
     /// Share of the driven path on cells with known θ, 0 to 1.
     pub known_ratio: f64,
     /// Time in which θ was known to [`THETA_SURE_RATIO`], seconds.

@@ -45,7 +45,7 @@ pub(crate) const SITE_DEFAULT: &str = "yard";
 /// Most robots of a demo; each is a process of its own.
 const DEMO_ROBOTS_MAX: i64 = 50;
 
-/// Runs fleets of skid-steered robots and maps how the ground grips while they drive.
+/// Runs fleets of skid-steered robots and maps the friction of the ground while they drive.
 #[derive(Debug, Parser)]
 #[command(name = "tread", version)]
 pub(crate) struct Arguments {

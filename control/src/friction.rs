@@ -1,4 +1,4 @@
-//! The ground's grip: friction coefficient over slip, equations (7) to (9) of the paper.
+//! The ground's friction: friction coefficient over slip, equations (7) to (9) of the paper.
 //!
 //! `μ(λ) = K (σ₁(λ) + σ₂(λ) λ)` for λ ≥ 0: rises with slope K up to the peak at `λ_m`, then falls
 //! in a straight line to the share α of the peak at λ = 1. θ = 1/K is the slip compliance.

@@ -10,7 +10,7 @@
 //! * Driving (one call per tick): [`mod@reference`] walks along the plan, [`tracking`] turns errors
 //!   into wheel speeds, [`follower`] runs one mission, [`mod@gate`] has the last word within [`twist_limits`], [`fence`] says
 //!   how fast a robot may be where it is.
-//! * Knowing: [`localisation`] says where the robot is, [`estimation`] how the ground grips,
+//! * Knowing: [`localisation`] says where the robot is, [`estimation`] the friction of the ground,
 //!   [`consistency`] whether the sensors agree.
 //! * [`mod@paper`] is the paper this began with, exactly; its law is a bench, not what ships.
 //! * [`plant`] is the simulated base; [`mod@bench`] holds laws written only for comparison.

@@ -48,7 +48,7 @@ pub struct PlantSpec {
     pub left_radius_ratio: f64,
     /// True rolling radius of the right wheels over the model's, about 1.
     pub right_radius_ratio: f64,
-    /// How the tyres grip beyond the ground's curve.
+    /// How the tyres differ from the ground's curve.
     pub tyres: Tyres,
 }
 
@@ -218,7 +218,11 @@ impl Plant {
         )?;
         check("left_radius_ratio", spec.left_radius_ratio, 0.5..=2.0)?;
         check("right_radius_ratio", spec.right_radius_ratio, 0.5..=2.0)?;
-        check("side_grip_ratio", spec.tyres.side_grip_ratio, 0.1..=10.0)?;
+        check(
+            "lateral_stiffness_ratio",
+            spec.tyres.lateral_stiffness_ratio,
+            0.1..=10.0,
+        )?;
         if !pose.is_finite() {
             return Err(PlantError::OutOfRange {
                 field: "pose",
@@ -342,8 +346,8 @@ impl Plant {
         let reference_m_s = slip_reference_m_s(slowest_m_s);
         let shape = model.mass_kg() * (model.track_width_m().powi(2) + model.wheelbase_m().powi(2))
             / (4.0 * model.yaw_inertia_kg_m2());
-        let side_grip = self.spec.tyres.side_grip_ratio.max(1.0);
-        let pole_s1 = GRAVITY_M_S2 * stiffness * side_grip / reference_m_s * shape.max(1.0);
+        let lateral_ratio = self.spec.tyres.lateral_stiffness_ratio.max(1.0);
+        let pole_s1 = GRAVITY_M_S2 * stiffness * lateral_ratio / reference_m_s * shape.max(1.0);
         let servo_s = 0.5 * self.spec.servo_lag_s.max(SERVO_LAG_FLOOR_S);
         let step_max_s = if slowest_m_s < SLOW_M_S {
             STEP_SLOW_MAX_S
@@ -415,7 +419,7 @@ impl Plant {
                 (state.ahead_m_s - state.yaw_rate_rad_s * y_m - rim_m_s) * per_speed_s_m;
             for x_m in [half_base_m, -half_base_m] {
                 // The slip across that would give its force on an isotropic tyre.
-                let slip_left = tyres.side_grip_ratio
+                let slip_left = tyres.lateral_stiffness_ratio
                     * (state.left_m_s + state.yaw_rate_rad_s * x_m)
                     * per_speed_s_m;
                 let slip = (slip_ahead * slip_ahead + slip_left * slip_left).sqrt();

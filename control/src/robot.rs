@@ -9,11 +9,11 @@ use crate::measured::WheelSpeeds;
 /// Standard gravity, metres per second squared.
 pub const GRAVITY_M_S2: f64 = 9.81;
 
-/// Share of the grip that a plan may use along the path.
-const GRIP_SHARE_ALONG: f64 = 0.58;
-/// Share of the grip that a plan may use across the path: both together leave three tenths for
+/// Share of the traction limit that a plan may use along the path.
+const TRACTION_SHARE_LONGITUDINAL: f64 = 0.58;
+/// Share of the traction limit that a plan may use across the path: both together leave three tenths for
 /// turning the body and for feedback.
-const GRIP_SHARE_ACROSS: f64 = 0.4;
+const TRACTION_SHARE_LATERAL: f64 = 0.4;
 
 /// What a robot may do at most. Every figure is finite and above zero.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -175,7 +175,7 @@ impl RobotModel {
     /// The same robot with accelerations that a peak friction coefficient can give.
     ///
     /// Only a share of `μg`: the rest turns the wheels against the ground, and serves feedback.
-    pub(crate) fn within_grip(&self, mu_peak: f64) -> Self {
+    pub(crate) fn within_traction_limit(&self, mu_peak: f64) -> Self {
         let along_m_s2 = Self::grip_along_m_s2(mu_peak);
         let across_m_s2 = Self::grip_across_m_s2(mu_peak);
         let mut spec = self.spec;
@@ -189,12 +189,12 @@ impl RobotModel {
     /// Acceleration along the path that a plan may ask of ground with this peak friction, metres per
     /// second squared.
     pub fn grip_along_m_s2(mu_peak: f64) -> f64 {
-        GRIP_SHARE_ALONG * mu_peak * GRAVITY_M_S2
+        TRACTION_SHARE_LONGITUDINAL * mu_peak * GRAVITY_M_S2
     }
 
     /// The same across the path.
     pub fn grip_across_m_s2(mu_peak: f64) -> f64 {
-        GRIP_SHARE_ACROSS * mu_peak * GRAVITY_M_S2
+        TRACTION_SHARE_LATERAL * mu_peak * GRAVITY_M_S2
     }
 
     /// How much wider than W the robot turns at low speed: `W_eff/W = 1 + (L/W)²`, whatever the

@@ -11,7 +11,7 @@
 //! What the body did shows what the ground gave: four wheels of equal load that push the body
 //! with `a_y = vω` and turn it with `I_G ω̇` have a mean square of at least
 //! `a_y² + (2 I_G ω̇/(m √(W² + L²)))²`, so that some wheel had at least the root of it over g as μ. It
-//! bounds the grip from below as far as the nose turns with the course and rates are seen well; where
+//! bounds friction from below as far as the nose turns with the course and rates are seen well; where
 //! not, more is shown than was given. Either way the robot only becomes slower, never quicker.
 
 use crate::measured::Measured;

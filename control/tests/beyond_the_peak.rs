@@ -1,4 +1,4 @@
-//! Bends in which wheels slip beyond the peak of their grip.
+//! Bends in which wheels slip beyond the peak of their friction curve.
 
 use tread_control::bench::{Course, Figure8, Law, Run, Scenario, TickInput, TickOutput};
 use tread_control::friction::{FrictionCurve, FrictionSpec};
@@ -25,12 +25,15 @@ fn known(theta: f64) -> ThetaKnowledge {
 }
 
 /// The figure-8 of the report, told a θ that may change with time; every tick's output.
-fn figure_8(grip: FrictionCurve, told: impl Fn(f64) -> ThetaKnowledge) -> Vec<TickOutput> {
+fn figure_8(
+    friction_curve: FrictionCurve,
+    told: impl Fn(f64) -> ThetaKnowledge,
+) -> Vec<TickOutput> {
     let course = Course::Figure8(Figure8::usual());
     let law = Law::Shipped(Some(told(0.0)));
-    let scenario = Scenario::usual(grip);
+    let scenario = Scenario::usual(friction_curve);
     let mut run = Run::new(course, RobotModel::yi2007(), scenario, law).expect("a valid scenario");
-    let ground = Ground::uniform(grip);
+    let ground = Ground::uniform(friction_curve);
     let mut ticks = Vec::new();
     loop {
         let input = TickInput {

@@ -160,7 +160,7 @@ fn tyres_that_grip_better_or_worse_across_do_not_bias_theta() {
             let mut robot = SimRobot::new(Pose::default(), 5.0, seed, true);
             let spec = PlantSpec {
                 tyres: Tyres {
-                    side_grip_ratio: ratio,
+                    lateral_stiffness_ratio: ratio,
                     ..Tyres::default()
                 },
                 ..PlantSpec::default()

@@ -1,4 +1,4 @@
-//! What a plan and a mission may be asked beside the trajectory: approach speed, grip, excitation,
+//! What a plan and a mission may be asked beside the trajectory: approach speed, traction limit, excitation,
 //! speed limit under way.
 
 use proptest::prelude::*;
@@ -6,7 +6,9 @@ use tread_control::excitation::ExcitationSpec;
 use tread_control::follower::{Follower, FollowerConfig};
 use tread_control::geometry::{Point, Pose};
 use tread_control::measured::Measured;
-use tread_control::plan::{GripMap, GripSquare, Plan, PlanError, PlanOptions, SlowedBy};
+use tread_control::plan::{
+    Plan, PlanError, PlanOptions, SlowedBy, TractionLimitCell, TractionLimitMap,
+};
 use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 use tread_control::trajectory::{CircleSpec, Direction, Trajectory, Waypoint, WaypointsSpec};
 
@@ -113,7 +115,7 @@ fn on_circle() -> Pose {
 fn accelerations_stay_within_what_the_ground_can_give() {
     for mu in [0.05, 0.1, 0.5] {
         let options = PlanOptions {
-            grip_mu: Some(mu),
+            traction_limit_mu: Some(mu),
             ..PlanOptions::default()
         };
         let plan = planned(&bends(), Pose::default(), &options);
@@ -130,34 +132,34 @@ fn accelerations_stay_within_what_the_ground_can_give() {
 #[test]
 fn a_plan_is_slow_only_where_the_ice_is_and_brakes_before_it() {
     const ICE_MU: f64 = 0.03;
-    const GRIP_MU: f64 = 0.6;
+    const HIGH_MU: f64 = 0.6;
     let squares = (-3..9_i32).flat_map(|ix| (-3..9_i32).map(move |iy| (ix, iy)));
-    let squares = squares.map(|(ix, iy)| GripSquare {
+    let squares = squares.map(|(ix, iy)| TractionLimitCell {
         ix,
         iy,
-        mu: if ix >= 5 { ICE_MU } else { GRIP_MU },
+        mu: if ix >= 5 { ICE_MU } else { HIGH_MU },
     });
-    let map = GripMap::new(1.0, squares.collect(), 0.14).unwrap();
+    let map = TractionLimitMap::new(1.0, squares.collect(), 0.14).unwrap();
     let along = PlanOptions {
-        grip: Some(&map),
+        traction_limits: Some(&map),
         ..PlanOptions::default()
     };
     let plan = planned(&bends(), Pose::default(), &along);
-    let everywhere = |grip_mu| {
+    let everywhere = |traction_limit_mu| {
         let options = PlanOptions {
-            grip_mu: Some(grip_mu),
+            traction_limit_mu: Some(traction_limit_mu),
             ..PlanOptions::default()
         };
         planned(&bends(), Pose::default(), &options)
     };
-    let (ice, grip) = (everywhere(ICE_MU), everywhere(GRIP_MU));
+    let (ice, traction_limit) = (everywhere(ICE_MU), everywhere(HIGH_MU));
     assert!(
         plan.duration_s() < 0.8 * ice.duration_s(),
         "{}",
         plan.duration_s()
     );
     assert!(
-        plan.duration_s() > 1.0 + grip.duration_s(),
+        plan.duration_s() > 1.0 + traction_limit.duration_s(),
         "{}",
         plan.duration_s()
     );
@@ -179,11 +181,14 @@ fn a_plan_is_slow_only_where_the_ice_is_and_brakes_before_it() {
         }
         time_s += 0.01;
     }
-    assert!(fastest_m_s > 0.6, "{fastest_m_s} m/s where there is grip");
+    assert!(
+        fastest_m_s > 0.6,
+        "{fastest_m_s} m/s where the traction limit is high"
+    );
     assert!(
         plan.slowed()
             .iter()
-            .any(|slowed| slowed.by == SlowedBy::Grip)
+            .any(|slowed| slowed.by == SlowedBy::Traction)
     );
 }
 
@@ -219,11 +224,15 @@ fn options_that_are_no_numbers_are_refused() {
         Plan::with_options(&circle(), Pose::default(), &model, &options).unwrap_err()
     };
     for bad in [0.0, -1.0, f64::NAN, f64::INFINITY] {
-        let grip = PlanOptions {
-            grip_mu: Some(bad),
+        let traction_limit = PlanOptions {
+            traction_limit_mu: Some(bad),
             ..PlanOptions::default()
         };
-        assert!(refused(grip).to_string().contains("the grip"));
+        assert!(
+            refused(traction_limit)
+                .to_string()
+                .contains("the traction limit")
+        );
         let approach = PlanOptions {
             approach_speed_m_s: Some(bad),
             ..PlanOptions::default()

@@ -77,7 +77,7 @@ fn surface_change(found: &Comparison) -> Option<AlertReport> {
     let how = if measured.theta > expected.theta {
         "slips more"
     } else {
-        "grips better"
+        "has more friction"
     };
     let text = format!(
         "the ground in cell ({}, {}) {how} than the map says: θ {:.2} ± {:.2}, not {:.2} ± {:.2}",

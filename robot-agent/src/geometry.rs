@@ -142,7 +142,7 @@ pub fn plan_options(asked: &trajectory::Trajectory) -> PlanOptions<'static> {
             depth_ratio: excitation.depth_ratio,
             period_s: excitation.period_s,
         }),
-        grip_mu: None,
-        grip: None,
+        traction_limit_mu: None,
+        traction_limits: None,
     }
 }

@@ -1,6 +1,6 @@
 //! Tread's agent: the program on every robot.
 //!
-//! A loop thread drives trajectories with `tread-control` and measures how the ground grips;
+//! A loop thread drives trajectories with `tread-control` and measures the friction of the ground;
 //! everything around it takes missions from the server, and brings measurements to it without
 //! losing or doubling any.
 //!

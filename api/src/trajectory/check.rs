@@ -148,9 +148,9 @@ pub enum BindingLimit {
     WheelAcceleration,
     /// Acceleration or braking along the path, up to the next slower place.
     LinearAcceleration,
-    /// What the ground is known to give, along or across the path; on the way to the trajectory a
-    /// cautious guess where nothing is known.
-    Grip,
+    /// Traction limit of the ground, longitudinal or lateral; during the approach a cautious one where
+    /// nothing is known.
+    Traction,
 }
 
 /// A place along a path.

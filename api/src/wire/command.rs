@@ -44,35 +44,36 @@ pub struct Offer {
 /// Most cells of a prior.
 pub const PRIOR_CELLS_MAX: usize = 4_096;
 
-/// What the map knows along a way. It helps the robot to drive and never goes into what it
+/// What the map knows along a path. It helps the robot to drive and never goes into what it
 /// measures; nor is it part of what is to be driven.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PathPrior {
     /// The grid that cuts the cells.
     pub grid_revision: u32,
-    /// Friction coefficient to plan with: the lowest along the way, above zero.
-    pub grip_mu: f64,
+    /// Friction coefficient to plan with: the lowest along the path, above zero.
+    #[serde(alias = "grip_mu")]
+    pub traction_limit_mu: f64,
     /// Standard deviation of one robot's own θ around that of all robots as a share of it, 0 to 1.
     #[serde(default = "robot_bias_ratio")]
     pub robot_bias_ratio: f64,
     /// Cells of one ground of which θ is known, at most [`PRIOR_CELLS_MAX`].
     pub cells: Vec<CellPrior>,
-    /// Friction coefficient to plan with by place, for cells along the way, at most
-    /// [`PRIOR_CELLS_MAX`]; `grip_mu` holds away from them, and everywhere where there are none.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub grips: Vec<CellGrip>,
+    /// Friction coefficient to plan with by place, for cells along the path, at most
+    /// [`PRIOR_CELLS_MAX`]; `traction_limit_mu` holds away from them, and everywhere where there are none.
+    #[serde(default, alias = "grips", skip_serializing_if = "Vec::is_empty")]
+    pub traction_limits: Vec<CellTractionLimit>,
 }
 
-/// How a cell grips, for a plan.
+/// Traction limit of a cell, for a plan.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct CellGrip {
+pub struct CellTractionLimit {
     /// The cell.
     pub cell: Cell,
     /// Friction coefficient, above zero: a lower bound of the peak.
     pub mu: f64,
 }
 
-/// What servers reckon with unless they are told otherwise.
+/// Default of servers.
 const fn robot_bias_ratio() -> f64 {
     0.08
 }
@@ -95,12 +96,15 @@ impl PathPrior {
         let is_known = |cell: &CellPrior| {
             is_positive(cell.theta) && cell.theta <= THETA_MAX && is_positive(cell.std_dev)
         };
-        is_positive(self.grip_mu)
+        is_positive(self.traction_limit_mu)
             && (0.0..=1.0).contains(&self.robot_bias_ratio)
             && self.cells.len() <= PRIOR_CELLS_MAX
             && self.cells.iter().all(is_known)
-            && self.grips.len() <= PRIOR_CELLS_MAX
-            && self.grips.iter().all(|grip| is_positive(grip.mu))
+            && self.traction_limits.len() <= PRIOR_CELLS_MAX
+            && self
+                .traction_limits
+                .iter()
+                .all(|limit| is_positive(limit.mu))
     }
 }
 

@@ -202,6 +202,6 @@ fn limit_name(limit: BindingLimit) -> &'static str {
         BindingLimit::WheelSpeed => "wheel speed",
         BindingLimit::WheelAcceleration => "wheel acceleration in a bend",
         BindingLimit::LinearAcceleration => "acceleration or braking",
-        BindingLimit::Grip => "grip of the ground",
+        BindingLimit::Traction => "traction limit of the ground",
     }
 }

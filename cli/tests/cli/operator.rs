@@ -61,7 +61,7 @@ async fn the_ground_is_drawn_changed_and_asked_about_by_commands() {
     let path = ["friction", "path", "--robot", ROBOT, "0,0", "4,0", "4,3"];
     let along = yard.json(&path).await;
     assert_eq!(along["length_m"], 7.0);
-    assert!(yard.table(&path).await.contains("GRIP MU"));
+    assert!(yard.table(&path).await.contains("MU LIMIT"));
     for words in [
         &["friction"][..],
         &["friction", "terrains", "sand-pit", "--as-of", "1h"],

@@ -390,8 +390,8 @@ fn sweeps(all: &mut Vec<Scenario>) {
         robot.aliases = true;
     });
     for ratio in [0.7, 1.4] {
-        push(format!("side grip × {ratio}"), &move |robot| {
-            robot.tyres.side_grip_ratio = ratio;
+        push(format!("lateral stiffness × {ratio}"), &move |robot| {
+            robot.tyres.lateral_stiffness_ratio = ratio;
         });
     }
 }

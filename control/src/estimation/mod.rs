@@ -1,4 +1,4 @@
-//! How the ground grips: θ measured, with an honest standard deviation.
+//! Friction of the ground: θ measured, with an honest standard deviation.
 //!
 //! This is the figure that reaches the map; it never mixes with θ̂ of the loop. Per side, in the
 //! linear range, `λ = θ μ` holds exactly under combined slip: slip is regressed on force, from

@@ -37,7 +37,7 @@ impl OffsetKnowledge {
         };
         put(index::RADIUS_OFFSET, 2.0 * radius);
         put(index::RADIUS_DIFFERENCE, 0.5 * radius);
-        put(index::TRACK, weight(tyres.side_grip_spread));
+        put(index::TRACK, weight(tyres.lateral_stiffness_std_dev));
         put(index::GYRO_OFFSET, weight(noise.gyro_offset_rad_s));
         put(index::AHEAD_OFFSET, weight(noise.accelerometer_offset_m_s2));
         put(index::AHEAD_SCALE, weight(noise.accelerometer_scale_ratio));

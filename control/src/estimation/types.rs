@@ -52,7 +52,7 @@ impl Default for SensorNoise {
 pub struct TyrePrior {
     /// How far the tyres' stiffness across may differ from that along, one standard deviation as
     /// a share. It is learned from turning; it only matters until then.
-    pub side_grip_spread: f64,
+    pub lateral_stiffness_std_dev: f64,
     /// Mean θκ of `λ = θμ(1 + κλ + ⅔κ²λ²)`, per friction coefficient: 0 for the paper's straight
     /// rise, `1/(3μ_p)` for a brush-like tyre of peak `μ_p`.
     pub curvature: f64,
@@ -188,7 +188,7 @@ impl Default for TyrePrior {
     /// Tyres that rise straight to their peak, as the paper's (7).
     fn default() -> Self {
         Self {
-            side_grip_spread: 0.3,
+            lateral_stiffness_std_dev: 0.3,
             curvature: 0.0,
             curvature_std_dev: 0.0,
             mu_max: None,

@@ -1,7 +1,7 @@
 //! The speed that keeps a robot inside its fence.
 //!
 //! It is the fastest from which the robot still stops within its free way, `v t + v²/2a = way`, with
-//! the time `t` until it brakes and the braking `a` that the ground's lower grip bound surely gives.
+//! the time `t` until it brakes and the braking `a` that the ground's lower bound of friction surely gives.
 //! Outside already, only motion that gains clearance is let through, slowly.
 
 use super::{Fence, MARGIN_M, disc_radius_m};
@@ -12,7 +12,7 @@ use crate::robot::{GRAVITY_M_S2, RobotModel};
 pub const MARGIN_STD_DEVS: f64 = 2.0;
 /// Fastest drive back in from outside, metres per second.
 pub const RETURN_MAX_M_S: f64 = 0.15;
-/// Friction coefficient that ground of unknown grip is taken to have.
+/// Friction coefficient that ground of unknown friction is taken to have.
 pub const MU_UNKNOWN: f64 = 0.15;
 /// Time from a decision until the wheels brake, seconds: a tick of the slowest loop, the servo,
 /// and the age of the position.

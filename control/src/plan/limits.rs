@@ -82,18 +82,18 @@ pub(super) struct Blame {
 }
 
 impl Blame {
-    /// Of a model whose limits have been brought within the grip already.
-    pub(super) fn of(model: &RobotModel, grip_mu: Option<f64>) -> Self {
+    /// Of a model whose limits have been brought within the traction limit already.
+    pub(super) fn of(model: &RobotModel, traction_limit_mu: Option<f64>) -> Self {
         let limits = model.limits();
         let gives = |at_m_s2: fn(f64) -> f64, limit_m_s2: f64| {
-            grip_mu.is_some_and(|mu| at_m_s2(mu) <= limit_m_s2)
+            traction_limit_mu.is_some_and(|mu| at_m_s2(mu) <= limit_m_s2)
         };
         Self {
             along: if gives(
                 RobotModel::grip_along_m_s2,
                 limits.linear_acceleration_max_m_s2,
             ) {
-                SlowedBy::Grip
+                SlowedBy::Traction
             } else {
                 SlowedBy::LinearAcceleration
             },
@@ -101,7 +101,7 @@ impl Blame {
                 RobotModel::grip_across_m_s2,
                 limits.lateral_acceleration_max_m_s2,
             ) {
-                SlowedBy::Grip
+                SlowedBy::Traction
             } else {
                 SlowedBy::LateralAcceleration
             },

@@ -7,9 +7,9 @@
 //! direction than the robot points, [`Plan::start_heading_rad`] tells where to turn on the spot.
 
 mod error;
-mod grip;
 mod limits;
 mod slowed;
+mod traction_limit;
 
 use crate::excitation::{Excitation, ExcitationSpec, Warp};
 use crate::geometry::{Point, Pose};
@@ -22,8 +22,8 @@ use crate::robot::RobotModel;
 use crate::trajectory::{CircleSpec, Trajectory, WaypointsSpec};
 
 pub use error::PlanError;
-pub use grip::{GripMap, GripSquare};
 pub use slowed::{SLOWED_MAX, Slowed, SlowedBy};
+pub use traction_limit::{TractionLimitCell, TractionLimitMap};
 
 use limits::{Blame, NodeBounds, Shares, WHEEL_SHARE, node_limits, with_excitation};
 use slowed::{CellBounds, Stretches};
@@ -48,7 +48,7 @@ const BEND_LOOKED_INTO_1_M: f64 = 1.0;
 const PARTS_LOOKED_INTO: u8 = 8;
 /// Peak friction coefficient that is reckoned with on the way to a trajectory while nothing is
 /// known of the ground.
-const GRIP_UNKNOWN_MU: f64 = 0.14;
+const TRACTION_LIMIT_UNKNOWN_MU: f64 = 0.14;
 /// Fewest cells of the timing.
 const GRID_MIN: usize = 16;
 
@@ -61,16 +61,18 @@ pub struct PlanOptions<'map> {
     pub excitation: Option<ExcitationSpec>,
     /// Lower bound of the ground's peak friction coefficient, above zero: accelerations stay within
     /// what it can give. Without it only the robot's own limits hold.
-    pub grip_mu: Option<f64>,
+    pub traction_limit_mu: Option<f64>,
     /// The same by place. The geometry keeps to the lowest of it, the timing to what holds at each
-    /// place; `grip_mu` counts no more then.
-    pub grip: Option<&'map GripMap>,
+    /// place; `traction_limit_mu` counts no more then.
+    pub traction_limits: Option<&'map TractionLimitMap>,
 }
 
 impl PlanOptions<'_> {
     /// Peak friction coefficient that the geometry reckons with, if the ground is known.
-    fn least_grip_mu(&self) -> Option<f64> {
-        self.grip.map(GripMap::least).or(self.grip_mu)
+    fn least_traction_limit_mu(&self) -> Option<f64> {
+        self.traction_limits
+            .map(TractionLimitMap::least)
+            .or(self.traction_limit_mu)
     }
 }
 
@@ -94,7 +96,7 @@ pub struct Plan {
     profile: SpeedProfile,
     excitation: Option<Excitation>,
     approach_length_m: f64,
-    grip_is_known: bool,
+    traction_limit_is_known: bool,
     peak_speed_m_s: f64,
     peak_acceleration_m_s2: f64,
     peak_lateral_m_s2: f64,
@@ -134,19 +136,19 @@ impl Plan {
         if let Some(speed_m_s) = options.approach_speed_m_s {
             check_speed(speed_m_s, 0, model)?;
         }
-        let gripped = match options.least_grip_mu() {
+        let limited = match options.least_traction_limit_mu() {
             Some(mu) if !(mu.is_finite() && mu > 0.0) => {
                 return Err(PlanError::NotFinite {
-                    what: "the grip",
+                    what: "the traction limit",
                     place: 0,
                     value: mu,
                 });
             }
-            Some(mu) => model.within_grip(mu),
+            Some(mu) => model.within_traction_limit(mu),
             None => *model,
         };
-        let ungripped = model;
-        let model = &gripped;
+        let unlimited = model;
+        let model = &limited;
         if !start.is_finite() || start.x_m.abs().max(start.y_m.abs()) > COORDINATE_MAX_M {
             return Err(PlanError::NotFinite {
                 what: "the start pose",
@@ -155,9 +157,9 @@ impl Plan {
             });
         }
         match trajectory {
-            Trajectory::Circle(circle) => Self::circle(circle, start, (model, ungripped), options),
+            Trajectory::Circle(circle) => Self::circle(circle, start, (model, unlimited), options),
             Trajectory::Waypoints(waypoints) => {
-                Self::waypoints(waypoints, start, (model, ungripped), options)
+                Self::waypoints(waypoints, start, (model, unlimited), options)
             }
         }
     }
@@ -165,7 +167,7 @@ impl Plan {
     fn circle(
         circle: &CircleSpec,
         start: Pose,
-        (model, ungripped): (&RobotModel, &RobotModel),
+        (model, unlimited): (&RobotModel, &RobotModel),
         options: &PlanOptions<'_>,
     ) -> Result<Self, PlanError> {
         check_coordinate("the centre", 0, circle.center)?;
@@ -213,13 +215,13 @@ impl Plan {
                 speed_m_s: circle.speed_m_s,
             },
         ];
-        Self::timed(path, &speeds, approach_pieces, (model, ungripped), options)
+        Self::timed(path, &speeds, approach_pieces, (model, unlimited), options)
     }
 
     fn waypoints(
         spec: &WaypointsSpec,
         start: Pose,
-        (model, ungripped): (&RobotModel, &RobotModel),
+        (model, unlimited): (&RobotModel, &RobotModel),
         options: &PlanOptions<'_>,
     ) -> Result<Self, PlanError> {
         let points = &spec.points;
@@ -306,7 +308,7 @@ impl Plan {
                 speed_m_s: asked.unwrap_or(spec.speed_m_s),
             });
         }
-        Self::timed(path, &speeds, approach_pieces, (model, ungripped), options)
+        Self::timed(path, &speeds, approach_pieces, (model, unlimited), options)
     }
 
     #[expect(
@@ -319,7 +321,7 @@ impl Plan {
         path: Path,
         speeds: &[SpeedFrom],
         approach_pieces: usize,
-        (model, ungripped): (&RobotModel, &RobotModel),
+        (model, unlimited): (&RobotModel, &RobotModel),
         options: &PlanOptions<'_>,
     ) -> Result<Self, PlanError> {
         let length_m = path.length_m();
@@ -329,14 +331,16 @@ impl Plan {
         let cells = ((length_m / GRID_M).ceil() as usize).clamp(GRID_MIN, GRID_MAX);
         let cell_m = length_m / cells as f64;
         let mut asked = 0;
-        let blame = Blame::of(model, options.grip_mu);
+        let blame = Blame::of(model, options.traction_limit_mu);
         let mut bounds: Vec<NodeBounds> = Vec::with_capacity(cells + 1);
         let mut asked_m_s = Vec::with_capacity(cells + 1);
         let mut bend_before_1_m = 0.0;
         let approach_end_m = path.piece_start_m(approach_pieces);
         let careful = on_approach(model, options);
-        let careful_grip = options.grip_mu.unwrap_or(GRIP_UNKNOWN_MU);
-        let careful_blame = Blame::of(&careful, Some(careful_grip));
+        let careful_mu = options
+            .traction_limit_mu
+            .unwrap_or(TRACTION_LIMIT_UNKNOWN_MU);
+        let careful_blame = Blame::of(&careful, Some(careful_mu));
         for index in 0..=cells {
             let arc_m = cell_m * index as f64;
             while speeds
@@ -348,9 +352,9 @@ impl Plan {
             let speed_m_s = speeds[asked].speed_m_s;
             let here = path.sample(arc_m);
             let placed;
-            let (model, blame) = if let Some(grip) = options.grip {
-                let mu = grip.at(here.pose.point());
-                placed = ungripped.within_grip(mu);
+            let (model, blame) = if let Some(traction_limit) = options.traction_limits {
+                let mu = traction_limit.at(here.pose.point());
+                placed = unlimited.within_traction_limit(mu);
                 (&placed, Blame::of(&placed, Some(mu)))
             } else if arc_m < approach_end_m {
                 (&careful, careful_blame)
@@ -382,9 +386,9 @@ impl Plan {
             Some(spec) => Some(with_excitation(spec, &mut nodes, &mut jerk_m_s3)?),
             None => None,
         };
-        // On unknown ground the way to the trajectory is bounded by a cautious grip already, and
+        // On unknown ground the way to the trajectory is bounded by a cautious traction limit already, and
         // needs no more room before and after a bend than the mean takes.
-        let brisk = match options.least_grip_mu() {
+        let brisk = match options.least_traction_limit_mu() {
             Some(_) => 0,
             None => (approach_end_m / cell_m).ceil() as usize,
         };
@@ -392,7 +396,7 @@ impl Plan {
         let mut plan = Self {
             excitation,
             approach_length_m: path.piece_start_m(approach_pieces),
-            grip_is_known: options.least_grip_mu().is_some(),
+            traction_limit_is_known: options.least_traction_limit_mu().is_some(),
             path,
             profile,
             peak_speed_m_s: 0.0,
@@ -475,7 +479,7 @@ impl Plan {
     /// Peak friction coefficient that the way to the trajectory is reckoned with, unless the ground
     /// is known.
     pub(crate) fn reckoned_mu(&self) -> Option<f64> {
-        (!self.grip_is_known).then_some(GRIP_UNKNOWN_MU)
+        (!self.traction_limit_is_known).then_some(TRACTION_LIMIT_UNKNOWN_MU)
     }
 
     /// Time from rest to rest when nothing slows the robot, without turning on the spot, seconds.
@@ -527,10 +531,10 @@ fn check_coordinate(what: &'static str, place: usize, point: Point) -> Result<()
 
 /// What the robot may do on its way to the trajectory.
 fn on_approach(model: &RobotModel, options: &PlanOptions<'_>) -> RobotModel {
-    match options.least_grip_mu() {
+    match options.least_traction_limit_mu() {
         // The model has been bounded already.
         Some(_) => *model,
-        None => model.within_grip(GRIP_UNKNOWN_MU),
+        None => model.within_traction_limit(TRACTION_LIMIT_UNKNOWN_MU),
     }
 }
 

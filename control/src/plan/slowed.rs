@@ -14,7 +14,7 @@ pub enum SlowedBy {
     /// Acceleration or braking along the path.
     LinearAcceleration,
     /// What the ground is known to give, along or across the path.
-    Grip,
+    Traction,
 }
 
 /// A stretch of the path on which one limit makes the robot slower than it was asked to be.

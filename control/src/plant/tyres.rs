@@ -1,4 +1,4 @@
-//! How real tyres may differ from the paper's: grip across, and a smooth rise to the peak.
+//! How real tyres may differ from the paper's: lateral stiffness, and a smooth rise to the peak.
 
 use crate::friction::FrictionCurve;
 
@@ -6,7 +6,7 @@ use crate::friction::FrictionCurve;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tyres {
     /// Stiffness across over that along, above 0.
-    pub side_grip_ratio: f64,
+    pub lateral_stiffness_ratio: f64,
     /// Shape of the rise to the peak.
     pub rise: TyreRise,
 }
@@ -14,7 +14,7 @@ pub struct Tyres {
 impl Default for Tyres {
     fn default() -> Self {
         Self {
-            side_grip_ratio: 1.0,
+            lateral_stiffness_ratio: 1.0,
             rise: TyreRise::Straight,
         }
     }

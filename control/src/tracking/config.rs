@@ -49,8 +49,8 @@ pub struct TrackerConfig {
     pub servo_lag_s: f64,
     /// Adaptation gain ρ.
     pub adaptation_gain: f64,
-    /// How grip is lost beyond its peak; of this curve only the shape counts, never the stiffness.
-    pub grip: FrictionCurve,
+    /// Friction curve, for the loss beyond its peak; of this curve only the shape counts, never the stiffness.
+    pub friction_curve: FrictionCurve,
     /// Adaptation gain of the share of that loss which shows.
     pub beyond_gain: f64,
     /// Fastest change of θ̂, per second.
@@ -83,7 +83,7 @@ impl Default for TrackerConfig {
             integral_max_1_m: 0.5,
             servo_lag_s: 0.05,
             adaptation_gain: 2000.0,
-            grip: FrictionCurve::yi2007(),
+            friction_curve: FrictionCurve::yi2007(),
             beyond_gain: 8_000.0,
             adaptation_rate_max_1_s: 0.3,
             adaptation_pull_1_s: 10.0,

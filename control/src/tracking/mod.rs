@@ -7,9 +7,9 @@
 //! adaptation (26) of the paper, on a law that never inverts a measured velocity: it is regular at
 //! standstill.
 //!
-//! In tight bends wheels slip beyond the peak of their grip, whatever the speed, and the sideslip
+//! In tight bends wheels slip beyond the peak of their friction curve, whatever the speed, and the sideslip
 //! is several times as large. The turn is therefore reckoned by the four-wheel sum itself, in its
-//! linear range and with the loss beyond the peak of [`TrackerConfig::grip`]; a share χ̂ of that
+//! linear range and with the loss beyond the peak of [`TrackerConfig::friction_curve`]; a share χ̂ of that
 //! loss is believed, adapted like θ̂, so that tyres of another shape are found out.
 //!
 //! The command is the reference's motion, corrected by the errors (Kanayama's form, with integral
@@ -106,7 +106,7 @@ pub struct TrackerOutput {
     pub errors: TrackingErrors,
     /// θ̂ in the loop; never a measurement.
     pub theta_loop: f64,
-    /// How much of the grip that is lost beyond its peak is believed in the loop, χ̂, 0 to 1.
+    /// How much of the friction that is lost beyond the peak is believed in the loop, χ̂, 0 to 1.
     pub beyond_loop: f64,
     /// How much the known θ is believed, 0 to 1.
     pub confidence: f64,
@@ -130,7 +130,7 @@ pub struct Tracker {
     config: TrackerConfig,
     integral_1_m: f64,
     theta: f64,
-    /// Share of the loss beyond the grip's peak that is believed, χ̂.
+    /// Share of the loss beyond the peak of the friction curve that is believed, χ̂.
     beyond: f64,
     /// The θ under which χ̂ was adapted.
     known: Option<ThetaKnowledge>,
@@ -213,7 +213,7 @@ impl Tracker {
             theta,
             beyond: self.beyond,
         };
-        let sideslip = Sideslip::of(reference, belief, &config.grip, &self.model);
+        let sideslip = Sideslip::of(reference, belief, &config.friction_curve, &self.model);
         let mut course = measured.pose;
         course.heading_rad += sideslip.angle_rad;
         let ahead = course.body_from_site(reference.pose.point());

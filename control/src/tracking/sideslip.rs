@@ -45,12 +45,12 @@ impl Sideslip {
     pub(super) fn of(
         reference: &ReferenceSample,
         belief: Belief,
-        grip: &FrictionCurve,
+        friction_curve: &FrictionCurve,
         model: &RobotModel,
     ) -> Self {
         let speed_m_s = reference.speed_m_s;
         let at = |speed_m_s: f64, turn_rad_s: f64| {
-            Instant::of(speed_m_s, turn_rad_s, belief, grip, model)
+            Instant::of(speed_m_s, turn_rad_s, belief, friction_curve, model)
         };
         let now = at(speed_m_s, reference.turn_rad_s);
         let then = at(
@@ -73,7 +73,7 @@ impl Sideslip {
 struct Instant {
     /// Sideslip per θ, to the right.
     per_theta: f64,
-    /// What of it is lost grip, if all of it is believed.
+    /// What of it is lost friction, if all of it is believed.
     per_theta_beyond: f64,
     is_at_end: bool,
     rims: Twist,
@@ -84,13 +84,13 @@ impl Instant {
         speed_m_s: f64,
         turn_rad_s: f64,
         belief: Belief,
-        grip: &FrictionCurve,
+        friction_curve: &FrictionCurve,
         model: &RobotModel,
     ) -> Self {
         let asked_1_m = turn_rad_s / speed_m_s.max(SPEED_MIN_M_S);
         let theta = belief.theta.max(THETA_LOOK_MIN);
         let compliance_m = theta * speed_m_s * speed_m_s / GRAVITY_M_S2;
-        let turn = Turn::steady(model, grip, asked_1_m, compliance_m);
+        let turn = Turn::steady(model, friction_curve, asked_1_m, compliance_m);
         let per_theta = |turn: SteadyTurn| -turn.sideslip / theta;
         let (linear, beyond) = (per_theta(turn.linear), per_theta(turn.beyond));
         let of_rims = |turn: SteadyTurn| {

@@ -1,4 +1,4 @@
-//! A steady turn of the four-wheel sum, with wheels beyond the peak of their grip.
+//! A steady turn of the four-wheel sum, with wheels beyond the peak of their friction curve.
 //!
 //! In a turn every wheel slips, by what the turn's geometry asks and by what the force across it
 //! takes. With the rims' speeds as unknowns the balances of force along and of moment are linear in
@@ -35,7 +35,7 @@ pub(super) struct SteadyTurn {
     pub(super) rims: [f64; 2],
 }
 
-/// The same turn twice: as if every wheel stayed in the linear range, and with what grip is lost
+/// The same turn twice: as if every wheel stayed in the linear range, and with what friction is lost
 /// beyond the peak.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Turn {
@@ -47,10 +47,10 @@ pub(super) struct Turn {
 
 impl Turn {
     /// The turn of a curvature, 1/m, finite; `compliance_m` is `θv²/g`, metres, ≥ 0. Only the shape
-    /// of `grip` counts, not its stiffness.
+    /// of `friction_curve` counts, not its stiffness.
     pub(super) fn steady(
         model: &RobotModel,
-        grip: &FrictionCurve,
+        friction_curve: &FrictionCurve,
         curvature_1_m: f64,
         compliance_m: f64,
     ) -> Self {
@@ -62,7 +62,7 @@ impl Turn {
         }
         let linear = wheels.turn();
         for _ in 0..SHARE_ROUNDS {
-            if !wheels.lose(grip) {
+            if !wheels.lose(friction_curve) {
                 break;
             }
             wheels.balance();
@@ -144,14 +144,15 @@ impl Wheels {
     }
 
     /// Takes the shares of stiffness that this slip leaves; whether any moved.
-    fn lose(&mut self, grip: &FrictionCurve) -> bool {
+    fn lose(&mut self, friction_curve: &FrictionCurve) -> bool {
         let mut has_moved = false;
         for side in [0, 1] {
             let ahead = self.ground[side] * self.per_rim[side] - 1.0;
             for (axle, across) in [self.across, -self.across].into_iter().enumerate() {
                 let left = (self.sideslip + across) * self.per_rim[side];
                 let slip = (ahead * ahead + left * left).sqrt();
-                let share = (grip.mu_over_slip(slip) / grip.stiffness()).max(SHARE_MIN);
+                let share =
+                    (friction_curve.mu_over_slip(slip) / friction_curve.stiffness()).max(SHARE_MIN);
                 has_moved |= (share - self.shares[side][axle]).abs() > SHARE_STEP_MIN;
                 self.shares[side][axle] = share;
             }
@@ -171,7 +172,7 @@ mod tests {
     use crate::plant::{Ground, Plant, PlantSpec};
     use crate::robot::GRAVITY_M_S2;
 
-    fn grip(stiffness: f64, peak_slip: f64) -> FrictionCurve {
+    fn friction_curve(stiffness: f64, peak_slip: f64) -> FrictionCurve {
         let shape = FrictionCurve::yi2007().into();
         let spec = FrictionSpec {
             stiffness,
@@ -213,7 +214,7 @@ mod tests {
             stiffness in (-0.7..3.0_f64).prop_map(f64::exp), peak_slip in 0.15..0.9_f64,
             curvature in -1.4..1.4_f64, speed_m_s in 0.3..0.6_f64,
         ) {
-            let curve = grip(stiffness, peak_slip);
+            let curve = friction_curve(stiffness, peak_slip);
             let compliance_m = speed_m_s * speed_m_s / (stiffness * GRAVITY_M_S2);
             // Ground that cannot hold the turn at all is not reckoned.
             prop_assume!(speed_m_s * speed_m_s * curvature.abs() < 0.5 * curve.mu_peak() * GRAVITY_M_S2);
@@ -234,8 +235,8 @@ mod tests {
             sliding_ratio in 0.0..=1.0_f64,
         ) {
             let model = RobotModel::yi2007();
-            let grip = FrictionSpec { stiffness: 1.0, peak_slip, sliding_ratio }.try_into().unwrap();
-            let turn = |curvature| Turn::steady(&model, &grip, curvature, compliance_m);
+            let friction_curve = FrictionSpec { stiffness: 1.0, peak_slip, sliding_ratio }.try_into().unwrap();
+            let turn = |curvature| Turn::steady(&model, &friction_curve, curvature, compliance_m);
             let (one, other) = (turn(curvature), turn(-curvature));
             for (one, other) in [(one.linear, other.linear), (one.beyond, other.beyond)] {
                 prop_assert!((one.sideslip + other.sideslip).abs() < 1.0e-9);
@@ -249,10 +250,10 @@ mod tests {
     #[test]
     fn without_compliance_there_is_no_sideslip_and_on_a_straight_no_slip() {
         let model = RobotModel::yi2007();
-        let bend = Turn::steady(&model, &grip(1.0, 0.2), 1.2, 0.0);
+        let bend = Turn::steady(&model, &friction_curve(1.0, 0.2), 1.2, 0.0);
         assert!(bend.beyond.sideslip.abs() < 1.0e-12, "{bend:?}");
         assert!(bend.beyond != bend.linear, "{bend:?}");
-        let straight = Turn::steady(&model, &grip(1.0, 0.2), 0.0, 0.1);
+        let straight = Turn::steady(&model, &friction_curve(1.0, 0.2), 0.0, 0.1);
         let rolls = SteadyTurn {
             sideslip: 0.0,
             rims: [1.0, 1.0],
@@ -265,7 +266,12 @@ mod tests {
     fn in_the_linear_range_a_tight_turn_takes_from_the_sideslip_what_the_square_of_the_base_says() {
         let model = RobotModel::yi2007();
         let (curvature_1_m, compliance_m) = (1.2, 1.0e-3);
-        let turn = Turn::steady(&model, &grip(1.0, 0.9), curvature_1_m, compliance_m);
+        let turn = Turn::steady(
+            &model,
+            &friction_curve(1.0, 0.9),
+            curvature_1_m,
+            compliance_m,
+        );
         let square_m2 = model.track_width_m().powi(2) + model.wheelbase_m().powi(2);
         let left = 1.0 - 0.25 * square_m2 * curvature_1_m * curvature_1_m;
         let expected = -compliance_m * curvature_1_m * left;

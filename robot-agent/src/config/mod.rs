@@ -525,7 +525,7 @@ fn simulated(
     let usual = Individual::of_seed(seed);
     let individual = listed.map_or(usual, |listed| Individual {
         seed,
-        grip_ratio: listed.grip_ratio,
+        stiffness_ratio: listed.stiffness_ratio,
         has_torque: listed.wheel_torque,
     });
     let faults = listed

@@ -9,7 +9,7 @@ use super::surface::Comparison;
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct GroundRecord {
     /// Friction coefficient that the plan was made with; none where the map knew nothing.
-    pub(crate) grip_mu: Option<f64>,
+    pub(crate) traction_limit_mu: Option<f64>,
     /// Whether the map knew this cell.
     pub(crate) is_on_the_map: bool,
     /// What the law was told.
@@ -25,7 +25,7 @@ fn is_sure(known: Option<ThetaKnowledge>) -> bool {
 /// The sums behind a [`PriorGain`].
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Gain {
-    grip_mu: Option<f64>,
+    traction_limit_mu: Option<f64>,
     known_m: f64,
     sure_s: f64,
     sure_alone_s: f64,
@@ -44,7 +44,7 @@ impl Gain {
         (dt_s, driven_m): (f64, f64),
         since_start_s: f64,
     ) {
-        self.grip_mu = ground.grip_mu.or(self.grip_mu);
+        self.traction_limit_mu = ground.traction_limit_mu.or(self.traction_limit_mu);
         if ground.is_on_the_map {
             self.known_m += driven_m;
         }
@@ -71,10 +71,10 @@ impl Gain {
 
     /// The report on a way of so many metres; none where the map knew nothing.
     pub(super) fn report(&self, distance_m: f64) -> Option<PriorGain> {
-        let grip_mu = self.grip_mu?;
+        let traction_limit_mu = self.traction_limit_mu?;
         let mean = |sum: f64| (self.compared > 0).then(|| sum / f64::from(self.compared));
         Some(PriorGain {
-            grip_mu,
+            traction_limit_mu,
             known_ratio: if distance_m > 0.0 {
                 (self.known_m / distance_m).min(1.0)
             } else {

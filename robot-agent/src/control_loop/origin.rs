@@ -44,10 +44,10 @@ impl JobOrigin {
     /// A sentence on why it cannot be driven.
     pub(crate) fn plan(&self, model: &RobotModel) -> Result<Plan, String> {
         let prior = Prior::new(self.prior.as_ref());
-        let grip = self.grid.and_then(|grid| prior.grip_map(grid));
+        let traction_limit = self.grid.and_then(|grid| prior.traction_limit_map(grid));
         let options = PlanOptions {
-            grip_mu: prior.grip_mu(),
-            grip: grip.as_ref(),
+            traction_limit_mu: prior.traction_limit_mu(),
+            traction_limits: traction_limit.as_ref(),
             ..plan_options(&self.trajectory)
         };
         let trajectory = control_trajectory(&self.trajectory);

@@ -4,8 +4,8 @@
 //! estimator alone, which does not know this module.
 
 use tread_api::site::{Cell, Grid};
-use tread_api::wire::command::{CellGrip, PathPrior};
-use tread_control::plan::{GripMap, GripSquare};
+use tread_api::wire::command::{CellTractionLimit, PathPrior};
+use tread_control::plan::{TractionLimitCell, TractionLimitMap};
 use tread_control::tracking::ThetaKnowledge;
 
 /// Standard deviations from which the robot's own measurement is believed alone: the ground is not
@@ -16,11 +16,11 @@ const CONTRADICTION_DEVIATIONS: f64 = 4.0;
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Prior {
     grid_revision: u32,
-    grip_mu: Option<f64>,
+    traction_limit_mu: Option<f64>,
     robot_bias_ratio: f64,
     /// By row and column.
     cells: Box<[(Cell, ThetaKnowledge)]>,
-    grips: Box<[CellGrip]>,
+    traction_limits: Box<[CellTractionLimit]>,
 }
 
 impl Prior {
@@ -43,30 +43,30 @@ impl Prior {
         cells.sort_by_key(|(cell, _)| (cell.iy, cell.ix));
         Self {
             grid_revision: prior.grid_revision,
-            grip_mu: Some(prior.grip_mu),
+            traction_limit_mu: Some(prior.traction_limit_mu),
             robot_bias_ratio: prior.robot_bias_ratio,
             cells: cells.into_boxed_slice(),
-            grips: prior.grips.clone().into_boxed_slice(),
+            traction_limits: prior.traction_limits.clone().into_boxed_slice(),
         }
     }
 
     /// Friction coefficient to plan with.
-    pub(crate) fn grip_mu(&self) -> Option<f64> {
-        self.grip_mu
+    pub(crate) fn traction_limit_mu(&self) -> Option<f64> {
+        self.traction_limit_mu
     }
 
     /// The same by place, if it is known for this grid.
-    pub(crate) fn grip_map(&self, grid: Grid) -> Option<GripMap> {
-        let elsewhere_mu = self.grip_mu?;
-        if grid.revision != self.grid_revision || self.grips.is_empty() {
+    pub(crate) fn traction_limit_map(&self, grid: Grid) -> Option<TractionLimitMap> {
+        let elsewhere_mu = self.traction_limit_mu?;
+        if grid.revision != self.grid_revision || self.traction_limits.is_empty() {
             return None;
         }
-        let squares = self.grips.iter().map(|grip| GripSquare {
-            ix: grip.cell.ix,
-            iy: grip.cell.iy,
-            mu: grip.mu,
+        let squares = self.traction_limits.iter().map(|limit| TractionLimitCell {
+            ix: limit.cell.ix,
+            iy: limit.cell.iy,
+            mu: limit.mu,
         });
-        GripMap::new(grid.cell_m, squares.collect(), elsewhere_mu)
+        TractionLimitMap::new(grid.cell_m, squares.collect(), elsewhere_mu)
     }
 
     /// Standard deviation of one robot's own θ around the map's, as a share of it.
@@ -119,10 +119,10 @@ mod tests {
     fn prior(cells: Vec<CellPrior>) -> PathPrior {
         PathPrior {
             grid_revision: 1,
-            grip_mu: 0.3,
+            traction_limit_mu: 0.3,
             robot_bias_ratio: 0.08,
             cells,
-            grips: Vec::new(),
+            traction_limits: Vec::new(),
         }
     }
 
@@ -143,7 +143,7 @@ mod tests {
         assert_eq!(theta(5, -2), Some(0.5));
         assert_eq!(theta(4, -3), None);
         assert_eq!(kept.at(2, Cell { ix: 0, iy: 0 }), None);
-        assert_eq!(kept.grip_mu(), Some(0.3));
+        assert_eq!(kept.traction_limit_mu(), Some(0.3));
     }
 
     #[test]
@@ -153,21 +153,24 @@ mod tests {
             cell_m: 2.0,
         };
         let at = |x_m, y_m| tread_control::geometry::Point { x_m, y_m };
-        let square = |mu| CellGrip {
+        let square = |mu| CellTractionLimit {
             cell: Cell { ix: 3, iy: -1 },
             mu,
         };
         let offered = PathPrior {
-            grips: vec![square(0.5)],
+            traction_limits: vec![square(0.5)],
             ..prior(Vec::new())
         };
         let kept = Prior::new(Some(&offered));
-        let map = kept.grip_map(grid(1)).unwrap();
+        let map = kept.traction_limit_map(grid(1)).unwrap();
         assert_eq!((map.at(at(7.0, -1.0)), map.at(at(0.0, 0.0))), (0.5, 0.3));
-        assert_eq!(kept.grip_map(grid(2)), None);
-        assert_eq!(Prior::new(Some(&prior(Vec::new()))).grip_map(grid(1)), None);
+        assert_eq!(kept.traction_limit_map(grid(2)), None);
+        assert_eq!(
+            Prior::new(Some(&prior(Vec::new()))).traction_limit_map(grid(1)),
+            None
+        );
         let offered = PathPrior {
-            grips: vec![square(-0.5)],
+            traction_limits: vec![square(-0.5)],
             ..offered
         };
         assert_eq!(Prior::new(Some(&offered)), Prior::default());
@@ -179,7 +182,7 @@ mod tests {
             let offered = prior(vec![cell(0, 0, 0.2), cell(1, 0, bad)]);
             assert_eq!(Prior::new(Some(&offered)), Prior::default());
             let offered = PathPrior {
-                grip_mu: bad,
+                traction_limit_mu: bad,
                 ..prior(Vec::new())
             };
             assert_eq!(Prior::new(Some(&offered)), Prior::default());

@@ -10,7 +10,7 @@ use super::tests::{CIRCLE, LINE, ORIGIN, bench_at, one_ground, site_of};
 use crate::bench::Bench;
 
 /// The same word on every cell around the test's ways.
-pub(super) fn everywhere(theta: f64, std_dev: f64, grip_mu: f64) -> PathPrior {
+pub(super) fn everywhere(theta: f64, std_dev: f64, traction_limit_mu: f64) -> PathPrior {
     let cell = |ix, iy| CellPrior {
         cell: Cell { ix, iy },
         theta,
@@ -18,12 +18,12 @@ pub(super) fn everywhere(theta: f64, std_dev: f64, grip_mu: f64) -> PathPrior {
     };
     PathPrior {
         grid_revision: 1,
-        grip_mu,
+        traction_limit_mu,
         robot_bias_ratio: 0.08,
         cells: (-5..20)
             .flat_map(|iy| (-5..20).map(move |ix| cell(ix, iy)))
             .collect(),
-        grips: Vec::new(),
+        traction_limits: Vec::new(),
     }
 }
 
@@ -84,13 +84,16 @@ fn a_robot_that_was_told_knows_the_ground_from_the_first_metre() {
 
 #[test]
 fn little_grip_makes_a_slower_plan() {
-    let duration_s = |grip_mu: f64| {
-        let prior = everywhere(0.2, 0.02, grip_mu);
+    let duration_s = |traction_limit_mu: f64| {
+        let prior = everywhere(0.2, 0.02, traction_limit_mu);
         let mut bench = knowing_bench(5.0, 5, Some(&prior));
         let begun = bench.now;
         assert_eq!(bench.drive_to_the_end(1, LINE), EndReason::Reached);
         bench.now.saturating_sub(begun).as_secs_f64()
     };
-    let (grip, ice) = (duration_s(0.6), duration_s(0.03));
-    assert!(ice > grip + 2.0, "{grip} s with grip, {ice} s without");
+    let (limit, ice) = (duration_s(0.6), duration_s(0.03));
+    assert!(
+        ice > limit + 2.0,
+        "{limit} s on good ground, {ice} s on ice"
+    );
 }

@@ -8,7 +8,7 @@ use super::tests::{LINE, ORIGIN, bench_at, site_of};
 use crate::bench::Bench;
 use crate::sim::scenario::Scenario;
 
-const GRIP_MU: f64 = 0.3;
+const HIGH_MU: f64 = 0.3;
 
 /// A floor with a strip across the way of [`LINE`], and what becomes of the floor.
 fn floor_with_strip(stiffness: f64, strip: f64, then: &str) -> Scenario {
@@ -37,7 +37,7 @@ stiffness = {strip}
 fn knowing(scenario: &Scenario, theta: f64, seed: u64) -> Bench {
     let mut bench = bench_at(scenario, ORIGIN, seed);
     bench.know_site(site_of(scenario)).unwrap();
-    bench.tell(&everywhere(theta, 0.02, GRIP_MU));
+    bench.tell(&everywhere(theta, 0.02, HIGH_MU));
     bench.run_for(Duration::from_millis(500));
     bench
 }
@@ -73,7 +73,7 @@ fn ground_that_is_not_as_the_map_says_is_told_while_it_is_so_and_no_longer() {
             gain.known_ratio > 0.99 && gain.cells_compared >= 5,
             "{gain:?}"
         );
-        assert!((gain.grip_mu - GRIP_MU).abs() < 1.0e-12);
+        assert!((gain.traction_limit_mu - HIGH_MU).abs() < 1.0e-12);
         // It knew its ground from the start, and would not have known it alone.
         assert!(gain.sure_s > gain.sure_alone_s + 1.0, "{gain:?}");
         let first_s = gain.first_sure_alone_s.unwrap();
@@ -98,7 +98,7 @@ fn a_robot_that_was_told_nothing_reports_no_gain() {
 
 #[test]
 fn wheels_that_turn_without_progress_are_told_until_they_take_the_robot_on() {
-    // No grip at all for a while, then a floor.
+    // No friction at all for a while, then a floor.
     let scenario = floor_with_strip(0.004, 0.004, "{ after_s = 9.0, stiffness = 5.0 }");
     let mut bench = bench_at(&scenario, ORIGIN, 8);
     bench.know_site(site_of(&scenario)).unwrap();

@@ -55,10 +55,10 @@ pub(super) fn findings(
 fn friction(model: &RobotModel, turned: &Drove) -> Option<[f64; 2]> {
     let (torques, wheels) = (turned.torques?, turned.wheels?);
     let along = model.wheelbase_m() / model.wheelbase_m().hypot(model.track_width_m());
-    let grip_n_m = model.wheel_radius_m() * model.side_load_n() * along;
+    let traction_n_m = model.wheel_radius_m() * model.side_load_n() * along;
     Some([
-        torques.left_n_m * wheels.left_rad_s.signum() / grip_n_m,
-        torques.right_n_m * wheels.right_rad_s.signum() / grip_n_m,
+        torques.left_n_m * wheels.left_rad_s.signum() / traction_n_m,
+        torques.right_n_m * wheels.right_rad_s.signum() / traction_n_m,
     ])
 }
 

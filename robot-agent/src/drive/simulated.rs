@@ -84,7 +84,7 @@ pub struct Individual {
     /// What makes its noise, offsets and rolling radii its own.
     pub seed: u64,
     /// How much stiffer any ground is on its tyres than the scenario says.
-    pub grip_ratio: f64,
+    pub stiffness_ratio: f64,
     /// Whether it measures wheel torque.
     pub has_torque: bool,
 }
@@ -94,7 +94,7 @@ impl Individual {
     pub fn of_seed(seed: u64) -> Self {
         Self {
             seed,
-            grip_ratio: 1.0,
+            stiffness_ratio: 1.0,
             has_torque: true,
         }
     }
@@ -114,7 +114,7 @@ impl SimulatedDrive {
     ) -> Result<Self, SimulatedDriveError> {
         let Individual {
             seed,
-            grip_ratio,
+            stiffness_ratio,
             has_torque,
         } = individual;
         let sensors = Sensors::new(SensorSpec::default(), &model, seed);
@@ -127,7 +127,7 @@ impl SimulatedDrive {
         Ok(Self {
             mode,
             plant: Plant::new(model, spec, start)?,
-            ground: GroundMap::new(scenario, grip_ratio)?,
+            ground: GroundMap::new(scenario, stiffness_ratio)?,
             sensors,
             faults: Faults::default(),
             track_width_m: model.track_width_m(),

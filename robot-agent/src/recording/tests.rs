@@ -211,7 +211,7 @@ fn a_day_with_all_that_happens_runs_again_to_the_bit() {
     });
     bench.tell(&PathPrior {
         grid_revision: 1,
-        grip_mu: 0.3,
+        traction_limit_mu: 0.3,
         robot_bias_ratio: 0.08,
         cells: (0..40)
             .map(|place| CellPrior {
@@ -223,7 +223,7 @@ fn a_day_with_all_that_happens_runs_again_to_the_bit() {
                 std_dev: 0.02,
             })
             .collect(),
-        grips: Vec::new(),
+        traction_limits: Vec::new(),
     });
     drive(&mut bench, 5 * SECOND);
     let mission = bench.starts[0];

@@ -34,11 +34,11 @@ pub struct GroundMap {
 }
 
 impl GroundMap {
-    /// The true ground of a scenario for a robot on whose tyres it is stiffer by `grip_ratio`.
+    /// The true ground of a scenario for a robot on whose tyres it is stiffer by `stiffness_ratio`.
     ///
     /// # Errors
     /// [`ScenarioError`] for figures that a parsed scenario cannot have.
-    pub fn new(scenario: &Scenario, grip_ratio: f64) -> Result<Self, ScenarioError> {
+    pub fn new(scenario: &Scenario, stiffness_ratio: f64) -> Result<Self, ScenarioError> {
         let malformed = |problem: String| ScenarioError::Malformed {
             file: scenario.site.to_string(),
             problem,
@@ -55,7 +55,7 @@ impl GroundMap {
             let outline = terrain.outline().map_err(malformed)?;
             let curve = |ground: GroundSpec| {
                 let felt = GroundSpec {
-                    stiffness: ground.stiffness * grip_ratio,
+                    stiffness: ground.stiffness * stiffness_ratio,
                     ..ground
                 };
                 felt.curve().map_err(malformed)
@@ -74,7 +74,7 @@ impl GroundMap {
             });
         }
         let elsewhere = GroundSpec {
-            stiffness: scenario.ground.stiffness * grip_ratio,
+            stiffness: scenario.ground.stiffness * stiffness_ratio,
             ..scenario.ground
         };
         let elsewhere = elsewhere.curve().map_err(malformed)?;

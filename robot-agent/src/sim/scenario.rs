@@ -20,7 +20,7 @@ pub const BUILT_IN: &str = include_str!("../../scenarios/yard.toml");
 /// What [`BUILT_IN`] is called in error messages and on the command line.
 pub const BUILT_IN_NAME: &str = "yard";
 /// How much tyres may differ from what the scenario says of the ground.
-pub const GRIP_RATIO_RANGE: std::ops::RangeInclusive<f64> = 0.2..=5.0;
+pub const STIFFNESS_RATIO_RANGE: std::ops::RangeInclusive<f64> = 0.2..=5.0;
 /// Latest change of the ground, seconds.
 const CHANGE_AFTER_MAX_S: f64 = 1.0e6;
 /// Largest scenario file, bytes.
@@ -215,9 +215,9 @@ pub struct ScenarioRobot {
     /// What makes its noise, offsets and rolling radii its own.
     pub seed: u64,
     /// How much stiffer any ground is on its tyres than the scenario says, within
-    /// [`GRIP_RATIO_RANGE`].
-    #[serde(default = "default_grip_ratio")]
-    pub grip_ratio: f64,
+    /// [`STIFFNESS_RATIO_RANGE`].
+    #[serde(default = "default_stiffness_ratio", alias = "grip_ratio")]
+    pub stiffness_ratio: f64,
     /// Whether its base measures wheel torque.
     #[serde(default = "default_wheel_torque")]
     pub wheel_torque: bool,
@@ -226,7 +226,7 @@ pub struct ScenarioRobot {
     pub faults: Vec<Fault>,
 }
 
-fn default_grip_ratio() -> f64 {
+fn default_stiffness_ratio() -> f64 {
     1.0
 }
 
@@ -343,12 +343,12 @@ impl Scenario {
             if !(start.is_on_the_map() && robot.heading_rad.is_finite()) {
                 return Err(refused("x_m, y_m or heading_rad is no place".to_owned()));
             }
-            if !GRIP_RATIO_RANGE.contains(&robot.grip_ratio) {
+            if !STIFFNESS_RATIO_RANGE.contains(&robot.stiffness_ratio) {
                 return Err(refused(format!(
-                    "grip_ratio must be {} to {}, not {}",
-                    GRIP_RATIO_RANGE.start(),
-                    GRIP_RATIO_RANGE.end(),
-                    robot.grip_ratio
+                    "stiffness_ratio must be {} to {}, not {}",
+                    STIFFNESS_RATIO_RANGE.start(),
+                    STIFFNESS_RATIO_RANGE.end(),
+                    robot.stiffness_ratio
                 )));
             }
             if robot.faults.len() > FAULTS_MAX {
@@ -461,7 +461,7 @@ speed_m_s = 0.5
                 "seed = 1",
                 "seed = 1\ngrip_ratio = nan",
                 "line 11",
-                "grip_ratio",
+                "stiffness_ratio",
             ),
             (
                 "seed = 1",

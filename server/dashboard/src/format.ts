@@ -1,11 +1,11 @@
 // Numbers and times for people. What is not known is a dash.
-import { words } from './words';
+import { texts } from './texts';
 
 const cache = new Map<number, Intl.NumberFormat>();
 
 /** A number with a fixed count of digits after the point. */
 export function number(value: number | null | undefined, digits: number): string {
-  if (value === null || value === undefined || !Number.isFinite(value)) return words.unknown;
+  if (value === null || value === undefined || !Number.isFinite(value)) return texts.unknown;
   let format = cache.get(digits);
   if (!format) {
     format = new Intl.NumberFormat('en', {
@@ -21,7 +21,7 @@ export function number(value: number | null | undefined, digits: number): string
 
 /** A number with three significant digits. */
 export function short(value: number | null | undefined): string {
-  if (value === null || value === undefined || !Number.isFinite(value)) return words.unknown;
+  if (value === null || value === undefined || !Number.isFinite(value)) return texts.unknown;
   if (value === 0) return '0';
   const digits = Math.max(0, 2 - Math.floor(Math.log10(Math.abs(value))));
   return number(value, Math.min(digits, 6));
@@ -30,13 +30,13 @@ export function short(value: number | null | undefined): string {
 /** A value with its unit. */
 export function unit(value: number | null | undefined, digits: number, name: string): string {
   const text = number(value, digits);
-  return text === words.unknown ? text : `${text} ${name}`;
+  return text === texts.unknown ? text : `${text} ${name}`;
 }
 
 /** A span, as short as it can be read. */
 export function span(seconds: number | null | undefined): string {
-  if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return words.unknown;
-  const { s, min, h, d } = words.unit;
+  if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return texts.unknown;
+  const { s, min, h, d } = texts.unit;
   const passed = Math.max(0, seconds);
   if (passed < 10) return `${number(passed, 1)} ${s}`;
   if (passed < 60) return `${number(passed, 0)} ${s}`;

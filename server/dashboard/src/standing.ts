@@ -1,23 +1,23 @@
 // Whether a robot stands where it is to: commanded is one thing, measured another.
 
 import type { RobotLive, Stop } from './api/schema';
-import { words } from './words';
+import { texts } from './texts';
 
 /** What a robot does; where it is stopped whether it stands, and in any case that it does not. */
 export function doing(live: RobotLive | null | undefined): { text: string; isBad: boolean } {
-  if (!live) return { text: words.unknown, isBad: false };
+  if (!live) return { text: texts.unknown, isBad: false };
   const standing = live.safety.standing?.state;
-  if (standing === 'does_not_stand' || standing === 'moves') return { text: words.standing[standing], isBad: true };
+  if (standing === 'does_not_stand' || standing === 'moves') return { text: texts.standing[standing], isBad: true };
   const isStopped = live.mode === 'stopped' && (standing === 'stopping' || standing === 'standing');
-  return { text: isStopped ? words.standing[standing] : words.mode[live.mode], isBad: false };
+  return { text: isStopped ? texts.standing[standing] : texts.mode[live.mode], isBad: false };
 }
 
 /** A stop that is in force: unconfirmed, stopping, standing, or not obeyed. */
 export function stopped(stop: Stop, live: RobotLive | null | undefined): { text: string; look: 'held' | 'red' } {
   const standing = live?.safety.standing?.state;
-  if (!stop.confirmed_at) return { text: words.stop.unconfirmed(stop.robot), look: 'red' };
-  if (standing === 'does_not_stand') return { text: words.stop.runs(stop.robot), look: 'red' };
-  if (standing === 'moves') return { text: words.stop.moves(stop.robot), look: 'red' };
+  if (!stop.confirmed_at) return { text: texts.stop.unconfirmed(stop.robot), look: 'red' };
+  if (standing === 'does_not_stand') return { text: texts.stop.runs(stop.robot), look: 'red' };
+  if (standing === 'moves') return { text: texts.stop.moves(stop.robot), look: 'red' };
   const stands = standing === 'standing' || (standing === undefined && stop.standing_at);
-  return { text: stands ? words.stop.confirmed(stop.robot) : words.stop.stopping(stop.robot), look: 'held' };
+  return { text: stands ? texts.stop.confirmed(stop.robot) : texts.stop.stopping(stop.robot), look: 'held' };
 }

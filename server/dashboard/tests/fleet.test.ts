@@ -171,7 +171,7 @@ test('ground that has changed is red where θ rose, blue where it fell, and grey
         answer.items = answer.items.map((cell, index) => {
           const factor = before[index % 3] ?? 1;
           const was = cell.after ? { ...cell.after, theta: cell.after.theta * factor } : null;
-          return { ...cell, before: was, deviations: factor === 1 ? 0.3 : factor < 1 ? 6 : -6 };
+          return { ...cell, before: was, z_score: factor === 1 ? 0.3 : factor < 1 ? 6 : -6 };
         });
         cells.push(...answer.items);
         await route.fulfill({ response, json: answer });
@@ -187,9 +187,9 @@ test('ground that has changed is red where θ rose, blue where it fell, and grey
   const canvas = page.getByRole('application', { name: /^Map/ });
   const isSeen = ({ cell }: CellDifference) => place(cell.ix + 1, 0).x < box.x + box.width - 280;
   for (const [rest, said, colour] of [
-    [0, '50.0 %, 6.0 deviations', changeColour(shareOfChange(1.5))],
-    [1, '-50.0 %, -6.0 deviations', changeColour(-1)],
-    [2, '0.0 %, 0.3 deviations', changeColour(0)],
+    [0, '50.0 %, 6.0 standard deviations', changeColour(shareOfChange(1.5))],
+    [1, '-50.0 %, -6.0 standard deviations', changeColour(-1)],
+    [2, '0.0 %, 0.3 standard deviations', changeColour(0)],
   ] as const) {
     const shown = cells.find((cell, index) => index % 3 === rest && cell.after && isSeen(cell));
     if (!shown) throw new Error(`no cell of kind ${rest} can be pointed at`);

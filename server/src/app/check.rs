@@ -397,7 +397,7 @@ fn binding(plan: &Plan, slowed: &Slowed) -> Binding {
             SlowedBy::WheelSpeed => BindingLimit::WheelSpeed,
             SlowedBy::WheelAcceleration => BindingLimit::WheelAcceleration,
             SlowedBy::LinearAcceleration => BindingLimit::LinearAcceleration,
-            SlowedBy::Grip => BindingLimit::Grip,
+            SlowedBy::Traction => BindingLimit::Traction,
         },
         from: place(slowed.from_m),
         to: place(slowed.to_m),
@@ -492,7 +492,7 @@ fn plan_options(asked: &Trajectory) -> PlanOptions<'static> {
             depth_ratio: excitation.depth_ratio,
             period_s: excitation.period_s,
         }),
-        grip_mu: None,
-        grip: None,
+        traction_limit_mu: None,
+        traction_limits: None,
     }
 }

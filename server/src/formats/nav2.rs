@@ -5,7 +5,7 @@
 //! picture is read in the mode `scale`, in which 0 (black) is 100 and 255 (white) is 0.
 //!
 //! The speed is the one from which a robot stops within a distance: `v² = 2·a·s`, where `a` comes
-//! from the grip as the robots' own planner takes it. Where nothing is known the cautious grip
+//! from the traction limit as the robots' own planner takes it. Where nothing is known the cautious traction limit
 //! counts, so that unknown ground is slow, not free.
 
 use tread_control::robot::RobotModel;
@@ -30,8 +30,8 @@ pub struct SpeedScale {
 }
 
 /// The speed from which a robot stops within the distance, metres per second.
-fn speed_m_s(grip_mu: f64, scale: SpeedScale) -> f64 {
-    (2.0 * RobotModel::grip_along_m_s2(grip_mu) * scale.stopping_m).sqrt()
+fn speed_m_s(traction_limit_mu: f64, scale: SpeedScale) -> f64 {
+    (2.0 * RobotModel::grip_along_m_s2(traction_limit_mu) * scale.stopping_m).sqrt()
 }
 
 /// The value of a cell: whole hundredths, rounded down, at least one (0 would be no limit at all).
@@ -56,7 +56,7 @@ pub fn pgm(raster: &Raster, scale: SpeedScale) -> Vec<u8> {
     for row in raster.rows().rev() {
         bytes.extend(row.iter().map(|square| {
             let value = value(
-                speed_m_s(KnownCell::grip_mu(square.known().as_ref()), scale),
+                speed_m_s(KnownCell::traction_limit_mu(square.known().as_ref()), scale),
                 scale,
             );
             255 - u8::try_from((u32::from(value) * 255 + 50) / 100).unwrap_or(u8::MAX)

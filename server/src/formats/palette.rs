@@ -43,8 +43,8 @@ pub fn share(theta: f64) -> f64 {
 }
 
 /// How unsure a value is, 0 to 1.
-pub fn doubt(relative_deviation: f64) -> f64 {
-    ((relative_deviation - SURE) / (UNSURE - SURE)).clamp(0.0, 1.0)
+pub fn doubt(relative_std_dev: f64) -> f64 {
+    ((relative_std_dev - SURE) / (UNSURE - SURE)).clamp(0.0, 1.0)
 }
 
 /// The colour of a share from 0 to 1, drawn towards grey by `doubt` from 0 to 1.

@@ -7,12 +7,12 @@
 
 pub mod fixed;
 pub mod fuse;
-pub mod grip;
 pub mod index;
 mod joined;
 pub mod raster;
 mod seen;
 pub mod sums;
+pub mod traction_limit;
 pub mod weights;
 
 use jiff::Timestamp;

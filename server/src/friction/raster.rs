@@ -5,8 +5,8 @@ use tread_api::geometry::Point;
 use tread_api::ids::ConfigurationId;
 use tread_api::site::{Cell, Site};
 
-use super::grip::grip_mu;
 use super::index::{CellSummary, KnownCell};
+use super::traction_limit::traction_limit_mu;
 
 /// The map as squares.
 #[derive(Debug, Clone, PartialEq)]
@@ -82,8 +82,8 @@ impl Raster {
 
 impl KnownCell {
     /// Friction coefficient to plan with; the cautious one where nothing is known.
-    pub fn grip_mu(known: Option<&Self>) -> f64 {
+    pub fn traction_limit_mu(known: Option<&Self>) -> f64 {
         let upper = |known: &Self| known.theta + NORMAL_90 * known.std_dev;
-        grip_mu(known.and_then(|known| known.mu_peak), known.map(upper))
+        traction_limit_mu(known.and_then(|known| known.mu_peak), known.map(upper))
     }
 }

@@ -344,7 +344,7 @@ async fn every_representation_has_a_tag_of_its_own_that_changes_when_its_content
     let (status, said) = yard.post(path, &json!({"reason": "worn tyres"})).await;
     assert_eq!(status, StatusCode::CREATED, "{said}");
     for (tag, path) in &tags {
-        // Speeds follow from the grip, which is the same as before; so is the mask's YAML.
+        // Speeds follow from the traction limit, which is the same as before; so is the mask's YAML.
         if ["robot=rover-1", "nav2", "pgm"]
             .iter()
             .any(|same| path.contains(same))

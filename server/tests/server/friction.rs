@@ -203,7 +203,7 @@ async fn a_terrain_has_a_history_and_cells_differ_between_two_times() {
         "{item:?}"
     );
     assert!(after.changed_at.is_some());
-    assert!(item.deviations.unwrap() > 5.0, "{item:?}");
+    assert!(item.z_score.unwrap() > 5.0, "{item:?}");
     yard.server.stop().await.unwrap();
 }
 
@@ -236,15 +236,18 @@ async fn a_path_tells_what_is_known_and_how_fast_it_may_be_driven() {
             .unwrap()
     };
     let (ice, unknown) = (piece(15), piece(22));
-    assert!(close(piece(12).grip_mu, 0.4), "shown of late");
-    assert!(close(piece(5).grip_mu, 0.14), "shown ten hours ago");
+    assert!(close(piece(12).traction_limit_mu, 0.4), "shown of late");
     assert!(
-        ice.grip_mu < 0.14 && ice.theta_upper_95.unwrap() > 1.5,
+        close(piece(5).traction_limit_mu, 0.14),
+        "shown ten hours ago"
+    );
+    assert!(
+        ice.traction_limit_mu < 0.14 && ice.theta_upper_95.unwrap() > 1.5,
         "{ice:?}"
     );
     assert_eq!(unknown.theta, None);
     assert!(
-        close(unknown.grip_mu, 0.14),
+        close(unknown.traction_limit_mu, 0.14),
         "cautious where nothing is known"
     );
     let speeds: Vec<f64> = path.pieces.iter().map(|piece| piece.speed_m_s).collect();
@@ -295,7 +298,11 @@ async fn a_path_that_nobody_has_driven_says_so() {
         for layer in ["theta", "std_dev", "theta_upper_95", "age_s"] {
             assert_eq!(piece[layer], Value::Null, "unknown stays null: {piece}");
         }
-        assert_eq!(piece["grip_mu"], json!(0.14), "the cautious one: {piece}");
+        assert_eq!(
+            piece["traction_limit_mu"],
+            json!(0.14),
+            "the cautious one: {piece}"
+        );
     }
     yard.server.stop().await.unwrap();
 }
@@ -420,24 +427,27 @@ async fn a_dispatch_tells_the_robot_what_the_map_knows_along_its_way() {
     assert!((prior.cells[2].theta - 0.2).abs() < 0.01, "{prior:?}");
     assert!((prior.cells[8].theta - 0.05).abs() < 0.01, "{prior:?}");
     assert!(
-        close(prior.grip_mu, 0.14),
+        close(prior.traction_limit_mu, 0.14),
         "nothing was shown there of late"
     );
     assert!(close(prior.robot_bias_ratio, 0.08));
-    let grips: Vec<(i32, f64)> = prior
-        .grips
+    let traction_limits: Vec<(i32, f64)> = prior
+        .traction_limits
         .iter()
-        .map(|grip| (grip.cell.ix, grip.mu))
+        .map(|limit| (limit.cell.ix, limit.mu))
         .collect();
-    let columns: Vec<i32> = grips.iter().map(|(ix, _)| *ix).collect();
+    let columns: Vec<i32> = traction_limits.iter().map(|(ix, _)| *ix).collect();
     assert_eq!(
         columns,
         [5, 6, 7, 8, 9, 10, 11, 12],
         "every cell of the way"
     );
-    for &(ix, mu) in &grips {
+    for &(ix, mu) in &traction_limits {
         let shown = if ix < 10 { 0.14 } else { 0.4 };
-        assert!(close(mu, shown), "as each terrain has shown: {grips:?}");
+        assert!(
+            close(mu, shown),
+            "as each terrain has shown: {traction_limits:?}"
+        );
     }
     // Ice two cells farther on the road: the road may be frozen here too, the lawn is not.
     let ice = (0..2).map(|number| {
@@ -447,15 +457,15 @@ async fn a_dispatch_tells_the_robot_what_the_map_knows_along_its_way() {
     });
     robot.upload(numbered(ice)).await.unwrap();
     let prior = offered(5.5, 0.5).await.unwrap();
-    for grip in &prior.grips {
-        let is_road = grip.cell.ix > 10;
+    for limit in &prior.traction_limits {
+        let is_road = limit.cell.ix > 10;
         // In the border cell lies some of both.
         assert!(
-            grip.cell.ix == 10 || (grip.mu < 0.139) == is_road,
-            "{grip:?}"
+            limit.cell.ix == 10 || (limit.mu < 0.139) == is_road,
+            "{limit:?}"
         );
     }
-    assert!(prior.grip_mu < 0.139, "{prior:?}");
+    assert!(prior.traction_limit_mu < 0.139, "{prior:?}");
     yard.server.stop().await.unwrap();
 }
 
@@ -472,7 +482,7 @@ async fn visits_are_worth_most_where_nothing_is_known_and_robots_show_their_bias
             .items
             .is_sorted_by(|left, right| left.gain >= right.gain)
     );
-    assert_eq!(visits.items[0].relative_deviation, None, "unknown first");
+    assert_eq!(visits.items[0].relative_std_dev, None, "unknown first");
     assert!(
         visits.items.iter().all(|item| item.cell.ix < 20),
         "nobody is sent where nothing is drawn"

@@ -359,7 +359,7 @@ async fn arrive(
         arrivals.push(Arrival {
             robot: robot.clone(),
             course: Some([of(&sites[0])?, of(&sites[1])?]),
-            grip_mu: gain_of(with).map(|gain| gain.grip_mu),
+            traction_limit_mu: gain_of(with).map(|gain| gain.traction_limit_mu),
             ends: vec![with.mission.state, without.mission.state],
             stop: None,
         });
@@ -400,7 +400,7 @@ async fn stop_on_ice(
         .map(|((with, without), entry)| Arrival {
             robot: entry.robot.clone(),
             course: None,
-            grip_mu: None,
+            traction_limit_mu: None,
             ends: Vec::new(),
             stop: Some([*with, *without]),
         })

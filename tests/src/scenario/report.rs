@@ -64,7 +64,7 @@ pub struct Arrival {
     /// How the bend and the end on the ice went.
     pub course: Option<[Tracking; 2]>,
     /// Friction coefficient that the map told it to plan with where it was lowest.
-    pub grip_mu: Option<f64>,
+    pub traction_limit_mu: Option<f64>,
     /// How the missions ended.
     pub ends: Vec<MissionState>,
     /// How it stopped on the ice.

@@ -196,7 +196,7 @@ pub fn put(
             heading_rad: std::f64::consts::FRAC_PI_2,
             // Below 2^53, as every number of a file.
             seed: random.next_u64() >> 12,
-            grip_ratio: (1.0 + bias).recip(),
+            stiffness_ratio: (1.0 + bias).recip(),
             wheel_torque: row.has_torque,
             faults: Vec::new(),
         });

@@ -14,7 +14,7 @@ use tread_tests::scenario::yard::{Kind, way};
 /// θ of the only ground.
 const THETA: f64 = 0.4;
 
-/// One ground everywhere, and robots side by side at its south: name, grip of the tyres.
+/// One ground everywhere, and robots side by side at its south: name, stiffness of the tyres.
 fn field(robots: &[(&str, f64)]) -> Scenario {
     let text = r#"
 site = "field"
@@ -27,14 +27,14 @@ polygon = [[-40, -40], [40, -40], [40, 40], [-40, 40]]
 stiffness = 2.5
 "#;
     let mut scenario = Scenario::parse("field", text).unwrap();
-    for (&(name, grip_ratio), seed) in robots.iter().zip(40..) {
+    for (&(name, stiffness_ratio), seed) in robots.iter().zip(40..) {
         scenario.robots.push(ScenarioRobot {
             id: name.parse().unwrap(),
             x_m: 0.0,
             y_m: 0.0,
             heading_rad: 0.0,
             seed,
-            grip_ratio,
+            stiffness_ratio,
             wheel_torque: true,
             faults: Vec::new(),
         });
@@ -140,7 +140,7 @@ async fn a_map_made_wrong_by_one_robot_leads_no_other_robot_astray() {
     );
     let alerts = surface_alerts(&world, "sound").await;
     assert_eq!(alerts.len(), 1, "{alerts:?}");
-    assert!(alerts[0].text.contains("grips better"), "{alerts:?}");
+    assert!(alerts[0].text.contains("has more friction"), "{alerts:?}");
     // Without the robot that was wrong the map is as if it had never come.
     let path = "/v1/sites/field/robots/worn/withdrawals";
     let body = serde_json::json!({"reason": "worn tyres"});

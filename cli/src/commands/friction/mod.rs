@@ -1,4 +1,4 @@
-//! `tread friction`: how the ground grips, and how sure that is.
+//! `tread friction`: friction of the ground and its uncertainty.
 
 mod tables;
 

@@ -186,7 +186,7 @@ pub(super) fn path(path: &PathFriction) -> String {
         "± SD",
         "95 % BELOW",
         "AGE",
-        "GRIP MU",
+        "MU LIMIT",
         "SPEED M/S",
     ]);
     for piece in &path.pieces {
@@ -200,7 +200,7 @@ pub(super) fn path(path: &PathFriction) -> String {
             number(piece.std_dev, 4),
             number(piece.theta_upper_95, 4),
             seconds(piece.age_s),
-            format!("{:.2}", piece.grip_mu),
+            format!("{:.2}", piece.traction_limit_mu),
             format!("{:.2}", piece.speed_m_s),
         ]);
     }
@@ -229,7 +229,7 @@ pub(super) fn differences(Known { items, of }: &Known<CellDifference>) -> String
         "THETA BEFORE",
         "THETA AFTER",
         "CHANGE",
-        "IN DEVIATIONS",
+        "Z SCORE",
     ]);
     let theta = |friction: &Option<FusedFriction>| match friction {
         Some(known) if is_sure(known) => format!("{:.4} ± {:.4}", known.theta, known.std_dev),
@@ -256,7 +256,7 @@ pub(super) fn differences(Known { items, of }: &Known<CellDifference>) -> String
             theta(&cell.before),
             theta(&cell.after),
             change,
-            or_dash(cell.deviations.map(|many| format!("{many:+.1}"))),
+            or_dash(cell.z_score.map(|many| format!("{many:+.1}"))),
         ]);
     }
     of_time(*of, &render(&table))
@@ -276,7 +276,7 @@ pub(super) fn visits(as_of: Option<Timestamp>, visits: &[VisitSuggestion]) -> St
         "DISPUTED",
     ]);
     for visit in visits {
-        let known = visit.relative_deviation;
+        let known = visit.relative_std_dev;
         table.add_row([
             format!("{:.2}", visit.center.x_m),
             format!("{:.2}", visit.center.y_m),
@@ -344,7 +344,7 @@ mod tests {
     fn row(before: &Value, after: &Value) -> String {
         let cell: CellDifference = serde_json::from_value(json!({
             "cell": {"ix": 4, "iy": 2}, "terrain": null, "before": before, "after": after,
-            "configuration": "8c8722f3-7240-59d0-bde2-495b2d9205b8", "deviations": null,
+            "configuration": "8c8722f3-7240-59d0-bde2-495b2d9205b8", "z_score": null,
         }))
         .unwrap();
         let known = Known {

@@ -293,12 +293,12 @@ fn from_standstill(threads: usize, found: &mut Found) {
                 heading_rad,
             };
             let curve = FrictionCurve::with_stiffness(stiffness).expect("stiffness is positive");
-            let grip_mu = Some(curve.mu_peak());
+            let traction_limit_mu = Some(curve.mu_peak());
             (
                 name,
                 stiffness,
                 arrival(start, stiffness, None),
-                arrival(start, stiffness, grip_mu),
+                arrival(start, stiffness, traction_limit_mu),
             )
         },
     );
@@ -307,11 +307,11 @@ fn from_standstill(threads: usize, found: &mut Found) {
         "\nFrom rest 3 m off the circle, seconds until inside 5 cm for good; in brackets with the \
          peak friction known to the plan.\n\n| K | start | s |\n|---|---|---|"
     );
-    for (name, stiffness, arrival, gripped) in rows {
+    for (name, stiffness, arrival, limited) in rows {
         let _ = writeln!(
             found.text,
             "| {stiffness} | {name} | {:.2} ({:.2}) |",
-            arrival.time_s, gripped.time_s
+            arrival.time_s, limited.time_s
         );
         let name = format!("K {stiffness}, 3 m {name}");
         let checks = &mut found.checks;
@@ -336,12 +336,12 @@ struct Arrival {
     wheel_share: f64,
 }
 
-fn arrival(start: Pose, stiffness: f64, grip_mu: Option<f64>) -> Arrival {
+fn arrival(start: Pose, stiffness: f64, traction_limit_mu: Option<f64>) -> Arrival {
     const LOOP_S: f64 = 0.01;
     let model = RobotModel::yi2007();
     let options = PlanOptions {
         approach_speed_m_s: Some(model.limits().linear_max_m_s),
-        grip_mu,
+        traction_limit_mu,
         ..PlanOptions::default()
     };
     let plan = Plan::with_options(&courses::circle_trajectory(), start, &model, &options)

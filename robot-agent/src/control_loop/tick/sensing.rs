@@ -1,4 +1,4 @@
-//! What the base says: where the robot is, how the ground grips, and what is broken.
+//! What the base says: where the robot is, the friction of the ground, and what is broken.
 
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -163,7 +163,7 @@ impl LoopCore {
             prior.at(grid.revision, cell)
         });
         GroundRecord {
-            grip_mu: prior.grip_mu(),
+            traction_limit_mu: prior.traction_limit_mu(),
             is_on_the_map: mapped.is_some(),
             told: told(measured, mapped),
             measured,

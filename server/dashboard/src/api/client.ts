@@ -1,6 +1,6 @@
 // Asks the server: one function, one kind of error.
 import type { ProblemBody } from './schema';
-import { words } from '../words';
+import { texts } from '../texts';
 
 /** How long an answer may take, milliseconds; the server's own bound is 15 s. */
 const ANSWER_MAX_MS = 16_000;
@@ -57,15 +57,15 @@ export async function ask<T>(path: string, asked: Asked = {}): Promise<T> {
   try {
     response = await fetch(path, init);
   } catch {
-    throw new Problem(words.problem.lost, 0);
+    throw new Problem(texts.problem.lost, 0);
   }
   if (response.status === 204) return undefined as T;
   let body: unknown;
   try {
     body = await response.json();
   } catch {
-    if (response.ok) throw new Problem(words.problem.lost, 0);
-    throw new Problem(words.problem.unreadable(response.status), response.status);
+    if (response.ok) throw new Problem(texts.problem.lost, 0);
+    throw new Problem(texts.problem.unreadable(response.status), response.status);
   }
   if (response.ok) return body as T;
   const problem = body as ProblemBody;

@@ -5,7 +5,7 @@ import { CHANGE_TICKS, changeColour, changePercent, lookOf, shareOfChange } from
 /** A cell whose θ was one value and is another, so many deviations apart. */
 function cell(before: number | null, after: number | null, deviations: number | null): CellDifference {
   const known = (theta: number | null) => (theta === null ? null : { theta, std_dev: 0.01 });
-  return { cell: { ix: 0, iy: 0 }, before: known(before), after: known(after), deviations } as CellDifference;
+  return { cell: { ix: 0, iy: 0 }, before: known(before), after: known(after), z_score: deviations } as CellDifference;
 }
 
 test('where θ rose a cell is red, where it fell blue, and the more the further', () => {

@@ -34,7 +34,7 @@ export function changePercent(cell: CellDifference): number | null {
 /** How a cell looks: coloured as far as it really changed, hatched where one time knows nothing. */
 export function lookOf(cell: CellDifference): Look {
   const percent = changePercent(cell);
-  const isChance = Math.abs(cell.deviations ?? 0) < CHANCE;
+  const isChance = Math.abs(cell.z_score ?? 0) < CHANCE;
   const share = percent === null || isChance ? 0 : shareOfChange(1 + percent / 100);
   return { colour: changeColour(share), isHatched: percent === null };
 }
@@ -42,7 +42,7 @@ export function lookOf(cell: CellDifference): Look {
 /** Where two terrains or models share a cell, the one that changed most. */
 export class Comparison extends Raster<CellDifference> {
   constructor(cells: CellDifference[], cellM: number) {
-    const strength = (cell: CellDifference) => Math.abs(cell.deviations ?? 0);
+    const strength = (cell: CellDifference) => Math.abs(cell.z_score ?? 0);
     super(cells, cellM, (known, other) => strength(other) > strength(known));
     this.paint(lookOf);
   }

@@ -3,7 +3,7 @@ import type { Cell, Geofence, Mission, Terrain, Trajectory } from '../api/schema
 import type { Tracked } from '../state/tracked';
 import type { Theme } from '../state/session.svelte';
 import { span } from '../format';
-import { words } from '../words';
+import { texts } from '../texts';
 import { roundUp, type Camera, type PointM } from './camera';
 import type { Draft } from './draft';
 import { HATCHED_CELL_PX, drawFriction } from './draw_friction';
@@ -116,7 +116,7 @@ function drawTerrains(context: CanvasRenderingContext2D, camera: Camera, scene: 
   }
   for (const terrain of terrains) {
     const at = camera.toPx(labelPlace(terrain.polygon));
-    const text = `${terrain.name} · ${words.terrains.classes[terrain.class]}`;
+    const text = `${terrain.name} · ${texts.terrains.classes[terrain.class]}`;
     // From far names would only cover each other.
     if (context.measureText(text).width > widthM(terrain.polygon) * camera.scale) continue;
     label(context, text, at.x, at.y, palette.text, palette);
@@ -362,8 +362,8 @@ function drawRobot(
   context.restore();
   if (!withLabel && !isSelected) return;
   const age = tracked.ageS(scene.now);
-  const note = (isLost || scene.isOld) && age !== null ? ` · ${words.robots.lastKnown}, ${words.robots.age(span(age))}` : '';
-  const late = robot.link === 'stale' && !scene.isOld ? ` · ${words.link.stale}` : '';
+  const note = (isLost || scene.isOld) && age !== null ? ` · ${texts.robots.lastKnown}, ${texts.robots.age(span(age))}` : '';
+  const late = robot.link === 'stale' && !scene.isOld ? ` · ${texts.link.stale}` : '';
   label(context, `${robot.name}${late}${note}`, x + length / 2 + 7, y - 6, colour, palette);
 }
 

@@ -1,10 +1,10 @@
 // The friction layer: cells to an image, with a fixed range for each quantity.
 import type { CellFriction, FusedFriction } from '../api/schema';
-import { words } from '../words';
+import { texts } from '../texts';
 import { colour } from './cividis';
 import { Raster } from './raster';
 
-export type Quantity = 'theta' | 'stiffness' | 'grip' | 'age' | 'visits';
+export type Quantity = 'theta' | 'stiffness' | 'friction' | 'age' | 'visits';
 
 export interface Range {
   low: number;
@@ -24,7 +24,7 @@ export const RANGES: Record<Quantity, Range> = {
     high: 2,
     isLog: true,
     unit: '',
-    label: words.map.theta,
+    label: texts.map.theta,
     ticks: [0.05, 0.1, 0.2, 0.5, 1, 2],
     value: (friction) => friction.theta,
   },
@@ -33,16 +33,16 @@ export const RANGES: Record<Quantity, Range> = {
     high: 20,
     isLog: true,
     unit: '',
-    label: words.map.stiffness,
+    label: texts.map.stiffness,
     ticks: [0.5, 1, 2, 5, 10, 20],
     value: (friction) => friction.stiffness,
   },
-  grip: {
+  friction: {
     low: 0,
     high: 1,
     isLog: false,
     unit: '',
-    label: words.map.grip,
+    label: texts.map.friction,
     ticks: [0, 0.25, 0.5, 0.75, 1],
     value: (friction) => friction.mu_peak_lower_bound ?? null,
   },
@@ -50,8 +50,8 @@ export const RANGES: Record<Quantity, Range> = {
     low: 1 / 60,
     high: 720,
     isLog: true,
-    unit: words.unit.h,
-    label: words.map.age,
+    unit: texts.unit.h,
+    label: texts.map.age,
     ticks: [1 / 60, 1, 24, 720],
     value: (friction, nowMs) => Math.max(0, nowMs - Date.parse(friction.newest_at)) / 3_600_000,
   },
@@ -60,7 +60,7 @@ export const RANGES: Record<Quantity, Range> = {
     high: 1_000,
     isLog: true,
     unit: '',
-    label: words.map.visits,
+    label: texts.map.visits,
     ticks: [1, 10, 100, 1_000],
     value: (friction) => friction.segments,
   },

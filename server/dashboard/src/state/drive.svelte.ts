@@ -1,6 +1,6 @@
 // Driving by hand: the socket, the lease, and what the hands want. Whatever goes wrong means zero.
 import type { DriveUpdate, DriveView, Lease } from '../api/schema';
-import { words } from '../words';
+import { texts } from '../texts';
 import { KEYS, clamped, wishOfAxes, wishOfKeys, type Wish } from './hands';
 
 /** Time between two drive commands, milliseconds; the server asks for 50 to 100. */
@@ -33,9 +33,9 @@ export class Drive {
   #wasZero = true;
 
   constructor(readonly driver: () => string) {
-    addEventListener('blur', () => this.#rest(words.drive.zero.blur));
+    addEventListener('blur', () => this.#rest(texts.drive.zero.blur));
     document.addEventListener('visibilitychange', () => {
-      if (document.hidden) this.#rest(words.drive.zero.hidden);
+      if (document.hidden) this.#rest(texts.drive.zero.hidden);
     });
     addEventListener('pagehide', () => this.close());
   }
@@ -58,7 +58,7 @@ export class Drive {
       if (this.#socket !== socket) return;
       const had = this.hasLease || this.connection === 'connecting';
       this.#off();
-      if (had) this.said ??= words.drive.zero.lost;
+      if (had) this.said ??= texts.drive.zero.lost;
     };
   }
 
@@ -143,15 +143,15 @@ export class Drive {
       this.#pressed.clear();
       this.#stick = null;
       this.wish = { forward: 0, left: 0 };
-      this.said = words.drive.released(update.released.detail);
+      this.said = texts.drive.released(update.released.detail);
       this.isTakenByOther = update.released.cause === 'taken';
     } else if ('refused' in update) {
-      this.said = words.drive.refused(update.refused.detail);
+      this.said = texts.drive.refused(update.refused.detail);
       this.isTakenByOther = update.refused.cause === 'leased';
     } else if ('view' in update) {
       this.view = update.view;
     } else if ('ended' in update) {
-      this.said = words.drive.released(update.ended.detail);
+      this.said = texts.drive.released(update.ended.detail);
     }
   }
 

@@ -3,7 +3,7 @@ import type { CreateMission, Geofence, Mission, ReplaceGeofence, Terrain, Terrai
 import { Problem, ask, sentence } from '../api/client';
 import { Draft, RADIUS_MIN_M, type DraftKind } from '../map/draft';
 import type { PointM } from '../map/camera';
-import { words } from '../words';
+import { texts } from '../texts';
 import type { Fleet } from './fleet.svelte';
 
 /** Wait after a change before the dry run is asked for, milliseconds. */
@@ -112,16 +112,16 @@ export class Editor {
   /** Why what was typed can be no mission, in one sentence; null when it can. */
   get flaw(): string | null {
     const wrong = this.draft?.flaw ?? null;
-    if (wrong === 'center') return words.draw.flaw.center;
-    if (wrong === 'radius') return words.draw.flaw.radius(RADIUS_MIN_M);
-    if (wrong !== null) return words.draw.flaw.point(wrong);
+    if (wrong === 'center') return texts.draw.flaw.center;
+    if (wrong === 'radius') return texts.draw.flaw.radius(RADIUS_MIN_M);
+    if (wrong !== null) return texts.draw.flaw.point(wrong);
     if (this.draft?.kind === 'terrain') return null;
-    if (!(this.speed_m_s > 0)) return words.draw.flaw.speed;
+    if (!(this.speed_m_s > 0)) return texts.draw.flaw.speed;
     const model = this.fleet.robots.find((view) => view.id === this.robot)?.robot.model;
     const top = model?.limits.linear_max_m_s ?? Infinity;
-    if (this.speed_m_s > top) return words.draw.flaw.fast(this.robot, String(Number(top.toFixed(2))));
-    if (this.draft?.kind === 'circle' && !(this.turns > 0)) return words.draw.flaw.turns;
-    return Number.isInteger(this.priority) ? null : words.draw.flaw.priority;
+    if (this.speed_m_s > top) return texts.draw.flaw.fast(this.robot, String(Number(top.toFixed(2))));
+    if (this.draft?.kind === 'circle' && !(this.turns > 0)) return texts.draw.flaw.turns;
+    return Number.isInteger(this.priority) ? null : texts.draw.flaw.priority;
   }
 
   /** Says that draft or form are no longer what they were. */
@@ -253,7 +253,7 @@ export class Editor {
   /** Replaces one area of the geofence, unless somebody changed it meanwhile. */
   async #putFence(side: FenceSide, old: PointM[] | null, area: PointM[] | null): Promise<string | null> {
     const { fence, site } = this.fleet;
-    if (!fence || !site) return words.problem.lost;
+    if (!fence || !site) return texts.problem.lost;
     const gone = JSON.stringify(old);
     const others = fence[side].filter((known) => JSON.stringify(known) !== gone);
     const body: ReplaceGeofence = { keep_in: fence.keep_in, keep_out: fence.keep_out };
@@ -267,7 +267,7 @@ export class Editor {
     } catch (error) {
       if (!(error instanceof Problem) || error.status !== 412) return sentence(error);
       await this.fleet.readGround();
-      return words.fence.changed;
+      return texts.fence.changed;
     }
   }
 

@@ -5,7 +5,7 @@ import { ask, list, sentence } from '../api/client';
 import { Stream, type Listener } from '../api/stream';
 import { signedIn } from './session.svelte';
 import { doing } from '../standing';
-import { words } from '../words';
+import { texts } from '../texts';
 import { Stops } from './stops.svelte';
 import { Tracked } from './tracked';
 
@@ -86,9 +86,9 @@ export class Fleet implements Listener {
 
   /** How a robot is heard, as far as it is known: a lost server says nothing more of it. */
   linkOf(robot: Robot): { text: string; look: 'good' | 'warn' | 'bad' } {
-    if (robot.link === 'offline') return { text: words.link.offline, look: 'bad' };
-    if (this.lostAt !== null) return { text: words.robots.lastKnown, look: 'warn' };
-    return { text: words.link[robot.link], look: robot.link === 'online' ? 'good' : 'warn' };
+    if (robot.link === 'offline') return { text: texts.link.offline, look: 'bad' };
+    if (this.lostAt !== null) return { text: texts.robots.lastKnown, look: 'warn' };
+    return { text: texts.link[robot.link], look: robot.link === 'online' ? 'good' : 'warn' };
   }
 
   /** Robots of the site that are to stand and move. */

@@ -2,7 +2,7 @@
 import { SvelteMap } from 'svelte/reactivity';
 import type { FleetStop, Robot, Stop } from '../api/schema';
 import { Problem, ask, list, sentence } from '../api/client';
-import { words } from '../words';
+import { texts } from '../texts';
 
 /** How often stops are read while one is unconfirmed, milliseconds. */
 const READ_AGAIN_MS = 1_000;
@@ -57,7 +57,7 @@ export class Stops {
       this.#take(stopped.stops);
       this.sent.delete(FLEET);
     } catch (error) {
-      this.sent.set(FLEET, { state: 'failed', text: told(words.stop.everyRobot, error) });
+      this.sent.set(FLEET, { state: 'failed', text: told(texts.stop.everyRobot, error) });
     }
   }
 
@@ -137,5 +137,5 @@ export class Stops {
 
 function told(robot: string, error: unknown): string {
   const isLost = error instanceof Problem && error.isLost;
-  return isLost ? words.stop.failed(robot) : words.stop.refused(robot, sentence(error));
+  return isLost ? texts.stop.failed(robot) : texts.stop.refused(robot, sentence(error));
 }

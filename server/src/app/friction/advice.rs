@@ -139,7 +139,7 @@ fn suggested(
         center,
         terrain: terrain.map(terrain_ref),
         gain,
-        relative_deviation: relative,
+        relative_std_dev: relative,
         normalisation: reading.normalisation(),
         disputed: known.is_some_and(|known| known.disputed),
     })

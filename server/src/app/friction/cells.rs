@@ -292,7 +292,7 @@ fn differences(map: &SiteMap, cell: Cell, early: &Reading, late: &Reading) -> Ve
         let key = key(&group);
         let before = before.remove(&key);
         let after = late.fused(group, Ground::Cell);
-        let deviations = before.zip(after).map(|(before, after)| {
+        let z_score = before.zip(after).map(|(before, after)| {
             (after.theta - before.theta) / before.std_dev.hypot(after.std_dev)
         });
         CellDifference {
@@ -301,7 +301,7 @@ fn differences(map: &SiteMap, cell: Cell, early: &Reading, late: &Reading) -> Ve
             configuration: key.1,
             before,
             after,
-            deviations,
+            z_score,
             normalisation: late.normalisation(),
         }
     });

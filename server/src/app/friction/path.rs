@@ -2,7 +2,7 @@
 //!
 //! Curves are driven with `v² ≤ a_across/κ`, and the robot must be able to stand at the end and to
 //! be as slow as each later piece asks: `v² ≤ v_next² + 2·a_along·Δs`. Both accelerations come from
-//! the grip of the piece, a lower bound, through the shares that the robot's own planner uses.
+//! the traction limit of the piece, a lower bound, through the shares that the robot's own planner uses.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -12,13 +12,13 @@ use tread_api::ids::{RobotId, SiteId};
 use tread_api::robot::RobotModel;
 use tread_api::site::{Cell, Grid};
 use tread_api::trajectory::{Trajectory, Waypoint};
-use tread_api::wire::command::{CellGrip, CellPrior, PRIOR_CELLS_MAX, PathPrior};
+use tread_api::wire::command::{CellPrior, CellTractionLimit, PRIOR_CELLS_MAX, PathPrior};
 use tread_control::robot::RobotModel as PlannedModel;
 
 use super::drawn::{Drawn, Near};
 use super::{App, AppError, Asked, Reading, SiteView};
-use crate::friction::grip;
 use crate::friction::index::{Lens, Room, SiteMap};
+use crate::friction::traction_limit;
 
 /// Longest path, metres.
 const LENGTH_MAX_M: f64 = 10_000.0;
@@ -94,8 +94,8 @@ impl App {
 impl App {
     /// What a robot is told of the ground along a trajectory; `None` when nothing is known of it.
     ///
-    /// Cells with several grounds are left out: the robot could not tell them apart. A terrain grips
-    /// no better on the way than where it is known to grip worst, there or near it: ground that has
+    /// Cells with several grounds are left out: the robot could not tell them apart. A terrain has
+    /// no higher traction limit on the path than where it is known to be lowest, there or near it: ground that has
     /// frozen in one cell may have in the next, where nobody has been since.
     pub(in crate::app) async fn prior_along(
         &self,
@@ -123,7 +123,7 @@ impl App {
     fn prior_of(&self, view: &SiteView, reading: &Reading, cut: &[Cut]) -> Option<PathPrior> {
         let drawn = Drawn::new(&view.terrains);
         let mut cells: BTreeMap<(i32, i32), CellPrior> = BTreeMap::new();
-        let mut grips: BTreeMap<(i32, i32), CellGrip> = BTreeMap::new();
+        let mut traction_limits: BTreeMap<(i32, i32), CellTractionLimit> = BTreeMap::new();
         let near = near(cut, &view.row.site.grid);
         let around = drawn_near(&drawn, cut.iter().chain(&near));
         self.maps().look(&view.row, |map| {
@@ -133,7 +133,7 @@ impl App {
                 let Some(known) = reader.known_at(place).filter(is_measured) else {
                     continue;
                 };
-                let mu = grip_mu(Some(&known));
+                let mu = traction_limit_mu(Some(&known));
                 let least = grounds.entry(around.ground_at(place.middle)).or_insert(mu);
                 *least = least.min(mu);
             }
@@ -141,10 +141,12 @@ impl App {
                 let (cell, known) = (cut.cell, reader.known_at(cut));
                 let ground = around.ground_at(cut.middle);
                 let least_mu = grounds.get(&ground).copied().unwrap_or(f64::INFINITY);
-                let mu = grip_mu(known.as_ref()).min(least_mu);
+                let mu = traction_limit_mu(known.as_ref()).min(least_mu);
                 let key = (cell.iy, cell.ix);
-                let grip = grips.entry(key).or_insert(CellGrip { cell, mu });
-                grip.mu = grip.mu.min(mu);
+                let limit = traction_limits
+                    .entry(key)
+                    .or_insert(CellTractionLimit { cell, mu });
+                limit.mu = limit.mu.min(mu);
             }
             // A robot drives smoothly from corner to corner, so a little beside the way, too.
             for place in cut.iter().chain(&near) {
@@ -167,16 +169,19 @@ impl App {
                 }
             }
         });
-        let grip_least_mu = grips.values().map(|grip| grip.mu);
-        let grip_least_mu = grip_least_mu.fold(f64::INFINITY, f64::min);
-        let grips: Vec<CellGrip> = grips.into_values().take(PRIOR_CELLS_MAX).collect();
+        let traction_limit_least_mu = traction_limits.values().map(|limit| limit.mu);
+        let traction_limit_least_mu = traction_limit_least_mu.fold(f64::INFINITY, f64::min);
+        let traction_limits: Vec<CellTractionLimit> = traction_limits
+            .into_values()
+            .take(PRIOR_CELLS_MAX)
+            .collect();
         let cells: Vec<CellPrior> = cells.into_values().collect();
         let prior = PathPrior {
             grid_revision: view.row.site.grid.revision,
-            grip_mu: grip_least_mu,
+            traction_limit_mu: traction_limit_least_mu,
             robot_bias_ratio: self.friction_config().robot_bias_ratio,
             cells,
-            grips,
+            traction_limits,
         };
         Some(prior).filter(|prior| !prior.cells.is_empty() && prior.is_possible())
     }
@@ -201,15 +206,15 @@ fn corners(trajectory: &Trajectory) -> Vec<Point> {
     }
 }
 
-/// Whether a place is known well enough to say something of its grip: the upper bound of a θ that
+/// Whether a place is known well enough to have a traction limit: the upper bound of a θ that
 /// is hardly known is no reason to creep.
 fn is_measured(known: &FusedFriction) -> bool {
     known.std_dev <= DEVIATION_RATIO_MAX * known.theta
 }
 
 /// The planner's friction coefficient.
-pub(in crate::app) fn grip_mu(known: Option<&FusedFriction>) -> f64 {
-    grip::grip_mu(
+pub(in crate::app) fn traction_limit_mu(known: Option<&FusedFriction>) -> f64 {
+    traction_limit::traction_limit_mu(
         known.and_then(|known| known.mu_peak_lower_bound),
         known
             .filter(|known| is_measured(known))
@@ -434,7 +439,7 @@ fn described(cut: &Cut, known: Option<&FusedFriction>) -> PathPiece {
         theta_upper_95: known.map(|known| known.bounds.theta_upper_95),
         age_s: known.map(|known| known.age_s),
         disputed: known.is_some_and(|known| known.disputed),
-        grip_mu: grip_mu(known),
+        traction_limit_mu: traction_limit_mu(known),
         speed_m_s: 0.0,
     }
 }
@@ -445,9 +450,9 @@ fn set_speeds(pieces: &mut [PathPiece], cut: &[Cut], length_m: f64, model: &Robo
     let mut next_m_s = 0.0_f64;
     let mut next_at_m = length_m;
     for (piece, cut) in pieces.iter_mut().zip(cut).rev() {
-        let along = PlannedModel::grip_along_m_s2(piece.grip_mu);
+        let along = PlannedModel::grip_along_m_s2(piece.traction_limit_mu);
         let along = along.min(limits.linear_acceleration_max_m_s2);
-        let across = PlannedModel::grip_across_m_s2(piece.grip_mu);
+        let across = PlannedModel::grip_across_m_s2(piece.traction_limit_mu);
         let across = across.min(limits.lateral_acceleration_max_m_s2);
         let braked = (next_m_s * next_m_s + 2.0 * along * (next_at_m - cut.from_m)).sqrt();
         let curve = if cut.curvature_1_m > 0.0 {

@@ -27,7 +27,7 @@ fn tables(out: &mut impl Write, report: &Report) -> fmt::Result {
         robot,
         course,
         stop,
-        grip_mu,
+        traction_limit_mu,
         ends,
     } in &report.arrivals
     {
@@ -41,7 +41,7 @@ fn tables(out: &mut impl Write, report: &Report) -> fmt::Result {
                 without.farthest_m,
                 without.rms_m,
                 without.fastest_m_s,
-                grip_mu.unwrap_or(f64::NAN)
+                traction_limit_mu.unwrap_or(f64::NAN)
             )?;
         }
         if let Some([with, without]) = stop {

@@ -1,10 +1,10 @@
-//! How the ground grips along a way, by place.
+//! Friction of the ground along a way, by place.
 
 use crate::geometry::Point;
 
 /// A square of a grid with its peak friction coefficient.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct GripSquare {
+pub struct TractionLimitCell {
     /// Which square ahead of the origin along x: floor of the coordinate over the side.
     pub ix: i32,
     /// The same along y.
@@ -15,17 +15,21 @@ pub struct GripSquare {
 
 /// Lower bounds of the peak friction coefficient by place.
 #[derive(Debug, Clone, PartialEq)]
-pub struct GripMap {
+pub struct TractionLimitMap {
     square_m: f64,
     /// By row and column.
-    squares: Box<[GripSquare]>,
+    squares: Box<[TractionLimitCell]>,
     elsewhere_mu: f64,
 }
 
-impl GripMap {
+impl TractionLimitMap {
     /// Squares of this side, and what holds where none is near; `None` for a number that is not
     /// above zero or not finite.
-    pub fn new(square_m: f64, mut squares: Vec<GripSquare>, elsewhere_mu: f64) -> Option<Self> {
+    pub fn new(
+        square_m: f64,
+        mut squares: Vec<TractionLimitCell>,
+        elsewhere_mu: f64,
+    ) -> Option<Self> {
         let is_possible = |value: f64| value.is_finite() && value > 0.0;
         let all = is_possible(square_m)
             && is_possible(elsewhere_mu)
@@ -84,8 +88,8 @@ mod tests {
             squares in prop::collection::btree_map((-6..6_i32, -6..6_i32), 0.01..1.0_f64, 0..40),
             x_m in -8.0..8.0_f64, y_m in -8.0..8.0_f64, square_m in 0.5..2.0_f64,
         ) {
-            let list = squares.iter().map(|(&(ix, iy), &mu)| GripSquare { ix, iy, mu });
-            let map = GripMap::new(square_m, list.collect(), 0.14).unwrap();
+            let list = squares.iter().map(|(&(ix, iy), &mu)| TractionLimitCell { ix, iy, mu });
+            let map = TractionLimitMap::new(square_m, list.collect(), 0.14).unwrap();
             let (ix, iy) = ((x_m / square_m).floor(), (y_m / square_m).floor());
             let near = squares.iter().filter(|((column, row), _)| {
                 (f64::from(*column) - ix).abs() < 1.5 && (f64::from(*row) - iy).abs() < 1.5
@@ -101,14 +105,14 @@ mod tests {
     #[test]
     fn what_is_no_grip_makes_no_map() {
         for bad in [0.0, -1.0, f64::NAN, f64::INFINITY] {
-            let square = GripSquare {
+            let square = TractionLimitCell {
                 ix: 0,
                 iy: 0,
                 mu: bad,
             };
-            assert_eq!(GripMap::new(1.0, vec![square], 0.14), None);
-            assert_eq!(GripMap::new(bad, Vec::new(), 0.14), None);
-            assert_eq!(GripMap::new(1.0, Vec::new(), bad), None);
+            assert_eq!(TractionLimitMap::new(1.0, vec![square], 0.14), None);
+            assert_eq!(TractionLimitMap::new(bad, Vec::new(), 0.14), None);
+            assert_eq!(TractionLimitMap::new(1.0, Vec::new(), bad), None);
         }
     }
 }

@@ -65,7 +65,7 @@ const limit: Record<BindingLimit, string> = {
   wheel_speed: 'wheel speed',
   wheel_acceleration: 'wheel acceleration',
   linear_acceleration: 'acceleration',
-  grip: 'grip of the ground',
+  traction: 'traction limit of the ground',
 };
 const gate: Record<GateCause, string> = {
   acceleration: 'acceleration limit',
@@ -117,7 +117,7 @@ const standing: Record<StandingState, string> = {
   other: 'stopped',
 };
 
-export const words = {
+export const texts = {
   name: 'Tread',
   problem: {
     lost: 'The server does not answer; what you entered is kept.',
@@ -436,13 +436,13 @@ export const words = {
     none: 'none',
     theta: 'θ = 1/K',
     stiffness: 'K',
-    grip: 'peak friction, lower bound',
+    friction: 'peak friction, lower bound',
     age: 'age of the newest measurement',
     visits: 'measurements',
     change: 'change of θ between two times',
     from: 'Before',
     to: 'After (now when empty)',
-    changeBy: (percent: string, deviations: string) => `${percent} %, ${deviations} deviations`,
+    changeBy: (percent: string, zScore: string) => `${percent} %, ${zScore} standard deviations`,
     isNew: 'measured for the first time',
     isGone: 'no longer known',
     unchanged: 'grey: within two standard deviations; hatched: known at one of the times only',

@@ -1,13 +1,13 @@
 //! The friction coefficient to plan with, from what the map knows.
 
 /// What is reckoned with where nothing better is known; the robots' own planner has the same.
-pub const GRIP_CAUTIOUS_MU: f64 = 0.14;
+pub const CAUTIOUS_MU: f64 = 0.14;
 /// Slip up to which friction grows in proportion to it.
 const SLIP_LINEAR: f64 = 0.2;
 
 /// The larger of what was shown of late and a cautious value, within what needs no more than linear
 /// slip where θ is at its upper bound.
-pub fn grip_mu(mu_peak: Option<f64>, theta_upper_95: Option<f64>) -> f64 {
-    let grip = mu_peak.unwrap_or(0.0).max(GRIP_CAUTIOUS_MU);
-    theta_upper_95.map_or(grip, |upper| grip.min(SLIP_LINEAR * upper.recip()))
+pub fn traction_limit_mu(mu_peak: Option<f64>, theta_upper_95: Option<f64>) -> f64 {
+    let limit_mu = mu_peak.unwrap_or(0.0).max(CAUTIOUS_MU);
+    theta_upper_95.map_or(limit_mu, |upper| limit_mu.min(SLIP_LINEAR * upper.recip()))
 }
