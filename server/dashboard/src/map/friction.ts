@@ -42,7 +42,7 @@ export const RANGES: Record<Quantity, Range> = {
     high: 1,
     isLog: false,
     unit: '',
-    label: texts.map.friction,
+    label: texts.map.peakFriction,
     ticks: [0, 0.25, 0.5, 0.75, 1],
     value: (friction) => friction.mu_peak_lower_bound ?? null,
   },
