@@ -1,4 +1,4 @@
-//! Driving by hand over `GET /v1/sites/{site}/robots/{robot}/drive`, a WebSocket with one JSON
+//! Teleoperation over `GET /v1/sites/{site}/robots/{robot}/drive`, a WebSocket with one JSON
 //! object in each text frame.
 //!
 //! Every socket observes; at most one of a robot's drives, with a lease that the robot itself

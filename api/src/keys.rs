@@ -35,7 +35,7 @@ pub enum Verb {
     Stop,
     /// End a stop.
     Clear,
-    /// Acquire, take or release the lease of driving by hand.
+    /// Acquire, take or release the lease of teleoperation.
     Lease,
     /// Hold or slow the robot from outside.
     Limit,

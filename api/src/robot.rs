@@ -69,7 +69,7 @@ pub enum RobotMode {
     Idle,
     /// Driving a mission.
     Tracking,
-    /// Driven by hand.
+    /// Teleoperated.
     Teleoperated,
     /// Stopped and latched until an operator clears it.
     Stopped,
@@ -390,7 +390,7 @@ pub struct MissionProgress {
 }
 
 impl MissionProgress {
-    /// Whether the robot paused it of itself, for a stop or for driving by hand: then only a
+    /// Whether the robot paused it of itself, for a stop or for teleoperation: then only a
     /// person lets it go on.
     pub fn is_paused_for_safety(&self) -> bool {
         let is_for_safety = |cause| matches!(cause, PauseCause::Stop | PauseCause::Teleoperation);
@@ -404,7 +404,7 @@ impl MissionProgress {
 pub enum PauseCause {
     /// A request to pause it.
     Request,
-    /// The robot is driven by hand.
+    /// The robot is teleoperated.
     Teleoperation,
     /// The robot was stopped.
     Stop,

@@ -82,7 +82,7 @@ pub enum GateCause {
     NotFinite,
     /// There was no command.
     NoCommand,
-    /// The driver by hand is silent, or the lease has ended.
+    /// The teleoperator is silent, or the lease has ended.
     Lease,
     /// The server has been silent for longer than the mission allows.
     LinkPolicy,

@@ -10,7 +10,7 @@ pub enum StartPolicy {
     /// The new one waits for its turn.
     #[default]
     Append,
-    /// The others are cancelled: the one in hand, and all that wait.
+    /// The others are cancelled: the active one, and all that wait.
     Replace,
     /// The new one is refused if the robot has any other that has not ended.
     Refuse,

@@ -155,9 +155,9 @@ pub(crate) enum RemoteCommand {
     Clear(ClearArguments),
     /// List alerts, or note that one was seen
     Alerts(AlertsArguments),
-    /// Drive a robot by hand, in this terminal
+    /// Teleoperate a robot, in this terminal
     Drive(DriveArguments),
-    /// List who drives which robot by hand
+    /// List who teleoperates which robot
     Leases(PlainArguments),
     /// List, set or end what other programs hold or slow a robot by
     Limits(LimitsArguments),

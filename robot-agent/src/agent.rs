@@ -276,7 +276,7 @@ fn renew_membership(
     (heard, Some(membership))
 }
 
-/// Reads the mission memory; what was in hand when the agent died is reported as failed.
+/// Reads the mission memory; what was active when the agent died is reported as failed.
 fn recall_missions(
     config: &AgentConfig,
     outbox: &Outbox,

@@ -4,7 +4,7 @@
 //! commands beside them, so that no planning delays a cancellation. Planning and disks are waited
 //! for here, never in the loop.
 //!
-//! A new revision of the mission in hand is planned from where the robot comes to stand:
+//! A new revision of the active mission is planned from where the robot comes to stand:
 //! ```text
 //! offer ─► loop holds the mission ─► foretell where it stands ─► plan ─► held ─► loop swaps there
 //!                                                                 └ refused: loop lets it go on
@@ -291,7 +291,7 @@ impl Dispatcher {
             return Err(refused(OfferRefusal::Stopped, detail));
         }
         if let Some(lease) = self.safety.lease_now() {
-            let detail = format!("{} drives the robot by hand", lease.driver.name);
+            let detail = format!("{} teleoperates the robot", lease.driver.name);
             return Err(refused(OfferRefusal::Leased, detail));
         }
         match self.shared.snapshot().off_path_m {
@@ -365,7 +365,7 @@ impl Dispatcher {
         Outcome::Accepted { plan: Some(plan) }
     }
 
-    /// Swaps the mission in hand for its next revision; the loop holds it already or soon.
+    /// Swaps the active mission for its next revision; the loop holds it already or soon.
     async fn plan_and_replace(&self, offer: Offer) -> Outcome {
         let Some(start) = self.rest_of(offer.mission).await else {
             return refused(OfferRefusal::NotReady, "the robot could not be held");

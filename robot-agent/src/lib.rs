@@ -9,7 +9,7 @@
 //! * Around it: [`missions`] (what is held), `dispatcher` (answers), `alerts`, `recorder` and [`outbox`]
 //!   (what must not be lost), `reporter` (what may), [`fleet`] (the only one that knows zenoh).
 //! * [`membership`]: the robot's certificate, how it gets it and the next one.
-//! * `safety`: what may only slow the robot down, and driving by hand.
+//! * `safety`: what may only slow the robot down, and teleoperation.
 //! * `recording`: what the loop took and gave, in files, and running such files again.
 //! * [`mod@bench`] steps the loop by hand, for tests and figures.
 //! * Below all: [`clock`], `supervisor`, [`geometry`] (between wire and controller).

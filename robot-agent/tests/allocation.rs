@@ -76,7 +76,7 @@ fn fence() -> Geofence {
 }
 
 #[test]
-fn no_tick_of_driving_by_hand_to_a_fence_and_into_silence_allocates() {
+fn no_tick_of_teleoperation_to_a_fence_and_into_silence_allocates() {
     let scenario = Scenario::built_in().unwrap();
     let start = Pose {
         x_m: 4.0,
@@ -113,7 +113,7 @@ fn no_tick_of_driving_by_hand_to_a_fence_and_into_silence_allocates() {
                     angular_rad_s: 0.0,
                 },
             };
-            assert!(bench.drive_by_hand(&wire::encode(&command).unwrap()));
+            assert!(bench.teleoperate(&wire::encode(&command).unwrap()));
         }
         bench.simulate();
         let region = Region::new(ALLOCATOR);

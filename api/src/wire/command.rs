@@ -14,7 +14,7 @@ use crate::trajectory::Trajectory;
 
 /// `cmd/offer`: drive this mission.
 ///
-/// A higher revision of the mission in hand replaces it: the robot plans the new one from where
+/// A higher revision of the active mission replaces it: the robot plans the new one from where
 /// it is and swaps only when it holds it whole; until its answer the old one goes on, and after a
 /// refusal too.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -164,7 +164,7 @@ pub enum Outcome {
     },
     /// The command has taken effect, now or already before.
     Done,
-    /// The lease of driving by hand is given; the run that gave it is that of the answer.
+    /// The lease of teleoperation is given; the run that gave it is that of the answer.
     Leased {
         /// The lease.
         epoch: u64,
@@ -199,7 +199,7 @@ pub enum OfferRefusal {
     TooLate,
     /// The mission, or whatever the command names, is not known here.
     Unknown,
-    /// Somebody else drives the robot by hand; the detail names who.
+    /// Somebody else teleoperates the robot; the detail names who.
     Leased,
     /// A stop is in force.
     Stopped,

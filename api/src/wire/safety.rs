@@ -55,10 +55,10 @@ pub enum LeaseAction {
     Release,
 }
 
-/// `cmd/lease`: acquire, take or release the lease of driving by hand.
+/// `cmd/lease`: acquire, take or release the lease of teleoperation.
 ///
 /// Answered by `leased`, by `done` (released), or refused as `leased` with a detail that names who
-/// has it. A lease holds the mission in hand: it stays paused until it is resumed by request.
+/// has it. A lease holds the active mission: it stays paused until it is resumed by request.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LeaseCommand {
     /// Makes the command idempotent: the same request again gets the same answer and changes

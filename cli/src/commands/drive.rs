@@ -1,4 +1,4 @@
-//! `tread drive`: drive a robot by hand in the terminal.
+//! `tread drive`: teleoperate a robot in the terminal.
 //!
 //! A terminal says when a key is pressed and repeats it while it is held, but not when it is let
 //! go: so a key drives for a moment, longer than the pause before it repeats. Without a key the

@@ -27,7 +27,7 @@ pub(super) async fn run(
     Ok(ExitCode::SUCCESS)
 }
 
-/// Who drives a robot by hand.
+/// Who teleoperates a robot.
 #[derive(Serialize)]
 struct Leased<'robot> {
     robot: &'robot RobotId,
@@ -55,7 +55,7 @@ pub(super) async fn leases(
     let leases: Vec<Leased<'_>> = robots.iter().filter_map(Leased::of).collect();
     output.show(&leases, |leases| {
         if leases.is_empty() {
-            return "nobody drives a robot by hand".to_owned();
+            return "nobody teleoperates a robot".to_owned();
         }
         let mut table = table(["ROBOT", "DRIVER", "LEASE", "CONNECTION"]);
         for lease in leases {

@@ -10,7 +10,7 @@
 //! bounded by the braking limit: rest is met on a ramp, along the arc that was being driven. The
 //! strictest cause is reported: the order of [`GateCause`], and of several caps the lowest one.
 
-pub mod hand;
+pub mod teleoperation;
 
 use crate::measured::WheelSpeeds;
 use crate::robot::RobotModel;
@@ -26,7 +26,7 @@ pub enum GateCause {
     Acceleration,
     /// The command was above a speed limit: along the path, in yaw, or of a wheel.
     Speed,
-    /// Commands by hand come late: the slower the link, the slower the robot.
+    /// Teleoperation commands arrive late: the slower the link, the slower the robot.
     CommandAge,
     /// A limit from outside.
     ExternalLimit,
@@ -36,7 +36,7 @@ pub enum GateCause {
     NotFinite,
     /// There was no command.
     NoCommand,
-    /// Whoever drives by hand is silent.
+    /// Whoever teleoperates is silent.
     Lease,
     /// The server has been silent for longer than the mission allows.
     LinkPolicy,
@@ -106,13 +106,13 @@ pub struct Reasons {
     pub is_held_outside: bool,
     /// The server has been silent for longer than it may.
     pub is_link_silent: bool,
-    /// Whoever drives by hand is silent.
+    /// Whoever teleoperates is silent.
     pub is_driver_silent: bool,
     /// Fastest speed that keeps the robot inside its fence, metres per second.
     pub fence_max_m_s: Option<f64>,
     /// Fastest speed that somebody outside allows, metres per second.
     pub outside_max_m_s: Option<f64>,
-    /// Fastest speed that the age of commands by hand allows, metres per second.
+    /// Fastest speed that the age of teleoperation commands allows, metres per second.
     pub command_age_max_m_s: Option<f64>,
     /// Fastest speed of a robot that does not know where it is, metres per second.
     pub blind_max_m_s: Option<f64>,
@@ -309,7 +309,7 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
     if input.feedback_age_s > LATE_SHARE * limits.feedback_age_max_s {
         let model = &limits.model;
         let twist = |wheels: WheelSpeeds| model.twist_from_wheel_speeds(wheels);
-        let steady = hand::no_faster(twist(previous), twist(target));
+        let steady = teleoperation::no_faster(twist(previous), twist(target));
         if steady != twist(target) {
             target = model.wheel_speeds_from_twist(steady);
             note(GateCause::Acceleration);

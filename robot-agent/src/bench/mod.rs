@@ -3,8 +3,8 @@
 //! No thread, no clock, no network, so runs repeat to the bit and go as fast as the machine does.
 //! For tests, figures and benchmarks.
 
-pub mod hand_trials;
 pub mod lease_model;
+pub mod teleoperation_trials;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -406,7 +406,7 @@ impl<D: SteppedDrive> Bench<D> {
         Ok(mission)
     }
 
-    /// Holds the mission in hand for its next revision, plans that from where the robot comes to
+    /// Holds the active mission for its next revision, plans that from where the robot comes to
     /// stand, and hands it to the loop.
     ///
     /// # Errors
@@ -428,7 +428,7 @@ impl<D: SteppedDrive> Bench<D> {
         Ok(self.ends.commands.send(LoopCommand::Replace(job))?)
     }
 
-    /// Pauses the mission in hand, or lets it go on.
+    /// Pauses the active mission, or lets it go on.
     ///
     /// # Errors
     /// [`BenchError::Gone`].
@@ -458,13 +458,13 @@ impl<D: SteppedDrive> Bench<D> {
         microseconds(self.now)
     }
 
-    /// Acquires, takes or releases the lease of driving by hand.
+    /// Acquires, takes or releases the lease of teleoperation.
     pub fn lease(&self, command: &LeaseCommand) -> Outcome {
         answers::lease(&self.safety, command)
     }
 
     /// Hands over a drive command as it comes from the network; true if it counts.
-    pub fn drive_by_hand(&self, payload: &[u8]) -> bool {
+    pub fn teleoperate(&self, payload: &[u8]) -> bool {
         let accepted = || {
             let status = self.safety.drive_status();
             status.map_or(0, |status| status.counts.accepted)

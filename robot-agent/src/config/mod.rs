@@ -256,7 +256,7 @@ pub struct AgentConfig {
     /// Holders of external limits whose silence holds the robot, at most
     /// [`LIMITS_MAX`].
     pub required_holders: Vec<HolderId>,
-    /// Whether the robot may be driven by hand, slowly, within a fence without knowing where it is.
+    /// Whether the robot may be teleoperated, slowly, within a fence without knowing where it is.
     pub blind_within_fence: bool,
     /// Bounds of the outbox.
     pub outbox: outbox::Limits,

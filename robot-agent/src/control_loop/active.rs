@@ -1,4 +1,4 @@
-//! The mission that the loop has in hand: driven, held standing, and ended for a reason.
+//! The active mission of the loop: driven, held standing, and ended for a reason.
 //!
 //! ```text
 //!          hold (pause, revision, outside)    stands
@@ -82,7 +82,7 @@ struct Holds {
     sensors: bool,
 }
 
-/// The mission in hand.
+/// The active mission.
 #[derive(Debug)]
 pub(super) struct Active {
     pub(super) job: Box<Job>,
@@ -264,7 +264,7 @@ impl Active {
         &coming.unwrap_or(&self.job).prior
     }
 
-    /// What is left in hand when the mission ends.
+    /// What is left when the mission ends.
     pub(super) fn into_jobs(self) -> (Box<Job>, Option<Box<Job>>) {
         (self.job, self.next)
     }

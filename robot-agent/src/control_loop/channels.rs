@@ -68,7 +68,7 @@ pub(crate) enum LoopCommand {
     Hold(MissionId, Hold),
     /// Let it go on, if nothing else holds it.
     Release(MissionId, Hold),
-    /// Drive this revision instead of the one in hand, once the robot stands.
+    /// Drive this revision instead of the active one, once the robot stands.
     Replace(Box<Job>),
     /// The site is like this now.
     Site(Arc<SiteView>),

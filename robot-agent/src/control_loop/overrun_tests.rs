@@ -118,7 +118,7 @@ fn a_driver_is_held_by_a_late_loop_and_a_stop_is_stricter_than_that() {
     let mut drive = |bench: &mut Bench, late_by: Duration| {
         seq += 1;
         let payload = command(epoch, seq, bench.now_us(), 400 * MILLISECOND);
-        assert!(bench.drive_by_hand(&payload));
+        assert!(bench.teleoperate(&payload));
         late_tick(bench, late_by);
     };
     for _ in 0..100 {
@@ -151,7 +151,7 @@ fn a_command_that_ends_while_a_tick_is_interrupted_moves_nothing_any_more() {
     };
     for seq in 1..100 {
         let payload = command(epoch, seq, bench.now_us(), 200 * MILLISECOND);
-        assert!(bench.drive_by_hand(&payload));
+        assert!(bench.teleoperate(&payload));
         bench.tick();
     }
     assert!(!bench.target_rests());

@@ -54,7 +54,7 @@ pub struct Ended {
 pub struct Holder {
     held: Option<Held>,
     ended: VecDeque<Ended>,
-    /// How the mission in hand ends, while that is being written.
+    /// How the active mission ends, while that is being written.
     #[serde(skip)]
     ending: Option<MissionPhase>,
 }
@@ -87,7 +87,7 @@ pub enum CancelDecision {
 }
 
 impl Holder {
-    /// The mission in hand.
+    /// The active mission.
     pub fn held(&self) -> Option<&Held> {
         self.held.as_ref()
     }
@@ -139,7 +139,7 @@ impl Holder {
         }
     }
 
-    /// Takes a mission into hand; false, and nothing changes, where [`Holder::offer`] would not
+    /// Makes a mission the active one; false, and nothing changes, where [`Holder::offer`] would not
     /// say [`OfferDecision::Plan`].
     #[must_use]
     pub fn take(&mut self, held: Held) -> bool {
@@ -150,7 +150,7 @@ impl Holder {
         is_free
     }
 
-    /// Puts a higher revision in place of the one in hand and gives the old one back; `None`, and
+    /// Puts a higher revision in place of the active one and gives the old one back; `None`, and
     /// nothing changes, where [`Holder::offer`] would not say [`OfferDecision::Replace`].
     #[must_use]
     pub fn replace(&mut self, next: Held) -> Option<Held> {
@@ -226,7 +226,7 @@ impl Holder {
         }
     }
 
-    /// How the mission in hand ends, before that is reported; from here on it can no longer be
+    /// How the active mission ends, before that is reported; from here on it can no longer be
     /// cancelled. One that the server believes cancelled ends as that, whatever came in between.
     pub fn begin_end(&mut self, mission: MissionId, phase: MissionPhase) -> MissionPhase {
         let Some(held) = self.held.as_ref().filter(|held| held.mission == mission) else {
@@ -240,7 +240,7 @@ impl Holder {
         *self.ending.insert(phase)
     }
 
-    /// Ends the mission in hand; `None` if it is not this one.
+    /// Ends the active mission; `None` if it is not this one.
     pub fn end(&mut self, mission: MissionId, phase: MissionPhase) -> Option<Held> {
         self.ending.take_if(|_| {
             self.held

@@ -55,7 +55,7 @@ pub(crate) mod topics {
     pub(crate) const RUN: &str = "/tread/run";
     /// Commands that the loop took.
     pub(crate) const COMMAND: &str = "/tread/command";
-    /// Leases, what is wanted by hand, limits from outside; when they change.
+    /// Leases, teleoperation commands, limits from outside; when they change.
     pub(crate) const SAFETY: &str = "/tread/safety";
     /// Ticks.
     pub(crate) const TICK: &str = "/tread/tick";

@@ -160,8 +160,8 @@ fn with_tick(
     })
 }
 
-/// A limit from outside, and a hand under it.
-fn drive_by_hand_under_a_limit(bench: &mut Bench) {
+/// A limit from outside, and a teleoperator under it.
+fn teleoperate_under_a_limit(bench: &mut Bench) {
     let lidar: HolderId = "lidar".parse().unwrap();
     let limit = ExternalLimit {
         boot: boot(),
@@ -195,7 +195,7 @@ fn drive_by_hand_under_a_limit(bench: &mut Bench) {
                 angular_rad_s: 0.2,
             },
         };
-        assert!(bench.drive_by_hand(&wire::encode(&command).unwrap()));
+        assert!(bench.teleoperate(&wire::encode(&command).unwrap()));
         bench.tick();
         bench.tick();
     }
@@ -243,7 +243,7 @@ fn a_day_with_all_that_happens_runs_again_to_the_bit() {
         bench.tick_without_position();
     }
     bench.run_for(SECOND);
-    drive_by_hand_under_a_limit(&mut bench);
+    teleoperate_under_a_limit(&mut bench);
     let mut site = site_of(&Scenario::built_in().unwrap()).unwrap();
     site.geofence = Geofence {
         revision: 2,
@@ -294,7 +294,7 @@ fn a_record_in_which_the_loop_was_late_and_interrupted_runs_again_to_the_bit() {
     bench.run_for(2 * SECOND);
     bench.tick_interrupted(SECOND / 5);
     bench.run_for(3 * SECOND);
-    drive_by_hand_under_a_limit(&mut bench);
+    teleoperate_under_a_limit(&mut bench);
     bench.tick_interrupted(SECOND / 5);
     bench.run_for(SECOND);
     assert_eq!(bench.end_record(), 0);

@@ -221,7 +221,7 @@ pub(crate) fn state(mode: RobotMode, fault: Option<Fault>) -> (Level, &'static s
     match (mode, fault) {
         (_, Some(fault)) => (Level::Error, fault.text()),
         (RobotMode::Stopped, _) => (Level::Warn, "stopped"),
-        (RobotMode::Teleoperated, _) => (Level::Ok, "driven by hand"),
+        (RobotMode::Teleoperated, _) => (Level::Ok, "teleoperated"),
         (RobotMode::Tracking, _) => (Level::Ok, "on a mission"),
         (RobotMode::Idle | RobotMode::Fault, _) => (Level::Ok, "idle"),
     }

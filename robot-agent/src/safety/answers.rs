@@ -73,7 +73,7 @@ pub(crate) fn lease(safety: &Safety, command: &LeaseCommand) -> Outcome {
         Ok(LeaseAnswer::Released) => Outcome::Done,
         Err(LeaseRefusal::Held(driver)) => refused(
             OfferRefusal::Leased,
-            format!("{} drives the robot by hand", driver.name),
+            format!("{} teleoperates the robot", driver.name),
         ),
         Err(LeaseRefusal::Over) => refused(OfferRefusal::Ended, "this lease is over"),
     }

@@ -7,7 +7,7 @@ use tread_control::geometry::Pose;
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 
-use super::tests::{Hand, limit};
+use super::tests::{Teleoperator, limit};
 use crate::bench::{Bench, PERIOD, site_of};
 use crate::control_loop::channels::EndReason;
 use crate::drive::SensorSample;
@@ -202,9 +202,9 @@ fn a_base_that_falls_silent_is_not_speeded_up() {
 }
 
 #[test]
-fn driving_by_hand_keeps_every_limit_when_the_hand_turns_about() {
+fn teleoperation_keeps_every_limit_when_the_hand_turns_about() {
     let mut bench = bench(5);
-    let mut hand = Hand::acquire(&bench);
+    let mut teleoperator = Teleoperator::acquire(&bench);
     let mut watch = Watch::of(&bench);
     for (linear_m_s, angular_rad_s) in [
         (1.0, 0.0),
@@ -216,14 +216,14 @@ fn driving_by_hand_keeps_every_limit_when_the_hand_turns_about() {
         (-0.6, 0.5),
     ] {
         for _ in 0..24 {
-            hand.say(&mut bench, linear_m_s, angular_rad_s, 10_000);
+            teleoperator.say(&mut bench, linear_m_s, angular_rad_s, 10_000);
             for _ in 0..5 {
                 bench.tick();
                 watch.look(&bench);
             }
         }
     }
-    // The hand lets go.
+    // The teleoperator lets go.
     for _ in 0..150 {
         bench.tick();
         watch.look(&bench);

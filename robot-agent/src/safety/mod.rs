@@ -1,4 +1,4 @@
-//! What may only slow the robot down: stops, driving by hand, limits from outside.
+//! What may only slow the robot down: stops, teleoperation, limits from outside.
 //!
 //! [`stop`], [`operator`] and [`limits`] are pure and decide; [`Safety`] owns them, keeps the stop on
 //! the disk ([`latch_file`]), and leaves what the loop needs in a cell that the loop never waits
@@ -34,7 +34,7 @@ use crate::clock::SharedClock;
 use crate::fleet::Urgent;
 use latch_file::LatchFile;
 use limits::{ExternalLimits, LimitRefusal, LimitsView};
-use operator::{HandView, LeaseAnswer, LeaseRefusal, Operator, Verdict};
+use operator::{LeaseAnswer, LeaseRefusal, Operator, TeleoperationView, Verdict};
 use stop::{ClearRefusal, StopState};
 
 /// Longest wait until the loop has set its target to zero.
@@ -68,7 +68,7 @@ pub(crate) enum NotCleared {
 /// What the loop looks at in a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct LoopView {
-    pub(crate) hand: HandView,
+    pub(crate) teleoperation: TeleoperationView,
     pub(crate) limits: LimitsView,
 }
 
@@ -158,7 +158,7 @@ impl Safety {
         cell.stop.store(number, Ordering::Release);
         cell.publish(|view| {
             view.limits = limits.view();
-            view.hand = operator.view();
+            view.teleoperation = operator.view();
         });
         Arc::new(Self {
             clock,
@@ -251,14 +251,15 @@ impl Safety {
         Ok(())
     }
 
-    /// Acquires, takes or releases the lease of driving by hand.
+    /// Acquires, takes or releases the lease of teleoperation.
     ///
     /// # Errors
     /// [`LeaseRefusal`].
     pub(crate) fn lease(&self, command: &LeaseCommand) -> Result<LeaseAnswer, LeaseRefusal> {
         let mut operator = lock(&self.operator);
         let answer = operator.lease(command, self.now_us());
-        self.cell.publish(|view| view.hand = operator.view());
+        self.cell
+            .publish(|view| view.teleoperation = operator.view());
         if answer.is_ok() {
             self.changed.notify_one();
         }
@@ -270,7 +271,7 @@ impl Safety {
         self.changed.notified().await;
     }
 
-    /// Who drives by hand.
+    /// Who teleoperates.
     pub(crate) fn lease_now(&self) -> Option<Lease> {
         lock(&self.operator).lease_at(self.now_us()).cloned()
     }
@@ -298,7 +299,8 @@ impl Safety {
         match command {
             Some(command) => {
                 if operator.drive(&command, self.now_us()) == Verdict::Accepted {
-                    self.cell.publish(|view| view.hand = operator.view());
+                    self.cell
+                        .publish(|view| view.teleoperation = operator.view());
                 }
             }
             None => operator.note_malformed(),
@@ -329,7 +331,7 @@ impl Safety {
         Ok(())
     }
 
-    /// Driving by hand, for the state.
+    /// Teleoperation, for the state.
     pub(crate) fn drive_status(&self) -> Option<DriveStatus> {
         lock(&self.operator).status()
     }

@@ -1,4 +1,4 @@
-//! Driving by hand on the robot: who has the lease, and which commands count. Pure.
+//! Teleoperation on the robot: who has the lease, and which commands count. Pure.
 //!
 //! ```text
 //!            acquire, take                 release, silence of 5 s
@@ -18,7 +18,7 @@ use tread_api::safety::{
     BY_LENGTH_MAX, DriveCounts, DriveStatus, Driver, LEASE_SILENCE_MAX_US, Lease,
 };
 use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
-use tread_control::gate::hand::{AgeMeter, STEADY_BEFORE_END_S, within_limits};
+use tread_control::gate::teleoperation::{AgeMeter, STEADY_BEFORE_END_S, within_limits};
 use tread_control::geometry::Twist;
 use tread_control::robot::RobotModel;
 use uuid::Uuid;
@@ -63,7 +63,7 @@ struct Held {
 
 /// What the loop needs to know of it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-pub(crate) struct HandView {
+pub(crate) struct TeleoperationView {
     /// The lease in force, and until when without another command.
     pub(crate) lease: Option<(u64, u64)>,
     /// What is wanted, and until when.
@@ -72,8 +72,8 @@ pub(crate) struct HandView {
     pub(crate) speed_share: f64,
 }
 
-impl HandView {
-    /// Whether somebody drives by hand.
+impl TeleoperationView {
+    /// Whether somebody teleoperates.
     pub(crate) fn is_leased(&self, now_us: u64) -> bool {
         self.lease.is_some_and(|(_, until_us)| now_us < until_us)
     }
@@ -92,7 +92,7 @@ impl HandView {
     }
 }
 
-/// The state of driving by hand.
+/// The state of teleoperation.
 #[derive(Debug, Clone)]
 pub(crate) struct Operator {
     boot: BootId,
@@ -255,8 +255,8 @@ impl Operator {
     }
 
     /// What the loop needs.
-    pub(crate) fn view(&self) -> HandView {
-        HandView {
+    pub(crate) fn view(&self) -> TeleoperationView {
+        TeleoperationView {
             lease: self.held.as_ref().map(|held| {
                 let until_us = held.heard_us.saturating_add(LEASE_SILENCE_MAX_US);
                 (held.lease.epoch, until_us)

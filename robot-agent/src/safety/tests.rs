@@ -14,7 +14,7 @@ use tread_api::wire::safety::{DriveCommand, ExternalLimit, LeaseAction, LeaseCom
 use tread_control::fence::disc_radius_m;
 use tread_control::follower::FailureReason;
 use tread_control::gate::GateCause;
-use tread_control::gate::hand::BLIND_MAX_M_S;
+use tread_control::gate::teleoperation::BLIND_MAX_M_S;
 use tread_control::geometry::Pose;
 use tread_control::robot::RobotModel;
 use uuid::Uuid;
@@ -108,12 +108,12 @@ fn lease(bench: &Bench, request: u128, action: LeaseAction, who: u128) -> Outcom
     })
 }
 
-pub(super) struct Hand {
+pub(super) struct Teleoperator {
     epoch: u64,
     seq: u64,
 }
 
-impl Hand {
+impl Teleoperator {
     pub(super) fn acquire(bench: &Bench) -> Self {
         let Outcome::Leased { epoch } = lease(bench, 1, LeaseAction::Acquire, 1) else {
             panic!("no lease");
@@ -179,7 +179,7 @@ impl Hand {
                 angular_rad_s,
             },
         };
-        assert!(bench.drive_by_hand(&wire::encode(&command).unwrap()));
+        assert!(bench.teleoperate(&wire::encode(&command).unwrap()));
     }
 }
 
@@ -248,12 +248,12 @@ fn a_stop_counts_while_the_base_is_silent_and_is_still_there_afterwards() {
 #[test]
 fn the_operator_watchdog_stops_a_robot_whose_driver_is_silent() {
     let (mut bench, mission) = driving();
-    let mut hand = Hand::acquire(&bench);
-    hand.drive(&mut bench, 0.0, 0.0, 3 * SECOND);
+    let mut teleoperator = Teleoperator::acquire(&bench);
+    teleoperator.drive(&mut bench, 0.0, 0.0, 3 * SECOND);
     assert_eq!(mode(&bench), RobotMode::Teleoperated);
     assert_eq!(paused_by(&bench), Some(PauseCause::Teleoperation));
     assert!(bench.stands());
-    hand.drive(&mut bench, 0.5, 0.0, 2 * SECOND);
+    teleoperator.drive(&mut bench, 0.5, 0.0, 2 * SECOND);
     assert!((speed_m_s(&bench) - 0.5).abs() < 0.05);
     let silent_at = bench.now;
     while !bench.target_rests() {
@@ -277,20 +277,20 @@ fn the_operator_watchdog_stops_a_robot_whose_driver_is_silent() {
 #[test]
 fn a_hand_within_limits_and_its_ramps() {
     let mut bench = bench_in(Geofence::default());
-    let mut hand = Hand::acquire(&bench);
+    let mut teleoperator = Teleoperator::acquire(&bench);
     let mut fastest_m_s2: f64 = 0.0;
     for _ in 0..60 {
         let before_m_s = speed_m_s(&bench);
-        hand.drive(&mut bench, 9.0, 0.0, Duration::from_millis(50));
+        teleoperator.drive(&mut bench, 9.0, 0.0, Duration::from_millis(50));
         fastest_m_s2 = fastest_m_s2.max((speed_m_s(&bench) - before_m_s) / 0.05);
     }
     assert!(speed_m_s(&bench) < 1.05);
     assert!(fastest_m_s2 < 1.0, "sped up by {fastest_m_s2} m/s²");
     let counts = bench.safety.drive_status().unwrap().counts;
     assert_eq!(counts.over_limit, counts.accepted);
-    // Driven by hand and stopped: a stop needs no lease, and the hand no longer counts.
+    // Teleoperated and stopped: a stop needs no lease, and teleoperation no longer counts.
     bench.safety.stop_now(&stop(1));
-    hand.drive(&mut bench, 0.5, 0.0, 3 * SECOND);
+    teleoperator.drive(&mut bench, 0.5, 0.0, 3 * SECOND);
     assert!(bench.stands());
     assert_eq!(cause(&bench), Some(GateCause::Stop));
 }
@@ -298,8 +298,8 @@ fn a_hand_within_limits_and_its_ramps() {
 #[test]
 fn late_commands_slow_the_robot_down() {
     let mut bench = bench_in(Geofence::default());
-    let mut hand = Hand::acquire(&bench);
-    hand.drive_with_age(&mut bench, 1.0, 0.0, 3 * SECOND, 400_000);
+    let mut teleoperator = Teleoperator::acquire(&bench);
+    teleoperator.drive_with_age(&mut bench, 1.0, 0.0, 3 * SECOND, 400_000);
     assert!(speed_m_s(&bench) < 0.5, "{} m/s", speed_m_s(&bench));
     assert_eq!(cause(&bench), Some(GateCause::CommandAge));
 }
@@ -376,11 +376,11 @@ fn a_hand_cannot_drive_through_a_fence() {
     for (linear_m_s, angular_rad_s) in [(1.0, 0.0), (-1.0, 0.0), (0.8, 0.3), (1.0, -0.15)] {
         let mut bench = bench_in(yard());
         assert_eq!(bench.ends.shared.snapshot().fence_revision, Some(4));
-        let mut hand = Hand::acquire(&bench);
+        let mut teleoperator = Teleoperator::acquire(&bench);
         let fence = crate::geometry::fence_of(&yard());
         let mut least_m = f64::INFINITY;
         for _ in 0..400 {
-            hand.drive(
+            teleoperator.drive(
                 &mut bench,
                 linear_m_s,
                 angular_rad_s,
@@ -398,13 +398,13 @@ fn a_hand_cannot_drive_through_a_fence() {
     }
 }
 
-/// Drives by hand for two seconds with nothing that says where the robot is; the fastest speed.
+/// Teleoperates for two seconds with nothing that says where the robot is; the fastest speed.
 fn driven_blind(bench: &mut Bench) -> f64 {
-    let mut hand = Hand::acquire(bench);
+    let mut teleoperator = Teleoperator::acquire(bench);
     let mut fastest_m_s: f64 = 0.0;
     for tick in 0..200 {
         if tick % 5 == 0 {
-            hand.say(bench, 0.8, 0.0, 10_000);
+            teleoperator.say(bench, 0.8, 0.0, 10_000);
         }
         bench.tick_without_position();
         fastest_m_s = fastest_m_s.max(speed_m_s(bench));
@@ -422,7 +422,7 @@ fn lost_in(geofence: Geofence) -> Bench {
 }
 
 #[test]
-fn a_robot_without_a_position_is_driven_slowly_by_hand_and_within_a_fence_only_if_it_may() {
+fn a_robot_without_a_position_is_teleoperated_slowly_and_within_a_fence_only_if_it_may() {
     let mut bench = lost_in(Geofence::default());
     let fastest_m_s = driven_blind(&mut bench);
     assert!(
@@ -445,7 +445,7 @@ fn a_robot_without_a_position_is_driven_slowly_by_hand_and_within_a_fence_only_i
 }
 
 #[test]
-fn a_robot_that_never_knew_where_it_is_is_driven_slowly_by_hand() {
+fn a_robot_that_never_knew_where_it_is_is_teleoperated_slowly() {
     let scenario = Scenario::built_in().unwrap();
     let mut bench = Bench::new(&scenario, START, 5).unwrap();
     for _ in 0..100 {
@@ -478,18 +478,18 @@ fn the_localisation_watchdog_stops_a_mission_without_a_position_for_three_second
 #[test]
 fn a_command_that_is_about_to_end_does_not_speed_the_robot_up() {
     let mut bench = bench_in(Geofence::default());
-    let mut hand = Hand::acquire(&bench);
+    let mut teleoperator = Teleoperator::acquire(&bench);
     for _ in 0..40 {
-        hand.say_for(&mut bench, 0.8, 0.0, 10_000, 90_000);
+        teleoperator.say_for(&mut bench, 0.8, 0.0, 10_000, 90_000);
         bench.run_for(Duration::from_millis(50));
     }
     assert!(bench.stands(), "{} m/s", speed_m_s(&bench));
     // The same with commands that last longer.
-    hand.drive(&mut bench, 0.8, 0.0, SECOND);
+    teleoperator.drive(&mut bench, 0.8, 0.0, SECOND);
     assert!(speed_m_s(&bench) > 0.5);
     // What drives already goes on as it is.
     for _ in 0..20 {
-        hand.say_for(&mut bench, 0.8, 0.0, 10_000, 90_000);
+        teleoperator.say_for(&mut bench, 0.8, 0.0, 10_000, 90_000);
         bench.run_for(Duration::from_millis(50));
     }
     assert!(speed_m_s(&bench) > 0.4, "{} m/s", speed_m_s(&bench));
@@ -510,7 +510,7 @@ fn a_base_that_is_told_nothing_more_stops_its_wheels() {
 #[test]
 fn a_refusal_of_a_lease_names_who_has_it() {
     let bench = bench_in(Geofence::default());
-    let _hand = Hand::acquire(&bench);
+    let _hand = Teleoperator::acquire(&bench);
     let Outcome::Refused { code, detail } = lease(&bench, 2, LeaseAction::Acquire, 2) else {
         panic!("two drivers");
     };
@@ -521,10 +521,10 @@ fn a_refusal_of_a_lease_names_who_has_it() {
 #[test]
 fn commands_that_do_not_parse_are_counted_and_change_nothing() {
     let mut bench = bench_in(Geofence::default());
-    let _hand = Hand::acquire(&bench);
+    let _hand = Teleoperator::acquire(&bench);
     let long = vec![b' '; 5_000];
     for bad in [&b""[..], b"{}", b"\xff", &long] {
-        assert!(!bench.drive_by_hand(bad));
+        assert!(!bench.teleoperate(bad));
     }
     bench.run_for(SECOND);
     let counts = bench.safety.drive_status().unwrap().counts;

@@ -143,7 +143,7 @@ async fn a_mission_is_paused_resumed_and_replaced_and_tells_how_it_went() {
     assert_eq!(resume(&server, &rig, mission, 1).await, Outcome::Done);
     drives(&rig, mission, stood_m + 0.3).await;
 
-    // A revision that cannot be driven is refused, and the one in hand goes on.
+    // A revision that cannot be driven is refused, and the active one goes on.
     let impossible = server.offer(&rig.robot, &revised(&first, TOO_TIGHT)).await;
     assert_eq!(refusal(&impossible.outcome), Some(OfferRefusal::Impossible));
     let before_m = agent.state().mission.unwrap().driven_m;

@@ -180,7 +180,7 @@ async fn an_agent_that_ran_before_and_misses_its_latch_starts_stopped() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_robot_is_driven_by_hand_by_one_driver_and_stops_with_its_silence() {
+async fn the_robot_is_teleoperated_by_one_driver_and_stops_with_its_silence() {
     let rig = Rig::new();
     let server = rig.serve();
     let agent = rig.agent();

@@ -168,7 +168,7 @@ record! {
         segment_information: f64,
         /// The same, weighted by θ.
         segment_weighted: f64,
-        /// What the agent did: 0 idle, 1 tracking, 2 driven by hand, 3 stopped, 4 at fault.
+        /// What the agent did: 0 idle, 1 tracking, 2 teleoperated, 3 stopped, 4 at fault.
         mode: u8,
         /// What is broken: 0 the base is silent, 1 the position is lost.
         fault: u8,

@@ -18,7 +18,7 @@ const link: Record<LinkState, string> = { online: 'online', stale: 'late', offli
 const mode: Record<RobotMode, string> = {
   idle: 'idle',
   tracking: 'on a mission',
-  teleoperated: 'driven by hand',
+  teleoperated: 'teleoperated',
   stopped: 'stopped',
   fault: 'fault',
 };
@@ -88,7 +88,7 @@ const gate: Record<GateCause, string> = {
 };
 const pausedBy: Record<PauseCause, string> = {
   request: 'on request',
-  teleoperation: 'driven by hand',
+  teleoperation: 'teleoperated',
   stop: 'stopped',
   other: 'another reason',
 };
@@ -384,8 +384,8 @@ export const texts = {
     revision: (n: number) => `revision ${n}`,
   },
   drive: {
-    title: 'Drive by hand',
-    begin: 'Drive by hand',
+    title: 'Teleoperate',
+    begin: 'Teleoperate',
     connecting: 'Connecting …',
     take: (name: string) => `Take over from ${name}`,
     takeFree: 'Take the lease',
@@ -408,7 +408,7 @@ export const texts = {
     refused: (detail: string) => `Not done: ${detail}.`,
     gamepad: 'Gamepad',
     gamepadNone: 'none; press a button on it',
-    cannot: 'This robot cannot be driven by hand.',
+    cannot: 'This robot cannot be teleoperated.',
     missionsPause: 'A mission that it is on pauses, and stays so until you resume it.',
     command: 'Command',
   },
@@ -423,7 +423,7 @@ export const texts = {
       ['← ↑ → ↓, + and −', 'on the map: move, zoom'],
       ['F', 'on the map: show everything'],
       ['Enter, Backspace', 'on the map while drawing: add its middle, undo'],
-      ['W A S D, ← ↑ → ↓', 'while driving by hand'],
+      ['W A S D, ← ↑ → ↓', 'while teleoperating'],
       ['Space', 'stop, while the drive stick has the focus'],
     ] as const,
     zoomIn: 'Zoom in',

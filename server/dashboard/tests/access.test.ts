@@ -65,7 +65,7 @@ for (const theme of ['light', 'dark'] as const) {
       await page.getByText('Options').click();
       expect(await violations(page), 'drawing').toEqual([]);
       await page.getByRole('button', { name: 'Put away' }).click();
-      await page.getByRole('button', { name: 'Drive by hand' }).click();
+      await page.getByRole('button', { name: 'Teleoperate' }).click();
       await page.getByText('You have the lease.').waitFor();
       await page.getByRole('button', { name: 'Stop rover-3' }).click();
       const clear = page.getByRole('button', { name: 'Clear rover-3' });

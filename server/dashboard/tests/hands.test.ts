@@ -1,4 +1,4 @@
-// Stop and driving by hand, with real robots at the other end.
+// Stop and teleoperation, with real robots at the other end.
 import { execFileSync } from 'node:child_process';
 import { readFileSync } from 'node:fs';
 import { expect, inject, test } from 'vitest';
@@ -25,7 +25,7 @@ function agentOf(id: string): number {
 
 async function beginDriving(page: Page, id: string): Promise<void> {
   await select(page, id);
-  await page.getByRole('button', { name: 'Drive by hand' }).click();
+  await page.getByRole('button', { name: 'Teleoperate' }).click();
   await page.getByText('You have the lease.').waitFor();
 }
 
@@ -142,7 +142,7 @@ test('a lease is refused while another has it, taken by force, and the loss is s
   const second = await open();
   await beginDriving(first, 'rover-2');
   await select(second, 'rover-2');
-  await second.getByRole('button', { name: 'Drive by hand' }).click();
+  await second.getByRole('button', { name: 'Teleoperate' }).click();
   const take = second.getByRole('button', { name: /^Take over from/ });
   await take.waitFor();
   await take.click();

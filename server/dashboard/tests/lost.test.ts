@@ -62,7 +62,7 @@ test('a driver whose line is cut is told, and the robot stands', async () => {
   const wire = await line();
   const page = await open({ address: wire.address, expected: CUT });
   await select(page, 'rover-3');
-  await page.getByRole('button', { name: 'Drive by hand' }).click();
+  await page.getByRole('button', { name: 'Teleoperate' }).click();
   await page.getByText('You have the lease.').waitFor();
   wire.cut();
   await page.getByText(/^The socket is lost/).waitFor();

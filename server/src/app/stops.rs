@@ -14,7 +14,7 @@
 //! The robot is the truth of what is in force, in the order in which stops came to it: the clear of
 //! the last one ends those before. A robot that does not show a stop which it had confirmed and
 //! which nobody asked to clear is told again, and may answer that it was cleared (`judge`).
-//! Everything that a stopped robot had in hand or in its queue is held, and goes on only when a
+//! Everything of a stopped robot that was active or queued is held, and goes on only when a
 //! person says so.
 
 mod delivery;
@@ -349,13 +349,13 @@ impl App {
         Ok(())
     }
 
-    /// Writes stops down, and holds everything that their robots have in hand.
+    /// Writes stops down, and holds everything of their robots that is active.
     async fn record_stops(&self, tx: &mut Tx, stops: &[Stop]) -> Result<(), AppError> {
         db::stops::insert(tx, stops, KEPT_MAX).await?;
         let mut busy = None;
         if stops.len() > 1 {
             // Of a whole fleet most robots may have nothing to hold.
-            let mut missions = db::missions::in_hand(tx).await?;
+            let mut missions = db::missions::in_progress(tx).await?;
             missions.extend(db::missions::next_in_queues(tx).await?);
             let keys = missions
                 .into_iter()

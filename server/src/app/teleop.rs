@@ -1,4 +1,4 @@
-//! Driving by hand: one session for each connection, of which at most one has a robot's lease.
+//! Teleoperation: one session for each connection, of which at most one has a robot's lease.
 //!
 //! The robot gives the lease and is the truth of it. A session only passes on: it puts the
 //! robot's own time and the lease's epoch into commands, so that whatever comes late, from an old
@@ -162,11 +162,11 @@ impl App {
         self.inner.drive_shares.take(of, "drive connections")
     }
 
-    /// Holds everything that a robot has in hand or in its queue while somebody drives it.
+    /// Holds everything of a robot that is active or queued while somebody drives it.
     async fn hold_for_driver(&self, key: &RobotKey, name: &str) -> Result<(), AppError> {
         let mut tx = self.db().write("teleop").await?;
         if let Some(robot_pk) = db::robots::pk_of(&mut tx, &key.0, &key.1).await? {
-            let reason = format!("`{name}` drives the robot by hand");
+            let reason = format!("`{name}` teleoperates the robot");
             hold_all(&mut tx, robot_pk, &reason, self.clock().now()).await?;
         }
         tx.commit().await?;
@@ -264,7 +264,7 @@ impl Session {
             return Err(refused(DriveRefusal::Unreachable, detail));
         };
         let name = &lease.driver.name;
-        info!(robot.id = %self.key.1, "robot `{}` is driven by hand by `{name}`", self.key.1);
+        info!(robot.id = %self.key.1, "robot `{}` is teleoperated by `{name}`", self.key.1);
         self.held = Some(Held {
             lease: lease.clone(),
             boot: answer.boot,

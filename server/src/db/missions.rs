@@ -12,7 +12,7 @@ use tread_api::mission::{
 use tread_api::rights::Scope;
 use tread_api::robot::MissionProgress;
 
-pub use self::standing::{Standing, in_hand, next_in_queues, open_of_robot, overdue};
+pub use self::standing::{Standing, in_progress, next_in_queues, open_of_robot, overdue};
 use super::{DbError, corrupt, from_json, from_us, parse, scope_text, to_json, to_us, unsigned};
 
 /// A mission with the key of its robot.

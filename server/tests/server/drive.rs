@@ -1,4 +1,4 @@
-//! Driving by hand over the WebSocket: one driver, observers, and a robot that stands whenever
+//! Teleoperation over the WebSocket: one driver, observers, and a robot that stands whenever
 //! anything about its driver is wrong.
 
 use std::time::Duration;
@@ -170,7 +170,7 @@ async fn a_driver_drives_in_robot_time_and_losing_the_driver_lets_the_robot_stan
     driver.drive(0.5).await;
     driven_at(&robot, 0.5).await;
     assert!(robot.drives().last().unwrap().seq > command.seq);
-    // What the robot had in hand is held.
+    // The active mission is held.
     let held = yard.mission_becomes(mission.id, MissionState::Paused).await;
     assert!(held.mission.pause_wanted);
     let resume = format!("/v1/missions/{}/resume", mission.id);

@@ -97,7 +97,7 @@ async fn a_stop_is_confirmed_shown_and_cleared_and_nothing_goes_on_by_itself() {
     assert!(cleared.cleared_at.is_some());
     assert_eq!(cleared.clear_asked_by.as_deref(), Some("tests: Bob"));
 
-    // The mission in hand ends; the queue does not move until somebody says so.
+    // The active mission ends; the queue does not move until somebody says so.
     robot.report(0, &driven, MissionPhase::Failed).await;
     yard.mission_becomes(driven.id, MissionState::Failed).await;
     let fresh = yard.create_mission(&robot.id).await;

@@ -4,7 +4,7 @@
 //! process, and so is the time. Messages are lost, delayed, doubled and reordered; robots, server
 //! and links go down at any moment. After every step the history that the server wrote is checked
 //! against the reference; at the end of a run the network heals, and every mission must end, with
-//! both sides of one mind. People stop robots, clear their stops and drive by hand meanwhile; what
+//! both sides of one mind. People stop robots, clear their stops and teleoperate meanwhile; what
 //! was held for that must not be told to go on before somebody says so.
 
 mod dice;
@@ -411,7 +411,7 @@ impl Storm {
                 world.robots.iter().all(done)
             });
             let free = with(&self.world, |world| {
-                !world.robots.iter().any(Robot::is_in_hands)
+                !world.robots.iter().any(Robot::is_operator_controlled)
             });
             if idle && free && self.reference.open().is_empty() && !self.is_any_stopped().await? {
                 return Ok(());
@@ -424,7 +424,7 @@ impl Storm {
                     robot.id.clone(),
                     robot.holds(),
                     stopped_by,
-                    robot.is_in_hands(),
+                    robot.is_operator_controlled(),
                 )
             };
             world.robots.iter().map(hand).collect::<Vec<_>>()

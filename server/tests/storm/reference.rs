@@ -35,15 +35,15 @@ impl Reference {
             };
             let standing = (step.robot.clone(), step.step.to, cause);
             self.missions.insert(step.mission, standing);
-            let mut in_hand: HashMap<&RobotId, usize> = HashMap::new();
+            let mut in_progress: HashMap<&RobotId, usize> = HashMap::new();
             for (robot, state, _) in self.missions.values() {
                 if !state.is_terminal() && *state != MissionState::Queued {
-                    *in_hand.entry(robot).or_default() += 1;
+                    *in_progress.entry(robot).or_default() += 1;
                 }
             }
-            if let Some((robot, count)) = in_hand.into_iter().find(|(_, count)| *count > 1) {
+            if let Some((robot, count)) = in_progress.into_iter().find(|(_, count)| *count > 1) {
                 return Err(format!(
-                    "robot {robot} has {count} missions in hand: {step:?}"
+                    "robot {robot} has {count} active missions: {step:?}"
                 ));
             }
         }

@@ -76,7 +76,7 @@ impl Robot {
     }
 
     /// Whether a stop is in force, or a person drives.
-    pub(crate) fn is_in_hands(&self) -> bool {
+    pub(crate) fn is_operator_controlled(&self) -> bool {
         self.stop.is_some() || self.lease.is_some()
     }
 
@@ -85,7 +85,7 @@ impl Robot {
         self.stop.as_ref().map(|latch| latch.id)
     }
 
-    /// Whoever drove by hand is gone; what was paused for it stays paused.
+    /// Whoever teleoperated is gone; what was paused for it stays paused.
     pub(crate) fn end_lease(&mut self) {
         self.lease = None;
     }
@@ -260,7 +260,7 @@ impl Robot {
             driven_m: 0.0,
         };
         match self.held {
-            None if self.is_in_hands() => refused(OfferRefusal::NotReady),
+            None if self.is_operator_controlled() => refused(OfferRefusal::NotReady),
             None if impossible => refused(OfferRefusal::Impossible),
             None => {
                 self.held = Some(new);
@@ -326,7 +326,7 @@ impl Robot {
         Outcome::Done
     }
 
-    /// Whatever is in hand stands, and goes on only when it is told to.
+    /// Whatever is active stands, and goes on only when it is told to.
     fn stand(&mut self, cause: PauseCause) {
         if let Some(held) = &mut self.held {
             (held.to_stand, held.paused_by) = (true, cause);

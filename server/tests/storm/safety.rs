@@ -1,4 +1,4 @@
-//! People who stop robots, clear their stops, and drive them by hand in the middle of it all.
+//! People who stop robots, clear their stops, and teleoperate them in the middle of it all.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -91,7 +91,7 @@ impl Storm {
         Ok(!self.stops_in_force().await?.is_empty())
     }
 
-    /// Somebody clears a robot's newest stop, or whoever drives it by hand lets go.
+    /// Somebody clears a robot's newest stop, or whoever teleoperates it lets go.
     pub(super) async fn clear_or_release(&mut self, index: usize) -> Result<(), String> {
         let robot = with(&self.world, |world| {
             world.robots[index].end_lease();

@@ -156,16 +156,16 @@ type Step = (String, String);
 /// Whether two missions were in the robot's hands at the same time, by the order in which the
 /// server committed its history. Times do not matter.
 fn two_at_once(steps: &[Step]) -> Option<String> {
-    let mut in_hand: Vec<&str> = Vec::new();
+    let mut in_progress: Vec<&str> = Vec::new();
     for (mission, state) in steps {
         let state = MissionState::from_name(state)?;
         let is_in_hand = !state.is_terminal() && state != MissionState::Queued;
-        in_hand.retain(|held| held != mission);
+        in_progress.retain(|held| held != mission);
         if is_in_hand {
-            in_hand.push(mission);
+            in_progress.push(mission);
         }
-        if in_hand.len() > 1 {
-            return Some(format!("{in_hand:?} were in hand together"));
+        if in_progress.len() > 1 {
+            return Some(format!("{in_progress:?} were active together"));
         }
     }
     None

@@ -1,4 +1,4 @@
-//! Losing whoever drives a real robot by hand: it always stands. Losing one who looks on: it never
+//! Losing whoever teleoperates a real robot: it always stands. Losing one who looks on: it never
 //! does.
 
 use std::net::SocketAddr;

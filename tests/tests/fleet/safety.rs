@@ -1,4 +1,4 @@
-//! Stops over the death of an agent, fences, and driving by hand, with real servers and agents.
+//! Stops over the death of an agent, fences, and teleoperation, with real servers and agents.
 
 use std::time::Duration;
 
@@ -80,7 +80,7 @@ async fn a_stop_outlives_its_agent_and_its_clear_starts_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_robot_is_driven_by_hand_within_its_fence_and_stands_when_its_driver_is_gone() {
+async fn a_robot_is_teleoperated_within_its_fence_and_stands_when_its_driver_is_gone() {
     let mut fleet = fleet().await;
     fleet.start_agent(&robot(), 0.0).await;
     // The robot looks along x, at a fence 2.5 m ahead.

@@ -27,7 +27,7 @@ pub(super) struct Counts {
     pub(super) stale: usize,
     pub(super) offline: usize,
     pub(super) stopped: usize,
-    pub(super) in_hand: usize,
+    pub(super) in_progress: usize,
     pub(super) queued: usize,
     pub(super) alerts: usize,
 }
@@ -70,7 +70,7 @@ impl Known {
             .filter(|robot| robot.retired_at.is_none())
     }
 
-    /// Missions in hand, then those that wait, then what has ended, each the newest first.
+    /// Active missions, then those that wait, then what has ended, each the newest first.
     pub(super) fn missions(&self) -> Vec<Mission> {
         let mut missions: Vec<Mission> = self
             .missions
@@ -124,7 +124,7 @@ impl Known {
             stale: linked(LinkState::Stale),
             offline: linked(LinkState::Offline),
             stopped: self.robots().filter(is_stopped).count(),
-            in_hand: open().count() - queued,
+            in_progress: open().count() - queued,
             queued,
             alerts: self.alerts().len(),
         }

@@ -138,7 +138,7 @@ fn head(picture: &Picture<'_>) -> Vec<Line<'static>> {
         counted(counts.stale, "stale", Color::Yellow),
         counted(counts.offline, "offline", Color::Red),
         counted(counts.stopped, "stopped", Color::Red),
-        counted(counts.in_hand, "missions in hand", Color::Cyan),
+        counted(counts.in_progress, "active missions", Color::Cyan),
         counted(counts.queued, "queued", Color::Reset),
         counted(counts.alerts, "alerts", Color::Yellow),
     ];

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use tread_api::robot::PauseCause;
 use tread_control::fence::{FenceInput, MU_UNKNOWN};
-use tread_control::gate::hand::{BLIND_MAX_M_S, approach, no_faster, not_ahead};
+use tread_control::gate::teleoperation::{BLIND_MAX_M_S, approach, no_faster, not_ahead};
 use tread_control::gate::{GateCause, GateInput, GateOutput, Reasons, gate_with};
 use tread_control::geometry::Twist;
 use tread_control::measured::WheelSpeeds;
@@ -39,9 +39,9 @@ impl Guard {
         self.stop != 0
     }
 
-    /// Whether somebody has the lease of driving by hand.
+    /// Whether somebody has the lease of teleoperation.
     pub(super) fn is_leased(&self) -> bool {
-        self.view.hand.is_leased(self.now_us)
+        self.view.teleoperation.is_leased(self.now_us)
     }
 
     /// Judges what carries its own end by this time from now on.
@@ -82,12 +82,12 @@ impl Guard {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Wanted {
     pub(super) wheels: WheelSpeeds,
-    is_by_hand: bool,
+    is_teleoperated: bool,
     is_driver_silent: bool,
 }
 
 impl LoopCore {
-    /// Looks at stops, leases and limits, and holds the mission in hand where they ask for it.
+    /// Looks at stops, leases and limits, and holds the active mission where they ask for it.
     pub(super) fn check_safety(&mut self, now: Duration) {
         if let Some(watch) = &mut self.overrun {
             watch.note(now);
@@ -119,27 +119,27 @@ impl LoopCore {
         active.limit_speed(most_m_s);
     }
 
-    /// What the wheels are to do: what the hand wants, or what the mission wants.
+    /// What the wheels are to do: what the teleoperator wants, or what the mission wants.
     pub(super) fn choose(
         &self,
         now: Duration,
         by_mission: Option<WheelSpeeds>,
         dt_s: f64,
     ) -> Wanted {
-        let hand = &self.guard.view.hand;
+        let teleoperation = &self.guard.view.teleoperation;
         // A mission that is still braking for the lease comes to rest first.
         let is_mission_at_rest = self.active.as_ref().is_none_or(Active::rests);
-        if !(hand.is_leased(self.guard.now_us) && is_mission_at_rest) {
+        if !(teleoperation.is_leased(self.guard.now_us) && is_mission_at_rest) {
             return Wanted {
                 wheels: by_mission.unwrap_or_default(),
-                is_by_hand: false,
+                is_teleoperated: false,
                 is_driver_silent: false,
             };
         }
-        let wanted = hand.wanted_at(self.guard.now_us);
+        let wanted = teleoperation.wanted_at(self.guard.now_us);
         let previous = self.model.twist_from_wheel_speeds(self.command);
         let mut target = wanted.unwrap_or_default();
-        let ends_soon = hand.ends_soon(self.guard.now_us);
+        let ends_soon = teleoperation.ends_soon(self.guard.now_us);
         if ends_soon {
             target = no_faster(previous, target);
         }
@@ -149,7 +149,7 @@ impl LoopCore {
         }
         Wanted {
             wheels: self.model.wheel_speeds_from_twist(twist),
-            is_by_hand: true,
+            is_teleoperated: true,
             is_driver_silent: wanted.is_none(),
         }
     }
@@ -178,7 +178,7 @@ impl LoopCore {
 
     /// Whether the robot must stand for not knowing where it is, or else how fast it may be driven.
     ///
-    /// A mission needs a position. By hand the driver sees where the robot is: it goes slowly, and
+    /// A mission needs a position. A teleoperator sees where the robot is: it goes slowly, and
     /// within a fence only if its configuration says so.
     fn blindness(&self, fault: Option<Fault>, wanted: &Wanted) -> (bool, Option<f64>) {
         let is_lost = fault == Some(Fault::PositionLost)
@@ -191,12 +191,12 @@ impl LoopCore {
             .site
             .as_ref()
             .is_some_and(|site| !site.fence().is_empty());
-        let must_stand = if wanted.is_by_hand {
+        let must_stand = if wanted.is_teleoperated {
             is_fenced && !self.blind_within_fence
         } else {
             is_fenced || self.active.is_some()
         };
-        (must_stand, wanted.is_by_hand.then_some(BLIND_MAX_M_S))
+        (must_stand, wanted.is_teleoperated.then_some(BLIND_MAX_M_S))
     }
 
     fn reasons(&self, now: Duration, fault: Option<Fault>, wanted: &Wanted) -> Reasons {
@@ -209,26 +209,26 @@ impl LoopCore {
         } else {
             None
         };
-        let is_driving = is_moving || self.active.is_some() || wanted.is_by_hand;
+        let is_driving = is_moving || self.active.is_some() || wanted.is_teleoperated;
         let (is_position_lost, blind_max_m_s) = if is_driving {
             self.blindness(fault, wanted)
         } else {
             (false, None)
         };
-        let share = guard.view.hand.speed_share;
+        let share = guard.view.teleoperation.speed_share;
         let linear_max_m_s = self.model.limits().linear_max_m_s;
         Reasons {
             is_stopped: guard.is_stopped(),
             tilt_rad: self.tilt_rad,
             is_position_lost,
             is_loop_late: self.overrun().is_some(),
-            is_sensor_wrong: self.must_hold() && !wanted.is_by_hand,
+            is_sensor_wrong: self.must_hold() && !wanted.is_teleoperated,
             is_held_outside: guard.view.limits.holds(guard.now_us),
             is_link_silent: self.is_long_silent(),
             is_driver_silent: wanted.is_driver_silent,
             fence_max_m_s,
             outside_max_m_s: guard.view.limits.linear_max_m_s(guard.now_us),
-            command_age_max_m_s: (wanted.is_by_hand && share < 1.0)
+            command_age_max_m_s: (wanted.is_teleoperated && share < 1.0)
                 .then_some(share * linear_max_m_s),
             blind_max_m_s,
             sensors_max_m_s: sensors_max_m_s(&self.findings),

@@ -81,7 +81,7 @@ pub(crate) struct LoopCore {
     guard: Guard,
     /// Whether the loop keeps its rate, where that is known.
     overrun: Option<OverrunWatch>,
-    /// Whether the robot may be driven by hand within a fence without knowing where it is.
+    /// Whether the robot may be teleoperated within a fence without knowing where it is.
     blind_within_fence: bool,
     /// Whether a wheel slips beyond the model.
     slips: bool,
@@ -157,7 +157,7 @@ impl LoopCore {
         }
     }
 
-    /// The same loop with the configuration's word on driving by hand within a fence without
+    /// The same loop with the configuration's word on teleoperation within a fence without
     /// knowing where the robot is.
     #[must_use]
     pub(crate) fn with_blind_within_fence(mut self, may: bool) -> Self {

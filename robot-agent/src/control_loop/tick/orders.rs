@@ -67,7 +67,7 @@ impl LoopCore {
         }
     }
 
-    /// The mission in hand, if it is this one.
+    /// The active mission, if it is this one.
     fn of(&mut self, mission: MissionId) -> Option<&mut Active> {
         self.active
             .as_mut()

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use tread_control::consistency::{Consequence, Findings, Kind, Sample, Subject};
 use tread_control::gate::GateOutput;
-use tread_control::gate::hand::BLIND_MAX_M_S;
+use tread_control::gate::teleoperation::BLIND_MAX_M_S;
 use tread_control::measured::WheelSpeeds;
 
 use super::LoopCore;

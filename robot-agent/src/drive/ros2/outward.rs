@@ -35,7 +35,7 @@ const THETA_LABEL: &str = "theta,theta_std_dev,theta_loop";
 /// One of the topics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Word {
-    /// The plan of the mission in hand; empty without one.
+    /// The plan of the active mission; empty without one.
     Plan,
     /// The way driven since the last mission began, the newest [`PATH_POINTS_MAX`] points.
     Driven,

@@ -237,7 +237,7 @@ impl Ros2Settings {
 /// What is said to the rest of the robot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OutwardSettings {
-    /// The plan of the mission in hand, `nav_msgs/Path`.
+    /// The plan of the active mission, `nav_msgs/Path`.
     pub plan: Name,
     /// The way driven, `nav_msgs/Path`.
     pub driven: Name,

@@ -1,4 +1,4 @@
-// Driving by hand: the socket, the lease, and what the hands want. Whatever goes wrong means zero.
+// Teleoperation: the socket, the lease, and what the hands want. Whatever goes wrong means zero.
 import type { DriveUpdate, DriveView, Lease } from '../api/schema';
 import { texts } from '../texts';
 import { KEYS, clamped, wishOfAxes, wishOfKeys, type Wish } from './hands';

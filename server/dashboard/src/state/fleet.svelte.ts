@@ -241,7 +241,7 @@ export class Fleet implements Listener {
   }
 }
 
-/** Missions in hand before those that wait. */
+/** Active missions before those that wait. */
 function rank(mission: Mission): number {
   return mission.state === 'queued' ? 1 : 0;
 }

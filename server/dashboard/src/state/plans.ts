@@ -1,4 +1,4 @@
-// The smooth ways of missions in hand, which the server plans on request. They change when their
+// The smooth ways of active missions, which the server plans on request. They change when their
 // robot says from where it planned, and with the revision. Not reactive: the map draws them.
 import type { Mission, PlannedPath } from '../api/schema';
 import { ask } from '../api/client';

@@ -226,7 +226,7 @@ impl App {
         let (mut rows, _more) =
             db::missions::list(tx, &of_site, MISSIONS_MAX, MISSIONS_BYTES_MAX).await?;
         let known: HashSet<MissionId> = rows.iter().map(|row| row.mission.id).collect();
-        for standing in db::missions::in_hand(tx).await? {
+        for standing in db::missions::in_progress(tx).await? {
             if !known.contains(&standing.id) {
                 rows.extend(db::missions::find(tx, standing.id).await?);
             }

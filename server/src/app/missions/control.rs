@@ -20,7 +20,7 @@ use crate::db::robots::RobotRow;
 use crate::db::{self, DbError, Tx};
 
 impl App {
-    /// Wants a mission to end: one that waits ends at once, one in hand when its robot says so.
+    /// Wants a mission to end: one that waits ends at once, an active one when its robot says so.
     pub async fn cancel_mission(&self, id: MissionId) -> Result<MissionDetail, AppError> {
         let mut tx = self.db().write("missions").await?;
         let row = open_row(&mut tx, id).await?;
@@ -37,7 +37,7 @@ impl App {
         self.written(tx, id).await
     }
 
-    /// Wants a mission in hand to be held, the robot standing.
+    /// Wants an active mission to be held, the robot standing.
     pub async fn pause_mission(&self, id: MissionId) -> Result<MissionDetail, AppError> {
         self.want_pause(id, true).await
     }
@@ -57,13 +57,13 @@ impl App {
         let row = open_row(&mut tx, id).await?;
         let mission = &row.mission;
         let state = mission.state;
-        // One that waits and was held, because its robot was stopped or driven by hand, waits on.
+        // One that waits and was held, because its robot was stopped or teleoperated, waits on.
         let held_in_queue = state == MissionState::Queued && mission.pause_wanted && !wanted;
-        let in_hand = matches!(
+        let in_progress = matches!(
             state,
             MissionState::Offered | MissionState::Active | MissionState::Paused
         );
-        if !in_hand && !held_in_queue {
+        if !in_progress && !held_in_queue {
             return Err(AppError::MissionState { id, state, asked });
         }
         if !wanted {
@@ -83,7 +83,7 @@ impl App {
         self.written(tx, id).await
     }
 
-    /// Refuses to let a mission go on while its robot is stopped or driven by hand: it would start
+    /// Refuses to let a mission go on while its robot is stopped or teleoperated: it would start
     /// by itself afterwards.
     async fn check_free(&self, tx: &mut Tx, mission: &Mission) -> Result<(), AppError> {
         let (site, robot) = (&mission.site, &mission.robot);
@@ -94,7 +94,7 @@ impl App {
         {
             "a stop is in force; clear it first".to_owned()
         } else if let Some(lease) = safety.and_then(|safety| safety.lease.as_ref()) {
-            format!("`{}` drives it by hand", lease.driver.name)
+            format!("`{}` teleoperates it", lease.driver.name)
         } else {
             return Ok(());
         };
@@ -102,7 +102,7 @@ impl App {
         Err(AppError::RobotRefused { robot, detail })
     }
 
-    /// Wants a mission to be another trajectory. What waits is changed at once; what is in hand
+    /// Wants a mission to be another trajectory. What waits is changed at once; what is active
     /// when its robot holds the new revision whole, and until then the old one is driven.
     pub async fn replace_mission(
         &self,
@@ -134,11 +134,11 @@ impl App {
         let at = self.clock().now();
         let why = (Actor::Client, Cause::ReplaceRequested);
         let state = mission.state;
-        let in_hand = matches!(state, MissionState::Active | MissionState::Paused);
+        let in_progress = matches!(state, MissionState::Active | MissionState::Paused);
         if state == MissionState::Queued && mission.boot.is_none() {
             // Nobody drives it yet; a robot that has it all the same takes the new revision.
             db::missions::swap_content(&mut tx, id, mission.revision, &replacement).await?;
-        } else if in_hand && mission.replacement.is_none() {
+        } else if in_progress && mission.replacement.is_none() {
             if !robot.capabilities.replace {
                 return Err(AppError::RobotCannot {
                     robot: mission.robot.clone(),
@@ -162,8 +162,8 @@ impl App {
     }
 }
 
-/// Holds everything that a robot has in hand or that waits for it, because somebody stopped it or
-/// drives it by hand: nothing of it goes on until a person says so.
+/// Holds everything of a robot that is active or that waits for it, because somebody stopped it or
+/// teleoperates it: nothing of it goes on until a person says so.
 pub(in crate::app) async fn hold_all(
     tx: &mut Tx,
     robot_pk: i64,

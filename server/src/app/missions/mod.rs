@@ -135,7 +135,7 @@ impl App {
             mission,
         };
         db::missions::insert(tx, &row).await?;
-        if self.is_in_hands(tx, &row.mission).await? {
+        if self.is_operator_controlled(tx, &row.mission).await? {
             // It would start by itself once the robot is free again.
             db::missions::want_pause(tx, id, true).await?;
             row.mission.pause_wanted = true;
@@ -152,11 +152,15 @@ impl App {
         Ok(row.mission)
     }
 
-    /// Whether a mission's robot is stopped, or driven by hand.
-    async fn is_in_hands(&self, tx: &mut Tx, mission: &Mission) -> Result<bool, AppError> {
+    /// Whether a mission's robot is stopped, or teleoperated.
+    async fn is_operator_controlled(
+        &self,
+        tx: &mut Tx,
+        mission: &Mission,
+    ) -> Result<bool, AppError> {
         let (site, robot) = (&mission.site, &mission.robot);
         let presence = self.presences().get(&(site.clone(), robot.clone()));
-        Ok(presence.is_in_hands() || db::stops::is_stopped(tx, site, robot).await?)
+        Ok(presence.is_operator_controlled() || db::stops::is_stopped(tx, site, robot).await?)
     }
 
     /// Missions, newest first.

@@ -17,9 +17,9 @@
 //! * What the *robot* says of an end (`succeed`, `fail`, `cancel`, `expire`) is taken from every
 //!   open state, also from `queued`: a robot may have driven what its server believes returned.
 //! * A *cancel wanted*, by a person, by another mission that takes its place or by the robot's
-//!   retirement, ends what waits at once; what is in hand becomes `cancelling` until the robot has
+//!   retirement, ends what waits at once; what is active becomes `cancelling` until the robot has
 //!   answered, or is lost.
-//! * What is in hand fails when its robot is *lost*, when its agent *restarted* without it, or when
+//! * What is active fails when its robot is *lost*, when its agent *restarted* without it, or when
 //!   the robot *forgot* it; one that was being cancelled is cancelled then, unless it was lost.
 //!
 //! The states in the last row are terminal: nothing leads out of them, whatever arrives late.
@@ -231,12 +231,12 @@ mod tests {
     }
 
     #[test]
-    fn a_mission_that_waits_is_cancelled_at_once_and_one_in_hand_when_the_robot_says_so() {
+    fn a_mission_that_waits_is_cancelled_at_once_and_one_in_progress_when_the_robot_says_so() {
         use MissionState as S;
         for wanted in [Change::RequestCancel, Change::Supersede, Change::Retire] {
             assert_eq!(next(S::Queued, wanted), Some(S::Cancelled));
-            for in_hand in [S::Offered, S::Active, S::Paused] {
-                assert_eq!(next(in_hand, wanted), Some(S::Cancelling));
+            for in_progress in [S::Offered, S::Active, S::Paused] {
+                assert_eq!(next(in_progress, wanted), Some(S::Cancelling));
             }
         }
         assert_eq!(next(S::Cancelling, Change::Accept), None);

@@ -142,7 +142,7 @@ impl Presence {
     }
 
     /// Whether a stop is in force on the robot, or a person drives it.
-    pub fn is_in_hands(&self) -> bool {
+    pub fn is_operator_controlled(&self) -> bool {
         let safety = self.state().map(|state| &state.safety);
         safety.is_some_and(|safety| safety.stop.is_some() || safety.lease.is_some())
     }

@@ -106,7 +106,7 @@ pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppE
                 tx.commit().await?;
                 app.announce();
             }
-            // Cancelled meanwhile, or the robot has another one in hand.
+            // Cancelled meanwhile, or the robot has another an active one.
             Ok(None) => return Ok(Finished::Settled),
             Err(error) if error.is_unique_violation() => return Ok(Finished::Again),
             Err(error) => return Err(error.into()),
@@ -196,7 +196,7 @@ async fn take_offer_answer(
     Ok(how)
 }
 
-/// Offers a new revision of a mission in hand and writes down the answer.
+/// Offers a new revision of an active mission and writes down the answer.
 pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, AppError> {
     let mut tx = app.db().read("reconciler").await?;
     let row = db::missions::find(&mut tx, standing.id).await?;

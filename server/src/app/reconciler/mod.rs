@@ -208,7 +208,7 @@ impl Reconciler {
         self.app.sync_alerts().await?;
         self.attendance.look(&self.app).await?;
         let mut tx = self.app.db().read("reconciler").await?;
-        let mut open = db::missions::in_hand(&mut tx).await?;
+        let mut open = db::missions::in_progress(&mut tx).await?;
         open.extend(db::missions::next_in_queues(&mut tx).await?);
         let sites = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         drop(tx);

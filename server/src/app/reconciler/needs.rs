@@ -182,9 +182,9 @@ pub(super) fn decide(mission: &Standing, presence: &Presence, memory: Memory, no
         }
         MissionState::Active | MissionState::Paused => {
             let differs = memory.differs_from.is_some_and(longer_than(HOLD_GRACE));
-            let need = in_hand(mission, said, differs);
-            // Whoever stopped it or drives it by hand has written down that it is to be held.
-            if need == Need::Resume && presence.is_in_hands() {
+            let need = in_progress(mission, said, differs);
+            // Whoever stopped it or teleoperates it has written down that it is to be held.
+            if need == Need::Resume && presence.is_operator_controlled() {
                 Need::Wait
             } else {
                 need
@@ -208,7 +208,7 @@ fn of_present(mission: &Standing) -> impl Fn(MissionProgress) -> bool {
 
 /// What a mission needs that its robot drives or holds; `differs` when the robot has shown it as
 /// paused for a while and the server has not, or the other way round.
-fn in_hand(mission: &Standing, said: Option<MissionProgress>, differs: bool) -> Need {
+fn in_progress(mission: &Standing, said: Option<MissionProgress>, differs: bool) -> Need {
     let content = said.map(|said| (said.revision, said.plan_hash));
     if mission.replacement.is_some() {
         return if content == mission.replacement {
@@ -223,7 +223,7 @@ fn in_hand(mission: &Standing, said: Option<MissionProgress>, differs: bool) -> 
         (true, false) if differs => Need::Settle(Change::Resume),
         (false, true) => Need::Pause,
         (true, false) => Need::Resume,
-        // Whoever stopped the robot, or drove it by hand: only a person lets the mission go on. The
+        // Whoever stopped the robot, or teleoperated it: only a person lets the mission go on. The
         // robot's report of the pause makes that what is wanted here too.
         (false, false) if said.is_some_and(|said| said.is_paused_for_safety()) => Need::Wait,
         // A command that came late or twice had its way on the robot: once more.

@@ -146,15 +146,15 @@ fn standings(raw: Vec<RawStanding>) -> Result<Vec<Standing>, DbError> {
     raw.into_iter().map(Standing::try_from).collect()
 }
 
-/// All missions that a robot has in hand, or that wait for its answer.
-pub async fn in_hand(db: &mut SqliteConnection) -> Result<Vec<Standing>, DbError> {
+/// All active missions of a robot, or that wait for its answer.
+pub async fn in_progress(db: &mut SqliteConnection) -> Result<Vec<Standing>, DbError> {
     let raw = standings!("WHERE missions.state IN ('offered', 'active', 'paused', 'cancelling')")
         .fetch_all(db)
         .await?;
     standings(raw)
 }
 
-/// The mission that is next in the queue of each robot that has nothing in hand; one that is held
+/// The mission that is next in the queue of each robot that has no active mission; one that is held
 /// is passed over.
 pub async fn next_in_queues(db: &mut SqliteConnection) -> Result<Vec<Standing>, DbError> {
     let raw = standings!(
@@ -190,7 +190,7 @@ pub async fn overdue(
     standings(raw)
 }
 
-/// All missions of a robot that have not ended, the one in hand first, then as they are queued.
+/// All missions of a robot that have not ended, the active one first, then as they are queued.
 pub async fn open_of_robot(
     db: &mut SqliteConnection,
     robot_pk: i64,

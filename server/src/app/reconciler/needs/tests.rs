@@ -221,7 +221,7 @@ fn what_has_ended_needs_nothing() {
 }
 
 #[test]
-fn what_is_wanted_of_a_mission_in_hand_is_sent_until_the_robot_has_done_it() {
+fn what_is_wanted_of_a_mission_in_progress_is_sent_until_the_robot_has_done_it() {
     let driving = Said {
         drives: true,
         ..IDLE
@@ -258,7 +258,7 @@ fn what_is_wanted_of_a_mission_in_hand_is_sent_until_the_robot_has_done_it() {
     assert_eq!(needs(active, false, &holding, JUST), Need::Wait);
     assert_eq!(needs(active, false, &holding, LONG_AGO), Need::Resume);
     assert_eq!(needs(paused, true, &driving, LONG_AGO), Need::Pause);
-    // Stopped, or driven by hand: nothing goes on before a person wants it.
+    // Stopped, or teleoperated: nothing goes on before a person wants it.
     for cause in [PauseCause::Stop, PauseCause::Teleoperation] {
         let held = Said {
             paused_by: Some(cause),
@@ -289,7 +289,7 @@ fn a_new_revision_is_offered_until_the_robot_shows_that_it_holds_it() {
 }
 
 #[test]
-fn a_robot_that_stays_away_past_its_bound_loses_what_it_has_in_hand() {
+fn a_robot_that_stays_away_past_its_bound_loses_its_mission_in_progress() {
     let away_s = |state, away_s: i64| {
         let since = now().wall - jiff::SignedDuration::from_secs(away_s);
         let mission = Standing {

@@ -1,4 +1,4 @@
-//! Randomised trials of driving by hand over a bad network: how soon silence brings the robot to
+//! Randomised trials of teleoperation over a bad network: how soon silence brings the robot to
 //! rest, and on how much way.
 //!
 //! A driver sends a command every 50 ms, each with an end a little ahead; messages are lost,
@@ -101,7 +101,7 @@ impl Trial<'_> {
             .position(|message| message.arrives_us <= now_us)
         {
             let message = self.under_way.swap_remove(place);
-            if self.bench.drive_by_hand(&message.payload) {
+            if self.bench.teleoperate(&message.payload) {
                 self.last_end = Some((message.until_us, false));
             }
         }

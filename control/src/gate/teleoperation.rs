@@ -1,4 +1,4 @@
-//! What a twist wanted by hand becomes before the gate: within the robot's limits, on a ramp.
+//! What a teleoperated twist becomes before the gate: within the robot's limits, on a ramp.
 //!
 //! Late commands slow the robot down: above [`AGE_FULL_S`] the share of its speed falls in a
 //! straight line to [`SHARE_LEAST`] at [`AGE_LEAST_S`]. [`AgeMeter`] keeps the worst age of late, so
@@ -19,7 +19,7 @@ pub const AGE_FULL_S: f64 = 0.15;
 pub const AGE_LEAST_S: f64 = 0.5;
 /// The least share of the speed.
 pub const SHARE_LEAST: f64 = 0.2;
-/// Fastest drive by hand of a robot that does not know where it is, metres per second.
+/// Fastest teleoperate of a robot that does not know where it is, metres per second.
 pub const BLIND_MAX_M_S: f64 = 0.3;
 /// Time before the end of a command from which on it speeds the robot up no more, seconds: twice
 /// the lag of a wheel servo, so that robot and wheels have come together when it ends.
