@@ -205,8 +205,8 @@ impl Follower {
             FollowerStatus::Tracking
         };
         let sliding = plan
-            .reckoned_mu()
-            .map(|reckoned_mu| Sliding::new(model, reckoned_mu));
+            .assumed_mu()
+            .map(|assumed_mu| Sliding::new(model, assumed_mu));
         Ok(Self {
             sliding,
             governor: Governor::new(&model),

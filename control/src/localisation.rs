@@ -1,6 +1,6 @@
 //! Where the robot is: position fixes fused with gyro and wheel speeds.
 //!
-//! A Kalman filter over six states: pose, the difference between true and wheel-reckoned speed
+//! A Kalman filter over six states: pose, the difference between true and odometric speed
 //! ahead, the speed to the left (a skid-steered base slides sideways in turns), and the gyro's
 //! offset. The two speeds are first-order Markov, the offset wanders. Fixes that cannot be true are
 //! refused and counted; after [`REFUSED_MAX`] in a row the robot was moved, and the filter starts
@@ -64,7 +64,7 @@ pub struct LocalisationNoise {
     pub gyro_rad_s: f64,
     /// Wandering of the gyro's offset, radians per second and root second.
     pub gyro_offset_walk: f64,
-    /// Difference between true and wheel-reckoned speed ahead, metres per second.
+    /// Difference between true and odometric speed ahead, metres per second.
     pub speed_m_s: f64,
     /// Speed to the left, metres per second.
     pub sideways_m_s: f64,

@@ -10,7 +10,7 @@ use crate::plan::{Plan, PlanSample};
 use crate::robot::RobotModel;
 use crate::sliding::SlidingBounds;
 
-/// Plan speed below which rates of σ are reckoned as at this one, metres per second.
+/// Plan speed below which rates of σ are computed as at this one, metres per second.
 const SPEED_FLOOR_M_S: f64 = 0.05;
 /// A reference slower than this is brought to rest on a stop, metres per second.
 const REST_M_S: f64 = 2.0e-3;

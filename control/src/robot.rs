@@ -176,8 +176,8 @@ impl RobotModel {
     ///
     /// Only a share of `μg`: the rest turns the wheels against the ground, and serves feedback.
     pub(crate) fn within_traction_limit(&self, mu_peak: f64) -> Self {
-        let along_m_s2 = Self::grip_along_m_s2(mu_peak);
-        let across_m_s2 = Self::grip_across_m_s2(mu_peak);
+        let along_m_s2 = Self::longitudinal_traction_m_s2(mu_peak);
+        let across_m_s2 = Self::lateral_traction_m_s2(mu_peak);
         let mut spec = self.spec;
         let limits = &mut spec.limits;
         limits.linear_acceleration_max_m_s2 = limits.linear_acceleration_max_m_s2.min(along_m_s2);
@@ -188,12 +188,12 @@ impl RobotModel {
 
     /// Acceleration along the path that a plan may ask of ground with this peak friction, metres per
     /// second squared.
-    pub fn grip_along_m_s2(mu_peak: f64) -> f64 {
+    pub fn longitudinal_traction_m_s2(mu_peak: f64) -> f64 {
         TRACTION_SHARE_LONGITUDINAL * mu_peak * GRAVITY_M_S2
     }
 
     /// The same across the path.
-    pub fn grip_across_m_s2(mu_peak: f64) -> f64 {
+    pub fn lateral_traction_m_s2(mu_peak: f64) -> f64 {
         TRACTION_SHARE_LATERAL * mu_peak * GRAVITY_M_S2
     }
 

@@ -1,12 +1,12 @@
-//! Whether the ground gives less than a plan reckons with, seen from gyro and wheel speeds.
+//! Whether the ground gives less than a plan assumes, seen from gyro and wheel speeds.
 //!
 //! In the linear range the turn that the wheels ask for runs ahead of the body's by
-//! `θ (u/g) (4 I_G/(m(W² + L²))) ω̇`, u the speed of the rims. Ground whose peak the plan reckons
-//! with explains so much of it with `θ = λ_m/μ`; what is left over, less what radii, the effective
+//! `θ (u/g) (4 I_G/(m(W² + L²))) ω̇`, u the speed of the rims. Ground whose peak the plan assumes
+//! explains so much of it with `θ = λ_m/μ`; what is left over, less what radii, the effective
 //! track and noise may do, is summed to an angle, and a robot slides once that is large:
 //!
 //! ```text
-//! gripping ─ angle large, too little shown ─► sliding (for good)
+//! rolling ─ angle large, too little shown ─► sliding (for good)
 //! ```
 //! What the body did shows what the ground gave: four wheels of equal load that push the body
 //! with `a_y = vω` and turn it with `I_G ω̇` have a mean square of at least
@@ -38,13 +38,13 @@ const TRACK_RATIO: f64 = 0.1;
 const NOISE_RAD_S: f64 = 0.01;
 /// Angle from which a robot slides, radians.
 const SLIDING_RAD: f64 = 0.007;
-/// Slowest rims that slip is reckoned with, metres per second.
+/// Slowest rims for which slip is computed, metres per second.
 const RIM_MIN_M_S: f64 = 0.05;
 /// Share of what was shown that may be asked for along and across the path.
 const SHARE: f64 = 0.5;
 /// The same in yaw, where turning wheels scrub.
 const SHARE_YAW: f64 = 0.35;
-/// Least that counts as shown, over what the plan reckons with.
+/// Least that counts as shown, over what the plan assumes.
 const SHOWN_RATIO_MIN: f64 = 0.2;
 
 /// What may be asked of ground that slides.
@@ -73,7 +73,7 @@ struct Smoothed {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Sliding {
     model: RobotModel,
-    reckoned_mu: f64,
+    assumed_mu: f64,
     smoothed: Option<Smoothed>,
     /// `∫ (turn of the wheels − turn of the body) u` and `∫ u²` straight on.
     straight: [f64; 2],
@@ -83,11 +83,11 @@ pub(crate) struct Sliding {
 }
 
 impl Sliding {
-    /// A robot that grips, on ground whose plan reckons with a peak friction coefficient.
-    pub(crate) fn new(model: RobotModel, reckoned_mu: f64) -> Self {
+    /// A robot with traction, on ground whose plan assumes a peak friction coefficient.
+    pub(crate) fn new(model: RobotModel, assumed_mu: f64) -> Self {
         Self {
             model,
-            reckoned_mu,
+            assumed_mu,
             smoothed: None,
             straight: [0.0; 2],
             shown_m_s2: 0.0,
@@ -132,7 +132,7 @@ impl Sliding {
         let radii_ratio = RADII_RATIO * RADII_MIDDLE_M2_S / known_m2_s + RADII_LEFT_RATIO;
         let square_m2 = model.track_width_m().powi(2) + model.wheelbase_m().powi(2);
         let inertia_ratio = 4.0 * model.yaw_inertia_kg_m2() / (model.mass_kg() * square_m2);
-        let theta = SLIP_LINEAR / self.reckoned_mu;
+        let theta = SLIP_LINEAR / self.assumed_mu;
         let lag_s = theta * inertia_ratio * rim_m_s.max(RIM_MIN_M_S) / GRAVITY_M_S2;
         let explained_rad_s = EXPLAINED_RATIO * lag_s * yaw_rad_s2.abs()
             + radii_ratio * rim_m_s / model.effective_track_m()
@@ -140,14 +140,14 @@ impl Sliding {
             + NOISE_RAD_S;
         let left_over_rad_s = (smoothed.ahead_rad_s - radii_rad_s).abs() - explained_rad_s;
         self.left_over_rad = (self.left_over_rad + left_over_rad_s * dt_s).max(0.0);
-        // Ground that has given what the plan asks of it along the path is as good as reckoned.
-        let is_enough = self.shown_m_s2 >= RobotModel::grip_along_m_s2(self.reckoned_mu);
+        // Ground that has given what the plan asks of it along the path is as good as assumed.
+        let is_enough = self.shown_m_s2 >= RobotModel::longitudinal_traction_m_s2(self.assumed_mu);
         self.slides |= self.left_over_rad > SLIDING_RAD && !is_enough;
     }
 
     /// What may be asked of the ground, if the robot slides; rises with what was shown.
     pub(crate) fn bounds(&self) -> Option<SlidingBounds> {
-        let least_m_s2 = SHOWN_RATIO_MIN * self.reckoned_mu * GRAVITY_M_S2;
+        let least_m_s2 = SHOWN_RATIO_MIN * self.assumed_mu * GRAVITY_M_S2;
         let shown_m_s2 = self.shown_m_s2.max(least_m_s2);
         self.slides.then(|| SlidingBounds {
             along_m_s2: SHARE * shown_m_s2,
@@ -172,7 +172,7 @@ mod tests {
     use crate::measured::WheelSpeeds;
 
     const DT_S: f64 = 0.01;
-    const RECKONED_MU: f64 = 0.14;
+    const ASSUMED_MU: f64 = 0.14;
 
     fn measured(turn_rad_s: f64, wheels: Twist, radii: [f64; 2]) -> Measured {
         let wheels = RobotModel::yi2007().wheel_speeds_from_twist(wheels);
@@ -211,7 +211,7 @@ mod tests {
             swing_rad_s in -0.8..0.8_f64, pace_1_s in 0.5..4.0_f64, lag_s in 0.0..0.03_f64,
             left in 0.98..1.02_f64, right in 0.98..1.02_f64,
         ) {
-            let mut sliding = Sliding::new(RobotModel::yi2007(), RECKONED_MU);
+            let mut sliding = Sliding::new(RobotModel::yi2007(), ASSUMED_MU);
             for tick in driven(swing_rad_s, pace_1_s, lag_s, [left, right]) {
                 sliding.step(&tick, DT_S);
                 prop_assert!(sliding.bounds().is_none());
@@ -222,7 +222,7 @@ mod tests {
         fn bounds_never_fall_and_sliding_never_ends(
             swing_rad_s in 0.1..0.4_f64, pace_1_s in 0.5..2.0_f64, lag_s in 0.1..2.0_f64,
         ) {
-            let mut sliding = Sliding::new(RobotModel::yi2007(), RECKONED_MU);
+            let mut sliding = Sliding::new(RobotModel::yi2007(), ASSUMED_MU);
             let mut before_m_s2 = 0.0;
             for tick in driven(swing_rad_s, pace_1_s, lag_s, [1.0; 2]) {
                 sliding.step(&tick, DT_S);
@@ -238,7 +238,7 @@ mod tests {
 
     #[test]
     fn a_body_that_stays_behind_its_wheels_slides() {
-        let mut sliding = Sliding::new(RobotModel::yi2007(), RECKONED_MU);
+        let mut sliding = Sliding::new(RobotModel::yi2007(), ASSUMED_MU);
         for tick in driven(0.4, 2.0, 0.5, [1.0; 2]) {
             sliding.step(&tick, DT_S);
         }

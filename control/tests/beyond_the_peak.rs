@@ -74,7 +74,7 @@ fn wheels_beyond_the_peak_cost_hardly_more_than_wheels_below_it() {
 }
 
 #[test]
-fn tyres_that_lose_no_grip_in_a_bend_are_found_out() {
+fn tyres_that_lose_no_friction_in_a_bend_are_detected() {
     for (stiffness, bound_m) in [(0.5, 5.0e-4), (1.0, 4.0e-4), (5.0, 7.0e-4)] {
         let ticks = figure_8(curve(stiffness, 0.9), |_| known(1.0 / stiffness));
         let (found_m, last) = (rms_m(last_half(&ticks)), believed(ticks.last().unwrap()));

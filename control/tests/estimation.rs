@@ -154,7 +154,7 @@ fn without_torque_segments_add_up_to_the_truth() {
 }
 
 #[test]
-fn tyres_that_grip_better_or_worse_across_do_not_bias_theta() {
+fn tyres_of_another_lateral_stiffness_do_not_bias_theta() {
     for (seed, ratio) in [(1_u64, 0.7), (2, 1.4)] {
         for torque in [true, false] {
             let mut robot = SimRobot::new(Pose::default(), 5.0, seed, true);

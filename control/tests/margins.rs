@@ -1,4 +1,4 @@
-//! Margins of the loop across the path, reckoned from its linear model.
+//! Margins of the loop across the path, computed from its linear model.
 //!
 //! Heading and cross-track error in the distance domain, slip relaxation of yaw and of the course,
 //! servo lag, delay of a sample and a half; the inner loop on the turn rate closed.

@@ -56,7 +56,7 @@ class Plant:
         self.command = [0.0, 0.0]
         self.sides = [0.0, 0.0]
 
-    def grip(self, slip):
+    def friction(self, slip):
         peak, left = 0.2, 0.8
         if slip < peak:
             return self.stiffness
@@ -75,7 +75,7 @@ class Plant:
             for end in (1.0, -1.0):
                 across_y = left + end * self.base / 2 * turn
                 slip = math.hypot(across_x, across_y) / reference
-                pull = -load * self.grip(slip) / reference
+                pull = -load * self.friction(slip) / reference
                 fx, fy = pull * across_x, pull * across_y
                 force_x += fx
                 force_y += fy
@@ -196,7 +196,7 @@ class Node:
         self.session.close()
 
 
-class Rival:
+class DuplicateCommander:
     """Another node, which writes on a topic that has its writer."""
 
     def __init__(self, node, topic, kind):
@@ -220,7 +220,7 @@ class Robot:
         self.bias = [0.02 * self.rng.uniform(-1, 1) for _ in range(2)]
         self.torque_scale = 1 + 0.02 * self.rng.uniform(-1, 1)
         self.faults, self.commanded_at, self.bare_commands, self.commands = {}, 0.0, 0, 0
-        self.late, self.rivals, self.frozen, self.own_command = [], {}, {}, [0.0, 0.0]
+        self.late, self.duplicates, self.frozen, self.own_command = [], {}, {}, [0.0, 0.0]
         # What `rmw_zenohd` is beside the nodes.
         self.router = session({"mode": "router", "listen/endpoints": [arguments.endpoint]}) if arguments.router else None
         self.node = Node(self)
@@ -249,9 +249,9 @@ class Robot:
 
     def write_as_another(self, fault, topic, content):
         """Another node writes this."""
-        if fault not in self.rivals:
-            self.rivals[fault] = Rival(self.node, topic, content.__msgtype__)
-        self.rivals[fault].write(content)
+        if fault not in self.duplicates:
+            self.duplicates[fault] = DuplicateCommander(self.node, topic, content.__msgtype__)
+        self.duplicates[fault].write(content)
 
     def held(self, fault, values):
         """What a sensor that froze says: what it said first when it did."""

@@ -6,7 +6,7 @@ use crate::reference::ReferenceSample;
 
 /// Newton steps to the nearest point.
 const NEWTON_STEPS: usize = 6;
-/// Speed below which a Newton step is reckoned as at this one, metres per second.
+/// Speed below which a Newton step is computed as at this one, metres per second.
 const SPEED_FLOOR_M_S: f64 = 0.05;
 /// Farthest move of the nearest point in one Newton step, seconds.
 const MOVE_MAX_S: f64 = 0.5;

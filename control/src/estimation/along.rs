@@ -80,7 +80,7 @@ pub(super) struct SlipBound {
     pub(super) curvature: Curvature,
 }
 
-/// What sideways drift is reckoned with.
+/// Assumed lateral drift.
 #[derive(Debug, Clone, Copy)]
 struct Sideways {
     /// θ as it is known.

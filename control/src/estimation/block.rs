@@ -111,7 +111,7 @@ pub(super) struct ThetaBound {
 }
 
 impl ThetaBound {
-    /// θ with which a block reckons slip from force. One that is barely known may be many times too
+    /// θ with which a block computes slip from force. One that is barely known may be many times too
     /// large, and what a row holds is never taken back.
     pub(super) fn theta_of_slip(&self) -> f64 {
         self.theta.unwrap_or(THETA_FIRST)

@@ -17,7 +17,7 @@ use crate::robot::{GRAVITY_M_S2, RobotModel};
 
 /// Rounds in which the slips that the forces cause are found.
 const ROUNDS: usize = 3;
-/// Share of a tyre's stiffness that is reckoned with at least.
+/// Share of a tyre's stiffness that is assumed at least.
 const STIFFNESS_LEFT_MIN: f64 = 0.2;
 
 /// What contacts lose, over κ.

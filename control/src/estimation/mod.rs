@@ -75,7 +75,7 @@ const MU_MAX: f64 = 10.0;
 const THETA_FIRST: f64 = 0.2;
 /// Range in which an estimate of θ is believed.
 const THETA_RANGE: std::ops::RangeInclusive<f64> = 5.0e-3..=10.0;
-/// Largest θ that is reckoned with before there is any estimate.
+/// Largest θ that is assumed before there is any estimate.
 const THETA_MOST_FIRST: f64 = 2.0;
 /// Share of θ that rows on accelerations leave out: products of θ with what is learned meanwhile.
 /// One error of all of a robot's segments; with torque that of the torque constants is.
@@ -337,7 +337,7 @@ impl Estimator {
                 .map_or(THETA_FIRST, |found| {
                     found.theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end())
                 }),
-            // A measured θ may be beyond what is reckoned with at first.
+            // A measured θ may be beyond what is assumed at first.
             theta_most: if theta.is_some() {
                 most
             } else {

@@ -229,7 +229,7 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
                 (theta, 0.0)
             } else {
                 // Force over load is then an acceleration, and the slip that stands for it is
-                // reckoned with a radius too large by δ_c: what is estimated is θ(1 − δ_c). Torque
+                // computed with a radius too large by δ_c: what is estimated is θ(1 − δ_c). Torque
                 // reads too high by just that share.
                 (theta * (1.0 + parameters[index::RADIUS_OFFSET]), theta)
             };
@@ -317,7 +317,7 @@ pub(super) struct Solution {
     noisier: f64,
     /// How θ follows from the parameters.
     of_theta: Parameters,
-    /// θκ² as it was reckoned with.
+    /// θκ² as it was computed with.
     tangent: Tangent,
     /// What rows to second order may miss of curved tyres, in θ; alike everywhere.
     missed: f64,

@@ -25,7 +25,7 @@ const TURNS_RAD: [f64; 5] = [-1.0, -0.5, 0.0, 0.5, 1.0];
 /// Paces of the parameter at a leg's start that are tried, over that at its end: a slow one bends
 /// early, while the robot gathers speed.
 const START_PACES: [f64; 2] = [1.0, 0.4];
-/// Turn rate reckoned for turning on the spot, share of the limit.
+/// Turn rate computed for turning on the spot, share of the limit.
 const SPOT_TURN_SHARE: f64 = 0.4;
 
 /// The circle that is joined.

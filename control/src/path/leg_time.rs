@@ -17,7 +17,7 @@ const PIECE_TIME_STEPS: usize = 10;
 const ADVANCE_SHARE_MIN: f64 = 0.05;
 /// Tightest turn of a leg, metres.
 const LEG_RADIUS_MIN_M: f64 = 2.0 * RADIUS_MIN_M;
-/// Share of the limits reckoned with in the bends of a spline: one that needs them all is no good
+/// Share of the limits assumed in the bends of a spline: one that needs them all is no good
 /// one.
 const SPLINE_LIMIT_SHARE: f64 = 0.5;
 /// A leg nearer to its circle than this is on it, metres.

@@ -90,7 +90,7 @@ impl Blame {
         };
         Self {
             along: if gives(
-                RobotModel::grip_along_m_s2,
+                RobotModel::longitudinal_traction_m_s2,
                 limits.linear_acceleration_max_m_s2,
             ) {
                 SlowedBy::Traction
@@ -98,7 +98,7 @@ impl Blame {
                 SlowedBy::LinearAcceleration
             },
             across: if gives(
-                RobotModel::grip_across_m_s2,
+                RobotModel::lateral_traction_m_s2,
                 limits.lateral_acceleration_max_m_s2,
             ) {
                 SlowedBy::Traction

@@ -46,7 +46,7 @@ const GRID_MAX: usize = 1_000_000;
 const BEND_LOOKED_INTO_1_M: f64 = 1.0;
 /// Parts of such a cell.
 const PARTS_LOOKED_INTO: u8 = 8;
-/// Peak friction coefficient that is reckoned with on the way to a trajectory while nothing is
+/// Peak friction coefficient that is assumed on the approach while nothing is
 /// known of the ground.
 const TRACTION_LIMIT_UNKNOWN_MU: f64 = 0.14;
 /// Fewest cells of the timing.
@@ -68,7 +68,7 @@ pub struct PlanOptions<'map> {
 }
 
 impl PlanOptions<'_> {
-    /// Peak friction coefficient that the geometry reckons with, if the ground is known.
+    /// Peak friction coefficient that the geometry assumes, if the ground is known.
     fn least_traction_limit_mu(&self) -> Option<f64> {
         self.traction_limits
             .map(TractionLimitMap::least)
@@ -476,9 +476,9 @@ impl Plan {
         self.approach_length_m
     }
 
-    /// Peak friction coefficient that the way to the trajectory is reckoned with, unless the ground
+    /// Peak friction coefficient that the approach is computed with, unless the ground
     /// is known.
-    pub(crate) fn reckoned_mu(&self) -> Option<f64> {
+    pub(crate) fn assumed_mu(&self) -> Option<f64> {
         (!self.traction_limit_is_known).then_some(TRACTION_LIMIT_UNKNOWN_MU)
     }
 

@@ -84,7 +84,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_place_has_the_lowest_grip_of_all_squares_that_touch_its_own(
+        fn a_place_has_the_lowest_traction_limit_of_all_squares_that_touch_its_own(
             squares in prop::collection::btree_map((-6..6_i32, -6..6_i32), 0.01..1.0_f64, 0..40),
             x_m in -8.0..8.0_f64, y_m in -8.0..8.0_f64, square_m in 0.5..2.0_f64,
         ) {
@@ -103,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_grip_makes_no_map() {
+    fn what_is_no_traction_limit_makes_no_map() {
         for bad in [0.0, -1.0, f64::NAN, f64::INFINITY] {
             let square = TractionLimitCell {
                 ix: 0,

@@ -8,7 +8,7 @@
 //! standstill.
 //!
 //! In tight bends wheels slip beyond the peak of their friction curve, whatever the speed, and the sideslip
-//! is several times as large. The turn is therefore reckoned by the four-wheel sum itself, in its
+//! is several times as large. The turn is therefore computed with the four-wheel sum itself, in its
 //! linear range and with the loss beyond the peak of [`TrackerConfig::friction_curve`]; a share χ̂ of that
 //! loss is believed, adapted like θ̂, so that tyres of another shape are found out.
 //!
@@ -310,7 +310,7 @@ impl Tracker {
         } else {
             cross_m
         };
-        // More changes nothing at the end of what is reckoned with, and would wind up.
+        // More changes nothing at the end of what is assumed, and would wind up.
         let most = if sideslip.is_at_end {
             0.0
         } else {

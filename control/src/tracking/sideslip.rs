@@ -12,7 +12,7 @@ use super::turn::{SIDESLIP_MAX, SteadyTurn, Turn};
 const RATE_SPAN_S: f64 = 0.02;
 /// Speed that curvature is taken over at least, metres per second.
 const SPEED_MIN_M_S: f64 = 1.0e-3;
-/// θ with which a turn is reckoned at least: sideslip is looked at per θ.
+/// θ with which a turn is computed at least: sideslip is looked at per θ.
 const THETA_LOOK_MIN: f64 = 0.02;
 
 /// What the law believes of the ground.
@@ -35,7 +35,7 @@ pub(super) struct Sideslip {
     pub(super) drift_per_theta_m_s: f64,
     /// The same per share of the loss beyond the peak.
     pub(super) drift_per_beyond_m_s: f64,
-    /// Whether it is at the end of what is reckoned with: more of θ or of the loss changes nothing.
+    /// Whether it is at the end of what is assumed: more of θ or of the loss changes nothing.
     pub(super) is_at_end: bool,
     /// What the rims must roll beyond the kinematics of the reference.
     pub(super) rims: Twist,

@@ -15,7 +15,7 @@ const LINEAR_ROUNDS: u32 = 2;
 const SHARE_ROUNDS: u32 = 6;
 /// Change of a share that asks for another round.
 const SHARE_STEP_MIN: f64 = 1.0e-6;
-/// Largest sideslip that is reckoned with, left over ahead: beyond it the robot slides, and a nose
+/// Largest sideslip that is assumed, left over ahead: beyond it the robot slides, and a nose
 /// that is turned further in makes it slide more.
 pub(super) const SIDESLIP_MAX: f64 = 0.1;
 /// Share of stiffness that a wheel keeps at least.
@@ -23,7 +23,7 @@ const SHARE_MIN: f64 = 0.05;
 /// Slowest and fastest rims over the speed ahead.
 const RIMS: std::ops::RangeInclusive<f64> = 0.05..=20.0;
 /// Share of the curvature at which the inner rims would stand, by kinematics alone, up to which a
-/// turn is reckoned.
+/// turn is computed.
 const TIGHT_MAX: f64 = 0.7;
 
 /// A steady turn, all speeds over the speed ahead.
@@ -39,7 +39,7 @@ pub(super) struct SteadyTurn {
 /// beyond the peak.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Turn {
-    /// Curvature that was reckoned with, 1/m: the asked one up to a bound.
+    /// Curvature that was assumed, 1/m: the asked one up to a bound.
     pub(super) curvature_1_m: f64,
     pub(super) linear: SteadyTurn,
     pub(super) beyond: SteadyTurn,
@@ -210,13 +210,13 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(48))]
         #[test]
-        fn a_simulated_base_turns_as_reckoned(
+        fn a_simulated_base_turns_as_modelled(
             stiffness in (-0.7..3.0_f64).prop_map(f64::exp), peak_slip in 0.15..0.9_f64,
             curvature in -1.4..1.4_f64, speed_m_s in 0.3..0.6_f64,
         ) {
             let curve = friction_curve(stiffness, peak_slip);
             let compliance_m = speed_m_s * speed_m_s / (stiffness * GRAVITY_M_S2);
-            // Ground that cannot hold the turn at all is not reckoned.
+            // Ground that cannot hold the turn at all is not modelled.
             prop_assume!(speed_m_s * speed_m_s * curvature.abs() < 0.5 * curve.mu_peak() * GRAVITY_M_S2);
             let model = RobotModel::yi2007();
             let turn = Turn::steady(&model, &curve, curvature, compliance_m);

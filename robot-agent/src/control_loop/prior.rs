@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn grip_by_place_counts_in_its_grid_alone() {
+    fn traction_limits_by_place_count_in_their_grid_alone() {
         let grid = |revision| Grid {
             revision,
             cell_m: 2.0,

@@ -83,7 +83,7 @@ fn a_robot_that_was_told_knows_the_ground_from_the_first_metre() {
 }
 
 #[test]
-fn little_grip_makes_a_slower_plan() {
+fn a_low_traction_limit_makes_a_slower_plan() {
     let duration_s = |traction_limit_mu: f64| {
         let prior = everywhere(0.2, 0.02, traction_limit_mu);
         let mut bench = knowing_bench(5.0, 5, Some(&prior));

@@ -156,7 +156,7 @@ mod tests {
         for theta in [0.01, 0.01] {
             watch.note(seen(theta));
         }
-        assert!(watch.raised().is_some(), "more grip is a change too");
+        assert!(watch.raised().is_some(), "more friction is a change too");
         watch.begin_mission();
         assert_eq!(watch.raised(), None);
     }

@@ -9,7 +9,7 @@
 //! W_eff = W + α·L²/W,    α = lateral over longitudinal slip stiffness
 //! ```
 //!
-//! Ground that grips alike in all directions has α = 1, whatever its θ, and the tyres of real
+//! Ground with the same friction in all directions has α = 1, whatever its θ, and the tyres of real
 //! robots lie within [`STIFFNESS_RATIO`]. So a configured W is impossible where `W_eff` is below it, and
 //! implausible where α would have to lie outside that range. A W within the range that `W_eff` allows
 //! looks like another ground: that range is said, to be compared with a tape measure.

@@ -459,7 +459,7 @@ speed_m_s = 0.5
             ("cell_m = 1.0", "cell_m = 0.0", "cell_m", "0"),
             (
                 "seed = 1",
-                "seed = 1\ngrip_ratio = nan",
+                "seed = 1\nstiffness_ratio = nan",
                 "line 11",
                 "stiffness_ratio",
             ),

@@ -219,7 +219,7 @@ export const texts = {
     legendSlip: 'Slip: line left, dashed right; positive drives, negative brakes.',
   },
   missions: {
-    open: 'In hand and waiting',
+    open: 'Active and waiting',
     ended: 'History',
     none: 'No mission is open.',
     noneEnded: 'No mission has ended yet.',

@@ -31,7 +31,7 @@ pub struct SpeedScale {
 
 /// The speed from which a robot stops within the distance, metres per second.
 fn speed_m_s(traction_limit_mu: f64, scale: SpeedScale) -> f64 {
-    (2.0 * RobotModel::grip_along_m_s2(traction_limit_mu) * scale.stopping_m).sqrt()
+    (2.0 * RobotModel::longitudinal_traction_m_s2(traction_limit_mu) * scale.stopping_m).sqrt()
 }
 
 /// The value of a cell: whole hundredths, rounded down, at least one (0 would be no limit at all).

@@ -5,7 +5,7 @@ use tread_api::friction::NORMAL_95;
 
 use super::coverage::Normal;
 use super::fuse::MU_ALONE_MAX;
-use super::tests::{HOUR_S, at_us, fused, fused_as, gripping, measured};
+use super::tests::{HOUR_S, at_us, fused, fused_as, measured, with_peak_friction};
 use super::weights::FrictionConfig;
 use super::*;
 
@@ -120,7 +120,12 @@ fn the_word_of_one_robot_raises_no_limit_above_what_others_have_shown() {
         robot_bias_ratio: BIAS_RATIO,
         ..FrictionConfig::default()
     };
-    let claim = |robot: u8, mu: f64| (robot, gripping(mu, measured(0.2, 0.01, i64::from(robot))));
+    let claim = |robot: u8, mu: f64| {
+        (
+            robot,
+            with_peak_friction(mu, measured(0.2, 0.01, i64::from(robot))),
+        )
+    };
     let mu = |parts: &[(u8, Sums)]| {
         let fused = fused(parts.iter().copied(), &config).unwrap();
         fused.mu_peak_lower_bound
@@ -139,7 +144,10 @@ fn the_word_of_one_robot_raises_no_limit_above_what_others_have_shown() {
     );
     let often = [
         claim(1, 10.0),
-        (1, gripping(10.0, measured(0.2, 0.01, HOUR_S + 60))),
+        (
+            1,
+            with_peak_friction(10.0, measured(0.2, 0.01, HOUR_S + 60)),
+        ),
     ];
     assert_eq!(
         mu(&often),

@@ -97,7 +97,7 @@ impl<R> Seen<R> {
     }
 
     /// Deviation of this robot's bias as a share of θ: what it says of itself, and no less than what
-    /// is reckoned with.
+    /// is assumed.
     pub(super) fn bias_ratio(&self, config: &FrictionConfig) -> f64 {
         self.robot_ratio.max(config.robot_bias_ratio)
     }

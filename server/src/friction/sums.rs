@@ -75,7 +75,7 @@ pub struct Pass {
 }
 
 impl Pass {
-    /// Whether θ is known by it at all: `θ/σ = Λθ/√Λ`. The database reckons the same.
+    /// Whether θ is known by it at all: `θ/σ = Λθ/√Λ`. The database computes the same.
     fn is_telling(&self) -> bool {
         self.theta.is_some_and(|theta| {
             let least = TELLING_DEVIATIONS * TELLING_DEVIATIONS * theta.information;

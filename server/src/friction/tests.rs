@@ -50,7 +50,7 @@ pub(super) fn measured(theta: f64, std_dev: f64, age_s: i64) -> Sums {
     }
 }
 
-pub(super) fn gripping(mu_peak: f64, sums: Sums) -> Sums {
+pub(super) fn with_peak_friction(mu_peak: f64, sums: Sums) -> Sums {
     let newest = Pass {
         mu_peak: Some(mu_peak),
         ..sums.newest
@@ -229,11 +229,11 @@ fn iced(on_ice: &[(u8, i64)]) -> Vec<(u8, Sums)> {
         let robot = u8::try_from(visit % 3).unwrap();
         let theta = 0.2 + 0.001 * f64::from(robot);
         let age_s = 600 + i64::from(visit) * 700;
-        (robot, gripping(0.6, measured(theta, 0.01, age_s)))
+        (robot, with_peak_friction(0.6, measured(theta, 0.01, age_s)))
     });
     let after = on_ice
         .iter()
-        .map(|&(robot, age_s)| (robot, gripping(0.1, measured(1.43, 0.07, age_s))));
+        .map(|&(robot, age_s)| (robot, with_peak_friction(0.1, measured(1.43, 0.07, age_s))));
     before.chain(after).collect()
 }
 
@@ -270,7 +270,7 @@ fn a_pass_that_says_next_to_nothing_does_not_hide_the_ice_before_it() {
 }
 
 #[test]
-fn better_grip_is_believed_when_a_second_pass_confirms_it() {
+fn more_friction_is_believed_when_a_second_pass_confirms_it() {
     let config = FrictionConfig::default();
     let frozen = |visit: i64| (1, measured(1.43, 0.07, 2 * HOUR_S + visit));
     let thawed = |robot: u8, age_s: i64| (robot, measured(0.2, 0.01, age_s));
@@ -286,7 +286,7 @@ fn better_grip_is_believed_when_a_second_pass_confirms_it() {
 #[test]
 fn friction_that_was_seen_expires() {
     let config = FrictionConfig::default();
-    let seen = |age_s| gripping(0.7, measured(0.2, 0.01, age_s));
+    let seen = |age_s| with_peak_friction(0.7, measured(0.2, 0.01, age_s));
     let by_two = |age_s| [1, 2].map(|robot| (robot, seen(age_s)));
     let young = fused(by_two(HOUR_S), &config).unwrap();
     assert_eq!(young.mu_peak_lower_bound, Some(0.7));
@@ -329,7 +329,7 @@ fn part() -> impl Strategy<Value = (u8, Sums)> {
     )
         .prop_map(|(robot, theta, std_dev, age_s, mu)| {
             let sums = measured(theta, std_dev, age_s);
-            (robot, mu.map_or(sums, |mu| gripping(mu, sums)))
+            (robot, mu.map_or(sums, |mu| with_peak_friction(mu, sums)))
         })
 }
 

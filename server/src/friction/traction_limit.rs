@@ -1,6 +1,6 @@
 //! The friction coefficient to plan with, from what the map knows.
 
-/// What is reckoned with where nothing better is known; the robots' own planner has the same.
+/// What is assumed where nothing better is known; the robots' own planner has the same.
 pub const CAUTIOUS_MU: f64 = 0.14;
 /// Slip up to which friction grows in proportion to it.
 const SLIP_LINEAR: f64 = 0.2;

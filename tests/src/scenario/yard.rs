@@ -146,7 +146,7 @@ pub fn truth(scenario: &Scenario, terrain: Option<&str>, at_s: f64) -> f64 {
 }
 
 /// How much θ of each of `count` robots differs from that of all, as a share: equal steps whose
-/// standard deviation is the one that the server reckons with, dealt out by the seed. So no seed
+/// standard deviation is the one that the server assumes, dealt out by the seed. So no seed
 /// decides whether the fleet is as it is said to be.
 fn biases(count: u32, random: &mut Random) -> Vec<f64> {
     let deviation = FrictionConfig::default().robot_bias_ratio;

@@ -65,7 +65,7 @@ pub(crate) struct LoopCore {
     last_sample: Option<Duration>,
     last_fix: Option<Duration>,
     /// Until when the localisation has accounted for the robot's motion.
-    reckoned_to: Option<Duration>,
+    integrated_to: Option<Duration>,
     /// How fast the robot went by a sensor of its own, m/s, and when.
     body_speed: Option<(f64, Duration)>,
     /// How far the robot leans, if the base measures it.
@@ -130,7 +130,7 @@ impl LoopCore {
             last_tick: None,
             last_sample: None,
             last_fix: None,
-            reckoned_to: None,
+            integrated_to: None,
             body_speed: None,
             tilt_rad: None,
             silent_after: SILENT_AFTER_MAX,

@@ -59,7 +59,7 @@ impl LoopCore {
                 // nonsense is as good as silent.
                 self.last_sample = Some(sample.at);
                 self.check_gap(sample.at);
-                self.reckoned_to = self.reckoned_to.max(Some(sample.at));
+                self.integrated_to = self.integrated_to.max(Some(sample.at));
                 self.measured_wheels = wheel_speeds;
                 if dt_s > 0.0 {
                     let ahead = self.model.twist_from_wheel_speeds(wheel_speeds).linear_m_s;
@@ -114,13 +114,13 @@ impl LoopCore {
     /// Where the robot went while its wheels were not heard, nobody knows: without this, what its
     /// position says afterwards would be refused as a jump.
     fn check_gap(&mut self, at: Duration) {
-        let Some(reckoned_to) = self.reckoned_to else {
+        let Some(integrated_to) = self.integrated_to else {
             return;
         };
-        let gap = at.saturating_sub(reckoned_to);
+        let gap = at.saturating_sub(integrated_to);
         if gap > self.silent_after {
             self.localisation.lose_track(gap.as_secs_f64());
-            self.reckoned_to = Some(at);
+            self.integrated_to = Some(at);
         }
     }
 

@@ -18,7 +18,7 @@ pub(super) fn message_type(kind: CommandKind) -> MessageType {
     }
 }
 
-/// The motion by which the base, with the radius and track that it reckons with, turns its wheels
+/// The motion by which the base, with the radius and track that it assumes, turns its wheels
 /// so.
 fn twist(command: WheelSpeeds, settings: &CommandSettings) -> Twist {
     let half_radius_m = 0.5 * settings.base_radius_m;

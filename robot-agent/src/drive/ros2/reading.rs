@@ -342,7 +342,7 @@ pub fn battery(bytes: &[u8]) -> Result<Option<Reading>, Refusal> {
     Ok(Some((message.header.stamp, Content::Battery(battery))))
 }
 
-/// The wheels' speeds behind a motion that the base reckoned from them.
+/// The wheels' speeds behind a motion that the base computed from them.
 pub fn wheels_of(motion: &Motion, command: &CommandSettings) -> WheelSpeeds {
     let turn_m_s = 0.5 * command.base_track_m * motion.yaw_rate_rad_s;
     WheelSpeeds {

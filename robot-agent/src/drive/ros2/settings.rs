@@ -92,7 +92,7 @@ pub struct Timing {
 /// What the odometry's motion is the motion of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MotionOf {
-    /// The wheels: it was reckoned from them, by the base's own radius and track.
+    /// The wheels: it was computed from them, by the base's own radius and track.
     Wheels,
     /// The body over ground: by camera, laser or satellite.
     Ground,
@@ -205,9 +205,9 @@ pub struct CommandSettings {
     pub kind: CommandKind,
     /// The frame of a stamped command.
     pub frame: String,
-    /// The wheels' radius that the base reckons with, metres.
+    /// The wheels' radius that the base assumes, metres.
     pub base_radius_m: f64,
-    /// The track that the base reckons with, metres: its separation times its multiplier.
+    /// The track that the base assumes, metres: its separation times its multiplier.
     pub base_track_m: f64,
     /// 1.0, or -1.0 where the base takes a turn to the right for positive.
     pub turn_sign: f64,

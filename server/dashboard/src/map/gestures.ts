@@ -20,7 +20,7 @@ export interface Hands {
   over(at: PointPx | null): void;
 }
 
-type Grip =
+type Drag =
   | { what: 'press'; from: PointPx; at: PointPx }
   | { what: 'pan'; at: PointPx }
   | { what: 'point'; index: number }
@@ -29,7 +29,7 @@ type Grip =
 /** Lets hands work on a canvas; gives what ends it. */
 export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands): () => void {
   const pointers = new Map<number, PointPx>();
-  let grip: Grip | null = null;
+  let drag: Drag | null = null;
 
   const place = (event: MouseEvent): PointPx => {
     const box = canvas.getBoundingClientRect();
@@ -42,18 +42,18 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, at);
     if (pointers.size > 1) {
-      grip = null;
+      drag = null;
       return;
     }
     const draft = hands.draft();
     const near = draft && draft.kind !== 'circle' ? draft.nearest(camera.toM(at), REACH_PX / camera.scale) : null;
     if (draft && near !== null) {
       draft.mark();
-      grip = { what: 'point', index: near };
+      drag = { what: 'point', index: near };
     } else if (draft?.kind === 'circle') {
-      grip = { what: 'circle', from: at };
+      drag = { what: 'circle', from: at };
     } else {
-      grip = { what: 'press', from: at, at };
+      drag = { what: 'press', from: at, at };
     }
   };
 
@@ -68,16 +68,16 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
       return;
     }
     const draft = hands.draft();
-    if (grip?.what === 'press' && distance(grip.from, at) > CLICK_PX) grip = { what: 'pan', at: grip.from };
-    if (grip?.what === 'pan') {
-      camera.pan(at.x - grip.at.x, at.y - grip.at.y);
-      grip.at = at;
+    if (drag?.what === 'press' && distance(drag.from, at) > CLICK_PX) drag = { what: 'pan', at: drag.from };
+    if (drag?.what === 'pan') {
+      camera.pan(at.x - drag.at.x, at.y - drag.at.y);
+      drag.at = at;
       hands.moved();
-    } else if (grip?.what === 'point' && draft) {
-      draft.move(grip.index, camera.toM(at));
+    } else if (drag?.what === 'point' && draft) {
+      draft.move(drag.index, camera.toM(at));
       hands.changed();
-    } else if (grip?.what === 'circle' && draft && distance(grip.from, at) > CLICK_PX) {
-      drawCircle(draft, grip.from, at);
+    } else if (drag?.what === 'circle' && draft && distance(drag.from, at) > CLICK_PX) {
+      drawCircle(draft, drag.from, at);
     }
   };
 
@@ -100,10 +100,10 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
   };
 
   const up = (event: PointerEvent) => {
-    const held = grip;
+    const held = drag;
     pointers.delete(event.pointerId);
     isDrawing = false;
-    grip = null;
+    drag = null;
     if (held?.what !== 'press') return;
     const draft = hands.draft();
     if (draft && draft.kind !== 'circle') {
@@ -117,7 +117,7 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
   const cancel = (event: PointerEvent) => {
     pointers.delete(event.pointerId);
     isDrawing = false;
-    grip = null;
+    drag = null;
   };
 
   const wheel = (event: WheelEvent) => {

@@ -88,7 +88,7 @@ impl SiteView {
 
 impl App {
     /// Works on the map on a thread that may be kept busy: a lock that is held while something is
-    /// reckoned keeps no other request waiting for its thread.
+    /// computed keeps no other request waiting for its thread.
     pub(in crate::app) async fn off_thread<T: Send + 'static>(
         &self,
         work: impl FnOnce(&Self) -> T + Send + 'static,

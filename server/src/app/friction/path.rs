@@ -450,9 +450,9 @@ fn set_speeds(pieces: &mut [PathPiece], cut: &[Cut], length_m: f64, model: &Robo
     let mut next_m_s = 0.0_f64;
     let mut next_at_m = length_m;
     for (piece, cut) in pieces.iter_mut().zip(cut).rev() {
-        let along = PlannedModel::grip_along_m_s2(piece.traction_limit_mu);
+        let along = PlannedModel::longitudinal_traction_m_s2(piece.traction_limit_mu);
         let along = along.min(limits.linear_acceleration_max_m_s2);
-        let across = PlannedModel::grip_across_m_s2(piece.traction_limit_mu);
+        let across = PlannedModel::lateral_traction_m_s2(piece.traction_limit_mu);
         let across = across.min(limits.lateral_acceleration_max_m_s2);
         let braked = (next_m_s * next_m_s + 2.0 * along * (next_at_m - cut.from_m)).sqrt();
         let curve = if cut.curvature_1_m > 0.0 {
