@@ -77,7 +77,7 @@ const KNOWN_CYCLES: &[(&str, &str, &[&str])] = &[
         "outbox",
         &["bounded_file", "damage", "head_file", "recovery", "store"],
     ),
-    ("robot-agent", "recording", &["read", "replay", "words"]),
+    ("robot-agent", "recording", &["codec", "read", "replay"]),
 ];
 
 /// What one module names.

@@ -32,15 +32,15 @@ fn root() -> PathBuf {
 }
 
 fn walk(folder: &Path, found: &mut Vec<PathBuf>) {
-    for entry in fs::read_dir(folder).unwrap() {
-        let entry = entry.unwrap();
+    for entry in fs::read_dir(folder).expect("a folder") {
+        let entry = entry.expect("a readable entry");
         let (path, name) = (entry.path(), entry.file_name());
         let name = name.to_string_lossy();
         if SKIPPED.contains(&&*name) {
             continue;
         }
         let is_read = path.extension().and_then(|end| end.to_str());
-        if entry.file_type().unwrap().is_dir() {
+        if path.is_dir() {
             walk(&path, found);
         } else if is_read.is_some_and(|end| READ.contains(&end)) {
             found.push(path);
@@ -50,7 +50,7 @@ fn walk(folder: &Path, found: &mut Vec<PathBuf>) {
 
 /// The lines of a list: its columns.
 fn columns(file: &str) -> Vec<Vec<String>> {
-    let text = fs::read_to_string(root().join("tests").join(file)).unwrap();
+    let text = fs::read_to_string(root().join("tests").join(file)).expect("the list");
     let lines = text.lines().filter(|line| !line.starts_with('#'));
     lines
         .map(|line| line.split('\t').map(str::to_owned).collect())

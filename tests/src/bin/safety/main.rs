@@ -20,7 +20,7 @@ mod stop;
 use std::process::ExitCode;
 
 use clap::Parser;
-use tread_agent::bench::{hand_trials, lease_model};
+use tread_agent::bench::{lease_model, teleoperation_trials};
 use tread_tests::fleet::Fleet;
 use tread_tests::process::node;
 use tread_tests::report::{self, Check, figure};
@@ -78,7 +78,7 @@ async fn main() -> anyhow::Result<ExitCode> {
 }
 
 fn on_the_bench(trials: u64, steps: u64, seed: u64) -> anyhow::Result<Vec<Check>> {
-    let hand = hand_trials::run(trials, seed)?;
+    let hand = teleoperation_trials::run(trials, seed)?;
     let model = lease_model::run(steps, seed);
     let counts = model.counts;
     let refused = counts.malformed + counts.foreign + counts.out_of_order + counts.expired;
