@@ -21,12 +21,12 @@ const SAMPLES_PER_FIX: u32 = 10;
 /// Standard deviations of a position fix: metres, and radians of heading.
 const FIX_NOISE: (f64, f64) = (0.01, 0.005);
 
-/// What a robot of a scenario is like, and what it is told about itself.
+/// What a robot of a scenario is like, and what is configured about it.
 #[derive(Clone, Copy)]
 pub(crate) struct RobotSpec {
     pub(crate) model: RobotModel,
     pub(crate) curve: FrictionCurve,
-    /// Noise of the sensors, and what the estimator is told of it.
+    /// Noise of the sensors, and what is configured of it in the estimator.
     pub(crate) noise: SensorNoise,
     /// Largest error of a side's rolling radius; drawn evenly up to it.
     pub(crate) radius_error_max: f64,
@@ -38,7 +38,7 @@ pub(crate) struct RobotSpec {
     pub(crate) tyres: Tyres,
     /// Brush tyres whose curvature is drawn evenly between these, per slip.
     pub(crate) curvatures: Option<[f64; 2]>,
-    pub(crate) told_tyres: TyrePrior,
+    pub(crate) configured_tyres: TyrePrior,
 }
 
 impl RobotSpec {
@@ -54,7 +54,7 @@ impl RobotSpec {
             servo_lag_s: 0.05,
             tyres: Tyres::default(),
             curvatures: None,
-            told_tyres: TyrePrior::default(),
+            configured_tyres: TyrePrior::default(),
         }
     }
 }
@@ -98,7 +98,7 @@ impl SeededRobot {
         };
         let model = spec.model;
         let prior = EstimatorPrior {
-            tyres: spec.told_tyres,
+            tyres: spec.configured_tyres,
             ..EstimatorPrior::exact()
         };
         let mut robot = Self {

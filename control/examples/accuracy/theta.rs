@@ -15,7 +15,7 @@ const WIDTHS: [f64; 3] = [0.6745, 1.2816, 1.9600];
 pub(crate) enum Goal {
     /// Intervals that hold, and an RMS error of at most this share, where one is asked for.
     Measures { rms_max: Option<f64> },
-    /// Told plainly and not asked for: the robot is not what it is told to be.
+    /// Reported without a goal: the robot is not as it is configured.
     Reports,
     /// No measurement at any moment.
     Abstains,
@@ -176,8 +176,8 @@ const INTERVALS_HOLD: &str = ": 95 % intervals hold";
 /// Runs scenarios with seeds from one on.
 pub(crate) fn measure(scenarios: Vec<Scenario>, first_seed: u64, options: &Options) -> Section {
     let mut text = String::from(
-        "| scenario | bias % | RMS % | told σ % | in 50 % | in 80 % | in 95 % | abstains % | \
-         false alarms | first in 95 % | segments RMS % | segments in 95 % |\n\
+        "| scenario | bias % | RMS % | reported σ % | coverage of 50 % | of 80 % | of 95 % | abstains % | \
+         false alarms | first-estimate coverage | segments RMS % | segment coverage |\n\
          |---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     let mut lines = Vec::new();
@@ -255,7 +255,7 @@ fn check(scenario: &Scenario, found: &Figures, checks: &mut Vec<Check>) {
 fn line(name: &str, found: &Figures) -> Value {
     json!({
         "scenario": name,
-        "bias": found.bias, "rms": found.rms, "told_std_dev": found.std_dev,
+        "bias": found.bias, "rms": found.rms, "reported_std_dev": found.std_dev,
         "coverage_50": found.coverage[0], "coverage_80": found.coverage[1],
         "coverage_95": found.coverage[2], "abstention": 1.0 - found.measured,
         "ever_measured": found.ever_measured, "ever_informed": found.ever_informed,
@@ -399,24 +399,28 @@ fn sweeps(all: &mut Vec<Scenario>) {
 /// Tyres of a smooth curve; the truth is their initial slope.
 fn tyres(all: &mut Vec<Scenario>) {
     // κ = 1/(3λ_m) of 0.46 to 2.88, mean 1.67, standard deviation 0.7, at θ = 0.2.
-    let told = TyrePrior {
+    let brush = TyrePrior {
         curvature: 0.2 * 1.67,
         curvature_std_dev: 0.2 * 0.7,
         ..TyrePrior::default()
     };
-    for (who, told_tyres, goal) in [
+    for (who, configured_tyres, goal) in [
         (
-            "told of a straight rise",
+            "configured for a straight rise",
             TyrePrior::default(),
             Goal::Reports,
         ),
-        ("told of a brush", told, Goal::Measures { rms_max: None }),
+        (
+            "configured for a brush",
+            brush,
+            Goal::Measures { rms_max: None },
+        ),
     ] {
         for has_torque in [true, false] {
             let mut robot = RobotSpec::on(5.0);
             robot.has_torque = has_torque;
             robot.curvatures = Some([0.46, 2.88]);
-            robot.told_tyres = told_tyres;
+            robot.configured_tyres = configured_tyres;
             let (drive, what) = if has_torque {
                 (
                     Drive::StraightThenCircles {

@@ -138,10 +138,10 @@ const CHANGES: [(&str, Change); 22] = [
         robot.rotor_ratio = 0.1;
         robot.gear_loss_ratio = 0.03;
     }),
-    ("center of mass 5 % ahead", |robot| {
+    ("center of mass 5 % forward", |robot| {
         robot.center_ahead_ratio = 0.05;
     }),
-    ("center of mass 5 % behind", |robot| {
+    ("center of mass 5 % rearward", |robot| {
         robot.center_ahead_ratio = -0.05;
     }),
     ("center of mass 3 % left", |robot| {
