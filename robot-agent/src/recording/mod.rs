@@ -3,7 +3,7 @@
 //! ```text
 //! loop ──notes (bounded, never waited for)──► thread ──► run-….mcap, the oldest gives way
 //! ```
-//! A record holds the loop's own words to the bit ([`words`]), so that `tread-agent replay` can run
+//! A record holds the loop's own values to the bit ([`codec`]), so that `tread-agent replay` can run
 //! controller and estimator on it again, and beside them the same in messages of ROS ([`views`]),
 //! for Foxglove and ROS's tools. A disk that is full or dead costs the record alone.
 
