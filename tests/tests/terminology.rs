@@ -14,7 +14,7 @@ const READ: [&str; 10] = [
     "rs", "ts", "svelte", "md", "toml", "json", "py", "mjs", "sh", "yml",
 ];
 /// Folders and files that are made by programs, that must stay as they were, or that name the words.
-const SKIPPED: [&str; 10] = [
+const SKIPPED: [&str; 11] = [
     ".git",
     ".sqlx",
     "dist",
@@ -22,6 +22,7 @@ const SKIPPED: [&str; 10] = [
     "node_modules",
     "package-lock.json",
     "samples",
+    "schema.d.ts",
     "target",
     "terminology.rs",
     "terminology-exceptions.txt",

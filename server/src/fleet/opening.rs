@@ -6,11 +6,13 @@
 //! undefined behaviour, and is not compiled in.
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use tracing::warn;
 use tread_api::tunnel::RouterCredentials;
+use uuid::Uuid;
 use zenoh::{Config, Session, Wait as _};
 
 use super::access::control;
@@ -104,6 +106,11 @@ impl Opener {
     }
 }
 
+/// Ports of which one is taken where any will do: below those of outgoing connections.
+const PORTS: Range<u16> = 20_000..32_768;
+/// Ports that are tried before the system is asked for one.
+const PORT_TRIES_MAX: u32 = 32;
+
 /// Closes a session, as far as it lets itself be closed.
 pub(super) async fn close(session: Session) {
     let closing = tokio::task::spawn_blocking(move || session.close().wait());
@@ -115,13 +122,21 @@ pub(super) async fn close(session: Session) {
     }
 }
 
-/// Zenoh does not say which port it took for 0, so a free one is looked for first.
+/// Zenoh does not say which port it took for 0, so a free one is looked for first: where the system
+/// takes none for outgoing connections, so that nobody has it when zenoh listens.
 pub(super) fn with_free_port(address: SocketAddr) -> Result<SocketAddr, FleetError> {
     if address.port() != 0 {
         return Ok(address);
     }
-    TcpListener::bind(address)
-        .and_then(|listener| listener.local_addr())
+    let somewhere = || {
+        let within = Uuid::new_v4().as_u128() % u128::from(PORTS.end - PORTS.start);
+        let port = PORTS.start + u16::try_from(within).unwrap_or_default();
+        SocketAddr::new(address.ip(), port)
+    };
+    let tries = (0..PORT_TRIES_MAX).map(|_| somewhere()).chain([address]);
+    let mut free = tries.map(|address| TcpListener::bind(address)?.local_addr());
+    free.find(Result::is_ok)
+        .unwrap_or_else(|| Err(std::io::ErrorKind::AddrInUse.into()))
         .map_err(|cause| FleetError::NoPort { address, cause })
 }
 
