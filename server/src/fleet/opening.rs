@@ -133,10 +133,10 @@ pub(super) fn with_free_port(address: SocketAddr) -> Result<SocketAddr, FleetErr
         let port = PORTS.start + u16::try_from(within).unwrap_or_default();
         SocketAddr::new(address.ip(), port)
     };
-    let tries = (0..PORT_TRIES_MAX).map(|_| somewhere()).chain([address]);
-    let mut free = tries.map(|address| TcpListener::bind(address)?.local_addr());
-    free.find(Result::is_ok)
-        .unwrap_or_else(|| Err(std::io::ErrorKind::AddrInUse.into()))
+    let free = (0..PORT_TRIES_MAX).find_map(|_| TcpListener::bind(somewhere()).ok());
+    // The system's own choice otherwise, or its reason.
+    free.map_or_else(|| TcpListener::bind(address), Ok)
+        .and_then(|listener| listener.local_addr())
         .map_err(|cause| FleetError::NoPort { address, cause })
 }
 
