@@ -45,7 +45,8 @@ pub(super) struct Channels {
     hellos: mpsc::Sender<Asked>,
     uploads: mpsc::Sender<Asked>,
     limits: RateLimits,
-    links: Links,
+    /// Robots' links, where they come through the gate.
+    links: Option<Links>,
 }
 
 #[derive(Debug)]
@@ -73,7 +74,7 @@ impl Channels {
         supervisor: &Supervisor,
         app: &App,
         uploads_out: mpsc::Sender<Upload>,
-        links: Links,
+        links: Option<Links>,
     ) -> Self {
         let (presence, presence_in) = mpsc::channel(PRESENCE_WAITING_MAX);
         let (states, states_in) = mpsc::channel(STATES_WAITING_MAX);
@@ -168,7 +169,8 @@ impl Channels {
 
     /// The router keeps every token, and gets slow for all robots.
     fn cut_off(&self, robot: &RobotKey, now: Duration) {
-        if self.links.cut_off(robot, now) {
+        let links = self.links.as_ref();
+        if links.is_some_and(|links| links.cut_off(robot, now)) {
             let (site, robot) = robot;
             warn!(
                 robot.id = %robot,

@@ -207,7 +207,8 @@ impl Fleet {
         let Some(opener) = opener else {
             return Ok(());
         };
-        let links = gate::Links::default();
+        let gate = self.gate.lock().ok().and_then(|mut gate| gate.take());
+        let links = gate.as_ref().map(|_| gate::Links::default());
         let pool = Arc::new(RouterPool {
             app: app.clone(),
             routers: Arc::clone(&self.routers),
@@ -221,8 +222,7 @@ impl Fleet {
         self.supervisor.spawn_vital("pulse", pulse);
         let changes = changes::run(app.clone(), Arc::clone(&self.routers), stop());
         self.supervisor.spawn_vital("changes", changes);
-        let gate = self.gate.lock().ok().and_then(|mut gate| gate.take());
-        if let Some(gate) = gate {
+        if let (Some(gate), Some(links)) = (gate, links) {
             let keeping = Arc::clone(&pool).run(stop());
             self.supervisor.spawn_vital("routers", keeping);
             let (routers, supervisor) = (Arc::clone(&self.routers), self.supervisor.clone());

@@ -123,7 +123,6 @@ mod tests {
     use zenoh::Wait as _;
 
     use super::super::Fleet;
-    use super::super::gate::Links;
     use super::super::inbox::Channels;
     use super::super::opening::{Opener, with_free_port};
     use super::*;
@@ -163,7 +162,7 @@ mod tests {
                     supervisor: supervisor.clone(),
                     next: AtomicU64::new(0),
                 },
-                channels: Channels::new(&supervisor, &app, uploads, Links::default()),
+                channels: Channels::new(&supervisor, &app, uploads, None),
                 turn: Mutex::new(()),
             };
             pool.open().await.unwrap();
