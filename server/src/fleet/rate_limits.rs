@@ -22,9 +22,9 @@ const TOKENS_MAX: usize = 16;
 const LATE_TOKENS_MAX: usize = 4;
 /// Tokens of one robot that one router may have, and that may appear at once; one more each second.
 /// An agent declares one each time it connects.
-const TOKENS_BEARABLE: u32 = 128;
-const TOKENS_APPEARING: RateLimit = RateLimit {
-    burst: TOKENS_BEARABLE,
+const DECLARED_TOKENS_MAX: u32 = 128;
+const DECLARED_TOKENS_RATE: RateLimit = RateLimit {
+    burst: DECLARED_TOKENS_MAX,
     interval: Duration::from_secs(1),
 };
 /// Least time between two log lines on one robot's refused messages.
@@ -149,7 +149,7 @@ impl Robot {
     fn declared(&mut self, router: u64, now: Duration) -> bool {
         let there = self.declared.entry(router).or_default();
         *there += 1;
-        *there > TOKENS_BEARABLE || !self.appearing.take(TOKENS_APPEARING, now)
+        *there > DECLARED_TOKENS_MAX || !self.appearing.take(DECLARED_TOKENS_RATE, now)
     }
 
     /// Takes a token up, if there is room and it does not come too fast.
@@ -393,7 +393,7 @@ mod tests {
         assert_eq!(count(Appeared::Taken), TOKENS_MAX);
         assert_eq!(
             count(Appeared::Excessive),
-            23_000 - TOKENS_BEARABLE as usize
+            23_000 - DECLARED_TOKENS_MAX as usize
         );
         assert!(
             limits.late_tokens(ms(60_000)).is_empty(),
@@ -435,10 +435,10 @@ mod tests {
             gap_s in 1_u64..100,
         ) {
             let limits = RateLimits::default();
-            for number in 0..=u64::from(TOKENS_BEARABLE) {
+            for number in 0..=u64::from(DECLARED_TOKENS_MAX) {
                 let place = (number.to_string(), 0);
                 let appeared = limits.token_appeared(&robot("rover-1"), place, ms(1_000 * gap_s * number));
-                let is_beyond = number == u64::from(TOKENS_BEARABLE);
+                let is_beyond = number == u64::from(DECLARED_TOKENS_MAX);
                 prop_assert_eq!(appeared == Appeared::Excessive, is_beyond);
             }
         }

@@ -146,7 +146,7 @@ fn standings(raw: Vec<RawStanding>) -> Result<Vec<Standing>, DbError> {
     raw.into_iter().map(Standing::try_from).collect()
 }
 
-/// All active missions of a robot, or that wait for its answer.
+/// All missions in progress: active ones, and those that wait for their robot's answer.
 pub async fn in_progress(db: &mut SqliteConnection) -> Result<Vec<Standing>, DbError> {
     let raw = standings!("WHERE missions.state IN ('offered', 'active', 'paused', 'cancelling')")
         .fetch_all(db)
