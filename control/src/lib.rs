@@ -4,7 +4,7 @@
 //! are SI and stand last in a name. Frames are right-handed: the site's frame is metric with
 //! headings counter-clockwise from x; the body frame has x ahead and y to the left.
 //!
-//! * Words: [`geometry`], [`robot`], [`friction`], [`measured`].
+//! * Words: [`geometry`], [`robot`], [`friction`], [`slip`], [`measured`].
 //! * Planning (may allocate): [`trajectory`] is what is asked for, [`path`] its geometry,
 //!   [`profile`] its timing, [`excitation`] a variation of it, [`plan`] all, from where the robot stands.
 //! * Driving (one call per tick): [`mod@reference`] walks along the plan, [`tracking`] turns errors
@@ -12,10 +12,8 @@
 //!   how fast a robot may be where it is.
 //! * Knowing: [`localisation`] says where the robot is, [`estimation`] the friction of the ground,
 //!   [`consistency`] whether the sensors agree.
-//! * [`mod@paper`] is the paper this began with, exactly; its law is a bench, not what ships.
-//! * [`plant`] is the simulated base; [`mod@bench`] holds laws written only for comparison.
+//! * [`plant`] is the simulated base.
 
-pub mod bench;
 pub mod consistency;
 pub mod estimation;
 pub mod excitation;
@@ -26,7 +24,6 @@ pub mod gate;
 pub mod geometry;
 pub mod localisation;
 pub mod measured;
-pub mod paper;
 pub mod path;
 pub mod plan;
 pub mod plant;
@@ -35,6 +32,7 @@ pub mod progress;
 pub mod reference;
 pub mod robot;
 mod sliding;
+pub mod slip;
 pub mod tracking;
 pub mod trajectory;
 pub mod twist_limits;

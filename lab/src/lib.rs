@@ -1,7 +1,18 @@
 //! What the product is measured with, and no package contains.
 //!
-//! * [`rough`]: a second world, written from the physics alone: robots, contacts and sensors that
+//! * [`mod@paper`] is the paper this began with, exactly; its law is a bench, not what ships.
+//! * [`mod@bench`] holds laws written only for comparison, and the run that compares.
+//! * `rough`: a second world, written from the physics alone: robots, contacts and sensors that
 //!   differ from the agent's own simulator and from each other.
+//! * `teleoperation_trials`: random drivers on a bad network who fall silent.
+//!
+//! The last two drive the agent's own loop, which the feature `agent` brings (on by default). What
+//! needs the controller alone compiles much sooner with `--no-default-features`.
 
+pub mod bench;
+pub mod paper;
 pub mod random;
+#[cfg(feature = "agent")]
 pub mod rough;
+#[cfg(feature = "agent")]
+pub mod teleoperation_trials;

@@ -13,8 +13,8 @@ use std::time::Duration;
 
 use anyhow::Context;
 use tread_agent::RecordingConfig;
-use tread_agent::bench::{Bench, PERIOD, site_of};
 use tread_agent::sim::scenario::Scenario;
+use tread_agent::testing::{Bench, PERIOD, site_of};
 use tread_control::geometry::Pose;
 
 /// How long is recorded.

@@ -8,9 +8,9 @@
 use std::time::Duration;
 
 use anyhow::Context;
-use tread_agent::bench::{Bench, site_of};
 use tread_agent::clock::{Clock, SystemClock};
 use tread_agent::sim::scenario::Scenario;
+use tread_agent::testing::{Bench, site_of};
 use tread_control::geometry::Pose;
 
 /// Longest simulated time of one mission.
@@ -36,7 +36,7 @@ fn main() -> anyhow::Result<()> {
             .filter(|mission| mission.robot == robot.id);
         for (number, asked) in (1..).zip(missions) {
             let mission = bench.begin(number, &asked.trajectory, None)?;
-            let ticks_max = MISSION_MAX.as_millis() / tread_agent::bench::PERIOD.as_millis();
+            let ticks_max = MISSION_MAX.as_millis() / tread_agent::testing::PERIOD.as_millis();
             for _ in 0..ticks_max {
                 bench.simulate();
                 let began = clock.monotonic();

@@ -11,13 +11,12 @@
 //! * [`membership`]: the robot's certificate, how it gets it and the next one.
 //! * `safety`: what may only slow the robot down, and teleoperation.
 //! * `recording`: what the loop took and gave, in files, and running such files again.
-//! * [`mod@bench`] steps the loop by hand, for tests and figures.
+//! * `testing` steps the loop by hand, for tests and figures; no program that ships contains it.
 //! * Below all: [`clock`], `supervisor`, [`geometry`] (between wire and controller).
 //!
 //! No module keeps anything global: several agents may run in one process.
 
 pub mod agent;
-pub mod bench;
 pub mod clock;
 pub mod config;
 pub mod drive;
@@ -28,6 +27,8 @@ pub mod missions;
 pub mod outbox;
 pub mod program;
 pub mod sim;
+#[cfg(any(test, feature = "testing"))]
+pub mod testing;
 
 mod alerts;
 mod base;

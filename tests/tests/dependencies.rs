@@ -22,13 +22,18 @@ const CRATES: [&str; 7] = [
 ];
 
 /// Crates of this workspace that a crate may depend on, tests aside.
-const CRATE_RULES: [(&str, &[&str]); 5] = [
+const CRATE_RULES: [(&str, &[&str]); 7] = [
     ("api", &[]),
     ("control", &[]),
     ("ros2", &[]),
     ("robot-agent", &["tread-api", "tread-control", "tread-ros2"]),
     ("server", &["tread-api", "tread-control"]),
+    ("cli", &["tread-agent", "tread-api", "tread-server"]),
+    ("lab", &["tread-agent", "tread-api", "tread-control"]),
 ];
+
+/// Crates that are shipped. None of them may contain the agent's test support.
+const SHIPPED: [&str; 6] = ["api", "cli", "control", "robot-agent", "ros2", "server"];
 
 /// Modules of the server that a module must not name.
 const SERVER_RULES: [(&str, &[&str]); 12] = [
@@ -264,13 +269,34 @@ fn cycles(modules: &Modules) -> BTreeMap<String, BTreeSet<String>> {
     found
 }
 
+/// The dependencies of a crate, tests aside.
+fn dependencies_of(name: &str) -> toml::Table {
+    let manifest = fs::read_to_string(root().join(name).join("Cargo.toml"));
+    let manifest: toml::Table = manifest
+        .expect("every crate has a manifest")
+        .parse()
+        .expect("a manifest is TOML");
+    let dependencies = manifest.get("dependencies").and_then(toml::Value::as_table);
+    dependencies.cloned().unwrap_or_default()
+}
+
+#[test]
+fn nothing_shipped_contains_the_test_support_of_the_agent() {
+    for name in SHIPPED {
+        let dependencies = dependencies_of(name);
+        let agent = dependencies.get("tread-agent");
+        let features = agent.and_then(|agent| agent.get("features")?.as_array());
+        assert!(
+            features.is_none_or(|features| !features.contains(&toml::Value::from("testing"))),
+            "{name} ships the feature `testing` of the agent"
+        );
+    }
+}
+
 #[test]
 fn no_crate_depends_on_one_that_it_must_not_know() {
     for (name, allowed) in CRATE_RULES {
-        let manifest = fs::read_to_string(root().join(name).join("Cargo.toml")).unwrap();
-        let manifest: toml::Table = manifest.parse().unwrap();
-        let dependencies = manifest.get("dependencies").and_then(toml::Value::as_table);
-        for dependency in dependencies.into_iter().flat_map(toml::Table::keys) {
+        for dependency in dependencies_of(name).keys() {
             let is_ours = dependency.starts_with("tread-");
             assert!(
                 !is_ours || allowed.contains(&dependency.as_str()),

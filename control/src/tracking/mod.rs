@@ -369,8 +369,9 @@ impl Tracker {
     }
 }
 
-/// Wheel speeds for a twist within the wheel limit: the turn is kept, the speed gives way.
-pub(crate) fn desaturated(model: &RobotModel, twist: Twist) -> (WheelSpeeds, bool) {
+/// Wheel speeds for a twist within the wheel limit: the turn is kept, the speed gives way. True if
+/// it had to.
+pub fn desaturated(model: &RobotModel, twist: Twist) -> (WheelSpeeds, bool) {
     let limit_rad_s = model.limits().wheel_speed_max_rad_s;
     let free = model.wheel_speeds_from_twist(twist);
     if free.magnitude_max_rad_s() <= limit_rad_s {

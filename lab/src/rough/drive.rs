@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use tread_agent::bench::SteppedDrive;
 use tread_agent::drive::{Drive, Feedback};
+use tread_agent::testing::SteppedDrive;
 use tread_control::geometry::Pose;
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use tread_agent::bench::Bench;
+use tread_agent::testing::Bench;
 use tread_api::friction::ThetaEstimate;
 use tread_api::geometry::Point;
 use tread_api::trajectory::{

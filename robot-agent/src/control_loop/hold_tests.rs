@@ -10,9 +10,9 @@ use tread_control::plan::Plan;
 use tread_control::robot::RobotModel;
 
 use super::channels::{EndReason, LoopCommand};
-use crate::bench::{Bench, site_of};
 use crate::geometry::control_trajectory;
 use crate::sim::scenario::Scenario;
+use crate::testing::{Bench, site_of};
 
 const START: Pose = Pose {
     x_m: 4.0,

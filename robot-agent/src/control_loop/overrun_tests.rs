@@ -19,12 +19,12 @@ use super::channels::{EndReason, loop_channels};
 use super::overrun::{LATE_AFTER, LATE_MAX, Overrun, RELEASE_AFTER};
 use super::tests::{LINE, ORIGIN, bench_at, one_ground, site_of};
 use super::tick::LoopCore;
-use crate::bench::{Bench, PERIOD, boot};
 use crate::clock::{SharedClock, SystemClock};
 use crate::drive::simulated::{Individual, SimMode, SimulatedDrive};
 use crate::drive::{Drive, Feedback};
 use crate::safety::stop::StopState;
 use crate::safety::{Safety, answers, microseconds};
+use crate::testing::{Bench, PERIOD, boot};
 
 const MILLISECOND: Duration = Duration::from_millis(1);
 

@@ -7,7 +7,7 @@ use tread_api::wire::command::{CellPrior, PathPrior};
 
 use super::channels::EndReason;
 use super::tests::{CIRCLE, LINE, ORIGIN, bench_at, one_ground, site_of};
-use crate::bench::Bench;
+use crate::testing::Bench;
 
 /// The same word on every cell around the test's ways.
 pub(super) fn everywhere(theta: f64, std_dev: f64, traction_limit_mu: f64) -> PathPrior {

@@ -13,10 +13,10 @@ use uuid::Uuid;
 
 use super::channels::EndReason;
 use super::tests::{CIRCLE, LINE, ORIGIN, bench_at, one_ground, site_of};
-use crate::bench::{Bench, PERIOD};
 use crate::drive::simulated::{Individual, SimMode, SimulatedDrive};
 use crate::sim::faults::{Channel, Fault, FaultKind};
 use crate::sim::scenario::Scenario;
+use crate::testing::{Bench, PERIOD};
 
 const SECOND: Duration = Duration::from_secs(1);
 /// On the circle, where wheels, gyro and position are excited.

@@ -6,9 +6,8 @@
 
 use tread_api::friction::SideSlip;
 use tread_control::measured::WheelSpeeds;
-use tread_control::paper::BodyVelocity;
-use tread_control::paper::wheels::SideSlips;
 use tread_control::robot::RobotModel;
+use tread_control::slip::{BodyVelocity, SideSlips};
 
 /// Time over which it is smoothed, seconds: a few strides of the sensors' noise, far less than the
 /// ground needs to change.

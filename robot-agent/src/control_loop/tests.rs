@@ -13,14 +13,14 @@ use tread_control::geometry::Pose;
 
 use super::channels::{EVENTS_MAX, EndReason, Fault, LoopCommand};
 use super::site_view::SiteView;
-use crate::bench::Bench;
 use crate::sim::scenario::Scenario;
+use crate::testing::Bench;
 
 /// Longest simulated time of a test's mission.
 const MISSION_MAX: Duration = Duration::from_mins(3);
 
 pub(super) fn site_of(scenario: &Scenario) -> SiteDefinition {
-    crate::bench::site_of(scenario).unwrap()
+    crate::testing::site_of(scenario).unwrap()
 }
 
 pub(super) fn bench_at(scenario: &Scenario, start: Pose, seed: u64) -> Bench {

@@ -5,8 +5,8 @@ use std::time::Duration;
 use super::channels::EndReason;
 use super::prior_tests::everywhere;
 use super::tests::{LINE, ORIGIN, bench_at, site_of};
-use crate::bench::Bench;
 use crate::sim::scenario::Scenario;
+use crate::testing::Bench;
 
 const HIGH_MU: f64 = 0.3;
 

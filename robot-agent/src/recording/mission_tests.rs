@@ -13,9 +13,9 @@ use uuid::Uuid;
 use super::replay::replay;
 use super::report;
 use super::tests::{SECOND, bench, config, files};
-use crate::bench::Bench;
 use crate::control_loop::channels::{EndReason, LoopCommand};
 use crate::geometry::control_trajectory;
+use crate::testing::Bench;
 
 const LINE: &str = r#"{"waypoints":{"speed_m_s":0.8,
     "points":[{"x_m":4,"y_m":3},{"x_m":8,"y_m":3.2},{"x_m":11,"y_m":4.5}]}}"#;

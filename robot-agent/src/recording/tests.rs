@@ -22,8 +22,8 @@ use uuid::Uuid;
 use super::read::ReadError;
 use super::replay::{ReplayError, Replayed, replay};
 use super::{RecordingConfig, RunHead, codec, report, topics};
-use crate::bench::{Bench, boot, site_of};
 use crate::sim::scenario::Scenario;
+use crate::testing::{Bench, boot, site_of};
 
 pub(super) const SECOND: Duration = Duration::from_secs(1);
 

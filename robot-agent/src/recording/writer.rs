@@ -265,6 +265,7 @@ impl RecordWriter {
     }
 
     /// Writes what waits.
+    #[cfg(any(test, feature = "testing"))]
     pub(crate) fn drain(&mut self, notes: &Notes) {
         for note in notes.notes.try_iter() {
             self.note(notes, &note);

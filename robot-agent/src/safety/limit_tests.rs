@@ -8,10 +8,10 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 
 use super::tests::{Teleoperator, limit};
-use crate::bench::{Bench, PERIOD, site_of};
 use crate::control_loop::channels::EndReason;
 use crate::drive::SensorSample;
 use crate::sim::scenario::Scenario;
+use crate::testing::{Bench, PERIOD, site_of};
 
 const START: Pose = Pose {
     x_m: 0.0,

@@ -19,10 +19,10 @@ use tread_control::geometry::Pose;
 use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
-use crate::bench::{Bench, boot, site_of};
 use crate::control_loop::channels::EndReason;
 use crate::drive::simulated::COMMAND_TIMEOUT;
 use crate::sim::scenario::Scenario;
+use crate::testing::{Bench, boot, site_of};
 
 const START: Pose = Pose {
     x_m: 4.0,

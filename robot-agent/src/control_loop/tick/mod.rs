@@ -206,11 +206,6 @@ impl LoopCore {
             && self.measured_wheels.magnitude_max_rad_s() * radius_m < 5.0 * STANDING
     }
 
-    /// One tick that takes no time; see [`Self::tick_by`].
-    pub(crate) fn tick(&mut self, now: Moment, stop: bool, drive: &mut dyn Drive) {
-        self.tick_by(now, &|| now.monotonic, stop, drive);
-    }
-
     /// One tick that begins at `now`. With `stop`, the robot brakes and its mission ends. What carries
     /// its own end, such as a driver's command, is judged by the clock right before the gate: a tick
     /// that was interrupted lets nothing last longer.

@@ -6,7 +6,7 @@ use std::time::Duration;
 use tread_api::friction::TYRE_DIFFERENCE_SHARE;
 use tread_control::estimation::{SensorNoise, SensorSample};
 use tread_control::localisation::{FixOutcome, PositionFix};
-use tread_control::paper::BodyVelocity;
+use tread_control::slip::BodyVelocity;
 use tread_control::tracking::ThetaKnowledge;
 
 use super::{LoopCore, TICK_MAX_S, age_s};

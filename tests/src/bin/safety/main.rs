@@ -20,7 +20,8 @@ mod stop;
 use std::process::ExitCode;
 
 use clap::Parser;
-use tread_agent::bench::{lease_model, teleoperation_trials};
+use tread_agent::testing::lease_model;
+use tread_lab::teleoperation_trials;
 use tread_tests::fleet::Fleet;
 use tread_tests::process::node;
 use tread_tests::report::{self, Check, figure};

@@ -1,0 +1,31 @@
+//! Peers, written only for comparison, and the run that compares. Nothing that ships uses them.
+//!
+//! Every law drives the same [`Course`] on the same free plant from the same start, and sees the
+//! same measurements. Noise comes from outside: a run draws no random numbers.
+
+mod course;
+mod kanayama;
+mod paper_law;
+mod pursuit;
+mod run;
+
+pub use course::{Course, Figure8, Nearest};
+pub use kanayama::{Kanayama, KanayamaGains, Track};
+pub use paper_law::PaperLaw;
+pub use pursuit::{Pursuit, PursuitConfig};
+pub use run::{BenchError, CrossTrack, Run, Scenario, TickInput, TickOutput, cross_track};
+
+use tread_control::tracking::ThetaKnowledge;
+
+/// A law that drives a comparison.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Law {
+    /// Kanayama's tracker.
+    Kanayama(KanayamaGains),
+    /// Regulated pure pursuit with Nav2's rules.
+    Pursuit(PursuitConfig),
+    /// The paper's law, its wheel speeds found by inverting the measured velocity.
+    Yi2007,
+    /// The shipped law, with what it is told about θ before the first tick.
+    Shipped(Option<ThetaKnowledge>),
+}

@@ -1,0 +1,122 @@
+//! The law `yi2007` on a free base: integrators in the loop, wheel speeds by (21) with the measured
+//! velocity. No force enforces the constraint that (21) inverts, so it diverges; that is shown.
+
+use nalgebra::Vector2;
+
+use crate::bench::course::Course;
+use crate::paper::closed_form::SlipShape;
+use crate::paper::law::{DesiredPoint, LawInput};
+use crate::paper::reduced::Reduced;
+use crate::paper::{Setting, Yi2007, Yi2007Config};
+use tread_control::friction::FrictionCurve;
+use tread_control::geometry::Twist;
+use tread_control::measured::{BodyAcceleration, Measured, WheelSpeeds};
+use tread_control::robot::RobotModel;
+use tread_control::tracking::desaturated;
+
+/// Step of the differences that give the course's third derivative, seconds.
+const DIFFERENCE_S: f64 = 0.01;
+/// θ̂ is held between these: at zero the law would be blind.
+const THETA_RANGE: [f64; 2] = [0.01, 10.0];
+/// τ₁ is held within this, so that a run away stays finite.
+const ZETA_MAX: f64 = 1.0;
+
+/// The law with its memory.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PaperLaw {
+    model: RobotModel,
+    law: Yi2007,
+    reduced: Reduced,
+    zeta: f64,
+    theta: f64,
+    wheels: WheelSpeeds,
+}
+
+impl PaperLaw {
+    /// The law of section IV, θ̂ from 1; the wheel transformation knows the true curve.
+    pub fn new(model: RobotModel, curve: FrictionCurve) -> Option<Self> {
+        let config = Yi2007Config::section_iv();
+        Some(Self {
+            model,
+            law: Yi2007::new(config).ok()?,
+            reduced: Reduced::new(Setting { model, curve }, config.centre_ahead_m).ok()?,
+            zeta: 0.0,
+            theta: 1.0,
+            wheels: WheelSpeeds::default(),
+        })
+    }
+
+    /// Distance of the control point ahead of the centre, metres.
+    pub fn point_ahead_m(&self) -> f64 {
+        self.law.config().centre_ahead_m
+    }
+
+    /// One tick.
+    pub fn step(
+        &mut self,
+        course: &Course,
+        time_s: f64,
+        measured: &Measured,
+        felt: BodyAcceleration,
+        dt_s: f64,
+    ) -> WheelSpeeds {
+        let ahead_m = self.law.config().centre_ahead_m;
+        let input = LawInput {
+            pose: measured.pose,
+            ahead_m_s: measured.twist.linear_m_s,
+            left_m_s: -ahead_m * measured.twist.angular_rad_s,
+            ahead_m_s2: felt.ahead_m_s2,
+            zeta: self.zeta,
+            theta: self.theta,
+        };
+        let desired = desired(course, time_s);
+        let Ok(output) = self.law.evaluate(&input, &desired) else {
+            // Singular at standstill: drive ahead until it is not.
+            let twist = Twist {
+                linear_m_s: 0.1,
+                angular_rad_s: 0.0,
+            };
+            return desaturated(&self.model, twist).0;
+        };
+        let tau = Vector2::new(self.zeta, output.inputs[1]);
+        self.zeta = (self.zeta + output.inputs[0] * dt_s).clamp(-ZETA_MAX, ZETA_MAX);
+        self.theta =
+            (self.theta + output.theta_rate_1_s * dt_s).clamp(THETA_RANGE[0], THETA_RANGE[1]);
+        let eta = Vector2::new(input.ahead_m_s, input.left_m_s);
+        let shape = SlipShape::linear();
+        let wheels = self
+            .reduced
+            .inputs(tau, eta, &shape)
+            .and_then(|inputs| self.reduced.wheel_speeds(inputs, &shape));
+        // Where no wheel speed ahead gives τ, the wheels keep theirs.
+        if let Ok(wheels) = wheels {
+            let most_rad_s = self.model.limits().wheel_speed_max_rad_s;
+            self.wheels = WheelSpeeds {
+                left_rad_s: wheels.left_rad_s.min(most_rad_s),
+                right_rad_s: wheels.right_rad_s.min(most_rad_s),
+            };
+        }
+        self.wheels
+    }
+}
+
+/// The course as the motion of point D, its jerk by differences.
+fn desired(course: &Course, time_s: f64) -> DesiredPoint {
+    let derivatives = |time_s: f64| {
+        let sample = course.sample(time_s);
+        let (sin, cos) = sample.pose.heading_rad.sin_cos();
+        let (along, across) = (Vector2::new(cos, sin), Vector2::new(-sin, cos));
+        let acceleration = along.scale(sample.acceleration_m_s2)
+            + across.scale(sample.speed_m_s * sample.turn_rad_s);
+        (sample, along.scale(sample.speed_m_s), acceleration)
+    };
+    let (sample, velocity, acceleration) = derivatives(time_s);
+    let (_, _, later) = derivatives(time_s + DIFFERENCE_S);
+    let (_, _, earlier) = derivatives((time_s - DIFFERENCE_S).max(0.0));
+    DesiredPoint {
+        position: Vector2::new(sample.pose.x_m, sample.pose.y_m),
+        velocity,
+        acceleration,
+        jerk: (later - earlier).scale(0.5 / DIFFERENCE_S),
+    }
+}

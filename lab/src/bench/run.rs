@@ -1,0 +1,306 @@
+//! One comparison: a law, a course, the free plant.
+
+use crate::bench::Law;
+use crate::bench::course::Course;
+use crate::bench::kanayama::Kanayama;
+use crate::bench::paper_law::PaperLaw;
+use crate::bench::pursuit::Pursuit;
+use tread_control::friction::FrictionCurve;
+use tread_control::gate::{GateInput, GateLimits, gate};
+use tread_control::geometry::{Point, Pose};
+use tread_control::measured::{Measured, WheelSpeeds};
+use tread_control::plan::Plan;
+use tread_control::plant::{Ground, Plant, PlantError, PlantSpec, PlantState};
+use tread_control::robot::RobotModel;
+use tread_control::tracking::{
+    ThetaKnowledge, Tracker, TrackerConfig, TrackerError, TrackerOutput,
+};
+
+/// Cross-track error at which a run is given up, metres.
+const GIVEN_UP_M: f64 = 50.0;
+
+/// Under what a comparison runs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Scenario {
+    /// The ground at the start; the paper's law is told it.
+    pub curve: FrictionCurve,
+    /// Lag of the wheel servo, seconds.
+    pub servo_lag_s: f64,
+    /// Gains of the shipped law, and the lag that it is told.
+    pub tracker: TrackerConfig,
+    /// Period of the loop, seconds.
+    pub loop_s: f64,
+    /// Sensor samples per loop, at least 1.
+    pub samples: u32,
+}
+
+impl Scenario {
+    /// 50 Hz, sensors at 200 Hz, 50 ms of lag that is known.
+    pub fn usual(curve: FrictionCurve) -> Self {
+        Self {
+            curve,
+            servo_lag_s: 0.05,
+            tracker: TrackerConfig::default(),
+            loop_s: 0.02,
+            samples: 4,
+        }
+    }
+}
+
+/// Why a comparison cannot run.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum BenchError {
+    /// The plant was refused.
+    #[error("the simulated base was refused")]
+    Plant(#[from] PlantError),
+    /// The shipped law was refused.
+    #[error("the law was refused")]
+    Tracker(#[from] TrackerError),
+}
+
+/// What one tick gets from outside.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TickInput<'a> {
+    /// The ground under the robot during this tick.
+    pub ground: &'a Ground,
+    /// Error of the measured pose.
+    pub pose_error: Pose,
+    /// What is known of θ.
+    pub knowledge: Option<ThetaKnowledge>,
+}
+
+/// What one tick led to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TickOutput {
+    /// Time at which the law looked, seconds.
+    pub time_s: f64,
+    /// The true distance from the course then, to the left, metres.
+    pub cross_m: f64,
+    /// What was commanded.
+    pub command: WheelSpeeds,
+    /// The shipped law's own words.
+    pub tracker: Option<TrackerOutput>,
+}
+
+/// A law with its memory.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Driver {
+    Kanayama(Kanayama),
+    Pursuit(Pursuit),
+    Paper(PaperLaw),
+    Shipped(Tracker),
+}
+
+/// A run under way.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Run {
+    course: Course,
+    scenario: Scenario,
+    driver: Driver,
+    plant: Plant,
+    limits: GateLimits,
+    /// What the gate let through last.
+    command: WheelSpeeds,
+    nearest_s: f64,
+    ticks: u32,
+    given_up: bool,
+}
+
+impl Run {
+    /// A robot on the course's start, moving as the course does there.
+    ///
+    /// # Errors
+    /// [`BenchError`] when the scenario's lag is out of range.
+    pub fn new(
+        course: Course,
+        model: RobotModel,
+        scenario: Scenario,
+        law: Law,
+    ) -> Result<Self, BenchError> {
+        let spec = PlantSpec {
+            servo_lag_s: scenario.servo_lag_s,
+            ..PlantSpec::default()
+        };
+        let start = course.sample(0.0);
+        let command = model.wheel_speeds_from_twist(tread_control::geometry::Twist {
+            linear_m_s: start.speed_m_s,
+            angular_rad_s: start.turn_rad_s,
+        });
+        let mut plant = Plant::new(model, spec, start.pose)?;
+        plant.set_state(PlantState {
+            pose: start.pose,
+            ahead_m_s: start.speed_m_s,
+            left_m_s: 0.0,
+            yaw_rate_rad_s: start.turn_rad_s,
+            wheel_speeds: command,
+        });
+        let mut tracker = Tracker::new(model, scenario.tracker)?;
+        let driver = match law {
+            Law::Kanayama(gains) => Driver::Kanayama(Kanayama::new(model, gains)),
+            Law::Pursuit(config) => Driver::Pursuit(Pursuit::new(model, config)),
+            Law::Yi2007 => {
+                PaperLaw::new(model, scenario.curve).map_or(Driver::Shipped(tracker), Driver::Paper)
+            }
+            Law::Shipped(told) => {
+                if let Some(known) = told {
+                    tracker.warm_start(known);
+                }
+                Driver::Shipped(tracker)
+            }
+        };
+        Ok(Self {
+            course,
+            scenario,
+            driver,
+            plant,
+            limits: GateLimits::of(&model),
+            command,
+            nearest_s: 0.0,
+            ticks: 0,
+            given_up: false,
+        })
+    }
+
+    /// The simulated base.
+    pub fn plant(&self) -> &Plant {
+        &self.plant
+    }
+
+    /// Time since the start, seconds.
+    pub fn time_s(&self) -> f64 {
+        f64::from(self.ticks) * self.scenario.loop_s
+    }
+
+    /// Whether the robot was lost so far that the run ended.
+    pub fn is_given_up(&self) -> bool {
+        self.given_up
+    }
+
+    /// One tick; `each_sample` sees the plant after every sensor sample and the time since the last.
+    ///
+    /// None at the end of the course, or when the robot is lost.
+    pub fn tick(
+        &mut self,
+        input: &TickInput,
+        mut each_sample: impl FnMut(&Plant, f64),
+    ) -> Option<TickOutput> {
+        let time_s = self.time_s();
+        if self.given_up || time_s >= self.course.duration_s() {
+            return None;
+        }
+        let dt_s = self.scenario.loop_s;
+        let state = *self.plant.state();
+        let nearest = self.course.nearest(self.scored_point(), self.nearest_s);
+        self.nearest_s = nearest.time_s;
+        self.given_up = nearest.cross_m.is_nan() || nearest.cross_m.abs() > GIVEN_UP_M;
+        let measured = Measured {
+            pose: Pose {
+                x_m: state.pose.x_m + input.pose_error.x_m,
+                y_m: state.pose.y_m + input.pose_error.y_m,
+                heading_rad: state.pose.heading_rad + input.pose_error.heading_rad,
+            },
+            twist: state.twist(),
+            wheel_speeds: state.wheel_speeds,
+            pose_age_s: 0.0,
+        };
+        let reference = self.course.sample(time_s);
+        let mut told = None;
+        let wanted = match &mut self.driver {
+            Driver::Kanayama(law) => law.step(&reference, &measured, dt_s),
+            Driver::Pursuit(law) => law.step(&self.course, &measured),
+            Driver::Paper(law) => {
+                let felt = self.plant.body_acceleration();
+                law.step(&self.course, time_s, &measured, felt, dt_s)
+            }
+            Driver::Shipped(law) => {
+                let output = law.step(&reference, &measured, input.knowledge, dt_s);
+                told = Some(output);
+                output.wheel_speeds
+            }
+        };
+        let passed = gate(
+            &GateInput {
+                command: Some(wanted),
+                previous: self.command,
+                stop: false,
+                feedback_age_s: 0.0,
+                dt_s,
+            },
+            &self.limits,
+        );
+        self.command = passed.wheel_speeds;
+        let command = self.command;
+        let sample_s = dt_s / f64::from(self.scenario.samples.max(1));
+        for _ in 0..self.scenario.samples.max(1) {
+            self.plant.step(command, input.ground, sample_s);
+            each_sample(&self.plant, sample_s);
+        }
+        self.ticks += 1;
+        Some(TickOutput {
+            time_s,
+            cross_m: nearest.cross_m,
+            command,
+            tracker: told,
+        })
+    }
+
+    /// The point that the law leads: the centre, or the paper's point D.
+    fn scored_point(&self) -> Point {
+        let pose = self.plant.state().pose;
+        let ahead_m = match &self.driver {
+            Driver::Paper(law) => law.point_ahead_m(),
+            Driver::Kanayama(_) | Driver::Pursuit(_) | Driver::Shipped(_) => 0.0,
+        };
+        let (sin, cos) = pose.heading_rad.sin_cos();
+        Point {
+            x_m: pose.x_m + ahead_m * cos,
+            y_m: pose.y_m + ahead_m * sin,
+        }
+    }
+}
+
+/// Cross-track errors of one run.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct CrossTrack {
+    /// Root mean square over the second half of the time, metres.
+    pub rms_m: f64,
+    /// Largest over the whole time, metres.
+    pub most_m: f64,
+}
+
+/// Drives a plan without noise on one ground; the law is told θ from the start, or never.
+///
+/// # Errors
+/// [`BenchError`] when the scenario's lag is out of range.
+pub fn cross_track(
+    plan: &Plan,
+    model: RobotModel,
+    scenario: &Scenario,
+    law: Law,
+) -> Result<CrossTrack, BenchError> {
+    let knowledge = match law {
+        Law::Shipped(told) => told,
+        Law::Kanayama(_) | Law::Pursuit(_) | Law::Yi2007 => None,
+    };
+    let course = Course::Plan(plan.clone());
+    let half_s = 0.5 * course.duration_s();
+    let ground = Ground::uniform(scenario.curve);
+    let mut run = Run::new(course, model, *scenario, law)?;
+    let (mut sum, mut count, mut most_m) = (0.0, 0.0_f64, 0.0_f64);
+    let input = TickInput {
+        ground: &ground,
+        pose_error: Pose::default(),
+        knowledge,
+    };
+    while let Some(output) = run.tick(&input, |_, _| {}) {
+        most_m = most_m.max(output.cross_m.abs());
+        if output.time_s > half_s {
+            sum += output.cross_m * output.cross_m;
+            count += 1.0;
+        }
+    }
+    Ok(CrossTrack {
+        rms_m: (sum / count.max(1.0)).sqrt(),
+        most_m,
+    })
+}

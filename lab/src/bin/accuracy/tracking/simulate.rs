@@ -1,0 +1,278 @@
+//! One seeded run of a law on a course, with the sensors that the estimator gets.
+
+use rand::{RngExt as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
+use tread_control::estimation::{Estimator, SensorNoise, SensorSample};
+use tread_control::friction::FrictionCurve;
+use tread_control::geometry::Pose;
+use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
+use tread_control::plant::{Ground, Plant};
+use tread_control::robot::RobotModel;
+use tread_control::tracking::{ThetaKnowledge, TrackerConfig};
+use tread_lab::bench::{Course, Law, Run, Scenario, TickInput};
+
+/// Noise of the pose in the noisy runs: 2 cm per axis, 0.01 rad.
+const NOISE_M: f64 = 0.02;
+const NOISE_RAD: f64 = 0.01;
+/// Relative deviation of a map's prior.
+pub(crate) const PRIOR_DEVIATION: f64 = 0.1;
+
+/// What lies under the robot.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Terrain {
+    /// The same stiffness everywhere.
+    Uniform(f64),
+    /// Two stiffnesses, in turn, ten seconds each.
+    Switching([f64; 2]),
+    /// One stiffness for x below a border, another from there on.
+    Border { at_m: f64, pair: [f64; 2] },
+}
+
+impl Terrain {
+    fn stiffness(self, time_s: f64, pose: Pose) -> f64 {
+        match self {
+            Self::Uniform(stiffness) => stiffness,
+            Self::Switching(pair) => {
+                if time_s.rem_euclid(20.0) < 10.0 {
+                    pair[0]
+                } else {
+                    pair[1]
+                }
+            }
+            Self::Border { at_m, pair } => {
+                if pose.x_m < at_m {
+                    pair[0]
+                } else {
+                    pair[1]
+                }
+            }
+        }
+    }
+}
+
+/// Where the shipped law's θ comes from.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Knowing {
+    /// From nowhere.
+    Nothing,
+    /// From its own torque channel, unknown at the start.
+    Own,
+    /// From the map until it is measured, with the map's word taken at once at a border.
+    Map,
+    /// A claim that is wrong by a factor until a time, then its own torque channel.
+    Wrong { factor: f64, until_s: f64 },
+}
+
+/// One run.
+#[derive(Debug, Clone)]
+pub(crate) struct Case<'a> {
+    pub(crate) model: RobotModel,
+    pub(crate) course: &'a Course,
+    pub(crate) terrain: Terrain,
+    pub(crate) lag_s: f64,
+    pub(crate) noisy: bool,
+    pub(crate) seed: u64,
+    pub(crate) tracker: TrackerConfig,
+}
+
+/// Time, true cross-track error and place of every tick.
+pub(crate) struct Trace {
+    pub(crate) ticks: Vec<Tick>,
+    pub(crate) duration_s: f64,
+    pub(crate) lost: bool,
+}
+
+/// One tick of a trace.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Tick {
+    pub(crate) time_s: f64,
+    pub(crate) cross_m: f64,
+    pub(crate) pose: Pose,
+}
+
+impl Trace {
+    /// Root mean square of the cross-track error between two times, metres; infinite if lost.
+    pub(crate) fn rms_m(&self, from_s: f64, to_s: f64) -> f64 {
+        let (mut sum, mut count) = (0.0, 0.0_f64);
+        for tick in &self.ticks {
+            if tick.time_s >= from_s && tick.time_s < to_s {
+                sum += tick.cross_m * tick.cross_m;
+                count += 1.0;
+            }
+        }
+        if self.lost {
+            f64::INFINITY
+        } else {
+            (sum / count.max(1.0)).sqrt()
+        }
+    }
+
+    /// The same over the second half of the time.
+    pub(crate) fn second_half_rms_m(&self) -> f64 {
+        self.rms_m(0.5 * self.duration_s, f64::INFINITY)
+    }
+
+    /// Largest cross-track error of the second half, metres; infinite if lost.
+    pub(crate) fn second_half_most_m(&self) -> f64 {
+        self.most_m(0.5 * self.duration_s)
+    }
+
+    /// Largest cross-track error from a time on, metres; infinite if lost.
+    pub(crate) fn most_m(&self, from_s: f64) -> f64 {
+        if self.lost {
+            return f64::INFINITY;
+        }
+        self.ticks
+            .iter()
+            .filter(|tick| tick.time_s >= from_s)
+            .fold(0.0, |most: f64, tick| most.max(tick.cross_m.abs()))
+    }
+}
+
+fn curve(stiffness: f64) -> FrictionCurve {
+    FrictionCurve::with_stiffness(stiffness).expect("the scenarios' stiffnesses are positive")
+}
+
+/// A standard normal number.
+fn normal(rng: &mut ChaCha8Rng) -> f64 {
+    let first: f64 = rng.random_range(f64::MIN_POSITIVE..1.0);
+    let second: f64 = rng.random();
+    (-2.0 * first.ln()).sqrt() * (std::f64::consts::TAU * second).cos()
+}
+
+/// The robot's sensors at 200 Hz, with their default noise.
+struct Sensors {
+    noise: SensorNoise,
+    model: RobotModel,
+    rng: ChaCha8Rng,
+    count: u32,
+}
+
+impl Sensors {
+    fn sample(&mut self, plant: &Plant) -> SensorSample {
+        self.count += 1;
+        let noise = self.noise;
+        let mut gauss = |deviation: f64| deviation * normal(&mut self.rng);
+        let (state, seen, torques) = (plant.state(), plant.means(), plant.wheel_torques());
+        let felt = seen.acceleration;
+        let torque_noise = noise.torque_mu * self.model.wheel_radius_m() * self.model.side_load_n();
+        SensorSample {
+            wheel_speeds: WheelSpeeds {
+                left_rad_s: seen.wheel_speeds.left_rad_s + gauss(noise.wheel_speed_rad_s),
+                right_rad_s: seen.wheel_speeds.right_rad_s + gauss(noise.wheel_speed_rad_s),
+            },
+            gyro_rad_s: seen.yaw_rate_rad_s + gauss(noise.gyro_rad_s),
+            acceleration: Some(BodyAcceleration {
+                ahead_m_s2: felt.ahead_m_s2 + gauss(noise.accelerometer_m_s2),
+                left_m_s2: felt.left_m_s2 + gauss(noise.accelerometer_m_s2),
+            }),
+            body_speed_m_s: self
+                .count
+                .is_multiple_of(20)
+                .then(|| state.ahead_m_s + gauss(noise.body_speed_m_s)),
+            wheel_torques: Some(WheelTorques {
+                left_n_m: torques.left_n_m + gauss(torque_noise),
+                right_n_m: torques.right_n_m + gauss(torque_noise),
+            }),
+        }
+    }
+}
+
+/// Drives one law to the end of the course, or until it is lost.
+pub(crate) fn simulate(case: &Case, law: Law, knowing: Knowing) -> Trace {
+    let model = case.model;
+    let start_pose = case.course.sample(0.0).pose;
+    let first = curve(case.terrain.stiffness(0.0, start_pose));
+    let scenario = Scenario {
+        servo_lag_s: case.lag_s,
+        tracker: TrackerConfig {
+            servo_lag_s: case.lag_s,
+            ..case.tracker
+        },
+        ..Scenario::usual(first)
+    };
+    let mut run = Run::new(case.course.clone(), model, scenario, law)
+        .expect("the scenarios are within the plant's range");
+    let mut pose_rng = ChaCha8Rng::seed_from_u64(case.seed);
+    let noise = SensorNoise::default();
+    let mut sensors = Sensors {
+        noise,
+        model,
+        rng: ChaCha8Rng::seed_from_u64(case.seed ^ 0x5eed_0000),
+        count: 0,
+    };
+    let mut estimator = Estimator::new(model, noise);
+    let shipped = matches!(law, Law::Shipped(_));
+    let mut ticks = Vec::new();
+    let mut before = first;
+    loop {
+        let (time_s, pose) = (run.time_s(), run.plant().state().pose);
+        let here = curve(case.terrain.stiffness(time_s, pose));
+        // A border that the map knows begins a new ground; one it does not must be noticed.
+        if knowing == Knowing::Map && here != before {
+            estimator.close_segment();
+            estimator.begin_ground();
+        }
+        before = here;
+        let own = shipped
+            .then(|| estimator.estimate().theta)
+            .flatten()
+            .map(|found| ThetaKnowledge {
+                theta: found.theta,
+                std_dev: found.std_dev,
+            });
+        let claim = |factor: f64, deviation: f64| ThetaKnowledge {
+            theta: factor * here.theta(),
+            std_dev: deviation * factor * here.theta(),
+        };
+        let knowledge = match knowing {
+            Knowing::Nothing => None,
+            Knowing::Map => {
+                let prior = claim(1.0, PRIOR_DEVIATION);
+                Some(own.map_or(prior, |own| own.fused(prior)))
+            }
+            Knowing::Wrong { factor, until_s } if time_s < until_s => {
+                Some(claim(factor, PRIOR_DEVIATION))
+            }
+            Knowing::Own | Knowing::Wrong { .. } => own,
+        };
+        let mut gauss = |deviation: f64| {
+            let drawn = normal(&mut pose_rng);
+            if case.noisy { deviation * drawn } else { 0.0 }
+        };
+        let pose_error = Pose {
+            x_m: gauss(NOISE_M),
+            y_m: gauss(NOISE_M),
+            heading_rad: gauss(NOISE_RAD),
+        };
+        let ground = Ground::uniform(here);
+        let input = TickInput {
+            ground: &ground,
+            pose_error,
+            knowledge,
+        };
+        let output = run.tick(&input, |plant, dt_s| {
+            if shipped
+                && estimator
+                    .update(&sensors.sample(plant), dt_s)
+                    .ground_changed
+            {
+                estimator.close_segment();
+                estimator.begin_ground();
+            }
+        });
+        let Some(output) = output else {
+            break;
+        };
+        ticks.push(Tick {
+            time_s,
+            cross_m: output.cross_m,
+            pose,
+        });
+    }
+    Trace {
+        ticks,
+        duration_s: case.course.duration_s(),
+        lost: run.is_given_up(),
+    }
+}

@@ -1,0 +1,167 @@
+//! The reduced model: constraint (18), dynamics (19) and (20), input transformation (21).
+//!
+//! `ẏ + Sφ̇ = 0` leaves the pseudo-velocities η = (ẋ, ẏ), and `φ̇ = −η₂/S`. As printed, without the
+//! Coriolis terms of (14): `η̇ = M_η Gᵀ(forces)`, which (21) turns into `η̇ = Kτ`.
+
+use nalgebra::{Matrix2, Vector2};
+use thiserror::Error;
+
+use crate::paper::closed_form::{SlipShape, e_1, e_2};
+use crate::paper::wheels::{BodyForce, four_wheel_sum};
+use tread_control::measured::WheelSpeeds;
+use tread_control::slip::BodyVelocity;
+
+use crate::paper::Setting;
+use tread_control::robot::GRAVITY_M_S2;
+
+/// Determinant below which (21) is singular: standstill without turning.
+const DETERMINANT_MIN: f64 = 1.0e-9;
+
+/// Why the reduced model has no answer.
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+pub enum ReducedError {
+    /// S is zero or not finite.
+    #[error("`centre_ahead_m` must be finite and not zero, not {0}")]
+    Centre(f64),
+    /// `E₁ + g₁ᵀe₂` cannot be inverted at this velocity.
+    #[error("the transformation (21) is singular at this velocity")]
+    Singular,
+    /// The inputs ask for wheels that stand, turn back, or turn without bound.
+    #[error("no wheel speed ahead gives these inputs")]
+    NoWheelSpeed,
+}
+
+/// The constrained robot.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Reduced {
+    setting: Setting,
+    centre_ahead_m: f64,
+}
+
+impl Reduced {
+    /// A robot whose turning centre is held at S ahead of its centre of mass.
+    ///
+    /// # Errors
+    /// [`ReducedError::Centre`] when S is zero or not finite.
+    pub fn new(setting: Setting, centre_ahead_m: f64) -> Result<Self, ReducedError> {
+        if !centre_ahead_m.is_finite() || centre_ahead_m.abs() <= 0.0 {
+            return Err(ReducedError::Centre(centre_ahead_m));
+        }
+        Ok(Self {
+            setting,
+            centre_ahead_m,
+        })
+    }
+
+    /// S, metres.
+    pub fn centre_ahead_m(&self) -> f64 {
+        self.centre_ahead_m
+    }
+
+    /// (19a) in the body frame: all three speeds from η.
+    pub fn velocity(&self, eta: Vector2<f64>) -> BodyVelocity {
+        BodyVelocity {
+            ahead_m_s: eta[0],
+            left_m_s: eta[1],
+            yaw_rate_rad_s: -eta[1] / self.centre_ahead_m,
+        }
+    }
+
+    /// Diagonal of `M_η⁻¹`: m and `m + I_G/S²`, kilograms.
+    fn masses_kg(&self) -> Vector2<f64> {
+        let model = &self.setting.model;
+        let turned_kg = model.yaw_inertia_kg_m2() / self.centre_ahead_m.powi(2);
+        Vector2::new(model.mass_kg(), model.mass_kg() + turned_kg)
+    }
+
+    /// η̇ under forces on the body, (19b) as printed.
+    pub fn rates(&self, force: &BodyForce) -> Vector2<f64> {
+        let masses_kg = self.masses_kg();
+        Vector2::new(
+            force.ahead_n / masses_kg[0],
+            (force.left_n - force.moment_n_m / self.centre_ahead_m) / masses_kg[1],
+        )
+    }
+
+    /// η̇ under wheel speeds ahead, both ranges of slip, by the four-wheel sum.
+    pub fn rates_from_wheels(&self, eta: Vector2<f64>, wheels: WheelSpeeds) -> Vector2<f64> {
+        self.rates(&four_wheel_sum(&self.velocity(eta), wheels, &self.setting))
+    }
+
+    /// `E₁ + g₁ᵀe₂` of (20).
+    fn input_matrix(&self, eta: Vector2<f64>, shape: &SlipShape) -> Matrix2<f64> {
+        let velocity = self.velocity(eta);
+        let mut matrix = e_1(&velocity, shape, &self.setting);
+        let yaw = e_2(&velocity, shape, &self.setting) / self.centre_ahead_m;
+        matrix[(1, 0)] -= yaw[0];
+        matrix[(1, 1)] -= yaw[1];
+        matrix
+    }
+
+    /// The vector `[2σ_Σ, Wσ_Δ/S]` of (20) and (21); printed there as a fraction.
+    fn offset(&self, shape: &SlipShape) -> Vector2<f64> {
+        let track_m = self.setting.model.track_width_m();
+        Vector2::new(
+            2.0 * shape.sum,
+            track_m * shape.difference / self.centre_ahead_m,
+        )
+    }
+
+    /// (20): η̇ from the inputs v, metres per second squared.
+    pub fn rates_from_inputs(
+        &self,
+        eta: Vector2<f64>,
+        inputs: Vector2<f64>,
+        shape: &SlipShape,
+    ) -> Vector2<f64> {
+        let model = &self.setting.model;
+        let scale_n = 0.25 * model.mass_kg() * GRAVITY_M_S2 * self.setting.curve.stiffness();
+        let masses_kg = self.masses_kg();
+        (self.input_matrix(eta, shape) * inputs + self.offset(shape))
+            .component_div(&masses_kg)
+            .scale(scale_n)
+    }
+
+    /// (21): the inputs v that make `η̇ = Kτ`.
+    ///
+    /// # Errors
+    /// [`ReducedError::Singular`] near standstill.
+    pub fn inputs(
+        &self,
+        tau: Vector2<f64>,
+        eta: Vector2<f64>,
+        shape: &SlipShape,
+    ) -> Result<Vector2<f64>, ReducedError> {
+        let matrix = self.input_matrix(eta, shape);
+        if matrix.determinant().abs() < DETERMINANT_MIN {
+            return Err(ReducedError::Singular);
+        }
+        let inverse = matrix.try_inverse().ok_or(ReducedError::Singular)?;
+        let weight_n = self.setting.model.mass_kg() * GRAVITY_M_S2;
+        let wanted = self.masses_kg().component_mul(&tau).scale(4.0 / weight_n);
+        Ok(inverse * (wanted - self.offset(shape)))
+    }
+
+    /// Wheel speeds of inputs v.
+    ///
+    /// # Errors
+    /// [`ReducedError::NoWheelSpeed`] where a wheel would have to stand still or turn back.
+    pub fn wheel_speeds(
+        &self,
+        inputs: Vector2<f64>,
+        shape: &SlipShape,
+    ) -> Result<WheelSpeeds, ReducedError> {
+        let radius_m = self.setting.model.wheel_radius_m();
+        let left_s_m = 0.5 * (inputs[1] + inputs[0]) / shape.left.two;
+        let right_s_m = 0.5 * (inputs[1] - inputs[0]) / shape.right.two;
+        let wheels = WheelSpeeds {
+            left_rad_s: (radius_m * left_s_m).recip(),
+            right_rad_s: (radius_m * right_s_m).recip(),
+        };
+        if wheels.is_finite() && wheels.left_rad_s.min(wheels.right_rad_s) > 0.0 {
+            Ok(wheels)
+        } else {
+            Err(ReducedError::NoWheelSpeed)
+        }
+    }
+}

@@ -1,0 +1,617 @@
+//! The loop on a bench: the agent's own tick with a simulated base, stepped by hand.
+//!
+//! No thread, no clock, no network, so runs repeat to the bit and go as fast as the machine does.
+//! For tests, figures and benchmarks: compiled for tests and with the feature `testing`.
+
+pub mod lease_model;
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::SendError;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use tread_api::friction::ThetaEstimate;
+use tread_api::ids::{BootId, MissionId, PlanHash, RobotId, SiteId};
+use tread_api::safety::Geofence;
+use tread_api::site::Grid;
+use tread_api::terrain::{TerrainRef, TerrainShape};
+use tread_api::trajectory::Trajectory;
+use tread_api::wire::command::{Outcome, PathPrior};
+use tread_api::wire::hello::SiteDefinition;
+use tread_api::wire::ingest::MissionPhase;
+use tread_api::wire::safety::LeaseCommand;
+use tread_control::estimation::EstimatorPrior;
+use tread_control::geometry::Pose;
+use tread_control::measured::WheelSpeeds;
+use tread_control::plan::Plan;
+use tread_control::robot::RobotModel;
+use uuid::Uuid;
+
+use crate::clock::{ManualClock, SharedClock};
+use crate::control_loop::active::Hold;
+use crate::control_loop::channels::{
+    AgentEnds, ClosedSegment, EndReason, Job, LoopCommand, LoopEvent, loop_channels,
+};
+use crate::control_loop::driven::Driven;
+use crate::control_loop::origin::JobOrigin;
+use crate::control_loop::segments::Moment;
+use crate::control_loop::site_view::SiteView;
+use crate::control_loop::tick::LoopCore;
+use crate::drive::simulated::{Individual, SimMode, SimulatedDrive, SimulatedDriveError};
+use crate::drive::{Drive, Feedback, SILENT_AFTER_MAX, SensorSample};
+use crate::geometry::paper_robot;
+use crate::recording::frame::{Notes, notes};
+use crate::recording::{FORMAT, RecordWriter, RecordingConfig, RunHead, VERSION};
+use crate::safety::stop::StopState;
+use crate::safety::{Safety, answers, microseconds};
+use crate::sim::scenario::Scenario;
+
+/// Time between two ticks on the bench.
+pub const PERIOD: Duration = Duration::from_millis(10);
+
+/// When the bench begins, by its clock.
+const START_AT: Duration = Duration::from_secs(1);
+
+/// The run of the agent that the bench stands for.
+pub fn boot() -> BootId {
+    BootId::from_uuid(Uuid::from_u128(1))
+}
+
+/// Why the bench could not do what it was asked.
+#[derive(Debug, thiserror::Error)]
+pub enum BenchError {
+    /// The robot has not had a position fix yet.
+    #[error("the robot does not know yet where it is")]
+    NoPose,
+    /// The trajectory cannot be driven.
+    #[error("the trajectory cannot be driven: {0}")]
+    Impossible(String),
+    /// The loop is gone.
+    #[error("the loop takes no commands any more")]
+    Gone,
+}
+
+impl<T> From<SendError<T>> for BenchError {
+    fn from(_: SendError<T>) -> Self {
+        Self::Gone
+    }
+}
+
+/// A base whose time passes when it is told.
+pub trait SteppedDrive: Drive {
+    /// Moves the base on to `now`.
+    fn advance(&mut self, now: Duration);
+}
+
+impl SteppedDrive for SimulatedDrive {
+    fn advance(&mut self, now: Duration) {
+        Self::advance(self, now);
+    }
+}
+
+/// A robot on the bench, by default with the agent's own simulated base.
+#[derive(Debug)]
+pub struct Bench<D = SimulatedDrive> {
+    pub(crate) core: LoopCore,
+    pub(crate) drive: D,
+    model: RobotModel,
+    pub(crate) ends: AgentEnds,
+    pub(crate) safety: Arc<Safety>,
+    clock: Arc<ManualClock>,
+    pub(crate) now: Duration,
+    pub(crate) segments: Vec<ClosedSegment>,
+    pub(crate) starts: Vec<MissionId>,
+    pub(crate) ended: Vec<(MissionId, EndReason)>,
+    /// Pauses, resumptions and new revisions, as they were reported.
+    pub(crate) news: Vec<MissionPhase>,
+    /// How long before it stood the last pause for safety had begun.
+    pub(crate) paused_for: Option<jiff::SignedDuration>,
+    /// Longest silence of the server that missions bear from now on.
+    pub(crate) silence_max: Option<Duration>,
+    /// What a map knows along the way of missions from now on.
+    prior: Option<PathPrior>,
+    /// The record of the last mission that ended.
+    pub(crate) last_driven: Option<Driven>,
+    /// Distance from the path when the last mission ended.
+    pub(crate) cross_track_m: f64,
+    /// Who records, if anybody does, and what waits for him.
+    record: Option<(RecordWriter, Notes)>,
+}
+
+/// The site of a scenario as a server would define it.
+///
+/// # Errors
+/// A sentence on a polygon that is none; a parsed scenario has no such.
+pub fn site_of(scenario: &Scenario) -> Result<SiteDefinition, String> {
+    let mut terrains = Vec::with_capacity(scenario.terrains.len());
+    for terrain in &scenario.terrains {
+        terrains.push(TerrainShape {
+            terrain: TerrainRef {
+                id: terrain.id.clone(),
+                revision: 1,
+            },
+            polygon: terrain.outline()?,
+            layer: terrain.layer,
+        });
+    }
+    let grid = Grid {
+        revision: 1,
+        cell_m: scenario.cell_m,
+    };
+    Ok(SiteDefinition {
+        grid,
+        terrain_revision: 1,
+        terrains,
+        geofence: Geofence::default(),
+    })
+}
+
+fn mission_of(number: u128) -> MissionId {
+    MissionId::from_uuid(Uuid::from_u128(number))
+}
+
+/// A base whose sensors say what is no number.
+struct Nonsense;
+
+impl Drive for Nonsense {
+    fn read(&mut self, now: Duration) -> Feedback {
+        let mut feedback = Feedback::default();
+        feedback.push(SensorSample {
+            at: now,
+            yaw_rate_rad_s: Some(0.0),
+            wheel_speeds: Some(WheelSpeeds {
+                left_rad_s: f64::NAN,
+                right_rad_s: 0.0,
+            }),
+            ..SensorSample::default()
+        });
+        feedback
+    }
+
+    fn write(&mut self, _: WheelSpeeds) {}
+}
+
+/// A base that does not know where it is.
+struct Blind<'base, D>(&'base mut D);
+
+impl<D: Drive> Drive for Blind<'_, D> {
+    fn read(&mut self, now: Duration) -> Feedback {
+        let mut feedback = Feedback::default();
+        for &sample in self.0.read(now).samples() {
+            feedback.push(SensorSample {
+                position: None,
+                ..sample
+            });
+        }
+        feedback
+    }
+
+    fn write(&mut self, command: WheelSpeeds) {
+        self.0.write(command);
+    }
+}
+
+/// A base that is not heard, though it hears.
+struct Unheard<'base, D>(&'base mut D);
+
+impl<D: Drive> Drive for Unheard<'_, D> {
+    fn read(&mut self, now: Duration) -> Feedback {
+        self.0.read(now);
+        Feedback::default()
+    }
+
+    fn write(&mut self, command: WheelSpeeds) {
+        self.0.write(command);
+    }
+}
+
+/// A base whose sensors say the same for ever, with fresh stamps, though it moves.
+#[cfg(test)]
+struct Frozen<'base, D> {
+    base: &'base mut D,
+    said: SensorSample,
+}
+
+#[cfg(test)]
+impl<D: Drive> Drive for Frozen<'_, D> {
+    fn read(&mut self, now: Duration) -> Feedback {
+        self.base.read(now);
+        let mut feedback = Feedback::default();
+        feedback.push(SensorSample {
+            at: now,
+            ..self.said
+        });
+        feedback
+    }
+
+    fn write(&mut self, command: WheelSpeeds) {
+        self.base.write(command);
+    }
+}
+
+/// A base that says nothing.
+struct Silence;
+
+impl Drive for Silence {
+    fn read(&mut self, _: Duration) -> Feedback {
+        Feedback::default()
+    }
+
+    fn write(&mut self, _: WheelSpeeds) {}
+}
+
+impl LoopCore {
+    /// One tick that takes no time; see [`Self::tick_by`].
+    fn tick(&mut self, now: Moment, stop: bool, drive: &mut dyn Drive) {
+        self.tick_by(now, &|| now.monotonic, stop, drive);
+    }
+}
+
+impl Bench {
+    /// The paper's robot at rest on a scenario's ground.
+    ///
+    /// # Errors
+    /// [`SimulatedDriveError`] when the start is no pose.
+    pub fn new(scenario: &Scenario, start: Pose, seed: u64) -> Result<Self, SimulatedDriveError> {
+        let model = RobotModel::yi2007();
+        let individual = Individual::of_seed(seed);
+        let drive = SimulatedDrive::new(scenario, model, start, individual, SimMode::Explicit)?;
+        // A simulated robot is as its model says.
+        Ok(Self::with_drive(drive, model).with_prior(EstimatorPrior::exact()))
+    }
+
+    /// Records from now on, before the first tick.
+    pub fn record(&mut self, config: RecordingConfig, site: SiteId, robot: RobotId) {
+        let head = RunHead {
+            format: FORMAT,
+            version: VERSION.to_owned(),
+            boot: boot(),
+            site,
+            robot,
+            part: 0,
+            model: paper_robot(),
+            blind_within_fence: false,
+            silent_after: SILENT_AFTER_MAX,
+            rate_hz: PERIOD.as_secs_f64().recip(),
+            prior: EstimatorPrior::exact(),
+        };
+        let (taker, notes) = notes();
+        self.core.record_to(Some(taker));
+        let clock = Arc::clone(&self.clock) as SharedClock;
+        let writer = RecordWriter::new(config, head, self.model, clock);
+        self.record = Some((writer, notes));
+    }
+}
+
+impl<D: SteppedDrive> Bench<D> {
+    /// A base, driven by an agent that is configured with this model.
+    pub fn with_drive(drive: D, model: RobotModel) -> Self {
+        let (loop_ends, ends) = loop_channels();
+        let clock = Arc::new(ManualClock::new(Timestamp::UNIX_EPOCH));
+        clock.advance(START_AT);
+        let safety = Safety::open(
+            // Nothing is there, and nothing is written while nobody waits for a confirmation.
+            Path::new("no-such-folder"),
+            StopState::default(),
+            boot(),
+            model,
+            &[],
+            Arc::clone(&ends.shared.safety),
+            Arc::clone(&clock) as SharedClock,
+        );
+        Self {
+            core: LoopCore::new(model, loop_ends).with_period(PERIOD),
+            drive,
+            model,
+            ends,
+            safety,
+            clock,
+            now: START_AT,
+            segments: Vec::new(),
+            starts: Vec::new(),
+            ended: Vec::new(),
+            news: Vec::new(),
+            paused_for: None,
+            silence_max: None,
+            prior: None,
+            last_driven: None,
+            cross_track_m: f64::NAN,
+            record: None,
+        }
+    }
+
+    /// The same, with what is known beforehand of the robot.
+    #[must_use]
+    pub fn with_prior(mut self, prior: EstimatorPrior) -> Self {
+        self.core = self.core.with_prior(prior);
+        self
+    }
+
+    /// The base.
+    pub fn drive(&self) -> &D {
+        &self.drive
+    }
+
+    /// What the robot measured of the present ground, as it reports it.
+    pub fn theta(&self) -> Option<ThetaEstimate> {
+        self.ends.shared.snapshot().theta_measured
+    }
+
+    /// Writes what was noted, if it is to be recorded.
+    fn write_record(&mut self) {
+        if let Some((writer, notes)) = &mut self.record {
+            writer.drain(notes);
+        }
+    }
+
+    /// Ends the record; notes that found no room.
+    pub fn end_record(&mut self) -> u64 {
+        self.write_record();
+        self.core.record_to(None);
+        let Some((mut writer, notes)) = self.record.take() else {
+            return 0;
+        };
+        writer.close();
+        notes.lost.load(Ordering::Relaxed)
+    }
+
+    /// Tells the loop of its site.
+    ///
+    /// # Errors
+    /// [`BenchError::Gone`].
+    pub fn know_site(&mut self, definition: SiteDefinition) -> Result<(), BenchError> {
+        let view = Arc::new(SiteView::new(definition));
+        Ok(self.ends.commands.send(LoopCommand::Site(view))?)
+    }
+
+    /// Tells the robot what a map knows, from its next mission on.
+    pub fn tell(&mut self, prior: &PathPrior) {
+        self.prior = Some(prior.clone());
+    }
+
+    fn planned(
+        &self,
+        number: u128,
+        revision: u32,
+        trajectory: &Trajectory,
+        start: Pose,
+        start_by: Option<Duration>,
+    ) -> Result<Box<Job>, BenchError> {
+        let model = self.model;
+        let origin = JobOrigin {
+            mission: mission_of(number),
+            revision,
+            plan_hash: PlanHash::from_uuid(Uuid::from_u128(number)),
+            trajectory: trajectory.clone(),
+            start,
+            prior: self.prior.clone(),
+            grid: None,
+            start_by,
+            silence_max: self.silence_max,
+        };
+        let plan = origin.plan(&model).map_err(BenchError::Impossible)?;
+        origin.job(plan, model).map_err(BenchError::Impossible)
+    }
+
+    /// Plans a trajectory from where the robot stands and hands it to the loop.
+    ///
+    /// # Errors
+    /// [`BenchError`] when the robot does not know where it is or the trajectory is impossible.
+    pub fn begin(
+        &mut self,
+        number: u128,
+        trajectory: &Trajectory,
+        start_by: Option<Duration>,
+    ) -> Result<MissionId, BenchError> {
+        let (pose, _) = self.ends.shared.snapshot().pose.ok_or(BenchError::NoPose)?;
+        let job = self.planned(number, 1, trajectory, pose, start_by)?;
+        let mission = job.mission;
+        self.ends.commands.send(LoopCommand::Start(job))?;
+        Ok(mission)
+    }
+
+    /// Holds the active mission for its next revision, plans that from where the robot comes to
+    /// stand, and hands it to the loop.
+    ///
+    /// # Errors
+    /// As [`Bench::begin`].
+    pub fn replace(
+        &mut self,
+        number: u128,
+        revision: u32,
+        driving: &Plan,
+        trajectory: &Trajectory,
+    ) -> Result<(), BenchError> {
+        let mission = mission_of(number);
+        let hold = LoopCommand::Hold(mission, Hold::Replacement);
+        self.ends.commands.send(hold)?;
+        self.tick();
+        let governor = self.ends.shared.snapshot().governor;
+        let rest = governor.ok_or(BenchError::Gone)?.rest(driving);
+        let job = self.planned(number, revision, trajectory, rest, None)?;
+        Ok(self.ends.commands.send(LoopCommand::Replace(job))?)
+    }
+
+    /// Pauses the active mission, or lets it go on.
+    ///
+    /// # Errors
+    /// [`BenchError::Gone`].
+    pub fn pause(&mut self, mission: MissionId, is_wanted: bool) -> Result<(), BenchError> {
+        let command = if is_wanted {
+            LoopCommand::Hold(mission, Hold::Pause)
+        } else {
+            LoopCommand::Release(mission, Hold::Pause)
+        };
+        Ok(self.ends.commands.send(command)?)
+    }
+
+    /// Moves the base on by one period.
+    pub fn simulate(&mut self) {
+        self.pass_time(PERIOD);
+        self.drive.advance(self.now);
+    }
+
+    /// Lets time pass.
+    pub fn pass_time(&mut self, time: Duration) {
+        self.now += time;
+        self.clock.advance(time);
+    }
+
+    /// The time of the bench.
+    pub fn now(&self) -> Duration {
+        self.now
+    }
+
+    /// The robot's clock, as end times are told, microseconds.
+    pub fn now_us(&self) -> u64 {
+        microseconds(self.now)
+    }
+
+    /// Acquires, takes or releases the lease of teleoperation.
+    pub fn lease(&self, command: &LeaseCommand) -> Outcome {
+        answers::lease(&self.safety, command)
+    }
+
+    /// Hands over a drive command as it comes from the network; true if it counts.
+    pub fn teleoperate(&self, payload: &[u8]) -> bool {
+        let accepted = || {
+            let status = self.safety.drive_status();
+            status.map_or(0, |status| status.counts.accepted)
+        };
+        let before = accepted();
+        self.safety.take_drive(payload);
+        accepted() > before
+    }
+
+    /// Whether the wheels' target is zero.
+    pub fn target_rests(&self) -> bool {
+        self.ends.shared.snapshot().gate.target_rests
+    }
+
+    /// Whether the robot stands.
+    pub fn stands(&self) -> bool {
+        self.core.stands()
+    }
+
+    fn moment(&self) -> Moment {
+        Moment {
+            monotonic: self.now,
+            wall: Timestamp::UNIX_EPOCH + self.now,
+        }
+    }
+
+    /// One tick of the loop alone; with `stop`, the robot brakes and its mission ends.
+    pub fn tick_loop(&mut self, stop: bool) {
+        let now = self.moment();
+        self.core.tick(now, stop, &mut self.drive);
+    }
+
+    /// One period in which the base says nothing and does nothing.
+    pub fn tick_without_base(&mut self) {
+        self.pass_time(PERIOD);
+        let now = self.moment();
+        self.core.tick(now, false, &mut Silence);
+        self.collect();
+    }
+
+    /// One period in which the base says nothing but nonsense.
+    pub fn tick_with_nonsense(&mut self) {
+        self.pass_time(PERIOD);
+        let now = self.moment();
+        self.core.tick(now, false, &mut Nonsense);
+        self.collect();
+    }
+
+    /// One period in which nothing says where the robot is.
+    pub fn tick_without_position(&mut self) {
+        self.simulate();
+        let now = self.moment();
+        self.core.tick(now, false, &mut Blind(&mut self.drive));
+        self.collect();
+    }
+
+    /// A tick in which the base goes on as it is told, but is not heard.
+    pub fn tick_unheard(&mut self) {
+        self.simulate();
+        let now = self.moment();
+        self.core.tick(now, false, &mut Unheard(&mut self.drive));
+        self.collect();
+    }
+
+    /// A tick whose thread gets no time for a while before it judges what is wanted.
+    #[cfg(test)]
+    pub(crate) fn tick_interrupted(&mut self, time: Duration) {
+        self.simulate();
+        let now = self.moment();
+        self.pass_time(time);
+        let judged = self.now;
+        self.core.tick_by(now, &|| judged, false, &mut self.drive);
+        self.collect();
+    }
+
+    /// A tick of a base that moves as it is told, and whose sensors say this and nothing else.
+    #[cfg(test)]
+    pub(crate) fn tick_frozen(&mut self, said: SensorSample) {
+        self.simulate();
+        let now = self.moment();
+        let base = &mut self.drive;
+        self.core.tick(now, false, &mut Frozen { base, said });
+        self.collect();
+    }
+
+    /// Takes what the loop has reported.
+    pub fn collect(&mut self) {
+        self.write_record();
+        for event in self.ends.events.try_iter() {
+            match event {
+                LoopEvent::Started { progress, .. } => self.starts.push(progress.id),
+                LoopEvent::Ended {
+                    reason,
+                    job,
+                    progress,
+                    ..
+                } => {
+                    self.ended.push((job.mission, reason));
+                    self.last_driven = Some(job.driven);
+                    self.cross_track_m = progress.cross_track_m;
+                }
+                LoopEvent::Segment(segment) => self.segments.push(segment),
+                LoopEvent::Paused { at, since, .. } => {
+                    self.news.push(MissionPhase::Paused);
+                    self.paused_for = since.map(|since| at.duration_since(since));
+                }
+                LoopEvent::Resumed { .. } => self.news.push(MissionPhase::Resumed),
+                LoopEvent::Replaced { .. } => self.news.push(MissionPhase::Replaced),
+                LoopEvent::CameTooLate(_) | LoopEvent::Retired(_) => {}
+            }
+        }
+    }
+
+    /// One whole period: base, loop, reports.
+    pub fn tick(&mut self) {
+        self.simulate();
+        self.tick_loop(false);
+        self.collect();
+    }
+
+    /// So many whole periods as fit.
+    pub fn run_for(&mut self, time: Duration) {
+        let until = self.now + time;
+        while self.now < until {
+            self.tick();
+        }
+    }
+
+    /// How a mission ended, if it has.
+    pub fn end_of(&self, mission: MissionId) -> Option<MissionPhase> {
+        let ended = self.ended.iter().find(|(ended, _)| *ended == mission);
+        ended.map(|(_, reason)| reason.phase())
+    }
+
+    /// How many segments were closed so far.
+    pub fn segment_count(&self) -> usize {
+        self.segments.len()
+    }
+}
