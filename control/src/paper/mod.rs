@@ -29,7 +29,7 @@ use crate::robot::RobotModel;
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct BodyVelocity {
     /// ẋ, metres per second.
-    pub ahead_m_s: f64,
+    pub forward_m_s: f64,
     /// ẏ, metres per second.
     pub left_m_s: f64,
     /// φ̇, radians per second.
