@@ -119,14 +119,14 @@ mod tests {
     /// One key of every kind that [`Key`] knows. A new kind does not compile until it is here.
     fn one_of_each(site: &SiteId, robot: &RobotId) -> Vec<String> {
         let boot = BootId::from_uuid(Uuid::from_u128(7));
-        let holder = "lidar".parse().unwrap();
+        let owner = "lidar".parse().unwrap();
         let all = [
             keys::alive(site, robot, boot),
             keys::state(site, robot),
             keys::friction(site, robot),
             keys::command(site, robot, Verb::Stop),
             keys::teleop(site, robot),
-            keys::limit(site, robot, &holder),
+            keys::limit(site, robot, &owner),
             keys::pulse(site),
             keys::map(site),
             keys::hello(site, robot),

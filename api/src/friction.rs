@@ -33,8 +33,8 @@ impl Information {
     }
 }
 
-/// What the error of a segment's θ is made of: an independent part, which averages out over segments,
-/// and common parts, which do not.
+/// What the error of a segment's θ is made of: an independent part, which averages out over
+/// segments, and common parts, which do not.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ThetaErrors {
     /// Information 1/σ² on θ of the independent part alone.
@@ -70,8 +70,8 @@ pub struct Segment {
     /// The terrain under the robot; absent where none is drawn.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub terrain: Option<TerrainRef>,
-    /// θ, slip per friction coefficient. For who adds up segments and knows nothing of common errors:
-    /// it claims no more than the sum of a robot's segments keeps.
+    /// θ, slip per friction coefficient. For who adds up segments and knows nothing of common
+    /// errors: it claims no more than the sum of a robot's segments keeps.
     pub theta: Information,
     /// What the error of θ is made of; absent from an older agent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -95,12 +95,13 @@ pub struct Segment {
 
 /// Largest θ that is taken for a measurement; softer ground than K = 0.02 is not driven.
 pub const THETA_MAX: f64 = 50.0;
-/// Most information that one segment may claim, from a deviation of 10⁻⁵.
+/// Most information that one segment may claim, from a standard deviation of 10⁻⁵.
 pub const INFORMATION_MAX: f64 = 1.0e10;
 /// Largest common error that a segment may name, as a share of θ.
 pub const COMMON_RATIO_MAX: f64 = 10.0;
-/// How far apart the tyres' errors of two measurements on the same tyres may be, as a share of either:
-/// one standard deviation. They are the same where tyres slip alike, and grow with the slip.
+/// How far apart the tyres' errors of two measurements on the same tyres may be, as a share of
+/// either: one standard deviation. They are the same where tyres slip alike, and grow with the
+/// slip.
 pub const TYRE_DIFFERENCE_SHARE: f64 = 0.5;
 /// Most samples that one segment may claim.
 pub const SAMPLES_MAX: u32 = 10_000_000;
@@ -294,8 +295,8 @@ pub struct TerrainFriction {
     pub name: String,
     /// Kind of ground.
     pub class: TerrainClass,
-    /// As of when: nothing that was measured later counts. The end of the last epoch before the time
-    /// that was asked for; `null` when no time was, and all that has come counts.
+    /// As of when: nothing that was measured later counts. The end of the last epoch before the
+    /// time that was asked for; `null` when no time was, and all that has come counts.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
     /// What is known for each robot model, kept apart.
@@ -356,8 +357,8 @@ pub struct TerrainAt {
 /// What is known of the ground at a point.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PointFriction {
-    /// As of when: nothing that was measured later counts. The end of the last epoch before the time
-    /// that was asked for; `null` when no time was, and all that has come counts.
+    /// As of when: nothing that was measured later counts. The end of the last epoch before the
+    /// time that was asked for; `null` when no time was, and all that has come counts.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
     /// The cell.
@@ -373,7 +374,8 @@ pub struct PointFriction {
 pub struct AskPath {
     /// Corners of the path, 2 to 10 000, at most 10 km.
     pub points: Vec<Point>,
-    /// Who is to drive it; its model decides whose measurements count, its limits what speed follows.
+    /// Who is to drive it; its model decides whose measurements count, its limits what speed
+    /// follows.
     pub robot: RobotId,
     /// As of when; now when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -386,8 +388,8 @@ pub struct AskPath {
 /// What is known along a path.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PathFriction {
-    /// As of when: nothing that was measured later counts. The end of the last epoch before the time
-    /// that was asked for; `null` when no time was, and all that has come counts.
+    /// As of when: nothing that was measured later counts. The end of the last epoch before the
+    /// time that was asked for; `null` when no time was, and all that has come counts.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
     /// Length, metres.

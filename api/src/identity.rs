@@ -1,5 +1,5 @@
-//! Who may do what: roles, tokens, sessions of browsers, and the audit log. A role is a name for some
-//! [rights](crate::rights).
+//! Who may do what: roles, tokens, sessions of browsers, and the audit log. A role is a name for
+//! some [rights](crate::rights).
 
 use std::fmt;
 
@@ -46,8 +46,8 @@ pub struct Token {
     pub last_used_at: Option<Timestamp>,
 }
 
-/// A token as servers of any version tell it: before there were rights, the role said all, and a token
-/// held everywhere.
+/// A token as servers of any version tell it: before there were rights, the role said all, and a
+/// token held everywhere.
 #[derive(Deserialize)]
 struct TokenAnswer {
     id: TokenId,
@@ -214,8 +214,8 @@ pub struct Session {
     /// Where it may be done; `null` for everywhere.
     #[schema(value_type = Option<Vec<SiteScope>>)]
     pub sites: Scope,
-    /// All that may be done, each with where: whatever any one of these allows. One, unless a person is in
-    /// groups that have different rights at different sites.
+    /// All that may be done, each with where: whatever any one of these allows. One, unless a
+    /// person is in groups that have different rights at different sites.
     #[schema(required = true)]
     pub grants: Vec<Grant>,
     /// The token; `null` for a person who signed in at the provider.
@@ -232,7 +232,7 @@ pub struct Session {
 
 /// How people may sign in.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-pub struct SignInWays {
+pub struct SignInMethods {
     /// With a token: always.
     pub token: bool,
     /// At an OpenID provider; `null` if none is configured.
@@ -290,7 +290,8 @@ pub struct AuditEntry {
     /// Number of requests. Repeats of a request with the same answer share one entry when their
     /// author sends very many.
     pub count: u64,
-    /// The name of the token that was shown or of the person; `null` for a request without a good one.
+    /// The name of the token that was shown or of the person; `null` for a request without a good
+    /// one.
     pub who: Option<String>,
     /// That token.
     pub token: Option<TokenId>,

@@ -94,7 +94,7 @@ slug! {
 
 slug! {
     /// A program that limits a robot from outside, such as an obstacle detection.
-    HolderId
+    OwnerId
 }
 
 slug! {

@@ -7,13 +7,13 @@
 //! | `robots/{robot}/friction` | published | robot → all |
 //! | `robots/{robot}/cmd/{verb}` | query | server → robot |
 //! | `robots/{robot}/teleop` | published | server → robot |
-//! | `robots/{robot}/limit/{holder}` | published | any program → robot |
+//! | `robots/{robot}/limit/{owner}` | published | any program → robot |
 //! | `server/pulse` | published | server → all robots |
 //! | `server/map` | published | server → all robots and programs |
 //! | `server/hello/{robot}` | query | robot → server |
 //! | `server/ingest/{robot}` | query | robot → server |
 
-use crate::ids::{BootId, HolderId, RobotId, SiteId};
+use crate::ids::{BootId, OwnerId, RobotId, SiteId};
 
 /// The first chunk of every key.
 pub const ROOT: &str = "tread";
@@ -119,12 +119,12 @@ pub fn teleop(site: &SiteId, robot: &RobotId) -> String {
     robot_key(site, robot, "teleop")
 }
 
-/// Where one holder publishes its limits of a robot.
-pub fn limit(site: &SiteId, robot: &RobotId, holder: &HolderId) -> String {
-    robot_key(site, robot, &format!("limit/{holder}"))
+/// Where one owner publishes its limits of a robot.
+pub fn limit(site: &SiteId, robot: &RobotId, owner: &OwnerId) -> String {
+    robot_key(site, robot, &format!("limit/{owner}"))
 }
 
-/// The limits of a robot by all holders.
+/// The limits of a robot by all owners.
 pub fn limits(site: &SiteId, robot: &RobotId) -> String {
     robot_key(site, robot, "limit/*")
 }
@@ -173,8 +173,8 @@ pub enum Key {
     Command(SiteId, RobotId, Verb),
     /// Drive commands to a robot.
     Teleop(SiteId, RobotId),
-    /// A holder's limits of a robot.
-    Limit(SiteId, RobotId, HolderId),
+    /// An owner's limits of a robot.
+    Limit(SiteId, RobotId, OwnerId),
     /// The server's pulse.
     Pulse(SiteId),
     /// Where the friction map changes.
@@ -204,8 +204,8 @@ impl Key {
                 Self::Command(site, robot.parse().ok()?, Verb::from_chunk(verb)?)
             }
             ["robots", robot, "teleop"] => Self::Teleop(site, robot.parse().ok()?),
-            ["robots", robot, "limit", holder] => {
-                Self::Limit(site, robot.parse().ok()?, holder.parse().ok()?)
+            ["robots", robot, "limit", owner] => {
+                Self::Limit(site, robot.parse().ok()?, owner.parse().ok()?)
             }
             ["server", "pulse"] => Self::Pulse(site),
             ["server", "map"] => Self::Map(site),
@@ -227,7 +227,7 @@ mod tests {
         let site: SiteId = "yard".parse().unwrap();
         let robot: RobotId = "rover-1".parse().unwrap();
         let boot = BootId::from_uuid(Uuid::from_u128(7));
-        let holder: HolderId = "lidar".parse().unwrap();
+        let owner: OwnerId = "lidar".parse().unwrap();
         let pair = || (site.clone(), robot.clone());
         let cases = [
             (
@@ -242,8 +242,8 @@ mod tests {
             ),
             (teleop(&site, &robot), Key::Teleop(pair().0, pair().1)),
             (
-                limit(&site, &robot, &holder),
-                Key::Limit(pair().0, pair().1, holder.clone()),
+                limit(&site, &robot, &owner),
+                Key::Limit(pair().0, pair().1, owner.clone()),
             ),
             (pulse(&site), Key::Pulse(site.clone())),
             (map(&site), Key::Map(site.clone())),

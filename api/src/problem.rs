@@ -203,7 +203,7 @@ impl ProblemType {
             Self::StopNotCleared => "The robot has not cleared the stop",
             Self::RobotUnreachable => "The robot does not answer",
             Self::RobotRefused => "The robot refuses",
-            Self::CrossesGeofence => "The way leaves where robots may be",
+            Self::CrossesGeofence => "The path leaves where robots may be",
             Self::RobotOutsideGeofence => "A robot would stand outside the geofence",
             Self::ChangedMeanwhile => "It was changed meanwhile",
             Self::IdempotencyKeyInFlight => "A request with this key is being answered",

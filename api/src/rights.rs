@@ -80,9 +80,9 @@ pub enum Right {
     Drive,
     /// Clears stops.
     ClearStop,
-    /// Holds and slows robots as the limit's holder that is named like the token.
+    /// Holds and slows robots as the limit's owner that is named like the token.
     Hold,
-    /// Sets and ends the limits of every holder; brings `hold` along.
+    /// Sets and ends the limits of every owner; brings `hold` along.
     ReleaseHold,
     /// Gives missions, changes, pauses, resumes and cancels them.
     Dispatch,
@@ -380,8 +380,8 @@ impl Scope {
         }
     }
 
-    /// The robots that a list of a site is limited to: `None` for all, none at all where the site is
-    /// not in it.
+    /// The robots that a list of a site is limited to: `None` for all, none at all where the site
+    /// is not in it.
     pub fn limit_of(&self, site: &SiteId) -> Option<BTreeSet<RobotId>> {
         match self.robots_of(site) {
             None => Some(BTreeSet::new()),
@@ -405,8 +405,8 @@ impl Scope {
     /// The scope of such names.
     ///
     /// # Errors
-    /// A name is neither, a site is named twice or both whole and by robots, or there are none or too
-    /// many.
+    /// A name is neither, a site is named twice or both whole and by robots, or there are none or
+    /// too many.
     pub fn from_names<'name>(
         names: impl IntoIterator<Item = &'name str>,
     ) -> Result<Self, InvalidScope> {

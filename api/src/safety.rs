@@ -9,7 +9,7 @@ use utoipa::ToSchema;
 use uuid::Uuid;
 
 use crate::geometry::Polygon;
-use crate::ids::{HolderId, StopId};
+use crate::ids::{OwnerId, StopId};
 
 /// Longest name of a person or program that stops or drives, in characters.
 pub const BY_LENGTH_MAX: usize = 100;
@@ -86,7 +86,7 @@ pub enum GateCause {
     Lease,
     /// The server has been silent for longer than the mission allows.
     LinkPolicy,
-    /// An external limit holds the robot, or a required holder is silent.
+    /// An external limit holds the robot, or a required owner is silent.
     ExternalHold,
     /// The robot's control loop does not keep its rate.
     LoopOverrun,
@@ -158,7 +158,8 @@ pub struct DriveStatus {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct LimitStatus {
     /// Who limits.
-    pub holder: HolderId,
+    #[serde(alias = "holder")]
+    pub owner: OwnerId,
     /// Whether the robot must hear this owner to move; it stays on hold while the owner is silent.
     pub required: bool,
     /// Whether the robot is on hold now: because the owner asked, or because a required owner is
@@ -262,7 +263,7 @@ pub struct ReplaceGeofence {
     pub keep_out: Vec<Polygon>,
 }
 
-/// The body of `PUT /v1/sites/{site}/robots/{robot}/limits/{holder}`.
+/// The body of `PUT /v1/sites/{site}/robots/{robot}/limits/{owner}`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct SetLimit {
     /// Whether the robot is to stand.

@@ -19,11 +19,11 @@
 //! | 48 | 16 bytes | configuration (robot model and tyres), a UUID; zeros if nobody has measured |
 //! | 64 | UTF-8 | name of the normalisation that was used, up to the end of the header; may be empty |
 //! | header | u16 × n | mean: 0 is unknown, else `θ = 10⁻⁶ · 10^(8·(code − 1)/65 534)` |
-//! | + 2n | u8 × n | deviation: `σ = 10⁻⁵ · 10^(6·code/255)`, never less than it is |
+//! | + 2n | u8 × n | standard deviation: `σ = 10⁻⁵ · 10^(6·code/255)`, never less than it is |
 //! | + 3n | u8 × n | count: `segments = 2^(code/8)`, rounded; 0 is one |
 //!
-//! A mean is within 0.015 % of what it was, a deviation at most 5.6 % too large, a count within
-//! 4.5 %.
+//! A mean is within 0.015 % of what it was, a standard deviation at most 5.6 % too large, a count
+//! within 4.5 %.
 
 use std::f64::consts::LOG10_E;
 
@@ -45,14 +45,14 @@ const SQUARE: usize = 4;
 /// Most squares that are read: 4 096 by 4 096.
 pub const SQUARES_MAX: usize = 1 << 24;
 
-/// Lowest θ that is told apart, as a power of ten.
+/// Lowest θ that is distinguished, as a power of ten.
 const THETA_LOW_LOG: f64 = -6.0;
 /// Powers of ten from the lowest to the highest θ.
 const THETA_SPAN_LOG: f64 = 8.0;
-/// Lowest deviation that is told apart, as a power of ten.
-const DEVIATION_LOW_LOG: f64 = -5.0;
-/// Powers of ten from the lowest to the highest deviation.
-const DEVIATION_SPAN_LOG: f64 = 6.0;
+/// Lowest standard deviation that is distinguished, as a power of ten.
+const STD_DEV_LOW_LOG: f64 = -5.0;
+/// Powers of ten from the lowest to the highest standard deviation.
+const STD_DEV_SPAN_LOG: f64 = 6.0;
 /// Steps from a count to its double.
 const COUNT_STEPS: f64 = 8.0;
 
@@ -112,8 +112,8 @@ pub enum InvalidTile {
     TooLarge,
 }
 
-/// Steps of a code that are told apart: what is off by the last bits of a logarithm belongs to its
-/// own step.
+/// Steps of a code that are distinguished: what is off by the last bits of a logarithm belongs to
+/// its own step.
 const PARTS_OF_A_STEP: f64 = 1.0e6;
 
 /// How many parts of a step a share of a range is, from 0 to those of `steps`. Rounded by casts,
@@ -136,11 +136,11 @@ fn codes(square: &TileSquare) -> (u16, u8, u8) {
     const STEP: u64 = PARTS_OF_A_STEP as u64;
     let share = |value: f64, low: f64, span: f64| (value.ln() * LOG10_E - low) / span;
     let theta = share(square.theta, THETA_LOW_LOG, THETA_SPAN_LOG);
-    let deviation = share(square.std_dev, DEVIATION_LOW_LOG, DEVIATION_SPAN_LOG);
+    let std_dev = share(square.std_dev, STD_DEV_LOW_LOG, STD_DEV_SPAN_LOG);
     let count = f64::from(square.segments.max(1)).log2() * COUNT_STEPS;
     (
         ((parts(theta, 65_534.0) + STEP / 2) / STEP) as u16 + 1,
-        parts(deviation, 255.0).div_ceil(STEP) as u8,
+        parts(std_dev, 255.0).div_ceil(STEP) as u8,
         ((parts(count / 255.0, 255.0) + STEP / 2) / STEP) as u8,
     )
 }
@@ -150,15 +150,15 @@ fn codes(square: &TileSquare) -> (u16, u8, u8) {
     clippy::cast_sign_loss,
     reason = "at most 2^31.9"
 )]
-fn square((mean, deviation, count): (u16, u8, u8)) -> Option<TileSquare> {
+fn square((mean, std_dev, count): (u16, u8, u8)) -> Option<TileSquare> {
     let power = |low: f64, span: f64, share: f64| 10_f64.powf(low + span * share);
     let share = f64::from(mean.checked_sub(1)?) / 65_534.0;
     Some(TileSquare {
         theta: power(THETA_LOW_LOG, THETA_SPAN_LOG, share),
         std_dev: power(
-            DEVIATION_LOW_LOG,
-            DEVIATION_SPAN_LOG,
-            f64::from(deviation) / 255.0,
+            STD_DEV_LOW_LOG,
+            STD_DEV_SPAN_LOG,
+            f64::from(std_dev) / 255.0,
         ),
         segments: (f64::from(count) / COUNT_STEPS).exp2().round() as u32,
     })
@@ -198,12 +198,12 @@ impl Tile {
         bytes.extend(name);
         bytes.resize(header + SQUARE * count, 0);
         let (means, rest) = bytes[header..].split_at_mut(2 * count);
-        let (deviations, counts) = rest.split_at_mut(count);
-        let planes = means.chunks_exact_mut(2).zip(deviations).zip(counts);
-        for (found, ((mean, deviation), segments)) in squares.zip(planes) {
+        let (std_devs, counts) = rest.split_at_mut(count);
+        let planes = means.chunks_exact_mut(2).zip(std_devs).zip(counts);
+        for (found, ((mean, std_dev), segments)) in squares.zip(planes) {
             let Some(found) = found else { continue };
             let theta;
-            (theta, *deviation, *segments) = codes(&found);
+            (theta, *std_dev, *segments) = codes(&found);
             mean.copy_from_slice(&theta.to_le_bytes());
         }
         bytes
@@ -253,8 +253,8 @@ impl Tile {
         let name = std::str::from_utf8(&bytes[HEADER..header]);
         let name = name.map_err(|_text| InvalidTile::NotATile)?;
         let (means, rest) = bytes[header..].split_at(2 * count);
-        let (deviations, counts) = rest.split_at(count);
-        let squares = means.chunks_exact(2).zip(deviations).zip(counts);
+        let (std_devs, counts) = rest.split_at(count);
+        let squares = means.chunks_exact(2).zip(std_devs).zip(counts);
         Ok(Self {
             columns,
             rows,
@@ -268,8 +268,8 @@ impl Tile {
             configuration: (!uuid.is_nil()).then(|| ConfigurationId::from_uuid(uuid)),
             normalisation: (!name.is_empty()).then(|| name.to_owned()),
             squares: squares
-                .map(|((mean, &deviation), &segments)| {
-                    square((u16::from_le_bytes([mean[0], mean[1]]), deviation, segments))
+                .map(|((mean, &std_dev), &segments)| {
+                    square((u16::from_le_bytes([mean[0], mean[1]]), std_dev, segments))
                 })
                 .collect(),
         })
@@ -302,10 +302,10 @@ mod tests {
             known in prop::collection::vec(
                 prop::option::of((-5.9_f64..1.9, -4.9_f64..0.9, 0.0_f64..30.0)), 0..50),
         ) {
-            let squares: Vec<_> = known.iter().map(|known| known.map(|(theta, deviation, count)| {
+            let squares: Vec<_> = known.iter().map(|known| known.map(|(theta, std_dev, count)| {
                 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "below 2^30")]
                 let segments = count.exp2() as u32;
-                TileSquare { theta: 10_f64.powf(theta), std_dev: 10_f64.powf(deviation), segments }
+                TileSquare { theta: 10_f64.powf(theta), std_dev: 10_f64.powf(std_dev), segments }
             })).collect();
             let tile = tile(squares, Some("to the largest"));
             let read = Tile::decode(&tile.encode()).unwrap();

@@ -112,7 +112,7 @@ impl FailureReason {
 /// Where a mission is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum FollowerStatus {
-    /// On the way to the trajectory.
+    /// On the approach to the trajectory.
     Approach,
     /// On the trajectory.
     Tracking,
@@ -170,7 +170,7 @@ pub struct Follower {
     config: FollowerConfig,
     governor: Governor,
     tracker: Tracker,
-    /// On the way to a trajectory whose ground is unknown.
+    /// On the approach to a trajectory whose ground is unknown.
     sliding: Option<Sliding>,
     status: FollowerStatus,
     aligning: bool,
@@ -399,7 +399,7 @@ impl Follower {
     /// Looks whether the robot itself gets on along its path.
     fn watch_progress(&mut self, reference: &ReferenceSample, commanded_m_s: f64, dt_s: f64) {
         let tick = ProgressTick {
-            robot_m: reference.arc_m - self.last_errors.along_m,
+            robot_m: reference.arc_m - self.last_errors.along_track_m,
             allowed_m_s: self.governor.allowed_speed_m_s(&self.plan),
             commanded_m_s,
             reference_m_s: reference.speed_m_s,
@@ -411,7 +411,7 @@ impl Follower {
     /// Moves the state on after a tick of driving.
     fn advance(&mut self, reference: &ReferenceSample, measured: &Measured, dt_s: f64) {
         let config = self.config;
-        let far = self.last_errors.cross_m.abs() > config.cross_track_max_m;
+        let far = self.last_errors.cross_track_m.abs() > config.cross_track_max_m;
         self.off_path_s = if far { self.off_path_s + dt_s } else { 0.0 };
         self.best_arc_m = self.best_arc_m.max(reference.arc_m);
         let standing = measured.twist.linear_m_s.abs() < config.rest_speed_m_s;

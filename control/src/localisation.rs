@@ -1,10 +1,24 @@
-//! Where the robot is: position fixes fused with gyro and wheel speeds.
+//! Pose estimation: an extended Kalman filter that fuses position fixes, gyro and wheel speeds.
 //!
-//! A Kalman filter over six states: pose, the difference between true and odometric speed
-//! ahead, the speed to the left (a skid-steered base slides sideways in turns), and the gyro's
-//! offset. The two speeds are first-order Markov, the offset wanders. Fixes that cannot be true are
-//! refused and counted; after [`REFUSED_MAX`] in a row the robot was moved, and the filter starts
-//! afresh from the fix.
+//! **State** `(x, y, φ, δ_v, v_l, b)`: position in the site's frame, m; heading, rad; true minus
+//! odometric forward speed, m/s; lateral speed, m/s (a skid-steered base slides in turns); gyro
+//! bias, rad/s. **Inputs**: odometric forward speed `v_o` and measured turn rate `ω_m`.
+//!
+//! **Process model**, at the loop's rate `1/dt`:
+//!
+//! ```text
+//! ẋ = (v_o + δ_v) cos φ − v_l sin φ      white noise of the gyro on φ, σ_ω dt a step
+//! ẏ = (v_o + δ_v) sin φ + v_l cos φ      δ_v, v_l: first-order Gauss–Markov, time constant
+//! φ̇ = ω_m − b                                      `speed_memory_s`, less driven at low speed
+//! ḃ = 0 + random walk                    `gyro_offset_walk`
+//! ```
+//!
+//! **Measurement model**: a fix is `(x, y, φ) + noise` of an earlier moment. It is carried forward
+//! over its age with the present twist; its covariance is its own, or the configured one. A
+//! χ² gate on the Mahalanobis distance refuses outliers and counts them; after [`REFUSED_MAX`] in
+//! a row the robot was moved, and the filter starts again from the fix. The covariance update is
+//! Joseph's form. See Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking
+//! and Navigation*, 2001, chapters 5 and 10.
 
 use nalgebra::{Matrix3, Matrix3x6, Matrix6, Vector3, Vector6};
 
@@ -17,7 +31,7 @@ pub const REFUSED_MAX: u32 = 20;
 /// Squared Mahalanobis distance beyond which a fix is refused (three degrees of freedom, one in
 /// 10⁶ true ones).
 const GATE: f64 = 30.7;
-/// Curvature of ways that nobody heard of, one standard deviation, 1/m: a bend may begin in them.
+/// Curvature of paths that nobody heard of, one standard deviation, 1/m: a bend may begin in them.
 const UNHEARD_CURVATURE_PER_M: f64 = 1.0;
 /// Longest prediction in one call, seconds.
 const STEP_MAX_S: f64 = 0.5;
@@ -48,7 +62,7 @@ pub struct FixNoise {
 
 impl FixNoise {
     fn is_possible(self) -> bool {
-        let is_possible = |deviation: f64| deviation.is_finite() && deviation > 0.0;
+        let is_possible = |std_dev: f64| std_dev.is_finite() && std_dev > 0.0;
         is_possible(self.position_m) && is_possible(self.heading_rad)
     }
 }
@@ -64,7 +78,7 @@ pub struct LocalisationNoise {
     pub gyro_rad_s: f64,
     /// Wandering of the gyro's offset, radians per second and root second.
     pub gyro_offset_walk: f64,
-    /// Difference between true and odometric speed ahead, metres per second.
+    /// Difference between true and odometric forward speed, metres per second.
     pub speed_m_s: f64,
     /// Speed to the left, metres per second.
     pub sideways_m_s: f64,
@@ -109,7 +123,7 @@ pub struct Localisation {
     state: Vector6<f64>,
     covariance: Matrix6<f64>,
     turn_rad_s: f64,
-    ahead_m_s: f64,
+    forward_m_s: f64,
     started: bool,
     fix_age_s: f64,
     refused_in_a_row: u32,
@@ -127,7 +141,7 @@ impl Localisation {
             state: Vector6::zeros(),
             covariance: Matrix6::zeros(),
             turn_rad_s: 0.0,
-            ahead_m_s: 0.0,
+            forward_m_s: 0.0,
             started: false,
             fix_age_s: f64::INFINITY,
             refused_in_a_row: 0,
@@ -149,7 +163,7 @@ impl Localisation {
     /// How the robot moves, body frame.
     pub fn twist(&self) -> Twist {
         Twist {
-            linear_m_s: self.ahead_m_s + self.state[3],
+            linear_m_s: self.forward_m_s + self.state[3],
             angular_rad_s: self.turn_rad_s,
         }
     }
@@ -202,7 +216,7 @@ impl Localisation {
             self.invalid += 1;
         }
         if wheel_m_s.is_finite() && wheel_m_s.abs() < RATE_MAX {
-            self.ahead_m_s = wheel_m_s;
+            self.forward_m_s = wheel_m_s;
         } else {
             self.invalid += 1;
         }
@@ -212,16 +226,16 @@ impl Localisation {
         let dt_s = dt_s.min(STEP_MAX_S);
         let middle_rad = self.state[2] + 0.5 * dt_s * self.turn_rad_s;
         let (sin, cos) = middle_rad.sin_cos();
-        let (ahead_m_s, left_m_s) = (self.ahead_m_s + self.state[3], self.state[4]);
-        self.state[0] += dt_s * (ahead_m_s * cos - left_m_s * sin);
-        self.state[1] += dt_s * (ahead_m_s * sin + left_m_s * cos);
+        let (forward_m_s, left_m_s) = (self.forward_m_s + self.state[3], self.state[4]);
+        self.state[0] += dt_s * (forward_m_s * cos - left_m_s * sin);
+        self.state[1] += dt_s * (forward_m_s * sin + left_m_s * cos);
         self.state[2] += dt_s * self.turn_rad_s;
         let fade = (-dt_s / self.noise.speed_memory_s.max(dt_s)).exp();
         self.state[3] *= fade;
         self.state[4] *= fade;
         let mut motion = Matrix6::identity();
-        motion[(0, 2)] = -dt_s * (ahead_m_s * sin + left_m_s * cos);
-        motion[(1, 2)] = dt_s * (ahead_m_s * cos - left_m_s * sin);
+        motion[(0, 2)] = -dt_s * (forward_m_s * sin + left_m_s * cos);
+        motion[(1, 2)] = dt_s * (forward_m_s * cos - left_m_s * sin);
         motion[(0, 3)] = dt_s * cos;
         motion[(0, 4)] = -dt_s * sin;
         motion[(1, 3)] = dt_s * sin;
@@ -230,7 +244,7 @@ impl Localisation {
         motion[(3, 3)] = fade;
         motion[(4, 4)] = fade;
         // Standing wheels do not slide: the Markov speeds are let loose with the speed.
-        let moving = (self.ahead_m_s.abs() + 0.2 * self.turn_rad_s.abs()).min(0.5) / 0.5;
+        let moving = (self.forward_m_s.abs() + 0.2 * self.turn_rad_s.abs()).min(0.5) / 0.5;
         let renewed = (1.0 - fade * fade) * (0.05 + 0.95 * moving).powi(2);
         self.covariance = motion * self.covariance * motion.transpose();
         self.covariance[(2, 2)] += (self.noise.gyro_rad_s * dt_s).powi(2);
@@ -246,12 +260,12 @@ impl Localisation {
         if !self.started || !unheard_s.is_finite() || unheard_s <= 0.0 {
             return;
         }
-        let (ahead_m_s, left_m_s) = (self.ahead_m_s + self.state[3], self.state[4]);
-        let way_m = ahead_m_s.hypot(left_m_s) * unheard_s;
-        let turn_rad = (self.turn_rad_s * unheard_s).hypot(UNHEARD_CURVATURE_PER_M * way_m);
+        let (forward_m_s, left_m_s) = (self.forward_m_s + self.state[3], self.state[4]);
+        let distance_m = forward_m_s.hypot(left_m_s) * unheard_s;
+        let turn_rad = (self.turn_rad_s * unheard_s).hypot(UNHEARD_CURVATURE_PER_M * distance_m);
         let turn_rad = turn_rad.min(std::f64::consts::PI);
-        for (index, deviation) in [way_m, way_m, turn_rad].into_iter().enumerate() {
-            self.covariance[(index, index)] += deviation * deviation;
+        for (index, std_dev) in [distance_m, distance_m, turn_rad].into_iter().enumerate() {
+            self.covariance[(index, index)] += std_dev * std_dev;
         }
     }
 
@@ -283,8 +297,9 @@ impl Localisation {
             position,
             fix_noise.heading_rad.powi(2),
         ));
-        let spread: Matrix3<f64> = observe * self.covariance * observe.transpose() + noise;
-        let Some(inverse) = spread.try_inverse() else {
+        let innovation_variance: Matrix3<f64> =
+            observe * self.covariance * observe.transpose() + noise;
+        let Some(inverse) = innovation_variance.try_inverse() else {
             self.invalid += 1;
             return FixOutcome::Invalid;
         };
@@ -313,11 +328,11 @@ impl Localisation {
     fn carried(&self, fix: &PositionFix) -> Pose {
         let turn_rad = self.turn_rad_s * fix.age_s;
         let (sin, cos) = (fix.pose.heading_rad + 0.5 * turn_rad).sin_cos();
-        let ahead_m = (self.ahead_m_s + self.state[3]) * fix.age_s;
+        let forward_m = (self.forward_m_s + self.state[3]) * fix.age_s;
         let left_m = self.state[4] * fix.age_s;
         Pose {
-            x_m: fix.pose.x_m + ahead_m * cos - left_m * sin,
-            y_m: fix.pose.y_m + ahead_m * sin + left_m * cos,
+            x_m: fix.pose.x_m + forward_m * cos - left_m * sin,
+            y_m: fix.pose.y_m + forward_m * sin + left_m * cos,
             heading_rad: fix.pose.heading_rad + turn_rad,
         }
     }

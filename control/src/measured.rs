@@ -44,8 +44,8 @@ impl WheelTorques {
 /// Acceleration of the body without gravity, in the body frame.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct BodyAcceleration {
-    /// Ahead, metres per second squared.
-    pub ahead_m_s2: f64,
+    /// Forward, metres per second squared.
+    pub forward_m_s2: f64,
     /// To the left, metres per second squared.
     pub left_m_s2: f64,
 }

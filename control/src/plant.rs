@@ -102,7 +102,7 @@ pub struct PlantState {
     /// Pose in the site's frame.
     pub pose: Pose,
     /// Speed ahead, ẋ, metres per second.
-    pub ahead_m_s: f64,
+    pub forward_m_s: f64,
     /// Speed to the left, ẏ, metres per second.
     pub left_m_s: f64,
     /// Turn rate φ̇, radians per second.
@@ -115,7 +115,7 @@ impl PlantState {
     /// Speed ahead and turn rate.
     pub fn twist(&self) -> Twist {
         Twist {
-            linear_m_s: self.ahead_m_s,
+            linear_m_s: self.forward_m_s,
             angular_rad_s: self.yaw_rate_rad_s,
         }
     }
@@ -130,7 +130,7 @@ pub struct Plant {
     contact: Contact,
     means: PlantMeans,
     /// Means of the forward forces of the left and the right side over the last step, newtons.
-    side_ahead_n: [f64; 2],
+    side_longitudinal_n: [f64; 2],
 }
 
 /// Means over the time of one call of [`Plant::step`]: what encoders that count, and inertial
@@ -153,7 +153,7 @@ struct MeanSums {
     yaw_rad: f64,
     /// `∫ẏφ̇ dt` and `∫ẋφ̇ dt`, metres per second.
     left_turned_m_s: f64,
-    ahead_turned_m_s: f64,
+    forward_turned_m_s: f64,
 }
 
 impl MeanSums {
@@ -164,7 +164,7 @@ impl MeanSums {
             self.right_rad += half_s * state.wheel_speeds.right_rad_s;
             self.yaw_rad += half_s * state.yaw_rate_rad_s;
             self.left_turned_m_s += half_s * state.left_m_s * state.yaw_rate_rad_s;
-            self.ahead_turned_m_s += half_s * state.ahead_m_s * state.yaw_rate_rad_s;
+            self.forward_turned_m_s += half_s * state.forward_m_s * state.yaw_rate_rad_s;
         }
     }
 
@@ -176,8 +176,8 @@ impl MeanSums {
             },
             yaw_rate_rad_s: self.yaw_rad / span_s,
             acceleration: BodyAcceleration {
-                ahead_m_s2: (end.ahead_m_s - start.ahead_m_s - self.left_turned_m_s) / span_s,
-                left_m_s2: (end.left_m_s - start.left_m_s + self.ahead_turned_m_s) / span_s,
+                forward_m_s2: (end.forward_m_s - start.forward_m_s - self.left_turned_m_s) / span_s,
+                left_m_s2: (end.left_m_s - start.left_m_s + self.forward_turned_m_s) / span_s,
             },
         }
     }
@@ -186,11 +186,11 @@ impl MeanSums {
 /// Forces of all contacts on the body.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Contact {
-    ahead_n: f64,
+    longitudinal_n: f64,
     left_n: f64,
     moment_n_m: f64,
-    left_side_ahead_n: f64,
-    right_side_ahead_n: f64,
+    left_side_longitudinal_n: f64,
+    right_side_longitudinal_n: f64,
     slip_max: f64,
 }
 
@@ -239,7 +239,7 @@ impl Plant {
             state,
             contact: Contact::default(),
             means: PlantMeans::default(),
-            side_ahead_n: [0.0; 2],
+            side_longitudinal_n: [0.0; 2],
         })
     }
 
@@ -261,14 +261,14 @@ impl Plant {
     /// What an accelerometer at the centre of mass feels now, without noise.
     pub fn body_acceleration(&self) -> BodyAcceleration {
         BodyAcceleration {
-            ahead_m_s2: self.contact.ahead_n / self.model.mass_kg(),
+            forward_m_s2: self.contact.longitudinal_n / self.model.mass_kg(),
             left_m_s2: self.contact.left_n / self.model.mass_kg(),
         }
     }
 
-    /// Drive torques per side as means over the last step, like [`Plant::means`]: ground force times
-    /// rolling radius plus rolling resistance. A torque of one moment beside means of all else
-    /// would make slip lag behind force, and θ read low wherever the command moves.
+    /// Drive torques per side as means over the last step, like [`Plant::means`]: ground force
+    /// times rolling radius plus rolling resistance. A torque of one moment beside means of all
+    /// else would make slip lag behind force, and θ read low wherever the command moves.
     pub fn wheel_torques(&self) -> WheelTorques {
         let radius_m = self.model.wheel_radius_m();
         let side = |force_n: f64, wheel_rad_s: f64, radius_ratio: f64| {
@@ -278,7 +278,7 @@ impl Plant {
             (force_n + resistance_n) * radius_m * radius_ratio
         };
         let wheels = self.means.wheel_speeds;
-        let [left_n, right_n] = self.side_ahead_n;
+        let [left_n, right_n] = self.side_longitudinal_n;
         WheelTorques {
             left_n_m: side(left_n, wheels.left_rad_s, self.spec.left_radius_ratio),
             right_n_m: side(right_n, wheels.right_rad_s, self.spec.right_radius_ratio),
@@ -322,8 +322,11 @@ impl Plant {
             self.runge_kutta(command, ground, step_s);
             sums.add(&before, &self.state, step_s);
             let after = self.contact_forces(&self.state, ground);
-            left_n_s += 0.5 * step_s * (contact.left_side_ahead_n + after.left_side_ahead_n);
-            right_n_s += 0.5 * step_s * (contact.right_side_ahead_n + after.right_side_ahead_n);
+            left_n_s +=
+                0.5 * step_s * (contact.left_side_longitudinal_n + after.left_side_longitudinal_n);
+            right_n_s += 0.5
+                * step_s
+                * (contact.right_side_longitudinal_n + after.right_side_longitudinal_n);
             contact = after;
             left_s -= step_s;
             if left_s <= 1.0e-12 {
@@ -332,7 +335,7 @@ impl Plant {
         }
         let span_s = dt_s - left_s;
         self.means = sums.means(&start, &self.state, span_s);
-        self.side_ahead_n = [left_n_s / span_s, right_n_s / span_s];
+        self.side_longitudinal_n = [left_n_s / span_s, right_n_s / span_s];
         self.contact = contact;
     }
 
@@ -375,18 +378,19 @@ impl Plant {
         let state = unpack(packed);
         let contact = self.contact_forces(&state, ground);
         let (sin, cos) = state.pose.heading_rad.sin_cos();
-        let (ahead_m_s, left_m_s, yaw) = (state.ahead_m_s, state.left_m_s, state.yaw_rate_rad_s);
+        let (forward_m_s, left_m_s, yaw) =
+            (state.forward_m_s, state.left_m_s, state.yaw_rate_rad_s);
         let acceleration_max = self.model.limits().wheel_acceleration_max_rad_s2;
         let lag_s = self.spec.servo_lag_s.max(SERVO_LAG_FLOOR_S);
         let servo = |target: f64, speed: f64| {
             ((target - speed) / lag_s).clamp(-acceleration_max, acceleration_max)
         };
         [
-            ahead_m_s * cos - left_m_s * sin,
-            ahead_m_s * sin + left_m_s * cos,
+            forward_m_s * cos - left_m_s * sin,
+            forward_m_s * sin + left_m_s * cos,
             yaw,
-            contact.ahead_n / self.model.mass_kg() + left_m_s * yaw,
-            contact.left_n / self.model.mass_kg() - ahead_m_s * yaw,
+            contact.longitudinal_n / self.model.mass_kg() + left_m_s * yaw,
+            contact.left_n / self.model.mass_kg() - forward_m_s * yaw,
             contact.moment_n_m / self.model.yaw_inertia_kg_m2(),
             servo(command.left_rad_s, state.wheel_speeds.left_rad_s),
             servo(command.right_rad_s, state.wheel_speeds.right_rad_s),
@@ -415,25 +419,26 @@ impl Plant {
         let mut side_n = [0.0; 2];
         for (side, (y_m, rim_m_s, curve)) in sides.into_iter().enumerate() {
             let per_speed_s_m = slip_reference_m_s(rim_m_s).recip();
-            let slip_ahead =
-                (state.ahead_m_s - state.yaw_rate_rad_s * y_m - rim_m_s) * per_speed_s_m;
+            let longitudinal_slip =
+                (state.forward_m_s - state.yaw_rate_rad_s * y_m - rim_m_s) * per_speed_s_m;
             for x_m in [half_base_m, -half_base_m] {
                 // The slip across that would give its force on an isotropic tyre.
                 let slip_left = tyres.lateral_stiffness_ratio
                     * (state.left_m_s + state.yaw_rate_rad_s * x_m)
                     * per_speed_s_m;
-                let slip = (slip_ahead * slip_ahead + slip_left * slip_left).sqrt();
+                let slip = (longitudinal_slip * longitudinal_slip + slip_left * slip_left).sqrt();
                 let gain_n = -load_n * tyres.rise.mu_over_slip(curve, slip);
-                let (force_ahead_n, force_left_n) = (gain_n * slip_ahead, gain_n * slip_left);
-                side_n[side] += force_ahead_n;
+                let (longitudinal_force_n, force_left_n) =
+                    (gain_n * longitudinal_slip, gain_n * slip_left);
+                side_n[side] += longitudinal_force_n;
                 sum.left_n += force_left_n;
-                sum.moment_n_m += x_m * force_left_n - y_m * force_ahead_n;
+                sum.moment_n_m += x_m * force_left_n - y_m * longitudinal_force_n;
                 sum.slip_max = sum.slip_max.max(slip);
             }
         }
-        sum.left_side_ahead_n = side_n[0];
-        sum.right_side_ahead_n = side_n[1];
-        sum.ahead_n = side_n[0] + side_n[1];
+        sum.left_side_longitudinal_n = side_n[0];
+        sum.right_side_longitudinal_n = side_n[1];
+        sum.longitudinal_n = side_n[0] + side_n[1];
         sum
     }
 }
@@ -450,7 +455,7 @@ fn pack(state: &PlantState) -> Rates {
         state.pose.x_m,
         state.pose.y_m,
         state.pose.heading_rad,
-        state.ahead_m_s,
+        state.forward_m_s,
         state.left_m_s,
         state.yaw_rate_rad_s,
         state.wheel_speeds.left_rad_s,
@@ -463,7 +468,7 @@ fn unpack(packed: &Rates) -> PlantState {
         x_m,
         y_m,
         heading_rad,
-        ahead_m_s,
+        forward_m_s,
         left_m_s,
         yaw_rate_rad_s,
         left_rad_s,
@@ -475,7 +480,7 @@ fn unpack(packed: &Rates) -> PlantState {
             y_m,
             heading_rad,
         },
-        ahead_m_s,
+        forward_m_s,
         left_m_s,
         yaw_rate_rad_s,
         wheel_speeds: WheelSpeeds {

@@ -2,9 +2,9 @@
 //!
 //! The robot's place is its measured position projected on the path. Progress counts from the
 //! farthest place that has counted before, in gains that noise does not give: neither a reference
-//! that creeps on, nor a robot that moves to and fro, nor many gains too small to count end the time
-//! without progress. A robot that may drive slowly needs a smaller gain. Time in which it must not
-//! drive does not count, and does not make up for what counted before.
+//! that creeps on, nor a robot that moves to and fro, nor many gains too small to count end the
+//! time without progress. A robot that may drive slowly needs a smaller gain. Time in which it must
+//! not drive does not count, and does not make up for what counted before.
 //!
 //! A robot that makes no progress and whose feedback drives it faster than its plan all the while
 //! drives blindly, or digs: that is bounded by the way commanded, sooner than by the time.
@@ -16,11 +16,12 @@ pub struct ProgressBounds {
     pub time_max_s: f64,
     /// Gain along the path that counts as progress, metres.
     pub gain_m: f64,
-    /// Longest way commanded beyond the plan without progress, metres.
+    /// Longest distance commanded beyond the plan without progress, metres.
     pub beyond_plan_max_m: f64,
 }
 
-/// Share of the way that the robot may drive that counts as progress, where it is less than the gain.
+/// Share of the distance that the robot may drive that counts as progress, where it is less than
+/// the gain.
 const GAIN_SHARE: f64 = 0.25;
 /// Speed below which a robot is not to drive, metres per second.
 const ALLOWED_MIN_M_S: f64 = 1.0e-3;
@@ -48,9 +49,9 @@ pub(crate) struct ProgressMonitor {
     best_m: Option<f64>,
     /// Time in which the robot might have driven since, seconds.
     idle_s: f64,
-    /// Way that it might have driven in that time, metres.
+    /// Distance that it might have driven in that time, metres.
     allowed_m: f64,
-    /// Way commanded beyond the plan in that time, metres.
+    /// Distance commanded beyond the plan in that time, metres.
     beyond_plan_m: f64,
 }
 
@@ -66,7 +67,8 @@ impl ProgressMonitor {
         }
         let gained_m = tick.robot_m - best_m;
         let is_over = self.idle_s > bounds.time_max_s;
-        // A slow robot is looked at when its time is over: a share of little way is no progress.
+        // A slow robot is looked at when its time is over: a share of a short distance is no
+        // progress.
         let needed_m = if is_over {
             bounds.gain_m.min(GAIN_SHARE * self.allowed_m)
         } else {

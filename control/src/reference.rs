@@ -168,8 +168,8 @@ impl Governor {
         (limit_m_s / fastest_m_s).min(1.0)
     }
 
-    /// Fastest speed now and soon that plan, pace and speed limit allow a robot that keeps up, metres
-    /// per second.
+    /// Fastest speed now and soon that plan, pace and speed limit allow a robot that keeps up,
+    /// metres per second.
     pub(crate) fn allowed_speed_m_s(&self, plan: &Plan) -> f64 {
         if self.stopping {
             return 0.0;
@@ -188,7 +188,7 @@ impl Governor {
     }
 
     /// The largest σ that sliding ground allows: within its bounds at every bend ahead, as far as
-    /// braking along the way does not do, and slow while the robot is turned off its path.
+    /// braking along the path does not do, and slow while the robot is turned off its path.
     fn rate_on_sliding_ground(&self, plan: &Plan, planned: &PlanSample) -> f64 {
         let Some(Slide {
             bounds,
@@ -204,8 +204,8 @@ impl Governor {
             let bend_1_m = there.path.curvature_1_m.abs().max(f64::MIN_POSITIVE);
             let slope_1_m2 = there.path.curvature_slope_1_m2.abs().max(f64::MIN_POSITIVE);
             let square = (bounds.across_m_s2 / bend_1_m).min(bounds.yaw_rad_s2 / slope_1_m2);
-            let way_m = there.arc_m - planned.arc_m;
-            energy = energy.min(0.5 * square + bounds.along_m_s2 * way_m);
+            let distance_m = there.arc_m - planned.arc_m;
+            energy = energy.min(0.5 * square + bounds.along_m_s2 * distance_m);
         }
         let turned = (HEADING_FULL_RAD - heading_rad.abs()) / (HEADING_FULL_RAD - HEADING_FREE_RAD);
         ((2.0 * energy).sqrt() / planned.speed_m_s.max(f64::MIN_POSITIVE))

@@ -10,9 +10,10 @@
 //! ```
 //! What the body did shows what the ground gave: four wheels of equal load that push the body
 //! with `a_y = vω` and turn it with `I_G ω̇` have a mean square of at least
-//! `a_y² + (2 I_G ω̇/(m √(W² + L²)))²`, so that some wheel had at least the root of it over g as μ. It
-//! bounds friction from below as far as the nose turns with the course and rates are seen well; where
-//! not, more is shown than was given. Either way the robot only becomes slower, never quicker.
+//! `a_y² + (2 I_G ω̇/(m √(W² + L²)))²`, so that some wheel had at least the root of it over g as μ.
+//! It bounds friction from below as far as the nose turns with the course and rates are seen well;
+//! where not, more is shown than was given. Either way the robot only becomes slower, never
+//! quicker.
 
 use crate::measured::Measured;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
@@ -66,7 +67,7 @@ pub(crate) struct SlidingBounds {
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Smoothed {
     turn_rad_s: f64,
-    ahead_rad_s: f64,
+    forward_rad_s: f64,
 }
 
 /// Watches one robot on its way.
@@ -101,16 +102,16 @@ impl Sliding {
         let model = &self.model;
         let turn_rad_s = measured.twist.angular_rad_s;
         let wheels = measured.wheel_speeds;
-        let ahead_rad_s = model.twist_from_wheel_speeds(wheels).angular_rad_s - turn_rad_s;
+        let forward_rad_s = model.twist_from_wheel_speeds(wheels).angular_rad_s - turn_rad_s;
         let before = self.smoothed.unwrap_or(Smoothed {
             turn_rad_s,
-            ahead_rad_s,
+            forward_rad_s,
         });
         let share = (dt_s / SMOOTHING_S).min(1.0);
         let change_rad_s = turn_rad_s - before.turn_rad_s;
         let smoothed = Smoothed {
             turn_rad_s: before.turn_rad_s + share * change_rad_s,
-            ahead_rad_s: before.ahead_rad_s + share * (ahead_rad_s - before.ahead_rad_s),
+            forward_rad_s: before.forward_rad_s + share * (forward_rad_s - before.forward_rad_s),
         };
         self.smoothed = Some(smoothed);
         let yaw_rad_s2 = change_rad_s / SMOOTHING_S;
@@ -121,7 +122,7 @@ impl Sliding {
         let rim_m_s =
             0.5 * model.wheel_radius_m() * (wheels.left_rad_s.abs() + wheels.right_rad_s.abs());
         if turn_rad_s.abs() < STRAIGHT_RAD_S {
-            self.straight[0] += ahead_rad_s * rim_m_s * dt_s;
+            self.straight[0] += forward_rad_s * rim_m_s * dt_s;
             self.straight[1] += rim_m_s * rim_m_s * dt_s;
         }
         let known_m2_s = RADII_MIDDLE_M2_S + self.straight[1];
@@ -138,7 +139,7 @@ impl Sliding {
             + radii_ratio * rim_m_s / model.effective_track_m()
             + TRACK_RATIO * turn_rad_s.abs()
             + NOISE_RAD_S;
-        let left_over_rad_s = (smoothed.ahead_rad_s - radii_rad_s).abs() - explained_rad_s;
+        let left_over_rad_s = (smoothed.forward_rad_s - radii_rad_s).abs() - explained_rad_s;
         self.left_over_rad = (self.left_over_rad + left_over_rad_s * dt_s).max(0.0);
         // Ground that has given what the plan asks of it along the path is as good as assumed.
         let is_enough = self.shown_m_s2 >= RobotModel::longitudinal_traction_m_s2(self.assumed_mu);

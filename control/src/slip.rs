@@ -7,7 +7,7 @@ use crate::robot::RobotModel;
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct BodyVelocity {
     /// ẋ, metres per second.
-    pub ahead_m_s: f64,
+    pub forward_m_s: f64,
     /// ẏ, metres per second.
     pub left_m_s: f64,
     /// φ̇, radians per second.
@@ -24,7 +24,7 @@ pub struct SideSlips {
 }
 
 impl SideSlips {
-    /// Slips of a moving base. Wheels must turn ahead: at `rω` = 0 the slip is not defined.
+    /// Slips of a moving base. Wheels must turn forward: at `rω` = 0 the slip is not defined.
     pub fn of(velocity: &BodyVelocity, wheels: WheelSpeeds, model: &RobotModel) -> Self {
         let half_m_s = 0.5 * model.track_width_m() * velocity.yaw_rate_rad_s;
         let slip = |wheel_rad_s: f64, contact_m_s: f64| {
@@ -32,8 +32,8 @@ impl SideSlips {
             ((rim_m_s - contact_m_s) / rim_m_s).clamp(-1.0, 1.0)
         };
         Self {
-            left: slip(wheels.left_rad_s, velocity.ahead_m_s - half_m_s),
-            right: slip(wheels.right_rad_s, velocity.ahead_m_s + half_m_s),
+            left: slip(wheels.left_rad_s, velocity.forward_m_s - half_m_s),
+            right: slip(wheels.right_rad_s, velocity.forward_m_s + half_m_s),
         }
     }
 }

@@ -38,10 +38,10 @@ fn drive(trajectory: &Trajectory, start: Pose, stiffness: f64, noisy: bool) -> (
         before_m = output.progress_m;
         if output.status == FollowerStatus::Tracking {
             let true_pose = robot.plant.state().pose;
-            let cross_m = output.reference.pose.body_from_site(true_pose.point()).y_m;
-            sum += cross_m * cross_m;
+            let cross_track_m = output.reference.pose.body_from_site(true_pose.point()).y_m;
+            sum += cross_track_m * cross_track_m;
             count += 1.0;
-            most = most.max(cross_m.abs());
+            most = most.max(cross_track_m.abs());
         }
     });
     assert_eq!(

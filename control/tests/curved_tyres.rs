@@ -10,7 +10,7 @@ use tread_control::plant::{Ground, Plant, PlantSpec, TyreRise, Tyres};
 
 /// θ of all runs.
 const THETA: f64 = 0.25;
-/// What the robots are told: κ spreads evenly over this much of its mean.
+/// What the robots are configured with: κ spreads evenly over this much of its mean.
 const CURVATURE: f64 = 1.5;
 const CURVATURE_HALF_RANGE: f64 = 1.0;
 

@@ -36,9 +36,9 @@ fn open_loop(gains: CrossGains, plant: Plant, rate_rad_s: f64) -> Complex<f64> {
         / ((s * plant.servo_lag_s + one) * (s / (slip_pole * shape) + one));
     let inner = base * (1.0 + gains.yaw_rate) / (one + base * gains.yaw_rate);
     let course = one / (s / slip_pole + one);
-    let across = (one * (v * v * gains.cross_1_m2)) / (s * s)
+    let lateral = (one * (v * v * gains.cross_1_m2)) / (s * s)
         + (one * (v.powi(3) * gains.integral_1_m3)) / (s * s * s);
-    inner * ((one * (v * gains.heading_1_m)) / s + course * across)
+    inner * ((one * (v * gains.heading_1_m)) / s + course * lateral)
 }
 
 fn margins(gains: CrossGains, plant: Plant) -> Margins {

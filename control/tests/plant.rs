@@ -35,7 +35,7 @@ proptest! {
         let twist = Twist { linear_m_s: speed_m_s, angular_rad_s: speed_m_s * curvature_1_m };
         let state = *settled(stiffness, twist).state();
         prop_assert!((state.yaw_rate_rad_s / twist.angular_rad_s - 1.0).abs() < 0.02);
-        prop_assert!((state.ahead_m_s / speed_m_s - 1.0).abs() < 0.01);
+        prop_assert!((state.forward_m_s / speed_m_s - 1.0).abs() < 0.01);
     }
 
     #[test]
@@ -44,19 +44,19 @@ proptest! {
         let state = *settled(stiffness, twist).state();
         // β = −v φ̇ θ/g.
         let sideslip_rad = -0.6 * 0.1 / (stiffness * GRAVITY_M_S2);
-        prop_assert!((state.left_m_s / state.ahead_m_s / sideslip_rad - 1.0).abs() < 0.03);
+        prop_assert!((state.left_m_s / state.forward_m_s / sideslip_rad - 1.0).abs() < 0.03);
     }
 
     #[test]
     fn with_locked_wheels_energy_only_falls(
-        stiffness in 0.5..20.0_f64, ahead_m_s in -1.0..1.0_f64, left_m_s in -1.0..1.0_f64,
+        stiffness in 0.5..20.0_f64, forward_m_s in -1.0..1.0_f64, left_m_s in -1.0..1.0_f64,
         yaw_rate_rad_s in -2.0..2.0_f64,
     ) {
         let model = RobotModel::yi2007();
         let mut plant = plant(PlantSpec::default());
-        plant.set_state(PlantState { ahead_m_s, left_m_s, yaw_rate_rad_s, ..PlantState::default() });
+        plant.set_state(PlantState { forward_m_s, left_m_s, yaw_rate_rad_s, ..PlantState::default() });
         let energy = |state: &PlantState| {
-            0.5 * model.mass_kg() * (state.ahead_m_s.powi(2) + state.left_m_s.powi(2))
+            0.5 * model.mass_kg() * (state.forward_m_s.powi(2) + state.left_m_s.powi(2))
                 + 0.5 * model.yaw_inertia_kg_m2() * state.yaw_rate_rad_s.powi(2)
         };
         let mut before = energy(plant.state());
@@ -85,7 +85,7 @@ proptest! {
                     state.wheel_speeds.magnitude_max_rad_s()
                         <= model.limits().wheel_speed_max_rad_s + 1.0e-9
                 );
-                prop_assert!(state.ahead_m_s.abs() < 2.0 && state.yaw_rate_rad_s.abs() < 12.0);
+                prop_assert!(state.forward_m_s.abs() < 2.0 && state.yaw_rate_rad_s.abs() < 12.0);
             }
         }
     }
@@ -135,7 +135,7 @@ fn wheel_torque_is_force_times_radius_plus_rolling_resistance() {
         &ground(5.0),
         0.05,
     );
-    let force_n = model.mass_kg() * plant.means().acceleration.ahead_m_s2;
+    let force_n = model.mass_kg() * plant.means().acceleration.forward_m_s2;
     let torques = plant.wheel_torques();
     let drive_n =
         (torques.left_n_m + torques.right_n_m - 2.0 * rolling_n_m) / model.wheel_radius_m();

@@ -1,5 +1,5 @@
 //! Randomised trials of teleoperation over a bad network: how soon silence brings the robot to
-//! rest, and on how much way.
+//! rest, and over which distance.
 //!
 //! A driver sends a command every 50 ms, each with an end a little ahead; messages are lost,
 //! delayed, doubled and reordered, and the loop stalls now and then. At a random moment the driver
@@ -42,11 +42,11 @@ pub struct HandReport {
     pub worst_zero_ms: f64,
     /// The fastest that the robot was when a trial's last command ended, metres per second.
     pub fastest_m_s: f64,
-    /// Trials in which the robot took more way to rest than `v²/2a + v·0.25 s`, or did not rest;
+    /// Trials in which the robot took more stop than `v²/2a + v·0.25 s`, or did not rest;
     /// `a` is the braking ramp, or what the ground gives where that is less.
     pub overruns: u64,
     /// The largest share of that way that was used.
-    pub worst_way_share: f64,
+    pub worst_distance_share: f64,
 }
 
 struct UnderWay {
@@ -170,7 +170,7 @@ impl Trial<'_> {
         let model = RobotModel::yi2007();
         let ramp_m_s2 = GateLimits::of(&model).wheel_braking_max_rad_s2 * model.wheel_radius_m();
         let mut braking_m_s2 = ramp_m_s2;
-        // Way since the last end, and the speed then; begins anew with every end.
+        // Distance since the last end, and the speed then; begins anew with every end.
         let mut since: Option<(u64, f64, f64)> = None;
         while self.bench.now() < until {
             let before = *self.bench.drive().truth();
@@ -185,9 +185,9 @@ impl Trial<'_> {
             let (now_us, after) = (self.bench.now_us(), *truth);
             match self.last_end {
                 Some((end_us, _)) if now_us >= end_us => match &mut since {
-                    Some((known_us, _, way_m)) if *known_us == end_us => *way_m += step_m,
+                    Some((known_us, _, distance_m)) if *known_us == end_us => *distance_m += step_m,
                     Some(_) | None => {
-                        // Of this tick's way only what came after the end, and the speed then.
+                        // Of this tick's distance only what came after the end, and the speed then.
                         let rest = Duration::from_micros(now_us - end_us.max(before_us));
                         let whole = Duration::from_micros(now_us - before_us);
                         let share = rest.as_secs_f64() / whole.as_secs_f64();
@@ -199,14 +199,15 @@ impl Trial<'_> {
                 Some(_) | None => {}
             }
             if self.under_way.is_empty() && self.bench.target_rests() && self.bench.stands() {
-                if let Some((_, speed_m_s, way_m)) = since {
+                if let Some((_, speed_m_s, distance_m)) = since {
                     let allowed_m = speed_m_s * speed_m_s / (2.0 * braking_m_s2) + speed_m_s * 0.25;
                     let report = &mut *self.report;
                     report.fastest_m_s = report.fastest_m_s.max(speed_m_s);
-                    if way_m > 0.0 {
-                        report.worst_way_share = report.worst_way_share.max(way_m / allowed_m);
+                    if distance_m > 0.0 {
+                        report.worst_distance_share =
+                            report.worst_distance_share.max(distance_m / allowed_m);
                     }
-                    report.overruns += u64::from(way_m > allowed_m);
+                    report.overruns += u64::from(distance_m > allowed_m);
                 }
                 return;
             }
@@ -259,7 +260,7 @@ mod tests {
             "{report:?}"
         );
         assert!(report.worst_zero_ms <= 250.0, "{report:?}");
-        assert!(report.worst_way_share <= 1.0, "{report:?}");
+        assert!(report.worst_distance_share <= 1.0, "{report:?}");
     }
 
     #[test]

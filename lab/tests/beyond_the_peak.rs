@@ -24,7 +24,7 @@ fn known(theta: f64) -> ThetaKnowledge {
     }
 }
 
-/// The figure-8 of the report, told a θ that may change with time; every tick's output.
+/// The figure-8 of the report, given a θ that may change with time; every tick's output.
 fn figure_8(
     friction_curve: FrictionCurve,
     told: impl Fn(f64) -> ThetaKnowledge,
@@ -49,7 +49,10 @@ fn figure_8(
 }
 
 fn rms_m(ticks: &[TickOutput]) -> f64 {
-    let sum: f64 = ticks.iter().map(|tick| tick.cross_m * tick.cross_m).sum();
+    let sum: f64 = ticks
+        .iter()
+        .map(|tick| tick.cross_track_m * tick.cross_track_m)
+        .sum();
     #[expect(clippy::cast_precision_loss, reason = "some thousand ticks")]
     let count = ticks.len() as f64;
     (sum / count).sqrt()
@@ -83,7 +86,7 @@ fn tyres_that_lose_no_friction_in_a_bend_are_detected() {
     }
 }
 
-/// Told ten times too much for a lap, then in a time less and less, then the truth.
+/// Given ten times too much for a lap, then in a time less and less, then the truth.
 fn lies(theta: f64, falls_s: f64) -> impl Fn(f64) -> ThetaKnowledge {
     move |time_s| {
         let share = ((time_s - LAP_S) / falls_s).clamp(0.0, 1.0);

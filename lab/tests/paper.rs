@@ -29,17 +29,17 @@ fn slip() -> impl Strategy<Value = f64> {
 fn case() -> impl Strategy<Value = Case> {
     let motion = (0.4..1.5_f64, -0.3..0.3_f64, 0.05..1.2_f64, any::<bool>());
     (motion, slip(), slip(), 0.3..25.0_f64, 0.0..0.95_f64).prop_map(
-        |((ahead, left, turn, right_handed), slip_left, slip_right, stiffness, sliding)| {
+        |((forward, left, turn, right_handed), slip_left, slip_right, stiffness, sliding)| {
             let model = RobotModel::yi2007();
             let velocity = BodyVelocity {
-                ahead_m_s: ahead,
+                forward_m_s: forward,
                 left_m_s: left,
                 yaw_rate_rad_s: if right_handed { -turn } else { turn },
             };
             let half = 0.5 * model.track_width_m() * velocity.yaw_rate_rad_s;
             let wheels = WheelSpeeds {
-                left_rad_s: (ahead - half) / (1.0 - slip_left) / model.wheel_radius_m(),
-                right_rad_s: (ahead + half) / (1.0 - slip_right) / model.wheel_radius_m(),
+                left_rad_s: (forward - half) / (1.0 - slip_left) / model.wheel_radius_m(),
+                right_rad_s: (forward + half) / (1.0 - slip_right) / model.wheel_radius_m(),
             };
             let spec = FrictionSpec {
                 stiffness,
@@ -83,7 +83,7 @@ proptest! {
     fn the_closed_form_is_the_sum_over_four_wheels_in_both_ranges(case in case()) {
         let sum = four_wheel_sum(&case.velocity, case.wheels, &case.setting);
         let closed = forces(&case.velocity, case.wheels, &case.setting).unwrap();
-        prop_assert!(close(closed.ahead_n, sum.ahead_n), "{closed:?} {sum:?}");
+        prop_assert!(close(closed.longitudinal_n, sum.longitudinal_n), "{closed:?} {sum:?}");
         prop_assert!(close(closed.left_n, sum.left_n), "{closed:?} {sum:?}");
         prop_assert!(close(closed.moment_n_m, sum.moment_n_m), "{closed:?} {sum:?}");
     }
@@ -155,14 +155,14 @@ proptest! {
         let Case { velocity, wheels, setting } = case;
         let over_ground = |velocity: &BodyVelocity, heading_rad: f64| {
             let (sin, cos) = heading_rad.sin_cos();
-            let (ahead, left) = (velocity.ahead_m_s, velocity.left_m_s);
-            Vector2::new(cos * ahead - sin * left, sin * ahead + cos * left)
+            let (forward, left) = (velocity.forward_m_s, velocity.left_m_s);
+            Vector2::new(cos * forward - sin * left, sin * forward + cos * left)
         };
         let force = four_wheel_sum(&velocity, wheels, &setting);
         let rates = force.rates(&velocity, &setting.model);
         let moved = |dt_s: f64| {
             let later = BodyVelocity {
-                ahead_m_s: velocity.ahead_m_s + dt_s * rates.ahead_m_s2,
+                forward_m_s: velocity.forward_m_s + dt_s * rates.forward_m_s2,
                 left_m_s: velocity.left_m_s + dt_s * rates.left_m_s2,
                 yaw_rate_rad_s: velocity.yaw_rate_rad_s,
             };
@@ -171,7 +171,7 @@ proptest! {
         let dt_s = 1.0e-5;
         let found = (moved(dt_s) - moved(-dt_s)).scale(0.5 / dt_s);
         let pushed = BodyVelocity {
-            ahead_m_s: force.ahead_n, left_m_s: force.left_n, yaw_rate_rad_s: 0.0,
+            forward_m_s: force.longitudinal_n, left_m_s: force.left_n, yaw_rate_rad_s: 0.0,
         };
         let wanted = over_ground(&pushed, heading_rad).scale(setting.model.mass_kg().recip());
         prop_assert!((found - wanted).norm() < 1.0e-6 * (1.0 + wanted.norm()));
@@ -184,11 +184,11 @@ proptest! {
         let centres = TurningCentres::of(&velocity, wheels, model).unwrap();
         let half_m = 0.5 * model.track_width_m();
         // (5) against (2) and (3).
-        let skid_m_s = velocity.ahead_m_s - half_m * velocity.yaw_rate_rad_s
+        let skid_m_s = velocity.forward_m_s - half_m * velocity.yaw_rate_rad_s
             - model.wheel_radius_m() * wheels.left_rad_s;
         prop_assert!(close((centres.left_m - half_m) * velocity.yaw_rate_rad_s, skid_m_s));
-        prop_assert!(close(centres.body_m * velocity.yaw_rate_rad_s, velocity.ahead_m_s));
-        prop_assert!(close(-centres.ahead_m * velocity.yaw_rate_rad_s, velocity.left_m_s));
+        prop_assert!(close(centres.body_m * velocity.yaw_rate_rad_s, velocity.forward_m_s));
+        prop_assert!(close(-centres.forward_m * velocity.yaw_rate_rad_s, velocity.left_m_s));
     }
 
     #[test]
@@ -196,7 +196,7 @@ proptest! {
         case in case(), tau_1 in -0.1..0.1_f64, tau_2 in -0.02..0.02_f64,
     ) {
         let reduced = Reduced::new(case.setting, 0.167).unwrap();
-        let eta = Vector2::new(case.velocity.ahead_m_s, -0.167 * case.velocity.yaw_rate_rad_s);
+        let eta = Vector2::new(case.velocity.forward_m_s, -0.167 * case.velocity.yaw_rate_rad_s);
         let shape = terms(&case).shape;
         let tau = Vector2::new(tau_1, tau_2);
         let inputs = reduced.inputs(tau, eta, &shape).unwrap();
@@ -208,7 +208,7 @@ proptest! {
     #[test]
     fn the_reduced_model_is_the_constrained_four_wheel_sum(case in case()) {
         let reduced = Reduced::new(case.setting, 0.167).unwrap();
-        let eta = Vector2::new(case.velocity.ahead_m_s, -0.167 * case.velocity.yaw_rate_rad_s);
+        let eta = Vector2::new(case.velocity.forward_m_s, -0.167 * case.velocity.yaw_rate_rad_s);
         let slips = SideSlips::of(&reduced.velocity(eta), case.wheels, &case.setting.model);
         let shape = SlipShape::at(slips, &case.setting.curve).unwrap();
         let inputs = shape.inputs(case.wheels, case.setting.model.wheel_radius_m());
@@ -286,7 +286,7 @@ fn the_law_refuses_standstill_and_gains_that_are_none() {
     }
     let law = Yi2007::new(Yi2007Config::section_iv()).unwrap();
     let still = ClosedLoopState {
-        ahead_m_s: 0.0,
+        forward_m_s: 0.0,
         ..ClosedLoopState::section_iv()
     };
     let mut run = ClosedLoop::new(law, 5.0, DesiredPoint::section_iv, still).unwrap();

@@ -119,8 +119,8 @@ impl Agent {
         fleet::check_endpoint(&config.server)?;
         let base = Base::new(&config.drive, model, &clock)?;
         let boot = BootId::from_uuid(Uuid::new_v4());
-        // Before anything else is left in the folder: what is there tells a first start from a latch
-        // that was lost.
+        // Before anything else is left in the folder: what is there tells a first start from a
+        // latch that was lost.
         let stops = LatchFile::new(&config.data_dir).load(&clock);
         let outbox_folder = config.data_dir.join("outbox");
         let outbox = Outbox::open(&outbox_folder, config.outbox, config.robot.clone(), boot)?;
@@ -149,7 +149,7 @@ impl Agent {
             stops,
             boot,
             model,
-            &config.required_holders,
+            &config.required_owners,
             Arc::clone(&shared.safety),
             Arc::clone(&clock),
         );
@@ -283,19 +283,19 @@ fn recall_missions(
     clock: &SharedClock,
 ) -> Result<Arc<Missions>, StartError> {
     let memory = Memory::new(&config.data_dir);
-    let mut holder = memory.load()?;
-    let interrupted = holder.held().cloned();
-    if let Some(held) = &interrupted {
-        let phase = holder.begin_end(held.mission, MissionPhase::Failed);
+    let mut slot = memory.load()?;
+    let interrupted = slot.active().cloned();
+    if let Some(active) = &interrupted {
+        let phase = slot.begin_end(active.mission, MissionPhase::Failed);
         let reason = if phase == MissionPhase::Cancelled {
             "cancelled on request; the agent restarted meanwhile"
         } else {
             "the agent restarted during the mission"
         };
         let report = MissionReport {
-            mission: held.mission,
-            revision: held.revision,
-            plan_hash: held.plan_hash,
+            mission: active.mission,
+            revision: active.revision,
+            plan_hash: active.plan_hash,
             at: clock.wall(),
             phase,
             since: None,
@@ -305,9 +305,9 @@ fn recall_missions(
             driven: None,
         };
         outbox.append(&RecordContent::Mission(report))?;
-        holder.end(held.mission, phase);
+        slot.end(active.mission, phase);
     }
-    let missions = Missions::new(holder, memory);
+    let missions = Missions::new(slot, memory);
     if interrupted.is_some() {
         missions.save();
     }

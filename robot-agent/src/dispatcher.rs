@@ -36,7 +36,7 @@ use crate::control_loop::site_view::SiteView;
 use crate::fleet::{Commands, IncomingCommand};
 use crate::geometry::wire_pose;
 use crate::knowledge::{Missions, SiteCell};
-use crate::missions::{CancelDecision, Held, OfferDecision};
+use crate::missions::{ActiveMission, CancelDecision, OfferDecision};
 use crate::safety::{Safety, answers};
 
 /// Offers that may wait while another is planned; the server asks again for more.
@@ -79,8 +79,8 @@ fn refused(code: OfferRefusal, detail: impl Into<String>) -> Outcome {
     }
 }
 
-fn held_of(offer: &Offer, plan: PlanSummary) -> Held {
-    Held {
+fn active_of(offer: &Offer, plan: PlanSummary) -> ActiveMission {
+    ActiveMission {
         mission: offer.mission,
         revision: offer.revision,
         plan_hash: offer.plan_hash,
@@ -238,7 +238,7 @@ impl Dispatcher {
         let start_by = offer
             .start_within_ms
             .map(|within_ms| received_at.saturating_add(Duration::from_millis(within_ms)));
-        let decision = self.missions.holder().offer(&offer);
+        let decision = self.missions.slot().offer(&offer);
         match decision {
             OfferDecision::AcceptAgain(plan) => Outcome::Accepted { plan: Some(plan) },
             OfferDecision::Refuse(code, detail) => {
@@ -266,7 +266,7 @@ impl Dispatcher {
     }
 
     fn hold(&self, mission: MissionId, revision: u32, is_pause: bool) -> Outcome {
-        if let Err((code, detail)) = self.missions.holder().check_held(mission, revision) {
+        if let Err((code, detail)) = self.missions.slot().check_active(mission, revision) {
             return refused(code, detail);
         }
         if !is_pause && let Err(refusal) = self.may_resume() {
@@ -334,9 +334,9 @@ impl Dispatcher {
         }
         // Held before the loop has it, so that its end cannot be reported before its begin.
         let (mission, plan) = (offer.mission, planned.summary);
-        if !self.missions.holder().take(held_of(&offer, plan)) {
+        if !self.missions.slot().take(active_of(&offer, plan)) {
             // What came meanwhile says why: a cancellation, or another mission.
-            return match self.missions.holder().offer(&offer) {
+            return match self.missions.slot().offer(&offer) {
                 OfferDecision::Refuse(code, detail) => refused(code, detail),
                 OfferDecision::Plan | OfferDecision::Replace | OfferDecision::AcceptAgain(_) => {
                     refused(OfferRefusal::NotReady, "another command came first")
@@ -347,12 +347,12 @@ impl Dispatcher {
         match self.to_loop.try_send(LoopCommand::Start(planned.job)) {
             Ok(()) => {}
             Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => {
-                self.missions.holder().release(mission);
+                self.missions.slot().release(mission);
                 return refused(OfferRefusal::NotReady, "the control loop is busy");
             }
         }
         // The same tick takes both. Without room the server pauses it once it sees it driven.
-        if offer.held && !self.tell_loop(LoopCommand::Hold(mission, Hold::Pause)) {
+        if offer.on_hold && !self.tell_loop(LoopCommand::Hold(mission, Hold::Pause)) {
             warn!(mission.id = %mission, "{mission} was to be held, and the control loop is busy");
         }
         info!(
@@ -375,11 +375,11 @@ impl Dispatcher {
             Err(detail) => return refused(OfferRefusal::Impossible, detail),
         };
         let (mission, plan) = (offer.mission, planned.summary);
-        let Some(former) = self.missions.holder().replace(held_of(&offer, plan)) else {
+        let Some(former) = self.missions.slot().replace(active_of(&offer, plan)) else {
             return refused(OfferRefusal::Ended, "the mission ended meanwhile");
         };
         if !self.tell_loop(LoopCommand::Replace(planned.job)) {
-            self.missions.holder().restore(former);
+            self.missions.slot().restore(former);
             return refused(OfferRefusal::NotReady, "the control loop is busy");
         }
         self.shared.show_plan(given_of(&offer, planned.plan));
@@ -397,7 +397,7 @@ impl Dispatcher {
                 let snapshot = self.shared.snapshot();
                 let progress = snapshot.mission.filter(|now| now.id == mission)?;
                 // A revision that was taken a moment ago may still wait for the robot to stand.
-                if snapshot.is_held && progress.revision == driving.revision {
+                if snapshot.is_on_hold && progress.revision == driving.revision {
                     let governor = snapshot.governor?;
                     let (measured, _) = snapshot.pose?;
                     let speed_m_s = governor.sample(&driving.plan).speed_m_s;
@@ -442,7 +442,7 @@ impl Dispatcher {
             let plan = origin.plan(&model)?;
             if let Some(breach) = view.and_then(|view| view.fence().plan_breach(&plan, &model)) {
                 return Err(format!(
-                    "the way leaves the geofence at ({:.1} m, {:.1} m), {:.1} m along it",
+                    "the path leaves the geofence at ({:.1} m, {:.1} m), {:.1} m along it",
                     breach.point.x_m, breach.point.y_m, breach.arc_m,
                 ));
             }
@@ -467,7 +467,7 @@ impl Dispatcher {
 
     async fn cancel(&self, cancel: &Cancel) -> Outcome {
         let mission = cancel.mission;
-        let decision = self.missions.holder().cancel(mission);
+        let decision = self.missions.slot().cancel(mission);
         match decision {
             CancelDecision::Brake => match self.to_loop.try_send(LoopCommand::Cancel(mission)) {
                 Ok(()) => {

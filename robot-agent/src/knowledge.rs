@@ -6,33 +6,33 @@ use tracing::error;
 use tread_api::wire::hello::SiteDefinition;
 
 use crate::control_loop::site_view::SiteView;
-use crate::missions::Holder;
+use crate::missions::MissionSlot;
 use crate::missions::memory::Memory;
 
 /// The robot's missions, shared by those who answer and those who record.
 #[derive(Debug)]
 pub(crate) struct Missions {
-    holder: Mutex<Holder>,
+    slot: Mutex<MissionSlot>,
     memory: Memory,
 }
 
 impl Missions {
-    pub(crate) fn new(holder: Holder, memory: Memory) -> Arc<Self> {
+    pub(crate) fn new(slot: MissionSlot, memory: Memory) -> Arc<Self> {
         Arc::new(Self {
-            holder: Mutex::new(holder),
+            slot: Mutex::new(slot),
             memory,
         })
     }
 
-    pub(crate) fn holder(&self) -> MutexGuard<'_, Holder> {
-        self.holder.lock().unwrap_or_else(PoisonError::into_inner)
+    pub(crate) fn slot(&self) -> MutexGuard<'_, MissionSlot> {
+        self.slot.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Makes what is known safe from a crash. Blocks.
     pub(crate) fn save(&self) {
         // The lock is not held while the disk is waited for.
-        let holder = self.holder().clone();
-        if let Err(cause) = self.memory.save(&holder) {
+        let slot = self.slot().clone();
+        if let Err(cause) = self.memory.save(&slot) {
             error!(
                 error = &cause as &dyn std::error::Error,
                 "cannot save the missions"

@@ -93,7 +93,7 @@ impl Recorder {
                 job,
             } => {
                 let mission = job.mission;
-                let phase = self.missions.holder().begin_end(mission, reason.phase());
+                let phase = self.missions.slot().begin_end(mission, reason.phase());
                 info!(
                     mission.id = %mission,
                     driven_m = progress.driven_m,
@@ -107,7 +107,7 @@ impl Recorder {
                 // First the record, then the memory: a crash between the two reports twice.
                 unsaved.push_back(RecordContent::Mission(report));
                 self.save(unsaved);
-                self.missions.holder().end(mission, phase);
+                self.missions.slot().end(mission, phase);
                 self.missions.save();
             }
             LoopEvent::Segment(closed) => {

@@ -146,7 +146,7 @@ const DEFINITIONS: [(&str, &str); 25] = [
         "uint64 at_ns\n\
          uint32 present\n\
          float64 yaw_rate_rad_s\n\
-         float64 ahead_m_s2\n\
+         float64 forward_m_s2\n\
          float64 left_m_s2\n\
          float64 wheel_left_rad_s\n\
          float64 wheel_right_rad_s\n\

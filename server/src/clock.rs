@@ -1,10 +1,11 @@
 //! Time and identifiers that grow with it, injected: nothing else here asks the machine.
 //!
 //! The wall time that [`Clock::now`] gives never goes back while the process lives. A machine whose
-//! clock is set back by up to [`STEP_BACK_HELD_MAX`] is waited for: from the last time given on, this
-//! clock advances at half the pace until the machine's has caught up. A larger step is followed,
-//! because a clock that was a day ahead was wrong, and would keep the fleet in the future for days.
-//! The order within one history does not depend on this clock alone: SQL keeps it over restarts.
+//! clock is set back by up to [`STEP_BACK_HELD_MAX`] is waited for: from the last time given on,
+//! this clock advances at half the pace until the machine's has caught up. A larger step is
+//! followed, because a clock that was a day ahead was wrong, and would keep the fleet in the future
+//! for days. The order within one history does not depend on this clock alone: SQL keeps it over
+//! restarts.
 
 mod floor;
 
@@ -156,15 +157,15 @@ impl Clock {
     }
 
     /// Takes up where an earlier run of the server left off: no time before the newest one that the
-    /// database holds, if the machine's clock is behind it by at most [`STEP_BACK_HELD_MAX`], and no
-    /// identifier before the newest one.
+    /// database holds, if the machine's clock is behind it by at most [`STEP_BACK_HELD_MAX`], and
+    /// no identifier before the newest one.
     pub fn continue_after(&self, newest: Option<Timestamp>, newest_id: Option<Uuid>) {
         let id_time = newest_id.and_then(|id| id.get_timestamp());
         let id_time = id_time.and_then(|time| {
             let (seconds, nanos) = time.to_unix();
             Timestamp::new(i64::try_from(seconds).ok()?, i32::try_from(nanos).ok()?).ok()
         });
-        // Identifiers of one millisecond are told apart by a counter that begins anywhere.
+        // Identifiers of one millisecond are distinguished by a counter that begins anywhere.
         let after = id_time.and_then(|time| time.checked_add(Duration::from_millis(1)).ok());
         if let Some(after) = after {
             let mut identifiers = lock(&self.identifiers);

@@ -41,7 +41,7 @@ pub enum InvalidTrajectory {
     /// Too few or too many points.
     #[error("a path has {WAYPOINTS_MIN} to {WAYPOINTS_MAX} points, this one has {0}")]
     PointCount(usize),
-    /// The speed on the way to the trajectory is out of range.
+    /// The speed on the approach to the trajectory is out of range.
     #[error("approach_speed_m_s must be {SPEED_MIN_M_S} to {SPEED_MAX_M_S}, not {0}")]
     ApproachSpeed(f64),
     /// The excitation's depth is out of range.

@@ -32,13 +32,13 @@ pub struct Offer {
     /// What to do when the server is no longer heard.
     #[serde(default)]
     pub link_policy: LinkPolicy,
-    /// What the map knows along the way; absent when it knows nothing.
+    /// What the map knows along the path; absent when it knows nothing.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prior: Option<PathPrior>,
     /// Whether it is to stand at its start until it is resumed: whoever paused it, or stopped the
     /// robot before it was taken, has not let it go on. Counts only when the mission is taken.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub held: bool,
+    pub on_hold: bool,
 }
 
 /// Most cells of a prior.
@@ -59,7 +59,8 @@ pub struct PathPrior {
     /// Cells of one ground of which θ is known, at most [`PRIOR_CELLS_MAX`].
     pub cells: Vec<CellPrior>,
     /// Friction coefficient to plan with by place, for cells along the path, at most
-    /// [`PRIOR_CELLS_MAX`]; `traction_limit_mu` holds away from them, and everywhere where there are none.
+    /// [`PRIOR_CELLS_MAX`]; `traction_limit_mu` holds away from them, and everywhere where there
+    /// are none.
     #[serde(default, alias = "grips", skip_serializing_if = "Vec::is_empty")]
     pub traction_limits: Vec<CellTractionLimit>,
 }

@@ -1,6 +1,6 @@
 //! zenoh payloads: JSON, versioned, readable by any zenoh client.
 //!
-//! Every payload is `{"v": 1, "body": {…}}`. `v` is the major version: another one is refused.
+//! Every payload is `{"v": 2, "body": {…}}`. `v` is the major version: another one is refused.
 //! Fields that are not known are ignored, so that a newer peer may add some.
 
 pub mod command;
@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::value::RawValue;
 
 /// The major version of all payloads.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 /// Largest payload that is read, in bytes: a path of the most waypoints with room to spare.
 pub const PAYLOAD_BYTES_MAX: usize = 16 * 1024 * 1024;
 
@@ -25,7 +25,9 @@ pub enum WireError {
     #[error("a payload of {0} bytes is over the limit of {PAYLOAD_BYTES_MAX}")]
     TooLarge(usize),
     /// It is of another major version.
-    #[error("major version {0} is not known here, this side speaks {VERSION}")]
+    #[error(
+        "the other side speaks major version {0} and this side {VERSION}: update the older one"
+    )]
     Version(u32),
     /// It does not parse.
     #[error("the payload does not parse")]
@@ -125,20 +127,20 @@ mod tests {
     #[test]
     fn a_payload_comes_back_as_it_was_written() {
         let payload = encode(&Body { x: 0.1 }).unwrap();
-        assert_eq!(payload, br#"{"v":1,"body":{"x":0.1}}"#);
+        assert_eq!(payload, br#"{"v":2,"body":{"x":0.1}}"#);
         assert_eq!(decode::<Body>(&payload).unwrap(), Body { x: 0.1 });
     }
 
     #[test]
     fn fields_of_a_newer_minor_version_are_ignored() {
-        let payload = br#"{"v":1,"trace":"t","body":{"x":0.5,"y":[1,{}]}}"#;
+        let payload = br#"{"v":2,"trace":"t","body":{"x":0.5,"y":[1,{}]}}"#;
         assert_eq!(decode::<Body>(payload).unwrap(), Body { x: 0.5 });
     }
 
     #[test]
     fn another_major_version_is_refused_by_its_number() {
-        let refused = decode::<Body>(br#"{"v":2,"body":{"z":1}}"#).unwrap_err();
-        assert!(matches!(refused, WireError::Version(2)));
+        let refused = decode::<Body>(br#"{"v":1,"body":{"z":1}}"#).unwrap_err();
+        assert!(matches!(refused, WireError::Version(1)));
         assert_eq!(Refusal::from(&refused).code, RefusalCode::Version);
     }
 
@@ -150,7 +152,7 @@ mod tests {
             Err(WireError::Malformed(_))
         ));
         for text in ["NaN", "1e999", "-Infinity"] {
-            let payload = format!(r#"{{"v":1,"body":{{"x":{text}}}}}"#);
+            let payload = format!(r#"{{"v":2,"body":{{"x":{text}}}}}"#);
             assert!(decode::<Body>(payload.as_bytes()).is_err(), "{text}");
         }
     }

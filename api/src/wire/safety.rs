@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
 use crate::geometry::Twist;
-use crate::ids::{BootId, HolderId, StopId};
+use crate::ids::{BootId, OwnerId, StopId};
 use crate::safety::{DRIVE_AHEAD_MAX_US, Driver, LIMIT_AHEAD_MAX_US};
 
 /// `cmd/stop`: command zero, latch, and answer `done` once the latch is on the disk.
@@ -92,20 +92,21 @@ pub struct DriveCommand {
     pub twist: Twist,
 }
 
-/// On the robot's `limit/{holder}` key, or by `cmd/limit`: hold or slow down until then.
+/// On the robot's `limit/{owner}` key, or by `cmd/limit`: hold or slow down until then.
 ///
-/// The highest `seq` of a holder counts while it lasts (microseconds of any clock that never falls
-/// do well). `until_us` in the past, such as 0, ends the holder's limit at once. A holder that
+/// The highest `seq` of an owner counts while it lasts (microseconds of any clock that never falls
+/// do well). `until_us` in the past, such as 0, ends the owner's limit at once. An owner that
 /// the robot's configuration calls required holds the robot by its silence.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ExternalLimit {
     /// Who limits; the same as in the key.
-    pub holder: HolderId,
+    #[serde(alias = "holder")]
+    pub owner: OwnerId,
     /// The run of the agent.
     pub boot: BootId,
     /// The robot's clock at which it ends, microseconds, at most an hour ahead.
     pub until_us: u64,
-    /// Orders the limits of this holder.
+    /// Orders the limits of this owner.
     pub seq: u64,
     /// Whether the robot is to stand.
     #[serde(default)]
@@ -175,7 +176,7 @@ mod tests {
 
     #[test]
     fn a_drive_command_that_is_no_number_does_not_parse() {
-        let good = r#"{"v":1,"body":{"boot":"00000000-0000-0000-0000-000000000001","epoch":2,
+        let good = r#"{"v":2,"body":{"boot":"00000000-0000-0000-0000-000000000001","epoch":2,
             "seq":3,"sent_us":4,"until_us":5,"twist":{"linear_m_s":0.5,"angular_rad_s":-0.1}}}"#;
         let command: DriveCommand = wire::decode(good.as_bytes()).unwrap();
         assert_eq!((command.epoch, command.seq), (2, 3));

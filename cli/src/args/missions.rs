@@ -56,7 +56,7 @@ pub(crate) struct Order {
     /// The mission fails when the robot has been away for so long
     #[arg(long, value_name = "TIME", value_parser = duration)]
     pub(crate) lost_after: Option<Duration>,
-    /// Speed on the way to the trajectory, metres per second; the trajectory's own when absent
+    /// Speed on the approach to the trajectory, metres per second; the trajectory's own when absent
     #[arg(long, value_name = "M/S", value_parser = finite, allow_negative_numbers = true)]
     pub(crate) approach_speed: Option<f64>,
     /// Excitation the speed, so that a base without torque sensing can measure friction

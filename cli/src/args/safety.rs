@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Subcommand};
-use tread_api::ids::{AlertId, HolderId, RobotId, StopId};
+use tread_api::ids::{AlertId, OwnerId, RobotId, StopId};
 
 use super::Connection;
 use super::values::{duration, finite, look_interval, positive};
@@ -132,7 +132,7 @@ pub(crate) enum LimitsAction {
     /// Hold or slow the robot for a while
     Set {
         /// Who limits
-        holder: HolderId,
+        owner: OwnerId,
         /// The robot is to stand
         #[arg(long, required_unless_present = "speed")]
         hold: bool,
@@ -143,10 +143,10 @@ pub(crate) enum LimitsAction {
         #[arg(long = "for", value_name = "TIME", value_parser = duration)]
         lasting: Duration,
     },
-    /// End a holder's limit
+    /// End an owner's limit
     End {
         /// Who limits
-        holder: HolderId,
+        owner: OwnerId,
     },
 }
 

@@ -1,7 +1,7 @@
 //! What may only slow robots down, and what needs a person.
 
 use reqwest::Method;
-use tread_api::ids::{AlertId, HolderId, RobotId, SiteId};
+use tread_api::ids::{AlertId, OwnerId, RobotId, SiteId};
 use tread_api::page::Page;
 use tread_api::robot::Alert;
 use tread_api::safety::{Geofence, LimitStatus, ReplaceGeofence, SetLimit};
@@ -83,15 +83,15 @@ impl Client {
             .await
     }
 
-    /// Sets a holder's limit, or ends it.
+    /// Sets an owner's limit, or ends it.
     pub(crate) async fn change_limit(
         &self,
         site: &SiteId,
         robot: &RobotId,
-        holder: &HolderId,
+        owner: &OwnerId,
         limit: Option<&SetLimit>,
     ) -> Result<(), ClientError> {
-        let path = format!("/v1/sites/{site}/robots/{robot}/limits/{holder}");
+        let path = format!("/v1/sites/{site}/robots/{robot}/limits/{owner}");
         let request = match limit {
             Some(limit) => self.request(Method::PUT, &path).json(limit),
             None => self.request(Method::DELETE, &path),

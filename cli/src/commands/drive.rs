@@ -115,19 +115,19 @@ fn meaning(key: KeyEvent) -> Meaning {
     }
 }
 
-/// What the keys of the last moment ask for: along and around, each as long as its key.
+/// What the keys of the last moment ask for: linear and around, each as long as its key.
 #[derive(Debug, Clone, Copy, Default)]
 struct Keys {
-    along: Option<(f64, Instant)>,
+    linear: Option<(f64, Instant)>,
     around: Option<(f64, Instant)>,
 }
 
 impl Keys {
-    fn press(&mut self, (along, around): (f64, f64), now: Instant) {
-        if along == 0.0 {
+    fn press(&mut self, (linear, around): (f64, f64), now: Instant) {
+        if linear == 0.0 {
             self.around = Some((around, now));
         } else {
-            self.along = Some((along, now));
+            self.linear = Some((linear, now));
         }
     }
 
@@ -136,7 +136,7 @@ impl Keys {
             let held = key.filter(|(_, at)| now.saturating_duration_since(*at) < KEY_HOLDS);
             held.map_or(0.0, |(share, _)| share)
         };
-        (share(self.along), share(self.around))
+        (share(self.linear), share(self.around))
     }
 }
 
@@ -248,7 +248,7 @@ impl Driving<'_> {
     /// Whether to go on.
     async fn press(&mut self, socket: &mut Socket, key: KeyEvent) -> anyhow::Result<bool> {
         match meaning(key) {
-            Meaning::Move(along, around) => self.keys.press((along, around), Instant::now()),
+            Meaning::Move(linear, around) => self.keys.press((linear, around), Instant::now()),
             Meaning::Stand => {
                 self.keys = Keys::default();
                 self.drive(socket).await?;
@@ -271,9 +271,9 @@ impl Driving<'_> {
         if !self.has_lease {
             return Ok(());
         }
-        let (along, around) = self.keys.shares(Instant::now());
+        let (linear, around) = self.keys.shares(Instant::now());
         let drive = Drive {
-            linear_m_s: along * self.arguments.speed,
+            linear_m_s: linear * self.arguments.speed,
             angular_rad_s: around * self.arguments.turn,
             for_ms: Some(FOR_MS),
         };

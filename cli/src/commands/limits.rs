@@ -20,7 +20,7 @@ pub(super) async fn run(
             output.show(&limits.items, |limits| list(limits))?;
         }
         Some(LimitsAction::Set {
-            holder,
+            owner,
             hold,
             speed,
             lasting,
@@ -31,16 +31,16 @@ pub(super) async fn run(
                 for_ms: u64::try_from(lasting.as_millis())?,
             };
             client
-                .change_limit(site, robot, &holder, Some(&limit))
+                .change_limit(site, robot, &owner, Some(&limit))
                 .await?;
             output.show(&limit, |_| {
-                format!("{robot} has taken the limit of {holder}")
+                format!("{robot} has taken the limit of {owner}")
             })?;
         }
-        Some(LimitsAction::End { holder }) => {
-            client.change_limit(site, robot, &holder, None).await?;
-            output.show(&holder, |_| {
-                format!("{robot} has ended the limit of {holder}")
+        Some(LimitsAction::End { owner }) => {
+            client.change_limit(site, robot, &owner, None).await?;
+            output.show(&owner, |_| {
+                format!("{robot} has ended the limit of {owner}")
             })?;
         }
     }
@@ -55,7 +55,7 @@ fn list(limits: &[LimitStatus]) -> String {
     let yes_or_no = |is: bool| if is { "yes" } else { "no" }.to_owned();
     for limit in limits {
         table.add_row([
-            limit.holder.to_string(),
+            limit.owner.to_string(),
             yes_or_no(limit.hold),
             or_dash(limit.linear_max_m_s),
             or_dash(limit.ends_in_ms.map(age)),

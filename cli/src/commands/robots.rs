@@ -233,12 +233,12 @@ fn safety_lines(safety: &SafetyStatus) -> Vec<String> {
             Some(speed_m_s) => format!("slows it to {speed_m_s} m/s"),
             None => "holds it".to_owned(),
         };
-        format!("limited        {} {how}", limit.holder)
+        format!("limited        {} {how}", limit.owner)
     }));
     lines
 }
 
-/// The measured θ with its deviation.
+/// The measured θ with its standard deviation.
 pub(super) fn theta(live: &RobotLive) -> Option<String> {
     let measured = live.friction?.value.theta_measured?;
     Some(format!("{:.4} ± {:.4}", measured.theta, measured.std_dev))

@@ -3,7 +3,7 @@
 //! This executable starts itself again as the server and as one agent for each robot of a
 //! scenario, draws the scenario's terrains and sends its missions over REST, and shows how they
 //! come along. What the robots then know of the ground they have measured: only their simulated
-//! bases are told the truth.
+//! bases are given the truth.
 
 mod processes;
 mod progress;

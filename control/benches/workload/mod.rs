@@ -98,7 +98,7 @@ impl Robot {
     }
 
     /// The same robot within a fence of a thousand corners, the most that there may be, most of
-    /// them near its way.
+    /// them near its path.
     pub(crate) fn fenced(mut self) -> Self {
         let keep_out = [(2.7, 0.0), (-2.7, 0.0), (0.0, 2.6), (0.0, -2.6)];
         let keep_out = keep_out.map(|(x_m, y_m)| ring(x_m, y_m, 0.25, 100));
@@ -116,7 +116,7 @@ impl Robot {
                 wheel_speeds: state.wheel_speeds,
                 gyro_rad_s: state.yaw_rate_rad_s,
                 acceleration: Some(self.plant.body_acceleration()),
-                body_speed_m_s: self.ticks.is_multiple_of(10).then_some(state.ahead_m_s),
+                body_speed_m_s: self.ticks.is_multiple_of(10).then_some(state.forward_m_s),
                 wheel_torques: Some(self.plant.wheel_torques()),
             };
         }

@@ -16,23 +16,25 @@ const HIGH_PASS_S: f64 = 3.0;
 const MEMORY_S: f64 = 1.5;
 /// Least excitation, metres squared per second cubed.
 const EXCITATION_MIN: f64 = 0.04;
-/// Gain beyond which it is scaled. A low gain is no fault: slip and noise of the prediction give one.
+/// Gain beyond which it is scaled. A low gain is no fault: slip and noise of the prediction give
+/// one.
 const GAIN_MAX: f64 = 1.6;
 /// Gain from which it agrees.
 const GAIN_AGREES: f64 = 0.5;
 /// Gain below which it is inverted.
 const GAIN_INVERTED: f64 = -0.3;
-/// Gain that ice does not give: wheels that slip speed up while the body slows down, but not as much.
+/// Gain that ice does not give: wheels that slip speed up while the body slows down, but not as
+/// much.
 const GAIN_OF_ICE: f64 = -0.5;
 /// How far below that gain must be for how long, seconds: longer than the wheels may lag.
 const INVERTED_S: f64 = 0.35;
 /// Excitation, squared, that shows the sign: at least this, and noise beside it.
 const SIGN_MIN: f64 = 0.06;
 /// What a change of speed weighs against a turn.
-const SIGN_AHEAD: f64 = 0.6;
+const SIGN_FORWARD: f64 = 0.6;
 const SIGN_NOISE: f64 = 0.015;
 /// Standard deviations of the gain that are let be.
-const DEVIATIONS: f64 = 4.0;
+const STD_DEVS: f64 = 4.0;
 /// Change of what is expected while it is frozen, metres per second squared.
 const FROZEN_CHANGE_M_S2: f64 = 0.3;
 /// Difference that no lean explains, metres per second squared.
@@ -65,7 +67,7 @@ pub(super) struct Accelerometer {
     means: [BodyAcceleration; BINS],
     speeds_m_s: [f64; BINS + 1],
     bins: usize,
-    ahead: Axis,
+    forward: Axis,
     left: Axis,
     /// `∫ felt·expected`, `∫ expected²`, `∫ residual²` and `∫ 1`, with a memory.
     sums: [f64; 4],
@@ -83,7 +85,7 @@ impl Accelerometer {
     }
 
     pub(super) fn take(&mut self, felt: BodyAcceleration) {
-        self.sum.ahead_m_s2 += felt.ahead_m_s2;
+        self.sum.forward_m_s2 += felt.forward_m_s2;
         self.sum.left_m_s2 += felt.left_m_s2;
         self.count += 1.0;
     }
@@ -107,7 +109,7 @@ impl Accelerometer {
         }
         self.means.rotate_left(1);
         self.means[BINS - 1] = BodyAcceleration {
-            ahead_m_s2: self.sum.ahead_m_s2 / self.count,
+            forward_m_s2: self.sum.forward_m_s2 / self.count,
             left_m_s2: self.sum.left_m_s2 / self.count,
         };
         (self.sum, self.count) = (BodyAcceleration::default(), 0.0);
@@ -124,8 +126,8 @@ impl Accelerometer {
             speed_m_s * turn_rad_s,
         ];
         let mean = |of: fn(&BodyAcceleration) -> f64| self.means.iter().map(of).sum::<f64>() / bins;
-        let felt = [mean(|felt| felt.ahead_m_s2), mean(|felt| felt.left_m_s2)];
-        self.ahead.take(felt[0], expected[0]);
+        let felt = [mean(|felt| felt.forward_m_s2), mean(|felt| felt.left_m_s2)];
+        self.forward.take(felt[0], expected[0]);
         self.left.take(felt[1], expected[1]);
         let gain = self.regress();
         if !repeats.is_repeating() {
@@ -149,7 +151,7 @@ impl Accelerometer {
         } else {
             1.0
         };
-        for axis in [self.ahead, self.left] {
+        for axis in [self.forward, self.left] {
             let residual = axis.felt - before * axis.expected;
             let new = [
                 axis.felt * axis.expected,
@@ -170,21 +172,22 @@ impl Accelerometer {
         }
         #[expect(clippy::cast_precision_loss, reason = "there are few bins")]
         let correlation_s = BINS as f64 * BIN_S;
-        let deviation = (residual / time * correlation_s / square).sqrt();
-        Some((product / square, deviation))
+        let std_dev = (residual / time * correlation_s / square).sqrt();
+        Some((product / square, std_dev))
     }
 
     /// Looks whether what is felt and what is expected have the same sign.
     fn sign(&mut self) {
-        let square = self.ahead.expected.powi(2) + self.left.expected.powi(2);
+        let square = self.forward.expected.powi(2) + self.left.expected.powi(2);
         if square < SIGN_MIN {
             return;
         }
-        let product = self.ahead.felt * self.ahead.expected + self.left.felt * self.left.expected;
+        let product =
+            self.forward.felt * self.forward.expected + self.left.felt * self.left.expected;
         let gain = (product / (square + SIGN_NOISE)).clamp(-1.0, 1.0);
         // Wheels that slip speed up while the body slows down; in a turn it still goes their way.
-        let weight = if self.ahead.expected.abs() > self.left.expected.abs() {
-            SIGN_AHEAD
+        let weight = if self.forward.expected.abs() > self.left.expected.abs() {
+            SIGN_FORWARD
         } else {
             1.0
         };
@@ -201,16 +204,16 @@ impl Accelerometer {
 
     /// The axis that is excited more.
     fn stronger(&self) -> Axis {
-        if self.ahead.expected.abs() > self.left.expected.abs() {
-            self.ahead
+        if self.forward.expected.abs() > self.left.expected.abs() {
+            self.forward
         } else {
             self.left
         }
     }
 
     fn scaled(&self, gain: Option<(f64, f64)>) -> Option<Finding> {
-        let (gain, deviation) = gain?;
-        let slack = DEVIATIONS * deviation;
+        let (gain, std_dev) = gain?;
+        let slack = STD_DEVS * std_dev;
         let kind = if gain < GAIN_INVERTED - slack {
             Kind::Inverted
         } else if gain > GAIN_MAX + slack {

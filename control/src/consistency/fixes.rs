@@ -5,9 +5,9 @@
 //! ```text
 //! e(t) = a + s·t + b·max(0, t − begin)      s ~ N(0, usual error), a and b free
 //! ```
-//! The fixes before the span say where it began, better than those in it could, so that a fault that
-//! began with the span shows soon; `s + b` is the speed by which both differ in the span. A wild fix
-//! between two that agree is left out, and what does not fit the line counts as noise.
+//! The fixes before the span say where it began, better than those in it could, so that a fault
+//! that began with the span shows soon; `s + b` is the speed by which both differ in the span. A
+//! wild fix between two that agree is left out, and what does not fit the line counts as noise.
 
 use super::history::{Edge, History};
 use crate::geometry::{Point, Pose, wrap_angle_rad};
@@ -22,15 +22,15 @@ const BEFORE_S: f64 = 0.6;
 /// Usual speeds by which fixes and right channels differ, metres and radians per second: slip, and
 /// what the gyro is off by.
 const USUAL: (f64, f64) = (0.06, 0.03);
-/// What the error of fixes that follow each other walks off, metres and radians per root of a second:
-/// not all of their noise is new with each.
+/// What the error of fixes that follow each other walks off, metres and radians per root of a
+/// second: not all of their noise is new with each.
 const DRIFT: (f64, f64) = (0.01, 0.002);
-/// Deviations, of a fix, from both of its neighbours that make it a wild one.
-const WILD_DEVIATIONS: f64 = 6.0;
-/// Smallest deviation of a fix that is assumed, metres and radians.
-const DEVIATION_MIN: (f64, f64) = (0.02, 0.008);
+/// Standard deviations, of a fix, from both of its neighbours that make it a wild one.
+const WILD_STD_DEVS: f64 = 6.0;
+/// Smallest standard deviation of a fix that is assumed, metres and radians.
+const STD_DEV_MIN: (f64, f64) = (0.02, 0.008);
 /// Standard deviations that noise is let reach; spans overlap, so there are few independent ones.
-const DEVIATIONS: f64 = 4.3;
+const STD_DEVS: f64 = 4.3;
 /// The same of spans shorter than this, seconds.
 const DEVIATIONS_SHORT: f64 = 5.0;
 const SHORT_S: f64 = 0.5;
@@ -114,10 +114,10 @@ pub(super) struct Seen {
     /// When the span begins and ends.
     pub(super) from_s: f64,
     pub(super) to_s: f64,
-    /// Ahead and to the left over dead reckoning's, metres per second.
-    pub(super) ahead_error_m_s: f64,
+    /// Forward and to the left over dead reckoning's, metres per second.
+    pub(super) forward_error_m_s: f64,
     pub(super) left_error_m_s: f64,
-    /// Ahead over odometry's, where there is any, metres per second.
+    /// Forward, over odometry's, where there is any, metres per second.
     pub(super) odometry_error_m_s: f64,
     /// Turn rate over the gyro's, and over the wheels', radians per second.
     pub(super) turn_error_rad_s: f64,
@@ -142,7 +142,7 @@ pub(super) struct Fixes {
     ring: [Fix; FIXES],
     count: usize,
     newest: usize,
-    deviations: (f64, f64),
+    std_devs: (f64, f64),
     /// When the newest was measured, used or not; older ones come too late.
     last_s: Option<f64>,
     /// The last fix where it was expected.
@@ -163,7 +163,7 @@ impl Default for Fixes {
             ring: [Fix::default(); FIXES],
             count: 0,
             newest: 0,
-            deviations: DEVIATION_MIN,
+            std_devs: STD_DEV_MIN,
             last_s: None,
             anchor: None,
             before: None,
@@ -200,8 +200,8 @@ impl Fixes {
     }
 
     /// Standard deviations of a fix, metres and radians.
-    pub(super) fn deviations(&self) -> (f64, f64) {
-        self.deviations
+    pub(super) fn std_devs(&self) -> (f64, f64) {
+        self.std_devs
     }
 
     /// The jump that is not over yet.
@@ -220,10 +220,10 @@ impl Fixes {
         let Some(edge) = history.at(at_s) else {
             return false;
         };
-        self.deviations = noise.map_or(DEVIATION_MIN, |noise| {
+        self.std_devs = noise.map_or(STD_DEV_MIN, |noise| {
             (
-                noise.position_m.max(DEVIATION_MIN.0),
-                noise.heading_rad.max(DEVIATION_MIN.1),
+                noise.position_m.max(STD_DEV_MIN.0),
+                noise.heading_rad.max(STD_DEV_MIN.1),
             )
         });
         if self.last_s.is_some_and(|last_s| at_s <= last_s) {
@@ -247,12 +247,12 @@ impl Fixes {
             self.anchor = Some(fix);
             return true;
         };
-        let (position_m, heading_rad) = self.deviations;
+        let (position_m, heading_rad) = self.std_devs;
         let agrees = |from: &Fix| {
             let (by_m, by_rad, driven_m) = from.error(&fix);
             let most_m =
-                JUMP_M.max(2.0 * DEVIATIONS * position_m) + JUMP_SLIP_RATIO * driven_m.min(2.0);
-            by_m <= most_m && by_rad.abs() <= JUMP_RAD.max(2.0 * DEVIATIONS * heading_rad)
+                JUMP_M.max(2.0 * STD_DEVS * position_m) + JUMP_SLIP_RATIO * driven_m.min(2.0);
+            by_m <= most_m && by_rad.abs() <= JUMP_RAD.max(2.0 * STD_DEVS * heading_rad)
         };
         let with_newest = agrees(&anchor);
         if with_newest || self.before.is_some_and(|before| agrees(&before)) {
@@ -336,28 +336,28 @@ impl Fixes {
             );
             let east_m = cos * x_m + sin * y_m - (fix.integrated.x_m - newest.integrated.x_m);
             let north_m = cos * y_m - sin * x_m - (fix.integrated.y_m - newest.integrated.y_m);
-            let ahead_m = middle_cos * east_m + middle_sin * north_m;
+            let forward_m = middle_cos * east_m + middle_sin * north_m;
             let left_m = middle_cos * north_m - middle_sin * east_m;
             let turned_rad = wrap_angle_rad(offset_rad(fix) - reference_rad);
             times_s[places] = fix.at_s - newest.at_s;
             errors[places] = [
-                ahead_m,
+                forward_m,
                 left_m,
-                ahead_m - (fix.odometry_lead_m - newest.odometry_lead_m),
+                forward_m - (fix.odometry_lead_m - newest.odometry_lead_m),
                 turned_rad,
                 turned_rad - (fix.wheels_lead_rad - newest.wheels_lead_rad),
             ];
         }
-        let (position_m, heading_rad) = self.deviations;
+        let (position_m, heading_rad) = self.std_devs;
         let fit = |column: usize| {
-            let (deviation, usual) = if column < HEADING {
+            let (std_dev, usual) = if column < HEADING {
                 (position_m, USUAL.0)
             } else {
                 (heading_rad, USUAL.1)
             };
             let points = (0..used).map(|places| (times_s[places], errors[places][column]));
             let away = |one: usize, other: usize| errors[one][column] - errors[other][column];
-            let most = WILD_DEVIATIONS * deviation;
+            let most = WILD_STD_DEVS * std_dev;
             let wild = |places: usize| match places {
                 // The newest: the next one will say.
                 0 => away(0, 1).abs() > most && away(1, 2).abs() < 0.5 * most,
@@ -373,34 +373,34 @@ impl Fixes {
                 .map(|(_, point)| point);
             let bend = Bend {
                 begin_s: -span_s,
-                deviation,
+                std_dev,
                 usual,
             };
-            let (speed, spread) = bend.fit(points)?;
+            let (speed, std_dev) = bend.fit(points)?;
             let drift = if column < HEADING { DRIFT.0 } else { DRIFT.1 };
-            Some((speed, spread.hypot(drift / span_s.sqrt())))
+            Some((speed, std_dev.hypot(drift / span_s.sqrt())))
         };
-        let [ahead, left, odometry, turn, wheels_turn] = [0, 1, 2, 3, 4].map(fit);
-        let (ahead, left, odometry) = (ahead?, left?, odometry?);
+        let [forward, left, odometry, turn, wheels_turn] = [0, 1, 2, 3, 4].map(fit);
+        let (forward, left, odometry) = (forward?, left?, odometry?);
         let (turn, wheels_turn) = (turn?, wheels_turn?);
         // Few fixes are in a short span, and there are many such spans.
-        let deviations = if span_s < SHORT_S {
+        let std_devs = if span_s < SHORT_S {
             DEVIATIONS_SHORT
         } else {
-            DEVIATIONS
+            STD_DEVS
         };
         Some(Seen {
             from_s: newest.at_s - span_s,
             to_s: newest.at_s,
-            ahead_error_m_s: ahead.0,
+            forward_error_m_s: forward.0,
             left_error_m_s: left.0,
             odometry_error_m_s: odometry.0,
             turn_error_rad_s: turn.0,
             wheels_turn_error_rad_s: wheels_turn.0,
-            noise_m_s: deviations * ahead.1.max(left.1),
-            odometry_noise_m_s: deviations * odometry.1,
-            noise_rad_s: deviations * turn.1,
-            wheels_noise_rad_s: deviations * wheels_turn.1,
+            noise_m_s: std_devs * forward.1.max(left.1),
+            odometry_noise_m_s: std_devs * odometry.1,
+            noise_rad_s: std_devs * turn.1,
+            wheels_noise_rad_s: std_devs * wheels_turn.1,
         })
     }
 }
@@ -413,7 +413,7 @@ const HEADING: usize = 3;
 #[derive(Debug, Clone, Copy)]
 struct Bend {
     begin_s: f64,
-    deviation: f64,
+    std_dev: f64,
     /// The usual speed before it bends.
     usual: f64,
 }
@@ -434,7 +434,7 @@ impl Bend {
             }
             count += 1.0;
         }
-        normal[1][1] += (self.deviation / self.usual).powi(2);
+        normal[1][1] += (self.std_dev / self.usual).powi(2);
         let inverse = inverse(&normal)?;
         let solution = [0, 1, 2].map(|i| {
             let row: &[f64; 3] = &inverse[i];
@@ -447,9 +447,9 @@ impl Bend {
                 (value - fitted).powi(2)
             })
             .sum();
-        let variance = (residual / (count - 2.0).max(1.0)).max(self.deviation.powi(2));
-        let spread = inverse[1][1] + 2.0 * inverse[1][2] + inverse[2][2];
-        Some((solution[1] + solution[2], (variance * spread).sqrt()))
+        let variance = (residual / (count - 2.0).max(1.0)).max(self.std_dev.powi(2));
+        let unit_variance = inverse[1][1] + 2.0 * inverse[1][2] + inverse[2][2];
+        Some((solution[1] + solution[2], (variance * unit_variance).sqrt()))
     }
 }
 

@@ -127,8 +127,8 @@ impl History {
         self.now.command = command;
     }
 
-    pub(super) fn odometry(&mut self, ahead_m_s: f64) {
-        self.odometry = Some((ahead_m_s, self.now.at_s));
+    pub(super) fn odometry(&mut self, forward_m_s: f64) {
+        self.odometry = Some((forward_m_s, self.now.at_s));
     }
 
     /// Adds what gyro and wheels said at a moment; true if an edge was passed.
@@ -143,10 +143,10 @@ impl History {
         now.gyro_rad += dt_s * gyro_rad_s;
         now.wheels_rad += dt_s * wheels.angular_rad_s;
         now.wheels_m += dt_s * wheels.linear_m_s;
-        if let Some((ahead_m_s, heard_s)) = self.odometry
+        if let Some((forward_m_s, heard_s)) = self.odometry
             && now.at_s - heard_s <= ODOMETRY_AGE_MAX_S
         {
-            now.odometry_m += dt_s * ahead_m_s;
+            now.odometry_m += dt_s * forward_m_s;
             now.odometry_s += dt_s;
         }
         let is_due = now.at_s - self.edges[self.newest].at_s >= BIN_S - 1.0e-6;

@@ -1,20 +1,21 @@
 //! Whether the sensors agree: each channel is predicted from the others all the time.
 //!
-//! The turn rate is seen by gyro, wheels and the heading of position fixes; the speed ahead by
+//! The turn rate is seen by gyro, wheels and the heading of position fixes; the forward speed by
 //! wheels, odometry over ground and position; changes of both by the accelerometer. The wheels'
 //! command is one more word on the wheels. What contradicts the others beyond noise, for long
 //! enough, is a [`Finding`]:
 //!
-//! * Gyro, odometry and position say how the *body* moves, so that two of them which disagree mean a
-//!   fault of one. It is the one that the wheels, or else the command, contradict more.
-//! * Wheels that contradict the body are a fault of their sensor where they contradict their command
-//!   too and the body obeys it. Where they obey it, they may as well slip: the finding is then
-//!   [`Subject::WheelsAndMotion`], and nobody is blamed.
+//! * Gyro, odometry and position say how the *body* moves, so that two of them which disagree mean
+//!   a fault of one. It is the one that the wheels, or else the command, contradict more.
+//! * Wheels that contradict the body are a fault of their sensor where they contradict their
+//!   command too and the body obeys it. Where they obey it, they may as well slip: the finding is
+//!   then [`Subject::WheelsAndMotion`], and nobody is blamed.
 //! * A channel that repeats its word to the last bit while it should not is frozen.
 //!
 //! ```text
 //!            contradicts for RAISE_S                       agrees for CLEAR_S, while excited
-//! consistent ───────────────────────► finding that stands ──────────────────────────────► consistent
+//! consistent ───────────────────────► finding that stands ──────────────────────────────►
+//! consistent
 //! ```
 //! How findings end, also at rest, is [`track`]'s matter; who is compared with whom, [`verdict`]'s.
 //! Pure, without allocation.
@@ -138,10 +139,10 @@ impl Monitor {
             self.history.odometry(odometry_m_s);
         }
         if let Some(felt) = sample.acceleration
-            && felt.ahead_m_s2.is_finite()
+            && felt.forward_m_s2.is_finite()
             && felt.left_m_s2.is_finite()
         {
-            let words = [felt.ahead_m_s2, felt.left_m_s2, 0.0];
+            let words = [felt.forward_m_s2, felt.left_m_s2, 0.0];
             self.repeats.acceleration.take(at, words);
             self.accelerometer.take(felt);
         }
@@ -275,13 +276,14 @@ impl Monitor {
         }
     }
 
-    /// Whether a finding on the place ended at rest, and no motion has shown yet that it was right to.
+    /// Whether a finding on the place ended at rest, and no motion has shown yet that it was right
+    /// to.
     fn is_on_probation(&self) -> bool {
         self.tracks.iter().any(|track| track.is_on_probation)
     }
 
-    /// Whether the robot stands, by what it is commanded and by its wheels, and the fixes stay where
-    /// they were when it came to rest.
+    /// Whether the robot stands, by what it is commanded and by its wheels, and the fixes stay
+    /// where they were when it came to rest.
     fn stands(&mut self, now_s: f64) -> bool {
         let commanded = self.history.commanded(now_s - REST_SPAN_S, now_s);
         let is_commanded = [commanded.least, commanded.most]
@@ -303,7 +305,7 @@ impl Monitor {
         };
         let rest_at = *self.rest_at.get_or_insert(newest);
         let turned_rad = wrap_angle_rad(newest.heading_rad - rest_at.heading_rad);
-        let (position_m, heading_rad) = self.fixes.deviations();
+        let (position_m, heading_rad) = self.fixes.std_devs();
         let stays = rest_at.point().distance_m(newest.point())
             <= REST_SPREAD_M.max(REST_DEVIATIONS * position_m)
             && turned_rad.abs() <= REST_SPREAD_RAD.max(REST_DEVIATIONS * heading_rad);
@@ -314,13 +316,13 @@ impl Monitor {
     }
 }
 
-/// Span over which a robot stands, seconds, and what its wheels may say then, metres and radians per
-/// second.
+/// Span over which a robot stands, seconds, and what its wheels may say then, metres and radians
+/// per second.
 const REST_SPAN_S: f64 = 1.0;
 const REST_M_S: f64 = 0.02;
 const REST_RAD_S: f64 = 0.05;
 /// How far fixes of a standing robot may be from the first one, metres and radians, and in standard
-/// deviations of a fix.
+/// standard deviations of a fix.
 const REST_SPREAD_M: f64 = 0.3;
 const REST_SPREAD_RAD: f64 = 0.1;
 const REST_DEVIATIONS: f64 = 7.0;

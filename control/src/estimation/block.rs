@@ -111,8 +111,8 @@ pub(super) struct ThetaBound {
 }
 
 impl ThetaBound {
-    /// θ with which a block computes slip from force. One that is barely known may be many times too
-    /// large, and what a row holds is never taken back.
+    /// θ with which a block computes slip from force. One that is barely known may be many times
+    /// too large, and what a row holds is never taken back.
     pub(super) fn theta_of_slip(&self) -> f64 {
         self.theta.unwrap_or(THETA_FIRST)
     }
@@ -124,12 +124,13 @@ pub(super) struct Block {
     pub(super) duration_s: f64,
     /// Whether slip was in the linear range.
     pub(super) is_linear: bool,
-    /// Slip of the slower side, across and by the sides' difference, as [`Self::judge_slip`] found it.
+    /// Slip of the slower side, across and by the sides' difference, as [`Self::judge_slip`] found
+    /// it.
     pub(super) slip: f64,
     /// Geometric slip across of the slower side's wheels.
     slip_lateral: f64,
     /// Acceleration ahead over gravity, magnitude.
-    ahead_mu: f64,
+    longitudinal_mu: f64,
     /// Rim speed of the slower side, metres per second.
     slower_m_s: f64,
     /// `u_R − u_L − Wφ̇`, metres per second, and its variance.
@@ -156,11 +157,11 @@ pub(super) struct Block {
 }
 
 impl Block {
-    /// Judges whether slip was in the linear range, combined from along and across. Across, and along the
-    /// sides' difference, it is measured well, known θ or not; what the sides have in common is θμ.
-    /// Before θ is known that is the most it may be, so that turning alone does not keep a long robot
-    /// from ever beginning. With torque it comes from the body speed, which is coarse: the bound is
-    /// tighter, or a robot that slides would begin with what sliding shows.
+    /// Judges whether slip was in the linear range, combined from along and across. Across, and
+    /// along the sides' difference, it is measured well, known θ or not; what the sides have in
+    /// common is θμ. Before θ is known that is the most it may be, so that turning alone does not
+    /// keep a long robot from ever beginning. With torque it comes from the body speed, which is
+    /// coarse: the bound is tighter, or a robot that slides would begin with what sliding shows.
     pub(super) fn judge_slip(&mut self, bound: &ThetaBound) {
         let turning = 0.5 * self.difference_m_s.abs() / self.slower_m_s;
         let most = SLIP_LINEAR_MAX.min(bound.slip_max);
@@ -172,7 +173,7 @@ impl Block {
                 self.slip_m_s.unwrap_or(0.0).abs() / self.slower_m_s,
                 SLIP_LINEAR_FIRST_MAX.min(bound.slip_max),
             ),
-            (_, None) => (bound.theta_most * self.ahead_mu, most),
+            (_, None) => (bound.theta_most * self.longitudinal_mu, most),
         };
         // What is measured well; the rest is an upper bound, or coarse.
         self.slip = turning.hypot(self.slip_lateral);
@@ -206,7 +207,7 @@ impl Block {
         Some(Row {
             regressors,
             response: self.difference_m_s,
-            spread: self.difference_noise,
+            innovation_variance: self.difference_noise,
             force_noise: force.difference_noise,
             bend: [force.bend[0], force.bend[1], 0.0],
             common_noise,
@@ -238,7 +239,7 @@ impl Block {
         Some(Row {
             regressors,
             response: slip_m_s,
-            spread: self.slip_noise,
+            innovation_variance: self.slip_noise,
             force_noise: 0.25 * force.difference_noise,
             bend: [force.bend[0], force.bend[1], 0.0],
             common_noise: Regressors::zeros(),
@@ -249,10 +250,10 @@ impl Block {
 
     /// Twice the mean force on the sides, metres per second.
     pub(super) fn mean_force_m_s(&self) -> f64 {
-        self.force
-            .map_or(2.0 * self.ahead_mu * self.rim_mean_m_s.abs(), |force| {
-                2.0 * force.mean_m_s.abs()
-            })
+        self.force.map_or(
+            2.0 * self.longitudinal_mu * self.rim_mean_m_s.abs(),
+            |force| 2.0 * force.mean_m_s.abs(),
+        )
     }
 }
 
@@ -275,7 +276,7 @@ pub(super) struct BlockBuilder {
     left_force_m_s: f64,
     right_force_m_s: f64,
     lateral_m_s2: f64,
-    ahead_m_s2: f64,
+    forward_m_s2: f64,
     /// Mean rim speed minus body speed where the latter was new.
     slip_m_s: f64,
     window: TurnWindow,
@@ -343,7 +344,7 @@ impl BlockBuilder {
         if let Some(acceleration) = sample.acceleration {
             self.with_acceleration += 1;
             self.lateral_m_s2 += acceleration.left_m_s2;
-            self.ahead_m_s2 += acceleration.ahead_m_s2;
+            self.forward_m_s2 += acceleration.forward_m_s2;
         }
         if let Some(body_m_s) = sample.body_speed_m_s {
             self.with_body_speed += 1;
@@ -370,7 +371,7 @@ impl BlockBuilder {
         let slip = lateral.hypot(0.5 * difference_m_s.abs() / slower_m_s);
         let rim_noise_m_s = noise.wheel_speed_rad_s * model.wheel_radius_m();
         let has_acceleration = self.with_acceleration == self.samples;
-        let ahead_mu = self.ahead_m_s2 / count / GRAVITY_M_S2;
+        let longitudinal_mu = self.forward_m_s2 / count / GRAVITY_M_S2;
         let force = (self.with_torque == self.samples).then(|| self.force(&context));
         let turning = has_acceleration
             .then(|| self.window.means(self.duration_s))
@@ -387,7 +388,7 @@ impl BlockBuilder {
         let resistance =
             (force.is_some() && has_acceleration && lateral < STRAIGHT_SLIP_MAX).then(|| {
                 ValueWithDeviation {
-                    value: (mean_mu - ahead_mu) * mean_m_s.signum(),
+                    value: (mean_mu - longitudinal_mu) * mean_m_s.signum(),
                     std_dev: (noise.torque_mu * std::f64::consts::FRAC_1_SQRT_2)
                         .hypot(noise.accelerometer_m_s2 / GRAVITY_M_S2)
                         / count.sqrt(),
@@ -399,7 +400,7 @@ impl BlockBuilder {
             is_linear: slip < SLIP_LINEAR_MAX,
             slip,
             slip_lateral: lateral,
-            ahead_mu: ahead_mu.abs(),
+            longitudinal_mu: longitudinal_mu.abs(),
             slower_m_s,
             difference_m_s,
             difference_noise: (2.0 * rim_noise_m_s.powi(2)
@@ -446,7 +447,7 @@ impl BlockBuilder {
         };
         // The torque holds rolling resistance, which no contact carries.
         let contact_m_s = if self.with_acceleration == self.samples {
-            self.ahead_m_s2 / count / GRAVITY_M_S2 * mean_m_s.abs()
+            self.forward_m_s2 / count / GRAVITY_M_S2 * mean_m_s.abs()
         } else {
             mean_force_m_s
         };
@@ -468,10 +469,10 @@ impl BlockBuilder {
                 -bent_slope(contact[0], left_slip, curvature),
                 bent_slope(contact[1], right_slip, curvature),
             ];
-            let along = |by: [f64; 2]| slopes[0] * by[order[0]] + slopes[1] * by[order[1]];
-            along(sides.by_apart) / mean_m_s.abs()
+            let longitudinal = |by: [f64; 2]| slopes[0] * by[order[0]] + slopes[1] * by[order[1]];
+            longitudinal(sides.by_apart) / mean_m_s.abs()
                 * (rim_noise + model.track_width_m() * turn_noise)
-                - along(sides.by_turn_s) * turn_noise
+                - longitudinal(sides.by_turn_s) * turn_noise
         };
         let curvatures = Curvatures::of(curvature);
         let nodes = curvatures.nodes();
@@ -508,16 +509,17 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
     let track_m = model.track_width_m();
     // 4 I_G/(m g W), seconds squared.
     let inertia = 4.0 * model.yaw_inertia_kg_m2() / (model.mass_kg() * GRAVITY_M_S2 * track_m);
-    // What is known of the radii belongs into the rim speeds' difference here, where it multiplies θ.
+    // What is known of the radii belongs into the rim speeds' difference here, where it multiplies
+    // θ.
     let force_m_s = inertia * means.harmonic_m_s * means.turn_acceleration_rad_s2
-        + means.ahead_force_m_s
-        - radius_difference * means.rim_mean_m_s * means.ahead_mu;
+        + means.longitudinal_force_m_s
+        - radius_difference * means.rim_mean_m_s * means.longitudinal_mu;
     let mut regressors = Regressors::zeros();
     regressors[index::RADIUS_OFFSET] = means.rim_difference_m_s;
     regressors[index::RADIUS_DIFFERENCE] = means.rim_mean_m_s;
     regressors[index::TRACK] = track_m * (model.effective_track_ratio() - 1.0) * means.turn_rad_s;
     regressors[index::GYRO_OFFSET] = -model.effective_track_m();
-    regressors[index::AHEAD_OFFSET] = -theta * means.rim_difference_m_s / GRAVITY_M_S2;
+    regressors[index::LONGITUDINAL_OFFSET] = -theta * means.rim_difference_m_s / GRAVITY_M_S2;
     regressors[index::RELAXATION] = inertia * means.turn_jerk_rad_s3;
     let jerk_noise = (4.0 * inertia / means.duration_s.powi(2)).powi(2)
         * noise.gyro_rad_s.powi(2)
@@ -541,13 +543,13 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
         turn: &turn,
         swing: &swing,
         mu: MeanSlip {
-            ahead: means.ahead_mu,
-            across: means.harmonic_m_s * means.turn_rad_s / GRAVITY_M_S2,
+            forward: means.longitudinal_mu,
+            lateral: means.harmonic_m_s * means.turn_rad_s / GRAVITY_M_S2,
         },
         theta,
         force_m_s,
         uneven_m_s: |loss: &Loss| {
-            means.harmonic_m_s * (4.0 * loss.moment_m / track_m + gap * loss.ahead)
+            means.harmonic_m_s * (4.0 * loss.moment_m / track_m + gap * loss.forward)
         },
     };
     let (bends, bend) = input.bends(model, curvature);
@@ -558,13 +560,14 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
     common_noise[index::TRACK] =
         -track_m * (model.effective_track_ratio() - 1.0) * model.effective_track_m() * gyro_noise
             / means.samples;
-    common_noise[index::AHEAD_OFFSET] = -theta * difference_noise / GRAVITY_M_S2;
+    common_noise[index::LONGITUDINAL_OFFSET] = -theta * difference_noise / GRAVITY_M_S2;
     let ramp_noise = (inertia * means.harmonic_m_s / means.duration_s).powi(2) * 2.0 * gyro_noise
         / means.ramp_samples;
     Row {
         regressors,
         response: means.slip_m_s,
-        spread: (2.0 * rim_noise_m_s.powi(2) + model.effective_track_m().powi(2) * gyro_noise)
+        innovation_variance: (2.0 * rim_noise_m_s.powi(2)
+            + model.effective_track_m().powi(2) * gyro_noise)
             / means.samples,
         force_noise: ramp_noise
             + (means.rim_difference_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2)

@@ -1,8 +1,8 @@
 //! What four contacts on curved tyres carry together.
 //!
-//! Contact i keeps `w_i = 1 − κℓ_i` of its stiffness, `ℓ = s − κs²/3` at its combined slip s. A force
-//! or moment F to which contacts add their slip times a lever `m_i` then obeys `Σ w_i m_i = θF`, so
-//! that with the means `ℓ̄`, `w̄` over the contacts, exactly,
+//! Contact i keeps `w_i = 1 − κℓ_i` of its stiffness, `ℓ = s − κs²/3` at its combined slip s. A
+//! force or moment F to which contacts add their slip times a lever `m_i` then obeys `Σ w_i m_i =
+//! θF`, so that with the means `ℓ̄`, `w̄` over the contacts, exactly,
 //!
 //! ```text
 //! Σ m_i = (θF + κ Σ (ℓ_i − ℓ̄) m_i) / w̄
@@ -27,10 +27,10 @@ pub(super) struct Loss {
     pub(super) mean: f64,
     /// `w̄`.
     pub(super) left: f64,
-    /// Mean of `(ℓ_i − ℓ̄)` times the slip ahead.
-    pub(super) ahead: f64,
+    /// Mean of `(ℓ_i − ℓ̄)` times the longitudinal slip.
+    pub(super) forward: f64,
     /// The same with the slip across, to the left.
-    pub(super) across: f64,
+    pub(super) lateral: f64,
     /// The same with the moment of the slip, metres.
     pub(super) moment_m: f64,
 }
@@ -38,8 +38,8 @@ pub(super) struct Loss {
 /// Forces over load times θ: the mean slip that they cause on straight tyres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct MeanSlip {
-    pub(super) ahead: f64,
-    pub(super) across: f64,
+    pub(super) forward: f64,
+    pub(super) lateral: f64,
 }
 
 impl Loss {
@@ -68,27 +68,27 @@ impl Loss {
         let mut now = slip;
         for _ in 0..ROUNDS {
             // Sums of ℓ, of ℓ times each slip, of the slips themselves.
-            let (mut loss, mut ahead, mut across, mut turning) = (0.0, 0.0, 0.0, 0.0);
-            let (mut sum_ahead, mut sum_across, mut sum_moment) = (0.0, 0.0, 0.0);
+            let (mut loss, mut forward, mut lateral, mut turning) = (0.0, 0.0, 0.0, 0.0);
+            let (mut longitudinal_sum, mut lateral_sum, mut sum_moment) = (0.0, 0.0, 0.0);
             for moment in swing {
                 let share = 0.25 * moment.weight;
                 let gap = apart + moment.apart;
                 let turn_rad_s = turn.yaw_rate_rad_s + moment.turn_rad_s;
-                let common = now.ahead + theta * moment.ahead_mu;
-                let drift = now.across + theta * turn.rim_m_s * moment.turn_rad_s / GRAVITY_M_S2;
+                let common = now.forward + theta * moment.longitudinal_mu;
+                let drift = now.lateral + theta * turn.rim_m_s * moment.turn_rad_s / GRAVITY_M_S2;
                 for (side, sign) in [-1.0, 1.0].into_iter().enumerate() {
-                    let slip_ahead = common + 0.5 * sign * gap;
+                    let longitudinal_slip = common + 0.5 * sign * gap;
                     for x_m in [half_base_m, -half_base_m] {
-                        let slip_across = drift - x_m * turn_rad_s / sides_m_s[side];
-                        let slip = slip_ahead.hypot(slip_across);
+                        let lateral_slip = drift - x_m * turn_rad_s / sides_m_s[side];
+                        let slip = longitudinal_slip.hypot(lateral_slip);
                         let kept_back = share * slip * (1.0 - curvature * slip / 3.0);
-                        let lever = sign * half_track_m * slip_ahead + x_m * slip_across;
+                        let lever = sign * half_track_m * longitudinal_slip + x_m * lateral_slip;
                         loss += kept_back;
-                        ahead += kept_back * slip_ahead;
-                        across += kept_back * slip_across;
+                        forward += kept_back * longitudinal_slip;
+                        lateral += kept_back * lateral_slip;
                         turning += kept_back * lever;
-                        sum_ahead += share * slip_ahead;
-                        sum_across += share * slip_across;
+                        longitudinal_sum += share * longitudinal_slip;
+                        lateral_sum += share * lateral_slip;
                         sum_moment += share * lever;
                     }
                 }
@@ -97,13 +97,13 @@ impl Loss {
             found = Self {
                 mean,
                 left: (1.0 - curvature * mean).max(STIFFNESS_LEFT_MIN),
-                ahead: ahead - mean * sum_ahead,
-                across: across - mean * sum_across,
+                forward: forward - mean * longitudinal_sum,
+                lateral: lateral - mean * lateral_sum,
                 moment_m: turning - mean * sum_moment,
             };
             now = MeanSlip {
-                ahead: (slip.ahead + curvature * found.ahead) / found.left,
-                across: (slip.across + curvature * found.across) / found.left,
+                forward: (slip.forward + curvature * found.forward) / found.left,
+                lateral: (slip.lateral + curvature * found.lateral) / found.left,
             };
         }
         found
@@ -133,8 +133,8 @@ impl<F: Fn(&Loss) -> f64> BendInput<'_, F> {
         }
         let at = |theta: f64, curvature: f64| {
             let slip = MeanSlip {
-                ahead: theta * self.mu.ahead,
-                across: theta * self.mu.across,
+                forward: theta * self.mu.forward,
+                lateral: theta * self.mu.lateral,
             };
             let loss = Loss::of(self.turn, self.swing, slip, theta, model, curvature);
             [loss.mean / loss.left, (self.uneven_m_s)(&loss) / loss.left]
@@ -177,8 +177,8 @@ mod tests {
     proptest! {
         #[test]
         fn what_contacts_lose_is_that_of_four_brushes(
-            curvature in 0.3..3.0_f64, ahead in -0.04..0.04_f64, apart in -0.06..0.06_f64,
-            turn_rad_s in -0.3..0.3_f64, across in -0.01..0.01_f64,
+            curvature in 0.3..3.0_f64, forward in -0.04..0.04_f64, apart in -0.06..0.06_f64,
+            turn_rad_s in -0.3..0.3_f64, lateral in -0.01..0.01_f64,
         ) {
             let model = RobotModel::yi2007();
             let rim_m_s = 0.6;
@@ -190,28 +190,28 @@ mod tests {
             };
             let still = [Moment { weight: 1.0, ..Moment::default() }];
             // The forces that these slips cause.
-            let (mut force_ahead, mut force_across, mut moment_m) = (0.0, 0.0, 0.0);
+            let (mut longitudinal_force, mut lateral_force, mut moment_m) = (0.0, 0.0, 0.0);
             let mut straight_moment_m = 0.0;
             for sign in [-1.0, 1.0] {
                 for end in [-0.5, 0.5] {
                     let x_m = end * model.wheelbase_m();
                     let side_m_s = rim_m_s + 0.5 * sign * turn.rim_difference_m_s;
-                    let slip_ahead = ahead + 0.5 * sign * apart;
-                    let slip_across = across - x_m * turn_rad_s / side_m_s;
-                    let lever_m = 0.5 * sign * model.track_width_m() * slip_ahead + x_m * slip_across;
-                    let stiffness = left(slip_ahead.hypot(slip_across), curvature);
-                    force_ahead += 0.25 * stiffness * slip_ahead;
-                    force_across += 0.25 * stiffness * slip_across;
+                    let longitudinal_slip = forward + 0.5 * sign * apart;
+                    let lateral_slip = lateral - x_m * turn_rad_s / side_m_s;
+                    let lever_m = 0.5 * sign * model.track_width_m() * longitudinal_slip + x_m * lateral_slip;
+                    let stiffness = left(longitudinal_slip.hypot(lateral_slip), curvature);
+                    longitudinal_force += 0.25 * stiffness * longitudinal_slip;
+                    lateral_force += 0.25 * stiffness * lateral_slip;
                     moment_m += 0.25 * stiffness * lever_m;
                     straight_moment_m += 0.25 * lever_m;
                 }
             }
-            let forces = MeanSlip { ahead: force_ahead, across: force_across };
+            let forces = MeanSlip { forward: longitudinal_force, lateral: lateral_force };
             let loss = Loss::of(&turn, &still, forces, 0.2, &model, curvature);
             let found_m = (moment_m + curvature * loss.moment_m) / loss.left;
             prop_assert!((found_m - straight_moment_m).abs() < 2.0e-5);
-            let found_ahead = (force_ahead + curvature * loss.ahead) / loss.left;
-            prop_assert!((found_ahead - ahead).abs() < 2.0e-4);
+            let found_longitudinal = (longitudinal_force + curvature * loss.forward) / loss.left;
+            prop_assert!((found_longitudinal - forward).abs() < 2.0e-4);
         }
     }
 }

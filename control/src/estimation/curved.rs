@@ -1,7 +1,7 @@
 //! Tyres that rise along a curve: what their bend adds to rows that are linear in θκ.
 //!
-//! Stiffness falls with the combined slip s as `1 − x + x²/3`, `x = κs` (a brush). Rows are exact in
-//! s at two κ, and to second order in κ between them. What the contacts carry unequally is in
+//! Stiffness falls with the combined slip s as `1 − x + x²/3`, `x = κs` (a brush). Rows are exact
+//! in s at two κ, and to second order in κ between them. What the contacts carry unequally is in
 //! [`super::contacts`].
 
 use super::types::Curvature;
@@ -31,7 +31,7 @@ pub(super) struct Curvatures {
 }
 
 impl Curvatures {
-    /// One deviation from the mean.
+    /// One standard deviation from the mean.
     pub(super) fn of(known: Curvature) -> Self {
         Self {
             low: (known.mean - known.std_dev).max(0.0),
@@ -83,7 +83,7 @@ pub(super) struct SideSlips {
     pub(super) mean: f64,
     /// Left minus right combined slip.
     pub(super) unequal: f64,
-    /// Right minus left slip ahead.
+    /// Right minus left longitudinal slip.
     pub(super) apart: f64,
     /// Left and right combined slip by `apart`.
     pub(super) by_apart: [f64; 2],
@@ -92,8 +92,8 @@ pub(super) struct SideSlips {
 }
 
 impl SideSlips {
-    /// At a mean rim speed above zero, all of a robot that drives ahead; `common` is the slip ahead
-    /// that both sides have.
+    /// At a mean rim speed above zero, all of a robot that drives ahead; `common` is the
+    /// longitudinal slip that both sides have.
     pub(super) fn of(turn: &Turn, common: f64, model: &RobotModel) -> Self {
         let Turn {
             rim_m_s,
@@ -103,12 +103,12 @@ impl SideSlips {
         } = *turn;
         let apart = (rim_difference_m_s - model.track_width_m() * yaw_rate_rad_s) / rim_m_s
             - radius_difference;
-        let combined = |ahead: f64, side_m_s: f64| {
+        let combined = |forward: f64, side_m_s: f64| {
             let arm_s = 0.5 * model.wheelbase_m() / side_m_s;
-            let across = arm_s * yaw_rate_rad_s;
-            let slip = ahead.hypot(across);
+            let lateral = arm_s * yaw_rate_rad_s;
+            let slip = forward.hypot(lateral);
             let inverse = slip.max(SLIP_MIN).recip();
-            (slip, 0.5 * ahead * inverse, arm_s * across * inverse)
+            (slip, 0.5 * forward * inverse, arm_s * lateral * inverse)
         };
         let (left, left_by_apart, left_by_turn_s) =
             combined(common - 0.5 * apart, rim_m_s - 0.5 * rim_difference_m_s);

@@ -19,9 +19,9 @@ pub(super) struct Excitation {
     turning: f64,
     turning_mean: f64,
     turning_blocks: f64,
-    along: f64,
-    along_sum: f64,
-    along_rows: f64,
+    longitudinal: f64,
+    longitudinal_sum: f64,
+    longitudinal_rows: f64,
 }
 
 impl Excitation {
@@ -41,28 +41,28 @@ impl Excitation {
         self.turning += ((centred * centred).min(SQUARE_MAX) - self.turning) / MEMORY_BLOCKS;
     }
 
-    /// Notes a row of the speed ahead.
-    pub(super) fn note_along(&mut self, row: &Row) {
+    /// Notes a row of the forward speed.
+    pub(super) fn note_longitudinal(&mut self, row: &Row) {
         if row.force_noise > 0.0 {
-            self.along_sum += row.regressors[index::THETA].powi(2) / row.force_noise;
-            self.along_rows += 1.0;
+            self.longitudinal_sum += row.regressors[index::THETA].powi(2) / row.force_noise;
+            self.longitudinal_rows += 1.0;
         }
     }
 
     /// Ends a block, driven or not.
     pub(super) fn end_block(&mut self) {
-        let square = if self.along_rows > 0.0 {
-            self.along_sum / self.along_rows
+        let square = if self.longitudinal_rows > 0.0 {
+            self.longitudinal_sum / self.longitudinal_rows
         } else {
             0.0
         };
-        self.along += (square.min(SQUARE_MAX) - self.along) / MEMORY_BLOCKS;
-        self.along_sum = 0.0;
-        self.along_rows = 0.0;
+        self.longitudinal += (square.min(SQUARE_MAX) - self.longitudinal) / MEMORY_BLOCKS;
+        self.longitudinal_sum = 0.0;
+        self.longitudinal_rows = 0.0;
     }
 
     /// Whether there is excitation now.
     pub(super) fn is_present(&self) -> bool {
-        self.turning.max(self.along) > PRESENT
+        self.turning.max(self.longitudinal) > PRESENT
     }
 }

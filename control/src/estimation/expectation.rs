@@ -121,7 +121,7 @@ fn undisturbed(motion: &Motion, model: &RobotModel, theta: f64, has_torque: bool
         },
         gyro_rad_s: turn_rad_s,
         acceleration: Some(BodyAcceleration {
-            ahead_m_s2: motion.acceleration_m_s2,
+            forward_m_s2: motion.acceleration_m_s2,
             left_m_s2: motion.speed_m_s * turn_rad_s,
         }),
         body_speed_m_s: None,

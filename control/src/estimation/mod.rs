@@ -3,33 +3,33 @@
 //! This is the figure that reaches the map; it never mixes with θ̂ of the loop. Per side, in the
 //! linear range, `λ = θ μ` holds exactly under combined slip: slip is regressed on force, from
 //! *measured* wheel speed, gyro, accelerometer, body speed and wheel torque. Every row is linear in
-//! eleven parameters: θ; what is the robot's own, namely `δ_c` and `δ_d` (the shares by which nominal
-//! radii are too large, mean and right minus left), the effective track, the gyro's and the
-//! accelerometer's offset and the latter's scale; θf, rolling resistance f in measured torques;
-//! θκ, the bend of a curved tyre; θℓ, the contacts' relaxation length, times the force's rate; and θj,
-//! the inertia of rotors and wheels over the mass, whose torque no contact carries. Without the last
-//! three, in metres per second, u rim speeds:
+//! eleven parameters: θ; what is the robot's own, namely `δ_c` and `δ_d` (the shares by which
+//! nominal radii are too large, mean and right minus left), the effective track, the gyro's and the
+//! accelerometer's offset and the latter's scale; θf, rolling resistance f in measured torques; θκ,
+//! the bend of a curved tyre; θℓ, the contacts' relaxation length, times the force's rate; and θj,
+//! the inertia of rotors and wheels over the mass, whose torque no contact carries. Without the
+//! last three, in metres per second, u rim speeds:
 //!
 //! ```text
 //! with wheel torque
 //!   u_R − u_L − Wφ̇    = θ (μ_R u_R − μ_L u_L)   + (δ_c − θf)(u_R − u_L)   + δ_d (u_R + u_L)/2 − W b_g
 //!   (u_R + u_L)/2 − v = θ (μ_R u_R + μ_L u_L)/2 + (δ_c − θf)(u_R + u_L)/2 + δ_d (u_R − u_L)/4
 //! without
-//!   the moment balance ([`window`]) and the innovations of the speed ahead ([`along`])
+//!   the moment balance ([`window`]) and the innovations of the forward speed ([`along`])
 //! ```
 //! The robot's own parameters survive changes of the ground; θ, f and κ are the ground's. Samples
 //! are averaged over blocks; the noise of the regressor is taken out of its square (errors in
-//! variables), and its effect is part of the deviation. Only the difference of `δ_c` and θf shows,
-//! so what is known of it goes from segment to segment as a whole (`offsets.rs`). Where nothing
-//! excites θ, there is no θ: `None`.
+//! variables), and its effect is part of the standard deviation. Only the difference of `δ_c` and
+//! θf shows, so what is known of it goes from segment to segment as a whole (`offsets.rs`). Where
+//! nothing excites θ, there is no θ: `None`.
 
-mod along;
 mod block;
 mod change;
 mod contacts;
 mod curved;
 mod excitation;
 mod expectation;
+mod longitudinal;
 mod offsets;
 mod regression;
 mod rows;
@@ -41,11 +41,11 @@ mod window;
 use crate::measured::WheelSpeeds;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-use along::{AlongFilter, SlipBound};
 use block::{Block, BlockBuilder, BlockContext, ThetaBound};
 use change::ChangeDetector;
 use excitation::Excitation;
 pub use expectation::{ExpectedAccuracy, expected_accuracy};
+use longitudinal::{LongitudinalFilter, SlipBound};
 use offsets::OffsetKnowledge;
 use regression::{Shared, Solution, SolveInput, solve};
 use rows::Row;
@@ -65,7 +65,7 @@ const RIM_SPEED_MIN_M_S: f64 = 0.15;
 const SLIP_LINEAR_MAX: f64 = 0.15;
 /// The same before θ is known, where slip along is told by the body speed.
 const SLIP_LINEAR_FIRST_MAX: f64 = 0.10;
-/// Relative deviation above which there is said to be no measurement.
+/// Relative standard deviation above which there is said to be no measurement.
 const RELATIVE_STD_DEV_MAX: f64 = 0.5;
 /// Fewest blocks of a measurement.
 const BLOCKS_MIN: u64 = 5;
@@ -99,7 +99,7 @@ pub struct Estimator {
     tyres: TyrePrior,
     uncertainty: ModelUncertainty,
     block: BlockBuilder,
-    along: AlongFilter,
+    longitudinal: LongitudinalFilter,
     offsets: OffsetKnowledge,
     /// Blocks of this ground in segments that are closed.
     ground: Sums,
@@ -141,7 +141,7 @@ impl Estimator {
             tyres,
             uncertainty,
             block: BlockBuilder::default(),
-            along: AlongFilter::new(),
+            longitudinal: LongitudinalFilter::new(),
             offsets: OffsetKnowledge::unknown(&noise, &tyres),
             ground: Sums::default(),
             claims: Claims::default(),
@@ -190,7 +190,7 @@ impl Estimator {
             // Nothing is known of the time between: averages begin anew.
             self.block = BlockBuilder::default();
             self.turning_before = None;
-            self.along = AlongFilter::new();
+            self.longitudinal = LongitudinalFilter::new();
             return UpdateOutcome::default();
         }
         self.step_along(sample, dt_s);
@@ -238,7 +238,7 @@ impl Estimator {
         is_leap
     }
 
-    /// The speed ahead: its innovations are rows where the base gives no torque.
+    /// The forward speed: its innovations are rows where the base gives no torque.
     fn step_along(&mut self, sample: &SensorSample, dt_s: f64) {
         let bound = SlipBound {
             theta_most: self.bound.theta_most,
@@ -248,13 +248,13 @@ impl Estimator {
             curvature: self.tyres.at(self.bound.theta_weights),
         };
         let rows = self
-            .along
+            .longitudinal
             .add(sample, dt_s, &self.model, &self.noise, &bound);
         if sample.wheel_torques.is_some() {
             return;
         }
         for row in rows.into_iter().flatten().flatten() {
-            self.excitation.note_along(&row);
+            self.excitation.note_longitudinal(&row);
             self.pending.add_along(&row, bound.theta);
         }
     }
@@ -411,11 +411,11 @@ impl Estimator {
     }
 
     /// Ends the segment and gives its additive statistics, which hold no prior on θ. The robot's
-    /// own parameters are those known from everything else, and their deviation is inside.
+    /// own parameters are those known from everything else, and their standard deviation is inside.
     ///
     /// What is not known of the robot itself is the same error in all segments, so that their sum
     /// would promise too much: each claims as much as the sum of this ground's segments can keep.
-    /// The errors that no drive averages out are told apart from it as [`CommonError`].
+    /// The errors that no drive averages out are distinguished from it as [`CommonError`].
     pub fn close_segment(&mut self) -> SegmentStatistics {
         let segment = self.segment.plus(&self.pending);
         let before = self
@@ -495,7 +495,7 @@ impl Estimator {
         self.change = ChangeDetector::default();
         self.turning_before = None;
         self.block = BlockBuilder::default();
-        self.along = AlongFilter::new();
+        self.longitudinal = LongitudinalFilter::new();
         self.excitation = Excitation::default();
         self.refresh();
     }
@@ -542,7 +542,7 @@ fn is_possible(sample: &SensorSample, model: &RobotModel) -> bool {
             .body_speed_m_s
             .is_none_or(|speed| speed.is_finite() && speed.abs() < 100.0)
         && sample.acceleration.is_none_or(|acceleration| {
-            acceleration.ahead_m_s2.hypot(acceleration.left_m_s2) < 200.0
+            acceleration.forward_m_s2.hypot(acceleration.left_m_s2) < 200.0
         })
         && sample.wheel_torques.is_none_or(|torques| {
             (torques.left_n_m.abs().max(torques.right_n_m.abs()) * mu_scale) < MU_MAX

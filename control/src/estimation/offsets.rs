@@ -39,8 +39,14 @@ impl OffsetKnowledge {
         put(index::RADIUS_DIFFERENCE, 0.5 * radius);
         put(index::TRACK, weight(tyres.lateral_stiffness_std_dev));
         put(index::GYRO_OFFSET, weight(noise.gyro_offset_rad_s));
-        put(index::AHEAD_OFFSET, weight(noise.accelerometer_offset_m_s2));
-        put(index::AHEAD_SCALE, weight(noise.accelerometer_scale_ratio));
+        put(
+            index::LONGITUDINAL_OFFSET,
+            weight(noise.accelerometer_offset_m_s2),
+        );
+        put(
+            index::LONGITUDINAL_SCALE,
+            weight(noise.accelerometer_scale_ratio),
+        );
         put(index::RESISTANCE, RESISTANCE_VAGUE);
         Self {
             information,
@@ -122,8 +128,8 @@ impl OffsetKnowledge {
         take_out(index::RELAXATION, &mut matrix, &mut right);
         take_out(index::CURVATURE, &mut matrix, &mut right);
         // A corrected square below its own noise is not known to be smaller than that noise, and it
-        // is no smaller than what the other regressors explain of it: rows whose force hardly varies
-        // would tell the radii by what the correction takes too much.
+        // is no smaller than what the other regressors explain of it: rows whose force hardly
+        // varies would tell the radii by what the correction takes too much.
         let others = self.information * REGULAR_SHARE + matrix.fixed_view::<OFFSETS, OFFSETS>(1, 1);
         let with_others = matrix
             .fixed_view::<OFFSETS, 1>(1, index::THETA)
@@ -143,7 +149,7 @@ impl OffsetKnowledge {
         ))
     }
 
-    /// `δ_c` and `δ_d` with their deviations.
+    /// `δ_c` and `δ_d` with their standard deviations.
     pub(super) fn values(&self) -> (ValueWithDeviation, ValueWithDeviation) {
         let covariance = self
             .information

@@ -5,7 +5,7 @@
 //! (found by iteration), and the variance of θ is
 //! `[M⁻¹]₁₁ + [M⁻¹]₁₁² Σ_c n (σ_x² s_c² + θ²σ_x⁴)/s_c⁴` (Fuller, Measurement Error Models, 1987).
 //! Noise that the response shares with another regressor, `u_R − u_L` beside `δ_c` above all, is
-//! taken out of their product: θ would read low by up to a third of its deviation.
+//! taken out of their product: θ would read low by up to a third of its standard deviation.
 
 use super::offsets::OffsetKnowledge;
 use super::rows::{Channel, OFFSETS, ParameterMatrix, Parameters, Tangent, index};
@@ -71,13 +71,14 @@ impl Normal {
             if channel.count < 1.0 {
                 continue;
             }
-            let spread = channel.spread(theta) * inflation;
+            let innovation_variance = channel.innovation_variance(theta) * inflation;
             let force_noise = channel.force_variance();
-            normal.matrix += channel.corrected_square(tangent) / spread;
-            normal.right += channel.corrected_product(tangent) / spread;
-            normal.excess += channel.count * (force_noise * spread + (theta * force_noise).powi(2))
-                / (spread * spread);
-            noise_variance += 2.0 * channel.count * (force_noise / spread).powi(2);
+            normal.matrix += channel.corrected_square(tangent) / innovation_variance;
+            normal.right += channel.corrected_product(tangent) / innovation_variance;
+            normal.excess += channel.count
+                * (force_noise * innovation_variance + (theta * force_noise).powi(2))
+                / (innovation_variance * innovation_variance);
+            noise_variance += 2.0 * channel.count * (force_noise / innovation_variance).powi(2);
         }
         normal.noise_std_dev = noise_variance.sqrt();
         let known = normal.curvature_weight;
@@ -141,7 +142,7 @@ pub(super) fn inflation(
         }
         let fitted = (channel.square(tangent) * parameters).dot(parameters);
         let sum = channel.response - 2.0 * channel.product(tangent).dot(parameters) + fitted;
-        squares += sum / channel.spread(theta);
+        squares += sum / channel.innovation_variance(theta);
         count += channel.count;
     }
     if count < INFLATION_ROWS {
@@ -164,7 +165,7 @@ fn neighbours(channels: &[&Channel], direction: &Parameters, theta: f64, tangent
         if channel.count < 1.0 {
             return 0.0;
         }
-        let scale = theta / channel.spread(theta);
+        let scale = theta / channel.innovation_variance(theta);
         (channel.neighbours(tangent) * direction).dot(direction) * scale * scale
     };
     channels.iter().map(of_channel).sum()
@@ -233,9 +234,9 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
                 // reads too high by just that share.
                 (theta * (1.0 + parameters[index::RADIUS_OFFSET]), theta)
             };
-            let across = covariance[(index::THETA, index::RADIUS_OFFSET)];
+            let lateral = covariance[(index::THETA, index::RADIUS_OFFSET)];
             let own = covariance[(index::RADIUS_OFFSET, index::RADIUS_OFFSET)];
-            let scaled = (2.0 * scale * across + scale * scale * own).max(-0.5 * base);
+            let scaled = (2.0 * scale * lateral + scale * scale * own).max(-0.5 * base);
             let mut of_theta = Parameters::zeros();
             of_theta[index::THETA] = 1.0;
             of_theta[index::RADIUS_OFFSET] = scale;
@@ -410,7 +411,7 @@ impl Solution {
         let regressors = self.tangent.of_parameters(&row.regressors);
         let error = row.response - regressors.dot(&self.parameters);
         let missed = MODEL_SHARE * self.theta * (force.abs() + block.mean_force_m_s());
-        let variance = row.spread
+        let variance = row.innovation_variance
             + self.theta.powi(2) * row.force_noise
             + (self.covariance * regressors).dot(&regressors)
             + missed * missed;

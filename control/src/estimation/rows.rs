@@ -33,17 +33,19 @@ pub(super) mod index {
     /// `b_g`, the gyro's offset, radians per second.
     pub(in crate::estimation) const GYRO_OFFSET: usize = 4;
     /// `b_a`, the accelerometer's offset ahead, metres per second squared.
-    pub(in crate::estimation) const AHEAD_OFFSET: usize = 5;
+    pub(in crate::estimation) const LONGITUDINAL_OFFSET: usize = 5;
     /// Share by which the accelerometer reads too little.
-    pub(in crate::estimation) const AHEAD_SCALE: usize = 6;
+    pub(in crate::estimation) const LONGITUDINAL_SCALE: usize = 6;
     /// `θf`, θ times the rolling resistance over load that measured torques hold. It is the
     /// ground's: new ground forgets it.
     pub(in crate::estimation) const RESISTANCE: usize = 7;
     /// θκ, θ times the tyre's curvature per slip.
     pub(in crate::estimation) const CURVATURE: usize = 8;
-    /// θℓ, θ times the contacts' relaxation length, metres: a force that rises takes slip of its own.
+    /// θℓ, θ times the contacts' relaxation length, metres: a force that rises takes slip of its
+    /// own.
     pub(in crate::estimation) const RELAXATION: usize = 9;
-    /// θj, θ times the inertia of the rotors and wheels over the mass: torque that no contact carries.
+    /// θj, θ times the inertia of the rotors and wheels over the mass: torque that no contact
+    /// carries.
     pub(in crate::estimation) const ROTORS: usize = 10;
     /// θκ², a regressor's place only, as all that follow.
     pub(in crate::estimation) const CURVATURE_SQUARE: usize = 11;
@@ -156,7 +158,7 @@ pub(super) struct Row {
     pub(super) regressors: Regressors,
     pub(super) response: f64,
     /// Variance of the response, with that of the force at the θ of the time.
-    pub(super) spread: f64,
+    pub(super) innovation_variance: f64,
     /// Variance of the force regressor.
     pub(super) force_noise: f64,
     /// The force's shares in the regressors of θκ, θκ² and θ²κ, which have the same noise.
@@ -173,11 +175,11 @@ pub(super) struct Row {
 
 impl Row {
     /// A row whose regressors are known.
-    pub(super) fn white(regressors: Regressors, response: f64, spread: f64) -> Self {
+    pub(super) fn white(regressors: Regressors, response: f64, innovation_variance: f64) -> Self {
         Self {
             regressors,
             response,
-            spread,
+            innovation_variance,
             force_noise: 0.0,
             bend: [0.0; 3],
             common_noise: Regressors::zeros(),
@@ -222,7 +224,7 @@ impl Default for Channel {
 }
 
 impl Channel {
-    /// Adds a row; its `spread` is that of the response alone.
+    /// Adds a row; its `innovation_variance` is that of the response alone.
     pub(super) fn add(&mut self, row: &Row) {
         self.count += 1.0;
         self.square += row.regressors * row.regressors.transpose();
@@ -231,7 +233,7 @@ impl Channel {
         let shares = SVector::from([1.0, row.bend[0], row.bend[1], row.bend[2]]);
         self.force_noise += shares * shares.transpose() * row.force_noise;
         self.common_noise += row.common_noise;
-        self.response_noise += row.spread;
+        self.response_noise += row.innovation_variance;
         self.rate_noise += row.rate_noise;
     }
 
@@ -242,15 +244,15 @@ impl Channel {
         self.neighbours += (product + product.transpose()) * covariance;
     }
 
-    /// Adds a row in units of its own spread, which holds the force's noise at this θ.
+    /// Adds a row in units of its own innovation variance, which holds the force's noise at this θ.
     pub(super) fn add_standardised(&mut self, row: &Row, theta: f64) {
-        let force_noise = row.force_noise / row.spread;
-        let scale = row.spread.sqrt().recip();
+        let force_noise = row.force_noise / row.innovation_variance;
+        let scale = row.innovation_variance.sqrt().recip();
         self.add(&Row {
             common_noise: row.common_noise * (scale * scale),
             regressors: row.regressors * scale,
             response: row.response * scale,
-            spread: (1.0 - theta * theta * force_noise).max(0.1),
+            innovation_variance: (1.0 - theta * theta * force_noise).max(0.1),
             force_noise,
             bend: row.bend,
             ramp_noise: 0.0,
@@ -273,7 +275,7 @@ impl Channel {
     }
 
     /// `s²` at a θ.
-    pub(super) fn spread(&self, theta: f64) -> f64 {
+    pub(super) fn innovation_variance(&self, theta: f64) -> f64 {
         self.response_noise / self.count + theta * theta * self.force_variance()
     }
 

@@ -9,9 +9,10 @@ use super::sums::Sums;
 /// Additive statistics of one segment. `Λ = 1/σ²` of segments add up, and so do `Λθ`.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct SegmentStatistics {
-    /// Information on θ, Λ = 1/σ²; 0 when there is none. It holds the offsets' deviation and the
-    /// tyres', but not the robot's common error: for who sums up segments and knows nothing of
-    /// common errors. Where the tyres are not known, later segments of one ground say next to nothing.
+    /// Information on θ, Λ = 1/σ²; 0 when there is none. It holds the offsets' standard deviation
+    /// and the tyres', but not the robot's common error: for who sums up segments and knows nothing
+    /// of common errors. Where the tyres are not known, later segments of one ground say next to
+    /// nothing.
     pub theta_information: f64,
     /// Λθ.
     pub theta_weighted: f64,

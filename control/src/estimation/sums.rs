@@ -7,7 +7,7 @@ use super::rows::{Channel, Row, index};
 
 /// Blocks of straight driving for a rolling resistance.
 const RESISTANCE_BLOCKS_MIN: f64 = 10.0;
-/// Relative deviation above which an effective track is not told.
+/// Relative standard deviation above which an effective track is not told.
 const TRACK_STD_DEV_MAX: f64 = 0.1;
 
 /// Additive sums.
@@ -22,8 +22,8 @@ pub(super) struct Sums {
     mean: Channel,
     /// Moment balance, on measured accelerations.
     turning: Channel,
-    /// Innovations of the speed ahead, in units of their own deviation.
-    along: Channel,
+    /// Innovations of the forward speed, in units of their own standard deviation.
+    longitudinal: Channel,
     signal: f64,
     signal_2: f64,
     fast_blocks: f64,
@@ -65,7 +65,7 @@ impl Sums {
         self.blocks += 1;
         self.duration_s += block.duration_s;
         self.slip_square += block.slip * block.slip;
-        self.note_signal(&row, row.spread);
+        self.note_signal(&row, row.innovation_variance);
         if block.force.is_some() {
             self.difference.add(&row);
             if let Some(row) = block.mean_row() {
@@ -86,14 +86,14 @@ impl Sums {
         self.turning.note_neighbour(row, before);
     }
 
-    /// Adds an innovation of the speed ahead, weighed at this θ.
+    /// Adds an innovation of the forward speed, weighed at this θ.
     pub(super) fn add_along(&mut self, row: &Row, theta: f64) {
-        self.along.add_standardised(row, theta);
-        self.note_signal(row, row.spread);
+        self.longitudinal.add_standardised(row, theta);
+        self.note_signal(row, row.innovation_variance);
     }
 
-    fn note_signal(&mut self, row: &Row, spread: f64) {
-        let signal = row.regressors[index::THETA].powi(2) / spread;
+    fn note_signal(&mut self, row: &Row, innovation_variance: f64) {
+        let signal = row.regressors[index::THETA].powi(2) / innovation_variance;
         self.signal += signal;
         self.signal_2 += signal * signal;
     }
@@ -106,7 +106,7 @@ impl Sums {
             difference: self.difference.plus(&other.difference),
             mean: self.mean.plus(&other.mean),
             turning: self.turning.plus(&other.turning),
-            along: self.along.plus(&other.along),
+            longitudinal: self.longitudinal.plus(&other.longitudinal),
             signal: self.signal + other.signal,
             signal_2: self.signal_2 + other.signal_2,
             fast_blocks: self.fast_blocks + other.fast_blocks,
@@ -129,7 +129,12 @@ impl Sums {
 
     /// All kinds of rows.
     pub(super) fn channels(&self) -> [&Channel; 4] {
-        [&self.difference, &self.mean, &self.turning, &self.along]
+        [
+            &self.difference,
+            &self.mean,
+            &self.turning,
+            &self.longitudinal,
+        ]
     }
 
     /// Root of the mean square of the blocks' slip.
@@ -166,8 +171,8 @@ impl Sums {
         }
     }
 
-    /// Rolling resistance over load. Its deviation holds the offset that the accelerometer may
-    /// have, `offset_mu` over gravity, which no number of blocks takes out.
+    /// Rolling resistance over load. Its standard deviation holds the offset that the accelerometer
+    /// may have, `offset_mu` over gravity, which no number of blocks takes out.
     pub(super) fn rolling_resistance(&self, offset_mu: f64) -> Option<ValueWithDeviation> {
         (self.resistance_count >= RESISTANCE_BLOCKS_MIN).then(|| ValueWithDeviation {
             value: self.resistance / self.resistance_count,

@@ -59,10 +59,10 @@ pub struct TyrePrior {
     /// Its standard deviation, per friction coefficient. It cannot be learned from turns of one
     /// radius: where it is above zero, intervals are as wide as it makes them.
     pub curvature_std_dev: f64,
-    /// Largest friction coefficient at which the rise is as above, somewhat less than the least peak
-    /// that the tyres may have; none if only slip limits it.
+    /// Largest friction coefficient at which the rise is as above, somewhat less than the least
+    /// peak that the tyres may have; none if only slip limits it.
     pub mu_max: Option<f64>,
-    /// Mean of the contacts' relaxation length, metres: the way over which force follows slip.
+    /// Mean of the contacts' relaxation length, metres: the distance over which force follows slip.
     #[serde(default)]
     pub relaxation_m: f64,
     /// Its standard deviation, metres.
@@ -74,8 +74,8 @@ pub struct TyrePrior {
     /// Its standard deviation.
     #[serde(default)]
     pub rotor_std_dev_ratio: f64,
-    /// Error of θ, as a share, where nearly all of the residuals is what rows do not know. Where it is
-    /// 0 the model counts as exact, and residuals beyond the noise as more noise.
+    /// Error of θ, as a share, where nearly all of the residuals is what rows do not know. Where it
+    /// is 0 the model counts as exact, and residuals beyond the noise as more noise.
     #[serde(default)]
     pub unexplained_ratio: f64,
 }
@@ -223,8 +223,8 @@ pub struct SensorSample {
 /// Standard deviations of the errors of θ that no drive of a robot on one ground averages out.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct CommonError {
-    /// Of what is the robot's: mass, yaw inertia, torque constants, and of a segment what is left unknown
-    /// of radii and sensor offsets. One error of all that it measures.
+    /// Of what is the robot's: mass, yaw inertia, torque constants, and of a segment what is left
+    /// unknown of radii and sensor offsets. One error of all that it measures.
     pub robot: f64,
     /// Of the tyres' curvature. One error of all robots on these tyres, where they slip alike.
     pub tyres: f64,
@@ -267,9 +267,9 @@ pub struct Estimate {
     pub effective_track_ratio: Option<f64>,
     /// Rolling resistance over load; none before enough straight driving with torque.
     pub rolling_resistance_ratio: Option<f64>,
-    /// Mean share by which the nominal rolling radii are too large, and its deviation.
+    /// Mean share by which the nominal rolling radii are too large, and its standard deviation.
     pub radius_offset: ValueWithDeviation,
-    /// Right minus left of the same, and its deviation.
+    /// Right minus left of the same, and its standard deviation.
     pub radius_difference: ValueWithDeviation,
     /// Share of blocks beyond the linear range of slip, of those driven fast enough.
     pub saturation_share: f64,

@@ -24,11 +24,11 @@ pub(super) const MOMENTS: usize = 10;
 /// What a swing is at one moment, about the means of its window.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Moment {
-    /// Right minus left slip ahead.
+    /// Right minus left longitudinal slip.
     pub(super) apart: f64,
     pub(super) turn_rad_s: f64,
     /// Acceleration ahead over gravity.
-    pub(super) ahead_mu: f64,
+    pub(super) longitudinal_mu: f64,
     /// Share of the window; all add up to one.
     pub(super) weight: f64,
 }
@@ -69,12 +69,12 @@ struct Part {
     is_broken: bool,
     slip: f64,
     harmonic: f64,
-    ahead_force: f64,
-    ahead_mu: f64,
+    longitudinal_force: f64,
+    longitudinal_mu: f64,
     turn: f64,
     rim_difference: f64,
     rim_mean: f64,
-    /// Right minus left slip ahead, and its square.
+    /// Right minus left longitudinal slip, and its square.
     apart: [f64; 2],
     /// Sums by the time since the window's start.
     moments: [Moment; MOMENTS],
@@ -94,9 +94,9 @@ pub(super) struct TurnMeans {
     /// `1/s`, metres per second.
     pub(super) harmonic_m_s: f64,
     /// `(a/g) d/s²`, metres per second.
-    pub(super) ahead_force_m_s: f64,
+    pub(super) longitudinal_force_m_s: f64,
     /// `a/g`; in reverse that of the mirrored robot.
-    pub(super) ahead_mu: f64,
+    pub(super) longitudinal_mu: f64,
     pub(super) turn_rad_s: f64,
     pub(super) turn_acceleration_rad_s2: f64,
     /// By how much that rises in the window's time, and the samples of its middle.
@@ -167,8 +167,8 @@ impl TurnWindow {
         Some(TurnMeans {
             slip_m_s: mean(part.slip),
             harmonic_m_s: mean(part.harmonic),
-            ahead_force_m_s: mean(part.ahead_force),
-            ahead_mu: mean(part.ahead_mu),
+            longitudinal_force_m_s: mean(part.longitudinal_force),
+            longitudinal_mu: mean(part.longitudinal_mu),
             turn_rad_s: mean(part.turn),
             turn_acceleration_rad_s2: (rates[1] - rates[0]) / block_s,
             turn_jerk_rad_s3: if part.middle[1] > 0.0 {
@@ -191,7 +191,10 @@ impl TurnWindow {
 impl Part {
     fn swing(&self) -> Swing {
         let [apart, square] = self.apart.map(|sum| sum / self.weight_s);
-        let (turn_rad_s, ahead_mu) = (self.turn / self.weight_s, self.ahead_mu / self.weight_s);
+        let (turn_rad_s, longitudinal_mu) = (
+            self.turn / self.weight_s,
+            self.longitudinal_mu / self.weight_s,
+        );
         Swing {
             moments: self.moments.map(|sum| {
                 if sum.weight <= 0.0 {
@@ -200,7 +203,7 @@ impl Part {
                 Moment {
                     apart: sum.apart / sum.weight - apart,
                     turn_rad_s: sum.turn_rad_s / sum.weight - turn_rad_s,
-                    ahead_mu: sum.ahead_mu / sum.weight - ahead_mu,
+                    longitudinal_mu: sum.longitudinal_mu / sum.weight - longitudinal_mu,
                     weight: sum.weight / self.weight_s,
                 }
             }),
@@ -228,7 +231,7 @@ impl Part {
         let turning_m_s = gap / (half_sum * half_sum);
         let tight = 0.5 * gap / half_sum;
         let arm_m = model.effective_track_m() - track_m * tight * tight;
-        let ahead_m_s2 = rims.sign * acceleration.ahead_m_s2;
+        let forward_m_s2 = rims.sign * acceleration.forward_m_s2;
         let weight_s = share * dt_s;
         if (time_s - 0.5 * (BLOCK_S + RAMP_S)).abs() <= 0.5 * RAMP_S {
             self.middle[0] += sample.gyro_rad_s;
@@ -238,8 +241,8 @@ impl Part {
         self.samples += share;
         self.slip += weight_s * (turning_m_s - sample.gyro_rad_s * arm_m);
         self.harmonic += weight_s / half_sum;
-        self.ahead_force += weight_s * turning_m_s * ahead_m_s2 / GRAVITY_M_S2;
-        self.ahead_mu += weight_s * ahead_m_s2 / GRAVITY_M_S2;
+        self.longitudinal_force += weight_s * turning_m_s * forward_m_s2 / GRAVITY_M_S2;
+        self.longitudinal_mu += weight_s * forward_m_s2 / GRAVITY_M_S2;
         self.turn += weight_s * sample.gyro_rad_s;
         self.rim_difference += weight_s * (rims.right_m_s - rims.left_m_s);
         let apart = (rims.right_m_s - rims.left_m_s - track_m * sample.gyro_rad_s) * half_sum;
@@ -255,7 +258,7 @@ impl Part {
         let moment = &mut self.moments[moment.min(MOMENTS - 1)];
         moment.apart += weight_s * apart;
         moment.turn_rad_s += weight_s * sample.gyro_rad_s;
-        moment.ahead_mu += weight_s * ahead_m_s2 / GRAVITY_M_S2;
+        moment.longitudinal_mu += weight_s * forward_m_s2 / GRAVITY_M_S2;
         moment.weight += weight_s;
         self.rim_mean += weight_s * rims.sign * 0.5 * (rims.right_m_s + rims.left_m_s);
     }

@@ -2,9 +2,9 @@
 //!
 //! The robot is a disc around its centre. *Clearance* is how far a point is inside the allowed
 //! ground: into one of the `keep_in` polygons (the deepest, if there are several) and away from
-//! every `keep_out` polygon. It changes by no more than the way between two points, so a path can
-//! be walked in steps as long as the clearance of the last one : a few
-//! looks answer exactly how far the robot may go along its arc, whatever the fence looks like.
+//! every `keep_out` polygon. It changes by no more than the distance between two points, so a path
+//! can be walked in steps as long as the clearance of the last one : a few looks answer exactly how
+//! far the robot may go along its arc, whatever the fence looks like.
 //!
 //! [`speed`] caps the speed so that it still stops within that way. Nothing here allocates after
 //! [`Fence::new`].
@@ -18,12 +18,12 @@ use crate::robot::RobotModel;
 use ring::Ring;
 pub use speed::{
     FenceInput, FenceVerdict, MARGIN_STD_DEVS, MU_UNKNOWN, REACTION_S, RETURN_MAX_M_S,
-    speed_within_m_s, stopping_way_m, sure_braking_m_s2,
+    speed_within_m_s, stopping_distance_m, sure_braking_m_s2,
 };
 
 /// Distance kept from a fence beyond the robot's own radius, metres.
 pub const MARGIN_M: f64 = 0.10;
-/// Shortest step along a planned way, metres.
+/// Shortest step along a planned path, metres.
 const BREACH_STEP_M: f64 = 0.02;
 
 /// Polygons within which, and out of which, a robot must keep.
@@ -36,7 +36,7 @@ pub struct Fence {
 /// Where something leaves the allowed ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Breach {
-    /// Way from the start to there, metres.
+    /// Distance from the start to there, metres.
     pub arc_m: f64,
     /// The centre of the robot there.
     pub point: Point,
@@ -150,7 +150,7 @@ impl Fence {
         self.first_breach(point_at, plan.length_m(), radius_m)
     }
 
-    /// The first place along a way at which a disc leaves the allowed ground.
+    /// The first place along a path at which a disc leaves the allowed ground.
     pub fn first_breach(
         &self,
         point_at: impl Fn(f64) -> Point,
@@ -175,7 +175,7 @@ impl Fence {
             if arc_m >= length_m {
                 return None;
             }
-            // Clearance cannot be used up before so much more of the way.
+            // Clearance cannot be used up before so much more of the path.
             arc_m = (arc_m + (-depth_m).max(BREACH_STEP_M)).min(length_m);
         }
     }

@@ -1,8 +1,8 @@
 //! The speed that keeps a robot inside its fence.
 //!
-//! It is the fastest from which the robot still stops within its free way, `v t + v²/2a = way`, with
-//! the time `t` until it brakes and the braking `a` that the ground's lower bound of friction surely gives.
-//! Outside already, only motion that gains clearance is let through, slowly.
+//! It is the fastest from which the robot still stops within its free distance `d`, `v t + v²/2a =
+//! d`, with the time `t` until it brakes and the braking `a` that the ground's lower bound of
+//! friction surely gives. Outside already, only motion that gains clearance is let through, slowly.
 
 use super::{Fence, MARGIN_M, disc_radius_m};
 use crate::geometry::{Pose, Twist};
@@ -60,28 +60,28 @@ pub fn sure_braking_m_s2(model: &RobotModel, mu_lower: Option<f64>) -> f64 {
         .min(0.5 * mu * GRAVITY_M_S2)
 }
 
-/// Way from a decision to standstill, metres.
-pub fn stopping_way_m(speed_m_s: f64, braking_m_s2: f64) -> f64 {
+/// Distance from a decision to standstill, metres.
+pub fn stopping_distance_m(speed_m_s: f64, braking_m_s2: f64) -> f64 {
     let speed_m_s = speed_m_s.abs();
     speed_m_s * REACTION_S + speed_m_s * speed_m_s / (2.0 * braking_m_s2)
 }
 
-/// Fastest speed with which the robot stops within a way, metres per second.
-pub fn speed_within_m_s(way_m: f64, braking_m_s2: f64) -> f64 {
+/// Fastest speed with which the robot stops within a distance, metres per second.
+pub fn speed_within_m_s(distance_m: f64, braking_m_s2: f64) -> f64 {
     let delay_m_s = braking_m_s2 * REACTION_S;
-    (delay_m_s * delay_m_s + 2.0 * braking_m_s2 * way_m.max(0.0)).sqrt() - delay_m_s
+    (delay_m_s * delay_m_s + 2.0 * braking_m_s2 * distance_m.max(0.0)).sqrt() - delay_m_s
 }
 
-/// The pose after a way along an arc; a negative way goes backwards.
-pub(super) fn along_arc(pose: Pose, curvature_1_m: f64, way_m: f64) -> Pose {
-    let turn_rad = curvature_1_m * way_m;
+/// The pose after a distance along an arc; a negative one goes backwards.
+pub(super) fn along_arc(pose: Pose, curvature_1_m: f64, distance_m: f64) -> Pose {
+    let turn_rad = curvature_1_m * distance_m;
     let middle_rad = pose.heading_rad + 0.5 * turn_rad;
     // The chord of the arc: sin(x)/x of half the turn.
     let half_rad = 0.5 * turn_rad;
     let chord_m = if half_rad.abs() < 1.0e-6 {
-        way_m
+        distance_m
     } else {
-        way_m * half_rad.sin() / half_rad
+        distance_m * half_rad.sin() / half_rad
     };
     Pose {
         x_m: pose.x_m + chord_m * middle_rad.cos(),
@@ -92,25 +92,25 @@ pub(super) fn along_arc(pose: Pose, curvature_1_m: f64, way_m: f64) -> Pose {
 
 impl Fence {
     /// How far a disc may go along its arc, metres, at most `most_m`; 0 outside.
-    fn free_way_m(&self, pose: Pose, twist: Twist, radius_m: f64, most_m: f64) -> f64 {
+    fn free_distance_m(&self, pose: Pose, twist: Twist, radius_m: f64, most_m: f64) -> f64 {
         if twist.linear_m_s.abs() < 1.0e-6 {
             return most_m;
         }
         let curvature_1_m = twist.angular_rad_s / twist.linear_m_s;
         let direction = twist.linear_m_s.signum();
-        let mut way_m = 0.0;
+        let mut distance_m = 0.0;
         for _ in 0..STEPS_MAX {
-            let at = along_arc(pose, curvature_1_m, direction * way_m);
+            let at = along_arc(pose, curvature_1_m, direction * distance_m);
             let clearance_m = self.clearance_m(at.point()) - radius_m;
             if clearance_m < STEP_MIN_M {
-                return way_m;
+                return distance_m;
             }
-            way_m += clearance_m;
-            if way_m >= most_m {
+            distance_m += clearance_m;
+            if distance_m >= most_m {
                 return most_m;
             }
         }
-        way_m
+        distance_m
     }
 
     /// Whether motion from outside leads back in.
@@ -166,7 +166,7 @@ impl Fence {
             .abs()
             .max(input.wanted.linear_m_s.abs());
         // A little more than is needed, so that the cap does not flicker at its own edge.
-        let reach_m = 1.2 * stopping_way_m(fastest_m_s, braking_m_s2);
+        let reach_m = 1.2 * stopping_distance_m(fastest_m_s, braking_m_s2);
         if clearance_m >= reach_m {
             return FenceVerdict {
                 clearance_m,
@@ -175,7 +175,7 @@ impl Fence {
         }
         let free_m = [input.present, input.wanted]
             .into_iter()
-            .map(|twist| self.free_way_m(input.pose, twist, radius_m, reach_m))
+            .map(|twist| self.free_distance_m(input.pose, twist, radius_m, reach_m))
             .fold(reach_m, f64::min);
         if free_m >= reach_m {
             return FenceVerdict {

@@ -119,7 +119,7 @@ pub struct Reasons {
     /// Fastest speed of a robot whose sensors contradict each other, metres per second.
     pub sensors_max_m_s: Option<f64>,
     /// How fast the robot really goes along its path, metres per second, if that is known. On the
-    /// way to rest its wheels do not pull it on to a speed that it does not have yet.
+    /// stop its wheels do not pull it on to a speed that it does not have yet.
     pub real_m_s: Option<f64>,
 }
 
@@ -171,7 +171,7 @@ pub struct GateLimits {
     pub wheel_speed_max_rad_s: f64,
     /// Fastest change of a wheel's speed, radians per second squared.
     pub wheel_acceleration_max_rad_s2: f64,
-    /// Fastest slowing down of the robot's centre on the way to rest, as a wheel's, radians per
+    /// Fastest slowing down of the robot's centre on the stop, as a wheel's, radians per
     /// second squared.
     pub wheel_braking_max_rad_s2: f64,
     /// Oldest feedback of the base that is trusted, seconds.
@@ -298,12 +298,12 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
     }
     let mut is_capped = false;
     if let Some((most_m_s, capped_by)) = reasons.cap() {
-        let ahead_m_s =
+        let forward_m_s =
             0.5 * limits.wheel_radius_m * (target.left_rad_s + target.right_rad_s).abs();
-        if ahead_m_s > most_m_s {
+        if forward_m_s > most_m_s {
             note(capped_by);
             is_capped = true;
-            target = scaled(target, most_m_s / ahead_m_s);
+            target = scaled(target, most_m_s / forward_m_s);
         }
     }
     if input.feedback_age_s > LATE_SHARE * limits.feedback_age_max_s {
@@ -334,7 +334,7 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
     }
 }
 
-/// The share of both sides' speeds that a tick takes away on the way to rest.
+/// The share of both sides' speeds that a tick takes away on the stop.
 ///
 /// The centre slows down at the braking limit, also in a turn, where one side must slow down faster
 /// for it: by twice the limit at the most.
@@ -361,8 +361,8 @@ fn slip_share(previous: WheelSpeeds, real_m_s: Option<f64>, radius_m: f64, up: f
     if centre_m_s.abs() < SLIP_LEAST_M_S {
         return 0.0;
     }
-    let ahead = 1.0 - (real_m_s / centre_m_s).max(0.0);
-    ahead
+    let forward = 1.0 - (real_m_s / centre_m_s).max(0.0);
+    forward
         .min(up / previous.magnitude_max_rad_s())
         .clamp(0.0, 1.0)
 }
@@ -385,8 +385,8 @@ fn scaled(speeds: WheelSpeeds, share: f64) -> WheelSpeeds {
 /// From `previous` towards `target` as far as `dt_s` allows.
 ///
 /// While the command stands, it speeds up within the limits of the twist and slows down as the
-/// wheels may; where a cap cuts, the braking ramp holds along the path. Rest is met by both sides at
-/// once, so that the robot stays on its arc.
+/// wheels may; where a cap cuts, the braking ramp holds along the path. Rest is met by both sides
+/// at once, so that the robot stays on its arc.
 fn ramped(
     previous: WheelSpeeds,
     target: WheelSpeeds,

@@ -57,7 +57,7 @@ fn caps_of(reasons: &Reasons) -> impl Iterator<Item = (f64, GateCause)> + use<> 
     })
 }
 
-/// Whether neither the speed ahead nor the turn rate is beyond both what was wanted and what was
+/// Whether neither the forward speed nor the turn rate is beyond both what was wanted and what was
 /// commanded before.
 fn is_within(got: WheelSpeeds, before: WheelSpeeds, wanted: WheelSpeeds) -> bool {
     let model = RobotModel::yi2007();

@@ -48,7 +48,7 @@ impl CircleTarget {
 
     fn derivatives(&self, place_rad: f64) -> Derivatives {
         let (sin, cos) = place_rad.sin_cos();
-        let ahead = Point {
+        let forward = Point {
             x_m: -self.sign * sin,
             y_m: self.sign * cos,
         };
@@ -66,9 +66,9 @@ impl CircleTarget {
                 x_m: self.center.x_m + self.radius_m * cos,
                 y_m: self.center.y_m + self.radius_m * sin,
             },
-            ahead,
+            forward,
             scaled(inward, bend),
-            scaled(ahead, -bend * bend),
+            scaled(forward, -bend * bend),
             scaled(inward, -bend * bend * bend),
         ]
     }
@@ -131,24 +131,24 @@ pub(crate) fn join(
         best = Some((time_s, vec![leg]));
     }
     let pace = end[1].x_m.hypot(end[1].y_m);
-    let ahead = Point {
+    let forward = Point {
         x_m: end[1].x_m / pace,
         y_m: end[1].y_m / pace,
     };
     for run_in_m in RUN_INS_M {
         let behind = Point {
-            x_m: end[0].x_m - run_in_m * ahead.x_m,
-            y_m: end[0].y_m - run_in_m * ahead.y_m,
+            x_m: end[0].x_m - run_in_m * forward.x_m,
+            y_m: end[0].y_m - run_in_m * forward.y_m,
         };
         let still = Point::default();
         let bound_s = best.as_ref().map_or(bound_s, |(best_s, _)| *best_s);
-        let Some(last) = leg(behind, ahead.y_m.atan2(ahead.x_m), end, run_in_m, 1.0) else {
+        let Some(last) = leg(behind, forward.y_m.atan2(forward.x_m), end, run_in_m, 1.0) else {
             continue;
         };
         let Some(last_s) = timing.of_leg_s(&last, false, bound_s) else {
             continue;
         };
-        let entry = [behind, ahead, still, still, still];
+        let entry = [behind, forward, still, still, still];
         let before = LegTime {
             // Where the second curve counts, the first does to its end.
             ring: timing.ring.filter(|_| last_s <= 0.0),
@@ -230,9 +230,9 @@ fn leg(
     let (sin, cos) = heading_rad.sin_cos();
     let pace = end[1].x_m.hypot(end[1].y_m);
     let still = Point::default();
-    let ahead = Point {
+    let forward = Point {
         x_m: start_pace * pace * cos,
         y_m: start_pace * pace * sin,
     };
-    Polynomial::nonic(&[start, ahead, still, still, still], end, length_m / pace)
+    Polynomial::nonic(&[start, forward, still, still, still], end, length_m / pace)
 }

@@ -7,8 +7,8 @@ use super::{Path, PathError, Piece, Polynomial};
 use crate::geometry::{Pose, wrap_angle_rad};
 use crate::robot::RobotModel;
 
-/// A robot this near to the first waypoint may start beside it when no smooth way leads through it,
-/// metres.
+/// A robot this near to the first waypoint may start beside it when no smooth path leads through
+/// it, metres.
 const BESIDE_START_M: f64 = 0.25;
 /// The path follows the robot's heading when it would leave within this angle of it, radians.
 const HEADING_KEPT_RAD: f64 = 0.6;
@@ -70,7 +70,7 @@ pub(crate) fn from_here(
         }
         (Ok((path, _)), Err(_)) | (Err(_), Ok((path, _))) => Ok(path),
         (Err(error), Err(_)) => {
-            // Beside the first waypoint, where no smooth way leads through it: it counts as met.
+            // Beside the first waypoint, where no smooth path leads through it: it counts as met.
             if knots.len() < 3 || knots[0].point.distance_m(knots[1].point) > BESIDE_START_M {
                 return Err(error);
             }

@@ -58,7 +58,7 @@ pub enum PlanError {
     /// The path would turn tighter than [`RADIUS_MIN_M`].
     #[error("the path turns too sharply near waypoint {place}")]
     TooTight {
-        /// Index of the waypoint at the start of the sharp piece; 0 on the way to a circle.
+        /// Index of the waypoint at the start of the sharp piece; 0 on the approach to a circle.
         place: usize,
     },
     /// The path is longer than [`LENGTH_MAX_M`].

@@ -38,7 +38,7 @@ impl Shares {
         angular_acceleration: None,
     };
 
-    /// Those of the way to the trajectory, or of the trajectory itself.
+    /// Those of the approach to the trajectory, or of the trajectory itself.
     pub(super) fn on(is_approach: bool) -> &'static Self {
         if is_approach {
             &Self::APPROACH
@@ -77,8 +77,8 @@ pub(super) fn with_excitation(
 /// What bounds the accelerations: the robot's own limits, or what the ground gives.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Blame {
-    pub(super) along: SlowedBy,
-    pub(super) across: SlowedBy,
+    pub(super) longitudinal: SlowedBy,
+    pub(super) lateral: SlowedBy,
 }
 
 impl Blame {
@@ -89,7 +89,7 @@ impl Blame {
             traction_limit_mu.is_some_and(|mu| at_m_s2(mu) <= limit_m_s2)
         };
         Self {
-            along: if gives(
+            longitudinal: if gives(
                 RobotModel::longitudinal_traction_m_s2,
                 limits.linear_acceleration_max_m_s2,
             ) {
@@ -97,7 +97,7 @@ impl Blame {
             } else {
                 SlowedBy::LinearAcceleration
             },
-            across: if gives(
+            lateral: if gives(
                 RobotModel::lateral_traction_m_s2,
                 limits.lateral_acceleration_max_m_s2,
             ) {
@@ -115,7 +115,7 @@ pub(super) struct NodeBounds {
     pub(super) limits: NodeLimits,
     pub(super) by: Option<SlowedBy>,
     /// What bounds the acceleration along the path.
-    pub(super) along: SlowedBy,
+    pub(super) longitudinal: SlowedBy,
 }
 
 impl NodeBounds {
@@ -128,10 +128,10 @@ impl NodeBounds {
             } else {
                 self.by
             },
-            along: if other.limits.acceleration_m_s2 < self.limits.acceleration_m_s2 {
-                other.along
+            longitudinal: if other.limits.acceleration_m_s2 < self.limits.acceleration_m_s2 {
+                other.longitudinal
             } else {
-                self.along
+                self.longitudinal
             },
         }
     }
@@ -161,7 +161,7 @@ pub(super) fn node_limits(
     let floor = f64::MIN_POSITIVE;
     let bounds_m_s = [
         (
-            blame.across,
+            blame.lateral,
             (limits.lateral_acceleration_max_m_s2 / bend.max(floor)).sqrt(),
         ),
         (
@@ -195,6 +195,6 @@ pub(super) fn node_limits(
                 .min(yaw_left_rad_s2 / bend.max(floor)),
         },
         by: slowed_by,
-        along: blame.along,
+        longitudinal: blame.longitudinal,
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! A circle is joined tangentially by the quickest of many smooth legs; a robot that stands on it
 //! starts there. Waypoints are joined by making the robot's place the first point of the spline;
-//! a robot that stands on the first waypoint, or beside it with no smooth way through it, starts
+//! a robot that stands on the first waypoint, or beside it with no smooth path through it, starts
 //! from there. Where the path leaves in another
 //! direction than the robot points, [`Plan::start_heading_rad`] tells where to turn on the spot.
 
@@ -55,7 +55,8 @@ const GRID_MIN: usize = 16;
 /// What a plan may do beside its trajectory; nothing by default.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PlanOptions<'map> {
-    /// Speed on the way to the trajectory, metres per second; the trajectory's own when absent.
+    /// Speed on the approach to the trajectory, metres per second; the trajectory's own when
+    /// absent.
     pub approach_speed_m_s: Option<f64>,
     /// A variation of the speed (excitation), so that θ can be measured without torque.
     pub excitation: Option<ExcitationSpec>,
@@ -386,8 +387,8 @@ impl Plan {
             Some(spec) => Some(with_excitation(spec, &mut nodes, &mut jerk_m_s3)?),
             None => None,
         };
-        // On unknown ground the way to the trajectory is bounded by a cautious traction limit already, and
-        // needs no more room before and after a bend than the mean takes.
+        // On unknown ground the approach to the trajectory is bounded by a cautious traction limit
+        // already, and needs no more room before and after a bend than the mean takes.
         let brisk = match options.least_traction_limit_mu() {
             Some(_) => 0,
             None => (approach_end_m / cell_m).ceil() as usize,
@@ -424,8 +425,8 @@ impl Plan {
                 left_m_s: nodes[node].speed_m_s,
                 by: bounds[node].by,
             };
-            plan.stretches
-                .note(timing.arc_m, timing.speed_m_s, &cell, bounds[node].along);
+            let by = bounds[node].longitudinal;
+            (plan.stretches).note(timing.arc_m, timing.speed_m_s, &cell, by);
         }
         Ok(plan)
     }
@@ -471,7 +472,7 @@ impl Plan {
         self.path.length_m()
     }
 
-    /// Length of the way to the circle or the first waypoint, metres.
+    /// Length of the approach to the circle or the first waypoint, metres.
     pub fn approach_length_m(&self) -> f64 {
         self.approach_length_m
     }
@@ -529,7 +530,7 @@ fn check_coordinate(what: &'static str, place: usize, point: Point) -> Result<()
     Ok(())
 }
 
-/// What the robot may do on its way to the trajectory.
+/// What the robot may do on its approach to the trajectory.
 fn on_approach(model: &RobotModel, options: &PlanOptions<'_>) -> RobotModel {
     match options.least_traction_limit_mu() {
         // The model has been bounded already.

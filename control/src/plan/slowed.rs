@@ -59,12 +59,18 @@ pub(super) struct Stretches {
 impl Stretches {
     /// Takes the planned speed at one place. `along` is the limit to blame where the robot has yet
     /// to reach, or already leaves, the speed that the place itself would allow.
-    pub(super) fn note(&mut self, arc_m: f64, speed_m_s: f64, cell: &CellBounds, along: SlowedBy) {
+    pub(super) fn note(
+        &mut self,
+        arc_m: f64,
+        speed_m_s: f64,
+        cell: &CellBounds,
+        longitudinal: SlowedBy,
+    ) {
         if speed_m_s >= AS_ASKED * cell.asked_m_s {
             return;
         }
         let is_near = speed_m_s >= AS_ASKED * AS_ASKED * cell.left_m_s;
-        let by = cell.by.filter(|_| is_near).unwrap_or(along);
+        let by = cell.by.filter(|_| is_near).unwrap_or(longitudinal);
         let reach_m = STRETCH_GAP_M + STRETCH_GAP_S * speed_m_s;
         let has_room = self.slowed.len() < SLOWED_MAX;
         match self.slowed.last_mut() {

@@ -1,4 +1,4 @@
-//! Friction of the ground along a way, by place.
+//! Friction of the ground along a path, by place.
 
 use crate::geometry::Point;
 

@@ -12,7 +12,7 @@ pub struct CrossGains {
     pub cross_1_m2: f64,
     /// Heading gain `k_θ`, per metre.
     pub heading_1_m: f64,
-    /// Integral gain `k_I` on the cross-track error over the way driven, per metre cubed.
+    /// Integral gain `k_I` on the cross-track error over the distance driven, per metre cubed.
     pub integral_1_m3: f64,
     /// Gain from the gap between the wanted and the measured turn rate to the command; below 1, so
     /// that no lag or delay of the base can make this inner loop unstable.
@@ -36,7 +36,7 @@ impl CrossGains {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackerConfig {
     /// Along-track gain `k_x`, per second.
-    pub along_gain_1_s: f64,
+    pub along_track_gain_1_s: f64,
     /// Gains across the path while the pose is quiet.
     pub quiet: CrossGains,
     /// Gains across the path while the pose is noisy.
@@ -49,7 +49,8 @@ pub struct TrackerConfig {
     pub servo_lag_s: f64,
     /// Adaptation gain ρ.
     pub adaptation_gain: f64,
-    /// Friction curve, for the loss beyond its peak; of this curve only the shape counts, never the stiffness.
+    /// Friction curve, for the loss beyond its peak; of this curve only the shape counts, never the
+    /// stiffness.
     pub friction_curve: FrictionCurve,
     /// Adaptation gain of the share of that loss which shows.
     pub beyond_gain: f64,
@@ -66,7 +67,7 @@ pub struct TrackerConfig {
 impl Default for TrackerConfig {
     fn default() -> Self {
         Self {
-            along_gain_1_s: 3.0,
+            along_track_gain_1_s: 3.0,
             quiet: CrossGains {
                 cross_1_m2: 20.0,
                 heading_1_m: 8.0,
@@ -110,7 +111,7 @@ impl TrackerConfig {
     /// Refuses gains that are out of range by name.
     pub(super) fn check(&self) -> Result<(), TrackerError> {
         let positive = [
-            ("along_gain_1_s", self.along_gain_1_s),
+            ("along_track_gain_1_s", self.along_track_gain_1_s),
             ("quiet.cross_1_m2", self.quiet.cross_1_m2),
             ("quiet.heading_1_m", self.quiet.heading_1_m),
             ("noisy.cross_1_m2", self.noisy.cross_1_m2),

@@ -1,4 +1,4 @@
-//! What the law is told about the ground.
+//! What the law is given about the ground.
 
 /// How many standard deviations apart two words contradict each other.
 const CONTRADICTION: f64 = 3.0;
@@ -19,7 +19,7 @@ impl ThetaKnowledge {
         apart > CONTRADICTION * self.std_dev.hypot(other.std_dev)
     }
 
-    /// How much of it to believe, 0 to 1: falls with the relative deviation.
+    /// How much of it to believe, 0 to 1: falls with the relative standard deviation.
     pub fn confidence(&self) -> f64 {
         let relative = self.std_dev / self.theta;
         if self.theta > 0.0 && relative.is_finite() && relative >= 0.0 {
@@ -29,13 +29,13 @@ impl ThetaKnowledge {
         }
     }
 
-    /// Two independent words on the same ground, weighed by their deviations; one that is not
-    /// usable is left out.
+    /// Two independent words on the same ground, weighed by their standard deviations; one that is
+    /// not usable is left out.
     #[must_use]
     pub fn fused(self, other: Self) -> Self {
         let weight = |known: &Self| {
             if known.confidence() > 0.0 {
-                // A deviation of zero would silence the other word for good.
+                // A standard deviation of zero would silence the other word for good.
                 known.std_dev.max(1.0e-3 * known.theta).powi(-2)
             } else {
                 0.0

@@ -7,21 +7,23 @@
 //! adaptation (26) of the paper, on a law that never inverts a measured velocity: it is regular at
 //! standstill.
 //!
-//! In tight bends wheels slip beyond the peak of their friction curve, whatever the speed, and the sideslip
-//! is several times as large. The turn is therefore computed with the four-wheel sum itself, in its
-//! linear range and with the loss beyond the peak of [`TrackerConfig::friction_curve`]; a share χ̂ of that
-//! loss is believed, adapted like θ̂, so that tyres of another shape are found out.
+//! In tight bends wheels slip beyond the peak of their friction curve, whatever the speed, and the
+//! sideslip is several times as large. The turn is therefore computed with the four-wheel sum
+//! itself, in its linear range and with the loss beyond the peak of
+//! [`TrackerConfig::friction_curve`]; a share χ̂ of that loss is believed, adapted like θ̂, so that
+//! tyres of another shape are found out.
 //!
 //! The command is the reference's motion, corrected by the errors (Kanayama's form, with integral
-//! action over the way driven), plus feed-forward with θ̂: the sideslip, the rims that the turn
-//! needs, lead for the wheel servo and half a sample, and lead for slip relaxation, `vθ/g` along
-//! and `(vθ/g)·4 I_G/(m(W² + L²))` in yaw. An inner loop on the measured turn rate, of gain below
-//! one, keeps margin where slip is slow. Gains follow the noise of the pose.
+//! action over the distance driven), plus feed-forward with θ̂: the sideslip, the rims that the
+//! turn needs, lead for the wheel servo and half a sample, and lead for slip relaxation, `vθ/g`
+//! along and `(vθ/g)·4 I_G/(m(W² + L²))` in yaw. An inner loop on the measured turn rate, of gain
+//! below one, keeps margin where slip is slow. Gains follow the noise of the pose.
 //!
 //! θ̂ starts at zero: no knowledge, no sideslip. A known θ pulls it, by the confidence in it. χ̂
-//! starts at one, and goes back to it when a known θ contradicts the one before. Both are bounded in
-//! range and rate, and held while the wheels saturate, something outside cuts the command, or the
-//! pose is stale. They serve this loop only; what the map gets comes from [`crate::estimation`].
+//! starts at one, and goes back to it when a known θ contradicts the one before. Both are bounded
+//! in range and rate, and held while the wheels saturate, something outside cuts the command, or
+//! the pose is stale. They serve this loop only; what the map gets comes from
+//! [`crate::estimation`].
 
 mod config;
 mod knowledge;
@@ -48,7 +50,7 @@ const CATCH_UP_MAX_M_S: f64 = 0.06;
 /// Share of the robot's speed limit up to which it may drive faster than that.
 const CATCH_UP_SPEED_SHARE: f64 = 0.5;
 /// Largest error along the path that acts, metres.
-const ALONG_MAX_M: f64 = 0.3;
+const ALONG_TRACK_MAX_M: f64 = 0.3;
 /// Reference speed below which the integral is held, metres per second.
 const INTEGRAL_SPEED_MIN_M_S: f64 = 0.05;
 /// Heading feedback acts as if driving at least this fast, so that it holds at rest too.
@@ -62,7 +64,7 @@ const CARRIED_MAX: Twist = Twist {
     angular_rad_s: 0.3,
 };
 
-/// How much smaller the deviation of a word is that replaces the one χ̂ was adapted under.
+/// How much smaller the standard deviation of a word is that replaces the one χ̂ was adapted under.
 const BETTER_WORD: f64 = 0.5;
 /// Fastest change of the share of the loss beyond the peak that is believed, per second.
 const BEYOND_RATE_MAX_1_S: f64 = 1.0;
@@ -71,9 +73,9 @@ const BEYOND_RATE_MAX_1_S: f64 = 1.0;
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct TrackingErrors {
     /// How far the reference is ahead along its path, metres.
-    pub along_m: f64,
+    pub along_track_m: f64,
     /// How far the reference is to the left of the robot, across its path, metres.
-    pub cross_m: f64,
+    pub cross_track_m: f64,
     /// Reference heading minus the robot's, radians.
     pub heading_rad: f64,
 }
@@ -83,15 +85,15 @@ impl TrackingErrors {
     pub fn between(reference: &ReferenceSample, measured: &Measured) -> Self {
         let robot = reference.pose.body_from_site(measured.pose.point());
         Self {
-            along_m: -robot.x_m,
-            cross_m: -robot.y_m,
+            along_track_m: -robot.x_m,
+            cross_track_m: -robot.y_m,
             heading_rad: wrap_angle_rad(reference.pose.heading_rad - measured.pose.heading_rad),
         }
     }
 
     /// Distance to the reference, metres.
     pub fn distance_m(&self) -> f64 {
-        self.along_m.hypot(self.cross_m)
+        self.along_track_m.hypot(self.cross_track_m)
     }
 }
 
@@ -216,23 +218,25 @@ impl Tracker {
         let sideslip = Sideslip::of(reference, belief, &config.friction_curve, &self.model);
         let mut course = measured.pose;
         course.heading_rad += sideslip.angle_rad;
-        let ahead = course.body_from_site(reference.pose.point());
+        let forward = course.body_from_site(reference.pose.point());
         let heading_rad = wrap_angle_rad(reference.pose.heading_rad - course.heading_rad);
         let catch_up_m_s = (CATCH_UP_SPEED_SHARE * self.model.limits().linear_max_m_s - speed_m_s)
             .max(CATCH_UP_MAX_M_S);
-        let catch_up_m = catch_up_m_s / config.along_gain_1_s;
-        let along_m = ahead.x_m.clamp(-ALONG_MAX_M, catch_up_m.min(ALONG_MAX_M));
+        let catch_up_m = catch_up_m_s / config.along_track_gain_1_s;
+        let along_track_m = forward
+            .x_m
+            .clamp(-ALONG_TRACK_MAX_M, catch_up_m.min(ALONG_TRACK_MAX_M));
         // Bounded so that a far-off robot comes in at a bounded angle instead of spinning.
         let cross_max_m = 0.8 * gains.heading_1_m / gains.cross_1_m2;
-        let cross_m = ahead.y_m.clamp(-cross_max_m, cross_max_m);
+        let cross_track_m = forward.y_m.clamp(-cross_max_m, cross_max_m);
 
         let held = self.was_cut
             || self.held_from_outside
             || measured.pose_age_s > config.pose_age_max_s
             || speed_m_s < INTEGRAL_SPEED_MIN_M_S;
         if !held {
-            self.integrate(gains.integral_1_m3 * cross_m * speed_m_s * dt_s);
-            self.adapt(&sideslip, cross_m, knowledge, dt_s);
+            self.integrate(gains.integral_1_m3 * cross_track_m * speed_m_s * dt_s);
+            self.adapt(&sideslip, cross_track_m, knowledge, dt_s);
         }
 
         let slip_lead_s = speed_m_s * theta / GRAVITY_M_S2;
@@ -241,11 +245,11 @@ impl Tracker {
                 * (self.model.track_width_m().powi(2) + self.model.wheelbase_m().powi(2)));
         let lead_s = config.servo_lag_s + 0.5 * dt_s;
         let linear_m_s = speed_m_s * heading_rad.cos()
-            + config.along_gain_1_s * along_m
+            + config.along_track_gain_1_s * along_track_m
             + (lead_s + slip_lead_s) * reference.acceleration_m_s2
             + sideslip.rims.linear_m_s;
         let wanted_rad_s = reference.turn_rad_s - sideslip.rate_rad_s
-            + speed_m_s * (gains.cross_1_m2 * cross_m + self.integral_1_m)
+            + speed_m_s * (gains.cross_1_m2 * cross_track_m + self.integral_1_m)
             + speed_m_s.max(HEADING_SPEED_MIN_M_S) * gains.heading_1_m * heading_rad.sin();
         let angular_rad_s = wanted_rad_s
             + gains.yaw_rate * (wanted_rad_s - measured.twist.angular_rad_s)
@@ -295,20 +299,20 @@ impl Tracker {
         self.integral_1_m = (self.integral_1_m + change_1_m).clamp(-bound, bound);
     }
 
-    /// `θ̂̇ = ρ e_y φ + pull·c (cθ − θ̂)` and `χ̂̇ = ρ_χ e_y φ_χ`, c the confidence, φ and `φ_χ` the
-    /// drifts per θ and per χ; bounded in rate and range.
+    /// `θ̂̇ = ρ e_y φ + pull·c (cθ − θ̂)` and `χ̂̇ = ρ_χ e_y φ_χ`, c the confidence, φ and `φ_χ`
+    /// the drifts per θ and per χ; bounded in rate and range.
     fn adapt(
         &mut self,
         sideslip: &Sideslip,
-        cross_m: f64,
+        cross_track_m: f64,
         knowledge: Option<ThetaKnowledge>,
         dt_s: f64,
     ) {
         let config = &self.config;
-        let error_m = if cross_m.abs() < ADAPTATION_DEAD_ZONE_M {
+        let error_m = if cross_track_m.abs() < ADAPTATION_DEAD_ZONE_M {
             0.0
         } else {
-            cross_m
+            cross_track_m
         };
         // More changes nothing at the end of what is assumed, and would wind up.
         let most = if sideslip.is_at_end {

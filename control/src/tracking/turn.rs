@@ -20,13 +20,13 @@ const SHARE_STEP_MIN: f64 = 1.0e-6;
 pub(super) const SIDESLIP_MAX: f64 = 0.1;
 /// Share of stiffness that a wheel keeps at least.
 const SHARE_MIN: f64 = 0.05;
-/// Slowest and fastest rims over the speed ahead.
+/// Slowest and fastest rims over the forward speed.
 const RIMS: std::ops::RangeInclusive<f64> = 0.05..=20.0;
 /// Share of the curvature at which the inner rims would stand, by kinematics alone, up to which a
 /// turn is computed.
 const TIGHT_MAX: f64 = 0.7;
 
-/// A steady turn, all speeds over the speed ahead.
+/// A steady turn, all speeds over the forward speed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SteadyTurn {
     /// Speed to the left.
@@ -35,8 +35,8 @@ pub(super) struct SteadyTurn {
     pub(super) rims: [f64; 2],
 }
 
-/// The same turn twice: as if every wheel stayed in the linear range, and with what friction is lost
-/// beyond the peak.
+/// The same turn twice: as if every wheel stayed in the linear range, and with what friction is
+/// lost beyond the peak.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Turn {
     /// Curvature that was assumed, 1/m: the asked one up to a bound.
@@ -85,7 +85,7 @@ struct Wheels {
     /// Speed of the ground under the left and the right wheels, ahead.
     ground: [f64; 2],
     /// Speed across under the front wheels that the turn itself brings.
-    across: f64,
+    lateral: f64,
     /// Share of stiffness left: front and rear of the left side, then of the right.
     shares: [[f64; 2]; 2],
     /// One over the rims' speeds.
@@ -103,7 +103,7 @@ impl Wheels {
             slip_of_all_m: 4.0 * compliance_m,
             slenderness: half_base_m / half_track_m,
             ground: [1.0 - outward, 1.0 + outward],
-            across: curvature_1_m * half_base_m,
+            lateral: curvature_1_m * half_base_m,
             shares: [[1.0; 2]; 2],
             per_rim: [1.0; 2],
             sideslip: 0.0,
@@ -122,24 +122,25 @@ impl Wheels {
         let sums = self.shares.map(|[front, rear]| front + rear);
         let gaps = self.shares.map(|[front, rear]| front - rear);
         // Force along: the body's acceleration along, v²κ times sideslip, is what is left of it.
-        let along = [sums[0] * self.ground[0], sums[1] * self.ground[1]];
+        let longitudinal = [sums[0] * self.ground[0], sums[1] * self.ground[1]];
         let force = sums[0] + sums[1] + self.slip_of_all_m * self.sideslip * self.curvature_1_m;
         // Moment over half the track: what the sides push apart, less what the axles scrub.
-        let scrubs = [0, 1]
-            .map(|side| self.slenderness * (gaps[side] * self.sideslip + sums[side] * self.across));
-        let (left, right) = (along[0] - scrubs[0], -along[1] - scrubs[1]);
+        let scrubs = [0, 1].map(|side| {
+            self.slenderness * (gaps[side] * self.sideslip + sums[side] * self.lateral)
+        });
+        let (left, right) = (longitudinal[0] - scrubs[0], -longitudinal[1] - scrubs[1]);
         let moment = sums[0] - sums[1];
-        let determinant = along[0] * right - along[1] * left;
+        let determinant = longitudinal[0] * right - longitudinal[1] * left;
         self.per_rim = [
-            (force * right - along[1] * moment) / determinant,
-            (along[0] * moment - force * left) / determinant,
+            (force * right - longitudinal[1] * moment) / determinant,
+            (longitudinal[0] * moment - force * left) / determinant,
         ]
         .map(|per_rim| per_rim.clamp(RIMS.end().recip(), RIMS.start().recip()));
         // Force across.
         let stiffness = self.per_rim[0] * sums[0] + self.per_rim[1] * sums[1];
         let unequal = self.per_rim[0] * gaps[0] + self.per_rim[1] * gaps[1];
         let sideslip =
-            -(self.slip_of_all_m * self.curvature_1_m + unequal * self.across) / stiffness;
+            -(self.slip_of_all_m * self.curvature_1_m + unequal * self.lateral) / stiffness;
         self.sideslip = sideslip.clamp(-SIDESLIP_MAX, SIDESLIP_MAX);
     }
 
@@ -147,10 +148,10 @@ impl Wheels {
     fn lose(&mut self, friction_curve: &FrictionCurve) -> bool {
         let mut has_moved = false;
         for side in [0, 1] {
-            let ahead = self.ground[side] * self.per_rim[side] - 1.0;
-            for (axle, across) in [self.across, -self.across].into_iter().enumerate() {
-                let left = (self.sideslip + across) * self.per_rim[side];
-                let slip = (ahead * ahead + left * left).sqrt();
+            let forward = self.ground[side] * self.per_rim[side] - 1.0;
+            for (axle, lateral) in [self.lateral, -self.lateral].into_iter().enumerate() {
+                let left = (self.sideslip + lateral) * self.per_rim[side];
+                let slip = (forward * forward + left * left).sqrt();
                 let share =
                     (friction_curve.mu_over_slip(slip) / friction_curve.stiffness()).max(SHARE_MIN);
                 has_moved |= (share - self.shares[side][axle]).abs() > SHARE_STEP_MIN;
@@ -182,7 +183,7 @@ mod tests {
         spec.try_into().unwrap()
     }
 
-    /// A simulated base that has driven on these rims for long: speed ahead, sideslip, curvature.
+    /// A simulated base that has driven on these rims for long: forward speed, sideslip, curvature.
     fn driven(curve: FrictionCurve, rims_m_s: [f64; 2]) -> (f64, f64, f64) {
         let model = RobotModel::yi2007();
         let spec = PlantSpec {
@@ -199,11 +200,11 @@ mod tests {
             plant.step(command, &Ground::uniform(curve), 0.01);
         }
         let state = plant.state();
-        let ahead_m_s = state.ahead_m_s;
+        let forward_m_s = state.forward_m_s;
         (
-            ahead_m_s,
-            state.left_m_s / ahead_m_s,
-            state.yaw_rate_rad_s / ahead_m_s,
+            forward_m_s,
+            state.left_m_s / forward_m_s,
+            state.yaw_rate_rad_s / forward_m_s,
         )
     }
 
@@ -222,8 +223,8 @@ mod tests {
             let turn = Turn::steady(&model, &curve, curvature, compliance_m);
             prop_assume!(turn.beyond.sideslip.abs() < SIDESLIP_MAX);
             let rims = turn.beyond.rims.map(|rim| rim * speed_m_s);
-            let (ahead_m_s, sideslip, driven) = driven(curve, rims);
-            prop_assert!((ahead_m_s / speed_m_s - 1.0).abs() < 0.02, "{ahead_m_s} of {speed_m_s}");
+            let (forward_m_s, sideslip, driven) = driven(curve, rims);
+            prop_assert!((forward_m_s / speed_m_s - 1.0).abs() < 0.02, "{forward_m_s} of {speed_m_s}");
             prop_assert!((driven - curvature).abs() < 0.03, "{driven} of {curvature}");
             let off = (sideslip - turn.beyond.sideslip).abs();
             prop_assert!(off < 2.0e-3 + 0.1 * turn.beyond.sideslip.abs(), "{sideslip} of {turn:?}");

@@ -117,8 +117,8 @@ impl SimRobot {
         robot
     }
 
-    /// From now on each side's wheels follow their command as fast as they may, without the gate: for
-    /// tests that excite the robot by steps.
+    /// From now on each side's wheels follow their command as fast as they may, without the gate:
+    /// for tests that excite the robot by steps.
     pub(crate) fn drive_wheel_by_wheel(&mut self) {
         self.is_gated = false;
     }
@@ -227,13 +227,13 @@ impl SimRobot {
             wheel_speeds,
             gyro_rad_s,
             acceleration: Some(BodyAcceleration {
-                ahead_m_s2: felt.ahead_m_s2
+                forward_m_s2: felt.forward_m_s2
                     + self.accelerometer_offset
                     + self.gauss(noise.accelerometer_m_s2),
                 left_m_s2: felt.left_m_s2 + self.gauss(noise.accelerometer_m_s2),
             }),
             body_speed_m_s: (body_speed && self.rng.random::<bool>())
-                .then(|| state.ahead_m_s + self.gauss(noise.body_speed_m_s)),
+                .then(|| state.forward_m_s + self.gauss(noise.body_speed_m_s)),
             wheel_torques: self.torque.then(|| WheelTorques {
                 left_n_m: self.torque_gain[0] * torques.left_n_m + self.gauss(torque_noise),
                 right_n_m: self.torque_gain[1] * torques.right_n_m + self.gauss(torque_noise),

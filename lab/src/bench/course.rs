@@ -74,7 +74,7 @@ pub struct Nearest {
     /// Its time on the course, seconds.
     pub time_s: f64,
     /// The robot's distance to the left of it, metres.
-    pub cross_m: f64,
+    pub cross_track_m: f64,
 }
 
 /// What the laws follow.
@@ -108,15 +108,15 @@ impl Course {
         let mut time_s = guess_s;
         for _ in 0..NEWTON_STEPS {
             let sample = self.sample(time_s);
-            let ahead = sample.pose.body_from_site(point);
+            let forward = sample.pose.body_from_site(point);
             // The speed at which the nearest point moves per metre ahead falls inside a bend.
-            let bend = (1.0 - sample.curvature_1_m * ahead.y_m).max(0.2);
-            let step_s = ahead.x_m / (bend * sample.speed_m_s.max(SPEED_FLOOR_M_S));
+            let bend = (1.0 - sample.curvature_1_m * forward.y_m).max(0.2);
+            let step_s = forward.x_m / (bend * sample.speed_m_s.max(SPEED_FLOOR_M_S));
             time_s = (time_s + step_s.clamp(-MOVE_MAX_S, MOVE_MAX_S)).clamp(0.0, self.duration_s());
         }
         Nearest {
             time_s,
-            cross_m: self.sample(time_s).pose.body_from_site(point).y_m,
+            cross_track_m: self.sample(time_s).pose.body_from_site(point).y_m,
         }
     }
 }
@@ -161,7 +161,7 @@ mod tests {
                 (found.time_s - time_s).abs() < 1.0e-3,
                 "{time_s}: {found:?}"
             );
-            assert!((found.cross_m - 0.1).abs() < 1.0e-6);
+            assert!((found.cross_track_m - 0.1).abs() < 1.0e-6);
         }
     }
 }

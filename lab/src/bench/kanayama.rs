@@ -83,15 +83,15 @@ impl Kanayama {
         dt_s: f64,
     ) -> WheelSpeeds {
         let gains = &self.gains;
-        let ahead = measured.pose.body_from_site(reference.pose.point());
+        let forward = measured.pose.body_from_site(reference.pose.point());
         let heading_rad = wrap_angle_rad(reference.pose.heading_rad - measured.pose.heading_rad);
         self.integral_m_s =
-            (self.integral_m_s + ahead.y_m * dt_s).clamp(-INTEGRAL_MAX_M_S, INTEGRAL_MAX_M_S);
+            (self.integral_m_s + forward.y_m * dt_s).clamp(-INTEGRAL_MAX_M_S, INTEGRAL_MAX_M_S);
         let mut twist = Twist {
-            linear_m_s: reference.speed_m_s * heading_rad.cos() + gains.along_1_s * ahead.x_m,
+            linear_m_s: reference.speed_m_s * heading_rad.cos() + gains.along_1_s * forward.x_m,
             angular_rad_s: reference.turn_rad_s
                 + reference.speed_m_s
-                    * (gains.cross_1_m2 * ahead.y_m
+                    * (gains.cross_1_m2 * forward.y_m
                         + gains.heading_1_m * heading_rad.sin()
                         + gains.integral_1_m2_s * self.integral_m_s),
         };

@@ -26,6 +26,6 @@ pub enum Law {
     Pursuit(PursuitConfig),
     /// The paper's law, its wheel speeds found by inverting the measured velocity.
     Yi2007,
-    /// The shipped law, with what it is told about θ before the first tick.
+    /// The shipped law, with what it is given about θ before the first tick.
     Shipped(Option<ThetaKnowledge>),
 }

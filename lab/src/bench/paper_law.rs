@@ -39,7 +39,7 @@ impl PaperLaw {
         Some(Self {
             model,
             law: Yi2007::new(config).ok()?,
-            reduced: Reduced::new(Setting { model, curve }, config.centre_ahead_m).ok()?,
+            reduced: Reduced::new(Setting { model, curve }, config.centre_forward_m).ok()?,
             zeta: 0.0,
             theta: 1.0,
             wheels: WheelSpeeds::default(),
@@ -47,8 +47,8 @@ impl PaperLaw {
     }
 
     /// Distance of the control point ahead of the centre, metres.
-    pub fn point_ahead_m(&self) -> f64 {
-        self.law.config().centre_ahead_m
+    pub fn point_forward_m(&self) -> f64 {
+        self.law.config().centre_forward_m
     }
 
     /// One tick.
@@ -60,12 +60,12 @@ impl PaperLaw {
         felt: BodyAcceleration,
         dt_s: f64,
     ) -> WheelSpeeds {
-        let ahead_m = self.law.config().centre_ahead_m;
+        let forward_m = self.law.config().centre_forward_m;
         let input = LawInput {
             pose: measured.pose,
-            ahead_m_s: measured.twist.linear_m_s,
-            left_m_s: -ahead_m * measured.twist.angular_rad_s,
-            ahead_m_s2: felt.ahead_m_s2,
+            forward_m_s: measured.twist.linear_m_s,
+            left_m_s: -forward_m * measured.twist.angular_rad_s,
+            forward_m_s2: felt.forward_m_s2,
             zeta: self.zeta,
             theta: self.theta,
         };
@@ -82,13 +82,13 @@ impl PaperLaw {
         self.zeta = (self.zeta + output.inputs[0] * dt_s).clamp(-ZETA_MAX, ZETA_MAX);
         self.theta =
             (self.theta + output.theta_rate_1_s * dt_s).clamp(THETA_RANGE[0], THETA_RANGE[1]);
-        let eta = Vector2::new(input.ahead_m_s, input.left_m_s);
+        let eta = Vector2::new(input.forward_m_s, input.left_m_s);
         let shape = SlipShape::linear();
         let wheels = self
             .reduced
             .inputs(tau, eta, &shape)
             .and_then(|inputs| self.reduced.wheel_speeds(inputs, &shape));
-        // Where no wheel speed ahead gives τ, the wheels keep theirs.
+        // Where no wheel forward speed gives τ, the wheels keep theirs.
         if let Ok(wheels) = wheels {
             let most_rad_s = self.model.limits().wheel_speed_max_rad_s;
             self.wheels = WheelSpeeds {
@@ -105,10 +105,10 @@ fn desired(course: &Course, time_s: f64) -> DesiredPoint {
     let derivatives = |time_s: f64| {
         let sample = course.sample(time_s);
         let (sin, cos) = sample.pose.heading_rad.sin_cos();
-        let (along, across) = (Vector2::new(cos, sin), Vector2::new(-sin, cos));
-        let acceleration = along.scale(sample.acceleration_m_s2)
-            + across.scale(sample.speed_m_s * sample.turn_rad_s);
-        (sample, along.scale(sample.speed_m_s), acceleration)
+        let (longitudinal, lateral) = (Vector2::new(cos, sin), Vector2::new(-sin, cos));
+        let acceleration = longitudinal.scale(sample.acceleration_m_s2)
+            + lateral.scale(sample.speed_m_s * sample.turn_rad_s);
+        (sample, longitudinal.scale(sample.speed_m_s), acceleration)
     };
     let (sample, velocity, acceleration) = derivatives(time_s);
     let (_, _, later) = derivatives(time_s + DIFFERENCE_S);

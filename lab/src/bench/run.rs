@@ -22,11 +22,11 @@ const GIVEN_UP_M: f64 = 50.0;
 /// Under what a comparison runs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Scenario {
-    /// The ground at the start; the paper's law is told it.
+    /// The ground at the start; the paper's law is given it.
     pub curve: FrictionCurve,
     /// Lag of the wheel servo, seconds.
     pub servo_lag_s: f64,
-    /// Gains of the shipped law, and the lag that it is told.
+    /// Gains of the shipped law, and the lag that it is configured with.
     pub tracker: TrackerConfig,
     /// Period of the loop, seconds.
     pub loop_s: f64,
@@ -75,7 +75,7 @@ pub struct TickOutput {
     /// Time at which the law looked, seconds.
     pub time_s: f64,
     /// The true distance from the course then, to the left, metres.
-    pub cross_m: f64,
+    pub cross_track_m: f64,
     /// What was commanded.
     pub command: WheelSpeeds,
     /// The shipped law's own words.
@@ -129,7 +129,7 @@ impl Run {
         let mut plant = Plant::new(model, spec, start.pose)?;
         plant.set_state(PlantState {
             pose: start.pose,
-            ahead_m_s: start.speed_m_s,
+            forward_m_s: start.speed_m_s,
             left_m_s: 0.0,
             yaw_rate_rad_s: start.turn_rad_s,
             wheel_speeds: command,
@@ -176,7 +176,8 @@ impl Run {
         self.given_up
     }
 
-    /// One tick; `each_sample` sees the plant after every sensor sample and the time since the last.
+    /// One tick; `each_sample` sees the plant after every sensor sample and the time since the
+    /// last.
     ///
     /// None at the end of the course, or when the robot is lost.
     pub fn tick(
@@ -192,7 +193,7 @@ impl Run {
         let state = *self.plant.state();
         let nearest = self.course.nearest(self.scored_point(), self.nearest_s);
         self.nearest_s = nearest.time_s;
-        self.given_up = nearest.cross_m.is_nan() || nearest.cross_m.abs() > GIVEN_UP_M;
+        self.given_up = nearest.cross_track_m.is_nan() || nearest.cross_track_m.abs() > GIVEN_UP_M;
         let measured = Measured {
             pose: Pose {
                 x_m: state.pose.x_m + input.pose_error.x_m,
@@ -238,7 +239,7 @@ impl Run {
         self.ticks += 1;
         Some(TickOutput {
             time_s,
-            cross_m: nearest.cross_m,
+            cross_track_m: nearest.cross_track_m,
             command,
             tracker: told,
         })
@@ -247,14 +248,14 @@ impl Run {
     /// The point that the law leads: the centre, or the paper's point D.
     fn scored_point(&self) -> Point {
         let pose = self.plant.state().pose;
-        let ahead_m = match &self.driver {
-            Driver::Paper(law) => law.point_ahead_m(),
+        let forward_m = match &self.driver {
+            Driver::Paper(law) => law.point_forward_m(),
             Driver::Kanayama(_) | Driver::Pursuit(_) | Driver::Shipped(_) => 0.0,
         };
         let (sin, cos) = pose.heading_rad.sin_cos();
         Point {
-            x_m: pose.x_m + ahead_m * cos,
-            y_m: pose.y_m + ahead_m * sin,
+            x_m: pose.x_m + forward_m * cos,
+            y_m: pose.y_m + forward_m * sin,
         }
     }
 }
@@ -268,7 +269,7 @@ pub struct CrossTrack {
     pub most_m: f64,
 }
 
-/// Drives a plan without noise on one ground; the law is told θ from the start, or never.
+/// Drives a plan without noise on one ground; the law is given θ from the start, or never.
 ///
 /// # Errors
 /// [`BenchError`] when the scenario's lag is out of range.
@@ -293,9 +294,9 @@ pub fn cross_track(
         knowledge,
     };
     while let Some(output) = run.tick(&input, |_, _| {}) {
-        most_m = most_m.max(output.cross_m.abs());
+        most_m = most_m.max(output.cross_track_m.abs());
         if output.time_s > half_s {
-            sum += output.cross_m * output.cross_m;
+            sum += output.cross_track_m * output.cross_track_m;
             count += 1.0;
         }
     }

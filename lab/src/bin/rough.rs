@@ -3,10 +3,11 @@
 //! `cargo run --release -p tread-lab --bin rough -- [--runs N] [--seed N] [--only TEXT]
 //! [--tyres-straight] [--json]`
 //!
-//! Every robot is configured with its data sheet and drives in the rough world. A line is one way of
-//! being different, or the population, in which everything differs at once. Printed are the share of
-//! 95 % intervals that hold the true θ, the median error, the median half-width and the share of
-//! answers without an interval, or with one wider than 60 % of its value, which says as little.
+//! Every robot is configured with its data sheet and drives in the rough world. A line is one way
+//! of being different, or the population, in which everything differs at once. Printed are the
+//! share of 95 % intervals that hold the true θ, the median error, the median half-width and the
+//! share of answers without an interval, or with one wider than 60 % of its value, which says as
+//! little.
 
 #![expect(clippy::print_stdout, reason = "a program that prints a report")]
 
@@ -99,7 +100,7 @@ const GROUNDS: [f64; 3] = [0.7, 3.0, 12.0];
 
 type Change = fn(&mut Deviations);
 
-/// Ways of being different, one at a time.
+/// Deviations, one at a time.
 const CHANGES: [(&str, Change); 22] = [
     ("nothing", |_| {}),
     ("payload 20 %", |robot| {
@@ -139,10 +140,10 @@ const CHANGES: [(&str, Change); 22] = [
         robot.gear_loss_ratio = 0.03;
     }),
     ("center of mass 5 % forward", |robot| {
-        robot.center_ahead_ratio = 0.05;
+        robot.center_forward_ratio = 0.05;
     }),
     ("center of mass 5 % rearward", |robot| {
-        robot.center_ahead_ratio = -0.05;
+        robot.center_forward_ratio = -0.05;
     }),
     ("center of mass 3 % left", |robot| {
         robot.center_left_ratio = 0.03;

@@ -117,10 +117,10 @@ impl SlipShape {
 
 /// E₁ of (17), corrected: rows ahead and left, columns v₁ and v₂.
 pub fn e_1(velocity: &BodyVelocity, shape: &SlipShape, setting: &Setting) -> Matrix2<f64> {
-    let (ahead, left) = (velocity.ahead_m_s, velocity.left_m_s);
+    let (forward, left) = (velocity.forward_m_s, velocity.left_m_s);
     Matrix2::new(
         setting.model.track_width_m() * velocity.yaw_rate_rad_s,
-        -2.0 * ahead,
+        -2.0 * forward,
         -shape.ratio_difference * left,
         -2.0 * left * (1.0 + 0.5 * shape.ratio_sum),
     )
@@ -131,7 +131,7 @@ pub fn e_2(velocity: &BodyVelocity, shape: &SlipShape, setting: &Setting) -> Row
     let (track_m, base_m) = (setting.model.track_width_m(), setting.model.wheelbase_m());
     let turn = velocity.yaw_rate_rad_s;
     RowVector2::new(
-        track_m * velocity.ahead_m_s - 0.25 * base_m * base_m * turn * shape.ratio_difference,
+        track_m * velocity.forward_m_s - 0.25 * base_m * base_m * turn * shape.ratio_difference,
         -0.5 * turn * (track_m * track_m + base_m * base_m * (1.0 + 0.5 * shape.ratio_sum)),
     )
 }
@@ -153,7 +153,7 @@ pub fn forces(
     let moment =
         (e_2(velocity, &shape, setting) * inputs)[0] - model.track_width_m() * shape.difference;
     Some(BodyForce {
-        ahead_n: scale_n * body[0],
+        longitudinal_n: scale_n * body[0],
         left_n: scale_n * body[1],
         moment_n_m: scale_n * moment,
     })

@@ -20,7 +20,7 @@ pub const SPEED_MIN_M_S: f64 = 1.0e-3;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Yi2007Config {
     /// S, distance of the control point D ahead of the centre, metres, above zero.
-    pub centre_ahead_m: f64,
+    pub centre_forward_m: f64,
     /// `k₁`, per second, above zero.
     pub k_1_1_s: f64,
     /// `k₂`, per second squared, above zero.
@@ -35,7 +35,7 @@ impl Yi2007Config {
     /// Section IV.
     pub fn section_iv() -> Self {
         Self {
-            centre_ahead_m: 0.167,
+            centre_forward_m: 0.167,
             k_1_1_s: 2.0,
             k_2_1_s2: 1.0,
             xi_1_s: 0.1,
@@ -95,11 +95,11 @@ pub struct LawInput {
     /// Pose of the centre, site frame.
     pub pose: Pose,
     /// η₁ = ẋ, metres per second.
-    pub ahead_m_s: f64,
+    pub forward_m_s: f64,
     /// η₂ = ẏ, metres per second; by the constraint `−Sφ̇`.
     pub left_m_s: f64,
     /// η̇₁, measured, metres per second squared.
-    pub ahead_m_s2: f64,
+    pub forward_m_s2: f64,
     /// ζ = τ₁, the law's own integrator.
     pub zeta: f64,
     /// θ̂.
@@ -132,7 +132,7 @@ impl Yi2007 {
     /// [`Yi2007Error::OutOfRange`] names the gain.
     pub fn new(config: Yi2007Config) -> Result<Self, Yi2007Error> {
         for (field, value) in [
-            ("centre_ahead_m", config.centre_ahead_m),
+            ("centre_forward_m", config.centre_forward_m),
             ("k_1_1_s", config.k_1_1_s),
             ("k_2_1_s2", config.k_2_1_s2),
             ("xi_1_s", config.xi_1_s),
@@ -154,8 +154,8 @@ impl Yi2007 {
     pub fn point(&self, pose: Pose) -> Point {
         let (sin, cos) = pose.heading_rad.sin_cos();
         Point {
-            x_m: pose.x_m + self.config.centre_ahead_m * cos,
-            y_m: pose.y_m + self.config.centre_ahead_m * sin,
+            x_m: pose.x_m + self.config.centre_forward_m * cos,
+            y_m: pose.y_m + self.config.centre_forward_m * sin,
         }
     }
 
@@ -169,26 +169,27 @@ impl Yi2007 {
         desired: &DesiredPoint,
     ) -> Result<LawOutput, Yi2007Error> {
         let config = &self.config;
-        let eta_1 = input.ahead_m_s;
+        let eta_1 = input.forward_m_s;
         if eta_1.is_nan() || eta_1.abs() < SPEED_MIN_M_S {
             return Err(Yi2007Error::Standstill(eta_1));
         }
-        let turn_rad_s = -input.left_m_s / config.centre_ahead_m;
+        let turn_rad_s = -input.left_m_s / config.centre_forward_m;
         let (sin, cos) = input.pose.heading_rad.sin_cos();
-        let (along, across) = (Vector2::new(cos, sin), Vector2::new(-sin, cos));
+        let (longitudinal, lateral) = (Vector2::new(cos, sin), Vector2::new(-sin, cos));
         let point = self.point(input.pose);
         let error = Vector2::new(point.x_m, point.y_m) - desired.position;
-        let error_rate = along.scale(eta_1) - desired.velocity;
-        let error_rate_2 =
-            along.scale(input.ahead_m_s2) + across.scale(eta_1 * turn_rad_s) - desired.acceleration;
+        let error_rate = longitudinal.scale(eta_1) - desired.velocity;
+        let error_rate_2 = longitudinal.scale(input.forward_m_s2)
+            + lateral.scale(eta_1 * turn_rad_s)
+            - desired.acceleration;
         let surface =
             error_rate_2 + error_rate.scale(config.k_1_1_s) + error.scale(config.k_2_1_s2);
-        let gamma = along.scale(-eta_1 * turn_rad_s * turn_rad_s);
-        let beta = across.scale(2.0 * input.zeta * turn_rad_s);
+        let gamma = longitudinal.scale(-eta_1 * turn_rad_s * turn_rad_s);
+        let beta = lateral.scale(2.0 * input.zeta * turn_rad_s);
         let drift =
             -desired.jerk + error_rate_2.scale(config.k_1_1_s) + error_rate.scale(config.k_2_1_s2);
         let wanted = -gamma - drift - surface.scale(config.xi_1_s);
-        let lever = eta_1 / config.centre_ahead_m;
+        let lever = eta_1 / config.centre_forward_m;
         let alpha = Matrix2::new(cos, lever * sin, sin, -lever * cos);
         let inverse = alpha.try_inverse().ok_or(Yi2007Error::Standstill(eta_1))?;
         Ok(LawOutput {
@@ -208,7 +209,7 @@ pub struct ClosedLoopState {
     /// Pose of the centre.
     pub pose: Pose,
     /// η₁, metres per second.
-    pub ahead_m_s: f64,
+    pub forward_m_s: f64,
     /// η₂, metres per second.
     pub left_m_s: f64,
     /// ζ.
@@ -227,7 +228,7 @@ impl ClosedLoopState {
                 y_m: 3.0,
                 heading_rad: 0.0,
             },
-            ahead_m_s: 0.3,
+            forward_m_s: 0.3,
             left_m_s: 0.0,
             zeta: 0.0,
             theta: 1.0,
@@ -319,9 +320,9 @@ impl ClosedLoop {
         let state = unpack(packed, time_s);
         let input = LawInput {
             pose: state.pose,
-            ahead_m_s: state.ahead_m_s,
+            forward_m_s: state.forward_m_s,
             left_m_s: state.left_m_s,
-            ahead_m_s2: self.stiffness * state.zeta,
+            forward_m_s2: self.stiffness * state.zeta,
             zeta: state.zeta,
             theta: state.theta,
         };
@@ -333,9 +334,9 @@ impl ClosedLoop {
         let state = unpack(packed, time_s);
         let (sin, cos) = state.pose.heading_rad.sin_cos();
         Ok(Packed::from([
-            state.ahead_m_s * cos - state.left_m_s * sin,
-            state.ahead_m_s * sin + state.left_m_s * cos,
-            -state.left_m_s / self.law.config.centre_ahead_m,
+            state.forward_m_s * cos - state.left_m_s * sin,
+            state.forward_m_s * sin + state.left_m_s * cos,
+            -state.left_m_s / self.law.config.centre_forward_m,
             self.stiffness * state.zeta,
             self.stiffness * output.inputs[1],
             output.inputs[0],
@@ -349,7 +350,7 @@ fn pack(state: &ClosedLoopState) -> Packed {
         state.pose.x_m,
         state.pose.y_m,
         state.pose.heading_rad,
-        state.ahead_m_s,
+        state.forward_m_s,
         state.left_m_s,
         state.zeta,
         state.theta,
@@ -364,7 +365,7 @@ fn unpack(packed: &Packed, time_s: f64) -> ClosedLoopState {
             y_m: packed[1],
             heading_rad: packed[2],
         },
-        ahead_m_s: packed[3],
+        forward_m_s: packed[3],
         left_m_s: packed[4],
         zeta: packed[5],
         theta: packed[6],

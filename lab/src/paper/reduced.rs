@@ -21,7 +21,7 @@ const DETERMINANT_MIN: f64 = 1.0e-9;
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum ReducedError {
     /// S is zero or not finite.
-    #[error("`centre_ahead_m` must be finite and not zero, not {0}")]
+    #[error("`centre_forward_m` must be finite and not zero, not {0}")]
     Centre(f64),
     /// `E₁ + g₁ᵀe₂` cannot be inverted at this velocity.
     #[error("the transformation (21) is singular at this velocity")]
@@ -35,7 +35,7 @@ pub enum ReducedError {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reduced {
     setting: Setting,
-    centre_ahead_m: f64,
+    centre_forward_m: f64,
 }
 
 impl Reduced {
@@ -43,34 +43,34 @@ impl Reduced {
     ///
     /// # Errors
     /// [`ReducedError::Centre`] when S is zero or not finite.
-    pub fn new(setting: Setting, centre_ahead_m: f64) -> Result<Self, ReducedError> {
-        if !centre_ahead_m.is_finite() || centre_ahead_m.abs() <= 0.0 {
-            return Err(ReducedError::Centre(centre_ahead_m));
+    pub fn new(setting: Setting, centre_forward_m: f64) -> Result<Self, ReducedError> {
+        if !centre_forward_m.is_finite() || centre_forward_m.abs() <= 0.0 {
+            return Err(ReducedError::Centre(centre_forward_m));
         }
         Ok(Self {
             setting,
-            centre_ahead_m,
+            centre_forward_m,
         })
     }
 
     /// S, metres.
-    pub fn centre_ahead_m(&self) -> f64 {
-        self.centre_ahead_m
+    pub fn centre_forward_m(&self) -> f64 {
+        self.centre_forward_m
     }
 
     /// (19a) in the body frame: all three speeds from η.
     pub fn velocity(&self, eta: Vector2<f64>) -> BodyVelocity {
         BodyVelocity {
-            ahead_m_s: eta[0],
+            forward_m_s: eta[0],
             left_m_s: eta[1],
-            yaw_rate_rad_s: -eta[1] / self.centre_ahead_m,
+            yaw_rate_rad_s: -eta[1] / self.centre_forward_m,
         }
     }
 
     /// Diagonal of `M_η⁻¹`: m and `m + I_G/S²`, kilograms.
     fn masses_kg(&self) -> Vector2<f64> {
         let model = &self.setting.model;
-        let turned_kg = model.yaw_inertia_kg_m2() / self.centre_ahead_m.powi(2);
+        let turned_kg = model.yaw_inertia_kg_m2() / self.centre_forward_m.powi(2);
         Vector2::new(model.mass_kg(), model.mass_kg() + turned_kg)
     }
 
@@ -78,12 +78,12 @@ impl Reduced {
     pub fn rates(&self, force: &BodyForce) -> Vector2<f64> {
         let masses_kg = self.masses_kg();
         Vector2::new(
-            force.ahead_n / masses_kg[0],
-            (force.left_n - force.moment_n_m / self.centre_ahead_m) / masses_kg[1],
+            force.longitudinal_n / masses_kg[0],
+            (force.left_n - force.moment_n_m / self.centre_forward_m) / masses_kg[1],
         )
     }
 
-    /// η̇ under wheel speeds ahead, both ranges of slip, by the four-wheel sum.
+    /// η̇ under wheel forward speeds, both ranges of slip, by the four-wheel sum.
     pub fn rates_from_wheels(&self, eta: Vector2<f64>, wheels: WheelSpeeds) -> Vector2<f64> {
         self.rates(&four_wheel_sum(&self.velocity(eta), wheels, &self.setting))
     }
@@ -92,7 +92,7 @@ impl Reduced {
     fn input_matrix(&self, eta: Vector2<f64>, shape: &SlipShape) -> Matrix2<f64> {
         let velocity = self.velocity(eta);
         let mut matrix = e_1(&velocity, shape, &self.setting);
-        let yaw = e_2(&velocity, shape, &self.setting) / self.centre_ahead_m;
+        let yaw = e_2(&velocity, shape, &self.setting) / self.centre_forward_m;
         matrix[(1, 0)] -= yaw[0];
         matrix[(1, 1)] -= yaw[1];
         matrix
@@ -103,7 +103,7 @@ impl Reduced {
         let track_m = self.setting.model.track_width_m();
         Vector2::new(
             2.0 * shape.sum,
-            track_m * shape.difference / self.centre_ahead_m,
+            track_m * shape.difference / self.centre_forward_m,
         )
     }
 

@@ -19,7 +19,7 @@ const TURN_MIN_RAD_S: f64 = 1.0e-9;
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct BodyForce {
     /// ΣF, newtons ahead.
-    pub ahead_n: f64,
+    pub longitudinal_n: f64,
     /// ΣP, newtons to the left.
     pub left_n: f64,
     /// `Σ(x_i P_i − y_i F_i)`, newton metres.
@@ -30,7 +30,7 @@ pub struct BodyForce {
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct BodyRates {
     /// ẍ, metres per second squared.
-    pub ahead_m_s2: f64,
+    pub forward_m_s2: f64,
     /// ÿ, metres per second squared.
     pub left_m_s2: f64,
     /// φ̈, radians per second squared.
@@ -41,9 +41,10 @@ impl BodyForce {
     /// (14) with its Coriolis terms: `m(ẍ − ẏφ̇) = ΣF`, `m(ÿ + ẋφ̇) = ΣP`.
     pub fn rates(&self, velocity: &BodyVelocity, model: &RobotModel) -> BodyRates {
         BodyRates {
-            ahead_m_s2: self.ahead_n / model.mass_kg()
+            forward_m_s2: self.longitudinal_n / model.mass_kg()
                 + velocity.left_m_s * velocity.yaw_rate_rad_s,
-            left_m_s2: self.left_n / model.mass_kg() - velocity.ahead_m_s * velocity.yaw_rate_rad_s,
+            left_m_s2: self.left_n / model.mass_kg()
+                - velocity.forward_m_s * velocity.yaw_rate_rad_s,
             yaw_rad_s2: self.moment_n_m / model.yaw_inertia_kg_m2(),
         }
     }
@@ -53,7 +54,7 @@ impl BodyForce {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TurningCentres {
     /// S = −ẏ/φ̇, the x of all three, metres.
-    pub ahead_m: f64,
+    pub forward_m: f64,
     /// `y_l = (ẋ − rω₁)/φ̇`, metres.
     pub left_m: f64,
     /// `y_r = (ẋ − rω₃)/φ̇`, metres.
@@ -67,10 +68,10 @@ impl TurningCentres {
     pub fn of(velocity: &BodyVelocity, wheels: WheelSpeeds, model: &RobotModel) -> Option<Self> {
         let turn = velocity.yaw_rate_rad_s;
         (turn.abs() > TURN_MIN_RAD_S).then(|| Self {
-            ahead_m: -velocity.left_m_s / turn,
-            left_m: (velocity.ahead_m_s - model.wheel_radius_m() * wheels.left_rad_s) / turn,
-            right_m: (velocity.ahead_m_s - model.wheel_radius_m() * wheels.right_rad_s) / turn,
-            body_m: velocity.ahead_m_s / turn,
+            forward_m: -velocity.left_m_s / turn,
+            left_m: (velocity.forward_m_s - model.wheel_radius_m() * wheels.left_rad_s) / turn,
+            right_m: (velocity.forward_m_s - model.wheel_radius_m() * wheels.right_rad_s) / turn,
+            body_m: velocity.forward_m_s / turn,
         })
     }
 }
@@ -101,7 +102,7 @@ pub fn four_wheel_sum(
         let rim_m_s = model.wheel_radius_m() * wheel_rad_s;
         let stiff = stiffness(&setting.curve, slip);
         let force_n = load_n * stiff * slip;
-        let skid_m_s = velocity.ahead_m_s - velocity.yaw_rate_rad_s * y_m - rim_m_s;
+        let skid_m_s = velocity.forward_m_s - velocity.yaw_rate_rad_s * y_m - rim_m_s;
         for x_sign in [1.0, -1.0] {
             let x_m = x_sign * 0.5 * model.wheelbase_m();
             let left_m_s = velocity.left_m_s + velocity.yaw_rate_rad_s * x_m;
@@ -111,7 +112,7 @@ pub fn four_wheel_sum(
             } else {
                 force_n * left_m_s / skid_m_s
             };
-            sum.ahead_n += force_n;
+            sum.longitudinal_n += force_n;
             sum.left_n += lateral_n;
             sum.moment_n_m += x_m * lateral_n - y_m * force_n;
         }
@@ -145,9 +146,9 @@ pub fn lateral_forces_n(
         if lever_m.abs() <= 0.0 {
             return None;
         }
-        let ahead_n = load_n * setting.curve.mu(slip);
-        forces_n[2 * side] = ahead_n * (half_base_m - centres.ahead_m) / lever_m;
-        forces_n[2 * side + 1] = -ahead_n * (half_base_m + centres.ahead_m) / lever_m;
+        let longitudinal_n = load_n * setting.curve.mu(slip);
+        forces_n[2 * side] = longitudinal_n * (half_base_m - centres.forward_m) / lever_m;
+        forces_n[2 * side + 1] = -longitudinal_n * (half_base_m + centres.forward_m) / lever_m;
     }
     Some(forces_n)
 }

@@ -1,12 +1,12 @@
 //! The body, its wheels and its motors, from Newton's laws.
 //!
-//! State in the body frame at the centre of mass: speed ahead and to the left, turn rate; per side
-//! the wheels' speed (front and rear are coupled by a chain, as on the makes of [`super::spec`]);
-//! per contact the deflection of the tyre as a slip vector s, which follows
-//! `ℓ ṡ = v_slip − |rω| s`. Its force is `N μ(|s|) s/|s|`, with the wheel's own load N: the loads are
+//! State in the body frame at the centre of mass: forward speed and to the left, turn rate; per
+//! side the wheels' speed (front and rear are coupled by a chain, as on the makes of
+//! [`super::spec`]); per contact the deflection of the tyre as a slip vector s, which follows `ℓ ṡ
+//! = v_slip − |rω| s`. Its force is `N μ(|s|) s/|s|`, with the wheel's own load N: the loads are
 //! those of a rigid body on four equal springs. Gravity acts along the slope. Motors give torque,
-//! limited in size, by a proportional-integral speed servo; rotors, gears and rolling resistance take
-//! their part of it before it reaches the contact.
+//! limited in size, by a proportional-integral speed servo; rotors, gears and rolling resistance
+//! take their part of it before it reaches the contact.
 
 use nalgebra::{Matrix3, Vector3};
 use tread_control::geometry::{Pose, wrap_angle_rad};
@@ -48,8 +48,8 @@ struct Contact {
 pub struct State {
     /// Pose of the centre of the wheels, site frame.
     pub pose: Pose,
-    /// Its speed ahead, metres per second.
-    pub ahead_m_s: f64,
+    /// Its forward speed, metres per second.
+    pub forward_m_s: f64,
     /// Its speed to the left, metres per second.
     pub left_m_s: f64,
     /// Turn rate, radians per second.
@@ -99,7 +99,7 @@ impl Plant {
         let (track_m, base_m) = (model.track_width_m(), model.wheelbase_m());
         let mass_kg = model.mass_kg() * (1.0 + spec.payload_ratio);
         let center_m = [
-            spec.center_ahead_ratio * base_m,
+            spec.center_forward_ratio * base_m,
             spec.center_left_ratio * track_m,
             spec.center_height_ratio * track_m,
         ];
@@ -174,7 +174,7 @@ impl Plant {
                 y_m: self.pose.y_m - sin * x_m - cos * y_m,
                 heading_rad: self.pose.heading_rad,
             },
-            ahead_m_s: self.speed_m_s[0] + self.yaw_rate_rad_s * y_m,
+            forward_m_s: self.speed_m_s[0] + self.yaw_rate_rad_s * y_m,
             left_m_s: self.speed_m_s[1] - self.yaw_rate_rad_s * x_m,
             yaw_rate_rad_s: self.yaw_rate_rad_s,
         }
@@ -280,11 +280,11 @@ impl Plant {
         let forces = self.forces();
         let (mut force, mut moment, mut side_n) = ([0.0; 2], 0.0, [0.0; 2]);
         let mut side_load_n = [0.0; 2];
-        for (contact, [ahead_n, left_n]) in self.contacts.iter().zip(forces) {
-            force[0] += ahead_n;
+        for (contact, [longitudinal_n, left_n]) in self.contacts.iter().zip(forces) {
+            force[0] += longitudinal_n;
             force[1] += left_n;
-            moment += contact.x_m * left_n - contact.y_m * ahead_n;
-            side_n[contact.side] += ahead_n;
+            moment += contact.x_m * left_n - contact.y_m * longitudinal_n;
+            side_n[contact.side] += longitudinal_n;
             side_load_n[contact.side] += contact.load_n;
         }
         let share = STEP_S / LOAD_LAG_S;
@@ -298,10 +298,10 @@ impl Plant {
             force[1] / self.mass_kg + gravity[1],
         ];
         let yaw_rate = self.yaw_rate_rad_s;
-        let [ahead, left] = self.speed_m_s;
+        let [forward, left] = self.speed_m_s;
         self.speed_m_s = [
-            ahead + STEP_S * (acceleration[0] + left * yaw_rate),
-            left + STEP_S * (acceleration[1] - ahead * yaw_rate),
+            forward + STEP_S * (acceleration[0] + left * yaw_rate),
+            left + STEP_S * (acceleration[1] - forward * yaw_rate),
         ];
         self.yaw_rate_rad_s += STEP_S * moment / self.inertia_kg_m2;
         for side in 0..2 {
@@ -317,10 +317,10 @@ impl Plant {
         }
         self.deflect();
         let (sin, cos) = self.pose.heading_rad.sin_cos();
-        let [ahead, left] = self.speed_m_s;
+        let [forward, left] = self.speed_m_s;
         self.pose = Pose {
-            x_m: self.pose.x_m + STEP_S * (cos * ahead - sin * left),
-            y_m: self.pose.y_m + STEP_S * (sin * ahead + cos * left),
+            x_m: self.pose.x_m + STEP_S * (cos * forward - sin * left),
+            y_m: self.pose.y_m + STEP_S * (sin * forward + cos * left),
             heading_rad: wrap_angle_rad(self.pose.heading_rad + STEP_S * self.yaw_rate_rad_s),
         };
         sums.add(self, acceleration);
@@ -397,7 +397,7 @@ impl Sums {
         Means {
             yaw_rate_rad_s: self.yaw_rate / count,
             acceleration: BodyAcceleration {
-                ahead_m_s2: self.acceleration[0] / count,
+                forward_m_s2: self.acceleration[0] / count,
                 left_m_s2: self.acceleration[1] / count,
             },
             wheel_speeds: WheelSpeeds {

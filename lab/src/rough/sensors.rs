@@ -179,7 +179,7 @@ impl Sensors {
             .normal(spec.gyro_walk_rad_s * SAMPLE_PERIOD.as_secs_f64().sqrt());
         let body_speed_m_s = (at >= self.next_speed_at).then(|| {
             self.next_speed_at = at + spec.body_speed_period;
-            truth.ahead_m_s + self.random.normal(spec.body_speed_m_s)
+            truth.forward_m_s + self.random.normal(spec.body_speed_m_s)
         });
         let scale = plant.spec().torque_scale;
         let noise_n_m = self.torque_noise_n_m;
@@ -194,7 +194,7 @@ impl Sensors {
                 means.yaw_rate_rad_s + self.gyro_offset_rad_s + self.random.normal(spec.gyro_rad_s),
             ),
             acceleration: Some(BodyAcceleration {
-                ahead_m_s2: means.acceleration.ahead_m_s2
+                forward_m_s2: means.acceleration.forward_m_s2
                     + offset[0]
                     + self.random.normal(spec.acceleration_m_s2),
                 left_m_s2: means.acceleration.left_m_s2

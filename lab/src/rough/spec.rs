@@ -91,7 +91,7 @@ pub struct Deviations {
     /// Yaw inertia over that of the agent's model, beside the payload's share.
     pub inertia_ratio: f64,
     /// Centre of mass ahead of the centre of the wheels, over the wheelbase.
-    pub center_ahead_ratio: f64,
+    pub center_forward_ratio: f64,
     /// Centre of mass to the left of it, over the track.
     pub center_left_ratio: f64,
     /// Height of the centre of mass over the track.
@@ -119,12 +119,13 @@ pub struct Deviations {
 }
 
 impl Deviations {
-    /// As near to our simulator as this world can be: nothing differs but the plant and the sensors.
+    /// As near to our simulator as this world can be: nothing differs but the plant and the
+    /// sensors.
     pub fn none(stiffness: f64) -> Self {
         Self {
             payload_ratio: 0.0,
             inertia_ratio: 1.0,
-            center_ahead_ratio: 0.0,
+            center_forward_ratio: 0.0,
             center_left_ratio: 0.0,
             center_height_ratio: 0.3,
             relaxation_m: 2.0e-3,
@@ -163,7 +164,7 @@ impl Deviations {
         Self {
             payload_ratio: random.uniform(0.0, 0.3),
             inertia_ratio: random.uniform(0.8, 1.25),
-            center_ahead_ratio: random.uniform(-0.05, 0.05),
+            center_forward_ratio: random.uniform(-0.05, 0.05),
             center_left_ratio: random.uniform(-0.03, 0.03),
             center_height_ratio: random.uniform(0.2, 0.5),
             relaxation_m: random.log_uniform(0.01, 0.1),

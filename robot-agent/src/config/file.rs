@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use serde::Deserialize;
-use tread_api::ids::{HolderId, RobotId, SiteId};
+use tread_api::ids::{OwnerId, RobotId, SiteId};
 use tread_api::robot::RobotModel;
 
 use super::ConfigError;
@@ -20,7 +20,8 @@ pub(super) struct FileConfig {
     pub(super) rate_hz: Option<f64>,
     pub(super) state_rate_hz: Option<f64>,
     pub(super) friction_rate_hz: Option<f64>,
-    pub(super) required_holders: Option<Vec<HolderId>>,
+    #[serde(alias = "required_holders")]
+    pub(super) required_owners: Option<Vec<OwnerId>>,
     pub(super) blind_within_fence: Option<bool>,
     pub(super) model: Option<ModelFile>,
     pub(super) drive: Option<DriveFile>,

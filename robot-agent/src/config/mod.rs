@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Parser;
-use tread_api::ids::{HolderId, RobotId, SiteId};
+use tread_api::ids::{OwnerId, RobotId, SiteId};
 use tread_api::robot::RobotModel;
 use tread_api::safety::LIMITS_MAX;
 use tread_control::estimation::EstimatorPrior;
@@ -255,7 +255,7 @@ pub struct AgentConfig {
     pub drive: DriveConfig,
     /// Holders of external limits whose silence holds the robot, at most
     /// [`LIMITS_MAX`].
-    pub required_holders: Vec<HolderId>,
+    pub required_owners: Vec<OwnerId>,
     /// Whether the robot may be teleoperated, slowly, within a fence without knowing where it is.
     pub blind_within_fence: bool,
     /// Bounds of the outbox.
@@ -413,10 +413,10 @@ fn assemble(
         .or(joined.map(|joined| joined.endpoint.clone()))
         .unwrap_or_else(|| SERVER_DEFAULT.to_owned());
     let membership = place_at(&server, &site, &robot, membership)?;
-    let required_holders = file.required_holders.unwrap_or_default();
-    if required_holders.len() > LIMITS_MAX {
+    let required_owners = file.required_owners.unwrap_or_default();
+    if required_owners.len() > LIMITS_MAX {
         return Err(ConfigError::OutOfRange {
-            key: "required_holders",
+            key: "required_owners",
             problem: format!("at most {LIMITS_MAX} programs may limit a robot"),
         });
     }
@@ -444,7 +444,7 @@ fn assemble(
         state_rate_hz,
         friction_rate_hz,
         model,
-        required_holders,
+        required_owners,
         blind_within_fence: file.blind_within_fence.unwrap_or(false),
         outbox: outbox::Limits::default(),
     })

@@ -156,9 +156,9 @@ impl Active {
 
     /// How long what pauses it of itself has done so; none for a request.
     pub(super) fn paused_for(&self, now: Duration) -> Option<Duration> {
-        let is_held = self.progress.is_paused_for_safety();
+        let is_on_hold = self.progress.is_paused_for_safety();
         self.paused_from
-            .filter(|_| is_held)
+            .filter(|_| is_on_hold)
             .map(|from| now.saturating_sub(from))
     }
 
@@ -182,15 +182,17 @@ impl Active {
         if std::mem::replace(present, is_wanted) == is_wanted {
             return;
         }
-        let is_held = self.is_held();
-        if !is_held {
+        let is_on_hold = self.is_on_hold();
+        if !is_on_hold {
             self.standing_ticks = 0;
         }
-        self.job.follower.set_pace(if is_held { 0.0 } else { 1.0 });
+        self.job
+            .follower
+            .set_pace(if is_on_hold { 0.0 } else { 1.0 });
     }
 
     /// Whether it is held, braking or standing.
-    pub(super) fn is_held(&self) -> bool {
+    pub(super) fn is_on_hold(&self) -> bool {
         let holds = &self.holds;
         holds.pause
             || holds.replacement
@@ -211,12 +213,12 @@ impl Active {
     }
 
     /// Holds the law's adaptation.
-    pub(super) fn hold_adaptation(&mut self, is_held: bool) {
-        self.job.follower.hold_adaptation(is_held);
+    pub(super) fn hold_adaptation(&mut self, is_on_hold: bool) {
+        self.job.follower.hold_adaptation(is_on_hold);
     }
 
     fn stands_held(&self) -> bool {
-        self.is_held() && self.standing_ticks >= STANDING_TICKS
+        self.is_on_hold() && self.standing_ticks >= STANDING_TICKS
     }
 
     /// Puts the next revision in place of this one as soon as the robot stands; hands back one
@@ -249,13 +251,13 @@ impl Active {
         };
         let old = std::mem::replace(&mut self.job, next);
         self.hold(Hold::Replacement, false);
-        if self.is_held() {
+        if self.is_on_hold() {
             self.job.follower.set_pace(0.0);
         }
         Some(old)
     }
 
-    /// What the map knows along the way that is driven, or is to be once the robot stands.
+    /// What the map knows along the path that is driven, or is to be once the robot stands.
     pub(super) fn prior(&self) -> &Prior {
         let coming = self
             .next
@@ -294,8 +296,8 @@ impl Active {
         self.job.follower.set_commanded(command);
         let output = self.job.follower.step(measured, knowledge, dt_s);
         self.progress.driven_m = self.progress.driven_m.max(output.progress_m);
-        self.progress.cross_track_m = output.errors.cross_m;
-        self.tracked = Some((output.errors.cross_m, output.saturated));
+        self.progress.cross_track_m = output.errors.cross_track_m;
+        self.tracked = Some((output.errors.cross_track_m, output.saturated));
         let end = match output.status {
             // With a revision to come, an end of the old one is not the end.
             FollowerStatus::Done if self.holds.replacement => None,
@@ -317,7 +319,7 @@ impl Active {
 
     fn note_standing(&mut self, measured: &Measured, model: &RobotModel, command: WheelSpeeds) {
         let command_m_s = command.magnitude_max_rad_s() * model.wheel_radius_m();
-        let stands = self.is_held()
+        let stands = self.is_on_hold()
             && command_m_s < STANDING
             && measured.twist.linear_m_s.abs() < STANDING
             && measured.twist.angular_rad_s.abs() < 2.0 * STANDING;
@@ -342,7 +344,7 @@ impl Active {
         })
     }
 
-    /// Adds this tick to the record of the way.
+    /// Adds this tick to the record of the path.
     pub(super) fn record(&mut self, tick: TickRecord) {
         let (cross_track_m, is_saturated) = self.tracked.unzip();
         self.job.driven.add(&TickRecord {
@@ -352,7 +354,7 @@ impl Active {
             // Slowing to rest and speeding up are the gate's usual work while it is held.
             gate: tick
                 .gate
-                .filter(|cause| !self.is_held() || *cause > GateCause::Speed),
+                .filter(|cause| !self.is_on_hold() || *cause > GateCause::Speed),
             ..tick
         });
     }

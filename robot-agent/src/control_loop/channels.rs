@@ -45,7 +45,7 @@ pub(crate) struct Job {
     pub(crate) revision: u32,
     pub(crate) plan_hash: PlanHash,
     pub(crate) follower: Follower,
-    /// What the map knows along the way.
+    /// What the map knows along the path.
     pub(crate) prior: Prior,
     /// Past this monotonic time it must not start.
     pub(crate) start_by: Option<Duration>,
@@ -195,7 +195,7 @@ impl Fault {
 pub(crate) struct GateSnapshot {
     /// The strictest cause in the last tick.
     pub(crate) cause: Option<GateCause>,
-    /// Whether it was on the way to rest, or there.
+    /// Whether it was on the stop, or there.
     pub(crate) target_rests: bool,
     /// Ticks in which it reduced a command.
     pub(crate) reduced_ticks: u64,
@@ -221,7 +221,7 @@ pub(crate) struct Snapshot {
     /// What walks along its plan.
     pub governor: Option<Governor>,
     /// What holds the mission.
-    pub is_held: bool,
+    pub is_on_hold: bool,
     /// How far the robot is from where its held mission goes on, metres.
     pub off_path_m: Option<f64>,
     /// Whether the wheels are commanded to rest and do.
@@ -248,7 +248,7 @@ pub(crate) struct Snapshot {
     pub(crate) findings: Findings,
     /// Whether the robot stands, where it is to.
     pub(crate) standing: StandingReport,
-    /// How much the wheels slip along their way, while they turn.
+    /// How much the wheels slip along their direction, while they turn.
     pub slip: Option<SideSlip>,
     /// The cell that the robot is in.
     pub cell: Option<Cell>,
@@ -270,7 +270,7 @@ impl Default for Snapshot {
             twist: None,
             mission: None,
             governor: None,
-            is_held: false,
+            is_on_hold: false,
             off_path_m: None,
             stands: false,
             gate: GateSnapshot::default(),

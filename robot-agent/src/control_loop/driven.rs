@@ -1,4 +1,4 @@
-//! What a mission really was: the way driven, and how well it was driven.
+//! What a mission really was: the driven path, and how well it was driven.
 //!
 //! All room is taken before the loop has the mission; a full store drops every other entry and
 //! asks for twice the distance between two, so that a mission of any length fits. What is dropped
@@ -42,7 +42,7 @@ pub(crate) struct TickRecord {
     pub(crate) dt_s: f64,
     /// Where the robot is; none while it does not know.
     pub(crate) at: Option<Point>,
-    /// Way driven in this tick, metres.
+    /// Distance driven in this tick, metres.
     pub(crate) driven_m: f64,
     /// Distance from the path, metres; none while it turns on the spot or stands held.
     pub(crate) cross_track_m: Option<f64>,
@@ -67,7 +67,7 @@ pub(crate) struct TickRecord {
 pub(crate) struct Driven {
     points: Vec<Passed>,
     spacing_m: f64,
-    /// Farthest that the way so far is from the line through the points, metres.
+    /// Farthest that the path so far is from the line through the points, metres.
     tolerance_m: f64,
     last: Option<Passed>,
     since_point_m: f64,
@@ -133,10 +133,13 @@ impl Driven {
         self.ticks += 1;
         self.saturated_ticks += u64::from(tick.is_saturated);
         self.reduced_ticks += u64::from(tick.gate.is_some());
-        if let Some(cross_m) = tick.cross_track_m.filter(|cross_m| cross_m.is_finite()) {
+        if let Some(cross_track_m) = tick
+            .cross_track_m
+            .filter(|cross_track_m| cross_track_m.is_finite())
+        {
             self.tracked_s += tick.dt_s;
-            self.cross_squared_m2_s += cross_m * cross_m * tick.dt_s;
-            self.cross_max_m = self.cross_max_m.max(cross_m.abs());
+            self.cross_squared_m2_s += cross_track_m * cross_track_m * tick.dt_s;
+            self.cross_max_m = self.cross_max_m.max(cross_track_m.abs());
         }
         if tick.slips && !self.was_slipping {
             self.slip_events = self.slip_events.saturating_add(1);
@@ -173,7 +176,7 @@ impl Driven {
         if self.since_point_m < self.spacing_m {
             return;
         }
-        // Between two points the way is no longer than this, so it strays by half at the most.
+        // Between two points the path is no longer than this, so it strays by half at the most.
         self.tolerance_m = self.tolerance_m.max(0.5 * self.since_point_m);
         self.since_point_m = 0.0;
         if self.points.len() >= DRIVEN_POINTS_MAX - 1 {
@@ -381,14 +384,14 @@ mod tests {
             repeats in 1..400_usize,
         ) {
             let mut driven = Driven::new();
-            let (mut at, mut heading_rad, mut way) = (Point::default(), 0.0_f64, Vec::new());
+            let (mut at, mut heading_rad, mut travelled) = (Point::default(), 0.0_f64, Vec::new());
             for _ in 0..repeats {
                 for &(step_m, turn_rad) in &steps {
                     heading_rad += turn_rad;
                     at.x_m += step_m * heading_rad.cos();
                     at.y_m += step_m * heading_rad.sin();
                     driven.add(&tick(at, step_m, 0.0));
-                    way.push(at);
+                    travelled.push(at);
                 }
             }
             let path = driven.path();
@@ -396,7 +399,7 @@ mod tests {
             prop_assert!(path.has_possible_times() && !path.times_s.is_empty());
             prop_assert!(driven.quality().theta.len() <= THETA_SAMPLES_MAX);
             if path.points.len() > 1 {
-                for point in way.iter().step_by(1 + way.len() / 200) {
+                for point in travelled.iter().step_by(1 + travelled.len() / 200) {
                     let off_m = distance_from_path_m(*point, &path);
                     prop_assert!(off_m <= path.tolerance_m + 1.0e-9, "{off_m} {}", path.tolerance_m);
                 }
@@ -426,7 +429,7 @@ mod tests {
     fn a_pause_is_seen_in_the_times_and_motion_between_two_points_is_even() {
         let mut driven = Driven::new();
         let mut at = Point::default();
-        let mut way = Vec::new();
+        let mut travelled = Vec::new();
         for step in 0..3_000_u32 {
             // Ten seconds ahead, ten standing, ten ahead at half the speed.
             let step_m = match step {
@@ -436,12 +439,12 @@ mod tests {
             };
             at.x_m += step_m;
             driven.add(&tick(at, step_m, 0.0));
-            way.push((0.01 * f64::from(step + 1), at));
+            travelled.push((0.01 * f64::from(step + 1), at));
         }
         let path = driven.path();
         assert!(path.has_possible_times());
         assert!((3..=8).contains(&path.points.len()), "{path:?}");
-        for (time_s, at) in way {
+        for (time_s, at) in travelled {
             let after = path.times_s.partition_point(|known| *known < time_s);
             let after = after.clamp(1, path.times_s.len() - 1);
             let (from_s, to_s) = (path.times_s[after - 1], path.times_s[after]);

@@ -12,7 +12,7 @@ pub(crate) struct GroundRecord {
     pub(crate) traction_limit_mu: Option<f64>,
     /// Whether the map knew this cell.
     pub(crate) is_on_the_map: bool,
-    /// What the law was told.
+    /// What the law was given.
     pub(crate) told: Option<ThetaKnowledge>,
     /// What the robot has measured by itself.
     pub(crate) measured: Option<ThetaKnowledge>,
@@ -59,7 +59,7 @@ impl Gain {
 
     /// Adds a cell in which the map's word could be held against a measurement.
     pub(super) fn compare(&mut self, comparison: &Comparison) {
-        let apart = comparison.deviations();
+        let apart = comparison.z_score();
         if !apart.is_finite() {
             return;
         }
@@ -69,7 +69,7 @@ impl Gain {
         self.square_sum += apart * apart;
     }
 
-    /// The report on a way of so many metres; none where the map knew nothing.
+    /// The report on a path of so many metres; none where the map knew nothing.
     pub(super) fn report(&self, distance_m: f64) -> Option<PriorGain> {
         let traction_limit_mu = self.traction_limit_mu?;
         let mean = |sum: f64| (self.compared > 0).then(|| sum / f64::from(self.compared));

@@ -158,7 +158,7 @@ fn a_new_revision_takes_over_where_the_robot_comes_to_stand() {
         let first = path.points.first().unwrap();
         assert!(
             (first.x_m - START.x_m).hypot(first.y_m - START.y_m) < 0.3,
-            "the way before the new revision is lost: {first:?}"
+            "the path before the new revision is lost: {first:?}"
         );
     }
 }
@@ -219,18 +219,18 @@ fn the_mission_link_watchdog_ends_a_mission_that_minds_silence_and_no_other() {
 #[test]
 fn a_mission_whose_base_is_silent_for_a_while_is_held_and_goes_on_when_it_is_heard_again() {
     let (mut bench, _, _) = driving();
-    let is_held = |bench: &Bench| bench.ends.shared.snapshot().is_held;
-    assert!(!is_held(&bench));
+    let is_on_hold = |bench: &Bench| bench.ends.shared.snapshot().is_on_hold;
+    assert!(!is_on_hold(&bench));
     let silent_since = bench.now;
     while bench.now < silent_since + SECOND {
         bench.tick_without_base();
     }
-    assert!(is_held(&bench));
+    assert!(is_on_hold(&bench));
     // Heard for a moment only: that is not enough.
     bench.run_for(SECOND / 4);
-    assert!(is_held(&bench));
+    assert!(is_on_hold(&bench));
     bench.run_for(SECOND / 2);
-    assert!(!is_held(&bench));
+    assert!(!is_on_hold(&bench));
     assert_eq!(run_to_end(&mut bench), EndReason::Reached);
 }
 

@@ -27,7 +27,7 @@ pub(crate) struct JobOrigin {
     pub(crate) trajectory: Trajectory,
     /// Where the plan begins.
     pub(crate) start: Pose,
-    /// What the map knows along the way.
+    /// What the map knows along the path.
     pub(crate) prior: Option<PathPrior>,
     /// The grid of the site for which it was planned.
     pub(crate) grid: Option<Grid>,

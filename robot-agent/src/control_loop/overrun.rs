@@ -191,11 +191,11 @@ mod tests {
             assert!(ticking.tick_after(500));
             let mut released_ms = None;
             while ticking.now < Duration::from_secs(20) {
-                let mut is_held = ticking.tick_after(late_ms);
+                let mut is_on_hold = ticking.tick_after(late_ms);
                 for _ in 0..on_time {
-                    is_held &= ticking.tick_after(10);
+                    is_on_hold &= ticking.tick_after(10);
                 }
-                if !is_held {
+                if !is_on_hold {
                     released_ms = released_ms.or(Some(ticking.now.as_millis()));
                 }
             }
@@ -214,11 +214,11 @@ mod tests {
         let mut held_after = None;
         for round in 1..=20 {
             // One of six is late.
-            let mut is_held = ticking.tick_after(60);
+            let mut is_on_hold = ticking.tick_after(60);
             for _ in 0..5 {
-                is_held |= ticking.tick_after(10);
+                is_on_hold |= ticking.tick_after(10);
             }
-            if is_held {
+            if is_on_hold {
                 held_after = Some(round);
                 break;
             }
@@ -246,25 +246,25 @@ mod tests {
             gaps_ms in prop::collection::vec(prop_oneof![8 => 5..15_u64, 1 => 40..200_u64], 1..600),
         ) {
             let mut ticking = Loop::new();
-            let (mut late_at_ms, mut was_held) = (Vec::new(), false);
+            let (mut late_at_ms, mut was_on_hold) = (Vec::new(), false);
             let (mut now_ms, mut far_late_at_ms) = (0, None);
             for gap_ms in gaps_ms {
                 now_ms += gap_ms;
-                let is_held = ticking.tick_after(gap_ms);
+                let is_on_hold = ticking.tick_after(gap_ms);
                 if gap_ms > 50 {
                     late_at_ms.push(now_ms);
                 }
                 if gap_ms >= 130 {
                     far_late_at_ms = Some(now_ms);
                 }
-                prop_assert!(is_held || gap_ms < 130);
+                prop_assert!(is_on_hold || gap_ms < 130);
                 let of_late = late_at_ms.iter().filter(|at_ms| now_ms - **at_ms < 1_000).count();
                 let is_calm = of_late <= LATE_ISOLATED_MAX
                     && far_late_at_ms.is_none_or(|at_ms| now_ms - at_ms >= 1_000);
-                if was_held && !is_held {
+                if was_on_hold && !is_on_hold {
                     prop_assert!(is_calm);
                 }
-                was_held = is_held;
+                was_on_hold = is_on_hold;
             }
         }
 
@@ -274,15 +274,16 @@ mod tests {
         ) {
             let mut ticking = Loop::new();
             prop_assert!(ticking.tick_after(400));
-            // At most two of them are within a second: each comes at least half of one behind the last.
-            let mut is_held = true;
+            // At most two of them are within a second: each comes at least half of one behind the
+            // last.
+            let mut is_on_hold = true;
             for (late_ms, on_time) in hiccups {
-                is_held = ticking.tick_after(late_ms);
+                is_on_hold = ticking.tick_after(late_ms);
                 for _ in 0..on_time {
-                    is_held = ticking.tick_after(10);
+                    is_on_hold = ticking.tick_after(10);
                 }
             }
-            prop_assert!(!is_held);
+            prop_assert!(!is_on_hold);
         }
     }
 }

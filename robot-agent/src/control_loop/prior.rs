@@ -1,4 +1,4 @@
-//! What the map knows along the way of a mission, for the law and the plan.
+//! What the map knows along the path of a mission, for the law and the plan.
 //!
 //! It stands beside what the robot measures and never goes into it: segments come from the
 //! estimator alone, which does not know this module.
@@ -10,7 +10,7 @@ use tread_control::tracking::ThetaKnowledge;
 
 /// Standard deviations from which the robot's own measurement is believed alone: the ground is not
 /// as the map has it.
-const CONTRADICTION_DEVIATIONS: f64 = 4.0;
+const CONTRADICTION_STD_DEVS: f64 = 4.0;
 
 /// The prior of one mission; empty when the map knows nothing.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -95,8 +95,8 @@ pub(crate) fn told(
     match (measured, prior) {
         (Some(measured), Some(prior)) => {
             let apart = (measured.theta - prior.theta).abs();
-            let deviation = measured.std_dev.hypot(prior.std_dev);
-            if apart > CONTRADICTION_DEVIATIONS * deviation {
+            let std_dev = measured.std_dev.hypot(prior.std_dev);
+            if apart > CONTRADICTION_STD_DEVS * std_dev {
                 Some(measured)
             } else {
                 Some(measured.fused(prior))

@@ -38,7 +38,7 @@ fn knowing_bench(stiffness: f64, seed: u64, prior: Option<&PathPrior>) -> Bench 
     bench
 }
 
-/// θ of all segments with its deviation.
+/// θ of all segments with its standard deviation.
 fn mapped(bench: &Bench) -> (f64, f64) {
     let (mut information, mut weighted) = (0.0, 0.0);
     for segment in &bench.segments {
@@ -54,11 +54,11 @@ fn a_wrong_prior_never_comes_onto_the_map() {
     for (wrong, seed) in [(0.04, 2), (3.0, 3)] {
         let prior = everywhere(wrong, 0.01 * wrong, 0.5);
         let mut bench = knowing_bench(2.5, seed, Some(&prior));
-        for (number, way) in [(1, LINE), (2, CIRCLE)] {
-            assert_eq!(bench.drive_to_the_end(number, way), EndReason::Reached);
+        for (number, path) in [(1, LINE), (2, CIRCLE)] {
+            assert_eq!(bench.drive_to_the_end(number, path), EndReason::Reached);
         }
         let (theta, std_dev) = mapped(&bench);
-        // The same bound as for a robot that was told nothing.
+        // The same bound as for a robot that was given nothing.
         assert!(
             (theta - truth).abs() / truth < 0.1 + 3.0 * std_dev / truth,
             "told {wrong}: θ {theta} ± {std_dev}, truly {truth}"

@@ -14,7 +14,7 @@ use tread_control::geometry::Point;
 
 /// Wheel travel that is judged at a time, metres: far more than the noise of a fix.
 const WINDOW_M: f64 = 0.5;
-/// Share of the wheels' way below which they dig.
+/// Share of the wheels' distance below which they dig.
 const DUG_IN_RATIO: f64 = 0.3;
 /// Share above which they do not.
 const FREE_RATIO: f64 = 0.6;
@@ -37,10 +37,10 @@ impl ProgressWatch {
         self.dug_in_at
     }
 
-    /// The wheels have turned: their mean way ahead, metres, below zero for back.
-    pub(crate) fn note_wheels(&mut self, ahead_m: f64) {
-        if self.from.is_some() && ahead_m.is_finite() {
-            self.wheels_m += ahead_m;
+    /// The wheels have turned: their mean forward distance, metres, below zero for back.
+    pub(crate) fn note_wheels(&mut self, forward_m: f64) {
+        if self.from.is_some() && forward_m.is_finite() {
+            self.wheels_m += forward_m;
         }
     }
 

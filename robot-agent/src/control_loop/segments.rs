@@ -53,7 +53,7 @@ pub(crate) struct CutInput<'tick> {
     pub(crate) place: Option<Place>,
     pub(crate) site: Option<&'tick Arc<SiteView>>,
     pub(crate) mission: Option<MissionId>,
-    /// Way driven in this tick, metres.
+    /// Distance driven in this tick, metres.
     pub(crate) driven_m: f64,
     /// The estimator says that the ground is another one now.
     pub(crate) ground_changed: bool,

@@ -121,7 +121,7 @@ fn each_fault_on_a_mission_is_named_holds_it_within_two_seconds_and_ends_it_if_i
         bench.run_for(17 * SECOND);
         let ended = bench.ended.last().copied();
         assert_eq!(ended, Some((mission, EndReason::SensorFault)), "{fault:?}");
-        assert!(bench.drive.truth().ahead_m_s.abs() < 0.05, "{fault:?}");
+        assert!(bench.drive.truth().forward_m_s.abs() < 0.05, "{fault:?}");
     }
 }
 
@@ -192,12 +192,12 @@ fn a_mission_that_a_sensor_held_goes_on_when_the_sensor_is_right_again() {
         kind: FaultKind::PositionJumped { by_m: 5.0 },
     }]);
     bench.start(1, CIRCLE, None);
-    let mut was_held = false;
+    let mut was_on_hold = false;
     while bench.ended.is_empty() {
         bench.tick();
-        was_held |= bench.ends.shared.snapshot().is_held;
+        was_on_hold |= bench.ends.shared.snapshot().is_on_hold;
     }
-    assert!(was_held);
+    assert!(was_on_hold);
     assert_eq!(bench.ended[0].1, EndReason::Reached);
 }
 
@@ -239,7 +239,7 @@ fn within_a_fence_a_robot_whose_position_was_wrong_goes_on_by_itself_without_mov
         if is_doubted {
             held += PERIOD;
             assert!(snapshot.gate.target_rests, "{:?}", snapshot.gate);
-            blind_m += bench.drive.truth().ahead_m_s.abs() * PERIOD.as_secs_f64();
+            blind_m += bench.drive.truth().forward_m_s.abs() * PERIOD.as_secs_f64();
         }
         assert!(
             bench.now < Duration::from_mins(3),
@@ -265,7 +265,7 @@ fn a_base_that_ignores_a_stop_is_said_not_to_stand_and_one_that_obeys_to_stand()
         while bench.now.as_secs_f64() < BREAKS_AT_S + 1.0 {
             bench.tick();
         }
-        let speed_m_s = bench.drive.truth().ahead_m_s;
+        let speed_m_s = bench.drive.truth().forward_m_s;
         assert!(speed_m_s > 0.5, "{speed_m_s} m/s");
         stop_now(&bench);
         bench.run_for(3 * SECOND);

@@ -151,18 +151,22 @@ impl SiteView {
     /// What the four wheels of a robot stand on.
     pub(crate) fn footing(&self, pose: Pose, model: &RobotModel) -> Footing {
         let (sin, cos) = pose.heading_rad.sin_cos();
-        let (ahead_m, left_m) = (0.5 * model.wheelbase_m(), 0.5 * model.track_width_m());
-        let under = |ahead_m: f64, left_m: f64| {
+        let (forward_m, left_m) = (0.5 * model.wheelbase_m(), 0.5 * model.track_width_m());
+        let under = |forward_m: f64, left_m: f64| {
             self.terrain_at(Point {
-                x_m: pose.x_m + ahead_m * cos - left_m * sin,
-                y_m: pose.y_m + ahead_m * sin + left_m * cos,
+                x_m: pose.x_m + forward_m * cos - left_m * sin,
+                y_m: pose.y_m + forward_m * sin + left_m * cos,
             })
         };
-        let first = under(ahead_m, left_m);
-        let others = [(ahead_m, -left_m), (-ahead_m, left_m), (-ahead_m, -left_m)];
+        let first = under(forward_m, left_m);
+        let others = [
+            (forward_m, -left_m),
+            (-forward_m, left_m),
+            (-forward_m, -left_m),
+        ];
         if others
             .into_iter()
-            .all(|(ahead_m, left_m)| under(ahead_m, left_m) == first)
+            .all(|(forward_m, left_m)| under(forward_m, left_m) == first)
         {
             Footing::Whole(first)
         } else {

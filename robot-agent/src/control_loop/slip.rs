@@ -1,7 +1,7 @@
 //! How much the wheels slip along their way, for people to look at; nothing is controlled by it.
 //!
-//! Equation (3) of the paper for each side, `λ = (rω − v)/(rω)`, smoothed over [`MEMORY_S`]. While a
-//! base without a sensor for its own speed gains or loses speed, its fixes lag behind its wheels,
+//! Equation (3) of the paper for each side, `λ = (rω − v)/(rω)`, smoothed over [`MEMORY_S`]. While
+//! a base without a sensor for its own speed gains or loses speed, its fixes lag behind its wheels,
 //! which would look like slip: then nothing is said.
 
 use tread_api::friction::SideSlip;
@@ -81,7 +81,7 @@ mod tests {
     fn moving(rim_m_s: f64, share: f64) -> (BodyVelocity, WheelSpeeds) {
         let rad_s = rim_m_s / model().wheel_radius_m();
         let velocity = BodyVelocity {
-            ahead_m_s: share * rim_m_s,
+            forward_m_s: share * rim_m_s,
             ..BodyVelocity::default()
         };
         let wheels = WheelSpeeds {

@@ -1,11 +1,11 @@
 //! Whether the ground is as the map says: each cell's own measurement against the map's word on it.
 //!
-//! `z = (θ − θ_map)/√(σ² + σ_map² + (s_b·θ_map)²)`: the segment's deviation, the map's, and how much
-//! one robot differs from all others (`s_b`). The segment never contains the map's word, so z is
-//! standard normal where nothing has changed.
+//! `z = (θ − θ_map)/√(σ² + σ_map² + (s_b·θ_map)²)`: the segment's standard deviation, the map's,
+//! and how much one robot differs from all others (`s_b`). The segment never contains the map's
+//! word, so z is standard normal where nothing has changed.
 //!
 //! ```text
-//!        |z| ≥ RAISE_DEVIATIONS in two cells in a row, the same way
+//!        |z| ≥ RAISE_STD_DEVS in two cells in a row, the same way
 //! quiet ────────────────────────► raised
 //!   ▲ └── AGREE_CELLS cells in a row with |z| ≤ AGREE_DEVIATIONS, or another mission ──┘
 //! ```
@@ -15,10 +15,10 @@ use tread_control::tracking::ThetaKnowledge;
 
 /// Standard deviations from which a cell's ground is another one than the map's. By chance, one
 /// cell in 147 000 is as far off, and two in a row at the most as often:
-/// a robot that drives 2 000 cells an hour gives at most one false alarm in 73 hours of driving over
-/// ground that the map knows. The second cell is asked for since a single wrong word, of the map or
-/// of a robot without torque, is likelier than chance has it.
-pub(crate) const RAISE_DEVIATIONS: f64 = 4.5;
+/// a robot that drives 2 000 cells an hour gives at most one false alarm in 73 hours of driving
+/// over ground that the map knows. The second cell is asked for since a single wrong word, of the
+/// map or of a robot without torque, is likelier than chance has it.
+pub(crate) const RAISE_STD_DEVS: f64 = 4.5;
 /// The probability of a false alarm in a cell: both tails of the standard normal distribution.
 #[cfg(test)]
 const FALSE_ALARM_PROBABILITY: f64 = 6.8e-6;
@@ -41,11 +41,11 @@ pub(crate) struct Comparison {
 
 impl Comparison {
     /// How far apart they are, in standard deviations; above zero where the ground slips more.
-    pub(crate) fn deviations(&self) -> f64 {
+    pub(crate) fn z_score(&self) -> f64 {
         let (measured, expected) = (self.measured, self.expected);
         let bias = self.robot_bias_ratio * expected.theta;
-        let deviation = measured.std_dev.hypot(expected.std_dev).hypot(bias);
-        (measured.theta - expected.theta) / deviation
+        let std_dev = measured.std_dev.hypot(expected.std_dev).hypot(bias);
+        (measured.theta - expected.theta) / std_dev
     }
 
     /// How far apart they are, as a share of what was expected.
@@ -55,7 +55,7 @@ impl Comparison {
 
     /// Whether the ground is another one.
     pub(crate) fn contradicts(&self) -> bool {
-        self.deviations().abs() >= RAISE_DEVIATIONS
+        self.z_score().abs() >= RAISE_STD_DEVS
     }
 }
 
@@ -76,13 +76,11 @@ impl SurfaceWatch {
 
     /// Takes what a cell has shown.
     pub(crate) fn note(&mut self, comparison: Comparison) {
-        let apart = comparison.deviations().abs();
+        let apart = comparison.z_score().abs();
         if !apart.is_finite() {
             return;
         }
-        let slips = comparison
-            .contradicts()
-            .then(|| comparison.deviations() > 0.0);
+        let slips = comparison.contradicts().then(|| comparison.z_score() > 0.0);
         let before = std::mem::replace(&mut self.suspects_slip, slips);
         if slips.is_some() {
             if self.raised.is_some() || before == slips {
@@ -187,7 +185,8 @@ mod tests {
             alarms += u32::from(comparison.contradicts());
         }
         let expected = f64::from(CELLS) * FALSE_ALARM_PROBABILITY;
-        // Four deviations of a count of that mean; the bias is told as a share of the map's word.
+        // Four standard deviations of a count of that mean; the bias is told as a share of the
+        // map's word.
         assert!(alarms > 0, "an alarm that never comes tests nothing");
         assert!(
             f64::from(alarms) < expected + 4.0 * expected.sqrt(),

@@ -203,7 +203,7 @@ fn a_cancelled_mission_brakes_along_its_path_and_ends_cancelled() {
     bench.run_for(Duration::from_secs(5));
     assert_eq!(bench.ended, [(mission, EndReason::Cancelled)]);
     assert_eq!(EndReason::Cancelled.phase(), MissionPhase::Cancelled);
-    assert!(bench.drive.truth().ahead_m_s.abs() < 0.01);
+    assert!(bench.drive.truth().forward_m_s.abs() < 0.01);
     assert!(
         bench.cross_track_m.abs() < 0.05,
         "{} m off the path",
@@ -252,15 +252,15 @@ fn the_word_to_stop_brings_the_robot_to_rest_within_its_braking_time() {
     bench.run_for(Duration::from_millis(500));
     let mission = bench.start(1, LINE, None);
     bench.run_for(Duration::from_secs(5));
-    let speed_m_s = bench.drive.truth().ahead_m_s;
+    let speed_m_s = bench.drive.truth().forward_m_s;
     assert!(speed_m_s > 0.5, "{speed_m_s}");
-    let told_at = bench.now;
+    let logged_at = bench.now;
     while !bench.core.stands() {
         bench.simulate();
         bench.tick_loop(true);
         bench.collect();
         assert!(
-            bench.now < told_at + Duration::from_secs(3),
+            bench.now < logged_at + Duration::from_secs(3),
             "it does not stand"
         );
     }

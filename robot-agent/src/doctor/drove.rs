@@ -37,7 +37,8 @@ pub(super) struct Drove {
     pub(super) odometry_m_s: Option<f64>,
     /// The odometry's motion, and where its pose heads.
     pub(super) twist: Option<PlanarTwist>,
-    /// Difference of the wheels' speeds, right minus left, and turn rate: means of parts of the motion.
+    /// Difference of the wheels' speeds, right minus left, and turn rate: means of parts of the
+    /// motion.
     pub(super) turn_blocks: Vec<TurnBlock>,
     /// Between which bounds each figure lay, from setting off to the end.
     pub(super) ranges: Ranges,
@@ -118,7 +119,7 @@ pub(super) struct Ranges {
     pub(super) left: Range,
     pub(super) right: Range,
     pub(super) gyro: Range,
-    pub(super) odometry_ahead: Range,
+    pub(super) odometry_forward: Range,
     pub(super) odometry_turn: Range,
     pub(super) x: Range,
     pub(super) y: Range,
@@ -132,7 +133,7 @@ impl Ranges {
             left: self.left.with(other.left),
             right: self.right.with(other.right),
             gyro: self.gyro.with(other.gyro),
-            odometry_ahead: self.odometry_ahead.with(other.odometry_ahead),
+            odometry_forward: self.odometry_forward.with(other.odometry_forward),
             odometry_turn: self.odometry_turn.with(other.odometry_turn),
             x: self.x.with(other.x),
             y: self.y.with(other.y),
@@ -145,7 +146,7 @@ impl Ranges {
             Content::Wheels(wheels) => self.add_wheels(wheels.speeds),
             Content::Inertial(inertial) => self.gyro.add(inertial.yaw_rate_rad_s),
             Content::Motion(motion) => {
-                self.odometry_ahead.add(motion.ahead_m_s);
+                self.odometry_forward.add(motion.forward_m_s);
                 self.odometry_turn.add(motion.yaw_rate_rad_s);
                 if settings.joints.is_none() {
                     self.add_wheels(wheels_of(motion, &settings.command));
@@ -247,7 +248,7 @@ pub(super) fn drove(
                     add_wheels(wheels_of(&motion, &settings.command));
                 }
                 if motion_of == Some(MotionOf::Ground) {
-                    speed.add(motion.ahead_m_s);
+                    speed.add(motion.forward_m_s);
                 }
                 places.extend(motion.position.map(|position| (at_s, position)));
             }
@@ -414,19 +415,19 @@ fn speed_of(places: &[(f64, Position)]) -> Option<f64> {
     let points: Vec<(f64, f64)> = places
         .iter()
         .map(|(at_s, place)| {
-            let ahead_m = cos * place.pose.x_m + sin * place.pose.y_m;
-            (at_s - first_s, ahead_m)
+            let forward_m = cos * place.pose.x_m + sin * place.pose.y_m;
+            (at_s - first_s, forward_m)
         })
-        .inspect(|(at_s, ahead_m)| {
+        .inspect(|(at_s, forward_m)| {
             span.add(*at_s);
-            way.add(*ahead_m);
+            way.add(*forward_m);
         })
         .collect();
     let (middle_s, middle_m) = (span.value()?, way.value()?);
     let (mut squares, mut products) = (0.0, 0.0);
-    for (at_s, ahead_m) in points {
+    for (at_s, forward_m) in points {
         squares += (at_s - middle_s).powi(2);
-        products += (at_s - middle_s) * (ahead_m - middle_m);
+        products += (at_s - middle_s) * (forward_m - middle_m);
     }
     (squares > PLACES_SPREAD_MIN_S2).then(|| products / squares)
 }

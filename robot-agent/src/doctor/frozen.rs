@@ -33,22 +33,22 @@ pub(super) struct Frozen {
 
 impl Frozen {
     /// Which sensors froze during both motions of a robot whose gyro has this bias.
-    pub(super) fn of(turned: &Drove, ahead: &Drove, gyro_bias_rad_s: f64) -> Self {
-        let ranges = turned.ranges.with(&ahead.ranges);
+    pub(super) fn of(turned: &Drove, forward: &Drove, gyro_bias_rad_s: f64) -> Self {
+        let ranges = turned.ranges.with(&forward.ranges);
         let turn_rad_s = turned.turn_rad_s.unwrap_or(gyro_bias_rad_s) - gyro_bias_rad_s;
-        let seen = Seen::of(&ranges, turn_rad_s, ahead);
+        let seen = Seen::of(&ranges, turn_rad_s, forward);
         let Ranges {
             left,
             right,
             gyro,
-            odometry_ahead,
+            odometry_forward,
             odometry_turn,
             x,
             y,
             heading,
         } = &ranges;
         let is_position = x.is_frozen() && y.is_frozen() && heading.is_frozen();
-        let is_odometry = odometry_ahead.is_frozen() && odometry_turn.is_frozen();
+        let is_odometry = odometry_forward.is_frozen() && odometry_turn.is_frozen();
         Self {
             left: left.is_frozen() && (seen.right || seen.elsewhere()),
             right: right.is_frozen() && (seen.left || seen.elsewhere()),
@@ -67,7 +67,7 @@ impl Frozen {
         self,
         settings: &Ros2Settings,
         turned: &Drove,
-        ahead: &Drove,
+        forward: &Drove,
     ) -> Vec<Finding> {
         let mut findings = Vec::new();
         if self.joints() {
@@ -81,7 +81,7 @@ impl Frozen {
             } else {
                 "drive.ros2.odometry.topic"
             };
-            let moved = moved(turned, ahead);
+            let moved = moved(turned, forward);
             let text = format!(
                 "{which} the same speed all the time, though the robot moved ({moved}): they froze"
             );
@@ -116,12 +116,12 @@ impl Frozen {
 }
 
 /// How the robot moved by everything but its wheels, for people.
-fn moved(turned: &Drove, ahead: &Drove) -> String {
+fn moved(turned: &Drove, forward: &Drove) -> String {
     let mut parts = Vec::new();
     if let Some(turn_rad_s) = turned.turn_rad_s {
         parts.push(format!("turned at {turn_rad_s:.2} rad/s"));
     }
-    if let Some(ground_m_s) = ahead.ground_m_s() {
+    if let Some(ground_m_s) = forward.ground_m_s() {
         parts.push(format!("went {ground_m_s:.2} m/s"));
     }
     parts.join(", ")
@@ -142,13 +142,13 @@ struct Seen {
 }
 
 impl Seen {
-    fn of(ranges: &Ranges, turn_rad_s: f64, ahead: &Drove) -> Self {
+    fn of(ranges: &Ranges, turn_rad_s: f64, forward: &Drove) -> Self {
         let has_turned = |span: f64, commanded: f64| span > TURNED_SHARE * commanded.abs();
         Self {
-            left: has_turned(ranges.left.span(), ahead.commanded.left_rad_s),
-            right: has_turned(ranges.right.span(), ahead.commanded.right_rad_s),
+            left: has_turned(ranges.left.span(), forward.commanded.left_rad_s),
+            right: has_turned(ranges.right.span(), forward.commanded.right_rad_s),
             gyro: turn_rad_s.abs() > TURNED_RAD_S && !ranges.gyro.is_frozen(),
-            odometry: ranges.odometry_ahead.span() > MOVED_M_S,
+            odometry: ranges.odometry_forward.span() > MOVED_M_S,
             position: ranges.x.span().hypot(ranges.y.span()) > MOVED_M,
         }
     }
@@ -182,7 +182,7 @@ mod tests {
         };
         [(-1.0, 1.0), (1.0, 1.0)].map(|(left, right): (f64, f64)| {
             let scale = if moves { 1.0 } else { 0.0 };
-            let (turn, ahead) = (scale * (right - left), scale * (left + right));
+            let (turn, forward) = (scale * (right - left), scale * (left + right));
             let mut drove = Drove {
                 commanded: WheelSpeeds {
                     left_rad_s: 2.5 * left,
@@ -202,14 +202,14 @@ mod tests {
                     .add(measured(2.5 * right * scale * share, frozen.right));
                 ranges.gyro.add(measured(0.3 * turn * share, frozen.gyro));
                 ranges
-                    .odometry_ahead
-                    .add(measured(0.1 * ahead * share, frozen.odometry));
+                    .odometry_forward
+                    .add(measured(0.1 * forward * share, frozen.odometry));
                 ranges
                     .odometry_turn
                     .add(measured(0.3 * turn * share, frozen.odometry));
                 ranges
                     .x
-                    .add(measured(0.1 * ahead * share * 4.0, frozen.position));
+                    .add(measured(0.1 * forward * share * 4.0, frozen.position));
                 ranges.y.add(measured(0.0, frozen.position));
                 ranges
                     .heading
@@ -220,8 +220,8 @@ mod tests {
     }
 
     fn found(frozen: Frozen, moves: bool, noise: f64) -> Frozen {
-        let [turned, ahead] = robot(frozen, moves, noise);
-        Frozen::of(&turned, &ahead, 0.0)
+        let [turned, forward] = robot(frozen, moves, noise);
+        Frozen::of(&turned, &forward, 0.0)
     }
 
     #[test]
@@ -265,8 +265,9 @@ mod tests {
                 "drive.ros2.odometry.topic",
             ),
         ] {
-            let [turned, ahead] = robot(frozen, true, 0.01);
-            let findings = Frozen::of(&turned, &ahead, 0.0).findings(&settings(), &turned, &ahead);
+            let [turned, forward] = robot(frozen, true, 0.01);
+            let findings =
+                Frozen::of(&turned, &forward, 0.0).findings(&settings(), &turned, &forward);
             let keys: Vec<_> = findings.iter().filter_map(|finding| finding.key).collect();
             assert_eq!(keys, [key], "{frozen:?}");
         }
@@ -279,11 +280,11 @@ mod tests {
 
     #[test]
     fn a_gyro_with_a_bias_did_not_see_a_robot_turn_that_stood() {
-        let [mut turned, ahead] = robot(Frozen::default(), false, 0.0);
+        let [mut turned, forward] = robot(Frozen::default(), false, 0.0);
         turned.turn_rad_s = Some(0.3);
         turned.ranges.gyro.add(0.3);
-        assert_eq!(Frozen::of(&turned, &ahead, 0.3), Frozen::default());
-        let found = Frozen::of(&turned, &ahead, 0.0);
+        assert_eq!(Frozen::of(&turned, &forward, 0.3), Frozen::default());
+        let found = Frozen::of(&turned, &forward, 0.0);
         assert!(found.left && found.right, "{found:?}");
     }
 

@@ -1,10 +1,11 @@
 //! `tread-agent doctor`: what is wrong with the installation on a ROS 2 robot, before it drives.
 //!
 //! It listens for a while ([`listening`]); with `--move` it turns the robot on the spot and drives
-//! it ahead for a metre, slowly, and compares what was commanded with what was said ([`moving`]): sensors that
-//! froze ([`frozen`]), sides and signs ([`signs`]), the frame of the odometry's twist ([`twist_frame`]), the
-//! tracks ([`track`]), and how the wheels pull with the robot's mass ([`pulling`]). Each finding names the key of
-//! `robot.toml` to look at, and the lines that mend it where there are such.
+//! it ahead for a metre, slowly, and compares what was commanded with what was said ([`moving`]):
+//! sensors that froze ([`frozen`]), sides and signs ([`signs`]), the frame of the odometry's twist
+//! ([`twist_frame`]), the tracks ([`track`]), and how the wheels pull with the robot's mass
+//! ([`pulling`]). Each finding names the key of `robot.toml` to look at, and the lines that mend it
+//! where there are such.
 
 mod drove;
 mod finding;
@@ -205,18 +206,19 @@ impl Hands {
         };
         heard.forget();
         let mut turned = self.drive_for(speeds(-1.0, 1.0), settings, heard);
-        // Along the x axis of its odometry's frame a twist of that frame looks like one of the robot.
+        // Along the x axis of its odometry's frame a twist of that frame looks like one of the
+        // robot.
         if turned.twist.is_some() && heads_along_x(settings, heard) {
             turned = self.drive_for(speeds(-1.0, 1.0), settings, heard);
         }
-        let ahead = self.drive_for(speeds(1.0, 1.0), settings, heard);
+        let forward = self.drive_for(speeds(1.0, 1.0), settings, heard);
         // What two nodes command says nothing of signs and tracks.
         if let Some(finding) = self.other_commander(settings) {
             findings.push(finding);
             return findings;
         }
         findings.extend(moving::findings(
-            settings, model, &turned, &ahead, bias_rad_s,
+            settings, model, &turned, &forward, bias_rad_s,
         ));
         findings
     }
@@ -288,8 +290,8 @@ impl Hands {
         Drove::default()
     }
 
-    /// What was said while the robot set off, and when its speed was steady; none of a base that fell
-    /// silent.
+    /// What was said while the robot set off, and when its speed was steady; none of a base that
+    /// fell silent.
     fn try_to_drive(&mut self, command: WheelSpeeds, heard: &Heard) -> Option<[Vec<Message>; 2]> {
         heard.forget();
         let mut is_heard = self.ramp(command) && self.hold_heard(command, SETTLE);

@@ -1,8 +1,8 @@
-//! What a moving robot's messages say: frozen sensors, wheel directions, sides, signs, the frame of the
-//! twist, radius, track and torque.
+//! What a moving robot's messages say: frozen sensors, wheel directions, sides, signs, the frame of
+//! the twist, radius, track and torque.
 //!
-//! Pure: from what was commanded and what was said while the robot turned to the left on the spot, and
-//! while it drove ahead. A question whose answer another finding spoils is not asked.
+//! Pure: from what was commanded and what was said while the robot turned to the left on the spot,
+//! and while it drove ahead. A question whose answer another finding spoils is not asked.
 
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
@@ -46,10 +46,10 @@ pub(super) fn findings(
     settings: &Ros2Settings,
     model: &RobotModel,
     turned: &Drove,
-    ahead: &Drove,
+    forward: &Drove,
     gyro_bias_rad_s: f64,
 ) -> Vec<Finding> {
-    if !(turned.is_heard && ahead.is_heard) {
+    if !(turned.is_heard && forward.is_heard) {
         return vec![Finding::wrong(
             "wheels",
             "drive.ros2.silent_after_ms",
@@ -57,34 +57,34 @@ pub(super) fn findings(
              is overloaded",
         )];
     }
-    let (Some(turning), Some(going)) = (turned.wheels, ahead.wheels) else {
+    let (Some(turning), Some(going)) = (turned.wheels, forward.wheels) else {
         return vec![Finding::wrong(
             "wheels",
             "drive.ros2.joints.topic",
             "the wheels said nothing while they were commanded to move",
         )];
     };
-    let frozen = Frozen::of(turned, ahead, gyro_bias_rad_s);
-    let mut findings = frozen.findings(settings, turned, ahead);
+    let frozen = Frozen::of(turned, forward, gyro_bias_rad_s);
+    let mut findings = frozen.findings(settings, turned, forward);
     if frozen.left || frozen.right {
         let text = "sides, signs, radius and track: they need the joints";
         findings.push(Finding::skipped("sides", text));
         return findings;
     }
-    let (of_turn, of_ahead) = (directions(turning, turned), directions(going, ahead));
+    let (of_turn, of_forward) = (directions(turning, turned), directions(going, forward));
     // By the command, for joints that disagree have no mean.
-    let commanded_rad_s = 0.5 * (ahead.commanded.left_rad_s + ahead.commanded.right_rad_s);
+    let commanded_rad_s = 0.5 * (forward.commanded.left_rad_s + forward.commanded.right_rad_s);
     let rim_m_s = model.wheel_radius_m() * commanded_rad_s;
-    let twist = ahead.twist.filter(|_| !frozen.odometry);
-    let twist = twist.and_then(|twist| twist_frame::finding(&twist, rim_m_s, of_ahead));
+    let twist = forward.twist.filter(|_| !frozen.odometry);
+    let twist = twist.and_then(|twist| twist_frame::finding(&twist, rim_m_s, of_forward));
     let is_twist_well = twist.is_none();
     findings.extend(twist);
-    let ground_m_s = ahead.places_m_s.filter(|_| !frozen.position).or(ahead
+    let ground_m_s = forward.places_m_s.filter(|_| !frozen.position).or(forward
         .odometry_m_s
         .filter(|_| !frozen.odometry && is_twist_well));
     let turn_rad_s = turned.turn_rad_s.filter(|_| !frozen.gyro);
     let turn_rad_s = turn_rad_s.map(|rate| rate - gyro_bias_rad_s);
-    if let Some(standing) = of_standing(of_turn, of_ahead) {
+    if let Some(standing) = of_standing(of_turn, of_forward) {
         findings.push(standing);
         return findings;
     }
@@ -92,7 +92,7 @@ pub(super) fn findings(
     let sides = signs::finding(
         Answers {
             turn: of_turn,
-            ahead: of_ahead,
+            forward: of_forward,
             turned: turn_rad_s.map_or(0, |rate| way(rate, TURNING_RAD_S)),
             went,
         },
@@ -123,11 +123,11 @@ pub(super) fn findings(
         settings,
         model,
         &turned_of_track,
-        ahead,
+        forward,
         radius_m,
         gyro_bias_rad_s,
     ));
-    findings.extend(pulling::findings(settings, model, turned, ahead));
+    findings.extend(pulling::findings(settings, model, turned, forward));
     findings
 }
 
@@ -143,8 +143,8 @@ fn way(value: f64, least: f64) -> i8 {
 }
 
 /// Wheels that stand though they are commanded to turn.
-fn of_standing(of_turn: [i8; 2], of_ahead: [i8; 2]) -> Option<Finding> {
-    let stands = |side: usize| of_turn[side] == 0 && of_ahead[side] == 0;
+fn of_standing(of_turn: [i8; 2], of_forward: [i8; 2]) -> Option<Finding> {
+    let stands = |side: usize| of_turn[side] == 0 && of_forward[side] == 0;
     let text = match (stands(0), stands(1)) {
         (true, true) => {
             "the wheels stand though they are commanded to turn, and nothing else moved: nobody takes the \
@@ -153,7 +153,7 @@ fn of_standing(of_turn: [i8; 2], of_ahead: [i8; 2]) -> Option<Finding> {
         (true, false) => "the left wheels stand though they are commanded to turn",
         (false, true) => "the right wheels stand though they are commanded to turn",
         (false, false) if of_turn.contains(&0) => "the wheels stand when a turn is commanded",
-        (false, false) if of_ahead.contains(&0) => "the wheels stand when ahead is commanded",
+        (false, false) if of_forward.contains(&0) => "the wheels stand when ahead is commanded",
         (false, false) => return None,
     };
     Some(Finding::wrong("wheels", "drive.ros2.command.topic", text))
@@ -188,7 +188,7 @@ fn of_still_body(
     })
 }
 
-/// The wheels' radius against the way over ground.
+/// The wheels' radius against the distance over ground.
 fn of_radius(model: &RobotModel, radius_m: f64) -> Finding {
     let model_m = model.wheel_radius_m();
     if (radius_m / model_m - 1.0).abs() <= RADIUS_SHARE {
@@ -250,7 +250,7 @@ mod tests {
             is_heard: true,
             ..Drove::default()
         };
-        let ahead = Drove {
+        let forward = Drove {
             commanded: speeds(2.5, 2.5),
             wheels: Some(speeds(2.5, 2.5)),
             turn_rad_s: Some(0.0),
@@ -264,25 +264,25 @@ mod tests {
                 left: moving([0.0, 2.5]),
                 right: moving([0.0, 2.5]),
                 gyro: moving([0.0, 0.001]),
-                odometry_ahead: moving([0.0, 0.2]),
+                odometry_forward: moving([0.0, 0.2]),
                 ..Ranges::default()
             },
             is_heard: true,
             ..Drove::default()
         };
-        [turned, ahead]
+        [turned, forward]
     }
 
-    fn keys(turned: &Drove, ahead: &Drove) -> Vec<&'static str> {
-        let found = findings(&settings(), &RobotModel::yi2007(), turned, ahead, 0.0);
+    fn keys(turned: &Drove, forward: &Drove) -> Vec<&'static str> {
+        let found = findings(&settings(), &RobotModel::yi2007(), turned, forward, 0.0);
         found.iter().filter_map(|finding| finding.key).collect()
     }
 
     /// The paper's base, which has its own track and radius.
     fn keys_of(change: impl Fn(&mut Drove, &mut Drove)) -> Vec<&'static str> {
-        let [mut turned, mut ahead] = healthy();
-        change(&mut turned, &mut ahead);
-        keys(&turned, &ahead)
+        let [mut turned, mut forward] = healthy();
+        change(&mut turned, &mut forward);
+        keys(&turned, &forward)
     }
 
     #[test]
@@ -292,20 +292,20 @@ mod tests {
 
     #[test]
     fn frozen_joints_of_a_robot_that_moved_are_not_a_command_that_nobody_takes() {
-        let still = |turned: &mut Drove, ahead: &mut Drove| {
-            for drove in [turned, ahead] {
+        let still = |turned: &mut Drove, forward: &mut Drove| {
+            for drove in [turned, forward] {
                 drove.wheels = Some(speeds(0.0, 0.0));
                 drove.ranges.left = moving([0.0, 0.0]);
                 drove.ranges.right = moving([0.0, 0.0]);
             }
         };
         assert_eq!(keys_of(still), ["drive.ros2.joints.topic"]);
-        let of_a_robot_that_stood = keys_of(|turned, ahead| {
-            still(turned, ahead);
+        let of_a_robot_that_stood = keys_of(|turned, forward| {
+            still(turned, forward);
             turned.turn_rad_s = Some(0.001);
-            for drove in [turned, ahead] {
+            for drove in [turned, forward] {
                 drove.ranges.gyro = moving([0.0, 0.001]);
-                drove.ranges.odometry_ahead = moving([0.0, 0.0]);
+                drove.ranges.odometry_forward = moving([0.0, 0.0]);
             }
         });
         assert_eq!(of_a_robot_that_stood, ["drive.ros2.command.topic"]);
@@ -313,11 +313,11 @@ mod tests {
 
     #[test]
     fn frozen_odometry_is_not_a_radius_of_zero() {
-        let frozen = keys_of(|turned, ahead| {
-            ahead.odometry_m_s = Some(0.0);
-            ahead.twist = None;
-            for drove in [turned, ahead] {
-                drove.ranges.odometry_ahead = moving([0.0, 0.0]);
+        let frozen = keys_of(|turned, forward| {
+            forward.odometry_m_s = Some(0.0);
+            forward.twist = None;
+            for drove in [turned, forward] {
+                drove.ranges.odometry_forward = moving([0.0, 0.0]);
                 drove.ranges.odometry_turn = moving([0.0, 0.0]);
             }
         });
@@ -326,10 +326,10 @@ mod tests {
 
     #[test]
     fn a_twist_of_the_world_is_neither_a_radius_nor_a_sign() {
-        let world = keys_of(|_, ahead| {
+        let world = keys_of(|_, forward| {
             let heading_rad: f64 = 2.8;
-            ahead.odometry_m_s = Some(0.2 * heading_rad.cos());
-            ahead.twist = Some(PlanarTwist {
+            forward.odometry_m_s = Some(0.2 * heading_rad.cos());
+            forward.twist = Some(PlanarTwist {
                 x_m_s: 0.2 * heading_rad.cos(),
                 y_m_s: 0.2 * heading_rad.sin(),
                 heading_rad,
@@ -340,22 +340,22 @@ mod tests {
 
     #[test]
     fn one_side_inverted_is_a_sign_and_no_twist_after_a_turn_half_around() {
-        let inverted = keys_of(|turned, ahead| {
+        let inverted = keys_of(|turned, forward| {
             turned.wheels = Some(speeds(2.5, 2.5));
-            ahead.wheels = Some(speeds(-2.5001, 2.5));
-            ahead.twist = Some(PlanarTwist {
+            forward.wheels = Some(speeds(-2.5001, 2.5));
+            forward.twist = Some(PlanarTwist {
                 x_m_s: -0.2,
                 y_m_s: 0.001,
                 heading_rad: std::f64::consts::PI,
             });
-            ahead.odometry_m_s = None;
+            forward.odometry_m_s = None;
         });
         assert_eq!(inverted, ["drive.ros2.joints.left_sign"]);
     }
 
     #[test]
     fn a_radius_is_told_from_the_way_over_ground_with_the_line_that_mends_it() {
-        let [turned, mut ahead] = healthy();
+        let [turned, mut forward] = healthy();
         let turned = Drove {
             turn_rad_s: turned.turn_rad_s.map(|rate| 1.25 * rate),
             turn_blocks: turned
@@ -368,8 +368,8 @@ mod tests {
                 .collect(),
             ..turned
         };
-        ahead.odometry_m_s = Some(0.25);
-        let found = findings(&settings(), &RobotModel::yi2007(), &turned, &ahead, 0.0);
+        forward.odometry_m_s = Some(0.25);
+        let found = findings(&settings(), &RobotModel::yi2007(), &turned, &forward, 0.0);
         let wrong: Vec<_> = found.iter().filter(|finding| !finding.holds).collect();
         let [wrong] = wrong.as_slice() else {
             panic!("{found:#?}");
@@ -380,9 +380,9 @@ mod tests {
 
     #[test]
     fn one_side_that_stands_is_named() {
-        let keys = keys_of(|turned, ahead| {
+        let keys = keys_of(|turned, forward| {
             turned.wheels = Some(speeds(0.0, 2.5));
-            ahead.wheels = Some(speeds(0.001, 2.5));
+            forward.wheels = Some(speeds(0.001, 2.5));
         });
         assert_eq!(keys, ["drive.ros2.command.topic"]);
     }

@@ -1,11 +1,11 @@
 //! Whether the joints' effort can be the torque of the wheels: its signs, gear and torque constant.
 //!
-//! Pure. Nothing measures a torque directly here, but two things bound it. Wheels that scrub in a turn on
-//! the spot work against the ground, so each side pulls the way it turns, and as hard as a friction
-//! coefficient that grounds have: by the balance of moments of four equal contacts a side pulls
-//! `μ·(m·g/2)·L/√(L² + W²)`. And what the wheels pull to set off ahead, above what keeps the robot
-//! going, is its momentum `m·v`, whatever the ground and its slope; the motors' own inertia behind the
-//! gear comes on top. A factor of some four is found, one of two is not.
+//! Pure. Nothing measures a torque directly here, but two things bound it. Wheels that scrub in a
+//! turn on the spot work against the ground, so each side pulls the way it turns, and as hard as a
+//! friction coefficient that grounds have: by the balance of moments of four equal contacts a side
+//! pulls `μ·(m·g/2)·L/√(L² + W²)`. And what the wheels pull to set off ahead, above what keeps the
+//! robot going, is its momentum `m·v`, whatever the ground and its slope; the motors' own inertia
+//! behind the gear comes on top. A factor of some four is found, one of two is not.
 
 use tread_control::robot::RobotModel;
 
@@ -17,8 +17,8 @@ use crate::drive::ros2::settings::{Effort, JointSettings, Ros2Settings};
 const AGAINST_MIN: f64 = 0.02;
 /// Friction coefficients that grounds have for scrubbing wheels, drive train included.
 const FRICTION: std::ops::RangeInclusive<f64> = 0.1..=1.5;
-/// Momentum that the wheels gave as a share of the robot's. Heavy rotors behind a high gear can make it
-/// several times as much, nothing can make it a third.
+/// Momentum that the wheels gave as a share of the robot's. Heavy rotors behind a high gear can
+/// make it several times as much, nothing can make it a third.
 const MOMENTUM_RATIO: std::ops::RangeInclusive<f64> = 0.4..=8.0;
 /// Least speed that the robot must have gained, as a share of what it was told.
 const GAINED_MIN: f64 = 0.5;
@@ -26,7 +26,8 @@ const GAINED_MIN: f64 = 0.5;
 /// What the wheels pulled, beside what they can have pulled.
 #[derive(Debug, Clone, Copy)]
 struct Pull {
-    /// Friction coefficients that a side's pull in the turn needs, left and right; negative against the motion.
+    /// Friction coefficients that a side's pull in the turn needs, left and right; negative against
+    /// the motion.
     friction: [f64; 2],
     /// Momentum that the wheels gave over the robot's own, if it gained enough speed.
     momentum_ratio: Option<f64>,
@@ -37,16 +38,16 @@ pub(super) fn findings(
     settings: &Ros2Settings,
     model: &RobotModel,
     turned: &Drove,
-    ahead: &Drove,
+    forward: &Drove,
 ) -> Option<Finding> {
     let joints = settings.joints.as_ref()?;
     let effort = joints.effort;
     (effort != Effort::None).then_some(())?;
     let pull = Pull {
         friction: friction(model, turned)?,
-        momentum_ratio: ahead.set_off.and_then(|set_off| {
-            let steady = ahead.torques?;
-            momentum_ratio(model, ahead, &set_off, steady.left_n_m + steady.right_n_m)
+        momentum_ratio: forward.set_off.and_then(|set_off| {
+            let steady = forward.torques?;
+            momentum_ratio(model, forward, &set_off, steady.left_n_m + steady.right_n_m)
         }),
     };
     Some(of_signs(&pull, joints).unwrap_or_else(|| of_size(&pull, effort, model)))
@@ -54,8 +55,8 @@ pub(super) fn findings(
 
 fn friction(model: &RobotModel, turned: &Drove) -> Option<[f64; 2]> {
     let (torques, wheels) = (turned.torques?, turned.wheels?);
-    let along = model.wheelbase_m() / model.wheelbase_m().hypot(model.track_width_m());
-    let traction_n_m = model.wheel_radius_m() * model.side_load_n() * along;
+    let longitudinal = model.wheelbase_m() / model.wheelbase_m().hypot(model.track_width_m());
+    let traction_n_m = model.wheel_radius_m() * model.side_load_n() * longitudinal;
     Some([
         torques.left_n_m * wheels.left_rad_s.signum() / traction_n_m,
         torques.right_n_m * wheels.right_rad_s.signum() / traction_n_m,
@@ -64,11 +65,11 @@ fn friction(model: &RobotModel, turned: &Drove) -> Option<[f64; 2]> {
 
 fn momentum_ratio(
     model: &RobotModel,
-    ahead: &Drove,
+    forward: &Drove,
     set_off: &SetOff,
     steady_n_m: f64,
 ) -> Option<f64> {
-    let told_rad_s = 0.5 * (ahead.commanded.left_rad_s + ahead.commanded.right_rad_s);
+    let told_rad_s = 0.5 * (forward.commanded.left_rad_s + forward.commanded.right_rad_s);
     (set_off.gained_rad_s > GAINED_MIN * told_rad_s).then_some(())?;
     let gained_m_s = model.wheel_radius_m() * set_off.gained_rad_s;
     let given_n_s = (set_off.torque_n_m - steady_n_m) * set_off.span_s / model.wheel_radius_m();
@@ -169,7 +170,8 @@ mod tests {
     use super::*;
     use crate::drive::ros2::tests::settings;
 
-    /// A turn and a start of the paper's robot on ground of this friction, its torques times these factors.
+    /// A turn and a start of the paper's robot on ground of this friction, its torques times these
+    /// factors.
     fn found(effort: Effort, friction: f64, factors: [f64; 2]) -> Option<Finding> {
         let model = RobotModel::yi2007();
         let mut settings = settings();
@@ -185,8 +187,8 @@ mod tests {
                 right_n_m: right * factors[1],
             })
         };
-        let along = model.wheelbase_m() / model.wheelbase_m().hypot(model.track_width_m());
-        let scrub_n_m = friction * along * model.side_load_n() * model.wheel_radius_m();
+        let longitudinal = model.wheelbase_m() / model.wheelbase_m().hypot(model.track_width_m());
+        let scrub_n_m = friction * longitudinal * model.side_load_n() * model.wheel_radius_m();
         let turned = Drove {
             commanded: speeds(-2.0, 2.0),
             wheels: Some(speeds(-2.0, 2.0)),
@@ -195,7 +197,7 @@ mod tests {
         };
         // On a slope that takes half a newton metre of each side, to 2 rad/s within a second.
         let setting_off_n_m = model.mass_kg() * 2.0 * model.wheel_radius_m().powi(2);
-        let ahead = Drove {
+        let forward = Drove {
             commanded: speeds(2.0, 2.0),
             wheels: Some(speeds(2.0, 2.0)),
             torques: torques(0.5, 0.5),
@@ -206,7 +208,7 @@ mod tests {
             }),
             ..Drove::default()
         };
-        findings(&settings, &model, &turned, &ahead)
+        findings(&settings, &model, &turned, &forward)
     }
 
     fn key(effort: Effort, friction: f64, factors: [f64; 2]) -> Option<&'static str> {

@@ -13,7 +13,7 @@ pub(super) struct Answers {
     /// How the left and the right joints turned when a turn to the left was commanded.
     pub(super) turn: [i8; 2],
     /// The same when it was commanded to drive ahead.
-    pub(super) ahead: [i8; 2],
+    pub(super) forward: [i8; 2],
     /// Whether the robot turned to the left then, by its gyro; 0 where that is not known.
     pub(super) turned: i8,
     /// Whether it went ahead, by its position or its speed over ground; 0 where that is not known.
@@ -32,7 +32,7 @@ pub(super) enum Flip {
     /// The base takes a turn to the right for positive.
     TurnCommand,
     /// The base takes backwards for positive.
-    AheadCommand,
+    ForwardCommand,
     /// The gyro says the opposite.
     Gyro,
     /// The position or the odometry says the opposite.
@@ -45,7 +45,7 @@ impl Flip {
         Self::LeftJoints,
         Self::RightJoints,
         Self::TurnCommand,
-        Self::AheadCommand,
+        Self::ForwardCommand,
         Self::Gyro,
         Self::Ground,
     ];
@@ -56,7 +56,7 @@ impl Flip {
             Self::LeftJoints => "drive.ros2.joints.left_sign",
             Self::RightJoints => "drive.ros2.joints.right_sign",
             Self::TurnCommand => "drive.ros2.command.turn_sign",
-            Self::AheadCommand => "drive.ros2.command.ahead_sign",
+            Self::ForwardCommand => "drive.ros2.command.forward_sign",
             Self::Gyro => "drive.ros2.imu.upside_down",
             Self::Ground => "drive.ros2.pose.topic",
         }
@@ -68,7 +68,7 @@ impl Flip {
             Self::LeftJoints => "the left joints say the opposite of what they do",
             Self::RightJoints => "the right joints say the opposite of what they do",
             Self::TurnCommand => "the base takes a turn to the right for positive",
-            Self::AheadCommand => "the base takes backwards for positive",
+            Self::ForwardCommand => "the base takes backwards for positive",
             Self::Gyro => "the gyro turns the other way: it hangs upside down",
             Self::Ground => "position or odometry says backwards where the robot went ahead",
         }
@@ -93,9 +93,9 @@ impl Flip {
                 let sign = opposite(command.turn_sign);
                 finding.with_line("drive.ros2.command", "turn_sign", sign)
             }
-            (Self::AheadCommand, _) => {
-                let sign = opposite(command.ahead_sign);
-                finding.with_line("drive.ros2.command", "ahead_sign", sign)
+            (Self::ForwardCommand, _) => {
+                let sign = opposite(command.forward_sign);
+                finding.with_line("drive.ros2.command", "forward_sign", sign)
             }
             (Self::Gyro, _) => match &settings.imu {
                 Some(imu) => {
@@ -112,7 +112,7 @@ impl Flip {
 /// What a robot with these flips answers.
 fn predicted(flips: &[Flip]) -> Answers {
     let sign = |flip: Flip| if flips.contains(&flip) { -1 } else { 1 };
-    let (turned, went) = (sign(Flip::TurnCommand), sign(Flip::AheadCommand));
+    let (turned, went) = (sign(Flip::TurnCommand), sign(Flip::ForwardCommand));
     let said = |left: i8, right: i8| {
         let [left, right] = if flips.contains(&Flip::Sides) {
             [right, left]
@@ -126,7 +126,7 @@ fn predicted(flips: &[Flip]) -> Answers {
     };
     Answers {
         turn: said(-turned, turned),
-        ahead: said(went, went),
+        forward: said(went, went),
         turned: turned * sign(Flip::Gyro),
         went: went * sign(Flip::Ground),
     }
@@ -146,7 +146,7 @@ pub(super) fn explanations(answers: Answers) -> Vec<Vec<Flip>> {
         .filter(|flips| {
             let predicted = predicted(flips);
             answers.turn == predicted.turn
-                && answers.ahead == predicted.ahead
+                && answers.forward == predicted.forward
                 && agrees(answers.turned, predicted.turned)
                 && agrees(answers.went, predicted.went)
         })
@@ -202,14 +202,14 @@ mod tests {
     /// A robot as it really is, simulated on its own terms: where its wheels go, and what says so.
     fn robot(flips: &[Flip], sees_ground: bool) -> Answers {
         let is = |flip| flips.contains(&flip);
-        let drive = |ahead: f64, turn: f64| {
-            let ahead = if is(Flip::AheadCommand) {
-                -ahead
+        let drive = |forward: f64, turn: f64| {
+            let forward = if is(Flip::ForwardCommand) {
+                -forward
             } else {
-                ahead
+                forward
             };
             let turn = if is(Flip::TurnCommand) { -turn } else { turn };
-            let (left, right) = (ahead - turn, ahead + turn);
+            let (left, right) = (forward - turn, forward + turn);
             let (mut first, mut second) = if is(Flip::Sides) {
                 (right, left)
             } else {
@@ -222,16 +222,16 @@ mod tests {
                 second = -second;
             }
             let gyro = if is(Flip::Gyro) { -turn } else { turn };
-            let ground = if is(Flip::Ground) { -ahead } else { ahead };
+            let ground = if is(Flip::Ground) { -forward } else { forward };
             (first, second, gyro, ground)
         };
         let sign = |value: f64| if value > 0.0 { 1 } else { -1 };
-        let (turn, ahead) = (drive(0.0, 1.0), drive(1.0, 0.0));
+        let (turn, forward) = (drive(0.0, 1.0), drive(1.0, 0.0));
         Answers {
             turn: [sign(turn.0), sign(turn.1)],
-            ahead: [sign(ahead.0), sign(ahead.1)],
+            forward: [sign(forward.0), sign(forward.1)],
             turned: sign(turn.2),
-            went: if sees_ground { sign(ahead.3) } else { 0 },
+            went: if sees_ground { sign(forward.3) } else { 0 },
         }
     }
 
@@ -251,7 +251,7 @@ mod tests {
 
     #[test]
     fn both_signs_of_the_command_are_named_and_not_the_joints() {
-        let flips = [Flip::TurnCommand, Flip::AheadCommand];
+        let flips = [Flip::TurnCommand, Flip::ForwardCommand];
         for sees_ground in [true, false] {
             let found = finding(robot(&flips, sees_ground), &settings());
             assert_eq!(found.key, Some("drive.ros2.command.turn_sign"));
@@ -260,7 +260,7 @@ mod tests {
                 .iter()
                 .map(|line| (line.key, line.value.as_str()))
                 .collect();
-            assert_eq!(lines, [("turn_sign", "-1"), ("ahead_sign", "-1")]);
+            assert_eq!(lines, [("turn_sign", "-1"), ("forward_sign", "-1")]);
         }
     }
 
@@ -284,7 +284,8 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever is flipped, what is named explains all answers with no more flips than there are.
+        /// Whatever is flipped, what is named explains all answers with no more flips than there
+        /// are.
         #[test]
         fn what_is_named_explains_the_answers(set in 0_u32..128, sees_ground: bool) {
             let flips: Vec<Flip> = Flip::ALL

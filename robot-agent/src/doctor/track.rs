@@ -2,17 +2,18 @@
 //!
 //! Two figures are measured. The first is exact: how fast the wheels turn for a commanded turn says
 //! which track the base itself divides by, whatever the ground. The second is the effective track,
-//! `W_eff = r·(ω_R − ω_L)/ψ̇`, and it depends on the ground. By the balance of moments of four equal
-//! contacts in a turn on the spot
+//! `W_eff = r·(ω_R − ω_L)/ψ̇`, and it depends on the ground. By the balance of moments of four
+//! equal contacts in a turn on the spot
 //!
 //! ```text
 //! W_eff = W + α·L²/W,    α = lateral over longitudinal slip stiffness
 //! ```
 //!
 //! Ground with the same friction in all directions has α = 1, whatever its θ, and the tyres of real
-//! robots lie within [`STIFFNESS_RATIO`]. So a configured W is impossible where `W_eff` is below it, and
-//! implausible where α would have to lie outside that range. A W within the range that `W_eff` allows
-//! looks like another ground: that range is said, to be compared with a tape measure.
+//! robots lie within [`STIFFNESS_RATIO`]. So a configured W is impossible where `W_eff` is below
+//! it, and implausible where α would have to lie outside that range. A W within the range that
+//! `W_eff` allows looks like another ground: that range is said, to be compared with a tape
+//! measure.
 
 use super::drove::{Drove, TurnBlock};
 use super::finding::Finding;
@@ -42,7 +43,8 @@ pub(super) struct EffectiveTrack {
 }
 
 impl EffectiveTrack {
-    /// From the parts of a turn on the spot; none where it turned too slowly or too little was said.
+    /// From the parts of a turn on the spot; none where it turned too slowly or too little was
+    /// said.
     pub(super) fn measured(
         blocks: &[TurnBlock],
         gyro_bias_rad_s: f64,
@@ -97,7 +99,7 @@ impl EffectiveTrack {
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Obeyed {
     turn: f64,
-    ahead: f64,
+    forward: f64,
 }
 
 /// What was found of the command and of the track. The radius is the one by which the robot went
@@ -106,18 +108,18 @@ pub(super) fn findings(
     settings: &Ros2Settings,
     model: &RobotModel,
     turned: &Drove,
-    ahead: &Drove,
+    forward: &Drove,
     radius_m: f64,
     gyro_bias_rad_s: f64,
 ) -> Vec<Finding> {
-    let (Some(turning), Some(going)) = (turned.wheels, ahead.wheels) else {
+    let (Some(turning), Some(going)) = (turned.wheels, forward.wheels) else {
         return Vec::new();
     };
     let obeyed = Obeyed {
         turn: (turning.right_rad_s - turning.left_rad_s)
             / (turned.commanded.right_rad_s - turned.commanded.left_rad_s),
-        ahead: (going.left_rad_s + going.right_rad_s)
-            / (ahead.commanded.left_rad_s + ahead.commanded.right_rad_s),
+        forward: (going.left_rad_s + going.right_rad_s)
+            / (forward.commanded.left_rad_s + forward.commanded.right_rad_s),
     };
     let effective = EffectiveTrack::measured(&turned.turn_blocks, gyro_bias_rad_s, radius_m);
     let mut findings = vec![of_radius_of_base(settings, obeyed)];
@@ -127,18 +129,18 @@ pub(super) fn findings(
 
 /// The radius by which the base turns speeds into the wheels' speeds.
 fn of_radius_of_base(settings: &Ros2Settings, obeyed: Obeyed) -> Finding {
-    if (obeyed.ahead - 1.0).abs() <= COMMAND_SHARE {
+    if (obeyed.forward - 1.0).abs() <= COMMAND_SHARE {
         return Finding::well(
             "command",
             "driving ahead the wheels turn as fast as they are commanded",
         );
     }
-    let percent = 100.0 * obeyed.ahead;
+    let percent = 100.0 * obeyed.forward;
     if settings.command.kind == CommandKind::JointSpeeds {
         let text = format!("driving ahead the wheels turn at {percent:.0} % of their command");
         return Finding::wrong("command", "drive.ros2.joints.gear_ratio", text);
     }
-    let base_radius_m = settings.command.base_radius_m / obeyed.ahead;
+    let base_radius_m = settings.command.base_radius_m / obeyed.forward;
     let text = format!(
         "driving ahead the wheels turn at {percent:.0} % of their command: the base itself divides by a \
          radius of about {base_radius_m:.3} m (or the gear is another)"
@@ -160,7 +162,7 @@ fn of_tracks(
 ) -> Vec<Finding> {
     let (model_m, command_m) = (model.track_width_m(), settings.command.base_track_m);
     let wheelbase_m = model.wheelbase_m();
-    let ratio = obeyed.turn / obeyed.ahead;
+    let ratio = obeyed.turn / obeyed.forward;
     let is_obeyed = (ratio - 1.0).abs() <= COMMAND_SHARE;
     let base_m = command_m * ratio;
     let allows = |track_m: f64| effective.is_none_or(|it| it.allows(track_m, wheelbase_m));
@@ -187,7 +189,7 @@ fn of_tracks(
              divides by a track of {base_m:.3} m (its wheel separation times its multiplier), the \
              configuration says {command_m:.3} m",
             100.0 * obeyed.turn,
-            100.0 * obeyed.ahead,
+            100.0 * obeyed.forward,
         );
         let wrong = Finding::wrong("turn command", "drive.ros2.command.track_width_m", text);
         findings.push(wrong.with_line(
@@ -272,8 +274,8 @@ mod tests {
             for (x_m, y_m) in [(0.5, 0.5), (0.5, -0.5), (-0.5, 0.5), (-0.5, -0.5)] {
                 let (x_m, y_m) = (x_m * self.wheelbase_m, y_m * self.track_m);
                 let rim_m_s = if y_m > 0.0 { -rim_m_s } else { rim_m_s };
-                let (ahead_m_s, left_m_s) = (-turn_rad_s * y_m - rim_m_s, turn_rad_s * x_m);
-                let (force_x, force_y) = (-ahead_m_s, -self.ratio * left_m_s);
+                let (forward_m_s, left_m_s) = (-turn_rad_s * y_m - rim_m_s, turn_rad_s * x_m);
+                let (force_x, force_y) = (-forward_m_s, -self.ratio * left_m_s);
                 moment += x_m * force_y - y_m * force_x;
             }
             moment
@@ -340,12 +342,12 @@ mod tests {
             let model = RobotModel::try_from(spec).unwrap();
             let mut settings = settings();
             settings.command.base_track_m = command_m;
-            let [turned, ahead] = self.drive(command_m, noise, bias_rad_s);
+            let [turned, forward] = self.drive(command_m, noise, bias_rad_s);
             findings(
                 &settings,
                 &model,
                 &turned,
-                &ahead,
+                &forward,
                 self.radius_m,
                 bias_rad_s,
             )

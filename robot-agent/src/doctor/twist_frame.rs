@@ -1,8 +1,8 @@
 //! In which frame the odometry's motion is. Pure.
 //!
 //! The motion in `nav_msgs/Odometry` is of the frame `child_frame_id`: ahead and to the left of the
-//! robot. Where its writer put it into the frame of the pose, it points where the robot heads, and is
-//! right only while that is along the x axis.
+//! robot. Where its writer put it into the frame of the pose, it points where the robot heads, and
+//! is right only while that is along the x axis.
 
 use std::f64::consts::PI;
 
@@ -12,13 +12,13 @@ use super::drove::PlanarTwist;
 use super::finding::Finding;
 
 /// Angle up to which a motion counts as straight ahead, radians.
-pub(super) const AHEAD_MAX_RAD: f64 = 0.35;
+pub(super) const FORWARD_MAX_RAD: f64 = 0.35;
 /// Share of the wheels' speed below which the odometry says nothing of direction.
 const SPEED_MIN_SHARE: f64 = 0.3;
 
 /// Whether the robot heads along the x axis of its odometry's frame, where both frames look alike.
 pub(super) fn is_along_x(heading_rad: f64) -> bool {
-    wrap_angle_rad(heading_rad).abs() < 1.5 * AHEAD_MAX_RAD
+    wrap_angle_rad(heading_rad).abs() < 1.5 * FORWARD_MAX_RAD
 }
 
 /// Whether the motion is in the wrong frame; nothing of a robot whose odometry does not move.
@@ -32,12 +32,12 @@ pub(super) fn finding(twist: &PlanarTwist, rim_m_s: f64, joints: [i8; 2]) -> Opt
     // A robot that goes backwards is judged by its back.
     let back_rad = if joints == [-1, -1] { PI } else { 0.0 };
     let direction_rad = wrap_angle_rad(twist.y_m_s.atan2(twist.x_m_s) - back_rad);
-    let is_along = direction_rad.abs() >= PI - AHEAD_MAX_RAD;
-    if direction_rad.abs() <= AHEAD_MAX_RAD || (is_along && joints[0] != joints[1]) {
+    let is_along = direction_rad.abs() >= PI - FORWARD_MAX_RAD;
+    if direction_rad.abs() <= FORWARD_MAX_RAD || (is_along && joints[0] != joints[1]) {
         return None;
     }
     let key = "drive.ros2.odometry.child_frame";
-    if wrap_angle_rad(direction_rad - twist.heading_rad).abs() <= AHEAD_MAX_RAD {
+    if wrap_angle_rad(direction_rad - twist.heading_rad).abs() <= FORWARD_MAX_RAD {
         let text = format!(
             "driving ahead, the odometry's twist points {:.0}° to the left, which is where its pose heads: it \
              is in the frame of the pose, and nav_msgs/Odometry wants it in `child_frame_id`. Mend what \
@@ -65,7 +65,7 @@ mod tests {
     use super::*;
 
     const RIM_M_S: f64 = 0.2;
-    const AHEAD: [i8; 2] = [1, 1];
+    const FORWARD: [i8; 2] = [1, 1];
     const BACK: [i8; 2] = [-1, -1];
 
     fn twist(direction_rad: f64, heading_rad: f64) -> PlanarTwist {
@@ -78,13 +78,17 @@ mod tests {
 
     #[test]
     fn a_twist_that_is_turned_otherwise_is_named_as_that() {
-        let turned = finding(&twist(PI / 2.0, 2.8), RIM_M_S, AHEAD).unwrap();
+        let turned = finding(&twist(PI / 2.0, 2.8), RIM_M_S, FORWARD).unwrap();
         assert!(
             turned.text.contains("child frame is turned"),
             "{}",
             turned.text
         );
-        assert_eq!(finding(&twist(PI, 1.0), RIM_M_S, AHEAD), None, "backwards");
+        assert_eq!(
+            finding(&twist(PI, 1.0), RIM_M_S, FORWARD),
+            None,
+            "backwards"
+        );
     }
 
     #[test]
@@ -94,7 +98,7 @@ mod tests {
             y_m_s: -0.001,
             heading_rad: 1.0,
         };
-        assert_eq!(finding(&still, RIM_M_S, AHEAD), None);
+        assert_eq!(finding(&still, RIM_M_S, FORWARD), None);
     }
 
     #[test]
@@ -120,7 +124,7 @@ mod tests {
     proptest! {
         #[test]
         fn a_twist_of_the_body_is_well_wherever_the_robot_heads(heading_rad in -3.2_f64..3.2, off_rad in -0.3_f64..0.3) {
-            prop_assert_eq!(finding(&twist(off_rad, heading_rad), RIM_M_S, AHEAD), None);
+            prop_assert_eq!(finding(&twist(off_rad, heading_rad), RIM_M_S, FORWARD), None);
         }
 
         #[test]
@@ -128,7 +132,7 @@ mod tests {
             heading_rad in -3.1_f64..3.1,
             off_rad in -0.15_f64..0.15,
         ) {
-            let found = finding(&twist(heading_rad + off_rad, heading_rad), RIM_M_S, AHEAD);
+            let found = finding(&twist(heading_rad + off_rad, heading_rad), RIM_M_S, FORWARD);
             if is_along_x(heading_rad) {
                 prop_assert!(found.is_none_or(|finding| finding.text.contains("frame of the pose")));
             } else {

@@ -1,6 +1,6 @@
 //! Why the link could not be made, and why a question went without an answer.
 
-use tread_api::wire::{Refusal, RefusalCode, WireError};
+use tread_api::wire::{self, Refusal, RefusalCode, WireError};
 
 /// Why the link could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -56,6 +56,18 @@ pub enum AskError {
     Link(#[from] LinkError),
 }
 
+impl AskError {
+    /// Reads the payload of an error reply.
+    pub(super) fn of_reply(payload: &[u8]) -> Self {
+        match wire::decode::<Refusal>(payload) {
+            Ok(refusal) => Self::Refused(refusal),
+            Err(other @ WireError::Version(_)) => Self::Unreadable(other),
+            // zenoh itself reports a timeout as an error reply of its own.
+            Err(WireError::TooLarge(_) | WireError::Malformed(_)) => Self::NoAnswer,
+        }
+    }
+}
+
 /// Whether sending the same again to the same server may help.
 pub fn may_pass_later(error: &AskError) -> bool {
     match error {
@@ -64,5 +76,23 @@ pub fn may_pass_later(error: &AskError) -> bool {
         | AskError::Unreadable(_)
         | AskError::Unwritable(_)
         | AskError::Link(_) => true,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_refusal_of_an_older_server_names_both_versions() {
+        let reply = br#"{"v":1,"body":{"code":"version","detail":"major version 2 is not known"}}"#;
+        let AskError::Unreadable(cause) = AskError::of_reply(reply) else {
+            panic!("it was read");
+        };
+        assert_eq!(
+            cause.to_string(),
+            "the other side speaks major version 1 and this side 2: update the older one"
+        );
+        assert!(matches!(AskError::of_reply(b"Timeout"), AskError::NoAnswer));
     }
 }

@@ -19,13 +19,13 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
 use tread_api::enrolment::TrustId;
-use tread_api::ids::{BootId, HolderId, RobotId, SiteId};
+use tread_api::ids::{BootId, OwnerId, RobotId, SiteId};
 use tread_api::keys::{self, Key, Verb};
 use tread_api::safety::SMALL_PAYLOAD_MAX;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::ingest::{Batch, Receipt};
 use tread_api::wire::state::{FrictionReport, RobotState, ServerPulse};
-use tread_api::wire::{self, PAYLOAD_BYTES_MAX, Refusal};
+use tread_api::wire::{self, PAYLOAD_BYTES_MAX};
 use zenoh::Wait;
 use zenoh::handlers::FifoChannel;
 use zenoh::liveliness::LivelinessToken;
@@ -87,8 +87,8 @@ pub enum Urgent<'payload> {
     Stop(&'payload [u8]),
     /// A drive command.
     Drive(&'payload [u8]),
-    /// A limit by this holder.
-    Limit(&'payload HolderId, &'payload [u8]),
+    /// A limit by this owner.
+    Limit(&'payload OwnerId, &'payload [u8]),
 }
 
 /// Who takes what must not wait; must not wait either.
@@ -381,8 +381,8 @@ impl FleetLink {
         session
             .declare_subscriber(keys::limits(site, robot))
             .callback(move |sample| {
-                if let Some(Key::Limit(_, _, holder)) = Key::parse(sample.key_expr().as_str()) {
-                    take(Urgent::Limit(&holder, &small(sample.payload())));
+                if let Some(Key::Limit(_, _, owner)) = Key::parse(sample.key_expr().as_str()) {
+                    take(Urgent::Limit(&owner, &small(sample.payload())));
                 }
             })
             .background()
@@ -464,11 +464,7 @@ impl FleetLink {
         };
         match reply.into_result() {
             Ok(sample) => Ok(sample.payload().to_bytes().into_owned()),
-            Err(error) => match wire::decode::<Refusal>(&error.payload().to_bytes()) {
-                Ok(refusal) => Err(AskError::Refused(refusal)),
-                // zenoh itself reports a timeout as an error reply of its own.
-                Err(_) => Err(AskError::NoAnswer),
-            },
+            Err(error) => Err(AskError::of_reply(&error.payload().to_bytes())),
         }
     }
 

@@ -4,7 +4,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use super::Holder;
+use super::MissionSlot;
 use crate::durable;
 
 const FILE_NAME: &str = "missions.json";
@@ -40,7 +40,7 @@ pub enum MemoryError {
     },
 }
 
-/// The file in which a [`Holder`] outlives the process.
+/// The file in which a [`MissionSlot`] outlives the process.
 #[derive(Debug, Clone)]
 pub struct Memory {
     folder: PathBuf,
@@ -58,7 +58,7 @@ impl Memory {
     ///
     /// # Errors
     /// [`MemoryError`] when the file cannot be read or does not parse.
-    pub fn load(&self) -> Result<Holder, MemoryError> {
+    pub fn load(&self) -> Result<MissionSlot, MemoryError> {
         let path = self.folder.join(FILE_NAME);
         match fs::read(&path) {
             Ok(file) => {
@@ -68,7 +68,7 @@ impl Memory {
                 serde_json::from_slice(text)
                     .map_err(|source| MemoryError::Malformed { path, source })
             }
-            Err(source) if source.kind() == io::ErrorKind::NotFound => Ok(Holder::default()),
+            Err(source) if source.kind() == io::ErrorKind::NotFound => Ok(MissionSlot::default()),
             Err(source) => Err(MemoryError::File {
                 action: "read",
                 path,
@@ -81,8 +81,8 @@ impl Memory {
     ///
     /// # Errors
     /// [`MemoryError`] when the disk refuses; the former content stays then.
-    pub fn save(&self, holder: &Holder) -> Result<(), MemoryError> {
-        let text = serde_json::to_vec(holder).map_err(io::Error::from);
+    pub fn save(&self, slot: &MissionSlot) -> Result<(), MemoryError> {
+        let text = serde_json::to_vec(slot).map_err(io::Error::from);
         let written = text
             .and_then(|text| durable::replace(&self.folder, FILE_NAME, &durable::sealed(&text)));
         written.map_err(|source| MemoryError::File {
@@ -104,12 +104,12 @@ mod tests {
     fn a_holder_comes_back_as_it_was_saved() {
         let folder = tempfile::tempdir().unwrap();
         let memory = Memory::new(folder.path());
-        assert_eq!(memory.load().unwrap(), Holder::default());
-        let mut holder = Holder::default();
-        holder.cancel(MissionId::from_uuid(Uuid::from_u128(7)));
-        memory.save(&holder).unwrap();
-        memory.save(&holder).unwrap();
-        assert_eq!(memory.load().unwrap(), holder);
+        assert_eq!(memory.load().unwrap(), MissionSlot::default());
+        let mut slot = MissionSlot::default();
+        slot.cancel(MissionId::from_uuid(Uuid::from_u128(7)));
+        memory.save(&slot).unwrap();
+        memory.save(&slot).unwrap();
+        assert_eq!(memory.load().unwrap(), slot);
     }
 
     #[test]
@@ -124,9 +124,9 @@ mod tests {
     fn a_memory_with_any_bit_flipped_is_refused_and_never_another_one() {
         let folder = tempfile::tempdir().unwrap();
         let memory = Memory::new(folder.path());
-        let mut holder = Holder::default();
-        holder.cancel(MissionId::from_uuid(Uuid::from_u128(7)));
-        memory.save(&holder).unwrap();
+        let mut slot = MissionSlot::default();
+        slot.cancel(MissionId::from_uuid(Uuid::from_u128(7)));
+        memory.save(&slot).unwrap();
         let path = folder.path().join(FILE_NAME);
         let intact = fs::read(&path).unwrap();
         for bit in 0..intact.len() * 8 {
@@ -135,15 +135,15 @@ mod tests {
             fs::write(&path, damaged).unwrap();
             match memory.load() {
                 // In the checksum's own name.
-                Ok(read) => assert_eq!(read, holder, "bit {bit}"),
+                Ok(read) => assert_eq!(read, slot, "bit {bit}"),
                 Err(refused) => {
                     let refused = refused.to_string();
                     assert!(refused.contains("move it away"), "bit {bit}: {refused}");
                 }
             }
         }
-        let earlier = serde_json::to_vec(&holder).unwrap();
+        let earlier = serde_json::to_vec(&slot).unwrap();
         fs::write(&path, earlier).unwrap();
-        assert_eq!(memory.load().unwrap(), holder, "of an earlier agent");
+        assert_eq!(memory.load().unwrap(), slot, "of an earlier agent");
     }
 }

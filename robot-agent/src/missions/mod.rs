@@ -1,4 +1,4 @@
-//! Missions on the robot: what is held, what has ended, and what to answer.
+//! Missions on the robot: what is active, what has ended, and what to answer.
 //!
 //! ```text
 //!            offer                    report of the loop
@@ -8,7 +8,7 @@
 //!     └ cancel ────────────────────────────────────────────┘
 //! ```
 //!
-//! [`Holder`] is pure: it decides, others act. An ended mission never comes back, whatever is
+//! [`MissionSlot`] is pure: it decides, others act. An ended mission never comes back, whatever is
 //! offered late; [`memory`] keeps that over a restart of the agent.
 
 pub mod memory;
@@ -26,7 +26,7 @@ pub const ENDED_MAX: usize = 1_000;
 
 /// A mission that the robot has taken and not ended.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Held {
+pub struct ActiveMission {
     /// The mission.
     pub mission: MissionId,
     /// Its revision.
@@ -51,8 +51,9 @@ pub struct Ended {
 
 /// What the robot knows of missions.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct Holder {
-    held: Option<Held>,
+pub struct MissionSlot {
+    #[serde(alias = "held")]
+    active: Option<ActiveMission>,
     ended: VecDeque<Ended>,
     /// How the active mission ends, while that is being written.
     #[serde(skip)]
@@ -62,12 +63,12 @@ pub struct Holder {
 /// What to do about an offer.
 #[derive(Debug, Clone, PartialEq)]
 pub enum OfferDecision {
-    /// It is new: plan it, hand it to the loop, then [`Holder::take`] it.
+    /// It is new: plan it, hand it to the loop, then [`MissionSlot::take`] it.
     Plan,
-    /// It is a new revision of what is held: plan it from where the robot comes to stand, then
-    /// [`Holder::replace`] the old one and hand it to the loop.
+    /// It is a new revision of what is active: plan it from where the robot comes to stand, then
+    /// [`MissionSlot::replace`] the old one and hand it to the loop.
     Replace,
-    /// It is held already: say so again.
+    /// It is active already: say so again.
     AcceptAgain(PlanSummary),
     /// No, and why.
     Refuse(OfferRefusal, String),
@@ -76,7 +77,7 @@ pub enum OfferDecision {
 /// What to do about a cancellation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CancelDecision {
-    /// It is held: brake, along its path.
+    /// It is active: brake, along its path.
     Brake,
     /// It was cancelled before.
     CancelledBefore,
@@ -86,10 +87,10 @@ pub enum CancelDecision {
     Unknown,
 }
 
-impl Holder {
+impl MissionSlot {
     /// The active mission.
-    pub fn held(&self) -> Option<&Held> {
-        self.held.as_ref()
+    pub fn active(&self) -> Option<&ActiveMission> {
+        self.active.as_ref()
     }
 
     /// The missions that have ended here, oldest first.
@@ -115,61 +116,63 @@ impl Holder {
             );
             return refuse(OfferRefusal::Ended, detail);
         }
-        match &self.held {
+        match &self.active {
             None => OfferDecision::Plan,
-            Some(held) if held.mission == mission && held.is_cancelled => refuse(
+            Some(active) if active.mission == mission && active.is_cancelled => refuse(
                 OfferRefusal::Ended,
                 format!("mission {mission} is being cancelled"),
             ),
-            Some(held) if held.mission != mission => {
-                let detail = format!("mission {} is being driven", held.mission);
+            Some(active) if active.mission != mission => {
+                let detail = format!("mission {} is being driven", active.mission);
                 refuse(OfferRefusal::Busy, detail)
             }
-            Some(held) if held.revision == offer.revision && held.plan_hash == offer.plan_hash => {
-                OfferDecision::AcceptAgain(held.plan)
+            Some(active)
+                if active.revision == offer.revision && active.plan_hash == offer.plan_hash =>
+            {
+                OfferDecision::AcceptAgain(active.plan)
             }
-            Some(held) if held.revision < offer.revision => OfferDecision::Replace,
-            Some(held) => {
+            Some(active) if active.revision < offer.revision => OfferDecision::Replace,
+            Some(active) => {
                 let detail = format!(
                     "mission {mission} is held as revision {} with plan hash {}",
-                    held.revision, held.plan_hash
+                    active.revision, active.plan_hash
                 );
                 refuse(OfferRefusal::Conflict, detail)
             }
         }
     }
 
-    /// Makes a mission the active one; false, and nothing changes, where [`Holder::offer`] would not
-    /// say [`OfferDecision::Plan`].
+    /// Makes a mission the active one; false, and nothing changes, where [`MissionSlot::offer`]
+    /// would not say [`OfferDecision::Plan`].
     #[must_use]
-    pub fn take(&mut self, held: Held) -> bool {
-        let is_free = self.held.is_none() && self.ended_phase(held.mission).is_none();
+    pub fn take(&mut self, active: ActiveMission) -> bool {
+        let is_free = self.active.is_none() && self.ended_phase(active.mission).is_none();
         if is_free {
-            self.held = Some(held);
+            self.active = Some(active);
         }
         is_free
     }
 
     /// Puts a higher revision in place of the active one and gives the old one back; `None`, and
-    /// nothing changes, where [`Holder::offer`] would not say [`OfferDecision::Replace`].
+    /// nothing changes, where [`MissionSlot::offer`] would not say [`OfferDecision::Replace`].
     #[must_use]
-    pub fn replace(&mut self, next: Held) -> Option<Held> {
-        let held = self.held.as_mut()?;
-        let is_next = held.mission == next.mission
-            && held.revision < next.revision
-            && !held.is_cancelled
+    pub fn replace(&mut self, next: ActiveMission) -> Option<ActiveMission> {
+        let active = self.active.as_mut()?;
+        let is_next = active.mission == next.mission
+            && active.revision < next.revision
+            && !active.is_cancelled
             && self.ending.is_none();
-        is_next.then(|| std::mem::replace(held, next))
+        is_next.then(|| std::mem::replace(active, next))
     }
 
     /// Goes back to a former revision, if the later one could not be handed to the loop.
-    pub fn restore(&mut self, former: Held) {
-        if let Some(held) = self
-            .held
+    pub fn restore(&mut self, former: ActiveMission) {
+        if let Some(active) = self
+            .active
             .as_mut()
-            .filter(|held| held.mission == former.mission)
+            .filter(|active| active.mission == former.mission)
         {
-            *held = former;
+            *active = former;
         }
     }
 
@@ -177,7 +180,7 @@ impl Holder {
     ///
     /// # Errors
     /// Why not, for the server.
-    pub fn check_held(
+    pub fn check_active(
         &self,
         mission: MissionId,
         revision: u32,
@@ -186,14 +189,14 @@ impl Holder {
             let detail = format!("it has ended before: {}", name_of(phase));
             return Err((OfferRefusal::Ended, detail));
         }
-        match &self.held {
-            Some(held) if held.mission == mission && held.is_cancelled => {
+        match &self.active {
+            Some(active) if active.mission == mission && active.is_cancelled => {
                 Err((OfferRefusal::Ended, "it is being cancelled".to_owned()))
             }
-            Some(held) if held.mission == mission && held.revision == revision => Ok(()),
-            Some(held) if held.mission == mission => Err((
+            Some(active) if active.mission == mission && active.revision == revision => Ok(()),
+            Some(active) if active.mission == mission => Err((
                 OfferRefusal::Conflict,
-                format!("it is held as revision {}", held.revision),
+                format!("it is held as revision {}", active.revision),
             )),
             Some(_) | None => Err((OfferRefusal::Unknown, "it is not held here".to_owned())),
         }
@@ -201,16 +204,20 @@ impl Holder {
 
     /// Lets go of a mission that was taken but could not be handed to the loop.
     pub fn release(&mut self, mission: MissionId) {
-        self.held.take_if(|held| held.mission == mission);
+        self.active.take_if(|active| active.mission == mission);
     }
 
     /// What to do about a cancellation; one that comes before its offer is remembered.
     pub fn cancel(&mut self, mission: MissionId) -> CancelDecision {
-        if let Some(held) = self.held.as_mut().filter(|held| held.mission == mission) {
-            if let Some(phase) = self.ending.filter(|_| !held.is_cancelled) {
+        if let Some(active) = self
+            .active
+            .as_mut()
+            .filter(|active| active.mission == mission)
+        {
+            if let Some(phase) = self.ending.filter(|_| !active.is_cancelled) {
                 return CancelDecision::EndedBefore(phase);
             }
-            held.is_cancelled = true;
+            active.is_cancelled = true;
             return CancelDecision::Brake;
         }
         match self.ended_phase(mission) {
@@ -229,10 +236,14 @@ impl Holder {
     /// How the active mission ends, before that is reported; from here on it can no longer be
     /// cancelled. One that the server believes cancelled ends as that, whatever came in between.
     pub fn begin_end(&mut self, mission: MissionId, phase: MissionPhase) -> MissionPhase {
-        let Some(held) = self.held.as_ref().filter(|held| held.mission == mission) else {
+        let Some(active) = self
+            .active
+            .as_ref()
+            .filter(|active| active.mission == mission)
+        else {
             return phase;
         };
-        let phase = if held.is_cancelled {
+        let phase = if active.is_cancelled {
             MissionPhase::Cancelled
         } else {
             phase
@@ -241,15 +252,15 @@ impl Holder {
     }
 
     /// Ends the active mission; `None` if it is not this one.
-    pub fn end(&mut self, mission: MissionId, phase: MissionPhase) -> Option<Held> {
+    pub fn end(&mut self, mission: MissionId, phase: MissionPhase) -> Option<ActiveMission> {
         self.ending.take_if(|_| {
-            self.held
+            self.active
                 .as_ref()
-                .is_some_and(|held| held.mission == mission)
+                .is_some_and(|active| active.mission == mission)
         });
-        let held = self.held.take_if(|held| held.mission == mission)?;
+        let active = self.active.take_if(|active| active.mission == mission)?;
         self.remember(Ended { mission, phase });
-        Some(held)
+        Some(active)
     }
 
     fn remember(&mut self, ended: Ended) {
@@ -322,22 +333,22 @@ mod tests {
             start_within_ms: None,
             link_policy: LinkPolicy::default(),
             prior: None,
-            held: false,
+            on_hold: false,
         }
     }
 
     proptest! {
         #[test]
         fn whatever_arrives_late_or_twice_no_ended_mission_comes_back(steps in steps()) {
-            let mut holder = Holder::default();
+            let mut slot = MissionSlot::default();
             let mut over: Vec<MissionId> = Vec::new();
             for step in steps {
-                let before = holder.clone();
+                let before = slot.clone();
                 match step {
                     Step::Offer { mission, revision } => {
                         let offer = offer(mission, revision);
-                        let decision = holder.offer(&offer);
-                        let held = Held {
+                        let decision = slot.offer(&offer);
+                        let active = ActiveMission {
                             mission: offer.mission,
                             revision,
                             plan_hash: offer.plan_hash,
@@ -345,17 +356,17 @@ mod tests {
                             is_cancelled: false,
                         };
                         let is_over = over.contains(&offer.mission);
-                        match before.held() {
+                        match before.active() {
                             _ if is_over => prop_assert!(
                                 matches!(decision, OfferDecision::Refuse(OfferRefusal::Ended, _))
                             ),
                             None => prop_assert_eq!(&decision, &OfferDecision::Plan),
-                            Some(now) if now.mission == held.mission && now.is_cancelled => {
+                            Some(now) if now.mission == active.mission && now.is_cancelled => {
                                 prop_assert!(
                                     matches!(decision, OfferDecision::Refuse(OfferRefusal::Ended, _))
                                 );
                             }
-                            Some(now) if *now == held => {
+                            Some(now) if *now == active => {
                                 prop_assert_eq!(&decision, &OfferDecision::AcceptAgain(PLAN));
                             }
                             Some(now)
@@ -371,18 +382,18 @@ mod tests {
                             ),
                         }
                         if decision == OfferDecision::Replace {
-                            let former = holder.replace(held.clone());
-                            prop_assert_eq!(former.as_ref(), before.held());
-                            prop_assert_eq!(holder.held(), Some(&held));
-                            prop_assert!(holder.check_held(held.mission, revision).is_ok());
+                            let former = slot.replace(active.clone());
+                            prop_assert_eq!(former.as_ref(), before.active());
+                            prop_assert_eq!(slot.active(), Some(&active));
+                            prop_assert!(slot.check_active(active.mission, revision).is_ok());
                         } else {
-                            prop_assert_eq!(holder.replace(held.clone()), None);
+                            prop_assert_eq!(slot.replace(active.clone()), None);
                         }
-                        prop_assert_eq!(holder.take(held), decision == OfferDecision::Plan);
+                        prop_assert_eq!(slot.take(active), decision == OfferDecision::Plan);
                     }
                     Step::Cancel { mission } => {
-                        let decision = holder.cancel(id(mission));
-                        if before.held().is_some_and(|held| held.mission == id(mission)) {
+                        let decision = slot.cancel(id(mission));
+                        if before.active().is_some_and(|active| active.mission == id(mission)) {
                             prop_assert_eq!(decision, CancelDecision::Brake);
                         } else {
                             prop_assert_eq!(
@@ -398,37 +409,37 @@ mod tests {
                         let phase =
                             if succeeded { MissionPhase::Succeeded } else { MissionPhase::Failed };
                         let was_cancelled = before
-                            .held()
-                            .is_some_and(|held| held.mission == id(mission) && held.is_cancelled);
-                        let phase = holder.begin_end(id(mission), phase);
+                            .active()
+                            .is_some_and(|active| active.mission == id(mission) && active.is_cancelled);
+                        let phase = slot.begin_end(id(mission), phase);
                         prop_assert_eq!(phase == MissionPhase::Cancelled, was_cancelled);
-                        if before.held().is_some_and(|held| held.mission == id(mission))
+                        if before.active().is_some_and(|active| active.mission == id(mission))
                             && !was_cancelled
                         {
                             // Too late now.
-                            let late = holder.cancel(id(mission));
+                            let late = slot.cancel(id(mission));
                             prop_assert_eq!(late, CancelDecision::EndedBefore(phase));
                         }
-                        if holder.end(id(mission), phase).is_some() {
+                        if slot.end(id(mission), phase).is_some() {
                             prop_assert!(!over.contains(&id(mission)));
                             over.push(id(mission));
                         } else {
-                            prop_assert_eq!(&before, &holder);
+                            prop_assert_eq!(&before, &slot);
                         }
                     }
                 }
-                prop_assert!(holder.held().is_none_or(|held| !over.contains(&held.mission)));
+                prop_assert!(slot.active().is_none_or(|active| !over.contains(&active.mission)));
             }
         }
 
         #[test]
         fn the_memory_of_ended_missions_is_bounded(count in prop::sample::select(vec![0, 1, 999, 1_000, 1_001, 1_300_u128])) {
-            let mut holder = Holder::default();
+            let mut slot = MissionSlot::default();
             for mission in 0..count {
-                holder.cancel(id(mission));
+                slot.cancel(id(mission));
             }
-            prop_assert_eq!(holder.ended().count() as u128, count.min(ENDED_MAX as u128));
-            let newest = holder.ended().last().map(|ended| ended.mission);
+            prop_assert_eq!(slot.ended().count() as u128, count.min(ENDED_MAX as u128));
+            let newest = slot.ended().last().map(|ended| ended.mission);
             prop_assert_eq!(newest, count.checked_sub(1).map(id));
         }
     }

@@ -46,7 +46,7 @@ pub(super) fn sample_message(sample: &SensorSample) -> LoopSample {
             | bit(sample_bits::POSITION, position.is_some())
             | bit(sample_bits::POSITION_NOISE, noise.is_some()),
         yaw_rate_rad_s: sample.yaw_rate_rad_s.unwrap_or(NONE),
-        ahead_m_s2: acceleration.map_or(NONE, |it| it.ahead_m_s2),
+        forward_m_s2: acceleration.map_or(NONE, |it| it.forward_m_s2),
         left_m_s2: acceleration.map_or(NONE, |it| it.left_m_s2),
         wheel_left_rad_s: wheels.map_or(NONE, |it| it.left_rad_s),
         wheel_right_rad_s: wheels.map_or(NONE, |it| it.right_rad_s),
@@ -69,7 +69,7 @@ fn sample_of(message: &LoopSample) -> SensorSample {
         at: Duration::from_nanos(message.at_ns),
         yaw_rate_rad_s: has(sample_bits::YAW_RATE).then_some(message.yaw_rate_rad_s),
         acceleration: has(sample_bits::ACCELERATION).then_some(BodyAcceleration {
-            ahead_m_s2: message.ahead_m_s2,
+            forward_m_s2: message.forward_m_s2,
             left_m_s2: message.left_m_s2,
         }),
         wheel_speeds: has(sample_bits::WHEELS).then_some(WheelSpeeds {
@@ -270,7 +270,7 @@ pub(super) fn differences(recorded: &LoopTick<'_>, replayed: &LoopTick<'_>) -> V
             ("turn rate, rad/s", tick.angular_rad_s),
             ("theta of the law", tick.theta_loop),
             ("theta measured", tick.theta),
-            ("deviation of theta", tick.theta_std_dev),
+            ("standard deviation of theta", tick.theta_std_dev),
             ("way, m", tick.driven_m),
             ("cross-track error, m", tick.cross_track_m),
             ("slip left", tick.slip_left_ratio),
@@ -316,7 +316,7 @@ mod tests {
                 yaw_rate_rad_s: singles[0],
                 body_speed_m_s: singles[1],
                 tilt_rad: singles[2],
-                acceleration: pairs[0].map(|(ahead_m_s2, left_m_s2)| BodyAcceleration { ahead_m_s2, left_m_s2 }),
+                acceleration: pairs[0].map(|(forward_m_s2, left_m_s2)| BodyAcceleration { forward_m_s2, left_m_s2 }),
                 wheel_speeds: pairs[1].map(|(left_rad_s, right_rad_s)| WheelSpeeds { left_rad_s, right_rad_s }),
                 wheel_torques: pairs[2].map(|(left_n_m, right_n_m)| WheelTorques { left_n_m, right_n_m }),
                 position: position.map(|(x_m, y_m, heading_rad)| Pose { x_m, y_m, heading_rad }),

@@ -51,7 +51,7 @@ pub(crate) struct TickOutputs {
     pub(crate) theta_loop: Option<f64>,
     /// θ as measured, and its standard deviation.
     pub(crate) theta: Option<(f64, f64)>,
-    /// Way along the path and distance from it, metres.
+    /// Distance along the path and from it, metres.
     pub(crate) mission: Option<(f64, f64)>,
     pub(crate) slip: Option<SideSlip>,
     /// Information on θ of a closed segment, and the same weighted by θ.

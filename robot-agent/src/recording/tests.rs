@@ -1,4 +1,5 @@
-//! Records on the bench: run again to the bit, changed, torn, thinned out, and on a disk that refuses.
+//! Records on the bench: run again to the bit, changed, torn, thinned out, and on a disk that
+//! refuses.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -9,7 +10,7 @@ use mcap::Writer;
 use mcap::io::MessageReader;
 use mcap::records::MessageHeader;
 use tempfile::TempDir;
-use tread_api::ids::HolderId;
+use tread_api::ids::OwnerId;
 use tread_api::safety::{Driver, Geofence};
 use tread_api::wire;
 use tread_api::wire::command::{CellPrior, Outcome, PathPrior};
@@ -162,10 +163,10 @@ fn with_tick(
 
 /// A limit from outside, and a teleoperator under it.
 fn teleoperate_under_a_limit(bench: &mut Bench) {
-    let lidar: HolderId = "lidar".parse().unwrap();
+    let lidar: OwnerId = "lidar".parse().unwrap();
     let limit = ExternalLimit {
         boot: boot(),
-        holder: lidar,
+        owner: lidar,
         seq: 1,
         until_us: bench.now_us() + 3_000_000,
         hold: false,

@@ -125,7 +125,7 @@ pub(super) fn imu(sample: &SensorSample, wall_ns: i64, into: &mut Vec<u8>) -> bo
         },
         angular_velocity_covariance: unmeasured(sample.yaw_rate_rad_s.is_none()),
         linear_acceleration: Vector3 {
-            x: acceleration.ahead_m_s2,
+            x: acceleration.forward_m_s2,
             y: acceleration.left_m_s2,
             z: 0.0,
         },

@@ -71,7 +71,7 @@ pub(crate) fn lease(safety: &Safety, command: &LeaseCommand) -> Outcome {
     match safety.lease(command) {
         Ok(LeaseAnswer::Leased(epoch)) => Outcome::Leased { epoch },
         Ok(LeaseAnswer::Released) => Outcome::Done,
-        Err(LeaseRefusal::Held(driver)) => refused(
+        Err(LeaseRefusal::Taken(driver)) => refused(
             OfferRefusal::Leased,
             format!("{} teleoperates the robot", driver.name),
         ),
@@ -89,7 +89,7 @@ pub(crate) fn limit(safety: &Safety, limit: &ExternalLimit) -> Outcome {
         ),
         Err(LimitRefusal::OutOfOrder) => refused(
             OfferRefusal::Conflict,
-            "a newer limit of this holder is in force",
+            "a newer limit of this owner is in force",
         ),
         Err(LimitRefusal::TooLong) => refused(
             OfferRefusal::Impossible,
@@ -97,7 +97,7 @@ pub(crate) fn limit(safety: &Safety, limit: &ExternalLimit) -> Outcome {
         ),
         Err(LimitRefusal::Invalid(detail)) => refused(OfferRefusal::Impossible, detail),
         Err(LimitRefusal::TooMany) => {
-            refused(OfferRefusal::TooMany, "too many holders limit the robot")
+            refused(OfferRefusal::TooMany, "too many owners limit the robot")
         }
     }
 }

@@ -1,10 +1,10 @@
-//! What programs outside allow: holds and speed limits, each with its holder and end. Pure.
+//! What programs outside allow: holds and speed limits, each with its owner and end. Pure.
 //!
-//! The newest limit of a holder counts until its end. A holder that the configuration calls
+//! The newest limit of an owner counts until its end. An owner that the configuration calls
 //! required holds the robot while it is silent; of any other an ended limit has no effect.
 
 use serde::{Deserialize, Serialize};
-use tread_api::ids::{BootId, HolderId};
+use tread_api::ids::{BootId, OwnerId};
 use tread_api::safety::{LIMITS_MAX, LimitStatus};
 use tread_api::wire::safety::ExternalLimit;
 
@@ -19,11 +19,11 @@ pub(crate) enum LimitRefusal {
     TooLong,
     /// Its speed is none.
     Invalid(String),
-    /// There are too many holders.
+    /// There are too many owners.
     TooMany,
 }
 
-/// One holder's limit as the loop sees it.
+/// One owner's limit as the loop sees it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct Entry {
     is_required: bool,
@@ -93,8 +93,8 @@ impl LimitsView {
 }
 
 #[derive(Debug, Clone)]
-struct Holder {
-    id: HolderId,
+struct Owner {
+    id: OwnerId,
     entry: Entry,
     seq: Option<u64>,
     /// Up to here an older limit, come late, could still be in time.
@@ -105,15 +105,15 @@ struct Holder {
 #[derive(Debug, Clone)]
 pub(crate) struct ExternalLimits {
     boot: BootId,
-    holders: Vec<Holder>,
+    owners: Vec<Owner>,
     refused: u64,
 }
 
 impl ExternalLimits {
-    /// Nothing but the holders that are required, at most [`LIMITS_MAX`]; they are silent.
-    pub(crate) fn new(boot: BootId, required: &[HolderId]) -> Self {
-        let mut holders = Vec::with_capacity(LIMITS_MAX);
-        let required = required.iter().take(LIMITS_MAX).map(|id| Holder {
+    /// Nothing but the owners that are required, at most [`LIMITS_MAX`]; they are silent.
+    pub(crate) fn new(boot: BootId, required: &[OwnerId]) -> Self {
+        let mut owners = Vec::with_capacity(LIMITS_MAX);
+        let required = required.iter().take(LIMITS_MAX).map(|id| Owner {
             id: id.clone(),
             entry: Entry {
                 is_required: true,
@@ -122,10 +122,10 @@ impl ExternalLimits {
             seq: None,
             guarded_until_us: 0,
         });
-        holders.extend(required);
+        owners.extend(required);
         Self {
             boot,
-            holders,
+            owners,
             refused: 0,
         }
     }
@@ -150,23 +150,20 @@ impl ExternalLimits {
         if limit.is_too_long(now_us) {
             return Err(LimitRefusal::TooLong);
         }
-        let place = self
-            .holders
-            .iter()
-            .position(|holder| holder.id == limit.holder);
+        let place = self.owners.iter().position(|owner| owner.id == limit.owner);
         let place = match place {
             Some(place) => place,
             None => self.make_room(limit, now_us)?,
         };
-        let holder = &mut self.holders[place];
-        let is_guarded = now_us < holder.guarded_until_us;
-        if is_guarded && holder.seq.is_some_and(|last| limit.seq <= last) {
+        let owner = &mut self.owners[place];
+        let is_guarded = now_us < owner.guarded_until_us;
+        if is_guarded && owner.seq.is_some_and(|last| limit.seq <= last) {
             return Err(LimitRefusal::OutOfOrder);
         }
-        holder.seq = Some(limit.seq);
-        holder.guarded_until_us = holder.guarded_until_us.max(limit.until_us);
-        holder.entry = Entry {
-            is_required: holder.entry.is_required,
+        owner.seq = Some(limit.seq);
+        owner.guarded_until_us = owner.guarded_until_us.max(limit.until_us);
+        owner.entry = Entry {
+            is_required: owner.entry.is_required,
             until_us: limit.until_us,
             hold: limit.hold,
             linear_max_m_s: limit.linear_max_m_s,
@@ -175,20 +172,20 @@ impl ExternalLimits {
     }
 
     fn make_room(&mut self, limit: &ExternalLimit, now_us: u64) -> Result<usize, LimitRefusal> {
-        if self.holders.len() >= LIMITS_MAX {
-            self.holders
-                .retain(|holder| holder.entry.is_required || now_us < holder.guarded_until_us);
+        if self.owners.len() >= LIMITS_MAX {
+            self.owners
+                .retain(|owner| owner.entry.is_required || now_us < owner.guarded_until_us);
         }
-        if self.holders.len() >= LIMITS_MAX {
+        if self.owners.len() >= LIMITS_MAX {
             return Err(LimitRefusal::TooMany);
         }
-        self.holders.push(Holder {
-            id: limit.holder.clone(),
+        self.owners.push(Owner {
+            id: limit.owner.clone(),
             entry: Entry::default(),
             seq: None,
             guarded_until_us: 0,
         });
-        Ok(self.holders.len() - 1)
+        Ok(self.owners.len() - 1)
     }
 
     /// Counts one that does not parse, or is too large.
@@ -204,28 +201,28 @@ impl ExternalLimits {
     /// What the loop needs.
     pub(crate) fn view(&self) -> LimitsView {
         let mut view = LimitsView {
-            count: self.holders.len(),
+            count: self.owners.len(),
             ..LimitsView::default()
         };
-        for (entry, holder) in view.entries.iter_mut().zip(&self.holders) {
-            *entry = holder.entry;
+        for (entry, owner) in view.entries.iter_mut().zip(&self.owners) {
+            *entry = owner.entry;
         }
         view
     }
 
-    /// For the robot's state: limits in force, and required holders.
+    /// For the robot's state: limits in force, and required owners.
     pub(crate) fn status(&self, now_us: u64) -> Vec<LimitStatus> {
         let of_note = self
-            .holders
+            .owners
             .iter()
-            .filter(|holder| holder.entry.is_required || now_us < holder.entry.until_us);
+            .filter(|owner| owner.entry.is_required || now_us < owner.entry.until_us);
         of_note
-            .map(|holder| LimitStatus {
-                holder: holder.id.clone(),
-                required: holder.entry.is_required,
-                hold: holder.entry.holds(now_us),
-                linear_max_m_s: holder.entry.limit_m_s(now_us),
-                ends_in_ms: holder
+            .map(|owner| LimitStatus {
+                owner: owner.id.clone(),
+                required: owner.entry.is_required,
+                hold: owner.entry.holds(now_us),
+                linear_max_m_s: owner.entry.limit_m_s(now_us),
+                ends_in_ms: owner
                     .entry
                     .until_us
                     .checked_sub(now_us)
@@ -247,9 +244,9 @@ mod tests {
         BootId::from_uuid(Uuid::from_u128(5))
     }
 
-    fn limit(holder: &str, seq: u64, until_us: u64, hold: bool) -> ExternalLimit {
+    fn limit(owner: &str, seq: u64, until_us: u64, hold: bool) -> ExternalLimit {
         ExternalLimit {
-            holder: holder.parse().unwrap(),
+            owner: owner.parse().unwrap(),
             boot: boot(),
             until_us,
             seq,
@@ -274,15 +271,15 @@ mod tests {
         assert!(limits.view().holds(2_999));
         assert!(!limits.view().holds(3_000));
         limits.take(&limit("lidar", 3, 0, false), 3_000).unwrap();
-        assert!(limits.view().holds(3_000), "ended by its holder is silence");
+        assert!(limits.view().holds(3_000), "ended by its owner is silence");
     }
 
     #[test]
     fn too_many_holders_foreign_and_endless_limits_are_refused() {
         let mut limits = ExternalLimits::new(boot(), &["lidar".parse().unwrap()]);
         for number in 1..LIMITS_MAX {
-            let holder = format!("h{number}");
-            limits.take(&limit(&holder, 1, 1_000, true), 0).unwrap();
+            let owner = format!("h{number}");
+            limits.take(&limit(&owner, 1, 1_000, true), 0).unwrap();
         }
         let one_more = limit("one-more", 1, 2_000, true);
         assert_eq!(limits.take(&one_more, 0), Err(LimitRefusal::TooMany));

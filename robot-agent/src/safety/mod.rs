@@ -1,7 +1,7 @@
 //! What may only slow the robot down: stops, teleoperation, limits from outside.
 //!
-//! [`stop`], [`operator`] and [`limits`] are pure and decide; [`Safety`] owns them, keeps the stop on
-//! the disk ([`latch_file`]), and leaves what the loop needs in a cell that the loop never waits
+//! [`stop`], [`operator`] and [`limits`] are pure and decide; [`Safety`] owns them, keeps the stop
+//! on the disk ([`latch_file`]), and leaves what the loop needs in a cell that the loop never waits
 //! for. What the loop has once seen carries its own end, so that a cell that it cannot read for a
 //! moment makes nothing last longer. [`watchdog`] looks after the loop itself.
 //!
@@ -24,7 +24,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use tokio::sync::Notify;
 use tracing::{error, info, warn};
-use tread_api::ids::{BootId, HolderId, StopId};
+use tread_api::ids::{BootId, OwnerId, StopId};
 use tread_api::safety::{DriveStatus, Lease, LimitStatus, SMALL_PAYLOAD_MAX, StopLatch};
 use tread_api::wire;
 use tread_api::wire::safety::{DriveCommand, ExternalLimit, LeaseCommand, Stop};
@@ -136,7 +136,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Safety {
-    /// What the disk says of stops, nobody driving, and the required holders silent.
+    /// What the disk says of stops, nobody driving, and the required owners silent.
     ///
     /// `state` is what the latch file of this folder said when the agent started.
     pub(crate) fn open(
@@ -144,7 +144,7 @@ impl Safety {
         state: StopState,
         boot: BootId,
         model: RobotModel,
-        required: &[HolderId],
+        required: &[OwnerId],
         cell: Arc<SafetyCell>,
         clock: SharedClock,
     ) -> Arc<Self> {
@@ -286,7 +286,7 @@ impl Safety {
                 }
             }
             Urgent::Drive(payload) => self.take_drive(payload),
-            Urgent::Limit(holder, payload) => self.take_published_limit(holder, payload),
+            Urgent::Limit(owner, payload) => self.take_published_limit(owner, payload),
         }
     }
 
@@ -307,12 +307,12 @@ impl Safety {
         }
     }
 
-    /// Takes a published limit as it came; `holder` is the one in its key.
-    pub(crate) fn take_published_limit(&self, holder: &HolderId, payload: &[u8]) {
+    /// Takes a published limit as it came; `owner` is the one in its key.
+    pub(crate) fn take_published_limit(&self, owner: &OwnerId, payload: &[u8]) {
         let limit = (payload.len() <= SMALL_PAYLOAD_MAX)
             .then(|| wire::decode::<ExternalLimit>(payload).ok())
             .flatten()
-            .filter(|limit| limit.holder == *holder);
+            .filter(|limit| limit.owner == *owner);
         match limit {
             // What is refused is counted.
             Some(limit) => drop(self.limit(&limit)),

@@ -39,7 +39,7 @@ pub(crate) enum LeaseAnswer {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum LeaseRefusal {
     /// Somebody else has it.
-    Held(Driver),
+    Taken(Driver),
     /// The same request was granted before, and the lease has gone on since.
     Over,
 }
@@ -55,7 +55,7 @@ pub(crate) enum Verdict {
 }
 
 #[derive(Debug, Clone)]
-struct Held {
+struct ActiveLease {
     lease: Lease,
     heard_us: u64,
     last_seq: Option<u64>,
@@ -98,7 +98,7 @@ pub(crate) struct Operator {
     boot: BootId,
     model: RobotModel,
     epoch: u64,
-    held: Option<Held>,
+    active: Option<ActiveLease>,
     wanted: Option<(Twist, u64)>,
     meter: AgeMeter,
     counts: DriveCounts,
@@ -111,7 +111,7 @@ impl Operator {
             boot,
             model,
             epoch: 0,
-            held: None,
+            active: None,
             wanted: None,
             meter: AgeMeter::default(),
             counts: DriveCounts::default(),
@@ -121,16 +121,16 @@ impl Operator {
 
     fn free_if_silent(&mut self, now_us: u64) {
         let is_silent = self
-            .held
+            .active
             .as_ref()
-            .is_some_and(|held| now_us >= held.heard_us.saturating_add(LEASE_SILENCE_MAX_US));
+            .is_some_and(|active| now_us >= active.heard_us.saturating_add(LEASE_SILENCE_MAX_US));
         if is_silent {
             self.free();
         }
     }
 
     fn free(&mut self) {
-        self.held = None;
+        self.active = None;
         self.wanted = None;
     }
 
@@ -141,7 +141,7 @@ impl Operator {
             client: driver.client,
             name: driver.name.chars().take(BY_LENGTH_MAX).collect(),
         };
-        self.held = Some(Held {
+        self.active = Some(ActiveLease {
             lease: Lease {
                 epoch: self.epoch,
                 driver,
@@ -167,7 +167,7 @@ impl Operator {
             .answered
             .iter()
             .find(|(request, _)| *request == command.request);
-        let present = self.held.as_ref().map(|held| &held.lease);
+        let present = self.active.as_ref().map(|active| &active.lease);
         if let Some(&(_, answer)) = known {
             return match answer {
                 LeaseAnswer::Leased(epoch) if present.map(|lease| lease.epoch) != Some(epoch) => {
@@ -180,7 +180,7 @@ impl Operator {
         let other = present.filter(|lease| lease.driver.client != client);
         let answer = match (command.action, present, other) {
             (LeaseAction::Acquire | LeaseAction::Release, _, Some(other)) => {
-                return Err(LeaseRefusal::Held(other.driver.clone()));
+                return Err(LeaseRefusal::Taken(other.driver.clone()));
             }
             (LeaseAction::Acquire, Some(own), None) => LeaseAnswer::Leased(own.epoch),
             (LeaseAction::Acquire, None, None) | (LeaseAction::Take, _, _) => {
@@ -222,22 +222,22 @@ impl Operator {
         self.wanted = Some((within, command.until_us));
         let age_us = now_us.saturating_sub(command.sent_us);
         self.meter.note(seconds_of(age_us));
-        if let Some(held) = &mut self.held {
-            held.heard_us = now_us;
-            held.last_seq = Some(command.seq);
+        if let Some(active) = &mut self.active {
+            active.heard_us = now_us;
+            active.last_seq = Some(command.seq);
         }
         verdict
     }
 
     fn judge(&self, command: &DriveCommand, now_us: u64) -> Verdict {
-        let Some(held) = self
-            .held
+        let Some(active) = self
+            .active
             .as_ref()
-            .filter(|held| command.boot == self.boot && command.epoch == held.lease.epoch)
+            .filter(|active| command.boot == self.boot && command.epoch == active.lease.epoch)
         else {
             return Verdict::Foreign;
         };
-        if held.last_seq.is_some_and(|last| command.seq <= last) {
+        if active.last_seq.is_some_and(|last| command.seq <= last) {
             Verdict::OutOfOrder
         } else if !command.is_in_time(now_us) {
             Verdict::Expired
@@ -257,9 +257,9 @@ impl Operator {
     /// What the loop needs.
     pub(crate) fn view(&self) -> TeleoperationView {
         TeleoperationView {
-            lease: self.held.as_ref().map(|held| {
-                let until_us = held.heard_us.saturating_add(LEASE_SILENCE_MAX_US);
-                (held.lease.epoch, until_us)
+            lease: self.active.as_ref().map(|active| {
+                let until_us = active.heard_us.saturating_add(LEASE_SILENCE_MAX_US);
+                (active.lease.epoch, until_us)
             }),
             wanted: self.wanted,
             speed_share: self.meter.speed_share(),
@@ -268,9 +268,9 @@ impl Operator {
 
     /// The lease in force.
     pub(crate) fn lease_at(&self, now_us: u64) -> Option<&Lease> {
-        let held = self.held.as_ref()?;
-        let until_us = held.heard_us.saturating_add(LEASE_SILENCE_MAX_US);
-        (now_us < until_us).then_some(&held.lease)
+        let active = self.active.as_ref()?;
+        let until_us = active.heard_us.saturating_add(LEASE_SILENCE_MAX_US);
+        (now_us < until_us).then_some(&active.lease)
     }
 
     /// For the robot's state; none before the first lease.
@@ -318,7 +318,7 @@ mod tests {
         let first = operator.lease(&request(1, LeaseAction::Acquire, 0), 0);
         assert_eq!(first, Ok(LeaseAnswer::Leased(1)));
         let refused = operator.lease(&request(2, LeaseAction::Acquire, 1), 0);
-        assert_eq!(refused, Err(LeaseRefusal::Held(driver(0))));
+        assert_eq!(refused, Err(LeaseRefusal::Taken(driver(0))));
         let taken = operator.lease(&request(3, LeaseAction::Take, 1), 0);
         assert_eq!(taken, Ok(LeaseAnswer::Leased(2)));
         // The first one's request comes twice; it must not steal the lease back, nor be told that
@@ -326,7 +326,7 @@ mod tests {
         let again = operator.lease(&request(1, LeaseAction::Acquire, 0), 0);
         assert_eq!(again, Err(LeaseRefusal::Over));
         let released = operator.lease(&request(4, LeaseAction::Release, 0), 0);
-        assert_eq!(released, Err(LeaseRefusal::Held(driver(1))));
+        assert_eq!(released, Err(LeaseRefusal::Taken(driver(1))));
         assert_eq!(operator.lease_at(0).unwrap().driver, driver(1));
     }
 

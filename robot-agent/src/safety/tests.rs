@@ -185,7 +185,7 @@ impl Teleoperator {
 
 pub(super) fn limit(bench: &Bench, seq: u64, for_us: u64, hold: bool, linear_max_m_s: Option<f64>) {
     let limit = ExternalLimit {
-        holder: "lidar".parse().unwrap(),
+        owner: "lidar".parse().unwrap(),
         boot: boot(),
         until_us: bench.now_us() + for_us,
         seq,

@@ -1,5 +1,5 @@
-//! Faults of a simulated base: channels that freeze, turn over, scale, drift off or leap, wheels that
-//! lock, and a base that ignores its commands.
+//! Faults of a simulated base: channels that freeze, turn over, scale, drift off or leap, wheels
+//! that lock, and a base that ignores its commands.
 
 use std::time::Duration;
 
@@ -268,7 +268,7 @@ fn change(sample: &mut SensorSample, channel: Channel, to: impl Fn(f64) -> f64) 
     }
     if is(Channel::Accelerometer) {
         sample.acceleration = sample.acceleration.map(|felt| BodyAcceleration {
-            ahead_m_s2: to(felt.ahead_m_s2),
+            forward_m_s2: to(felt.forward_m_s2),
             left_m_s2: to(felt.left_m_s2),
         });
     }

@@ -18,7 +18,7 @@ const SAMPLES_PER_BODY_SPEED: u64 = 20;
 /// A position fix with each so many samples: 20 Hz.
 const SAMPLES_PER_POSITION: u64 = 10;
 
-/// How good the sensors are; deviations of white noise unless said otherwise.
+/// How good the sensors are; standard deviations of white noise unless said otherwise.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SensorSpec {
     /// Gyro, rad/s.
@@ -78,7 +78,7 @@ impl Sensors {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let mut within = |most: f64| most * (2.0 * random.random::<f64>() - 1.0);
         let bias = BodyAcceleration {
-            ahead_m_s2: within(spec.acceleration_bias_m_s2),
+            forward_m_s2: within(spec.acceleration_bias_m_s2),
             left_m_s2: within(spec.acceleration_bias_m_s2),
         };
         let torque_scale = 1.0 + within(spec.torque_scale_ratio);
@@ -110,8 +110,8 @@ impl Sensors {
         radius * (std::f64::consts::TAU * self.random.random::<f64>()).cos()
     }
 
-    fn noisy(&mut self, value: f64, deviation: f64) -> f64 {
-        value + deviation * self.normal()
+    fn noisy(&mut self, value: f64, std_dev: f64) -> f64 {
+        value + std_dev * self.normal()
     }
 
     /// What the sensors say of the base now.
@@ -126,7 +126,7 @@ impl Sensors {
         let wheel_noise = spec.wheel_speed_rad_s;
         let body_speed_m_s = index
             .is_multiple_of(SAMPLES_PER_BODY_SPEED)
-            .then(|| self.noisy(state.ahead_m_s, spec.body_speed_m_s));
+            .then(|| self.noisy(state.forward_m_s, spec.body_speed_m_s));
         let position = index.is_multiple_of(SAMPLES_PER_POSITION).then(|| Pose {
             x_m: self.noisy(state.pose.x_m, spec.position_m),
             y_m: self.noisy(state.pose.y_m, spec.position_m),
@@ -137,8 +137,8 @@ impl Sensors {
             at,
             yaw_rate_rad_s: Some(self.noisy(means.yaw_rate_rad_s, spec.gyro_rad_s)),
             acceleration: Some(BodyAcceleration {
-                ahead_m_s2: self.noisy(
-                    acceleration.ahead_m_s2 + self.bias.ahead_m_s2,
+                forward_m_s2: self.noisy(
+                    acceleration.forward_m_s2 + self.bias.forward_m_s2,
                     spec.acceleration_m_s2,
                 ),
                 left_m_s2: self.noisy(

@@ -228,7 +228,7 @@ impl World {
                         };
                     }
                 }
-                if let Err(LeaseRefusal::Held(other)) = answer {
+                if let Err(LeaseRefusal::Taken(other)) = answer {
                     let is_named = before.is_some_and(|lease| lease.driver == other);
                     self.report.stolen += u64::from(!is_named);
                 }

@@ -110,7 +110,7 @@ pub struct Bench<D = SimulatedDrive> {
     pub(crate) paused_for: Option<jiff::SignedDuration>,
     /// Longest silence of the server that missions bear from now on.
     pub(crate) silence_max: Option<Duration>,
-    /// What a map knows along the way of missions from now on.
+    /// What a map knows along the path of missions from now on.
     prior: Option<PathPrior>,
     /// The record of the last mission that ended.
     pub(crate) last_driven: Option<Driven>,

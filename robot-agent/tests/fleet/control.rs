@@ -90,7 +90,7 @@ async fn a_mission_that_is_taken_held_stands_at_its_start_until_it_is_resumed() 
     let agent = rig.agent();
     rig.ready(agent.boot()).await;
     let first = Offer {
-        held: true,
+        on_hold: true,
         ..offer(1, LONG)
     };
     let mission = first.mission;

@@ -127,8 +127,8 @@ async fn what_cannot_be_understood_or_driven_is_refused_with_a_reason() {
     rig.ready(agent.boot()).await;
     let cases = [
         (&b"\xff\xfe"[..], RefusalCode::Malformed),
-        (br#"{"v":2,"body":{}}"#, RefusalCode::Version),
-        (br#"{"v":1,"body":{"mission":7}}"#, RefusalCode::Malformed),
+        (br#"{"v":1,"body":{}}"#, RefusalCode::Version),
+        (br#"{"v":2,"body":{"mission":7}}"#, RefusalCode::Malformed),
     ];
     for (payload, code) in cases {
         for verb in Verb::ALL {

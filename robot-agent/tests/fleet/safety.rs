@@ -240,13 +240,13 @@ async fn a_program_outside_holds_the_robot_and_a_required_one_by_its_silence() {
     let rig = Rig::new();
     let server = rig.serve();
     let mut config = rig.config();
-    config.required_holders = vec!["lidar".parse().unwrap()];
+    config.required_owners = vec!["lidar".parse().unwrap()];
     let agent = tread_agent::Agent::start(config).unwrap();
     rig.ready(agent.boot()).await;
     let status = agent.state().safety;
     assert!(status.limits[0].required && status.limits[0].hold);
     let limit = |seq: u64, for_us: u64| ExternalLimit {
-        holder: "lidar".parse().unwrap(),
+        owner: "lidar".parse().unwrap(),
         boot: agent.boot(),
         until_us: agent.state().monotonic_us.unwrap() + for_us,
         seq,
@@ -324,14 +324,14 @@ async fn a_required_program_that_falls_silent_holds_the_robot_until_it_is_heard_
     let rig = Rig::new();
     let server = rig.serve();
     let mut config = rig.config();
-    config.required_holders = vec!["lidar".parse().unwrap()];
+    config.required_owners = vec!["lidar".parse().unwrap()];
     let agent = tread_agent::Agent::start(config).unwrap();
     rig.ready(agent.boot()).await;
     let site = "yard".parse().unwrap();
     let key = keys::limit(&site, &rig.robot, &"lidar".parse().unwrap());
     let speak = async |seq: u64, for_us: u64| {
         let limit = ExternalLimit {
-            holder: "lidar".parse().unwrap(),
+            owner: "lidar".parse().unwrap(),
             boot: agent.boot(),
             until_us: agent.state().monotonic_us.unwrap() + for_us,
             seq,

@@ -358,6 +358,6 @@ pub(crate) fn offer(number: u128, asked: &str) -> Offer {
         start_within_ms: Some(10_000),
         link_policy: LinkPolicy::default(),
         prior: None,
-        held: false,
+        on_hold: false,
     }
 }

@@ -6,7 +6,7 @@ use super::{message, record};
 record! {
     /// A direction and its length.
     Vector3 {
-        /// Ahead.
+        /// Forward.
         x: f64,
         /// To the left.
         y: f64,
@@ -18,7 +18,7 @@ record! {
 record! {
     /// A place, metres.
     Point {
-        /// Ahead.
+        /// Forward.
         x: f64,
         /// To the left.
         y: f64,

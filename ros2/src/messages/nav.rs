@@ -26,7 +26,7 @@ message!(
 );
 
 record! {
-    /// A way.
+    /// A path.
     Path<'a> {
         /// When, in which frame.
         header: Header<'a>,

@@ -73,7 +73,7 @@ record! {
         /// Turn rate, radians per second.
         yaw_rate_rad_s: f64,
         /// Acceleration ahead, metres per second squared.
-        ahead_m_s2: f64,
+        forward_m_s2: f64,
         /// Acceleration to the left.
         left_m_s2: f64,
         /// Speed of the left wheels, radians per second.
@@ -146,7 +146,7 @@ record! {
         y_m: f64,
         /// Estimated heading, radians.
         heading_rad: f64,
-        /// Estimated speed ahead, metres per second.
+        /// Estimated forward speed, metres per second.
         linear_m_s: f64,
         /// Estimated turn rate, radians per second.
         angular_rad_s: f64,
@@ -156,7 +156,7 @@ record! {
         theta: f64,
         /// Its standard deviation.
         theta_std_dev: f64,
-        /// Way along the mission's path, metres.
+        /// Distance along the mission's path, metres.
         driven_m: f64,
         /// Distance from it, metres, positive to the left.
         cross_track_m: f64,

@@ -50,7 +50,7 @@ for (const theme of ['light', 'dark'] as const) {
       await page.getByRole('combobox', { name: 'Friction' }).selectOption('change');
       await page.getByLabel('Before').waitFor();
       expect(await violations(page), 'geofence and comparison').toEqual([]);
-      await page.getByRole('button', { name: 'Put away' }).click();
+      await page.getByRole('button', { name: 'Discard' }).click();
       await page.getByRole('combobox', { name: 'Friction' }).selectOption('theta');
       const past = page.locator('.ended button', { hasText: 'succeeded' }).first();
       await page.getByRole('tab', { name: 'Missions' }).click();
@@ -64,7 +64,7 @@ for (const theme of ['light', 'dark'] as const) {
       await page.getByRole('button', { name: 'Add point' }).click();
       await page.getByText('Options').click();
       expect(await violations(page), 'drawing').toEqual([]);
-      await page.getByRole('button', { name: 'Put away' }).click();
+      await page.getByRole('button', { name: 'Discard' }).click();
       await page.getByRole('button', { name: 'Teleoperate' }).click();
       await page.getByText('You have the lease.').waitFor();
       await page.getByRole('button', { name: 'Stop rover-3' }).click();

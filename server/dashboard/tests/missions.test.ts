@@ -251,7 +251,7 @@ test('a path outside of where robots may be is refused in one sentence, and kept
     await page.getByLabel('Centre y, m').press('Tab');
     const problem = page.locator('form .problem');
     await problem.waitFor();
-    expect(await problem.innerText()).toMatch(/^The way leaves where robots may be: [^.]*(\d\.\d+[^.]*)*\.$/);
+    expect(await problem.innerText()).toMatch(/^The path leaves where robots may be: [^.]*(\d\.\d+[^.]*)*\.$/);
     expect(await page.getByLabel('Centre x, m').inputValue()).toBe('60');
     expect(await page.getByRole('button', { name: 'Send', exact: true }).isEnabled()).toBe(false);
     await shot(page, 'outside');

@@ -114,9 +114,9 @@ impl App {
 }
 
 impl App {
-    /// Refuses a trajectory that leaves the site's geofence, on it or on the way to its begin from
-    /// where the robot will be after what it drives and what is queued before. Without a geofence it
-    /// costs nothing.
+    /// Refuses a trajectory that leaves the site's geofence, on it or on the approach to its begin
+    /// from where the robot will be after what it drives and what is queued before. Without a
+    /// geofence it costs nothing.
     ///
     /// # Errors
     /// [`AppError::CrossesGeofence`] names the place.
@@ -306,7 +306,7 @@ fn check(
     })
 }
 
-/// Length of a way without what goes where it went before: further turns of a circle, metres.
+/// Length of a path without what goes where it went before: further turns of a circle, metres.
 pub(super) fn once_m(plan: &Plan, trajectory: &Trajectory) -> f64 {
     match trajectory {
         Trajectory::Circle(circle) => {

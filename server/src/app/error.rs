@@ -153,7 +153,7 @@ pub enum AppError {
         /// Why.
         detail: String,
     },
-    /// The way leaves where robots of the site may be.
+    /// The path leaves where robots of the site may be.
     #[error("robot `{robot}` may not drive this: {detail}")]
     CrossesGeofence {
         /// The robot.

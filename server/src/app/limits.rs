@@ -5,7 +5,7 @@
 
 use std::time::Duration;
 
-use tread_api::ids::{HolderId, RobotId, SiteId};
+use tread_api::ids::{OwnerId, RobotId, SiteId};
 use tread_api::keys::Verb;
 use tread_api::page::Page;
 use tread_api::safety::{LIMIT_AHEAD_MAX_US, LimitStatus, SetLimit};
@@ -42,7 +42,7 @@ impl App {
     pub async fn set_limit(
         &self,
         (site, robot): (&SiteId, &RobotId),
-        holder: HolderId,
+        owner: OwnerId,
         limit: SetLimit,
     ) -> Result<(), AppError> {
         if !(1..=FOR_MAX_MS).contains(&limit.for_ms) {
@@ -51,25 +51,25 @@ impl App {
                 detail: format!("for_ms must be 1 to {FOR_MAX_MS}, not {}", limit.for_ms),
             });
         }
-        self.send_limit((site, robot), holder, Some(limit)).await
+        self.send_limit((site, robot), owner, Some(limit)).await
     }
 
-    /// Ends a holder's limit of a robot. A holder that the robot must hear holds it from then on.
+    /// Ends an owner's limit of a robot. An owner that the robot must hear holds it from then on.
     ///
     /// # Errors
     /// The robot does not answer, or refuses.
     pub async fn end_limit(
         &self,
         (site, robot): (&SiteId, &RobotId),
-        holder: HolderId,
+        owner: OwnerId,
     ) -> Result<(), AppError> {
-        self.send_limit((site, robot), holder, None).await
+        self.send_limit((site, robot), owner, None).await
     }
 
     async fn send_limit(
         &self,
         (site, robot): (&SiteId, &RobotId),
-        holder: HolderId,
+        owner: OwnerId,
         limit: Option<SetLimit>,
     ) -> Result<(), AppError> {
         self.known_robot(site, robot).await?;
@@ -81,10 +81,10 @@ impl App {
         let lasting = limit.map_or(Duration::ZERO, |limit| Duration::from_millis(limit.for_ms));
         let lasting_us = u64::try_from(lasting.as_micros()).unwrap_or(0);
         let command = ExternalLimit {
-            holder,
+            owner,
             boot,
             until_us: limit.map_or(0, |_| clock_us.saturating_add(lasting_us)),
-            // The wall clock orders the limits of one holder also over a restart of the server.
+            // The wall clock orders the limits of one owner also over a restart of the server.
             seq: u64::try_from(self.clock().now().as_microsecond()).unwrap_or(0),
             hold: limit.is_some_and(|limit| limit.hold),
             linear_max_m_s: limit.and_then(|limit| limit.linear_max_m_s),

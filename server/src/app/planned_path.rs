@@ -1,4 +1,4 @@
-//! Where the planner lays a mission's way, for people to see before and after it was driven.
+//! Where the planner lays a mission's path, for people to see before and after it was driven.
 
 use tread_api::ids::MissionId;
 use tread_api::trajectory::PlannedPath;
@@ -8,8 +8,8 @@ use super::{App, AppError};
 use crate::db;
 
 impl App {
-    /// The smooth way of a mission's present revision: from where its robot planned it, once it has
-    /// taken it, and from the begin of the trajectory before.
+    /// The smooth path of a mission's present revision: from where its robot planned it, once it
+    /// has taken it, and from the begin of the trajectory before.
     ///
     /// # Errors
     /// [`AppError::UnknownMission`]; [`AppError::Impossible`] for what its robot has refused or

@@ -113,7 +113,7 @@ impl Holds {
 
 /// A lease that the robot gave to this session.
 #[derive(Debug)]
-struct Held {
+struct ActiveLease {
     lease: Lease,
     boot: BootId,
     since: Duration,
@@ -127,7 +127,7 @@ pub struct Session {
     app: App,
     key: RobotKey,
     client: Uuid,
-    held: Option<Held>,
+    active: Option<ActiveLease>,
     /// The server's stop waits until the session has commanded the robot to stand; dropped last.
     _attended: TaskTrackerToken,
 }
@@ -144,7 +144,7 @@ impl App {
             _attended: self.supervisor().attend(),
             key: (site.clone(), robot.clone()),
             client: Uuid::new_v4(),
-            held: None,
+            active: None,
         })
     }
 
@@ -188,7 +188,7 @@ impl Session {
 
     /// Ends the session: a robot that it drives is told to stand, and the lease is given back.
     pub fn end(&mut self) {
-        if self.held.is_some() {
+        if self.active.is_some() {
             let robot = &self.key.1;
             warn!(robot.id = %robot, "the driver of robot `{robot}` is gone; it is told to stand");
             self.app.counters().drivers_lost.one();
@@ -252,9 +252,10 @@ impl Session {
         };
         let lease = Lease { epoch, driver };
         // The same lease again goes on where it was.
-        let is_same = |held: &&mut Held| (held.lease.epoch, held.boot) == (epoch, answer.boot);
-        if let Some(held) = self.held.as_mut().filter(is_same) {
-            held.lease = lease.clone();
+        let is_same =
+            |active: &&mut ActiveLease| (active.lease.epoch, active.boot) == (epoch, answer.boot);
+        if let Some(active) = self.active.as_mut().filter(is_same) {
+            active.lease = lease.clone();
             return Ok(lease);
         }
         let publisher = self.app.robot_link().drive.open(&self.key).await;
@@ -265,7 +266,7 @@ impl Session {
         };
         let name = &lease.driver.name;
         info!(robot.id = %self.key.1, "robot `{}` is teleoperated by `{name}`", self.key.1);
-        self.held = Some(Held {
+        self.active = Some(ActiveLease {
             lease: lease.clone(),
             boot: answer.boot,
             since: self.app.clock().elapsed(),
@@ -326,7 +327,7 @@ impl Session {
 
     fn send(&mut self, twist: Twist, lasting: Duration) -> Result<(), Refused> {
         let no_lease = || refused(DriveRefusal::NoLease, "acquire the lease first");
-        let held = self.held.as_mut().ok_or_else(no_lease)?;
+        let active = self.active.as_mut().ok_or_else(no_lease)?;
         let now = self.app.clock().elapsed();
         let clock = self.app.presences().get(&self.key).robot_clock_us(now);
         let (boot, sent_us) = clock.ok_or_else(|| {
@@ -335,21 +336,21 @@ impl Session {
                 "the robot has not been heard yet",
             )
         })?;
-        if boot != held.boot {
+        if boot != active.boot {
             return Err(no_lease());
         }
         let lasting_us = u64::try_from(lasting.as_micros()).unwrap_or(0);
         let command = DriveCommand {
             boot,
-            epoch: held.lease.epoch,
-            seq: held.next_seq,
+            epoch: active.lease.epoch,
+            seq: active.next_seq,
             sent_us,
             until_us: sent_us.saturating_add(lasting_us),
             twist,
         };
-        held.next_seq += 1;
+        active.next_seq += 1;
         self.app.counters().drive_commands_sent.one();
-        if held.publisher.publish(&command) {
+        if active.publisher.publish(&command) {
             Ok(())
         } else {
             let detail = "the network to the robot is not open";
@@ -361,9 +362,9 @@ impl Session {
     pub fn release(&mut self) -> bool {
         // Without the robot's clock it stands when its last command ends.
         let _ = self.send(Twist::default(), STAND_FOR);
-        match self.held.take() {
-            Some(held) => {
-                self.give_back(held.lease);
+        match self.active.take() {
+            Some(active) => {
+                self.give_back(active.lease);
                 true
             }
             None => false,
@@ -398,9 +399,9 @@ impl Session {
     /// As [`App::stop_robot`].
     pub async fn stop(&mut self, words: StopWords) -> Result<Stop, AppError> {
         let driver = self
-            .held
+            .active
             .as_ref()
-            .map(|held| held.lease.driver.name.clone());
+            .map(|active| active.lease.driver.name.clone());
         let words = StopWords {
             by: words.by.or(driver),
             ..words
@@ -412,17 +413,17 @@ impl Session {
     /// Whether the robot's states say that this session's lease is over; the session has none
     /// then.
     pub fn lost_lease(&mut self) -> Option<(ReleaseCause, String)> {
-        let held = self.held.as_ref()?;
+        let active = self.active.as_ref()?;
         let now = self.app.clock().elapsed();
         let presence = self.app.presences().get(&self.key);
         let state = presence.state()?;
-        let other_run = presence.boot().is_some_and(|(boot, _)| boot != held.boot);
+        let other_run = presence.boot().is_some_and(|(boot, _)| boot != active.boot);
         let shown = state.safety.lease.as_ref();
-        let is_own = shown.is_some_and(|shown| shown.epoch == held.lease.epoch);
-        if !other_run && (is_own || now.saturating_sub(held.since) < LEASE_GRACE) {
+        let is_own = shown.is_some_and(|shown| shown.epoch == active.lease.epoch);
+        if !other_run && (is_own || now.saturating_sub(active.since) < LEASE_GRACE) {
             return None;
         }
-        let lost = match shown.filter(|shown| shown.epoch > held.lease.epoch || other_run) {
+        let lost = match shown.filter(|shown| shown.epoch > active.lease.epoch || other_run) {
             Some(other) => {
                 let detail = format!("`{}` has taken it", other.driver.name);
                 (ReleaseCause::Taken, detail)
@@ -436,7 +437,7 @@ impl Session {
                 (ReleaseCause::Lost, detail)
             }
         };
-        self.held = None;
+        self.active = None;
         Some(lost)
     }
 

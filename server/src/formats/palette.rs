@@ -5,11 +5,11 @@
 pub const THETA_LOW: f64 = 0.05;
 /// Highest θ that has a colour of its own.
 pub const THETA_HIGH: f64 = 2.0;
-/// Relative deviation up to which a value keeps its colour.
+/// Relative standard deviation up to which a value keeps its colour.
 pub const SURE: f64 = 0.05;
-/// Relative deviation from which a value is grey.
+/// Relative standard deviation from which a value is grey.
 pub const UNSURE: f64 = 0.5;
-/// Relative deviation from which a value is hatched as well.
+/// Relative standard deviation from which a value is hatched as well.
 pub const HATCHED: f64 = 0.25;
 
 /// Red, green, blue.

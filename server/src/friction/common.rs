@@ -9,7 +9,7 @@ use super::weights::FrictionConfig;
 use super::*;
 
 const THETA: f64 = 0.2;
-/// Independent deviation of one segment.
+/// Independent standard deviation of one segment.
 const OWN_STD_DEV: f64 = 0.01;
 /// What robots say of their common errors.
 const ROBOT_RATIO: f64 = 0.12;
@@ -75,8 +75,8 @@ fn intervals_hold_the_truth_where_robots_share_the_error_of_their_tyres() {
     }
 }
 
-/// Share of intervals that hold the truth, and their mean width, of honest robots and perhaps a wrong
-/// one.
+/// Share of intervals that hold the truth, and their mean width, of honest robots and perhaps a
+/// wrong one.
 fn beside(honest: u8, wrong: Option<Sums>) -> (f64, f64) {
     let mut normal = Normal(0x5EED_0004);
     let (mut held, mut width) = (0, 0.0);

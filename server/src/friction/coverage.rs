@@ -8,9 +8,9 @@ use super::*;
 
 /// Visits of all runs of a fleet. `examples/map_report` does the same with more of them.
 const VISITS: u32 = 500_000;
-/// Deviation of a robot's own bias as a share of θ.
+/// Standard deviation of a robot's own bias as a share of θ.
 const BIAS_RATIO: f64 = 0.08;
-/// Deviation of one visit's θ.
+/// Standard deviation of one visit's θ.
 const VISIT_STD_DEV: f64 = 0.02;
 const THETA: f64 = 0.2;
 /// Of the random numbers; kept, so that a failure is the same again.

@@ -6,19 +6,20 @@
 //! small. The variance of θ is `1 / Σ w_r`.
 //!
 //! `Λ_e` is the information of independent errors. What a robot says of the error that all its
-//! segments have in common takes the place of `s_b` where it is more; that which all robots on the same
-//! tyres have in common, `t·θ`, is added to the deviation once and never averages out. Among three
-//! robots or more no robot's bias counts as less than the median, and `t` is the median, so that
-//! no robot is heavier or makes the interval wider by what it says of its errors.
+//! segments have in common takes the place of `s_b` where it is more; that which all robots on the
+//! same tyres have in common, `t·θ`, is added to the standard deviation once and never averages
+//! out. Among three robots or more no robot's bias counts as less than the median, and `t` is the
+//! median, so that no robot is heavier or makes the interval wider by what it says of its errors.
 //!
 //! A friction coefficient counts when a second robot has shown as much; of one robot alone up to
 //! [`MU_ALONE_MAX`]. No robot can raise the limits of others by its word.
 //!
 //! The ground changes. For a cell, the epochs are gone through from the newest back, and where one
 //! contradicts what is newer by more than [`CHANGE_DEVIATIONS`], it and all older ones are left
-//! out. An epoch whose newest telling pass contradicts its other ones counts with that pass alone. Bad news
-//! (more slip) is believed from the first pass, good news when a second one confirms it, which must
-//! be another robot's if several others say otherwise; until then the estimate is disputed.
+//! out. An epoch whose newest telling pass contradicts its other ones counts with that pass alone.
+//! Bad news (more slip) is believed from the first pass, good news when a second one confirms it,
+//! which must be another robot's if several others say otherwise; until then the estimate is
+//! disputed.
 
 use tread_api::friction::TYRE_DIFFERENCE_SHARE;
 
@@ -27,7 +28,7 @@ use super::seen::{CHANGE_DEVIATIONS, Estimate, Ground, Seen, age_s, seconds};
 use super::sums::Known;
 use super::weights::FrictionConfig;
 
-/// Smallest θ that the map states: stiffer than K = 10⁶ is not told apart.
+/// Smallest θ that the map states: stiffer than K = 10⁶ is not distinguished.
 pub const THETA_MIN: f64 = 1.0e-6;
 /// Largest standard deviation of θ that tells something: the whole range of θ, to K 0.1.
 pub const THETA_STD_DEV_MAX: f64 = 10.0;
@@ -152,8 +153,8 @@ fn fuse_in<R: Ord + Copy>(
             tyre_ratio: one.tyre_ratio,
         })
     };
-    let (theta, spread) = joined(seen, words, said, (now_us, drift))?;
-    let std_dev = theta.std_dev * spread.widening();
+    let (theta, heterogeneity) = joined(seen, words, said, (now_us, drift))?;
+    let std_dev = theta.std_dev * heterogeneity.widening();
     if std_dev > THETA_STD_DEV_MAX {
         return None;
     }
@@ -180,9 +181,9 @@ fn fuse_in<R: Ord + Copy>(
         track,
         rolling,
         passes,
-        robots: spread.robots,
+        robots: heterogeneity.robots,
         newest_at_us,
-        is_disputed: present.is_unconfirmed || spread.is_dispute(ground),
+        is_disputed: present.is_unconfirmed || heterogeneity.is_dispute(ground),
         changed_at_us: present.changed_at_us,
     })
 }
@@ -282,8 +283,9 @@ impl Present {
     }
 }
 
-/// The one robot that says the ground is better while several others say it is worse. Its word alone
-/// confirms nothing, however often and in however many ways it says it: nothing of it counts then.
+/// The one robot that says the ground is better while several others say it is worse. Its word
+/// alone confirms nothing, however often and in however many ways it says it: nothing of it counts
+/// then.
 fn lone_witness<R: Ord + Copy>(
     kept: &[Seen<R>],
     contradicted: &[Seen<R>],
@@ -312,8 +314,8 @@ fn lone_witness<R: Ord + Copy>(
     (is_alone && !is_of_others).then_some(lone)
 }
 
-/// θ of one or several measurements, with what it takes to compare them: sums of information, and of
-/// information times θ, the robots' bias and the tyres' error, both as shares of θ.
+/// θ of one or several measurements, with what it takes to compare them: sums of information, and
+/// of information times θ, the robots' bias and the tyres' error, both as shares of θ.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Word {
     information: f64,
@@ -343,8 +345,8 @@ impl Word {
         self.weighted / self.information
     }
 
-    /// How far their difference may be off if nothing has changed, as a variance: without the robots'
-    /// biases where both are of one robot.
+    /// How far their difference may be off if nothing has changed, as a variance: without the
+    /// robots' biases where both are of one robot.
     fn difference_variance(&self, other: &Self, is_one_robot: bool) -> f64 {
         // If nothing has changed, robots differ by a share of the θ that they have in common, which
         // is nearest to what is known best, not of the larger one.

@@ -34,9 +34,9 @@ pub(super) struct Room {
 pub(super) struct Said {
     /// The value, with its independent error.
     pub(super) known: Known,
-    /// Deviation of the robot's bias as a share of the value.
+    /// Standard deviation of the robot's bias as a share of the value.
     pub(super) bias_ratio: f64,
-    /// Deviation of the error that all robots on its tyres have, as a share of the value.
+    /// Standard deviation of the error that all robots on its tyres have, as a share of the value.
     pub(super) tyre_ratio: f64,
 }
 
@@ -58,7 +58,7 @@ impl Word {
 
 /// How far apart measurements lie, as sums of squares with their degrees of freedom.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Spread {
+pub(super) struct Heterogeneity {
     /// How many robots.
     pub(super) robots: u32,
     between: f64,
@@ -68,7 +68,7 @@ pub(super) struct Spread {
     scatter_freedom: u64,
 }
 
-impl Spread {
+impl Heterogeneity {
     /// One robot's measurements of an area may differ from place to place; those of a cell may not.
     pub(super) fn is_dispute(&self, ground: Ground) -> bool {
         let between = u64::from(self.robots.saturating_sub(1));
@@ -117,12 +117,13 @@ pub(super) fn joined<R: Ord + Copy>(
     }: &mut Room,
     said_of: impl Fn(&Seen<R>) -> Option<Said>,
     (now_us, drift): (i64, f64),
-) -> Option<(Estimate, Spread)> {
+) -> Option<(Estimate, Heterogeneity)> {
     robots.clear();
-    let mut spread = Spread::default();
+    let mut heterogeneity = Heterogeneity::default();
     for epochs in seen.chunk_by(|left, right| left.robot == right.robot) {
         let (mut information, mut weighted, mut square) = (0.0, 0.0, 0.0);
-        // One robot's biases of two epochs are one, so their deviations add up, not their squares.
+        // One robot's biases of two epochs are one, so their standard deviations add up, not their
+        // squares.
         let (mut bias, mut tyre) = (0.0, 0.0);
         for one in epochs {
             let Some(said) = said_of(one) else { continue };
@@ -133,14 +134,14 @@ pub(super) fn joined<R: Ord + Copy>(
             square += weight * known.value * known.value;
             bias += weight * said.bias_ratio;
             tyre += weight * said.tyre_ratio;
-            spread.within_freedom += 1;
-            spread.scatter += one.scatter;
-            spread.scatter_freedom += one.passes.saturating_sub(1);
+            heterogeneity.within_freedom += 1;
+            heterogeneity.scatter += one.scatter;
+            heterogeneity.scatter_freedom += one.passes.saturating_sub(1);
         }
         if information > 0.0 {
             let value = weighted / information;
-            spread.within += (square - weighted * value).max(0.0);
-            spread.within_freedom -= 1;
+            heterogeneity.within += (square - weighted * value).max(0.0);
+            heterogeneity.within_freedom -= 1;
             let variance = f64::recip(information);
             robots.push(Word {
                 variance,
@@ -155,9 +156,9 @@ pub(super) fn joined<R: Ord + Copy>(
     if !robots.iter().all(knows_little) {
         robots.retain(|robot| !knows_little(robot));
     }
-    spread.robots = u32::try_from(robots.len()).unwrap_or(u32::MAX);
+    heterogeneity.robots = u32::try_from(robots.len()).unwrap_or(u32::MAX);
     if robots.len() >= ROBUST_ROBOTS_MIN {
-        return Some(hull_of_groups(robots, (groups, ratios), spread));
+        return Some(hull_of_groups(robots, (groups, ratios), heterogeneity));
     }
     let (mut value, mut information) = weighed(robots, 0.0)?;
     for _ in 0..ROUNDS_MAX {
@@ -171,11 +172,11 @@ pub(super) fn joined<R: Ord + Copy>(
     let mut tyre_ratio = 0.0;
     for robot in robots.iter() {
         let weight = robot.weight(value);
-        spread.between += weight * (robot.value - value).powi(2);
+        heterogeneity.between += weight * (robot.value - value).powi(2);
         tyre_ratio += weight * robot.tyre_ratio / information;
     }
     let std_dev = information.sqrt().recip().hypot(tyre_ratio * value);
-    Some((Estimate { value, std_dev }, spread))
+    Some((Estimate { value, std_dev }, heterogeneity))
 }
 
 /// Standard deviation above which a robot's own word does not count beside others.
@@ -221,8 +222,8 @@ impl Group {
 fn hull_of_groups(
     robots: &mut [Word],
     (behind, ratios): (&mut Vec<Group>, &mut Vec<f64>),
-    mut spread: Spread,
-) -> (Estimate, Spread) {
+    mut heterogeneity: Heterogeneity,
+) -> (Estimate, Heterogeneity) {
     robots.sort_unstable_by(|left, right| {
         let by_value = left.value.total_cmp(&right.value);
         by_value.then_with(|| left.variance.total_cmp(&right.variance))
@@ -259,7 +260,7 @@ fn hull_of_groups(
     for (index, robot) in robots.iter().enumerate().rev() {
         behind[index] = behind[index + 1].plus(robot, median);
     }
-    spread.between = behind[0].chi_square();
+    heterogeneity.between = behind[0].chi_square();
     let mut before = Group::default();
     let mut least = f64::INFINITY;
     for (index, left_out) in robots.iter().enumerate() {
@@ -268,7 +269,7 @@ fn hull_of_groups(
         before = before.plus(left_out, median);
     }
     let groups = &behind[..robots.len()];
-    let freedom = u64::from(spread.robots.saturating_sub(2));
+    let freedom = u64::from(heterogeneity.robots.saturating_sub(2));
     let bound = chi_square_bound(freedom);
     let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
     for group in groups {
@@ -291,7 +292,7 @@ fn hull_of_groups(
         value,
         std_dev: ((high - low) / (2.0 * NORMAL_95)).hypot(tyre_ratio * value),
     };
-    (estimate, spread)
+    (estimate, heterogeneity)
 }
 
 /// The mean of robots whose biases are shares of this value, and its information.

@@ -10,9 +10,9 @@ use super::weights::FrictionConfig;
 use super::*;
 
 const THETA: f64 = 0.2;
-/// Deviation of a robot's own bias as a share of θ, as the map assumes it.
+/// Standard deviation of a robot's own bias as a share of θ, as the map assumes it.
 const BIAS_RATIO: f64 = 0.08;
-/// Deviation of what one robot measures by itself.
+/// Standard deviation of what one robot measures by itself.
 const OWN_STD_DEV: f64 = 0.01;
 /// Fleets of each kind.
 const FLEETS: u32 = 4_000;
@@ -56,14 +56,14 @@ fn width_of(robots: u8) -> f64 {
 
 /// One robot of `honest + 1` is wrong in every way.
 fn check_one_wrong_beside(honest: u8) {
-    let deviation = (THETA * BIAS_RATIO).hypot(OWN_STD_DEV);
+    let std_dev = (THETA * BIAS_RATIO).hypot(OWN_STD_DEV);
     let (mut held_least, mut ratio_most) = (1.0_f64, 0.0_f64);
     for ground in [Ground::Area, Ground::Cell] {
         for off in [
             -0.2, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 8.0, 12.0, 30.0, 5e4,
         ] {
             for own_std_dev in [OWN_STD_DEV, 1e-3, 3e-5] {
-                let theta = (THETA + off * deviation).max(1e-6);
+                let theta = (THETA + off * std_dev).max(1e-6);
                 let wrong = measured(theta, own_std_dev, 40);
                 let (held, width) = coverage(honest, Some(wrong), ground);
                 let ratio = width / width_of(honest + 1);

@@ -96,8 +96,8 @@ impl<R> Seen<R> {
             .then_some((newest, before))
     }
 
-    /// Deviation of this robot's bias as a share of θ: what it says of itself, and no less than what
-    /// is assumed.
+    /// Standard deviation of this robot's bias as a share of θ: what it says of itself, and no less
+    /// than what is assumed.
     pub(super) fn bias_ratio(&self, config: &FrictionConfig) -> f64 {
         self.robot_ratio.max(config.robot_bias_ratio)
     }
@@ -144,8 +144,8 @@ pub struct Estimate {
 
 impl Estimate {
     /// The value that is undercut with this normal quantile, not below `least`.
-    pub fn quantile(&self, deviations: f64, least: f64) -> f64 {
-        (self.value + deviations * self.std_dev).max(least)
+    pub fn quantile(&self, std_devs: f64, least: f64) -> f64 {
+        (self.value + std_devs * self.std_dev).max(least)
     }
 
     /// The 95 % interval; θ is never negative.

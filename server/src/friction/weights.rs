@@ -19,7 +19,7 @@ impl Default for FrictionConfig {
     fn default() -> Self {
         Self {
             robot_bias_ratio: 0.08,
-            // A deviation of 0.02 after a day: a tenth of θ on ordinary ground.
+            // A standard deviation of 0.02 after a day: a tenth of θ on ordinary ground.
             drift_variance_per_s: 4.6e-9,
             mu_peak_age_max_s: 6.0 * 3_600.0,
         }

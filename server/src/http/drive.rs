@@ -94,7 +94,7 @@ pub(super) async fn drive(
             heard_at: Instant::now(),
             ping_due: Instant::now(),
             pinged_at: None,
-            socket_way: None,
+            socket_delay: None,
             refused_at: None,
         };
         let end = connection.run(&stop).await;
@@ -122,7 +122,7 @@ struct Connection {
     /// When the ping went out that is not answered yet.
     pinged_at: Option<Instant>,
     /// The way to the client and back, as the last pong showed.
-    socket_way: Option<Duration>,
+    socket_delay: Option<Duration>,
     refused_at: Option<(DriveRefusal, Instant)>,
 }
 
@@ -241,7 +241,7 @@ impl Connection {
                 refused(close_code::UNSUPPORTED, detail)
             }
             Message::Pong(_) => {
-                self.socket_way = self.pinged_at.take().map(|at| at.elapsed());
+                self.socket_delay = self.pinged_at.take().map(|at| at.elapsed());
                 Ok(None)
             }
             Message::Ping(_) => Ok(None),
@@ -325,7 +325,7 @@ impl Connection {
             self.pinged_at = Some(now);
             self.put(Message::Ping(Vec::new().into())).await?;
         }
-        let view = self.session.view(self.socket_way);
+        let view = self.session.view(self.socket_delay);
         self.send(&DriveUpdate::View(Box::new(view))).await
     }
 

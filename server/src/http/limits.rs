@@ -2,7 +2,7 @@
 
 use axum::extract::State;
 use axum::http::StatusCode;
-use tread_api::ids::{HolderId, RobotId, SiteId};
+use tread_api::ids::{OwnerId, RobotId, SiteId};
 use tread_api::page::Page;
 use tread_api::problem::ProblemBody;
 use tread_api::safety::{LimitStatus, SetLimit};
@@ -26,37 +26,37 @@ pub(super) async fn list(
 /// Hold or slow a robot for a while.
 ///
 /// Repeat the request before the limit expires to keep it.
-#[utoipa::path(put, path = "/v1/sites/{site}/robots/{robot}/limits/{holder}", tag = "safety",
+#[utoipa::path(put, path = "/v1/sites/{site}/robots/{robot}/limits/{owner}", tag = "safety",
     security(("token" = ["hold"])),
     operation_id = "set_limit", params(("site" = SiteId, Path), ("robot" = RobotId, Path),
-        ("holder" = HolderId, Path)),
+        ("owner" = OwnerId, Path)),
     request_body = SetLimit,
     responses((status = 204, description = "The robot has taken it"),
         (status = 404, body = ProblemBody), (status = 409, body = ProblemBody),
         (status = 422, body = ProblemBody), (status = 503, body = ProblemBody)))]
 pub(super) async fn set(
     State(app): State<App>,
-    Path((site, robot, holder)): Path<(SiteId, RobotId, HolderId)>,
+    Path((site, robot, owner)): Path<(SiteId, RobotId, OwnerId)>,
     Json(request): Json<SetLimit>,
 ) -> Result<StatusCode, Problem> {
-    app.set_limit((&site, &robot), holder, request).await?;
+    app.set_limit((&site, &robot), owner, request).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 
 /// End an external limit.
 ///
 /// A required owner of a limit that falls silent holds the robot from then on.
-#[utoipa::path(delete, path = "/v1/sites/{site}/robots/{robot}/limits/{holder}", tag = "safety",
+#[utoipa::path(delete, path = "/v1/sites/{site}/robots/{robot}/limits/{owner}", tag = "safety",
     security(("token" = ["hold"])),
     operation_id = "end_limit", params(("site" = SiteId, Path), ("robot" = RobotId, Path),
-        ("holder" = HolderId, Path)),
+        ("owner" = OwnerId, Path)),
     responses((status = 204, description = "The robot has ended it"),
         (status = 404, body = ProblemBody), (status = 409, body = ProblemBody),
         (status = 503, body = ProblemBody)))]
 pub(super) async fn end(
     State(app): State<App>,
-    Path((site, robot, holder)): Path<(SiteId, RobotId, HolderId)>,
+    Path((site, robot, owner)): Path<(SiteId, RobotId, OwnerId)>,
 ) -> Result<StatusCode, Problem> {
-    app.end_limit((&site, &robot), holder).await?;
+    app.end_limit((&site, &robot), owner).await?;
     Ok(StatusCode::NO_CONTENT)
 }

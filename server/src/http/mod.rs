@@ -89,7 +89,7 @@ fn routes() -> OpenApiRouter<App> {
         .layer(Extension(BodyLimit(MISSION_BODY_MAX)));
     let session = OpenApiRouter::new()
         .routes(routes!(session::create, session::get, session::end))
-        .routes(routes!(sign_in::ways))
+        .routes(routes!(sign_in::methods))
         .routes(routes!(sign_in::begin))
         .routes(routes!(sign_in::finish))
         .layer(Extension(BodyLimit(SIGN_IN_BODY_MAX)));

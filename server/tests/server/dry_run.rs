@@ -78,7 +78,7 @@ async fn the_planned_path_is_told_by_a_dry_run_and_of_a_mission_and_is_bounded()
     let last = round.last().unwrap();
     let off_m = (last.0 - centre.0).hypot(last.1 - centre.1) - radius_m;
     assert!(off_m.abs() < 1e-6, "{off_m}");
-    // Waypoints are passed on a smooth way, not on the straight lines between them.
+    // Waypoints are passed on a smooth path, not on the straight lines between them.
     let corners =
         json!([{"x_m": 0.0, "y_m": 0.0}, {"x_m": 6.0, "y_m": 0.0}, {"x_m": 6.0, "y_m": 6.0}]);
     body["trajectory"] = json!({"waypoints": {"points": corners, "speed_m_s": 0.5}});

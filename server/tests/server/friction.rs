@@ -422,7 +422,7 @@ async fn a_dispatch_tells_the_robot_what_the_map_knows_along_its_way() {
     assert_eq!(
         cells,
         [3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14],
-        "the way and two cells around it; the border cell has two grounds"
+        "the path and two cells around it; the border cell has two grounds"
     );
     assert!((prior.cells[2].theta - 0.2).abs() < 0.01, "{prior:?}");
     assert!((prior.cells[8].theta - 0.05).abs() < 0.01, "{prior:?}");
@@ -440,7 +440,7 @@ async fn a_dispatch_tells_the_robot_what_the_map_knows_along_its_way() {
     assert_eq!(
         columns,
         [5, 6, 7, 8, 9, 10, 11, 12],
-        "every cell of the way"
+        "every cell of the path"
     );
     for &(ix, mu) in &traction_limits {
         let shown = if ix < 10 { 0.14 } else { 0.4 };

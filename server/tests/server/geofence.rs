@@ -83,14 +83,14 @@ async fn a_geofence_reaches_the_robots_and_refuses_ways_that_leave_it_with_the_p
     let x_m = body["place"]["point"]["x_m"].as_f64().unwrap();
     assert!((-0.8..-0.3).contains(&x_m), "{body}");
     // The mission itself is clear of the wall, but its robot comes from where its queue ends.
-    let way = |from: f64, to: f64| {
+    let path = |from: f64, to: f64| {
         json!({"site": "yard", "robot": "rover-2", "trajectory": {"waypoints": {
             "speed_m_s": 0.5, "points": [{"x_m": from, "y_m": 0}, {"x_m": to, "y_m": 0}]}}})
     };
     let second = Robot::join(&yard, "rover-2").await;
-    let (status, body) = yard.post(missions, &way(-8.0, -5.0)).await;
+    let (status, body) = yard.post(missions, &path(-8.0, -5.0)).await;
     assert_eq!(status, StatusCode::CREATED, "{body}");
-    let mut beyond = way(3.0, 6.0);
+    let mut beyond = path(3.0, 6.0);
     for path in [missions, "/v1/trajectories/check"] {
         let (status, body) = yard.post(path, &beyond).await;
         assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{path}: {body}");
@@ -210,7 +210,7 @@ async fn an_external_limit_reaches_the_robot_in_its_own_time_and_ends_there() {
         robot.state().monotonic_us.unwrap(),
     );
     assert_eq!(
-        (limit.holder.as_str(), limit.boot, limit.hold),
+        (limit.owner.as_str(), limit.boot, limit.hold),
         ("lidar", robot.boot, false)
     );
     assert!(
@@ -240,7 +240,7 @@ async fn an_external_limit_reaches_the_robot_in_its_own_time_and_ends_there() {
     }
     robot.say(|state| {
         state.safety.limits = vec![LimitStatus {
-            holder: "lidar".parse().unwrap(),
+            owner: "lidar".parse().unwrap(),
             required: true,
             hold: true,
             linear_max_m_s: None,

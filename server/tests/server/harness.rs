@@ -318,7 +318,8 @@ pub(crate) fn model() -> RobotModel {
     rover("test rover", "lugged")
 }
 
-/// A measurement of θ 0.2 with a deviation of 0.01, an hour apart for each 3600 of `second`.
+/// A measurement of θ 0.2 with a standard deviation of 0.01, an hour apart for each 3600 of
+/// `second`.
 pub(crate) fn segment(cell: (i32, i32), theta: f64, second: i64) -> Segment {
     let at = Timestamp::from_second(1_793_000_000 + second).unwrap();
     Segment {

@@ -78,11 +78,8 @@ async fn a_tile_says_what_the_cells_say() {
             (square.theta / friction.theta - 1.0).abs() < 2e-4,
             "{cell:?}"
         );
-        let deviation = square.std_dev / friction.std_dev;
-        assert!(
-            (1.0 - 1e-6..1.06).contains(&deviation),
-            "{cell:?}: {deviation}"
-        );
+        let std_dev = square.std_dev / friction.std_dev;
+        assert!((1.0 - 1e-6..1.06).contains(&std_dev), "{cell:?}: {std_dev}");
         assert_eq!(u64::from(square.segments), friction.segments, "{cell:?}");
     }
     // A box is what it says, known or not.

@@ -40,7 +40,7 @@ impl World {
         let mission = match verb {
             Verb::Offer => match wire::decode::<Offer>(payload) {
                 // It is to be taken and not to be driven.
-                Ok(offer) if offer.held => return,
+                Ok(offer) if offer.on_hold => return,
                 offer => offer.map(|offer| offer.mission),
             },
             Verb::Resume => wire::decode::<Pause>(payload).map(|pause| pause.mission),

@@ -254,7 +254,7 @@ impl Robot {
             mission: offer.mission,
             revision: offer.revision,
             plan_hash: offer.plan_hash,
-            to_stand: offer.held,
+            to_stand: offer.on_hold,
             paused: false,
             paused_by: PauseCause::Request,
             driven_m: 0.0,

@@ -181,7 +181,7 @@ fn parameter(name: &str, random: &mut Random, is_odd: bool) -> String {
         "site" => "yard",
         "robot" => HONEST_ROBOT,
         "terrain" => "slab",
-        "holder" => "lidar",
+        "owner" => "lidar",
         "format" => ["png", "csv", "geojson", "parquet", "nav2"][random.index(5)],
         "limit" => ["1", "0", "1000", "100000"][random.index(4)],
         "as_of" | "from" | "to" => "2026-11-22T13:00:00Z",

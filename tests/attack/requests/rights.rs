@@ -38,12 +38,12 @@ const TABLE: [(&str, &str, Needs); 48] = [
     ("PATCH", "/v1/sites/{site}/robots/{robot}", Operator),
     (
         "PUT",
-        "/v1/sites/{site}/robots/{robot}/limits/{holder}",
+        "/v1/sites/{site}/robots/{robot}/limits/{owner}",
         Operator,
     ),
     (
         "DELETE",
-        "/v1/sites/{site}/robots/{robot}/limits/{holder}",
+        "/v1/sites/{site}/robots/{robot}/limits/{owner}",
         Operator,
     ),
     (

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use sqlx::ConnectOptions as _;
 use sqlx::sqlite::SqliteConnectOptions;
-use tread_agent::missions::Holder;
+use tread_agent::missions::MissionSlot;
 use tread_agent::outbox::{Limits, Outbox};
 use tread_api::ids::{BootId, RobotId};
 use tread_api::mission::{Cause, MissionDetail, MissionState};
@@ -26,7 +26,7 @@ pub(super) fn end_of(detail: &MissionDetail) -> String {
 pub(super) fn judge(
     followed: &[Followed],
     details: &[MissionDetail],
-    memory: Option<&Holder>,
+    memory: Option<&MissionSlot>,
     report: &mut RunReport,
 ) {
     let agent_was_killed = report.agent_kills > 0;
@@ -109,9 +109,9 @@ fn against_policy(
 
 /// What the robot remembers must be what the server says; a mission that the server gave up as
 /// lost may have ended otherwise on the robot, and then the server has kept its word as an event.
-fn disagreement(detail: &MissionDetail, memory: &Holder) -> Option<String> {
+fn disagreement(detail: &MissionDetail, memory: &MissionSlot) -> Option<String> {
     let id = detail.mission.id;
-    if memory.held().is_some_and(|held| held.mission == id) {
+    if memory.active().is_some_and(|active| active.mission == id) {
         return Some("the robot still holds it".to_owned());
     }
     let remembered = memory.ended().find(|ended| ended.mission == id);
@@ -160,7 +160,7 @@ fn two_at_once(steps: &[Step]) -> Option<String> {
     for (mission, state) in steps {
         let state = MissionState::from_name(state)?;
         let is_in_hand = !state.is_terminal() && state != MissionState::Queued;
-        in_progress.retain(|held| held != mission);
+        in_progress.retain(|active| active != mission);
         if is_in_hand {
             in_progress.push(mission);
         }
@@ -174,17 +174,17 @@ fn two_at_once(steps: &[Step]) -> Option<String> {
 /// Whether the robot took a mission before it had ended the one before, by the order of its own
 /// log; a new run begins with nothing.
 fn two_on_the_robot(log: &str) -> Option<String> {
-    let mut held: Option<&str> = None;
+    let mut active: Option<&str> = None;
     for line in log.lines() {
         if line.contains("agent of `") {
-            held = None;
+            active = None;
         } else if let Some((_, taken)) = line.split_once("took mission ") {
             let taken = taken.split_whitespace().next().unwrap_or_default();
-            if let Some(held) = held.replace(taken) {
-                return Some(format!("the robot took {taken} while it had {held}"));
+            if let Some(active) = active.replace(taken) {
+                return Some(format!("the robot took {taken} while it had {active}"));
             }
-        } else if line.contains(" ended: ") && held.is_some_and(|held| line.contains(held)) {
-            held = None;
+        } else if line.contains(" ended: ") && active.is_some_and(|active| line.contains(active)) {
+            active = None;
         }
     }
     None

@@ -220,7 +220,7 @@ async fn robots_memory(
     fleet: &mut Fleet,
     robot: &RobotId,
     details: &[MissionDetail],
-) -> Option<tread_agent::missions::Holder> {
+) -> Option<tread_agent::missions::MissionSlot> {
     let deadline = Instant::now() + END_WAIT_MAX;
     loop {
         let live = fleet.rest.robot(robot).await.and_then(|robot| robot.live);
@@ -235,10 +235,10 @@ async fn robots_memory(
     // An agent that is asked to stop has written everything.
     _ = fleet.stop_agent(robot).await;
     let memory = tread_agent::missions::memory::Memory::new(&fleet.robot_folder(robot));
-    let holder = memory.load().ok()?;
+    let slot = memory.load().ok()?;
     // What the server remembers of the ends may still have been on its way.
     for detail in details {
         _ = fleet.rest.mission(detail.mission.id).await;
     }
-    Some(holder)
+    Some(slot)
 }

@@ -145,7 +145,7 @@ pub fn map_figures(
     figures
 }
 
-/// How a robot kept to its way on ice.
+/// How a robot kept to its path on ice.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Tracking {
     /// How often it left the band around its path.
@@ -188,7 +188,7 @@ pub fn tracking(
     let mut before: Option<Duration> = None;
     for sample in samples {
         let last = before.replace(sample.at).unwrap_or(sample.at);
-        let speed_m_s = sample.state.ahead_m_s.hypot(sample.state.left_m_s);
+        let speed_m_s = sample.state.forward_m_s.hypot(sample.state.left_m_s);
         if sample.theta < ICE_THETA {
             is_out = false;
             continue;
@@ -227,11 +227,11 @@ pub struct Stopping {
 ///
 /// # Errors
 /// It was not seen to come to rest.
-pub fn stopping(samples: &[TruthSample], told_at: Duration) -> anyhow::Result<Stopping> {
-    let speed = |sample: &TruthSample| sample.state.ahead_m_s.hypot(sample.state.left_m_s);
+pub fn stopping(samples: &[TruthSample], logged_at: Duration) -> anyhow::Result<Stopping> {
+    let speed = |sample: &TruthSample| sample.state.forward_m_s.hypot(sample.state.left_m_s);
     let after: Vec<&TruthSample> = samples
         .iter()
-        .filter(|sample| sample.at >= told_at)
+        .filter(|sample| sample.at >= logged_at)
         .collect();
     let first = after.first().context("nothing was seen after the stop")?;
     let rest = after.iter().position(|sample| speed(sample) < STANDING_M_S);
@@ -246,7 +246,7 @@ pub fn stopping(samples: &[TruthSample], told_at: Duration) -> anyhow::Result<St
     Ok(Stopping {
         from_m_s: speed(first),
         distance_m,
-        time_s: after[rest].at.saturating_sub(told_at).as_secs_f64(),
+        time_s: after[rest].at.saturating_sub(logged_at).as_secs_f64(),
     })
 }
 
@@ -267,7 +267,7 @@ mod tests {
                     y_m,
                     heading_rad: 0.0,
                 },
-                ahead_m_s: speed_m_s,
+                forward_m_s: speed_m_s,
                 ..PlantState::default()
             },
             command: WheelSpeeds::default(),
@@ -277,7 +277,7 @@ mod tests {
 
     #[test]
     fn leaving_the_band_counts_once_each_time_and_only_on_ice() {
-        let asked = yard::way(&[(0.0, 0.0), (5.0, 0.0)], 0.5).unwrap();
+        let asked = yard::path(&[(0.0, 0.0), (5.0, 0.0)], 0.5).unwrap();
         let aside = [0.9, 0.0, 0.1, 0.4, 0.5, 0.1, -0.31, -0.29];
         let samples: Vec<TruthSample> = (0_u32..)
             .zip(aside)

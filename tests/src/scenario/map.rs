@@ -132,8 +132,8 @@ async fn learn(
             0
         };
         kind_before = Some(*kind);
-        for way in yard::ways(scenario, *kind, number, size.visits)? {
-            missions.push(world.send(&scenario.site, robot, &way).await?);
+        for path in yard::paths(scenario, *kind, number, size.visits)? {
+            missions.push(world.send(&scenario.site, robot, &path).await?);
         }
     }
     let ended = world.succeeded(&missions).await?;
@@ -229,13 +229,13 @@ async fn freeze(
     let frozen_at = world.wall();
     let first_of = |kind: Kind| fleet.iter().find(move |(its, _)| *its == kind);
     let first: Vec<&(Kind, Entry)> = Kind::ALL.into_iter().filter_map(first_of).collect();
-    let way = yard::over_the_ford(scenario)?;
+    let path = yard::over_the_ford(scenario)?;
     let mut both: Vec<Option<BTreeSet<Cell>>> = vec![None; first.len()];
     let mut passes: Vec<Vec<IcePass>> = vec![Vec::new(); first.len()];
     for _pass in 0..2 {
         let sends = first
             .iter()
-            .map(|(_, entry)| world.send(&scenario.site, &entry.robot, &way));
+            .map(|(_, entry)| world.send(&scenario.site, &entry.robot, &path));
         let missions = try_join_all(sends).await?;
         world.ended(&missions).await?;
         let alerts = surface_alerts(world).await;
@@ -305,7 +305,7 @@ async fn start_twice(
     Ok([scenario.clone(), blank])
 }
 
-/// A way over the ice with a bend, which ends on it.
+/// A path over the ice with a bend, which ends on it.
 fn course(
     start: tread_control::geometry::Point,
 ) -> anyhow::Result<tread_api::trajectory::Trajectory> {
@@ -319,7 +319,7 @@ fn course(
         (x_m + 2.1, y_m + 15.1),
         (x_m + 4.0, y_m + 15.1),
     ];
-    yard::way(&points, ARRIVAL_M_S)
+    yard::path(&points, ARRIVAL_M_S)
 }
 
 fn start_of(scenario: &Scenario, robot: &RobotId) -> anyhow::Result<Pose> {
@@ -341,8 +341,8 @@ async fn arrive(
     let mut missions = Vec::new();
     for site in &sites {
         for Entry { robot, .. } in entries {
-            let way = course(start_of(scenario, robot)?.point())?;
-            missions.push(world.send(&site.site, robot, &way).await?);
+            let path = course(start_of(scenario, robot)?.point())?;
+            missions.push(world.send(&site.site, robot, &path).await?);
         }
     }
     // Without the map one may well not come to its end.
@@ -351,10 +351,10 @@ async fn arrive(
     let mut arrivals = Vec::new();
     for (Entry { robot, model }, (with, without)) in entries.iter().zip(with.iter().zip(without)) {
         let start = start_of(scenario, robot)?;
-        let way = course(start.point())?;
+        let path = course(start.point())?;
         let of = |site: &Scenario| -> anyhow::Result<Tracking> {
             let samples = world.trace(&site.site, robot)?.samples();
-            tracking(&samples, start, model, &way)
+            tracking(&samples, start, model, &path)
         };
         arrivals.push(Arrival {
             robot: robot.clone(),
@@ -378,8 +378,8 @@ async fn stop_on_ice(
     for site in &sites {
         for Entry { robot, .. } in entries {
             let start = start_of(scenario, robot)?;
-            let way = yard::way(&[(start.x_m, start.y_m), (start.x_m, 22.5)], ARRIVAL_M_S)?;
-            world.send(&site.site, robot, &way).await?;
+            let path = yard::path(&[(start.x_m, start.y_m), (start.x_m, 22.5)], ARRIVAL_M_S)?;
+            world.send(&site.site, robot, &path).await?;
         }
     }
     let world = &*world;
@@ -414,12 +414,12 @@ async fn stop_one(world: &World, site: &SiteId, robot: &RobotId) -> anyhow::Resu
     world
         .until("the robot is on the ice", STOP_WAIT_MAX, passed)
         .await?;
-    let told_at = world.now();
+    let logged_at = world.now();
     let path = format!("/v1/sites/{site}/robots/{robot}/stop");
     world
         .rest
         .post(&path, &serde_json::json!({"by": "scenario"}))
         .await;
-    let stood = || async { stopping(&trace.samples(), told_at).ok() };
+    let stood = || async { stopping(&trace.samples(), logged_at).ok() };
     world.until("the robot stands", STOP_WAIT_MAX, stood).await
 }

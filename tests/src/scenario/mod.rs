@@ -5,7 +5,7 @@
 //! and never late, so that figures do not depend on how busy it is.
 //!
 //! * [`map`]: what a fleet's friction map is worth.
-//! * [`yard`]: the site of that scenario, its robots, and their ways.
+//! * [`yard`]: the site of that scenario, its robots, and their paths.
 //! * [`judge`]: what is read from a run, against the truth; [`report`]: what of it must hold.
 
 pub mod judge;

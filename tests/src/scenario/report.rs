@@ -28,8 +28,8 @@ pub struct IcePass {
     pub model: &'static str,
     /// Cells of the ford that this pass and all before it, since the ice, have measured.
     pub cells: u32,
-    /// Of these, those that the map shows as ice: their whole 95 % interval lies above the former θ,
-    /// and their θ is nearer to the new one than to it, by ratio.
+    /// Of these, those that the map shows as ice: their whole 95 % interval lies above the former
+    /// θ, and their θ is nearer to the new one than to it, by ratio.
     pub shown: u32,
     /// Of these, those that the map calls disputed.
     pub disputed: u32,
@@ -144,11 +144,11 @@ impl Report {
             };
             let (with_m, without_m) = (longest(0), longest(1));
             checks.push(Check::shown(
-                "longest way to a stop on ice with the map, m",
+                "longest distance to a stop on ice with the map, m",
                 with_m,
             ));
             checks.push(Check::shown(
-                "longest way to a stop on ice without the map, m",
+                "longest distance to a stop on ice without the map, m",
                 without_m,
             ));
         }

@@ -1,4 +1,5 @@
-//! The site of the scenario on the map: five terrains, a ford that freezes, ten robots of two models.
+//! The site of the scenario on the map: five terrains, a ford that freezes, ten robots of two
+//! models.
 
 use anyhow::Context as _;
 use serde_json::json;
@@ -68,7 +69,7 @@ then = [{ after_s = 900.0, stiffness = 0.35 }]
 "#;
 /// The terrains that every robot visits some of.
 const TERRAINS: [&str; 5] = ["concrete", "asphalt", "gravel", "grass", "sand"];
-/// Speed on all ways on which the map is made, m/s.
+/// Speed on all paths on which the map is made, m/s.
 const SPEED_M_S: f64 = 0.6;
 /// Half length and half width of a figure-8, metres: no bend is tighter than 1.5 m.
 const EIGHT_M: (f64, f64) = (6.0, 2.0);
@@ -149,11 +150,11 @@ pub fn truth(scenario: &Scenario, terrain: Option<&str>, at_s: f64) -> f64 {
 /// standard deviation is the one that the server assumes, dealt out by the seed. So no seed
 /// decides whether the fleet is as it is said to be.
 fn biases(count: u32, random: &mut Random) -> Vec<f64> {
-    let deviation = FrictionConfig::default().robot_bias_ratio;
+    let std_dev = FrictionConfig::default().robot_bias_ratio;
     let count_f = f64::from(count.max(2));
     let unit = ((1.0 - count_f.powi(-2)) / 3.0).sqrt();
     let mut steps: Vec<f64> = (0..count)
-        .map(|index| deviation / unit * (f64::from(2 * index + 1) / count_f - 1.0))
+        .map(|index| std_dev / unit * (f64::from(2 * index + 1) / count_f - 1.0))
         .collect();
     for last in (1..steps.len()).rev() {
         steps.swap(last, random.index(last + 1));
@@ -208,17 +209,17 @@ pub fn put(
     Ok(entries)
 }
 
-/// A way through points.
+/// A path through points.
 ///
 /// # Errors
 /// It is none.
-pub fn way(points: &[(f64, f64)], speed_m_s: f64) -> anyhow::Result<Trajectory> {
+pub fn path(points: &[(f64, f64)], speed_m_s: f64) -> anyhow::Result<Trajectory> {
     let points: Vec<_> = points
         .iter()
         .map(|&(x_m, y_m)| json!({"x_m": x_m, "y_m": y_m}))
         .collect();
-    let way = json!({"waypoints": {"speed_m_s": speed_m_s, "points": points}});
-    serde_json::from_value(way).context("a way")
+    let path = json!({"waypoints": {"speed_m_s": speed_m_s, "points": points}});
+    serde_json::from_value(path).context("a way")
 }
 
 /// A figure-8 around a centre, once through.
@@ -236,7 +237,7 @@ fn figure_eight(
             )
         })
         .collect();
-    way(&points, speed_m_s)
+    path(&points, speed_m_s)
 }
 
 fn middle(scenario: &Scenario, terrain: &str) -> anyhow::Result<(f64, f64)> {
@@ -252,19 +253,19 @@ fn middle(scenario: &Scenario, terrain: &str) -> anyhow::Result<(f64, f64)> {
     Ok((sum.0 / corners, sum.1 / corners))
 }
 
-/// The ways on which robot number `robot` of a model makes the map: figure-8s on so many terrains,
+/// The paths on which robot number `robot` of a model makes the map: figure-8s on so many terrains,
 /// each a little aside from those of the others, and for the first two of a model one on the ford.
 ///
 /// # Errors
 /// One is none.
-pub fn ways(
+pub fn paths(
     scenario: &Scenario,
     kind: Kind,
     robot: u32,
     visits: u32,
 ) -> anyhow::Result<Vec<Trajectory>> {
     let shift = u32::from(kind == Kind::Large);
-    let mut ways = Vec::new();
+    let mut paths = Vec::new();
     for visit in 0..visits {
         let terrain = TERRAINS[((robot + 2 * visit + shift) % 5) as usize];
         let (x_m, y_m) = middle(scenario, terrain)?;
@@ -273,12 +274,12 @@ pub fn ways(
             x_m + 0.45 * aside(7 * robot + 3 * visit + shift),
             y_m + 0.95 * aside(3 * robot + visit + 2 * shift),
         );
-        ways.push(figure_eight(center, EIGHT_M, SPEED_M_S)?);
+        paths.push(figure_eight(center, EIGHT_M, SPEED_M_S)?);
     }
     if robot < 2 {
-        ways.push(over_the_ford(scenario)?);
+        paths.push(over_the_ford(scenario)?);
     }
-    Ok(ways)
+    Ok(paths)
 }
 
 /// A figure-8 on the ford.
@@ -313,7 +314,7 @@ mod tests {
         assert!((theta(ICE_AFTER_S - 1.0) - 1.0 / 6.0).abs() < 1.0e-12);
         assert!((theta(ICE_AFTER_S) - 1.0 / 0.35).abs() < 1.0e-12);
         assert!((truth(&scenario, None, 0.0) - 0.25).abs() < 1.0e-12);
-        let terrains = |kind, robot| ways(&scenario, kind, robot, 3).unwrap().len();
+        let terrains = |kind, robot| paths(&scenario, kind, robot, 3).unwrap().len();
         assert_eq!((terrains(Kind::Small, 0), terrains(Kind::Large, 4)), (4, 3));
     }
 }

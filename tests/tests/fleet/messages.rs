@@ -25,7 +25,7 @@ async fn uploads_that_lie_or_do_not_parse_are_refused_and_counted() {
         .unwrap();
     let own_key = keys::ingest(&site, &id);
     let others_key = keys::ingest(&site, &"victim".parse().unwrap());
-    let good = json!({"v": 1, "body": robot.next_batch(1)}).to_string();
+    let good = json!({"v": 2, "body": robot.next_batch(1)}).to_string();
 
     assert!(
         refusal(&robot, &others_key, &good)
@@ -48,7 +48,7 @@ async fn uploads_that_lie_or_do_not_parse_are_refused_and_counted() {
     // A record that cannot be a measurement is refused by itself; its neighbours are stored.
     let mut batch = serde_json::to_value(robot.next_batch(3)).unwrap();
     batch["records"][1]["content"]["segment"]["theta"]["information"] = json!(-1.0);
-    let mixed = json!({"v": 1, "body": batch, "a_newer_field": true}).to_string();
+    let mixed = json!({"v": 2, "body": batch, "a_newer_field": true}).to_string();
     let receipt: Receipt = ask_raw(&robot.session, &own_key, mixed.into_bytes())
         .await
         .unwrap();
@@ -90,7 +90,7 @@ async fn a_state_that_makes_no_sense_changes_nothing() {
     let lies = [
         "{not json".to_owned(),
         json!({"v": 7, "body": {}}).to_string(),
-        json!({"v": 1, "body": {"robot": "somebody-else"}}).to_string(),
+        json!({"v": 2, "body": {"robot": "somebody-else"}}).to_string(),
     ];
     for lie in lies {
         robot

@@ -15,27 +15,27 @@ fn states_of(detail: &MissionDetail) -> Vec<MissionState> {
     states
 }
 
-/// Farthest that the way shown may be longer or shorter than the one planned on the robot, metres.
+/// Farthest that the path shown may be longer or shorter than the one planned on the robot, metres.
 const LENGTH_TOLERANCE_M: f64 = 0.001;
 
-/// The way that the server shows is as long as the robot's own, and everything that the robot
+/// The path that the server shows is as long as the robot's own, and everything that the robot
 /// drove is as near to it as the robot says.
 async fn assert_the_way_shown_was_driven(fleet: &Fleet, ended: &MissionDetail) {
     let id = ended.mission.id;
-    let way: PlannedPath = fleet.rest.get(&format!("/v1/missions/{id}/path")).await;
-    let plan = ended.mission.plan.expect("the robot told its plan");
-    let steps = u32::try_from(way.points.len() - 1).expect("at most a thousand");
-    let length_m = way.step_m * f64::from(steps);
+    let path: PlannedPath = fleet.rest.get(&format!("/v1/missions/{id}/path")).await;
+    let plan = ended.mission.plan.expect("the robot reported its plan");
+    let steps = u32::try_from(path.points.len() - 1).expect("at most a thousand");
+    let length_m = path.step_m * f64::from(steps);
     assert!(
         (length_m - plan.length_m).abs() < LENGTH_TOLERANCE_M,
         "{length_m} m are shown of {plan:?}"
     );
-    let driven = ended.driven.as_ref().expect("the robot told its way");
+    let driven = ended.driven.as_ref().expect("the robot reported its path");
     let quality = ended.quality.as_ref().expect("and how well it drove it");
     assert!(plan.begin.is_some(), "and from where it planned");
-    let near_m = quality.cross_track_max_m + driven.tolerance_m + way.step_m;
+    let near_m = quality.cross_track_max_m + driven.tolerance_m + path.step_m;
     for point in &driven.points {
-        let distances = way.points.iter().map(|shown| shown.distance_m(*point));
+        let distances = path.points.iter().map(|shown| shown.distance_m(*point));
         let off_m = distances.fold(f64::INFINITY, f64::min);
         assert!(off_m < near_m, "{point:?} is {off_m} m off, not {near_m} m");
     }
@@ -61,8 +61,11 @@ async fn a_circle_and_waypoints_reach_their_ends_and_the_ground_is_measured() {
             MissionState::Succeeded,
         ];
         assert_eq!(states_of(&ended), expected, "{ended:#?}");
-        let plan = ended.mission.plan.expect("the robot told its plan");
-        let progress = ended.mission.progress.expect("the robot told its progress");
+        let plan = ended.mission.plan.expect("the robot reported its plan");
+        let progress = ended
+            .mission
+            .progress
+            .expect("the robot reported its progress");
         assert!(plan.length_m > 2.0, "{plan:?}");
         assert!(progress.driven_m > 0.95 * progress.length_m, "{progress:?}");
         assert_eq!(

@@ -9,7 +9,7 @@ use tread_tests::scenario::judge::holds;
 use tread_tests::scenario::map;
 use tread_tests::scenario::report::{Report, Size};
 use tread_tests::scenario::world::{Entry, World};
-use tread_tests::scenario::yard::{Kind, way};
+use tread_tests::scenario::yard::{Kind, path};
 
 /// θ of the only ground.
 const THETA: f64 = 0.4;
@@ -62,7 +62,7 @@ async fn drive(world: &World, name: &str) -> MissionDetail {
     ];
     let site: SiteId = "field".parse().unwrap();
     let robot: RobotId = name.parse().unwrap();
-    let asked = way(&points, 0.6).unwrap();
+    let asked = path(&points, 0.6).unwrap();
     let mission: MissionId = world.send(&site, &robot, &asked).await.unwrap();
     let mut ended = world.ended(&[mission]).await.unwrap();
     assert_eq!(
@@ -106,7 +106,7 @@ async fn the_next_robot_starts_with_what_the_one_before_has_measured() {
     let first = drive(&world, "first").await.quality.unwrap();
     assert_eq!(first.prior, None, "nobody had been there");
     let next = drive(&world, "next").await.quality.unwrap();
-    let gain = next.prior.expect("the map knew its way");
+    let gain = next.prior.expect("the map knew its path");
     assert!(gain.known_ratio > 0.6, "{gain:?}");
     assert!(gain.sure_s > gain.sure_alone_s, "{gain:?}");
     assert!(gain.cells_compared >= 5, "{gain:?}");

@@ -11,26 +11,26 @@ const OBEYS: Tolerance = Tolerance {
     own_rad_s: 0.15,
     own_m_s: 0.08,
     share_turn: 0.2,
-    share_ahead: 0.2,
+    forward_share: 0.2,
 };
 /// From where on wheels do not, if the body does.
 const DISOBEYS: Tolerance = Tolerance {
     own_rad_s: 0.08,
     own_m_s: 0.05,
     share_turn: 0.15,
-    share_ahead: 0.15,
+    forward_share: 0.15,
 };
 /// How much more than commanded wheels may say.
 const ABOVE: Tolerance = Tolerance {
     own_rad_s: 0.1,
     own_m_s: 0.05,
     share_turn: 0.1,
-    share_ahead: 0.05,
+    forward_share: 0.05,
 };
 /// How near, of what the wheels say above the command, the body is to that.
 const NEARER_ABOVE: f64 = 0.4;
 /// The same ahead, of a body to its command than wheels are.
-const NEARER_AHEAD: f64 = 0.9;
+const NEARER_FORWARD: f64 = 0.9;
 /// Nearer to one than to the other: at most this share of the distance.
 pub(super) const NEARER: f64 = 0.6;
 
@@ -40,35 +40,35 @@ pub(super) struct Tolerance {
     pub(super) own_rad_s: f64,
     pub(super) own_m_s: f64,
     pub(super) share_turn: f64,
-    pub(super) share_ahead: f64,
+    pub(super) forward_share: f64,
 }
 
 /// One of the two motions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Axis {
     Turn,
-    Ahead,
+    Forward,
 }
 
 impl Axis {
     pub(super) fn of(self, twist: Twist) -> f64 {
         match self {
             Self::Turn => twist.angular_rad_s,
-            Self::Ahead => twist.linear_m_s,
+            Self::Forward => twist.linear_m_s,
         }
     }
 
     fn unit(self) -> Unit {
         match self {
             Self::Turn => Unit::RadiansPerSecond,
-            Self::Ahead => Unit::MetresPerSecond,
+            Self::Forward => Unit::MetresPerSecond,
         }
     }
 
     pub(super) fn slack(self, tolerance: Tolerance, one: f64, other: f64) -> f64 {
         let (own, share) = match self {
             Self::Turn => (tolerance.own_rad_s, tolerance.share_turn),
-            Self::Ahead => (tolerance.own_m_s, tolerance.share_ahead),
+            Self::Forward => (tolerance.own_m_s, tolerance.forward_share),
         };
         own + share * one.abs().max(other.abs())
     }
@@ -95,7 +95,7 @@ impl Axis {
         let nearer = match self {
             Self::Turn => NEARER,
             // Ahead nothing makes the body faster than wheels that are driven.
-            Self::Ahead => NEARER_AHEAD,
+            Self::Forward => NEARER_FORWARD,
         };
         off > self.slack(DISOBEYS, least, most) && self.off_command(body, commanded) < nearer * off
     }

@@ -30,7 +30,7 @@ pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
     if uses.gyro && (turns || gyro_lives || was_at_rest(Subject::Gyro)) {
         verdicts.agree(Subject::Gyro);
     }
-    let obeys = Axis::Ahead.obeys(wheels.linear_m_s, &recent.commanded)
+    let obeys = Axis::Forward.obeys(wheels.linear_m_s, &recent.commanded)
         && Axis::Turn.obeys(wheels.angular_rad_s, &recent.commanded);
     let wheels_live = was_frozen(Subject::Wheels) && !repeats.wheels.is_frozen();
     if uses.wheels && obeys && (goes || turns || wheels_live || was_at_rest(Subject::Wheels)) {
@@ -66,8 +66,8 @@ pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
         verdicts.agree(Subject::Motion);
     }
     verdicts.agree(Subject::WheelsAndMotion);
-    // What was frozen and still repeats itself is not shown to be right by standing still. A source that
-    // only says the same while the robot stands may be; motion will show it at once.
+    // What was frozen and still repeats itself is not shown to be right by standing still. A source
+    // that only says the same while the robot stands may be; motion will show it at once.
     let is_heard = uses.position && view.seen.iter().any(Option::is_some);
     if is_heard && view.stands {
         if !(was_frozen(Subject::Position) && repeats.position.is_repeating()) {

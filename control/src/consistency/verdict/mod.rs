@@ -3,8 +3,8 @@
 //! A channel that a finding names says nothing of the others: they are judged without it, and it is
 //! compared with them for its own sake alone, to see whether its finding may end.
 
-mod ahead;
 mod axis;
+mod forward;
 mod healthy;
 mod position;
 mod turn;
@@ -30,7 +30,7 @@ const BODY: Tolerance = Tolerance {
     own_rad_s: 0.02,
     own_m_s: 0.06,
     share_turn: 0.12,
-    share_ahead: 0.12,
+    forward_share: 0.12,
 };
 /// Share of the commanded speed below which motors may be at their limit.
 const SATURATED: f64 = 0.95;
@@ -198,7 +198,7 @@ impl Verdict {
 struct Recent {
     means: Means,
     turn_change: f64,
-    ahead_change: f64,
+    forward_change: f64,
     commanded: Commanded,
 }
 
@@ -217,7 +217,7 @@ impl Recent {
         Some(Self {
             means: view.recent_means()?,
             turn_change: change(Axis::Turn),
-            ahead_change: change(Axis::Ahead),
+            forward_change: change(Axis::Forward),
             commanded: view
                 .history
                 .commanded(now_s - RECENT_S - COMMAND_LAG_S, now_s),
@@ -258,8 +258,8 @@ fn compare(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
         wheels::locked(view, verdicts);
     }
     let is_turn_clean = turn::look(view, recent, verdicts);
-    let is_ahead_clean = ahead::look(view, recent, is_turn_clean, verdicts);
-    if is_turn_clean && is_ahead_clean && verdicts.is_consistent() {
+    let is_forward_clean = forward::look(view, recent, is_turn_clean, verdicts);
+    if is_turn_clean && is_forward_clean && verdicts.is_consistent() {
         healthy::look(view, recent, verdicts);
     }
 }

@@ -44,8 +44,9 @@ pub(super) fn frozen(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) 
     let path_m = means.wheels.linear_m_s.abs() * span_s;
     let turn_rad = means.gyro_rad_s.abs() * span_s;
     let odometry_m_s = means.odometry_m_s.filter(|_| view.uses.odometry);
-    let odometry_stands = odometry_m_s.is_some_and(|ahead_m_s| {
-        !view.repeats.odometry.is_frozen() && ahead_m_s.abs() < 0.25 * means.wheels.linear_m_s.abs()
+    let odometry_stands = odometry_m_s.is_some_and(|forward_m_s| {
+        !view.repeats.odometry.is_frozen()
+            && forward_m_s.abs() < 0.25 * means.wheels.linear_m_s.abs()
     });
     let moves = view.uses.wheels && path_m >= FROZEN_PATH.0 && !odometry_stands;
     // A gyro that is frozen too says nothing.
@@ -55,7 +56,7 @@ pub(super) fn frozen(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) 
         && recent.means.gyro_rad_s * recent.means.wheels.angular_rad_s > 0.0;
     if moves || turns {
         let (predicted, axis) = if moves {
-            (means.wheels.linear_m_s, Axis::Ahead)
+            (means.wheels.linear_m_s, Axis::Forward)
         } else {
             (means.gyro_rad_s, Axis::Turn)
         };

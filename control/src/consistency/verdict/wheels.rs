@@ -12,27 +12,27 @@ pub(super) const WHEELS: Tolerance = Tolerance {
     own_rad_s: 0.08,
     own_m_s: 0.06,
     share_turn: 0.28,
-    share_ahead: 0.16,
+    forward_share: 0.16,
 };
 /// The same where the command, or another channel of the body, says as well that one is wrong.
 pub(super) const WITNESSED: Tolerance = Tolerance {
     own_rad_s: 0.06,
     own_m_s: 0.05,
     share_turn: 0.15,
-    share_ahead: 0.12,
+    forward_share: 0.12,
 };
 /// The same where wheels say more than they are commanded.
 const ABOVE: Tolerance = Tolerance {
     own_rad_s: 0.06,
     own_m_s: 0.05,
     share_turn: 0.15,
-    share_ahead: 0.1,
+    forward_share: 0.1,
 };
 /// Shares of the fixes' noise that are let be where the command says as well that wheels are wrong.
 const SENSOR_NOISE_RATIO: f64 = 0.6;
 const ABOVE_NOISE_RATIO: f64 = 0.5;
-/// Change of the command, radians and metres per second and a share of it, that shows in the word of
-/// wheels that turn, and how long it may take to show, seconds.
+/// Change of the command, radians and metres per second and a share of it, that shows in the word
+/// of wheels that turn, and how long it may take to show, seconds.
 const HELD_MIN: f64 = 0.08;
 const HELD_SHARE: f64 = 0.1;
 const HELD_LAG_S: f64 = 0.25;
@@ -49,14 +49,14 @@ const RAISE_SENSOR_S: f64 = 0.2;
 const RAISE_LOCKED_S: f64 = 0.3;
 const RAISE_REPEATING_S: f64 = 0.5;
 
-/// Wheels and gyro that both repeat themselves while the wheels are to do something else: a base that
-/// says the same for ever. A gyro with noise would not.
+/// Wheels and gyro that both repeat themselves while the wheels are to do something else: a base
+/// that says the same for ever. A gyro with noise would not.
 pub(super) fn frozen_base(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
     let are_used = view.uses.wheels && view.uses.gyro;
     if !(are_used && view.repeats.wheels.is_frozen() && view.repeats.gyro.is_frozen()) {
         return;
     }
-    for axis in [Axis::Ahead, Axis::Turn] {
+    for axis in [Axis::Forward, Axis::Turn] {
         let wheels = axis.of(recent.means.wheels);
         let commanded = &recent.commanded;
         if !axis.obeys(wheels, commanded) {

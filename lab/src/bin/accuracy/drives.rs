@@ -48,7 +48,7 @@ pub(crate) struct Driven {
     pub(crate) ever_measured: bool,
     /// At some moment there was said to be new information.
     pub(crate) ever_informed: bool,
-    /// θ and its deviation when it was first said to be measured.
+    /// θ and its standard deviation when it was first said to be measured.
     pub(crate) first: Option<(f64, f64)>,
     /// Sums of the segments' information on θ, and of that times θ.
     pub(crate) segments: (f64, f64),

@@ -200,7 +200,7 @@ impl SeededRobot {
             wheel_speeds,
             gyro_rad_s,
             acceleration: Some(BodyAcceleration {
-                ahead_m_s2: felt.ahead_m_s2
+                forward_m_s2: felt.forward_m_s2
                     + self.accelerometer_offset[0]
                     + self.gauss(noise.accelerometer_m_s2),
                 left_m_s2: felt.left_m_s2
@@ -208,7 +208,7 @@ impl SeededRobot {
                     + self.gauss(noise.accelerometer_m_s2),
             }),
             body_speed_m_s: has_body_speed
-                .then(|| state.ahead_m_s + self.gauss(noise.body_speed_m_s)),
+                .then(|| state.forward_m_s + self.gauss(noise.body_speed_m_s)),
             wheel_torques: self.spec.has_torque.then(|| WheelTorques {
                 left_n_m: self.torque_gain[0] * torques.left_n_m + self.gauss(torque_noise),
                 right_n_m: self.torque_gain[1] * torques.right_n_m + self.gauss(torque_noise),

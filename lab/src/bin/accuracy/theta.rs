@@ -31,9 +31,9 @@ pub(crate) struct Scenario {
 
 /// One run's outcome.
 struct Run {
-    /// Error over the truth, and over its own deviation; none where the robot abstained.
+    /// Error over the truth, and over its own standard deviation; none where the robot abstained.
     error: Option<(f64, f64)>,
-    /// That deviation, over the truth.
+    /// That standard deviation, over the truth.
     std_dev: f64,
     driven: Driven,
 }

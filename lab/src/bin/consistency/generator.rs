@@ -2,8 +2,8 @@
 //! monitor that shares nothing with the plant of `tread_control::plant`.
 //!
 //! A point with a heading is pulled along by what its wheels slip, at most by μg; wheels lag behind
-//! their command and saturate. Encoders count, the gyro's offset walks, poses come late at 10 Hz with
-//! 2 cm of noise and wild ones among them, the accelerometer shakes and leans.
+//! their command and saturate. Encoders count, the gyro's offset walks, poses come late at 10 Hz
+//! with 2 cm of noise and wild ones among them, the accelerometer shakes and leans.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -187,7 +187,7 @@ pub(crate) struct Robot {
     step: u64,
     // What is true.
     pose: Pose,
-    ahead_m_s: f64,
+    forward_m_s: f64,
     left_m_s: f64,
     turn_rad_s: f64,
     acceleration: BodyAcceleration,
@@ -244,7 +244,7 @@ impl Robot {
             random,
             step: 0,
             pose,
-            ahead_m_s: 0.0,
+            forward_m_s: 0.0,
             left_m_s: 0.0,
             turn_rad_s: 0.0,
             acceleration: BodyAcceleration::default(),
@@ -336,13 +336,17 @@ impl Robot {
         let Some(fault) = self.fault else {
             return false;
         };
-        let (ahead, turn) = (self.ahead_m_s, self.turn_rad_s);
+        let (forward, turn) = (self.forward_m_s, self.turn_rad_s);
         let held = &self.held;
         let twist = held.wheel_speeds.map_or(Twist::default(), |wheels| {
             self.model.twist_from_wheel_speeds(wheels)
         });
         let is_off = |by: f64| by.abs() >= 0.2;
-        let felt = self.acceleration.ahead_m_s2.abs().max((ahead * turn).abs());
+        let felt = self
+            .acceleration
+            .forward_m_s2
+            .abs()
+            .max((forward * turn).abs());
         match fault {
             Fault::GyroFrozen => is_off(turn - held.gyro_rad_s.unwrap_or(0.0)),
             Fault::GyroInverted => is_off(2.0 * turn),
@@ -353,19 +357,19 @@ impl Robot {
             | Fault::PositionRotated
             | Fault::AccelerometerAtLimit => true,
             Fault::WheelsFrozen => {
-                is_off(ahead - twist.linear_m_s) || is_off(turn - twist.angular_rad_s)
+                is_off(forward - twist.linear_m_s) || is_off(turn - twist.angular_rad_s)
             }
             Fault::LeftEncoderDead | Fault::LeftWheelsLocked => {
                 let wheels = self.model.wheel_speeds_from_twist(self.commanded);
                 is_off(wheels.left_rad_s * self.model.wheel_radius_m())
             }
-            Fault::OdometryFrozen => is_off(ahead - held.odometry_m_s.unwrap_or(0.0)),
-            Fault::OdometryInWorldFrame => is_off(ahead * (self.pose.heading_rad.cos() - 1.0)),
+            Fault::OdometryFrozen => is_off(forward - held.odometry_m_s.unwrap_or(0.0)),
+            Fault::OdometryInWorldFrame => is_off(forward * (self.pose.heading_rad.cos() - 1.0)),
             Fault::WheelsScaled(scale)
             | Fault::OdometryScaled(scale)
             | Fault::PositionScaled(scale)
-            | Fault::EncodersOfTheBaseScaled(scale) => is_off((scale - 1.0) * ahead),
-            Fault::PositionFrozen => is_off(ahead),
+            | Fault::EncodersOfTheBaseScaled(scale) => is_off((scale - 1.0) * forward),
+            Fault::PositionFrozen => is_off(forward),
             Fault::AccelerometerFrozen | Fault::AccelerometerInverted => felt >= 0.5,
             Fault::EverythingFrozen => {
                 is_off(self.commanded.linear_m_s - twist.linear_m_s) || is_off(twist.linear_m_s)
@@ -465,7 +469,7 @@ impl Robot {
         // Slip pulls, at most as hard as the ground can.
         let most_m_s2 = self.mu * GRAVITY_M_S2;
         let (mut x, mut y) = (
-            (rim_m_s - self.ahead_m_s) / self.build.slip_s.0,
+            (rim_m_s - self.forward_m_s) / self.build.slip_s.0,
             -self.left_m_s / 0.08,
         );
         let size = x.hypot(y);
@@ -476,16 +480,16 @@ impl Robot {
         let yaw =
             ((rim_rad_s - self.turn_rad_s) / self.build.slip_s.1).clamp(-most_rad_s2, most_rad_s2);
         self.acceleration = BodyAcceleration {
-            ahead_m_s2: x,
+            forward_m_s2: x,
             left_m_s2: y,
         };
-        let (ahead, left, turn) = (self.ahead_m_s, self.left_m_s, self.turn_rad_s);
-        self.ahead_m_s += STEP_S * (x + turn * left);
-        self.left_m_s += STEP_S * (y - turn * ahead);
+        let (forward, left, turn) = (self.forward_m_s, self.left_m_s, self.turn_rad_s);
+        self.forward_m_s += STEP_S * (x + turn * left);
+        self.left_m_s += STEP_S * (y - turn * forward);
         self.turn_rad_s += STEP_S * yaw;
         let (sin, cos) = (self.pose.heading_rad + 0.5 * STEP_S * turn).sin_cos();
-        self.pose.x_m += STEP_S * (self.ahead_m_s * cos - self.left_m_s * sin);
-        self.pose.y_m += STEP_S * (self.ahead_m_s * sin + self.left_m_s * cos);
+        self.pose.x_m += STEP_S * (self.forward_m_s * cos - self.left_m_s * sin);
+        self.pose.y_m += STEP_S * (self.forward_m_s * sin + self.left_m_s * cos);
         self.pose.heading_rad += STEP_S * turn;
         for (angle, wheel) in self.angles.iter_mut().zip(self.wheels) {
             *angle += STEP_S * wheel;
@@ -515,7 +519,7 @@ impl Robot {
         let acceleration = self.kit.has_accelerometer.then(|| {
             self.lean_m_s2 = 0.5 * (0.05 * self.time_s()).sin();
             BodyAcceleration {
-                ahead_m_s2: self.acceleration.ahead_m_s2
+                forward_m_s2: self.acceleration.forward_m_s2
                     + self.lean_m_s2
                     + self.build.acceleration_noise_m_s2 * self.normal(),
                 left_m_s2: self.acceleration.left_m_s2 - 0.1
@@ -525,7 +529,7 @@ impl Robot {
         let says_odometry =
             self.kit.has_odometry && self.step.is_multiple_of(self.build.steps_per_odometry);
         let odometry = says_odometry.then(|| {
-            let said_m_s = self.ahead_m_s + self.build.odometry_noise_m_s * self.normal();
+            let said_m_s = self.forward_m_s + self.build.odometry_noise_m_s * self.normal();
             self.odometry_ratio * said_m_s
         });
         Sample {
@@ -632,13 +636,13 @@ impl Robot {
             Some(Fault::AccelerometerFrozen) => sample.acceleration = held.acceleration,
             Some(Fault::AccelerometerInverted) => {
                 sample.acceleration = sample.acceleration.map(|felt| BodyAcceleration {
-                    ahead_m_s2: -felt.ahead_m_s2,
+                    forward_m_s2: -felt.forward_m_s2,
                     left_m_s2: -felt.left_m_s2,
                 });
             }
             Some(Fault::AccelerometerAtLimit) => {
                 sample.acceleration = Some(BodyAcceleration {
-                    ahead_m_s2: 19.6,
+                    forward_m_s2: 19.6,
                     left_m_s2: 19.6,
                 });
             }

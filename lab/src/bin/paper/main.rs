@@ -149,7 +149,7 @@ fn drive_circle() -> anyhow::Result<Vec<CircleRow>> {
     let spec = PlantSpec::default();
     let mut plant = Plant::new(model, spec, Pose::default())?;
     plant.set_state(PlantState {
-        ahead_m_s: start_m_s,
+        forward_m_s: start_m_s,
         wheel_speeds: wheels,
         ..PlantState::default()
     });
@@ -231,7 +231,7 @@ fn write(folder: &Path, name: &str, text: &str) -> anyhow::Result<()> {
 fn write_tracking(folder: &Path, rows: &[Row]) -> anyhow::Result<()> {
     let mut fig_6 =
         String::from("time_s,x_m,y_m,x_desired_m,y_desired_m,error_x_m,error_y_m,lyapunov\n");
-    let mut fig_7 = String::from("time_s,ahead_m_s,left_m_s,yaw_rate_rad_s,zeta,theta_hat\n");
+    let mut fig_7 = String::from("time_s,forward_m_s,left_m_s,yaw_rate_rad_s,zeta,theta_hat\n");
     for row in rows {
         let state = &row.state;
         let ([x, y], [x_d, y_d], [e_x, e_y]) = (row.point, row.desired, row.error);
@@ -244,9 +244,9 @@ fn write_tracking(folder: &Path, rows: &[Row]) -> anyhow::Result<()> {
             fig_7,
             "{:.1},{:.6},{:.6},{:.6},{:.6},{:.6}",
             state.time_s,
-            state.ahead_m_s,
+            state.forward_m_s,
             state.left_m_s,
-            -state.left_m_s / Yi2007Config::section_iv().centre_ahead_m,
+            -state.left_m_s / Yi2007Config::section_iv().centre_forward_m,
             state.zeta,
             state.theta
         );
@@ -294,7 +294,7 @@ fn write_tracking(folder: &Path, rows: &[Row]) -> anyhow::Result<()> {
                 y_label: "m/s",
                 equal_scale: false,
                 curves: vec![
-                    timed("ahead", &|row: &Row| row.state.ahead_m_s),
+                    timed("ahead", &|row: &Row| row.state.forward_m_s),
                     timed("left", &|row: &Row| row.state.left_m_s),
                 ],
             },

@@ -391,7 +391,7 @@ impl CommandFile {
             base_radius_m,
             base_track_m,
             turn_sign: sign("drive.ros2.command.turn_sign", self.turn_sign)?,
-            ahead_sign: sign("drive.ros2.command.ahead_sign", self.ahead_sign)?,
+            forward_sign: sign("drive.ros2.command.forward_sign", self.forward_sign)?,
             joints,
             joint_ratios,
         })

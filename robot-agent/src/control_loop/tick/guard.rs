@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use tread_api::robot::PauseCause;
 use tread_control::fence::{FenceInput, MU_UNKNOWN};
-use tread_control::gate::teleoperation::{BLIND_MAX_M_S, approach, no_faster, not_ahead};
+use tread_control::gate::teleoperation::{BLIND_MAX_M_S, approach, no_faster, without_forward};
 use tread_control::gate::{GateCause, GateInput, GateOutput, Reasons, gate_with};
 use tread_control::geometry::Twist;
 use tread_control::measured::WheelSpeeds;
@@ -60,8 +60,8 @@ impl Guard {
         self.gate
     }
 
-    /// What it looked at in this tick: the number of the stop in force, how long the server had been
-    /// silent, and the rest.
+    /// What it looked at in this tick: the number of the stop in force, how long the server had
+    /// been silent, and the rest.
     pub(super) fn looked_at(&self) -> (u64, Duration, LoopView) {
         (self.stop, self.server_silence, self.view)
     }
@@ -111,8 +111,8 @@ impl LoopCore {
         }
         let limits = &guard.view.limits;
         let most_m_s = limits.linear_max_m_s(guard.now_us);
-        let is_held = limits.holds(guard.now_us) || most_m_s.is_some_and(|most| most < STANDING);
-        active.hold(Hold::Outside, is_held);
+        let is_on_hold = limits.holds(guard.now_us) || most_m_s.is_some_and(|most| most < STANDING);
+        active.hold(Hold::Outside, is_on_hold);
         active.hold(Hold::Overrun, is_loop_late);
         let sensors = sensors_max_m_s(&self.findings);
         let most_m_s = most_m_s.into_iter().chain(sensors).reduce(f64::min);
@@ -145,7 +145,7 @@ impl LoopCore {
         }
         let mut twist = approach(previous, target, &self.model, dt_s);
         if ends_soon {
-            twist = not_ahead(twist, self.real_m_s(now));
+            twist = without_forward(twist, self.real_m_s(now));
         }
         Wanted {
             wheels: self.model.wheel_speeds_from_twist(twist),

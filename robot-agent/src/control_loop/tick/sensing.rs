@@ -62,8 +62,8 @@ impl LoopCore {
                 self.integrated_to = self.integrated_to.max(Some(sample.at));
                 self.measured_wheels = wheel_speeds;
                 if dt_s > 0.0 {
-                    let ahead = self.model.twist_from_wheel_speeds(wheel_speeds).linear_m_s;
-                    self.progress.note_wheels(ahead * dt_s);
+                    let forward = self.model.twist_from_wheel_speeds(wheel_speeds).linear_m_s;
+                    self.progress.note_wheels(forward * dt_s);
                     self.localisation.predict(gyro_rad_s, wheel_speeds, dt_s);
                     // With wheels on two grounds there is no one θ to learn.
                     if self.footing != Some(Footing::Mixed) && self.may_learn() {
@@ -139,7 +139,7 @@ impl LoopCore {
         let is_silent =
             self.is_base_silent || age_s(now, self.last_sample) > self.silent_after.as_secs_f64();
         let velocity = BodyVelocity {
-            ahead_m_s: self.real_m_s(now),
+            forward_m_s: self.real_m_s(now),
             left_m_s: 0.0,
             yaw_rate_rad_s: self.localisation.twist().angular_rad_s,
         };
@@ -244,14 +244,14 @@ impl LoopCore {
         if fault == Some(Fault::BaseSilent) {
             self.base_silent_at = Some(now);
         }
-        let is_held = self
+        let is_on_hold = self
             .base_silent_at
             .is_some_and(|silent_at| now.saturating_sub(silent_at) < HEARD_AGAIN_FOR);
-        if !is_held {
+        if !is_on_hold {
             self.base_silent_at = None;
         }
         if let Some(active) = &mut self.active {
-            active.hold(Hold::Base, is_held);
+            active.hold(Hold::Base, is_on_hold);
         }
     }
 

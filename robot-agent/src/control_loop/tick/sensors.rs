@@ -1,7 +1,7 @@
 //! Whether what the base says can be true, and whether the robot stands where it is to.
 //!
-//! A channel that contradicts the others holds or slows whatever depends on it; the monitor itself is
-//! [`tread_control::consistency`], the watch over standstill [`crate::control_loop::standing`].
+//! A channel that contradicts the others holds or slows whatever depends on it; the monitor itself
+//! is [`tread_control::consistency`], the watch over standstill [`crate::control_loop::standing`].
 
 use std::time::Duration;
 
@@ -17,8 +17,8 @@ use crate::control_loop::channels::EndReason;
 use crate::control_loop::segments::Moment;
 use crate::drive::SensorSample;
 
-/// Longest time that a mission is held for sensors; then it fails. A finding on the place that ends at
-/// rest, after 10 s, leaves time for the mission to go on.
+/// Longest time that a mission is held for sensors; then it fails. A finding on the place that ends
+/// at rest, after 10 s, leaves time for the mission to go on.
 const SENSORS_HOLD_MAX: Duration = Duration::from_secs(15);
 /// The same where the position leapt: nobody drives on by a place that was believed meanwhile.
 const LEAPT_HOLD_MAX: Duration = Duration::from_secs(10);
@@ -80,8 +80,8 @@ impl LoopCore {
     /// A faulty base may never be seen to stand, so that the mission ends as it is.
     pub(super) fn hold_for_sensors(&mut self, at: Moment) {
         let now = at.monotonic;
-        let is_held = self.must_hold() && self.active.is_some();
-        self.sensors_hold_since = is_held.then(|| self.sensors_hold_since.unwrap_or(now));
+        let is_on_hold = self.must_hold() && self.active.is_some();
+        self.sensors_hold_since = is_on_hold.then(|| self.sensors_hold_since.unwrap_or(now));
         let since = self.sensors_hold_since;
         let position = self.findings.about(Subject::Position);
         let most = if position.is_some_and(|found| found.kind == Kind::Jumped) {
@@ -91,7 +91,7 @@ impl LoopCore {
         };
         let is_over = since.is_some_and(|since| now.saturating_sub(since) > most);
         if let Some(active) = &mut self.active {
-            active.hold(Hold::Sensors, is_held);
+            active.hold(Hold::Sensors, is_on_hold);
         }
         if is_over {
             self.sensors_hold_since = None;
@@ -99,7 +99,8 @@ impl LoopCore {
         }
     }
 
-    /// Tells the monitor what the wheels are commanded, and looks whether a robot that is to stand does.
+    /// Tells the monitor what the wheels are commanded, and looks whether a robot that is to stand
+    /// does.
     pub(super) fn check_standstill(&mut self, now: Duration, gated: &GateOutput) {
         self.monitor.command(self.command);
         let is_new = |at: Duration| now.saturating_sub(at) <= BODY_SPEED_AGE_MAX;

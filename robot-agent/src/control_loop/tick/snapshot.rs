@@ -41,7 +41,7 @@ impl LoopCore {
 
     /// How far a held mission's reference is from the robot, metres.
     fn off_path_m(&self, now: Duration) -> Option<f64> {
-        let active = self.active.as_ref().filter(|active| active.is_held())?;
+        let active = self.active.as_ref().filter(|active| active.is_on_hold())?;
         let follower = &active.job.follower;
         let reference = follower.governor().sample(follower.plan());
         let errors = TrackingErrors::between(&reference, &self.measured(now));
@@ -78,7 +78,7 @@ impl LoopCore {
                 .active
                 .as_ref()
                 .map(|active| *active.job.follower.governor()),
-            is_held: self.active.as_ref().is_some_and(Active::is_held),
+            is_on_hold: self.active.as_ref().is_some_and(Active::is_on_hold),
             off_path_m: self.off_path_m(now),
             stands: self.stands(),
             gate: self.guard.gate(),

@@ -97,8 +97,9 @@ impl Assembler {
                 }
                 self.last_motion = Some((arrived.at, motion));
                 if self.motion_of == MotionOf::Ground {
-                    self.ground_speed_m_s = Some(motion.ahead_m_s);
-                    self.noise.body_speed_m_s = motion.ahead_std_dev.or(self.noise.body_speed_m_s);
+                    self.ground_speed_m_s = Some(motion.forward_m_s);
+                    self.noise.body_speed_m_s =
+                        motion.forward_std_dev.or(self.noise.body_speed_m_s);
                 }
                 if !self.has_joints {
                     let speeds = wheels_of(&motion, &self.settings);
@@ -119,7 +120,7 @@ impl Assembler {
         self.sums.yaw_rad_s += inertial.yaw_rate_rad_s;
         if let Some(felt) = inertial.acceleration {
             self.sums.felt_count += 1.0;
-            self.sums.felt.ahead_m_s2 += felt.ahead_m_s2;
+            self.sums.felt.forward_m_s2 += felt.forward_m_s2;
             self.sums.felt.left_m_s2 += felt.left_m_s2;
         }
         self.tilt_rad = inertial.tilt_rad;
@@ -143,10 +144,10 @@ impl Assembler {
         let (yaw_rate_rad_s, acceleration) = if self.has_imu {
             // Means since the last sample; where nothing came since, what was last said.
             let yaw_rate = mean(sums.yaw_rad_s, sums.count);
-            let felt = mean(sums.felt.ahead_m_s2, sums.felt_count)
+            let felt = mean(sums.felt.forward_m_s2, sums.felt_count)
                 .zip(mean(sums.felt.left_m_s2, sums.felt_count))
-                .map(|(ahead_m_s2, left_m_s2)| BodyAcceleration {
-                    ahead_m_s2,
+                .map(|(forward_m_s2, left_m_s2)| BodyAcceleration {
+                    forward_m_s2,
                     left_m_s2,
                 });
             let last = inertial.map(|inertial| inertial.yaw_rate_rad_s);

@@ -22,12 +22,12 @@ pub(super) fn message_type(kind: CommandKind) -> MessageType {
 /// so.
 fn twist(command: WheelSpeeds, settings: &CommandSettings) -> Twist {
     let half_radius_m = 0.5 * settings.base_radius_m;
-    let ahead_m_s = half_radius_m * (command.left_rad_s + command.right_rad_s);
+    let forward_m_s = half_radius_m * (command.left_rad_s + command.right_rad_s);
     let turn_rad_s =
         2.0 * half_radius_m * (command.right_rad_s - command.left_rad_s) / settings.base_track_m;
     Twist {
         linear: Vector3 {
-            x: settings.ahead_sign * ahead_m_s,
+            x: settings.forward_sign * forward_m_s,
             ..Vector3::default()
         },
         angular: Vector3 {
@@ -85,7 +85,7 @@ mod tests {
             base_radius_m: 0.1,
             base_track_m: 0.5,
             turn_sign: 1.0,
-            ahead_sign: 1.0,
+            forward_sign: 1.0,
             joints: [2, 1],
             joint_ratios: [3.0, -3.0],
         }

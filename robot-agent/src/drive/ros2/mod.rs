@@ -1,9 +1,10 @@
-//! A ROS 2 robot behind the drive interface: read and commanded over zenoh, with no ROS on this side.
+//! A ROS 2 robot behind the drive interface: read and commanded over zenoh, with no ROS on this
+//! side.
 //!
 //! ```text
 //! bus ─callback─► inlet (key, attachment, CDR, values, stamp) ─channel─► assemble ─► loop
 //! bus ◄─thread─── command ◄──────────── outlet ◄──────────────────────────────────── loop
-//! bus ◄─thread─── outward (plan, way driven, θ, diagnostics) ◄─── newest snapshot ◄─── loop
+//! bus ◄─thread─── outward (plan, driven path, θ, diagnostics) ◄─── newest snapshot ◄─── loop
 //! ```
 //! A message that is not wholly good is dropped and counted by its reason. A base that is not
 //! heard for [`Timing::silent_after`](settings::Timing) is told to rest at once; it hears nothing

@@ -1,8 +1,9 @@
-//! What the agent says to the rest of the robot: plan, way driven, friction, and how it is.
+//! What the agent says to the rest of the robot: plan, driven path, friction, and how it is.
 //!
 //! It looks at what the loop and the dispatcher leave for everybody, and makes messages of it, once
 //! a second and when a mission begins or ends. It has a thread of its own, so nothing waits for it:
-//! the loop passes a snapshot by while it is being read, and commands are written by another thread.
+//! the loop passes a snapshot by while it is being read, and commands are written by another
+//! thread.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -27,7 +28,7 @@ pub(crate) const LOOK_EVERY: Duration = Duration::from_millis(100);
 const SAY_EVERY: Duration = Duration::from_secs(1);
 /// Silence of the server that is worth a warning.
 const SILENT_SERVER: Duration = Duration::from_secs(5);
-/// Distance between two points of the way driven, metres.
+/// Distance between two points of the driven path, metres.
 const SPACING_M: f64 = 0.1;
 /// What the numbers of friction are, in their order; what is not known is NaN.
 const THETA_LABEL: &str = "theta,theta_std_dev,theta_loop";
@@ -37,7 +38,7 @@ const THETA_LABEL: &str = "theta,theta_std_dev,theta_loop";
 pub(crate) enum Word {
     /// The plan of the active mission; empty without one.
     Plan,
-    /// The way driven since the last mission began, the newest [`PATH_POINTS_MAX`] points.
+    /// The driven path since the last mission began, the newest [`PATH_POINTS_MAX`] points.
     Driven,
     /// θ as measured, its standard deviation, and θ̂ of the law.
     Theta,
@@ -234,7 +235,7 @@ fn seen_from(site_from_frame: Pose, pose: Pose) -> Pose {
 
 fn control(snapshot: &Snapshot) -> Part {
     let (level, message) = match state(snapshot.mode, snapshot.fault) {
-        (Level::Ok, _) if snapshot.is_held => (Level::Ok, "holds its mission"),
+        (Level::Ok, _) if snapshot.is_on_hold => (Level::Ok, "holds its mission"),
         known => known,
     };
     let gate = snapshot.gate.cause.map(|cause| format!("{cause:?}"));
@@ -294,7 +295,7 @@ fn estimator(snapshot: &Snapshot) -> Part {
         values: vec![
             ("theta".to_owned(), number(measured.map(|it| it.theta))),
             (
-                "deviation of theta".to_owned(),
+                "standard deviation of theta".to_owned(),
                 number(measured.map(|it| it.std_dev)),
             ),
             ("theta of the law".to_owned(), number(snapshot.theta_loop)),

@@ -27,9 +27,9 @@ const ACCELERATION_MAX_M_S2: f64 = 200.0;
 const TORQUE_MAX_N_M: f64 = 1.0e5;
 /// Farthest place that is believed, metres.
 const PLACE_MAX_M: f64 = 1.0e6;
-/// Largest deviations that a covariance may state: metres (or metres per second), radians.
+/// Largest standard deviations that a covariance may state: metres (or metres per second), radians.
 const DEVIATION_MAX: f64 = 10.0;
-/// Smallest deviations of a fix that are believed, metres and radians.
+/// Smallest standard deviations of a fix that are believed, metres and radians.
 const FIX_DEVIATION_MIN: (f64, f64) = (0.002, 0.001);
 
 /// What a message said.
@@ -61,11 +61,11 @@ pub struct Wheels {
 pub struct Inertial {
     /// Turn rate, radians per second.
     pub yaw_rate_rad_s: f64,
-    /// Its deviation, if it is stated.
+    /// Its standard deviation, if it is stated.
     pub yaw_rate_std_dev: Option<f64>,
     /// Acceleration without gravity, if it is measured.
     pub acceleration: Option<BodyAcceleration>,
-    /// Its deviation, if it is stated.
+    /// Its standard deviation, if it is stated.
     pub acceleration_std_dev: Option<f64>,
     /// How far the robot leans, radians, if that is known.
     pub tilt_rad: Option<f64>,
@@ -75,9 +75,9 @@ pub struct Inertial {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Motion {
     /// Speed ahead, metres per second.
-    pub ahead_m_s: f64,
-    /// Its deviation, if it is stated.
-    pub ahead_std_dev: Option<f64>,
+    pub forward_m_s: f64,
+    /// Its standard deviation, if it is stated.
+    pub forward_std_dev: Option<f64>,
     /// Turn rate, radians per second.
     pub yaw_rate_rad_s: f64,
     /// Where the robot is, if the odometry may say so.
@@ -107,8 +107,8 @@ fn bounded(value: f64, most: f64) -> Result<f64, Refusal> {
     }
 }
 
-/// The deviation of a variance; none for zero, by which ROS says that it is not known.
-fn deviation(variance: f64) -> Result<Option<f64>, Refusal> {
+/// The standard deviation of a variance; none for zero, by which ROS says that it is not known.
+fn std_dev(variance: f64) -> Result<Option<f64>, Refusal> {
     if variance == 0.0 {
         return Ok(None);
     }
@@ -164,7 +164,7 @@ fn position(
         return Err(Refusal::Covariance);
     }
     // Of x, y and the turn about z: their places on the diagonal.
-    let [x_m, y_m, heading_rad] = [0, 1, 5].map(|at: usize| deviation(covariance[at][at]));
+    let [x_m, y_m, heading_rad] = [0, 1, 5].map(|at: usize| std_dev(covariance[at][at]));
     let (place_min_m, heading_min_rad) = FIX_DEVIATION_MIN;
     let noise = match (x_m?, y_m?, heading_rad?) {
         (Some(x_m), Some(y_m), Some(heading_rad)) => Some(FixNoise {
@@ -270,17 +270,17 @@ pub fn imu(bytes: &[u8], settings: &ImuSettings) -> Result<Reading, Refusal> {
         let y = flip * (bounded(felt.y, most)? - GRAVITY_M_S2 * up.y);
         let (sin, cos) = settings.yaw_rad.sin_cos();
         Some(BodyAcceleration {
-            ahead_m_s2: cos * x - sin * y,
+            forward_m_s2: cos * x - sin * y,
             left_m_s2: sin * x + cos * y,
         })
     };
     let acceleration_std_dev = match acceleration {
-        Some(_) => deviation(message.linear_acceleration_covariance[0])?,
+        Some(_) => std_dev(message.linear_acceleration_covariance[0])?,
         None => None,
     };
     let inertial = Inertial {
         yaw_rate_rad_s: flip * bounded(message.angular_velocity.z, RATE_MAX)?,
-        yaw_rate_std_dev: deviation(message.angular_velocity_covariance[8])?,
+        yaw_rate_std_dev: std_dev(message.angular_velocity_covariance[8])?,
         acceleration,
         acceleration_std_dev,
         tilt_rad,
@@ -302,8 +302,8 @@ pub fn odometry(bytes: &[u8], settings: &OdometrySettings) -> Result<Reading, Re
         None => None,
     };
     let motion = Motion {
-        ahead_m_s: bounded(twist.linear.x, RATE_MAX)?,
-        ahead_std_dev: deviation(covariance[0][0])?,
+        forward_m_s: bounded(twist.linear.x, RATE_MAX)?,
+        forward_std_dev: std_dev(covariance[0][0])?,
         yaw_rate_rad_s: bounded(twist.angular.z, RATE_MAX)?,
         position,
     };
@@ -346,8 +346,8 @@ pub fn battery(bytes: &[u8]) -> Result<Option<Reading>, Refusal> {
 pub fn wheels_of(motion: &Motion, command: &CommandSettings) -> WheelSpeeds {
     let turn_m_s = 0.5 * command.base_track_m * motion.yaw_rate_rad_s;
     WheelSpeeds {
-        left_rad_s: (motion.ahead_m_s - turn_m_s) / command.base_radius_m,
-        right_rad_s: (motion.ahead_m_s + turn_m_s) / command.base_radius_m,
+        left_rad_s: (motion.forward_m_s - turn_m_s) / command.base_radius_m,
+        right_rad_s: (motion.forward_m_s + turn_m_s) / command.base_radius_m,
     }
 }
 

@@ -212,7 +212,7 @@ pub struct CommandSettings {
     /// 1.0, or -1.0 where the base takes a turn to the right for positive.
     pub turn_sign: f64,
     /// 1.0, or -1.0 where the base takes backwards for positive.
-    pub ahead_sign: f64,
+    pub forward_sign: f64,
     /// Joints of the left and of the right side in [`CommandKind::JointSpeeds`].
     pub joints: [usize; 2],
     /// Turns of a joint for one turn of its wheel, each side with its sign.
@@ -239,7 +239,7 @@ impl Ros2Settings {
 pub struct OutwardSettings {
     /// The plan of the active mission, `nav_msgs/Path`.
     pub plan: Name,
-    /// The way driven, `nav_msgs/Path`.
+    /// The driven path, `nav_msgs/Path`.
     pub driven: Name,
     /// θ, its standard deviation and θ̂ of the law, `std_msgs/Float64MultiArray`.
     pub theta: Name,

@@ -66,7 +66,7 @@ pub(crate) fn settings() -> Ros2Settings {
             base_radius_m: 0.1,
             base_track_m: 0.5,
             turn_sign: 1.0,
-            ahead_sign: 1.0,
+            forward_sign: 1.0,
             joints: [1, 1],
             joint_ratios: [1.0, 1.0],
         },
@@ -219,7 +219,7 @@ fn a_good_message_is_a_whole_sample_by_its_stamp() {
     let torques = sample.wheel_torques.unwrap();
     assert!((torques.left_n_m - 1.0).abs() < 1.0e-12 && (torques.right_n_m - 2.0).abs() < 1.0e-12);
     let felt = sample.acceleration.unwrap();
-    assert!((felt.ahead_m_s2 - 0.5).abs() < 1.0e-9 && felt.left_m_s2.abs() < 1.0e-9);
+    assert!((felt.forward_m_s2 - 0.5).abs() < 1.0e-9 && felt.left_m_s2.abs() < 1.0e-9);
     assert!((sample.yaw_rate_rad_s.unwrap() - 0.2).abs() < 1.0e-12);
     assert!(sample.tilt_rad.unwrap() < 1.0e-6);
     assert_eq!(talk.drive.noise().gyro_rad_s, Some(0.01));

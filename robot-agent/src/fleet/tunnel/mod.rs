@@ -43,10 +43,11 @@ const FIRST_MESSAGE_BYTES_MAX: u16 = 1_024;
 const MESSAGE_LENGTH_BYTES: usize = 2;
 /// Most connections of the session at a time. It has one, and for a moment a second.
 const CONNECTIONS_MAX: usize = 16;
-/// Most local connections at a time that have not shown the session id yet; the newest stay. They have
-/// their places apart, so that no other program on the robot takes those of the session.
+/// Most local connections at a time that have not shown the session id yet; the newest stay. They
+/// have their places apart, so that no other program on the robot takes those of the session.
 const STRANGERS_MAX: usize = 16;
-/// Time between two lines of the log about other programs at the local port, which say how many came.
+/// Time between two lines of the log about other programs at the local port, which say how many
+/// came.
 const STRANGERS_LOG_EVERY: Duration = Duration::from_mins(1);
 /// Connections that the kernel keeps until they are accepted.
 const BACKLOG: u32 = 16;
@@ -57,8 +58,8 @@ const COPY_BUFFER_BYTES: usize = 4 * 1024;
 /// First pause after a failed try to connect, and the longest.
 const RETRY_FIRST: Duration = Duration::from_millis(100);
 const RETRY_MAX: Duration = Duration::from_millis(300);
-/// The longest pause while the server's authority is one that this robot does not trust. Each try counts
-/// as a failure of its address at the server, which other robots may share.
+/// The longest pause while the server's authority is one that this robot does not trust. Each try
+/// counts as a failure of its address at the server, which other robots may share.
 const DISTRUSTED_RETRY_MAX: Duration = Duration::from_secs(10);
 /// Rest after the machine refused to accept a connection.
 const ACCEPT_REST: Duration = Duration::from_millis(100);
@@ -93,7 +94,7 @@ struct StrangersLog(std::sync::Mutex<StrangersCount>);
 #[derive(Default)]
 struct StrangersCount {
     count: u64,
-    told_at: Option<tokio::time::Instant>,
+    logged_at: Option<tokio::time::Instant>,
 }
 
 impl StrangersLog {
@@ -102,12 +103,12 @@ impl StrangersLog {
         let mut counted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         counted.count += 1;
         let is_due = counted
-            .told_at
-            .is_none_or(|told_at| now.duration_since(told_at) >= STRANGERS_LOG_EVERY);
+            .logged_at
+            .is_none_or(|logged_at| now.duration_since(logged_at) >= STRANGERS_LOG_EVERY);
         if !is_due {
             return None;
         }
-        counted.told_at = Some(now);
+        counted.logged_at = Some(now);
         Some(std::mem::take(&mut counted.count))
     }
 
@@ -211,8 +212,8 @@ impl Tunnel {
     }
 
     /// Waits until a session through this tunnel can no longer connect: the server has other
-    /// credentials for this robot, or shows a certificate that the robot does not trust. Another tunnel
-    /// gets them, or tells of it.
+    /// credentials for this robot, or shows a certificate that the robot does not trust. Another
+    /// tunnel gets them, or tells of it.
     pub async fn stale(&self) {
         self.stale.cancelled().await;
     }
@@ -319,8 +320,8 @@ async fn join(local: TcpStream, shared: &Shared, first: Vec<u8>) {
 async fn reconnect(shared: &Shared, first: &[u8]) -> Result<Connection, DialError> {
     let dialled = shared.dialer.dial(first).await;
     if matches!(dialled, Err(DialError::Distrusted(_))) {
-        // The session cannot come back by what this tunnel trusts. Opening another one tells of it, so
-        // that the robot asks for a certificate of the authority that there is now.
+        // The session cannot come back by what this tunnel trusts. Opening another one tells of it,
+        // so that the robot asks for a certificate of the authority that there is now.
         shared.stale.cancel();
     }
     let (connection, credentials) = dialled?;

@@ -22,12 +22,12 @@ export interface Scene {
   unconfirmed: ReadonlySet<string>;
   friction: Raster<{ cell: Cell }> | null;
   draft: Draft | null;
-  /** The mission that is looked at: its way as it was planned, as far as that is known, and driven. */
+  /** The mission that is looked at: its path as it was planned, as far as that is known, and driven. */
   driven: { asked: Trajectory; planned: PointM[]; points: PointM[]; moment: Moment | null } | null;
-  /** The smooth way of what is drawn, by its dry run. */
+  /** The smooth path of what is drawn, by its dry run. */
   dryRun: PointM[];
-  /** The smooth way of a mission, once it is known. */
-  wayOf(mission: Mission): PointM[] | null;
+  /** The smooth path of a mission, once it is known. */
+  pathOf(mission: Mission): PointM[] | null;
   selected: string | null;
   showTerrains: boolean;
   showFence: boolean;
@@ -213,8 +213,8 @@ function drawPaths(context: CanvasRenderingContext2D, camera: Camera, scene: Sce
     context.globalAlpha = isWaiting ? 0.4 : mission.robot === scene.selected ? 1 : 0.6;
     context.lineWidth = mission.robot === scene.selected ? 2 : 1.25;
     context.strokeStyle = palette.planned;
-    const way = scene.wayOf(mission);
-    if (way) trace(context, camera, way);
+    const path = scene.pathOf(mission);
+    if (path) trace(context, camera, path);
     else traceTrajectory(context, camera, mission.trajectory);
     context.stroke();
     if ('waypoints' in mission.trajectory && !isWaiting && mission.trajectory.waypoints.points.length <= 200) {

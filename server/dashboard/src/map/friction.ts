@@ -66,10 +66,10 @@ export const RANGES: Record<Quantity, Range> = {
   },
 };
 
-/** Relative deviation up to which a value keeps its colour, and from which it is grey. */
+/** Relative standard deviation up to which a value keeps its colour, and from which it is grey. */
 const SURE = 0.05;
 const UNSURE = 0.5;
-/** Relative deviation from which a cell is hatched. */
+/** Relative standard deviation from which a cell is hatched. */
 export const HATCHED = 0.25;
 /** Where a value stands in its range, 0 to 1. */
 export function share(range: Range, value: number): number {

@@ -19,7 +19,7 @@ test('a robot is between its points by time, stands in a pause, and is nowhere b
   expect([track.from_s, track.to_s]).toEqual([0, 11]);
 });
 
-test('the error is the distance from the planned way, and unknown without one', () => {
+test('the error is the distance from the planned path, and unknown without one', () => {
   const beside = line.map(({ x_m, y_m }) => ({ x_m, y_m: y_m + 0.1 }));
   const track = new Track(beside, [0, 4, 6], line);
   expect(track.errorAt(2)).toBeCloseTo(0.1);

@@ -141,7 +141,7 @@ export class Editor {
     }
   }
 
-  putAway(): void {
+  discard(): void {
     clearTimeout(this.#due);
     this.purpose = null;
     this.draft = null;

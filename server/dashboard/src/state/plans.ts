@@ -1,14 +1,14 @@
-// The smooth ways of active missions, which the server plans on request. They change when their
+// The smooth paths of active missions, which the server plans on request. They change when their
 // robot says from where it planned, and with the revision. Not reactive: the map draws them.
 import type { Mission, PlannedPath } from '../api/schema';
 import { ask } from '../api/client';
 import type { PointM } from '../map/camera';
 
-/** Ways that are kept; planning costs the server time, and a map with more is read by nobody. */
-const WAYS_MAX = 20;
+/** Paths that are kept; planning costs the server time, and a map with more is read by nobody. */
+const PATHS_MAX = 20;
 
 export class Plans {
-  readonly #ways = new Map<string, PointM[] | null>();
+  readonly #paths = new Map<string, PointM[] | null>();
 
   constructor(readonly changed: () => void) {}
 
@@ -17,12 +17,12 @@ export class Plans {
     // Until its robot has said from where it comes, a circle is drawn exactly by what was asked for.
     if ('circle' in mission.trajectory && !mission.plan?.begin) return null;
     const key = keyOf(mission);
-    const known = this.#ways.get(key);
-    if (known !== undefined || this.#ways.size >= WAYS_MAX) return known ?? null;
-    this.#ways.set(key, null);
+    const known = this.#paths.get(key);
+    if (known !== undefined || this.#paths.size >= PATHS_MAX) return known ?? null;
+    this.#paths.set(key, null);
     void ask<PlannedPath>(`/v1/missions/${mission.id}/path`).then(
       (path) => {
-        this.#ways.set(key, path.points);
+        this.#paths.set(key, path.points);
         this.changed();
       },
       // The straight lines between its points stay.
@@ -31,10 +31,10 @@ export class Plans {
     return null;
   }
 
-  /** Forgets the ways of all other missions. */
+  /** Forgets the paths of all other missions. */
   keep(missions: Mission[]): void {
     const kept = new Set(missions.map(keyOf));
-    for (const key of this.#ways.keys()) if (!kept.has(key)) this.#ways.delete(key);
+    for (const key of this.#paths.keys()) if (!kept.has(key)) this.#paths.delete(key);
   }
 }
 

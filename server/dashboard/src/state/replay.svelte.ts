@@ -26,7 +26,7 @@ export class Replay {
     const { points, times_s } = detail.driven ?? { points: [], times_s: undefined };
     this.tolerance_m = detail.driven?.tolerance_m ?? 0;
     this.track = Track.isTimed(points, times_s) ? new Track(points, times_s, plan?.points ?? []) : null;
-    // The whole way is shown first.
+    // The whole path is shown first.
     this.time_s = this.track?.to_s ?? 0;
   }
 

@@ -1,5 +1,5 @@
 // Who is signed in, and how the page looks to them.
-import type { OidcSignIn, Right, Session, SignInWays, SignedOut } from '../api/schema';
+import type { OidcSignIn, Right, Session, SignInMethods, SignedOut } from '../api/schema';
 import { Problem, ask, sentence, whenSignedOut } from '../api/client';
 import { may } from '../rights';
 
@@ -56,7 +56,7 @@ class SignedIn {
   /** Asks how people may sign in; a token is a way whatever the answer. */
   async lookForWays(): Promise<void> {
     try {
-      this.oidc = (await ask<SignInWays>('/v1/sign-in')).oidc ?? null;
+      this.oidc = (await ask<SignInMethods>('/v1/sign-in')).oidc ?? null;
     } catch {
       this.oidc = null;
     }

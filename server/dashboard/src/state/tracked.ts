@@ -3,7 +3,7 @@ import type { Robot } from '../api/schema';
 
 /** Most points of a trail. */
 export const TRAIL_POINTS = 200;
-/** Way between two points of a trail, metres. */
+/** Distance between two points of a trail, metres. */
 const TRAIL_STEP_M = 0.08;
 /** How far back curves go, seconds. */
 export const CURVE_SPAN_S = 300;

@@ -35,7 +35,7 @@ export class View {
   isWhole = $state(true);
   detail = $state.raw<MissionDetail | null>(null);
   detailProblem = $state<string | null>(null);
-  /** The smooth way of the mission that is looked at, once it is known. */
+  /** The smooth path of the mission that is looked at, once it is known. */
   plan = $state.raw<PlannedPath | null>(null);
   /** Its time line, once it has ended. */
   replay = $state.raw<Replay | null>(null);

@@ -83,7 +83,7 @@ async function measure(): Promise<Frames> {
       draft: null,
       driven: null,
       dryRun: [],
-      wayOf: () => null,
+      pathOf: () => null,
       selected: 'rover-1',
       showTerrains: true,
       showFence: true,

@@ -18,7 +18,7 @@ use crate::friction::index::{Contribution, SiteMap};
 
 /// Most cells that one question about visits looks at.
 const LOOKED_AT_MAX: f64 = 262_144.0;
-/// Deviation of θ over θ of one ordinary visit by one robot, with the robot's own bias.
+/// Standard deviation of θ over θ of one ordinary visit by one robot, with the robot's own bias.
 const VISIT_DEVIATION_RATIO: f64 = 0.13;
 /// The same of ground of which nothing is known: a factor of three either way.
 const UNKNOWN_DEVIATION_RATIO: f64 = 1.1;
@@ -26,7 +26,8 @@ const UNKNOWN_DEVIATION_RATIO: f64 = 1.1;
 const HOUR_S: i64 = 3_600;
 
 impl App {
-    /// Cells of a box in which a visit would shrink the deviation of θ most, the best first.
+    /// Cells of a box in which a visit would shrink the standard deviation of θ most, the best
+    /// first.
     pub async fn visits_worth_most(
         &self,
         site: &SiteId,

@@ -1,8 +1,9 @@
 //! What is known along a path, and the speed that follows.
 //!
-//! Curves are driven with `v² ≤ a_across/κ`, and the robot must be able to stand at the end and to
-//! be as slow as each later piece asks: `v² ≤ v_next² + 2·a_along·Δs`. Both accelerations come from
-//! the traction limit of the piece, a lower bound, through the shares that the robot's own planner uses.
+//! Curves are driven with `v² ≤ lateral_acceleration/κ`, and the robot must be able to stand at the
+//! end and to be as slow as each later piece asks: `v² ≤ v_next² + 2·longitudinal_acceleration·Δs`.
+//! Both accelerations come from the traction limit of the piece, a lower bound, through the shares
+//! that the robot's own planner uses.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -30,9 +31,9 @@ const PIECES_MAX: usize = 100_000;
 const CIRCLE_CORNERS: u32 = 256;
 /// Relative standard deviation of θ above which a place counts as unknown; the estimator's own.
 const DEVIATION_RATIO_MAX: f64 = 0.5;
-/// Cells to either side of a way that say something of the ground under it.
+/// Cells to either side of a path that say something of the ground under it.
 const NEAR_CELLS: i32 = 2;
-/// Most cells near a way that are looked at.
+/// Most cells near a path that are looked at.
 const NEAR_MAX: usize = 20_000;
 
 impl App {
@@ -95,8 +96,8 @@ impl App {
     /// What a robot is told of the ground along a trajectory; `None` when nothing is known of it.
     ///
     /// Cells with several grounds are left out: the robot could not tell them apart. A terrain has
-    /// no higher traction limit on the path than where it is known to be lowest, there or near it: ground that has
-    /// frozen in one cell may have in the next, where nobody has been since.
+    /// no higher traction limit on the path than where it is known to be lowest, there or near it:
+    /// ground that has frozen in one cell may have in the next, where nobody has been since.
     pub(in crate::app) async fn prior_along(
         &self,
         (site, robot): (&SiteId, &RobotId),
@@ -148,7 +149,7 @@ impl App {
                     .or_insert(CellTractionLimit { cell, mu });
                 limit.mu = limit.mu.min(mu);
             }
-            // A robot drives smoothly from corner to corner, so a little beside the way, too.
+            // A robot drives smoothly from corner to corner, so a little beside the path, too.
             for place in cut.iter().chain(&near) {
                 let cell = place.cell;
                 let key = (cell.iy, cell.ix);
@@ -330,7 +331,7 @@ fn near(cut: &[Cut], grid: &Grid) -> Vec<Cut> {
             cells.extend(around(cut.cell.ix).map(|ix| (iy, ix)));
         }
         if cells.len() > NEAR_MAX {
-            // Of a way as long as this, its own cells say enough.
+            // Of a path as long as this, its own cells say enough.
             return Vec::new();
         }
     }
@@ -362,8 +363,8 @@ fn curvature(a: Point, b: Point, c: Point) -> f64 {
     let doubled_area =
         ((b.x_m - a.x_m) * (c.y_m - a.y_m) - (b.y_m - a.y_m) * (c.x_m - a.x_m)).abs();
     let product = ab * bc * ca;
-    let along = (b.x_m - a.x_m) * (c.x_m - b.x_m) + (b.y_m - a.y_m) * (c.y_m - b.y_m);
-    if product <= 0.0 || (along < 0.0 && doubled_area <= 1.0e-12) {
+    let longitudinal = (b.x_m - a.x_m) * (c.x_m - b.x_m) + (b.y_m - a.y_m) * (c.y_m - b.y_m);
+    if product <= 0.0 || (longitudinal < 0.0 && doubled_area <= 1.0e-12) {
         if ab > 0.0 && bc > 0.0 {
             f64::INFINITY
         } else {
@@ -450,14 +451,14 @@ fn set_speeds(pieces: &mut [PathPiece], cut: &[Cut], length_m: f64, model: &Robo
     let mut next_m_s = 0.0_f64;
     let mut next_at_m = length_m;
     for (piece, cut) in pieces.iter_mut().zip(cut).rev() {
-        let along = PlannedModel::longitudinal_traction_m_s2(piece.traction_limit_mu);
-        let along = along.min(limits.linear_acceleration_max_m_s2);
-        let across = PlannedModel::lateral_traction_m_s2(piece.traction_limit_mu);
-        let across = across.min(limits.lateral_acceleration_max_m_s2);
-        let braked = (next_m_s * next_m_s + 2.0 * along * (next_at_m - cut.from_m)).sqrt();
+        let longitudinal = PlannedModel::longitudinal_traction_m_s2(piece.traction_limit_mu);
+        let longitudinal = longitudinal.min(limits.linear_acceleration_max_m_s2);
+        let lateral = PlannedModel::lateral_traction_m_s2(piece.traction_limit_mu);
+        let lateral = lateral.min(limits.lateral_acceleration_max_m_s2);
+        let braked = (next_m_s * next_m_s + 2.0 * longitudinal * (next_at_m - cut.from_m)).sqrt();
         let curve = if cut.curvature_1_m > 0.0 {
             let turn = limits.angular_max_rad_s / cut.curvature_1_m;
-            (across / cut.curvature_1_m).sqrt().min(turn)
+            (lateral / cut.curvature_1_m).sqrt().min(turn)
         } else {
             f64::INFINITY
         };

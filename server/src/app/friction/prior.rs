@@ -84,8 +84,8 @@ impl Classes {
         let plain = known.iter().map(|(theta, _)| theta).sum::<f64>() / count;
         let apart: f64 = known.iter().map(|(theta, _)| (theta - plain).powi(2)).sum();
         let assumed = SPREAD_TERRAINS * (SPREAD_RATIO * plain).powi(2);
-        let spread = (assumed + apart) / (SPREAD_TERRAINS + count - 1.0);
-        let weight = |std_dev: f64| (spread + std_dev * std_dev).recip();
+        let between_variance = (assumed + apart) / (SPREAD_TERRAINS + count - 1.0);
+        let weight = |std_dev: f64| (between_variance + std_dev * std_dev).recip();
         let sum: f64 = known.iter().map(|&(_, std_dev)| weight(std_dev)).sum();
         let theta = known
             .iter()
@@ -95,7 +95,7 @@ impl Classes {
         Some(ClassPrior {
             class: terrain.class,
             theta,
-            std_dev: (spread + sum.recip()).sqrt(),
+            std_dev: (between_variance + sum.recip()).sqrt(),
             terrains,
         })
     }

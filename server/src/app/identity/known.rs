@@ -12,7 +12,7 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 use tokio_util::sync::CancellationToken;
 use tread_api::identity::{Person, Role, Session};
-use tread_api::ids::{HolderId, RobotId, SessionId, SiteId, TokenId};
+use tread_api::ids::{OwnerId, RobotId, SessionId, SiteId, TokenId};
 use tread_api::rights::{Grant, Right, Rights, Scope};
 
 use crate::app::AppError;
@@ -106,8 +106,8 @@ impl Credential {
         }
     }
 
-    /// Whoever it is, as far as a request goes that needs a right: with the places of the grants that
-    /// have this right, and the rights that hold at all of these. `None` if no grant has it.
+    /// Whoever it is, as far as a request goes that needs a right: with the places of the grants
+    /// that have this right, and the rights that hold at all of these. `None` if no grant has it.
     pub fn for_right(self: &Arc<Self>, right: Right) -> Option<Arc<Self>> {
         if !self.grants.are_several() {
             return self.rights.includes(right).then(|| Arc::clone(self));
@@ -244,16 +244,16 @@ impl Credential {
         Err(AppError::OutsideScope(detail))
     }
 
-    /// Whether it may set and end the limits of a holder: of its own, or of any with the right to
+    /// Whether it may set and end the limits of an owner: of its own, or of any with the right to
     /// release what others hold.
-    pub fn may_hold_as(&self, holder: &HolderId) -> bool {
+    pub fn may_hold_as(&self, owner: &OwnerId) -> bool {
         self.rights.includes(Right::ReleaseHold)
-            || (self.rights.includes(Right::Hold) && self.own_holder() == holder.as_str())
+            || (self.rights.includes(Right::Hold) && self.own_name() == owner.as_str())
     }
 
-    /// The name of its own limits: a token's name. A person may be called like a token, so it is their
-    /// identifier.
-    pub fn own_holder(&self) -> String {
+    /// The name of its own limits: a token's name. A person may be called like a token, so it is
+    /// their identifier.
+    pub fn own_name(&self) -> String {
         match &self.person {
             None => self.name.clone(),
             Some(person) => person.id.to_string(),
@@ -261,7 +261,7 @@ impl Credential {
     }
 
     /// Who does something, for people: this token's name always, and behind it the name that its
-    /// holder gave, if it is another one. Nobody acts under a name alone that is not his token's.
+    /// owner gave, if it is another one. Nobody acts under a name alone that is not his token's.
     pub fn said_by(&self, claimed: Option<&str>) -> String {
         match claimed.map(str::trim) {
             None | Some("") => self.name.clone(),
@@ -375,8 +375,8 @@ impl Known {
         self.rechecks.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The turn to look up again who is known; `None` while somebody else does, or for a while after
-    /// it failed.
+    /// The turn to look up again who is known; `None` while somebody else does, or for a while
+    /// after it failed.
     pub(super) fn recheck(&self, now: Duration) -> Option<Recheck<'_>> {
         let mut rechecks = self.rechecks();
         if rechecks.is_under_way || now < rechecks.not_before {
@@ -433,8 +433,8 @@ impl Known {
         inner.credentials.values().any(is_gone)
     }
 
-    /// Knows what was read within a generation, from a time on: who is valid is known, who is not is
-    /// ended. What was read beside an end says nothing, and is read again soon.
+    /// Knows what was read within a generation, from a time on: who is valid is known, who is not
+    /// is ended. What was read beside an end says nothing, and is read again soon.
     pub(super) fn read_again(&self, valid: Valid, generation: u64, began_at: Duration) {
         let mut inner = self.lock();
         if inner.generation != generation {
@@ -604,9 +604,9 @@ mod tests {
 
     #[test]
     fn who_may_hold_alone_holds_by_its_own_name_alone() {
-        let holder = |name: &str| -> HolderId { name.parse().unwrap() };
+        let owner = |name: &str| -> OwnerId { name.parse().unwrap() };
         let operator = credential(time(9));
-        assert!(operator.may_hold_as(&holder("desk")) && operator.may_hold_as(&holder("gate")));
+        assert!(operator.may_hold_as(&owner("desk")) && operator.may_hold_as(&owner("gate")));
         for (rights, own, others) in [
             (vec![Right::Hold], true, false),
             (vec![Right::ReleaseHold], true, true),
@@ -616,8 +616,8 @@ mod tests {
                 rights: rights.into(),
                 ..credential(time(9))
             };
-            assert_eq!(limited.may_hold_as(&holder("desk")), own);
-            assert_eq!(limited.may_hold_as(&holder("gate")), others);
+            assert_eq!(limited.may_hold_as(&owner("desk")), own);
+            assert_eq!(limited.may_hold_as(&owner("gate")), others);
         }
     }
 

@@ -130,7 +130,7 @@ pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppE
         trajectory: mission.trajectory,
         start_within_ms,
         link_policy: mission.link_policy,
-        held: mission.pause_wanted,
+        on_hold: mission.pause_wanted,
     };
     app.counters().offers_sent.one();
     let key = (mission.site, mission.robot);
@@ -218,7 +218,7 @@ pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, Ap
         // It has begun, so its latest start is behind it.
         start_within_ms: None,
         link_policy: row.mission.link_policy,
-        held: row.mission.pause_wanted,
+        on_hold: row.mission.pause_wanted,
     };
     app.counters().offers_sent.one();
     let key = (row.mission.site.clone(), row.mission.robot.clone());

@@ -200,13 +200,13 @@ impl Guard {
             }
             return Err(refusal);
         }
-        match place::others_holder(request, needed.1, who).await {
+        match place::foreign_owner(request, needed.1, who).await {
             None => Ok(()),
-            Some(holder) => {
-                let (right, name, own) = (Right::ReleaseHold, &who.name, who.own_holder());
+            Some(owner) => {
+                let (right, name, own) = (Right::ReleaseHold, &who.name, who.own_name());
                 let detail = format!(
                     "this needs the right `{right}`: `{name}` sets and ends the limit of the \
-                     holder `{own}` alone, not that of `{holder}`"
+                     owner `{own}` alone, not that of `{owner}`"
                 );
                 Err(self.forbidden(Arc::clone(who), detail))
             }
@@ -371,8 +371,9 @@ impl Guard {
     }
 }
 
-/// Ends what goes on after the head of the answer with the token or session that asked for it: a stream
-/// of events closes, and the connection of a download is cut, so that nobody takes a part for the whole.
+/// Ends what goes on after the head of the answer with the token or session that asked for it: a
+/// stream of events closes, and the connection of a download is cut, so that nobody takes a part
+/// for the whole.
 fn end_with(app: &App, subject: Arc<Credential>, cut: Option<Cut>, response: Response) -> Response {
     let body = response.body();
     if body.is_end_stream() || body.size_hint().exact().is_some() {

@@ -14,7 +14,7 @@ use axum::RequestExt as _;
 use axum::extract::{RawPathParams, Request};
 use axum::http::Method;
 use tread_api::ids::{
-    AlertId, HolderId, JoinTokenId, MissionId, RobotId, SessionId, SiteId, TokenId,
+    AlertId, JoinTokenId, MissionId, OwnerId, RobotId, SessionId, SiteId, TokenId,
 };
 use tread_api::rights::Right;
 
@@ -140,22 +140,22 @@ async fn named(request: &mut Request) -> Named {
     named
 }
 
-/// The holder whose limit a request sets or ends, if that is not for whoever asks.
-pub(super) async fn others_holder(
+/// The owner whose limit a request sets or ends, if that is not for whoever asks.
+pub(super) async fn foreign_owner(
     request: &mut Request,
     right: Right,
     who: &Credential,
-) -> Option<HolderId> {
+) -> Option<OwnerId> {
     if right != Right::Hold {
         return None;
     }
     let Named { site, robot, .. } = named(request).await;
     let params = request.extract_parts::<RawPathParams>().await.ok()?;
-    let mut holders = params.iter().filter(|(name, _)| *name == "holder");
-    let holder: HolderId = holders.next()?.1.parse().ok()?;
+    let mut owners = params.iter().filter(|(name, _)| *name == "owner");
+    let owner: OwnerId = owners.next()?.1.parse().ok()?;
     let may_release = |(site, robot)| who.may_at(Right::ReleaseHold, &site, &robot);
-    let is_own = who.may_hold_as(&holder) || site.zip(robot).is_some_and(may_release);
-    (!is_own).then_some(holder)
+    let is_own = who.may_hold_as(&owner) || site.zip(robot).is_some_and(may_release);
+    (!is_own).then_some(owner)
 }
 
 async fn check_query(

@@ -1,8 +1,8 @@
 //! `/v1/sign-in`: how people sign in, and the sign-in at an OpenID provider.
 //!
 //! `…/oidc` sends a browser to the provider and gives it a cookie; the provider sends it back to
-//! `…/oidc/callback`, which opens a session and sends it to the page. There is nothing in either address
-//! that says where a browser goes then.
+//! `…/oidc/callback`, which opens a session and sends it to the page. There is nothing in either
+//! address that says where a browser goes then.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 use serde_json::json;
-use tread_api::identity::SignInWays;
+use tread_api::identity::SignInMethods;
 use tread_api::problem::{ProblemBody, ProblemType};
 use utoipa::IntoParams;
 
@@ -29,10 +29,10 @@ use crate::identity::pending::SIGN_IN_LASTS;
 const SIGNED_IN: &str = "/#signed-in";
 
 /// Get the ways to sign in.
-#[utoipa::path(get, path = "/v1/sign-in", tag = "identity", operation_id = "get_sign_in_ways",
-    responses((status = 200, body = SignInWays)))]
-pub(in crate::http) async fn ways(State(app): State<App>) -> Json<SignInWays> {
-    Json(SignInWays {
+#[utoipa::path(get, path = "/v1/sign-in", tag = "identity", operation_id = "get_sign_in_methods",
+    responses((status = 200, body = SignInMethods)))]
+pub(in crate::http) async fn methods(State(app): State<App>) -> Json<SignInMethods> {
+    Json(SignInMethods {
         token: true,
         oidc: app.oidc_sign_in(),
     })

@@ -138,7 +138,7 @@ impl Ground {
             ("{token}", token),
             ("{session}", &self.session),
             ("{terrain}", "gravel"),
-            ("{holder}", "gate"),
+            ("{owner}", "gate"),
         ];
         let mut filled = path.to_owned();
         for (name, value) in pairs {
@@ -384,8 +384,8 @@ async fn whoever_may_hold_alone_does_not_end_what_another_program_holds() {
     let gate = yard.limited("gate", &[Right::Hold], &[]).await;
     let foreman = yard.limited("foreman", &[Right::ReleaseHold], &[]).await;
     let limits = "/v1/sites/yard/robots/rover-1/limits";
-    let limit = |token: &str, method: Method, holder: &str| {
-        let url = yard.url(&format!("{limits}/{holder}"));
+    let limit = |token: &str, method: Method, owner: &str| {
+        let url = yard.url(&format!("{limits}/{owner}"));
         let body = json!({"for_ms": 500, "hold": true});
         let asked = client(Some(token)).request(method.clone(), url);
         if method == Method::PUT {
@@ -403,7 +403,7 @@ async fn whoever_may_hold_alone_does_not_end_what_another_program_holds() {
         }
     })
     .await;
-    for (token, method, holder, is_refused) in [
+    for (token, method, owner, is_refused) in [
         (&gate, Method::PUT, "gate", false),
         (&gate, Method::PUT, "crane", true),
         (&gate, Method::DELETE, "crane", true),
@@ -411,13 +411,13 @@ async fn whoever_may_hold_alone_does_not_end_what_another_program_holds() {
         (&foreman, Method::DELETE, "crane", false),
         (&gate, Method::DELETE, "gate", false),
     ] {
-        let (status, body) = yard.send(limit(token, method.clone(), holder)).await;
+        let (status, body) = yard.send(limit(token, method.clone(), owner)).await;
         let expected = if is_refused {
             StatusCode::FORBIDDEN
         } else {
             StatusCode::NO_CONTENT
         };
-        assert_eq!(status, expected, "{method} {holder}: {body}");
+        assert_eq!(status, expected, "{method} {owner}: {body}");
         if is_refused {
             let detail = body["detail"].as_str().unwrap();
             assert!(detail.contains("`release_hold`"), "{detail}");
@@ -438,7 +438,7 @@ async fn nobody_gives_more_than_he_has() {
     let of_yard = yard.limited("yard", &Right::ALL, &["yard"]).await;
     let clerk = yard.limited("clerk", &[Right::Administer], &[]).await;
     let holds = [Right::Administer, Right::Hold];
-    let holder = yard.limited("obstacle watch", &holds, &[]).await;
+    let owner = yard.limited("obstacle watch", &holds, &[]).await;
     let give = async |token: &str, body: Value| {
         let asked = client(Some(token)).post(yard.url("/v1/tokens")).json(&body);
         yard.send(asked).await
@@ -461,8 +461,8 @@ async fn nobody_gives_more_than_he_has() {
         (&clerk, json!({"rights": ["administer"]}), 201),
         (&clerk, json!({"rights": ["drive"]}), 403),
         // A token named like another program would end that one's limits.
-        (&holder, json!({"rights": ["hold"]}), 403),
-        (&holder, json!({"rights": ["administer"]}), 201),
+        (&owner, json!({"rights": ["hold"]}), 403),
+        (&owner, json!({"rights": ["administer"]}), 201),
         (&clerk, json!({"role": "operator"}), 403),
         (&clerk, json!({"rights": []}), 422),
         (&clerk, json!({}), 422),
@@ -525,7 +525,8 @@ async fn whoever_administers_a_site_revokes_every_token_that_holds_there_alone_a
         let asked = client(Some(token)).delete(yard.url(&path));
         yard.send(asked).await.0.as_u16()
     };
-    // More rights protect from nobody who administers the place: taking away is what an incident needs.
+    // More rights protect from nobody who administers the place: taking away is what an incident
+    // needs.
     for (name, status) in [
         ("of both", 403),
         ("of all", 403),

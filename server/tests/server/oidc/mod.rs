@@ -69,13 +69,13 @@ async fn start(port: u16) -> Yard {
 
 async fn is_found(yard: &Yard) {
     eventually("the provider is found", async || {
-        let ways = client(None).get(yard.url("/v1/sign-in"));
-        let (status, ways) = yard.send(ways).await;
+        let paths = client(None).get(yard.url("/v1/sign-in"));
+        let (status, paths) = yard.send(paths).await;
         assert_eq!(status, StatusCode::OK);
-        if ways["oidc"]["available"] == true {
+        if paths["oidc"]["available"] == true {
             Ok(())
         } else {
-            Err(ways)
+            Err(paths)
         }
     })
     .await;
@@ -101,7 +101,7 @@ async fn somebody_signs_in_does_what_the_groups_give_and_signs_out() {
     let port = free_port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;
-    let ways = body(
+    let paths = body(
         client(None)
             .get(yard.url("/v1/sign-in"))
             .send()
@@ -111,7 +111,7 @@ async fn somebody_signs_in_does_what_the_groups_give_and_signs_out() {
     .await;
     let wanted = json!({"token": true,
         "oidc": {"label": "the company", "path": "/v1/sign-in/oidc", "available": true}});
-    assert_eq!(ways, wanted);
+    assert_eq!(paths, wanted);
 
     let mut browser = Browser::new(&yard);
     let begun = browser.get("/v1/sign-in/oidc").await;
@@ -249,15 +249,16 @@ async fn a_provider_that_is_down_keeps_nobody_out_who_has_a_token_and_is_found_l
     assert!(answer.headers().contains_key(header::RETRY_AFTER));
     assert_eq!(browser.get("/readyz").await.status(), 200);
     assert_eq!(yard.get_value("/v1/sites").await.0, StatusCode::OK);
-    let ways = body(browser.get("/v1/sign-in").await).await;
-    assert_eq!(ways["oidc"]["available"], false);
+    let paths = body(browser.get("/v1/sign-in").await).await;
+    assert_eq!(paths["oidc"]["available"], false);
 
     let provider = Provider::start(port, &Kind::default()).await;
     is_found(&yard).await;
     let answer = browser.sign_in("anna").await;
     is_signed_in(&mut browser, answer).await;
 
-    // Away again in the midst of a sign-in: who is signed in stays so, the sign-in can be tried again.
+    // Away again in the midst of a sign-in: who is signed in stays so, the sign-in can be tried
+    // again.
     let begun = browser.begin().await;
     let back = browser.at_provider(begun, "adam").await;
     drop(provider);

@@ -55,7 +55,7 @@ const fn switched(
     }
 }
 
-/// The way over ground is of the odometry alone.
+/// The distance over ground is of the odometry alone.
 const WITHOUT_POSE: Configuration = Configuration {
     pose: "",
     ..Configuration::PLAIN
@@ -98,7 +98,7 @@ const ROBOTS: [Planted; 25] = [
     },
     Planted {
         says: "the base takes backwards for positive",
-        lines: &["turn_sign = -1", "ahead_sign = -1"],
+        lines: &["turn_sign = -1", "forward_sign = -1"],
         ..switched(
             "both signs of the command",
             ("flipped", "on"),

@@ -195,7 +195,7 @@ fn shown_by(tokens: &[String]) -> Vec<Check> {
         counted("what it commands and tells", "/MP/", 1 + TOLD.len()),
         counted("what it listens to", "/MS/", 5),
         Check::so(
-            "graph: plan, way driven, friction and diagnostics by topic and type",
+            "graph: plan, driven path, friction and diagnostics by topic and type",
             TOLD.iter().all(|told| of_agent(told) == 1),
         ),
         Check::so(

@@ -1,7 +1,7 @@
-//! How old drive commands are at a robot behind a narrow link that bulk fills: messages to the robot
-//! in the clear, and by TLS the robot's own full outbox.
+//! How old drive commands are at a robot behind a narrow link that bulk fills: messages to the
+//! robot in the clear, and by TLS the robot's own full outbox.
 //!
-//! The commands go the whole way: WebSocket, server, zenoh, link, agent. What the robot says of
+//! The commands go the whole path: WebSocket, server, zenoh, link, agent. What the robot says of
 //! their age is by the server's estimate of the robot's clock, which only makes them look older.
 
 use std::path::Path;

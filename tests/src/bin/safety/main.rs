@@ -3,7 +3,7 @@
 //! One after the other:
 //!
 //! 1. **silence**: drivers on a bad network fall silent, on the bench, to the bit the same for a
-//!    seed; how soon the target is zero after the last valid end, and on how much way the robot
+//!    seed; how soon the target is zero after the last valid end, and over which distance the robot
 //!    comes to rest.
 //! 2. **lease**: random drivers against a model that knows which commands count.
 //! 3. **stop**: a server and real agents that all drive; from the REST call until the answer, which
@@ -95,7 +95,7 @@ fn on_the_bench(trials: u64, steps: u64, seed: u64) -> anyhow::Result<Vec<Check>
         Check::at_most(
             "silence: worst share of that way",
             1.0,
-            hand.worst_way_share,
+            hand.worst_distance_share,
         ),
         Check::at_least(
             "lease: steps of the model",

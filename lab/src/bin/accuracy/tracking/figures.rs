@@ -98,7 +98,7 @@ fn from_the_table(lines: &[Line], checks: &mut Vec<Check>) {
     }
 }
 
-/// From the first second on, never told θ: never worse than the peer, whole run.
+/// From the first second on, never given θ: never worse than the peer, whole run.
 fn before_theta_is_known(courses: &Courses, threads: usize, found: &mut Found) {
     let mut items = Vec::new();
     for (name, course) in courses {
@@ -171,7 +171,7 @@ fn after_entries(trace: &Trace, border_m: f64) -> [f64; 2] {
         }
         if left_m > 0.0 {
             left_m -= before.pose.point().distance_m(now.pose.point());
-            sum += now.cross_m * now.cross_m;
+            sum += now.cross_track_m * now.cross_track_m;
             count += 1.0;
         }
     }

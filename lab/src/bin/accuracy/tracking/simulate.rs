@@ -14,7 +14,7 @@ use tread_lab::bench::{Course, Law, Run, Scenario, TickInput};
 /// Noise of the pose in the noisy runs: 2 cm per axis, 0.01 rad.
 const NOISE_M: f64 = 0.02;
 const NOISE_RAD: f64 = 0.01;
-/// Relative deviation of a map's prior.
+/// Relative standard deviation of a map's prior.
 pub(crate) const PRIOR_DEVIATION: f64 = 0.1;
 
 /// What lies under the robot.
@@ -86,7 +86,7 @@ pub(crate) struct Trace {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Tick {
     pub(crate) time_s: f64,
-    pub(crate) cross_m: f64,
+    pub(crate) cross_track_m: f64,
     pub(crate) pose: Pose,
 }
 
@@ -96,7 +96,7 @@ impl Trace {
         let (mut sum, mut count) = (0.0, 0.0_f64);
         for tick in &self.ticks {
             if tick.time_s >= from_s && tick.time_s < to_s {
-                sum += tick.cross_m * tick.cross_m;
+                sum += tick.cross_track_m * tick.cross_track_m;
                 count += 1.0;
             }
         }
@@ -125,7 +125,7 @@ impl Trace {
         self.ticks
             .iter()
             .filter(|tick| tick.time_s >= from_s)
-            .fold(0.0, |most: f64, tick| most.max(tick.cross_m.abs()))
+            .fold(0.0, |most: f64, tick| most.max(tick.cross_track_m.abs()))
     }
 }
 
@@ -152,7 +152,7 @@ impl Sensors {
     fn sample(&mut self, plant: &Plant) -> SensorSample {
         self.count += 1;
         let noise = self.noise;
-        let mut gauss = |deviation: f64| deviation * normal(&mut self.rng);
+        let mut gauss = |std_dev: f64| std_dev * normal(&mut self.rng);
         let (state, seen, torques) = (plant.state(), plant.means(), plant.wheel_torques());
         let felt = seen.acceleration;
         let torque_noise = noise.torque_mu * self.model.wheel_radius_m() * self.model.side_load_n();
@@ -163,13 +163,13 @@ impl Sensors {
             },
             gyro_rad_s: seen.yaw_rate_rad_s + gauss(noise.gyro_rad_s),
             acceleration: Some(BodyAcceleration {
-                ahead_m_s2: felt.ahead_m_s2 + gauss(noise.accelerometer_m_s2),
+                forward_m_s2: felt.forward_m_s2 + gauss(noise.accelerometer_m_s2),
                 left_m_s2: felt.left_m_s2 + gauss(noise.accelerometer_m_s2),
             }),
             body_speed_m_s: self
                 .count
                 .is_multiple_of(20)
-                .then(|| state.ahead_m_s + gauss(noise.body_speed_m_s)),
+                .then(|| state.forward_m_s + gauss(noise.body_speed_m_s)),
             wheel_torques: Some(WheelTorques {
                 left_n_m: torques.left_n_m + gauss(torque_noise),
                 right_n_m: torques.right_n_m + gauss(torque_noise),
@@ -221,9 +221,9 @@ pub(crate) fn simulate(case: &Case, law: Law, knowing: Knowing) -> Trace {
                 theta: found.theta,
                 std_dev: found.std_dev,
             });
-        let claim = |factor: f64, deviation: f64| ThetaKnowledge {
+        let claim = |factor: f64, std_dev: f64| ThetaKnowledge {
             theta: factor * here.theta(),
-            std_dev: deviation * factor * here.theta(),
+            std_dev: std_dev * factor * here.theta(),
         };
         let knowledge = match knowing {
             Knowing::Nothing => None,
@@ -236,9 +236,9 @@ pub(crate) fn simulate(case: &Case, law: Law, knowing: Knowing) -> Trace {
             }
             Knowing::Own | Knowing::Wrong { .. } => own,
         };
-        let mut gauss = |deviation: f64| {
+        let mut gauss = |std_dev: f64| {
             let drawn = normal(&mut pose_rng);
-            if case.noisy { deviation * drawn } else { 0.0 }
+            if case.noisy { std_dev * drawn } else { 0.0 }
         };
         let pose_error = Pose {
             x_m: gauss(NOISE_M),
@@ -266,7 +266,7 @@ pub(crate) fn simulate(case: &Case, law: Law, knowing: Knowing) -> Trace {
         };
         ticks.push(Tick {
             time_s,
-            cross_m: output.cross_m,
+            cross_track_m: output.cross_track_m,
             pose,
         });
     }

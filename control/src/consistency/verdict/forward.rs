@@ -1,4 +1,4 @@
-//! The speed ahead, and to the left: wheels, odometry over ground, and position fixes.
+//! The forward speed, and to the left: wheels, odometry over ground, and position fixes.
 
 use super::axis::{Axis, Tolerance, finding, kind_of};
 use super::wheels::{self, WHEELS, WITNESSED};
@@ -8,10 +8,10 @@ use crate::consistency::fixes::Seen;
 use crate::consistency::history::Means;
 use crate::consistency::{Kind, Subject};
 
-const AXIS: Axis = Axis::Ahead;
+const AXIS: Axis = Axis::Forward;
 /// What a position may differ by from odometry, wheels and command, which say the same.
 const ALONE: Tolerance = Tolerance {
-    share_ahead: 0.08,
+    forward_share: 0.08,
     ..WITNESSED
 };
 /// By how much wheels must be nearer to the fixes than odometry is, beside noise.
@@ -43,9 +43,9 @@ pub(super) fn look(
             continue;
         };
         is_seen = true;
-        error_m_s = error_m_s.or(Some(seen.ahead_error_m_s));
+        error_m_s = error_m_s.or(Some(seen.forward_error_m_s));
         let wheels = means.wheels.linear_m_s;
-        let position = wheels + seen.ahead_error_m_s;
+        let position = wheels + seen.forward_error_m_s;
         if let Some(odometry) = means.odometry_m_s.filter(|_| view.uses.odometry)
             && !agrees_with_position(view, recent, seen, &means, odometry)
         {
@@ -57,13 +57,13 @@ pub(super) fn look(
         }
         let commanded = view.commanded(seen);
         let (slack, share) = wheels::slack(view, AXIS, wheels, position, &commanded);
-        let noise = share * seen.noise_m_s + 0.3 * recent.ahead_change;
-        if seen.ahead_error_m_s.abs() > slack + noise {
+        let noise = share * seen.noise_m_s + 0.3 * recent.forward_change;
+        if seen.forward_error_m_s.abs() > slack + noise {
             let odometry = means.odometry_m_s.filter(|_| view.uses.odometry);
             let is_seconded = odometry
                 .is_some_and(|said| (said - wheels).abs() <= AXIS.slack(WITNESSED, said, wheels));
             if is_seconded {
-                // Not the wheels then: odometry and fixes will be told apart.
+                // Not the wheels then: odometry and fixes will be distinguished.
                 return false;
             }
             wheels::against_body(view, position, wheels, &commanded, AXIS, verdicts);
@@ -82,7 +82,7 @@ pub(super) fn look(
     };
     let (wheels, commanded) = (recent.means.wheels.linear_m_s, &recent.commanded);
     let (slack, _) = wheels::slack(view, AXIS, wheels, odometry, commanded);
-    if (odometry - wheels).abs() <= slack + recent.ahead_change {
+    if (odometry - wheels).abs() <= slack + recent.forward_change {
         return true;
     }
     if AXIS.obeys(wheels, commanded) {
@@ -115,14 +115,14 @@ fn agrees_with_position(
     odometry: f64,
 ) -> bool {
     let wheels = means.wheels.linear_m_s;
-    let position = wheels + seen.ahead_error_m_s;
+    let position = wheels + seen.forward_error_m_s;
     let at = |at_s: f64| {
         let means = view.history.means(at_s - INSTANT_S, at_s);
         means.map_or(wheels, |means| means.wheels.linear_m_s)
     };
     let span_s = seen.to_s - seen.from_s;
     let lag = ODOMETRY_LAG_S * (at(seen.to_s) - at(seen.from_s)).abs() / span_s;
-    let change = 0.3 * recent.ahead_change;
+    let change = 0.3 * recent.forward_change;
     // A robot that slides and turns goes ahead by what it slid to the left before.
     let turned = (means.gyro_rad_s.abs() * span_s).min(1.0);
     let noise_m_s = seen.odometry_noise_m_s + turned * seen.left_error_m_s.abs();
@@ -140,7 +140,7 @@ fn agrees_with_position(
             > AXIS.slack(ALONE, odometry, position) + ALONE_NOISE_RATIO * noise_m_s + change + lag;
     let is_witnessed = (odometry - wheels).abs()
         > AXIS.slack(WITNESSED, odometry, wheels) + change + lag
-        && seen.odometry_error_m_s.abs() - seen.ahead_error_m_s.abs()
+        && seen.odometry_error_m_s.abs() - seen.forward_error_m_s.abs()
             > WITNESSED_MIN_M_S + noise_m_s;
     !(is_witnessed || is_alone)
 }
@@ -148,12 +148,12 @@ fn agrees_with_position(
 /// Odometry and fixes contradict each other: names the wrong one, or both.
 fn blame(view: &View<'_>, seen: &Seen, means: &Means, odometry: f64, verdicts: &mut Verdicts) {
     let wheels = means.wheels.linear_m_s;
-    let position = wheels + seen.ahead_error_m_s;
+    let position = wheels + seen.forward_error_m_s;
     let commanded = view.commanded(seen);
     let witnesses = Witnesses {
         by_wheels: view.uses.wheels.then_some((
-            (seen.odometry_error_m_s - seen.ahead_error_m_s).abs(),
-            seen.ahead_error_m_s.abs(),
+            (seen.odometry_error_m_s - seen.forward_error_m_s).abs(),
+            seen.forward_error_m_s.abs(),
         )),
         slack: AXIS.slack(WHEELS, wheels, odometry.abs().min(position.abs())),
         noise: seen.noise_m_s,

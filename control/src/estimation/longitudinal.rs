@@ -27,7 +27,7 @@ pub(super) const STEP_S: f64 = 0.05;
 const UNKNOWN_M2_S2: f64 = 1.0;
 /// Rim speed up to which wheels stand, metres per second.
 const STANDING_M_S: f64 = 3.0e-3;
-/// Deviation of a standing robot's speed, metres per second.
+/// Standard deviation of a standing robot's speed, metres per second.
 const STANDING_NOISE_M_S: f64 = 1.0e-3;
 /// Turn rate below which a robot drives straight, radians per second.
 const TURNING_MIN_RAD_S: f64 = 1.0e-3;
@@ -38,7 +38,7 @@ const STANDING_STEPS: u32 = 3;
 const STILL: Moment = Moment {
     apart: 0.0,
     turn_rad_s: 0.0,
-    ahead_mu: 0.0,
+    longitudinal_mu: 0.0,
     weight: 1.0,
 };
 
@@ -53,9 +53,9 @@ struct Step {
     harmonic_m_s: f64,
     force_m_s: f64,
     rim_difference_m_s: f64,
-    ahead_m_s2: f64,
+    forward_m_s2: f64,
     /// Acceleration times the time since the step's start.
-    ahead_late_m_s: f64,
+    forward_late_m_s: f64,
     gyro_rad_s: f64,
     /// Speed of the slower side, summed.
     slower_m_s: f64,
@@ -91,7 +91,7 @@ struct Sideways {
 
 /// The filter.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct AlongFilter {
+pub(super) struct LongitudinalFilter {
     step: Step,
     speed_m_s: f64,
     variance: f64,
@@ -108,7 +108,7 @@ pub(super) struct AlongFilter {
 /// Rows of one step: wheels, body speed or standing, and the gyro of a standing robot.
 pub(super) type Rows = [Option<Row>; 3];
 
-impl AlongFilter {
+impl LongitudinalFilter {
     pub(super) fn new() -> Self {
         Self {
             step: Step::default(),
@@ -147,13 +147,13 @@ impl AlongFilter {
             step.usable += 1.0;
             step.wheels_m_s += rims.sign * (1.0 + 0.25 * turn_m_s * gap) / inverse;
             step.harmonic_m_s += rims.sign / inverse;
-            step.force_m_s += acceleration.ahead_m_s2 / GRAVITY_M_S2 / inverse;
+            step.force_m_s += acceleration.forward_m_s2 / GRAVITY_M_S2 / inverse;
             step.rim_difference_m_s +=
                 radius_m * (sample.wheel_speeds.right_rad_s - sample.wheel_speeds.left_rad_s);
             step.slower_m_s += rims.left_m_s.min(rims.right_m_s);
         }
-        step.ahead_m_s2 += acceleration.ahead_m_s2;
-        step.ahead_late_m_s += acceleration.ahead_m_s2 * (step.duration_s + 0.5 * dt_s);
+        step.forward_m_s2 += acceleration.forward_m_s2;
+        step.forward_late_m_s += acceleration.forward_m_s2 * (step.duration_s + 0.5 * dt_s);
         step.gyro_rad_s += sample.gyro_rad_s;
         step.duration_s += dt_s;
         if let Some(body_m_s) = sample.body_speed_m_s {
@@ -167,21 +167,21 @@ impl AlongFilter {
     fn finish(&mut self, model: &RobotModel, noise: &SensorNoise, bound: &SlipBound) -> Rows {
         let step = std::mem::take(&mut self.step);
         let count = step.samples;
-        let ahead_m_s2 = step.ahead_m_s2 / count;
+        let forward_m_s2 = step.forward_m_s2 / count;
         let gyro_rad_s = step.gyro_rad_s / count;
         let sideways = Sideways {
             theta: bound.theta,
             bend: sideways_bend(&step, gyro_rad_s, model, bound.theta, bound.curvature),
         };
-        self.predict(&step, ahead_m_s2, gyro_rad_s, noise, sideways);
+        self.predict(&step, forward_m_s2, gyro_rad_s, noise, sideways);
         let mut rows: Rows = [None; 3];
-        let gained_m_s2 = ahead_m_s2 - std::mem::replace(&mut self.last_ahead_m_s2, ahead_m_s2);
+        let gained_m_s2 = forward_m_s2 - std::mem::replace(&mut self.last_ahead_m_s2, forward_m_s2);
         let is_standing = (step.rim_m_s / count).abs() < STANDING_M_S;
         self.standing = if is_standing { self.standing + 1 } else { 0 };
         if step.usable >= count {
             rows[0] = self.wheels(
                 &step,
-                (ahead_m_s2, gained_m_s2),
+                (forward_m_s2, gained_m_s2),
                 gyro_rad_s,
                 model,
                 noise,
@@ -201,10 +201,10 @@ impl AlongFilter {
             // The samples were taken off the step's middle.
             let late_s = step.body_time_s / step.body_samples - 0.5 * step.duration_s;
             let mut regressors = Regressors::zeros();
-            regressors[index::AHEAD_OFFSET] = -late_s;
+            regressors[index::LONGITUDINAL_OFFSET] = -late_s;
             rows[1] = Some(self.observe(
                 regressors,
-                step.body_m_s / step.body_samples - ahead_m_s2 * late_s,
+                step.body_m_s / step.body_samples - forward_m_s2 * late_s,
                 noise.body_speed_m_s.powi(2) / step.body_samples,
                 0.0,
             ));
@@ -217,13 +217,13 @@ impl AlongFilter {
     fn predict(
         &mut self,
         step: &Step,
-        ahead_m_s2: f64,
+        forward_m_s2: f64,
         gyro_rad_s: f64,
         noise: &SensorNoise,
         sideways: Sideways,
     ) {
-        let late_m_s = step.ahead_late_m_s / step.samples;
-        let early_m_s = ahead_m_s2 * step.duration_s - late_m_s;
+        let late_m_s = step.forward_late_m_s / step.samples;
+        let early_m_s = forward_m_s2 * step.duration_s - late_m_s;
         let span_s = 0.5 * (self.last_duration_s + step.duration_s);
         let gained_m_s = self.last_share_m_s + early_m_s;
         self.last_share_m_s = late_m_s;
@@ -235,16 +235,16 @@ impl AlongFilter {
             return;
         }
         self.speed_m_s += gained_m_s;
-        self.sensitivity[index::AHEAD_OFFSET] -= span_s;
-        self.sensitivity[index::AHEAD_SCALE] += gained_m_s;
+        self.sensitivity[index::LONGITUDINAL_OFFSET] -= span_s;
+        self.sensitivity[index::LONGITUDINAL_SCALE] += gained_m_s;
         // Between the middles of two steps. Drift follows the acceleration across, which is less
         // than vφ̇ while the drift itself grows.
         let turn_rad_s = 0.5 * (gyro_rad_s + last_gyro_rad_s);
         let turn_rad_s2 = (gyro_rad_s - last_gyro_rad_s) / span_s;
-        let ahead_m_s2 = gained_m_s / span_s;
+        let forward_m_s2 = gained_m_s / span_s;
         let drift_s = sideways.theta * self.speed_m_s / GRAVITY_M_S2;
         let across_m_s2 = self.speed_m_s * turn_rad_s
-            - drift_s * (self.speed_m_s * turn_rad_s2 + 2.0 * ahead_m_s2 * turn_rad_s);
+            - drift_s * (self.speed_m_s * turn_rad_s2 + 2.0 * forward_m_s2 * turn_rad_s);
         let sideways_m_s = span_s * self.speed_m_s * turn_rad_s * across_m_s2 / GRAVITY_M_S2;
         self.sensitivity[index::THETA] -= sideways_m_s;
         self.sensitivity[index::CURVATURE] -= sideways_m_s * sideways.bend[0];
@@ -257,7 +257,7 @@ impl AlongFilter {
     fn wheels(
         &mut self,
         step: &Step,
-        (ahead_m_s2, gained_m_s2): (f64, f64),
+        (forward_m_s2, gained_m_s2): (f64, f64),
         gyro_rad_s: f64,
         model: &RobotModel,
         noise: &SensorNoise,
@@ -269,7 +269,7 @@ impl AlongFilter {
         let turn_m_s = model.track_width_m() * gyro_rad_s;
         let lateral = 0.5 * model.wheelbase_m() * gyro_rad_s.abs() / slower_m_s;
         let turning = 0.5 * (rim_difference_m_s - turn_m_s).abs() / slower_m_s;
-        let driving = bound.theta_most * ahead_m_s2.abs() / GRAVITY_M_S2;
+        let driving = bound.theta_most * forward_m_s2.abs() / GRAVITY_M_S2;
         if lateral.hypot(turning + driving) > bound.slip_max {
             return None;
         }
@@ -287,28 +287,33 @@ impl AlongFilter {
             yaw_rate_rad_s: gyro_rad_s,
             radius_difference: bound.radius_difference * harmonic_m_s.signum(),
         };
-        let ahead_mu = ahead_m_s2 / GRAVITY_M_S2 * harmonic_m_s.signum();
+        let longitudinal_mu = forward_m_s2 / GRAVITY_M_S2 * harmonic_m_s.signum();
         let input = BendInput {
             turn: &turn,
             swing: &[STILL],
             mu: MeanSlip {
-                ahead: ahead_mu,
-                across: harmonic_m_s.abs() * gyro_rad_s / GRAVITY_M_S2,
+                forward: longitudinal_mu,
+                lateral: harmonic_m_s.abs() * gyro_rad_s / GRAVITY_M_S2,
             },
             theta: bound.theta,
             force_m_s,
-            uneven_m_s: |loss: &Loss| harmonic_m_s * loss.ahead,
+            uneven_m_s: |loss: &Loss| harmonic_m_s * loss.forward,
         };
         let (bends, mut bend) = input.bends(model, bound.curvature);
         bends.put(&mut regressors);
         // The measured acceleration is averaged over the step, and so is its offset.
         let felt_noise = (harmonic_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2) / count;
         let rim_noise = 0.5 * (noise.wheel_speed_rad_s * model.wheel_radius_m()).powi(2) / count;
-        regressors[index::AHEAD_OFFSET] = -bound.theta * harmonic_m_s.abs() / GRAVITY_M_S2;
-        let spread = rim_noise + bound.theta.powi(2) * felt_noise;
-        let mut row = self.observe(regressors, step.wheels_m_s / count, spread, felt_noise);
+        regressors[index::LONGITUDINAL_OFFSET] = -bound.theta * harmonic_m_s.abs() / GRAVITY_M_S2;
+        let innovation_variance = rim_noise + bound.theta.powi(2) * felt_noise;
+        let mut row = self.observe(
+            regressors,
+            step.wheels_m_s / count,
+            innovation_variance,
+            felt_noise,
+        );
         // The force makes the sides' slip unequal too, with its noise.
-        let sides = SideSlips::of(&turn, bound.theta * ahead_mu, model);
+        let sides = SideSlips::of(&turn, bound.theta * longitudinal_mu, model);
         let unequal_by_force = 0.25 * sides.apart * sides.apart / sides.mean.max(SLIP_MIN);
         let curvatures = Curvatures::of(bound.curvature);
         let more = curvatures.split(
@@ -332,8 +337,8 @@ impl AlongFilter {
         noise: f64,
         force_noise: f64,
     ) -> Row {
-        let spread = self.variance + noise;
-        let gain = self.variance / spread;
+        let innovation_variance = self.variance + noise;
+        let gain = self.variance / innovation_variance;
         let row = regressors + self.sensitivity;
         let innovation_m_s = response_m_s - self.speed_m_s;
         self.speed_m_s += gain * innovation_m_s;
@@ -342,7 +347,7 @@ impl AlongFilter {
         Row {
             regressors: row,
             response: innovation_m_s,
-            spread,
+            innovation_variance,
             // What is wrong in this row stays in the next ones until it has faded.
             force_noise: force_noise * 2.0 / (2.0 - gain),
             bend: [0.0; 3],
@@ -371,17 +376,20 @@ fn sideways_bend(
         yaw_rate_rad_s: gyro_rad_s,
         radius_difference: 0.0,
     };
-    let across = theta * rim_m_s * gyro_rad_s / GRAVITY_M_S2;
+    let lateral = theta * rim_m_s * gyro_rad_s / GRAVITY_M_S2;
     let curvatures = Curvatures::of(known);
     curvatures.split(curvatures.nodes().map(|curvature| {
         let loss = Loss::of(
             &turn,
             &[STILL],
-            MeanSlip { ahead: 0.0, across },
+            MeanSlip {
+                forward: 0.0,
+                lateral,
+            },
             theta,
             model,
             curvature,
         );
-        (loss.mean + loss.across / across) / loss.left
+        (loss.mean + loss.lateral / lateral) / loss.left
     }))
 }
