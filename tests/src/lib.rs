@@ -11,11 +11,13 @@
 //! * [`damage`]: damages payloads.
 //! * [`light_robot`]: robots without physics, for load.
 //! * [`report`]: figures against their goals, as every report program prints them.
+//! * [`markdown`]: the documentation, to be held against what there is.
 
 pub mod chaos;
 pub mod damage;
 pub mod fleet;
 pub mod light_robot;
+pub mod markdown;
 pub mod ports;
 pub mod process;
 pub mod random;
