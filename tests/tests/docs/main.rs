@@ -1,3 +1,14 @@
-//! What the documentation says is held against what there is: where its links lead.
+//! What the documentation says is held against what there is: where its links lead, whether its
+//! JSON is what the API takes and gives, and whether its settings are read.
+//! `cli/tests/cli/documentation.rs` runs its commands.
 
+#![expect(
+    clippy::unwrap_used,
+    reason = "what the helpers of a test cannot do fails the test"
+)]
+
+mod data;
 mod links;
+mod routes;
+mod schema;
+mod settings;
