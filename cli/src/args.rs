@@ -1,5 +1,7 @@
 //! The words of the command line.
 
+#[cfg(test)]
+mod documented;
 mod examples;
 mod identity;
 mod map;

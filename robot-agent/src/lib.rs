@@ -49,6 +49,6 @@ mod supervisor;
 pub use agent::{Agent, RunningAgent};
 pub use config::AgentConfig;
 pub use control_loop::channels::Fault;
-pub use program::run_from_args;
+pub use program::{command_line, run_from_args};
 pub use recording::{FILE_MIB_RANGE, FILES_RANGE, RecordingConfig};
 pub use supervisor::PartEnded;

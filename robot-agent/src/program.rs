@@ -39,6 +39,11 @@ enum Action {
     Recover(RecoverArgs),
 }
 
+/// The words of the program's command line.
+pub fn command_line() -> clap::Command {
+    <Words as clap::CommandFactory>::command()
+}
+
 /// Runs an agent until it is told to stop by SIGTERM or ctrl-c; the first argument is the
 /// program's name. Sets up logging, so it is for whole processes.
 ///

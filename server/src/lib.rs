@@ -277,6 +277,11 @@ enum Action {
     ForgetCertificates(init::ForgetArgs),
 }
 
+/// The words of the program's command line.
+pub fn command_line() -> clap::Command {
+    <Command as clap::CommandFactory>::command()
+}
+
 /// The whole program with these arguments, the first of which is its name.
 ///
 /// Says on standard error what went wrong, and gives the code to end with: 0 after a stop that

@@ -11,11 +11,14 @@
 //! * [`damage`]: damages payloads.
 //! * [`light_robot`]: robots without physics, for load.
 //! * [`report`]: figures against their goals, as every report program prints them.
+//! * [`markdown`]: the documentation, to be held against what there is.
+//! * [`shell`]: the commands that it shows.
 
 pub mod chaos;
 pub mod damage;
 pub mod fleet;
 pub mod light_robot;
+pub mod markdown;
 pub mod ports;
 pub mod process;
 pub mod random;
@@ -23,4 +26,5 @@ pub mod relay;
 pub mod report;
 pub mod rest;
 pub mod scenario;
+pub mod shell;
 pub mod wait;

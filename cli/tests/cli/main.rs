@@ -6,6 +6,7 @@
 )]
 
 mod authority;
+mod documentation;
 mod drive;
 mod manual;
 mod operator;

@@ -1,0 +1,15 @@
+//! What the documentation says is held against what there is: where its links lead, whether its
+//! JSON is what the API takes and gives, whether its settings are read, and whether its book is
+//! whole. `cli/tests/cli/documentation.rs` runs its commands.
+
+#![expect(
+    clippy::unwrap_used,
+    reason = "what the helpers of a test cannot do fails the test"
+)]
+
+mod book;
+mod data;
+mod links;
+mod routes;
+mod schema;
+mod settings;
