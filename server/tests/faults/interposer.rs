@@ -85,10 +85,15 @@ impl Interposer {
         self.arm(Fault::SyncSlow, 1, false);
     }
 
+    /// How many calls have failed, or were slow, since something was set.
+    pub(crate) fn fired(&self) -> u64 {
+        self.number(3)
+    }
+
     /// Lets everything work again; how many calls have failed.
     pub(crate) fn disarm(&self) -> u64 {
         self.set(0, 0);
-        self.number(3)
+        self.fired()
     }
 }
 

@@ -11,6 +11,8 @@ mod hanging;
 #[cfg(test)]
 mod interposer;
 #[cfg(test)]
+mod joining;
+#[cfg(test)]
 mod lasting;
 #[cfg(test)]
 mod paths;
@@ -29,6 +31,7 @@ mod tests {
     use crate::ground::Ground;
     use crate::hanging;
     use crate::interposer::{Fault, Interposer, run_with_faults};
+    use crate::joining;
     use crate::paths::{PATHS, WritePath};
     use crate::statements;
     use crate::uncertain;
@@ -190,6 +193,15 @@ mod tests {
         let name = "tests::a_token_is_refused_after_its_revocation_whoever_waits_and_whatever_is_heard_of_the_commit";
         match Interposer::loaded() {
             Some(interposer) => uncertain::run(&interposer, uncertain::revoked),
+            None => run_with_faults(name),
+        }
+    }
+
+    #[test]
+    fn a_robot_that_joins_while_the_authority_is_replaced_gets_a_certificate_that_counts() {
+        let name = "tests::a_robot_that_joins_while_the_authority_is_replaced_gets_a_certificate_that_counts";
+        match Interposer::loaded() {
+            Some(interposer) => uncertain::run(&interposer, joining::replaced),
             None => run_with_faults(name),
         }
     }

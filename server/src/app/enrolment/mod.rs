@@ -11,18 +11,18 @@
 //!
 //! What fails is told alike, whatever the cause; the cause is for the audit log and the counters.
 
+mod joining;
 pub mod registry;
 mod revoked_robots;
 mod rotation;
 
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 use tread_api::enrolment::{
-    CreateJoinToken, CreatedJoinToken, EnrolRobot, Enrolment, JOIN_MINUTES_DEFAULT,
-    JOIN_MINUTES_MAX, JoinToken, RenewCertificate, RobotCertificate,
+    CreateJoinToken, CreatedJoinToken, Enrolment, JOIN_MINUTES_DEFAULT, JOIN_MINUTES_MAX,
+    JoinToken, RenewCertificate, RobotCertificate,
 };
 use tread_api::ids::{JoinTokenId, RobotId, SiteId};
 use tread_api::page::Page;
@@ -37,12 +37,10 @@ use super::identity::new_secret;
 use super::identity::quota::Quota;
 use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::{App, AppError, page, site_row};
-use crate::authority::{Authorities, CertificateError, Issued, RobotName, RobotRequest, Trusted};
-use crate::connections::Purpose;
+use crate::authority::{Authorities, CertificateError, Issued, RobotName, RobotRequest};
 use crate::db::enrolments::{Counting, Renewal};
 use crate::db::{self, DbError, Outcome, Tx};
-use crate::identity::attempts::Source;
-use crate::identity::secret::{Kind, Secret};
+use crate::identity::secret::Kind;
 
 /// Most join tokens that can be used at once.
 const JOIN_TOKENS: Quota = Quota {
@@ -357,132 +355,6 @@ impl App {
         Ok(committed.await?)
     }
 
-    /// A robot joins: its join token is used up, and whatever it had before counts no more.
-    ///
-    /// # Errors
-    /// [`EnrolError`]; all but `Request`, `Locked`, `Closed` and `App` look the same from outside.
-    pub async fn enrol_robot(
-        &self,
-        address: IpAddr,
-        request: &EnrolRobot,
-    ) -> Result<Enrolled, EnrolError> {
-        let service = self.service().ok_or(EnrolError::Closed)?;
-        // Whether the request reads says nothing about the token, so it is looked at first.
-        let key = RobotRequest::read(&request.certificate_request).map_err(EnrolError::Request)?;
-        let secret = Secret::read(&request.token).filter(|secret| secret.kind() == Kind::Join);
-        let mut sources = vec![Source::of_address(address)];
-        if let Some(secret) = &secret {
-            sources.push(Source::Prefix(secret.prefix().to_owned()));
-        }
-        let enrolled = match &secret {
-            Some(secret) if self.is_join_token(secret).await? => {
-                self.enrol(service, secret, request.robot.as_ref(), &key)
-                    .await
-            }
-            Some(_) => Err(EnrolError::Unknown),
-            None => Err(EnrolError::Malformed),
-        };
-        match &enrolled {
-            Ok(_) | Err(EnrolError::App(_)) => return enrolled,
-            Err(_refused) => {}
-        }
-        if let Some(left) = self.locked_for(&sources) {
-            return Err(EnrolError::Locked(left));
-        }
-        self.failed(sources);
-        enrolled
-    }
-
-    /// Whether a secret is a join token's, valid or not. What is none takes no turn of those who
-    /// write.
-    async fn is_join_token(&self, secret: &Secret) -> Result<bool, AppError> {
-        let _turn = self.look_up_turn(Purpose::Other).await?;
-        let mut tx = self.db().read("enrolment").await?;
-        let fingerprint = secret.fingerprint();
-        let kept = db::join_tokens::by_lookup(&mut tx, &fingerprint).await?;
-        Ok(kept.is_some_and(|kept| fingerprint.matches(&kept.hash)))
-    }
-
-    async fn enrol(
-        &self,
-        service: &EnrolmentService,
-        secret: &Secret,
-        robot: Option<&RobotId>,
-        key: &RobotRequest,
-    ) -> Result<Enrolled, EnrolError> {
-        let now = self.clock().now();
-        let mut tx = self.db().write("enrolment").await?;
-        let fingerprint = secret.fingerprint();
-        let kept = db::join_tokens::by_lookup(&mut tx, &fingerprint).await?;
-        let kept = kept.filter(|kept| fingerprint.matches(&kept.hash));
-        let token = kept.ok_or(EnrolError::Unknown)?.token;
-        if token.revoked_at.is_some() {
-            return Err(EnrolError::Revoked(token.id));
-        }
-        if token.used_at.is_some() {
-            return Err(EnrolError::Used(token.id));
-        }
-        if token.expires_at <= now {
-            return Err(EnrolError::Expired(token.id));
-        }
-        let robot = match (&token.robot, robot) {
-            (Some(named), Some(asked)) if named != asked => {
-                return Err(EnrolError::OtherRobot(token.id));
-            }
-            (Some(named), _) => named.clone(),
-            (None, Some(asked)) => asked.clone(),
-            (None, None) => return Err(EnrolError::Nameless(token.id)),
-        };
-        let former = db::enrolments::newest(&mut tx, &token.site, &robot).await?;
-        let is_known =
-            former.is_some() || db::robots::is_known(&mut tx, Some(&token.site), &robot).await?;
-        if is_known && token.robot.is_none() {
-            return Err(EnrolError::KnownRobot(token.id));
-        }
-        let robot_count = db::enrolments::robot_count(&mut tx).await?;
-        if former.is_none() && usize::try_from(robot_count).is_ok_and(|count| count >= ROBOTS_MAX) {
-            return Err(EnrolError::App(AppError::TooMany {
-                what: "robots that have joined",
-                count: ROBOTS_MAX,
-            }));
-        }
-        let number = former.map_or(1, |former| former.number.saturating_add(1));
-        let name = RobotName {
-            site: token.site.clone(),
-            robot: robot.clone(),
-            enrolment: number,
-        };
-        let trusted = service.authorities.present();
-        let (certificate, fingerprint) =
-            service.sign(&trusted, key, &name, self.clock().machine_time())?;
-        if !db::join_tokens::use_up(&mut tx, token.id, &robot, now).await? {
-            return Err(EnrolError::Used(token.id));
-        }
-        db::enrolments::revoke(&mut tx, (&token.site, &robot), "a new enrolment", now).await?;
-        let enrolment = Enrolment {
-            site: token.site,
-            robot,
-            number,
-            enrolled_at: now,
-            join_token: token.id,
-            renewed_at: now,
-            expires_at: certificate.expires_at,
-            revoked_at: None,
-            revoked_by: None,
-            authority: Some(trusted.signing().fingerprint().to_owned()),
-        };
-        db::enrolments::insert(&mut tx, &enrolment, &Issued::one(fingerprint)).await?;
-        let ended = self.end_outsider(&mut tx, &enrolment).await?;
-        self.commit_enrolment(tx, &enrolment, ended).await?;
-        self.counters().robots_enrolled.one();
-        let (site, robot) = (&enrolment.site, &enrolment.robot);
-        tracing::info!(robot.id = %robot, "robot `{robot}` joined site `{site}`");
-        Ok(Enrolled {
-            certificate,
-            join_token: token.id,
-        })
-    }
-
     /// A robot of the fleet gets its next certificate.
     ///
     /// # Errors
@@ -542,33 +414,5 @@ impl App {
             .forget(&(name.site.clone(), name.robot.clone()));
         self.counters().certificates_renewed.one();
         Ok(certificate)
-    }
-}
-
-impl EnrolmentService {
-    /// Signs a certificate, and says its fingerprint.
-    fn sign(
-        &self,
-        trusted: &Trusted,
-        key: &RobotRequest,
-        name: &RobotName,
-        now: Timestamp,
-    ) -> Result<(RobotCertificate, String), EnrolError> {
-        let signed = trusted.signing().sign(key, name, now, self.lifetime);
-        let signed = signed.map_err(|cause| {
-            tracing::error!("cannot sign a certificate: {cause:?}");
-            EnrolError::App(AppError::NoRandomness(cause.to_string()))
-        })?;
-        let certificate = RobotCertificate {
-            site: name.site.clone(),
-            robot: name.robot.clone(),
-            enrolment: name.enrolment,
-            certificate: signed.certificate,
-            authority: trusted.bundle_pem(),
-            lifetime_s: u64::try_from(self.lifetime.as_secs()).unwrap_or_default(),
-            expires_at: signed.expires_at,
-            port: self.port,
-        };
-        Ok((certificate, signed.fingerprint))
     }
 }

@@ -134,6 +134,12 @@ async fn a_join_token_counts_once_and_whatever_does_not_count_is_answered_alike(
     ];
     assert_eq!(counted, [3, 1, 1, 1, 2, 1], "{counters:?}");
 
+    // What was refused has not used its token up.
+    for (made, robot) in [(&named, "rover-2"), (&any, "rover-4")] {
+        let (status, got) = enrol(&yard, &secret_of(made), robot, &key).await;
+        assert_eq!(status, StatusCode::CREATED, "{got}");
+    }
+
     // The audit log names the tokens that were refused, and why.
     let named_in_log = |log: &Value, made: &Value, refused: &str| {
         let entries = log["items"].as_array().unwrap();
