@@ -18,7 +18,7 @@ use std::sync::{Arc, PoisonError, RwLock};
 use std::time::Duration;
 
 use openidconnect::core::{
-    CoreAuthenticationFlow, CoreClient, CoreClientAuthMethod, CoreErrorResponseType,
+    CoreAuthenticationFlow, CoreClient, CoreClientAuthMethod, CoreErrorResponseType, CoreJsonWebKey,
 };
 use openidconnect::{
     AuthType, AuthorizationCode, ClientId, ClientSecret, CsrfToken, DiscoveryError, EndSessionUrl,
@@ -336,16 +336,19 @@ impl Provider {
             .id_token()
             .ok_or(ExchangeError::Invalid(InvalidIdToken::Missing))?;
         let access_token = answer.access_token();
-        let expected = |keys| Expected {
-            issuer: &self.issuer,
-            client_id: &self.client_id,
-            nonce: &pending.nonce,
-            access_token,
-            now: self.clock.now(),
-            keys,
+        let looked_at = |keys: &JsonWebKeySet<CoreJsonWebKey>| {
+            let expected = Expected {
+                issuer: &self.issuer,
+                client_id: &self.client_id,
+                nonce: &pending.nonce,
+                access_token,
+                now: self.clock.now(),
+                keys,
+            };
+            verify::claims(id_token, &expected)
         };
         let mut held_against = Arc::clone(&metadata);
-        let mut believed = verify::claims(id_token, &expected(held_against.jwks()));
+        let mut believed = looked_at(held_against.jwks());
         for _ in 1..KEYS_TRIED_MAX {
             let Err(InvalidIdToken::Signature(_)) = &believed else {
                 break;
@@ -356,7 +359,7 @@ impl Provider {
                 break;
             };
             held_against = newer;
-            believed = verify::claims(id_token, &expected(held_against.jwks()));
+            believed = looked_at(held_against.jwks());
         }
         let (subject, mut claims) = believed.map_err(ExchangeError::Invalid)?;
         if claim(&claims, &self.groups_claim).is_none()

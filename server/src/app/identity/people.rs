@@ -35,6 +35,7 @@ use crate::identity::grants::Grants;
 use crate::identity::origin::{Origin, Provenance};
 use crate::identity::pending::{Pending, PendingKey, RANDOM_BYTES};
 use crate::identity::secret::Secret;
+use crate::identity::subject::name_of_person;
 use crate::oidc::{ExchangeError, Provider, SignedInThere};
 
 /// Where a browser is sent to sign in.
@@ -428,10 +429,12 @@ impl App {
         Ok((credential, secret))
     }
 
-    /// A name that no valid token has: people may choose theirs, and are not to be taken for a program.
+    /// A name by which the person is called like no valid token. None is made with such a name any more, but
+    /// one of an earlier version may have it.
     async fn unlike_tokens(&self, name: String, subject: &str) -> Result<String, AppError> {
         let mut tx = self.db().read("identity").await?;
-        let taken = db::tokens::valid_by_name(&mut tx, &name, self.clock().now()).await?;
+        let called = name_of_person(&name);
+        let taken = db::tokens::valid_by_name(&mut tx, &called, self.clock().now()).await?;
         Ok(match taken {
             None => name,
             Some(_) => format!("{name} ({})", cleaned(subject, NAME_MAX)),
