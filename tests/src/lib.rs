@@ -12,6 +12,7 @@
 //! * [`light_robot`]: robots without physics, for load.
 //! * [`report`]: figures against their goals, as every report program prints them.
 //! * [`markdown`]: the documentation, to be held against what there is.
+//! * [`repository`]: its files.
 //! * [`shell`]: the commands that it shows.
 
 pub mod chaos;
@@ -24,6 +25,7 @@ pub mod process;
 pub mod random;
 pub mod relay;
 pub mod report;
+pub mod repository;
 pub mod rest;
 pub mod scenario;
 pub mod shell;

@@ -3,9 +3,10 @@
 
 use std::fmt::Write as _;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use regex::Regex;
+use tread_tests::repository::{files, root};
 
 /// Most exceptions.
 const EXCEPTIONS_MAX: usize = 20;
@@ -14,8 +15,7 @@ const READ: [&str; 10] = [
     "rs", "ts", "svelte", "md", "toml", "json", "py", "mjs", "sh", "yml",
 ];
 /// Folders and files that are made by programs, that must stay as they were, or that name the words.
-const SKIPPED: [&str; 11] = [
-    ".git",
+const SKIPPED: [&str; 9] = [
     ".sqlx",
     "dist",
     "migrations",
@@ -23,30 +23,14 @@ const SKIPPED: [&str; 11] = [
     "package-lock.json",
     "samples",
     "schema.d.ts",
-    "target",
     "terminology.rs",
     "terminology-exceptions.txt",
 ];
 
-fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
-}
-
-fn walk(folder: &Path, found: &mut Vec<PathBuf>) {
-    for entry in fs::read_dir(folder).expect("a folder") {
-        let entry = entry.expect("a readable entry");
-        let (path, name) = (entry.path(), entry.file_name());
-        let name = name.to_string_lossy();
-        if SKIPPED.contains(&&*name) {
-            continue;
-        }
-        let is_read = path.extension().and_then(|end| end.to_str());
-        if path.is_dir() {
-            walk(&path, found);
-        } else if is_read.is_some_and(|end| READ.contains(&end)) {
-            found.push(path);
-        }
-    }
+fn is_read(name: &str) -> bool {
+    let end = Path::new(name).extension().and_then(|end| end.to_str());
+    let is_skipped = name.split('/').any(|part| SKIPPED.contains(&part));
+    !is_skipped && end.is_some_and(|end| READ.contains(&end))
 }
 
 /// The lines of a list: its columns.
@@ -68,12 +52,11 @@ fn words_that_are_no_terms_do_not_come_back() {
     assert!(exceptions.len() <= EXCEPTIONS_MAX);
     let mut unused: Vec<bool> = vec![true; exceptions.len()];
     let root = root();
-    let (mut files, mut faults) = (Vec::new(), String::new());
-    walk(&root, &mut files);
-    assert!(files.len() > 500, "the sources are here");
-    for file in files {
-        let text = fs::read_to_string(&file).unwrap();
-        let name = file.strip_prefix(&root).unwrap().display().to_string();
+    let mut faults = String::new();
+    let names: Vec<String> = files().into_iter().filter(|name| is_read(name)).collect();
+    assert!(names.len() > 500, "the sources are here");
+    for name in names {
+        let text = fs::read_to_string(root.join(&name)).unwrap();
         for (number, line) in text.lines().enumerate() {
             for (pattern, instead) in &patterns {
                 let Some(word) = pattern.find(line) else {

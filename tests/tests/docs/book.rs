@@ -1,6 +1,7 @@
 //! The book that `book/build` makes has every page for readers.
 
-use tread_tests::markdown::{Document, documents, root};
+use tread_tests::markdown::{Document, documents};
+use tread_tests::repository::root;
 
 /// Pages that are for readers of the sources alone.
 const LEFT_OUT: [&str; 1] = ["book/SUMMARY.md"];

@@ -7,7 +7,8 @@
 use std::fmt::Write as _;
 
 use serde_json::Value;
-use tread_tests::markdown::{Block, documents, root};
+use tread_tests::markdown::{Block, documents};
+use tread_tests::repository::root;
 
 use crate::schema;
 

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::{Component, Path, PathBuf};
 
-use tread_tests::markdown::{Document, documents, files, root};
+use tread_tests::markdown::{Document, documents};
+use tread_tests::repository::{files, root};
 
 /// Fewest links and paths that are looked at; with less, the documentation was not found.
 const LOOKED_AT_MIN: usize = 100;

@@ -24,8 +24,8 @@ fn example() -> &'static str {
     let page = include_str!("../../../../docs/ros2.md");
     let (_, after) = page.split_once("<!-- complete example: begin -->").unwrap();
     let (example, _) = after.split_once("<!-- complete example: end -->").unwrap();
-    let text = example.trim().strip_prefix("```toml\n").unwrap();
-    text.strip_suffix("```").unwrap()
+    let (_, text) = example.split_once("```toml\n").unwrap();
+    text.trim_end().strip_suffix("```").unwrap()
 }
 
 fn of_example(text: &str) -> Result<Ros2Settings, String> {

@@ -1,0 +1,138 @@
+use super::*;
+
+pub(super) fn load(text: &str) -> Result<Config, ConfigError> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("tread.toml");
+    std::fs::write(&path, text).unwrap();
+    Config::load(&ServerArgs {
+        config: Some(path),
+        ..ServerArgs::default()
+    })
+}
+
+#[test]
+fn an_unknown_key_is_named_with_its_file_and_line() {
+    let error = load("site = \"yard\"\nhtpp = \"127.0.0.1:1\"\n")
+        .unwrap_err()
+        .to_string();
+    assert!(error.contains("tread.toml"), "{error}");
+    assert!(error.contains("line 2"), "{error}");
+    assert!(error.contains("htpp"), "{error}");
+    let nested = load("[friction]\nbias = 1.0\n").unwrap_err().to_string();
+    assert!(
+        nested.contains("line 2") && nested.contains("bias"),
+        "{nested}"
+    );
+}
+
+#[test]
+fn a_value_that_is_not_possible_is_named() {
+    let error = load("site = \"A B\"\n").unwrap_err().to_string();
+    assert!(error.contains("line 1") && error.contains("A B"), "{error}");
+    let nan = load("[friction]\nrobot_bias_ratio = nan\n")
+        .unwrap_err()
+        .to_string();
+    assert!(nan.contains("friction.robot_bias_ratio"), "{nan}");
+}
+
+#[test]
+fn how_long_measurements_are_kept_is_bounded() {
+    let kept = load("[retention]\nsegments_days = 7").unwrap().retention;
+    assert_eq!(kept.segments_days, 7);
+    assert_eq!(kept.segments_max, RetentionConfig::default().segments_max);
+    for wrong in [
+        "segments_days = 0",
+        "segments_max = 10",
+        "segments_hours = 1",
+    ] {
+        let error = load(&format!("[retention]\n{wrong}")).unwrap_err();
+        assert!(error.to_string().contains("segments_"), "{error}");
+    }
+}
+
+#[test]
+fn a_normalisation_names_its_reference_and_its_ratios() {
+    let id = "11111111-1111-4111-8111-111111111111";
+    let text = |ratio: &str| {
+        format!("[normalisations.all]\nreference = \"{id}\"\nratios = {{ \"{id}\" = {ratio} }}\n")
+    };
+    let declared = load(&text("1.3")).unwrap().normalisations;
+    assert_eq!(declared[0].name, "all");
+    for bad in ["0.0", "-1.0", "nan"] {
+        let error = load(&text(bad)).unwrap_err().to_string();
+        assert!(error.contains("ratios"), "{error}");
+    }
+}
+
+#[test]
+fn an_address_beyond_this_machine_is_refused_with_a_sentence() {
+    for text in [
+        "http = \"0.0.0.0:8080\"",
+        "zenoh = \"192.0.2.7:7447\"",
+        "http = \"[::]:1\"",
+    ] {
+        let error = load(text).unwrap_err().to_string();
+        assert!(error.contains("other machines can reach"), "{error}");
+    }
+    assert!(load("http = \"[::1]:8080\"").is_ok());
+}
+
+#[test]
+fn with_a_certificate_the_rest_api_may_be_reached_and_the_rest_may_not() {
+    let tls = "[tls]\ncertificate = \"c.pem\"\nkey = \"k.pem\"";
+    let config = load(&format!("http = \"0.0.0.0:443\"\n{tls}")).unwrap();
+    assert!(config.names().is_tls);
+    let robots = "[robots]\nauthority = \"ca\"\n";
+    assert!(load(&format!("zenoh = \"0.0.0.0:1\"\n{robots}")).is_ok());
+    for wrong in ["names = [\"a b\"]", "certificate_s = 4"] {
+        let error = load(&format!("{robots}{wrong}")).unwrap_err();
+        assert!(error.to_string().contains("robots."), "{error}");
+    }
+    for key in ["zenoh", "metrics"] {
+        let error = load(&format!("{key} = \"0.0.0.0:1\"\n{tls}")).unwrap_err();
+        assert!(
+            error.to_string().contains("other machines can reach"),
+            "{error}"
+        );
+    }
+    let half = load("[tls]\ncertificate = \"c.pem\"").unwrap_err();
+    assert!(half.to_string().contains("key"), "{half}");
+}
+
+#[test]
+fn a_trusted_proxy_is_an_address_or_a_network() {
+    let config = load("[web]\ntrusted_proxies = [\"127.0.0.1\", \"fd00::/8\"]").unwrap();
+    assert_eq!(config.web.trusted_proxies.len(), 2);
+    let said = load("[web]\ntrusted_proxies = [\"proxy\"]")
+        .unwrap_err()
+        .to_string();
+    assert!(
+        said.contains("line 2") && said.contains("`proxy` is no address"),
+        "{said}"
+    );
+}
+
+#[test]
+fn an_origin_that_is_none_is_named() {
+    let error = load("[web]\nallowed_origins = [\"*\"]").unwrap_err();
+    let said = error.to_string();
+    assert!(
+        said.contains("line 2") && said.contains("`*` is no origin"),
+        "{said}"
+    );
+}
+
+#[test]
+fn a_flag_wins_over_the_file_and_the_file_over_the_built_in_value() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("tread.toml");
+    std::fs::write(&path, "http = \"127.0.0.1:1\"\nzenoh = \"127.0.0.1:2\"").unwrap();
+    let args = ServerArgs {
+        config: Some(path),
+        http: Some("127.0.0.1:3".parse().unwrap()),
+        ..ServerArgs::default()
+    };
+    let config = Config::load(&args).unwrap();
+    assert_eq!((config.http.port(), config.zenoh.port()), (3, 2));
+    assert_eq!(config.site.as_str(), SITE_DEFAULT);
+}
