@@ -9,10 +9,12 @@
 //! of the crate `openidconnect`; what an ID token must say is in [`verify`].
 
 mod http;
+#[cfg(test)]
+mod rollover_tests;
 pub mod verify;
 
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::sync::{Arc, PoisonError, RwLock};
 use std::time::Duration;
 
 use openidconnect::core::{
@@ -36,6 +38,11 @@ use crate::identity::pending::Pending;
 /// The provider's keys are asked for again this often at the most, however many ID tokens are signed by a
 /// key that is not known.
 pub const KEYS_REFRESH_INTERVAL: Duration = Duration::from_secs(10);
+/// The same after a question that was not answered.
+const KEYS_RETRY_INTERVAL: Duration = Duration::from_secs(1);
+/// Sets of keys that one ID token is held against: those that were known, those that somebody else brought
+/// meanwhile, and those that were asked for because of it.
+const KEYS_TRIED_MAX: usize = 3;
 /// Longest ID token that is kept for the sign-out, bytes.
 const ID_TOKEN_MAX: usize = 16 * 1_024;
 
@@ -97,6 +104,9 @@ pub enum ExchangeError {
     /// It did not answer.
     #[error("the OpenID provider does not answer")]
     Unanswered(#[source] Box<dyn std::error::Error + Send + Sync>),
+    /// It did not say by which keys it signs, a moment ago or now.
+    #[error("the OpenID provider does not say which keys it has")]
+    KeysUnknown,
     /// It takes the code from nobody, or not from us.
     #[error("the OpenID provider refuses the code: {0}")]
     Refused(String),
@@ -140,7 +150,26 @@ pub struct Provider {
     http: HttpClient,
     clock: Clock,
     known: RwLock<Option<Arc<ProviderMetadataWithLogout>>>,
-    keys_asked_at: Mutex<Option<Duration>>,
+    /// Whoever asks the provider for its keys holds this until they are known: the keys that were asked for
+    /// last are those that count, and nobody is refused while better ones are on their way.
+    keys_turn: tokio::sync::Mutex<KeysAsked>,
+}
+
+/// What became of the last question for the provider's keys, and when it was asked; nothing at first.
+#[derive(Debug, Default)]
+struct KeysAsked(Option<(Duration, bool)>);
+
+impl KeysAsked {
+    /// Whether the last question was answered, if it is too early for another.
+    fn recently(&self, now: Duration) -> Option<bool> {
+        let (at, is_answered) = self.0?;
+        let interval = if is_answered {
+            KEYS_REFRESH_INTERVAL
+        } else {
+            KEYS_RETRY_INTERVAL
+        };
+        (now.saturating_sub(at) < interval).then_some(is_answered)
+    }
 }
 
 impl std::fmt::Debug for Provider {
@@ -177,7 +206,7 @@ impl Provider {
             http: HttpClient::new(config.ca.as_deref(), config.issuer.starts_with("https:"))?,
             clock,
             known: RwLock::default(),
-            keys_asked_at: Mutex::default(),
+            keys_turn: tokio::sync::Mutex::default(),
         })
     }
 
@@ -191,6 +220,7 @@ impl Provider {
     /// # Errors
     /// [`DiscoverError`]; what was known before stays.
     pub async fn discover(&self) -> Result<(), DiscoverError> {
+        let _turn = self.keys_turn.lock().await;
         let found = ProviderMetadataWithLogout::discover_async(self.issuer.clone(), &self.http);
         let found = found
             .await
@@ -306,19 +336,30 @@ impl Provider {
             .id_token()
             .ok_or(ExchangeError::Invalid(InvalidIdToken::Missing))?;
         let access_token = answer.access_token();
-        let expected = |keys| Expected {
-            issuer: &self.issuer,
-            client_id: &self.client_id,
-            nonce: &pending.nonce,
-            access_token,
-            now: self.clock.now(),
-            keys,
+        let looked_at = |keys: &JsonWebKeySet<CoreJsonWebKey>| {
+            let expected = Expected {
+                issuer: &self.issuer,
+                client_id: &self.client_id,
+                nonce: &pending.nonce,
+                access_token,
+                now: self.clock.now(),
+                keys,
+            };
+            verify::claims(id_token, &expected)
         };
-        let mut believed = verify::claims(id_token, &expected(metadata.jwks()));
-        if let Err(InvalidIdToken::Signature(_)) = &believed
-            && let Some(keys) = self.fresh_keys(&metadata).await
-        {
-            believed = verify::claims(id_token, &expected(&keys));
+        let mut held_against = Arc::clone(&metadata);
+        let mut believed = looked_at(held_against.jwks());
+        for _ in 1..KEYS_TRIED_MAX {
+            let Err(InvalidIdToken::Signature(_)) = &believed else {
+                break;
+            };
+            let asking = tokio::time::timeout(http::ANSWER_MAX, self.newer_than(&held_against));
+            let asked = asking.await.unwrap_or(Err(ExchangeError::KeysUnknown));
+            let Some(newer) = asked? else {
+                break;
+            };
+            held_against = newer;
+            believed = looked_at(held_against.jwks());
         }
         let (subject, mut claims) = believed.map_err(ExchangeError::Invalid)?;
         if claim(&claims, &self.groups_claim).is_none()
@@ -337,33 +378,35 @@ impl Provider {
         })
     }
 
-    /// The provider's keys, asked for anew; `None` if that was done a moment ago, or fails.
-    async fn fresh_keys(
+    /// The provider with newer keys than these: those that somebody else has brought meanwhile, or else
+    /// those that it is asked for now. `None` if they were asked for a moment ago.
+    ///
+    /// # Errors
+    /// The provider does not say which keys it has.
+    async fn newer_than(
         &self,
-        metadata: &ProviderMetadataWithLogout,
-    ) -> Option<JsonWebKeySet<CoreJsonWebKey>> {
+        known: &Arc<ProviderMetadataWithLogout>,
+    ) -> Result<Option<Arc<ProviderMetadataWithLogout>>, ExchangeError> {
+        let mut asked = self.keys_turn.lock().await;
+        let present = self.metadata().ok_or(ExchangeError::Unknown)?;
+        if !Arc::ptr_eq(&present, known) {
+            return Ok(Some(present));
+        }
         let now = self.clock.elapsed();
-        {
-            let asked_at = self.keys_asked_at.lock();
-            let mut asked_at = asked_at.unwrap_or_else(PoisonError::into_inner);
-            let is_recent = |at: Duration| now.saturating_sub(at) < KEYS_REFRESH_INTERVAL;
-            if asked_at.is_some_and(is_recent) {
-                // Somebody else may have brought them meanwhile.
-                return self.metadata().map(|known| known.jwks().clone());
-            }
-            *asked_at = Some(now);
+        match asked.recently(now) {
+            Some(true) => return Ok(None),
+            Some(false) => return Err(ExchangeError::KeysUnknown),
+            None => {}
         }
-        let keys = JsonWebKeySet::fetch_async(metadata.jwks_uri(), &self.http);
-        match keys.await {
-            Ok(keys) => {
-                self.keep(metadata.clone().set_jwks(keys.clone()));
-                Some(keys)
-            }
-            Err(error) => {
-                tracing::warn!("cannot ask the OpenID provider for its keys: {error}");
-                None
-            }
-        }
+        *asked = KeysAsked(Some((now, false)));
+        let keys = JsonWebKeySet::fetch_async(present.jwks_uri(), &self.http);
+        let keys = keys.await.map_err(|error| {
+            tracing::warn!("cannot ask the OpenID provider for its keys: {error}");
+            ExchangeError::KeysUnknown
+        })?;
+        *asked = KeysAsked(Some((now, true)));
+        self.keep((*present).clone().set_jwks(keys));
+        Ok(self.metadata())
     }
 }
 

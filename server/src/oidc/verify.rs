@@ -158,39 +158,13 @@ fn payload(id_token: &IdToken) -> Option<Claims> {
 
 #[cfg(test)]
 mod tests {
-    use openidconnect::JsonWebKeyId;
-    use ring::signature::{Ed25519KeyPair, KeyPair as _};
     use serde_json::{Value, json};
 
+    use super::super::rollover_tests::Signer;
     use super::*;
 
     const NOW_S: i64 = 1_800_000_000;
     const ISSUER: &str = "https://login.test";
-
-    /// A key of a provider, and what it signs.
-    struct Signer {
-        pair: Ed25519KeyPair,
-        public: CoreJsonWebKey,
-    }
-
-    impl Signer {
-        fn new(seed: u8, kid: &str) -> Self {
-            let pair = Ed25519KeyPair::from_seed_unchecked(&[seed; 32]).unwrap();
-            let public = pair.public_key().as_ref().to_vec();
-            let kid = Some(JsonWebKeyId::new(kid.to_owned()));
-            let curve = openidconnect::core::CoreJsonCurveType::Ed25519;
-            let public = CoreJsonWebKey::new_okp(public, curve, kid);
-            Self { pair, public }
-        }
-
-        fn sign(&self, header: &Value, claims: &Value) -> IdToken {
-            let part = |value: &Value| URL_SAFE_NO_PAD.encode(value.to_string());
-            let text = format!("{}.{}", part(header), part(claims));
-            let signature = self.pair.sign(text.as_bytes());
-            let signature = URL_SAFE_NO_PAD.encode(signature.as_ref());
-            format!("{text}.{signature}").parse().unwrap()
-        }
-    }
 
     fn good() -> Value {
         json!({"iss": ISSUER, "aud": "tread", "sub": "anna", "nonce": "n", "iat": NOW_S,

@@ -389,7 +389,7 @@ impl App {
         let there = people.provider.exchange(code, &pending).await;
         drop(turn);
         let there = there.map_err(|error| match error {
-            ExchangeError::Unknown | ExchangeError::Unanswered(_) => {
+            ExchangeError::Unknown | ExchangeError::Unanswered(_) | ExchangeError::KeysUnknown => {
                 self.log_failure("sign people in", &error);
                 PersonError::Unavailable
             }
