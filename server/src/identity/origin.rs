@@ -113,6 +113,15 @@ pub struct Provenance<'request> {
     pub fetch_site: Option<&'request str>,
 }
 
+impl Provenance<'_> {
+    /// Whether the request names the host of an origin. Its scheme is not known here: a proxy may end TLS.
+    pub fn is_at(&self, origin: &Origin) -> bool {
+        let scheme = origin.0.split_once("://").map_or("", |(scheme, _)| scheme);
+        let named = self.host.map(|host| format!("{scheme}://{host}").parse());
+        named.is_some_and(|named| named.as_ref() == Ok(origin))
+    }
+}
+
 impl Names {
     /// Whether a `Host` header names this server: an address, `localhost`, or a configured name.
     /// (Only names can be made to point elsewhere; an address is what it is.)
@@ -254,6 +263,31 @@ mod tests {
         ] {
             assert!(!may(Some(foreign)), "{foreign}");
         }
+    }
+
+    #[test]
+    fn a_request_is_at_the_host_and_port_that_it_names() {
+        let is_at = |host, origin: &str| {
+            let request = Provenance {
+                host,
+                ..Provenance::default()
+            };
+            request.is_at(&origin.parse().unwrap())
+        };
+        for own in ["tread.example.org", "Tread.Example.org:443"] {
+            assert!(is_at(Some(own), "https://tread.example.org"), "{own}");
+        }
+        assert!(is_at(Some("[::1]:8420"), "http://[::1]:8420"));
+        for other in [
+            "tread.example.org:8420",
+            "example.org",
+            "127.0.0.1",
+            "",
+            "a b",
+        ] {
+            assert!(!is_at(Some(other), "https://tread.example.org"), "{other}");
+        }
+        assert!(!is_at(None, "https://tread.example.org"));
     }
 
     #[test]

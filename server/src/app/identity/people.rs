@@ -32,6 +32,7 @@ use crate::db::sessions::{Kept, Owner, SignedIn};
 use crate::identity::address::network_of;
 use crate::identity::claims::{NAME_MAX, groups, shown_name};
 use crate::identity::grants::Grants;
+use crate::identity::origin::{Origin, Provenance};
 use crate::identity::pending::{Pending, PendingKey, RANDOM_BYTES};
 use crate::identity::secret::Secret;
 use crate::oidc::{ExchangeError, Provider, SignedInThere};
@@ -102,8 +103,8 @@ pub enum PersonError {
 pub struct Begun {
     /// Where the browser is sent.
     pub location: String,
-    /// What it keeps.
-    pub cookie: String,
+    /// What it keeps; `None` if it is sent to the page first.
+    pub cookie: Option<String>,
 }
 
 /// What the provider sends a browser back with.
@@ -123,6 +124,8 @@ pub struct Answer {
 #[derive(Debug)]
 pub struct People {
     provider: Provider,
+    /// Where browsers find this server: the one place to which the provider sends them back.
+    home: Origin,
     grants: BTreeMap<String, Grant>,
     groups_claim: String,
     name_claim: Option<String>,
@@ -157,6 +160,7 @@ impl People {
         getrandom::fill(&mut random).map_err(|error| AppError::NoRandomness(error.to_string()))?;
         Ok(Self {
             provider: Provider::new(config, app.clock().clone())?,
+            home: config.public_url.clone(),
             grants: config.grants()?,
             groups_claim: config.groups_claim.clone(),
             name_claim: config.name_claim.clone(),
@@ -341,12 +345,19 @@ impl App {
         Some(Credential::of_person(signed_in, grants, session, times))
     }
 
-    /// Begins a sign-in at the provider.
+    /// Begins a sign-in at the provider. A browser that asks by another name of this server than the one
+    /// that the provider sends it back to is sent there first: cookies are of one name alone.
     ///
     /// # Errors
     /// There is no provider, or it is not known yet.
-    pub fn begin_sign_in(&self) -> Result<Begun, PersonError> {
+    pub fn begin_sign_in(&self, asked: &Provenance<'_>) -> Result<Begun, PersonError> {
         let people = self.people().ok_or(PersonError::NotConfigured)?;
+        if !asked.is_at(&people.home) {
+            return Ok(Begun {
+                location: format!("{}/", people.home),
+                cookie: None,
+            });
+        }
         let mut random = [0; RANDOM_BYTES];
         getrandom::fill(&mut random).map_err(|error| AppError::NoRandomness(error.to_string()))?;
         let pending = Pending::begin(&people.key, &random, self.clock().now());
@@ -355,7 +366,7 @@ impl App {
             self.log_failure("sign people in", &ExchangeError::Unknown);
             return Err(PersonError::Unavailable);
         };
-        let cookie = pending.cookie().to_owned();
+        let cookie = Some(pending.cookie().to_owned());
         Ok(Begun { location, cookie })
     }
 

@@ -489,7 +489,8 @@ fn is_change(method: &Method) -> bool {
     !(method == Method::GET || method == Method::HEAD || method == Method::OPTIONS)
 }
 
-fn provenance(headers: &HeaderMap) -> Provenance<'_> {
+/// What a request says about where it comes from.
+pub(super) fn provenance(headers: &HeaderMap) -> Provenance<'_> {
     let text = |name: &str| {
         let mut values = headers.get_all(name).iter();
         let first = values.next()?;

@@ -16,7 +16,7 @@ use tread_api::problem::{ProblemBody, ProblemType};
 use utoipa::IntoParams;
 
 use super::browser;
-use super::guard::{Audited, Peer, SignedIn};
+use super::guard::{Audited, Peer, SignedIn, provenance};
 use crate::app::App;
 use crate::app::identity::people::{Answer, PersonError};
 use crate::http::extract::{Json, Query};
@@ -46,14 +46,15 @@ pub(in crate::http) async fn begin(
     Extension(names): Extension<Arc<Names>>,
     headers: HeaderMap,
 ) -> Response {
-    let begun = match app.begin_sign_in() {
+    let begun = match app.begin_sign_in(&provenance(&headers)) {
         Ok(begun) => begun,
         Err(error) => return refused(error, &headers),
     };
     let mut response = see_other(&begun.location);
-    let lasts_s = SIGN_IN_LASTS.as_secs();
-    let headers = response.headers_mut();
-    browser::give_sign_in_cookie(headers, names.is_tls, &begun.cookie, lasts_s);
+    if let Some(cookie) = &begun.cookie {
+        let (headers, lasts_s) = (response.headers_mut(), SIGN_IN_LASTS.as_secs());
+        browser::give_sign_in_cookie(headers, names.is_tls, cookie, lasts_s);
+    }
     response
 }
 

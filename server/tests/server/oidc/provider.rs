@@ -141,9 +141,21 @@ impl Browser {
         self.cookies.get_mut(&origin)?.get_mut(name)
     }
 
-    /// A request for a page of the server or the provider.
+    /// A request for a page of the server or the provider. The server is asked by the name that it has in
+    /// public, as by a proxy.
     pub(super) fn asking(&self, url: &str) -> reqwest::RequestBuilder {
-        self.client.get(self.here(url))
+        let url = self.here(url);
+        let is_server = url.as_str().starts_with(&self.server);
+        let asked = self.client.get(url);
+        match PUBLIC.strip_prefix("http://") {
+            Some(host) if is_server => asked.header(header::HOST, host),
+            _ => asked,
+        }
+    }
+
+    /// A request for a path of the server, by another name of it.
+    pub(super) fn asking_at(&self, host: &str, path: &str) -> reqwest::RequestBuilder {
+        self.client.get(self.here(path)).header(header::HOST, host)
     }
 
     /// Asks for a page of the server or the provider.

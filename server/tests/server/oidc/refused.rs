@@ -5,7 +5,7 @@ use std::time::Duration;
 use reqwest::{Response, StatusCode, Url, header};
 use tread_server::clock::Clock;
 
-use super::provider::{Browser, Kind, Provider, free_port, location};
+use super::provider::{Browser, Kind, PUBLIC, Provider, free_port, location};
 use super::{body, config, is_found, is_signed_in, start};
 use crate::harness::{Yard, eventually};
 
@@ -210,5 +210,29 @@ async fn no_address_sends_a_browser_elsewhere_after_the_sign_in() {
     let back = browser.at_provider(sent.parse().unwrap(), "anna").await;
     let answer = browser.get(&format!("{back}&{}", &hints[1..])).await;
     assert_eq!(location(&answer), "/#signed-in");
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_browser_at_another_name_of_the_server_is_sent_to_the_one_that_the_provider_knows() {
+    let port = free_port();
+    let _provider = Provider::start(port, &Kind::default()).await;
+    let yard = Yard::start_configured(|config, folder| {
+        config.oidc = Some(self::config(port, folder));
+        config.web.hosts = vec!["tread.test".to_owned()];
+    })
+    .await;
+    is_found(&yard).await;
+    let mut browser = Browser::new(&yard);
+    for host in ["tread.test", "localhost:8420", "127.0.0.1", "[::1]:8420"] {
+        let asked = browser.asking_at(host, "/v1/sign-in/oidc");
+        let sent = browser.send("/", asked).await;
+        assert_eq!(sent.status(), StatusCode::SEE_OTHER, "{host}");
+        assert_eq!(location(&sent), format!("{PUBLIC}/"), "{host}");
+        assert!(browser.cookie("tread_sign_in").is_none(), "{host}");
+    }
+    // From there it works.
+    let answer = browser.sign_in("anna").await;
+    is_signed_in(&mut browser, answer).await;
     yard.server.stop().await.unwrap();
 }
