@@ -114,6 +114,12 @@ pub struct Provenance<'request> {
 }
 
 impl Provenance<'_> {
+    /// Whether no foreign page makes the browser ask: this server's own does, or the person typed the
+    /// address. What says nothing is no browser of today.
+    pub fn is_no_foreign_page(&self) -> bool {
+        matches!(self.fetch_site, None | Some("same-origin" | "none"))
+    }
+
     /// Whether the request names the host of an origin. Its scheme is not known here: a proxy may end TLS.
     pub fn is_at(&self, origin: &Origin) -> bool {
         let scheme = origin.0.split_once("://").map_or("", |(scheme, _)| scheme);

@@ -345,14 +345,18 @@ impl App {
         Some(Credential::of_person(signed_in, grants, session, times))
     }
 
-    /// Begins a sign-in at the provider. A browser that asks by another name of this server than the one
-    /// that the provider sends it back to is sent there first: cookies are of one name alone.
+    /// Begins a sign-in at the provider, or sends the browser to the page first, where the person does:
+    ///
+    /// * if it asks by another name of this server than the one that the provider sends it back to, since
+    ///   cookies are of one name alone;
+    /// * if a foreign page makes it ask. Whoever is signed in at the provider would be here without having
+    ///   wished it, in place of the session that there is.
     ///
     /// # Errors
     /// There is no provider, or it is not known yet.
     pub fn begin_sign_in(&self, asked: &Provenance<'_>) -> Result<Begun, PersonError> {
         let people = self.people().ok_or(PersonError::NotConfigured)?;
-        if !asked.is_at(&people.home) {
+        if !asked.is_at(&people.home) || !asked.is_no_foreign_page() {
             return Ok(Begun {
                 location: format!("{}/", people.home),
                 cookie: None,

@@ -236,3 +236,41 @@ async fn a_browser_at_another_name_of_the_server_is_sent_to_the_one_that_the_pro
     is_signed_in(&mut browser, answer).await;
     yard.server.stop().await.unwrap();
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_foreign_page_begins_no_sign_in() {
+    let port = free_port();
+    let _provider = Provider::start(port, &Kind::default()).await;
+    let yard = start(port).await;
+    let mut browser = Browser::new(&yard);
+    let path = "/v1/sign-in/oidc";
+    for site in ["cross-site", "same-site", "", "elsewhere"] {
+        for mode in ["navigate", "no-cors"] {
+            let asked = browser.asking(path).header("sec-fetch-site", site);
+            let asked = asked.header("sec-fetch-mode", mode);
+            let sent = browser.send("/", asked).await;
+            assert_eq!(location(&sent), format!("{PUBLIC}/"), "{site} {mode}");
+            assert!(browser.cookie("tread_sign_in").is_none(), "{site} {mode}");
+        }
+    }
+    // Nor does it disturb one that is under way.
+    let begun = browser.begin().await;
+    let kept = browser.cookie("tread_sign_in").cloned();
+    let asked = browser.asking(path).header("sec-fetch-site", "cross-site");
+    browser.send("/", asked).await;
+    assert_eq!(browser.cookie("tread_sign_in").cloned(), kept);
+    let back = browser.at_provider(begun, "anna").await;
+    let came = browser.asking(&back).header("sec-fetch-site", "cross-site");
+    let answer = browser.send("/", came).await;
+    is_signed_in(&mut browser, answer).await;
+
+    // The page's own link, and an address that was typed, do.
+    for site in ["same-origin", "none"] {
+        let mut browser = Browser::new(&yard);
+        let asked = browser.asking(path).header("sec-fetch-site", site);
+        let sent = browser.send("/", asked).await;
+        assert!(location(&sent).contains("code_challenge="), "{site}");
+        assert!(browser.cookie("tread_sign_in").is_some(), "{site}");
+    }
+    yard.server.stop().await.unwrap();
+}
