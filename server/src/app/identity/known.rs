@@ -19,7 +19,7 @@ use crate::app::AppError;
 use crate::db::sessions::SignedIn;
 use crate::identity::grants::Grants;
 use crate::identity::secret::Fingerprint;
-use crate::identity::subject::SubjectId;
+use crate::identity::subject::{SubjectId, name_of_person};
 
 /// Above so many, expired ones are dropped before another is kept. What is valid is bounded by
 /// the bounds on tokens and sessions.
@@ -37,7 +37,7 @@ pub struct Credential {
     pub subject: SubjectId,
     /// Who signed in at the provider, if it is no token.
     pub person: Option<Person>,
-    /// The token's name, or the person's.
+    /// The token's name, or the person's with what tells it from any token's.
     pub name: String,
     /// Its role, if it has no rights of its own.
     pub role: Option<Role>,
@@ -93,7 +93,7 @@ impl Credential {
         Self {
             subject: SubjectId::Person(signed_in.person.id),
             person: Some(signed_in.person),
-            name: signed_in.name,
+            name: name_of_person(&signed_in.name),
             role: grants.role(),
             rights,
             scope: sites,
@@ -266,6 +266,9 @@ impl Credential {
         match claimed.map(str::trim) {
             None | Some("") => self.name.clone(),
             Some(claimed) if claimed == self.name => self.name.clone(),
+            Some(claimed) if self.person.is_some() && name_of_person(claimed) == self.name => {
+                self.name.clone()
+            }
             Some(claimed) => format!("{}: {claimed}", self.name),
         }
     }

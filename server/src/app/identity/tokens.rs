@@ -15,7 +15,7 @@ use super::{Credential, new_secret};
 use crate::app::{App, AppError, page, people_line, site_row};
 use crate::db::{self, Tx};
 use crate::identity::secret::Kind;
-use crate::identity::subject::SubjectId;
+use crate::identity::subject::{SubjectId, may_name_token};
 
 /// Most tokens that are valid at once.
 const TOKENS: Quota = Quota {
@@ -184,6 +184,14 @@ impl App {
     ) -> Result<CreatedToken, AppError> {
         let now = self.clock().now();
         let name = people_line("name", &request.name, TOKEN_NAME_MAX)?;
+        if !may_name_token(&name) {
+            let detail =
+                "no token is called like a person (`oidc:NAME`) or by a person's identifier";
+            return Err(AppError::Invalid {
+                field: "name",
+                detail: detail.to_owned(),
+            });
+        }
         let expires_at = expiry(now, request.valid_days)?;
         let (valid_count, _) = db::tokens::valid_counts(tx, now).await?;
         let of_maker = db::tokens::valid_count_within(tx, within, now).await?;

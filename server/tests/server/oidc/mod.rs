@@ -142,7 +142,7 @@ async fn somebody_signs_in_does_what_the_groups_give_and_signs_out() {
         |given: &&str| given.starts_with("tread_session=") && given.contains("SameSite=Strict");
     assert!(given.iter().any(is_session), "{given:?}");
     let session = is_signed_in(&mut browser, answer).await;
-    assert_eq!(session["name"], "anna");
+    assert_eq!(session["name"], "oidc:anna");
     assert_eq!(session["role"], "operator");
     assert_eq!(session["sites"], json!([{"site": "yard"}]));
     assert_eq!(session["token"], Value::Null);
@@ -159,7 +159,7 @@ async fn somebody_signs_in_does_what_the_groups_give_and_signs_out() {
 
     // The audit log says who it was and how.
     let entry = eventually("the sign-in is in the audit log", async || {
-        let (_, entries) = yard.get_value("/v1/audit?who=anna").await;
+        let (_, entries) = yard.get_value("/v1/audit?who=oidc:anna").await;
         let entry = entries["items"].as_array().unwrap().iter();
         let mut entry = entry.filter(|entry| entry["status"] == 303);
         entry.next().cloned().ok_or(entries.clone())
@@ -229,7 +229,7 @@ async fn a_public_client_takes_es256_a_nested_claim_of_the_user_info_and_an_own_
     let mut browser = Browser::trusting(&yard, Some(pem.as_bytes()));
     let answer = browser.sign_in("adam").await;
     let session = is_signed_in(&mut browser, answer).await;
-    assert_eq!(session["name"], "adam@example.org");
+    assert_eq!(session["name"], "oidc:adam@example.org");
     assert_eq!(session["role"], "admin");
     assert_eq!(session["sites"], Value::Null);
     assert_eq!(browser.get("/v1/tokens").await.status(), 200);

@@ -9,7 +9,7 @@ use tread_api::identity::Role;
 use super::provider::{Browser, Kind, Provider, free_port};
 use super::{body, config, is_signed_in, start};
 use crate::events::read_until;
-use crate::harness::{Yard, client};
+use crate::harness::{Yard, client, eventually};
 use crate::robot::Robot;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -38,7 +38,7 @@ async fn somebody_in_several_groups_has_at_each_site_what_one_of_them_gives_ther
     let refused = browser.delete(&limit("field")).await;
     assert_eq!(refused.status(), StatusCode::FORBIDDEN);
     let detail = body(refused).await["detail"].as_str().unwrap().to_owned();
-    assert!(detail.contains("`bert` is for yard alone"), "{detail}");
+    assert!(detail.contains("`oidc:bert` is for yard alone"), "{detail}");
     let origin = browser.delete("/v1/sites/field/origin").await;
     assert_eq!(origin.status(), StatusCode::FORBIDDEN);
     yard.server.stop().await.unwrap();
@@ -141,11 +141,11 @@ async fn a_person_has_one_share_of_sessions_and_is_never_called_like_a_token() {
     let port = free_port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;
-    // There is a token of that name.
+    // There is a token `tests`.
     let mut first = Browser::new(&yard);
     let answer = first.sign_in("tests").await;
     let session = is_signed_in(&mut first, answer).await;
-    assert_eq!(session["name"], "tests (id-tests)");
+    assert_eq!(session["name"], "oidc:tests");
     let mut last = Browser::new(&yard);
     for _ in 0..tread_server::app::identity::SESSIONS_EACH_MAX {
         let answer = last.sign_in("tests").await;
@@ -159,6 +159,54 @@ async fn a_person_has_one_share_of_sessions_and_is_never_called_like_a_token() {
     assert_eq!(last.get("/v1/session").await.status(), 200);
     let token = client(Some(yard.admin())).get(yard.url("/v1/session"));
     assert_eq!(yard.send(token).await.1["name"], "tests");
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_token_that_is_made_with_the_name_of_a_person_is_told_from_them_everywhere() {
+    let port = free_port();
+    let _provider = Provider::start(port, &Kind::default()).await;
+    let yard = start(port).await;
+    let mut anna = Browser::new(&yard);
+    let answer = anna.sign_in("anna").await;
+    let session = is_signed_in(&mut anna, answer).await;
+    let token = yard.token("anna", Role::Operator).await;
+    // Both are refused the same thing.
+    let path = format!("/v1/tokens/{}", token.token.id);
+    assert_eq!(anna.delete(&path).await.status(), StatusCode::FORBIDDEN);
+    let asked = client(Some(&token.secret)).delete(yard.url(&path));
+    assert_eq!(yard.send(asked).await.0, StatusCode::FORBIDDEN);
+    let asked = client(Some(&token.secret)).get(yard.url("/v1/session"));
+    let of_token = yard.send(asked).await.1;
+    let names = [&session["name"], &of_token["name"]];
+    assert_eq!(names, [&json!("oidc:anna"), &json!("anna")]);
+    for (name, token, person) in [
+        ("oidc:anna", &Value::Null, &session["person"]),
+        ("anna", &of_token["token"], &Value::Null),
+    ] {
+        let entries = eventually("the refusal is in the audit log", async || {
+            let (_, entries) = yard.get_value(&format!("/v1/audit?who={name}")).await;
+            let entries = entries["items"].as_array().unwrap().clone();
+            let is_there = entries.iter().any(|entry| entry["status"] == 403);
+            if is_there { Ok(entries) } else { Err(entries) }
+        })
+        .await;
+        for entry in entries {
+            let who = [&entry["token"], &entry["person"]];
+            assert_eq!(who, [token, person], "{entry}");
+        }
+    }
+    // And no token takes a name that people have.
+    let id = session["person"]["id"].as_str().unwrap();
+    for name in ["oidc:anna", "OIDC : anna", "oidc", id] {
+        let body = json!({"name": name, "role": "viewer"});
+        let (status, said) = yard.post("/v1/tokens", &body).await;
+        assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{said}");
+        assert!(
+            said["detail"].as_str().unwrap().contains("`oidc:NAME`"),
+            "{said}"
+        );
+    }
     yard.server.stop().await.unwrap();
 }
 
