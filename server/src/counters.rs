@@ -111,6 +111,8 @@ counters! {
     gate_displaced,
     /// Connections of robots that declared liveliness tokens without end, cut or refused for a while.
     gate_cut_off,
+    /// Pauses in the reading of robots that send more bytes a second than they may.
+    gate_throttled,
     /// Connections of robots whose enrolment was revoked, or that have joined again since.
     gate_revoked,
     /// Connections of robots ended because their certificate was over.

@@ -57,6 +57,13 @@ impl Bucket {
         delay
     }
 
+    /// Takes some that have been used already, also more than there are: how long until that is paid for.
+    pub(crate) fn charge(&mut self, limit: RateLimit, now: Duration, count: u32) -> Duration {
+        let owed = self.full_at.saturating_sub(now) + limit.interval * count;
+        self.full_at = now + owed;
+        owed.saturating_sub(limit.interval * limit.burst)
+    }
+
     /// Whether nothing of the limit is used.
     pub(crate) fn is_full(self, now: Duration) -> bool {
         self.full_at <= now
@@ -114,6 +121,25 @@ mod tests {
                 if delay < delay_max {
                     prop_assert!(used.take(limit, now + delay));
                 }
+            }
+        }
+
+        #[test]
+        fn whoever_waits_until_it_is_paid_for_keeps_the_rate(
+            counts in prop::collection::vec(0..2_000_u32, 1..300),
+            burst in 1..5_000_u32,
+        ) {
+            let limit = RateLimit { burst, interval: Duration::from_micros(10) };
+            let mut bucket = Bucket::default();
+            let (mut now, mut used) = (Duration::ZERO, 0_u128);
+            for count in counts {
+                let delay = bucket.charge(limit, now, count);
+                used += u128::from(count);
+                now += delay;
+                let earned = u128::from(burst) + now.as_micros() / 10;
+                prop_assert!(used <= earned);
+                // Nobody waits for what is there.
+                prop_assert!(delay.is_zero() || used == earned);
             }
         }
 

@@ -103,6 +103,11 @@ pub(super) struct Rig {
 
 impl Rig {
     pub(super) async fn start() -> Self {
+        Self::start_with(|_fleet| ()).await
+    }
+
+    /// The same, with a network that is changed before it opens.
+    pub(super) async fn start_with(change: impl FnOnce(&mut Fleet)) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
         let clock = Clock::system();
@@ -115,7 +120,8 @@ impl Rig {
         let supervisor = Supervisor::new();
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
         let opening = Fleet::open(address, Some(security), clock.clone(), supervisor.clone());
-        let fleet = opening.unwrap();
+        let mut fleet = opening.unwrap();
+        change(&mut fleet);
         let app = App::new(Dependencies {
             db,
             clock: clock.clone(),

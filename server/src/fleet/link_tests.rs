@@ -17,6 +17,7 @@ use super::gate::LINKS_PER_ROBOT_MAX;
 use super::inbox::STATE_BYTES_MAX;
 use super::routers::Router;
 use super::test_client::{Shown, TestSession};
+use crate::rate_limit::RateLimit;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 /// How soon a robot that was put out is cut off.
@@ -297,5 +298,33 @@ async fn a_message_above_its_bound_is_dropped_and_the_next_one_is_heard() {
     .await;
     assert_eq!(counters.refused_malformed.get(), refused + 1);
     again.close().await;
+    end(rig).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_robot_that_sends_too_many_bytes_is_read_later_and_keeps_its_link() {
+    let rig = Rig::start_with(|fleet| {
+        fleet.byte_rate = RateLimit {
+            burst: 16 * 1024,
+            interval: Duration::from_secs(1) / (128 * 1024),
+        };
+    })
+    .await;
+    let mut session = rig.connect(Who::Own, 10_000).await.unwrap();
+    let counters = rig.app.counters();
+    let (zenoh, key) = (
+        session.zenoh.clone(),
+        keys::state(&site(), &robot("rover-1")),
+    );
+    let putting = tokio::task::spawn_blocking(move || put(&zenoh, key, "x".repeat(64 * 1024)));
+    putting.await.unwrap();
+    until("all of it has come", async || {
+        counters.refused_malformed.get() == 1
+    })
+    .await;
+    assert!(counters.gate_throttled.get() > 0);
+    let cut = tokio::time::timeout(LOOK_EVERY, session.link_ended()).await;
+    assert!(cut.is_err(), "its link stays");
+    session.close().await;
     end(rig).await;
 }

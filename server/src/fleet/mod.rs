@@ -51,6 +51,7 @@ use crate::app::robot_link::RobotLink;
 use crate::app::stops::STOP_CONFIRM_MAX;
 use crate::authority::Authorities;
 use crate::clock::Clock;
+use crate::rate_limit::RateLimit;
 use crate::supervisor::Supervisor;
 
 /// Most robots that may be connected; zenoh's own default is 1000.
@@ -123,6 +124,8 @@ pub struct Fleet {
     address: SocketAddr,
     is_tls: bool,
     probe_period: Duration,
+    /// How fast the bytes of one robot are read.
+    byte_rate: RateLimit,
 }
 
 impl Fleet {
@@ -166,6 +169,7 @@ impl Fleet {
             address,
             is_tls,
             probe_period: router::PROBE_PERIOD,
+            byte_rate: gate::BYTE_RATE,
         })
     }
 
@@ -208,7 +212,7 @@ impl Fleet {
             return Ok(());
         };
         let gate = self.gate.lock().ok().and_then(|mut gate| gate.take());
-        let links = gate.as_ref().map(|_| gate::Links::default());
+        let links = gate.as_ref().map(|_| gate::Links::new(self.byte_rate));
         let pool = Arc::new(RouterPool {
             app: app.clone(),
             routers: Arc::clone(&self.routers),

@@ -278,10 +278,13 @@ async fn a_discovery_that_takes_long_does_not_bring_the_former_keys_back() {
             assert!(early.is_err(), "{early:?}");
             // The discovery gets the former key, and only then the other one is told.
             fake.answers.add_permits(1);
-            fake.is_asked(3).await;
-            fake.rolls_over(2);
-            fake.answers.add_permits(1);
-            sign_in.await
+            let rollover = async {
+                fake.is_asked(3).await;
+                fake.rolls_over(2);
+                fake.answers.add_permits(1);
+            };
+            let (signed_in, ()) = tokio::join!(sign_in, rollover);
+            signed_in
         };
         let (discovered, signed_in) = tokio::join!(discovery, sign_in);
         discovered.unwrap();

@@ -14,6 +14,7 @@
 //! needs a look-up but after `init`; look-ups take turns, of which a Stop has one of its own.
 
 pub mod audit;
+mod id_tokens;
 mod known;
 pub mod people;
 pub(super) mod quota;

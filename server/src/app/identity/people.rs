@@ -20,11 +20,12 @@ use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::CancellationToken;
 use tracing::info;
 use tread_api::identity::{OidcSignIn, Person};
-use tread_api::ids::{PersonId, SessionId};
+use tread_api::ids::PersonId;
 use tread_api::rights::{Grant, Scope};
 use tread_api::text::cleaned;
 
 use super::Credential;
+use super::id_tokens::IdTokens;
 use crate::app::{App, AppError};
 use crate::config::oidc::OidcConfig;
 use crate::db;
@@ -51,8 +52,6 @@ const CODE_MAX: usize = 2_048;
 /// Sign-ins that succeeded and are remembered, so that none does so twice. A provider takes a code once;
 /// this is for one that does not.
 const USED_MAX: usize = 4_096;
-/// ID tokens that are kept for signing out at the provider.
-const ID_TOKENS_MAX: usize = 1_000;
 /// First and longest rest between attempts to find the provider.
 const FIND_AGAIN_MIN: Duration = Duration::from_secs(1);
 const FIND_AGAIN_MAX: Duration = Duration::from_secs(30);
@@ -136,7 +135,7 @@ pub struct People {
     turns: Arc<Semaphore>,
     networks: Mutex<HashMap<IpAddr, Arc<Semaphore>>>,
     used: Mutex<Used>,
-    id_tokens: Mutex<IdTokens>,
+    pub(super) id_tokens: IdTokens,
     /// Somebody wants to sign in, and the provider is not known.
     wanted: Notify,
 }
@@ -146,13 +145,6 @@ pub struct People {
 struct Used {
     states: HashSet<String>,
     order: VecDeque<String>,
-}
-
-/// ID tokens of sessions, the oldest first.
-#[derive(Debug, Default)]
-struct IdTokens {
-    of: HashMap<SessionId, String>,
-    order: VecDeque<SessionId>,
 }
 
 impl People {
@@ -171,7 +163,7 @@ impl People {
             turns: Arc::new(Semaphore::new(EXCHANGES_MAX)),
             networks: Mutex::default(),
             used: Mutex::default(),
-            id_tokens: Mutex::default(),
+            id_tokens: IdTokens::default(),
             wanted: Notify::new(),
         })
     }
@@ -250,39 +242,6 @@ impl People {
             }
         }
         true
-    }
-
-    fn keep_id_token(&self, session: SessionId, id_token: String) {
-        let mut kept = self
-            .id_tokens
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
-        kept.of.insert(session, id_token);
-        kept.order.push_back(session);
-        while kept.order.len() > ID_TOKENS_MAX {
-            if let Some(oldest) = kept.order.pop_front() {
-                kept.of.remove(&oldest);
-            }
-        }
-    }
-
-    pub(super) fn forget_id_tokens(&self, sessions: &[SessionId]) {
-        let mut kept = self
-            .id_tokens
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
-        for session in sessions {
-            kept.of.remove(session);
-        }
-        kept.order.retain(|session| !sessions.contains(session));
-    }
-
-    fn id_token(&self, session: SessionId) -> Option<String> {
-        let kept = self
-            .id_tokens
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
-        kept.of.get(&session).cloned()
     }
 
     fn signed_in(&self, there: &SignedInThere) -> Result<SignedIn, PersonError> {
@@ -424,7 +383,7 @@ impl App {
         let opened = self.open_session_of(Owner::Person(signed_in), expires_at);
         let (credential, secret) = opened.await?.ok_or(PersonError::NotBelieved)?;
         if let (Some(session), Some(id_token)) = (credential.session, there.id_token) {
-            people.keep_id_token(session, id_token);
+            people.id_tokens.keep(session, id_token);
         }
         Ok((credential, secret))
     }
@@ -445,7 +404,7 @@ impl App {
     pub fn sign_out_at_provider(&self, who: &Credential) -> Option<String> {
         let (people, session) = (self.people()?, who.session?);
         who.person.as_ref()?;
-        let id_token = people.id_token(session);
+        let id_token = people.id_tokens.of(session);
         people.provider.sign_out_url(id_token.as_deref())
     }
 }

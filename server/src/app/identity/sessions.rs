@@ -115,7 +115,7 @@ impl App {
         let known = &self.identity().known;
         known.end(|known| known.session.is_some_and(is_ended));
         if let Some(people) = self.people() {
-            people.forget_id_tokens(ids);
+            people.id_tokens.forget(ids);
         }
     }
 

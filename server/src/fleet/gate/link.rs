@@ -16,6 +16,7 @@ use tread_api::tunnel::{ALPN, RouterCredentials, splice};
 use super::Failures;
 use super::links::{CertificateHash, Entry, Links};
 use super::session::{Init, pass_opening, read_init};
+use super::throttle::{BYTES_PER_S, Throttled};
 use crate::app::App;
 use crate::app::enrolment::registry::Standing;
 use crate::app::presence::RobotKey;
@@ -104,9 +105,18 @@ impl Link {
         let mut outside = admitted.stream;
         let joined = async {
             self.app.note_shown(robot, name.enrolment, issuer).await;
-            if let Some(inside) = self.open(robot, &entry, &mut outside).await
-                && let Err(error) = splice(outside, inside, BUFFER_BYTES).await
-            {
+            let Some(inside) = self.open(robot, &entry, &mut outside).await else {
+                return;
+            };
+            let (rate, clock) = (entry.byte_rate(), self.app.clock());
+            let paused = |now| {
+                counters.gate_throttled.one();
+                if rate.is_to_be_logged(now) {
+                    warn!(robot.id = %robot.1, "robot `{}` sends more than {BYTES_PER_S} bytes a second, and is read no faster", robot.1);
+                }
+            };
+            let outside = Throttled::new(outside, rate, clock, paused);
+            if let Err(error) = splice(outside, inside, BUFFER_BYTES).await {
                 debug!("a robot's link broke: {error}");
             }
         };

@@ -2,7 +2,7 @@
 //!
 //! A robot has one session and for a moment a second. Without a bound one robot's certificate would
 //! open as many links as there is room for, and lock the others out. A robot that burdens the router
-//! with what cannot be refused there is cut off for a while.
+//! with what cannot be refused there is cut off for a while. All links of a robot have one rate of bytes.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,7 +10,9 @@ use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 
+use super::throttle::{BYTE_RATE, ByteRate};
 use crate::app::presence::RobotKey;
+use crate::rate_limit::RateLimit;
 
 /// Most links of one robot. Two agents under one name are noticed and shown, so both get in.
 pub(in crate::fleet) const LINKS_PER_ROBOT_MAX: usize = 4;
@@ -25,15 +27,25 @@ pub(super) type CertificateHash = [u8; 32];
 type OfRobots = HashMap<RobotKey, VecDeque<OneLink>>;
 
 /// All robots' links.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub(in crate::fleet) struct Links(Arc<Mutex<Table>>);
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Table {
     next: u64,
+    byte_limit: RateLimit,
+    /// What each robot that was ever here uses of it: a new link is no new rate. Only robots that have
+    /// joined come this far, and their number is bounded.
+    byte_rates: HashMap<RobotKey, Arc<ByteRate>>,
     of_robots: OfRobots,
     /// Robots that were cut off, and until when.
     cut_off: HashMap<RobotKey, Duration>,
+}
+
+impl Default for Links {
+    fn default() -> Self {
+        Self::new(BYTE_RATE)
+    }
 }
 
 #[derive(Debug)]
@@ -53,12 +65,24 @@ pub(super) struct Entry {
     links: Links,
     robot: RobotKey,
     number: u64,
+    byte_rate: Arc<ByteRate>,
     displaced: CancellationToken,
     cut_off: CancellationToken,
     ended: CancellationToken,
 }
 
 impl Links {
+    /// None yet; all links of a robot together are read at that rate.
+    pub(in crate::fleet) fn new(byte_limit: RateLimit) -> Self {
+        Self(Arc::new(Mutex::new(Table {
+            next: 0,
+            byte_limit,
+            byte_rates: HashMap::new(),
+            of_robots: HashMap::new(),
+            cut_off: HashMap::new(),
+        })))
+    }
+
     fn lock(&self) -> MutexGuard<'_, Table> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -87,7 +111,7 @@ impl Links {
             cut_off.cancel();
         }
         table.next += 1;
-        let number = table.next;
+        let (number, byte_limit) = (table.next, table.byte_limit);
         let own = table.of_robots.entry(robot.clone()).or_default();
         own.push_back(OneLink {
             number,
@@ -103,12 +127,20 @@ impl Links {
         {
             oldest.displaced.cancel();
         }
+        let new_rate = || Arc::new(ByteRate::new(byte_limit));
+        let byte_rate = Arc::clone(
+            table
+                .byte_rates
+                .entry(robot.clone())
+                .or_insert_with(new_rate),
+        );
         drop(table);
         let links = self.clone();
         Entry {
             links,
             robot,
             number,
+            byte_rate,
             displaced,
             cut_off,
             ended,
@@ -120,6 +152,11 @@ impl Entry {
     /// Waits until the robot is cut off.
     pub(super) async fn cut_off(&self) {
         self.cut_off.cancelled().await;
+    }
+
+    /// What its robot uses of its rate of bytes.
+    pub(super) fn byte_rate(&self) -> &ByteRate {
+        &self.byte_rate
     }
 
     /// Waits until newer links of the robot have taken its place.

@@ -14,7 +14,8 @@
 //!     │ only now a connection inside is made; the session opens as that user? ─no─► closed
 //!     ▼
 //!  joined to the router, as the robot that the certificate names, until either side ends, the
-//!  certificate is over, its authority is retired, or the robot is put out of the fleet
+//!  certificate is over, its authority is retired, or the robot is put out of the fleet; read no faster
+//!  than the rate of bytes that all links of a robot share
 //! ```
 //!
 //! zenoh's own TLS link is unsound: its reader and its writer use one rustls stream at the same
@@ -26,6 +27,7 @@ mod failures;
 mod link;
 mod links;
 mod session;
+mod throttle;
 
 use std::net::{IpAddr, SocketAddr};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -47,6 +49,7 @@ use self::link::Link;
 #[cfg(test)]
 pub(super) use self::links::LINKS_PER_ROBOT_MAX;
 pub(super) use self::links::{CUT_OFF, Links};
+pub(super) use self::throttle::BYTE_RATE;
 use super::routers::Routers;
 use super::{FleetError, SEND_BUFFER_BYTES, SESSIONS_MAX, Security};
 use crate::app::App;

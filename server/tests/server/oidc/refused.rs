@@ -243,10 +243,10 @@ async fn a_foreign_page_begins_no_sign_in() {
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;
     let mut browser = Browser::new(&yard);
-    let route = "/v1/sign-in/oidc";
+    let path = "/v1/sign-in/oidc";
     for site in ["cross-site", "same-site", "", "elsewhere"] {
         for mode in ["navigate", "no-cors"] {
-            let asked = browser.asking(route).header("sec-fetch-site", site);
+            let asked = browser.asking(path).header("sec-fetch-site", site);
             let asked = asked.header("sec-fetch-mode", mode);
             let sent = browser.send("/", asked).await;
             assert_eq!(location(&sent), format!("{PUBLIC}/"), "{site} {mode}");
@@ -256,7 +256,7 @@ async fn a_foreign_page_begins_no_sign_in() {
     // Nor does it disturb one that is under way.
     let begun = browser.begin().await;
     let kept = browser.cookie("tread_sign_in").cloned();
-    let asked = browser.asking(route).header("sec-fetch-site", "cross-site");
+    let asked = browser.asking(path).header("sec-fetch-site", "cross-site");
     browser.send("/", asked).await;
     assert_eq!(browser.cookie("tread_sign_in").cloned(), kept);
     let back = browser.at_provider(begun, "anna").await;
@@ -267,7 +267,7 @@ async fn a_foreign_page_begins_no_sign_in() {
     // The page's own link, and an address that was typed, do.
     for site in ["same-origin", "none"] {
         let mut browser = Browser::new(&yard);
-        let asked = browser.asking(route).header("sec-fetch-site", site);
+        let asked = browser.asking(path).header("sec-fetch-site", site);
         let sent = browser.send("/", asked).await;
         assert!(location(&sent).contains("code_challenge="), "{site}");
         assert!(browser.cookie("tread_sign_in").is_some(), "{site}");

@@ -172,9 +172,9 @@ async fn a_token_that_is_made_with_the_name_of_a_person_is_told_from_them_everyw
     let session = is_signed_in(&mut anna, answer).await;
     let token = yard.token("anna", Role::Operator).await;
     // Both are refused the same thing.
-    let path = "/v1/sites/yard/origin";
-    assert_eq!(anna.delete(path).await.status(), StatusCode::FORBIDDEN);
-    let asked = client(Some(&token.secret)).delete(yard.url(path));
+    let path = format!("/v1/tokens/{}", token.token.id);
+    assert_eq!(anna.delete(&path).await.status(), StatusCode::FORBIDDEN);
+    let asked = client(Some(&token.secret)).delete(yard.url(&path));
     assert_eq!(yard.send(asked).await.0, StatusCode::FORBIDDEN);
     let asked = client(Some(&token.secret)).get(yard.url("/v1/session"));
     let of_token = yard.send(asked).await.1;

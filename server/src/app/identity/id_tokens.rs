@@ -1,0 +1,52 @@
+//! ID tokens of people's sessions, for signing out at the provider: in memory alone, and not too many.
+
+use std::collections::{HashMap, VecDeque};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use tread_api::ids::SessionId;
+
+/// Most that are kept.
+const ID_TOKENS_MAX: usize = 1_000;
+
+/// ID tokens of sessions.
+#[derive(Debug, Default)]
+pub(super) struct IdTokens(Mutex<Kept>);
+
+#[derive(Debug, Default)]
+struct Kept {
+    of: HashMap<SessionId, String>,
+    /// The oldest first.
+    order: VecDeque<SessionId>,
+}
+
+impl IdTokens {
+    fn lock(&self) -> MutexGuard<'_, Kept> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Keeps a session's; the oldest goes if there are too many.
+    pub(super) fn keep(&self, session: SessionId, id_token: String) {
+        let mut kept = self.lock();
+        kept.of.insert(session, id_token);
+        kept.order.push_back(session);
+        while kept.order.len() > ID_TOKENS_MAX {
+            if let Some(oldest) = kept.order.pop_front() {
+                kept.of.remove(&oldest);
+            }
+        }
+    }
+
+    /// Forgets those of sessions that have ended.
+    pub(super) fn forget(&self, sessions: &[SessionId]) {
+        let mut kept = self.lock();
+        for session in sessions {
+            kept.of.remove(session);
+        }
+        kept.order.retain(|session| !sessions.contains(session));
+    }
+
+    /// A session's, if it is kept.
+    pub(super) fn of(&self, session: SessionId) -> Option<String> {
+        self.lock().of.get(&session).cloned()
+    }
+}
