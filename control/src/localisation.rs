@@ -434,7 +434,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fix_weighs_by_its_own_deviation() {
+    fn a_fix_weighs_by_its_own_standard_deviation() {
         let moved_by = |position_m: f64| {
             let mut filter = filter();
             filter.correct(&fix(0.0, 0.0));

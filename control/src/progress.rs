@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn a_way_commanded_beyond_the_plan_without_progress_ends_sooner() {
+    fn a_distance_commanded_beyond_the_plan_without_progress_ends_sooner() {
         let mut monitor = ProgressMonitor::default();
         let mut time_s = 0.0;
         let blind = ProgressTick {

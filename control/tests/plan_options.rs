@@ -193,7 +193,7 @@ fn a_plan_is_slow_only_where_the_ice_is_and_brakes_before_it() {
 }
 
 #[test]
-fn the_way_to_the_trajectory_may_be_quicker_than_the_trajectory() {
+fn the_approach_to_the_trajectory_may_be_quicker_than_the_trajectory() {
     let start = Pose {
         x_m: 0.5,
         ..Pose::default()

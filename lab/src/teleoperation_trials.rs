@@ -42,10 +42,10 @@ pub struct HandReport {
     pub worst_zero_ms: f64,
     /// The fastest that the robot was when a trial's last command ended, metres per second.
     pub fastest_m_s: f64,
-    /// Trials in which the robot took more stop than `v²/2a + v·0.25 s`, or did not rest;
+    /// Trials in which the robot needed a longer distance to stop than `v²/2a + v·0.25 s`, or did not rest;
     /// `a` is the braking ramp, or what the ground gives where that is less.
     pub overruns: u64,
-    /// The largest share of that way that was used.
+    /// The largest share of that distance that was used.
     pub worst_distance_share: f64,
 }
 
@@ -252,7 +252,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn silence_brings_the_robot_to_rest_in_time_and_within_its_braking_way() {
+    fn silence_brings_the_robot_to_rest_in_time_and_within_its_braking_distance() {
         let report = run(150, 9).unwrap();
         assert_eq!((report.misses, report.overruns), (0, 0), "{report:?}");
         assert!(

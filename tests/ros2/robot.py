@@ -51,7 +51,7 @@ class Plant:
         self.mass, self.track, self.base, self.radius, self.inertia = 5.0, 0.43, 0.28, arguments.radius, 0.45
         self.stiffness, self.lag = arguments.stiffness, arguments.lag
         self.radius_ratio = [1 + 0.01 * rng.uniform(-1, 1) for _ in range(2)]
-        # x, y, heading, speed ahead, speed to the left, turn rate, wheel speeds left and right
+        # x, y, heading, forward speed, speed to the left, turn rate, wheel speeds left and right
         self.state = [arguments.x, arguments.y, arguments.heading, 0.0, 0.0, 0.0, 0.0, 0.0]
         self.command = [0.0, 0.0]
         self.sides = [0.0, 0.0]

@@ -100,7 +100,6 @@ pub struct DriveCommand {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ExternalLimit {
     /// Who limits; the same as in the key.
-    #[serde(alias = "holder")]
     pub owner: OwnerId,
     /// The run of the agent.
     pub boot: BootId,

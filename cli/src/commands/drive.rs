@@ -115,7 +115,7 @@ fn meaning(key: KeyEvent) -> Meaning {
     }
 }
 
-/// What the keys of the last moment ask for: linear and around, each as long as its key.
+/// What the keys of the last moment ask for: linear and angular, each as long as its key.
 #[derive(Debug, Clone, Copy, Default)]
 struct Keys {
     linear: Option<(f64, Instant)>,

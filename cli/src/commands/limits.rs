@@ -51,7 +51,7 @@ fn list(limits: &[LimitStatus]) -> String {
     if limits.is_empty() {
         return "no program limits it".to_owned();
     }
-    let mut table = table(["HOLDER", "HOLDS", "SPEED M/S", "ENDS IN", "REQUIRED"]);
+    let mut table = table(["OWNER", "HOLDS", "SPEED M/S", "ENDS IN", "REQUIRED"]);
     let yes_or_no = |is: bool| if is { "yes" } else { "no" }.to_owned();
     for limit in limits {
         table.add_row([

@@ -92,7 +92,7 @@ pub(super) struct SideSlips {
 }
 
 impl SideSlips {
-    /// At a mean rim speed above zero, all of a robot that drives ahead; `common` is the
+    /// At a mean rim speed above zero, all of a robot that drives forward; `common` is the
     /// longitudinal slip that both sides have.
     pub(super) fn of(turn: &Turn, common: f64, model: &RobotModel) -> Self {
         let Turn {

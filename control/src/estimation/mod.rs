@@ -15,7 +15,7 @@
 //!   u_R − u_L − Wφ̇    = θ (μ_R u_R − μ_L u_L)   + (δ_c − θf)(u_R − u_L)   + δ_d (u_R + u_L)/2 − W b_g
 //!   (u_R + u_L)/2 − v = θ (μ_R u_R + μ_L u_L)/2 + (δ_c − θf)(u_R + u_L)/2 + δ_d (u_R − u_L)/4
 //! without
-//!   the moment balance ([`window`]) and the innovations of the forward speed ([`along`])
+//!   the moment balance ([`window`]) and the innovations of the forward speed ([`longitudinal`])
 //! ```
 //! The robot's own parameters survive changes of the ground; θ, f and κ are the ground's. Samples
 //! are averaged over blocks; the noise of the regressor is taken out of its square (errors in
@@ -193,7 +193,7 @@ impl Estimator {
             self.longitudinal = LongitudinalFilter::new();
             return UpdateOutcome::default();
         }
-        self.step_along(sample, dt_s);
+        self.step_longitudinal(sample, dt_s);
         self.block.add(sample, &self.model, dt_s);
         if !self.block.is_full() {
             return UpdateOutcome::default();
@@ -239,7 +239,7 @@ impl Estimator {
     }
 
     /// The forward speed: its innovations are rows where the base gives no torque.
-    fn step_along(&mut self, sample: &SensorSample, dt_s: f64) {
+    fn step_longitudinal(&mut self, sample: &SensorSample, dt_s: f64) {
         let bound = SlipBound {
             theta_most: self.bound.theta_most,
             theta: self.bound.theta_weights,
@@ -255,7 +255,7 @@ impl Estimator {
         }
         for row in rows.into_iter().flatten().flatten() {
             self.excitation.note_longitudinal(&row);
-            self.pending.add_along(&row, bound.theta);
+            self.pending.add_longitudinal(&row, bound.theta);
         }
     }
 

@@ -234,9 +234,9 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
                 // reads too high by just that share.
                 (theta * (1.0 + parameters[index::RADIUS_OFFSET]), theta)
             };
-            let lateral = covariance[(index::THETA, index::RADIUS_OFFSET)];
+            let cross = covariance[(index::THETA, index::RADIUS_OFFSET)];
             let own = covariance[(index::RADIUS_OFFSET, index::RADIUS_OFFSET)];
-            let scaled = (2.0 * scale * lateral + scale * scale * own).max(-0.5 * base);
+            let scaled = (2.0 * scale * cross + scale * scale * own).max(-0.5 * base);
             let mut of_theta = Parameters::zeros();
             of_theta[index::THETA] = 1.0;
             of_theta[index::RADIUS_OFFSET] = scale;

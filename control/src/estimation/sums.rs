@@ -87,7 +87,7 @@ impl Sums {
     }
 
     /// Adds an innovation of the forward speed, weighed at this θ.
-    pub(super) fn add_along(&mut self, row: &Row, theta: f64) {
+    pub(super) fn add_longitudinal(&mut self, row: &Row, theta: f64) {
         self.longitudinal.add_standardised(row, theta);
         self.note_signal(row, row.innovation_variance);
     }

@@ -3,10 +3,10 @@
 //! The robot is a disc around its centre. *Clearance* is how far a point is inside the allowed
 //! ground: into one of the `keep_in` polygons (the deepest, if there are several) and away from
 //! every `keep_out` polygon. It changes by no more than the distance between two points, so a path
-//! can be walked in steps as long as the clearance of the last one : a few looks answer exactly how
+//! can be walked in steps as long as the clearance of the last one: a few looks answer exactly how
 //! far the robot may go along its arc, whatever the fence looks like.
 //!
-//! [`speed`] caps the speed so that it still stops within that way. Nothing here allocates after
+//! [`speed`] caps the speed so that it still stops within that distance. Nothing here allocates after
 //! [`Fence::new`].
 
 mod ring;

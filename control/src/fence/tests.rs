@@ -27,7 +27,7 @@ fn yard() -> Fence {
 
 proptest! {
     #[test]
-    fn clearance_changes_by_no_more_than_the_way(
+    fn clearance_changes_by_no_more_than_the_distance(
         x_m in -15.0..15.0_f64, y_m in -15.0..15.0_f64,
         dx_m in -2.0..2.0_f64, dy_m in -2.0..2.0_f64,
     ) {

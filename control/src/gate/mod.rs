@@ -118,8 +118,8 @@ pub struct Reasons {
     pub blind_max_m_s: Option<f64>,
     /// Fastest speed of a robot whose sensors contradict each other, metres per second.
     pub sensors_max_m_s: Option<f64>,
-    /// How fast the robot really goes along its path, metres per second, if that is known. On the
-    /// stop its wheels do not pull it on to a speed that it does not have yet.
+    /// How fast the robot really goes along its path, metres per second, if that is known. While it
+    /// comes to rest its wheels do not pull it on to a speed that it does not have yet.
     pub real_m_s: Option<f64>,
 }
 
@@ -171,7 +171,7 @@ pub struct GateLimits {
     pub wheel_speed_max_rad_s: f64,
     /// Fastest change of a wheel's speed, radians per second squared.
     pub wheel_acceleration_max_rad_s2: f64,
-    /// Fastest slowing down of the robot's centre on the stop, as a wheel's, radians per
+    /// Fastest slowing down of the robot's centre while it comes to rest, as a wheel's, radians per
     /// second squared.
     pub wheel_braking_max_rad_s2: f64,
     /// Oldest feedback of the base that is trusted, seconds.
@@ -334,7 +334,7 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
     }
 }
 
-/// The share of both sides' speeds that a tick takes away on the stop.
+/// The share of both sides' speeds that a tick takes away while the robot comes to rest.
 ///
 /// The centre slows down at the braking limit, also in a turn, where one side must slow down faster
 /// for it: by twice the limit at the most.

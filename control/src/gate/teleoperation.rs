@@ -5,7 +5,7 @@
 //! so that one command that came quickly does not make up for many that did not.
 //!
 //! In the last [`STEADY_BEFORE_END_S`] of a command the robot gains no more speed, and wheels that
-//! longitudinal slip of it come back to its own speed: should the driver fall silent, it brakes
+//! run faster than it by slip come back to its own speed: should the driver fall silent, it brakes
 //! from the speed that it had when the command ended.
 
 use super::SLIP_LEAST_M_S;
@@ -127,7 +127,7 @@ pub fn no_faster(previous: Twist, target: Twist) -> Twist {
 
 /// A twist that is not ahead of what the robot really does, bent the same way: wheels that slip
 /// to gain speed are taken back to the robot's.
-pub fn without_forward(twist: Twist, real_m_s: f64) -> Twist {
+pub fn no_faster_than_real(twist: Twist, real_m_s: f64) -> Twist {
     if twist.linear_m_s.abs() < SLIP_LEAST_M_S || !real_m_s.is_finite() {
         return twist;
     }
@@ -198,13 +198,13 @@ mod tests {
             prop_assert!(steady.linear_m_s.abs() <= linear_m_s.abs().min(wanted_m_s.abs()));
             prop_assert!(steady.angular_rad_s.abs() <= angular_rad_s.abs().min(wanted_rad_s.abs()));
             prop_assert!(steady.linear_m_s * linear_m_s >= 0.0);
-            let beside = without_forward(steady, real_m_s);
+            let beside = no_faster_than_real(steady, real_m_s);
             prop_assert!(beside.linear_m_s.abs() <= steady.linear_m_s.abs());
             prop_assert!(beside.linear_m_s.abs() <= real_m_s.abs().max(SLIP_LEAST_M_S) + 1.0e-12);
             let cross = beside.linear_m_s * steady.angular_rad_s
                 - beside.angular_rad_s * steady.linear_m_s;
             prop_assert!(cross.abs() < 1.0e-9);
-            prop_assert_eq!(without_forward(steady, f64::NAN), steady);
+            prop_assert_eq!(no_faster_than_real(steady, f64::NAN), steady);
         }
     }
 

@@ -103,7 +103,7 @@ impl Course {
         }
     }
 
-    /// The nearest point to a robot near `guess_s`; moves a bounded way from there.
+    /// The nearest point to a robot near `guess_s`; moves a bounded distance from there.
     pub fn nearest(&self, point: Point, guess_s: f64) -> Nearest {
         let mut time_s = guess_s;
         for _ in 0..NEWTON_STEPS {

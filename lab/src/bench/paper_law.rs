@@ -88,7 +88,7 @@ impl PaperLaw {
             .reduced
             .inputs(tau, eta, &shape)
             .and_then(|inputs| self.reduced.wheel_speeds(inputs, &shape));
-        // Where no wheel forward speed gives τ, the wheels keep theirs.
+        // Where no forward wheel speed gives τ, the wheels keep theirs.
         if let Ok(wheels) = wheels {
             let most_rad_s = self.model.limits().wheel_speed_max_rad_s;
             self.wheels = WheelSpeeds {

@@ -107,7 +107,7 @@ impl SlipShape {
         }
     }
 
-    /// The inputs `(v₁, v₂)` of these wheel speeds, which must turn ahead, seconds per metre.
+    /// The inputs `(v₁, v₂)` of these wheel speeds, which must turn forward, seconds per metre.
     pub fn inputs(&self, wheels: WheelSpeeds, radius_m: f64) -> Vector2<f64> {
         let left = self.left.two / (radius_m * wheels.left_rad_s);
         let right = self.right.two / (radius_m * wheels.right_rad_s);
@@ -115,7 +115,7 @@ impl SlipShape {
     }
 }
 
-/// E₁ of (17), corrected: rows ahead and left, columns v₁ and v₂.
+/// E₁ of (17), corrected: rows forward and left, columns v₁ and v₂.
 pub fn e_1(velocity: &BodyVelocity, shape: &SlipShape, setting: &Setting) -> Matrix2<f64> {
     let (forward, left) = (velocity.forward_m_s, velocity.left_m_s);
     Matrix2::new(

@@ -13,7 +13,7 @@ use thiserror::Error;
 
 use tread_control::geometry::{Point, Pose};
 
-/// Speed ahead below which α is taken for singular, metres per second.
+/// Forward speed below which α is taken for singular, metres per second.
 pub const SPEED_MIN_M_S: f64 = 1.0e-3;
 
 /// Gains of the law and the place of its control point.

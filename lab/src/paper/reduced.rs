@@ -27,7 +27,7 @@ pub enum ReducedError {
     #[error("the transformation (21) is singular at this velocity")]
     Singular,
     /// The inputs ask for wheels that stand, turn back, or turn without bound.
-    #[error("no wheel speed ahead gives these inputs")]
+    #[error("no forward wheel speed gives these inputs")]
     NoWheelSpeed,
 }
 
@@ -83,7 +83,7 @@ impl Reduced {
         )
     }
 
-    /// η̇ under wheel forward speeds, both ranges of slip, by the four-wheel sum.
+    /// η̇ under forward wheel speeds, both ranges of slip, by the four-wheel sum.
     pub fn rates_from_wheels(&self, eta: Vector2<f64>, wheels: WheelSpeeds) -> Vector2<f64> {
         self.rates(&four_wheel_sum(&self.velocity(eta), wheels, &self.setting))
     }

@@ -18,7 +18,7 @@ const TURN_MIN_RAD_S: f64 = 1.0e-9;
 /// Forces on the body, and its accelerations as (1) means them.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct BodyForce {
-    /// ΣF, newtons ahead.
+    /// ΣF, newtons forward.
     pub longitudinal_n: f64,
     /// ΣP, newtons to the left.
     pub left_n: f64,
@@ -83,7 +83,7 @@ fn stiffness(curve: &FrictionCurve, slip: f64) -> f64 {
 
 /// Sum of the four wheels' forces, in both ranges of slip, regular at λ = 0.
 ///
-/// Wheels must turn ahead. Slips beyond 1 slide as at 1 along the wheel; across it the force keeps
+/// Wheels must turn forward. Slips beyond 1 slide as at 1 along the wheel; across it the force keeps
 /// the direction of the slip vector.
 pub fn four_wheel_sum(
     velocity: &BodyVelocity,

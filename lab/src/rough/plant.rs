@@ -1,6 +1,6 @@
 //! The body, its wheels and its motors, from Newton's laws.
 //!
-//! State in the body frame at the centre of mass: forward speed and to the left, turn rate; per
+//! State in the body frame at the centre of mass: speed forward and to the left, turn rate; per
 //! side the wheels' speed (front and rear are coupled by a chain, as on the makes of
 //! [`super::spec`]); per contact the deflection of the tyre as a slip vector s, which follows `ℓ ṡ
 //! = v_slip − |rω| s`. Its force is `N μ(|s|) s/|s|`, with the wheel's own load N: the loads are
@@ -37,7 +37,7 @@ struct Contact {
     x_m: f64,
     y_m: f64,
     side: usize,
-    /// Deflection as a slip, ahead and to the left.
+    /// Deflection as a slip, forward and to the left.
     deflection: [f64; 2],
     load_n: f64,
     slip_m_s: f64,
@@ -80,7 +80,7 @@ pub struct Plant {
     radius_m: [f64; 2],
     contacts: [Contact; 4],
     load_of_moments: Matrix3<f64>,
-    /// Sums of the contacts' forces, for the loads: ahead and left, newtons.
+    /// Sums of the contacts' forces, for the loads: forward and left, newtons.
     load_force_n: [f64; 2],
     speed_m_s: [f64; 2],
     yaw_rate_rad_s: f64,
@@ -245,7 +245,7 @@ impl Plant {
         }
     }
 
-    /// Forces of the contacts on the body, ahead and left each, newtons.
+    /// Forces of the contacts on the body, forward and left each, newtons.
     fn forces(&mut self) -> [[f64; 2]; 4] {
         let curve = self.spec.curve;
         let damping =
@@ -361,7 +361,7 @@ impl Plant {
     }
 }
 
-/// Speed of a contact's patch over the ground, turned round: ahead and left.
+/// Speed of a contact's patch over the ground, turned round: forward and left.
 fn slip_velocity(contact: &Contact, speed: [f64; 2], yaw_rate: f64, rim_m_s: f64) -> [f64; 2] {
     [
         rim_m_s - (speed[0] - yaw_rate * contact.y_m),

@@ -253,7 +253,7 @@ pub struct AgentConfig {
     pub model: RobotModel,
     /// The base.
     pub drive: DriveConfig,
-    /// Holders of external limits whose silence holds the robot, at most
+    /// Owners of external limits whose silence holds the robot, at most
     /// [`LIMITS_MAX`].
     pub required_owners: Vec<OwnerId>,
     /// Whether the robot may be teleoperated, slowly, within a fence without knowing where it is.

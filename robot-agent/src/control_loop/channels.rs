@@ -195,7 +195,7 @@ impl Fault {
 pub(crate) struct GateSnapshot {
     /// The strictest cause in the last tick.
     pub(crate) cause: Option<GateCause>,
-    /// Whether it was on the stop, or there.
+    /// Whether it was coming to rest, or stood.
     pub(crate) target_rests: bool,
     /// Ticks in which it reduced a command.
     pub(crate) reduced_ticks: u64,

@@ -5,7 +5,7 @@
 //! taken as they come: the fused position follows the wheels while these spin.
 //!
 //! ```text
-//!        WINDOWS in a row with less than DUG_IN_RATIO of the way
+//!        WINDOWS in a row with less than DUG_IN_RATIO of the distance
 //! fine ──────────────────────────────────────────────────────────► dug in
 //!   ▲ └────── WINDOWS in a row with more than FREE_RATIO of it ──────┘
 //! ```

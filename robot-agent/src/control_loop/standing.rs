@@ -297,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn wheels_that_say_nothing_do_not_hide_a_turn_or_a_way() {
+    fn wheels_that_say_nothing_do_not_hide_a_turn_or_a_distance() {
         for motion in [
             Motion {
                 turn_rad_s: Some(0.4),

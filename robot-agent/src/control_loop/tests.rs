@@ -254,13 +254,13 @@ fn the_word_to_stop_brings_the_robot_to_rest_within_its_braking_time() {
     bench.run_for(Duration::from_secs(5));
     let speed_m_s = bench.drive.truth().forward_m_s;
     assert!(speed_m_s > 0.5, "{speed_m_s}");
-    let logged_at = bench.now;
+    let stop_requested_at = bench.now;
     while !bench.core.stands() {
         bench.simulate();
         bench.tick_loop(true);
         bench.collect();
         assert!(
-            bench.now < logged_at + Duration::from_secs(3),
+            bench.now < stop_requested_at + Duration::from_secs(3),
             "it does not stand"
         );
     }

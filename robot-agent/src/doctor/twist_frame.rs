@@ -1,6 +1,6 @@
 //! In which frame the odometry's motion is. Pure.
 //!
-//! The motion in `nav_msgs/Odometry` is of the frame `child_frame_id`: ahead and to the left of the
+//! The motion in `nav_msgs/Odometry` is of the frame `child_frame_id`: forward and to the left of the
 //! robot. Where its writer put it into the frame of the pose, it points where the robot heads, and
 //! is right only while that is along the x axis.
 

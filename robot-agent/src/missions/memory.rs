@@ -101,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_holder_comes_back_as_it_was_saved() {
+    fn a_slot_comes_back_as_it_was_saved() {
         let folder = tempfile::tempdir().unwrap();
         let memory = Memory::new(folder.path());
         assert_eq!(memory.load().unwrap(), MissionSlot::default());

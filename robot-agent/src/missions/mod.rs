@@ -2,8 +2,8 @@
 //!
 //! ```text
 //!            offer                    report of the loop
-//! (unknown) ───────► held ──────────────────────────────► ended
-//!     │              │ ▲ └ cancel: held, braking ──────────▲
+//! (unknown) ───────► active ────────────────────────────► ended
+//!     │              │ ▲ └ cancel: active, braking ────────▲
 //!     │              └─┘ offer of a higher revision        │
 //!     └ cancel ────────────────────────────────────────────┘
 //! ```
@@ -134,7 +134,7 @@ impl MissionSlot {
             Some(active) if active.revision < offer.revision => OfferDecision::Replace,
             Some(active) => {
                 let detail = format!(
-                    "mission {mission} is held as revision {} with plan hash {}",
+                    "mission {mission} is active as revision {} with plan hash {}",
                     active.revision, active.plan_hash
                 );
                 refuse(OfferRefusal::Conflict, detail)
@@ -176,7 +176,7 @@ impl MissionSlot {
         }
     }
 
-    /// Whether a mission is held in this revision, to be paused or resumed.
+    /// Whether a mission is active in this revision, to be paused or resumed.
     ///
     /// # Errors
     /// Why not, for the server.
@@ -196,9 +196,9 @@ impl MissionSlot {
             Some(active) if active.mission == mission && active.revision == revision => Ok(()),
             Some(active) if active.mission == mission => Err((
                 OfferRefusal::Conflict,
-                format!("it is held as revision {}", active.revision),
+                format!("it is active as revision {}", active.revision),
             )),
-            Some(_) | None => Err((OfferRefusal::Unknown, "it is not held here".to_owned())),
+            Some(_) | None => Err((OfferRefusal::Unknown, "it is not active here".to_owned())),
         }
     }
 

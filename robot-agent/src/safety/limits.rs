@@ -256,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn a_required_holder_holds_by_its_silence_and_any_other_only_while_it_lasts() {
+    fn a_required_owner_holds_by_its_silence_and_any_other_only_while_it_lasts() {
         let mut limits = ExternalLimits::new(boot(), &["lidar".parse().unwrap()]);
         assert!(limits.view().holds(0), "not heard yet");
         limits.take(&limit("lidar", 1, 1_000, false), 10).unwrap();
@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn too_many_holders_foreign_and_endless_limits_are_refused() {
+    fn too_many_owners_foreign_and_endless_limits_are_refused() {
         let mut limits = ExternalLimits::new(boot(), &["lidar".parse().unwrap()]);
         for number in 1..LIMITS_MAX {
             let owner = format!("h{number}");

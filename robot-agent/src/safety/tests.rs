@@ -337,7 +337,7 @@ fn a_robot_that_leans_too_far_or_says_nonsense_stops() {
 }
 
 #[test]
-fn a_mission_brakes_before_a_fence_that_was_drawn_across_its_way() {
+fn a_mission_brakes_before_a_fence_that_was_drawn_across_its_path() {
     let (mut bench, mission) = driving();
     let corners = [(9.0, 2.0), (10.0, 2.0), (10.0, 6.0), (9.0, 6.0)];
     let corners = corners.map(|(x_m, y_m)| Point { x_m, y_m });

@@ -167,7 +167,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn noise_has_the_deviation_that_was_asked_for() {
+    fn noise_has_the_standard_deviation_that_was_asked_for() {
         let mut sensors = Sensors::new(SensorSpec::default(), &RobotModel::yi2007(), 5);
         let count = 20_000;
         let values: Vec<f64> = (0..count).map(|_| sensors.noisy(3.0, 0.5)).collect();

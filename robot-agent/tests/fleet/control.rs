@@ -84,7 +84,7 @@ async fn end_report(rig: &Rig, mission: MissionId) -> MissionReport {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_mission_that_is_taken_held_stands_at_its_start_until_it_is_resumed() {
+async fn a_mission_that_is_taken_on_hold_stands_at_its_start_until_it_is_resumed() {
     let rig = Rig::new();
     let server = rig.serve();
     let agent = rig.agent();

@@ -1,6 +1,6 @@
 //! The messages that Tread reads from a robot and writes to it, field by field as ROS 2 defines them.
 //!
-//! Units and frames are ROS's: SI, x ahead, y to the left, z up. Nothing here checks a value: that
+//! Units and frames are ROS's: SI, x forward, y to the left, z up. Nothing here checks a value: that
 //! a number is finite, or a quaternion one, is for whoever uses it.
 
 mod common;

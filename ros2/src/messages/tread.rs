@@ -72,7 +72,7 @@ record! {
         present: u32,
         /// Turn rate, radians per second.
         yaw_rate_rad_s: f64,
-        /// Acceleration ahead, metres per second squared.
+        /// Forward acceleration, metres per second squared.
         forward_m_s2: f64,
         /// Acceleration to the left.
         left_m_s2: f64,
@@ -84,7 +84,7 @@ record! {
         torque_left_n_m: f64,
         /// Torque of the right wheels.
         torque_right_n_m: f64,
-        /// Speed over ground, ahead, metres per second.
+        /// Forward speed over ground, metres per second.
         body_speed_m_s: f64,
         /// Lean from level, radians.
         tilt_rad: f64,

@@ -395,7 +395,7 @@ async fn an_answer_says_which_normalisation_it_used() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_dispatch_tells_the_robot_what_the_map_knows_along_its_way() {
+async fn a_dispatch_tells_the_robot_what_the_map_knows_along_its_path() {
     let yard = measured_yard().await;
     let robot = Robot::join(&yard, "rover-3").await;
     let offered = async |begin_x_m: f64, y_m: f64| {

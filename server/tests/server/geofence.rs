@@ -33,7 +33,7 @@ impl Yard {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_geofence_reaches_the_robots_and_refuses_ways_that_leave_it_with_the_place() {
+async fn a_geofence_reaches_the_robots_and_refuses_paths_that_leave_it_with_the_place() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;
     let first: Geofence = yard.get(FENCE).await;

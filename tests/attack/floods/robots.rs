@@ -203,11 +203,11 @@ impl Flooder {
             Flood::Hellos => self.ask(keys::hello(&site, &id), b"no introduction".to_vec()),
             Flood::MalformedStates => self.put(
                 keys::state(&site, &id),
-                b"{\"v\":1,\"body\":{\"robot\"".to_vec(),
+                b"{\"v\":2,\"body\":{\"robot\"".to_vec(),
             ),
             Flood::Provocations => {
                 let number = self.number;
-                let words = format!("{{\"v\":1,\"body\":\"line\\n{number} \u{1b}[31m of a log\"}}");
+                let words = format!("{{\"v\":2,\"body\":\"line\\n{number} \u{1b}[31m of a log\"}}");
                 match number % 4 {
                     0 => self.put(keys::friction(&site, &id), words.into_bytes()),
                     1 => self.ask(keys::ingest(&site, &id), words.into_bytes()),

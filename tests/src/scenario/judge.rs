@@ -227,11 +227,11 @@ pub struct Stopping {
 ///
 /// # Errors
 /// It was not seen to come to rest.
-pub fn stopping(samples: &[TruthSample], logged_at: Duration) -> anyhow::Result<Stopping> {
+pub fn stopping(samples: &[TruthSample], stop_requested_at: Duration) -> anyhow::Result<Stopping> {
     let speed = |sample: &TruthSample| sample.state.forward_m_s.hypot(sample.state.left_m_s);
     let after: Vec<&TruthSample> = samples
         .iter()
-        .filter(|sample| sample.at >= logged_at)
+        .filter(|sample| sample.at >= stop_requested_at)
         .collect();
     let first = after.first().context("nothing was seen after the stop")?;
     let rest = after.iter().position(|sample| speed(sample) < STANDING_M_S);
@@ -246,7 +246,10 @@ pub fn stopping(samples: &[TruthSample], logged_at: Duration) -> anyhow::Result<
     Ok(Stopping {
         from_m_s: speed(first),
         distance_m,
-        time_s: after[rest].at.saturating_sub(logged_at).as_secs_f64(),
+        time_s: after[rest]
+            .at
+            .saturating_sub(stop_requested_at)
+            .as_secs_f64(),
     })
 }
 

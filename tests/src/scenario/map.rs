@@ -414,12 +414,12 @@ async fn stop_one(world: &World, site: &SiteId, robot: &RobotId) -> anyhow::Resu
     world
         .until("the robot is on the ice", STOP_WAIT_MAX, passed)
         .await?;
-    let logged_at = world.now();
+    let stop_requested_at = world.now();
     let path = format!("/v1/sites/{site}/robots/{robot}/stop");
     world
         .rest
         .post(&path, &serde_json::json!({"by": "scenario"}))
         .await;
-    let stood = || async { stopping(&trace.samples(), logged_at).ok() };
+    let stood = || async { stopping(&trace.samples(), stop_requested_at).ok() };
     world.until("the robot stands", STOP_WAIT_MAX, stood).await
 }

@@ -219,7 +219,7 @@ pub fn path(points: &[(f64, f64)], speed_m_s: f64) -> anyhow::Result<Trajectory>
         .map(|&(x_m, y_m)| json!({"x_m": x_m, "y_m": y_m}))
         .collect();
     let path = json!({"waypoints": {"speed_m_s": speed_m_s, "points": points}});
-    serde_json::from_value(path).context("a way")
+    serde_json::from_value(path).context("a path")
 }
 
 /// A figure-8 around a centre, once through.

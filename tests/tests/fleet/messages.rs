@@ -42,7 +42,7 @@ async fn uploads_that_lie_or_do_not_parse_are_refused_and_counted() {
             .await
             .contains("Malformed")
     );
-    let newer = good.replacen("\"v\":1", "\"v\":2", 1);
+    let newer = good.replacen("\"v\":2", "\"v\":3", 1);
     assert!(refusal(&robot, &own_key, &newer).await.contains("Version"));
 
     // A record that cannot be a measurement is refused by itself; its neighbours are stored.

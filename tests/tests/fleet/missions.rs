@@ -20,7 +20,7 @@ const LENGTH_TOLERANCE_M: f64 = 0.001;
 
 /// The path that the server shows is as long as the robot's own, and everything that the robot
 /// drove is as near to it as the robot says.
-async fn assert_the_way_shown_was_driven(fleet: &Fleet, ended: &MissionDetail) {
+async fn assert_the_path_shown_was_driven(fleet: &Fleet, ended: &MissionDetail) {
     let id = ended.mission.id;
     let path: PlannedPath = fleet.rest.get(&format!("/v1/missions/{id}/path")).await;
     let plan = ended.mission.plan.expect("the robot reported its plan");
@@ -72,7 +72,7 @@ async fn a_circle_and_waypoints_reach_their_ends_and_the_ground_is_measured() {
             ended.events.last().map(|event| event.actor),
             Some(Actor::Robot)
         );
-        assert_the_way_shown_was_driven(&fleet, &ended).await;
+        assert_the_path_shown_was_driven(&fleet, &ended).await;
     }
 
     // The last segment of a mission may still be on its way when the mission

@@ -29,7 +29,7 @@ const ABOVE: Tolerance = Tolerance {
 };
 /// How near, of what the wheels say above the command, the body is to that.
 const NEARER_ABOVE: f64 = 0.4;
-/// The same ahead, of a body to its command than wheels are.
+/// The same forward, of a body to its command than wheels are.
 const NEARER_FORWARD: f64 = 0.9;
 /// Nearer to one than to the other: at most this share of the distance.
 pub(super) const NEARER: f64 = 0.6;

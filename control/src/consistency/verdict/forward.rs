@@ -1,4 +1,4 @@
-//! The forward speed, and to the left: wheels, odometry over ground, and position fixes.
+//! The speed forward and to the left: wheels, odometry over ground, and position fixes.
 
 use super::axis::{Axis, Tolerance, finding, kind_of};
 use super::wheels::{self, WHEELS, WITNESSED};

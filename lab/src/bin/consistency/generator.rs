@@ -81,7 +81,7 @@ struct Build {
     command_delay_steps: usize,
     wheels_lag_s: f64,
     wheels_most_rad_s2: f64,
-    /// Slip over the force that it gives, in seconds: ahead and to the left, and in yaw.
+    /// Slip over the force that it gives, in seconds: forward and to the left, and in yaw.
     slip_s: (f64, f64),
     mu: f64,
     gyro_noise_rad_s: f64,

@@ -294,7 +294,7 @@ fn write_tracking(folder: &Path, rows: &[Row]) -> anyhow::Result<()> {
                 y_label: "m/s",
                 equal_scale: false,
                 curves: vec![
-                    timed("ahead", &|row: &Row| row.state.forward_m_s),
+                    timed("forward", &|row: &Row| row.state.forward_m_s),
                     timed("left", &|row: &Row| row.state.left_m_s),
                 ],
             },

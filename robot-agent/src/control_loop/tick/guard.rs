@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use tread_api::robot::PauseCause;
 use tread_control::fence::{FenceInput, MU_UNKNOWN};
-use tread_control::gate::teleoperation::{BLIND_MAX_M_S, approach, no_faster, without_forward};
+use tread_control::gate::teleoperation::{BLIND_MAX_M_S, approach, no_faster, no_faster_than_real};
 use tread_control::gate::{GateCause, GateInput, GateOutput, Reasons, gate_with};
 use tread_control::geometry::Twist;
 use tread_control::measured::WheelSpeeds;
@@ -145,7 +145,7 @@ impl LoopCore {
         }
         let mut twist = approach(previous, target, &self.model, dt_s);
         if ends_soon {
-            twist = without_forward(twist, self.real_m_s(now));
+            twist = no_faster_than_real(twist, self.real_m_s(now));
         }
         Wanted {
             wheels: self.model.wheel_speeds_from_twist(twist),

@@ -384,7 +384,7 @@ impl Bus {
     }
 
     /// Writes commands, and what there is to say from a thread of its own, so that no command waits
-    /// for a way of hundreds of points.
+    /// for a path of hundreds of points.
     fn speak(&self, declared: &Declared, outward: Option<&mut Outward>) {
         std::thread::scope(|scope| {
             let telling = outward.and_then(|outward| {

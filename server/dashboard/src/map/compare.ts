@@ -9,7 +9,7 @@ export const CHANCE = 2;
 const MOST = Math.LN2;
 /** What the legend names, percent. */
 export const CHANGE_TICKS = [-50, 0, 100];
-/** Blue to white to red, distinguished by all eyes: ends and middle. */
+/** Blue to white to red, which all eyes can distinguish: ends and middle. */
 const FALLEN = [33, 102, 172] as const;
 const SAME = [190, 190, 190] as const;
 const RISEN = [178, 24, 43] as const;

@@ -12,7 +12,7 @@ export class Plans {
 
   constructor(readonly changed: () => void) {}
 
-  /** The way of a mission, as soon as it is known. */
+  /** The path of a mission, as soon as it is known. */
   of(mission: Mission): PointM[] | null {
     // Until its robot has said from where it comes, a circle is drawn exactly by what was asked for.
     if ('circle' in mission.trajectory && !mission.plan?.begin) return null;

@@ -138,7 +138,7 @@ export class View {
   async open(mission: string): Promise<void> {
     try {
       const detail = await ask<MissionDetail>(`/v1/missions/${mission}`);
-      // What a robot has refused may have no way at all.
+      // What a robot has refused may have no path at all.
       const path = `/v1/missions/${mission}/path`;
       const plan = detail.state === 'rejected' ? null : await ask<PlannedPath>(path).catch(() => null);
       this.detail = detail;

@@ -58,7 +58,7 @@ impl App {
             None => Err(EnrolError::Malformed),
         };
         match &enrolled {
-            Ok(_) | Err(EnrolError::App(_)) => return enrolled,
+            Ok(_) | Err(EnrolError::App(_) | EnrolError::Ended(_)) => return enrolled,
             Err(_refused) => {}
         }
         if let Some(left) = self.locked_for(&sources) {

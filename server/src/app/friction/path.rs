@@ -363,8 +363,8 @@ fn curvature(a: Point, b: Point, c: Point) -> f64 {
     let doubled_area =
         ((b.x_m - a.x_m) * (c.y_m - a.y_m) - (b.y_m - a.y_m) * (c.x_m - a.x_m)).abs();
     let product = ab * bc * ca;
-    let longitudinal = (b.x_m - a.x_m) * (c.x_m - b.x_m) + (b.y_m - a.y_m) * (c.y_m - b.y_m);
-    if product <= 0.0 || (longitudinal < 0.0 && doubled_area <= 1.0e-12) {
+    let onward = (b.x_m - a.x_m) * (c.x_m - b.x_m) + (b.y_m - a.y_m) * (c.y_m - b.y_m);
+    if product <= 0.0 || (onward < 0.0 && doubled_area <= 1.0e-12) {
         if ab > 0.0 && bc > 0.0 {
             f64::INFINITY
         } else {

@@ -260,8 +260,8 @@ impl Credential {
         }
     }
 
-    /// Who does something, for people: this token's name always, and behind it the name that its
-    /// owner gave, if it is another one. Nobody acts under a name alone that is not his token's.
+    /// Who does something, for people: this token's name always, and behind it the name that
+    /// whoever shows it gave, if it is another one. Nobody acts under a name alone that is not his token's.
     pub fn said_by(&self, claimed: Option<&str>) -> String {
         match claimed.map(str::trim) {
             None | Some("") => self.name.clone(),

@@ -93,7 +93,7 @@ fn on_the_bench(trials: u64, steps: u64, seed: u64) -> anyhow::Result<Vec<Check>
             figure(hand.overruns),
         ),
         Check::at_most(
-            "silence: worst share of that way",
+            "silence: worst share of that distance",
             1.0,
             hand.worst_distance_share,
         ),

@@ -149,7 +149,7 @@ fn a_mission_is_shown_from_its_plan_to_the_way_driven_in_the_robots_frame() {
 }
 
 #[test]
-fn a_way_keeps_its_newest_points_and_no_more_than_it_may() {
+fn a_path_keeps_its_newest_points_and_no_more_than_it_may() {
     let mut outward = outward(&Arc::default());
     let at = |x_m: f64| Pose {
         x_m,
