@@ -2,7 +2,8 @@
 
 use std::fmt::Write as _;
 
-use tread_tests::markdown::{documents, root};
+use tread_tests::markdown::documents;
+use tread_tests::repository::root;
 use tread_tests::shell::commands;
 
 use super::{Arguments, shield_negative_points};

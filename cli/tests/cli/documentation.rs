@@ -8,8 +8,9 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
-use tread_tests::markdown::{Block, Document, documents, root};
+use tread_tests::markdown::{Block, Document, documents};
 use tread_tests::ports::free_address;
+use tread_tests::repository::root;
 use tread_tests::wait::{SHORT, eventually};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_tread");
