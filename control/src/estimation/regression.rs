@@ -1,6 +1,6 @@
 //! The regression of slip on force with errors in variables.
 //!
-//! Rows are in [`super`] and [`super::along`]. For known noise `σ_x²` of the force regressor the
+//! Rows are in [`super`] and [`super::longitudinal`]. For known noise `σ_x²` of the force regressor the
 //! corrected normal matrix is `M = Σ_c (X_cᵀX_c − n σ_x² e₁e₁ᵀ)/s_c²` with `s_c² = σ_y² + θ²σ_x²`
 //! (found by iteration), and the variance of θ is
 //! `[M⁻¹]₁₁ + [M⁻¹]₁₁² Σ_c n (σ_x² s_c² + θ²σ_x⁴)/s_c⁴` (Fuller, Measurement Error Models, 1987).
