@@ -20,7 +20,6 @@ pub(super) struct FileConfig {
     pub(super) rate_hz: Option<f64>,
     pub(super) state_rate_hz: Option<f64>,
     pub(super) friction_rate_hz: Option<f64>,
-    #[serde(alias = "required_holders")]
     pub(super) required_owners: Option<Vec<OwnerId>>,
     pub(super) blind_within_fence: Option<bool>,
     pub(super) model: Option<ModelFile>,

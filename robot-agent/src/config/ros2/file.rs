@@ -151,7 +151,6 @@ pub(super) struct CommandFile {
     pub(super) wheel_radius_m: Option<f64>,
     pub(super) track_width_m: Option<f64>,
     pub(super) turn_sign: Option<f64>,
-    #[serde(alias = "ahead_sign")]
     pub(super) forward_sign: Option<f64>,
 }
 
