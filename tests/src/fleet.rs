@@ -66,9 +66,32 @@ impl Fleet {
         Self::start_configured(node, Some(&text)).await
     }
 
-    async fn start_configured(node: &Path, config: Option<&str>) -> Self {
-        let (http, zenoh) = (free_address(), free_address());
+    /// The same, on what an earlier fleet left: `lay_out` puts `tread.db`, `authority` and the robots'
+    /// folders into this one's. No terrain is drawn, and raw measurements of any age are kept.
+    ///
+    /// # Panics
+    /// If the server does not get ready.
+    pub async fn start_secure_on(node: &Path, lay_out: impl FnOnce(&Path)) -> Self {
+        let text = "[robots]\nauthority = \"authority\"\n[retention]\nsegments_days = 36500\n";
         let folder = tempfile::tempdir().expect("a temporary folder");
+        lay_out(folder.path());
+        // An admin's token of another name, so that those that are there stay as they are.
+        let mut fleet = Self::new(node, folder, Some(text), &["--force", "--name=harness"]);
+        fleet.start_server().await;
+        fleet
+    }
+
+    async fn start_configured(node: &Path, config: Option<&str>) -> Self {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let mut fleet = Self::new(node, folder, config, &[]);
+        fleet.start_server().await;
+        fleet.draw_ground().await;
+        fleet
+    }
+
+    /// A fleet of which nothing runs yet.
+    fn new(node: &Path, folder: TempDir, config: Option<&str>, init: &[&str]) -> Self {
+        let (http, zenoh) = (free_address(), free_address());
         let config = config.map(|text| {
             let path = folder.path().join("tread.toml");
             let authority = folder.path().join("authority");
@@ -76,8 +99,8 @@ impl Fleet {
             std::fs::write(&path, text).expect("the temporary folder can be written");
             path
         });
-        let token = first_token(node, folder.path(), config.as_deref());
-        let mut fleet = Self {
+        let token = first_token(node, folder.path(), config.as_deref(), init);
+        Self {
             rest: Rest::new(format!("http://{http}"), &token),
             token,
             node: node.to_owned(),
@@ -88,8 +111,11 @@ impl Fleet {
             agents: HashMap::new(),
             agent_flags: Vec::new(),
             config,
-        };
-        fleet.start_server().await;
+        }
+    }
+
+    /// Draws the terrain under every robot.
+    async fn draw_ground(&self) {
         let corner = |x: f64, y: f64| json!({"x_m": GROUND_HALF_M * x, "y_m": GROUND_HALF_M * y});
         let polygon = [
             corner(-1.0, -1.0),
@@ -98,11 +124,9 @@ impl Fleet {
             corner(-1.0, 1.0),
         ];
         let terrain = json!({"id": GROUND, "class": "concrete", "polygon": polygon});
-        fleet
-            .rest
+        self.rest
             .post(&format!("/v1/sites/{SITE}/terrains"), &terrain)
             .await;
-        fleet
     }
 
     /// The fleet's site.
@@ -432,9 +456,10 @@ fn database(folder: &Path) -> PathBuf {
 }
 
 /// Makes the database with an admin's token in it, as one does before a server's first start.
-fn first_token(node: &Path, folder: &Path, config: Option<&Path>) -> String {
+fn first_token(node: &Path, folder: &Path, config: Option<&Path>, flags: &[&str]) -> String {
     let made = Command::new(node)
         .args(["server", "init"])
+        .args(flags)
         .arg(format!("--database={}", database(folder).display()))
         .args(config.map(|config| format!("--config={}", config.display())))
         .output()

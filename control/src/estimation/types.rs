@@ -52,6 +52,7 @@ impl Default for SensorNoise {
 pub struct TyrePrior {
     /// How far the tyres' stiffness across may differ from that along, one standard deviation as
     /// a share. It is learned from turning; it only matters until then.
+    #[serde(alias = "side_grip_spread")]
     pub lateral_stiffness_std_dev: f64,
     /// Mean θκ of `λ = θμ(1 + κλ + ⅔κ²λ²)`, per friction coefficient: 0 for the paper's straight
     /// rise, `1/(3μ_p)` for a brush-like tyre of peak `μ_p`.

@@ -68,6 +68,8 @@ pub(crate) enum NotCleared {
 /// What the loop looks at in a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct LoopView {
+    // Earlier records say `hand`.
+    #[serde(alias = "hand")]
     pub(crate) teleoperation: TeleoperationView,
     pub(crate) limits: LimitsView,
 }

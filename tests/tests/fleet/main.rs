@@ -5,6 +5,8 @@ mod chaos;
 mod control;
 #[cfg(test)]
 mod drivers;
+#[cfg(test)]
+mod earlier_state;
 mod event_clients;
 mod impostors;
 mod membership;
