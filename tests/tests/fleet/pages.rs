@@ -24,7 +24,15 @@ fn every_test_that_the_page_on_safety_names_is_there() {
     let root = Path::new(&tests).parent().unwrap();
     let page = std::fs::read_to_string(root.join("docs/safety.md")).unwrap();
     let mut code = String::new();
-    for part in ["api", "cli", "control", "robot-agent", "server", "tests"] {
+    for part in [
+        "api",
+        "cli",
+        "control",
+        "lab",
+        "robot-agent",
+        "server",
+        "tests",
+    ] {
         sources(&root.join(part), &mut code);
     }
     let tables = page
