@@ -61,6 +61,8 @@ pub struct Measured {
     pub wheel_speeds: WheelSpeeds,
     /// Age of the last accepted position fix, seconds.
     pub pose_age_s: f64,
+    /// Standard deviation of the position per axis, metres; infinite where it is not known.
+    pub position_std_dev_m: f64,
 }
 
 impl Measured {

@@ -154,6 +154,7 @@ impl Robot {
             twist: self.localisation.twist(),
             wheel_speeds: self.samples[SAMPLES as usize - 1].wheel_speeds,
             pose_age_s: self.localisation.fix_age_s(),
+            position_std_dev_m: self.localisation.position_std_dev_m(),
         };
         let output = self.follower.step(&measured, knowledge, LOOP_S);
         let input = GateInput {

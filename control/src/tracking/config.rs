@@ -43,6 +43,8 @@ pub struct TrackerConfig {
     pub noisy: CrossGains,
     /// Noise of the pose half-way between both, as density `σ√T` of white noise, m·√s.
     pub noise_middle_m_sqrt_s: f64,
+    /// The same as the position's standard deviation, metres: a filter's noise is no white one.
+    pub position_middle_m: f64,
     /// Largest turn of the path's curvature by the integral, per metre.
     pub integral_max_1_m: f64,
     /// First-order lag of the wheel servo that is led, seconds.
@@ -56,8 +58,13 @@ pub struct TrackerConfig {
     pub beyond_gain: f64,
     /// Fastest change of θ̂, per second.
     pub adaptation_rate_max_1_s: f64,
-    /// Pull of θ̂ to a θ that is known, per second, at full confidence.
+    /// Pull of θ̂ to a θ that is known, per second, at full confidence: so little that errors may
+    /// lead it off.
     pub adaptation_pull_1_s: f64,
+    /// The same farther from it than it may be led off.
+    pub adaptation_return_1_s: f64,
+    /// How far θ̂ may be led off a known θ, as a share of that and beside its standard deviation.
+    pub adaptation_band_ratio: f64,
     /// Largest θ̂.
     pub theta_max: f64,
     /// Age of the pose beyond which adaptation and integral are held, seconds.
@@ -71,23 +78,26 @@ impl Default for TrackerConfig {
             quiet: CrossGains {
                 cross_1_m2: 20.0,
                 heading_1_m: 8.0,
-                integral_1_m3: 40.0,
+                integral_1_m3: 26.0,
                 yaw_rate: 0.7,
             },
             noisy: CrossGains {
                 cross_1_m2: 14.0,
                 heading_1_m: 9.0,
-                integral_1_m3: 5.0,
-                yaw_rate: 0.5,
+                integral_1_m3: 7.0,
+                yaw_rate: 0.6,
             },
             noise_middle_m_sqrt_s: 7.0e-4,
+            position_middle_m: 4.0e-3,
             integral_max_1_m: 0.5,
             servo_lag_s: 0.05,
-            adaptation_gain: 2000.0,
+            adaptation_gain: 2800.0,
             friction_curve: FrictionCurve::yi2007(),
             beyond_gain: 8_000.0,
             adaptation_rate_max_1_s: 0.3,
-            adaptation_pull_1_s: 10.0,
+            adaptation_pull_1_s: 1.0,
+            adaptation_return_1_s: 10.0,
+            adaptation_band_ratio: 0.3,
             theta_max: 4.0,
             pose_age_max_s: 0.3,
         }
@@ -117,6 +127,7 @@ impl TrackerConfig {
             ("noisy.cross_1_m2", self.noisy.cross_1_m2),
             ("noisy.heading_1_m", self.noisy.heading_1_m),
             ("noise_middle_m_sqrt_s", self.noise_middle_m_sqrt_s),
+            ("position_middle_m", self.position_middle_m),
             ("theta_max", self.theta_max),
             ("pose_age_max_s", self.pose_age_max_s),
         ];
@@ -131,6 +142,8 @@ impl TrackerConfig {
             ("beyond_gain", self.beyond_gain),
             ("adaptation_rate_max_1_s", self.adaptation_rate_max_1_s),
             ("adaptation_pull_1_s", self.adaptation_pull_1_s),
+            ("adaptation_return_1_s", self.adaptation_return_1_s),
+            ("adaptation_band_ratio", self.adaptation_band_ratio),
         ];
         for (field, value) in positive {
             if !(value.is_finite() && value > 0.0) {

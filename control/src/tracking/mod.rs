@@ -207,8 +207,9 @@ impl Tracker {
         self.apply_knowledge(knowledge, dt_s);
         let theta = self.theta;
         let density = self.noise.update(measured, dt_s);
-        let middle = config.noise_middle_m_sqrt_s.powi(2);
-        let gains = CrossGains::blend(config.quiet, config.noisy, middle / (middle + density));
+        let noise = density / config.noise_middle_m_sqrt_s.powi(2)
+            + (measured.position_std_dev_m / config.position_middle_m).powi(2);
+        let gains = CrossGains::blend(config.quiet, config.noisy, 1.0 / (1.0 + noise));
 
         let speed_m_s = reference.speed_m_s;
         let belief = Belief {
@@ -323,7 +324,10 @@ impl Tracker {
         let gradient = (config.adaptation_gain * error_m * sideslip.drift_per_theta_m_s).min(most);
         let pull = knowledge.map_or(0.0, |known| {
             let weight = known.confidence();
-            config.adaptation_pull_1_s * weight * (weight * known.theta - self.theta)
+            let apart = weight * known.theta - self.theta;
+            let band = config.adaptation_band_ratio * known.theta + known.std_dev;
+            let outside = apart - apart.clamp(-band, band);
+            weight * (config.adaptation_pull_1_s * apart + config.adaptation_return_1_s * outside)
         });
         let bound = config.adaptation_rate_max_1_s;
         // The pull is a way back, not a drift: it may act faster than the gradient.

@@ -165,6 +165,7 @@ impl SimRobot {
             twist: self.localisation.twist(),
             wheel_speeds: true_motion.wheel_speeds,
             pose_age_s: self.localisation.fix_age_s(),
+            position_std_dev_m: self.localisation.position_std_dev_m(),
         }
     }
 
@@ -176,6 +177,7 @@ impl SimRobot {
             twist: state.twist(),
             wheel_speeds: state.wheel_speeds,
             pose_age_s: 0.0,
+            position_std_dev_m: 0.0,
         }
     }
 

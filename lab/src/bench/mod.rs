@@ -4,12 +4,14 @@
 //! same measurements. Noise comes from outside: a run draws no random numbers.
 
 mod course;
+mod driver;
 mod kanayama;
 mod paper_law;
 mod pursuit;
 mod run;
 
 pub use course::{Course, Figure8, Nearest};
+pub use driver::{Driver, Sight};
 pub use kanayama::{Kanayama, KanayamaGains, Track};
 pub use paper_law::PaperLaw;
 pub use pursuit::{Pursuit, PursuitConfig};

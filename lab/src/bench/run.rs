@@ -2,9 +2,7 @@
 
 use crate::bench::Law;
 use crate::bench::course::Course;
-use crate::bench::kanayama::Kanayama;
-use crate::bench::paper_law::PaperLaw;
-use crate::bench::pursuit::Pursuit;
+use crate::bench::driver::{Driver, Sight};
 use tread_control::friction::FrictionCurve;
 use tread_control::gate::{GateInput, GateLimits, gate};
 use tread_control::geometry::{Point, Pose};
@@ -12,9 +10,7 @@ use tread_control::measured::{Measured, WheelSpeeds};
 use tread_control::plan::Plan;
 use tread_control::plant::{Ground, Plant, PlantError, PlantSpec, PlantState};
 use tread_control::robot::RobotModel;
-use tread_control::tracking::{
-    ThetaKnowledge, Tracker, TrackerConfig, TrackerError, TrackerOutput,
-};
+use tread_control::tracking::{ThetaKnowledge, TrackerConfig, TrackerError, TrackerOutput};
 
 /// Cross-track error at which a run is given up, metres.
 const GIVEN_UP_M: f64 = 50.0;
@@ -82,15 +78,6 @@ pub struct TickOutput {
     pub tracker: Option<TrackerOutput>,
 }
 
-/// A law with its memory.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Driver {
-    Kanayama(Kanayama),
-    Pursuit(Pursuit),
-    Paper(PaperLaw),
-    Shipped(Tracker),
-}
-
 /// A run under way.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Run {
@@ -134,20 +121,7 @@ impl Run {
             yaw_rate_rad_s: start.turn_rad_s,
             wheel_speeds: command,
         });
-        let mut tracker = Tracker::new(model, scenario.tracker)?;
-        let driver = match law {
-            Law::Kanayama(gains) => Driver::Kanayama(Kanayama::new(model, gains)),
-            Law::Pursuit(config) => Driver::Pursuit(Pursuit::new(model, config)),
-            Law::Yi2007 => {
-                PaperLaw::new(model, scenario.curve).map_or(Driver::Shipped(tracker), Driver::Paper)
-            }
-            Law::Shipped(told) => {
-                if let Some(known) = told {
-                    tracker.warm_start(known);
-                }
-                Driver::Shipped(tracker)
-            }
-        };
+        let driver = Driver::new(model, scenario.tracker, scenario.curve, law)?;
         Ok(Self {
             course,
             scenario,
@@ -203,22 +177,18 @@ impl Run {
             twist: state.twist(),
             wheel_speeds: state.wheel_speeds,
             pose_age_s: 0.0,
+            position_std_dev_m: 0.0,
         };
-        let reference = self.course.sample(time_s);
-        let mut told = None;
-        let wanted = match &mut self.driver {
-            Driver::Kanayama(law) => law.step(&reference, &measured, dt_s),
-            Driver::Pursuit(law) => law.step(&self.course, &measured),
-            Driver::Paper(law) => {
-                let felt = self.plant.body_acceleration();
-                law.step(&self.course, time_s, &measured, felt, dt_s)
-            }
-            Driver::Shipped(law) => {
-                let output = law.step(&reference, &measured, input.knowledge, dt_s);
-                told = Some(output);
-                output.wheel_speeds
-            }
+        let felt = self.plant.body_acceleration();
+        let sight = Sight {
+            course: &self.course,
+            time_s,
+            reference: &self.course.sample(time_s),
+            measured: &measured,
+            knowledge: input.knowledge,
+            felt,
         };
+        let (wanted, tracker) = self.driver.step(&sight, dt_s);
         let passed = gate(
             &GateInput {
                 command: Some(wanted),
@@ -241,17 +211,14 @@ impl Run {
             time_s,
             cross_track_m: nearest.cross_track_m,
             command,
-            tracker: told,
+            tracker,
         })
     }
 
     /// The point that the law leads: the centre, or the paper's point D.
     fn scored_point(&self) -> Point {
         let pose = self.plant.state().pose;
-        let forward_m = match &self.driver {
-            Driver::Paper(law) => law.point_forward_m(),
-            Driver::Kanayama(_) | Driver::Pursuit(_) | Driver::Shipped(_) => 0.0,
-        };
+        let forward_m = self.driver.point_forward_m();
         let (sin, cos) = pose.heading_rad.sin_cos();
         Point {
             x_m: pose.x_m + forward_m * cos,

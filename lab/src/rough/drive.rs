@@ -65,7 +65,7 @@ impl SteppedDrive for RoughDrive {
             at += SAMPLE_PERIOD;
             let means = self.plant.advance(self.command, self.steps_per_sample);
             self.sensors
-                .sample(&self.plant, &means, at, &mut self.waiting);
+                .sample(&self.plant.truth(), &means, at, &mut self.waiting);
         }
         self.simulated_to = Some(at);
     }

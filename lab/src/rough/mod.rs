@@ -10,3 +10,4 @@ pub mod plant;
 pub mod run;
 pub mod sensors;
 pub mod spec;
+pub mod tracking;

@@ -56,6 +56,19 @@ pub struct State {
     pub yaw_rate_rad_s: f64,
 }
 
+/// What sensors are given of a robot at one time, beside its [`Means`].
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Truth {
+    /// Where it is and how it moves.
+    pub state: State,
+    /// How far each side's wheels have turned, radians.
+    pub turned_rad: [f64; 2],
+    /// Measured over true torque, left and right.
+    pub torque_scale: [f64; 2],
+    /// How far it leans from level, radians.
+    pub tilt_rad: f64,
+}
+
 /// Means over one call of [`Plant::advance`].
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Means {
@@ -159,9 +172,14 @@ impl Plant {
         &self.spec
     }
 
-    /// How far each side's wheels have turned, radians.
-    pub fn turned_rad(&self) -> [f64; 2] {
-        self.turned_rad
+    /// What sensors are given of it now.
+    pub fn truth(&self) -> Truth {
+        Truth {
+            state: self.state(),
+            turned_rad: self.turned_rad,
+            torque_scale: self.spec.torque_scale,
+            tilt_rad: self.tilt_rad(),
+        }
     }
 
     /// The state of the wheels' centre.
@@ -234,7 +252,10 @@ impl Plant {
             let gain = inertia / self.spec.servo_lag_s;
             let error = target_rad_s - self.wheels_rad_s[side];
             let most = self.spec.motor_limit_mu * 0.5 * self.mass_kg * GRAVITY_M_S2 * radius_m;
-            let wanted = gain * error + self.integral_n_m[side];
+            // The proportional part as it is at the step's end: light rotors follow a stiff servo in
+            // less than one step.
+            let stiffness = gain / (1.0 + gain * STEP_S / self.side_inertia_kg_m2);
+            let wanted = stiffness * error + self.integral_n_m[side];
             let torque = wanted.clamp(-most, most);
             // The integral rests while the motor gives all it can.
             if (wanted - torque).abs() < f64::EPSILON {
@@ -408,6 +429,32 @@ impl Sums {
                 left_n_m: self.torques[0] / count,
                 right_n_m: self.torques[1] / count,
             },
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::spec::MAKES;
+    use super::*;
+
+    #[test]
+    fn a_stiff_servo_on_light_rotors_holds_a_robot_on_a_slope() {
+        for make in MAKES {
+            let spec = Deviations {
+                rotor_ratio: 0.01,
+                servo_lag_s: 0.02,
+                slope_rad: [0.05, -0.05],
+                ..Deviations::none(3.0)
+            };
+            let model = make.model().expect("the makes are robots");
+            let mut plant = Plant::new(&model, spec, Pose::default()).expect("a rectangle");
+            plant.advance(WheelSpeeds::default(), 4_000);
+            let means = plant.advance(WheelSpeeds::default(), 4_000);
+            let wheels = means.wheel_speeds;
+            let rim_m_s =
+                wheels.left_rad_s.abs().max(wheels.right_rad_s.abs()) * model.wheel_radius_m();
+            assert!(rim_m_s < 5.0e-3, "{}: {rim_m_s} m/s", make.name);
         }
     }
 }

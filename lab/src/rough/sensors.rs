@@ -11,7 +11,7 @@ use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 use tread_control::robot::RobotModel;
 
-use super::plant::{GRAVITY_M_S2, Means, Plant};
+use super::plant::{GRAVITY_M_S2, Means, Truth};
 use crate::random::Random;
 
 /// Time between two samples of the fast sensors.
@@ -135,9 +135,9 @@ impl Sensors {
         }
     }
 
-    fn wheels(&mut self, plant: &Plant) -> WheelSpeeds {
+    fn wheels(&mut self, turned_rad: [f64; 2]) -> WheelSpeeds {
         let per_rad = self.spec.counts_per_turn / std::f64::consts::TAU;
-        let counts = plant.turned_rad().map(|turned| (turned * per_rad).floor());
+        let counts = turned_rad.map(|turned| (turned * per_rad).floor());
         let before = std::mem::replace(&mut self.counts, counts);
         let speed =
             |side: usize| (counts[side] - before[side]) / per_rad / SAMPLE_PERIOD.as_secs_f64();
@@ -171,17 +171,17 @@ impl Sensors {
         }
     }
 
-    /// What the sensors say at `at`, after a time over which the plant's means are these.
-    pub fn sample(&mut self, plant: &Plant, means: &Means, at: Duration, to: &mut Feedback) {
-        let (spec, truth) = (self.spec, plant.state());
+    /// What the sensors say at `at`, of a robot in a state, after a time over which its means are these.
+    pub fn sample(&mut self, truth: &Truth, means: &Means, at: Duration, to: &mut Feedback) {
+        let (spec, state) = (self.spec, truth.state);
         self.gyro_offset_rad_s += self
             .random
             .normal(spec.gyro_walk_rad_s * SAMPLE_PERIOD.as_secs_f64().sqrt());
         let body_speed_m_s = (at >= self.next_speed_at).then(|| {
             self.next_speed_at = at + spec.body_speed_period;
-            truth.forward_m_s + self.random.normal(spec.body_speed_m_s)
+            state.forward_m_s + self.random.normal(spec.body_speed_m_s)
         });
-        let scale = plant.spec().torque_scale;
+        let scale = truth.torque_scale;
         let noise_n_m = self.torque_noise_n_m;
         let wheel_torques = spec.has_torque.then(|| WheelTorques {
             left_n_m: scale[0] * means.torques.left_n_m + self.random.normal(noise_n_m),
@@ -201,10 +201,10 @@ impl Sensors {
                     + offset[1]
                     + self.random.normal(spec.acceleration_m_s2),
             }),
-            wheel_speeds: Some(self.wheels(plant)),
+            wheel_speeds: Some(self.wheels(truth.turned_rad)),
             wheel_torques,
             body_speed_m_s,
-            tilt_rad: Some(plant.tilt_rad()),
+            tilt_rad: Some(truth.tilt_rad),
             position: None,
             position_noise: None,
         });
@@ -212,7 +212,7 @@ impl Sensors {
             self.next_position_at = at + spec.position_period;
             let fix = SensorSample {
                 at,
-                position: Some(self.position(truth.pose)),
+                position: Some(self.position(state.pose)),
                 ..SensorSample::default()
             };
             self.late.push_back((at + spec.position_delay, fix));

@@ -156,6 +156,7 @@ impl SeededRobot {
             twist: self.localisation.twist(),
             wheel_speeds: self.plant.state().wheel_speeds,
             pose_age_s: self.localisation.fix_age_s(),
+            position_std_dev_m: self.localisation.position_std_dev_m(),
         }
     }
 

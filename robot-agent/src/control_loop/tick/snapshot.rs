@@ -36,6 +36,7 @@ impl LoopCore {
             twist: self.localisation.twist(),
             wheel_speeds: self.measured_wheels,
             pose_age_s: age_s(now, self.last_fix),
+            position_std_dev_m: self.localisation.position_std_dev_m(),
         }
     }
 

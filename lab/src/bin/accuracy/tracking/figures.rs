@@ -362,6 +362,7 @@ fn arrival(start: Pose, stiffness: f64, traction_limit_mu: Option<f64>) -> Arriv
             twist: state.twist(),
             wheel_speeds: state.wheel_speeds,
             pose_age_s: 0.0,
+            position_std_dev_m: 0.0,
         };
         let output = follower.step(&measured, None, LOOP_S);
         let input = GateInput {

@@ -14,17 +14,21 @@
 //! ```
 //!
 //! **Measurement model**: a fix is `(x, y, φ) + noise` of an earlier moment. It is carried forward
-//! over its age with the present twist; its covariance is its own, or the configured one. A
+//! over its age with the present twist; its covariance is its own where it states one, and is else
+//! found from the differences of fixes in a row (`fix_noise.rs`), begun with the configured one. A
 //! χ² gate on the Mahalanobis distance refuses outliers and counts them; after [`REFUSED_MAX`] in
 //! a row the robot was moved, and the filter starts again from the fix. The covariance update is
 //! Joseph's form. See Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking
 //! and Navigation*, 2001, chapters 5 and 10.
+
+mod fix_noise;
 
 use nalgebra::{Matrix3, Matrix3x6, Matrix6, Vector3, Vector6};
 
 use crate::geometry::{Pose, Twist, wrap_angle_rad};
 use crate::measured::WheelSpeeds;
 use crate::robot::RobotModel;
+use fix_noise::FixNoiseEstimate;
 
 /// Refused fixes in a row after which the filter starts afresh.
 pub const REFUSED_MAX: u32 = 20;
@@ -47,7 +51,7 @@ pub struct PositionFix {
     pub pose: Pose,
     /// How long ago it was measured, seconds.
     pub age_s: f64,
-    /// How good it is; none for what [`LocalisationNoise`] says.
+    /// How good it is; none if that is to be found from the fixes themselves.
     pub noise: Option<FixNoise>,
 }
 
@@ -70,9 +74,9 @@ impl FixNoise {
 /// Noise of the sensors that localisation uses; one standard deviation each.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct LocalisationNoise {
-    /// Position of a fix, per axis, metres.
+    /// Position of a fix that states none, per axis, metres: until fixes tell.
     pub position_m: f64,
-    /// Heading of a fix, radians.
+    /// Heading of such a fix, radians: until fixes tell.
     pub heading_rad: f64,
     /// Gyro, white, at the loop's rate, radians per second.
     pub gyro_rad_s: f64,
@@ -120,6 +124,7 @@ pub enum FixOutcome {
 pub struct Localisation {
     model: RobotModel,
     noise: LocalisationNoise,
+    fix_noise: FixNoiseEstimate,
     state: Vector6<f64>,
     covariance: Matrix6<f64>,
     turn_rad_s: f64,
@@ -138,6 +143,10 @@ impl Localisation {
         Self {
             model,
             noise,
+            fix_noise: FixNoiseEstimate::new(FixNoise {
+                position_m: noise.position_m,
+                heading_rad: noise.heading_rad,
+            }),
             state: Vector6::zeros(),
             covariance: Matrix6::zeros(),
             turn_rad_s: 0.0,
@@ -207,6 +216,7 @@ impl Localisation {
             return;
         }
         self.fix_age_s += dt_s;
+        self.fix_noise.wait(dt_s);
         let wheel_m_s =
             0.5 * self.model.wheel_radius_m() * (wheels.left_rad_s + wheels.right_rad_s);
         // A sample that cannot be used leaves the last rates standing; the covariance grows.
@@ -264,6 +274,7 @@ impl Localisation {
         let distance_m = forward_m_s.hypot(left_m_s) * unheard_s;
         let turn_rad = (self.turn_rad_s * unheard_s).hypot(UNHEARD_CURVATURE_PER_M * distance_m);
         let turn_rad = turn_rad.min(std::f64::consts::PI);
+        self.fix_noise.forget_motion();
         for (index, std_dev) in [distance_m, distance_m, turn_rad].into_iter().enumerate() {
             self.covariance[(index, index)] += std_dev * std_dev;
         }
@@ -271,16 +282,17 @@ impl Localisation {
 
     /// Takes a position fix.
     pub fn correct(&mut self, fix: &PositionFix) -> FixOutcome {
-        let fix_noise = fix.noise.unwrap_or(FixNoise {
-            position_m: self.noise.position_m,
-            heading_rad: self.noise.heading_rad,
-        });
         let is_in_time = (0.0..=FIX_AGE_MAX_S).contains(&fix.age_s);
-        if !(fix.pose.is_finite() && is_in_time && fix_noise.is_possible()) {
+        let is_possible = fix.noise.is_none_or(FixNoise::is_possible);
+        if !(fix.pose.is_finite() && is_in_time && is_possible) {
             self.invalid += 1;
             return FixOutcome::Invalid;
         }
         let moved = self.carried(fix);
+        if let Some(filter) = self.pose().filter(|_| fix.noise.is_none()) {
+            self.fix_noise.compare(moved, filter);
+        }
+        let fix_noise = fix.noise.unwrap_or_else(|| self.fix_noise.noise());
         if !self.started {
             self.start(moved, fix.age_s, fix_noise);
             return FixOutcome::Started;
@@ -321,7 +333,14 @@ impl Localisation {
             keep * self.covariance * keep.transpose() + gain * noise * gain.transpose();
         self.refused_in_a_row = 0;
         self.fix_age_s = fix.age_s;
+        self.anchor(moved);
         FixOutcome::Fused
+    }
+
+    fn anchor(&mut self, moved: Pose) {
+        if let Some(filter) = self.pose() {
+            self.fix_noise.anchor(moved, filter);
+        }
     }
 
     /// The fix carried on over its age with the present motion.
@@ -358,6 +377,7 @@ impl Localisation {
         self.started = true;
         self.refused_in_a_row = 0;
         self.fix_age_s = age_s;
+        self.anchor(pose);
     }
 }
 
