@@ -424,9 +424,9 @@ impl Plan {
                 asked_m_s: asked_m_s[node],
                 left_m_s: nodes[node].speed_m_s,
                 by: bounds[node].by,
+                longitudinal: bounds[node].longitudinal,
             };
-            let by = bounds[node].longitudinal;
-            (plan.stretches).note(timing.arc_m, timing.speed_m_s, &cell, by);
+            plan.stretches.note(&timing, &cell);
         }
         Ok(plan)
     }
