@@ -7,12 +7,14 @@ mod course;
 mod kanayama;
 mod paper_law;
 mod pursuit;
+mod robots;
 mod run;
 
 pub use course::{Course, Figure8, Nearest};
 pub use kanayama::{Kanayama, KanayamaGains, Track};
 pub use paper_law::PaperLaw;
 pub use pursuit::{Pursuit, PursuitConfig};
+pub use robots::husky_like;
 pub use run::{BenchError, CrossTrack, Run, Scenario, TickInput, TickOutput, cross_track};
 
 use tread_control::tracking::ThetaKnowledge;

@@ -343,23 +343,26 @@ fn without_torque(all: &mut Vec<Scenario>) {
     }
 }
 
+/// What a robot with or without wheel torque drives in the sweeps, and its name.
+fn usual_drive(has_torque: bool) -> (Drive, &'static str) {
+    if has_torque {
+        let circles = Drive::StraightThenCircles {
+            radius_m: 6.0,
+            speed_m_s: SPEED_M_S,
+        };
+        (circles, "torque, circles R 6 m")
+    } else {
+        (Drive::Figure8, "no torque, figure-8")
+    }
+}
+
 fn sweeps(all: &mut Vec<Scenario>) {
     let mut push = |name: String, change: &dyn Fn(&mut RobotSpec)| {
         for has_torque in [true, false] {
             let mut robot = RobotSpec::on(5.0);
             robot.has_torque = has_torque;
             change(&mut robot);
-            let (drive, what) = if has_torque {
-                (
-                    Drive::StraightThenCircles {
-                        radius_m: 6.0,
-                        speed_m_s: SPEED_M_S,
-                    },
-                    "torque, circles R 6 m",
-                )
-            } else {
-                (Drive::Figure8, "no torque, figure-8")
-            };
+            let (drive, what) = usual_drive(has_torque);
             all.push(Scenario {
                 name: format!("{what}, K 5, {name}"),
                 drive,
@@ -421,17 +424,7 @@ fn tyres(all: &mut Vec<Scenario>) {
             robot.has_torque = has_torque;
             robot.curvatures = Some([0.46, 2.88]);
             robot.configured_tyres = configured_tyres;
-            let (drive, what) = if has_torque {
-                (
-                    Drive::StraightThenCircles {
-                        radius_m: 6.0,
-                        speed_m_s: SPEED_M_S,
-                    },
-                    "torque, circles R 6 m",
-                )
-            } else {
-                (Drive::Figure8, "no torque, figure-8")
-            };
+            let (drive, what) = usual_drive(has_torque);
             all.push(Scenario {
                 name: format!("{what}, K 5, brush tyres, {who}"),
                 drive,
