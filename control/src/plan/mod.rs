@@ -48,7 +48,7 @@ const BEND_LOOKED_INTO_1_M: f64 = 1.0;
 const PARTS_LOOKED_INTO: u8 = 8;
 /// Peak friction coefficient that is assumed on the approach while nothing is
 /// known of the ground.
-const TRACTION_LIMIT_UNKNOWN_MU: f64 = 0.14;
+pub const TRACTION_LIMIT_UNKNOWN_MU: f64 = 0.14;
 /// Fewest cells of the timing.
 const GRID_MIN: usize = 16;
 

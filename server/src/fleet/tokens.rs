@@ -7,7 +7,7 @@ use std::collections::{HashMap, HashSet, VecDeque};
 const TOKENS_MAX: usize = 32_768;
 
 /// Closed routers that are remembered: what was on its way is there long before so many more close.
-const CLOSED_MAX: usize = 64;
+pub(super) const CLOSED_MAX: usize = 64;
 
 /// The tokens that are there.
 #[derive(Debug, Default)]

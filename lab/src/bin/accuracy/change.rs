@@ -8,11 +8,10 @@ use tread_control::geometry::{Pose, Twist};
 use tread_control::plant::Ground;
 use tread_control::robot::RobotModel;
 
+use crate::drives::SPEED_M_S;
 use crate::report::{Check, Options, Section};
 use crate::robot::{LOOP_S, RobotSpec, SeededRobot, run_seeded};
 
-/// Speed, metres per second.
-const SPEED_M_S: f64 = 0.6;
 /// Time before the change, in which the first ground is measured, seconds.
 const BEFORE_S: f64 = 45.0;
 /// Time after it in which it must be noticed, seconds.

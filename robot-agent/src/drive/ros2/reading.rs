@@ -5,6 +5,7 @@
 use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_control::localisation::FixNoise;
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
+use tread_control::robot::GRAVITY_M_S2;
 use tread_ros2::cdr::decode;
 use tread_ros2::messages::{
     self, BatteryState, Imu, JointState, Odometry, PoseWithCovarianceStamped, Time,
@@ -17,8 +18,6 @@ use super::settings::{
 };
 use crate::drive::Battery;
 
-/// Standard gravity, metres per second squared.
-const GRAVITY_M_S2: f64 = 9.806_65;
 /// Fastest motion that is believed, metres or radians per second.
 const RATE_MAX: f64 = 100.0;
 /// Largest acceleration that is believed, metres per second squared.

@@ -12,6 +12,7 @@ use tread_api::friction::{CellBox, MapChange};
 use tread_api::rights::Scope;
 
 use super::{App, AppError};
+use crate::app::sites::SITES_MAX;
 use crate::db;
 use crate::db::sites::SiteRow;
 
@@ -21,8 +22,6 @@ pub const PERIOD: Duration = Duration::from_secs(1);
 pub const BOXES_MAX: usize = 256;
 /// Words that wait for a listener on the network; one that misses some hears that it did.
 const WAITING_MAX: usize = 64;
-/// Sites of one look.
-const SITES_MAX: u32 = 1_000;
 
 /// Where words about maps go besides the feed of events.
 #[derive(Debug)]

@@ -24,10 +24,10 @@ const TOKENS: Quota = Quota {
     reserved: 100,
     share: 100,
 };
-/// How long dead tokens are listed.
-const DEAD_KEPT: SignedDuration = SignedDuration::from_hours(400 * 24);
+/// How long dead tokens are listed, join tokens too.
+pub(in crate::app) const DEAD_KEPT: SignedDuration = SignedDuration::from_hours(400 * 24);
 /// Dead tokens that are forgotten with each new one.
-const FORGET_MAX: u32 = 10;
+pub(in crate::app) const FORGET_MAX: u32 = 10;
 
 /// Ends in memory whoever is known by a token, when it is dropped: after a commit, or when there is
 /// none. Whoever is not revoked in the database is known again once it was looked up.
