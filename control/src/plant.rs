@@ -223,11 +223,10 @@ impl Plant {
             spec.tyres.lateral_stiffness_ratio,
             0.1..=10.0,
         )?;
-        if !pose.is_finite() {
-            return Err(PlantError::OutOfRange {
-                field: "pose",
-                value: f64::NAN,
-            });
+        let figures = [pose.x_m, pose.y_m, pose.heading_rad];
+        if let Some(value) = figures.into_iter().find(|figure| !figure.is_finite()) {
+            let field = "pose";
+            return Err(PlantError::OutOfRange { field, value });
         }
         let state = PlantState {
             pose,

@@ -125,10 +125,10 @@ fn failure(
             each(&output);
         }
         robot.act(output.wheel_speeds);
-        match output.status {
-            FollowerStatus::Failed(reason) => return reason,
-            status => assert!(!status.is_final(), "{output:?}"),
+        if let FollowerStatus::Failed(reason) = output.status {
+            return reason;
         }
+        assert!(!output.status.is_final(), "{output:?}");
     }
     panic!("never failed: {:?}", follower.status());
 }

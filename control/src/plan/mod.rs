@@ -150,11 +150,12 @@ impl Plan {
         };
         let unlimited = model;
         let model = &limited;
-        if !start.is_finite() || start.x_m.abs().max(start.y_m.abs()) > COORDINATE_MAX_M {
+        check_coordinate("the start pose", 0, start.point())?;
+        if !start.heading_rad.is_finite() {
             return Err(PlanError::NotFinite {
                 what: "the start pose",
                 place: 0,
-                value: f64::NAN,
+                value: start.heading_rad,
             });
         }
         match trajectory {

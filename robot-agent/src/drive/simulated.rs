@@ -212,7 +212,7 @@ impl SimulatedDrive {
             let (wheels, torques) = (self.plant.state().wheel_speeds, self.plant.wheel_torques());
             let wheels_w =
                 wheels.left_rad_s * torques.left_n_m + wheels.right_rad_s * torques.right_n_m;
-            self.battery.step(wheels_w, SAMPLE_PERIOD.as_secs_f64());
+            self.battery.step(wheels_w, SAMPLE_PERIOD);
             let sample = self.sensors.sample(&self.plant, at);
             let sample = self.faults.sample(sample, pose.heading_rad);
             self.waiting.push(SensorSample {

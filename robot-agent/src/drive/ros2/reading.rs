@@ -205,9 +205,9 @@ pub fn joints(bytes: &[u8], settings: &JointSettings) -> Result<Option<Reading>,
             let index = index.ok_or(Refusal::Joints)?;
             let turned = message.velocity.get(index).ok_or(Refusal::Joints)?;
             speed_rad_s += bounded(turned / settings.gear_ratio, RATE_MAX)?;
-            torque_n_m = match settings.effort.torque_n_m() {
-                Some(constant) if has_effort => {
-                    let effort = message.effort.get(index).unwrap_or(f64::NAN);
+            let effort = message.effort.get(index).filter(|_| has_effort);
+            torque_n_m = match (settings.effort.torque_n_m(), effort) {
+                (Some(constant), Some(effort)) => {
                     let pulled = effort * constant * joints.effort_sign * settings.gear_ratio;
                     // Some bases write no number for an effort that they do not measure.
                     torque_n_m
