@@ -141,8 +141,8 @@ impl Run {
             Law::Yi2007 => {
                 PaperLaw::new(model, scenario.curve).map_or(Driver::Shipped(tracker), Driver::Paper)
             }
-            Law::Shipped(told) => {
-                if let Some(known) = told {
+            Law::Shipped(knowledge) => {
+                if let Some(known) = knowledge {
                     tracker.warm_start(known);
                 }
                 Driver::Shipped(tracker)
@@ -205,7 +205,7 @@ impl Run {
             pose_age_s: 0.0,
         };
         let reference = self.course.sample(time_s);
-        let mut told = None;
+        let mut tracker = None;
         let wanted = match &mut self.driver {
             Driver::Kanayama(law) => law.step(&reference, &measured, dt_s),
             Driver::Pursuit(law) => law.step(&self.course, &measured),
@@ -215,7 +215,7 @@ impl Run {
             }
             Driver::Shipped(law) => {
                 let output = law.step(&reference, &measured, input.knowledge, dt_s);
-                told = Some(output);
+                tracker = Some(output);
                 output.wheel_speeds
             }
         };
@@ -241,7 +241,7 @@ impl Run {
             time_s,
             cross_track_m: nearest.cross_track_m,
             command,
-            tracker: told,
+            tracker,
         })
     }
 
@@ -280,7 +280,7 @@ pub fn cross_track(
     law: Law,
 ) -> Result<CrossTrack, BenchError> {
     let knowledge = match law {
-        Law::Shipped(told) => told,
+        Law::Shipped(knowledge) => knowledge,
         Law::Kanayama(_) | Law::Pursuit(_) | Law::Yi2007 => None,
     };
     let course = Course::Plan(plan.clone());

@@ -105,8 +105,8 @@ mod tests {
                         closed.insert(router);
                         let went = before.into_iter().filter(|token| !is_there(&model, token));
                         let went: HashSet<String> = went.collect();
-                        let told: HashSet<String> = tokens.router_closed(router).into_iter().collect();
-                        prop_assert_eq!(told, went);
+                        let reported: HashSet<String> = tokens.router_closed(router).into_iter().collect();
+                        prop_assert_eq!(reported, went);
                     }
                 }
             }

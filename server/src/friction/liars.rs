@@ -162,8 +162,11 @@ fn one_robot_cannot_make_ground_better_that_several_others_found_worse() {
     };
     let honest = || (1..=3_u8).map(|robot| (robot, measured(1.4, 0.05, 1_000)));
     let lies = (0..5).map(|time| (9, measured(0.01, 0.001, 10 * time)));
-    let told = fused(honest().chain(lies), &config).unwrap();
-    assert!((told.theta - 1.4).abs() < 0.2 && told.disputed, "{told:?}");
+    let estimate = fused(honest().chain(lies), &config).unwrap();
+    assert!(
+        (estimate.theta - 1.4).abs() < 0.2 && estimate.disputed,
+        "{estimate:?}"
+    );
     // Nor by two words of which one makes the other look like bad news, in one hour or in two.
     for (earlier, later) in [(0.001, 0.01), (0.01, 0.001)] {
         for age_s in [20, HOUR_S + 20] {
@@ -172,15 +175,15 @@ fn one_robot_cannot_make_ground_better_that_several_others_found_worse() {
                 (9, measured(later, 1e-5, 10)),
             ];
             let honest = (1..=3_u8).map(|robot| (robot, measured(1.4, 0.05, 3 * HOUR_S)));
-            let told = fused(honest.chain(lies), &config).unwrap();
-            assert!((told.theta - 1.4).abs() < 0.3, "{told:?}");
+            let estimate = fused(honest.chain(lies), &config).unwrap();
+            assert!((estimate.theta - 1.4).abs() < 0.3, "{estimate:?}");
         }
     }
     // A vague word that contradicts nobody does not confirm it.
     let lie = (9, measured(0.01, 0.001, 10));
     let vague = (8, measured(1.2, 0.7, 20));
-    let told = fused(honest().chain([lie, vague]), &config).unwrap();
-    assert!((told.theta - 1.4).abs() < 0.3, "{told:?}");
+    let estimate = fused(honest().chain([lie, vague]), &config).unwrap();
+    assert!((estimate.theta - 1.4).abs() < 0.3, "{estimate:?}");
     // Another one that says so as well is believed.
     let others = (0..5).map(|time| {
         (
@@ -201,8 +204,8 @@ fn a_lie_about_bad_ground_ends_when_one_honest_robot_has_been_there_twice() {
     let before = (1, measured(0.2, 0.01, 4 * HOUR_S));
     let lie = (9, measured(5.0, 0.05, 3 * HOUR_S));
     let after = |age_s| (2, measured(0.2, 0.01, age_s));
-    let told = fused([before, lie, after(60), after(30)], &config).unwrap();
-    assert!((told.theta - 0.2).abs() < 0.05, "{told:?}");
+    let estimate = fused([before, lie, after(60), after(30)], &config).unwrap();
+    assert!((estimate.theta - 0.2).abs() < 0.05, "{estimate:?}");
 }
 
 #[test]

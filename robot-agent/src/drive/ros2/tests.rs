@@ -195,9 +195,9 @@ impl Talk {
     /// Commands the base; what it is told.
     fn tell(&mut self, command: WheelSpeeds) -> WheelSpeeds {
         self.drive.write(command);
-        let (number, told) = self.drive.outlet.newer_than(self.number).unwrap();
+        let (number, command) = self.drive.outlet.newer_than(self.number).unwrap();
         self.number = number;
-        told
+        command
     }
 }
 

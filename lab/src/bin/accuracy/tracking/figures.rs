@@ -148,10 +148,10 @@ fn with_a_prior(threads: usize, found: &mut Found) {
             theta: 1.0 / stiffness,
             std_dev: PRIOR_DEVIATION / stiffness,
         };
-        let told = simulate(&case, Law::Shipped(Some(prior)), Knowing::Map);
+        let mapped = simulate(&case, Law::Shipped(Some(prior)), Knowing::Map);
         (
             stiffness,
-            told.rms_m(0.0, lap_s) / converged.rms_m(2.0 * lap_s, 3.0 * lap_s),
+            mapped.rms_m(0.0, lap_s) / converged.rms_m(2.0 * lap_s, 3.0 * lap_s),
         )
     });
     for (stiffness, ratio) in ratios {
