@@ -77,6 +77,7 @@ impl FrictionCurve {
     }
 
     /// A curve of stiffness K with the paper's shape.
+    #[cfg(any(test, feature = "testing"))]
     pub fn with_stiffness(stiffness: f64) -> Result<Self, FrictionError> {
         FrictionSpec {
             stiffness,

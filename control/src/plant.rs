@@ -248,6 +248,7 @@ impl Plant {
     }
 
     /// Puts the base into a state, for instance a pose after a push.
+    #[cfg(any(test, feature = "testing"))]
     pub fn set_state(&mut self, state: PlantState) {
         self.state = state;
     }
@@ -258,6 +259,7 @@ impl Plant {
     }
 
     /// What an accelerometer at the centre of mass feels now, without noise.
+    #[cfg(any(test, feature = "testing"))]
     pub fn body_acceleration(&self) -> BodyAcceleration {
         BodyAcceleration {
             forward_m_s2: self.contact.longitudinal_n / self.model.mass_kg(),

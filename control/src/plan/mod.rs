@@ -496,11 +496,6 @@ impl Plan {
         self.path.sample(0.0).pose.heading_rad
     }
 
-    /// Where the path ends.
-    pub fn end_pose(&self) -> Pose {
-        self.path.sample(self.length_m()).pose
-    }
-
     /// Fastest speed along the path, metres per second.
     pub fn peak_speed_m_s(&self) -> f64 {
         self.peak_speed_m_s

@@ -13,8 +13,7 @@ use tread_ros2::messages::{
 
 use super::refusal::Refusal;
 use super::settings::{
-    CommandSettings, ImuSettings, JointSettings, MotionOf, OdometrySettings, PoseSettings,
-    SideJoints,
+    CommandSettings, ImuSettings, JointSettings, OdometrySettings, PoseSettings, SideJoints,
 };
 use crate::drive::Battery;
 
@@ -348,9 +347,4 @@ pub fn wheels_of(motion: &Motion, command: &CommandSettings) -> WheelSpeeds {
         left_rad_s: (motion.forward_m_s - turn_m_s) / command.base_radius_m,
         right_rad_s: (motion.forward_m_s + turn_m_s) / command.base_radius_m,
     }
-}
-
-/// Whether odometry's speed is the body's.
-pub fn is_of_ground(settings: &OdometrySettings) -> bool {
-    settings.motion_of == MotionOf::Ground
 }
