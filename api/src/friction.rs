@@ -212,6 +212,9 @@ pub struct ThetaEstimate {
     pub std_dev: f64,
 }
 
+/// Standard deviation of one robot's own bias as a share of θ, where nothing else is configured.
+pub const ROBOT_BIAS_RATIO: f64 = 0.08;
+
 /// Standard deviations to either side of a 95 % interval.
 pub const NORMAL_95: f64 = 1.959_963_984_540_054;
 

@@ -361,10 +361,10 @@ mod tests {
         let token: Token = serde_json::from_value(token).unwrap();
         assert_eq!(token.rights, Rights::from(Role::Viewer));
         // What is told is never widened by the role.
-        let mut told = serde_json::to_value(&token).unwrap();
-        told["rights"] = serde_json::json!([]);
-        told["sites"] = serde_json::json!([{"site": "yard"}]);
-        let token: Token = serde_json::from_value(told).unwrap();
+        let mut value = serde_json::to_value(&token).unwrap();
+        value["rights"] = serde_json::json!([]);
+        value["sites"] = serde_json::json!([{"site": "yard"}]);
+        let token: Token = serde_json::from_value(value).unwrap();
         assert_eq!(token.rights, Rights::default());
         assert!(!token.sites.is_everywhere());
     }

@@ -58,16 +58,16 @@ impl Output {
             (None, None) => Exit::WentWrong,
         };
         let next_step = client_error.and_then(ClientError::next_step);
-        let told = match client_error {
+        let message = match client_error {
             // What lies between only says again that it could not be asked.
             Some(ClientError::Unreachable { .. }) => format!("{error}: {}", error.root_cause()),
             _ => format!("{error:#}"),
         };
         if self.json {
             let problem = client_error.and_then(ClientError::problem);
-            note(&failure(&told, exit, next_step, problem).to_string());
+            note(&failure(&message, exit, next_step, problem).to_string());
         } else {
-            note(&format!("tread: {told}"));
+            note(&format!("tread: {message}"));
             if let Some(next_step) = next_step {
                 note(&format!("next: {next_step}"));
             }
@@ -78,13 +78,13 @@ impl Output {
 
 /// What programs get when there is no success.
 pub(crate) fn failure(
-    told: &str,
+    message: &str,
     exit: Exit,
     next_step: Option<&str>,
     problem: Option<&ProblemBody>,
 ) -> serde_json::Value {
     json!({
-        "error": told, "exit_code": exit as u8, "next_step": next_step, "problem": problem,
+        "error": message, "exit_code": exit as u8, "next_step": next_step, "problem": problem,
     })
 }
 

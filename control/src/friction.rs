@@ -6,6 +6,9 @@
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+/// Slip up to which friction is assumed to grow in proportion to it.
+pub const SLIP_LINEAR: f64 = 0.2;
+
 /// The three figures of a friction curve, not yet checked.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct FrictionSpec {
@@ -74,6 +77,7 @@ impl FrictionCurve {
     }
 
     /// A curve of stiffness K with the paper's shape.
+    #[cfg(any(test, feature = "testing"))]
     pub fn with_stiffness(stiffness: f64) -> Result<Self, FrictionError> {
         FrictionSpec {
             stiffness,

@@ -223,11 +223,10 @@ impl Plant {
             spec.tyres.lateral_stiffness_ratio,
             0.1..=10.0,
         )?;
-        if !pose.is_finite() {
-            return Err(PlantError::OutOfRange {
-                field: "pose",
-                value: f64::NAN,
-            });
+        let figures = [pose.x_m, pose.y_m, pose.heading_rad];
+        if let Some(value) = figures.into_iter().find(|figure| !figure.is_finite()) {
+            let field = "pose";
+            return Err(PlantError::OutOfRange { field, value });
         }
         let state = PlantState {
             pose,
@@ -249,6 +248,7 @@ impl Plant {
     }
 
     /// Puts the base into a state, for instance a pose after a push.
+    #[cfg(any(test, feature = "testing"))]
     pub fn set_state(&mut self, state: PlantState) {
         self.state = state;
     }
@@ -259,6 +259,7 @@ impl Plant {
     }
 
     /// What an accelerometer at the centre of mass feels now, without noise.
+    #[cfg(any(test, feature = "testing"))]
     pub fn body_acceleration(&self) -> BodyAcceleration {
         BodyAcceleration {
             forward_m_s2: self.contact.longitudinal_n / self.model.mass_kg(),

@@ -7,7 +7,7 @@ use crate::geometry::Twist;
 use crate::measured::WheelSpeeds;
 
 /// Standard gravity, metres per second squared.
-pub const GRAVITY_M_S2: f64 = 9.81;
+pub const GRAVITY_M_S2: f64 = 9.806_65;
 
 /// Share of the traction limit that a plan may use along the path.
 const TRACTION_SHARE_LONGITUDINAL: f64 = 0.58;

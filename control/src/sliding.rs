@@ -15,13 +15,12 @@
 //! where not, more is shown than was given. Either way the robot only becomes slower, never
 //! quicker.
 
+use crate::friction::SLIP_LINEAR;
 use crate::measured::Measured;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
 /// Time over which rates are smoothed, seconds.
 const SMOOTHING_S: f64 = 0.05;
-/// Slip up to which friction grows in proportion to it.
-const SLIP_LINEAR: f64 = 0.2;
 /// What the linear range explains is taken this much larger.
 const EXPLAINED_RATIO: f64 = 1.2;
 /// Difference of the sides' rolling radii that is not taken for sliding before it is measured.

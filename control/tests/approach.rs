@@ -4,7 +4,7 @@ mod common;
 
 use std::f64::consts::PI;
 
-use common::{SimRobot, circle, follower};
+use common::{OFF_CIRCLE, Pause, SimRobot, circle, follower};
 use tread_control::follower::{Follower, FollowerConfig, FollowerStatus};
 use tread_control::geometry::{Point, Pose};
 use tread_control::plan::{Plan, PlanOptions};
@@ -13,12 +13,7 @@ use tread_control::trajectory::Direction;
 
 #[test]
 fn from_three_metres_off_the_circle_is_reached_soon() {
-    let start = Pose {
-        x_m: 10.0,
-        y_m: -2.0,
-        heading_rad: PI / 2.0,
-    };
-    let follower = follower(&circle(Direction::CounterClockwise, 1.0), start);
+    let follower = follower(&circle(Direction::CounterClockwise, 1.0), OFF_CIRCLE);
     let approach_m = follower.plan().approach_length_m();
     assert!((2.9..9.0).contains(&approach_m), "{approach_m} m");
 }
@@ -65,27 +60,15 @@ fn three_metres_off_are_made_good_within_six_seconds_on_slippery_ground_too() {
 
 #[test]
 fn a_robot_that_slides_on_its_way_is_paused_goes_on_and_arrives() {
-    let start = Pose {
-        x_m: 10.0,
-        y_m: -2.0,
-        heading_rad: PI / 2.0,
+    let mut robot = SimRobot::new(OFF_CIRCLE, 0.5, 3, false);
+    let mut follower = follower(&circle(Direction::CounterClockwise, 0.3), OFF_CIRCLE);
+    let pause = Pause {
+        from: 300,
+        at_rest: 1000,
+        to: 2000,
     };
-    let mut robot = SimRobot::new(start, 0.5, 3, false);
-    let mut follower = follower(&circle(Direction::CounterClockwise, 0.3), start);
-    let mut ticks = 0;
-    let mut held_m = Vec::new();
-    let last = robot.drive(&mut follower, 120.0, |follower, output, _| {
-        ticks += 1;
-        match ticks {
-            300 => {
-                assert_eq!(output.status, FollowerStatus::Approach);
-                follower.set_pace(0.0);
-            }
-            2000 => follower.set_pace(1.0),
-            1000..2000 => held_m.push(output.progress_m),
-            _ => {}
-        }
-    });
+    let (paused_in, crept_m, last) = robot.drive_with_pause(&mut follower, &pause);
+    assert_eq!(paused_in, Some(FollowerStatus::Approach));
     assert_eq!(last.status, FollowerStatus::Done, "{last:?}");
-    assert!((held_m.last().unwrap() - held_m[0]).abs() < 1.0e-3);
+    assert!(crept_m.abs() < 1.0e-3, "{crept_m} m");
 }

@@ -4,28 +4,14 @@ mod common;
 
 use std::f64::consts::{PI, TAU};
 
-use common::{SimRobot, circle, follower};
+use common::figure_8::figure_8;
+use common::{OBLIQUE, ON_CIRCLE, Pause, SimRobot, circle, follower};
 use proptest::prelude::*;
-use tread_control::follower::{FailureReason, FollowerStatus};
-use tread_control::geometry::{Point, Pose, wrap_angle_rad};
+use tread_control::follower::{FailureReason, FollowerOutput, FollowerStatus};
+use tread_control::geometry::{Pose, wrap_angle_rad};
+use tread_control::measured::Measured;
 use tread_control::plant::Ground;
-use tread_control::trajectory::{Direction, Trajectory, Waypoint, WaypointsSpec};
-
-fn figure_8() -> Trajectory {
-    let points = (0..=24)
-        .map(|index| {
-            let angle_rad = f64::from(index) / 24.0 * TAU;
-            Waypoint::from(Point {
-                x_m: 4.0 * angle_rad.sin(),
-                y_m: 2.0 * (2.0 * angle_rad).sin(),
-            })
-        })
-        .collect();
-    Trajectory::Waypoints(WaypointsSpec {
-        points,
-        speed_m_s: 0.6,
-    })
-}
+use tread_control::trajectory::{Direction, Trajectory};
 
 /// Root mean square and largest cross-track error on the trajectory itself, metres.
 fn drive(trajectory: &Trajectory, start: Pose, stiffness: f64, noisy: bool) -> (f64, f64) {
@@ -55,11 +41,6 @@ fn drive(trajectory: &Trajectory, start: Pose, stiffness: f64, noisy: bool) -> (
 
 #[test]
 fn a_circle_and_a_figure_8_are_driven_on_every_ground() {
-    let start = Pose {
-        x_m: 0.0,
-        y_m: 0.0,
-        heading_rad: 0.7,
-    };
     for (stiffness, circle_m, figure_m) in [
         (0.5, 0.02, 0.06),
         (1.0, 0.01, 0.03),
@@ -69,52 +50,37 @@ fn a_circle_and_a_figure_8_are_driven_on_every_ground() {
     ] {
         let (rms_m, _) = drive(
             &circle(Direction::CounterClockwise, 1.0),
-            start,
+            OBLIQUE,
             stiffness,
             false,
         );
         assert!(rms_m < circle_m, "circle, K {stiffness}: {rms_m} m");
-        let (rms_m, _) = drive(&figure_8(), start, stiffness, false);
+        let (rms_m, _) = drive(&figure_8(), OBLIQUE, stiffness, false);
         assert!(rms_m < figure_m, "figure-8, K {stiffness}: {rms_m} m");
     }
 }
 
 #[test]
 fn noisy_sensors_cost_less_than_three_centimetres() {
-    let start = Pose {
-        x_m: 0.0,
-        y_m: 0.0,
-        heading_rad: 0.7,
-    };
     for (stiffness, bound_m) in [(0.5, 0.07), (2.0, 0.03), (20.0, 0.03)] {
-        let (rms_m, _) = drive(&circle(Direction::Clockwise, 1.0), start, stiffness, true);
+        let (rms_m, _) = drive(&circle(Direction::Clockwise, 1.0), OBLIQUE, stiffness, true);
         assert!(rms_m < 0.03, "circle, K {stiffness}: {rms_m} m");
-        let (rms_m, _) = drive(&figure_8(), start, stiffness, true);
+        let (rms_m, _) = drive(&figure_8(), OBLIQUE, stiffness, true);
         assert!(rms_m < bound_m, "figure-8, K {stiffness}: {rms_m} m");
     }
 }
 
 #[test]
 fn a_robot_on_the_circle_makes_no_detour() {
-    let start = Pose {
-        x_m: 7.0,
-        y_m: -2.0,
-        heading_rad: PI / 2.0,
-    };
-    let follower = follower(&circle(Direction::CounterClockwise, 1.0), start);
+    let follower = follower(&circle(Direction::CounterClockwise, 1.0), ON_CIRCLE);
     assert!((follower.plan().length_m() - TAU * 6.0).abs() < 1.0e-6);
     assert_eq!(follower.status(), FollowerStatus::Tracking);
 }
 
 #[test]
 fn a_stop_brakes_along_the_path_and_ends() {
-    let start = Pose {
-        x_m: 7.0,
-        y_m: -2.0,
-        heading_rad: PI / 2.0,
-    };
-    let mut robot = SimRobot::new(start, 2.0, 3, true);
-    let mut follower = follower(&circle(Direction::CounterClockwise, 1.0), start);
+    let mut robot = SimRobot::new(ON_CIRCLE, 2.0, 3, true);
+    let mut follower = follower(&circle(Direction::CounterClockwise, 1.0), ON_CIRCLE);
     let mut stopped_at_m = None;
     let last = robot.drive(&mut follower, 60.0, |follower, output, _| {
         if output.progress_m > 5.0 && stopped_at_m.is_none() {
@@ -129,84 +95,60 @@ fn a_stop_brakes_along_the_path_and_ends() {
 
 #[test]
 fn a_pause_holds_and_a_resume_goes_on() {
-    let start = Pose {
-        x_m: 7.0,
-        y_m: -2.0,
-        heading_rad: PI / 2.0,
+    let mut robot = SimRobot::new(ON_CIRCLE, 2.0, 3, false);
+    let mut follower = follower(&circle(Direction::CounterClockwise, 0.3), ON_CIRCLE);
+    let pause = Pause {
+        from: 500,
+        at_rest: 1000,
+        to: 4000,
     };
-    let mut robot = SimRobot::new(start, 2.0, 3, false);
-    let mut follower = follower(&circle(Direction::CounterClockwise, 0.3), start);
-    let mut ticks = 0;
-    let mut held_m = Vec::new();
-    let last = robot.drive(&mut follower, 120.0, |follower, output, _| {
-        ticks += 1;
-        match ticks {
-            500 => follower.set_pace(0.0),
-            4000 => follower.set_pace(1.0),
-            1000..4000 => held_m.push(output.progress_m),
-            _ => {}
-        }
-    });
+    let (_, crept_m, last) = robot.drive_with_pause(&mut follower, &pause);
     assert_eq!(last.status, FollowerStatus::Done);
-    assert!((held_m.last().unwrap() - held_m[0]).abs() < 1.0e-3);
+    assert!(crept_m.abs() < 1.0e-3, "{crept_m} m");
+}
+
+/// Drives the circle until the mission fails, measuring what `disturb` makes of it after five seconds.
+fn failure(
+    disturb: impl Fn(&mut Measured),
+    mut each: impl FnMut(&FollowerOutput),
+) -> FailureReason {
+    let mut robot = SimRobot::new(ON_CIRCLE, 2.0, 3, false);
+    let mut follower = follower(&circle(Direction::CounterClockwise, 1.0), ON_CIRCLE);
+    for tick in 0..3000 {
+        let mut measured = robot.measured();
+        let is_disturbed = tick > 500;
+        if is_disturbed {
+            disturb(&mut measured);
+        }
+        let output = follower.step(&measured, None, common::LOOP_S);
+        if is_disturbed {
+            each(&output);
+        }
+        robot.act(output.wheel_speeds);
+        if let FollowerStatus::Failed(reason) = output.status {
+            return reason;
+        }
+        assert!(!output.status.is_final(), "{output:?}");
+    }
+    panic!("never failed: {:?}", follower.status());
 }
 
 #[test]
 fn a_robot_that_is_carried_away_fails_and_says_why() {
-    let start = Pose {
-        x_m: 7.0,
-        y_m: -2.0,
-        heading_rad: PI / 2.0,
+    let carried = |measured: &mut Measured| {
+        measured.pose.x_m += 5.0;
+        measured.pose.y_m += 5.0;
     };
-    let mut robot = SimRobot::new(start, 2.0, 3, false);
-    let mut follower = follower(&circle(Direction::CounterClockwise, 1.0), start);
-    for tick in 0..3000 {
-        let mut measured = robot.measured();
-        if tick > 500 {
-            measured.pose.x_m += 5.0;
-            measured.pose.y_m += 5.0;
-        }
-        let output = follower.step(&measured, None, common::LOOP_S);
-        robot.act(output.wheel_speeds);
-        if output.status.is_final() {
-            assert_eq!(
-                output.status,
-                FollowerStatus::Failed(FailureReason::LeftPath)
-            );
-            return;
-        }
-    }
-    panic!("never failed: {:?}", follower.status());
+    assert_eq!(failure(carried, |_| {}), FailureReason::LeftPath);
 }
 
 #[test]
 fn a_lost_pose_stops_and_then_fails_the_mission() {
-    let start = Pose {
-        x_m: 7.0,
-        y_m: -2.0,
-        heading_rad: PI / 2.0,
+    let lost = |measured: &mut Measured| measured.pose.x_m = f64::NAN;
+    let stands = |output: &FollowerOutput| {
+        assert!(output.wheel_speeds.magnitude_max_rad_s() <= 0.0);
     };
-    let mut robot = SimRobot::new(start, 2.0, 3, false);
-    let mut follower = follower(&circle(Direction::CounterClockwise, 1.0), start);
-    for tick in 0..3000 {
-        let mut measured = robot.measured();
-        if tick > 500 {
-            measured.pose.x_m = f64::NAN;
-        }
-        let output = follower.step(&measured, None, common::LOOP_S);
-        if tick > 500 {
-            assert!(output.wheel_speeds.magnitude_max_rad_s() <= 0.0);
-        }
-        robot.act(output.wheel_speeds);
-        if output.status.is_final() {
-            assert_eq!(
-                output.status,
-                FollowerStatus::Failed(FailureReason::PoseLost)
-            );
-            return;
-        }
-    }
-    panic!("never failed: {:?}", follower.status());
+    assert_eq!(failure(lost, stands), FailureReason::PoseLost);
 }
 
 proptest! {
@@ -239,14 +181,9 @@ fn a_start_beside_the_circle_on_slippery_ground_ends_well() {
 
 #[test]
 fn localisation_is_better_than_the_fixes_it_is_made_of() {
-    let start = Pose {
-        x_m: 0.0,
-        y_m: 0.0,
-        heading_rad: 0.7,
-    };
     for stiffness in [0.7, 5.0] {
-        let mut robot = SimRobot::new(start, stiffness, 11, true);
-        let mut follower = follower(&figure_8(), start);
+        let mut robot = SimRobot::new(OBLIQUE, stiffness, 11, true);
+        let mut follower = follower(&figure_8(), OBLIQUE);
         let (mut position, mut heading, mut count) = (0.0, 0.0, 0.0_f64);
         robot.drive(&mut follower, 120.0, |_, _, robot| {
             let (found, truth) = (robot.measured().pose, robot.plant.state().pose);
@@ -267,13 +204,8 @@ fn localisation_is_better_than_the_fixes_it_is_made_of() {
 
 #[test]
 fn ground_that_changes_under_way_is_noticed_and_does_not_end_the_mission() {
-    let start = Pose {
-        x_m: 7.0,
-        y_m: -2.0,
-        heading_rad: PI / 2.0,
-    };
-    let mut robot = SimRobot::new(start, 5.0, 21, true);
-    let mut follower = follower(&circle(Direction::CounterClockwise, 2.0), start);
+    let mut robot = SimRobot::new(ON_CIRCLE, 5.0, 21, true);
+    let mut follower = follower(&circle(Direction::CounterClockwise, 2.0), ON_CIRCLE);
     let (mut ticks, mut most_m) = (0_u32, 0.0_f64);
     let last = loop {
         let output = follower.step(&robot.measured(), robot.knowledge(), common::LOOP_S);

@@ -32,16 +32,16 @@ fn brush_robot(seed: u64, curvature: f64, radius_ratios: [f64; 2]) -> SimRobot {
         ..curve(THETA.recip()).into()
     };
     robot.ground = Ground::uniform(ground.try_into().expect("a peak between 0 and 1"));
-    let told = TyrePrior {
+    let configured = TyrePrior {
         curvature: THETA * CURVATURE,
         curvature_std_dev: THETA * CURVATURE_HALF_RANGE / 3.0_f64.sqrt(),
         ..TyrePrior::default()
     };
-    let told = EstimatorPrior {
-        tyres: told,
+    let configured = EstimatorPrior {
+        tyres: configured,
         ..EstimatorPrior::exact()
     };
-    robot.estimator = Estimator::with_prior(robot.model, robot.noise, told);
+    robot.estimator = Estimator::with_prior(robot.model, robot.noise, configured);
     robot.torque_gain = [1.0; 2];
     robot
 }

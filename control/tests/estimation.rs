@@ -257,7 +257,7 @@ fn a_long_robot_begins_to_measure_in_a_bend_that_scrubs() {
         ..RobotModel::yi2007().into()
     };
     let model = RobotModel::try_from(spec).unwrap();
-    let mut robot = SimRobot::of(model, Pose::default(), 0.7, 4, true);
+    let mut robot = SimRobot::of(model, Pose::default(), 0.7, 5, true);
     robot.drive_wheel_by_wheel();
     robot.torque = false;
     // From the first metre on in the bend, faster and slower.

@@ -27,10 +27,10 @@ fn known(theta: f64) -> ThetaKnowledge {
 /// The figure-8 of the report, given a θ that may change with time; every tick's output.
 fn figure_8(
     friction_curve: FrictionCurve,
-    told: impl Fn(f64) -> ThetaKnowledge,
+    knowledge: impl Fn(f64) -> ThetaKnowledge,
 ) -> Vec<TickOutput> {
     let course = Course::Figure8(Figure8::usual());
-    let law = Law::Shipped(Some(told(0.0)));
+    let law = Law::Shipped(Some(knowledge(0.0)));
     let scenario = Scenario::usual(friction_curve);
     let mut run = Run::new(course, RobotModel::yi2007(), scenario, law).expect("a valid scenario");
     let ground = Ground::uniform(friction_curve);
@@ -39,7 +39,7 @@ fn figure_8(
         let input = TickInput {
             ground: &ground,
             pose_error: Pose::default(),
-            knowledge: Some(told(run.time_s())),
+            knowledge: Some(knowledge(run.time_s())),
         };
         match run.tick(&input, |_, _| {}) {
             Some(output) => ticks.push(output),
@@ -63,8 +63,8 @@ fn last_half(ticks: &[TickOutput]) -> &[TickOutput] {
 }
 
 fn believed(tick: &TickOutput) -> f64 {
-    let told = tick.tracker.expect("the shipped law says what it believes");
-    told.beyond_loop
+    let tracker = tick.tracker.expect("the shipped law says what it believes");
+    tracker.beyond_loop
 }
 
 #[test]

@@ -1,33 +1,20 @@
 //! The shipped law on the free plant, beside laws written for comparison.
 
-use std::f64::consts::{PI, TAU};
+#[path = "../../control/tests/common/figure_8.rs"]
+mod figure_8;
 
+use std::f64::consts::PI;
+
+use figure_8::figure_8;
 use tread_control::friction::FrictionCurve;
-use tread_control::geometry::{Point, Pose};
+use tread_control::geometry::Pose;
 use tread_control::plan::Plan;
-use tread_control::robot::{Limits, RobotModel, RobotModelSpec};
+use tread_control::robot::RobotModel;
 use tread_control::tracking::ThetaKnowledge;
-use tread_control::trajectory::{Trajectory, Waypoint, WaypointsSpec};
-use tread_lab::bench::{CrossTrack, KanayamaGains, Law, Scenario, cross_track};
+use tread_lab::bench::{CrossTrack, KanayamaGains, Law, Scenario, cross_track, husky_like};
 
 fn curve(stiffness: f64) -> FrictionCurve {
     FrictionCurve::with_stiffness(stiffness).expect("a positive stiffness")
-}
-
-fn figure_8() -> Trajectory {
-    let points = (0..=24)
-        .map(|index| {
-            let angle_rad = f64::from(index) / 24.0 * TAU;
-            Waypoint::from(Point {
-                x_m: 4.0 * angle_rad.sin(),
-                y_m: 2.0 * (2.0 * angle_rad).sin(),
-            })
-        })
-        .collect();
-    Trajectory::Waypoints(WaypointsSpec {
-        points,
-        speed_m_s: 0.6,
-    })
 }
 
 fn figure_8_run(stiffness: f64, servo_lag_s: f64, loop_s: f64, law: Law) -> CrossTrack {
@@ -110,24 +97,7 @@ fn a_theta_that_is_ten_times_wrong_does_not_throw_the_robot_off() {
 
 #[test]
 fn a_robot_of_another_size_drives_as_well() {
-    // About a Husky: 50 kg, wheels of 16.5 cm.
-    let model = RobotModel::try_from(RobotModelSpec {
-        mass_kg: 50.0,
-        track_width_m: 0.57,
-        wheelbase_m: 0.51,
-        wheel_radius_m: 0.165,
-        yaw_inertia_kg_m2: 3.0,
-        limits: Limits {
-            wheel_speed_max_rad_s: 8.0,
-            wheel_acceleration_max_rad_s2: 30.0,
-            linear_max_m_s: 1.0,
-            angular_max_rad_s: 1.5,
-            linear_acceleration_max_m_s2: 0.8,
-            linear_jerk_max_m_s3: 3.0,
-            lateral_acceleration_max_m_s2: 0.8,
-        },
-    })
-    .unwrap();
+    let model = husky_like();
     let start = Pose {
         x_m: 0.0,
         y_m: 0.0,

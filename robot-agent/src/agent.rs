@@ -15,7 +15,6 @@ use jiff::SignedDuration;
 use tokio::sync::watch;
 use tracing::{error, info};
 use tread_api::ids::BootId;
-use tread_api::robot::OutboxStatus;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
 use tread_api::wire::state::{FrictionReport, RobotState};
 use tread_control::robot::{RobotModel, RobotModelError};
@@ -336,11 +335,13 @@ impl RunningAgent {
     }
 
     /// What waits for the server, and what was lost.
-    pub fn outbox_status(&self) -> OutboxStatus {
+    #[cfg(any(test, feature = "testing"))]
+    pub fn outbox_status(&self) -> tread_api::robot::OutboxStatus {
         self.outbox.status()
     }
 
     /// Whether a server has been reached since the start.
+    #[cfg(any(test, feature = "testing"))]
     pub fn has_connected(&self) -> bool {
         *self.is_connected.borrow()
     }

@@ -277,6 +277,7 @@ impl Alerts {
 mod tests {
     use std::time::Duration;
 
+    use tread_api::friction::ROBOT_BIAS_RATIO;
     use tread_api::site::Cell;
     use tread_control::consistency::Unit;
     use tread_control::tracking::ThetaKnowledge;
@@ -414,7 +415,7 @@ mod tests {
                 cell: Cell { ix: -3, iy: 12 },
                 measured: known(1.43, 0.05),
                 expected: known(0.2, 0.02),
-                robot_bias_ratio: 0.08,
+                robot_bias_ratio: ROBOT_BIAS_RATIO,
             }),
             dug_in_at: Some(Point {
                 x_m: 3.04,

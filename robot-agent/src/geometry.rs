@@ -146,3 +146,22 @@ pub fn plan_options(asked: &trajectory::Trajectory) -> PlanOptions<'static> {
         traction_limits: None,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use tread_control::{path, plan};
+
+    use super::*;
+
+    #[test]
+    #[expect(clippy::float_cmp, reason = "the bounds are the same figures")]
+    fn the_planner_has_the_bounds_that_the_api_has() {
+        assert_eq!(trajectory::WAYPOINTS_MAX, plan::WAYPOINTS_MAX);
+        assert_eq!(
+            trajectory::WAYPOINT_SPACING_MIN_M,
+            plan::WAYPOINT_SPACING_MIN_M
+        );
+        assert_eq!(trajectory::RADIUS_MIN_M, path::RADIUS_MIN_M);
+        assert_eq!(wire::COORDINATE_MAX_M, plan::COORDINATE_MAX_M);
+    }
+}

@@ -11,7 +11,7 @@
 //! * [`membership`]: the robot's certificate, how it gets it and the next one.
 //! * `safety`: what may only slow the robot down, and teleoperation.
 //! * `recording`: what the loop took and gave, in files, and running such files again.
-//! * `testing` steps the loop by hand, for tests and figures; no program that ships contains it.
+//! * `testing` steps the loop tick by tick, for tests and figures; no program that ships contains it.
 //! * Below all: [`clock`], `supervisor`, [`geometry`] (between wire and controller).
 //!
 //! No module keeps anything global: several agents may run in one process.

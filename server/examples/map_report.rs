@@ -390,7 +390,7 @@ fn main() -> anyhow::Result<ExitCode> {
         ),
         at_most("upload_ack_p99_ms", "<= 100", 100.0, ack_p99_ms),
     ];
-    let told = [
+    let figures = [
         ("memory_bytes_per_sum_without_kept_squares", bytes),
         ("tile_256_first_time_longest_of_3_ms", asked.tile_first_ms),
     ];
@@ -399,13 +399,13 @@ fn main() -> anyhow::Result<ExitCode> {
         let checks = checks.map(|(name, goal, value, holds)| {
             json!({"name": name, "goal": goal, "value": value, "holds": holds})
         });
-        let told = told.map(|(name, value)| json!({"name": name, "value": value}));
-        writeln_out(&json!({"checks": checks, "told": told}).to_string())?;
+        let figures = figures.map(|(name, value)| json!({"name": name, "value": value}));
+        writeln_out(&json!({"checks": checks, "figures": figures}).to_string())?;
     } else {
         for (name, goal, value, holds) in checks {
             writeln_out(&format!("{name}: {value:.2} (goal {goal}), holds: {holds}"))?;
         }
-        for (name, value) in told {
+        for (name, value) in figures {
             writeln_out(&format!("{name}: {value:.2}"))?;
         }
     }

@@ -24,7 +24,7 @@ STEP_S = 0.001
 STEPS = 2
 SENSOR_S = 0.01
 SLIP_SPEED_M_S = 0.05
-GRAVITY = 9.81
+GRAVITY = 9.80665
 COMMAND_TIMEOUT_S = 0.5
 # What the base itself takes its wheels' radius for.
 BASE_RADIUS = 0.08

@@ -6,7 +6,7 @@
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
-use crate::friction::THETA_MAX;
+use crate::friction::{ROBOT_BIAS_RATIO, THETA_MAX};
 use crate::ids::{BootId, DERIVED_NAMESPACE, MissionId, PlanHash};
 use crate::mission::{LinkPolicy, PlanSummary};
 use crate::site::Cell;
@@ -76,7 +76,7 @@ pub struct CellTractionLimit {
 
 /// Default of servers.
 const fn robot_bias_ratio() -> f64 {
-    0.08
+    ROBOT_BIAS_RATIO
 }
 
 /// What the map knows of a cell.

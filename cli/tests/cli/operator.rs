@@ -117,8 +117,8 @@ async fn the_ground_is_drawn_changed_and_asked_about_by_commands() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_mission_is_checked_sent_held_followed_and_ended_by_commands() {
     let yard = Yard::start().await;
-    let told = yard.table(&[&LONG_CIRCLE[..], &["--check"]].concat()).await;
-    assert!(told.contains(" m: acceleration or braking"), "{told}");
+    let table = yard.table(&[&LONG_CIRCLE[..], &["--check"]].concat()).await;
+    assert!(table.contains(" m: acceleration or braking"), "{table}");
     let checked = yard.json(&[&LONG_CIRCLE[..], &["--check"]].concat()).await;
     assert!(
         checked["duration_s"]

@@ -83,7 +83,7 @@ pub const MODEL_RATIO: f64 = 1.5e-3;
 /// Most of a segment's own variance that it may share with the segments before.
 const OFFSETS_SHARE_MAX: f64 = 0.9;
 /// Standard deviations to either side of a 95 % interval.
-const NORMAL_95: f64 = 1.96;
+const NORMAL_95: f64 = 1.959_963_984_540_054;
 /// Longest time between two samples over which anything is averaged, seconds.
 const GAP_MAX_S: f64 = 0.1;
 /// Samples in a row that are refused because the wheels' speed leapt.

@@ -17,8 +17,7 @@ use crate::plan::Plan;
 use crate::robot::RobotModel;
 use ring::Ring;
 pub use speed::{
-    FenceInput, FenceVerdict, MARGIN_STD_DEVS, MU_UNKNOWN, REACTION_S, RETURN_MAX_M_S,
-    speed_within_m_s, stopping_distance_m, sure_braking_m_s2,
+    Braking, FenceInput, FenceVerdict, MARGIN_STD_DEVS, MU_UNKNOWN, REACTION_S, RETURN_MAX_M_S,
 };
 
 /// Distance kept from a fence beyond the robot's own radius, metres.

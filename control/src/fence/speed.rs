@@ -48,28 +48,38 @@ pub struct FenceVerdict {
     pub speed_max_m_s: Option<f64>,
 }
 
-/// Braking that a robot surely has, metres per second squared: its own limit, and half of what the
-/// ground gives, for the rest goes into steering.
-pub fn sure_braking_m_s2(model: &RobotModel, mu_lower: Option<f64>) -> f64 {
-    let mu = mu_lower
-        .filter(|mu| mu.is_finite() && *mu > 0.0)
-        .unwrap_or(MU_UNKNOWN);
-    model
-        .limits()
-        .linear_acceleration_max_m_s2
-        .min(0.5 * mu * GRAVITY_M_S2)
+/// Braking that a robot has.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Braking {
+    /// Deceleration, metres per second squared.
+    pub deceleration_m_s2: f64,
 }
 
-/// Distance from a decision to standstill, metres.
-pub fn stopping_distance_m(speed_m_s: f64, braking_m_s2: f64) -> f64 {
-    let speed_m_s = speed_m_s.abs();
-    speed_m_s * REACTION_S + speed_m_s * speed_m_s / (2.0 * braking_m_s2)
-}
+impl Braking {
+    /// What a robot surely has: its own limit, and half of what the ground gives, for the rest goes into
+    /// steering.
+    pub fn sure(model: &RobotModel, mu_lower: Option<f64>) -> Self {
+        let mu = mu_lower
+            .filter(|mu| mu.is_finite() && *mu > 0.0)
+            .unwrap_or(MU_UNKNOWN);
+        let own_m_s2 = model.limits().linear_acceleration_max_m_s2;
+        Self {
+            deceleration_m_s2: own_m_s2.min(0.5 * mu * GRAVITY_M_S2),
+        }
+    }
 
-/// Fastest speed with which the robot stops within a distance, metres per second.
-pub fn speed_within_m_s(distance_m: f64, braking_m_s2: f64) -> f64 {
-    let delay_m_s = braking_m_s2 * REACTION_S;
-    (delay_m_s * delay_m_s + 2.0 * braking_m_s2 * distance_m.max(0.0)).sqrt() - delay_m_s
+    /// Distance from a decision to standstill, metres.
+    pub fn stopping_distance_m(self, speed_m_s: f64) -> f64 {
+        let speed_m_s = speed_m_s.abs();
+        speed_m_s * REACTION_S + speed_m_s * speed_m_s / (2.0 * self.deceleration_m_s2)
+    }
+
+    /// Fastest speed with which the robot stops within a distance, metres per second.
+    pub fn speed_within_m_s(self, distance_m: f64) -> f64 {
+        let delay_m_s = self.deceleration_m_s2 * REACTION_S;
+        let free_m2_s2 = 2.0 * self.deceleration_m_s2 * distance_m.max(0.0);
+        (delay_m_s * delay_m_s + free_m2_s2).sqrt() - delay_m_s
+    }
 }
 
 /// The pose after a distance along an arc; a negative one goes backwards.
@@ -159,14 +169,14 @@ impl Fence {
                 0.0
             });
         }
-        let braking_m_s2 = sure_braking_m_s2(model, input.mu_lower);
+        let braking = Braking::sure(model, input.mu_lower);
         let fastest_m_s = input
             .present
             .linear_m_s
             .abs()
             .max(input.wanted.linear_m_s.abs());
         // A little more than is needed, so that the cap does not flicker at its own edge.
-        let reach_m = 1.2 * stopping_distance_m(fastest_m_s, braking_m_s2);
+        let reach_m = 1.2 * braking.stopping_distance_m(fastest_m_s);
         if clearance_m >= reach_m {
             return FenceVerdict {
                 clearance_m,
@@ -183,6 +193,6 @@ impl Fence {
                 speed_max_m_s: None,
             };
         }
-        cap(speed_within_m_s(free_m, braking_m_s2))
+        cap(braking.speed_within_m_s(free_m))
     }
 }

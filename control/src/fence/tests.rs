@@ -48,7 +48,7 @@ proptest! {
         let mut pose = Pose { x_m, y_m, heading_rad };
         let radius_m = disc_radius_m(&model);
         prop_assume!(fence.clearance_m(pose.point()) > radius_m + MARGIN_M);
-        let braking_m_s2 = sure_braking_m_s2(&model, mu);
+        let braking = Braking::sure(&model, mu);
         let dt_s = 0.02;
         let mut present = Twist::default();
         // What was decided comes to the wheels this much later.
@@ -69,7 +69,7 @@ proptest! {
                 };
                 // No braking harder than the ground surely gives.
                 let target = delayed[0];
-                let most = braking_m_s2 * dt_s;
+                let most = braking.deceleration_m_s2 * dt_s;
                 let linear_m_s = present.linear_m_s
                     + (target.linear_m_s - present.linear_m_s).clamp(-most, most);
                 let is_braking = linear_m_s.abs() < present.linear_m_s.abs();

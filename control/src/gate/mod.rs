@@ -76,12 +76,6 @@ impl GateCause {
         Self::StaleFeedback,
         Self::Stop,
     ];
-
-    /// Whether it comes from outside the command: more than a command that is cut to the robot's
-    /// own limits.
-    pub fn is_intervention(self) -> bool {
-        self > Self::Speed
-    }
 }
 
 /// Everything outside the command that may reduce it; by default nothing does.

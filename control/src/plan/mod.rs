@@ -48,7 +48,7 @@ const BEND_LOOKED_INTO_1_M: f64 = 1.0;
 const PARTS_LOOKED_INTO: u8 = 8;
 /// Peak friction coefficient that is assumed on the approach while nothing is
 /// known of the ground.
-const TRACTION_LIMIT_UNKNOWN_MU: f64 = 0.14;
+pub const TRACTION_LIMIT_UNKNOWN_MU: f64 = 0.14;
 /// Fewest cells of the timing.
 const GRID_MIN: usize = 16;
 
@@ -150,11 +150,12 @@ impl Plan {
         };
         let unlimited = model;
         let model = &limited;
-        if !start.is_finite() || start.x_m.abs().max(start.y_m.abs()) > COORDINATE_MAX_M {
+        check_coordinate("the start pose", 0, start.point())?;
+        if !start.heading_rad.is_finite() {
             return Err(PlanError::NotFinite {
                 what: "the start pose",
                 place: 0,
-                value: f64::NAN,
+                value: start.heading_rad,
             });
         }
         match trajectory {
@@ -424,9 +425,9 @@ impl Plan {
                 asked_m_s: asked_m_s[node],
                 left_m_s: nodes[node].speed_m_s,
                 by: bounds[node].by,
+                longitudinal: bounds[node].longitudinal,
             };
-            let by = bounds[node].longitudinal;
-            (plan.stretches).note(timing.arc_m, timing.speed_m_s, &cell, by);
+            plan.stretches.note(&timing, &cell);
         }
         Ok(plan)
     }
@@ -493,11 +494,6 @@ impl Plan {
     /// Direction in which the path leaves the start, radians.
     pub fn start_heading_rad(&self) -> f64 {
         self.path.sample(0.0).pose.heading_rad
-    }
-
-    /// Where the path ends.
-    pub fn end_pose(&self) -> Pose {
-        self.path.sample(self.length_m()).pose
     }
 
     /// Fastest speed along the path, metres per second.

@@ -1,5 +1,7 @@
 //! Where a plan is slower than it was asked to be, and what makes it so.
 
+use crate::profile::ProfileSample;
+
 /// What makes the robot slower than it was asked to be.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum SlowedBy {
@@ -48,6 +50,9 @@ pub(super) struct CellBounds {
     pub left_m_s: f64,
     /// The limit that leaves less than was asked for.
     pub by: Option<SlowedBy>,
+    /// The limit to blame where the robot has yet to reach, or already leaves, the speed that the place
+    /// itself would allow.
+    pub longitudinal: SlowedBy,
 }
 
 /// The stretches of a plan, gathered in driving order.
@@ -57,20 +62,16 @@ pub(super) struct Stretches {
 }
 
 impl Stretches {
-    /// Takes the planned speed at one place. `along` is the limit to blame where the robot has yet
-    /// to reach, or already leaves, the speed that the place itself would allow.
-    pub(super) fn note(
-        &mut self,
-        arc_m: f64,
-        speed_m_s: f64,
-        cell: &CellBounds,
-        longitudinal: SlowedBy,
-    ) {
+    /// Takes the planned speed at one place.
+    pub(super) fn note(&mut self, timing: &ProfileSample, cell: &CellBounds) {
+        let ProfileSample {
+            arc_m, speed_m_s, ..
+        } = *timing;
         if speed_m_s >= AS_ASKED * cell.asked_m_s {
             return;
         }
         let is_near = speed_m_s >= AS_ASKED * AS_ASKED * cell.left_m_s;
-        let by = cell.by.filter(|_| is_near).unwrap_or(longitudinal);
+        let by = cell.by.filter(|_| is_near).unwrap_or(cell.longitudinal);
         let reach_m = STRETCH_GAP_M + STRETCH_GAP_S * speed_m_s;
         let has_room = self.slowed.len() < SLOWED_MAX;
         match self.slowed.last_mut() {

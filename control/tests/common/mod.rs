@@ -6,10 +6,14 @@
     reason = "each test binary uses its own part"
 )]
 
+pub(crate) mod figure_8;
+
+use std::f64::consts::FRAC_PI_2;
+
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tread_control::estimation::{Estimator, SensorNoise, SensorSample};
-use tread_control::follower::{Follower, FollowerConfig, FollowerOutput};
+use tread_control::follower::{Follower, FollowerConfig, FollowerOutput, FollowerStatus};
 use tread_control::friction::FrictionCurve;
 use tread_control::gate::{GateInput, GateLimits, gate};
 use tread_control::geometry::{Point, Pose};
@@ -38,6 +42,31 @@ pub(crate) fn circle(direction: Direction, turns: f64) -> Trajectory {
         direction,
         turns,
     })
+}
+
+/// On [`circle`], headed along it counter-clockwise.
+pub(crate) const ON_CIRCLE: Pose = Pose {
+    x_m: 7.0,
+    y_m: -2.0,
+    heading_rad: FRAC_PI_2,
+};
+/// Three metres outside it, headed likewise.
+pub(crate) const OFF_CIRCLE: Pose = Pose {
+    x_m: 10.0,
+    ..ON_CIRCLE
+};
+/// On neither [`circle`] nor [`figure_8::figure_8`] in the right direction.
+pub(crate) const OBLIQUE: Pose = Pose {
+    x_m: 0.0,
+    y_m: 0.0,
+    heading_rad: 0.7,
+};
+
+/// Ticks of a mission at which it is paused, has come to rest, and is resumed.
+pub(crate) struct Pause {
+    pub(crate) from: u32,
+    pub(crate) at_rest: u32,
+    pub(crate) to: u32,
 }
 
 /// A robot's follower of a path from where it stands, at the defaults.
@@ -266,6 +295,33 @@ impl SimRobot {
                 return output;
             }
         }
+    }
+}
+
+impl SimRobot {
+    /// Drives a mission with a pause to its end; its status at the begin of the pause, the progress from
+    /// where the robot was at rest, metres, and the end.
+    pub(crate) fn drive_with_pause(
+        &mut self,
+        follower: &mut Follower,
+        pause: &Pause,
+    ) -> (Option<FollowerStatus>, f64, FollowerOutput) {
+        let (mut tick, mut paused_in) = (0, None);
+        let (mut first_m, mut last_m) = (None, 0.0);
+        let last = self.drive(follower, 120.0, |follower, output, _| {
+            tick += 1;
+            if tick == pause.from {
+                paused_in = Some(output.status);
+                follower.set_pace(0.0);
+            } else if tick == pause.to {
+                follower.set_pace(1.0);
+            } else if (pause.at_rest..pause.to).contains(&tick) {
+                first_m.get_or_insert(output.progress_m);
+                last_m = output.progress_m;
+            }
+        });
+        let crept_m = last_m - first_m.expect("the mission lasts longer than its pause");
+        (paused_in, crept_m, last)
     }
 }
 

@@ -8,6 +8,7 @@ mod driver;
 mod kanayama;
 mod paper_law;
 mod pursuit;
+mod robots;
 mod run;
 
 pub use course::{Course, Figure8, Nearest};
@@ -15,6 +16,7 @@ pub use driver::{Driver, Sight};
 pub use kanayama::{Kanayama, KanayamaGains, Track};
 pub use paper_law::PaperLaw;
 pub use pursuit::{Pursuit, PursuitConfig};
+pub use robots::husky_like;
 pub use run::{BenchError, CrossTrack, Run, Scenario, TickInput, TickOutput, cross_track};
 
 use tread_control::tracking::ThetaKnowledge;

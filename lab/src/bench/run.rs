@@ -247,7 +247,7 @@ pub fn cross_track(
     law: Law,
 ) -> Result<CrossTrack, BenchError> {
     let knowledge = match law {
-        Law::Shipped(told) => told,
+        Law::Shipped(knowledge) => knowledge,
         Law::Kanayama(_) | Law::Pursuit(_) | Law::Yi2007 => None,
     };
     let course = Course::Plan(plan.clone());

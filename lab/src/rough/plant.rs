@@ -11,12 +11,10 @@
 use nalgebra::{Matrix3, Vector3};
 use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
-use tread_control::robot::RobotModel;
+use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 
 use super::spec::Deviations;
 
-/// Gravity, metres per second squared.
-pub const GRAVITY_M_S2: f64 = 9.806_65;
 /// Integration step, seconds: a hundredth of the fastest oscillation of a contact.
 pub const STEP_S: f64 = 5.0e-4;
 /// Largest deflection of a contact, as a slip; far beyond every curve's peak.

@@ -9,9 +9,9 @@ use std::time::Duration;
 use tread_agent::drive::{Feedback, SensorSample};
 use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
-use tread_control::robot::RobotModel;
+use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 
-use super::plant::{GRAVITY_M_S2, Means, Truth};
+use super::plant::{Means, Truth};
 use crate::random::Random;
 
 /// Time between two samples of the fast sensors.

@@ -222,6 +222,7 @@ impl DriveConfig {
     }
 
     /// The same, to be changed.
+    #[cfg(any(test, feature = "testing"))]
     pub fn simulated_mut(&mut self) -> Option<&mut SimulatedConfig> {
         match self {
             Self::Simulated(simulated) => Some(simulated),

@@ -93,7 +93,7 @@ pub(super) struct Active {
     paused_from: Option<Duration>,
     standing_ticks: u32,
     /// Whether the server was told that it stands paused.
-    is_told_paused: bool,
+    is_pause_reported: bool,
     stopped_because: EndReason,
     /// The revision that takes over once the robot stands.
     next: Option<Box<Job>>,
@@ -123,7 +123,7 @@ impl Active {
             holds: Holds::default(),
             paused_from: None,
             standing_ticks: 0,
-            is_told_paused: false,
+            is_pause_reported: false,
             stopped_because: EndReason::Cancelled,
             next: None,
             tracked: None,
@@ -245,7 +245,7 @@ impl Active {
             next.follower.warm_start(knowledge);
         }
         self.progress = MissionProgress {
-            paused: self.is_told_paused,
+            paused: self.is_pause_reported,
             paused_by: self.progress.paused_by,
             ..progress_of(&next)
         };
@@ -332,10 +332,10 @@ impl Active {
 
     fn take_news(&mut self) -> Option<News> {
         let is_paused = self.holds.pause && self.stands_held();
-        if is_paused == self.is_told_paused || (self.is_told_paused && self.holds.pause) {
+        if is_paused == self.is_pause_reported || (self.is_pause_reported && self.holds.pause) {
             return None;
         }
-        self.is_told_paused = is_paused;
+        self.is_pause_reported = is_paused;
         self.progress.paused = is_paused;
         Some(if is_paused {
             News::Paused
@@ -350,7 +350,7 @@ impl Active {
         self.job.driven.add(&TickRecord {
             cross_track_m,
             is_saturated: is_saturated.unwrap_or(false),
-            is_paused: self.is_told_paused,
+            is_paused: self.is_pause_reported,
             // Slowing to rest and speeding up are the gate's usual work while it is held.
             gate: tick
                 .gate

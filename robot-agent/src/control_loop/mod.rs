@@ -47,7 +47,7 @@ pub(crate) fn run(
         "control loop runs"
     );
     let mut pace = Pace::new(period, drive.arrivals(), clock.monotonic());
-    let mut told_to_stop_at = None;
+    let mut stop_requested_at = None;
     let mut standing_ticks = 0;
     loop {
         let began = clock.monotonic();
@@ -63,7 +63,7 @@ pub(crate) fn run(
         let ended = clock.monotonic();
         core.note_tick_time(ended.saturating_sub(began));
         if stop {
-            let since = *told_to_stop_at.get_or_insert(began);
+            let since = *stop_requested_at.get_or_insert(began);
             standing_ticks = if core.stands() { standing_ticks + 1 } else { 0 };
             let has_stopped = standing_ticks >= STANDING_TICKS && core.flush();
             let is_overdue = began.saturating_sub(since) > BRAKING_MAX;

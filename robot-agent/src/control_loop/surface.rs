@@ -108,6 +108,8 @@ mod tests {
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
+    use tread_api::friction::ROBOT_BIAS_RATIO;
+
     use super::*;
 
     /// Cells of which as many raise a false alarm as chance lets them.
@@ -124,7 +126,7 @@ mod tests {
                 theta: 0.2,
                 std_dev: 0.01,
             },
-            robot_bias_ratio: 0.08,
+            robot_bias_ratio: ROBOT_BIAS_RATIO,
         }
     }
 

@@ -1,4 +1,4 @@
-//! The whole loop with the simulated base, stepped by hand: no thread, no clock, no network.
+//! The whole loop with the simulated base, stepped tick by tick: no thread, no clock, no network.
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -20,7 +20,7 @@ const FRICTION: std::ops::RangeInclusive<f64> = 0.1..=1.5;
 /// Momentum that the wheels gave as a share of the robot's. Heavy rotors behind a high gear can
 /// make it several times as much, nothing can make it a third.
 const MOMENTUM_RATIO: std::ops::RangeInclusive<f64> = 0.4..=8.0;
-/// Least speed that the robot must have gained, as a share of what it was told.
+/// Least speed that the robot must have gained, as a share of its command.
 const GAINED_MIN: f64 = 0.5;
 
 /// What the wheels pulled, beside what they can have pulled.
@@ -69,8 +69,8 @@ fn momentum_ratio(
     set_off: &SetOff,
     steady_n_m: f64,
 ) -> Option<f64> {
-    let told_rad_s = 0.5 * (forward.commanded.left_rad_s + forward.commanded.right_rad_s);
-    (set_off.gained_rad_s > GAINED_MIN * told_rad_s).then_some(())?;
+    let commanded_rad_s = 0.5 * (forward.commanded.left_rad_s + forward.commanded.right_rad_s);
+    (set_off.gained_rad_s > GAINED_MIN * commanded_rad_s).then_some(())?;
     let gained_m_s = model.wheel_radius_m() * set_off.gained_rad_s;
     let given_n_s = (set_off.torque_n_m - steady_n_m) * set_off.span_s / model.wheel_radius_m();
     Some(given_n_s / (model.mass_kg() * gained_m_s))

@@ -7,14 +7,14 @@ use std::time::Duration;
 
 use tread_control::geometry::Pose;
 use tread_control::measured::WheelSpeeds;
-use tread_control::plant::{Plant, PlantError, PlantSpec, PlantState};
+use tread_control::plant::{Plant, PlantError, PlantSpec};
 use tread_control::robot::RobotModel;
 
 use super::{Battery, Drive, Feedback, SensorSample};
 use crate::sim::battery::SimulatedBattery;
 use crate::sim::faults::{Fault, Faults};
 use crate::sim::ground::GroundMap;
-use crate::sim::scenario::{GroundSpec, Scenario, ScenarioError};
+use crate::sim::scenario::{Scenario, ScenarioError};
 use crate::sim::sensors::{SAMPLE_PERIOD, SensorSpec, Sensors};
 use crate::sim::trace::{Trace, TruthSample};
 
@@ -173,20 +173,23 @@ impl SimulatedDrive {
     }
 
     /// Leans the base from level, radians; a simulated fault.
+    #[cfg(any(test, feature = "testing"))]
     pub fn lean(&mut self, tilt_rad: f64) {
         self.tilt_rad = tilt_rad;
     }
 
     /// The true state, for tests and figures.
-    pub fn truth(&self) -> &PlantState {
+    #[cfg(any(test, feature = "testing"))]
+    pub fn truth(&self) -> &tread_control::plant::PlantState {
         self.plant.state()
     }
 
     /// The true ground under the robot's left side.
-    pub fn ground_truth(&self) -> GroundSpec {
+    #[cfg(any(test, feature = "testing"))]
+    pub fn ground_truth(&self) -> crate::sim::scenario::GroundSpec {
         let at = self.simulated_to.unwrap_or_default();
         let curve = self.ground.under(self.plant.state().pose, 0.0, at).left;
-        GroundSpec {
+        crate::sim::scenario::GroundSpec {
             stiffness: curve.stiffness(),
             peak_slip: curve.peak_slip(),
             sliding_ratio: curve.sliding_ratio(),
@@ -212,7 +215,7 @@ impl SimulatedDrive {
             let (wheels, torques) = (self.plant.state().wheel_speeds, self.plant.wheel_torques());
             let wheels_w =
                 wheels.left_rad_s * torques.left_n_m + wheels.right_rad_s * torques.right_n_m;
-            self.battery.step(wheels_w, SAMPLE_PERIOD.as_secs_f64());
+            self.battery.step(wheels_w, SAMPLE_PERIOD);
             let sample = self.sensors.sample(&self.plant, at);
             let sample = self.faults.sample(sample, pose.heading_rad);
             self.waiting.push(SensorSample {

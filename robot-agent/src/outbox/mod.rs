@@ -63,16 +63,6 @@ pub enum OutboxError {
     Content(#[source] serde_json::Error),
 }
 
-impl OutboxError {
-    /// Whether the same record will never be taken, however often it is tried.
-    pub fn is_for_ever(&self) -> bool {
-        match self {
-            Self::Store(StoreError::TooLarge(_)) | Self::Content(_) => true,
-            Self::Store(StoreError::File { .. }) | Self::InUse(_) | Self::Lock { .. } => false,
-        }
-    }
-}
-
 /// The oldest records that wait, ready to be sent.
 #[derive(Debug, Clone)]
 pub struct PendingBatch {

@@ -10,6 +10,7 @@ use mcap::Writer;
 use mcap::io::MessageReader;
 use mcap::records::MessageHeader;
 use tempfile::TempDir;
+use tread_api::friction::ROBOT_BIAS_RATIO;
 use tread_api::ids::OwnerId;
 use tread_api::safety::{Driver, Geofence};
 use tread_api::wire;
@@ -213,7 +214,7 @@ fn a_day_with_all_that_happens_runs_again_to_the_bit() {
     bench.tell(&PathPrior {
         grid_revision: 1,
         traction_limit_mu: 0.3,
-        robot_bias_ratio: 0.08,
+        robot_bias_ratio: ROBOT_BIAS_RATIO,
         cells: (0..40)
             .map(|place| CellPrior {
                 cell: tread_api::site::Cell {

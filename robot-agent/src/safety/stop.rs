@@ -12,13 +12,12 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 use tread_api::ids::StopId;
+use tread_api::mission::REASON_LENGTH_MAX;
 use tread_api::safety::{BY_LENGTH_MAX, StopLatch};
 use tread_api::wire::safety::Stop;
 
 /// Stops that are remembered as seen, in force or cleared; the oldest is forgotten first.
 pub(crate) const SEEN_MAX: usize = 256;
-/// Longest reason, in characters.
-const REASON_LENGTH_MAX: usize = tread_api::mission::REASON_LENGTH_MAX;
 
 /// Whether a stop is in force, and which were seen before.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]

@@ -1,5 +1,7 @@
 //! The simulated robot's battery: the work of the wheels and a constant draw empty it.
 
+use std::time::Duration;
+
 use crate::drive::Battery;
 
 /// Energy of a full battery, joules: 150 Wh.
@@ -25,11 +27,11 @@ impl SimulatedBattery {
         }
     }
 
-    /// Takes what `dt_s` of work needs; `wheels_w` is the wheels' mechanical power, and what they
+    /// Takes what some time of work needs; `wheels_w` is the wheels' mechanical power, and what they
     /// give back while braking is lost.
-    pub fn step(&mut self, wheels_w: f64, dt_s: f64) {
+    pub fn step(&mut self, wheels_w: f64, time: Duration) {
         let power_w = IDLE_W + wheels_w.max(0.0) / EFFICIENCY_RATIO;
-        self.charge_j = (self.charge_j - power_w * dt_s).max(0.0);
+        self.charge_j = (self.charge_j - power_w * time.as_secs_f64()).max(0.0);
     }
 
     /// What its gauge shows.
@@ -51,11 +53,11 @@ mod tests {
     fn standing_takes_the_idle_draw_and_an_empty_battery_stays_empty() {
         let mut battery = SimulatedBattery::new(1.0);
         for _ in 0..3_600 {
-            battery.step(-5.0, 1.0);
+            battery.step(-5.0, Duration::from_secs(1));
         }
         let left = battery.reading().charge_ratio;
         assert!((left - (1.0 - IDLE_W / 150.0)).abs() < 1.0e-9, "{left}");
-        battery.step(1.0e9, 10.0);
+        battery.step(1.0e9, Duration::from_secs(10));
         assert_eq!(battery.reading(), SimulatedBattery::new(0.0).reading());
     }
 }

@@ -1,4 +1,4 @@
-//! The loop on a bench: the agent's own tick with a simulated base, stepped by hand.
+//! The loop on a bench: the agent's own tick with a simulated base, stepped tick by tick.
 //!
 //! No thread, no clock, no network, so runs repeat to the bit and go as fast as the machine does.
 //! For tests, figures and benchmarks: compiled for tests and with the feature `testing`.

@@ -11,6 +11,7 @@ use tokio_util::sync::CancellationToken;
 use tread_api::rights::Scope;
 
 use super::map::MapChange;
+use super::sites::SITES_MAX;
 use super::{App, AppError};
 use crate::db;
 use crate::db::sums::SumKey;
@@ -23,8 +24,6 @@ pub const HOURS_KEPT: i64 = 7 * DAY_H;
 const MERGE_EVERY: Duration = Duration::from_mins(10);
 /// Rows that one transaction merges; others write in between.
 const ROWS_MERGED_MAX: u32 = 500;
-/// Sites of one look.
-const SITES_MAX: u32 = 1_000;
 
 /// Merges now and then until the stop.
 pub async fn run(app: App, stop: CancellationToken) {

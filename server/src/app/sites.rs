@@ -9,7 +9,7 @@ use super::{App, AppError, name_or, page, site_row};
 use crate::db;
 
 /// Most sites of one server.
-const SITES_MAX: u32 = 1_000;
+pub(super) const SITES_MAX: u32 = 1_000;
 /// Side of a cell when nothing is said, metres.
 const CELL_DEFAULT_M: f64 = 1.0;
 

@@ -6,6 +6,7 @@
 use jiff::Timestamp;
 use tread_api::friction::{CreateWithdrawal, Withdrawal};
 use tread_api::ids::{RobotId, SiteId};
+use tread_api::mission::REASON_LENGTH_MAX;
 use tread_api::page::Page;
 use tread_api::rights::Scope;
 
@@ -18,8 +19,6 @@ use crate::friction::{bucket_h, epoch_h};
 
 /// Most withdrawals of one server; each segment that comes is held against them.
 const WITHDRAWALS_MAX: usize = 1_000;
-/// Longest reason, in characters.
-const REASON_LENGTH_MAX: usize = 500;
 /// Seconds of an hour.
 const HOUR_S: i64 = 3_600;
 

@@ -52,6 +52,8 @@ pub const BOUNDS: Bounds = Bounds {
     unproven: 512,
     unproven_per_address: 64,
 };
+/// Rest after the machine refused a connection, such as for want of file handles.
+pub const ACCEPT_REST: Duration = Duration::from_millis(100);
 /// Most connections of one token, with its sessions, that are at work or idle: a dashboard may serve
 /// a thousand people by one token, and others find room beside it.
 pub const PER_IDENTITY_MAX: usize = 2_048;

@@ -6,6 +6,7 @@ use tread_api::enrolment::JoinToken;
 use tread_api::ids::{JoinTokenId, RobotId};
 use tread_api::rights::Scope;
 
+use super::secrets::{Kept, look_up_tokens};
 use super::{DbError, from_us, parse, scope_text, to_us};
 use crate::identity::secret::Fingerprint;
 
@@ -78,15 +79,13 @@ pub async fn list(
     raw.into_iter().map(JoinToken::try_from).collect()
 }
 
-/// The join token of that identifier.
-pub async fn find(
-    db: &mut SqliteConnection,
-    id: JoinTokenId,
-) -> Result<Option<JoinToken>, DbError> {
-    let id = id.to_string();
-    let raw = join_tokens!("WHERE id = ?", id).fetch_optional(db).await?;
-    raw.map(JoinToken::try_from).transpose()
-}
+look_up_tokens!(
+    "join_tokens",
+    join_tokens,
+    "join token",
+    JoinTokenId,
+    JoinToken
+);
 
 /// How many could be used at a time.
 pub async fn valid_count(db: &mut SqliteConnection, at: Timestamp) -> Result<i64, DbError> {
@@ -204,32 +203,4 @@ pub async fn forget_dead(
     .execute(db)
     .await?;
     Ok(())
-}
-
-/// What is kept of a secret, with what it opens.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Kept {
-    /// The hash of the secret.
-    pub hash: Vec<u8>,
-    /// The join token.
-    pub token: JoinToken,
-}
-
-/// The join token whose hash begins like this one.
-pub async fn by_lookup(
-    db: &mut SqliteConnection,
-    fingerprint: &Fingerprint,
-) -> Result<Option<Kept>, DbError> {
-    let lookup = fingerprint.lookup();
-    let row = sqlx::query!("SELECT id, hash FROM join_tokens WHERE lookup = ?", lookup)
-        .fetch_optional(&mut *db)
-        .await?;
-    let Some(row) = row else {
-        return Ok(None);
-    };
-    let token = find(db, parse("join token", &row.id)?).await?;
-    Ok(token.map(|token| Kept {
-        hash: row.hash,
-        token,
-    }))
 }

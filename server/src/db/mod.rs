@@ -21,6 +21,7 @@ mod private;
 pub mod removed;
 pub mod robots;
 mod rows;
+pub mod secrets;
 pub mod segments;
 pub mod sessions;
 pub mod sites;

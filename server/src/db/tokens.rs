@@ -6,6 +6,7 @@ use tread_api::identity::{Role, Token};
 use tread_api::ids::TokenId;
 use tread_api::rights::{Rights, Scope};
 
+use super::secrets::{Kept, look_up_tokens};
 use super::{DbError, corrupt, from_json, from_us, parse, scope_text, to_json, to_us};
 use crate::identity::secret::Fingerprint;
 
@@ -98,12 +99,7 @@ pub async fn list(
     raw.into_iter().map(Token::try_from).collect()
 }
 
-/// The token of that identifier.
-pub async fn find(db: &mut SqliteConnection, id: TokenId) -> Result<Option<Token>, DbError> {
-    let id = id.to_string();
-    let raw = tokens!("WHERE id = ?", id).fetch_optional(db).await?;
-    raw.map(Token::try_from).transpose()
-}
+look_up_tokens!("tokens", tokens, "token", TokenId, Token);
 
 /// The token that is valid at a time under a name.
 pub async fn valid_by_name(
@@ -256,17 +252,11 @@ pub async fn forget_dead(
     Ok(())
 }
 
-/// What is kept of a secret, with what it opens.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Kept {
-    /// The hash of the secret.
-    pub hash: Vec<u8>,
-    /// The token.
-    pub token: Token,
-}
-
 /// Every token that is valid at a time; [`super::DbError`] of one row is that of all.
-pub async fn all_valid(db: &mut SqliteConnection, at: Timestamp) -> Result<Vec<Kept>, DbError> {
+pub async fn all_valid(
+    db: &mut SqliteConnection,
+    at: Timestamp,
+) -> Result<Vec<Kept<Token>>, DbError> {
     let at_us = to_us(at);
     let rows = sqlx::query!(
         "SELECT id, hash, name, role, rights, scope, created_at_us, created_by, expires_at_us,
@@ -295,23 +285,4 @@ pub async fn all_valid(db: &mut SqliteConnection, at: Timestamp) -> Result<Vec<K
         })
     });
     kept.collect()
-}
-
-/// The token whose hash begins like this one.
-pub async fn by_lookup(
-    db: &mut SqliteConnection,
-    fingerprint: &Fingerprint,
-) -> Result<Option<Kept>, DbError> {
-    let lookup = fingerprint.lookup();
-    let row = sqlx::query!("SELECT id, hash FROM tokens WHERE lookup = ?", lookup)
-        .fetch_optional(&mut *db)
-        .await?;
-    let Some(row) = row else {
-        return Ok(None);
-    };
-    let token = find(db, parse("token", &row.id)?).await?;
-    Ok(token.map(|token| Kept {
-        hash: row.hash,
-        token,
-    }))
 }

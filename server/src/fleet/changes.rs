@@ -21,7 +21,7 @@ pub(super) async fn run(app: App, routers: Arc<Routers>, stop: CancellationToken
     let mut publishers = Publishers::new(keys::map);
     // Words that were missed, and how many of them each site has been told of.
     let mut missed: u64 = 0;
-    let mut told: HashMap<SiteId, u64> = HashMap::new();
+    let mut announced: HashMap<SiteId, u64> = HashMap::new();
     loop {
         let heard = tokio::select! {
             biased;
@@ -39,7 +39,7 @@ pub(super) async fn run(app: App, routers: Arc<Routers>, stop: CancellationToken
                 return;
             }
         };
-        if told.insert(change.site.clone(), missed).unwrap_or(0) < missed {
+        if announced.insert(change.site.clone(), missed).unwrap_or(0) < missed {
             change.everything = true;
             change.boxes.clear();
         }

@@ -11,6 +11,7 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use super::tokens::CLOSED_MAX;
 use crate::app::presence::RobotKey;
 use crate::rate_limit::{Bucket, RateLimit};
 
@@ -161,9 +162,6 @@ impl Robot {
         is_taken
     }
 }
-
-/// Closed routers that are remembered: what was on its way is there long before so many more close.
-const CLOSED_MAX: usize = 64;
 
 /// All robots' limits.
 #[derive(Debug, Clone, Default)]

@@ -7,7 +7,7 @@ use std::collections::{HashMap, HashSet, VecDeque};
 const TOKENS_MAX: usize = 32_768;
 
 /// Closed routers that are remembered: what was on its way is there long before so many more close.
-const CLOSED_MAX: usize = 64;
+pub(super) const CLOSED_MAX: usize = 64;
 
 /// The tokens that are there.
 #[derive(Debug, Default)]
@@ -105,8 +105,8 @@ mod tests {
                         closed.insert(router);
                         let went = before.into_iter().filter(|token| !is_there(&model, token));
                         let went: HashSet<String> = went.collect();
-                        let told: HashSet<String> = tokens.router_closed(router).into_iter().collect();
-                        prop_assert_eq!(told, went);
+                        let reported: HashSet<String> = tokens.router_closed(router).into_iter().collect();
+                        prop_assert_eq!(reported, went);
                     }
                 }
             }

@@ -1,6 +1,5 @@
 //! The friction map in the formats of other programs. Pure: what is known goes in, bytes come out.
 
-pub mod font;
 pub mod geodesy;
 pub mod json;
 pub mod nav2;

@@ -100,6 +100,8 @@ pub fn yaml(raster: &Raster, scale: SpeedScale) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
+    use tread_control::robot::GRAVITY_M_S2;
+
     use super::*;
 
     #[test]
@@ -113,7 +115,7 @@ mod tests {
         assert_eq!(value(9.0, scale), 100);
         let speed = speed_m_s(0.14, scale);
         assert!(
-            (speed * speed / (2.0 * 0.58 * 0.14 * 9.81) - 1.0).abs() < 1e-3,
+            (speed * speed / (2.0 * 0.58 * 0.14 * GRAVITY_M_S2) - 1.0).abs() < 1e-3,
             "{speed}"
         );
     }

@@ -2,8 +2,16 @@
 //! nothing is known, with a legend below. North-like is up.
 
 use std::collections::BTreeMap;
+use std::convert::Infallible;
 
-use super::font;
+use embedded_graphics::draw_target::DrawTarget;
+use embedded_graphics::geometry::{OriginDimensions, Point, Size};
+use embedded_graphics::mono_font::iso_8859_7::FONT_7X13;
+use embedded_graphics::mono_font::{MonoFont, MonoTextStyle};
+use embedded_graphics::pixelcolor::{Rgb888, RgbColor as _};
+use embedded_graphics::text::{Baseline, Text};
+use embedded_graphics::{Drawable as _, Pixel};
+
 use super::palette::{HATCHED, Rgb, THETA_HIGH, THETA_LOW, UNSURE, cividis, colour, doubt, share};
 use crate::friction::Raster;
 use crate::friction::index::KnownCell;
@@ -20,8 +28,13 @@ const PIXELS_MAX: usize = 1 << 24;
 const HATCHED_SIDE_PX: usize = 4;
 /// Distance of the lines of the hatching, pixels.
 const HATCH_PX: usize = 4;
-/// Pixels of a dot of a letter.
-const DOT_PX: usize = 2;
+/// Letters of the legend, Greek ones too.
+const FONT: MonoFont<'_> = FONT_7X13;
+/// Pixels of a letter's width and height.
+const LETTER_PX: (usize, usize) = (
+    FONT.character_size.width as usize,
+    FONT.character_size.height as usize,
+);
 /// Pixels of a margin in the legend.
 const MARGIN_PX: usize = 8;
 /// Pixels of the height of a bar of the legend.
@@ -68,22 +81,40 @@ impl Canvas {
     }
 
     fn write(&mut self, (x, y): (usize, usize), text: &str) {
-        for (place, letter) in text.chars().enumerate() {
-            let left = x + place * (font::COLUMNS + 1) * DOT_PX;
-            for (row, dots) in font::letter(letter).into_iter().enumerate() {
-                for column in 0..font::COLUMNS {
-                    if dots >> (font::COLUMNS - 1 - column) & 1 == 1 {
-                        let at = (left + column * DOT_PX, y + row * DOT_PX);
-                        self.fill(at, (DOT_PX, DOT_PX), INK);
-                    }
-                }
+        let [red, green, blue] = INK;
+        let style = MonoTextStyle::new(&FONT, Rgb888::new(red, green, blue));
+        let place = |pixels: usize| i32::try_from(pixels).unwrap_or(i32::MAX);
+        let at = Point::new(place(x), place(y));
+        let Ok(_end) = Text::with_baseline(text, at, style, Baseline::Top).draw(self);
+    }
+}
+
+impl OriginDimensions for Canvas {
+    fn size(&self) -> Size {
+        let side = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
+        Size::new(side(self.width), side(self.height))
+    }
+}
+
+impl DrawTarget for Canvas {
+    type Color = Rgb888;
+    type Error = Infallible;
+
+    fn draw_iter<I: IntoIterator<Item = Pixel<Rgb888>>>(
+        &mut self,
+        pixels: I,
+    ) -> Result<(), Infallible> {
+        for Pixel(at, ink) in pixels {
+            if let (Ok(x), Ok(y)) = (usize::try_from(at.x), usize::try_from(at.y)) {
+                self.put(x, y, [ink.r(), ink.g(), ink.b()]);
             }
         }
+        Ok(())
     }
 }
 
 fn text_width_px(text: &str) -> usize {
-    (text.chars().count() * (font::COLUMNS + 1)).saturating_sub(1) * DOT_PX
+    text.chars().count() * LETTER_PX.0
 }
 
 /// Pixels of a square's side when nobody says how many.
@@ -104,7 +135,7 @@ pub fn encode(raster: &Raster, scale: Option<usize>) -> Result<Vec<u8>, PngError
     if width.saturating_mul(height) > PIXELS_MAX {
         return Err(PngError::TooLarge(scale));
     }
-    let letters = font::ROWS * DOT_PX;
+    let (_, letters) = LETTER_PX;
     let legend = 5 * MARGIN_PX + 2 * (BAR_PX + letters + 2);
     let mut canvas = Canvas {
         width: width.max(LEGEND_WIDTH_PX),
@@ -144,7 +175,7 @@ fn draw(canvas: &mut Canvas, (x, y): (usize, usize), scale: usize, known: &Known
     reason = "pixels"
 )]
 fn draw_legend(canvas: &mut Canvas, top: usize, height: usize) {
-    let letters = font::ROWS * DOT_PX;
+    let (_, letters) = LETTER_PX;
     let width = canvas.width;
     canvas.fill((0, top), (width, height), WHITE);
     let title = text_width_px("θ") + MARGIN_PX;
@@ -152,7 +183,7 @@ fn draw_legend(canvas: &mut Canvas, top: usize, height: usize) {
     let bar = width - left - 2 * MARGIN_PX;
     let at = |share: f64| left + (share * bar as f64).round() as usize;
     let mut y = top + MARGIN_PX;
-    canvas.write((MARGIN_PX, y + 1), "θ");
+    canvas.write((MARGIN_PX, y), "θ");
     for column in 0..bar {
         let ink = cividis(column as f64 / bar as f64);
         canvas.fill((left + column, y), (1, BAR_PX), ink);
@@ -168,7 +199,7 @@ fn draw_legend(canvas: &mut Canvas, top: usize, height: usize) {
         canvas.write((text_left, y + 4), tick);
     }
     y += letters + 2 + 2 * MARGIN_PX;
-    canvas.write((MARGIN_PX, y + 1), "σ/θ");
+    canvas.write((MARGIN_PX, y), "σ/θ");
     for column in 0..bar {
         let relative = column as f64 / bar as f64 * UNSURE;
         let ink = colour(0.75, doubt(relative));

@@ -17,7 +17,7 @@ const TYRE_RATIO: f64 = 0.1;
 const FLEETS: u32 = 3_000;
 
 /// A measurement that tells its common errors.
-fn told(theta: f64, age_s: i64, [robot, tyre]: [f64; 2]) -> Sums {
+fn sums_of(theta: f64, age_s: i64, [robot, tyre]: [f64; 2]) -> Sums {
     let sums = measured(theta, OWN_STD_DEV, age_s);
     let information = OWN_STD_DEV.powi(-2);
     Sums {
@@ -30,7 +30,7 @@ fn told(theta: f64, age_s: i64, [robot, tyre]: [f64; 2]) -> Sums {
 fn fleet(robots: u8, passes: i64) -> Fused {
     let ratios = [ROBOT_RATIO, TYRE_RATIO];
     let parts = (0..robots)
-        .flat_map(|robot| (0..passes).map(move |pass| (robot, told(THETA, pass, ratios))));
+        .flat_map(|robot| (0..passes).map(move |pass| (robot, sums_of(THETA, pass, ratios))));
     fused_as(parts, Ground::Cell, &FrictionConfig::default()).unwrap()
 }
 
@@ -62,7 +62,7 @@ fn intervals_hold_the_truth_where_robots_share_the_error_of_their_tyres() {
                 let own = THETA * (1.0 + tyres + ROBOT_RATIO * normal.next());
                 for pass in 0..4 {
                     let theta = own + OWN_STD_DEV * normal.next();
-                    parts.push((robot, told(theta, pass, [ROBOT_RATIO, TYRE_RATIO])));
+                    parts.push((robot, sums_of(theta, pass, [ROBOT_RATIO, TYRE_RATIO])));
                 }
             }
             let fused = fused_as(parts, Ground::Cell, &FrictionConfig::default()).unwrap();
@@ -86,7 +86,7 @@ fn beside(honest: u8, wrong: Option<Sums>) -> (f64, f64) {
             .map(|robot| {
                 let own = THETA * (1.0 + tyres + ROBOT_RATIO * normal.next());
                 let theta = own + OWN_STD_DEV * normal.next();
-                (robot, told(theta, 1, [ROBOT_RATIO, TYRE_RATIO]))
+                (robot, sums_of(theta, 1, [ROBOT_RATIO, TYRE_RATIO]))
             })
             .collect();
         parts.extend(wrong.map(|wrong| (0, wrong)));
@@ -114,7 +114,7 @@ fn one_robot_of_three_or_more_gains_nothing_by_what_it_says_of_its_errors() {
             [ROBOT_RATIO, TYRE_RATIO],
         ] {
             for off in [0.5, 2.0, 3.0, 4.0, 8.0, 1e4] {
-                let wrong = told(THETA + off * own, 40, ratios);
+                let wrong = sums_of(THETA + off * own, 40, ratios);
                 let (held, width) = beside(honest, Some(wrong));
                 let said = format!(
                     "{honest} honest, one {off} off that says {ratios:?}: {held:.3}, {:.2} times",
@@ -128,8 +128,8 @@ fn one_robot_of_three_or_more_gains_nothing_by_what_it_says_of_its_errors() {
 
 #[test]
 fn sums_keep_the_independent_information_and_mean_shares_of_what_is_common() {
-    let mut sums = told(THETA, 0, [0.1, 0.2]);
-    sums.add(&told(THETA, 1, [0.3, 0.0]));
+    let mut sums = sums_of(THETA, 0, [0.1, 0.2]);
+    sums.add(&sums_of(THETA, 1, [0.3, 0.0]));
     let seen = Seen::of(1_u8, 0, &sums).unwrap();
     assert!((seen.robot_ratio - 0.2).abs() < 1e-6 && (seen.tyre_ratio - 0.1).abs() < 1e-6);
     // Who tells nothing of it counts as before.

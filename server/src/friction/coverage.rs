@@ -1,6 +1,6 @@
 //! How often the 95 % interval holds the truth, for robots with a bias of their own.
 
-use tread_api::friction::NORMAL_95;
+use tread_api::friction::{NORMAL_95, ROBOT_BIAS_RATIO};
 
 use super::tests::{at_us, measured};
 use super::weights::FrictionConfig;
@@ -8,8 +8,6 @@ use super::*;
 
 /// Visits of all runs of a fleet. `examples/map_report` does the same with more of them.
 const VISITS: u32 = 500_000;
-/// Standard deviation of a robot's own bias as a share of θ.
-const BIAS_RATIO: f64 = 0.08;
 /// Standard deviation of one visit's θ.
 const VISIT_STD_DEV: f64 = 0.02;
 const THETA: f64 = 0.2;
@@ -42,14 +40,14 @@ fn coverage(robots: u32, visits: u32) -> [f64; 3] {
     let mut held = [0; 3];
     let runs = VISITS / (robots * visits);
     let config = FrictionConfig {
-        robot_bias_ratio: BIAS_RATIO,
+        robot_bias_ratio: ROBOT_BIAS_RATIO,
         ..FrictionConfig::default()
     };
     for _ in 0..runs {
         let mut seen = Vec::new();
         let (mut information, mut weighted) = (0.0, 0.0);
         for robot in 0..robots {
-            let bias = 1.0 + BIAS_RATIO * normal.next();
+            let bias = 1.0 + ROBOT_BIAS_RATIO * normal.next();
             let mut sums: Option<Sums> = None;
             for visit in 0..visits {
                 let theta = THETA * bias + VISIT_STD_DEV * normal.next();

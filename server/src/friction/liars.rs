@@ -1,7 +1,7 @@
 //! One robot that is wrong without limit, among others that are not.
 
 use proptest::prelude::*;
-use tread_api::friction::NORMAL_95;
+use tread_api::friction::{NORMAL_95, ROBOT_BIAS_RATIO};
 
 use super::coverage::Normal;
 use super::fuse::MU_ALONE_MAX;
@@ -10,8 +10,6 @@ use super::weights::FrictionConfig;
 use super::*;
 
 const THETA: f64 = 0.2;
-/// Standard deviation of a robot's own bias as a share of θ, as the map assumes it.
-const BIAS_RATIO: f64 = 0.08;
 /// Standard deviation of what one robot measures by itself.
 const OWN_STD_DEV: f64 = 0.01;
 /// Fleets of each kind.
@@ -24,13 +22,13 @@ fn coverage(honest: u8, wrong: Option<Sums>, ground: Ground) -> (f64, f64) {
     let mut normal = Normal(SEED);
     let (mut held, mut width) = (0_u32, 0.0);
     let config = FrictionConfig {
-        robot_bias_ratio: BIAS_RATIO,
+        robot_bias_ratio: ROBOT_BIAS_RATIO,
         ..FrictionConfig::default()
     };
     for _ in 0..FLEETS {
         let mut seen: Vec<Seen<u8>> = (1..=honest)
             .filter_map(|robot| {
-                let own = THETA * (1.0 + BIAS_RATIO * normal.next());
+                let own = THETA * (1.0 + ROBOT_BIAS_RATIO * normal.next());
                 let theta = own + OWN_STD_DEV * normal.next();
                 Seen::of(robot, 0, &measured(theta, OWN_STD_DEV, i64::from(robot)))
             })
@@ -50,13 +48,13 @@ fn coverage(honest: u8, wrong: Option<Sums>, ground: Ground) -> (f64, f64) {
 
 /// The mean width of the interval if all robots were known to be honest.
 fn width_of(robots: u8) -> f64 {
-    let variance = (BIAS_RATIO * THETA).powi(2) + OWN_STD_DEV.powi(2);
+    let variance = (ROBOT_BIAS_RATIO * THETA).powi(2) + OWN_STD_DEV.powi(2);
     2.0 * NORMAL_95 * (variance / f64::from(robots)).sqrt()
 }
 
 /// One robot of `honest + 1` is wrong in every way.
 fn check_one_wrong_beside(honest: u8) {
-    let std_dev = (THETA * BIAS_RATIO).hypot(OWN_STD_DEV);
+    let std_dev = (THETA * ROBOT_BIAS_RATIO).hypot(OWN_STD_DEV);
     let (mut held_least, mut ratio_most) = (1.0_f64, 0.0_f64);
     for ground in [Ground::Area, Ground::Cell] {
         for off in [
@@ -117,7 +115,7 @@ fn where_all_are_honest_the_intervals_hold_and_are_not_much_wider() {
 #[test]
 fn the_word_of_one_robot_raises_no_limit_above_what_others_have_shown() {
     let config = FrictionConfig {
-        robot_bias_ratio: BIAS_RATIO,
+        robot_bias_ratio: ROBOT_BIAS_RATIO,
         ..FrictionConfig::default()
     };
     let claim = |robot: u8, mu: f64| {
@@ -159,13 +157,16 @@ fn the_word_of_one_robot_raises_no_limit_above_what_others_have_shown() {
 #[test]
 fn one_robot_cannot_make_ground_better_that_several_others_found_worse() {
     let config = FrictionConfig {
-        robot_bias_ratio: BIAS_RATIO,
+        robot_bias_ratio: ROBOT_BIAS_RATIO,
         ..FrictionConfig::default()
     };
     let honest = || (1..=3_u8).map(|robot| (robot, measured(1.4, 0.05, 1_000)));
     let lies = (0..5).map(|time| (9, measured(0.01, 0.001, 10 * time)));
-    let told = fused(honest().chain(lies), &config).unwrap();
-    assert!((told.theta - 1.4).abs() < 0.2 && told.disputed, "{told:?}");
+    let estimate = fused(honest().chain(lies), &config).unwrap();
+    assert!(
+        (estimate.theta - 1.4).abs() < 0.2 && estimate.disputed,
+        "{estimate:?}"
+    );
     // Nor by two words of which one makes the other look like bad news, in one hour or in two.
     for (earlier, later) in [(0.001, 0.01), (0.01, 0.001)] {
         for age_s in [20, HOUR_S + 20] {
@@ -174,15 +175,15 @@ fn one_robot_cannot_make_ground_better_that_several_others_found_worse() {
                 (9, measured(later, 1e-5, 10)),
             ];
             let honest = (1..=3_u8).map(|robot| (robot, measured(1.4, 0.05, 3 * HOUR_S)));
-            let told = fused(honest.chain(lies), &config).unwrap();
-            assert!((told.theta - 1.4).abs() < 0.3, "{told:?}");
+            let estimate = fused(honest.chain(lies), &config).unwrap();
+            assert!((estimate.theta - 1.4).abs() < 0.3, "{estimate:?}");
         }
     }
     // A vague word that contradicts nobody does not confirm it.
     let lie = (9, measured(0.01, 0.001, 10));
     let vague = (8, measured(1.2, 0.7, 20));
-    let told = fused(honest().chain([lie, vague]), &config).unwrap();
-    assert!((told.theta - 1.4).abs() < 0.3, "{told:?}");
+    let estimate = fused(honest().chain([lie, vague]), &config).unwrap();
+    assert!((estimate.theta - 1.4).abs() < 0.3, "{estimate:?}");
     // Another one that says so as well is believed.
     let others = (0..5).map(|time| {
         (
@@ -197,20 +198,20 @@ fn one_robot_cannot_make_ground_better_that_several_others_found_worse() {
 #[test]
 fn a_lie_about_bad_ground_ends_when_one_honest_robot_has_been_there_twice() {
     let config = FrictionConfig {
-        robot_bias_ratio: BIAS_RATIO,
+        robot_bias_ratio: ROBOT_BIAS_RATIO,
         ..FrictionConfig::default()
     };
     let before = (1, measured(0.2, 0.01, 4 * HOUR_S));
     let lie = (9, measured(5.0, 0.05, 3 * HOUR_S));
     let after = |age_s| (2, measured(0.2, 0.01, age_s));
-    let told = fused([before, lie, after(60), after(30)], &config).unwrap();
-    assert!((told.theta - 0.2).abs() < 0.05, "{told:?}");
+    let estimate = fused([before, lie, after(60), after(30)], &config).unwrap();
+    assert!((estimate.theta - 0.2).abs() < 0.05, "{estimate:?}");
 }
 
 #[test]
 fn robots_that_know_next_to_nothing_take_nothing_from_one_that_knows() {
     let config = FrictionConfig {
-        robot_bias_ratio: BIAS_RATIO,
+        robot_bias_ratio: ROBOT_BIAS_RATIO,
         ..FrictionConfig::default()
     };
     let precise = (1, measured(0.2, 0.01, 10));
@@ -231,7 +232,7 @@ proptest! {
         own_std_dev in 1e-5_f64..1.0,
     ) {
         let config = FrictionConfig {
-        robot_bias_ratio: BIAS_RATIO,
+        robot_bias_ratio: ROBOT_BIAS_RATIO,
         ..FrictionConfig::default()
     };
         let honest = [(1, measured(0.2, 0.01, 1)), (2, measured(0.205, 0.01, 2))];

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use proptest::prelude::*;
-use tread_api::friction::Information;
+use tread_api::friction::{Information, ROBOT_BIAS_RATIO};
 
 use super::fixed::Fixed;
 use super::fuse::THETA_STD_DEV_MAX;
@@ -154,7 +154,7 @@ fn one_robot_never_gets_surer_than_its_own_bias() {
         ..FrictionConfig::default()
     };
     let alone = fused([(1, measured(0.2, 1e-4, 0))], &config).unwrap();
-    assert!(alone.std_dev >= 0.08 * 0.2, "{alone:?}");
+    assert!(alone.std_dev >= ROBOT_BIAS_RATIO * 0.2, "{alone:?}");
     let robots = (0..5).map(|robot| (robot, measured(0.2, 1e-4, 0)));
     let many = fused(robots, &config).unwrap();
     // Any one of the five may be wrong: they are as sure as four.
@@ -190,7 +190,7 @@ fn what_is_old_weighs_less_and_a_clock_that_runs_ahead_gains_nothing() {
 #[test]
 fn robots_that_differ_by_more_than_their_bias_dispute_the_ground_and_widen_its_interval() {
     let config = FrictionConfig {
-        robot_bias_ratio: 0.08,
+        robot_bias_ratio: ROBOT_BIAS_RATIO,
         ..FrictionConfig::default()
     };
     let parts = |second: f64| {
@@ -305,7 +305,7 @@ fn other_layers_are_fused_where_they_were_seen_and_unknown_elsewhere() {
     let fused = fused([(1, turned), (2, measured(0.2, 0.01, 0))], &config).unwrap();
     let track = fused.effective_track_ratio.unwrap();
     assert!(
-        close(track.value, 1.5) && track.std_dev > 0.08 * 1.5,
+        close(track.value, 1.5) && track.std_dev > ROBOT_BIAS_RATIO * 1.5,
         "{track:?}"
     );
     assert_eq!(fused.rolling_resistance, None);

@@ -1,13 +1,11 @@
 //! The friction coefficient to plan with, from what the map knows.
 
-/// What is assumed where nothing better is known; the robots' own planner has the same.
-pub const CAUTIOUS_MU: f64 = 0.14;
-/// Slip up to which friction grows in proportion to it.
-const SLIP_LINEAR: f64 = 0.2;
+use tread_control::friction::SLIP_LINEAR;
+use tread_control::plan::TRACTION_LIMIT_UNKNOWN_MU;
 
 /// The larger of what was shown of late and a cautious value, within what needs no more than linear
 /// slip where θ is at its upper bound.
 pub fn traction_limit_mu(mu_peak: Option<f64>, theta_upper_95: Option<f64>) -> f64 {
-    let limit_mu = mu_peak.unwrap_or(0.0).max(CAUTIOUS_MU);
+    let limit_mu = mu_peak.unwrap_or(0.0).max(TRACTION_LIMIT_UNKNOWN_MU);
     theta_upper_95.map_or(limit_mu, |upper| limit_mu.min(SLIP_LINEAR * upper.recip()))
 }

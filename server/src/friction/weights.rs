@@ -1,6 +1,7 @@
 //! How measurements of several robots and times are weighed.
 
 use serde::Deserialize;
+use tread_api::friction::ROBOT_BIAS_RATIO;
 
 /// How measurements of several robots and times are weighed.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
@@ -18,7 +19,7 @@ pub struct FrictionConfig {
 impl Default for FrictionConfig {
     fn default() -> Self {
         Self {
-            robot_bias_ratio: 0.08,
+            robot_bias_ratio: ROBOT_BIAS_RATIO,
             // A standard deviation of 0.02 after a day: a tenth of θ on ordinary ground.
             drift_variance_per_s: 4.6e-9,
             mu_peak_age_max_s: 6.0 * 3_600.0,

@@ -24,7 +24,7 @@ use super::guarded::Guarded;
 use super::identity::guard::{Peer, purpose_of_path};
 use super::tls::Tls;
 use crate::app::App;
-use crate::connections::{BOUNDS, Connections, Slot};
+use crate::connections::{ACCEPT_REST, BOUNDS, Connections, Slot};
 use crate::identity::address::TrustedProxies;
 use crate::supervisor::Supervisor;
 
@@ -46,8 +46,6 @@ const BACKLOG: u32 = 4_096;
 /// Connections that are accepted before those that were get to show who they are: in a rush that is longer
 /// than the room of the unproven, nobody is to be displaced unread.
 const ACCEPTED_AT_ONCE: usize = 16;
-/// Rest after the machine refused a connection, such as for want of file handles.
-const ACCEPT_REST: Duration = Duration::from_millis(100);
 
 /// What is served where.
 #[derive(Debug)]

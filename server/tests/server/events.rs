@@ -117,15 +117,15 @@ async fn a_mission_that_does_not_read_keeps_no_other_from_being_told() {
     }
     tx.commit().await.unwrap();
     let mut text = String::new();
-    let is_told = |text: &str, kind: &str, id: MissionId| {
+    let is_notified = |text: &str, kind: &str, id: MissionId| {
         let mut events = text.split("\n\n");
         events.any(|event| event.contains(kind) && event.contains(&id.to_string()))
     };
     read_until(&mut stream, &mut text, |text| {
         let all = missions
             .iter()
-            .all(|&id| is_told(text, "event: mission", id));
-        all && is_told(text, "event: step", damaged)
+            .all(|&id| is_notified(text, "event: mission", id));
+        all && is_notified(text, "event: step", damaged)
     })
     .await;
     drop(stream);

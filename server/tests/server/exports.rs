@@ -161,8 +161,8 @@ async fn measurements_are_the_same_as_json_csv_and_parquet() {
         assert_eq!(field(row, "robot"), Field::Str(stored.robot.to_string()));
         let weighted = stored.segment.theta.weighted;
         assert_eq!(field(row, "theta_weighted"), Field::Double(weighted));
-        let told: f64 = comma["theta_weighted"].parse().unwrap();
-        assert_eq!(told.to_bits(), weighted.to_bits());
+        let weighted_theta: f64 = comma["theta_weighted"].parse().unwrap();
+        assert_eq!(weighted_theta.to_bits(), weighted.to_bits());
         assert_eq!(comma["ended_at"], stored.segment.ended_at.to_string());
     }
     let of_one = format!("{SEGMENTS}?format=csv&robot=rover-2&terrain=lawn");

@@ -6,13 +6,14 @@ use jiff::{SignedDuration, Timestamp};
 use reqwest::{StatusCode, header};
 use serde_json::{Value, json};
 use tread_api::friction::{
-    CellDifference, CellFriction, Information, PathFriction, PointFriction, RobotContribution,
-    Segment, TerrainFriction, TerrainHistory, VisitSuggestion,
+    CellDifference, CellFriction, Information, PathFriction, PointFriction, ROBOT_BIAS_RATIO,
+    RobotContribution, Segment, TerrainFriction, TerrainHistory, VisitSuggestion,
 };
 use tread_api::ids::ConfigurationId;
 use tread_api::page::{DifferencePage, MapPage, Page};
 use tread_api::tile::Tile;
 use tread_api::wire::ingest::Record;
+use tread_control::robot::GRAVITY_M_S2;
 use tread_server::friction::index::Normalisation;
 use uuid::Uuid;
 
@@ -256,7 +257,7 @@ async fn a_path_tells_what_is_known_and_how_fast_it_may_be_driven() {
         "{speeds:?}"
     );
     let last = path.pieces.last().unwrap();
-    let stopping_m = last.speed_m_s.powi(2) / (2.0 * 0.58 * 0.14 * 9.81);
+    let stopping_m = last.speed_m_s.powi(2) / (2.0 * 0.58 * 0.14 * GRAVITY_M_S2);
     assert!(stopping_m <= path.length_m - last.from_m + 1e-9, "{last:?}");
 
     for (points, said_of) in [
@@ -430,7 +431,7 @@ async fn a_dispatch_tells_the_robot_what_the_map_knows_along_its_path() {
         close(prior.traction_limit_mu, 0.14),
         "nothing was shown there of late"
     );
-    assert!(close(prior.robot_bias_ratio, 0.08));
+    assert!(close(prior.robot_bias_ratio, ROBOT_BIAS_RATIO));
     let traction_limits: Vec<(i32, f64)> = prior
         .traction_limits
         .iter()

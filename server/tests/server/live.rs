@@ -42,7 +42,7 @@ async fn read_event(
 async fn a_change_of_the_map_is_told_to_clients_and_programs_on_the_network() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;
-    let (words, mut told_of) = tokio::sync::mpsc::channel(64);
+    let (words, mut notified) = tokio::sync::mpsc::channel(64);
     let program = session(&yard).await;
     let listening = program
         .declare_subscriber(keys::map(&site()))
@@ -68,7 +68,7 @@ async fn a_change_of_the_map_is_told_to_clients_and_programs_on_the_network() {
             measured(seq, segment(cell, 0.2, 0))
         });
         robot.upload(drive.into()).await.unwrap();
-        let change = tokio::time::timeout(Duration::from_secs(3), told_of.recv()).await;
+        let change = tokio::time::timeout(Duration::from_secs(3), notified.recv()).await;
         if let Ok(change) = change {
             break change.unwrap();
         }

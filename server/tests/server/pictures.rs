@@ -7,6 +7,7 @@ use tread_api::friction::{CellFriction, Segment};
 use tread_api::page::Page;
 use tread_api::tile::Tile;
 use tread_api::wire::ingest::Record;
+use tread_control::robot::GRAVITY_M_S2;
 
 use crate::harness::{Yard, measured, model, segment};
 use crate::robot::Robot;
@@ -271,7 +272,7 @@ async fn a_speed_mask_is_slower_where_the_ground_gives_less() {
     let speed_m_s = |grey: u8| ((255.0 - f64::from(grey)) / 255.0 * 100.0).round() * 0.04;
     let speeds: Vec<f64> = greys.iter().map(|&grey| speed_m_s(grey)).collect();
     let (soft, unknown, firm) = (speeds[0], speeds[1], speeds[18]);
-    let stops_from = |mu: f64| (2.0 * 0.58 * mu * 9.81_f64).sqrt();
+    let stops_from = |mu: f64| (2.0 * 0.58 * mu * GRAVITY_M_S2).sqrt();
     assert!(
         (firm - stops_from(0.4)).abs() < 0.05,
         "shown of late: {firm}"

@@ -67,10 +67,10 @@ impl Storm {
             let is_confirmed = found
                 .as_ref()
                 .is_some_and(|found| found.confirmed_at.is_some());
-            let is_told = alerts
+            let is_notified = alerts
                 .iter()
                 .any(|alert| alert.robot.as_ref() == Some(&stop.robot));
-            if is_confirmed || (found.is_some() && is_told) {
+            if is_confirmed || (found.is_some() && is_notified) {
                 return Ok(());
             }
             tokio::time::sleep(CONFIRM_MAX).await;

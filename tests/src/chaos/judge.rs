@@ -260,9 +260,9 @@ fn lost_records(folder: &Path, robot: &RobotId, records: Vec<(String, i64)>) -> 
 mod tests {
     use super::*;
 
-    fn steps(told: &[(&str, &str)]) -> Vec<Step> {
+    fn steps(names: &[(&str, &str)]) -> Vec<Step> {
         let owned = |&(mission, state): &(&str, &str)| (mission.to_owned(), state.to_owned());
-        told.iter().map(owned).collect()
+        names.iter().map(owned).collect()
     }
 
     #[test]

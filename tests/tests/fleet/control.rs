@@ -144,12 +144,12 @@ async fn a_robot_that_stays_away_is_lost_and_its_late_success_changes_nothing() 
     relay.reset();
     relay.heal();
     let look = || fleet.rest.mission(mission);
-    let told = eventually("the late success is kept", DRIVE, look, |detail| {
+    let detail = eventually("the late success is kept", DRIVE, look, |detail| {
         detail.events.len() > lost.events.len() && detail.quality.is_some()
     })
     .await;
-    assert_eq!(told.mission.state, MissionState::Failed);
-    assert_eq!(told.mission.cause, Cause::RobotLost);
+    assert_eq!(detail.mission.state, MissionState::Failed);
+    assert_eq!(detail.mission.cause, Cause::RobotLost);
     // The robot is free and its next mission is driven.
     let next = fleet.rest.send(&robot(), bend(0.0)).await;
     fleet

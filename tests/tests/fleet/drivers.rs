@@ -215,7 +215,7 @@ async fn losing_an_observer_never_stops_the_robot() {
     let driver = drive(&fleet, server).await;
     it_drives(&fleet).await;
     for way in [Relay::reset, Relay::cut] {
-        let mut told_something = false;
+        let mut has_reported = false;
         for _ in 0..TRIALS_MAX {
             it_drives(&fleet).await;
             driver.longest_gap();
@@ -223,11 +223,11 @@ async fn losing_an_observer_never_stops_the_robot() {
             // A driver that the machine kept waiting makes the robot stand too, as it must.
             if driver.longest_gap() < GAP_MAX {
                 assert!(slowest_m_s > 0.2, "it slowed to {slowest_m_s} m/s");
-                told_something = true;
+                has_reported = true;
                 break;
             }
         }
-        assert!(told_something, "the machine is too busy for a driver");
+        assert!(has_reported, "the machine is too busy for a driver");
     }
     drop(driver);
     it_stands_and_is_free(&fleet).await;

@@ -225,13 +225,13 @@ async fn a_robot_that_comes_back_after_its_authority_was_retired_is_told_of_and_
 
     fleet.spawn_agent(&late, 20.0);
     let look = || fleet.rest.robot(&late);
-    let is_told = |robot: &tread_api::robot::Robot| {
+    let is_notified = |robot: &tread_api::robot::Robot| {
         let mut alerts = robot.alerts.iter();
         alerts.any(|alert| alert.code.as_str() == "retired-authority")
     };
     eventually("people are told", SHORT, look, |seen| {
         seen.as_ref()
-            .is_some_and(|seen| is_told(seen) && seen.link == LinkState::Offline)
+            .is_some_and(|seen| is_notified(seen) && seen.link == LinkState::Offline)
     })
     .await;
     let log = || async { fleet.log(late.as_str()) };
@@ -248,7 +248,7 @@ async fn a_robot_that_comes_back_after_its_authority_was_retired_is_told_of_and_
     fleet.start_agent(&late, 20.0).await;
     let look = || fleet.rest.robot(&late);
     eventually("the alert is over", SHORT, look, |seen| {
-        seen.as_ref().is_some_and(|seen| !is_told(seen))
+        seen.as_ref().is_some_and(|seen| !is_notified(seen))
     })
     .await;
 }
@@ -273,8 +273,9 @@ async fn after_a_replacement_no_robot_of_before_gets_in_until_it_has_joined_agai
             |seen| {
                 seen.as_ref().is_some_and(|seen| {
                     let mut alerts = seen.alerts.iter();
-                    let is_told = alerts.any(|alert| alert.code.as_str() == "retired-authority");
-                    is_told && seen.link == LinkState::Offline
+                    let is_notified =
+                        alerts.any(|alert| alert.code.as_str() == "retired-authority");
+                    is_notified && seen.link == LinkState::Offline
                 })
             },
         )

@@ -188,11 +188,11 @@ pub(super) fn locked(view: &View<'_>, verdicts: &mut Verdicts) {
         (Subject::RightWheels, right, left),
     ] {
         let (measured, commanded) = side;
-        let is_told = commanded.abs() >= least_rad_s;
+        let is_commanded = commanded.abs() >= least_rad_s;
         let other_goes =
             other.1.abs() < least_rad_s || other.0 * other.1.signum() >= goes * other.1.abs();
         let is_shown = other_goes && view.uses.gyro && !view.repeats.gyro.is_frozen();
-        if is_told && is_shown && measured.abs() <= stands * commanded.abs() {
+        if is_commanded && is_shown && measured.abs() <= stands * commanded.abs() {
             let lever_m = if subject == Subject::LeftWheels {
                 -model.effective_track_m()
             } else {
@@ -200,7 +200,7 @@ pub(super) fn locked(view: &View<'_>, verdicts: &mut Verdicts) {
             };
             let by_wheels = means.wheels.angular_rad_s;
             let missing = (commanded - measured) * model.wheel_radius_m() / lever_m;
-            let (off_wheels, off_told) = (
+            let (off_wheels, off_command) = (
                 (means.gyro_rad_s - by_wheels).abs(),
                 (means.gyro_rad_s - by_wheels - missing).abs(),
             );
@@ -211,9 +211,9 @@ pub(super) fn locked(view: &View<'_>, verdicts: &mut Verdicts) {
                 predicted: commanded,
                 unit: Unit::RadiansPerSecond,
             };
-            if off_wheels < NEARER * off_told {
+            if off_wheels < NEARER * off_command {
                 verdicts.contradict(finding, RAISE_LOCKED_S);
-            } else if off_told < NEARER * off_wheels {
+            } else if off_command < NEARER * off_wheels {
                 let is_frozen = view.repeats.wheels.is_frozen();
                 let found = Finding {
                     subject: Subject::Wheels,
@@ -222,7 +222,7 @@ pub(super) fn locked(view: &View<'_>, verdicts: &mut Verdicts) {
                 };
                 verdicts.contradict(found, sensor_raise_s(view));
             }
-        } else if is_told && measured * commanded.signum() >= goes * commanded.abs() {
+        } else if is_commanded && measured * commanded.signum() >= goes * commanded.abs() {
             verdicts.agree(subject);
         }
     }

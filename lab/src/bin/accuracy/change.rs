@@ -8,11 +8,10 @@ use tread_control::geometry::{Pose, Twist};
 use tread_control::plant::Ground;
 use tread_control::robot::RobotModel;
 
+use crate::drives::SPEED_M_S;
 use crate::report::{Check, Options, Section};
 use crate::robot::{LOOP_S, RobotSpec, SeededRobot, run_seeded};
 
-/// Speed, metres per second.
-const SPEED_M_S: f64 = 0.6;
 /// Time before the change, in which the first ground is measured, seconds.
 const BEFORE_S: f64 = 45.0;
 /// Time after it in which it must be noticed, seconds.
@@ -164,10 +163,8 @@ fn changes(
     #[expect(clippy::cast_precision_loss, reason = "counts of runs are small")]
     let (found, count) = (delays.len() as f64, runs.len() as f64);
     let mean_s = delays.iter().sum::<f64>() / found;
-    let late_s = delays
-        .get(delays.len() * 95 / 100)
-        .copied()
-        .unwrap_or(f64::NAN);
+    let late_s = delays.get(delays.len() * 95 / 100).copied();
+    let late = late_s.map_or("–".to_owned(), |late_s| format!("{late_s:.2}"));
     let missed = 1.0 - found / count;
     let alarms: u32 = runs.iter().map(|run| run.false_alarms).sum();
     let name = format!(
@@ -178,7 +175,7 @@ fn changes(
     );
     let _ = writeln!(
         text,
-        "| {} → {} | {} | {mean_s:.2} | {late_s:.2} | {:.1} | {alarms} |",
+        "| {} → {} | {} | {mean_s:.2} | {late} | {:.1} | {alarms} |",
         border.theta_before,
         border.theta_after,
         channel(border.has_torque),

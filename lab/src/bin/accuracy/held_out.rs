@@ -2,7 +2,8 @@
 //! speeds and seeds.
 
 use serde_json::json;
-use tread_control::robot::{Limits, RobotModel, RobotModelSpec};
+use tread_control::robot::RobotModel;
+use tread_lab::bench::husky_like;
 
 use crate::drives::Drive;
 use crate::report::{Options, Section};
@@ -17,29 +18,7 @@ pub(crate) const STIFFNESSES: [f64; 3] = [0.7, 3.0, 12.0];
 
 /// The robot of the other parts, and one about as large as a Husky.
 pub(crate) fn robots() -> [(&'static str, RobotModel); 2] {
-    let large = RobotModelSpec {
-        mass_kg: 50.0,
-        track_width_m: 0.57,
-        wheelbase_m: 0.51,
-        wheel_radius_m: 0.165,
-        yaw_inertia_kg_m2: 3.0,
-        limits: Limits {
-            wheel_speed_max_rad_s: 8.0,
-            wheel_acceleration_max_rad_s2: 30.0,
-            linear_max_m_s: 1.0,
-            angular_max_rad_s: 1.5,
-            linear_acceleration_max_m_s2: 0.8,
-            linear_jerk_max_m_s3: 3.0,
-            lateral_acceleration_max_m_s2: 0.8,
-        },
-    };
-    [
-        ("5 kg", RobotModel::yi2007()),
-        (
-            "50 kg",
-            RobotModel::try_from(large).expect("every figure is above zero"),
-        ),
-    ]
+    [("5 kg", RobotModel::yi2007()), ("50 kg", husky_like())]
 }
 
 /// Runs the part.

@@ -31,11 +31,20 @@ pub(crate) struct Scenario {
 
 /// One run's outcome.
 struct Run {
-    /// Error over the truth, and over its own standard deviation; none where the robot abstained.
-    error: Option<(f64, f64)>,
+    /// None where the robot abstained.
+    error: Option<RunError>,
+    driven: Driven,
+}
+
+/// How far off a run's θ is.
+#[derive(Debug, Clone, Copy)]
+struct RunError {
+    /// Error over the truth.
+    relative: f64,
+    /// Error over its own standard deviation.
+    normalised: f64,
     /// That standard deviation, over the truth.
     std_dev: f64,
-    driven: Driven,
 }
 
 /// Figures of one scenario.
@@ -65,9 +74,12 @@ fn run_one(scenario: &Scenario, seed: u64) -> Run {
     Run {
         error: found.map(|found| {
             let error = found.theta - truth;
-            (error / truth, error / found.std_dev)
+            RunError {
+                relative: error / truth,
+                normalised: error / found.std_dev,
+                std_dev: found.std_dev / truth,
+            }
         }),
-        std_dev: found.map_or(f64::NAN, |found| found.std_dev / truth),
         driven,
     }
 }
@@ -96,23 +108,20 @@ fn figures(scenario: &Scenario, runs: &[Run]) -> Figures {
             ((theta - truth) / truth, (theta - truth) / std_dev)
         })
         .collect();
-    let errors: Vec<(f64, f64)> = runs.iter().filter_map(|run| run.error).collect();
+    let errors: Vec<RunError> = runs.iter().filter_map(|run| run.error).collect();
     #[expect(clippy::cast_precision_loss, reason = "counts of runs are small")]
     let share = |count: usize, of: usize| count as f64 / of as f64;
-    let mean = |value: &dyn Fn(&(f64, f64)) -> f64| {
+    let mean = |value: &dyn Fn(&RunError) -> f64| {
         errors.iter().map(value).sum::<f64>() * share(1, errors.len())
     };
-    let std_devs = runs
-        .iter()
-        .map(|run| run.std_dev)
-        .filter(|one| one.is_finite());
     Figures {
         measured: share(errors.len(), runs.len()),
-        bias: mean(&|error| error.0),
-        rms: mean(&|error| error.0 * error.0).sqrt(),
-        std_dev: std_devs.sum::<f64>() * share(1, errors.len()),
+        bias: mean(&|error| error.relative),
+        rms: mean(&|error| error.relative * error.relative).sqrt(),
+        std_dev: mean(&|error| error.std_dev),
         coverage: WIDTHS.map(|width| {
-            let held = errors.iter().filter(|error| error.1.abs() < width).count();
+            let is_held = |error: &&RunError| error.normalised.abs() < width;
+            let held = errors.iter().filter(is_held).count();
             share(held, errors.len())
         }),
         ever_measured: share(
@@ -343,23 +352,26 @@ fn without_torque(all: &mut Vec<Scenario>) {
     }
 }
 
+/// What a robot with or without wheel torque drives in the sweeps, and its name.
+fn usual_drive(has_torque: bool) -> (Drive, &'static str) {
+    if has_torque {
+        let circles = Drive::StraightThenCircles {
+            radius_m: 6.0,
+            speed_m_s: SPEED_M_S,
+        };
+        (circles, "torque, circles R 6 m")
+    } else {
+        (Drive::Figure8, "no torque, figure-8")
+    }
+}
+
 fn sweeps(all: &mut Vec<Scenario>) {
     let mut push = |name: String, change: &dyn Fn(&mut RobotSpec)| {
         for has_torque in [true, false] {
             let mut robot = RobotSpec::on(5.0);
             robot.has_torque = has_torque;
             change(&mut robot);
-            let (drive, what) = if has_torque {
-                (
-                    Drive::StraightThenCircles {
-                        radius_m: 6.0,
-                        speed_m_s: SPEED_M_S,
-                    },
-                    "torque, circles R 6 m",
-                )
-            } else {
-                (Drive::Figure8, "no torque, figure-8")
-            };
+            let (drive, what) = usual_drive(has_torque);
             all.push(Scenario {
                 name: format!("{what}, K 5, {name}"),
                 drive,
@@ -421,17 +433,7 @@ fn tyres(all: &mut Vec<Scenario>) {
             robot.has_torque = has_torque;
             robot.curvatures = Some([0.46, 2.88]);
             robot.configured_tyres = configured_tyres;
-            let (drive, what) = if has_torque {
-                (
-                    Drive::StraightThenCircles {
-                        radius_m: 6.0,
-                        speed_m_s: SPEED_M_S,
-                    },
-                    "torque, circles R 6 m",
-                )
-            } else {
-                (Drive::Figure8, "no torque, figure-8")
-            };
+            let (drive, what) = usual_drive(has_torque);
             all.push(Scenario {
                 name: format!("{what}, K 5, brush tyres, {who}"),
                 drive,

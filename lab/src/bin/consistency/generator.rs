@@ -13,11 +13,10 @@ use rand_chacha::ChaCha8Rng;
 use tread_control::consistency::{Monitor, Sample};
 use tread_control::geometry::{Pose, Twist};
 use tread_control::measured::{BodyAcceleration, WheelSpeeds};
-use tread_control::robot::RobotModel;
+use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 
 /// Time of a step: every fast sensor speaks in each.
 pub(crate) const STEP_S: f64 = 0.01;
-const GRAVITY_M_S2: f64 = 9.81;
 
 /// What is wrong.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -195,15 +195,15 @@ impl Bus {
     }
 
     fn open(&self) -> Option<zenoh::Session> {
-        let mut is_told = false;
+        let mut is_reported = false;
         while !self.outlet.is_closed() {
             match zenoh::open(self.config.clone()).wait() {
                 Ok(session) => return Some(session),
-                Err(cause) if is_told => debug!("the robot's bus is not reached: {cause}"),
+                Err(cause) if is_reported => debug!("the robot's bus is not reached: {cause}"),
                 Err(cause) => {
                     let endpoint = &self.settings.bus.endpoint;
                     warn!("the robot's bus at `{endpoint}` is not reached yet: {cause}");
-                    is_told = true;
+                    is_reported = true;
                 }
             }
             std::thread::sleep(OPEN_REST);

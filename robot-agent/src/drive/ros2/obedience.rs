@@ -278,8 +278,8 @@ mod tests {
     #[test]
     fn a_lagging_and_slipping_base_is_trusted() {
         let lagging = |at_s: f64| {
-            let told = wave((at_s - 0.3).max(0.0));
-            speeds(0.9 * told.left_rad_s, 1.1 * told.right_rad_s)
+            let commanded = wave((at_s - 0.3).max(0.0));
+            speeds(0.9 * commanded.left_rad_s, 1.1 * commanded.right_rad_s)
         };
         assert_eq!(run(2_000, wave, lagging), None);
         assert_eq!(
@@ -315,14 +315,14 @@ mod tests {
             // They obey, are blocked for a moment, obey for another, and get stuck.
             for tick in 0..100 + before + 16 + 60 {
                 let now = tick * STEP;
-                let told = speeds(6.0, 6.0);
+                let commanded = speeds(6.0, 6.0);
                 let measured = match tick {
-                    ..100 => told,
+                    ..100 => commanded,
                     _ if tick < 100 + before => speeds(1.0, 6.0),
-                    _ if tick < 100 + before + 16 => told,
+                    _ if tick < 100 + before + 16 => commanded,
                     _ => speeds(0.0, 0.0),
                 };
-                obedience.command(now, told);
+                obedience.command(now, commanded);
                 verdict = obedience.judge(now, measured);
             }
             assert_eq!(
@@ -374,9 +374,13 @@ mod tests {
         for tick in 0..400 {
             let now = tick * STEP;
             let is_stuck = tick < 100;
-            let told = speeds(5.0, 5.0);
-            obedience.command(now, told);
-            let measured = if is_stuck { speeds(0.0, 0.0) } else { told };
+            let commanded = speeds(5.0, 5.0);
+            obedience.command(now, commanded);
+            let measured = if is_stuck {
+                speeds(0.0, 0.0)
+            } else {
+                commanded
+            };
             trusted.push(obedience.judge(now, measured) == Verdict::Obeys);
         }
         assert!(!trusted[99] && !trusted[199 - 5] && trusted[205]);

@@ -5,6 +5,7 @@
 use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_control::localisation::FixNoise;
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
+use tread_control::robot::GRAVITY_M_S2;
 use tread_ros2::cdr::decode;
 use tread_ros2::messages::{
     self, BatteryState, Imu, JointState, Odometry, PoseWithCovarianceStamped, Time,
@@ -12,13 +13,10 @@ use tread_ros2::messages::{
 
 use super::refusal::Refusal;
 use super::settings::{
-    CommandSettings, ImuSettings, JointSettings, MotionOf, OdometrySettings, PoseSettings,
-    SideJoints,
+    CommandSettings, ImuSettings, JointSettings, OdometrySettings, PoseSettings, SideJoints,
 };
 use crate::drive::Battery;
 
-/// Standard gravity, metres per second squared.
-const GRAVITY_M_S2: f64 = 9.806_65;
 /// Fastest motion that is believed, metres or radians per second.
 const RATE_MAX: f64 = 100.0;
 /// Largest acceleration that is believed, metres per second squared.
@@ -206,9 +204,9 @@ pub fn joints(bytes: &[u8], settings: &JointSettings) -> Result<Option<Reading>,
             let index = index.ok_or(Refusal::Joints)?;
             let turned = message.velocity.get(index).ok_or(Refusal::Joints)?;
             speed_rad_s += bounded(turned / settings.gear_ratio, RATE_MAX)?;
-            torque_n_m = match settings.effort.torque_n_m() {
-                Some(constant) if has_effort => {
-                    let effort = message.effort.get(index).unwrap_or(f64::NAN);
+            let effort = message.effort.get(index).filter(|_| has_effort);
+            torque_n_m = match (settings.effort.torque_n_m(), effort) {
+                (Some(constant), Some(effort)) => {
                     let pulled = effort * constant * joints.effort_sign * settings.gear_ratio;
                     // Some bases write no number for an effort that they do not measure.
                     torque_n_m
@@ -349,9 +347,4 @@ pub fn wheels_of(motion: &Motion, command: &CommandSettings) -> WheelSpeeds {
         left_rad_s: (motion.forward_m_s - turn_m_s) / command.base_radius_m,
         right_rad_s: (motion.forward_m_s + turn_m_s) / command.base_radius_m,
     }
-}
-
-/// Whether odometry's speed is the body's.
-pub fn is_of_ground(settings: &OdometrySettings) -> bool {
-    settings.motion_of == MotionOf::Ground
 }

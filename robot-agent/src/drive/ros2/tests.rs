@@ -1,6 +1,7 @@
 //! The drive from a message's bytes to the loop and back, with everything but zenoh.
 
 use jiff::Timestamp;
+use tread_control::robot::GRAVITY_M_S2;
 use tread_ros2::cdr::{Sequence, encode};
 use tread_ros2::messages::{Header, Imu, JointState, Quaternion, Time, Vector3};
 use tread_ros2::names::Name;
@@ -167,7 +168,7 @@ impl Talk {
             linear_acceleration: Vector3 {
                 x: 0.5,
                 y: 0.0,
-                z: 9.806_65,
+                z: GRAVITY_M_S2,
             },
             ..Imu::default()
         };
@@ -194,9 +195,9 @@ impl Talk {
     /// Commands the base; what it is told.
     fn tell(&mut self, command: WheelSpeeds) -> WheelSpeeds {
         self.drive.write(command);
-        let (number, told) = self.drive.outlet.newer_than(self.number).unwrap();
+        let (number, command) = self.drive.outlet.newer_than(self.number).unwrap();
         self.number = number;
-        told
+        command
     }
 }
 

@@ -4,13 +4,13 @@
 //!  token looked at ─► certificate signed ─► token used up, enrolment written, committed
 //!                                             │
 //!           signed and written down again ◄── is the authority that signed it still trusted?
-//!                                             │ yes
-//!                                             ▼
-//!                                           answer
+//!              │ a few times                  │ yes
+//!              ▼                              ▼
+//!            refused                        answer
 //! ```
 //!
 //! No transaction holds the fleet's authority, which may be replaced at any moment: the certificate is held
-//! against it last of all, so that nobody pays a join token for one that opens nothing.
+//! against it last of all, so that no robot gets one that opens nothing.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -58,7 +58,9 @@ impl App {
             None => Err(EnrolError::Malformed),
         };
         match &enrolled {
-            Ok(_) | Err(EnrolError::App(_) | EnrolError::Ended(_)) => return enrolled,
+            Ok(_) | Err(EnrolError::App(_) | EnrolError::Ended(_) | EnrolError::Retired(_)) => {
+                return enrolled;
+            }
             Err(_refused) => {}
         }
         if let Some(left) = self.locked_for(&sources) {
@@ -162,16 +164,20 @@ impl App {
     }
 
     /// The certificate of an enrolment that was written down, by an authority that is trusted now: the one
-    /// that was signed may have been replaced or retired meanwhile.
+    /// that signed it may have been replaced or retired meanwhile. After [`SIGN_AGAIN_MAX`] more of those
+    /// the robot gets none.
     async fn signed_by_trusted(
         &self,
         service: &EnrolmentService,
         (key, name): (&RobotRequest, &RobotName),
         (mut trusted, mut certificate): (Arc<Trusted>, RobotCertificate),
     ) -> Result<RobotCertificate, EnrolError> {
-        for _ in 0..SIGN_AGAIN_MAX {
+        for signed_again in 0..=SIGN_AGAIN_MAX {
             let present = service.authorities.present();
             if present.is_trusted(trusted.signing().fingerprint()) {
+                return Ok(certificate);
+            }
+            if signed_again == SIGN_AGAIN_MAX {
                 break;
             }
             trusted = present;
@@ -191,7 +197,7 @@ impl App {
             }
             tx.commit().await?;
         }
-        Ok(certificate)
+        Err(EnrolError::Retired(name.clone()))
     }
 }
 
@@ -222,3 +228,6 @@ impl EnrolmentService {
         Ok((certificate, signed.fingerprint))
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -34,7 +34,8 @@ use self::revoked_robots::RevokedRobots;
 pub(super) use self::revoked_robots::{RETIRED_ALERT, REVOKED_ALERT, UNISSUED_ALERT};
 use self::rotation::Shown;
 use super::identity::new_secret;
-use super::identity::quota::Quota;
+use super::identity::quota::{Count, Quota};
+use super::identity::tokens::{DEAD_KEPT, FORGET_MAX};
 use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::{App, AppError, page, site_row};
 use crate::authority::{Authorities, CertificateError, Issued, RobotName, RobotRequest};
@@ -51,10 +52,6 @@ const JOIN_TOKENS: Quota = Quota {
 };
 /// Most robots that may ever join.
 pub const ROBOTS_MAX: usize = 10_000;
-/// How long dead join tokens are listed.
-const DEAD_KEPT: SignedDuration = SignedDuration::from_hours(400 * 24);
-/// Dead join tokens that are forgotten with each new one.
-const FORGET_MAX: u32 = 10;
 
 /// What the server signs robots' certificates with.
 #[derive(Debug)]
@@ -238,7 +235,11 @@ impl App {
         site_row(&mut tx, &request.site).await?;
         let valid_count = db::join_tokens::valid_count(&mut tx, now).await?;
         let of_maker = db::join_tokens::valid_count_within(&mut tx, within, now).await?;
-        JOIN_TOKENS.check(within, valid_count, of_maker)?;
+        let count = Count {
+            all: valid_count,
+            within_scope: of_maker,
+        };
+        JOIN_TOKENS.check(within, count)?;
         let secret = new_secret(Kind::Join)?;
         let join_token = JoinToken {
             id: self.clock().new_id::<JoinTokenId>(),

@@ -12,6 +12,7 @@ use tread_api::friction::{CellBox, MapChange};
 use tread_api::rights::Scope;
 
 use super::{App, AppError};
+use crate::app::sites::SITES_MAX;
 use crate::db;
 use crate::db::sites::SiteRow;
 
@@ -21,8 +22,6 @@ pub const PERIOD: Duration = Duration::from_secs(1);
 pub const BOXES_MAX: usize = 256;
 /// Words that wait for a listener on the network; one that misses some hears that it did.
 const WAITING_MAX: usize = 64;
-/// Sites of one look.
-const SITES_MAX: u32 = 1_000;
 
 /// Where words about maps go besides the feed of events.
 #[derive(Debug)]
@@ -36,16 +35,16 @@ impl Default for MapNews {
 
 /// What was told last of a site.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Told {
+struct Announced {
     change: u64,
     terrain_revision: u64,
 }
 
 /// Tells until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
-    let mut told = HashMap::new();
+    let mut announced = HashMap::new();
     loop {
-        if let Err(cause) = db::limited(app.tell_changes(&mut told)).await {
+        if let Err(cause) = db::limited(app.tell_changes(&mut announced)).await {
             app.log_failure("tell where the map has changed", &cause);
         }
         tokio::select! {
@@ -61,16 +60,16 @@ impl App {
         self.news().0.subscribe()
     }
 
-    async fn tell_changes(&self, told: &mut HashMap<i64, Told>) -> Result<(), AppError> {
+    async fn tell_changes(&self, announced: &mut HashMap<i64, Announced>) -> Result<(), AppError> {
         let mut tx = self.db().read("friction").await?;
         let rows = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         drop(tx);
         for row in rows {
-            let present = Told {
+            let present = Announced {
                 change: self.maps().look(&row, |map| map.changes().newest()),
                 terrain_revision: row.site.terrain_revision,
             };
-            let Some(before) = told.insert(row.pk, present) else {
+            let Some(before) = announced.insert(row.pk, present) else {
                 continue;
             };
             if before != present {
@@ -83,7 +82,7 @@ impl App {
         Ok(())
     }
 
-    fn change_since(&self, row: &SiteRow, before: Told) -> MapChange {
+    fn change_since(&self, row: &SiteRow, before: Announced) -> MapChange {
         let mut boxes: Vec<CellBox> = self.maps().look(row, |map| {
             let changed = map.changes().blocks();
             let changed = changed.filter(|(_, newest)| *newest > before.change);

@@ -205,7 +205,7 @@ impl App {
         let kept = db::tokens::all_valid(&mut tx, now).await?;
         let sessions = db::sessions::all_valid(&mut tx, now).await?;
         let mut valid = Valid::default();
-        for db::tokens::Kept { hash, token } in kept {
+        for db::secrets::Kept { hash, token } in kept {
             let expires_at = token.expires_at;
             valid.token_ids.insert(token.id);
             if let Some(fingerprint) = Fingerprint::from_kept(&hash) {

@@ -49,6 +49,8 @@ const EXCHANGES_PER_NETWORK_MAX: usize = 4;
 const EXCHANGE_WAIT_MAX: Duration = Duration::from_secs(2);
 /// Longest code that is taken, bytes.
 const CODE_MAX: usize = 2_048;
+/// Longest name of a host in the log.
+const HOST_SHOWN_MAX: usize = 80;
 /// Sign-ins that succeeded and are remembered, so that none does so twice. A provider takes a code once;
 /// this is for one that does not.
 const USED_MAX: usize = 4_096;
@@ -96,6 +98,17 @@ pub enum PersonError {
     /// It failed here.
     #[error(transparent)]
     Failed(#[from] AppError),
+}
+
+/// A browser begins a sign-in at another name of this server than the one that the provider knows.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "a browser asks for it at `{asked}`, and is sent to `public_url`, {home}; if it asked for that, a proxy \
+     does not pass the `Host` header on"
+)]
+struct OtherHost {
+    asked: String,
+    home: Origin,
 }
 
 /// The beginning of a sign-in.
@@ -316,7 +329,15 @@ impl App {
     /// There is no provider, or it is not known yet.
     pub fn begin_sign_in(&self, asked: &Provenance<'_>) -> Result<Begun, PersonError> {
         let people = self.people().ok_or(PersonError::NotConfigured)?;
-        if !asked.is_at(&people.home) || !asked.is_no_foreign_page() {
+        let is_at_home = asked.is_at(&people.home);
+        if !is_at_home {
+            let error = OtherHost {
+                asked: cleaned(asked.host.unwrap_or_default(), HOST_SHOWN_MAX),
+                home: people.home.clone(),
+            };
+            self.log_failure("begin a sign-in", &error);
+        }
+        if !is_at_home || !asked.is_no_foreign_page() {
             return Ok(Begun {
                 location: format!("{}/", people.home),
                 cookie: None,

@@ -21,22 +21,26 @@ pub(in crate::app) struct Quota {
     pub(in crate::app) share: usize,
 }
 
+/// How many there are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::app) struct Count {
+    /// In all.
+    pub(in crate::app) all: i64,
+    /// Of them those for what the maker administers.
+    pub(in crate::app) within_scope: i64,
+}
+
 impl Quota {
     /// Refuses another one of a maker.
     ///
     /// # Errors
     /// [`AppError::TooMany`].
-    pub(in crate::app) fn check(
-        &self,
-        maker: &Scope,
-        all: i64,
-        within_scope: i64,
-    ) -> Result<(), AppError> {
+    pub(in crate::app) fn check(&self, maker: &Scope, count: Count) -> Result<(), AppError> {
         let is_limited = !maker.is_everywhere();
         let most = self.all - if is_limited { self.reserved } else { 0 };
-        let over = if is_limited && is_reached(within_scope, self.share) {
+        let over = if is_limited && is_reached(count.within_scope, self.share) {
             Some(self.share)
-        } else if is_reached(all, most) {
+        } else if is_reached(count.all, most) {
             Some(most)
         } else {
             None
@@ -63,7 +67,10 @@ mod tests {
             share: 3,
         };
         let site = Scope::from_names(["yard"]).unwrap();
-        let is_refused = |maker: &Scope, all, own| quota.check(maker, all, own).is_err();
+        let is_refused = |maker: &Scope, all, within_scope| {
+            let count = Count { all, within_scope };
+            quota.check(maker, count).is_err()
+        };
         assert!(!is_refused(&site, 7, 2));
         assert!(is_refused(&site, 3, 3), "it has its share");
         assert!(is_refused(&site, 8, 0), "the rest is not for it");

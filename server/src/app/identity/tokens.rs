@@ -9,7 +9,7 @@ use tread_api::ids::TokenId;
 use tread_api::page::Page;
 use tread_api::rights::{Right, Rights, Scope};
 
-use super::quota::Quota;
+use super::quota::{Count, Quota};
 use super::sessions::still_holds;
 use super::{Credential, new_secret};
 use crate::app::{App, AppError, page, people_line, site_row};
@@ -24,10 +24,10 @@ const TOKENS: Quota = Quota {
     reserved: 100,
     share: 100,
 };
-/// How long dead tokens are listed.
-const DEAD_KEPT: SignedDuration = SignedDuration::from_hours(400 * 24);
+/// How long dead tokens are listed, join tokens too.
+pub(in crate::app) const DEAD_KEPT: SignedDuration = SignedDuration::from_hours(400 * 24);
 /// Dead tokens that are forgotten with each new one.
-const FORGET_MAX: u32 = 10;
+pub(in crate::app) const FORGET_MAX: u32 = 10;
 
 /// Ends in memory whoever is known by a token, when it is dropped: after a commit, or when there is
 /// none. Whoever is not revoked in the database is known again once it was looked up.
@@ -195,7 +195,11 @@ impl App {
         let expires_at = expiry(now, request.valid_days)?;
         let (valid_count, _) = db::tokens::valid_counts(tx, now).await?;
         let of_maker = db::tokens::valid_count_within(tx, within, now).await?;
-        TOKENS.check(within, valid_count, of_maker)?;
+        let count = Count {
+            all: valid_count,
+            within_scope: of_maker,
+        };
+        TOKENS.check(within, count)?;
         if db::tokens::valid_by_name(tx, &name, now).await?.is_some() {
             return Err(AppError::AlreadyExists {
                 what: "token",

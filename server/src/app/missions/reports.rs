@@ -9,12 +9,9 @@ use tread_api::robot::MissionProgress;
 use tread_api::wire::ingest::{MissionPhase, MissionReport};
 
 use super::transitions::Change;
-use super::{Step, note, take_step};
+use super::{EVENTS_MAX, Step, note, take_step};
 use crate::db::missions::{Facts, MissionRow};
 use crate::db::{self, DbError, Tx};
-
-/// Most events of a mission that are looked through; of more, a pause is held to be wanted.
-const EVENTS_MAX: u32 = 1_000;
 
 /// Who reports, and when.
 #[derive(Debug, Clone, Copy)]

@@ -28,6 +28,7 @@ use self::jobs::{
 };
 use self::needs::{Memory, Need, Now, Silence, decide, is_absent, is_heard, is_held_otherwise};
 use super::missions::transitions::Change;
+use super::sites::SITES_MAX;
 use super::{App, AppError};
 use crate::app::presence::{DuplicateAgent, RobotKey};
 use crate::db;
@@ -47,8 +48,6 @@ const RETRY_MIN: Duration = Duration::from_millis(100);
 const RETRY_MAX: Duration = Duration::from_secs(2);
 /// Missions that expire in one pass.
 const EXPIRE_MAX: u32 = 1_000;
-/// Most sites that are read in one pass.
-const SITES_MAX: u32 = 1_000;
 /// How long a robot may show a mission that is none of its open ones before it is told: its report
 /// of the end may be on its way.
 const FOREIGN_GRACE: Duration = Duration::from_millis(1_500);

@@ -55,7 +55,7 @@ use super::{FleetError, SEND_BUFFER_BYTES, SESSIONS_MAX, Security};
 use crate::app::App;
 use crate::authority::{PORT_LASTS, Trusted};
 use crate::clock::Clock;
-use crate::connections::{Bounds, Connections};
+use crate::connections::{ACCEPT_REST, Bounds, Connections};
 use crate::supervisor::Supervisor;
 
 /// The bounds of the robots' port. A robot that has shown its certificate counts as at work, and
@@ -68,8 +68,6 @@ const BOUNDS: Bounds = Bounds {
 };
 /// Connections that the system may keep until they are accepted.
 const BACKLOG: u32 = 1_024;
-/// Rest after the machine refused a connection, such as for want of file handles.
-const ACCEPT_REST: Duration = Duration::from_millis(100);
 
 /// The robots' port, open.
 #[derive(Debug)]

@@ -79,7 +79,7 @@ pub(super) struct Throttled<'rate, S, P> {
     stream: S,
     rate: &'rate ByteRate,
     clock: &'rate Clock,
-    /// Told of each pause, with the time.
+    /// Called at each pause, with the time.
     paused: P,
     pause: Option<Pin<Box<Sleep>>>,
 }

@@ -185,8 +185,8 @@ mod tests {
                     .filter(|&&cell| Block::of(cell) == block).map(|&cell| Block::place(cell)).collect();
                 truth.sort_unstable();
                 truth.dedup();
-                if let Some(told) = changes.since(block, since as u64) {
-                    prop_assert_eq!(told, truth);
+                if let Some(found) = changes.since(block, since as u64) {
+                    prop_assert_eq!(found, truth);
                 } else {
                     prop_assert!(cells.len() - since > KEPT_MAX);
                 }

@@ -304,8 +304,8 @@ pub(in crate::http) async fn stand(
         guard.app.counters().refused_scope.one();
     }
     // Who comes back from the provider is signed in without a change being asked for.
-    let is_told = response.extensions().get::<Audited>().is_some();
-    if is_change || is_told {
+    let is_audited = response.extensions().get::<Audited>().is_some();
+    if is_change || is_audited {
         let signed_in = response.extensions().get::<SignedIn>().cloned();
         let who = subject.clone().or(signed_in.map(|SignedIn(who)| who));
         guard.note(asked, &response, who.as_ref());

@@ -18,6 +18,7 @@ use tread_lab::bench::{Course, Figure8, Law};
 use super::simulate::{Case, Knowing, PRIOR_DEVIATION, Terrain, Trace, simulate};
 use super::{Courses, Line, OWN, PEER, STIFFNESSES, UNKNOWN, courses, in_parallel};
 use crate::report::Check;
+use crate::robot::LOOP_S;
 
 /// Lag of the figures, seconds.
 const LAG_S: f64 = 0.05;
@@ -147,10 +148,10 @@ fn with_a_prior(threads: usize, found: &mut Found) {
             theta: 1.0 / stiffness,
             std_dev: PRIOR_DEVIATION / stiffness,
         };
-        let told = simulate(&case, Law::Shipped(Some(prior)), Knowing::Map);
+        let mapped = simulate(&case, Law::Shipped(Some(prior)), Knowing::Map);
         (
             stiffness,
-            told.rms_m(0.0, lap_s) / converged.rms_m(2.0 * lap_s, 3.0 * lap_s),
+            mapped.rms_m(0.0, lap_s) / converged.rms_m(2.0 * lap_s, 3.0 * lap_s),
         )
     });
     for (stiffness, ratio) in ratios {
@@ -337,7 +338,6 @@ struct Arrival {
 }
 
 fn arrival(start: Pose, stiffness: f64, traction_limit_mu: Option<f64>) -> Arrival {
-    const LOOP_S: f64 = 0.01;
     let model = RobotModel::yi2007();
     let options = PlanOptions {
         approach_speed_m_s: Some(model.limits().linear_max_m_s),

@@ -1,0 +1,47 @@
+//! What is kept of a secret, whatever it opens: its hash.
+
+/// What is kept of a secret, with what it opens.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Kept<T> {
+    /// The hash of the secret.
+    pub hash: Vec<u8>,
+    /// The token.
+    pub token: T,
+}
+
+/// Looks tokens up in a table: by their identifiers, and by what the hashes of their secrets begin with.
+/// `$rows!` selects the columns of a token.
+macro_rules! look_up_tokens {
+    ($table:tt, $rows:ident, $what:tt, $id:ty, $token:ty) => {
+        /// The one of that identifier.
+        pub async fn find(db: &mut SqliteConnection, id: $id) -> Result<Option<$token>, DbError> {
+            let id = id.to_string();
+            let raw = $rows!("WHERE id = ?", id).fetch_optional(db).await?;
+            raw.map(<$token>::try_from).transpose()
+        }
+
+        /// The one whose hash begins like this one.
+        pub async fn by_lookup(
+            db: &mut SqliteConnection,
+            fingerprint: &Fingerprint,
+        ) -> Result<Option<Kept<$token>>, DbError> {
+            let lookup = fingerprint.lookup();
+            let row = sqlx::query!(
+                "SELECT id, hash FROM " + $table + " WHERE lookup = ?",
+                lookup
+            )
+            .fetch_optional(&mut *db)
+            .await?;
+            let Some(row) = row else {
+                return Ok(None);
+            };
+            let token = find(db, parse($what, &row.id)?).await?;
+            Ok(token.map(|token| Kept {
+                hash: row.hash,
+                token,
+            }))
+        }
+    };
+}
+
+pub(super) use look_up_tokens;
