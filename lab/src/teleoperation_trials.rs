@@ -15,8 +15,7 @@ use tread_agent::testing::{Bench, BenchError, PERIOD, boot};
 use tread_api::geometry::Twist;
 use tread_api::safety::Driver;
 use tread_api::wire;
-use tread_api::wire::command::Outcome;
-use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
+use tread_api::wire::safety::{AcquireLease, DriveCommand};
 use tread_control::gate::GateLimits;
 use tread_control::geometry::Pose;
 use tread_control::robot::{GRAVITY_M_S2, RobotModel};
@@ -134,15 +133,15 @@ impl Trial<'_> {
     }
 
     fn run(&mut self, number: u128) {
-        let request = LeaseCommand {
+        let request = AcquireLease {
             request: Uuid::from_u128(number + 1),
-            action: LeaseAction::Take,
+            take: true,
             holder: Driver {
                 client: Uuid::from_u128(7),
                 name: "trial".to_owned(),
             },
         };
-        let Outcome::Leased { epoch } = self.bench.lease(&request) else {
+        let Ok(epoch) = self.bench.lease(&request) else {
             self.report.misses += 1;
             return;
         };

@@ -10,19 +10,24 @@
 //!                                                                 └ refused: loop lets it go on
 //! ```
 
+mod planning;
+
 use std::sync::Arc;
-use std::sync::mpsc::{SyncSender, TrySendError};
+use std::sync::mpsc::SyncSender;
 use std::time::Duration;
 
+use serde::de::DeserializeOwned;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tracing::{error, info, warn};
 use tread_api::ids::{BootId, MissionId};
 use tread_api::keys::Verb;
-use tread_api::mission::{LinkPolicy, PlanSummary};
+use tread_api::mission::PlanSummary;
 use tread_api::robot::RobotMode;
-use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome, Pause, Resume};
+use tread_api::wire::command::{Cancel, Offer, Pause, Resume};
 use tread_api::wire::hello::SiteDefinition;
+use tread_api::wire::reply::{Answer, Command, CommandRefusal, CommandRefusalCode};
+use tread_api::wire::safety::{AcquireLease, LeaseCommand, ReleaseLease};
 use tread_api::wire::{self, Refusal, WireError};
 use tread_control::geometry::Pose;
 use tread_control::plan::Plan;
@@ -30,11 +35,9 @@ use tread_control::robot::RobotModel;
 
 use crate::clock::SharedClock;
 use crate::control_loop::active::Hold;
-use crate::control_loop::channels::{GivenPlan, Job, LoopCommand, Shared};
-use crate::control_loop::origin::JobOrigin;
+use crate::control_loop::channels::{GivenPlan, LoopCommand, Shared};
 use crate::control_loop::site_view::SiteView;
 use crate::fleet::{Commands, IncomingCommand};
-use crate::geometry::wire_pose;
 use crate::knowledge::{Missions, SiteCell};
 use crate::missions::{ActiveMission, CancelDecision, OfferDecision};
 use crate::safety::{Safety, answers};
@@ -65,18 +68,12 @@ pub(crate) struct Dispatcher {
     pub(crate) to_loop: SyncSender<LoopCommand>,
 }
 
-/// A plan that can be driven.
-struct Planned {
-    summary: PlanSummary,
-    plan: Arc<Plan>,
-    job: Box<Job>,
+fn refused<T>(code: CommandRefusalCode, detail: impl Into<String>) -> Result<T, CommandRefusal> {
+    Err(CommandRefusal::new(code, detail))
 }
 
-fn refused(code: OfferRefusal, detail: impl Into<String>) -> Outcome {
-    Outcome::Refused {
-        code,
-        detail: detail.into(),
-    }
+fn loop_is_busy() -> CommandRefusal {
+    CommandRefusal::new(CommandRefusalCode::NotReady, "the control loop is busy")
 }
 
 fn active_of(offer: &Offer, plan: PlanSummary) -> ActiveMission {
@@ -95,15 +92,6 @@ fn given_of(offer: &Offer, plan: Arc<Plan>) -> GivenPlan {
         revision: offer.revision,
         plan,
     }
-}
-
-/// Longest silence of the server that a mission bears.
-fn silence_max(policy: LinkPolicy) -> Result<Option<Duration>, String> {
-    policy.validate()?;
-    Ok(match policy {
-        LinkPolicy::Continue => None,
-        LinkPolicy::StopAfter { silence_s } => Some(Duration::from_secs_f64(silence_s)),
-    })
 }
 
 impl Dispatcher {
@@ -144,54 +132,93 @@ impl Dispatcher {
     }
 
     async fn respond(&self, command: IncomingCommand) {
-        match self.decide(command.verb, &command.payload).await {
-            Ok(outcome) => {
-                let boot = self.boot;
-                command.answer(&Answer { boot, outcome }).await;
+        match command.verb {
+            Verb::Offer => self.answer(command, |offer| self.offer(offer)).await,
+            Verb::Cancel => self.answer(command, |cancel| self.cancel(cancel)).await,
+            Verb::Pause => {
+                let pause = async |pause: Pause| self.hold(pause.mission, pause.revision, true);
+                self.answer(command, pause).await;
             }
-            Err(cause) => {
-                Shared::count(&self.shared.commands_refused);
-                warn!(
-                    error = &cause as &dyn std::error::Error,
-                    "refused a `{}` command",
-                    command.verb.as_str(),
-                );
-                command.refuse(&Refusal::from(&cause)).await;
+            Verb::Resume => {
+                let resume =
+                    async |resume: Resume| self.hold(resume.mission, resume.revision, false);
+                self.answer(command, resume).await;
+            }
+            Verb::Site => {
+                let site = async |definition| self.take_valid_site(definition);
+                self.answer(command, site).await;
+            }
+            Verb::Stop => {
+                let stop = async |stop| answers::stop(&self.safety, &stop).await;
+                self.answer(command, stop).await;
+            }
+            Verb::Clear => {
+                let clear = async |clear| {
+                    answers::clear(&self.safety, &self.shared, &self.clock, &clear).await
+                };
+                self.answer(command, clear).await;
+            }
+            Verb::Lease => match wire::decode(&command.payload) {
+                Ok(LeaseCommand::Acquire(acquire)) => {
+                    let acquired = answers::acquire_lease(&self.safety, &acquire);
+                    self.reply::<AcquireLease, _>(command, acquired).await;
+                }
+                Ok(LeaseCommand::Release(release)) => {
+                    let released = answers::release_lease(&self.safety, &release);
+                    self.reply::<ReleaseLease, _>(command, released).await;
+                }
+                Err(cause) => self.refuse(command, &cause).await,
+            },
+            Verb::Limit => {
+                let limit = async |limit| answers::limit(&self.safety, &limit);
+                self.answer(command, limit).await;
             }
         }
     }
 
-    async fn decide(&self, verb: Verb, payload: &[u8]) -> Result<Outcome, WireError> {
-        Ok(match verb {
-            Verb::Offer => self.offer(wire::decode(payload)?).await,
-            Verb::Cancel => self.cancel(&wire::decode(payload)?).await,
-            Verb::Pause => {
-                let Pause { mission, revision } = wire::decode(payload)?;
-                self.hold(mission, revision, true)
-            }
-            Verb::Resume => {
-                let Resume { mission, revision } = wire::decode(payload)?;
-                self.hold(mission, revision, false)
-            }
-            Verb::Site => {
-                let definition: SiteDefinition = wire::decode(payload)?;
-                let checked = definition.geofence.validate();
-                if let Err(cause) = checked {
-                    refused(OfferRefusal::Impossible, cause.to_string())
-                } else if self.take_site(definition) {
-                    Outcome::Done
-                } else {
-                    refused(OfferRefusal::NotReady, "the control loop is busy")
-                }
-            }
-            Verb::Stop => answers::stop(&self.safety, &wire::decode(payload)?).await,
-            Verb::Clear => {
-                let clear = wire::decode(payload)?;
-                answers::clear(&self.safety, &self.shared, &self.clock, &clear).await
-            }
-            Verb::Lease => answers::lease(&self.safety, &wire::decode(payload)?),
-            Verb::Limit => answers::limit(&self.safety, &wire::decode(payload)?),
-        })
+    /// Reads a command, decides it and answers.
+    async fn answer<C, T>(
+        &self,
+        command: IncomingCommand,
+        decide: impl AsyncFnOnce(C) -> Result<T, CommandRefusal>,
+    ) where
+        C: Command + DeserializeOwned,
+        C::Reply: From<Result<T, CommandRefusal>>,
+    {
+        match wire::decode(&command.payload) {
+            Ok(asked) => self.reply::<C, T>(command, decide(asked).await).await,
+            Err(cause) => self.refuse(command, &cause).await,
+        }
+    }
+
+    async fn reply<C, T>(&self, command: IncomingCommand, decided: Result<T, CommandRefusal>)
+    where
+        C: Command,
+        C::Reply: From<Result<T, CommandRefusal>>,
+    {
+        let boot = self.boot;
+        let reply = C::Reply::from(decided);
+        command.answer(&Answer { boot, reply }).await;
+    }
+
+    /// Refuses a command that does not read.
+    async fn refuse(&self, command: IncomingCommand, cause: &WireError) {
+        Shared::count(&self.shared.commands_refused);
+        warn!(
+            error = cause as &dyn std::error::Error,
+            "refused a `{}` command",
+            command.verb.as_str(),
+        );
+        command.refuse(&Refusal::from(cause)).await;
+    }
+
+    fn take_valid_site(&self, definition: SiteDefinition) -> Result<(), CommandRefusal> {
+        let checked = definition.geofence.validate();
+        checked.or_else(|cause| refused(CommandRefusalCode::Impossible, cause.to_string()))?;
+        if !self.take_site(definition) {
+            return Err(loop_is_busy());
+        }
+        Ok(())
     }
 
     /// Takes the site of a server's welcome; false if the loop has no room for it now.
@@ -233,30 +260,31 @@ impl Dispatcher {
         true
     }
 
-    async fn offer(&self, offer: Offer) -> Outcome {
+    async fn offer(&self, offer: Offer) -> Result<PlanSummary, CommandRefusal> {
         let received_at = self.clock.monotonic();
         let start_by = offer
             .start_within_ms
             .map(|within_ms| received_at.saturating_add(Duration::from_millis(within_ms)));
         let decision = self.missions.slot().offer(&offer);
         match decision {
-            OfferDecision::AcceptAgain(plan) => Outcome::Accepted { plan: Some(plan) },
-            OfferDecision::Refuse(code, detail) => {
+            OfferDecision::AcceptAgain(plan) => Ok(plan),
+            OfferDecision::Refuse(refusal) => {
+                let CommandRefusal { code, detail } = &refusal;
                 info!(mission.id = %offer.mission, ?code, "refused a mission: {detail}");
-                refused(code, detail)
+                Err(refusal)
             }
             OfferDecision::Plan => self.plan_and_start(offer, start_by).await,
             OfferDecision::Replace => {
                 let mission = offer.mission;
                 if !self.tell_loop(LoopCommand::Hold(mission, Hold::Replacement)) {
-                    return refused(OfferRefusal::NotReady, "the control loop is busy");
+                    return Err(loop_is_busy());
                 }
-                let outcome = self.plan_and_replace(offer).await;
-                if !matches!(outcome, Outcome::Accepted { .. }) {
+                let replaced = self.plan_and_replace(offer).await;
+                if replaced.is_err() {
                     // Should it not arrive, the loop lets go by itself after a while.
                     self.tell_loop(LoopCommand::Release(mission, Hold::Replacement));
                 }
-                outcome
+                replaced
             }
         }
     }
@@ -265,12 +293,15 @@ impl Dispatcher {
         self.to_loop.try_send(command).is_ok()
     }
 
-    fn hold(&self, mission: MissionId, revision: u32, is_pause: bool) -> Outcome {
-        if let Err((code, detail)) = self.missions.slot().check_active(mission, revision) {
-            return refused(code, detail);
-        }
-        if !is_pause && let Err(refusal) = self.may_resume() {
-            return refusal;
+    fn hold(
+        &self,
+        mission: MissionId,
+        revision: u32,
+        is_pause: bool,
+    ) -> Result<(), CommandRefusal> {
+        self.missions.slot().check_active(mission, revision)?;
+        if !is_pause {
+            self.may_resume()?;
         }
         let (command, what) = if is_pause {
             (LoopCommand::Hold(mission, Hold::Pause), "pausing")
@@ -278,40 +309,43 @@ impl Dispatcher {
             (LoopCommand::Release(mission, Hold::Pause), "resuming")
         };
         if !self.tell_loop(command) {
-            return refused(OfferRefusal::NotReady, "the control loop is busy");
+            return Err(loop_is_busy());
         }
         info!(mission.id = %mission, "{what} {mission}");
-        Outcome::Done
+        Ok(())
     }
 
     /// Whether a paused mission may go on now.
-    fn may_resume(&self) -> Result<(), Outcome> {
+    fn may_resume(&self) -> Result<(), CommandRefusal> {
         if let Some(latch) = self.safety.latch() {
             let detail = format!("stopped by {}: {}", latch.by, latch.reason);
-            return Err(refused(OfferRefusal::Stopped, detail));
+            return refused(CommandRefusalCode::Stopped, detail);
         }
         if let Some(lease) = self.safety.lease_now() {
-            let detail = format!("{} teleoperates the robot", lease.driver.name);
-            return Err(refused(OfferRefusal::Leased, detail));
+            return Err(answers::leased_by(&lease.driver));
         }
         match self.shared.snapshot().off_path_m {
-            Some(off_m) if off_m.is_nan() || off_m > RESUME_WITHIN_M => Err(refused(
-                OfferRefusal::Impossible,
+            Some(off_m) if off_m.is_nan() || off_m > RESUME_WITHIN_M => refused(
+                CommandRefusalCode::Impossible,
                 format!(
                     "the robot is {off_m:.1} m from where the mission goes on: drive it back, or replace the mission"
                 ),
-            )),
+            ),
             Some(_) | None => Ok(()),
         }
     }
 
-    async fn plan_and_start(&self, offer: Offer, start_by: Option<Duration>) -> Outcome {
+    async fn plan_and_start(
+        &self,
+        offer: Offer,
+        start_by: Option<Duration>,
+    ) -> Result<PlanSummary, CommandRefusal> {
         let snapshot = self.shared.snapshot();
         let start = match (snapshot.mode, snapshot.pose) {
             (RobotMode::Idle, Some((pose, _))) => pose,
             (RobotMode::Idle, None) => {
                 return refused(
-                    OfferRefusal::NotReady,
+                    CommandRefusalCode::NotReady,
                     "the robot does not know where it is",
                 );
             }
@@ -320,36 +354,30 @@ impl Dispatcher {
                     .fault
                     .map_or("", super::control_loop::channels::Fault::text);
                 return refused(
-                    OfferRefusal::NotReady,
+                    CommandRefusalCode::NotReady,
                     format!("the robot is {mode:?} {fault}"),
                 );
             }
         };
-        let planned = match self.plan(&offer, start, start_by).await {
-            Ok(planned) => planned,
-            Err(detail) => return refused(OfferRefusal::Impossible, detail),
-        };
+        let planned = self.plan(&offer, start, start_by).await?;
         if start_by.is_some_and(|latest| self.clock.monotonic() > latest) {
-            return refused(OfferRefusal::TooLate, "its latest start has passed");
+            return refused(CommandRefusalCode::TooLate, "its latest start has passed");
         }
         // Held before the loop has it, so that its end cannot be reported before its begin.
         let (mission, plan) = (offer.mission, planned.summary);
         if !self.missions.slot().take(active_of(&offer, plan)) {
             // What came meanwhile says why: a cancellation, or another mission.
             return match self.missions.slot().offer(&offer) {
-                OfferDecision::Refuse(code, detail) => refused(code, detail),
+                OfferDecision::Refuse(refusal) => Err(refusal),
                 OfferDecision::Plan | OfferDecision::Replace | OfferDecision::AcceptAgain(_) => {
-                    refused(OfferRefusal::NotReady, "another command came first")
+                    refused(CommandRefusalCode::NotReady, "another command came first")
                 }
             };
         }
         self.shared.show_plan(given_of(&offer, planned.plan));
-        match self.to_loop.try_send(LoopCommand::Start(planned.job)) {
-            Ok(()) => {}
-            Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => {
-                self.missions.slot().release(mission);
-                return refused(OfferRefusal::NotReady, "the control loop is busy");
-            }
+        if !self.tell_loop(LoopCommand::Start(planned.job)) {
+            self.missions.slot().release(mission);
+            return Err(loop_is_busy());
         }
         // The same tick takes both. Without room the server pauses it once it sees it driven.
         if offer.on_hold && !self.tell_loop(LoopCommand::Hold(mission, Hold::Pause)) {
@@ -362,31 +390,28 @@ impl Dispatcher {
             "took mission {mission}",
         );
         self.save().await;
-        Outcome::Accepted { plan: Some(plan) }
+        Ok(plan)
     }
 
     /// Swaps the active mission for its next revision; the loop holds it already or soon.
-    async fn plan_and_replace(&self, offer: Offer) -> Outcome {
+    async fn plan_and_replace(&self, offer: Offer) -> Result<PlanSummary, CommandRefusal> {
         let Some(start) = self.rest_of(offer.mission).await else {
-            return refused(OfferRefusal::NotReady, "the robot could not be held");
+            return refused(CommandRefusalCode::NotReady, "the robot could not be held");
         };
-        let planned = match self.plan(&offer, start, None).await {
-            Ok(planned) => planned,
-            Err(detail) => return refused(OfferRefusal::Impossible, detail),
-        };
+        let planned = self.plan(&offer, start, None).await?;
         let (mission, plan) = (offer.mission, planned.summary);
         let Some(former) = self.missions.slot().replace(active_of(&offer, plan)) else {
-            return refused(OfferRefusal::Ended, "the mission ended meanwhile");
+            return refused(CommandRefusalCode::Ended, "the mission ended meanwhile");
         };
         if !self.tell_loop(LoopCommand::Replace(planned.job)) {
             self.missions.slot().restore(former);
-            return refused(OfferRefusal::NotReady, "the control loop is busy");
+            return Err(loop_is_busy());
         }
         self.shared.show_plan(given_of(&offer, planned.plan));
         let revision = offer.revision;
         info!(mission.id = %mission, revision, "took revision {revision} of {mission}");
         self.save().await;
-        Outcome::Accepted { plan: Some(plan) }
+        Ok(plan)
     }
 
     /// Where the robot comes to stand, once the loop holds the mission.
@@ -417,75 +442,27 @@ impl Dispatcher {
         foretelling.await.ok()
     }
 
-    /// Plans an offer from a pose.
-    async fn plan(
-        &self,
-        offer: &Offer,
-        start: Pose,
-        start_by: Option<Duration>,
-    ) -> Result<Planned, String> {
-        let model = self.model;
-        let view = self.site.view();
-        let offer = offer.clone();
-        let planning = tokio::task::spawn_blocking(move || {
-            let origin = JobOrigin {
-                mission: offer.mission,
-                revision: offer.revision,
-                plan_hash: offer.plan_hash,
-                trajectory: offer.trajectory,
-                start,
-                prior: offer.prior,
-                grid: view.as_ref().map(|view| view.grid()),
-                start_by,
-                silence_max: silence_max(offer.link_policy)?,
-            };
-            let plan = origin.plan(&model)?;
-            if let Some(breach) = view.and_then(|view| view.fence().plan_breach(&plan, &model)) {
-                return Err(format!(
-                    "the path leaves the geofence at ({:.1} m, {:.1} m), {:.1} m along it",
-                    breach.point.x_m, breach.point.y_m, breach.arc_m,
-                ));
-            }
-            let summary = PlanSummary {
-                length_m: plan.length_m(),
-                duration_s: plan.duration_s(),
-                speed_peak_m_s: plan.peak_speed_m_s(),
-                begin: Some(wire_pose(start)),
-            };
-            let kept = Arc::new(plan.clone());
-            let job = origin.job(plan, model)?;
-            Ok(Planned {
-                summary,
-                plan: kept,
-                job,
-            })
-        });
-        planning
-            .await
-            .unwrap_or_else(|_| Err("planning ended in a panic".to_owned()))
-    }
-
-    async fn cancel(&self, cancel: &Cancel) -> Outcome {
+    async fn cancel(&self, cancel: Cancel) -> Result<(), CommandRefusal> {
         let mission = cancel.mission;
         let decision = self.missions.slot().cancel(mission);
         match decision {
-            CancelDecision::Brake => match self.to_loop.try_send(LoopCommand::Cancel(mission)) {
-                Ok(()) => {
-                    info!(mission.id = %mission, reason = cancel.reason, "cancelling {mission}");
-                    // Once this is answered it is cancelled, even if the agent dies on the way.
-                    self.save().await;
-                    Outcome::Done
+            CancelDecision::Brake => {
+                if !self.tell_loop(LoopCommand::Cancel(mission)) {
+                    return Err(loop_is_busy());
                 }
-                Err(_) => refused(OfferRefusal::NotReady, "the control loop is busy"),
-            },
-            CancelDecision::CancelledBefore => Outcome::Done,
+                info!(mission.id = %mission, reason = cancel.reason, "cancelling {mission}");
+                // Once this is answered it is cancelled, even if the agent dies on the way.
+                self.save().await;
+                Ok(())
+            }
+            CancelDecision::CancelledBefore => Ok(()),
             CancelDecision::EndedBefore(phase) => refused(
-                OfferRefusal::Ended,
+                CommandRefusalCode::Ended,
                 format!("it has ended before: {phase:?}"),
             ),
             CancelDecision::Unknown => {
                 self.save().await;
-                refused(OfferRefusal::Unknown, "it was never offered here")
+                refused(CommandRefusalCode::Unknown, "it was never offered here")
             }
         }
     }

@@ -11,9 +11,8 @@ use tread_agent::testing::{Bench, boot, site_of};
 use tread_api::geometry::{Point, Polygon, Twist};
 use tread_api::safety::{Driver, Geofence};
 use tread_api::wire;
-use tread_api::wire::command::Outcome;
 use tread_api::wire::ingest::MissionPhase;
-use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
+use tread_api::wire::safety::{AcquireLease, DriveCommand};
 use tread_control::geometry::Pose;
 use uuid::Uuid;
 
@@ -88,17 +87,15 @@ fn no_tick_of_teleoperation_to_a_fence_and_into_silence_allocates() {
     site.geofence = fence();
     bench.know_site(site).unwrap();
     bench.run_for(Duration::from_secs(1));
-    let lease = bench.lease(&LeaseCommand {
+    let lease = bench.lease(&AcquireLease {
         request: Uuid::from_u128(1),
-        action: LeaseAction::Acquire,
         holder: Driver {
             client: Uuid::from_u128(2),
             name: "a driver".to_owned(),
         },
+        take: false,
     });
-    let Outcome::Leased { epoch } = lease else {
-        panic!("{lease:?}");
-    };
+    let epoch = lease.unwrap();
     // Up to the fence, then silence until the lease has freed itself.
     for tick in 0..2_000_u64 {
         if tick < 1_000 && tick % 5 == 0 {

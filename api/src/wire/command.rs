@@ -1,14 +1,16 @@
-//! Commands from the server to a robot, and the robot's answers.
+//! Commands about missions, from the server to a robot.
 //!
-//! Each is a zenoh query. No reply means not delivered: the server sends the same again, and the
-//! robot takes the same twice without harm.
+//! Each is a zenoh query; what a robot replies is in [`reply`](super::reply). No reply means not
+//! delivered: the server sends the same again, and the robot takes the same twice without harm.
 
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
+use super::reply::{Acknowledgement, Command, OfferReply};
 use crate::friction::{ROBOT_BIAS_RATIO, THETA_MAX};
-use crate::ids::{BootId, DERIVED_NAMESPACE, MissionId, PlanHash};
-use crate::mission::{LinkPolicy, PlanSummary};
+use crate::ids::{DERIVED_NAMESPACE, MissionId, PlanHash};
+use crate::keys::Verb;
+use crate::mission::LinkPolicy;
 use crate::site::Cell;
 use crate::trajectory::Trajectory;
 
@@ -145,72 +147,24 @@ pub struct Resume {
     pub revision: u32,
 }
 
-/// A robot's answer to any command.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Answer {
-    /// The run of the agent that answers.
-    pub boot: BootId,
-    /// What it answers.
-    pub outcome: Outcome,
+impl Command for Offer {
+    const VERB: Verb = Verb::Offer;
+    type Reply = OfferReply;
 }
 
-/// What a robot says to a command.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Outcome {
-    /// The mission is taken, now or already before.
-    Accepted {
-        /// What the robot planned; absent when it was answered before and is over.
-        plan: Option<PlanSummary>,
-    },
-    /// The command has taken effect, now or already before.
-    Done,
-    /// The lease of teleoperation is given; the run that gave it is that of the answer.
-    Leased {
-        /// The lease.
-        epoch: u64,
-    },
-    /// The robot will not.
-    Refused {
-        /// For programs.
-        code: OfferRefusal,
-        /// For people.
-        #[serde(
-            deserialize_with = "crate::text::bounded::<_, {crate::mission::REASON_LENGTH_MAX}>"
-        )]
-        detail: String,
-    },
+impl Command for Cancel {
+    const VERB: Verb = Verb::Cancel;
+    type Reply = Acknowledgement;
 }
 
-/// Why a robot refuses a command.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum OfferRefusal {
-    /// Another mission is being driven.
-    Busy,
-    /// The same mission and revision were offered with other content.
-    Conflict,
-    /// The mission, the lease or the stop has ended here before.
-    Ended,
-    /// The trajectory cannot be driven by this robot.
-    Impossible,
-    /// The robot is in no state to drive.
-    NotReady,
-    /// The latest start has passed.
-    TooLate,
-    /// The mission, or whatever the command names, is not known here.
-    Unknown,
-    /// Somebody else teleoperates the robot; the detail names who.
-    Leased,
-    /// A stop is in force.
-    Stopped,
-    /// The robot does not stand.
-    Moving,
-    /// There are too many of these.
-    TooMany,
-    /// Any code of a newer peer.
-    #[serde(other)]
-    Other,
+impl Command for Pause {
+    const VERB: Verb = Verb::Pause;
+    type Reply = Acknowledgement;
+}
+
+impl Command for Resume {
+    const VERB: Verb = Verb::Resume;
+    type Reply = Acknowledgement;
 }
 
 #[cfg(test)]

@@ -3,7 +3,9 @@
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
+use super::reply::{Acknowledgement, Command};
 use crate::ids::{BootId, RobotId};
+use crate::keys::Verb;
 use crate::robot::{Capabilities, RobotModel};
 use crate::safety::Geofence;
 use crate::site::Grid;
@@ -49,4 +51,10 @@ pub struct SiteDefinition {
     /// Where robots may be. An older server has none, an older robot ignores it.
     #[serde(default)]
     pub geofence: Geofence,
+}
+
+/// `cmd/site`: take this definition.
+impl Command for SiteDefinition {
+    const VERB: Verb = Verb::Site;
+    type Reply = Acknowledgement;
 }

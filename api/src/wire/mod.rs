@@ -6,6 +6,7 @@
 pub mod command;
 pub mod hello;
 pub mod ingest;
+pub mod reply;
 pub mod safety;
 pub mod state;
 

@@ -9,8 +9,10 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
+use super::reply::{Acknowledgement, Command, LeaseReply};
 use crate::geometry::Twist;
 use crate::ids::{BootId, OwnerId, StopId};
+use crate::keys::Verb;
 use crate::safety::{DRIVE_AHEAD_MAX_US, Driver, LIMIT_AHEAD_MAX_US};
 
 /// `cmd/stop`: command zero, latch, and answer `done` once the latch is on the disk.
@@ -43,31 +45,112 @@ pub struct ClearStop {
     pub by: String,
 }
 
-/// What is wanted with a lease.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum LeaseAction {
-    /// Have it, if nobody else does; the same again for whoever has it.
-    Acquire,
-    /// Have it, whoever does now.
-    Take,
-    /// Give it back.
-    Release,
-}
-
-/// `cmd/lease`: acquire, take or release the lease of teleoperation.
+/// `cmd/lease`: acquire the lease of teleoperation, or take it from whoever has it.
 ///
-/// Answered by `leased`, by `done` (released), or refused as `leased` with a detail that names who
-/// has it. A lease holds the active mission: it stays paused until it is resumed by request.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct LeaseCommand {
+/// A refusal as `leased` has a detail that names who has it. A lease holds the active mission: it
+/// stays paused until it is resumed by request.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(into = "LeaseMessage")]
+pub struct AcquireLease {
     /// Makes the command idempotent: the same request again gets the same answer and changes
     /// nothing.
     pub request: Uuid,
-    /// What is wanted.
-    pub action: LeaseAction,
-    /// Who wants it.
+    /// Who wants it; whoever has it gets it again.
     pub holder: Driver,
+    /// Whether to have it also if somebody else does now.
+    pub take: bool,
+}
+
+/// `cmd/lease`: give the lease of teleoperation back. It is `done` also when nobody has it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(into = "LeaseMessage")]
+pub struct ReleaseLease {
+    /// Makes the command idempotent.
+    pub request: Uuid,
+    /// Whose lease it is.
+    pub holder: Driver,
+}
+
+/// What comes on `cmd/lease`, for whoever answers it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(from = "LeaseMessage", into = "LeaseMessage")]
+pub enum LeaseCommand {
+    /// Answered by a [`LeaseReply`].
+    Acquire(AcquireLease),
+    /// Answered by an [`Acknowledgement`].
+    Release(ReleaseLease),
+}
+
+/// What is wanted with a lease.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum LeaseAction {
+    Acquire,
+    Take,
+    Release,
+}
+
+/// A lease command as it is on the wire.
+#[derive(Serialize, Deserialize)]
+struct LeaseMessage {
+    request: Uuid,
+    action: LeaseAction,
+    holder: Driver,
+}
+
+impl From<AcquireLease> for LeaseMessage {
+    fn from(command: AcquireLease) -> Self {
+        Self {
+            request: command.request,
+            action: if command.take {
+                LeaseAction::Take
+            } else {
+                LeaseAction::Acquire
+            },
+            holder: command.holder,
+        }
+    }
+}
+
+impl From<ReleaseLease> for LeaseMessage {
+    fn from(command: ReleaseLease) -> Self {
+        Self {
+            request: command.request,
+            action: LeaseAction::Release,
+            holder: command.holder,
+        }
+    }
+}
+
+impl From<LeaseCommand> for LeaseMessage {
+    fn from(command: LeaseCommand) -> Self {
+        match command {
+            LeaseCommand::Acquire(command) => command.into(),
+            LeaseCommand::Release(command) => command.into(),
+        }
+    }
+}
+
+impl From<LeaseMessage> for LeaseCommand {
+    fn from(message: LeaseMessage) -> Self {
+        let LeaseMessage {
+            request,
+            action,
+            holder,
+        } = message;
+        let acquire = |take, holder| {
+            Self::Acquire(AcquireLease {
+                request,
+                holder,
+                take,
+            })
+        };
+        match action {
+            LeaseAction::Acquire => acquire(false, holder),
+            LeaseAction::Take => acquire(true, holder),
+            LeaseAction::Release => Self::Release(ReleaseLease { request, holder }),
+        }
+    }
 }
 
 /// On the robot's `teleop` key: drive like this until then.
@@ -113,6 +196,31 @@ pub struct ExternalLimit {
     /// Fastest speed, m/s; as before when absent.
     #[serde(default)]
     pub linear_max_m_s: Option<f64>,
+}
+
+impl Command for Stop {
+    const VERB: Verb = Verb::Stop;
+    type Reply = Acknowledgement;
+}
+
+impl Command for ClearStop {
+    const VERB: Verb = Verb::Clear;
+    type Reply = Acknowledgement;
+}
+
+impl Command for AcquireLease {
+    const VERB: Verb = Verb::Lease;
+    type Reply = LeaseReply;
+}
+
+impl Command for ReleaseLease {
+    const VERB: Verb = Verb::Lease;
+    type Reply = Acknowledgement;
+}
+
+impl Command for ExternalLimit {
+    const VERB: Verb = Verb::Limit;
+    type Reply = Acknowledgement;
 }
 
 impl DriveCommand {
@@ -185,6 +293,50 @@ mod tests {
                 wire::decode::<DriveCommand>(text.as_bytes()).is_err(),
                 "{bad}"
             );
+        }
+    }
+    #[test]
+    fn a_lease_command_is_one_message_with_its_action() {
+        let holder = Driver {
+            client: Uuid::from_u128(2),
+            name: "a driver".to_owned(),
+        };
+        let request = Uuid::from_u128(1);
+        let acquire = |take| AcquireLease {
+            request,
+            holder: holder.clone(),
+            take,
+        };
+        let release = ReleaseLease {
+            request,
+            holder: holder.clone(),
+        };
+        let text = |action: &str| {
+            format!(
+                r#"{{"v":2,"body":{{"request":"{request}","action":"{action}","holder":{{"client":"{}","name":"a driver"}}}}}}"#,
+                holder.client
+            )
+        };
+        for (written, read, action) in [
+            (
+                wire::encode(&acquire(false)),
+                LeaseCommand::Acquire(acquire(false)),
+                "acquire",
+            ),
+            (
+                wire::encode(&acquire(true)),
+                LeaseCommand::Acquire(acquire(true)),
+                "take",
+            ),
+            (
+                wire::encode(&release),
+                LeaseCommand::Release(release.clone()),
+                "release",
+            ),
+        ] {
+            let written = written.unwrap();
+            assert_eq!(String::from_utf8_lossy(&written), text(action));
+            assert_eq!(wire::decode::<LeaseCommand>(&written).unwrap(), read);
         }
     }
 }

@@ -8,8 +8,7 @@ use tread_api::geometry::Twist;
 use tread_api::robot::RobotMode;
 use tread_api::safety::Driver;
 use tread_api::wire;
-use tread_api::wire::command::Outcome;
-use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand, Stop};
+use tread_api::wire::safety::{AcquireLease, DriveCommand, Stop};
 use tread_control::gate::GateCause;
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
@@ -50,10 +49,10 @@ fn late_tick(bench: &mut Bench, by: Duration) {
     bench.tick();
 }
 
-fn acquire() -> LeaseCommand {
-    LeaseCommand {
+fn acquire() -> AcquireLease {
+    AcquireLease {
         request: Uuid::from_u128(1),
-        action: LeaseAction::Acquire,
+        take: false,
         holder: Driver {
             client: Uuid::from_u128(2),
             name: "a driver".to_owned(),
@@ -111,9 +110,7 @@ fn a_late_loop_holds_the_robot_with_its_figures_and_lets_its_mission_go_on_after
 #[test]
 fn a_driver_is_held_by_a_late_loop_and_a_stop_is_stricter_than_that() {
     let mut bench = bench();
-    let Outcome::Leased { epoch } = bench.lease(&acquire()) else {
-        panic!("no lease");
-    };
+    let epoch = bench.lease(&acquire()).unwrap();
     let mut seq = 0;
     let mut drive = |bench: &mut Bench, late_by: Duration| {
         seq += 1;
@@ -146,9 +143,7 @@ fn a_driver_is_held_by_a_late_loop_and_a_stop_is_stricter_than_that() {
 #[test]
 fn a_command_that_ends_while_a_tick_is_interrupted_moves_nothing_any_more() {
     let mut bench = bench();
-    let Outcome::Leased { epoch } = bench.lease(&acquire()) else {
-        panic!("no lease");
-    };
+    let epoch = bench.lease(&acquire()).unwrap();
     for seq in 1..100 {
         let payload = command(epoch, seq, bench.now_us(), 200 * MILLISECOND);
         assert!(bench.teleoperate(&payload));
@@ -224,9 +219,7 @@ fn a_loop_on_a_busy_machine_obeys_in_its_next_tick_and_notices_each_late_one() {
                 }
             });
         }
-        let Outcome::Leased { epoch } = answers::lease(&safety, &acquire()) else {
-            panic!("no lease");
-        };
+        let epoch = answers::acquire_lease(&safety, &acquire()).unwrap();
         let began = clock.monotonic();
         let mut seq = 0;
         while clock.monotonic() < began + BUSY_FOR {

@@ -1,8 +1,9 @@
 //! A command that came in, and its answer.
 
+use serde::Serialize;
 use tracing::warn;
 use tread_api::keys::Verb;
-use tread_api::wire::command::Answer;
+use tread_api::wire::reply::Answer;
 use tread_api::wire::{self, Refusal};
 use zenoh::Wait;
 use zenoh::query::Query;
@@ -19,7 +20,7 @@ pub struct IncomingCommand {
 
 impl IncomingCommand {
     /// Answers; a failure is logged, for the server asks again.
-    pub async fn answer(self, answer: &Answer) {
+    pub async fn answer<R: Serialize>(self, answer: &Answer<R>) {
         match wire::encode(answer) {
             Ok(payload) => self.reply(payload, false).await,
             Err(cause) => warn!(

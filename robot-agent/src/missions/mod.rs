@@ -18,8 +18,9 @@ use std::collections::VecDeque;
 use serde::{Deserialize, Serialize};
 use tread_api::ids::{MissionId, PlanHash};
 use tread_api::mission::PlanSummary;
-use tread_api::wire::command::{Offer, OfferRefusal};
+use tread_api::wire::command::Offer;
 use tread_api::wire::ingest::MissionPhase;
+use tread_api::wire::reply::{CommandRefusal, CommandRefusalCode};
 
 /// Ended missions that are remembered; the oldest is forgotten first.
 pub const ENDED_MAX: usize = 1_000;
@@ -71,7 +72,7 @@ pub enum OfferDecision {
     /// It is active already: say so again.
     AcceptAgain(PlanSummary),
     /// No, and why.
-    Refuse(OfferRefusal, String),
+    Refuse(CommandRefusal),
 }
 
 /// What to do about a cancellation.
@@ -107,24 +108,25 @@ impl MissionSlot {
 
     /// What to do about an offer.
     pub fn offer(&self, offer: &Offer) -> OfferDecision {
-        let refuse = |code, detail: String| OfferDecision::Refuse(code, detail);
+        let refuse =
+            |code, detail: String| OfferDecision::Refuse(CommandRefusal::new(code, detail));
         let mission = offer.mission;
         if let Some(phase) = self.ended_phase(mission) {
             let detail = format!(
                 "mission {mission} has ended here before: {}",
                 name_of(phase)
             );
-            return refuse(OfferRefusal::Ended, detail);
+            return refuse(CommandRefusalCode::Ended, detail);
         }
         match &self.active {
             None => OfferDecision::Plan,
             Some(active) if active.mission == mission && active.is_cancelled => refuse(
-                OfferRefusal::Ended,
+                CommandRefusalCode::Ended,
                 format!("mission {mission} is being cancelled"),
             ),
             Some(active) if active.mission != mission => {
                 let detail = format!("mission {} is being driven", active.mission);
-                refuse(OfferRefusal::Busy, detail)
+                refuse(CommandRefusalCode::Busy, detail)
             }
             Some(active)
                 if active.revision == offer.revision && active.plan_hash == offer.plan_hash =>
@@ -137,7 +139,7 @@ impl MissionSlot {
                     "mission {mission} is active as revision {} with plan hash {}",
                     active.revision, active.plan_hash
                 );
-                refuse(OfferRefusal::Conflict, detail)
+                refuse(CommandRefusalCode::Conflict, detail)
             }
         }
     }
@@ -180,25 +182,26 @@ impl MissionSlot {
     ///
     /// # Errors
     /// Why not, for the server.
-    pub fn check_active(
-        &self,
-        mission: MissionId,
-        revision: u32,
-    ) -> Result<(), (OfferRefusal, String)> {
+    pub fn check_active(&self, mission: MissionId, revision: u32) -> Result<(), CommandRefusal> {
+        let refuse = |code, detail: String| Err(CommandRefusal::new(code, detail));
         if let Some(phase) = self.ended_phase(mission) {
             let detail = format!("it has ended before: {}", name_of(phase));
-            return Err((OfferRefusal::Ended, detail));
+            return refuse(CommandRefusalCode::Ended, detail);
         }
         match &self.active {
-            Some(active) if active.mission == mission && active.is_cancelled => {
-                Err((OfferRefusal::Ended, "it is being cancelled".to_owned()))
-            }
+            Some(active) if active.mission == mission && active.is_cancelled => refuse(
+                CommandRefusalCode::Ended,
+                "it is being cancelled".to_owned(),
+            ),
             Some(active) if active.mission == mission && active.revision == revision => Ok(()),
-            Some(active) if active.mission == mission => Err((
-                OfferRefusal::Conflict,
-                format!("it is active as revision {}", active.revision),
-            )),
-            Some(_) | None => Err((OfferRefusal::Unknown, "it is not active here".to_owned())),
+            Some(active) if active.mission == mission => {
+                let detail = format!("it is active as revision {}", active.revision);
+                refuse(CommandRefusalCode::Conflict, detail)
+            }
+            Some(_) | None => refuse(
+                CommandRefusalCode::Unknown,
+                "it is not active here".to_owned(),
+            ),
         }
     }
 
@@ -348,6 +351,12 @@ mod tests {
                     Step::Offer { mission, revision } => {
                         let offer = offer(mission, revision);
                         let decision = slot.offer(&offer);
+                        let refused = match &decision {
+                            OfferDecision::Refuse(refusal) => Some(refusal.code),
+                            OfferDecision::Plan
+                            | OfferDecision::Replace
+                            | OfferDecision::AcceptAgain(_) => None,
+                        };
                         let active = ActiveMission {
                             mission: offer.mission,
                             revision,
@@ -357,14 +366,12 @@ mod tests {
                         };
                         let is_over = over.contains(&offer.mission);
                         match before.active() {
-                            _ if is_over => prop_assert!(
-                                matches!(decision, OfferDecision::Refuse(OfferRefusal::Ended, _))
-                            ),
+                            _ if is_over => {
+                                prop_assert_eq!(refused, Some(CommandRefusalCode::Ended));
+                            }
                             None => prop_assert_eq!(&decision, &OfferDecision::Plan),
                             Some(now) if now.mission == active.mission && now.is_cancelled => {
-                                prop_assert!(
-                                    matches!(decision, OfferDecision::Refuse(OfferRefusal::Ended, _))
-                                );
+                                prop_assert_eq!(refused, Some(CommandRefusalCode::Ended));
                             }
                             Some(now) if *now == active => {
                                 prop_assert_eq!(&decision, &OfferDecision::AcceptAgain(PLAN));
@@ -374,12 +381,10 @@ mod tests {
                             {
                                 prop_assert_eq!(&decision, &OfferDecision::Replace);
                             }
-                            Some(now) if now.mission == offer.mission => prop_assert!(
-                                matches!(decision, OfferDecision::Refuse(OfferRefusal::Conflict, _))
-                            ),
-                            Some(_) => prop_assert!(
-                                matches!(decision, OfferDecision::Refuse(OfferRefusal::Busy, _))
-                            ),
+                            Some(now) if now.mission == offer.mission => {
+                                prop_assert_eq!(refused, Some(CommandRefusalCode::Conflict));
+                            }
+                            Some(_) => prop_assert_eq!(refused, Some(CommandRefusalCode::Busy)),
                         }
                         if decision == OfferDecision::Replace {
                             let former = slot.replace(active.clone());

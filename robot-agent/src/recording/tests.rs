@@ -14,8 +14,8 @@ use tread_api::friction::ROBOT_BIAS_RATIO;
 use tread_api::ids::OwnerId;
 use tread_api::safety::{Driver, Geofence};
 use tread_api::wire;
-use tread_api::wire::command::{CellPrior, Outcome, PathPrior};
-use tread_api::wire::safety::{DriveCommand, ExternalLimit, LeaseAction, LeaseCommand, Stop};
+use tread_api::wire::command::{CellPrior, PathPrior};
+use tread_api::wire::safety::{AcquireLease, DriveCommand, ExternalLimit, Stop};
 use tread_control::geometry::Pose;
 use tread_ros2::cdr::{decode, encode};
 use tread_ros2::messages::tread::LoopTick;
@@ -174,17 +174,15 @@ fn teleoperate_under_a_limit(bench: &mut Bench) {
         linear_max_m_s: Some(0.3),
     };
     bench.safety.limit(&limit).unwrap();
-    let lease = bench.lease(&LeaseCommand {
+    let lease = bench.lease(&AcquireLease {
         request: Uuid::from_u128(1),
-        action: LeaseAction::Acquire,
         holder: Driver {
             client: Uuid::from_u128(2),
             name: "a driver".to_owned(),
         },
+        take: false,
     });
-    let Outcome::Leased { epoch } = lease else {
-        panic!("{lease:?}");
-    };
+    let epoch = lease.unwrap();
     for seq in 0..150_u64 {
         let command = DriveCommand {
             boot: boot(),

@@ -25,16 +25,16 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::Notify;
 use tracing::{error, info, warn};
 use tread_api::ids::{BootId, OwnerId, StopId};
-use tread_api::safety::{DriveStatus, Lease, LimitStatus, SMALL_PAYLOAD_MAX, StopLatch};
+use tread_api::safety::{DriveStatus, Driver, Lease, LimitStatus, SMALL_PAYLOAD_MAX, StopLatch};
 use tread_api::wire;
-use tread_api::wire::safety::{DriveCommand, ExternalLimit, LeaseCommand, Stop};
+use tread_api::wire::safety::{AcquireLease, DriveCommand, ExternalLimit, ReleaseLease, Stop};
 use tread_control::robot::RobotModel;
 
 use crate::clock::SharedClock;
 use crate::fleet::Urgent;
 use latch_file::LatchFile;
 use limits::{ExternalLimits, LimitRefusal, LimitsView};
-use operator::{LeaseAnswer, LeaseRefusal, Operator, TeleoperationView, Verdict};
+use operator::{LeaseRefusal, Operator, TeleoperationView, Verdict};
 use stop::{ClearRefusal, StopState};
 
 /// Longest wait until the loop has set its target to zero.
@@ -253,13 +253,25 @@ impl Safety {
         Ok(())
     }
 
-    /// Acquires, takes or releases the lease of teleoperation.
+    /// Gives the lease of teleoperation, and says its epoch.
     ///
     /// # Errors
     /// [`LeaseRefusal`].
-    pub(crate) fn lease(&self, command: &LeaseCommand) -> Result<LeaseAnswer, LeaseRefusal> {
+    pub(crate) fn acquire_lease(&self, command: &AcquireLease) -> Result<u64, LeaseRefusal> {
+        self.operate(|operator, now_us| operator.acquire(command, now_us))
+    }
+
+    /// Takes the lease of teleoperation back.
+    ///
+    /// # Errors
+    /// Who has it, if it is somebody else.
+    pub(crate) fn release_lease(&self, command: &ReleaseLease) -> Result<(), Driver> {
+        self.operate(|operator, now_us| operator.release(command, now_us))
+    }
+
+    fn operate<T, E>(&self, act: impl FnOnce(&mut Operator, u64) -> Result<T, E>) -> Result<T, E> {
         let mut operator = lock(&self.operator);
-        let answer = operator.lease(command, self.now_us());
+        let answer = act(&mut operator, self.now_us());
         self.cell
             .publish(|view| view.teleoperation = operator.view());
         if answer.is_ok() {

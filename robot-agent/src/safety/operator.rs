@@ -17,7 +17,7 @@ use tread_api::ids::BootId;
 use tread_api::safety::{
     BY_LENGTH_MAX, DriveCounts, DriveStatus, Driver, LEASE_SILENCE_MAX_US, Lease,
 };
-use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
+use tread_api::wire::safety::{AcquireLease, DriveCommand, ReleaseLease};
 use tread_control::gate::teleoperation::{AgeMeter, STEADY_BEFORE_END_S, within_limits};
 use tread_control::geometry::Twist;
 use tread_control::robot::RobotModel;
@@ -25,15 +25,6 @@ use uuid::Uuid;
 
 /// Requests for a lease whose answers are remembered.
 const ANSWERED_MAX: usize = 64;
-
-/// What a request for a lease got.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum LeaseAnswer {
-    /// The lease of this epoch.
-    Leased(u64),
-    /// The lease is given back.
-    Released,
-}
 
 /// Why a lease is refused.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -52,6 +43,15 @@ pub(crate) enum Verdict {
     OutOfOrder,
     Expired,
     NotFinite,
+}
+
+/// What was granted to a request.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Granted {
+    /// The lease of this epoch.
+    Lease(u64),
+    /// The lease was given back.
+    Release,
 }
 
 #[derive(Debug, Clone)]
@@ -102,7 +102,7 @@ pub(crate) struct Operator {
     wanted: Option<(Twist, u64)>,
     meter: AgeMeter,
     counts: DriveCounts,
-    answered: VecDeque<(Uuid, LeaseAnswer)>,
+    answered: VecDeque<(Uuid, Granted)>,
 }
 
 impl Operator {
@@ -134,7 +134,7 @@ impl Operator {
         self.wanted = None;
     }
 
-    fn grant(&mut self, driver: &Driver, now_us: u64) -> LeaseAnswer {
+    fn grant(&mut self, driver: &Driver, now_us: u64) -> u64 {
         self.free();
         self.epoch += 1;
         let driver = Driver {
@@ -150,52 +150,73 @@ impl Operator {
             last_seq: None,
         });
         self.meter = AgeMeter::default();
-        LeaseAnswer::Leased(self.epoch)
+        self.epoch
     }
 
-    /// Acquires, takes or releases the lease.
-    ///
-    /// # Errors
-    /// [`LeaseRefusal`].
-    pub(crate) fn lease(
-        &mut self,
-        command: &LeaseCommand,
-        now_us: u64,
-    ) -> Result<LeaseAnswer, LeaseRefusal> {
-        self.free_if_silent(now_us);
-        let known = self
-            .answered
-            .iter()
-            .find(|(request, _)| *request == command.request);
-        let present = self.active.as_ref().map(|active| &active.lease);
-        if let Some(&(_, answer)) = known {
-            return match answer {
-                LeaseAnswer::Leased(epoch) if present.map(|lease| lease.epoch) != Some(epoch) => {
-                    Err(LeaseRefusal::Over)
-                }
-                LeaseAnswer::Leased(_) | LeaseAnswer::Released => Ok(answer),
-            };
-        }
-        let client = command.holder.client;
-        let other = present.filter(|lease| lease.driver.client != client);
-        let answer = match (command.action, present, other) {
-            (LeaseAction::Acquire | LeaseAction::Release, _, Some(other)) => {
-                return Err(LeaseRefusal::Taken(other.driver.clone()));
-            }
-            (LeaseAction::Acquire, Some(own), None) => LeaseAnswer::Leased(own.epoch),
-            (LeaseAction::Acquire, None, None) | (LeaseAction::Take, _, _) => {
-                self.grant(&command.holder, now_us)
-            }
-            (LeaseAction::Release, _, None) => {
-                self.free();
-                LeaseAnswer::Released
-            }
-        };
+    /// Who has the lease, if it is somebody else.
+    fn other_driver(&self, own: &Driver) -> Option<&Driver> {
+        let driver = self.active.as_ref().map(|active| &active.lease.driver);
+        driver.filter(|driver| driver.client != own.client)
+    }
+
+    fn remember(&mut self, request: Uuid, granted: Granted) {
         if self.answered.len() >= ANSWERED_MAX {
             self.answered.pop_front();
         }
-        self.answered.push_back((command.request, answer));
-        Ok(answer)
+        self.answered.push_back((request, granted));
+    }
+
+    /// Gives the lease, and says its epoch.
+    ///
+    /// # Errors
+    /// [`LeaseRefusal`].
+    pub(crate) fn acquire(
+        &mut self,
+        command: &AcquireLease,
+        now_us: u64,
+    ) -> Result<u64, LeaseRefusal> {
+        self.free_if_silent(now_us);
+        let own = self.active.as_ref().map(|active| active.lease.epoch);
+        let known = self.answered.iter().find_map(|(request, granted)| {
+            let epoch = match granted {
+                Granted::Lease(epoch) => Some(*epoch),
+                Granted::Release => None,
+            };
+            epoch.filter(|_| *request == command.request)
+        });
+        if let Some(epoch) = known {
+            return if own == Some(epoch) {
+                Ok(epoch)
+            } else {
+                Err(LeaseRefusal::Over)
+            };
+        }
+        let epoch = match (own, self.other_driver(&command.holder)) {
+            _ if command.take => self.grant(&command.holder, now_us),
+            (_, Some(other)) => return Err(LeaseRefusal::Taken(other.clone())),
+            (Some(own), None) => own,
+            (None, None) => self.grant(&command.holder, now_us),
+        };
+        self.remember(command.request, Granted::Lease(epoch));
+        Ok(epoch)
+    }
+
+    /// Takes the lease back.
+    ///
+    /// # Errors
+    /// Who has it, if it is somebody else.
+    pub(crate) fn release(&mut self, command: &ReleaseLease, now_us: u64) -> Result<(), Driver> {
+        self.free_if_silent(now_us);
+        let answer = (command.request, Granted::Release);
+        if self.answered.contains(&answer) {
+            return Ok(());
+        }
+        if let Some(other) = self.other_driver(&command.holder) {
+            return Err(other.clone());
+        }
+        self.free();
+        self.remember(command.request, Granted::Release);
+        Ok(())
     }
 
     /// Takes a command, if it counts.
@@ -304,41 +325,47 @@ mod tests {
         }
     }
 
-    fn request(number: u128, action: LeaseAction, who: u128) -> LeaseCommand {
-        LeaseCommand {
+    fn acquire(number: u128, who: u128) -> AcquireLease {
+        AcquireLease {
             request: Uuid::from_u128(number),
-            action,
             holder: driver(who),
+            take: false,
+        }
+    }
+
+    fn take(number: u128, who: u128) -> AcquireLease {
+        AcquireLease {
+            take: true,
+            ..acquire(number, who)
         }
     }
 
     #[test]
     fn a_refusal_names_the_holder_and_a_taken_lease_is_gone_for_good() {
         let mut operator = Operator::new(boot(1), RobotModel::yi2007());
-        let first = operator.lease(&request(1, LeaseAction::Acquire, 0), 0);
-        assert_eq!(first, Ok(LeaseAnswer::Leased(1)));
-        let refused = operator.lease(&request(2, LeaseAction::Acquire, 1), 0);
+        assert_eq!(operator.acquire(&acquire(1, 0), 0), Ok(1));
+        let refused = operator.acquire(&acquire(2, 1), 0);
         assert_eq!(refused, Err(LeaseRefusal::Taken(driver(0))));
-        let taken = operator.lease(&request(3, LeaseAction::Take, 1), 0);
-        assert_eq!(taken, Ok(LeaseAnswer::Leased(2)));
+        assert_eq!(operator.acquire(&take(3, 1), 0), Ok(2));
         // The first one's request comes twice; it must not steal the lease back, nor be told that
         // it has it.
-        let again = operator.lease(&request(1, LeaseAction::Acquire, 0), 0);
+        let again = operator.acquire(&acquire(1, 0), 0);
         assert_eq!(again, Err(LeaseRefusal::Over));
-        let released = operator.lease(&request(4, LeaseAction::Release, 0), 0);
-        assert_eq!(released, Err(LeaseRefusal::Taken(driver(1))));
+        let release = ReleaseLease {
+            request: Uuid::from_u128(4),
+            holder: driver(0),
+        };
+        assert_eq!(operator.release(&release, 0), Err(driver(1)));
         assert_eq!(operator.lease_at(0).unwrap().driver, driver(1));
     }
 
     #[test]
     fn a_lease_whose_driver_is_silent_frees_itself() {
         let mut operator = Operator::new(boot(1), RobotModel::yi2007());
-        operator
-            .lease(&request(1, LeaseAction::Acquire, 0), 0)
-            .unwrap();
+        operator.acquire(&acquire(1, 0), 0).unwrap();
         assert!(operator.lease_at(LEASE_SILENCE_MAX_US - 1).is_some());
         assert!(operator.lease_at(LEASE_SILENCE_MAX_US).is_none());
-        let next = operator.lease(&request(2, LeaseAction::Acquire, 1), LEASE_SILENCE_MAX_US);
-        assert_eq!(next, Ok(LeaseAnswer::Leased(2)));
+        let next = operator.acquire(&acquire(2, 1), LEASE_SILENCE_MAX_US);
+        assert_eq!(next, Ok(2));
     }
 }

@@ -8,9 +8,9 @@ use tread_api::ids::{MissionId, StopId};
 use tread_api::robot::{PauseCause, RobotMode};
 use tread_api::safety::{Driver, Geofence};
 use tread_api::wire;
-use tread_api::wire::command::{OfferRefusal, Outcome};
 use tread_api::wire::ingest::MissionPhase;
-use tread_api::wire::safety::{DriveCommand, ExternalLimit, LeaseAction, LeaseCommand, Stop};
+use tread_api::wire::reply::{CommandRefusal, CommandRefusalCode};
+use tread_api::wire::safety::{AcquireLease, DriveCommand, ExternalLimit, Stop};
 use tread_control::fence::disc_radius_m;
 use tread_control::follower::FailureReason;
 use tread_control::gate::GateCause;
@@ -97,14 +97,14 @@ fn until_standing(bench: &mut Bench) {
     }
 }
 
-fn lease(bench: &Bench, request: u128, action: LeaseAction, who: u128) -> Outcome {
-    bench.lease(&LeaseCommand {
+fn acquire(bench: &Bench, request: u128, who: u128) -> Result<u64, CommandRefusal> {
+    bench.lease(&AcquireLease {
         request: Uuid::from_u128(request),
-        action,
         holder: Driver {
             client: Uuid::from_u128(who),
             name: format!("driver {who}"),
         },
+        take: false,
     })
 }
 
@@ -115,9 +115,7 @@ pub(super) struct Teleoperator {
 
 impl Teleoperator {
     pub(super) fn acquire(bench: &Bench) -> Self {
-        let Outcome::Leased { epoch } = lease(bench, 1, LeaseAction::Acquire, 1) else {
-            panic!("no lease");
-        };
+        let epoch = acquire(bench, 1, 1).unwrap();
         Self { epoch, seq: 0 }
     }
 
@@ -511,11 +509,9 @@ fn a_base_that_is_told_nothing_more_stops_its_wheels() {
 fn a_refusal_of_a_lease_names_who_has_it() {
     let bench = bench_in(Geofence::default());
     let _hand = Teleoperator::acquire(&bench);
-    let Outcome::Refused { code, detail } = lease(&bench, 2, LeaseAction::Acquire, 2) else {
-        panic!("two drivers");
-    };
-    assert_eq!(code, OfferRefusal::Leased);
-    assert!(detail.contains("driver 1"), "{detail}");
+    let refusal = acquire(&bench, 2, 2).unwrap_err();
+    assert_eq!(refusal.code, CommandRefusalCode::Leased);
+    assert!(refusal.detail.contains("driver 1"), "{refusal:?}");
 }
 
 #[test]

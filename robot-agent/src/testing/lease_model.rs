@@ -7,12 +7,12 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tread_api::geometry::Twist;
 use tread_api::ids::BootId;
-use tread_api::safety::{DRIVE_AHEAD_MAX_US, DriveCounts, Driver, LEASE_SILENCE_MAX_US};
-use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
+use tread_api::safety::{DRIVE_AHEAD_MAX_US, DriveCounts, Driver, LEASE_SILENCE_MAX_US, Lease};
+use tread_api::wire::safety::{AcquireLease, DriveCommand, LeaseCommand, ReleaseLease};
 use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
-use crate::safety::operator::{LeaseAnswer, LeaseRefusal, Operator, Verdict};
+use crate::safety::operator::{LeaseRefusal, Operator, Verdict};
 
 /// Drivers that compete.
 const DRIVERS: usize = 4;
@@ -147,16 +147,17 @@ impl World {
     fn act(&mut self) {
         let number = self.random.random_range(0..DRIVERS);
         if self.chance(0.03) {
-            let action = match self.random.random_range(0..4) {
-                0 | 1 => LeaseAction::Acquire,
-                2 => LeaseAction::Take,
-                _ => LeaseAction::Release,
-            };
+            let choice = self.random.random_range(0..4);
             self.requests += 1;
-            let command = LeaseCommand {
-                request: Uuid::from_u128(self.requests),
-                action,
-                holder: driver(number),
+            let request = Uuid::from_u128(self.requests);
+            let holder = driver(number);
+            let command = match choice {
+                0..3 => LeaseCommand::Acquire(AcquireLease {
+                    request,
+                    holder,
+                    take: choice == 2,
+                }),
+                _ => LeaseCommand::Release(ReleaseLease { request, holder }),
             };
             self.post(&Message::Lease(command, number));
             return;
@@ -191,6 +192,55 @@ impl World {
         self.post(&Message::Drive(command, number));
     }
 
+    /// Who was named if the lease was refused for somebody.
+    fn acquire(
+        &mut self,
+        command: &AcquireLease,
+        number: usize,
+        before: Option<&Lease>,
+    ) -> Option<Driver> {
+        let epoch = match self.operator.acquire(command, self.now_us) {
+            Ok(epoch) => epoch,
+            Err(LeaseRefusal::Taken(other)) => return Some(other),
+            Err(LeaseRefusal::Over) => return None,
+        };
+        let newest = self.truth.granted.last().map_or(0, |&(epoch, _)| epoch);
+        self.report.stolen += u64::from(epoch < newest);
+        if epoch > newest {
+            self.report.leases += 1;
+            self.truth.granted.push((epoch, number));
+            self.truth.last_seq = None;
+            self.truth.until_us = 0;
+            self.truth.heard_us = Some(self.now_us);
+            self.report.stolen += u64::from(before.is_some() && !command.take);
+        }
+        let present = self.operator.lease_at(self.now_us);
+        let is_its_own = present.is_some_and(|lease| lease.driver == driver(number));
+        self.report.stolen += u64::from(!is_its_own);
+        // The driver hears of it, as often as not.
+        if self.chance(0.9) {
+            self.sides[number] = Side {
+                epoch: Some(epoch),
+                seq: self.sides[number].seq,
+            };
+        }
+        None
+    }
+
+    /// Who was named if somebody else has the lease.
+    fn release(&mut self, command: &ReleaseLease) -> Option<Driver> {
+        let is_known = self.released.contains(&command.request);
+        match self.operator.release(command, self.now_us) {
+            Ok(()) if is_known => None,
+            Ok(()) => {
+                self.truth.heard_us = None;
+                self.released.push(command.request);
+                None
+            }
+            Err(other) => Some(other),
+        }
+    }
+
     fn arrive(&mut self, message: Message) {
         match message {
             Message::Lease(command, number) => {
@@ -198,37 +248,13 @@ impl World {
                 if before.is_some() != self.truth.is_leased(self.now_us) {
                     self.report.stolen += 1;
                 }
-                let answer = self.operator.lease(&command, self.now_us);
-                let is_known = self.released.contains(&command.request);
-                if answer == Ok(LeaseAnswer::Released) && !is_known {
-                    self.truth.heard_us = None;
-                    self.released.push(command.request);
-                }
-                if let Ok(LeaseAnswer::Leased(epoch)) = answer {
-                    let newest = self.truth.granted.last().map_or(0, |&(epoch, _)| epoch);
-                    self.report.stolen += u64::from(epoch < newest);
-                    if epoch > newest {
-                        self.report.leases += 1;
-                        self.truth.granted.push((epoch, number));
-                        self.truth.last_seq = None;
-                        self.truth.until_us = 0;
-                        self.truth.heard_us = Some(self.now_us);
-                        let is_free = before.is_none();
-                        let is_take = command.action == LeaseAction::Take;
-                        self.report.stolen += u64::from(!is_free && !is_take);
+                let other = match command {
+                    LeaseCommand::Acquire(acquire) => {
+                        self.acquire(&acquire, number, before.as_ref())
                     }
-                    let present = self.operator.lease_at(self.now_us);
-                    let is_its_own = present.is_some_and(|lease| lease.driver == driver(number));
-                    self.report.stolen += u64::from(!is_its_own);
-                    // The driver hears of it, as often as not.
-                    if self.chance(0.9) {
-                        self.sides[number] = Side {
-                            epoch: Some(epoch),
-                            seq: self.sides[number].seq,
-                        };
-                    }
-                }
-                if let Err(LeaseRefusal::Taken(other)) = answer {
+                    LeaseCommand::Release(release) => self.release(&release),
+                };
+                if let Some(other) = other {
                     let is_named = before.is_some_and(|lease| lease.driver == other);
                     self.report.stolen += u64::from(!is_named);
                 }

@@ -18,10 +18,11 @@ use tread_api::safety::Geofence;
 use tread_api::site::Grid;
 use tread_api::terrain::{TerrainRef, TerrainShape};
 use tread_api::trajectory::Trajectory;
-use tread_api::wire::command::{Outcome, PathPrior};
+use tread_api::wire::command::PathPrior;
 use tread_api::wire::hello::SiteDefinition;
 use tread_api::wire::ingest::MissionPhase;
-use tread_api::wire::safety::LeaseCommand;
+use tread_api::wire::reply::CommandRefusal;
+use tread_api::wire::safety::AcquireLease;
 use tread_control::estimation::EstimatorPrior;
 use tread_control::geometry::Pose;
 use tread_control::measured::WheelSpeeds;
@@ -469,9 +470,12 @@ impl<D: SteppedDrive> Bench<D> {
         microseconds(self.now)
     }
 
-    /// Acquires, takes or releases the lease of teleoperation.
-    pub fn lease(&self, command: &LeaseCommand) -> Outcome {
-        answers::lease(&self.safety, command)
+    /// Acquires or takes the lease of teleoperation, and says its epoch.
+    ///
+    /// # Errors
+    /// The robot's refusal.
+    pub fn lease(&self, command: &AcquireLease) -> Result<u64, CommandRefusal> {
+        answers::acquire_lease(&self.safety, command)
     }
 
     /// Hands over a drive command as it comes from the network; true if it counts.

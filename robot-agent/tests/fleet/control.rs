@@ -7,13 +7,13 @@ use std::time::Duration;
 use tread_agent::Agent;
 use tread_agent::clock::SystemClock;
 use tread_api::ids::MissionId;
-use tread_api::keys::Verb;
 use tread_api::mission::LinkPolicy;
 use tread_api::robot::MissionProgress;
-use tread_api::wire;
-use tread_api::wire::command::{Cancel, Offer, OfferRefusal, Outcome, Pause, Resume};
+use tread_api::wire::command::{Cancel, Offer, Pause, Resume};
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
+use tread_api::wire::reply::{Acknowledgement, CommandRefusalCode, OfferReply};
 
+use crate::code;
 use crate::rig::Rig;
 use crate::support::{FakeServer, offer};
 
@@ -36,23 +36,22 @@ fn revised(first: &Offer, asked: &str) -> Offer {
     }
 }
 
-async fn pause(server: &FakeServer, rig: &Rig, mission: MissionId, revision: u32) -> Outcome {
-    let payload = wire::encode(&Pause { mission, revision }).unwrap();
-    let answer = server.command(&rig.robot, Verb::Pause, payload).await;
-    answer.unwrap().unwrap().outcome
+async fn pause(
+    server: &FakeServer,
+    rig: &Rig,
+    mission: MissionId,
+    revision: u32,
+) -> Acknowledgement {
+    server.send(&rig.robot, &Pause { mission, revision }).await
 }
 
-async fn resume(server: &FakeServer, rig: &Rig, mission: MissionId, revision: u32) -> Outcome {
-    let payload = wire::encode(&Resume { mission, revision }).unwrap();
-    let answer = server.command(&rig.robot, Verb::Resume, payload).await;
-    answer.unwrap().unwrap().outcome
-}
-
-fn refusal(outcome: &Outcome) -> Option<OfferRefusal> {
-    match outcome {
-        Outcome::Refused { code, .. } => Some(*code),
-        Outcome::Accepted { .. } | Outcome::Done | Outcome::Leased { .. } => None,
-    }
+async fn resume(
+    server: &FakeServer,
+    rig: &Rig,
+    mission: MissionId,
+    revision: u32,
+) -> Acknowledgement {
+    server.send(&rig.robot, &Resume { mission, revision }).await
 }
 
 async fn drives(rig: &Rig, mission: MissionId, from_m: f64) -> MissionProgress {
@@ -94,8 +93,8 @@ async fn a_mission_that_is_taken_on_hold_stands_at_its_start_until_it_is_resumed
         ..offer(1, LONG)
     };
     let mission = first.mission;
-    let answer = server.offer(&rig.robot, &first).await;
-    assert_eq!(refusal(&answer.outcome), None);
+    let reply = server.offer(&rig.robot, &first).await;
+    assert_eq!(code(reply.into_result()), None);
     rig.sees("it says that it is paused", |memory| {
         let paused = memory.phases(mission).contains(&MissionPhase::Paused);
         paused.then_some(())
@@ -104,7 +103,10 @@ async fn a_mission_that_is_taken_on_hold_stands_at_its_start_until_it_is_resumed
     let stood_m = agent.state().mission.unwrap().driven_m;
     assert!(stood_m < 0.05, "it drove {stood_m} m");
     // The same offer again takes nothing back.
-    assert_eq!(resume(&server, &rig, mission, 1).await, Outcome::Done);
+    assert_eq!(
+        resume(&server, &rig, mission, 1).await,
+        Acknowledgement::Done
+    );
     server.offer(&rig.robot, &first).await;
     drives(&rig, mission, 0.3).await;
     agent.stop().await;
@@ -120,13 +122,16 @@ async fn a_mission_is_paused_resumed_and_replaced_and_tells_how_it_went() {
     let first = offer(1, LONG);
     let mission = first.mission;
     assert_eq!(
-        refusal(&pause(&server, &rig, mission, 1).await),
-        Some(OfferRefusal::Unknown)
+        code(pause(&server, &rig, mission, 1).await.into_result()),
+        Some(CommandRefusalCode::Unknown)
     );
     server.offer(&rig.robot, &first).await;
     drives(&rig, mission, 0.5).await;
 
-    assert_eq!(pause(&server, &rig, mission, 1).await, Outcome::Done);
+    assert_eq!(
+        pause(&server, &rig, mission, 1).await,
+        Acknowledgement::Done
+    );
     rig.sees("it stands paused", |memory| {
         memory
             .phases(mission)
@@ -137,15 +142,21 @@ async fn a_mission_is_paused_resumed_and_replaced_and_tells_how_it_went() {
     let stood_m = agent.state().mission.unwrap().driven_m;
     assert!(agent.state().mission.unwrap().paused);
     assert_eq!(
-        refusal(&pause(&server, &rig, mission, 2).await),
-        Some(OfferRefusal::Conflict)
+        code(pause(&server, &rig, mission, 2).await.into_result()),
+        Some(CommandRefusalCode::Conflict)
     );
-    assert_eq!(resume(&server, &rig, mission, 1).await, Outcome::Done);
+    assert_eq!(
+        resume(&server, &rig, mission, 1).await,
+        Acknowledgement::Done
+    );
     drives(&rig, mission, stood_m + 0.3).await;
 
     // A revision that cannot be driven is refused, and the active one goes on.
     let impossible = server.offer(&rig.robot, &revised(&first, TOO_TIGHT)).await;
-    assert_eq!(refusal(&impossible.outcome), Some(OfferRefusal::Impossible));
+    assert_eq!(
+        code(impossible.into_result()),
+        Some(CommandRefusalCode::Impossible)
+    );
     let before_m = agent.state().mission.unwrap().driven_m;
     let progress = drives(&rig, mission, before_m + 0.3).await;
     assert_eq!((progress.revision, progress.paused), (1, false));
@@ -153,15 +164,15 @@ async fn a_mission_is_paused_resumed_and_replaced_and_tells_how_it_went() {
     let second = revised(&first, OTHER);
     let accepted = server.offer(&rig.robot, &second).await;
     assert!(
-        matches!(accepted.outcome, Outcome::Accepted { .. }),
+        matches!(accepted, OfferReply::Accepted { .. }),
         "{accepted:?}"
     );
-    assert_eq!(
-        server.offer(&rig.robot, &second).await.outcome,
-        accepted.outcome
-    );
+    assert_eq!(server.offer(&rig.robot, &second).await, accepted);
     let stale = server.offer(&rig.robot, &first).await;
-    assert_eq!(refusal(&stale.outcome), Some(OfferRefusal::Conflict));
+    assert_eq!(
+        code(stale.into_result()),
+        Some(CommandRefusalCode::Conflict)
+    );
 
     let end = end_report(&rig, mission).await;
     assert_eq!((end.phase, end.revision), (MissionPhase::Succeeded, 2));
@@ -183,8 +194,8 @@ async fn a_mission_is_paused_resumed_and_replaced_and_tells_how_it_went() {
     let driven = end.driven.unwrap();
     assert!(driven.points.len() > 5, "{driven:?}");
     assert_eq!(
-        refusal(&resume(&server, &rig, mission, 2).await),
-        Some(OfferRefusal::Ended)
+        code(resume(&server, &rig, mission, 2).await.into_result()),
+        Some(CommandRefusalCode::Ended)
     );
     agent.stop().await;
     server.stop().await;
@@ -204,12 +215,11 @@ async fn a_cancellation_overtakes_a_replacement() {
         mission: first.mission,
         reason: "test".to_owned(),
     };
-    let payload = wire::encode(&cancel).unwrap();
     let (_, cancelled) = tokio::join!(
         server.offer(&rig.robot, &second),
-        server.command(&rig.robot, Verb::Cancel, payload)
+        server.send(&rig.robot, &cancel)
     );
-    assert_eq!(cancelled.unwrap().unwrap().outcome, Outcome::Done);
+    assert_eq!(cancelled, Acknowledgement::Done);
     let end = end_report(&rig, first.mission).await;
     assert_eq!(end.phase, MissionPhase::Cancelled);
     assert_eq!(agent.state().mission, None);
@@ -233,7 +243,10 @@ async fn a_mission_that_minds_silence_ends_without_the_server_and_another_goes_o
         ..offer(9, LONG)
     };
     let refused = server.offer(&rig.robot, &impossible).await;
-    assert_eq!(refusal(&refused.outcome), Some(OfferRefusal::Impossible));
+    assert_eq!(
+        code(refused.into_result()),
+        Some(CommandRefusalCode::Impossible)
+    );
     server.offer(&rig.robot, &minds).await;
     drives(&rig, minds.mission, 1.5).await;
     pulse.abort();
@@ -305,17 +318,17 @@ async fn an_excitation_and_a_slower_approach_are_planned_as_asked() {
         (3, r#","options":{"approach_speed_m_s":0.1}"#.to_owned()),
     ] {
         let offer = offer(number, &asked(&options));
-        let Outcome::Accepted { plan: Some(plan) } = server.offer(&rig.robot, &offer).await.outcome
+        let OfferReply::Accepted { plan: Some(plan) } = server.offer(&rig.robot, &offer).await
         else {
             panic!("offer {number} was not taken");
         };
         durations_s.push(plan.duration_s);
-        let cancel = wire::encode(&Cancel {
+        let cancel = Cancel {
             mission: offer.mission,
             reason: "the next one".to_owned(),
-        });
-        let answer = server.command(&rig.robot, Verb::Cancel, cancel.unwrap());
-        assert_eq!(answer.await.unwrap().unwrap().outcome, Outcome::Done);
+        };
+        let reply = server.send(&rig.robot, &cancel).await;
+        assert_eq!(reply, Acknowledgement::Done);
         rig.sees("it is cancelled", |memory| {
             let phases = memory.phases(offer.mission);
             phases.contains(&MissionPhase::Cancelled).then_some(())

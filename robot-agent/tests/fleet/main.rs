@@ -20,8 +20,9 @@ use rig::Rig;
 use support::{eventually, offer};
 use tread_api::keys::Verb;
 use tread_api::wire::RefusalCode;
-use tread_api::wire::command::{Answer, Cancel, OfferRefusal, Outcome};
+use tread_api::wire::command::Cancel;
 use tread_api::wire::ingest::MissionPhase;
+use tread_api::wire::reply::{Acknowledgement, CommandRefusal, CommandRefusalCode, OfferReply};
 use tread_api::wire::{self};
 
 const SHORT: &str = r#"{"waypoints":{"speed_m_s":0.8,
@@ -29,11 +30,9 @@ const SHORT: &str = r#"{"waypoints":{"speed_m_s":0.8,
 const LONG: &str =
     r#"{"circle":{"center":{"x_m":7,"y_m":6},"radius_m":3,"speed_m_s":0.6,"turns":5}}"#;
 
-fn refusal(answer: &Answer) -> Option<OfferRefusal> {
-    match &answer.outcome {
-        Outcome::Refused { code, .. } => Some(*code),
-        Outcome::Accepted { .. } | Outcome::Done | Outcome::Leased { .. } => None,
-    }
+/// The code of a refusal, if it is one.
+fn code<T>(decided: Result<T, CommandRefusal>) -> Option<CommandRefusalCode> {
+    decided.err().map(|refusal| refusal.code)
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -70,22 +69,22 @@ async fn a_mission_is_driven_reported_and_answered_the_same_twice() {
 
     let first = offer(1, SHORT);
     let asked_at = agent.state().robot_time;
-    let answer = server.offer(&rig.robot, &first).await;
-    let Outcome::Accepted { plan: Some(plan) } = answer.outcome else {
-        panic!("{answer:?}");
+    let reply = server.offer(&rig.robot, &first).await;
+    let OfferReply::Accepted { plan: Some(plan) } = reply else {
+        panic!("{reply:?}");
     };
     assert!(plan.length_m > 3.0 && plan.duration_s > 3.0, "{plan:?}");
-    assert_eq!(
-        server.offer(&rig.robot, &first).await.outcome,
-        answer.outcome
-    );
+    assert_eq!(server.offer(&rig.robot, &first).await, reply);
     let mut other_content = first.clone();
     other_content.trajectory = offer(1, LONG).trajectory;
     other_content.plan_hash = offer(1, LONG).plan_hash;
     let conflict = server.offer(&rig.robot, &other_content).await;
-    assert_eq!(refusal(&conflict), Some(OfferRefusal::Conflict));
+    assert_eq!(
+        code(conflict.into_result()),
+        Some(CommandRefusalCode::Conflict)
+    );
     let busy = server.offer(&rig.robot, &offer(2, SHORT)).await;
-    assert_eq!(refusal(&busy), Some(OfferRefusal::Busy));
+    assert_eq!(code(busy.into_result()), Some(CommandRefusalCode::Busy));
 
     rig.sees("the mission ends", |memory| {
         let phases = memory.phases(first.mission);
@@ -114,7 +113,7 @@ async fn a_mission_is_driven_reported_and_answered_the_same_twice() {
         "{latency_ms} ms from the offer to the first wheel command"
     );
     let late = server.offer(&rig.robot, &first).await;
-    assert_eq!(refusal(&late), Some(OfferRefusal::Ended));
+    assert_eq!(code(late.into_result()), Some(CommandRefusalCode::Ended));
     agent.stop().await;
     server.stop().await;
 }
@@ -133,7 +132,7 @@ async fn what_cannot_be_understood_or_driven_is_refused_with_a_reason() {
     for (payload, code) in cases {
         for verb in Verb::ALL {
             let refused = server
-                .command(&rig.robot, verb, payload.to_vec())
+                .ask(&rig.robot, verb, payload.to_vec())
                 .await
                 .unwrap();
             assert_eq!(refused.unwrap_err().code, code, "{verb:?}");
@@ -144,34 +143,23 @@ async fn what_cannot_be_understood_or_driven_is_refused_with_a_reason() {
     assert_eq!(counted, sent, "every payload to every verb");
     let too_fast = offer(3, &SHORT.replace("0.8", "20.0"));
     let refused = server.offer(&rig.robot, &too_fast).await;
-    assert_eq!(
-        refusal(&refused),
-        Some(OfferRefusal::Impossible),
-        "{refused:?}"
-    );
+    let refused = code(refused.into_result());
+    assert_eq!(refused, Some(CommandRefusalCode::Impossible));
     let mut too_late = offer(4, SHORT);
     too_late.start_within_ms = Some(0);
     let refused = server.offer(&rig.robot, &too_late).await;
-    assert_eq!(
-        refusal(&refused),
-        Some(OfferRefusal::TooLate),
-        "{refused:?}"
-    );
+    let refused = code(refused.into_result());
+    assert_eq!(refused, Some(CommandRefusalCode::TooLate));
     let cancel = Cancel {
         mission: offer(5, SHORT).mission,
         reason: "test".to_owned(),
     };
-    let payload = wire::encode(&cancel).unwrap();
-    let unknown = server
-        .command(&rig.robot, Verb::Cancel, payload)
-        .await
-        .unwrap()
-        .unwrap();
-    assert_eq!(refusal(&unknown), Some(OfferRefusal::Unknown));
+    let unknown = server.send(&rig.robot, &cancel).await.into_result();
+    assert_eq!(code(unknown), Some(CommandRefusalCode::Unknown));
     let after_all = server.offer(&rig.robot, &offer(5, SHORT)).await;
     assert_eq!(
-        refusal(&after_all),
-        Some(OfferRefusal::Ended),
+        code(after_all.into_result()),
+        Some(CommandRefusalCode::Ended),
         "cancelled before it came"
     );
     assert!(rig.memory.lock().unwrap().records.is_empty());
@@ -187,13 +175,9 @@ async fn a_new_definition_of_the_site_reaches_the_loop() {
     rig.ready(agent.boot()).await;
     let mut definition = support::site_of(&rig.scenario);
     definition.terrain_revision = 6;
-    let payload = wire::encode(&definition).unwrap();
     for _ in 0..2 {
-        let done = server
-            .command(&rig.robot, Verb::Site, payload.clone())
-            .await
-            .unwrap();
-        assert_eq!(done.unwrap().outcome, Outcome::Done);
+        let done = server.send(&rig.robot, &definition).await;
+        assert_eq!(done, Acknowledgement::Done);
     }
     rig.sees("the robot reports the new revision", |memory| {
         (memory.states.last()?.terrain_revision == Some(6)).then_some(())
@@ -229,25 +213,17 @@ async fn a_cancelled_mission_ends_cancelled() {
         mission: long.mission,
         reason: "test".to_owned(),
     };
-    let payload = wire::encode(&cancel).unwrap();
     for _ in 0..2 {
-        let done = server
-            .command(&rig.robot, Verb::Cancel, payload.clone())
-            .await
-            .unwrap();
-        assert_eq!(done.unwrap().outcome, Outcome::Done);
+        let done = server.send(&rig.robot, &cancel).await;
+        assert_eq!(done, Acknowledgement::Done);
     }
     rig.sees("the mission ends", |memory| {
         let phases = memory.phases(long.mission);
         (phases == [MissionPhase::Started, MissionPhase::Cancelled]).then_some(())
     })
     .await;
-    let again = server
-        .command(&rig.robot, Verb::Cancel, payload)
-        .await
-        .unwrap()
-        .unwrap();
-    assert_eq!(again.outcome, Outcome::Done);
+    let again = server.send(&rig.robot, &cancel).await;
+    assert_eq!(again, Acknowledgement::Done);
     agent.stop().await;
     server.stop().await;
 }
@@ -366,7 +342,7 @@ async fn the_robot_drives_on_without_the_server_and_brings_everything_when_it_is
     rig.assert_every_record_came_once_per_name();
     // Commands find the robot again, too.
     let late = server.offer(&rig.robot, &short).await;
-    assert_eq!(refusal(&late), Some(OfferRefusal::Ended));
+    assert_eq!(code(late.into_result()), Some(CommandRefusalCode::Ended));
     agent.stop().await;
     server.stop().await;
 }
@@ -437,7 +413,7 @@ async fn a_killed_agent_loses_nothing_and_resumes_nothing_and_sigterm_ends_it_we
     .await;
     rig.assert_every_record_came_once_per_name();
     let again = server.offer(&rig.robot, &long).await;
-    assert_eq!(refusal(&again), Some(OfferRefusal::Ended));
+    assert_eq!(code(again.into_result()), Some(CommandRefusalCode::Ended));
 
     let second = offer(2, LONG);
     server.offer(&rig.robot, &second).await;

@@ -5,18 +5,19 @@ use std::time::Duration;
 use jiff::Timestamp;
 use tread_api::geometry::{Point, Polygon, Twist};
 use tread_api::ids::{BootId, StopId};
-use tread_api::keys::{self, Verb};
+use tread_api::keys;
 use tread_api::robot::{PauseCause, RobotMode};
 use tread_api::safety::{Driver, FENCE_POLYGONS_MAX, GateCause, Geofence};
 use tread_api::wire;
-use tread_api::wire::command::{OfferRefusal, Outcome};
 use tread_api::wire::ingest::MissionPhase;
+use tread_api::wire::reply::{Acknowledgement, CommandRefusal, CommandRefusalCode};
 use tread_api::wire::safety::{
-    ClearStop, DriveCommand, ExternalLimit, LeaseAction, LeaseCommand, Stop,
+    AcquireLease, ClearStop, DriveCommand, ExternalLimit, ReleaseLease, Stop,
 };
 use tread_api::wire::state::RobotState;
 use uuid::Uuid;
 
+use crate::code;
 use crate::rig::Rig;
 use crate::support::{FakeServer, offer, site_of};
 
@@ -27,57 +28,49 @@ fn stop_id(number: u128) -> StopId {
     StopId::from_uuid(Uuid::from_u128(number))
 }
 
-async fn send<T: serde::Serialize>(
-    server: &FakeServer,
-    rig: &Rig,
-    verb: Verb,
-    body: &T,
-) -> Outcome {
-    let payload = wire::encode(body).unwrap();
-    let answer = server.command(&rig.robot, verb, payload).await;
-    answer.expect("no answer").expect("refused").outcome
-}
-
-async fn stop(server: &FakeServer, rig: &Rig, number: u128) -> Outcome {
+async fn stop(server: &FakeServer, rig: &Rig, number: u128) -> Acknowledgement {
     let stop = Stop {
         stop: stop_id(number),
         by: "an operator".to_owned(),
         reason: "a person on the way".to_owned(),
         at: Timestamp::UNIX_EPOCH,
     };
-    send(server, rig, Verb::Stop, &stop).await
+    server.send(&rig.robot, &stop).await
 }
 
-async fn clear(server: &FakeServer, rig: &Rig, number: u128) -> Outcome {
+async fn clear(server: &FakeServer, rig: &Rig, number: u128) -> Acknowledgement {
     let clear = ClearStop {
         stop: stop_id(number),
         by: "an operator".to_owned(),
     };
-    send(server, rig, Verb::Clear, &clear).await
+    server.send(&rig.robot, &clear).await
 }
 
-async fn lease(
+fn driver(number: u128) -> Driver {
+    Driver {
+        client: Uuid::from_u128(number),
+        name: format!("driver {number}"),
+    }
+}
+
+async fn acquire(
     server: &FakeServer,
     rig: &Rig,
     request: u128,
-    action: LeaseAction,
     who: u128,
-) -> Outcome {
-    let command = LeaseCommand {
+) -> Result<u64, CommandRefusal> {
+    let command = AcquireLease {
         request: Uuid::from_u128(request),
-        action,
-        holder: Driver {
-            client: Uuid::from_u128(who),
-            name: format!("driver {who}"),
-        },
+        holder: driver(who),
+        take: false,
     };
-    send(server, rig, Verb::Lease, &command).await
+    server.send(&rig.robot, &command).await.into_result()
 }
 
-fn code(outcome: &Outcome) -> Option<OfferRefusal> {
-    match outcome {
-        Outcome::Refused { code, .. } => Some(*code),
-        Outcome::Accepted { .. } | Outcome::Done | Outcome::Leased { .. } => None,
+fn release(request: u128, who: u128) -> ReleaseLease {
+    ReleaseLease {
+        request: Uuid::from_u128(request),
+        holder: driver(who),
     }
 }
 
@@ -106,12 +99,16 @@ async fn a_stop_is_confirmed_survives_a_restart_and_is_cleared_only_by_its_newes
         state.mission.is_some_and(|mission| mission.driven_m > 0.3)
     })
     .await;
-    assert_eq!(stop(&server, &rig, 1).await, Outcome::Done);
+    assert_eq!(stop(&server, &rig, 1).await, Acknowledgement::Done);
     assert_eq!(agent.state().mode, RobotMode::Stopped);
-    assert_eq!(stop(&server, &rig, 1).await, Outcome::Done, "doubled");
+    assert_eq!(
+        stop(&server, &rig, 1).await,
+        Acknowledgement::Done,
+        "doubled"
+    );
     let moving = clear(&server, &rig, 1).await;
-    assert_eq!(code(&moving), Some(OfferRefusal::Moving));
-    assert_eq!(stop(&server, &rig, 2).await, Outcome::Done);
+    assert_eq!(code(moving.into_result()), Some(CommandRefusalCode::Moving));
+    assert_eq!(stop(&server, &rig, 2).await, Acknowledgement::Done);
     let stopped = state_of(&rig, agent.boot(), "the mission is paused", |state| {
         state.mission.is_some_and(|mission| mission.paused)
             && state
@@ -123,26 +120,36 @@ async fn a_stop_is_confirmed_survives_a_restart_and_is_cleared_only_by_its_newes
     assert_eq!(stopped.safety.stop.as_ref().unwrap().id, stop_id(2));
     assert!(stopped.monotonic_us.is_some());
     let older = clear(&server, &rig, 1).await;
-    assert_eq!(code(&older), Some(OfferRefusal::Conflict), "{older:?}");
+    assert_eq!(
+        code(older.into_result()),
+        Some(CommandRefusalCode::Conflict)
+    );
     rig.sees("the pause is reported", |memory| {
         let phases = memory.phases(offered.mission);
         phases.contains(&MissionPhase::Paused).then_some(())
     })
     .await;
     let other = server.offer(&rig.robot, &offer(2, LONG)).await;
-    assert_eq!(code(&other.outcome), Some(OfferRefusal::Busy));
+    assert_eq!(code(other.into_result()), Some(CommandRefusalCode::Busy));
     agent.stop().await;
 
     let agent = rig.agent();
     assert_eq!(agent.state().safety.stop.unwrap().id, stop_id(2));
     rig.ready(agent.boot()).await;
     let refused = server.offer(&rig.robot, &offer(3, LONG)).await;
-    assert_eq!(code(&refused.outcome), Some(OfferRefusal::NotReady));
-    assert_eq!(clear(&server, &rig, 2).await, Outcome::Done);
-    assert_eq!(clear(&server, &rig, 2).await, Outcome::Done, "doubled");
+    assert_eq!(
+        code(refused.into_result()),
+        Some(CommandRefusalCode::NotReady)
+    );
+    assert_eq!(clear(&server, &rig, 2).await, Acknowledgement::Done);
+    assert_eq!(
+        clear(&server, &rig, 2).await,
+        Acknowledgement::Done,
+        "doubled"
+    );
     for number in [1, 2] {
         let late = stop(&server, &rig, number).await;
-        assert_eq!(code(&late), Some(OfferRefusal::Ended), "{late:?}");
+        assert_eq!(code(late.into_result()), Some(CommandRefusalCode::Ended));
     }
     assert_eq!(
         agent.state().safety.stop,
@@ -150,7 +157,10 @@ async fn a_stop_is_confirmed_survives_a_restart_and_is_cleared_only_by_its_newes
         "a late double stops nobody"
     );
     let unknown = clear(&server, &rig, 9).await;
-    assert_eq!(code(&unknown), Some(OfferRefusal::Unknown));
+    assert_eq!(
+        code(unknown.into_result()),
+        Some(CommandRefusalCode::Unknown)
+    );
     agent.stop().await;
     server.stop().await;
 }
@@ -185,12 +195,9 @@ async fn the_robot_is_teleoperated_by_one_driver_and_stops_with_its_silence() {
     let server = rig.serve();
     let agent = rig.agent();
     rig.ready(agent.boot()).await;
-    let first = lease(&server, &rig, 1, LeaseAction::Acquire, 1).await;
-    let Outcome::Leased { epoch } = first else {
-        panic!("{first:?}");
-    };
-    let refused = lease(&server, &rig, 2, LeaseAction::Acquire, 2).await;
-    assert_eq!(code(&refused), Some(OfferRefusal::Leased));
+    let epoch = acquire(&server, &rig, 1, 1).await.unwrap();
+    let refused = acquire(&server, &rig, 2, 2).await;
+    assert_eq!(code(refused), Some(CommandRefusalCode::Leased));
     let site = "yard".parse().unwrap();
     let key = keys::teleop(&site, &rig.robot);
     let mut fastest_m_s: f64 = 0.0;
@@ -228,8 +235,8 @@ async fn the_robot_is_teleoperated_by_one_driver_and_stops_with_its_silence() {
         stands && state.safety.drive.unwrap().counts.malformed == 1
     })
     .await;
-    let released = lease(&server, &rig, 3, LeaseAction::Release, 1).await;
-    assert_eq!(released, Outcome::Done);
+    let released = server.send(&rig.robot, &release(3, 1)).await;
+    assert_eq!(released, Acknowledgement::Done);
     assert_eq!(agent.state().safety.lease, None);
     agent.stop().await;
     server.stop().await;
@@ -271,7 +278,7 @@ async fn a_program_outside_holds_the_robot_and_a_required_one_by_its_silence() {
     assert!(agent.state().twist.unwrap().value.linear_m_s < 0.4);
     let mut hold = limit(2, 60_000_000);
     hold.hold = true;
-    assert_eq!(send(&server, &rig, Verb::Limit, &hold).await, Outcome::Done);
+    assert_eq!(server.send(&rig.robot, &hold).await, Acknowledgement::Done);
     state_of(&rig, agent.boot(), "it stands", |state| {
         state
             .twist
@@ -280,8 +287,11 @@ async fn a_program_outside_holds_the_robot_and_a_required_one_by_its_silence() {
     .await;
     let mut foreign = limit(3, 60_000_000);
     foreign.boot = BootId::from_uuid(Uuid::from_u128(3));
-    let refused = send(&server, &rig, Verb::Limit, &foreign).await;
-    assert_eq!(code(&refused), Some(OfferRefusal::Conflict));
+    let refused = server.send(&rig.robot, &foreign).await;
+    assert_eq!(
+        code(refused.into_result()),
+        Some(CommandRefusalCode::Conflict)
+    );
     assert_eq!(agent.state().safety.limits_refused, 1);
     agent.stop().await;
     server.stop().await;
@@ -301,20 +311,21 @@ async fn a_mission_that_would_leave_the_fence_is_refused_with_the_place() {
         keep_in: vec![Polygon::new(corners.to_vec()).unwrap()],
         keep_out: Vec::new(),
     };
-    assert_eq!(send(&server, &rig, Verb::Site, &site).await, Outcome::Done);
+    assert_eq!(server.send(&rig.robot, &site).await, Acknowledgement::Done);
     state_of(&rig, agent.boot(), "it knows the fence", |state| {
         state.safety.fence_revision == Some(3)
     })
     .await;
-    let refused = server.offer(&rig.robot, &offer(1, LONG)).await.outcome;
-    let Outcome::Refused { code, detail } = refused else {
-        panic!("{refused:?}");
-    };
-    assert_eq!(code, OfferRefusal::Impossible);
-    assert!(detail.contains("geofence at (8."), "{detail}");
+    let refused = server.offer(&rig.robot, &offer(1, LONG)).await;
+    let refusal = refused.into_result().unwrap_err();
+    assert_eq!(refusal.code, CommandRefusalCode::Impossible);
+    assert!(refusal.detail.contains("geofence at (8."), "{refusal:?}");
     site.geofence.keep_out = vec![site.geofence.keep_in[0].clone(); 64];
-    let too_large = send(&server, &rig, Verb::Site, &site).await;
-    assert_eq!(self::code(&too_large), Some(OfferRefusal::Impossible));
+    let too_large = server.send(&rig.robot, &site).await;
+    assert_eq!(
+        code(too_large.into_result()),
+        Some(CommandRefusalCode::Impossible)
+    );
     agent.stop().await;
     server.stop().await;
 }
@@ -387,16 +398,12 @@ async fn a_welcome_with_a_geofence_too_large_for_a_tick_leaves_the_robot_standin
     let server = FakeServer::start_with_site(rig.port, &rig.scenario, &rig.memory, site.clone());
     let agent = rig.agent();
     rig.ready(agent.boot()).await;
-    let refused = server.offer(&rig.robot, &offer(1, LONG)).await.outcome;
+    let refused = server.offer(&rig.robot, &offer(1, LONG)).await;
     assert_eq!(
-        code(&refused),
-        Some(OfferRefusal::Impossible),
-        "{refused:?}"
+        code(refused.into_result()),
+        Some(CommandRefusalCode::Impossible)
     );
-    let leased = lease(&server, &rig, 1, LeaseAction::Acquire, 1).await;
-    let Outcome::Leased { epoch } = leased else {
-        panic!("{leased:?}");
-    };
+    let epoch = acquire(&server, &rig, 1, 1).await.unwrap();
     let key = keys::teleop(&"yard".parse().unwrap(), &rig.robot);
     for seq in 1..=20 {
         let now_us = agent.state().monotonic_us.unwrap();
@@ -420,7 +427,7 @@ async fn a_welcome_with_a_geofence_too_large_for_a_tick_leaves_the_robot_standin
     // One that it can keep is taken at once.
     site.geofence.keep_in.truncate(1);
     site.geofence.revision = 4;
-    assert_eq!(send(&server, &rig, Verb::Site, &site).await, Outcome::Done);
+    assert_eq!(server.send(&rig.robot, &site).await, Acknowledgement::Done);
     state_of(&rig, agent.boot(), "it knows the fence", |state| {
         state.safety.fence_revision == Some(4)
     })
@@ -443,22 +450,22 @@ async fn a_stop_a_clear_and_a_lease_are_published_at_once() {
     .await;
     let within = Duration::from_secs(5);
     let began = tokio::time::Instant::now();
-    assert_eq!(stop(&server, &rig, 1).await, Outcome::Done);
+    assert_eq!(stop(&server, &rig, 1).await, Acknowledgement::Done);
     state_of(&rig, agent.boot(), "the stop is shown", |state| {
         state.safety.stop.is_some() && state.mode == RobotMode::Stopped
     })
     .await;
-    assert_eq!(clear(&server, &rig, 1).await, Outcome::Done);
+    assert_eq!(clear(&server, &rig, 1).await, Acknowledgement::Done);
     state_of(&rig, agent.boot(), "the clear is shown", |state| {
         state.safety.stop.is_none() && state.mode == RobotMode::Idle
     })
     .await;
-    lease(&server, &rig, 1, LeaseAction::Acquire, 1).await;
+    acquire(&server, &rig, 1, 1).await.unwrap();
     state_of(&rig, agent.boot(), "the lease is shown", |state| {
         state.safety.lease.is_some() && state.mode == RobotMode::Teleoperated
     })
     .await;
-    lease(&server, &rig, 2, LeaseAction::Release, 1).await;
+    server.send(&rig.robot, &release(2, 1)).await;
     state_of(&rig, agent.boot(), "its end is shown", |state| {
         state.safety.lease.is_none() && state.mode == RobotMode::Idle
     })

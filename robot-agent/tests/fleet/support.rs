@@ -14,9 +14,10 @@ use tread_api::safety::Geofence;
 use tread_api::site::Grid;
 use tread_api::terrain::{TerrainRef, TerrainShape};
 use tread_api::trajectory::Trajectory;
-use tread_api::wire::command::{Answer, Offer};
+use tread_api::wire::command::Offer;
 use tread_api::wire::hello::{Hello, SiteDefinition, Welcome};
 use tread_api::wire::ingest::{Batch, MissionPhase, Receipt, Record, RecordContent};
+use tread_api::wire::reply::{Answer, Command, OfferReply};
 use tread_api::wire::state::{FrictionReport, PULSE_PERIOD_MS, RobotState, ServerPulse};
 use tread_api::wire::{self, Refusal, RefusalCode};
 use uuid::Uuid;
@@ -246,13 +247,14 @@ impl FakeServer {
             .unwrap();
     }
 
-    /// Sends a command as it stands; `None` when nobody answers.
-    pub(crate) async fn command(
+    /// Sends the payload of a command as it stands, and gives that of the reply; `None` when
+    /// nobody answers.
+    pub(crate) async fn ask(
         &self,
         robot: &RobotId,
         verb: Verb,
         payload: Vec<u8>,
-    ) -> Option<Result<Answer, Refusal>> {
+    ) -> Option<Result<Vec<u8>, Refusal>> {
         let replies = self
             .session
             .get(keys::command(&self.site, robot, verb))
@@ -263,9 +265,17 @@ impl FakeServer {
             .unwrap();
         let reply = replies.recv_async().await.ok()?;
         Some(match reply.into_result() {
-            Ok(sample) => Ok(wire::decode(&sample.payload().to_bytes()).unwrap()),
+            Ok(sample) => Ok(sample.payload().to_bytes().into_owned()),
             Err(error) => Err(wire::decode(&error.payload().to_bytes()).unwrap()),
         })
+    }
+
+    /// Sends a command, which must be answered.
+    pub(crate) async fn send<C: Command>(&self, robot: &RobotId, command: &C) -> C::Reply {
+        let payload = wire::encode(command).unwrap();
+        let answer = self.ask(robot, C::VERB, payload).await;
+        let answer = answer.expect("no answer").expect("refused");
+        wire::decode::<Answer<C::Reply>>(&answer).unwrap().reply
     }
 
     /// Publishes, as the server or another program would.
@@ -292,12 +302,8 @@ impl FakeServer {
         })
     }
 
-    pub(crate) async fn offer(&self, robot: &RobotId, offer: &Offer) -> Answer {
-        let payload = wire::encode(offer).unwrap();
-        self.command(robot, Verb::Offer, payload)
-            .await
-            .expect("no answer")
-            .expect("refused")
+    pub(crate) async fn offer(&self, robot: &RobotId, offer: &Offer) -> OfferReply {
+        self.send(robot, offer).await
     }
 
     pub(crate) async fn stop(self) {

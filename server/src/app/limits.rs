@@ -6,10 +6,8 @@
 use std::time::Duration;
 
 use tread_api::ids::{OwnerId, RobotId, SiteId};
-use tread_api::keys::Verb;
 use tread_api::page::Page;
 use tread_api::safety::{LIMIT_AHEAD_MAX_US, LimitStatus, SetLimit};
-use tread_api::wire::command::Outcome;
 use tread_api::wire::safety::ExternalLimit;
 
 use super::{App, AppError, site_row};
@@ -93,18 +91,15 @@ impl App {
             field: "linear_max_m_s",
             detail,
         })?;
-        let answer = self.commands().send(&key, Verb::Limit, &command).await;
-        let Some(answer) = answer else {
-            self.counters().commands_unanswered.one();
-            return Err(unreachable());
-        };
-        match answer.outcome {
-            Outcome::Refused { detail, .. } => Err(AppError::RobotRefused {
+        let answer = self.commands().send(&key, &command).await;
+        let answer = answer.map_err(|_undelivered| unreachable())?;
+        answer
+            .reply
+            .into_result()
+            .map_err(|refusal| AppError::RobotRefused {
                 robot: robot.clone(),
-                detail,
-            }),
-            Outcome::Done | Outcome::Accepted { .. } | Outcome::Leased { .. } => Ok(()),
-        }
+                detail: refusal.detail,
+            })
     }
 
     /// Checks that a robot has said hello once.

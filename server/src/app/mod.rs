@@ -77,7 +77,7 @@ struct Inner {
     db: Db,
     clock: Clock,
     friction: FrictionConfig,
-    counters: Counters,
+    counters: Arc<Counters>,
     presences: Arc<Presences>,
     robots: RobotLink,
     commands: Commands,
@@ -144,14 +144,19 @@ impl App {
         } = dependencies;
         let started_at = clock.elapsed();
         let presences = Arc::default();
-        let commands = Commands::new(Arc::clone(&robots.commands), Arc::clone(&presences));
+        let counters = Arc::<Counters>::default();
+        let commands = Commands::new(
+            Arc::clone(&robots.commands),
+            Arc::clone(&presences),
+            Arc::clone(&counters),
+        );
         let hub = Hub::new(clock.now());
         let run_id = clock.new_id::<Uuid>();
         let inner = Inner {
             db,
             clock,
             friction,
-            counters: Counters::default(),
+            counters,
             presences,
             robots,
             commands,

@@ -29,13 +29,12 @@ use jiff::{SignedDuration, Timestamp};
 use tokio::sync::{mpsc, oneshot, watch};
 use tracing::{info, warn};
 use tread_api::ids::{RobotId, SiteId, StopId};
-use tread_api::keys::Verb;
 use tread_api::page::Page;
 use tread_api::rights::Scope;
 use tread_api::robot::{Alert, Severity};
 use tread_api::safety::StopLatch;
 use tread_api::stop::{FleetStop, STOP_CONFIRM_MAX_MS, STOP_TEXT_MAX, Stop};
-use tread_api::wire::command::Outcome;
+use tread_api::wire::reply::Acknowledgement;
 use tread_api::wire::safety::ClearStop;
 
 use self::delivery::{Outgoing, Settling};
@@ -243,16 +242,13 @@ impl App {
         tx.commit().await?;
         let unreachable = || AppError::RobotUnreachable(robot.clone());
         let command = ClearStop { stop: id, by };
-        let answer = self.commands().send(&key, Verb::Clear, &command).await;
-        let Some(answer) = answer else {
-            self.counters().commands_unanswered.one();
-            return Err(unreachable());
-        };
+        let answer = self.commands().send(&key, &command).await;
+        let answer = answer.map_err(|_undelivered| unreachable())?;
         let mut tx = self.db().write("stops").await?;
-        if let Outcome::Refused { detail, .. } = answer.outcome {
+        if let Acknowledgement::Refused(refusal) = answer.reply {
             db::stops::refuse_clear(&mut tx, id).await?;
             tx.commit().await?;
-            let robot = robot.clone();
+            let (robot, detail) = (robot.clone(), refusal.detail);
             return Err(AppError::StopNotCleared { robot, detail });
         }
         self.presences().stop_cleared(&key, id);

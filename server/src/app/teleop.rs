@@ -19,11 +19,10 @@ use tread_api::drive::{
 };
 use tread_api::geometry::Twist;
 use tread_api::ids::{BootId, RobotId, SiteId};
-use tread_api::keys::Verb;
 use tread_api::safety::{BY_LENGTH_MAX, Driver, Lease};
 use tread_api::stop::Stop;
-use tread_api::wire::command::{OfferRefusal, Outcome};
-use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
+use tread_api::wire::reply::{CommandRefusal, CommandRefusalCode};
+use tread_api::wire::safety::{AcquireLease, DriveCommand, ReleaseLease};
 use uuid::Uuid;
 
 use super::identity::Credential;
@@ -75,6 +74,17 @@ fn refused(cause: DriveRefusal, detail: impl Into<String>) -> Refused {
         cause,
         detail: detail.into(),
     }
+}
+
+fn refused_by_robot(refusal: CommandRefusal) -> Refused {
+    let cause = if refusal.code == CommandRefusalCode::Leased {
+        DriveRefusal::Leased
+    } else if refusal.code == CommandRefusalCode::Stopped {
+        DriveRefusal::Stopped
+    } else {
+        DriveRefusal::Refused
+    };
+    refused(cause, refusal.detail)
 }
 
 /// Robots whose missions are being held for a driver, until that is written down: at most one task
@@ -210,46 +220,15 @@ impl Session {
             client: self.client,
             name,
         };
-        let action = if take {
-            LeaseAction::Take
-        } else {
-            LeaseAction::Acquire
-        };
-        let command = LeaseCommand {
+        let command = AcquireLease {
             request: Uuid::new_v4(),
-            action,
             holder: driver.clone(),
+            take,
         };
-        let answer = self.app.commands().send(&self.key, Verb::Lease, &command);
-        let Some(answer) = answer.await else {
-            self.app.counters().commands_unanswered.one();
-            let detail = "the robot does not answer";
-            return Err(refused(DriveRefusal::Unreachable, detail));
-        };
-        let epoch = match answer.outcome {
-            Outcome::Leased { epoch } => epoch,
-            Outcome::Refused { code, detail } => {
-                let cause = match code {
-                    OfferRefusal::Leased => DriveRefusal::Leased,
-                    OfferRefusal::Stopped => DriveRefusal::Stopped,
-                    OfferRefusal::Busy
-                    | OfferRefusal::Conflict
-                    | OfferRefusal::Ended
-                    | OfferRefusal::Impossible
-                    | OfferRefusal::NotReady
-                    | OfferRefusal::TooLate
-                    | OfferRefusal::Unknown
-                    | OfferRefusal::Moving
-                    | OfferRefusal::TooMany
-                    | OfferRefusal::Other => DriveRefusal::Refused,
-                };
-                return Err(refused(cause, detail));
-            }
-            Outcome::Done | Outcome::Accepted { .. } => {
-                let detail = "the robot's answer makes no sense";
-                return Err(refused(DriveRefusal::Refused, detail));
-            }
-        };
+        let answer = self.app.commands().send(&self.key, &command).await;
+        let answer = answer
+            .map_err(|undelivered| refused(DriveRefusal::Unreachable, undelivered.to_string()))?;
+        let epoch = answer.reply.into_result().map_err(refused_by_robot)?;
         let lease = Lease { epoch, driver };
         // The same lease again goes on where it was.
         let is_same =
@@ -377,17 +356,15 @@ impl Session {
         let ending = app.supervisor().stop_token();
         let supervisor = app.supervisor().clone();
         supervisor.spawn_passing("release", async move {
-            let command = LeaseCommand {
+            let command = ReleaseLease {
                 request: Uuid::new_v4(),
-                action: LeaseAction::Release,
                 holder: lease.driver,
             };
             for _ in 0..RELEASE_TRIES {
-                let answer = app.commands().send(&key, Verb::Lease, &command).await;
-                if answer.is_some() || ending.is_cancelled() {
+                let answer = app.commands().send(&key, &command).await;
+                if answer.is_ok() || ending.is_cancelled() {
                     return;
                 }
-                app.counters().commands_unanswered.one();
                 tokio::time::sleep(RELEASE_RETRY).await;
             }
         });

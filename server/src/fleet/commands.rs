@@ -7,7 +7,6 @@ use tokio::sync::oneshot;
 use tracing::{debug, warn};
 use tread_api::ids::BootId;
 use tread_api::keys::{self, Verb};
-use tread_api::wire::command::Answer;
 use tread_api::wire::{self, Refusal};
 use zenoh::Session;
 use zenoh::Wait as _;
@@ -16,7 +15,7 @@ use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 
 use super::routers::Routers;
 use crate::app::presence::RobotKey;
-use crate::app::robot_link::{Answering, CommandTransport};
+use crate::app::robot_link::{Answering, CommandTransport, Undelivered};
 use crate::supervisor::Supervisor;
 
 /// How long a robot may take to answer.
@@ -73,7 +72,7 @@ async fn query(
     supervisor: Supervisor,
     key: String,
     (priority, payload): (Priority, Vec<u8>),
-) -> Option<Answer> {
+) -> Result<Vec<u8>, Undelivered> {
     let (answer, answered) = oneshot::channel();
     let query_key = key.clone();
     // Sending blocks its thread when the robot's link is full.
@@ -102,29 +101,34 @@ async fn query(
         Ok::<(), zenoh::Error>(())
     });
     let exchange = async {
-        sent.await?
-            .inspect_err(|error| warn!("cannot query `{key}`: {error}"))
-            .ok()?;
-        answered.await.ok()
+        let sent = sent.await.ok_or(Undelivered::Unreachable)?;
+        sent.map_err(|error| {
+            warn!("cannot query `{key}`: {error}");
+            Undelivered::Unreachable
+        })?;
+        answered.await.map_err(|_nobody| Undelivered::NoAnswer)
     };
     let reply = tokio::time::timeout(COMMAND_TIMEOUT + MARGIN, exchange)
         .await
-        .ok()??;
-    read_answer(&key, &reply)
+        .map_err(|_elapsed| Undelivered::NoAnswer)??;
+    payload_of(&key, &reply)
 }
 
-fn read_answer(key: &str, reply: &Reply) -> Option<Answer> {
+fn payload_of(key: &str, reply: &Reply) -> Result<Vec<u8>, Undelivered> {
     match reply.result() {
-        Ok(sample) => wire::decode(&sample.payload().to_bytes())
-            .inspect_err(|error| warn!("the answer on `{key}` was refused: {error}"))
-            .ok(),
+        Ok(sample) => Ok(sample.payload().to_bytes().into_owned()),
         Err(error) => {
             // A robot's refusal to read, or the plain text with which zenoh says "timeout".
             match wire::decode::<Refusal>(&error.payload().to_bytes()) {
-                Ok(refusal) => warn!("`{key}` could not be read there: {}", refusal.detail),
-                Err(_not_a_refusal) => debug!("`{key}` was not answered"),
+                Ok(refusal) => {
+                    warn!("`{key}` could not be read there: {}", refusal.detail);
+                    Err(Undelivered::Unreadable)
+                }
+                Err(_not_a_refusal) => {
+                    debug!("`{key}` was not answered");
+                    Err(Undelivered::NoAnswer)
+                }
             }
-            None
         }
     }
 }

@@ -8,8 +8,8 @@ use tread_api::identity::Role;
 use tread_api::keys::Verb;
 use tread_api::mission::{Cause, Mission, MissionDetail, MissionState};
 use tread_api::robot::{LinkCause, LinkState, Robot as ShownRobot};
-use tread_api::wire::command::OfferRefusal;
 use tread_api::wire::ingest::MissionPhase;
+use tread_api::wire::reply::CommandRefusalCode;
 
 use crate::harness::{Yard, circle, client, eventually};
 use crate::robot::{Mood, Robot};
@@ -156,7 +156,7 @@ async fn a_filter_that_names_nothing_known_is_named() {
 async fn what_the_present_state_forbids_is_refused_with_that_state() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;
-    robot.set_mood(Mood::Refusing(OfferRefusal::Busy));
+    robot.set_mood(Mood::Refusing(CommandRefusalCode::Busy));
     let first = yard.create_mission(&robot.id).await;
     let second = yard.create_mission(&robot.id).await;
     let (status, body) = act(&yard, &second, "pause", &json!({})).await;
@@ -228,7 +228,7 @@ async fn a_refused_replacement_leaves_the_old_one() {
     let robot = Robot::join(&yard, "rover-1").await;
     let mission = yard.create_mission(&robot.id).await;
     yard.mission_becomes(mission.id, MissionState::Active).await;
-    robot.set_mood(Mood::Refusing(OfferRefusal::Impossible));
+    robot.set_mood(Mood::Refusing(CommandRefusalCode::Impossible));
     let other = json!({"trajectory": circle(&robot.id)["trajectory"]});
     act(&yard, &mission, "replace", &other).await;
     let refused = eventually("the replacement is gone", async || {

@@ -15,7 +15,7 @@ use tread_api::identity::Role;
 use tread_api::mission::MissionState;
 use tread_api::rights::Right;
 use tread_api::safety::Lease;
-use tread_api::wire::safety::LeaseAction;
+use tread_api::wire::safety::LeaseCommand;
 use tread_server::app::teleop::SESSIONS_PER_IDENTITY_MAX;
 
 use crate::harness::{PATIENCE, Yard, database, eventually};
@@ -131,11 +131,9 @@ fn is_driven_at(robot: &Robot, linear_m_s: f64) -> bool {
 async fn stands(robot: &Robot) {
     driven_at(robot, 0.0).await;
     eventually("the lease is given back", async || {
-        let last = robot.leases().last().map(|lease| lease.action);
-        if last == Some(LeaseAction::Release) {
-            Ok(())
-        } else {
-            Err(last)
+        match robot.leases().pop() {
+            Some(LeaseCommand::Release(_)) => Ok(()),
+            other => Err(other),
         }
     })
     .await;
@@ -205,7 +203,7 @@ async fn a_driver_drives_in_robot_time_and_losing_the_driver_lets_the_robot_stan
         robot
             .leases()
             .iter()
-            .all(|lease| lease.action == LeaseAction::Acquire)
+            .all(|lease| matches!(lease, LeaseCommand::Acquire(acquire) if !acquire.take))
     );
 
     // Without a word: the connection breaks.

@@ -7,8 +7,8 @@ use serde_json::json;
 use tread_api::ids::BootId;
 use tread_api::mission::{Actor, Mission, MissionState};
 use tread_api::page::Page;
-use tread_api::wire::command::OfferRefusal;
 use tread_api::wire::ingest::{MissionPhase, Record};
+use tread_api::wire::reply::CommandRefusalCode;
 use uuid::Uuid;
 
 use crate::harness::{Yard, circle, eventually, report};
@@ -144,7 +144,7 @@ async fn two_missions_of_one_robot_run_one_after_the_other() {
 async fn a_busy_robot_is_asked_again_and_a_silent_one_too() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;
-    robot.set_mood(Mood::Refusing(OfferRefusal::Busy));
+    robot.set_mood(Mood::Refusing(CommandRefusalCode::Busy));
     let mission = yard.create_mission(&robot.id).await;
     let offers = async |count: usize| {
         eventually("further offers", async || {
@@ -166,7 +166,7 @@ async fn a_busy_robot_is_asked_again_and_a_silent_one_too() {
 async fn what_a_robot_cannot_drive_is_rejected_with_its_words() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;
-    robot.set_mood(Mood::Refusing(OfferRefusal::Impossible));
+    robot.set_mood(Mood::Refusing(CommandRefusalCode::Impossible));
     let mission = yard.create_mission(&robot.id).await;
     let rejected = yard
         .mission_becomes(mission.id, MissionState::Rejected)

@@ -12,9 +12,10 @@ use tread_api::keys::{self, Verb};
 use tread_api::mission::Mission;
 use tread_api::robot::{Capabilities, LoopStatus, MissionProgress, OutboxStatus, RobotMode};
 use tread_api::safety::SafetyStatus;
-use tread_api::wire::command::{Cancel, Offer, OfferRefusal};
+use tread_api::wire::command::{Cancel, Offer};
 use tread_api::wire::hello::{Hello, SiteDefinition, Welcome};
 use tread_api::wire::ingest::{Batch, MissionPhase, Receipt, Record};
+use tread_api::wire::reply::CommandRefusalCode;
 use tread_api::wire::safety::{ClearStop, DriveCommand, ExternalLimit, LeaseCommand, Stop};
 use tread_api::wire::state::RobotState;
 use tread_api::wire::{self, Refusal};
@@ -29,7 +30,7 @@ use crate::harness::{PATIENCE, Yard, ask, eventually, model, report, site, time}
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Mood {
     Willing,
-    Refusing(OfferRefusal),
+    Refusing(CommandRefusalCode),
     Silent,
     /// Takes a pause and goes on braking for it.
     Braking,

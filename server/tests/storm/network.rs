@@ -9,7 +9,7 @@ use tread_api::wire;
 use tread_api::wire::command::{Offer, Pause};
 use tread_api::wire::state::RobotState;
 use tread_server::app::presence::RobotKey;
-use tread_server::app::robot_link::{Answering, CommandTransport};
+use tread_server::app::robot_link::{Answering, CommandTransport, Undelivered};
 
 use super::dice::Dice;
 use super::robot::Robot;
@@ -101,7 +101,7 @@ impl CommandTransport for Network {
             // Done, and the answer is lost.
             (fate >= 45).then_some(answer)
         });
-        Box::pin(std::future::ready(answer))
+        Box::pin(std::future::ready(answer.ok_or(Undelivered::NoAnswer)))
     }
 }
 

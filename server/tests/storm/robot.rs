@@ -2,14 +2,18 @@
 
 use std::collections::{BTreeMap, HashSet, VecDeque};
 
+use serde::Serialize;
 use tread_api::ids::{BootId, MissionId, PlanHash, RobotId, StopId};
 use tread_api::keys::Verb;
 use tread_api::robot::{LoopStatus, MissionProgress, OutboxStatus, PauseCause, RobotMode};
-use tread_api::safety::{Lease, SafetyStatus, StopLatch};
+use tread_api::safety::{Driver, Lease, SafetyStatus, StopLatch};
 use tread_api::wire;
-use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome, Pause};
+use tread_api::wire::command::{Cancel, Offer, Pause};
 use tread_api::wire::ingest::{Batch, MissionPhase, MissionReport, Record, RecordContent};
-use tread_api::wire::safety::{ClearStop, LeaseAction, LeaseCommand, Stop};
+use tread_api::wire::reply::{
+    Acknowledgement, Answer, CommandRefusal, CommandRefusalCode, LeaseReply, OfferReply,
+};
+use tread_api::wire::safety::{AcquireLease, ClearStop, LeaseCommand, ReleaseLease, Stop};
 use tread_api::wire::state::RobotState;
 use uuid::Uuid;
 
@@ -224,30 +228,59 @@ impl Robot {
         });
     }
 
-    /// Answers a command.
-    pub(crate) fn answer(&mut self, verb: Verb, payload: &[u8], impossible: bool) -> Answer {
-        let outcome = match verb {
-            Verb::Offer => self.offer(&wire::decode(payload).expect("an offer"), impossible),
-            Verb::Cancel => self.cancel(&wire::decode(payload).expect("a cancellation")),
+    /// Answers a command: the payload.
+    pub(crate) fn answer(&mut self, verb: Verb, payload: &[u8], impossible: bool) -> Vec<u8> {
+        match verb {
+            Verb::Offer => {
+                let offer = wire::decode(payload).expect("an offer");
+                let reply = self.offer(&offer, impossible);
+                self.says(reply)
+            }
+            Verb::Cancel => {
+                let cancelled = self.cancel(&wire::decode(payload).expect("a cancellation"));
+                self.acknowledges(cancelled)
+            }
             Verb::Pause | Verb::Resume => {
                 let pause: Pause = wire::decode(payload).expect("a pause or a resumption");
-                self.hold(&pause, verb == Verb::Pause)
+                let held = self.hold(&pause, verb == Verb::Pause);
+                self.acknowledges(held)
             }
-            Verb::Site => Outcome::Done,
-            Verb::Stop => self.latch(wire::decode(payload).expect("a stop")),
-            Verb::Clear => self.clear(&wire::decode(payload).expect("a clear")),
-            Verb::Lease => self.lend(wire::decode(payload).expect("a lease")),
-            Verb::Limit => refused(OfferRefusal::Other),
-        };
-        Answer {
-            boot: self.boot,
-            outcome,
+            Verb::Site => self.acknowledges(Ok(())),
+            Verb::Stop => {
+                let latched = self.latch(wire::decode(payload).expect("a stop"));
+                self.acknowledges(latched)
+            }
+            Verb::Clear => {
+                let cleared = self.clear(&wire::decode(payload).expect("a clear"));
+                self.acknowledges(cleared)
+            }
+            Verb::Lease => match wire::decode(payload).expect("a lease") {
+                LeaseCommand::Acquire(acquire) => {
+                    let reply = LeaseReply::from(self.lend(acquire));
+                    self.says(reply)
+                }
+                LeaseCommand::Release(release) => {
+                    self.take_back(&release);
+                    self.acknowledges(Ok(()))
+                }
+            },
+            Verb::Limit => self.acknowledges(refused(CommandRefusalCode::Other)),
         }
     }
 
-    fn offer(&mut self, offer: &Offer, impossible: bool) -> Outcome {
+    fn acknowledges(&self, decided: Result<(), CommandRefusal>) -> Vec<u8> {
+        self.says(Acknowledgement::from(decided))
+    }
+
+    fn says<R: Serialize>(&self, reply: R) -> Vec<u8> {
+        let boot = self.boot;
+        wire::encode(&Answer { boot, reply }).expect("it can be written")
+    }
+
+    fn offer(&mut self, offer: &Offer, impossible: bool) -> OfferReply {
+        let refuses = |code| OfferReply::Refused(refusal(code));
         if self.ended.contains_key(&offer.mission) {
-            return refused(OfferRefusal::Ended);
+            return refuses(CommandRefusalCode::Ended);
         }
         let content = (offer.revision, offer.plan_hash);
         let new = Held {
@@ -260,16 +293,16 @@ impl Robot {
             driven_m: 0.0,
         };
         match self.held {
-            None if self.is_operator_controlled() => refused(OfferRefusal::NotReady),
-            None if impossible => refused(OfferRefusal::Impossible),
+            None if self.is_operator_controlled() => refuses(CommandRefusalCode::NotReady),
+            None if impossible => refuses(CommandRefusalCode::Impossible),
             None => {
                 self.held = Some(new);
                 self.record(new, MissionPhase::Started);
-                Outcome::Accepted { plan: None }
+                OfferReply::Accepted { plan: None }
             }
-            Some(held) if held.mission != offer.mission => refused(OfferRefusal::Busy),
+            Some(held) if held.mission != offer.mission => refuses(CommandRefusalCode::Busy),
             Some(held) if (held.revision, held.plan_hash) == content => {
-                Outcome::Accepted { plan: None }
+                OfferReply::Accepted { plan: None }
             }
             Some(held) if held.revision < offer.revision && !impossible => {
                 let new = Held {
@@ -280,50 +313,50 @@ impl Robot {
                 };
                 self.held = Some(new);
                 self.record(new, MissionPhase::Replaced);
-                Outcome::Accepted { plan: None }
+                OfferReply::Accepted { plan: None }
             }
-            Some(_) => refused(OfferRefusal::Conflict),
+            Some(_) => refuses(CommandRefusalCode::Conflict),
         }
     }
 
-    fn cancel(&mut self, cancel: &Cancel) -> Outcome {
+    fn cancel(&mut self, cancel: &Cancel) -> Result<(), CommandRefusal> {
         match self.held.filter(|held| held.mission == cancel.mission) {
             Some(held) => {
                 self.end(held, MissionPhase::Cancelled);
-                Outcome::Done
+                Ok(())
             }
             None => match self.ended.get(&cancel.mission) {
-                Some(MissionPhase::Cancelled) => Outcome::Done,
-                Some(_) => refused(OfferRefusal::Ended),
+                Some(MissionPhase::Cancelled) => Ok(()),
+                Some(_) => refused(CommandRefusalCode::Ended),
                 None => {
                     self.ended.insert(cancel.mission, MissionPhase::Cancelled);
-                    refused(OfferRefusal::Unknown)
+                    refused(CommandRefusalCode::Unknown)
                 }
             },
         }
     }
 
-    fn hold(&mut self, pause: &Pause, paused: bool) -> Outcome {
+    fn hold(&mut self, pause: &Pause, paused: bool) -> Result<(), CommandRefusal> {
         let same = |held: &Held| (held.mission, held.revision) == (pause.mission, pause.revision);
         let Some(held) = self.held.filter(same) else {
             return refused(if self.ended.contains_key(&pause.mission) {
-                OfferRefusal::Ended
+                CommandRefusalCode::Ended
             } else {
-                OfferRefusal::Unknown
+                CommandRefusalCode::Unknown
             });
         };
         if !paused && self.stop.is_some() {
-            return refused(OfferRefusal::Stopped);
+            return refused(CommandRefusalCode::Stopped);
         }
         if !paused && self.lease.is_some() {
-            return refused(OfferRefusal::Leased);
+            return refused(CommandRefusalCode::Leased);
         }
         self.held = Some(Held {
             to_stand: paused,
             paused_by: PauseCause::Request,
             ..held
         });
-        Outcome::Done
+        Ok(())
     }
 
     /// Whatever is active stands, and goes on only when it is told to.
@@ -333,7 +366,7 @@ impl Robot {
         }
     }
 
-    fn latch(&mut self, stop: Stop) -> Outcome {
+    fn latch(&mut self, stop: Stop) -> Result<(), CommandRefusal> {
         // The same twice is one stop, also after it was cleared.
         if self.stops_seen.insert(stop.stop) {
             self.stop = Some(StopLatch {
@@ -345,50 +378,54 @@ impl Robot {
             self.stand(PauseCause::Stop);
         }
         if self.stop.is_none() {
-            return refused(OfferRefusal::Ended);
+            return refused(CommandRefusalCode::Ended);
         }
-        Outcome::Done
+        Ok(())
     }
 
-    fn clear(&mut self, clear: &ClearStop) -> Outcome {
+    fn clear(&mut self, clear: &ClearStop) -> Result<(), CommandRefusal> {
         match self.stopped_by() {
             Some(newest) if newest == clear.stop => {
                 self.stop = None;
-                Outcome::Done
+                Ok(())
             }
-            Some(_) => refused(OfferRefusal::Conflict),
-            None if self.stops_seen.contains(&clear.stop) => Outcome::Done,
-            None => refused(OfferRefusal::Unknown),
+            Some(_) => refused(CommandRefusalCode::Conflict),
+            None if self.stops_seen.contains(&clear.stop) => Ok(()),
+            None => refused(CommandRefusalCode::Unknown),
         }
     }
 
-    fn lend(&mut self, asked: LeaseCommand) -> Outcome {
-        let other = self.lease.as_ref();
-        let is_others = other.is_some_and(|lease| lease.driver.client != asked.holder.client);
-        match asked.action {
-            LeaseAction::Acquire if is_others => refused(OfferRefusal::Leased),
-            LeaseAction::Acquire | LeaseAction::Take => {
-                self.leases += 1;
-                self.lease = Some(Lease {
-                    epoch: self.leases,
-                    driver: asked.holder,
-                });
-                self.stand(PauseCause::Teleoperation);
-                Outcome::Leased { epoch: self.leases }
-            }
-            LeaseAction::Release => {
-                self.lease = self.lease.take().filter(|_| is_others);
-                Outcome::Done
-            }
+    fn lend(&mut self, asked: AcquireLease) -> Result<u64, CommandRefusal> {
+        if !asked.take && self.is_leased_by_other(&asked.holder) {
+            return refused(CommandRefusalCode::Leased);
         }
+        self.leases += 1;
+        self.lease = Some(Lease {
+            epoch: self.leases,
+            driver: asked.holder,
+        });
+        self.stand(PauseCause::Teleoperation);
+        Ok(self.leases)
+    }
+
+    fn take_back(&mut self, release: &ReleaseLease) {
+        if !self.is_leased_by_other(&release.holder) {
+            self.lease = None;
+        }
+    }
+
+    fn is_leased_by_other(&self, driver: &Driver) -> bool {
+        let lease = self.lease.as_ref();
+        lease.is_some_and(|lease| lease.driver.client != driver.client)
     }
 }
 
-fn refused(code: OfferRefusal) -> Outcome {
-    Outcome::Refused {
-        code,
-        detail: "so it is".to_owned(),
-    }
+fn refusal(code: CommandRefusalCode) -> CommandRefusal {
+    CommandRefusal::new(code, "so it is")
+}
+
+fn refused<T>(code: CommandRefusalCode) -> Result<T, CommandRefusal> {
+    Err(refusal(code))
 }
 
 fn boot_id(number: u64) -> BootId {

@@ -8,7 +8,7 @@ use tread_api::keys::Verb;
 use tread_api::safety::Driver;
 use tread_api::stop::Stop;
 use tread_api::wire;
-use tread_api::wire::safety::{LeaseAction, LeaseCommand};
+use tread_api::wire::safety::AcquireLease;
 use tread_server::app::robot_link::{CommandTransport as _, RobotLink};
 use tread_server::app::stops::StopWords;
 use tread_server::db;
@@ -109,17 +109,13 @@ impl Storm {
     pub(super) fn lease(&self, index: usize) {
         let robot = with(&self.world, |world| world.robots[index].id.clone());
         let (client, take) = self.dice(|dice| (dice.below(3) as u128, dice.percent(30)));
-        let command = LeaseCommand {
+        let command = AcquireLease {
             request: Uuid::from_u128(client),
-            action: if take {
-                LeaseAction::Take
-            } else {
-                LeaseAction::Acquire
-            },
             holder: Driver {
                 client: Uuid::from_u128(client),
                 name: "a driver".to_owned(),
             },
+            take,
         };
         let payload = wire::encode(&command).expect("it can be written");
         let network = Network(std::sync::Arc::clone(&self.world));

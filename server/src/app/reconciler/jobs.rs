@@ -2,11 +2,11 @@
 
 use tracing::warn;
 use tread_api::ids::MissionId;
-use tread_api::keys::Verb;
 use tread_api::mission::{Actor, Cause, MissionState};
 use tread_api::robot::MissionProgress;
 use tread_api::stop::Stop;
-use tread_api::wire::command::{Answer, Cancel, Offer, OfferRefusal, Outcome, Pause, Resume};
+use tread_api::wire::command::{Cancel, Offer, Pause, Resume};
+use tread_api::wire::reply::{Acknowledgement, Answer, CommandRefusalCode, OfferReply};
 
 use crate::app::missions::reports::adopt;
 use crate::app::missions::transitions::Change;
@@ -134,8 +134,7 @@ pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppE
     };
     app.counters().offers_sent.one();
     let key = (mission.site, mission.robot);
-    let Some(answer) = app.commands().send(&key, Verb::Offer, &command).await else {
-        app.counters().commands_unanswered.one();
+    let Ok(answer) = app.commands().send(&key, &command).await else {
         return Ok(Finished::Again);
     };
     take_offer_answer(&app, mission.id, &answer).await
@@ -144,38 +143,30 @@ pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppE
 async fn take_offer_answer(
     app: &App,
     id: MissionId,
-    answer: &Answer,
+    answer: &Answer<OfferReply>,
 ) -> Result<Finished, AppError> {
     let mut facts = Facts {
         boot: Some(answer.boot),
         ..Facts::default()
     };
-    let (change, reason, how) = match &answer.outcome {
-        Outcome::Accepted { plan } => {
+    let (change, reason, how) = match &answer.reply {
+        OfferReply::Accepted { plan } => {
             facts.plan = *plan;
             (Change::Accept, None, Finished::Settled)
         }
-        // Out of place, but it says that the robot will do it.
-        Outcome::Done | Outcome::Leased { .. } => (Change::Accept, None, Finished::Settled),
-        Outcome::Refused { code, detail } => {
-            let detail = Some(detail.as_str());
-            match code {
-                OfferRefusal::Busy
-                | OfferRefusal::NotReady
-                | OfferRefusal::Leased
-                | OfferRefusal::Stopped
-                | OfferRefusal::Moving => {
-                    facts = Facts::default();
-                    (Change::Return, detail, Finished::Again)
-                }
-                OfferRefusal::TooLate => (Change::Expire, detail, Finished::Settled),
-                // How it ended is in the robot's store and on its way.
-                OfferRefusal::Ended => return Ok(Finished::EndedThere),
-                OfferRefusal::Conflict
-                | OfferRefusal::Impossible
-                | OfferRefusal::Unknown
-                | OfferRefusal::TooMany
-                | OfferRefusal::Other => (Change::Reject, detail, Finished::Settled),
+        // How it ended is in the robot's store and on its way.
+        OfferReply::Refused(refusal) if refusal.code == CommandRefusalCode::Ended => {
+            return Ok(Finished::EndedThere);
+        }
+        OfferReply::Refused(refusal) => {
+            let detail = Some(refusal.detail.as_str());
+            if refusal.is_transient() {
+                facts = Facts::default();
+                (Change::Return, detail, Finished::Again)
+            } else if refusal.code == CommandRefusalCode::TooLate {
+                (Change::Expire, detail, Finished::Settled)
+            } else {
+                (Change::Reject, detail, Finished::Settled)
             }
         }
     };
@@ -222,8 +213,7 @@ pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, Ap
     };
     app.counters().offers_sent.one();
     let key = (row.mission.site.clone(), row.mission.robot.clone());
-    let Some(answer) = app.commands().send(&key, Verb::Offer, &command).await else {
-        app.counters().commands_unanswered.one();
+    let Ok(answer) = app.commands().send(&key, &command).await else {
         return Ok(Finished::Again);
     };
     let mut tx = app.db().write("reconciler").await?;
@@ -235,43 +225,29 @@ pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, Ap
     let Some(row) = row.filter(as_sent) else {
         return Ok(Finished::Settled);
     };
-    let how = match &answer.outcome {
-        Outcome::Accepted { .. } | Outcome::Done | Outcome::Leased { .. } => {
+    match answer.reply {
+        OfferReply::Accepted { plan } => {
             adopt(&mut tx, &row, Actor::Robot, app.clock().now()).await?;
-            let plan = match answer.outcome {
-                Outcome::Accepted { plan } => plan,
-                Outcome::Done | Outcome::Leased { .. } | Outcome::Refused { .. } => None,
-            };
             let facts = Facts {
                 plan,
                 ..Facts::default()
             };
             db::missions::add_facts(&mut tx, row.mission.id, facts).await?;
-            Finished::Settled
         }
-        Outcome::Refused { code, detail } => match code {
-            OfferRefusal::Busy
-            | OfferRefusal::NotReady
-            | OfferRefusal::Leased
-            | OfferRefusal::Stopped
-            | OfferRefusal::Moving => return Ok(Finished::Again),
-            OfferRefusal::Ended => return Ok(Finished::EndedThere),
-            OfferRefusal::Conflict
-            | OfferRefusal::Impossible
-            | OfferRefusal::TooLate
-            | OfferRefusal::Unknown
-            | OfferRefusal::TooMany
-            | OfferRefusal::Other => {
-                db::missions::set_replacement(&mut tx, row.mission.id, None).await?;
-                let why = (Actor::Robot, Cause::ReplaceRefused);
-                add_note(&mut tx, &row.mission, why, app.clock().now(), detail).await?;
-                Finished::Settled
-            }
-        },
-    };
+        OfferReply::Refused(refusal) if refusal.is_transient() => return Ok(Finished::Again),
+        OfferReply::Refused(refusal) if refusal.code == CommandRefusalCode::Ended => {
+            return Ok(Finished::EndedThere);
+        }
+        OfferReply::Refused(refusal) => {
+            db::missions::set_replacement(&mut tx, row.mission.id, None).await?;
+            let why = (Actor::Robot, Cause::ReplaceRefused);
+            let detail = &refusal.detail;
+            add_note(&mut tx, &row.mission, why, app.clock().now(), detail).await?;
+        }
+    }
     tx.commit().await?;
     app.wake();
-    Ok(how)
+    Ok(Finished::Settled)
 }
 
 /// Makes the revision that the robot shows the one that counts.
@@ -291,27 +267,24 @@ pub(super) async fn hold(app: App, standing: Standing, held: bool) -> Result<Fin
     let key = (standing.site.clone(), standing.robot.clone());
     let answer = if held {
         let command = Pause { mission, revision };
-        app.commands().send(&key, Verb::Pause, &command).await
+        app.commands().send(&key, &command).await
     } else {
         let command = Resume { mission, revision };
-        app.commands().send(&key, Verb::Resume, &command).await
+        app.commands().send(&key, &command).await
     };
-    let Some(answer) = answer else {
-        app.counters().commands_unanswered.one();
+    let Ok(answer) = answer else {
         return Ok(Finished::Again);
     };
-    match &answer.outcome {
+    match answer.reply {
         // It brakes or speeds up now. The mission moves when the robot says that it stands, or
         // that it drives on.
-        Outcome::Done | Outcome::Accepted { .. } | Outcome::Leased { .. } => {
-            Ok(Finished::Delivered)
+        Acknowledgement::Done => Ok(Finished::Delivered),
+        Acknowledgement::Refused(refusal) if refusal.code == CommandRefusalCode::Ended => {
+            Ok(Finished::EndedThere)
         }
-        Outcome::Refused {
-            code: OfferRefusal::Ended,
-            ..
-        } => Ok(Finished::EndedThere),
-        Outcome::Refused { detail, .. } => {
+        Acknowledgement::Refused(refusal) => {
             let wanted = if held { "pause" } else { "resume" };
+            let detail = refusal.detail;
             warn!(mission.id = %mission, "robot `{}` does not {wanted}: {detail}", key.1);
             Ok(Finished::Again)
         }
@@ -325,22 +298,20 @@ pub(super) async fn cancel(app: App, mission: Standing) -> Result<Finished, AppE
         reason: mission.reason.clone().unwrap_or_default(),
     };
     let key = (mission.site.clone(), mission.robot.clone());
-    let Some(answer) = app.commands().send(&key, Verb::Cancel, &command).await else {
-        app.counters().commands_unanswered.one();
+    let Ok(answer) = app.commands().send(&key, &command).await else {
         return Ok(Finished::Again);
     };
-    let detail = match &answer.outcome {
-        Outcome::Done | Outcome::Accepted { .. } | Outcome::Leased { .. } => None,
-        Outcome::Refused {
-            code: OfferRefusal::Unknown,
-            ..
-        } => Some("it had not reached the robot"),
+    let detail = match answer.reply {
+        Acknowledgement::Done => None,
+        Acknowledgement::Refused(refusal) if refusal.code == CommandRefusalCode::Unknown => {
+            Some("it had not reached the robot")
+        }
         // How it ended is in the robot's store and on its way.
-        Outcome::Refused {
-            code: OfferRefusal::Ended,
-            ..
-        } => return Ok(Finished::EndedThere),
-        Outcome::Refused { detail, .. } => {
+        Acknowledgement::Refused(refusal) if refusal.code == CommandRefusalCode::Ended => {
+            return Ok(Finished::EndedThere);
+        }
+        Acknowledgement::Refused(refusal) => {
+            let detail = refusal.detail;
             warn!(mission.id = %mission.id, "robot `{}` does not cancel: {detail}", key.1);
             return Ok(Finished::Again);
         }
@@ -394,15 +365,8 @@ pub(super) async fn disown(
     );
     app.counters().missions_disowned.one();
     let command = Cancel { mission, reason };
-    if app
-        .commands()
-        .send(&key, Verb::Cancel, &command)
-        .await
-        .is_none()
-    {
-        app.counters().commands_unanswered.one();
-    }
-    // Its next states show whether it has ended; if not, it is told again.
+    // Whatever it answers, its next states show whether it has ended; if not, it is told again.
+    let _ = app.commands().send(&key, &command).await;
     Ok(Finished::Again)
 }
 
@@ -420,13 +384,8 @@ pub(super) async fn end_duplicate_agent(app: App, duplicate: DuplicateAgent) -> 
     app.counters().missions_disowned.one();
     let reason = "another agent has taken this robot's name".to_owned();
     let command = Cancel { mission, reason };
-    let answer = app
-        .commands()
-        .send_to(&key, Some(boot), Verb::Cancel, &command);
-    if answer.await.is_none() {
-        app.counters().commands_unanswered.one();
-    }
-    // Its next states show whether it has ended; if not, it is told again.
+    // Whatever it answers, its next states show whether it has ended; if not, it is told again.
+    let _ = app.commands().send_to(&key, Some(boot), &command).await;
     Finished::Again
 }
 
@@ -454,25 +413,13 @@ pub(super) async fn push_site(app: App, key: RobotKey) -> Result<Finished, AppEr
     let Some(definition) = definition else {
         return Ok(Finished::Settled);
     };
-    match app.commands().send(&key, Verb::Site, &definition).await {
-        // Its next state shows the new revision; if not, it is sent again.
-        Some(Answer {
-            outcome: Outcome::Done | Outcome::Accepted { .. } | Outcome::Leased { .. },
-            ..
-        }) => Ok(Finished::Again),
-        Some(Answer {
-            outcome: Outcome::Refused { detail, .. },
-            ..
-        }) => {
-            warn!(
-                "robot `{}` does not take its site's terrains: {detail}",
-                key.1
-            );
-            Ok(Finished::Again)
-        }
-        None => {
-            app.counters().commands_unanswered.one();
-            Ok(Finished::Again)
-        }
+    let answer = app.commands().send(&key, &definition).await;
+    if let Ok(Acknowledgement::Refused(refusal)) = answer.map(|answer| answer.reply) {
+        warn!(
+            "robot `{}` does not take its site's terrains: {}",
+            key.1, refusal.detail
+        );
     }
+    // Its next state shows the new revision; if not, it is sent again.
+    Ok(Finished::Again)
 }

@@ -3,23 +3,37 @@
 use std::pin::Pin;
 use std::sync::Arc;
 
-use serde::Serialize;
 use tracing::warn;
 use tread_api::ids::BootId;
 use tread_api::keys::Verb;
 use tread_api::wire;
-use tread_api::wire::command::Answer;
+use tread_api::wire::reply::{Answer, Command};
 
 use super::Unconnected;
 use crate::app::presence::{Presences, RobotKey};
+use crate::counters::Counters;
 
-/// An answer that is awaited.
-pub type Answering = Pin<Box<dyn Future<Output = Option<Answer>> + Send>>;
+/// Why it is not known what a robot says to a command. The same may be sent again without harm.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum Undelivered {
+    /// It could not be sent.
+    #[error("the network to the robot is not open")]
+    Unreachable,
+    /// Nobody of the robot's name answered in time.
+    #[error("the robot does not answer")]
+    NoAnswer,
+    /// The robot could not read the command, or its answer does not read.
+    #[error("robot and server do not understand each other")]
+    Unreadable,
+}
+
+/// The payload of an answer that is awaited.
+pub type Answering = Pin<Box<dyn Future<Output = Result<Vec<u8>, Undelivered>> + Send>>;
 
 /// Carries one command to a robot and its answer back.
 pub trait CommandTransport: std::fmt::Debug + Send + Sync {
     /// Sends a payload to a robot's verb: to one run of its agent, or to whatever runs under its
-    /// name. `None` means not delivered, as far as anyone knows.
+    /// name.
     fn send(
         &self,
         robot: &RobotKey,
@@ -31,7 +45,7 @@ pub trait CommandTransport: std::fmt::Debug + Send + Sync {
 
 impl CommandTransport for Unconnected {
     fn send(&self, _: &RobotKey, _: Option<BootId>, _: Verb, _: Vec<u8>) -> Answering {
-        Box::pin(std::future::ready(None))
+        Box::pin(std::future::ready(Err(Undelivered::Unreachable)))
     }
 }
 
@@ -40,49 +54,74 @@ impl CommandTransport for Unconnected {
 pub struct Commands {
     transport: Arc<dyn CommandTransport>,
     presences: Arc<Presences>,
+    counters: Arc<Counters>,
 }
 
 impl Commands {
     /// Commands through a transport; `presences` tell which run of an agent is the present one.
+    /// Those that are not delivered are counted.
     pub(in crate::app) fn new(
         transport: Arc<dyn CommandTransport>,
         presences: Arc<Presences>,
+        counters: Arc<Counters>,
     ) -> Self {
         Self {
             transport,
             presences,
+            counters,
         }
     }
 
     /// Sends one command to a robot's present run and waits for its answer.
     ///
-    /// `None` as for [`Commands::send_to`].
-    pub async fn send<T: Serialize>(
+    /// # Errors
+    /// [`Undelivered`], as far as anyone knows.
+    pub async fn send<C: Command>(
         &self,
         robot: &RobotKey,
-        verb: Verb,
-        command: &T,
-    ) -> Option<Answer> {
+        command: &C,
+    ) -> Result<Answer<C::Reply>, Undelivered> {
         let present = self.presences.get(robot).boot();
         let run = present.map(|(boot, _since)| boot);
-        self.send_to(robot, run, verb, command).await
+        self.send_to(robot, run, command).await
     }
 
     /// Sends one command to one run of a robot's agent, or to all under its name, and waits for
     /// the first answer.
     ///
-    /// `None` means not delivered, as far as anyone knows: no robot answered in time, or its
-    /// answer does not read. The same may be sent again without harm.
-    pub async fn send_to<T: Serialize>(
+    /// # Errors
+    /// [`Undelivered`], as far as anyone knows.
+    pub async fn send_to<C: Command>(
         &self,
         robot: &RobotKey,
         run: Option<BootId>,
-        verb: Verb,
-        command: &T,
-    ) -> Option<Answer> {
-        let payload = wire::encode(command)
-            .inspect_err(|error| warn!("cannot write a command for `{}`: {error}", robot.1))
-            .ok()?;
-        self.transport.send(robot, run, verb, payload).await
+        command: &C,
+    ) -> Result<Answer<C::Reply>, Undelivered> {
+        let answer = self.exchange(robot, run, command).await;
+        if answer.is_err() {
+            self.counters.commands_unanswered.one();
+        }
+        answer
+    }
+
+    async fn exchange<C: Command>(
+        &self,
+        robot: &RobotKey,
+        run: Option<BootId>,
+        command: &C,
+    ) -> Result<Answer<C::Reply>, Undelivered> {
+        let verb = C::VERB.as_str();
+        let payload = wire::encode(command).map_err(|error| {
+            warn!("cannot write a `{verb}` command for `{}`: {error}", robot.1);
+            Undelivered::Unreachable
+        })?;
+        let answer = self.transport.send(robot, run, C::VERB, payload).await?;
+        wire::decode(&answer).map_err(|error| {
+            warn!(
+                error = &error as &dyn std::error::Error,
+                "the answer of `{}` to a `{verb}` command was refused", robot.1
+            );
+            Undelivered::Unreadable
+        })
     }
 }

@@ -7,7 +7,7 @@ mod drive;
 use std::sync::Arc;
 use std::time::Duration;
 
-pub use self::commands::{Answering, CommandTransport, Commands};
+pub use self::commands::{Answering, CommandTransport, Commands, Undelivered};
 pub use self::drive::{DrivePublisher, DriveTransport, Opening};
 use super::stops::STOP_CONFIRM_MAX;
 use crate::supervisor::Supervisor;

@@ -7,9 +7,8 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 use tracing::{error, warn};
 use tread_api::ids::StopId;
-use tread_api::keys::Verb;
 use tread_api::stop::Stop;
-use tread_api::wire::command::{Answer, OfferRefusal, Outcome};
+use tread_api::wire::reply::{Acknowledgement, CommandRefusalCode};
 use tread_api::wire::safety::Stop as StopCommand;
 
 use super::super::{App, AppError};
@@ -38,23 +37,21 @@ pub(in crate::app) async fn tell(app: &App, stop: &Stop) -> Told {
     app.counters().stops_sent.one();
     // Whatever runs under the robot's name stops; only its present run can confirm.
     let present = app.presences().get(&key).boot().map(|(boot, _since)| boot);
-    let answer = app
-        .commands()
-        .send_to(&key, None, Verb::Stop, &command)
-        .await;
-    let confirms = |answer: &Answer| present.is_none_or(|boot| boot == answer.boot);
-    match answer.filter(confirms).map(|answer| answer.outcome) {
-        Some(Outcome::Refused {
-            code: OfferRefusal::Ended,
-            ..
-        }) => Told::Over,
-        Some(Outcome::Refused { detail, .. }) => {
-            error!(robot.id = %stop.robot, "robot `{}` does not stop: {detail}", stop.robot);
-            Told::Unconfirmed
+    let Ok(answer) = app.commands().send_to(&key, None, &command).await else {
+        return Told::Unconfirmed;
+    };
+    if present.is_some_and(|boot| boot != answer.boot) {
+        app.counters().commands_unanswered.one();
+        return Told::Unconfirmed;
+    }
+    match answer.reply {
+        Acknowledgement::Done => Told::Confirmed,
+        Acknowledgement::Refused(refusal) if refusal.code == CommandRefusalCode::Ended => {
+            Told::Over
         }
-        Some(_) => Told::Confirmed,
-        None => {
-            app.counters().commands_unanswered.one();
+        Acknowledgement::Refused(refusal) => {
+            let detail = refusal.detail;
+            error!(robot.id = %stop.robot, "robot `{}` does not stop: {detail}", stop.robot);
             Told::Unconfirmed
         }
     }

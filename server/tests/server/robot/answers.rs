@@ -7,9 +7,14 @@ use tread_api::keys::{Key, Verb};
 use tread_api::robot::{MissionProgress, RobotMode};
 use tread_api::safety::{Lease, StopLatch};
 use tread_api::wire;
-use tread_api::wire::command::{Answer, Cancel, OfferRefusal, Outcome};
+use tread_api::wire::command::{Cancel, Offer, Pause};
 use tread_api::wire::hello::SiteDefinition;
-use tread_api::wire::safety::{ClearStop, LeaseAction, LeaseCommand, Stop};
+use tread_api::wire::reply::{
+    Acknowledgement, Answer, Command, CommandRefusal, CommandRefusalCode, LeaseReply, OfferReply,
+};
+use tread_api::wire::safety::{
+    AcquireLease, ClearStop, ExternalLimit, LeaseCommand, ReleaseLease, Stop,
+};
 use tread_api::wire::state::RobotState;
 use zenoh::Wait as _;
 
@@ -26,155 +31,149 @@ pub(super) fn answer(
     };
     let payload = query.payload().unwrap().to_bytes();
     let mut heard = heard.lock().unwrap();
-    let outcome = match verb {
+    let mut state = state.lock().unwrap();
+    let reply = match verb {
         Verb::Offer => {
             heard.offers.push(wire::decode(&payload).unwrap());
-            match heard.mood {
-                Mood::Silent => return,
-                Mood::Refusing(code) => Outcome::Refused {
-                    code,
-                    detail: "as told".to_owned(),
-                },
-                Mood::Willing | Mood::Braking => {
-                    let offer = heard.offers.last().unwrap();
-                    let mut state = state.lock().unwrap();
-                    state.mode = RobotMode::Tracking;
-                    state.mission = Some(MissionProgress {
-                        id: offer.mission,
-                        revision: offer.revision,
-                        plan_hash: offer.plan_hash,
-                        driven_m: 0.0,
-                        length_m: 18.85,
-                        cross_track_m: 0.0,
-                        paused: false,
-                        paused_by: None,
-                    });
-                    Outcome::Accepted { plan: None }
-                }
-            }
+            offered(&heard, &mut state).map(|reply| says::<Offer>(boot, reply))
         }
         Verb::Cancel => {
             let cancel: Cancel = wire::decode(&payload).unwrap();
-            let mut state = state.lock().unwrap();
             if state.mission.is_some_and(|held| held.id == cancel.mission) {
                 state.mode = RobotMode::Idle;
                 state.mission = None;
             }
             heard.cancels.push(cancel);
-            Outcome::Done
+            Some(says::<Cancel>(boot, Acknowledgement::Done))
         }
         Verb::Pause | Verb::Resume => {
-            let mut state = state.lock().unwrap();
             heard.holds.push(verb);
-            match heard.mood {
-                Mood::Silent => return,
-                Mood::Willing | Mood::Refusing(_) | Mood::Braking => {}
-            }
             if heard.mood != Mood::Braking
+                && heard.mood != Mood::Silent
                 && let Some(mission) = &mut state.mission
             {
                 mission.paused = verb == Verb::Pause;
             }
-            Outcome::Done
+            let is_silent = heard.mood == Mood::Silent;
+            (!is_silent).then(|| says::<Pause>(boot, Acknowledgement::Done))
         }
         Verb::Site => {
             let definition: SiteDefinition = wire::decode(&payload).unwrap();
-            let mut state = state.lock().unwrap();
             state.terrain_revision = Some(definition.terrain_revision);
             state.safety.fence_revision = Some(definition.geofence.revision);
             heard.sites.push(definition);
-            Outcome::Done
+            Some(says::<SiteDefinition>(boot, Acknowledgement::Done))
         }
-        Verb::Stop | Verb::Clear | Verb::Lease | Verb::Limit => {
-            let mut state = state.lock().unwrap();
-            match in_safety(verb, &payload, &mut heard, &mut state) {
-                Some(outcome) => outcome,
-                None => return,
+        Verb::Stop => {
+            let stop: Stop = wire::decode(&payload).unwrap();
+            let is_deaf = heard.deaf_to_stops;
+            (!is_deaf).then(|| says::<Stop>(boot, stopped(stop, &mut heard, &mut state)))
+        }
+        Verb::Clear => {
+            let clear: ClearStop = wire::decode(&payload).unwrap();
+            let reply = cleared(clear, &mut heard, &mut state);
+            Some(says::<ClearStop>(boot, reply))
+        }
+        Verb::Lease => Some(match wire::decode(&payload).unwrap() {
+            LeaseCommand::Acquire(acquire) => {
+                let reply = leased(acquire, &mut heard, &mut state);
+                says::<AcquireLease>(boot, reply)
             }
+            LeaseCommand::Release(release) => {
+                let client = release.holder.client;
+                let other = state.safety.lease.take();
+                state.safety.lease = other.filter(|other| other.driver.client != client);
+                heard.leases.push(LeaseCommand::Release(release));
+                says::<ReleaseLease>(boot, Acknowledgement::Done)
+            }
+        }),
+        Verb::Limit => {
+            heard.limits.push(wire::decode(&payload).unwrap());
+            Some(says::<ExternalLimit>(boot, Acknowledgement::Done))
         }
     };
-    let payload = wire::encode(&Answer { boot, outcome }).unwrap();
+    let Some(payload) = reply else {
+        return;
+    };
     query
         .reply(query.key_expr().clone(), payload)
         .wait()
         .unwrap();
 }
 
-/// What it answers to all that may only slow it down; `None` is silence.
-fn in_safety(
-    verb: Verb,
-    payload: &[u8],
-    heard: &mut Heard,
-    state: &mut RobotState,
-) -> Option<Outcome> {
-    Some(match verb {
-        Verb::Stop => {
-            if heard.deaf_to_stops {
-                return None;
-            }
-            let stop: Stop = wire::decode(payload).unwrap();
-            if heard.stops_are_over {
-                heard.stops.push(stop);
-                return Some(Outcome::Refused {
-                    code: OfferRefusal::Ended,
-                    detail: "this stop was in force, and was cleared".to_owned(),
-                });
-            }
-            state.mode = RobotMode::Stopped;
-            if let Some(mission) = &mut state.mission {
-                mission.paused = true;
-            }
-            state.safety.stop = Some(StopLatch {
-                id: stop.stop,
-                by: stop.by.clone(),
-                reason: stop.reason.clone(),
-                since: stop.at,
+fn says<C: Command>(boot: BootId, reply: C::Reply) -> Vec<u8> {
+    wire::encode(&Answer { boot, reply }).unwrap()
+}
+
+/// What it answers to the newest offer; `None` is silence.
+fn offered(heard: &Heard, state: &mut RobotState) -> Option<OfferReply> {
+    Some(match heard.mood {
+        Mood::Silent => return None,
+        Mood::Refusing(code) => OfferReply::Refused(CommandRefusal::new(code, "as told")),
+        Mood::Willing | Mood::Braking => {
+            let offer = heard.offers.last().unwrap();
+            state.mode = RobotMode::Tracking;
+            state.mission = Some(MissionProgress {
+                id: offer.mission,
+                revision: offer.revision,
+                plan_hash: offer.plan_hash,
+                driven_m: 0.0,
+                length_m: 18.85,
+                cross_track_m: 0.0,
+                paused: false,
+                paused_by: None,
             });
-            heard.stops.push(stop);
-            Outcome::Done
+            OfferReply::Accepted { plan: None }
         }
-        Verb::Clear => {
-            let clear: ClearStop = wire::decode(payload).unwrap();
-            let newest = state.safety.stop.as_ref().map(|latch| latch.id);
-            if newest.is_some_and(|newest| newest != clear.stop) {
-                Outcome::Refused {
-                    code: OfferRefusal::Conflict,
-                    detail: "a newer stop is in force".to_owned(),
-                }
-            } else {
-                state.safety.stop = None;
-                state.mode = RobotMode::Idle;
-                heard.clears.push(clear);
-                Outcome::Done
-            }
-        }
-        Verb::Lease => {
-            let lease: LeaseCommand = wire::decode(payload).unwrap();
-            let other = state.safety.lease.clone();
-            let other = other.filter(|other| other.driver.client != lease.holder.client);
-            heard.leases.push(lease.clone());
-            match (lease.action, other) {
-                (LeaseAction::Acquire, Some(other)) => Outcome::Refused {
-                    code: OfferRefusal::Leased,
-                    detail: format!("`{}` drives it", other.driver.name),
-                },
-                (LeaseAction::Acquire | LeaseAction::Take, _) => {
-                    heard.epoch += 1;
-                    let epoch = heard.epoch;
-                    let driver = lease.holder;
-                    state.safety.lease = Some(Lease { epoch, driver });
-                    Outcome::Leased { epoch }
-                }
-                (LeaseAction::Release, other) => {
-                    state.safety.lease = other;
-                    Outcome::Done
-                }
-            }
-        }
-        Verb::Limit => {
-            heard.limits.push(wire::decode(payload).unwrap());
-            Outcome::Done
-        }
-        Verb::Offer | Verb::Cancel | Verb::Pause | Verb::Resume | Verb::Site => return None,
     })
+}
+
+fn stopped(stop: Stop, heard: &mut Heard, state: &mut RobotState) -> Acknowledgement {
+    if heard.stops_are_over {
+        heard.stops.push(stop);
+        let detail = "this stop was in force, and was cleared";
+        let refusal = CommandRefusal::new(CommandRefusalCode::Ended, detail);
+        return Acknowledgement::Refused(refusal);
+    }
+    state.mode = RobotMode::Stopped;
+    if let Some(mission) = &mut state.mission {
+        mission.paused = true;
+    }
+    state.safety.stop = Some(StopLatch {
+        id: stop.stop,
+        by: stop.by.clone(),
+        reason: stop.reason.clone(),
+        since: stop.at,
+    });
+    heard.stops.push(stop);
+    Acknowledgement::Done
+}
+
+fn cleared(clear: ClearStop, heard: &mut Heard, state: &mut RobotState) -> Acknowledgement {
+    let newest = state.safety.stop.as_ref().map(|latch| latch.id);
+    if newest.is_some_and(|newest| newest != clear.stop) {
+        let detail = "a newer stop is in force";
+        let refusal = CommandRefusal::new(CommandRefusalCode::Conflict, detail);
+        return Acknowledgement::Refused(refusal);
+    }
+    state.safety.stop = None;
+    state.mode = RobotMode::Idle;
+    heard.clears.push(clear);
+    Acknowledgement::Done
+}
+
+fn leased(acquire: AcquireLease, heard: &mut Heard, state: &mut RobotState) -> LeaseReply {
+    heard.leases.push(LeaseCommand::Acquire(acquire.clone()));
+    let other = state.safety.lease.as_ref();
+    let other = other.filter(|other| other.driver.client != acquire.holder.client);
+    if let Some(other) = other.filter(|_| !acquire.take) {
+        let detail = format!("`{}` drives it", other.driver.name);
+        let refusal = CommandRefusal::new(CommandRefusalCode::Leased, detail);
+        return LeaseReply::Refused(refusal);
+    }
+    heard.epoch += 1;
+    let epoch = heard.epoch;
+    let driver = acquire.holder;
+    state.safety.lease = Some(Lease { epoch, driver });
+    LeaseReply::Leased { epoch }
 }

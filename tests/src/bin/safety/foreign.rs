@@ -10,8 +10,8 @@ use tread_api::ids::BootId;
 use tread_api::keys::{self, Verb};
 use tread_api::safety::{DRIVE_AHEAD_MAX_US, DriveCounts, Driver};
 use tread_api::wire;
-use tread_api::wire::command::{Answer, Outcome};
-use tread_api::wire::safety::{DriveCommand, LeaseAction, LeaseCommand};
+use tread_api::wire::reply::{Answer, LeaseReply};
+use tread_api::wire::safety::{AcquireLease, DriveCommand};
 use tread_tests::fleet::Fleet;
 use tread_tests::light_robot::{ask, open_session};
 use tread_tests::random::Random;
@@ -49,23 +49,19 @@ fn counts(agent: &RunningAgent) -> DriveCounts {
     drive.map_or_else(DriveCounts::default, |drive| drive.counts)
 }
 
-async fn lease(
-    session: &Session,
-    fleet: &Fleet,
-    action: LeaseAction,
-) -> anyhow::Result<(BootId, u64)> {
-    let command = LeaseCommand {
+async fn lease(session: &Session, fleet: &Fleet, take: bool) -> anyhow::Result<(BootId, u64)> {
+    let command = AcquireLease {
         request: Uuid::new_v4(),
-        action,
+        take,
         holder: Driver {
             client: Uuid::new_v4(),
             name: "safety".to_owned(),
         },
     };
     let key = keys::command(&fleet.site(), &name(NUMBER)?, Verb::Lease);
-    let answer: Answer = ask(session, &key, &command).await?;
-    let Outcome::Leased { epoch } = answer.outcome else {
-        anyhow::bail!("the robot gives no lease: {:?}", answer.outcome);
+    let answer: Answer<LeaseReply> = ask(session, &key, &command).await?;
+    let LeaseReply::Leased { epoch } = answer.reply else {
+        anyhow::bail!("the robot gives no lease: {:?}", answer.reply);
     };
     Ok((answer.boot, epoch))
 }
@@ -124,8 +120,8 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
     let agent = start(NUMBER, &fleet.zenoh_endpoint(), folder.path())?;
     fleet.robot_is_online(&name(NUMBER)?).await;
     let session = open_session(&fleet.zenoh_endpoint()).await?;
-    let (boot, old_epoch) = lease(&session, fleet, LeaseAction::Acquire).await?;
-    let (_, epoch) = lease(&session, fleet, LeaseAction::Take).await?;
+    let (boot, old_epoch) = lease(&session, fleet, false).await?;
+    let (_, epoch) = lease(&session, fleet, true).await?;
     anyhow::ensure!(epoch > old_epoch, "the epoch did not rise");
     let publisher = session
         .declare_publisher(keys::teleop(&fleet.site(), &name(NUMBER)?))
