@@ -2,6 +2,7 @@
 //!
 //! * [`mod@paper`] is the paper this began with, exactly; its law is a bench, not what ships.
 //! * [`mod@bench`] holds laws written only for comparison, and the run that compares.
+//! * [`report`]: the table of goals that report programs print.
 //! * `rough`: a second world, written from the physics alone: robots, contacts and sensors that
 //!   differ from the agent's own simulator and from each other.
 //! * `teleoperation_trials`: random drivers on a bad network who fall silent.
@@ -12,6 +13,7 @@
 pub mod bench;
 pub mod paper;
 pub mod random;
+pub mod report;
 #[cfg(feature = "agent")]
 pub mod rough;
 #[cfg(feature = "agent")]

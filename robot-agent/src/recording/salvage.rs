@@ -13,8 +13,9 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use mcap::read::{ChannelAccumulator, ChunkReader, Summary, parse_record};
+use mcap::read::{ChannelAccumulator, Summary, parse_record};
 use mcap::records::{Channel, MessageHeader, Record, SchemaHeader, op};
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{McapError, Writer};
 use serde_json::{Value, json};
 use tread_ros2::cdr::decode;
@@ -179,28 +180,53 @@ fn chunk_at(bytes: &[u8], at: usize) -> Option<(Range<usize>, Chunk)> {
     }
     let length = u64::from_le_bytes(head[1..].try_into().ok()?);
     let content = rest.get(..usize::try_from(length).ok()?)?;
-    let Ok(Record::Chunk { header, data }) = parse_record(op::CHUNK, content) else {
+    let Ok(Record::Chunk { header, .. }) = parse_record(op::CHUNK, content) else {
         return None;
     };
     if header.uncompressed_size > CHUNK_BYTES_MAX || header.uncompressed_crc == 0 {
         return None;
     }
+    let place = at..at + RECORD_HEAD_BYTES + content.len();
+    let largest = content
+        .len()
+        .max(usize::try_from(header.uncompressed_size).ok()?);
+    let options = LinearReaderOptions::default()
+        .with_skip_start_magic(true)
+        .with_skip_end_magic(true)
+        // Before anything in it is read: what a damaged chunk says of lengths is not to be believed.
+        .with_prevalidate_chunk_crcs(true)
+        .with_record_length_limit(largest);
+    let mut reader = LinearReader::new_with_options(options);
+    let mut rest = bytes.get(place.clone())?;
     let mut chunk = Chunk::default();
-    for record in ChunkReader::new(header, &data).ok()? {
-        let record = record.ok()?;
-        if let Record::Schema { header, data } = record {
-            chunk.schemas.push((header, data.into_owned()));
-        } else if let Record::Channel(channel) = record {
-            chunk.channels.push(channel);
-        } else if let Record::Message { header, data } = record {
-            let data = data.into_owned();
-            chunk.messages.push(Message { header, data });
+    while let Some(event) = reader.next_event() {
+        match event.ok()? {
+            LinearReadEvent::ReadRequest(wanted) => {
+                let (next, behind) = rest.split_at(wanted.min(rest.len()));
+                reader.insert(next.len()).copy_from_slice(next);
+                reader.notify_read(next.len());
+                rest = behind;
+            }
+            LinearReadEvent::Record { data, opcode } => {
+                chunk.take(parse_record(opcode, data).ok()?);
+            }
         }
     }
-    Some((at..at + RECORD_HEAD_BYTES + content.len(), chunk))
+    Some((place, chunk))
 }
 
 impl Chunk {
+    fn take(&mut self, record: Record<'_>) {
+        if let Record::Schema { header, data } = record {
+            self.schemas.push((header, data.into_owned()));
+        } else if let Record::Channel(channel) = record {
+            self.channels.push(channel);
+        } else if let Record::Message { header, data } = record {
+            let data = data.into_owned();
+            self.messages.push(Message { header, data });
+        }
+    }
+
     /// Notes the channels that it defines; what contradicts an earlier definition is left out.
     fn note_channels(self, known: &mut ChannelAccumulator<'static>) {
         for (header, data) in self.schemas {

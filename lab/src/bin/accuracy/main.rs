@@ -1,9 +1,9 @@
 //! How well the robot tracks, how well it measures θ, how soon it notices other ground.
 //!
 //! `cargo run --release -p tread-lab --no-default-features --bin accuracy --
-//! [--runs N] [--threads N] [--json] [--only tracking,theta,change,held-out]`
+//! [--runs N] [--threads N] [--json | --markdown] [--only tracking,theta,change,held-out]`
 //!
-//! Every run is seeded. Prints tables, or with `--json` one object with the tables' figures and
+//! Every run is seeded. Prints tables in Markdown, or with `--json` one object with the tables' figures and
 //! `checks`; the process fails if one does not hold.
 
 #![expect(clippy::print_stdout, reason = "a program that prints a report")]

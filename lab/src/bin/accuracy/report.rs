@@ -3,6 +3,8 @@
 use std::fmt::Write as _;
 
 use serde_json::{Value, json};
+pub(crate) use tread_lab::report::Check;
+use tread_lab::report::{checks_json, checks_markdown};
 
 /// Most seeded runs per scenario.
 const RUNS_MAX: u32 = 100_000;
@@ -23,8 +25,7 @@ impl Options {
     pub(crate) fn from_arguments(
         arguments: impl Iterator<Item = String>,
     ) -> Result<Self, &'static str> {
-        const USAGE: &str =
-            "accuracy [--runs N] [--threads N] [--json] [--only tracking,theta,change,held-out]";
+        const USAGE: &str = "accuracy [--runs N] [--threads N] [--json | --markdown] [--only tracking,theta,change,held-out]";
         let mut options = Self {
             runs: 200,
             threads: std::thread::available_parallelism().map_or(1, usize::from),
@@ -36,6 +37,8 @@ impl Options {
             let mut value = || arguments.next().ok_or(USAGE);
             match argument.as_str() {
                 "--json" => options.json = true,
+                // What is printed anyway, asked for as of the other report programs.
+                "--markdown" => options.json = false,
                 "--runs" => options.runs = value()?.parse().map_err(|_| USAGE)?,
                 "--threads" => options.threads = value()?.parse().map_err(|_| USAGE)?,
                 "--only" => options.only = value()?.split(',').map(str::to_owned).collect(),
@@ -58,44 +61,6 @@ impl Options {
     /// Whether a part is to run.
     pub(crate) fn wants(&self, part: &str) -> bool {
         self.only.is_empty() || self.only.iter().any(|name| name == part)
-    }
-}
-
-/// One figure that must be reached.
-pub(crate) struct Check {
-    /// What is measured, and where.
-    pub(crate) name: String,
-    /// The goal in words, for instance `≤ 0.6`.
-    pub(crate) goal: String,
-    /// What was measured.
-    pub(crate) value: f64,
-    /// Whether the goal is reached.
-    pub(crate) holds: bool,
-}
-
-impl Check {
-    /// A figure that must not be above a bound; NaN does not hold.
-    pub(crate) fn at_most(name: impl Into<String>, value: f64, bound: f64) -> Self {
-        Self {
-            name: name.into(),
-            goal: format!("≤ {bound}"),
-            value,
-            holds: value <= bound,
-        }
-    }
-
-    /// A figure that must lie between two bounds; NaN does not hold.
-    pub(crate) fn between(
-        name: impl Into<String>,
-        value: f64,
-        range: std::ops::RangeInclusive<f64>,
-    ) -> Self {
-        Self {
-            name: name.into(),
-            goal: format!("{} … {}", range.start(), range.end()),
-            value,
-            holds: range.contains(&value),
-        }
     }
 }
 
@@ -124,28 +89,12 @@ pub(crate) fn render(sections: &[(&str, Section)], as_json: bool) -> String {
             .iter()
             .map(|(name, section)| ((*name).to_owned(), section.figures.clone()))
             .collect();
-        let checks: Vec<Value> = checks
-            .map(|check| {
-                json!({
-                    "name": check.name, "goal": check.goal,
-                    "value": check.value, "holds": check.holds,
-                })
-            })
-            .collect();
-        return json!({ "figures": figures, "checks": checks }).to_string();
+        return json!({ "figures": figures, "checks": checks_json(checks) }).to_string();
     }
     let mut text = String::new();
     for (name, section) in sections {
         let _ = write!(text, "## {name}\n\n{}\n\n", section.text);
     }
-    text.push_str("## checks\n\n| figure | goal | value | |\n|---|---|---|---|\n");
-    for check in checks {
-        let verdict = if check.holds { "holds" } else { "FAILS" };
-        let _ = writeln!(
-            text,
-            "| {} | {} | {:.4} | {verdict} |",
-            check.name, check.goal, check.value
-        );
-    }
+    let _ = write!(text, "## checks\n\n{}", checks_markdown(checks));
     text
 }

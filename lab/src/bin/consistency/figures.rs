@@ -1,13 +1,15 @@
 //! Trials with each fault, and hours without one.
 
 use tread_control::consistency::{Kind, Subject};
+use tread_lab::report::Check;
 
 use crate::generator::{Fault, Kit, Make, Robot, STEP_S};
 
 /// How much motion that shows a fault there may be until it is named, seconds, of 95 % of robots.
 const NAMED_WITHIN_S: f64 = 1.0;
 
-const USAGE: &str = "consistency [--json] [--hours N] [--trials N] [--seed N] [--other]";
+const USAGE: &str =
+    "consistency [--json | --markdown] [--hours N] [--trials N] [--seed N] [--other]";
 /// Most hours and trials.
 const HOURS_MAX: u32 = 1_000;
 const TRIALS_MAX: u32 = 10_000;
@@ -34,10 +36,21 @@ const HIDDEN: Goals = Goals {
     named_share_min: 0.9,
 };
 
+/// How the figures are printed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Output {
+    /// Lines for a terminal.
+    Lines,
+    /// One object for programs.
+    Json,
+    /// A table for a page.
+    Markdown,
+}
+
 /// What was asked for.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Options {
-    pub(crate) json: bool,
+    pub(crate) output: Output,
     pub(crate) hours: u32,
     pub(crate) trials: u32,
     /// The first seed of the trials and of the hours.
@@ -52,7 +65,7 @@ impl Options {
         mut arguments: impl Iterator<Item = String>,
     ) -> Result<Self, &'static str> {
         let mut options = Self {
-            json: false,
+            output: Output::Lines,
             hours: 10,
             trials: 100,
             seed: 0,
@@ -66,7 +79,8 @@ impl Options {
                     .ok_or(USAGE)
             };
             match argument.as_str() {
-                "--json" => options.json = true,
+                "--json" => options.output = Output::Json,
+                "--markdown" => options.output = Output::Markdown,
                 "--hours" => options.hours = value(HOURS_MAX)?,
                 "--trials" => options.trials = value(TRIALS_MAX)?,
                 "--seed" => options.seed = value(SEED_MAX)?,
@@ -75,26 +89,6 @@ impl Options {
             }
         }
         Ok(options)
-    }
-}
-
-/// One figure that must be reached.
-#[derive(Debug, Clone)]
-pub(crate) struct Check {
-    pub(crate) name: String,
-    pub(crate) goal: String,
-    pub(crate) value: f64,
-    pub(crate) holds: bool,
-}
-
-impl Check {
-    fn at_most(name: String, value: f64, most: f64) -> Self {
-        Self {
-            name,
-            goal: format!("≤ {most}"),
-            value,
-            holds: value <= most,
-        }
     }
 }
 

@@ -1,5 +1,5 @@
 //! How soon and how surely the consistency monitor names a fault, and whether it stays silent without
-//! one: `consistency [--json] [--hours N] [--trials N]`. Exits 1 if a check fails.
+//! one: `consistency [--json | --markdown] [--hours N] [--trials N]`. Exits 1 if a check fails.
 
 #![expect(
     clippy::print_stdout,
@@ -16,8 +16,9 @@ mod generator;
 
 use std::process::ExitCode;
 
-use figures::{Options, checks};
+use figures::{Options, Output, checks};
 use serde_json::json;
+use tread_lab::report::{checks_json, checks_markdown};
 
 fn main() -> ExitCode {
     let options = match Options::from_arguments(std::env::args().skip(1)) {
@@ -29,24 +30,19 @@ fn main() -> ExitCode {
     };
     let checks = checks(&options);
     let holds = checks.iter().all(|check| check.holds);
-    if options.json {
-        let checks: Vec<_> = checks
-            .iter()
-            .map(|check| {
-                json!({
-                    "name": check.name, "goal": check.goal,
-                    "value": check.value, "holds": check.holds,
-                })
-            })
-            .collect();
-        println!("{}", json!({ "checks": checks }));
-    } else {
-        for check in &checks {
-            let mark = if check.holds { "holds" } else { "FAILS" };
-            println!(
-                "{mark}  {:<62} {:>9.3}  goal {}",
-                check.name, check.value, check.goal
-            );
+    match options.output {
+        Output::Json => println!("{}", json!({ "checks": checks_json(&checks) })),
+        Output::Markdown => print!("{}", checks_markdown(&checks)),
+        Output::Lines => {
+            for check in &checks {
+                println!(
+                    "{}  {:<62} {:>9.3}  goal {}",
+                    check.verdict(),
+                    check.name,
+                    check.value,
+                    check.goal
+                );
+            }
         }
     }
     if holds {

@@ -1,9 +1,9 @@
 //! Section IV of the paper, run again: tables (CSV) and plots (SVG) of its Fig. 5, 6 and 7.
 //!
-//! `cargo run --release -p tread-lab --no-default-features --bin paper [-- --json]`
+//! `cargo run --release -p tread-lab --no-default-features --bin paper [-- --json | --markdown]`
 //!
-//! Writes to `target/paper/`. With `--json` it prints one object with `checks`; the process fails
-//! if one does not hold.
+//! Writes to `target/paper/`. With `--json` it prints one object with `checks`, with
+//! `--markdown` tables; the process fails if one does not hold.
 
 #![expect(clippy::print_stdout, reason = "a program that prints a report")]
 
@@ -25,11 +25,14 @@ use tread_control::robot::RobotModel;
 use tread_lab::paper::law::DesiredPoint;
 use tread_lab::paper::reduced::Reduced;
 use tread_lab::paper::{ClosedLoop, ClosedLoopState, Setting, Yi2007, Yi2007Config};
+use tread_lab::report::{Check, checks_json, checks_markdown};
 
 const STEP_S: f64 = 1.0e-3;
 /// Steps between two lines of a table.
 const EVERY: u32 = 100;
 const DURATION_S: u32 = 120;
+/// Lines of the tables of which the Markdown table has one: every 10 s.
+const MARKDOWN_EVERY: usize = 100;
 
 /// One line of the tables of Fig. 6 and 7.
 struct Row {
@@ -47,15 +50,9 @@ struct CircleRow {
     free: [f64; 2],
 }
 
-struct Check {
-    name: &'static str,
-    goal: &'static str,
-    value: f64,
-    holds: bool,
-}
-
 fn main() -> anyhow::Result<ExitCode> {
-    let json = std::env::args().any(|argument| argument == "--json");
+    let is_asked = |flag: &str| std::env::args().skip(1).any(|argument| argument == flag);
+    let (json, markdown) = (is_asked("--json"), is_asked("--markdown"));
     let target =
         std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| "target".into(), PathBuf::from);
     let folder = target.join("paper");
@@ -70,20 +67,14 @@ fn main() -> anyhow::Result<ExitCode> {
         radius_m(&circle, |row| row.free),
     ];
     if json {
-        let checks: Vec<_> = checks
-            .iter()
-            .map(|check| {
-                serde_json::json!({
-                    "name": check.name, "goal": check.goal,
-                    "value": check.value, "holds": check.holds,
-                })
-            })
-            .collect();
         let folder = folder.display().to_string();
+        let checks = checks_json(&checks);
         println!(
             "{}",
             serde_json::json!({ "folder": folder, "checks": checks })
         );
+    } else if markdown {
+        print!("{}", markdown_of(&rows, radii_m, &checks));
     } else {
         println!("tables and plots are in `{}`", folder.display());
         println!(
@@ -91,10 +82,12 @@ fn main() -> anyhow::Result<ExitCode> {
             radii_m[0], radii_m[1]
         );
         for check in &checks {
-            let verdict = if check.holds { "holds" } else { "FAILS" };
             println!(
-                "{:44} {:>12.6}  goal {:20} {verdict}",
-                check.name, check.value, check.goal
+                "{:44} {:>12.6}  goal {:20} {}",
+                check.name,
+                check.value,
+                check.goal,
+                check.verdict()
             );
         }
     }
@@ -103,6 +96,27 @@ fn main() -> anyhow::Result<ExitCode> {
     } else {
         ExitCode::FAILURE
     })
+}
+
+/// The figures as tables: Fig. 5, a line of Fig. 6 and 7 every 10 s, and the checks.
+fn markdown_of(rows: &[Row], radii_m: [f64; 2], checks: &[Check]) -> String {
+    let [imposed_m, free_m] = radii_m;
+    let mut text = format!(
+        "| Fig. 5, 60 and 120 rpm | radius m |\n|---|---|\n| S imposed | {imposed_m:.3} |\n\
+         | free base | {free_m:.3} |\n\n\
+         | time s | \\|ε\\| m | V | forward m/s | lateral m/s | ζ | θ̂ |\n|---|---|---|---|---|---|---|\n"
+    );
+    for row in rows.iter().step_by(MARKDOWN_EVERY) {
+        let (state, error_m) = (&row.state, row.error[0].hypot(row.error[1]));
+        let _ = writeln!(
+            text,
+            "| {:.0} | {error_m:.4} | {:.4} | {:.4} | {:.4} | {:.4} | {:.4} |",
+            state.time_s, row.lyapunov, state.forward_m_s, state.left_m_s, state.zeta, state.theta
+        );
+    }
+    text.push('\n');
+    text.push_str(&checks_markdown(checks));
+    text
 }
 
 /// Fig. 6 and 7: the law on the reduced model. Also the largest rise of V in a step.
@@ -197,26 +211,26 @@ fn checks(rows: &[Row], lyapunov_rise: f64) -> Vec<Check> {
     let at_40_m = error_m(40);
     vec![
         Check {
-            name: "largest rise of V in a step",
-            goal: "≤ 0 within rounding",
+            name: "largest rise of V in a step".to_owned(),
+            goal: "≤ 0 within rounding".to_owned(),
             value: lyapunov_rise,
             holds: lyapunov_rise <= 1.0e-12,
         },
         Check {
-            name: "θ̂ at the end (the truth is 0.2)",
-            goal: "0.9747 ± 0.001",
+            name: "θ̂ at the end (the truth is 0.2)".to_owned(),
+            goal: "0.9747 ± 0.001".to_owned(),
             value: theta,
             holds: (theta - 0.9747).abs() <= 0.001,
         },
         Check {
-            name: "|ε| at 40 s, metres",
-            goal: "0.067 ± 0.003",
+            name: "|ε| at 40 s, metres".to_owned(),
+            goal: "0.067 ± 0.003".to_owned(),
             value: at_40_m,
             holds: (at_40_m - 0.067).abs() <= 0.003,
         },
         Check {
-            name: "|ε| at the start, metres",
-            goal: "3.00 ± 0.01",
+            name: "|ε| at the start, metres".to_owned(),
+            goal: "3.00 ± 0.01".to_owned(),
             value: error_m(0),
             holds: (error_m(0) - 3.0).abs() <= 0.01,
         },

@@ -1,0 +1,83 @@
+//! What report programs print of the goals that they check: one table for all of them.
+
+use std::fmt::Write as _;
+use std::ops::RangeInclusive;
+
+use serde_json::{Value, json};
+
+/// One figure that must be reached.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Check {
+    /// What is measured, and where.
+    pub name: String,
+    /// The goal in words, for instance `≤ 0.6`.
+    pub goal: String,
+    /// What was measured.
+    pub value: f64,
+    /// Whether the goal is reached.
+    pub holds: bool,
+}
+
+impl Check {
+    /// A figure that must not be above a bound; NaN does not hold.
+    pub fn at_most(name: impl Into<String>, value: f64, bound: f64) -> Self {
+        Self {
+            name: name.into(),
+            goal: format!("≤ {bound}"),
+            value,
+            holds: value <= bound,
+        }
+    }
+
+    /// A figure that must lie between two bounds; NaN does not hold.
+    pub fn between(name: impl Into<String>, value: f64, range: RangeInclusive<f64>) -> Self {
+        Self {
+            name: name.into(),
+            goal: format!("{} … {}", range.start(), range.end()),
+            value,
+            holds: range.contains(&value),
+        }
+    }
+
+    /// Whether it holds, for people.
+    pub fn verdict(&self) -> &'static str {
+        if self.holds { "holds" } else { "FAILS" }
+    }
+}
+
+/// The checks for programs.
+pub fn checks_json<'a>(checks: impl IntoIterator<Item = &'a Check>) -> Value {
+    let one = |check: &Check| {
+        json!({
+            "name": check.name, "goal": check.goal,
+            "value": check.value, "holds": check.holds,
+        })
+    };
+    checks.into_iter().map(one).collect()
+}
+
+/// The checks as a table in Markdown.
+pub fn checks_markdown<'a>(checks: impl IntoIterator<Item = &'a Check>) -> String {
+    let mut text = String::from("| figure | goal | value | |\n|---|---|---|---|\n");
+    for check in checks {
+        // A bar would end the cell.
+        let name = check.name.replace('|', "\\|");
+        let (goal, verdict) = (&check.goal, check.verdict());
+        let _ = writeln!(text, "| {name} | {goal} | {:.4} | {verdict} |", check.value);
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bar_in_a_name_ends_no_cell_and_no_number_holds_no_goal() {
+        let check = Check::at_most("|ε|, m", f64::NAN, 0.1);
+        let table = checks_markdown([&check]);
+        let last = table.lines().last().unwrap();
+        assert_eq!(last, "| \\|ε\\|, m | ≤ 0.1 | NaN | FAILS |");
+        assert!(!Check::between("x", f64::NAN, 0.0..=1.0).holds);
+    }
+}
