@@ -1,289 +1,223 @@
-//! What the base says: where the robot is, the friction of the ground, and what is broken.
+//! First stage: what the base says, and whether it can be true.
+//!
+//! A channel that contradicts the others holds or slows whatever depends on it; the monitor itself
+//! is [`tread_control::consistency`].
 
-use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use tread_api::friction::TYRE_DIFFERENCE_SHARE;
-use tread_control::estimation::{SensorNoise, SensorSample};
-use tread_control::localisation::{FixOutcome, PositionFix};
-use tread_control::slip::BodyVelocity;
-use tread_control::tracking::ThetaKnowledge;
+use tread_control::consistency::{Consequence, Findings, Monitor, Sample, Subject};
+use tread_control::estimation::SensorSample;
+use tread_control::gate::teleoperation::BLIND_MAX_M_S;
+use tread_control::geometry::Point;
+use tread_control::localisation::PositionFix;
+use tread_control::measured::WheelSpeeds;
+use tread_control::robot::RobotModel;
 
-use super::{LoopCore, TICK_MAX_S, age_s};
-use crate::control_loop::active::Hold;
-use crate::control_loop::channels::{ClosedSegment, Fault, LoopEvent, Shared};
-use crate::control_loop::gain::GroundRecord;
-use crate::control_loop::prior::{Prior, told};
-use crate::control_loop::segments::{CutInput, Moment, Place};
-use crate::control_loop::site_view::Footing;
-use crate::control_loop::surface::Comparison;
-use crate::drive::{Feedback, StatedNoise};
-use crate::geometry::wire_point;
+use super::TICK_MAX_S;
+use crate::drive::{self, Feedback, SAMPLES_MAX};
 
-/// How long a base that was silent must be heard before its mission goes on.
-const HEARD_AGAIN_FOR: Duration = Duration::from_millis(500);
-/// Range within which a base's own word on its noise is believed, as a multiple of the default.
-const NOISE_RANGE: std::ops::RangeInclusive<f64> = 0.1..=30.0;
 /// Oldest word of a sensor of the robot's own speed that says how fast it is now.
-pub(super) const BODY_SPEED_AGE_MAX: Duration = Duration::from_millis(150);
-/// Oldest position fix with which the position does not count as lost.
-const POSITION_LOST_AFTER: Duration = Duration::from_secs(3);
+const BODY_SPEED_AGE_MAX: Duration = Duration::from_millis(150);
+/// Fastest speed of a robot whose sensors contradict each other.
+const DOUBT_MAX_M_S: f64 = BLIND_MAX_M_S;
 
-impl LoopCore {
-    /// Takes what the base said; true if the estimator found the ground changed.
-    pub(super) fn take_samples(&mut self, feedback: &Feedback) -> bool {
-        let mut ground_changed = false;
-        let mut has_new_block = false;
-        let lost = u64::from(feedback.lost());
-        self.ends
-            .shared
-            .lost_samples
-            .fetch_add(lost, Ordering::Relaxed);
-        self.motion.fix = None;
-        for sample in feedback.samples() {
-            self.check_sensors(sample);
-            if sample.tilt_rad.is_some() {
-                self.tilt_rad = sample.tilt_rad;
-            }
-            if let Some(speed_m_s) = sample.body_speed_m_s.filter(|speed| speed.is_finite()) {
-                self.body_speed = Some((speed_m_s, sample.at));
-            }
-            let gyro_rad_s = sample.yaw_rate_rad_s.filter(|rate| rate.is_finite());
-            let wheel_speeds = sample.wheel_speeds.filter(|speeds| speeds.is_finite());
-            if let (Some(gyro_rad_s), Some(wheel_speeds)) = (gyro_rad_s, wheel_speeds) {
-                let dt_s = self
-                    .last_sample
-                    .map_or(0.0, |last| sample.at.saturating_sub(last).as_secs_f64())
-                    .min(TICK_MAX_S);
-                // Only what can be used counts as a word of the base: one that says nothing but
-                // nonsense is as good as silent.
-                self.last_sample = Some(sample.at);
-                self.check_gap(sample.at);
-                self.integrated_to = self.integrated_to.max(Some(sample.at));
-                self.measured_wheels = wheel_speeds;
-                if dt_s > 0.0 {
-                    let forward = self.model.twist_from_wheel_speeds(wheel_speeds).linear_m_s;
-                    self.progress.note_wheels(forward * dt_s);
-                    self.localisation.predict(gyro_rad_s, wheel_speeds, dt_s);
-                    // With wheels on two grounds there is no one θ to learn.
-                    if self.footing != Some(Footing::Mixed) && self.may_learn() {
-                        let taken = SensorSample {
-                            wheel_speeds,
-                            gyro_rad_s,
-                            acceleration: sample.acceleration,
-                            body_speed_m_s: sample.body_speed_m_s,
-                            wheel_torques: sample.wheel_torques,
-                        };
-                        let outcome = self.estimator.update(&taken, dt_s);
-                        ground_changed |= outcome.ground_changed;
-                        has_new_block |= outcome.block_done;
-                        if outcome.block_done {
-                            self.slips = outcome.slips;
-                        }
-                        if outcome.block_done && self.cutter.cell().is_none() {
-                            Shared::count(&self.ends.shared.unplaced_blocks);
-                        }
-                    }
-                }
-            }
-            if let Some(pose) = sample.position {
-                self.check_gap(sample.at);
-                self.progress.note_fix(pose.point());
-                // A position takes longer to be found than the motion since.
-                let fix = PositionFix {
-                    pose,
-                    age_s: self
-                        .last_sample
-                        .map_or(0.0, |last| last.saturating_sub(sample.at).as_secs_f64()),
-                    noise: sample.position_noise,
-                };
-                match self.localisation.correct(&fix) {
-                    FixOutcome::Started | FixOutcome::Fused | FixOutcome::Restarted => {
-                        self.last_fix = Some(sample.at);
-                    }
-                    FixOutcome::Invalid | FixOutcome::Outlier => {}
-                }
-            }
-        }
-        if has_new_block {
-            self.estimate = self.estimator.estimate();
-        }
-        ground_changed
-    }
+/// What the stage takes.
+#[derive(Debug)]
+pub(super) struct SensingInput<'tick> {
+    /// What the base has said since the last tick.
+    pub(super) feedback: &'tick Feedback,
+    /// Whether the drive says that the base is silent.
+    pub(super) is_base_silent: bool,
+    /// What the base was commanded by the last tick; none before the first.
+    pub(super) commanded: Option<WheelSpeeds>,
+}
 
-    /// Where the robot went while its wheels were not heard, nobody knows: without this, what its
-    /// position says afterwards would be refused as a jump.
-    fn check_gap(&mut self, at: Duration) {
-        let Some(integrated_to) = self.integrated_to else {
-            return;
-        };
-        let gap = at.saturating_sub(integrated_to);
-        if gap > self.silent_after {
-            self.localisation.lose_track(gap.as_secs_f64());
-            self.integrated_to = Some(at);
+/// One sample, as the estimation takes it.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct CheckedSample {
+    /// When it was measured.
+    pub(super) at: Duration,
+    /// Gyro and wheels with the rest, and the seconds since they were heard before.
+    pub(super) motion: Option<(SensorSample, f64)>,
+    /// A position, finite or not.
+    pub(super) fix: Option<PositionFix>,
+    /// Whether no sensor contradicts another, so that something may be learned of the ground.
+    pub(super) may_learn: bool,
+}
+
+/// What the stage gives.
+#[derive(Debug)]
+pub(super) struct Sensed {
+    samples: [CheckedSample; SAMPLES_MAX],
+    count: usize,
+    /// Samples that gave way to newer ones.
+    pub(super) lost_samples: u32,
+    /// Sensors that contradict each other.
+    pub(super) findings: Findings,
+    /// Whether the drive says that the base is silent.
+    pub(super) is_base_silent: bool,
+    /// When gyro and wheels were measured last.
+    pub(super) last_sample: Option<Duration>,
+    /// Wheel speeds as measured last.
+    pub(super) wheel_speeds: WheelSpeeds,
+    /// How far the robot leans, if the base measures it.
+    pub(super) tilt_rad: Option<f64>,
+    /// What the gyro said last in this tick, finite or not.
+    pub(super) turn_rad_s: Option<f64>,
+    /// The newest position of this tick.
+    pub(super) fix: Option<Point>,
+    body_speed: Option<(f64, Duration)>,
+}
+
+/// The stage's state.
+#[derive(Debug)]
+pub(super) struct Sensing {
+    monitor: Monitor,
+    findings: Findings,
+    last_sample: Option<Duration>,
+    wheel_speeds: WheelSpeeds,
+    tilt_rad: Option<f64>,
+    /// How fast the robot went by a sensor of its own, m/s, and when.
+    body_speed: Option<(f64, Duration)>,
+}
+
+impl Sensing {
+    pub(super) fn new(model: RobotModel) -> Self {
+        Self {
+            monitor: Monitor::new(model),
+            findings: Findings::default(),
+            last_sample: None,
+            wheel_speeds: WheelSpeeds::default(),
+            tilt_rad: None,
+            body_speed: None,
         }
     }
 
-    /// How fast the robot really goes along its path, as well as it is known: slip tells wheels and
-    /// robot apart, and position fixes tell of it only after a while.
-    pub(super) fn real_m_s(&self, now: Duration) -> f64 {
-        let is_new = |at: Duration| now.saturating_sub(at) <= BODY_SPEED_AGE_MAX;
-        match self.body_speed {
-            Some((speed_m_s, at)) if is_new(at) && self.is_odometry_right() => speed_m_s,
-            Some(_) | None => self.localisation.twist().linear_m_s,
+    /// Takes and checks what the base said.
+    pub(super) fn step(&mut self, input: &SensingInput<'_>) -> Sensed {
+        if let Some(commanded) = input.commanded {
+            self.monitor.command(commanded);
+        }
+        let heard = input.feedback.samples();
+        let mut samples = [CheckedSample::default(); SAMPLES_MAX];
+        let (mut turn_rad_s, mut fix) = (None, None);
+        for (checked, sample) in samples.iter_mut().zip(heard) {
+            *checked = self.check(sample);
+            turn_rad_s = sample.yaw_rate_rad_s.or(turn_rad_s);
+            if let Some(pose) = sample.position.filter(|pose| pose.is_finite()) {
+                fix = Some(pose.point());
+            }
+        }
+        Sensed {
+            samples,
+            count: heard.len(),
+            lost_samples: input.feedback.lost(),
+            findings: self.findings,
+            is_base_silent: input.is_base_silent,
+            last_sample: self.last_sample,
+            wheel_speeds: self.wheel_speeds,
+            tilt_rad: self.tilt_rad,
+            turn_rad_s,
+            fix,
+            body_speed: self.body_speed,
         }
     }
 
-    /// How much the wheels slip; nothing is known of a base that is silent.
-    pub(super) fn measure_slip(&mut self, now: Duration, dt_s: f64) {
-        let is_silent =
-            self.is_base_silent || age_s(now, self.last_sample) > self.silent_after.as_secs_f64();
-        let velocity = BodyVelocity {
-            forward_m_s: self.real_m_s(now),
-            left_m_s: 0.0,
-            yaw_rate_rad_s: self.localisation.twist().angular_rad_s,
-        };
-        let heard = (!is_silent).then_some((velocity, self.measured_wheels));
-        self.slip.step(heard, &self.model, dt_s);
-    }
-
-    /// What is known of the ground: what was measured, and what the map knows of the cell. The
-    /// estimator itself never hears of the map.
-    pub(super) fn ground(&self, prior: &Prior) -> GroundRecord {
-        // What is wrong in all that this robot measures is right for itself: its law feeds slip
-        // forward by the same mass, inertia and tyres.
-        let measured = self.estimate.theta.map(|measured| ThetaKnowledge {
-            theta: measured.theta,
-            std_dev: measured.own_std_dev,
+    fn check(&mut self, sample: &drive::SensorSample) -> CheckedSample {
+        self.monitor.take(&Sample {
+            at: sample.at,
+            gyro_rad_s: sample.yaw_rate_rad_s,
+            wheel_speeds: sample.wheel_speeds,
+            acceleration: sample.acceleration,
+            odometry_m_s: sample.body_speed_m_s,
+            position: sample.position,
+            position_noise: sample.position_noise,
         });
-        let site = self.site.as_ref();
-        let mapped = site.zip(self.localisation.pose()).and_then(|(site, pose)| {
-            let grid = site.grid();
-            let cell = grid.cell_at(wire_point(pose))?;
-            prior.at(grid.revision, cell)
-        });
-        GroundRecord {
-            traction_limit_mu: prior.traction_limit_mu(),
-            is_on_the_map: mapped.is_some(),
-            told: told(measured, mapped),
-            measured,
+        self.findings = self.monitor.findings();
+        if sample.tilt_rad.is_some() {
+            self.tilt_rad = sample.tilt_rad;
+        }
+        if let Some(speed_m_s) = sample.body_speed_m_s.filter(|speed| speed.is_finite()) {
+            self.body_speed = Some((speed_m_s, sample.at));
+        }
+        let motion = self.motion_of(sample);
+        // A position takes longer to be found than the motion since.
+        let age_s = self
+            .last_sample
+            .map_or(0.0, |last| last.saturating_sub(sample.at).as_secs_f64());
+        CheckedSample {
+            at: sample.at,
+            motion,
+            fix: sample.position.map(|pose| PositionFix {
+                pose,
+                age_s,
+                noise: sample.position_noise,
+            }),
+            may_learn: self.findings.consequence().is_none(),
         }
     }
 
-    /// Holds what a closed segment says against what the map says of its cell.
-    fn compare(&mut self, segment: &ClosedSegment) {
-        let active = self.active.as_mut();
-        let Some(active) = active.filter(|active| segment.mission == Some(active.job.mission))
-        else {
-            return;
+    /// Only what can be used counts as a word of the base: one that says nothing but nonsense is as
+    /// good as silent.
+    fn motion_of(&mut self, sample: &drive::SensorSample) -> Option<(SensorSample, f64)> {
+        let gyro_rad_s = sample.yaw_rate_rad_s.filter(|rate| rate.is_finite())?;
+        let wheel_speeds = sample.wheel_speeds.filter(|speeds| speeds.is_finite())?;
+        let dt_s = self
+            .last_sample
+            .map_or(0.0, |last| sample.at.saturating_sub(last).as_secs_f64())
+            .min(TICK_MAX_S);
+        self.last_sample = Some(sample.at);
+        self.wheel_speeds = wheel_speeds;
+        let taken = SensorSample {
+            wheel_speeds,
+            gyro_rad_s,
+            acceleration: sample.acceleration,
+            body_speed_m_s: sample.body_speed_m_s,
+            wheel_torques: sample.wheel_torques,
         };
-        let (prior, statistics) = (&active.job.prior, &segment.statistics);
-        let expected = prior.at(segment.site.grid().revision, segment.cell);
-        let Some((expected, theta)) = expected.zip(statistics.theta()) else {
-            return;
-        };
-        let comparison = Comparison {
-            cell: segment.cell,
-            measured: ThetaKnowledge {
-                theta,
-                std_dev: statistics.own_information.sqrt().recip(),
-            },
-            expected,
-            robot_bias_ratio: prior
-                .robot_bias_ratio()
-                .max(statistics.common_ratio.robot)
-                .hypot(TYRE_DIFFERENCE_SHARE * statistics.common_ratio.tyres),
-        };
-        active.compare(&comparison);
-        self.surface.note(comparison);
+        Some((taken, dt_s))
+    }
+}
+
+impl Sensed {
+    /// The samples of this tick, oldest first.
+    pub(super) fn samples(&self) -> &[CheckedSample] {
+        &self.samples[..self.count]
     }
 
-    pub(super) fn cut_segments(&mut self, now: Moment, ground_changed: bool, dt_s: f64) {
-        let pose = self.localisation.pose();
-        let mut place = None;
-        self.footing = None;
-        if let (Some(site), Some(pose)) = (&self.site, pose) {
-            let footing = site.footing(pose, &self.model);
-            self.footing = Some(footing);
-            let former = self.cutter.cell();
-            if let (Footing::Whole(terrain), Some(cell)) =
-                (footing, site.cell(wire_point(pose), former))
-            {
-                place = Some(Place { cell, terrain });
-            }
-        }
-        let speed_m_s = self.localisation.twist().linear_m_s.abs();
-        let input = CutInput {
-            now,
-            place,
-            site: self.site.as_ref(),
-            mission: self.active.as_ref().map(|active| active.job.mission),
-            driven_m: if speed_m_s.is_finite() {
-                speed_m_s * dt_s
-            } else {
-                0.0
-            },
-            ground_changed,
-        };
-        let cut = self.cutter.step(input, &mut self.estimator);
-        if cut.is_new_ground {
-            // What was known of the ground before says nothing here.
-            self.estimate = self.estimator.estimate();
-        }
-        if let Some(segment) = cut.segment {
-            let statistics = &segment.statistics;
-            self.closed = Some((statistics.theta_information, statistics.theta_weighted));
-            self.compare(&segment);
-            self.outgoing.send(LoopEvent::Segment(segment));
-        }
+    /// Whether nothing is wrong about a subject.
+    pub(super) fn is_right(&self, subject: Subject) -> bool {
+        self.findings.about(subject).is_none()
     }
 
-    /// Holds the mission of a base that is silent, and lets it go on when that is heard again for a
-    /// while.
-    pub(super) fn hold_for_base(&mut self, now: Duration, fault: Option<Fault>) {
-        if fault == Some(Fault::BaseSilent) {
-            self.base_silent_at = Some(now);
-        }
-        let is_on_hold = self
-            .base_silent_at
-            .is_some_and(|silent_at| now.saturating_sub(silent_at) < HEARD_AGAIN_FOR);
-        if !is_on_hold {
-            self.base_silent_at = None;
-        }
-        if let Some(active) = &mut self.active {
-            active.hold(Hold::Base, is_on_hold);
-        }
+    /// Whether the position may be wrong.
+    pub(super) fn is_position_doubted(&self) -> bool {
+        !(self.is_right(Subject::Position) && self.is_right(Subject::Motion))
     }
 
-    /// Weighs samples by what the base says of its sensors, as far as that can be.
-    pub(super) fn take_noise(&mut self, stated: StatedNoise) {
-        if self.stated_noise == stated {
-            return;
-        }
-        self.stated_noise = stated;
-        let default = SensorNoise::default();
-        let within = |stated: Option<f64>, default: f64| {
-            let (least, most) = (NOISE_RANGE.start() * default, NOISE_RANGE.end() * default);
-            stated.map_or(default, |stated| stated.clamp(least, most))
-        };
-        self.estimator.set_noise(SensorNoise {
-            gyro_rad_s: within(stated.gyro_rad_s, default.gyro_rad_s),
-            accelerometer_m_s2: within(stated.accelerometer_m_s2, default.accelerometer_m_s2),
-            body_speed_m_s: within(stated.body_speed_m_s, default.body_speed_m_s),
-            ..default
-        });
+    /// Whether the robot must not drive by itself.
+    pub(super) fn must_hold(&self) -> bool {
+        self.findings.consequence() == Some(Consequence::Hold)
     }
 
-    pub(super) fn fault(&self, now: Duration) -> Option<Fault> {
-        let is_older = |at: Option<Duration>, most: Duration| {
-            at.is_some_and(|at| now.saturating_sub(at) > most)
-        };
-        if self.is_base_silent || is_older(self.last_sample, self.silent_after) {
-            Some(Fault::BaseSilent)
-        } else if is_older(self.last_fix, POSITION_LOST_AFTER) {
-            Some(Fault::PositionLost)
-        } else {
-            None
-        }
+    /// How fast a robot with these findings may be.
+    pub(super) fn sensors_max_m_s(&self) -> Option<f64> {
+        let consequence = self.findings.consequence()?;
+        (consequence >= Consequence::Slow).then_some(DOUBT_MAX_M_S)
     }
+
+    /// Whether gyro and wheels were heard of late.
+    pub(super) fn is_heard(&self, now: Duration) -> bool {
+        !self.is_base_silent && self.last_sample.is_some_and(|at| is_new(at, now))
+    }
+
+    /// How fast the robot goes by a sensor of its own that is believed, m/s.
+    pub(super) fn odometry_m_s(&self, now: Duration) -> Option<f64> {
+        let (speed_m_s, at) = self.body_speed?;
+        (is_new(at, now) && self.is_right(Subject::Odometry)).then_some(speed_m_s)
+    }
+}
+
+fn is_new(at: Duration, now: Duration) -> bool {
+    now.saturating_sub(at) <= BODY_SPEED_AGE_MAX
 }

@@ -1,0 +1,405 @@
+//! Second stage: where the robot is, and the friction of the ground that it is on.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tread_api::friction::SideSlip;
+use tread_api::ids::MissionId;
+use tread_api::site::Cell;
+use tread_control::estimation::{Estimate, Estimator, EstimatorPrior, SensorNoise};
+use tread_control::geometry::{Point, Pose, Twist};
+use tread_control::localisation::{FixOutcome, Localisation, LocalisationNoise};
+use tread_control::measured::Measured;
+use tread_control::robot::RobotModel;
+use tread_control::slip::BodyVelocity;
+use tread_control::tracking::ThetaKnowledge;
+
+use super::sensing::{CheckedSample, Sensed};
+use super::{Tick, age_s};
+use crate::control_loop::channels::{ClosedSegment, Fault};
+use crate::control_loop::gain::GroundRecord;
+use crate::control_loop::prior::{Prior, told};
+use crate::control_loop::progress::ProgressWatch;
+use crate::control_loop::segments::{CutInput, Place, SegmentCutter};
+use crate::control_loop::site_view::{Footing, SiteView};
+use crate::control_loop::slip::SlipMeter;
+use crate::drive::{SILENT_AFTER_MAX, StatedNoise};
+use crate::geometry::wire_point;
+
+/// Range within which a base's own word on its noise is believed, as a multiple of the default.
+const NOISE_RANGE: std::ops::RangeInclusive<f64> = 0.1..=30.0;
+/// Oldest position fix with which the position does not count as lost.
+const POSITION_LOST_AFTER: Duration = Duration::from_secs(3);
+
+/// What the stage takes.
+#[derive(Debug)]
+pub(super) struct EstimationInput<'tick> {
+    pub(super) tick: Tick,
+    pub(super) sensed: &'tick Sensed,
+    /// What the base says of its sensors' noise.
+    pub(super) noise: StatedNoise,
+    /// A new definition of the site.
+    pub(super) site: Option<Arc<SiteView>>,
+    /// The mission to which a segment that opens now belongs.
+    pub(super) mission: Option<MissionId>,
+}
+
+/// What the stage gives.
+#[derive(Debug)]
+pub(super) struct Estimated<'tick> {
+    pub(super) pose: Option<Pose>,
+    pub(super) twist: Twist,
+    pub(super) position_std_dev_m: f64,
+    /// When the last fix behind the pose was measured.
+    pub(super) last_fix: Option<Duration>,
+    /// The robot as the tracking law sees it.
+    pub(super) measured: Measured,
+    /// What is broken.
+    pub(super) fault: Option<Fault>,
+    /// What is known of the ground.
+    pub(super) estimate: Estimate,
+    /// What is known of it beside a map.
+    pub(super) ground: Ground,
+    /// The same before this tick's segment was closed, for a mission that begins in this tick.
+    pub(super) ground_at_begin: Ground,
+    /// Whether the estimator found the ground changed.
+    pub(super) ground_changed: bool,
+    /// Whether a wheel slips beyond the model.
+    pub(super) slips: bool,
+    /// How much they slip.
+    pub(super) slip: Option<SideSlip>,
+    /// Where the wheels turn without progress.
+    pub(super) dug_in_at: Option<Point>,
+    /// The site as it is now.
+    pub(super) site: Option<&'tick SiteView>,
+    /// The cell that is measured, and the terrain under all wheels.
+    pub(super) cell: Option<Cell>,
+    pub(super) terrain: Option<usize>,
+    /// Sums on θ of the segment that was closed.
+    pub(super) closed: Option<(f64, f64)>,
+    /// Blocks of measurement in this tick that belong to no cell.
+    pub(super) unplaced_blocks: u64,
+}
+
+/// What leaves the loop with this stage.
+#[derive(Debug, Default)]
+pub(super) struct Released {
+    /// A segment that was closed with information.
+    pub(super) segment: Option<ClosedSegment>,
+    /// A site that is no longer used.
+    pub(super) site: Option<Arc<SiteView>>,
+}
+
+/// What is known of the ground where the robot is, without any map.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Ground {
+    measured: Option<ThetaKnowledge>,
+    /// The cell, and the revision of its grid.
+    cell: Option<(u32, Cell)>,
+}
+
+/// What became of this tick's samples.
+#[derive(Debug, Default)]
+struct Taken {
+    ground_changed: bool,
+    has_new_block: bool,
+    unplaced_blocks: u64,
+}
+
+/// The stage's state.
+#[derive(Debug)]
+pub(super) struct Estimation {
+    model: RobotModel,
+    localisation: Localisation,
+    estimator: Estimator,
+    estimate: Estimate,
+    cutter: SegmentCutter,
+    site: Option<Arc<SiteView>>,
+    footing: Option<Footing>,
+    last_fix: Option<Duration>,
+    /// Until when the localisation has accounted for the robot's motion.
+    integrated_to: Option<Duration>,
+    /// Oldest word of the base with which it does not count as silent.
+    silent_after: Duration,
+    /// What the base says of its sensors' noise.
+    stated_noise: StatedNoise,
+    slips: bool,
+    slip: SlipMeter,
+    progress: ProgressWatch,
+}
+
+impl Estimation {
+    pub(super) fn new(model: RobotModel) -> Self {
+        let prior = EstimatorPrior::default();
+        let estimator = Estimator::with_prior(model, SensorNoise::default(), prior);
+        Self {
+            model,
+            localisation: Localisation::new(model, LocalisationNoise::default()),
+            estimate: estimator.estimate(),
+            estimator,
+            cutter: SegmentCutter::default(),
+            site: None,
+            footing: None,
+            last_fix: None,
+            integrated_to: None,
+            silent_after: SILENT_AFTER_MAX,
+            stated_noise: StatedNoise::default(),
+            slips: false,
+            slip: SlipMeter::default(),
+            progress: ProgressWatch::default(),
+        }
+    }
+
+    /// A base counts as silent after this.
+    pub(super) fn set_silent_after(&mut self, silent_after: Duration) {
+        self.silent_after = silent_after;
+    }
+
+    /// Begins with what is known of the robot.
+    pub(super) fn set_prior(&mut self, prior: EstimatorPrior) {
+        self.estimator = Estimator::with_prior(self.model, SensorNoise::default(), prior);
+        self.estimate = self.estimator.estimate();
+    }
+
+    /// Localises the robot, measures the ground, and closes what is measured of a cell.
+    pub(super) fn step(&mut self, input: EstimationInput<'_>) -> (Estimated<'_>, Released) {
+        let (tick, sensed) = (input.tick, input.sensed);
+        let now = tick.now.monotonic;
+        self.take_noise(input.noise);
+        let taken = self.take_samples(sensed.samples());
+        self.measure_slip(sensed, tick);
+        let retired = input.site.and_then(|site| self.replace_site(site));
+        let ground_at_begin = self.ground();
+        let segment = self.cut_segment(tick, input.mission, taken.ground_changed);
+        let pose = self.localisation.pose();
+        let twist = self.localisation.twist();
+        let closed = segment.as_ref().map(|segment| {
+            let statistics = &segment.statistics;
+            (statistics.theta_information, statistics.theta_weighted)
+        });
+        let estimated = Estimated {
+            pose,
+            twist,
+            position_std_dev_m: self.localisation.position_std_dev_m(),
+            last_fix: self.last_fix,
+            measured: Measured {
+                pose: pose.unwrap_or_default(),
+                twist,
+                wheel_speeds: sensed.wheel_speeds,
+                pose_age_s: age_s(now, self.last_fix),
+                position_std_dev_m: self.localisation.position_std_dev_m(),
+            },
+            fault: self.fault(sensed, now),
+            estimate: self.estimate,
+            ground: self.ground(),
+            ground_at_begin,
+            ground_changed: taken.ground_changed,
+            slips: self.slips,
+            slip: self.slip.slip(),
+            dug_in_at: self.progress.dug_in_at(),
+            cell: self.cutter.cell(),
+            terrain: match self.footing {
+                Some(Footing::Whole(terrain)) => terrain,
+                Some(Footing::Mixed) | None => None,
+            },
+            closed,
+            unplaced_blocks: taken.unplaced_blocks,
+            site: self.site.as_deref(),
+        };
+        let released = Released {
+            segment,
+            site: retired,
+        };
+        (estimated, released)
+    }
+
+    /// Weighs samples by what the base says of its sensors, as far as that can be.
+    fn take_noise(&mut self, stated: StatedNoise) {
+        if self.stated_noise == stated {
+            return;
+        }
+        self.stated_noise = stated;
+        let default = SensorNoise::default();
+        let within = |stated: Option<f64>, default: f64| {
+            let (least, most) = (NOISE_RANGE.start() * default, NOISE_RANGE.end() * default);
+            stated.map_or(default, |stated| stated.clamp(least, most))
+        };
+        self.estimator.set_noise(SensorNoise {
+            gyro_rad_s: within(stated.gyro_rad_s, default.gyro_rad_s),
+            accelerometer_m_s2: within(stated.accelerometer_m_s2, default.accelerometer_m_s2),
+            body_speed_m_s: within(stated.body_speed_m_s, default.body_speed_m_s),
+            ..default
+        });
+    }
+
+    fn take_samples(&mut self, samples: &[CheckedSample]) -> Taken {
+        let mut taken = Taken::default();
+        for sample in samples {
+            self.take_motion(sample, &mut taken);
+            let Some(fix) = sample.fix else {
+                continue;
+            };
+            self.check_gap(sample.at);
+            self.progress.note_fix(fix.pose.point());
+            match self.localisation.correct(&fix) {
+                FixOutcome::Started | FixOutcome::Fused | FixOutcome::Restarted => {
+                    self.last_fix = Some(sample.at);
+                }
+                FixOutcome::Invalid | FixOutcome::Outlier => {}
+            }
+        }
+        if taken.has_new_block {
+            self.estimate = self.estimator.estimate();
+        }
+        taken
+    }
+
+    fn take_motion(&mut self, sample: &CheckedSample, taken: &mut Taken) {
+        let Some((motion, dt_s)) = sample.motion else {
+            return;
+        };
+        self.check_gap(sample.at);
+        self.integrated_to = self.integrated_to.max(Some(sample.at));
+        if dt_s <= 0.0 {
+            return;
+        }
+        let (gyro_rad_s, wheel_speeds) = (motion.gyro_rad_s, motion.wheel_speeds);
+        let forward_m_s = self.model.twist_from_wheel_speeds(wheel_speeds).linear_m_s;
+        self.progress.note_wheels(forward_m_s * dt_s);
+        self.localisation.predict(gyro_rad_s, wheel_speeds, dt_s);
+        // With wheels on two grounds there is no one θ to learn.
+        if self.footing == Some(Footing::Mixed) || !sample.may_learn {
+            return;
+        }
+        let outcome = self.estimator.update(&motion, dt_s);
+        taken.ground_changed |= outcome.ground_changed;
+        taken.has_new_block |= outcome.block_done;
+        if outcome.block_done {
+            self.slips = outcome.slips;
+            taken.unplaced_blocks += u64::from(self.cutter.cell().is_none());
+        }
+    }
+
+    /// Where the robot went while its wheels were not heard, nobody knows: without this, what its
+    /// position says afterwards would be refused as a jump.
+    fn check_gap(&mut self, at: Duration) {
+        let Some(integrated_to) = self.integrated_to else {
+            return;
+        };
+        let gap = at.saturating_sub(integrated_to);
+        if gap > self.silent_after {
+            self.localisation.lose_track(gap.as_secs_f64());
+            self.integrated_to = Some(at);
+        }
+    }
+
+    /// How much the wheels slip; nothing is known of a base that is silent.
+    fn measure_slip(&mut self, sensed: &Sensed, tick: Tick) {
+        let now = tick.now.monotonic;
+        let is_silent = sensed.is_base_silent
+            || age_s(now, sensed.last_sample) > self.silent_after.as_secs_f64();
+        let twist = self.localisation.twist();
+        let velocity = BodyVelocity {
+            forward_m_s: real_m_s(sensed, twist, now),
+            left_m_s: 0.0,
+            yaw_rate_rad_s: twist.angular_rad_s,
+        };
+        let heard = (!is_silent).then_some((velocity, sensed.wheel_speeds));
+        self.slip.step(heard, &self.model, tick.dt_s);
+    }
+
+    /// Takes another definition of the site and gives the former one back.
+    fn replace_site(&mut self, site: Arc<SiteView>) -> Option<Arc<SiteView>> {
+        self.cutter.abandon(&mut self.estimator);
+        self.estimate = self.estimator.estimate();
+        self.site.replace(site)
+    }
+
+    fn ground(&self) -> Ground {
+        // What is wrong in all that this robot measures is right for itself: its law feeds slip
+        // forward by the same mass, inertia and tyres.
+        let measured = self.estimate.theta.map(|measured| ThetaKnowledge {
+            theta: measured.theta,
+            std_dev: measured.own_std_dev,
+        });
+        let place = self.site.as_ref().zip(self.localisation.pose());
+        let cell = place.and_then(|(site, pose)| {
+            let grid = site.grid();
+            Some((grid.revision, grid.cell_at(wire_point(pose))?))
+        });
+        Ground { measured, cell }
+    }
+
+    fn cut_segment(
+        &mut self,
+        tick: Tick,
+        mission: Option<MissionId>,
+        ground_changed: bool,
+    ) -> Option<ClosedSegment> {
+        let mut place = None;
+        self.footing = None;
+        if let (Some(site), Some(pose)) = (&self.site, self.localisation.pose()) {
+            let footing = site.footing(pose, &self.model);
+            self.footing = Some(footing);
+            let former = self.cutter.cell();
+            if let (Footing::Whole(terrain), Some(cell)) =
+                (footing, site.cell(wire_point(pose), former))
+            {
+                place = Some(Place { cell, terrain });
+            }
+        }
+        let speed_m_s = self.localisation.twist().linear_m_s.abs();
+        let input = CutInput {
+            now: tick.now,
+            place,
+            site: self.site.as_ref(),
+            mission,
+            driven_m: if speed_m_s.is_finite() {
+                speed_m_s * tick.dt_s
+            } else {
+                0.0
+            },
+            ground_changed,
+        };
+        let cut = self.cutter.step(input, &mut self.estimator);
+        if cut.is_new_ground {
+            // What was known of the ground before says nothing here.
+            self.estimate = self.estimator.estimate();
+        }
+        cut.segment
+    }
+
+    fn fault(&self, sensed: &Sensed, now: Duration) -> Option<Fault> {
+        let is_older = |at: Option<Duration>, most: Duration| {
+            at.is_some_and(|at| now.saturating_sub(at) > most)
+        };
+        if sensed.is_base_silent || is_older(sensed.last_sample, self.silent_after) {
+            Some(Fault::BaseSilent)
+        } else if is_older(self.last_fix, POSITION_LOST_AFTER) {
+            Some(Fault::PositionLost)
+        } else {
+            None
+        }
+    }
+}
+
+impl Ground {
+    /// What is known with what the map says of the cell. The estimator itself never hears of it.
+    pub(super) fn with(&self, prior: &Prior) -> GroundRecord {
+        let mapped = self
+            .cell
+            .and_then(|(grid_revision, cell)| prior.at(grid_revision, cell));
+        GroundRecord {
+            traction_limit_mu: prior.traction_limit_mu(),
+            is_on_the_map: mapped.is_some(),
+            told: told(self.measured, mapped),
+            measured: self.measured,
+        }
+    }
+}
+
+/// How fast the robot really goes along its path, as well as it is known: slip tells wheels and
+/// robot apart, and position fixes tell of it only after a while.
+pub(super) fn real_m_s(sensed: &Sensed, twist: Twist, now: Duration) -> f64 {
+    sensed.odometry_m_s(now).unwrap_or(twist.linear_m_s)
+}

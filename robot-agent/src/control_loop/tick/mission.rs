@@ -1,0 +1,420 @@
+//! Third stage: the mission is begun, held, replaced, followed and ended.
+
+mod holds;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tread_api::friction::TYRE_DIFFERENCE_SHARE;
+use tread_api::ids::MissionId;
+use tread_api::robot::MissionProgress;
+use tread_control::gate::GateCause;
+use tread_control::geometry::Pose;
+use tread_control::measured::{Measured, WheelSpeeds};
+use tread_control::reference::Governor;
+use tread_control::robot::RobotModel;
+use tread_control::tracking::{ThetaKnowledge, TrackingErrors};
+
+use super::Tick;
+use super::demands::Demands;
+use super::estimation::{Estimated, Released};
+use super::sensing::Sensed;
+use crate::control_loop::BRAKING_MAX;
+use crate::control_loop::active::{Active, Hold, News, progress_of};
+use crate::control_loop::channels::{ClosedSegment, EndReason, Job, LoopCommand, LoopEvent};
+use crate::control_loop::driven::TickRecord;
+use crate::control_loop::gain::GroundRecord;
+use crate::control_loop::outgoing::Outgoing;
+use crate::control_loop::segments::Moment;
+use crate::control_loop::site_view::SiteView;
+use crate::control_loop::surface::{Comparison, SurfaceWatch};
+
+/// Longest that a mission is held for a revision that does not come.
+const REPLACEMENT_MAX: Duration = Duration::from_secs(10);
+/// What the commands of a tick mean for the other stages.
+#[derive(Debug, Default)]
+pub(super) struct Orders {
+    /// A new definition of the site.
+    pub(super) site: Option<Arc<SiteView>>,
+    /// Whether a mission begins in this tick.
+    pub(super) has_begun: bool,
+}
+
+/// What the stage takes.
+#[derive(Debug)]
+pub(super) struct MissionInput<'tick> {
+    pub(super) tick: Tick,
+    pub(super) sensed: &'tick Sensed,
+    pub(super) estimated: &'tick Estimated<'tick>,
+    pub(super) demands: &'tick Demands,
+    /// Whether the mission began in this tick.
+    pub(super) has_begun: bool,
+    /// What the base was commanded by the last tick.
+    pub(super) commanded: WheelSpeeds,
+}
+
+/// What the stage gives.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Followed {
+    /// The wheel speeds that the mission wants; none without one that may drive.
+    pub(super) wanted: Option<WheelSpeeds>,
+    /// Whether there is a mission.
+    pub(super) is_active: bool,
+    /// Whether it leaves the wheels to others.
+    pub(super) rests: bool,
+    /// Whether it should long have ended for the server's silence.
+    pub(super) is_long_silent: bool,
+}
+
+/// What the stage takes once the command is known.
+#[derive(Debug)]
+pub(super) struct RecordInput<'tick> {
+    pub(super) tick: Tick,
+    pub(super) sensed: &'tick Sensed,
+    pub(super) estimated: &'tick Estimated<'tick>,
+    /// Why the gate reduced the command.
+    pub(super) gate: Option<GateCause>,
+}
+
+/// What is said of the mission at the end of a tick.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct MissionStatus {
+    pub(super) progress: Option<MissionProgress>,
+    /// What walks along its plan.
+    pub(super) governor: Option<Governor>,
+    pub(super) is_on_hold: bool,
+    /// How far the robot is from where its held mission goes on, metres.
+    pub(super) off_path_m: Option<f64>,
+    /// θ̂ of the law; kept from the last mission.
+    pub(super) theta_loop: Option<f64>,
+    /// Where the ground is not as the map says.
+    pub(super) surface_change: Option<Comparison>,
+}
+
+/// The stage's state.
+#[derive(Debug)]
+pub(super) struct MissionStage {
+    model: RobotModel,
+    active: Option<Active>,
+    theta_loop: Option<f64>,
+    /// What was known of the ground in this tick of a mission.
+    known: GroundRecord,
+    surface: SurfaceWatch,
+    /// When the base was last silent, if the mission is held for that.
+    base_silent_at: Option<Duration>,
+    /// Since when sensors hold the mission.
+    sensors_hold_since: Option<Duration>,
+    /// Until when the mission is held for its next revision.
+    replacement_until: Option<Duration>,
+}
+
+impl MissionStage {
+    pub(super) fn new(model: RobotModel) -> Self {
+        Self {
+            model,
+            active: None,
+            theta_loop: None,
+            known: GroundRecord::default(),
+            surface: SurfaceWatch::default(),
+            base_silent_at: None,
+            sensors_hold_since: None,
+            replacement_until: None,
+        }
+    }
+
+    /// Takes one command of the rest of the agent.
+    pub(super) fn take(
+        &mut self,
+        command: LoopCommand,
+        tick: Tick,
+        orders: &mut Orders,
+        events: &mut Outgoing,
+    ) {
+        match command {
+            LoopCommand::Start(job) => orders.has_begun |= self.begin(tick, job, events),
+            LoopCommand::Cancel(mission) => {
+                if let Some(active) = self.of(mission) {
+                    active.stop(EndReason::Cancelled);
+                }
+            }
+            LoopCommand::Hold(mission, hold) => {
+                if let Some(active) = self.of(mission) {
+                    active.hold(hold, true);
+                    if hold == Hold::Replacement {
+                        self.replacement_until = Some(tick.now.monotonic + REPLACEMENT_MAX);
+                    }
+                }
+            }
+            LoopCommand::Release(mission, hold) => {
+                if let Some(active) = self.of(mission) {
+                    active.hold(hold, false);
+                }
+            }
+            LoopCommand::Replace(job) => match self.of(job.mission) {
+                Some(active) => {
+                    // The room of one revision that is replaced before it was driven.
+                    if let Some(unused) = active.replace_at_rest(job) {
+                        events.send(LoopEvent::CameTooLate(unused));
+                    }
+                    self.replacement_until = None;
+                }
+                None => events.send(LoopEvent::CameTooLate(job)),
+            },
+            LoopCommand::Site(site) => {
+                if let Some(unused) = orders.site.replace(site) {
+                    events.send(LoopEvent::Retired(unused));
+                }
+            }
+        }
+    }
+
+    /// The active mission.
+    pub(super) fn active(&self) -> Option<MissionId> {
+        self.active.as_ref().map(|active| active.job.mission)
+    }
+
+    /// The active mission, if it is this one.
+    fn of(&mut self, mission: MissionId) -> Option<&mut Active> {
+        self.active
+            .as_mut()
+            .filter(|active| active.job.mission == mission)
+    }
+
+    /// Makes a mission the active one; false if it is refused.
+    fn begin(&mut self, tick: Tick, job: Box<Job>, events: &mut Outgoing) -> bool {
+        let is_too_late = |latest: Duration| tick.now.monotonic > latest;
+        let refusal = if tick.stop {
+            Some(EndReason::AgentStopped)
+        } else if self.active.is_some() {
+            Some(EndReason::AnotherInHand)
+        } else if job.start_by.is_some_and(is_too_late) {
+            Some(EndReason::TooLate)
+        } else {
+            None
+        };
+        if let Some(reason) = refusal {
+            events.send(LoopEvent::Ended {
+                at: tick.now.wall,
+                reason,
+                progress: progress_of(&job),
+                job,
+            });
+            return false;
+        }
+        self.surface.begin_mission();
+        self.active = Some(Active::new(job));
+        true
+    }
+
+    /// Holds the mission where anything asks for it, and follows it.
+    pub(super) fn step(
+        &mut self,
+        input: &MissionInput<'_>,
+        released: Released,
+        events: &mut Outgoing,
+    ) -> Followed {
+        let (tick, estimated) = (input.tick, input.estimated);
+        let now = tick.now.monotonic;
+        let server_silence = input.demands.server_silence;
+        if input.has_begun {
+            self.warm_start(estimated);
+        }
+        self.hand_on(released, events);
+        self.hold_for_demands(input);
+        self.check_bounds(now, server_silence);
+        self.hold_for_base(now, estimated.fault);
+        self.hold_for_sensors(tick.now, input.sensed, events);
+        let wanted = self.follow(input, events);
+        let active = self.active.as_ref();
+        let beyond_braking = server_silence.saturating_sub(BRAKING_MAX);
+        Followed {
+            wanted,
+            is_active: active.is_some(),
+            rests: active.is_none_or(Active::rests),
+            is_long_silent: active.is_some_and(|active| active.minds_silence(beyond_braking)),
+        }
+    }
+
+    /// Gives the law what is known of the ground where the mission begins.
+    fn warm_start(&mut self, estimated: &Estimated<'_>) {
+        if let Some(active) = &mut self.active
+            && let Some(knowledge) = estimated.ground_at_begin.with(&active.job.prior).told
+        {
+            active.job.follower.warm_start(knowledge);
+        }
+    }
+
+    fn hand_on(&mut self, released: Released, events: &mut Outgoing) {
+        if let Some(site) = released.site {
+            events.send(LoopEvent::Retired(site));
+        }
+        if let Some(segment) = released.segment {
+            self.compare(&segment);
+            events.send(LoopEvent::Segment(segment));
+        }
+    }
+
+    /// Holds what a closed segment says against what the map says of its cell.
+    fn compare(&mut self, segment: &ClosedSegment) {
+        let active = self.active.as_mut();
+        let Some(active) = active.filter(|active| segment.mission == Some(active.job.mission))
+        else {
+            return;
+        };
+        let (prior, statistics) = (&active.job.prior, &segment.statistics);
+        let expected = prior.at(segment.site.grid().revision, segment.cell);
+        let Some((expected, theta)) = expected.zip(statistics.theta()) else {
+            return;
+        };
+        let comparison = Comparison {
+            cell: segment.cell,
+            measured: ThetaKnowledge {
+                theta,
+                std_dev: statistics.own_information.sqrt().recip(),
+            },
+            expected,
+            robot_bias_ratio: prior
+                .robot_bias_ratio()
+                .max(statistics.common_ratio.robot)
+                .hypot(TYRE_DIFFERENCE_SHARE * statistics.common_ratio.tyres),
+        };
+        active.compare(&comparison);
+        self.surface.note(comparison);
+    }
+
+    /// The wheel speeds that the mission wants; none without one.
+    fn follow(&mut self, input: &MissionInput<'_>, events: &mut Outgoing) -> Option<WheelSpeeds> {
+        let (now, estimated) = (input.tick.now, input.estimated);
+        let active = self.active.as_mut()?;
+        self.known = estimated.ground.with(active.prior());
+        let knowledge = self.known.told;
+        if active.is_at_rest_for_replacement() {
+            let old = active.replace(knowledge);
+            let (at, progress) = (now.wall, active.progress);
+            if let Some(old) = old {
+                events.send(LoopEvent::Replaced { at, progress, old });
+            }
+        }
+        let measured = &estimated.measured;
+        let step = active.step(
+            measured,
+            knowledge,
+            &self.model,
+            input.commanded,
+            input.tick.dt_s,
+        );
+        if step.theta_loop.is_finite() {
+            self.theta_loop = Some(step.theta_loop);
+        }
+        let (at, progress) = (now.wall, active.progress);
+        match step.news {
+            Some(News::Paused) => {
+                let paused_for = active.paused_for(now.monotonic);
+                let since = paused_for.and_then(|lasting| at.checked_sub(lasting).ok());
+                events.send(LoopEvent::Paused {
+                    at,
+                    since,
+                    progress,
+                });
+            }
+            Some(News::Resumed) => events.send(LoopEvent::Resumed { at, progress }),
+            None => {}
+        }
+        if let Some(reason) = step.end {
+            self.end(now, reason, events);
+            return None;
+        }
+        // The gate would brake anyway; a follower that hears of it does not wind up meanwhile. A base
+        // that is heard again after a silence comes to rest first.
+        let is_heard = estimated.fault.is_none() && self.base_silent_at.is_none();
+        is_heard.then_some(step.wanted)
+    }
+
+    fn end(&mut self, now: Moment, reason: EndReason, events: &mut Outgoing) {
+        let Some(active) = self.active.take() else {
+            return;
+        };
+        let (at, progress) = (now.wall, active.progress);
+        if !active.has_started {
+            events.send(LoopEvent::Started { at, progress });
+        }
+        let (job, next) = active.into_jobs();
+        if let Some(next) = next {
+            events.send(LoopEvent::CameTooLate(next));
+        }
+        events.send(LoopEvent::Ended {
+            at,
+            reason,
+            progress,
+            job,
+        });
+    }
+
+    /// Records the tick on the driven path, reports the begin of a mission, and ends it with the
+    /// agent.
+    pub(super) fn record(
+        &mut self,
+        input: &RecordInput<'_>,
+        events: &mut Outgoing,
+    ) -> MissionStatus {
+        let now = input.tick.now;
+        self.record_path(input);
+        if input.tick.stop {
+            self.end(now, EndReason::AgentStopped, events);
+        }
+        // The first tick of a mission has given its first wheel command by now.
+        if let Some(active) = self.active.as_mut().filter(|active| !active.has_started) {
+            active.has_started = true;
+            let (at, progress) = (now.wall, active.progress);
+            events.send(LoopEvent::Started { at, progress });
+        }
+        self.status(&input.estimated.measured)
+    }
+
+    fn record_path(&mut self, input: &RecordInput<'_>) {
+        let Some(active) = &mut self.active else {
+            return;
+        };
+        let (estimated, gate) = (input.estimated, input.gate);
+        let speed_m_s = estimated.twist.linear_m_s.abs();
+        let measured = estimated.estimate.theta;
+        // While something cuts the command, errors say nothing on the ground.
+        let may_learn = input.sensed.findings.consequence().is_none();
+        active.hold_adaptation(
+            !may_learn || gate.is_some_and(|cause| cause > GateCause::Acceleration),
+        );
+        active.record(TickRecord {
+            dt_s: input.tick.dt_s,
+            at: estimated.pose.map(Pose::point),
+            driven_m: speed_m_s * input.tick.dt_s,
+            cross_track_m: None,
+            is_saturated: false,
+            is_paused: false,
+            slips: estimated.slips || estimated.ground_changed,
+            gate,
+            theta_loop: self.theta_loop,
+            theta_measured: measured.map(|theta| (theta.theta, theta.std_dev)),
+            ground: self.known,
+        });
+    }
+
+    fn status(&self, measured: &Measured) -> MissionStatus {
+        let active = self.active.as_ref();
+        let held = active.filter(|active| active.is_on_hold());
+        MissionStatus {
+            progress: active.map(|active| active.progress),
+            governor: active.map(|active| *active.job.follower.governor()),
+            is_on_hold: held.is_some(),
+            off_path_m: held.map(|active| off_path_m(active, measured)),
+            theta_loop: self.theta_loop,
+            surface_change: self.surface.raised(),
+        }
+    }
+}
+
+/// How far the robot is from a mission's reference, metres.
+fn off_path_m(active: &Active, measured: &Measured) -> f64 {
+    let follower = &active.job.follower;
+    let reference = follower.governor().sample(follower.plan());
+    TrackingErrors::between(&reference, measured).distance_m()
+}

@@ -1,0 +1,234 @@
+//! Last stage: whether the robot stands where it is to, what the loop says of itself, and what a
+//! record holds of the tick.
+//!
+//! The watch over standstill is [`crate::control_loop::standing`]. A record holds enough to run the
+//! tick again, and to see whether that gives the same.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use tread_api::friction::ThetaEstimate;
+use tread_api::robot::RobotMode;
+use tread_control::consistency::Subject;
+use tread_control::geometry::{Pose, Twist};
+use tread_control::measured::WheelSpeeds;
+use tread_control::robot::RobotModel;
+
+use super::demands::Demands;
+use super::estimation::Estimated;
+use super::mission::MissionStatus;
+use super::safety::Gated;
+use super::sensing::Sensed;
+use super::{STANDING, Tick};
+use crate::control_loop::channels::{LoopCommand, Shared, Snapshot};
+use crate::control_loop::site_view::SiteView;
+use crate::control_loop::standing::{Motion, StandingWatch};
+use crate::drive::{Battery, Feedback, StatedNoise};
+use crate::recording::frame::{NoteTaker, TickFrame, TickInputs, TickOutputs};
+
+/// What the stage takes.
+#[derive(Debug)]
+pub(super) struct OutputInput<'tick> {
+    pub(super) tick: Tick,
+    pub(super) feedback: &'tick Feedback,
+    pub(super) noise: StatedNoise,
+    pub(super) battery: Option<Battery>,
+    pub(super) sensed: &'tick Sensed,
+    pub(super) estimated: &'tick Estimated<'tick>,
+    pub(super) demands: &'tick Demands,
+    pub(super) gated: &'tick Gated,
+    pub(super) mission: &'tick MissionStatus,
+}
+
+/// The stage's state.
+#[derive(Debug)]
+pub(super) struct Output {
+    model: RobotModel,
+    shared: Arc<Shared>,
+    standing: StandingWatch,
+    /// What was measured for that.
+    motion: Motion,
+    /// Whether the wheels are commanded to rest and do.
+    stands: bool,
+    ticks: u64,
+    /// Where ticks are noted, if they are recorded.
+    notes: Option<NoteTaker>,
+}
+
+impl Output {
+    pub(super) fn new(model: RobotModel, shared: Arc<Shared>) -> Self {
+        Self {
+            model,
+            shared,
+            standing: StandingWatch::default(),
+            motion: Motion::default(),
+            stands: true,
+            ticks: 0,
+            notes: None,
+        }
+    }
+
+    /// From now on ticks are noted, or no longer.
+    pub(super) fn record_to(&mut self, notes: Option<NoteTaker>) {
+        self.notes = notes;
+    }
+
+    /// Whether the wheels were commanded to rest by the last tick, and did.
+    pub(super) fn stands(&self) -> bool {
+        self.stands
+    }
+
+    /// Notes a command that the tick takes.
+    pub(super) fn note_command(&mut self, command: &LoopCommand) {
+        if let Some(notes) = &mut self.notes {
+            notes.command(self.ticks + 1, command);
+        }
+    }
+
+    /// Says what became of the tick.
+    pub(super) fn step(&mut self, input: &OutputInput<'_>) {
+        self.check_standstill(input);
+        let command = input.gated.output.wheel_speeds;
+        let wheels_m_s = self.fastest_rim_m_s(input.sensed.wheel_speeds);
+        self.stands = command == WheelSpeeds::default() && wheels_m_s < 5.0 * STANDING;
+        self.ticks += 1;
+        self.count(input);
+        let snapshot = self.snapshot(input);
+        self.shared.publish(&snapshot);
+        self.note(input, &snapshot);
+    }
+
+    fn fastest_rim_m_s(&self, wheel_speeds: WheelSpeeds) -> f64 {
+        wheel_speeds.magnitude_max_rad_s() * self.model.wheel_radius_m()
+    }
+
+    fn count(&self, input: &OutputInput<'_>) {
+        let lost = u64::from(input.sensed.lost_samples);
+        let shared = &self.shared;
+        shared.lost_samples.fetch_add(lost, Ordering::Relaxed);
+        shared
+            .unplaced_blocks
+            .fetch_add(input.estimated.unplaced_blocks, Ordering::Relaxed);
+        shared.ticks.store(self.ticks, Ordering::Relaxed);
+    }
+
+    /// Looks whether a robot that is to stand does.
+    fn check_standstill(&mut self, input: &OutputInput<'_>) {
+        let (sensed, now) = (input.sensed, input.tick.now.monotonic);
+        let is_heard = sensed.is_heard(now);
+        if let Some(turn_rad_s) = sensed.turn_rad_s {
+            self.motion.turn_rad_s = Some(turn_rad_s).filter(|rate| rate.is_finite());
+        }
+        if !(is_heard && sensed.is_right(Subject::Gyro)) {
+            self.motion.turn_rad_s = None;
+        }
+        self.motion.wheels_m_s = (is_heard && sensed.is_right(Subject::Wheels))
+            .then(|| self.fastest_rim_m_s(sensed.wheel_speeds));
+        self.motion.odometry_m_s = sensed.odometry_m_s(now);
+        self.motion.fix = sensed.fix.filter(|_| !sensed.is_position_doubted());
+        // What is not heard does not stand: it is not known.
+        let is_to_stand = input.gated.output.target == WheelSpeeds::default();
+        if is_heard || self.motion.odometry_m_s.is_some() || self.motion.fix.is_some() {
+            self.standing.step(now, is_to_stand, &self.motion);
+        } else if is_to_stand {
+            self.standing.forget();
+        } else {
+            self.standing.step(now, false, &self.motion);
+        }
+    }
+
+    fn snapshot(&self, input: &OutputInput<'_>) -> Snapshot {
+        let (sensed, estimated, mission) = (input.sensed, input.estimated, input.mission);
+        let pose = estimated.pose.filter(|pose: &Pose| pose.is_finite());
+        let twist = Some(estimated.twist).filter(|twist: &Twist| twist.is_finite());
+        let measured = estimated.estimate.theta.map(|theta| ThetaEstimate {
+            theta: theta.theta,
+            std_dev: theta.std_dev,
+        });
+        Snapshot {
+            at: input.tick.now.monotonic,
+            mode: mode(input),
+            fault: estimated.fault,
+            pose: pose.zip(estimated.last_fix),
+            twist: twist.zip(sensed.last_sample),
+            mission: mission.progress,
+            governor: mission.governor,
+            is_on_hold: mission.is_on_hold,
+            off_path_m: mission.off_path_m,
+            stands: self.stands,
+            gate: input.gated.gate,
+            fence_revision: estimated.site.map(SiteView::fence_revision),
+            battery: input.battery,
+            theta_loop: mission.theta_loop.filter(|theta| theta.is_finite()),
+            theta_measured: measured
+                .filter(|theta| theta.theta.is_finite() && theta.std_dev.is_finite()),
+            excited: !estimated.estimate.no_new_information,
+            surface_change: mission.surface_change,
+            dug_in_at: estimated.dug_in_at,
+            overrun: input.demands.overrun,
+            findings: sensed.findings,
+            standing: self.standing.report(),
+            slip: estimated.slip,
+            cell: estimated.cell,
+            terrain: estimated.terrain,
+            terrain_revision: estimated.site.map(SiteView::terrain_revision),
+            ticks: self.ticks,
+        }
+    }
+
+    /// Notes the tick that ends, if it is to be recorded.
+    fn note(&mut self, input: &OutputInput<'_>, snapshot: &Snapshot) {
+        let Some(notes) = &mut self.notes else {
+            return;
+        };
+        let (estimated, gated, demands) = (input.estimated, input.gated, input.demands);
+        let mission = snapshot.mission;
+        notes.tick(&TickFrame {
+            number: self.ticks,
+            inputs: TickInputs {
+                now: input.tick.now,
+                judged: gated.judged,
+                stop_requested: input.tick.stop,
+                commands: notes.commands(),
+                feedback: *input.feedback,
+                is_base_silent: input.sensed.is_base_silent,
+                noise: input.noise,
+                battery: snapshot.battery,
+                stop: demands.stop,
+                server_silence: demands.server_silence,
+                view: demands.view,
+            },
+            outputs: TickOutputs {
+                wanted: gated.wanted,
+                command: gated.output.wheel_speeds,
+                pose: estimated.pose,
+                twist: estimated.twist,
+                theta_loop: input.mission.theta_loop,
+                theta: estimated
+                    .estimate
+                    .theta
+                    .map(|theta| (theta.theta, theta.std_dev)),
+                mission: mission.map(|mission| (mission.driven_m, mission.cross_track_m)),
+                slip: snapshot.slip,
+                segment: estimated.closed,
+                mode: snapshot.mode,
+                fault: snapshot.fault,
+                gate: snapshot.gate.cause,
+            },
+        });
+    }
+}
+
+fn mode(input: &OutputInput<'_>) -> RobotMode {
+    if input.demands.is_stopped() {
+        RobotMode::Stopped
+    } else if input.estimated.fault.is_some() {
+        RobotMode::Fault
+    } else if input.gated.is_leased {
+        RobotMode::Teleoperated
+    } else if input.mission.progress.is_some() {
+        RobotMode::Tracking
+    } else {
+        RobotMode::Idle
+    }
+}
