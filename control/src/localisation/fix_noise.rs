@@ -3,7 +3,8 @@
 //! Two fixes in a row differ by what the robot moved, which gyro and wheels know over so short a
 //! time, and by the noise of both: `d = (z_k − z_{k−1}) − Δ`, of variance 2R per axis. R is the
 //! running mean of `d²/2`, begun with what is configured. Errors that change slowly do not show
-//! (a wandering receiver's): they are not in R, and neither is a fix that is refused for long.
+//! (a wandering receiver's): they are not in R. A wild fix counts as one of four standard
+//! deviations.
 
 use super::FixNoise;
 use crate::geometry::{Pose, wrap_angle_rad};
