@@ -2,6 +2,7 @@
 //!
 //! * [`mod@paper`] is the paper this began with, exactly; its law is a bench, not what ships.
 //! * [`mod@bench`] holds laws written only for comparison, and the run that compares.
+//! * [`parallel`]: drives on all processors.
 //! * [`report`]: the table of goals that report programs print.
 //! * `rough`: a second world, written from the physics alone: robots, contacts and sensors that
 //!   differ from the agent's own simulator and from each other.
@@ -12,6 +13,7 @@
 
 pub mod bench;
 pub mod paper;
+pub mod parallel;
 pub mod random;
 pub mod report;
 #[cfg(feature = "agent")]

@@ -4,6 +4,22 @@ use tread_control::geometry::{Point, Pose};
 use tread_control::plan::Plan;
 use tread_control::reference::ReferenceSample;
 
+/// Points of a closed path, metres: about 33 m long, with bends to the left and to the right.
+pub const CLOSED_PATH_M: [(f64, f64); 12] = [
+    (0.0, 0.0),
+    (3.0, -0.5),
+    (6.0, 0.5),
+    (7.0, 3.0),
+    (5.0, 4.5),
+    (3.0, 3.5),
+    (1.0, 4.5),
+    (-1.0, 6.5),
+    (-4.0, 6.0),
+    (-5.0, 3.5),
+    (-3.5, 1.5),
+    (-1.5, 1.2),
+];
+
 /// Newton steps to the nearest point.
 const NEWTON_STEPS: usize = 6;
 /// Speed below which a Newton step is computed as at this one, metres per second.

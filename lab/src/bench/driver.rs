@@ -16,7 +16,7 @@ use crate::bench::pursuit::Pursuit;
 
 /// What a law sees in one tick.
 #[derive(Debug, Clone, Copy)]
-pub struct Sight<'a> {
+pub struct LawInput<'a> {
     /// What it follows.
     pub course: &'a Course,
     /// Time on the course, seconds.
@@ -70,15 +70,19 @@ impl Driver {
     }
 
     /// Wheel speeds to command; with the shipped law's own output, if it is that.
-    pub fn step(&mut self, sight: &Sight<'_>, dt_s: f64) -> (WheelSpeeds, Option<TrackerOutput>) {
-        let &Sight {
+    pub fn step(
+        &mut self,
+        input: &LawInput<'_>,
+        dt_s: f64,
+    ) -> (WheelSpeeds, Option<TrackerOutput>) {
+        let &LawInput {
             course,
             time_s,
             reference,
             measured,
             knowledge,
             felt,
-        } = sight;
+        } = input;
         match &mut self.0 {
             Kind::Kanayama(law) => (law.step(reference, measured, dt_s), None),
             Kind::Pursuit(law) => (law.step(course, measured), None),

@@ -11,8 +11,8 @@ mod pursuit;
 mod robots;
 mod run;
 
-pub use course::{Course, Figure8, Nearest};
-pub use driver::{Driver, Sight};
+pub use course::{CLOSED_PATH_M, Course, Figure8, Nearest};
+pub use driver::{Driver, LawInput};
 pub use kanayama::{Kanayama, KanayamaGains, Track};
 pub use paper_law::PaperLaw;
 pub use pursuit::{Pursuit, PursuitConfig};

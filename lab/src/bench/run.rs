@@ -2,7 +2,7 @@
 
 use crate::bench::Law;
 use crate::bench::course::Course;
-use crate::bench::driver::{Driver, Sight};
+use crate::bench::driver::{Driver, LawInput};
 use tread_control::friction::FrictionCurve;
 use tread_control::gate::{GateInput, GateLimits, gate};
 use tread_control::geometry::{Point, Pose};
@@ -180,7 +180,7 @@ impl Run {
             position_std_dev_m: 0.0,
         };
         let felt = self.plant.body_acceleration();
-        let sight = Sight {
+        let law_input = LawInput {
             course: &self.course,
             time_s,
             reference: &self.course.sample(time_s),
@@ -188,7 +188,7 @@ impl Run {
             knowledge: input.knowledge,
             felt,
         };
-        let (wanted, tracker) = self.driver.step(&sight, dt_s);
+        let (wanted, tracker) = self.driver.step(&law_input, dt_s);
         let passed = gate(
             &GateInput {
                 command: Some(wanted),

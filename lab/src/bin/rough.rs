@@ -11,14 +11,16 @@
 
 #![expect(clippy::print_stdout, reason = "a program that prints a report")]
 
+use std::ops::RangeInclusive;
 use std::process::ExitCode;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 use clap::Parser;
 use serde::Serialize;
 use tread_api::friction::NORMAL_95;
 use tread_control::estimation::{EstimatorPrior, TyrePrior};
+use tread_lab::parallel::in_parallel;
 use tread_lab::random::Random;
+use tread_lab::report::{Check, checks_json};
 use tread_lab::rough::curve::Shape;
 use tread_lab::rough::run::{Course, Outcome, Trial, run};
 use tread_lab::rough::sensors::SensorSpec;
@@ -26,10 +28,12 @@ use tread_lab::rough::spec::{Deviations, MAKES};
 
 /// Half-width over value above which an interval counts as none.
 const WIDE_RATIO: f64 = 0.6;
-/// Share of intervals of one line that must hold.
-const LINE_GOAL: f64 = 0.9;
-/// Shares between which those of the population must be.
-const POPULATION_GOAL: (f64, f64) = (0.93, 0.975);
+/// Coverage that one deviation must have.
+const LINE_GOAL: RangeInclusive<f64> = 0.9..=1.0;
+/// Coverage that the population must have.
+const POPULATION_GOAL: RangeInclusive<f64> = 0.93..=0.975;
+/// Name of the line in which everything differs.
+const POPULATION: &str = "population";
 
 #[derive(Debug, Parser)]
 #[command(name = "rough")]
@@ -62,14 +66,6 @@ impl Arguments {
 }
 
 #[derive(Debug, Serialize)]
-struct Check {
-    name: String,
-    goal: String,
-    value: f64,
-    holds: bool,
-}
-
-#[derive(Debug, Serialize)]
 struct Line {
     name: String,
     has_torque: bool,
@@ -86,13 +82,25 @@ struct Line {
     abstained: f64,
     /// Share of the time in which a contact slipped beyond half the slip of the peak.
     beyond_half_peak: f64,
-    holds: bool,
 }
 
-#[derive(Debug, Serialize)]
-struct Report {
-    lines: Vec<Line>,
-    checks: Vec<Check>,
+impl Line {
+    fn check(&self) -> Check {
+        let torque = if self.has_torque { "with" } else { "without" };
+        let name = format!(
+            "{}, {torque} torque: coverage of the 95 % intervals",
+            self.name
+        );
+        Check::between(
+            name,
+            self.coverage,
+            if self.name == POPULATION {
+                POPULATION_GOAL
+            } else {
+                LINE_GOAL
+            },
+        )
+    }
 }
 
 /// Stiffnesses K of the grounds.
@@ -214,26 +222,7 @@ fn population(has_torque: bool, runs: u32, arguments: &Arguments) -> Vec<Trial> 
 
 /// Drives them all, on all processors.
 fn drive(trials: &[Trial]) -> anyhow::Result<Vec<Outcome>> {
-    let threads = std::thread::available_parallelism().map_or(1, usize::from);
-    let next = AtomicUsize::new(0);
-    let work = || -> anyhow::Result<Vec<Outcome>> {
-        let mut done = Vec::new();
-        while let Some(trial) = trials.get(next.fetch_add(1, Ordering::Relaxed)) {
-            done.push(run(trial)?);
-        }
-        Ok(done)
-    };
-    std::thread::scope(|scope| {
-        let workers: Vec<_> = (0..threads).map(|_| scope.spawn(work)).collect();
-        let mut outcomes = Vec::new();
-        for worker in workers {
-            let done = worker
-                .join()
-                .map_err(|_| anyhow::anyhow!("a drive panicked"))?;
-            outcomes.extend(done?);
-        }
-        Ok(outcomes)
-    })
+    in_parallel(trials, run).into_iter().collect()
 }
 
 fn median(figures: &mut [f64]) -> f64 {
@@ -246,7 +235,7 @@ fn share(part: usize, of: usize) -> f64 {
     part as f64 / of.max(1) as f64
 }
 
-fn line(name: &str, has_torque: bool, outcomes: &[Outcome], goal: (f64, f64)) -> Line {
+fn line(name: &str, has_torque: bool, outcomes: &[Outcome]) -> Line {
     let (mut errors, mut widths, mut beyond) = (Vec::new(), Vec::new(), Vec::new());
     let (mut held, mut asked, mut on) = (0, 0, [(0, 0); GROUNDS.len()]);
     for outcome in outcomes {
@@ -270,18 +259,16 @@ fn line(name: &str, has_torque: bool, outcomes: &[Outcome], goal: (f64, f64)) ->
             }
         }
     }
-    let coverage = share(held, errors.len());
     Line {
         name: name.to_owned(),
         has_torque,
         estimates: errors.len(),
-        coverage,
+        coverage: share(held, errors.len()),
         coverage_on: on.map(|(held, of)| share(held, of)),
         error: median(&mut errors),
         half_width: median(&mut widths),
         abstained: 1.0 - share(errors.len(), asked),
         beyond_half_peak: median(&mut beyond),
-        holds: !errors.is_empty() && (goal.0..=goal.1).contains(&coverage),
     }
 }
 
@@ -304,7 +291,7 @@ fn print(lines: &[Line]) {
             100.0 * line.half_width,
             100.0 * line.abstained,
             100.0 * line.beyond_half_peak,
-            if line.holds { "" } else { "  MISSED" },
+            if line.check().holds { "" } else { "  MISSED" },
         );
     }
 }
@@ -316,47 +303,30 @@ fn main() -> anyhow::Result<ExitCode> {
         for (name, change) in CHANGES {
             if name.contains(&arguments.only) {
                 let trials = alone(change, has_torque, &arguments);
-                lines.push(line(name, has_torque, &drive(&trials)?, (LINE_GOAL, 1.0)));
+                lines.push(line(name, has_torque, &drive(&trials)?));
             }
         }
-        if "population".contains(&arguments.only) {
+        if POPULATION.contains(&arguments.only) {
             let runs = arguments.runs.saturating_mul(10);
             let trials = population(has_torque, runs, &arguments);
-            lines.push(line(
-                "population",
-                has_torque,
-                &drive(&trials)?,
-                POPULATION_GOAL,
-            ));
+            lines.push(line(POPULATION, has_torque, &drive(&trials)?));
         }
     }
-    let check = |line: &Line| Check {
-        name: format!(
-            "{}, {} torque: share of 95 % intervals that hold",
-            line.name,
-            if line.has_torque { "with" } else { "without" }
-        ),
-        goal: if line.name == "population" {
-            format!("{} to {}", POPULATION_GOAL.0, POPULATION_GOAL.1)
-        } else {
-            format!(">= {LINE_GOAL}")
-        },
-        value: line.coverage,
-        holds: line.holds,
-    };
-    let checks: Vec<Check> = lines.iter().map(check).collect();
     anyhow::ensure!(
         !lines.is_empty(),
         "no line is named like `{}`",
         arguments.only
     );
-    let holds = checks.iter().all(|check| check.holds);
+    let checks: Vec<Check> = lines.iter().map(Line::check).collect();
     if arguments.json {
-        println!("{}", serde_json::to_string(&Report { lines, checks })?);
+        println!(
+            "{}",
+            serde_json::json!({ "lines": lines, "checks": checks_json(&checks) })
+        );
     } else {
         print(&lines);
     }
-    Ok(if holds {
+    Ok(if checks.iter().all(|check| check.holds) {
         ExitCode::SUCCESS
     } else {
         ExitCode::FAILURE

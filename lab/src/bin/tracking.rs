@@ -9,7 +9,6 @@
 #![expect(clippy::print_stdout, reason = "a program that prints a report")]
 
 use std::process::ExitCode;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 use clap::Parser;
 use serde::Serialize;
@@ -17,7 +16,9 @@ use tread_control::geometry::{Point, Pose};
 use tread_control::plan::Plan;
 use tread_control::tracking::TrackerConfig;
 use tread_control::trajectory::{CircleSpec, Direction, Trajectory, Waypoint, WaypointsSpec};
-use tread_lab::bench::{KanayamaGains, Law, PursuitConfig, Track};
+use tread_lab::bench::{CLOSED_PATH_M, KanayamaGains, Law, PursuitConfig, Track};
+use tread_lab::parallel::in_parallel;
+use tread_lab::report::{Check, checks_json};
 use tread_lab::rough::spec::MAKES;
 use tread_lab::rough::tracking::{Errors, Knowing, Poses, Trial, World, run};
 
@@ -90,31 +91,9 @@ struct Line {
     above_localisation_mm: [f64; 2],
 }
 
-#[derive(Debug, Serialize)]
-struct Check {
-    name: String,
-    goal: String,
-    value: f64,
-    holds: bool,
-}
-
 /// Courses of 3 m radius, a lemniscate of 8 m by 4 m, and a closed path of twelve points.
 fn plans() -> anyhow::Result<Vec<(&'static str, Plan)>> {
     const EIGHT_POINTS: u32 = 24;
-    const POINTS: [(f64, f64); 12] = [
-        (0.0, 0.0),
-        (3.0, -0.5),
-        (6.0, 0.5),
-        (7.0, 3.0),
-        (5.0, 4.5),
-        (3.0, 3.5),
-        (1.0, 4.5),
-        (-1.0, 6.5),
-        (-4.0, 6.0),
-        (-5.0, 3.5),
-        (-3.5, 1.5),
-        (-1.5, 1.2),
-    ];
     let circle = Trajectory::Circle(CircleSpec {
         center: Point { x_m: 0.0, y_m: 3.0 },
         radius_m: 3.0,
@@ -135,7 +114,11 @@ fn plans() -> anyhow::Result<Vec<(&'static str, Plan)>> {
         let angle = std::f64::consts::TAU * f64::from(index) / f64::from(EIGHT_POINTS);
         (4.0 * angle.sin(), 2.0 * (2.0 * angle).sin())
     });
-    let closed = POINTS.iter().copied().cycle().take(POINTS.len() + 1);
+    let closed = CLOSED_PATH_M
+        .iter()
+        .copied()
+        .cycle()
+        .take(CLOSED_PATH_M.len() + 1);
     let model = MAKES[0].model()?;
     let plan = |trajectory: &Trajectory, heading_rad: f64| -> anyhow::Result<Plan> {
         let start = Pose {
@@ -188,38 +171,6 @@ fn drive(
         localisation_rms_m: (sum.localisation_rms_m / count).sqrt(),
         ..sum
     })
-}
-
-/// Applies a function to all items on all processors; results in the items' order.
-fn in_parallel<T: Sync, R: Send>(
-    items: &[T],
-    work: impl Fn(&T) -> anyhow::Result<R> + Sync,
-) -> anyhow::Result<Vec<R>> {
-    let threads = std::thread::available_parallelism().map_or(1, usize::from);
-    let next = AtomicUsize::new(0);
-    let mut found = std::thread::scope(|scope| -> anyhow::Result<Vec<(usize, R)>> {
-        let one = || -> anyhow::Result<Vec<(usize, R)>> {
-            let mut mine = Vec::new();
-            loop {
-                let index = next.fetch_add(1, Ordering::Relaxed);
-                match items.get(index) {
-                    Some(item) => mine.push((index, work(item)?)),
-                    None => return Ok(mine),
-                }
-            }
-        };
-        let workers: Vec<_> = (0..threads).map(|_| scope.spawn(one)).collect();
-        let mut all = Vec::new();
-        for worker in workers {
-            let mine = worker
-                .join()
-                .map_err(|_| anyhow::anyhow!("a drive panicked"))?;
-            all.extend(mine?);
-        }
-        Ok(all)
-    })?;
-    found.sort_by_key(|(index, _)| *index);
-    Ok(found.into_iter().map(|(_, result)| result).collect())
 }
 
 /// A law's gains as numbers to search over.
@@ -288,7 +239,10 @@ fn badness<P: Gains>(places: &[Place<'_>], arguments: &Arguments, peer: P) -> an
     let (law, config) = peer.law();
     let errors = in_parallel(places, |place| {
         drive(place, arguments, law, config, Knowing::Nothing)
-    })?;
+    });
+    let errors = errors
+        .into_iter()
+        .collect::<anyhow::Result<Vec<Errors>>>()?;
     #[expect(clippy::cast_precision_loss, reason = "a few lines")]
     let count = errors.len() as f64;
     Ok(errors
@@ -427,7 +381,8 @@ fn main() -> anyhow::Result<ExitCode> {
         ("ours", ours.law(), Knowing::Nothing),
         ("ours, own θ", ours.law(), Knowing::Own),
     ];
-    let lines = in_parallel(&places, |place| line(place, &laws, &arguments))?;
+    let lines = in_parallel(&places, |place| line(place, &laws, &arguments));
+    let lines = lines.into_iter().collect::<anyhow::Result<Vec<Line>>>()?;
     let mut checks = Vec::new();
     for line in &lines {
         let name = format!(
@@ -438,12 +393,7 @@ fn main() -> anyhow::Result<ExitCode> {
             ("ours over the best peer", line.over_peer),
             ("with its own θ over without", line.over_unknown),
         ] {
-            checks.push(Check {
-                name: format!("{name}: {what}"),
-                goal: format!("<= {LINE_GOAL}"),
-                value,
-                holds: value <= LINE_GOAL,
-            });
+            checks.push(Check::at_most(format!("{name}: {what}"), value, LINE_GOAL));
         }
     }
     let sum = |which: usize| -> f64 {
@@ -453,19 +403,16 @@ fn main() -> anyhow::Result<ExitCode> {
             .sum()
     };
     let mean = sum(0) / sum(1);
-    checks.push(Check {
-        name:
-            "ours over the best peer, both means over the lines above the localisation's own error"
-                .to_owned(),
-        goal: format!("<= {MEAN_GOAL}"),
-        value: mean,
-        holds: mean <= MEAN_GOAL,
-    });
+    checks.push(Check::at_most(
+        "ours over the best peer, both means over the lines above the localisation's own error",
+        mean,
+        MEAN_GOAL,
+    ));
     let failed = checks.iter().filter(|check| !check.holds).count();
     if arguments.json {
         println!(
             "{}",
-            serde_json::json!({ "lines": lines, "checks": checks })
+            serde_json::json!({ "lines": lines, "checks": checks_json(&checks) })
         );
     } else {
         print(&lines);

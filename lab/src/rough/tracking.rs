@@ -23,7 +23,7 @@ use tread_control::tracking::{ThetaKnowledge, TrackerConfig, TrackingErrors};
 use super::plant::{Means, Plant, STEP_S, State, Truth};
 use super::sensors::{SAMPLE_PERIOD, SensorSpec, Sensors};
 use super::spec::{Deviations, Make};
-use crate::bench::{Course, Driver, Law, Sight};
+use crate::bench::{Course, Driver, Law, LawInput};
 use crate::random::Random;
 
 /// How long the robot stands before it starts.
@@ -369,7 +369,7 @@ pub fn run(trial: &Trial<'_>) -> anyhow::Result<Errors> {
                 TrackingErrors::between(&reference, &measured).distance_m()
             }
         };
-        let sight = Sight {
+        let input = LawInput {
             course: &course,
             time_s: governor.clock_s(),
             reference: &reference,
@@ -377,7 +377,7 @@ pub fn run(trial: &Trial<'_>) -> anyhow::Result<Errors> {
             knowledge,
             felt: known.felt,
         };
-        let (wanted, output) = driver.step(&sight, dt_s);
+        let (wanted, output) = driver.step(&input, dt_s);
         saturated = output.is_some_and(|output| output.saturated);
         let passed = gate(
             &GateInput {

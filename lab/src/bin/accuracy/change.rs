@@ -150,7 +150,7 @@ fn changes(
     checks: &mut Vec<Check>,
 ) {
     let curve = RobotSpec::on(1.0 / border.theta_after).curve;
-    let runs = run_seeded(options.runs, options.threads, |seed| {
+    let runs = run_seeded(options.runs, |seed| {
         drive(
             &spec(border.theta_before, border.has_torque),
             Some(curve),
@@ -208,7 +208,7 @@ fn quiet(
     checks: &mut Vec<Check>,
 ) {
     let runs = (options.runs / CHANGES_PER_QUIET).max(1);
-    let alarms: u32 = run_seeded(runs, options.threads, |seed| {
+    let alarms: u32 = run_seeded(runs, |seed| {
         drive(&spec(theta, has_torque), None, QUIET_S, seed).false_alarms
     })
     .into_iter()

@@ -31,6 +31,16 @@ fn main() -> ExitCode {
             return ExitCode::from(2);
         }
     };
+    if let Err(error) = rayon::ThreadPoolBuilder::new()
+        .num_threads(options.threads)
+        .build_global()
+    {
+        println!(
+            "accuracy: cannot start {} threads: {error}",
+            options.threads
+        );
+        return ExitCode::from(2);
+    }
     let parts: [(&str, Part); 4] = [
         ("tracking", tracking::run),
         ("theta", theta::run),

@@ -11,6 +11,7 @@ use tread_control::localisation::{Localisation, LocalisationNoise, PositionFix};
 use tread_control::measured::{BodyAcceleration, Measured, WheelSpeeds, WheelTorques};
 use tread_control::plant::{Ground, Plant, PlantMeans, PlantSpec, TyreRise, Tyres};
 use tread_control::robot::RobotModel;
+use tread_lab::parallel::in_parallel;
 
 /// Sensor samples, seconds.
 pub(crate) const SAMPLE_S: f64 = 0.005;
@@ -225,30 +226,8 @@ impl SeededRobot {
     }
 }
 
-/// Shares seeded runs among threads; results stand in the order of their seeds.
-pub(crate) fn run_seeded<T: Send>(
-    runs: u32,
-    threads: usize,
-    one: impl Fn(u64) -> T + Sync,
-) -> Vec<T> {
-    let threads = u64::try_from(threads.max(1)).unwrap_or(1);
-    let mut results: Vec<(u64, T)> = std::thread::scope(|scope| {
-        let one = &one;
-        let workers: Vec<_> = (0..threads)
-            .map(|first| {
-                scope.spawn(move || {
-                    (first..u64::from(runs))
-                        .step_by(usize::try_from(threads).unwrap_or(1))
-                        .map(|seed| (seed, one(seed)))
-                        .collect::<Vec<_>>()
-                })
-            })
-            .collect();
-        workers
-            .into_iter()
-            .flat_map(|worker| worker.join().expect("a run does not panic"))
-            .collect()
-    });
-    results.sort_by_key(|(seed, _)| *seed);
-    results.into_iter().map(|(_, result)| result).collect()
+/// Runs of the seeds from 0 on, on all threads; results stand in their order.
+pub(crate) fn run_seeded<T: Send>(runs: u32, one: impl Fn(u64) -> T + Sync + Send) -> Vec<T> {
+    let seeds: Vec<u64> = (0..u64::from(runs)).collect();
+    in_parallel(&seeds, |&seed| one(seed))
 }

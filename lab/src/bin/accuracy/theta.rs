@@ -192,9 +192,7 @@ pub(crate) fn measure(scenarios: Vec<Scenario>, first_seed: u64, options: &Optio
     let mut lines = Vec::new();
     let mut checks = Vec::new();
     for scenario in scenarios {
-        let runs = run_seeded(options.runs, options.threads, |seed| {
-            run_one(&scenario, first_seed + seed)
-        });
+        let runs = run_seeded(options.runs, |seed| run_one(&scenario, first_seed + seed));
         let found = figures(&scenario, &runs);
         check(&scenario, &found, &mut checks);
         let [half, most, nearly_all] = found.coverage.map(|share| 100.0 * share);

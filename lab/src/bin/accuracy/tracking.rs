@@ -6,10 +6,10 @@ pub(crate) mod held_out;
 mod simulate;
 
 use std::fmt::Write as _;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde_json::{Value, json};
 use tread_lab::bench::{Course, KanayamaGains, Law, PursuitConfig, Track};
+use tread_lab::parallel::in_parallel;
 
 use tread_control::robot::RobotModel;
 use tread_control::tracking::TrackerConfig;
@@ -65,23 +65,19 @@ pub(crate) fn run(options: &Options) -> Section {
         }
     }
     let seeds = u64::from((options.runs / 100).clamp(1, 20));
-    let lines = in_parallel(
-        &wanted,
-        options.threads,
-        |&(name, course, terrain, lag_s, noisy)| {
-            let case = Case {
-                model: RobotModel::yi2007(),
-                course,
-                terrain,
-                lag_s,
-                noisy,
-                seed: 0,
-                tracker: TrackerConfig::default(),
-            };
-            line(name, &case, if noisy { seeds } else { 1 })
-        },
-    );
-    let found = figures::find(&courses, &lines, options.threads);
+    let lines = in_parallel(&wanted, |&(name, course, terrain, lag_s, noisy)| {
+        let case = Case {
+            model: RobotModel::yi2007(),
+            course,
+            terrain,
+            lag_s,
+            noisy,
+            seed: 0,
+            tracker: TrackerConfig::default(),
+        };
+        line(name, &case, if noisy { seeds } else { 1 })
+    });
+    let found = figures::find(&courses, &lines);
     Section {
         text: table(&lines, seeds) + &found.text,
         figures: json!({
@@ -91,37 +87,6 @@ pub(crate) fn run(options: &Options) -> Section {
         }),
         checks: found.checks,
     }
-}
-
-/// Applies a function to all items on some threads; results in the items' order.
-fn in_parallel<T: Sync, R: Send>(
-    items: &[T],
-    threads: usize,
-    work: impl Fn(&T) -> R + Sync,
-) -> Vec<R> {
-    let next = AtomicUsize::new(0);
-    let mut found: Vec<(usize, R)> = std::thread::scope(|scope| {
-        let workers: Vec<_> = (0..threads.min(items.len()).max(1))
-            .map(|_| {
-                scope.spawn(|| {
-                    let mut mine = Vec::new();
-                    loop {
-                        let index = next.fetch_add(1, Ordering::Relaxed);
-                        match items.get(index) {
-                            Some(item) => mine.push((index, work(item))),
-                            None => return mine,
-                        }
-                    }
-                })
-            })
-            .collect();
-        workers
-            .into_iter()
-            .flat_map(|worker| worker.join().expect("a run does not panic"))
-            .collect()
-    });
-    found.sort_by_key(|(index, _)| *index);
-    found.into_iter().map(|(_, result)| result).collect()
 }
 
 /// The tuned peer with a heading gain.

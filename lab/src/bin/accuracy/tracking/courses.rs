@@ -6,23 +6,8 @@ use tread_control::geometry::{Point, Pose};
 use tread_control::plan::Plan;
 use tread_control::robot::RobotModel;
 use tread_control::trajectory::{CircleSpec, Direction, Trajectory, Waypoint, WaypointsSpec};
-use tread_lab::bench::{Course, Figure8};
+use tread_lab::bench::{CLOSED_PATH_M, Course, Figure8};
 
-/// A closed path of twelve points, about 33 m round, with bends of both hands.
-const POINTS: [(f64, f64); 12] = [
-    (0.0, 0.0),
-    (3.0, -0.5),
-    (6.0, 0.5),
-    (7.0, 3.0),
-    (5.0, 4.5),
-    (3.0, 3.5),
-    (1.0, 4.5),
-    (-1.0, 6.5),
-    (-4.0, 6.0),
-    (-5.0, 3.5),
-    (-3.5, 1.5),
-    (-1.5, 1.2),
-];
 /// How often the path is driven.
 const LAPS: usize = 2;
 
@@ -62,10 +47,10 @@ fn circle() -> Course {
 }
 
 fn waypoints() -> Course {
-    let points = POINTS
+    let points = CLOSED_PATH_M
         .iter()
         .cycle()
-        .take(LAPS * POINTS.len() + 1)
+        .take(LAPS * CLOSED_PATH_M.len() + 1)
         .map(|&(x_m, y_m)| Waypoint::from(Point { x_m, y_m }))
         .collect();
     let trajectory = Trajectory::Waypoints(WaypointsSpec {

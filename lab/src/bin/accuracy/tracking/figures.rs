@@ -14,9 +14,10 @@ use tread_control::plant::{Ground, Plant, PlantSpec};
 use tread_control::robot::RobotModel;
 use tread_control::tracking::{ThetaKnowledge, TrackerConfig};
 use tread_lab::bench::{Course, Figure8, Law};
+use tread_lab::parallel::in_parallel;
 
 use super::simulate::{Case, Knowing, PRIOR_DEVIATION, Terrain, Trace, simulate};
-use super::{Courses, Line, OWN, PEER, STIFFNESSES, UNKNOWN, courses, in_parallel};
+use super::{Courses, Line, OWN, PEER, STIFFNESSES, UNKNOWN, courses};
 use crate::report::Check;
 use crate::robot::LOOP_S;
 
@@ -37,18 +38,18 @@ pub(super) struct Found {
 }
 
 /// Everything that is not in the table.
-pub(super) fn find(courses: &Courses, lines: &[Line], threads: usize) -> Found {
+pub(super) fn find(courses: &Courses, lines: &[Line]) -> Found {
     let mut found = Found {
         text: String::new(),
         figures: json!({}),
         checks: Vec::new(),
     };
     from_the_table(lines, &mut found.checks);
-    before_theta_is_known(courses, threads, &mut found);
-    with_a_prior(threads, &mut found);
-    at_a_border(courses, threads, &mut found);
-    with_a_wrong_theta(threads, &mut found);
-    from_standstill(threads, &mut found);
+    before_theta_is_known(courses, &mut found);
+    with_a_prior(&mut found);
+    at_a_border(courses, &mut found);
+    with_a_wrong_theta(&mut found);
+    from_standstill(&mut found);
     found
 }
 
@@ -100,14 +101,14 @@ fn from_the_table(lines: &[Line], checks: &mut Vec<Check>) {
 }
 
 /// From the first second on, never given θ: never worse than the peer, whole run.
-fn before_theta_is_known(courses: &Courses, threads: usize, found: &mut Found) {
+fn before_theta_is_known(courses: &Courses, found: &mut Found) {
     let mut items = Vec::new();
     for (name, course) in courses {
         for stiffness in STIFFNESSES {
             items.push((*name, course, stiffness));
         }
     }
-    let ratios = in_parallel(&items, threads, |&(name, course, stiffness)| {
+    let ratios = in_parallel(&items, |&(name, course, stiffness)| {
         let case = case(course, Terrain::Uniform(stiffness));
         let whole = |law| simulate(&case, law, Knowing::Nothing).rms_m(0.0, f64::INFINITY);
         let best = super::PEER_HEADING_GAINS
@@ -138,10 +139,10 @@ fn case(course: &Course, terrain: Terrain) -> Case<'_> {
 }
 
 /// The first lap with the map's prior against a lap of the converged robot.
-fn with_a_prior(threads: usize, found: &mut Found) {
+fn with_a_prior(found: &mut Found) {
     let shape = Figure8::usual();
     let (course, lap_s) = (Course::Figure8(shape), shape.lap_s());
-    let ratios = in_parallel(&STIFFNESSES, threads, |&stiffness| {
+    let ratios = in_parallel(&STIFFNESSES, |&stiffness| {
         let case = case(&course, Terrain::Uniform(stiffness));
         let converged = simulate(&case, Law::Shipped(None), Knowing::Own);
         let prior = ThetaKnowledge {
@@ -180,7 +181,7 @@ fn after_entries(trace: &Trace, border_m: f64) -> [f64; 2] {
 }
 
 /// From K 5 to 0.7: on the circle, and on the figure-8 with the border at several places of it.
-fn at_a_border(courses: &Courses, threads: usize, found: &mut Found) {
+fn at_a_border(courses: &Courses, found: &mut Found) {
     let figure_8 = Course::Figure8(Figure8 {
         laps: 5.0,
         ..Figure8::usual()
@@ -191,7 +192,7 @@ fn at_a_border(courses: &Courses, threads: usize, found: &mut Found) {
         ("circle", circle, &[0.0][..]),
         ("figure-8", &figure_8, &[0.0, 1.0, 2.0, 3.0, 3.5][..]),
     ] {
-        let sums = in_parallel(borders_m, threads, |&at_m| {
+        let sums = in_parallel(borders_m, |&at_m| {
             let terrain = Terrain::Border {
                 at_m,
                 pair: [5.0, 0.7],
@@ -227,7 +228,7 @@ fn at_a_border(courses: &Courses, threads: usize, found: &mut Found) {
 }
 
 /// A claim that is ten times wrong, believed for a lap; then the robot's own measurement.
-fn with_a_wrong_theta(threads: usize, found: &mut Found) {
+fn with_a_wrong_theta(found: &mut Found) {
     let shape = Figure8::usual();
     let (course, lap_s) = (Course::Figure8(shape), shape.lap_s());
     let mut items = Vec::new();
@@ -236,7 +237,7 @@ fn with_a_wrong_theta(threads: usize, found: &mut Found) {
             items.push((stiffness, factor));
         }
     }
-    let rows = in_parallel(&items, threads, |&(stiffness, factor)| {
+    let rows = in_parallel(&items, |&(stiffness, factor)| {
         let case = case(&course, Terrain::Uniform(stiffness));
         let claim = ThetaKnowledge {
             theta: factor / stiffness,
@@ -272,7 +273,7 @@ fn with_a_wrong_theta(threads: usize, found: &mut Found) {
 }
 
 /// From rest 3 m off the circle with the robot's own follower: time until within 5 cm for good.
-fn from_standstill(threads: usize, found: &mut Found) {
+fn from_standstill(found: &mut Found) {
     let mut items = Vec::new();
     for (name, radius_m, heading_rad) in [
         ("inside, along the path", 3.0, FRAC_PI_2),
@@ -284,25 +285,21 @@ fn from_standstill(threads: usize, found: &mut Found) {
             items.push((name, radius_m, heading_rad, stiffness));
         }
     }
-    let rows = in_parallel(
-        &items,
-        threads,
-        |&(name, radius_m, heading_rad, stiffness)| {
-            let start = Pose {
-                x_m: radius_m,
-                y_m: 0.0,
-                heading_rad,
-            };
-            let curve = FrictionCurve::with_stiffness(stiffness).expect("stiffness is positive");
-            let traction_limit_mu = Some(curve.mu_peak());
-            (
-                name,
-                stiffness,
-                arrival(start, stiffness, None),
-                arrival(start, stiffness, traction_limit_mu),
-            )
-        },
-    );
+    let rows = in_parallel(&items, |&(name, radius_m, heading_rad, stiffness)| {
+        let start = Pose {
+            x_m: radius_m,
+            y_m: 0.0,
+            heading_rad,
+        };
+        let curve = FrictionCurve::with_stiffness(stiffness).expect("stiffness is positive");
+        let traction_limit_mu = Some(curve.mu_peak());
+        (
+            name,
+            stiffness,
+            arrival(start, stiffness, None),
+            arrival(start, stiffness, traction_limit_mu),
+        )
+    });
     let _ = writeln!(
         found.text,
         "\nFrom rest 3 m off the circle, seconds until inside 5 cm for good; in brackets with the \

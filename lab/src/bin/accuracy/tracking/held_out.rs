@@ -8,10 +8,11 @@ use tread_control::robot::RobotModel;
 use tread_control::tracking::TrackerConfig;
 use tread_control::trajectory::{CircleSpec, Direction, Trajectory, Waypoint, WaypointsSpec};
 use tread_lab::bench::{Course, Figure8, Law};
+use tread_lab::parallel::in_parallel;
 
 use super::courses::plan;
 use super::simulate::{Case, Knowing, Terrain};
-use super::{in_parallel, millimetres, peer, score};
+use super::{millimetres, peer, score};
 use crate::held_out::{FIRST_SEED, STIFFNESSES, robots};
 use crate::report::{Check, Options, Section};
 
@@ -43,27 +44,23 @@ pub(crate) fn run(options: &Options) -> Section {
             }
         }
     }
-    let rows = in_parallel(
-        &wanted,
-        options.threads,
-        |(_, model, _, course, stiffness, noisy)| {
-            let case = Case {
-                model: *model,
-                course,
-                terrain: Terrain::Uniform(*stiffness),
-                lag_s: LAG_S,
-                noisy: *noisy,
-                seed: FIRST_SEED,
-                tracker: TrackerConfig::default(),
-            };
-            let seeds = if *noisy { seeds } else { 1 };
-            [
-                peer(&case, seeds).0,
-                score(&case, seeds, Law::Shipped(None), Knowing::Nothing).0,
-                score(&case, seeds, Law::Shipped(None), Knowing::Own).0,
-            ]
-        },
-    );
+    let rows = in_parallel(&wanted, |(_, model, _, course, stiffness, noisy)| {
+        let case = Case {
+            model: *model,
+            course,
+            terrain: Terrain::Uniform(*stiffness),
+            lag_s: LAG_S,
+            noisy: *noisy,
+            seed: FIRST_SEED,
+            tracker: TrackerConfig::default(),
+        };
+        let seeds = if *noisy { seeds } else { 1 };
+        [
+            peer(&case, seeds).0,
+            score(&case, seeds, Law::Shipped(None), Knowing::Nothing).0,
+            score(&case, seeds, Law::Shipped(None), Knowing::Own).0,
+        ]
+    });
     let mut text = format!(
         "Cross-track RMS of the second half, mm, lag {:.0} ms; noisy lines over {seeds} seeds.\n\n\
          | robot | course | K | noise | tuned with integral | ours, θ unknown | ours, own θ |\n\
