@@ -1,7 +1,9 @@
 //! Friction over slip in the steady state, by four models of the literature.
 
+use serde::Serialize;
+
 /// Which model a contact follows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub enum Shape {
     /// Straight to the peak, constant beyond it: the model of Yi et al. (2007), eq. (7).
     Linear,
@@ -40,7 +42,7 @@ const LUGRE_STRIBECK_M_S: f64 = 2.0;
 const SLIP_SMALL: f64 = 1.0e-9;
 
 /// Friction over slip of one ground and tyre.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Curve {
     /// Its model.
     pub shape: Shape,

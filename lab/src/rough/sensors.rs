@@ -6,6 +6,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use serde::Serialize;
 use tread_agent::drive::{Feedback, SensorSample};
 use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
@@ -22,7 +23,7 @@ const POSITION_WANDERS_S: f64 = 20.0;
 const OUTLIER_M: f64 = 1.0;
 
 /// How good a robot's sensors are; one standard deviation each unless said otherwise.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct SensorSpec {
     /// Encoder counts per turn of a wheel.
     pub counts_per_turn: f64,

@@ -1,5 +1,6 @@
 //! What a robot of the rough world is, beside the model with which its agent is configured.
 
+use serde::Serialize;
 use tread_control::robot::{Limits, RobotModel, RobotModelError, RobotModelSpec};
 
 use super::curve::{Curve, Shape};
@@ -84,7 +85,7 @@ impl Make {
 }
 
 /// What makes a robot and its ground differ from the agent's model, and from our simulator.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Deviations {
     /// Payload over the mass of the agent's model; it sits at the centre of mass.
     pub payload_ratio: f64,

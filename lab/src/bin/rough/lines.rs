@@ -1,0 +1,127 @@
+//! What is driven: robots that differ in one way, and robots that differ in all.
+
+use tread_lab::random::Random;
+use tread_lab::rough::curve::Shape;
+use tread_lab::rough::run::{Course, Trial};
+use tread_lab::rough::sensors::SensorSpec;
+use tread_lab::rough::spec::{Deviations, MAKES};
+
+use crate::Arguments;
+
+/// Stiffnesses K of the grounds.
+pub(crate) const GROUNDS: [f64; 3] = [0.7, 3.0, 12.0];
+
+pub(crate) type Change = fn(&mut Deviations);
+
+/// Deviations, one at a time.
+pub(crate) const CHANGES: [(&str, Change); 22] = [
+    ("nothing", |_| {}),
+    ("payload 20 %", |robot| {
+        robot.payload_ratio = 0.2;
+    }),
+    ("payload -10 %", |robot| {
+        robot.payload_ratio = -0.1;
+    }),
+    ("yaw inertia +25 %", |robot| {
+        robot.inertia_ratio = 1.25;
+    }),
+    ("yaw inertia -20 %", |robot| {
+        robot.inertia_ratio = 0.8;
+    }),
+    ("brush, peak 0.3", |robot| {
+        bent(robot, Shape::Brush, 0.3);
+    }),
+    ("brush, peak 0.8", |robot| {
+        bent(robot, Shape::Brush, 0.8);
+    }),
+    ("Magic Formula, peak 0.5", |robot| {
+        bent(robot, Shape::MagicFormula, 0.5);
+    }),
+    ("LuGre, peak 0.6", |robot| {
+        bent(robot, Shape::LuGre, 0.6);
+    }),
+    ("relaxation 1 cm", |robot| {
+        robot.relaxation_m = 0.01;
+    }),
+    ("relaxation 5 cm", |robot| {
+        robot.relaxation_m = 0.05;
+    }),
+    ("torque scale +3 %", |robot| robot.torque_scale = [1.03; 2]),
+    ("torque scale -3 %", |robot| robot.torque_scale = [0.97; 2]),
+    ("rotors 10 %, gears 3 %", |robot| {
+        robot.rotor_ratio = 0.1;
+        robot.gear_loss_ratio = 0.03;
+    }),
+    ("center of mass 5 % forward", |robot| {
+        robot.center_forward_ratio = 0.05;
+    }),
+    ("center of mass 5 % rearward", |robot| {
+        robot.center_forward_ratio = -0.05;
+    }),
+    ("center of mass 3 % left", |robot| {
+        robot.center_left_ratio = 0.03;
+    }),
+    ("center of mass 3 % right", |robot| {
+        robot.center_left_ratio = -0.03;
+    }),
+    ("slope 5°", |robot| {
+        robot.slope_rad = [0.0, 5.0_f64.to_radians()];
+    }),
+    ("slope -5°", |robot| {
+        robot.slope_rad = [0.0, -5.0_f64.to_radians()];
+    }),
+    ("rolling resistance 4 %", |robot| {
+        robot.rolling_resistance_ratio = 0.04;
+    }),
+    ("servo lag 0.1 s", |robot| {
+        robot.servo_lag_s = 0.1;
+    }),
+];
+
+fn bent(robot: &mut Deviations, shape: Shape, mu_peak: f64) {
+    robot.curve.shape = shape;
+    robot.curve.mu_peak = mu_peak.min(0.9 * robot.curve.stiffness);
+}
+
+/// The drives of one way of being different: the paper's robot on three grounds and two courses.
+pub(crate) fn alone(change: Change, has_torque: bool, arguments: &Arguments) -> Vec<Trial> {
+    let trial = |index: u32| {
+        let stiffness = GROUNDS[index as usize % GROUNDS.len()];
+        let mut deviations = Deviations::none(stiffness);
+        change(&mut deviations);
+        let is_circle = (index / 3).is_multiple_of(2);
+        Trial {
+            make: MAKES[0],
+            deviations,
+            sensors: SensorSpec::usual(has_torque),
+            course: if is_circle {
+                Course::Circle
+            } else {
+                Course::Figure8
+            },
+            seed: arguments.seed + u64::from(index),
+            prior: arguments.prior(),
+        }
+    };
+    (0..arguments.runs).map(trial).collect()
+}
+
+/// Robots of all makes in which everything differs.
+pub(crate) fn population(has_torque: bool, arguments: &Arguments) -> Vec<Trial> {
+    let trial = |index: u32| {
+        let seed = arguments.seed + u64::from(index);
+        let mut random = Random::new(seed ^ 0x5eed);
+        Trial {
+            make: random.one_of(&MAKES).unwrap_or(MAKES[0]),
+            deviations: Deviations::drawn(&mut random),
+            sensors: SensorSpec::drawn(&mut random, has_torque),
+            course: random
+                .one_of(&[Course::Figure8, Course::Circle])
+                .unwrap_or(Course::Figure8),
+            seed,
+            prior: arguments.prior(),
+        }
+    };
+    let runs = arguments.runs.saturating_mul(10);
+    (0..runs).map(trial).collect()
+}

@@ -1,0 +1,190 @@
+//! How well the agents' intervals hold: figures of a line, and of the strata of the population.
+
+use std::ops::RangeInclusive;
+
+use serde::Serialize;
+use tread_api::friction::NORMAL_95;
+use tread_lab::report::Check;
+use tread_lab::rough::run::{Outcome, Trial};
+
+/// Half-width over value above which an interval counts as none.
+const WIDE_RATIO: f64 = 0.6;
+/// Coverage that one deviation, or one stratum of the population, must have.
+const LINE_GOAL: RangeInclusive<f64> = 0.9..=1.0;
+/// Coverage that the population must have.
+const POPULATION_GOAL: RangeInclusive<f64> = 0.93..=0.975;
+/// Name of the line in which everything differs.
+pub(crate) const POPULATION: &str = "population";
+/// Share of the time beyond half the peak's slip above which a drive is of the stratum that slips.
+const SLIPS_MOSTLY: f64 = 0.5;
+
+/// A drive and what came of it.
+pub(crate) type Drive = (Trial, Outcome);
+
+#[derive(Debug, Serialize)]
+pub(crate) struct Line {
+    pub(crate) name: String,
+    has_torque: bool,
+    estimates: usize,
+    /// Share of the estimates whose 95 % interval holds the true θ.
+    coverage: f64,
+    /// Median of θ̂/θ − 1.
+    error: f64,
+    /// Median half-width of the 95 % interval over its value.
+    half_width: f64,
+    /// Share of answers that say nothing.
+    abstained: f64,
+    /// The same of the last answers.
+    abstained_at_end: f64,
+    /// Share of the time in which a contact slipped beyond half the slip of the peak.
+    beyond_half_peak: f64,
+}
+
+impl Line {
+    /// Figures of drives with or without torque.
+    pub(crate) fn of(name: impl Into<String>, has_torque: bool, drives: &[&Drive]) -> Self {
+        let (mut errors, mut widths, mut beyond) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut covered, mut asked, mut last) = (0, 0, 0);
+        for (_, outcome) in drives {
+            beyond.push(outcome.beyond_half_peak);
+            asked += outcome.said.len();
+            for (index, said) in outcome.said.into_iter().enumerate() {
+                let Some(said) = said else { continue };
+                let half_width = NORMAL_95 * said.std_dev / said.theta;
+                if half_width > WIDE_RATIO {
+                    continue;
+                }
+                last += usize::from(index + 1 == outcome.said.len());
+                errors.push(said.theta / outcome.truth - 1.0);
+                widths.push(half_width);
+                let (low, high) = said.interval_95();
+                covered += usize::from((low..=high).contains(&outcome.truth));
+            }
+        }
+        Self {
+            name: name.into(),
+            has_torque,
+            estimates: errors.len(),
+            coverage: share(covered, errors.len()),
+            error: median(&mut errors),
+            half_width: median(&mut widths),
+            abstained: 1.0 - share(errors.len(), asked),
+            abstained_at_end: 1.0 - share(last, drives.len()),
+            beyond_half_peak: median(&mut beyond),
+        }
+    }
+
+    /// Whether the coverage is what it must be.
+    pub(crate) fn check(&self) -> Check {
+        let torque = if self.has_torque { "with" } else { "without" };
+        let name = format!(
+            "{}, {torque} torque: coverage of the 95 % intervals",
+            self.name
+        );
+        let goal = if self.name == POPULATION {
+            POPULATION_GOAL
+        } else {
+            LINE_GOAL
+        };
+        Check::between(name, self.coverage, goal)
+    }
+}
+
+/// The population by thirds of each deviation, by curve, ground and course, and by how much it slips.
+pub(crate) fn strata(has_torque: bool, drives: &[Drive]) -> Vec<Line> {
+    type Figure = fn(&Drive) -> f64;
+    let by_figure: [(&str, Figure); 4] = [
+        ("payload", |(trial, _)| trial.deviations.payload_ratio),
+        ("inertia over mass", |(trial, _)| {
+            trial.deviations.inertia_ratio
+        }),
+        ("relaxation length", |(trial, _)| {
+            trial.deviations.relaxation_m
+        }),
+        ("slope", |(trial, _)| {
+            let [x_rad, y_rad] = trial.deviations.slope_rad;
+            x_rad.hypot(y_rad)
+        }),
+    ];
+    let by_class: [fn(&Drive) -> String; 5] = [
+        |(trial, _)| trial.deviations.curve.shape.text().to_owned(),
+        |(trial, _)| format!("K {}", trial.deviations.curve.stiffness),
+        |(trial, _)| trial.course.text().to_owned(),
+        |(trial, _)| trial.make.name.to_owned(),
+        |(_, outcome)| {
+            let mostly = outcome.beyond_half_peak > SLIPS_MOSTLY;
+            format!(
+                "{} half the peak's slip",
+                if mostly { "beyond" } else { "below" }
+            )
+        },
+    ];
+    let mut lines = Vec::new();
+    let mut add = |name: &str, drives: &[&Drive]| {
+        lines.push(Line::of(
+            format!("{POPULATION}, {name}"),
+            has_torque,
+            drives,
+        ));
+    };
+    for (name, figure) in by_figure {
+        let mut sorted: Vec<&Drive> = drives.iter().collect();
+        sorted.sort_by(|one, other| figure(one).total_cmp(&figure(other)));
+        let third = sorted.len().div_ceil(3).max(1);
+        for (third, which) in sorted.chunks(third).zip(["low", "middle", "high"]) {
+            add(&format!("{which} {name}"), third);
+        }
+    }
+    for class in by_class {
+        let mut classes: Vec<String> = drives.iter().map(class).collect();
+        classes.sort();
+        classes.dedup();
+        for name in classes {
+            let of_class: Vec<&Drive> =
+                drives.iter().filter(|drive| class(drive) == name).collect();
+            add(&name, &of_class);
+        }
+    }
+    lines
+}
+
+/// The table for people.
+pub(crate) fn print(lines: &[Line]) {
+    println!(
+        "{:<42} {:>6} {:>9} {:>9} {:>9} {:>9} {:>9} {:>9} {:>9}",
+        "",
+        "torque",
+        "estimates",
+        "coverage",
+        "error",
+        "± half",
+        "none",
+        "none at 60 s",
+        "> ½ peak"
+    );
+    for line in lines {
+        println!(
+            "{:<42} {:>6} {:>9} {:>8.1}% {:>+8.1}% {:>8.1}% {:>8.1}% {:>11.1}% {:>8.1}%{}",
+            line.name,
+            if line.has_torque { "yes" } else { "no" },
+            line.estimates,
+            100.0 * line.coverage,
+            100.0 * line.error,
+            100.0 * line.half_width,
+            100.0 * line.abstained,
+            100.0 * line.abstained_at_end,
+            100.0 * line.beyond_half_peak,
+            if line.check().holds { "" } else { "  MISSED" },
+        );
+    }
+}
+
+fn median(figures: &mut [f64]) -> f64 {
+    figures.sort_by(f64::total_cmp);
+    figures.get(figures.len() / 2).copied().unwrap_or(0.0)
+}
+
+#[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
+fn share(part: usize, of: usize) -> f64 {
+    part as f64 / of.max(1) as f64
+}
