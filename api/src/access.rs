@@ -1,28 +1,29 @@
-//! What a robot may do with which keys: one table, from which the server makes the access control
-//! of its router, and tests the matrix of every key × every certificate.
+//! Access table: which operation a robot may perform on which zenoh keys. The server derives the
+//! access control list of its router from [`ROBOT_KEYS`]; tests check every key against every
+//! certificate.
 //!
-//! What is not in it is denied. See [`crate::keys`] for the keys themselves.
+//! Everything that is not in the table is denied. See [`crate::keys`] for the keys themselves.
 
 use crate::ids::{RobotId, SiteId};
 use crate::keys::ROOT;
 
-/// What a robot does with a key.
+/// Operation that a robot performs on a key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Act {
-    /// It publishes on it.
+    /// Publishes on the key.
     Publish,
-    /// It hears what others publish on it.
+    /// Subscribes to what others publish on the key.
     Listen,
-    /// It answers queries on it.
+    /// Answers queries on the key.
     Answer,
-    /// It asks the server by it.
+    /// Sends queries on the key, which the server answers.
     Ask,
-    /// It shows by a liveliness token that it is there.
+    /// Declares a liveliness token on the key.
     Announce,
 }
 
 impl Act {
-    /// Everything that a robot can do with a key.
+    /// Every operation that a robot can perform on a key.
     pub const ALL: [Self; 5] = [
         Self::Publish,
         Self::Listen,
@@ -32,23 +33,24 @@ impl Act {
     ];
 }
 
-/// Whose key it is.
+/// Robots that share a key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Owner {
-    /// One robot's: nobody else of the fleet may do anything with it.
+    /// One robot: every other robot of the fleet is denied access.
     Robot,
-    /// All robots' of a site.
+    /// All robots of a site.
     Site,
 }
 
-/// A key, or several of the same kind, that robots use.
+/// Key, or group of keys of one kind, that robots use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct RobotKeys {
-    /// What follows `tread/{site}/`; `{robot}` stands for the robot.
+    /// Key expression relative to `tread/{site}/`; `{robot}` is a placeholder for the robot's
+    /// identifier.
     pub pattern: &'static str,
-    /// Whose it is.
+    /// Robots that may use the key.
     pub owner: Owner,
-    /// The one thing that a robot does with it.
+    /// The only operation that a robot may perform on the key.
     pub act: Act,
 }
 
@@ -61,19 +63,19 @@ impl RobotKeys {
         }
     }
 
-    /// The key expression for one robot.
+    /// Returns the key expression for one robot.
     pub fn expression(&self, site: &SiteId, robot: &RobotId) -> String {
         let rest = self.pattern.replace("{robot}", robot.as_str());
         format!("{ROOT}/{site}/{rest}")
     }
 
-    /// The key expression for all robots of all sites, as the server uses it.
+    /// Returns the key expression that matches all robots of all sites, as the server uses it.
     pub fn of_all(&self) -> String {
         format!("{ROOT}/*/{}", self.pattern.replace("{robot}", "*"))
     }
 }
 
-/// Everything that robots do on the network.
+/// Every operation on every key that robots are allowed; all others are denied.
 pub const ROBOT_KEYS: [RobotKeys; 10] = [
     RobotKeys::of_robot("robots/{robot}/alive/*", Act::Announce),
     RobotKeys::of_robot("robots/{robot}/state", Act::Publish),
@@ -88,7 +90,7 @@ pub const ROBOT_KEYS: [RobotKeys; 10] = [
         owner: Owner::Site,
         act: Act::Listen,
     },
-    // Only the server writes it: a robot tells what it has measured by `server/ingest` alone.
+    // Only the server publishes on it: robots upload their measurements on `server/ingest` alone.
     RobotKeys {
         pattern: "server/map",
         owner: Owner::Site,
@@ -104,7 +106,7 @@ mod tests {
     use crate::ids::BootId;
     use crate::keys::{self, Key, Verb};
 
-    /// Whether an expression, whose `*` stands for one whole chunk, has a key.
+    /// Whether an expression matches a key; each `*` in it matches exactly one chunk.
     fn has(expression: &str, key: &str) -> bool {
         let (mut wanted, mut given) = (expression.split('/'), key.split('/'));
         loop {
@@ -116,7 +118,8 @@ mod tests {
         }
     }
 
-    /// One key of every kind that [`Key`] knows. A new kind does not compile until it is here.
+    /// One example key of each variant of [`Key`]. A new variant does not compile until it is
+    /// added.
     fn one_of_each(site: &SiteId, robot: &RobotId) -> Vec<String> {
         let boot = BootId::from_uuid(Uuid::from_u128(7));
         let owner = "lidar".parse().unwrap();

@@ -1,19 +1,20 @@
-//! The chain of the audit log: each entry carries the hash of the one before it, so that an entry
-//! that was changed, removed or put in between later shows to whoever reads the log.
+//! Hash chain of the audit log: each entry carries the hash of the entry before it, so that a later
+//! change, removal or insertion of an entry is detected by [`Verifier`].
 //!
 //! ```text
 //! hash(n) = SHA-256( hash(n − 1) in hexadecimal digits ‖ canonical form of entry n )
 //! ```
 //!
-//! The **canonical form** is the entry as JSON without `previous_hash` and `hash`: the names of each
-//! object sorted by their bytes, no white space, `null` where nothing is known, a number with a fraction
-//! or an exponent as the fewest digits that give it back, such as `5e-1`, `2e0` or `1.25e2`. The numbers
-//! of entries follow each other without a gap. What retention removes is the oldest entries, and the number and hash of the
-//! last one removed are kept ([`AuditChain`]), so the rest stays verifiable.
+//! The **canonical form** is the entry as JSON without the fields `previous_hash` and `hash`: the
+//! names of each object are sorted by their bytes, there is no white space, unknown values are
+//! `null`, and a number with a fraction or an exponent has the fewest digits that parse to the same
+//! value, such as `5e-1`, `2e0` or `1.25e2`. Entries are numbered without gaps. Retention removes
+//! the oldest entries; the number and hash of the last removed entry are kept in [`AuditChain`], so
+//! the rest stays verifiable.
 //!
-//! Whoever can write the database and knows this can make another chain that holds. What shows it is
-//! a number and hash that were noted elsewhere before: by `tread audit verify`, in an export, or in
-//! the machine's journal.
+//! Somebody who can write the database and knows this scheme can compute another valid chain. Only
+//! a number and hash that were recorded elsewhere before reveal it: by `tread audit verify`, in an
+//! export, or in the machine's journal.
 
 use std::fmt::Write as _;
 
@@ -24,24 +25,24 @@ use utoipa::ToSchema;
 
 use crate::identity::AuditEntry;
 
-/// What the first entry ever names as the hash before it.
+/// `previous_hash` of the first entry of a log.
 pub const FIRST_PREVIOUS_HASH: &str =
     "0000000000000000000000000000000000000000000000000000000000000000";
 
-/// What frames the entries that there are.
+/// Numbers and hashes at both ends of the stored entries, from which the chain is verified.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct AuditChain {
-    /// The number of the last entry that is gone, or that an earlier version wrote without a hash.
+    /// Number of the last entry that was removed, or that an earlier version wrote without a hash.
     pub before_id: u64,
-    /// Its hash, which the first entry of the chain names.
+    /// Hash of entry `before_id`; the first stored entry has it as `previous_hash`.
     pub before_hash: String,
-    /// The number of the newest entry.
+    /// Number of the newest entry.
     pub last_id: u64,
-    /// Its hash.
+    /// Hash of the newest entry.
     pub last_hash: String,
 }
 
-/// The hash of an entry after another.
+/// Returns the hash of `entry`, in hexadecimal digits, given the hash of the entry before it.
 pub fn hash_after(previous_hash: &str, entry: &AuditEntry) -> String {
     let mut hash = Sha256::new();
     hash.update(previous_hash);
@@ -54,7 +55,7 @@ pub fn hash_after(previous_hash: &str, entry: &AuditEntry) -> String {
     digits.collect()
 }
 
-/// The canonical form of an entry.
+/// Returns the canonical form of an entry, as the [module](self) defines it.
 pub fn canonical(entry: &AuditEntry) -> String {
     let mut value = serde_json::to_value(entry).unwrap_or_default();
     if let Value::Object(fields) = &mut value {
@@ -94,7 +95,7 @@ fn write_canonical(value: &Value, text: &mut String) {
         }
         Value::Number(number) => match number.as_f64() {
             Some(value) if number.is_f64() => {
-                // Writing into a text cannot fail.
+                // Writing to a `String` cannot fail.
                 let _ = write!(text, "{value:e}");
             }
             Some(_) | None => text.push_str(&number.to_string()),
@@ -103,40 +104,40 @@ fn write_canonical(value: &Value, text: &mut String) {
     }
 }
 
-/// Where a chain does not hold.
+/// Place and kind of the first violation in a hash chain.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Broken {
-    /// Numbers are missing.
+    /// Entries are missing, or out of order.
     #[error("entry {next} follows entry {last}: those between are missing")]
     Missing {
-        /// The last one that is there.
+        /// Number of the last entry before the gap.
         last: u64,
-        /// The next one that is there.
+        /// Number of the first entry after the gap.
         next: u64,
     },
-    /// An entry has no hash though the chain began before it.
+    /// An entry without a hash follows entries that have one.
     #[error("entry {0} has no hash")]
     Unhashed(u64),
-    /// An entry does not name the hash of the one before it.
+    /// `previous_hash` of an entry differs from the hash of the entry before it.
     #[error("entry {0} does not follow the entry before it: one of the two was replaced")]
     Unlinked(u64),
-    /// An entry says something else than when it was written.
+    /// The hash of an entry does not match its content.
     #[error("entry {0} was changed after it was written")]
     Changed(u64),
-    /// The newest entries are gone, or there are more than the server says.
+    /// The newest entries are missing, or there are more entries than the server recorded.
     #[error("the log ends with entry {found}, and the server's record says {expected}")]
     Ends {
-        /// The newest entry that is there.
+        /// Number of the newest entry in the log.
         found: u64,
-        /// What the record says.
+        /// Number of the newest entry by the server's record.
         expected: u64,
     },
-    /// The newest entry is another one than the record says.
+    /// The hash of the newest entry differs from the server's record.
     #[error("entry {0} is another one than the server's record says")]
     LastReplaced(u64),
 }
 
-/// Follows a chain from its beginning, entry by entry.
+/// Verifies a hash chain entry by entry, the oldest first.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Verifier {
     id: u64,
@@ -145,16 +146,16 @@ pub struct Verifier {
 }
 
 impl Verifier {
-    /// Begins after the entry of this number and hash.
+    /// Creates a verifier whose next entry must follow the entry with this number and hash.
     pub fn after(id: u64, hash: &str) -> Self {
         let hash = hash.to_owned();
         Self { id, hash, count: 0 }
     }
 
-    /// Takes the next entry.
+    /// Verifies the next entry.
     ///
     /// # Errors
-    /// [`Broken`] at this entry.
+    /// [`Broken`] if the entry does not continue the chain.
     pub fn take(&mut self, entry: &AuditEntry) -> Result<(), Broken> {
         if self.id.checked_add(1) != Some(entry.id) {
             return Err(Broken::Missing {
@@ -177,10 +178,10 @@ impl Verifier {
         Ok(())
     }
 
-    /// Compares the end of what was taken with the server's record.
+    /// Compares the last verified entry with the server's record of the newest entry.
     ///
     /// # Errors
-    /// The log ends elsewhere than the record says.
+    /// [`Broken::Ends`] if the numbers differ, [`Broken::LastReplaced`] if the hashes differ.
     pub fn end(&self, chain: &AuditChain) -> Result<(), Broken> {
         if self.id != chain.last_id {
             return Err(Broken::Ends {
@@ -194,12 +195,12 @@ impl Verifier {
         Ok(())
     }
 
-    /// Number and hash of the last entry that was taken.
+    /// Returns the number and hash of the last verified entry.
     pub fn last(&self) -> (u64, &str) {
         (self.id, &self.hash)
     }
 
-    /// How many entries were taken.
+    /// Returns the number of verified entries.
     pub fn count(&self) -> u64 {
         self.count
     }
@@ -273,7 +274,8 @@ mod tests {
             broken(|entries| entries[2].hash = None),
             Broken::Unhashed(3)
         );
-        // One that was hashed anew does not fit the next.
+        // An entry whose hash was computed anew does not match the `previous_hash` of the next
+        // entry.
         let renewed = broken(|entries| {
             entries[2].status = 200;
             let previous = entries[2].previous_hash.clone().unwrap();

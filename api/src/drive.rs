@@ -1,9 +1,10 @@
-//! Teleoperation over `GET /v1/sites/{site}/robots/{robot}/drive`, a WebSocket with one JSON
-//! object in each text frame.
+//! Messages of teleoperation over `GET /v1/sites/{site}/robots/{robot}/drive`, a WebSocket with one
+//! JSON object in each text frame: [`DriveRequest`] from the client, [`DriveUpdate`] from the
+//! server.
 //!
-//! Every socket observes; at most one of a robot's drives, with a lease that the robot itself
-//! gives. A driver sends [`DriveRequest::Drive`] again and again: the robot's target is zero at
-//! the latest 250 ms after the end of the last one.
+//! Every socket shows the robot; at most one socket per robot drives it, with a lease that the
+//! robot itself grants. A driver sends [`DriveRequest::Drive`] repeatedly: the robot's target
+//! velocity is zero at the latest 250 ms after the end of the last command.
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -14,73 +15,75 @@ use crate::robot::{Aged, LinkState, MissionProgress, RobotMode};
 use crate::safety::{Lease, SafetyStatus};
 use crate::stop::Stop;
 
-/// Largest text frame from a client, in bytes.
+/// Maximum size of a text frame from a client, bytes; the server closes the socket on a larger one.
 pub const DRIVE_FRAME_MAX: usize = 4_096;
-/// How long a drive command lasts when nothing is said, milliseconds.
+/// Default duration of a drive command, milliseconds.
 pub const DRIVE_FOR_DEFAULT_MS: u64 = 250;
-/// Shortest and longest that a drive command may last, milliseconds.
+/// Minimum duration of a drive command, milliseconds.
 pub const DRIVE_FOR_MIN_MS: u64 = 20;
-/// Longest that a drive command may last, milliseconds.
+/// Maximum duration of a drive command, milliseconds.
 pub const DRIVE_FOR_MAX_MS: u64 = 500;
-/// Time between two views of the robot on a drive socket, milliseconds.
+/// Period of [`DriveUpdate::View`] on a drive socket, milliseconds.
 pub const DRIVE_VIEW_PERIOD_MS: u64 = 100;
 
-/// What a client sends.
+/// Message from the client of a drive socket.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum DriveRequest {
-    /// Take the lease, if nobody else has it.
+    /// Acquires the lease; refused if another socket has it.
     Acquire(DriverName),
-    /// Take the lease, whoever has it now.
+    /// Takes the lease, also from another socket that has it.
     Take(DriverName),
-    /// Give the lease back; the robot's target is zero at once.
+    /// Gives the lease back; the robot's target velocity is zero at once.
     Release(Nothing),
-    /// Drive like this for a while. The newest counts.
+    /// Commands a velocity for a limited time. A newer command replaces an older one.
     Drive(Drive),
-    /// Stop the robot, and latch it. Needs no lease.
+    /// Stops the robot and latches the stop. Needs no lease.
     Stop(StopWords),
 }
 
-/// An object without fields.
+/// Object without fields.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Nothing {}
 
-/// Who wants to drive.
+/// Person who asks for the lease.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DriverName {
-    /// Name for people; others see it when they are refused, behind the token's name.
+    /// Name for people, shown to others whose requests are refused; the token's name is put before
+    /// it.
     #[serde(deserialize_with = "crate::text::bounded::<_, {crate::safety::BY_LENGTH_MAX}>")]
     pub name: String,
 }
 
-/// What a driver wants.
+/// Velocity command of the driver.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Drive {
-    /// Forward velocity, m/s; the robot reduces what is beyond its limits.
+    /// Forward velocity, m/s, negative backwards; the robot reduces values above its limits.
     pub linear_m_s: f64,
-    /// Yaw rate, rad/s, counter-clockwise.
+    /// Yaw rate, rad/s, positive counter-clockwise; the robot reduces values above its limits.
     pub angular_rad_s: f64,
-    /// How long it lasts, milliseconds; 250 when absent.
+    /// Duration of the command, milliseconds; 250 when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 20, maximum = 500)]
     pub for_ms: Option<u64>,
 }
 
-/// Why to stop, for people.
+/// Author and reason of a stop, for people.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StopWords {
-    /// Who stops; the token's name stands before it, and alone when absent.
+    /// Name of the person who stops, put behind the token's name; the token's name alone when
+    /// absent.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
         deserialize_with = "crate::text::bounded_option::<_, {crate::stop::STOP_TEXT_MAX}>"
     )]
     pub by: Option<String>,
-    /// Why.
+    /// Reason of the stop.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
@@ -89,92 +92,94 @@ pub struct StopWords {
     pub reason: Option<String>,
 }
 
-/// What the server sends.
+/// Message from the server on a drive socket.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum DriveUpdate {
-    /// The first frame: who this socket is.
+    /// First message on the socket.
     Welcome {
-        /// The socket, as leases name it.
+        /// Identifier of this socket, as leases contain it in `driver.client`.
         client: Uuid,
     },
     /// This socket has the lease.
     Leased(Lease),
     /// This socket no longer has the lease.
     Released {
-        /// Why.
+        /// Reason, for programs.
         cause: ReleaseCause,
-        /// For people.
+        /// Reason, for people.
         detail: String,
     },
-    /// Something was not done.
+    /// A request was refused.
     Refused {
-        /// Why.
+        /// Reason, for programs.
         cause: DriveRefusal,
-        /// For people; names who has the lease.
+        /// Reason, for people; names who has the lease when `cause` is `leased`.
         detail: String,
     },
-    /// The stop that was asked for, confirmed or not.
+    /// The requested stop, confirmed by the robot or not.
     Stopped(Box<Stop>),
-    /// The robot as it was heard last, ten times a second.
+    /// Latest state of the robot, sent ten times a second.
     View(Box<DriveView>),
     /// The server closes the socket.
     Ended {
-        /// For people.
+        /// Reason, for people.
         detail: String,
     },
 }
 
-/// Why a socket no longer has the lease.
+/// Reason why a socket no longer has the lease.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ReleaseCause {
-    /// It gave it back.
+    /// The socket gave the lease back.
     Released,
-    /// Somebody took it.
+    /// Another socket took the lease.
     Taken,
-    /// The robot no longer knows it: it restarted, or the driver was silent for too long.
+    /// The lease has ended on the robot: the agent restarted, or the driver sent nothing for too
+    /// long.
     Lost,
 }
 
-/// Why something was not done.
+/// Reason why a request on a drive socket was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum DriveRefusal {
-    /// Somebody else has the lease.
+    /// Another socket has the lease.
     Leased,
     /// This socket has no lease.
     NoLease,
-    /// A stop is in force; nothing is driven until it is cleared.
+    /// A stop is in force; the robot does not move until it is cleared.
     Stopped,
-    /// The token's role may watch and stop, not drive.
+    /// The token does not have the right `drive` for this robot.
     Forbidden,
-    /// The robot does not answer, or has not been heard.
+    /// The robot does not answer, or is offline.
     Unreachable,
-    /// The robot will not.
+    /// The robot refused the request for another reason.
     Refused,
 }
 
-/// A robot as a drive socket shows it.
+/// State of a robot as a drive socket shows it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct DriveView {
-    /// Whether the server hears it.
+    /// Link state of the robot.
     pub link: LinkState,
-    /// Time since its last state, milliseconds.
+    /// Time since the server received the robot's last state, milliseconds; `null` before the first
+    /// one.
     pub heard_age_ms: Option<u64>,
-    /// What it is doing.
+    /// Operating mode; `null` before the first state.
     pub mode: Option<RobotMode>,
-    /// Where it is.
+    /// Pose in the site frame; `null` if unknown.
     pub pose: Option<Aged<Pose>>,
-    /// How fast it moves.
+    /// Velocity in the robot frame; `null` if unknown.
     pub twist: Option<Aged<Twist>>,
-    /// The mission in its hand.
+    /// Progress of the robot's active mission; `null` without one.
     pub mission: Option<MissionProgress>,
-    /// Its stop, its lease, what reduces it.
+    /// Stop, lease, and whatever reduces the robot's speed.
     pub safety: SafetyStatus,
-    /// Age of drive commands at the robot, as it reports, plus this socket's round-trip time,
-    /// milliseconds; `null` while one of the two is not known.
+    /// Age of drive commands at the robot, as the robot reports it, plus this socket's round-trip
+    /// time, milliseconds; `null` while one of the two is unknown.
     pub latency_ms: Option<f64>,
-    /// Round-trip time of this socket, milliseconds.
+    /// Round-trip time of this socket, milliseconds; `null` before the first pong.
     pub socket_ms: Option<f64>,
 }

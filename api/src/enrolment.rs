@@ -1,7 +1,8 @@
-//! How robots join the fleet, stay in it, and are put out of it.
+//! Enrolment of robots: joining the fleet, renewal of certificates, revocation, and rotation of the
+//! fleet's certificate authority.
 //!
-//! A robot makes its key itself and never shows it. With a join token, which counts once, it asks
-//! for a certificate; with that certificate and key it asks for the next one.
+//! A robot generates its private key itself and never sends it. With a join token, which is valid
+//! for one use, it requests a certificate; with that certificate and key it requests the next one.
 
 use std::fmt;
 use std::num::ParseIntError;
@@ -14,62 +15,63 @@ use utoipa::ToSchema;
 
 use crate::ids::{JoinTokenId, RobotId, SiteId};
 
-/// Most minutes that a join token may be valid: a day.
+/// Maximum validity of a join token, minutes: one day.
 pub const JOIN_MINUTES_MAX: u32 = 24 * 60;
-/// Minutes that a join token is valid when nothing is said.
+/// Default validity of a join token, minutes.
 pub const JOIN_MINUTES_DEFAULT: u32 = 60;
-/// What the proof of a renewal is about, before the request's own text: no signature that was
-/// made for another purpose counts as one.
+/// Prefix of the message that proves a renewal. It ensures that no signature made for another
+/// purpose is valid as a proof.
 pub const RENEWAL_CONTEXT: &[u8] = b"tread: the next certificate for this request\n";
 
-/// What a robot signs with its present key to get its next certificate.
+/// Returns the message that a robot signs with its present key to renew its certificate:
+/// [`RENEWAL_CONTEXT`] and the certificate request.
 pub fn renewal_message(certificate_request: &str) -> Vec<u8> {
     [RENEWAL_CONTEXT, certificate_request.as_bytes()].concat()
 }
 
-/// A token by which one robot may join once, as it is listed.
+/// Join token, valid for one enrolment of one robot, without its secret.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct JoinToken {
-    /// Its identifier; no secret.
+    /// Identifier of the token; not secret.
     pub id: JoinTokenId,
-    /// The site that the robot joins.
+    /// Site that the robot joins.
     pub site: SiteId,
-    /// The robot that it is for; `null` for any that is new.
+    /// Robot that the token is for; `null` for any robot that is new to the site.
     pub robot: Option<RobotId>,
-    /// When it was made.
+    /// Time when the token was created.
     pub created_at: Timestamp,
-    /// Who made it.
+    /// Name of the token or person that created it.
     pub created_by: String,
-    /// From when on it is refused.
+    /// Time from which the token is refused.
     pub expires_at: Timestamp,
-    /// When a robot joined by it.
+    /// Time when a robot joined with the token; `null` while it is unused.
     pub used_at: Option<Timestamp>,
-    /// Which robot that was.
+    /// Robot that joined with the token; `null` while it is unused.
     pub used_by: Option<RobotId>,
-    /// When it was revoked.
+    /// Time when the token was revoked; `null` if it was not.
     pub revoked_at: Option<Timestamp>,
 }
 
-/// Asks for a join token.
+/// Request for a join token.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct CreateJoinToken {
-    /// The site that the robot joins.
+    /// Site that the robot joins.
     pub site: SiteId,
-    /// The robot that it is for. Without it any robot may join that is new to the site; one that
-    /// is known there, or was revoked, must be named.
+    /// Robot that the token is for. When absent, any robot that is new to the site may join; a
+    /// robot that the site knows, also a revoked one, must be named.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub robot: Option<RobotId>,
-    /// Minutes until it is refused, 1 to 1440; 60 when absent.
+    /// Validity of the token, minutes, 1 to 1440; 60 when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub valid_minutes: Option<u32>,
 }
 
-/// A new join token with its secret, which is shown only here.
+/// New join token with its secret, which no other answer contains.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct CreatedJoinToken {
-    /// The token.
+    /// The join token.
     pub join_token: JoinToken,
-    /// What the robot shows.
+    /// Secret that the robot sends as `token` of its enrolment request.
     pub secret: String,
 }
 
@@ -82,15 +84,16 @@ impl fmt::Debug for CreatedJoinToken {
     }
 }
 
-/// A robot joins.
+/// Request of a robot to join the fleet.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct EnrolRobot {
-    /// The secret of a join token.
+    /// Secret of a join token.
     pub token: String,
-    /// Who it is; may be left out if the token names it.
+    /// Identifier of the robot; may be absent if the join token names a robot.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub robot: Option<RobotId>,
-    /// A PKCS #10 request for its key, PEM. Only the key in it counts: names are the server's.
+    /// PKCS #10 certificate request for the robot's key, PEM. Only its public key is used; the
+    /// server sets the names in the certificate.
     pub certificate_request: String,
 }
 
@@ -103,74 +106,81 @@ impl fmt::Debug for EnrolRobot {
     }
 }
 
-/// A robot asks for its next certificate.
+/// Request of a robot for its next certificate.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct RenewCertificate {
-    /// Its present certificate, PEM.
+    /// Present certificate of the robot, PEM.
     pub certificate: String,
-    /// A PKCS #10 request for its next key, PEM, signed with that key.
+    /// PKCS #10 certificate request for the robot's next key, PEM, signed with that key.
     pub certificate_request: String,
-    /// The ECDSA P-256 signature of [`renewal_message`] with the present key, ASN.1, base64.
+    /// Signature that proves possession of the present key: ECDSA P-256 over the bytes `tread: the
+    /// next certificate for this request`, a line feed and `certificate_request`; ASN.1 DER in
+    /// base64.
     pub proof: String,
 }
 
-/// What a robot gets when it joins, and with each renewal.
+/// Certificate of a robot, answered to each enrolment and renewal.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct RobotCertificate {
-    /// The site.
+    /// Site of the robot.
     pub site: SiteId,
-    /// The robot.
+    /// Identifier of the robot.
     pub robot: RobotId,
-    /// How often it has joined, from 1; a certificate of an earlier time is refused.
+    /// Number of this enrolment of the robot, from 1. Certificates of earlier enrolments are
+    /// refused.
     pub enrolment: u32,
-    /// Its certificate, PEM.
+    /// Certificate of the robot, PEM.
     pub certificate: String,
-    /// Whom the robots' port may show to be signed by, PEM: the fleet's authority, and during a
-    /// rotation the former one after it.
+    /// Certificates of the authorities that the robot must trust on the robots' port, PEM: the
+    /// fleet's authority, and during a rotation also the former one behind it.
     pub authority: String,
-    /// How long the certificate is good for, seconds from now. Renew it after two thirds of that.
+    /// Remaining validity of the certificate, seconds from now. Renew it after two thirds of this
+    /// time.
     pub lifetime_s: u64,
-    /// From when on it is refused.
+    /// Time from which the certificate is refused.
     pub expires_at: Timestamp,
-    /// The TCP port that robots connect to.
+    /// TCP port of the server for robots.
     pub port: u16,
 }
 
-/// One time that a robot joined.
+/// One enrolment of a robot.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Enrolment {
-    /// The site.
+    /// Site of the robot.
     pub site: SiteId,
-    /// The robot.
+    /// Identifier of the robot.
     pub robot: RobotId,
-    /// How often it has joined, from 1.
+    /// Number of this enrolment of the robot, from 1.
     pub number: u32,
-    /// When it joined.
+    /// Time when the robot joined.
     pub enrolled_at: Timestamp,
-    /// The join token that it came with.
+    /// Join token that the robot used.
     pub join_token: JoinTokenId,
-    /// When it got its present certificate.
+    /// Time when the robot's present certificate was issued.
     pub renewed_at: Timestamp,
-    /// From when on its present certificate is refused.
+    /// Time from which the present certificate is refused.
     pub expires_at: Timestamp,
-    /// When it was revoked, or replaced because the robot joined again.
+    /// Time when the enrolment was revoked, or replaced because the robot joined again; `null`
+    /// while it is valid.
     pub revoked_at: Option<Timestamp>,
-    /// Who did that.
+    /// Name of the token or person that revoked or replaced it; `null` while it is valid.
     pub revoked_by: Option<String>,
-    /// SHA-256 of the authority that signed the certificate which the robot presented last; during
-    /// a rotation it shows which robots have moved to the new one. `null` for a robot that has
-    /// presented none since this is recorded.
+    /// SHA-256 fingerprint of the authority that signed the certificate which the robot presented
+    /// last. During a rotation it tells which robots use the new authority. `null` if the robot has
+    /// not presented a certificate since the server records this.
     #[serde(default)]
     pub authority: Option<String>,
 }
 
-/// Names the authorities that a robot trusts, so that both sides see whether they mean the same.
-/// It is a hint and no proof.
+/// Identifier of the set of authorities that a robot trusts: the first 64 bits of a SHA-256 hash.
+/// Server and robot compare it to detect that they trust different sets. It is a hint and proves
+/// nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct TrustId(u64);
 
 impl TrustId {
-    /// The name of a set of certificates, each as DER; their order does not matter.
+    /// Returns the identifier of a set of certificates, each as DER. Order and duplicates do not
+    /// matter.
     pub fn of<'der>(certificates: impl IntoIterator<Item = &'der [u8]>) -> Self {
         let mut hashes: Vec<[u8; 32]> = certificates
             .into_iter()
@@ -184,7 +194,7 @@ impl TrustId {
         Self(u64::from_be_bytes(upper))
     }
 
-    /// Its bits, which are as good as random.
+    /// Returns the identifier as an integer; its bits are uniformly distributed.
     pub const fn bits(self) -> u64 {
         self.0
     }
@@ -217,71 +227,76 @@ impl<'de> Deserialize<'de> for TrustId {
     }
 }
 
-/// The fleet's authority, and how far its rotation is.
+/// Certificate authority of the fleet, and the state of its rotation.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct FleetAuthority {
-    /// SHA-256 of the certificate of the authority that signs robots' certificates.
+    /// SHA-256 fingerprint of the certificate of the authority that signs robots' certificates.
     pub signing: String,
-    /// The rotation that is under way.
+    /// Rotation in progress; `null` if there is none.
     pub rotation: Option<AuthorityRotation>,
-    /// False while the disk has not confirmed that the former authority is retired. It is, and a power
-    /// cut before this is true may undo it; the server asks the disk again by itself.
+    /// Whether the disk has confirmed that the former authority is retired. While this is false the
+    /// retirement is in force, but a power failure may undo it; the server retries the write by
+    /// itself.
     pub on_disk: bool,
-    /// How many robots must join again: what they showed last was signed by an authority that was retired.
+    /// Number of robots that must join again, because a retired authority signed the certificate
+    /// that they presented last.
     pub robots_to_join: u32,
-    /// The first of them, at most 1000.
+    /// Robots that must join again, at most the first 1000.
     pub to_join: Vec<RobotLeft>,
 }
 
-/// A rotation of the fleet's authority: both are trusted, and the new one signs.
+/// Rotation of the fleet's authority, during which the new and the former authority are trusted and
+/// the new one signs.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct AuthorityRotation {
-    /// Its name, which finishing it takes.
+    /// Identifier of the rotation, required to finish it.
     #[schema(value_type = String)]
     pub id: TrustId,
-    /// SHA-256 of the certificate of the authority that is to be retired.
+    /// SHA-256 fingerprint of the certificate of the authority that will be retired.
     pub retiring: String,
-    /// When the rotation was started.
+    /// Time when the rotation was started.
     pub started_at: Timestamp,
-    /// Who started it.
+    /// Name of the token or person that started the rotation.
     pub started_by: String,
-    /// How many robots have shown a certificate of the new authority.
+    /// Number of robots that have presented a certificate of the new authority.
     pub robots_moved: u32,
-    /// How many robots have not; once the former authority is retired they must join again.
+    /// Number of robots that have not presented one. They must join again once the former authority
+    /// is retired.
     pub robots_left: u32,
-    /// The first of those that have not, at most 1000.
+    /// Robots that have not presented a certificate of the new authority, at most the first 1000.
     pub left: Vec<RobotLeft>,
 }
 
-/// A robot that still holds a certificate of an authority that is to be retired, or was.
+/// Robot whose certificate was signed by an authority that is retired, or will be.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct RobotLeft {
-    /// The site.
+    /// Site of the robot.
     pub site: SiteId,
-    /// The robot.
+    /// Identifier of the robot.
     pub robot: RobotId,
-    /// When it got its certificate.
+    /// Time when its certificate was issued.
     pub renewed_at: Timestamp,
-    /// Whether the server hears it now.
+    /// Whether the robot is online now.
     pub online: bool,
 }
 
-/// Finishes a rotation.
+/// Request to finish a rotation.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct FinishRotation {
-    /// Which one: the `id` that its start has answered.
+    /// Identifier of the rotation: `id` in the answer to its start.
     #[schema(value_type = String)]
     pub rotation: TrustId,
-    /// Retire the former authority though robots still hold certificates of it; they must join again.
+    /// Whether to retire the former authority although robots still hold certificates of it; these
+    /// robots must join again. When false, the request is refused while such robots exist.
     #[serde(default)]
     pub force: bool,
 }
 
-/// Puts another authority in the place of the present one, at once.
+/// Request to replace the fleet's authority at once, without a rotation.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct ReplaceAuthority {
-    /// The `signing` of the authority to replace, so that a client replaces only the one that it
-    /// has seen.
+    /// SHA-256 fingerprint of the authority to replace: `signing` of the present authority. The
+    /// request is refused if another authority signs by then.
     pub signing: String,
 }
 

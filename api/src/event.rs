@@ -1,10 +1,11 @@
-//! What `GET /v1/events` sends: everything that changes, as server-sent events.
+//! Server-sent events of `GET /v1/events`: every change of missions, robots, alerts and the
+//! friction map.
 //!
 //! Each event's `event:` line is [`Event::name`], its `data:` line an [`Event`] as JSON, its `id:`
-//! line what to give back as `Last-Event-ID`. A stream begins with a snapshot: `snapshot_begin`,
-//! the present state of everything that the filters let through, `snapshot_end`; or, when the
-//! given `Last-Event-ID` is still in reach, with everything since. A stream that the server ends
-//! says so in an [`Event::End`].
+//! line the value that a client sends as `Last-Event-ID` to resume. A stream begins with a
+//! snapshot: `snapshot_begin`, the present state of everything that matches the filters,
+//! `snapshot_end`. If the server still keeps the events since the given `Last-Event-ID`, the stream
+//! begins with those events instead. Before the server ends a stream it sends [`Event::End`].
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -14,17 +15,17 @@ use crate::ids::{MissionId, RobotId, SiteId};
 use crate::mission::{Mission, MissionEvent};
 use crate::robot::{Alert, Robot};
 
-/// What an event is about.
+/// Subject of an event, by which a stream is filtered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Topic {
-    /// Missions and their histories.
+    /// Missions and the steps of their histories.
     Missions,
     /// Robots and their live state.
     Robots,
     /// Alerts.
     Alerts,
-    /// Where the friction map changes.
+    /// Changes of the friction map.
     Map,
 }
 
@@ -32,7 +33,7 @@ impl Topic {
     /// Every topic.
     pub const ALL: [Self; 4] = [Self::Missions, Self::Robots, Self::Alerts, Self::Map];
 
-    /// The topic's name on the wire.
+    /// Returns the topic's name on the wire.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Missions => "missions",
@@ -42,36 +43,36 @@ impl Topic {
         }
     }
 
-    /// The topic of that name.
+    /// Returns the topic with this name; `None` if there is none.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|topic| topic.as_str() == name)
     }
 }
 
-/// One event of the stream.
+/// Event of a stream.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Event {
-    /// The snapshot begins: forget what was known.
+    /// Begin of the snapshot; the client discards all state from before.
     SnapshotBegin,
-    /// The snapshot is whole.
+    /// End of the snapshot.
     SnapshotEnd,
-    /// A mission as it is now.
+    /// Present state of a mission.
     Mission(Box<Mission>),
-    /// A step of a mission's history.
+    /// New step in a mission's history.
     Step(Box<MissionStep>),
-    /// A robot as it is now.
+    /// Present state of a robot.
     Robot(Box<Robot>),
-    /// An alert as it is now.
+    /// Present state of an alert.
     Alert(Box<Alert>),
-    /// Where the friction map has changed.
+    /// Region in which the friction map has changed.
     Map(Box<MapChange>),
-    /// The server ends the stream.
+    /// End of the stream by the server.
     End(StreamEnd),
 }
 
 impl Event {
-    /// The event's name, on its `event:` line.
+    /// Returns the event's name on its `event:` line.
     pub const fn name(&self) -> &'static str {
         match self {
             Self::SnapshotBegin => "snapshot_begin",
@@ -86,25 +87,26 @@ impl Event {
     }
 }
 
-/// A step of a mission's history.
+/// Step in a mission's history.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct MissionStep {
-    /// The mission.
+    /// Identifier of the mission.
     pub mission: MissionId,
-    /// The robot's site.
+    /// Site of the robot.
     pub site: SiteId,
-    /// The robot.
+    /// Robot of the mission.
     pub robot: RobotId,
     /// The step.
     pub step: MissionEvent,
 }
 
-/// Why the server ends a stream.
+/// Reason why the server ends a stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum StreamEnd {
-    /// The client reads too slowly; what it missed is lost unless it resumes soon.
+    /// The client reads too slowly. It misses events unless it resumes while the server still keeps
+    /// them.
     TooSlow,
-    /// The server stops.
+    /// The server shuts down.
     Stopping,
 }

@@ -1,7 +1,8 @@
-//! Friction: what robots measure, and what the map says.
+//! Friction: what robots measure in segments, and estimates fused from them in the friction map.
 //!
-//! θ = 1/K is the slip compliance of the ground for one robot model, K its friction stiffness.
-//! `mu_peak` is a lower bound of the peak friction seen. None of them stands for another.
+//! θ = 1/K is the slip compliance of the ground for one robot model and its tyres, K the friction
+//! stiffness. `mu_peak_lower_bound` is a lower bound of the peak friction coefficient; it can be
+//! derived neither from θ nor from K.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -12,116 +13,122 @@ use crate::ids::{ConfigurationId, MissionId, RobotId, SiteId};
 use crate::site::Cell;
 use crate::terrain::{TerrainClass, TerrainRef};
 
-/// An estimate as an additive pair: sums of such pairs are again estimates.
+/// Estimate of a value in additive form: the component-wise sum of the estimates of independent
+/// measurements is their optimal combination.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Information {
     /// Information Λ = 1/σ², in the inverse square of the value's unit.
     pub information: f64,
-    /// Λ times the value.
+    /// Λ times the value, in the inverse of the value's unit.
     pub weighted: f64,
 }
 
 impl Information {
-    /// The value, if anything is known.
+    /// Returns the estimated value; `None` if there is no information.
     pub fn value(&self) -> Option<f64> {
         (self.information > 0.0).then(|| self.weighted / self.information)
     }
 
-    /// The standard deviation, if anything is known.
+    /// Returns the standard deviation of the value; `None` if there is no information.
     pub fn std_dev(&self) -> Option<f64> {
         (self.information > 0.0).then(|| self.information.sqrt().recip())
     }
 }
 
-/// What the error of a segment's θ is made of: an independent part, which averages out over
-/// segments, and common parts, which do not.
+/// Components of the error of a segment's θ: an independent component, which averages out over
+/// segments, and common components, which do not.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ThetaErrors {
-    /// Information 1/σ² on θ of the independent part alone.
+    /// Information 1/σ² on θ from the independent error alone.
     pub independent_information: f64,
-    /// Standard deviation, as a share of θ, of the error that all segments of one robot have in
-    /// common: its mass, yaw inertia and torque constants.
+    /// Standard deviation, as a ratio of θ, of the error that all segments of one robot share: from
+    /// its mass, yaw inertia and torque constants.
     pub robot_ratio: f64,
-    /// Standard deviation, as a share of θ, of the error that all robots on the same tyres have in
-    /// common: how the tyres' force bends with slip.
+    /// Standard deviation, as a ratio of θ, of the error that all robots with the same tyres share:
+    /// from the nonlinearity of the tyres' force over slip.
     pub tyre_ratio: f64,
 }
 
-/// Largest friction coefficient that a segment may name. Rubber on dry concrete has about 1; no
-/// wheel on any ground that robots drive on has more than this.
+/// Maximum friction coefficient of a segment; one with a larger value is refused. Rubber on dry
+/// concrete reaches about 1; no wheel on drivable ground exceeds this value.
 pub const MU_PEAK_MAX: f64 = 1.5;
 
-/// What a robot learned in one cell on one pass; it does not contain any prior.
+/// Measurement of one robot in one cell on one pass, as additive statistics without any prior.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Segment {
-    /// The robot's model and tyres.
+    /// Configuration of the robot: model and tyres.
     pub configuration: ConfigurationId,
-    /// The mission during which it was measured.
+    /// Mission during which it was measured; absent if there was none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mission: Option<MissionId>,
-    /// Begin of the measurement by the robot's clock.
+    /// Begin of the measurement, by the robot's clock.
     pub started_at: Timestamp,
-    /// End of the measurement by the robot's clock.
+    /// End of the measurement, by the robot's clock.
     pub ended_at: Timestamp,
-    /// Revision of the grid that gave the cell.
+    /// Revision of the grid to which `cell` refers.
     pub grid_revision: u32,
-    /// The cell.
+    /// Cell in which it was measured.
     pub cell: Cell,
-    /// The terrain under the robot; absent where none is drawn.
+    /// Terrain under the robot; absent where no terrain is drawn.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub terrain: Option<TerrainRef>,
-    /// θ, slip per friction coefficient. For who adds up segments and knows nothing of common
-    /// errors: it claims no more than the sum of a robot's segments keeps.
+    /// θ, slip per friction coefficient. Its information is reduced so that a reader who adds up
+    /// the segments of a robot without regard to common errors does not underestimate the error of
+    /// the sum.
     pub theta: Information,
-    /// What the error of θ is made of; absent from an older agent.
+    /// Components of the error of θ; absent from an older agent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub theta_errors: Option<ThetaErrors>,
-    /// Ratio of effective to geometric track, where turning showed it.
+    /// Ratio of effective to geometric track width; absent if the robot did not turn enough to
+    /// measure it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub effective_track_ratio: Option<Information>,
-    /// Rolling resistance coefficient, where torque showed it.
+    /// Rolling resistance coefficient; absent if it could not be measured, for lack of wheel
+    /// torque.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rolling_resistance: Option<Information>,
-    /// Largest friction coefficient that the ground has demonstrably given, a lower bound.
+    /// Largest friction coefficient that the ground demonstrably gave, 0 to 1.5; a lower bound of
+    /// the peak.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mu_peak_lower_bound: Option<f64>,
-    /// Samples that carried information.
+    /// Number of samples with information, at least 1.
     pub samples: u32,
     /// Distance driven, metres.
     pub distance_m: f64,
-    /// Share of the time with a wheel beyond the linear range, 0 to 1.
+    /// Fraction of the time in which a wheel's slip was beyond the linear range, 0 to 1.
     pub saturation_ratio: f64,
 }
 
-/// Largest θ that is taken for a measurement; softer ground than K = 0.02 is not driven.
+/// Maximum plausible θ; a segment with a larger value is refused. It corresponds to K = 0.02,
+/// ground on which no robot drives.
 pub const THETA_MAX: f64 = 50.0;
-/// Most information that one segment may claim, from a standard deviation of 10⁻⁵.
+/// Maximum information of one segment on any value; corresponds to a standard deviation of 10⁻⁵.
 pub const INFORMATION_MAX: f64 = 1.0e10;
-/// Largest common error that a segment may name, as a share of θ.
+/// Maximum standard deviation of a common error in a segment, as a ratio of θ.
 pub const COMMON_RATIO_MAX: f64 = 10.0;
-/// How far apart the tyres' errors of two measurements on the same tyres may be, as a share of
-/// either: one standard deviation. They are the same where tyres slip alike, and grow with the
-/// slip.
+/// Standard deviation of the difference between the tyre errors of two measurements with the same
+/// tyres, as a ratio of the larger of them. The difference vanishes at equal slip and grows with
+/// the difference in slip.
 pub const TYRE_DIFFERENCE_SHARE: f64 = 0.5;
-/// Most samples that one segment may claim.
+/// Maximum number of samples of one segment.
 pub const SAMPLES_MAX: u32 = 10_000_000;
 
-/// Why a segment is not a possible measurement.
+/// Reason why a segment is not a plausible measurement.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum InvalidSegment {
-    /// A number is not finite or out of its range.
+    /// A field is not finite or out of its range; contains the field's name.
     #[error("{0} is out of range")]
     OutOfRange(&'static str),
-    /// It ends before it starts.
+    /// The segment ends before it starts.
     #[error("ended_at lies before started_at")]
     EndsBeforeStart,
 }
 
 impl Segment {
-    /// Checks that this is a possible measurement.
+    /// Checks that every field is within its plausible range.
     ///
     /// # Errors
-    /// [`InvalidSegment`] names the field.
+    /// [`InvalidSegment`] names the first field that is not.
     pub fn validate(&self) -> Result<(), InvalidSegment> {
         let check = |holds: bool, field: &'static str| {
             if holds {
@@ -178,32 +185,34 @@ impl Segment {
     }
 }
 
-/// Both estimates that a robot keeps, never mixed.
+/// Friction estimates of a robot at one moment: that of the tracking law, and that of the
+/// estimator. They are never combined.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct LiveFriction {
-    /// θ̂ of the tracking law in the loop; it tracks well and is no measurement.
+    /// Adapted estimate θ̂ of the tracking law; suited for control, but not a measurement of θ.
+    /// `null` while no law runs.
     pub theta_loop: Option<f64>,
-    /// θ measured in the present cell and ground; `null` without information.
+    /// θ measured by the estimator in the present cell and terrain; `null` without information.
     pub theta_measured: Option<ThetaEstimate>,
-    /// Whether the motion of late carried information on θ.
+    /// Whether the recent motion carried information on θ.
     pub excited: bool,
-    /// Longitudinal slip of the wheels; `null` while they hardly turn or change their speed, and
-    /// from an older agent.
+    /// Longitudinal slip of the wheels; `null` while the wheels hardly turn or hardly change their
+    /// speed, and from an older agent.
     #[serde(default)]
     pub slip: Option<SideSlip>,
 }
 
-/// Longitudinal slip of the wheels of each side, equation (3) of the paper: rim speed minus ground
-/// speed, over the rim speed; −1 to 1, positive when driving.
+/// Mean longitudinal slip of the wheels of each side, equation (3) of the paper: (rim speed −
+/// ground speed) / rim speed, −1 to 1, positive when driving.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct SideSlip {
-    /// Left wheels.
+    /// Slip of the left wheels.
     pub left_ratio: f64,
-    /// Right wheels.
+    /// Slip of the right wheels.
     pub right_ratio: f64,
 }
 
-/// θ with its standard deviation.
+/// Estimate of θ with its standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ThetaEstimate {
     /// θ = 1/K, slip per friction coefficient.
@@ -212,29 +221,30 @@ pub struct ThetaEstimate {
     pub std_dev: f64,
 }
 
-/// Standard deviation of one robot's own bias as a share of θ, where nothing else is configured.
+/// Default standard deviation of one robot's bias, as a ratio of θ.
 pub const ROBOT_BIAS_RATIO: f64 = 0.08;
 
-/// Standard deviations to either side of a 95 % interval.
+/// Half-width of a 95 % interval of the normal distribution, in standard deviations.
 pub const NORMAL_95: f64 = 1.959_963_984_540_054;
 
-/// Standard deviations to either side of a 90 % interval, each end of which is passed by 5 %.
+/// Half-width of a 90 % interval of the normal distribution, in standard deviations; 5 % lie beyond
+/// each end.
 pub const NORMAL_90: f64 = 1.644_853_626_951_472_7;
 
 impl ThetaEstimate {
-    /// The 95 % interval, low and high; θ is never negative.
+    /// Returns the 95 % interval `(low, high)`; the lower end is at least 0.
     pub fn interval_95(&self) -> (f64, f64) {
         let half = NORMAL_95 * self.std_dev;
         ((self.theta - half).max(0.0), self.theta + half)
     }
 }
 
-/// What the map knows of one piece of ground.
+/// Fused friction of one area of ground, from the measurements of all robots.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct FusedFriction {
     /// θ = 1/K, slip per friction coefficient.
     pub theta: f64,
-    /// Standard deviation of θ, including the robots' own biases and the age of their measurements.
+    /// Standard deviation of θ, including the robots' biases and the age of their measurements.
     pub std_dev: f64,
     /// Lower end of the 95 % interval of θ.
     pub theta_low_95: f64,
@@ -242,348 +252,360 @@ pub struct FusedFriction {
     pub theta_high_95: f64,
     /// Friction stiffness K = 1/θ.
     pub stiffness: f64,
-    /// What is undercut and what is exceeded once in twenty times.
+    /// Quantiles at 5 % and 95 % of θ and of K.
     pub bounds: FrictionBounds,
-    /// Largest friction coefficient that the ground has shown of late, a lower bound of the peak;
-    /// `null` when nothing was shown lately or before the ground changed.
+    /// Largest friction coefficient that robots have recently demonstrated, a lower bound of the
+    /// peak; `null` if none was demonstrated recently, or none since the ground changed.
     pub mu_peak_lower_bound: Option<f64>,
-    /// Ratio of effective to geometric track; `null` where no turning showed it.
+    /// Ratio of effective to geometric track width; `null` where no robot turned enough to measure
+    /// it.
     pub effective_track_ratio: Option<ValueEstimate>,
-    /// Rolling resistance coefficient; `null` where no torque showed it.
+    /// Rolling resistance coefficient; `null` where it was not measured, for lack of wheel torque.
     pub rolling_resistance: Option<ValueEstimate>,
-    /// Segments that were ever measured here, including those without information on θ and those
-    /// from before the ground changed: how often it was visited.
+    /// Number of all segments ever measured here, including segments without information on θ and
+    /// those from before the ground changed.
     pub segments: u64,
-    /// Robots behind the estimate.
+    /// Number of robots whose measurements contribute.
     pub robots: u32,
     /// End of the newest measurement.
     pub newest_at: Timestamp,
     /// Age of the newest measurement, seconds.
     pub age_s: f64,
-    /// Whether measurements differ by more than chance and the robots' own biases let them.
+    /// Whether the measurements differ by more than their noise and the robots' biases explain.
     pub disputed: bool,
-    /// Since when the ground is as it is, if it is known to have been otherwise; what was measured
-    /// before does not count.
+    /// Time since when the ground has its present friction; earlier measurements are ignored.
+    /// `null` if no change was detected.
     pub changed_at: Option<Timestamp>,
 }
 
-/// Bounds in the sense of COVESA VSS `RoadFriction`: with the most probable value between them.
+/// Quantiles of θ and K at 5 % and 95 %, as in `RoadFriction` of COVESA VSS, where the most
+/// probable value lies between them.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct FrictionBounds {
-    /// θ is below this with 5 %.
+    /// 5 % quantile of θ: θ is below it with a probability of 5 %.
     pub theta_lower_5: f64,
-    /// θ is above this with 5 %.
+    /// 95 % quantile of θ: θ is above it with a probability of 5 %.
     pub theta_upper_95: f64,
-    /// K is below this with 5 %: 1 / `theta_upper_95`.
+    /// 5 % quantile of K, 1 / `theta_upper_95`.
     pub stiffness_lower_5: f64,
-    /// K is above this with 5 %; `null` when the measurements set no such bound.
+    /// 95 % quantile of K, above which K is with a probability of 5 %; `null` when the measurements
+    /// do not bound K from above.
     pub stiffness_upper_95: Option<f64>,
 }
 
-/// A value with its standard deviation.
+/// Estimate of a value with its standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ValueEstimate {
-    /// The value.
+    /// Estimated value.
     pub value: f64,
-    /// Its standard deviation.
+    /// Standard deviation of the estimate.
     pub std_dev: f64,
 }
 
-/// The friction of one terrain.
+/// Friction of one terrain.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct TerrainFriction {
-    /// The terrain at its present revision.
+    /// Terrain at its present revision.
     pub terrain: TerrainRef,
-    /// Name for people.
+    /// Name of the terrain, for people.
     pub name: String,
-    /// Kind of ground.
+    /// Class of the ground.
     pub class: TerrainClass,
-    /// As of when: nothing that was measured later counts. The end of the last epoch before the
-    /// time that was asked for; `null` when no time was, and all that has come counts.
+    /// Time up to which measurements are included: the end of the last epoch before the requested
+    /// time. `null` if no time was requested; all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
-    /// What is known for each robot model, kept apart.
+    /// Friction for each robot model.
     pub models: Vec<ModelFriction>,
 }
 
-/// Friction for one robot model.
+/// Friction of an area for one robot model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ModelFriction {
-    /// The robot model and tyres.
+    /// Configuration: robot model and tyres.
     pub configuration: ConfigurationId,
-    /// The model's name.
+    /// Name of the robot model.
     pub model: String,
-    /// What is known; `null` when nothing is.
+    /// Fused friction; `null` when there is no measurement.
     pub friction: Option<FusedFriction>,
-    /// Friction of other terrains of this class, where this one has not been measured.
+    /// Expected friction from other terrains of the same class; present only where this terrain has
+    /// not been measured.
     #[serde(default)]
     pub prior: Option<ClassPrior>,
-    /// The declared normalisation that brought other models' measurements to this one's θ, if any.
+    /// Normalisation by which measurements of other models were converted to this model's θ; `null`
+    /// if none was applied.
     #[serde(default)]
     pub normalisation: Option<String>,
 }
 
-/// An expectation from the same class of ground elsewhere. It is no measurement of this ground.
+/// Friction expected from the same class of ground elsewhere on the site. It is not a measurement
+/// of this ground.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ClassPrior {
-    /// The class.
+    /// Class of the ground.
     pub class: TerrainClass,
-    /// θ to expect.
+    /// Expected θ.
     pub theta: f64,
-    /// Its standard deviation, including how terrains of one class differ.
+    /// Standard deviation of θ, including the variation between terrains of one class.
     pub std_dev: f64,
-    /// Terrains that it was learned from.
+    /// Number of terrains from which the expectation is derived.
     pub terrains: u32,
 }
 
-/// What is known of a terrain as it was at several times.
+/// Friction of a terrain at several times.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct TerrainHistory {
-    /// The terrain at its present revision.
+    /// Terrain at its present revision.
     pub terrain: TerrainRef,
-    /// The oldest time first.
+    /// Friction at each time, the oldest first.
     pub items: Vec<TerrainAt>,
 }
 
-/// What was known of a terrain at one time.
+/// Friction of a terrain at one time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct TerrainAt {
-    /// The time.
+    /// Requested time.
     pub at: Timestamp,
-    /// As of when this is: nothing that was measured later counts. The end of the last epoch before
-    /// `at`; `at` itself where that is now.
+    /// Time up to which measurements are included: the end of the last epoch before `at`, or `at`
+    /// itself where that is the present.
     pub as_of: Timestamp,
-    /// Per robot model.
+    /// Friction for each robot model.
     pub models: Vec<ModelFriction>,
 }
 
-/// What is known of the ground at a point.
+/// Friction of the ground at a point.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PointFriction {
-    /// As of when: nothing that was measured later counts. The end of the last epoch before the
-    /// time that was asked for; `null` when no time was, and all that has come counts.
+    /// Time up to which measurements are included: the end of the last epoch before the requested
+    /// time. `null` if no time was requested; all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
-    /// The cell.
+    /// Cell that contains the point.
     pub cell: Cell,
-    /// The terrain under the point; `null` where none is drawn. Only measurements on it count.
+    /// Terrain under the point, `null` where none is drawn. Only measurements on this terrain are
+    /// included.
     pub terrain: Option<TerrainRef>,
-    /// Per robot model.
+    /// Friction for each robot model.
     pub models: Vec<ModelFriction>,
 }
 
-/// The body of `POST /v1/sites/{site}/friction/path`.
+/// Body of `POST /v1/sites/{site}/friction/path`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct AskPath {
-    /// Corners of the path, 2 to 10 000, at most 10 km.
+    /// Corners of the path in the site frame, 2 to 10 000; at most 10 km long.
     pub points: Vec<Point>,
-    /// Who is to drive it; its model decides whose measurements count, its limits what speed
-    /// follows.
+    /// Robot that is to drive the path. Its model selects the measurements, its limits bound the
+    /// speed.
     pub robot: RobotId,
-    /// As of when; now when absent.
+    /// Time as of which the map is read; the present when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub as_of: Option<Timestamp>,
-    /// A declared normalisation, to count other models' measurements too.
+    /// Normalisation by which measurements of other models are included; only the robot's own model
+    /// when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub normalisation: Option<String>,
 }
 
-/// What is known along a path.
+/// Friction along a path, with the speed that follows from it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PathFriction {
-    /// As of when: nothing that was measured later counts. The end of the last epoch before the
-    /// time that was asked for; `null` when no time was, and all that has come counts.
+    /// Time up to which measurements are included: the end of the last epoch before the requested
+    /// time. `null` if no time was requested; all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
-    /// Length, metres.
+    /// Length of the path, metres.
     pub length_m: f64,
-    /// The robot model whose θ this is.
+    /// Configuration (robot model and tyres) for which θ holds.
     pub configuration: ConfigurationId,
-    /// The normalisation that was used, if any.
+    /// Normalisation that was applied; `null` if none.
     pub normalisation: Option<String>,
-    /// Share of the length on which friction was measured, 0 to 1.
+    /// Fraction of the length on which friction was measured, 0 to 1.
     pub known_ratio: f64,
-    /// Pieces of the path, each in one cell, in order.
+    /// Sections of the path in driving order, each within one cell.
     pub pieces: Vec<PathPiece>,
 }
 
-/// What is known of one piece of a path.
+/// Friction on one section of a path.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PathPiece {
-    /// Begin, metres along the path.
+    /// Begin of the section, metres along the path.
     pub from_m: f64,
-    /// The cell.
+    /// Cell of the section.
     pub cell: Cell,
-    /// θ; `null` when nothing is known.
+    /// θ; `null` where nothing was measured.
     pub theta: Option<f64>,
-    /// Its standard deviation.
+    /// Standard deviation of θ; `null` where nothing was measured.
     pub std_dev: Option<f64>,
-    /// θ is above this with 5 %.
+    /// 95 % quantile of θ; `null` where nothing was measured.
     pub theta_upper_95: Option<f64>,
-    /// Age of the newest measurement, seconds.
+    /// Age of the newest measurement, seconds; `null` where nothing was measured.
     pub age_s: Option<f64>,
-    /// Whether measurements contradict each other.
+    /// Whether the measurements contradict each other.
     pub disputed: bool,
-    /// Friction coefficient to plan with: the larger of what was shown of late and a cautious
-    /// value, within what keeps the wheels' slip in the linear range at `theta_upper_95`.
+    /// Traction limit, a friction coefficient: the larger of the recently demonstrated one and a
+    /// cautious default, but not above the one at which the wheels' slip leaves the linear range
+    /// for `theta_upper_95`.
     pub traction_limit_mu: f64,
-    /// Speed at its start, metres per second, from the curves, the traction limit and the robot's
-    /// limits; the robot stands at the end of the path.
+    /// Permitted speed at the begin of the section, m/s, from curvature, traction limit and the
+    /// robot's limits; the robot comes to rest at the end of the path.
     pub speed_m_s: f64,
 }
 
-/// How a cell differs between two times.
+/// Friction of a cell at two times.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct CellDifference {
     /// The cell.
     pub cell: Cell,
-    /// The terrain; `null` where none was drawn.
+    /// Terrain; `null` where none was drawn.
     pub terrain: Option<TerrainRef>,
-    /// The robot model and tyres.
+    /// Configuration: robot model and tyres.
     pub configuration: ConfigurationId,
-    /// What was known at the first time.
+    /// Friction at the first time; `null` if nothing was measured by then.
     pub before: Option<FusedFriction>,
-    /// What was known at the second time.
+    /// Friction at the second time; `null` if nothing was measured by then.
     pub after: Option<FusedFriction>,
-    /// Difference of θ in its own standard deviations; `null` unless both are known.
+    /// Difference of θ over its standard deviation; `null` unless both values are known.
     pub z_score: Option<f64>,
-    /// The normalisation that was used, if any.
+    /// Normalisation that was applied; `null` if none.
     #[serde(default)]
     pub normalisation: Option<String>,
 }
 
-/// Where a visit would teach most.
+/// Cell whose measurement would reduce the uncertainty of the map, with the expected gain.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct VisitSuggestion {
-    /// The cell.
+    /// Cell to visit.
     pub cell: Cell,
-    /// Its middle.
+    /// Centre of the cell.
     pub center: Point,
-    /// The terrain; `null` where none is drawn.
+    /// Terrain at the centre; `null` where none is drawn.
     pub terrain: Option<TerrainRef>,
-    /// Factor by which a visit would shrink the standard deviation of θ, as its natural logarithm;
-    /// for unknown ground relative to the prior.
+    /// Expected gain of a visit: natural logarithm of the ratio of the standard deviation of θ
+    /// before the visit to that after it. Where nothing was measured, the one before is that of the
+    /// prior.
     pub gain: f64,
-    /// Standard deviation of θ over θ now; `null` when nothing is known.
+    /// Present standard deviation of θ over θ; `null` when nothing was measured.
     pub relative_std_dev: Option<f64>,
-    /// The normalisation that was used, if any.
+    /// Normalisation that was applied; `null` if none.
     #[serde(default)]
     pub normalisation: Option<String>,
-    /// Whether measurements contradict each other.
+    /// Whether the measurements contradict each other.
     pub disputed: bool,
 }
 
-/// What one robot has put into the map of a site.
+/// Contribution of one robot to the map of a site.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct RobotContribution {
     /// The robot.
     pub robot: RobotId,
-    /// Cells that it has measured.
+    /// Number of cells that it has measured.
     pub cells: u64,
-    /// Its segments.
+    /// Number of its segments.
     pub segments: u64,
-    /// Begin of the hour or day of its first measurement.
+    /// Begin of the epoch (hour or day) of its first measurement.
     pub first_at: Timestamp,
     /// End of its newest measurement.
     pub newest_at: Timestamp,
-    /// Median of its θ over the one of all robots of its models together, over the terrains that it
-    /// has measured: its bias as far as it shows. `null` where it has measured alone.
+    /// Estimated bias: median, over terrains that other robots have measured too, of the robot's θ
+    /// over the θ of all robots of its models. `null` if there is no such terrain.
     pub bias_ratio: Option<f64>,
 }
 
-/// The friction of one cell, per terrain and robot model.
+/// Friction of one cell for one terrain and one robot model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct CellFriction {
-    /// The cell.
+    /// Index of the cell, in squares of side `size_m`.
     pub cell: Cell,
-    /// Side of the cell, metres; `ix` and `iy` count squares of this size.
+    /// Side of the square, metres.
     pub size_m: f64,
-    /// The terrain; `null` where none was drawn. A border cell is listed once per terrain.
+    /// Terrain; `null` where none was drawn. A cell across a border is listed once for each
+    /// terrain.
     pub terrain: Option<TerrainRef>,
-    /// The robot model and tyres.
+    /// Configuration: robot model and tyres.
     pub configuration: ConfigurationId,
-    /// What is known.
+    /// Fused friction of the cell.
     pub friction: FusedFriction,
-    /// The declared normalisation that brought other models' measurements to this one's θ, if any.
+    /// Normalisation by which measurements of other models were converted to this model's θ; `null`
+    /// if none was applied.
     #[serde(default)]
     pub normalisation: Option<String>,
 }
 
-/// A segment as the server stored it.
+/// Segment as the server has stored it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct StoredSegment {
-    /// Counts the site's segments in the order of their commits, with gaps.
+    /// Number of the segment within its site, in the order of commits, with gaps.
     pub id: i64,
-    /// Who measured.
+    /// Robot that measured it.
     pub robot: RobotId,
-    /// Which run of its agent.
+    /// Run of the robot's agent that measured it.
     pub boot: crate::ids::BootId,
-    /// Its number within that run.
+    /// Sequence number of the record within that run.
     pub seq: u64,
-    /// When the server took it.
+    /// Time when the server received it.
     pub received_at: Timestamp,
     /// The measurement.
     pub segment: Segment,
 }
 
-/// The body of `POST /v1/sites/{site}/robots/{robot}/withdrawals`.
+/// Body of `POST /v1/sites/{site}/robots/{robot}/withdrawals`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct CreateWithdrawal {
-    /// A time of the first hour; from the beginning when absent.
+    /// Time within the first hour to withdraw; from the first measurement when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub from: Option<Timestamp>,
-    /// A time of the last hour; the present one when absent.
+    /// Time within the last hour to withdraw; the present hour when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub to: Option<Timestamp>,
-    /// Why, for people.
+    /// Reason, for people.
     pub reason: String,
 }
 
-/// What a robot measured in some whole hours does not count.
+/// Withdrawal of a robot's measurements of some whole hours from the friction map.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Withdrawal {
-    /// Its number.
+    /// Number of the withdrawal.
     pub id: i64,
-    /// Whose measurements.
+    /// Robot whose measurements are withdrawn.
     pub robot: RobotId,
-    /// Begin of the first hour.
+    /// Begin of the first withdrawn hour.
     pub from: Timestamp,
-    /// End of the last hour.
+    /// End of the last withdrawn hour.
     pub before: Timestamp,
-    /// Why.
+    /// Reason, for people.
     pub reason: String,
-    /// Who said so.
+    /// Name of the token or person that withdrew them.
     pub by: String,
-    /// When.
+    /// Time of the withdrawal.
     pub at: Timestamp,
 }
 
-/// Where the map of a site has changed: in these boxes of cells, since the word before.
+/// Region in which the friction map of a site may have changed since the previous message.
 ///
-/// Changes are told at most once a second and put together to squares of cells, so that what is in
-/// a box may be as it was. Ask for what you need of it.
+/// Sent at most once a second. Changes are merged into squares of cells, so a box may contain
+/// unchanged cells. Request the cells that you need.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct MapChange {
-    /// The site.
+    /// Site of the map.
     pub site: SiteId,
     /// Time of this message.
     pub at: Timestamp,
-    /// Revision of the grid that the cells are of.
+    /// Revision of the grid to which the boxes refer.
     pub grid_revision: u32,
-    /// Counts changes of the site's terrains; another one than before changes what is said of any
-    /// cell.
+    /// Number of changes of the site's terrains. If it differs from the previous message, the
+    /// friction of any cell may have changed.
     pub terrain_revision: u64,
-    /// Whether anything of the map may have changed; there are no boxes then.
+    /// Whether any part of the map may have changed; `boxes` is empty then.
     pub everything: bool,
-    /// Where, at most 256 boxes.
+    /// Changed boxes of cells, at most 256.
     pub boxes: Vec<CellBox>,
 }
 
-/// A box of cells, both ends included.
+/// Box of cells; both corners are part of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct CellBox {
-    /// The cell with the lowest coordinates.
+    /// Corner cell with the lowest coordinates.
     pub min: Cell,
-    /// The cell with the highest coordinates.
+    /// Corner cell with the highest coordinates.
     pub max: Cell,
 }

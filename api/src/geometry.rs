@@ -1,18 +1,20 @@
-//! Points, poses and polygons in a site's frame.
+//! Points, poses, velocities and simple polygons in the frame of a site.
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-/// Farthest coordinate from a site's origin, in metres; `f64` keeps 0.1 µm out here.
+/// Maximum absolute value of a coordinate, metres; larger ones are refused. At this distance `f64`
+/// resolves 0.1 µm.
 pub const COORDINATE_MAX_M: f64 = 1.0e6;
-/// Fewest corners of a polygon.
+/// Minimum number of corners of a polygon.
 pub const CORNERS_MIN: usize = 3;
-/// Most corners of a polygon; the check for crossings is quadratic.
+/// Maximum number of corners of a polygon; bounds the check for crossing sides, whose cost is
+/// quadratic.
 pub const CORNERS_MAX: usize = 1_000;
-/// Smallest area of a polygon, in square metres.
+/// Minimum area of a polygon, square metres.
 pub const AREA_MIN_M2: f64 = 1.0e-2;
 
-/// A point in the site's frame.
+/// Point in the site frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Point {
     /// East-like coordinate, metres.
@@ -28,18 +30,18 @@ impl std::fmt::Display for Point {
 }
 
 impl Point {
-    /// Whether both coordinates are finite and within [`COORDINATE_MAX_M`].
+    /// Whether both coordinates are finite and within ±[`COORDINATE_MAX_M`].
     pub fn is_on_the_map(&self) -> bool {
         self.x_m.abs() <= COORDINATE_MAX_M && self.y_m.abs() <= COORDINATE_MAX_M
     }
 
-    /// Distance to another point, metres.
+    /// Returns the distance to another point, metres.
     pub fn distance_m(&self, other: Point) -> f64 {
         (other.x_m - self.x_m).hypot(other.y_m - self.y_m)
     }
 }
 
-/// A position with a heading in the site's frame.
+/// Position and heading in the site frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Pose {
     /// East-like coordinate, metres.
@@ -51,7 +53,7 @@ pub struct Pose {
 }
 
 impl Pose {
-    /// Where the pose stands.
+    /// Returns the position without the heading.
     pub fn position(&self) -> Point {
         Point {
             x_m: self.x_m,
@@ -60,25 +62,25 @@ impl Pose {
     }
 }
 
-/// Velocities in the robot's own frame.
+/// Velocity in the robot frame.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct Twist {
-    /// Forward velocity, metres per second.
+    /// Forward velocity, m/s, negative backwards.
     pub linear_m_s: f64,
-    /// Yaw rate, radians per second, counter-clockwise.
+    /// Yaw rate, rad/s, positive counter-clockwise.
     pub angular_rad_s: f64,
 }
 
-/// Why corners do not make a polygon.
+/// Reason why corners do not form a simple polygon. Corners are numbered from 0.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum InvalidPolygon {
     /// Fewer than [`CORNERS_MIN`] or more than [`CORNERS_MAX`] corners.
     #[error("a polygon has {CORNERS_MIN} to {CORNERS_MAX} corners, this one has {0}")]
     CornerCount(usize),
-    /// A coordinate is not finite or farther out than [`COORDINATE_MAX_M`].
+    /// A corner is not finite or a coordinate is beyond [`COORDINATE_MAX_M`].
     #[error("corner {0} is not within {COORDINATE_MAX_M} m of the origin")]
     OffTheMap(usize),
-    /// Two neighbouring corners are the same point.
+    /// Two neighbouring corners coincide.
     #[error("corners {0} and {1} are the same point; leave out the closing corner")]
     DuplicateCorner(usize, usize),
     /// Two sides touch or cross.
@@ -87,13 +89,13 @@ pub enum InvalidPolygon {
          at {onto}"
     )]
     SelfCrossing {
-        /// The corner where one side begins.
+        /// Index of the corner at which the first side begins.
         first: usize,
-        /// Where that is.
+        /// Position of that corner.
         from: Point,
-        /// The corner where the other begins.
+        /// Index of the corner at which the second side begins.
         second: usize,
-        /// Where that is.
+        /// Position of that corner.
         onto: Point,
     },
     /// The area is below [`AREA_MIN_M2`].
@@ -101,18 +103,19 @@ pub enum InvalidPolygon {
     TooSmall,
 }
 
-/// A simple polygon: corners in order, in either direction; the last side closes it.
+/// Simple polygon: its corners in order, clockwise or counter-clockwise. The last corner is
+/// connected to the first.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(try_from = "Vec<Point>", into = "Vec<Point>")]
 #[schema(value_type = Vec<Point>, min_items = 3, max_items = 1000)]
 pub struct Polygon(Vec<Point>);
 
 impl Polygon {
-    /// Checks the corners.
+    /// Creates a polygon and checks that it is simple.
     ///
     /// # Errors
-    /// [`InvalidPolygon`] names the corner: too few or many, off the map, doubled, sides that
-    /// cross or touch, or hardly any area.
+    /// [`InvalidPolygon`] if there are too few or too many corners, a corner is off the map or
+    /// coincides with the next, sides cross or touch, or the area is below [`AREA_MIN_M2`].
     pub fn new(corners: Vec<Point>) -> Result<Self, InvalidPolygon> {
         let count = corners.len();
         if !(CORNERS_MIN..=CORNERS_MAX).contains(&count) {
@@ -152,12 +155,12 @@ impl Polygon {
         }
     }
 
-    /// The corners in order.
+    /// Returns the corners in order.
     pub fn corners(&self) -> &[Point] {
         &self.0
     }
 
-    /// Enclosed area, square metres.
+    /// Returns the enclosed area, square metres.
     pub fn area_m2(&self) -> f64 {
         let origin = self.0[0];
         let doubled: f64 = self
@@ -168,7 +171,7 @@ impl Polygon {
         doubled.abs() / 2.0
     }
 
-    /// Whether a point lies inside; a point on the border may count either way.
+    /// Whether a point lies inside. For a point on the border the result is unspecified.
     pub fn contains(&self, point: Point) -> bool {
         let mut inside = false;
         let mut from = self.0[self.0.len() - 1];
@@ -199,12 +202,12 @@ impl From<Polygon> for Vec<Point> {
     }
 }
 
-/// Twice the signed area of the triangle; positive when `c` lies left of `a` → `b`.
+/// Returns twice the signed area of the triangle; positive when `c` lies left of `a` → `b`.
 fn cross(a: Point, b: Point, c: Point) -> f64 {
     (b.x_m - a.x_m) * (c.y_m - a.y_m) - (b.y_m - a.y_m) * (c.x_m - a.x_m)
 }
 
-/// Whether two sides that share no corner have a point in common.
+/// Whether two sides without a common corner have a point in common.
 fn touches(first: (Point, Point), second: (Point, Point)) -> bool {
     let (a, b) = first;
     let (c, d) = second;
@@ -220,7 +223,7 @@ fn touches(first: (Point, Point), second: (Point, Point)) -> bool {
         || (cdb == 0.0 && within_box(c, d, b))
 }
 
-/// Whether two neighbouring sides lie on each other instead of meeting only in their corner.
+/// Whether two neighbouring sides overlap, instead of sharing only their corner.
 fn folds_back(first: (Point, Point), second: (Point, Point)) -> bool {
     let (start, shared, end) = if first.1 == second.0 {
         (first.0, first.1, second.1)
