@@ -1,5 +1,5 @@
-//! Who may do what: roles, tokens, sessions of browsers, and the audit log. A role is a name for
-//! some [rights](crate::rights).
+//! Identities and their authorisation: tokens, roles, sessions of browsers and persons, and entries
+//! of the audit log. A role is a name for a set of [rights](crate::rights).
 
 use std::fmt;
 
@@ -11,43 +11,43 @@ use crate::ids::{PersonId, SessionId, TokenId};
 use crate::rights::{Grant, Right, Rights, Scope, SiteScope};
 pub use crate::rights::{InvalidRole, Role};
 
-/// Most days that a token may be valid.
+/// Maximum validity of a token, days.
 pub const TOKEN_DAYS_MAX: u32 = 1_826;
-/// Days that a token is valid when nothing is said.
+/// Default validity of a token, days.
 pub const TOKEN_DAYS_DEFAULT: u32 = 90;
-/// Longest name of a token, in characters.
+/// Maximum length of a token's name, characters.
 pub const TOKEN_NAME_MAX: usize = 80;
 
-/// A token as it is listed: everything but its secret, which is not stored.
+/// Token without its secret, which the server does not store.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(from = "TokenAnswer")]
 pub struct Token {
-    /// Its identifier, for revoking it; no secret.
+    /// Identifier of the token, with which it is revoked; not secret.
     pub id: TokenId,
-    /// What people call it.
+    /// Name of the token, for people.
     pub name: String,
-    /// The role that it was made with; `null` for one with rights of its own.
+    /// Role with which the token was created; `null` if it was created with a list of rights.
     pub role: Option<Role>,
-    /// What it may do.
+    /// Rights of the token.
     #[schema(value_type = Vec<Right>)]
     pub rights: Rights,
-    /// Where it may do that; `null` for everywhere.
+    /// Sites and robots for which the rights hold; `null` for all.
     #[schema(value_type = Option<Vec<SiteScope>>)]
     pub sites: Scope,
-    /// When it was made.
+    /// Time when the token was created.
     pub created_at: Timestamp,
-    /// Who made it.
+    /// Name of the token or person that created it.
     pub created_by: String,
-    /// From when on it is refused.
+    /// Time from which the token is refused.
     pub expires_at: Timestamp,
-    /// When it was revoked.
+    /// Time when the token was revoked; `null` if it was not.
     pub revoked_at: Option<Timestamp>,
-    /// When it was used last, to within ten minutes.
+    /// Time of its last use, accurate to ten minutes; `null` if it was never used.
     pub last_used_at: Option<Timestamp>,
 }
 
-/// A token as servers of any version tell it: before there were rights, the role said all, and a
-/// token held everywhere.
+/// Token as servers of every version send it. Servers before the introduction of rights send a role
+/// only, and their tokens hold everywhere.
 #[derive(Deserialize)]
 struct TokenAnswer {
     id: TokenId,
@@ -84,28 +84,29 @@ fn rights_of(rights: Option<Rights>, role: Option<Role>) -> Rights {
     rights.or(role.map(Rights::from)).unwrap_or_default()
 }
 
-/// Asks for a new token, with a role or with rights of its own.
+/// Request for a new token, with either a role or a list of rights.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct CreateToken {
-    /// What people call it; no other valid token may have this name.
+    /// Name of the token, for people; no other valid token may have the same name.
     pub name: String,
-    /// What it may do, as a role.
+    /// Role of the token; give this or `rights`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub role: Option<Role>,
-    /// What it may do, in place of a role. `stop` comes with every right, and `read` with every
-    /// right but `stop`.
+    /// Rights of the token; give this or `role`. `stop` is added to every right, and `read` to
+    /// every right but `stop`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rights: Option<Vec<Right>>,
-    /// Where it may do that; everywhere when absent. At most 100 sites and 1000 robots.
+    /// Sites and robots for which the rights hold, at most 100 sites and 1000 robots; all when
+    /// absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sites: Option<Vec<SiteScope>>,
-    /// Days until it is refused, 1 to 1826; 90 when absent.
+    /// Validity of the token, days, 1 to 1826; 90 when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub valid_days: Option<u32>,
 }
 
 impl CreateToken {
-    /// One with a role, everywhere.
+    /// Returns a request for a token with a role that holds everywhere.
     pub fn of_role(name: impl Into<String>, role: Role) -> Self {
         Self {
             name: name.into(),
@@ -117,12 +118,12 @@ impl CreateToken {
     }
 }
 
-/// A new token with its secret, which is shown only here.
+/// New token with its secret, which no other answer contains.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct CreatedToken {
     /// The token.
     pub token: Token,
-    /// The value to send as `authorization: Bearer …`.
+    /// Secret of the token, to be sent as `authorization: Bearer …`.
     pub secret: String,
 }
 
@@ -135,10 +136,10 @@ impl fmt::Debug for CreatedToken {
     }
 }
 
-/// Signs a browser in with a token.
+/// Request to sign a browser in with a token.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct CreateSession {
-    /// The secret of a token.
+    /// Secret of a token.
     pub token: String,
 }
 
@@ -150,7 +151,7 @@ impl fmt::Debug for CreateSession {
     }
 }
 
-/// A session as servers of any version tell it.
+/// Session as servers of every version send it.
 #[derive(Deserialize)]
 struct SessionAnswer {
     name: String,
@@ -187,148 +188,151 @@ impl From<SessionAnswer> for Session {
     }
 }
 
-/// A person who signed in at an OpenID provider.
+/// Person who signed in at an OpenID provider.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 pub struct Person {
-    /// The person here: of issuer and subject, the same at each sign-in.
+    /// Identifier of the person on this server, derived from issuer and subject; the same at each
+    /// sign-in.
     pub id: PersonId,
-    /// The provider, by its issuer.
+    /// Issuer URL of the provider.
     pub issuer: String,
-    /// The person there, the claim `sub`: it stays when names and addresses change.
+    /// Subject of the person at the provider, the claim `sub`; it stays when names and addresses
+    /// change.
     pub subject: String,
 }
 
-/// Who asks.
+/// Identity and rights of the author of a request.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(from = "SessionAnswer")]
 pub struct Session {
-    /// The name of the token that was shown, or of the person who signed in.
+    /// Name of the token, or of the person who signed in.
     pub name: String,
-    /// The role; `null` for a token with rights of its own, and a person who has more than one
-    /// role or such rights.
+    /// Role; `null` for a token with a list of rights, and for a person with several roles or with
+    /// a list of rights.
     pub role: Option<Role>,
-    /// Rights that hold at all of `sites`. A person with several `grants` may have more at some of
-    /// them.
+    /// Rights that hold at all of `sites`. A person with several `grants` may have further rights
+    /// at some of these sites.
     #[schema(value_type = Vec<Right>)]
     pub rights: Rights,
-    /// Where it may be done; `null` for everywhere.
+    /// Sites and robots for which `rights` hold; `null` for all.
     #[schema(value_type = Option<Vec<SiteScope>>)]
     pub sites: Scope,
-    /// All that may be done, each with where: whatever any one of these allows. One, unless a
-    /// person is in groups that have different rights at different sites.
+    /// All rights, each with the sites and robots for which they hold; a request is allowed if any
+    /// one grant allows it. There is one grant, unless a person is in groups that have different
+    /// rights at different sites.
     #[schema(required = true)]
     pub grants: Vec<Grant>,
-    /// The token; `null` for a person who signed in at the provider.
+    /// Identifier of the token; `null` for a person who signed in at the provider.
     #[schema(required = true)]
     pub token: Option<TokenId>,
-    /// Who signed in at the provider; `null` for a token.
+    /// Person who signed in at the provider; `null` for a token.
     #[schema(required = true)]
     pub person: Option<Person>,
-    /// The browser's session, if it is one.
+    /// Identifier of the browser's session; `null` for a request without one.
     pub session: Option<SessionId>,
-    /// From when on it is refused.
+    /// Time from which the token or session is refused.
     pub expires_at: Timestamp,
 }
 
-/// How people may sign in.
+/// Ways in which people may sign in.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct SignInMethods {
-    /// With a token: always.
+    /// Whether people may sign in with a token; always true.
     pub token: bool,
-    /// At an OpenID provider; `null` if none is configured.
+    /// Sign-in at an OpenID provider; `null` if none is configured.
     pub oidc: Option<OidcSignIn>,
 }
 
-/// The sign-in at an OpenID provider.
+/// Sign-in at an OpenID provider.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct OidcSignIn {
-    /// What people call the provider.
+    /// Name of the provider, for people.
     pub label: String,
-    /// Where a browser is sent to sign in.
+    /// Path on this server at which a browser begins the sign-in.
     pub path: String,
-    /// Whether the provider could be asked; the server goes on trying.
+    /// Whether the provider has answered; the server keeps retrying otherwise.
     pub available: bool,
 }
 
-/// The end of a session.
+/// Answer to the end of a session.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct SignedOut {
-    /// Where a browser is sent to sign out at the provider too.
+    /// Address at which a browser signs out at the provider too.
     pub provider: String,
 }
 
-/// A person's session, as it is listed.
+/// Session of a person who signed in at an OpenID provider.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct PersonSession {
-    /// Its identifier, for ending it; no secret.
+    /// Identifier of the session, with which it is ended; not secret.
     pub id: SessionId,
-    /// The person's name when they signed in.
+    /// Name of the person at the time of the sign-in.
     pub name: String,
-    /// Who it is.
+    /// The person.
     pub person: Person,
-    /// The groups that rights come from.
+    /// Groups of the person from which the rights derive.
     pub groups: Vec<String>,
-    /// What may be done, and where.
+    /// Rights, each with the sites and robots for which they hold.
     pub grants: Vec<Grant>,
-    /// When they signed in.
+    /// Time of the sign-in.
     pub created_at: Timestamp,
-    /// From when on it is refused.
+    /// Time from which the session is refused.
     pub expires_at: Timestamp,
-    /// When it was used last, to within ten minutes.
+    /// Time of its last use, accurate to ten minutes; `null` if it was never used.
     pub last_used_at: Option<Timestamp>,
 }
 
-/// An entry of the audit log: a change, or a request that was refused.
+/// Entry of the audit log: a change, or a request that was refused.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct AuditEntry {
-    /// Its number; they grow with time.
+    /// Number of the entry; consecutive in the order of time.
     pub id: u64,
-    /// When it was answered; the last one, of several.
+    /// Time of the answer; that of the last one if the entry stands for several requests.
     pub at: Timestamp,
-    /// When the first of several was answered; `null` for one.
+    /// Time of the first answer if the entry stands for several requests; `null` for a single one.
     pub since: Option<Timestamp>,
-    /// Number of requests. Repeats of a request with the same answer share one entry when their
-    /// author sends very many.
+    /// Number of requests. When an author sends very many, repetitions of a request with the same
+    /// answer share one entry.
     pub count: u64,
-    /// The name of the token that was shown or of the person; `null` for a request without a good
-    /// one.
+    /// Name of the token or of the person; `null` for a request without valid credentials.
     pub who: Option<String>,
-    /// That token.
+    /// Identifier of the token; `null` without one.
     pub token: Option<TokenId>,
-    /// The person who had signed in at an OpenID provider, if it was one.
-    // Left out when there is none, so that entries of before there were people keep their hashes.
+    /// Person who had signed in at an OpenID provider; absent for a token.
+    // Omitted when absent, so that entries from versions without persons keep their hashes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub person: Option<Person>,
-    /// Its role; `null` too for one with rights of its own.
+    /// Role of the token or person; `null` without one, and for a list of rights.
     pub role: Option<Role>,
-    /// The address of the other side, or of the client that a trusted proxy names.
+    /// Address of the peer, or of the client that a trusted proxy names.
     pub address: String,
-    /// The request's method.
+    /// HTTP method of the request.
     pub method: String,
-    /// The route, as `/openapi.json` names it.
+    /// Route of the request, as `/openapi.json` names it.
     pub route: String,
-    /// The path asked for, without its query.
+    /// Requested path, without its query.
     pub path: String,
-    /// The status of the answer.
+    /// HTTP status of the answer.
     pub status: u16,
-    /// The `x-request-id` of the answer, which the log has too.
+    /// `x-request-id` of the answer, which is in the server's log too.
     pub request_id: String,
-    /// What was asked: the body without secrets, shortened where it was long.
+    /// Body of the request without secrets, shortened if it was long; `null` without one.
     pub what: Option<serde_json::Value>,
-    /// The hash of the entry before it; `null` in entries of versions that had no chain.
+    /// Hash of the previous entry; `null` in entries of versions without a hash chain.
     pub previous_hash: Option<String>,
-    /// Its own hash, over the one before it and the canonical form of all else.
+    /// Hash of this entry, over `previous_hash` and the canonical form of the entry; `null` in
+    /// entries of versions without a hash chain.
     pub hash: Option<String>,
 }
 
-/// Which entries of the audit log come first.
+/// Order in which entries of the audit log are listed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum AuditOrder {
-    /// The newest.
+    /// Newest entry first.
     #[default]
     Newest,
-    /// The oldest, as the chain goes.
+    /// Oldest entry first, the order of the hash chain.
     Oldest,
 }
 
@@ -360,7 +364,7 @@ mod tests {
         });
         let token: Token = serde_json::from_value(token).unwrap();
         assert_eq!(token.rights, Rights::from(Role::Viewer));
-        // What is told is never widened by the role.
+        // Rights in the answer take precedence; the role never adds rights to them.
         let mut value = serde_json::to_value(&token).unwrap();
         value["rights"] = serde_json::json!([]);
         value["sites"] = serde_json::json!([{"site": "yard"}]);

@@ -1,4 +1,4 @@
-//! Identifiers: short readable names for what people name, UUIDs for what programs make.
+//! Identifiers: short readable names for what people name, UUIDs for what programs create.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,10 +7,10 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use uuid::Uuid;
 
-/// Longest readable identifier, in bytes; it is one chunk of a key expression.
+/// Maximum length of a readable identifier, bytes. An identifier is one chunk of a key expression.
 pub const SLUG_LENGTH_MAX: usize = 63;
 
-/// Why a text is not an identifier.
+/// Error for a text that is not a readable identifier.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "`{text}` is not an identifier: use 1 to {SLUG_LENGTH_MAX} characters out of a-z, 0-9 and `-`"
@@ -24,7 +24,7 @@ fn check_slug(text: &str) -> Result<(), InvalidSlug> {
     if !text.is_empty() && text.len() <= SLUG_LENGTH_MAX && text.bytes().all(allowed) {
         Ok(())
     } else {
-        // What is echoed is bounded: it may have come from the network.
+        // The text may come from the network, so only a bounded part of it is kept for the message.
         let text = text.chars().take(SLUG_LENGTH_MAX + 1).collect();
         Err(InvalidSlug { text })
     }
@@ -41,7 +41,7 @@ macro_rules! slug {
         pub struct $name(String);
 
         impl $name {
-            /// The identifier as text.
+            /// Returns the identifier as text.
             pub fn as_str(&self) -> &str {
                 &self.0
             }
@@ -80,25 +80,25 @@ macro_rules! slug {
 }
 
 slug! {
-    /// A site: one metric frame with its robots, terrains, cells and missions.
+    /// Identifier of a site: one metric frame with its robots, terrains, cells and missions.
     SiteId
 }
 slug! {
-    /// A robot, unique within its site.
+    /// Identifier of a robot, unique within its site.
     RobotId
 }
 slug! {
-    /// A terrain, unique within its site.
+    /// Identifier of a terrain, unique within its site.
     TerrainId
 }
 
 slug! {
-    /// A program that limits a robot from outside, such as an obstacle detection.
+    /// Identifier of an external program that limits a robot, such as an obstacle detection.
     OwnerId
 }
 
 slug! {
-    /// What an alert is about, stable, for programs.
+    /// Kind of an alert, for programs; the same kind always has the same code.
     AlertCode
 }
 
@@ -114,12 +114,12 @@ macro_rules! uuid_id {
         pub struct $name(Uuid);
 
         impl $name {
-            /// Takes a UUID that was made elsewhere.
+            /// Wraps an existing UUID.
             pub const fn from_uuid(uuid: Uuid) -> Self {
                 Self(uuid)
             }
 
-            /// The UUID below.
+            /// Returns the underlying UUID.
             pub const fn as_uuid(&self) -> Uuid {
                 self.0
             }
@@ -148,62 +148,68 @@ macro_rules! uuid_id {
 }
 
 uuid_id! {
-    /// A mission: a version 7 UUID, so that ids sort by creation.
+    /// Identifier of a mission: a version 7 UUID, so that identifiers sort by creation.
     MissionId
 }
 uuid_id! {
-    /// An alert: a version 7 UUID, so that ids sort by time.
+    /// Identifier of an alert: a version 7 UUID, so that identifiers sort by time.
     AlertId
 }
 uuid_id! {
-    /// A token of a person or a program: a version 7 UUID; no secret.
+    /// Identifier of a token of a person or program: a version 7 UUID; not secret.
     TokenId
 }
 uuid_id! {
-    /// A token by which a robot joins the fleet: a version 7 UUID; no secret.
+    /// Identifier of a join token, with which a robot joins the fleet: a version 7 UUID; not
+    /// secret.
     JoinTokenId
 }
 uuid_id! {
-    /// A browser's session: a version 7 UUID; no secret.
+    /// Identifier of a browser's session: a version 7 UUID; not secret.
     SessionId
 }
 uuid_id! {
-    /// A person who signs in at an OpenID provider: the version 5 UUID of the provider's issuer and
-    /// the person's subject there, so it stays whatever else the provider says of them.
+    /// Identifier of a person who signs in at an OpenID provider: the version 5 UUID of the
+    /// provider's issuer and the person's subject there. It does not depend on any other claim of
+    /// the provider.
     PersonId
 }
 uuid_id! {
-    /// A stop: a version 7 UUID, so that ids sort by time.
+    /// Identifier of a stop: a version 7 UUID, so that identifiers sort by time.
     StopId
 }
 uuid_id! {
-    /// One run of an agent's process: a new version 4 UUID at each start.
+    /// Identifier of one run of an agent's process: a new version 4 UUID at each start.
     BootId
 }
 uuid_id! {
-    /// A robot's model and tyres: the version 5 UUID of their description.
+    /// Identifier of a configuration, a robot's model and tyres: the version 5 UUID of their
+    /// description.
     ///
-    /// Equal descriptions give equal ids on every machine, so friction measured before and after
-    /// a change of tyres is never mixed. See [`crate::robot::RobotModel::configuration`].
+    /// Equal descriptions have equal identifiers on every machine, and a change of tyres changes
+    /// the identifier, so that friction measured with different tyres is never combined. See
+    /// [`crate::robot::RobotModel::configuration`].
     ConfigurationId
 }
 uuid_id! {
-    /// What exactly a robot was asked to drive: the version 5 UUID of request and revision.
+    /// Hash of exactly what a robot is requested to drive: the version 5 UUID of mission, revision
+    /// and trajectory.
     ///
     /// See [`crate::wire::command::Offer::plan_hash_of`].
     PlanHash
 }
 
 impl PersonId {
-    /// The person of that subject at the provider of that issuer.
+    /// Returns the identifier of the person with this subject at the provider with this issuer.
     pub fn of(issuer: &str, subject: &str) -> Self {
-        // The length keeps every pair of texts apart from every other pair.
+        // The length makes the name of every pair of issuer and subject unique.
         let name = format!("person {} {issuer} {subject}", issuer.len());
         Self(Uuid::new_v5(&DERIVED_NAMESPACE, name.as_bytes()))
     }
 }
 
-/// The name space of all version 5 UUIDs made here; changing it changes every derived id.
+/// Name space of all version 5 UUIDs of this crate. A change of it would change every derived
+/// identifier.
 pub(crate) const DERIVED_NAMESPACE: Uuid =
     Uuid::from_u128(0x8f1d_5d53_6a0e_4f0b_9d3c_2f7a_51c4_e6b0);
 

@@ -15,29 +15,29 @@
 
 use crate::ids::{BootId, OwnerId, RobotId, SiteId};
 
-/// The first chunk of every key.
+/// First chunk of every key.
 pub const ROOT: &str = "tread";
 
-/// The verbs of commands to a robot.
+/// Verb of a command to a robot, the last chunk of its key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Verb {
-    /// Offer a mission.
+    /// Offers a mission.
     Offer,
-    /// Cancel a mission.
+    /// Cancels a mission.
     Cancel,
-    /// Pause a mission.
+    /// Pauses a mission.
     Pause,
-    /// Let a paused mission go on.
+    /// Resumes a paused mission.
     Resume,
-    /// Take a new definition of the site.
+    /// Replaces the definition of the site.
     Site,
-    /// Stop and latch.
+    /// Stops the robot and latches the stop.
     Stop,
-    /// End a stop.
+    /// Clears a stop.
     Clear,
-    /// Acquire, take or release the lease of teleoperation.
+    /// Acquires, takes or releases the lease of teleoperation.
     Lease,
-    /// Hold or slow the robot from outside.
+    /// Holds or slows the robot by an external limit.
     Limit,
 }
 
@@ -55,7 +55,7 @@ impl Verb {
         Self::Limit,
     ];
 
-    /// The verb as a chunk of a key.
+    /// Returns the verb as a chunk of a key.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Offer => "offer",
@@ -70,7 +70,7 @@ impl Verb {
         }
     }
 
-    /// The verb of that name.
+    /// Returns the verb with this name; `None` if there is none.
     pub fn from_chunk(chunk: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|verb| verb.as_str() == chunk)
     }
@@ -80,113 +80,113 @@ fn robot_key(site: &SiteId, robot: &RobotId, rest: &str) -> String {
     format!("{ROOT}/{site}/robots/{robot}/{rest}")
 }
 
-/// The liveliness token of one run of an agent.
+/// Returns the key of the liveliness token of one run of an agent.
 pub fn alive(site: &SiteId, robot: &RobotId, boot: BootId) -> String {
     robot_key(site, robot, &format!("alive/{boot}"))
 }
 
-/// Where a robot publishes its state.
+/// Returns the key on which a robot publishes its state.
 pub fn state(site: &SiteId, robot: &RobotId) -> String {
     robot_key(site, robot, "state")
 }
 
-/// Where a robot publishes both of its friction estimates.
+/// Returns the key on which a robot publishes its two friction estimates.
 pub fn friction(site: &SiteId, robot: &RobotId) -> String {
     robot_key(site, robot, "friction")
 }
 
-/// Where a robot answers one verb.
+/// Returns the key on which a robot answers commands of one verb.
 pub fn command(site: &SiteId, robot: &RobotId, verb: Verb) -> String {
     robot_key(site, robot, &format!("cmd/{}", verb.as_str()))
 }
 
-/// The parameter of a command's selector that names the run of the agent that it is for. A run of
-/// another name does not answer; without it, every run does.
+/// Parameter of a command's selector that names the run of the agent to which the command is
+/// addressed. Other runs do not answer; without the parameter every run does.
 pub const RUN: &str = "boot";
 
-/// The selector of a command to one run of the agent.
+/// Returns the selector of a command to one run of the agent.
 pub fn to_run(command: &str, boot: BootId) -> String {
     format!("{command}?{RUN}={boot}")
 }
 
-/// Every command to one robot.
+/// Returns the key expression of all commands to one robot.
 pub fn commands(site: &SiteId, robot: &RobotId) -> String {
     robot_key(site, robot, "cmd/*")
 }
 
-/// Where drive commands to a robot are published.
+/// Returns the key on which drive commands to a robot are published.
 pub fn teleop(site: &SiteId, robot: &RobotId) -> String {
     robot_key(site, robot, "teleop")
 }
 
-/// Where one owner publishes its limits of a robot.
+/// Returns the key on which one owner publishes its limits of a robot.
 pub fn limit(site: &SiteId, robot: &RobotId, owner: &OwnerId) -> String {
     robot_key(site, robot, &format!("limit/{owner}"))
 }
 
-/// The limits of a robot by all owners.
+/// Returns the key expression of the limits of a robot by all owners.
 pub fn limits(site: &SiteId, robot: &RobotId) -> String {
     robot_key(site, robot, "limit/*")
 }
 
-/// Where the server publishes its pulse.
+/// Returns the key on which the server publishes its pulse.
 pub fn pulse(site: &SiteId) -> String {
     format!("{ROOT}/{site}/server/pulse")
 }
 
-/// Where the server publishes where the friction map changes.
+/// Returns the key on which the server publishes changes of the friction map.
 pub fn map(site: &SiteId) -> String {
     format!("{ROOT}/{site}/server/map")
 }
 
-/// Where a robot introduces itself.
+/// Returns the key on which a robot queries the server when it connects, with its model and state.
 pub fn hello(site: &SiteId, robot: &RobotId) -> String {
     format!("{ROOT}/{site}/server/hello/{robot}")
 }
 
-/// Where a robot uploads what must not be lost.
+/// Returns the key on which a robot uploads records that must not be lost.
 pub fn ingest(site: &SiteId, robot: &RobotId) -> String {
     format!("{ROOT}/{site}/server/ingest/{robot}")
 }
 
-/// The liveliness tokens of all robots of all sites.
+/// Key expression of the liveliness tokens of all robots of all sites.
 pub const ALL_ALIVE: &str = "tread/*/robots/*/alive/*";
-/// The states of all robots of all sites.
+/// Key expression of the states of all robots of all sites.
 pub const ALL_STATES: &str = "tread/*/robots/*/state";
-/// The friction of all robots of all sites.
+/// Key expression of the friction estimates of all robots of all sites.
 pub const ALL_FRICTION: &str = "tread/*/robots/*/friction";
-/// The introductions of all robots of all sites.
+/// Key expression of the hello queries of all robots of all sites.
 pub const ALL_HELLOS: &str = "tread/*/server/hello/*";
-/// The uploads of all robots of all sites.
+/// Key expression of the uploads of all robots of all sites.
 pub const ALL_INGEST: &str = "tread/*/server/ingest/*";
 
-/// What a key means, read back.
+/// Parsed key.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Key {
-    /// A liveliness token.
+    /// Liveliness token of one run of an agent.
     Alive(SiteId, RobotId, BootId),
-    /// A robot's state.
+    /// State of a robot.
     State(SiteId, RobotId),
-    /// A robot's friction estimates.
+    /// Friction estimates of a robot.
     Friction(SiteId, RobotId),
-    /// A command to a robot.
+    /// Command to a robot.
     Command(SiteId, RobotId, Verb),
     /// Drive commands to a robot.
     Teleop(SiteId, RobotId),
-    /// An owner's limits of a robot.
+    /// Limits of a robot by one owner.
     Limit(SiteId, RobotId, OwnerId),
-    /// The server's pulse.
+    /// Pulse of the server.
     Pulse(SiteId),
-    /// Where the friction map changes.
+    /// Changes of the friction map.
     Map(SiteId),
-    /// An introduction.
+    /// Hello query of a robot.
     Hello(SiteId, RobotId),
-    /// An upload.
+    /// Upload of a robot.
     Ingest(SiteId, RobotId),
 }
 
 impl Key {
-    /// Reads a key; `None` if it is not one of ours.
+    /// Parses a key; `None` if it is not a key of this protocol.
     pub fn parse(key: &str) -> Option<Self> {
         let mut chunks = key.split('/');
         if chunks.next()? != ROOT {

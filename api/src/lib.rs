@@ -1,16 +1,18 @@
-//! Every word that crosses the network: REST bodies, zenoh payloads, key expressions, identifiers.
+//! Types of every interface of Tread: REST bodies, zenoh payloads, key expressions, identifiers.
 //!
-//! This crate does no I/O, [`startup`] aside, and knows no other part of Tread. Both sides of every wire build on it,
-//! so a change here is a change of the protocol.
+//! This crate does no I/O, except [`startup`] and [`tunnel`], and depends on no other crate of
+//! Tread. Both sides of every interface are built on it, so a change here is a change of the
+//! protocol.
 //!
-//! * REST shapes: [`site`], [`terrain`], [`robot`], [`trajectory`], [`mission`], [`friction`],
+//! * REST bodies: [`site`], [`terrain`], [`robot`], [`trajectory`], [`mission`], [`friction`],
 //!   [`safety`], [`stop`], [`drive`], [`event`], [`identity`], [`page`], [`problem`].
-//! * The friction map as compact binary: [`tile`].
-//! * zenoh shapes: [`wire`], with the key expressions in [`keys`]; the TLS around it: [`tunnel`].
+//! * Compact binary form of the friction map: [`tile`].
+//! * zenoh payloads: [`wire`], with the key expressions in [`keys`]; the TLS tunnel below them:
+//!   [`tunnel`].
 //!
-//! Units are SI and stand last in a name (`_m`, `_m_s`, `_rad`). A site's frame is metric and
-//! right-handed, x east-like, y north-like; headings are counter-clockwise from x. A value that is
-//! not known is `null`, never a default. Integers stay below 2⁵³.
+//! Units are SI and are the suffix of a name (`_m`, `_m_s`, `_rad`). The frame of a site is metric
+//! and right-handed, x east-like, y north-like; headings are counter-clockwise from x. An unknown
+//! value is `null`, never a default. Integers stay below 2⁵³.
 
 pub mod access;
 pub mod audit;

@@ -1,4 +1,4 @@
-//! Missions: one run of a trajectory on one robot, with its whole history.
+//! Missions: runs of a trajectory on one robot, with their state, history and quality.
 
 use jiff::Timestamp;
 mod event;
@@ -13,45 +13,46 @@ use crate::robot::MissionProgress;
 pub use crate::start_policy::StartPolicy;
 use crate::trajectory::Trajectory;
 
-/// Longest reason or detail in a mission's history, in characters.
+/// Maximum length of a reason or detail in a mission's history, characters.
 pub const REASON_LENGTH_MAX: usize = 500;
-/// Lowest priority of a mission.
+/// Minimum priority of a mission.
 pub const PRIORITY_MIN: i32 = -100;
-/// Highest priority of a mission.
+/// Maximum priority of a mission.
 pub const PRIORITY_MAX: i32 = 100;
-/// Shortest silence after which a robot may be told to stop, seconds: several heartbeats.
+/// Minimum silence of the server after which [`LinkPolicy::StopAfter`] may stop a robot, seconds;
+/// several heartbeats.
 pub const LINK_SILENCE_MIN_S: f64 = 1.0;
-/// Longest silence after which a robot may be told to stop, and longest bound of a lost robot,
-/// seconds.
+/// Maximum silence of the server in [`LinkPolicy::StopAfter`], and maximum `lost_after_s` of a
+/// mission, seconds.
 pub const LINK_SILENCE_MAX_S: f64 = 86_400.0;
-/// Most points of a driven path; a longer one is thinned further.
+/// Maximum number of points of a driven path; a longer path is thinned out further.
 pub const DRIVEN_POINTS_MAX: usize = 2_000;
-/// Most samples of θ in a quality report; the rest is thinned.
+/// Maximum number of samples of θ in a quality report; more samples are thinned out.
 pub const THETA_SAMPLES_MAX: usize = 64;
 
-/// Where a mission stands. The last five are terminal: they never change again.
+/// State of a mission. The last five states are terminal: a mission never leaves them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum MissionState {
-    /// Waits for its robot.
+    /// Waits in the queue of its robot.
     Queued,
-    /// Sent to the robot, not answered yet.
+    /// Sent to the robot, which has not answered yet.
     Offered,
-    /// The robot drives it.
+    /// Being driven by the robot.
     Active,
-    /// The robot holds it, standing.
+    /// Paused; the robot has stopped on the path.
     Paused,
-    /// A cancellation is wanted, the robot has not confirmed it yet.
+    /// Cancellation requested; the robot has not confirmed it yet.
     Cancelling,
-    /// Driven to its end.
+    /// Driven to the end.
     Succeeded,
-    /// Ended by something that went wrong.
+    /// Ended by a failure.
     Failed,
     /// Ended by request.
     Cancelled,
     /// Refused by the robot.
     Rejected,
-    /// Its latest start passed before it began.
+    /// Ended because it had not begun by its latest start.
     Expired,
 }
 
@@ -70,7 +71,7 @@ impl MissionState {
         Self::Expired,
     ];
 
-    /// Whether the mission has ended for good.
+    /// Whether the state is terminal.
     pub const fn is_terminal(self) -> bool {
         matches!(
             self,
@@ -78,7 +79,7 @@ impl MissionState {
         )
     }
 
-    /// The state's name on the wire and in the database.
+    /// Returns the state's name on the wire and in the database.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Queued => "queued",
@@ -94,62 +95,66 @@ impl MissionState {
         }
     }
 
-    /// The state of that name.
+    /// Returns the state with this name; `None` if there is none.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|state| state.as_str() == name)
     }
 }
 
-/// The body of `POST /v1/missions`.
+/// Body of `POST /v1/missions`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct CreateMission {
-    /// The robot's site.
+    /// Site of the robot.
     pub site: SiteId,
-    /// The robot that is to drive.
+    /// Robot that is to drive.
     pub robot: RobotId,
-    /// What it is to drive.
+    /// Trajectory to drive.
     pub trajectory: Trajectory,
-    /// Past this time it never starts; it may wait for ever when absent.
+    /// Latest time at which the mission may start; it expires then if it has not begun. Without
+    /// limit when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub latest_start: Option<Timestamp>,
-    /// Missions of a higher priority are driven first, equal ones in their order; 0 when absent.
+    /// Priority in the robot's queue: a higher one is driven first, equal ones in the order of
+    /// creation; 0 when absent.
     #[serde(default)]
     #[schema(minimum = -100, maximum = 100)]
     pub priority: i32,
-    /// What becomes of the robot's other missions; it waits behind them when absent.
+    /// Effect on the robot's other missions; when absent, this mission waits behind them.
     #[serde(default)]
     pub start_policy: StartPolicy,
-    /// What the robot does when it no longer hears the server; it goes on when absent.
+    /// Behaviour of the robot when the server is silent; it continues the mission when absent.
     #[serde(default)]
     pub link_policy: LinkPolicy,
-    /// How long the robot may stay away before its mission fails as `robot_lost`, seconds. When
-    /// absent: what was left of the plan and a margin, or the silence after which it stops and a
-    /// margin.
+    /// Time for which the robot may be offline before the mission fails with the cause
+    /// `robot_lost`, seconds. When absent: the remaining planned time, or the silence of
+    /// `link_policy`, and a margin.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 1.0, maximum = 86_400.0)]
     pub lost_after_s: Option<f64>,
 }
 
-/// What a robot does with its mission when it no longer hears the server.
+/// Behaviour of a robot during a mission when the server is silent.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LinkPolicy {
-    /// It goes on to the end of the mission.
+    /// Continues the mission to its end.
     #[default]
     Continue,
-    /// It brakes along its path and ends the mission as failed after this long without contact.
+    /// Brakes along the path and ends the mission as failed when the server was silent for this
+    /// time.
     StopAfter {
-        /// The silence, seconds, [`LINK_SILENCE_MIN_S`] to [`LINK_SILENCE_MAX_S`].
+        /// Silence of the server after which the robot brakes, seconds, [`LINK_SILENCE_MIN_S`] to
+        /// [`LINK_SILENCE_MAX_S`].
         #[schema(minimum = 1.0, maximum = 86_400.0)]
         silence_s: f64,
     },
 }
 
 impl LinkPolicy {
-    /// Checks its figure.
+    /// Checks that the silence is within its range.
     ///
     /// # Errors
-    /// A sentence, if the silence is out of range.
+    /// A message for people, if it is not.
     pub fn validate(&self) -> Result<(), String> {
         match *self {
             Self::StopAfter { silence_s }
@@ -164,171 +169,176 @@ impl LinkPolicy {
     }
 }
 
-/// The body of `POST /v1/missions/{mission}/replace`.
+/// Body of `POST /v1/missions/{mission}/replace`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ReplaceMission {
-    /// What is to be driven from where the robot is then.
+    /// Trajectory to drive instead, from the place at which the robot is then.
     pub trajectory: Trajectory,
 }
 
-/// A new revision of a mission that its robot does not hold whole yet.
+/// New revision of a mission that the robot has not accepted yet.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Replacement {
-    /// The revision that it will be.
+    /// Number of the new revision.
     pub revision: u32,
-    /// What exactly it is.
+    /// Hash of the new trajectory with its revision.
     pub plan_hash: PlanHash,
-    /// What is to be driven.
+    /// Trajectory of the new revision.
     pub trajectory: Trajectory,
 }
 
-/// A mission as the server keeps it.
+/// Mission as the server stores it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Mission {
-    /// The mission's identifier; ids sort by creation.
+    /// Identifier of the mission; identifiers sort by creation.
     pub id: MissionId,
-    /// The robot's site.
+    /// Site of the robot.
     pub site: SiteId,
-    /// The robot.
+    /// Robot that drives the mission.
     pub robot: RobotId,
-    /// Where it stands.
+    /// Present state.
     pub state: MissionState,
-    /// Why it stands there, for people.
+    /// Reason of the present state, for people; `null` without one.
     pub reason: Option<String>,
-    /// Why it stands there, for programs.
+    /// Cause of the present state, for programs.
     pub cause: Cause,
-    /// Whether it is to be paused; the robot has not answered yet while the state says otherwise.
+    /// Whether a pause is requested. While this differs from `state`, the robot has not confirmed
+    /// it yet.
     pub pause_wanted: bool,
-    /// Counts changes of what is to be driven.
+    /// Number of the present revision of the trajectory.
     pub revision: u32,
-    /// What exactly is to be driven.
+    /// Hash of the trajectory with its revision.
     pub plan_hash: PlanHash,
-    /// What is to be driven.
+    /// Trajectory to drive.
     pub trajectory: Trajectory,
-    /// A new revision that the robot does not hold whole yet.
+    /// New revision that the robot has not accepted yet; `null` without one.
     pub replacement: Option<Replacement>,
-    /// Past this time it never starts.
+    /// Latest time at which the mission may start; `null` without a limit.
     pub latest_start: Option<Timestamp>,
-    /// Missions of a higher priority are driven first.
+    /// Priority in the robot's queue, −100 to 100; a higher one is driven first.
     pub priority: i32,
-    /// What the robot does when it no longer hears the server.
+    /// Behaviour of the robot when the server is silent.
     pub link_policy: LinkPolicy,
-    /// How long the robot may stay away before it counts as lost, seconds, if that was said.
+    /// Time for which the robot may be offline before the mission fails, seconds; `null` for the
+    /// default.
     pub lost_after_s: Option<f64>,
-    /// The run of the agent that took it.
+    /// Run of the agent that accepted the mission; `null` before that.
     pub boot: Option<BootId>,
-    /// What the robot planned.
+    /// Summary of the robot's plan; `null` before the robot has reported it.
     pub plan: Option<PlanSummary>,
-    /// How far the robot has come, by its last word while the mission was its present one.
+    /// Progress that the robot reported last while this was its active mission; `null` before that.
     pub progress: Option<MissionProgress>,
-    /// When it was asked for.
+    /// Time when the mission was requested.
     pub created_at: Timestamp,
-    /// When the robot began.
+    /// Time when the robot began to drive; `null` before that.
     pub started_at: Option<Timestamp>,
-    /// When it ended.
+    /// Time when the mission ended; `null` before that.
     pub ended_at: Option<Timestamp>,
 }
 
-/// A mission with its history.
+/// Mission with its history and the results of its run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct MissionDetail {
     /// The mission.
     #[serde(flatten)]
     pub mission: Mission,
-    /// What happened to it, oldest first.
+    /// Steps of its history, the oldest first.
     pub events: Vec<MissionEvent>,
-    /// How well it was driven, once the robot has said so.
+    /// Quality of the run; `null` until the robot has reported it.
     pub quality: Option<MissionQuality>,
-    /// Where the robot really was, once it has said so.
+    /// Path that the robot drove, as it measured it; `null` until the robot has reported it.
     pub driven: Option<DrivenPath>,
 }
 
-/// How well a mission was driven, measured by its robot.
+/// Quality of a mission's run, measured by the robot.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct MissionQuality {
-    /// Time from the first wheel command to the end, pauses included, seconds.
+    /// Time from the first wheel command to the end, including pauses, seconds.
     pub duration_s: f64,
-    /// Time that it stood paused, seconds.
+    /// Time for which the mission was paused with the robot stopped, seconds.
     pub paused_s: f64,
-    /// Distance that the robot travelled, metres.
+    /// Distance travelled, metres.
     pub distance_m: f64,
-    /// Root of the mean square of the distance from the path, metres.
+    /// Root mean square of the cross-track error, metres.
     pub cross_track_rms_m: f64,
-    /// Largest distance from the path, metres.
+    /// Maximum absolute cross-track error, metres.
     pub cross_track_max_m: f64,
-    /// Share of the ticks in which a wheel was at its limit, 0 to 1.
+    /// Fraction of the control ticks in which a wheel was at its limit, 0 to 1.
     pub saturated_ratio: f64,
     /// Number of sudden losses of traction: changes of friction, and slip beyond the model.
     pub slip_events: u32,
-    /// Share of the ticks in which the safety gate reduced the command, 0 to 1.
+    /// Fraction of the control ticks in which the safety gate reduced the command, 0 to 1.
     pub gate_reduced_ratio: f64,
-    /// How often the safety gate began to hold the robot.
+    /// Number of times that the safety gate began to hold the robot.
     pub gate_stops: u32,
-    /// θ along the driven path, at most [`THETA_SAMPLES_MAX`].
+    /// Samples of θ along the driven path, at most [`THETA_SAMPLES_MAX`].
     pub theta: Vec<ThetaSample>,
-    /// Value of the map's prior for this mission; absent when the map knew nothing along the path.
+    /// Value of the friction map's prior for this mission; absent when the map had no data along
+    /// the path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prior: Option<PriorGain>,
 }
 
-/// Value of the map's prior for a mission: on how much of the path it gave the robot θ, and how
-/// accurate it was.
+/// Value of the friction map's prior for a mission: coverage of the path, and accuracy of its θ.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct PriorGain {
-    /// Friction coefficient that the plan was made with.
+    /// Traction limit with which the plan was made, a friction coefficient.
     #[serde(alias = "grip_mu")]
     pub traction_limit_mu: f64,
-    /// Share of the driven path on cells with known θ, 0 to 1.
+    /// Fraction of the driven distance on cells for which the map had θ, 0 to 1.
     pub known_ratio: f64,
-    /// Time in which θ was known to [`THETA_SURE_RATIO`], seconds.
+    /// Time for which θ was known, from the prior and the robot's measurements, with a relative
+    /// standard deviation of at most [`THETA_SURE_RATIO`], seconds.
     pub sure_s: f64,
-    /// The same if the robot had had only its own measurements, seconds.
+    /// Time for which θ was known that accurately from the robot's own measurements alone, seconds.
     pub sure_alone_s: f64,
-    /// Time from the start until the robot's own measurement was as sure, seconds; `null` if it
-    /// never was.
+    /// Time from the start until the robot's own measurement reached that accuracy, seconds; `null`
+    /// if it never did.
     pub first_sure_alone_s: Option<f64>,
-    /// Cells in which the robot has measured what the map had a word on.
+    /// Number of cells with θ from the map in which the robot measured θ too.
     pub cells_compared: u32,
-    /// Of these, cells that contradicted the map.
+    /// Number of compared cells in which the measurement contradicted the map.
     pub cells_contradicted: u32,
-    /// Mean of measured over expected θ, less one; `null` without any cell.
+    /// Mean of (measured θ / θ of the map) − 1 over the compared cells; `null` if there are none.
     pub difference_ratio: Option<f64>,
-    /// Root mean square of the differences over their standard deviations: about 1 where the stated
-    /// uncertainties are right; `null` without any cell.
+    /// Root mean square, over the compared cells, of the difference of θ over its standard
+    /// deviation: about 1 if the stated uncertainties are right; `null` if there are no compared
+    /// cells.
     pub difference_rms: Option<f64>,
 }
 
-/// Relative standard deviation below which θ counts as known.
+/// Relative standard deviation up to which θ counts as known.
 pub const THETA_SURE_RATIO: f64 = 0.2;
 
-/// Friction at one place of a mission.
+/// Sample of θ at one place of a mission.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ThetaSample {
-    /// Arc length, metres.
+    /// Arc length driven, metres.
     pub driven_m: f64,
-    /// θ̂ of the tracking law.
+    /// Adapted estimate θ̂ of the tracking law.
     pub theta_loop: f64,
-    /// Measured θ, when it was known.
+    /// Measured θ; `null` where it was unknown.
     pub theta_measured: Option<f64>,
-    /// Standard deviation of measured θ.
+    /// Standard deviation of measured θ; `null` where it was unknown.
     pub theta_sd: Option<f64>,
 }
 
-/// Where a robot really was during a mission.
+/// Path that a robot drove during a mission, as it measured it.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct DrivenPath {
-    /// No place of the whole path is further than this from the line through the points, metres.
+    /// Tolerance of the thinning, metres: the maximum distance of the full path from the polyline
+    /// through `points`.
     pub tolerance_m: f64,
-    /// The points in their order, at most [`DRIVEN_POINTS_MAX`].
+    /// Points in driving order, in the site frame; at most [`DRIVEN_POINTS_MAX`].
     pub points: Vec<Point>,
-    /// When the robot was at each point, seconds since its first wheel command, pauses included;
-    /// between two points it went about evenly. Empty from an older agent.
+    /// Time at each point since the first wheel command, pauses included, seconds; interpolate
+    /// linearly between points. Empty from an older agent.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub times_s: Vec<f64>,
 }
 
 impl DrivenPath {
-    /// Whether its times are those of its points, in order.
+    /// Whether `times_s` is empty, or has one finite time per point in ascending order.
     pub fn has_possible_times(&self) -> bool {
         self.times_s.is_empty()
             || (self.times_s.len() == self.points.len()
@@ -337,16 +347,16 @@ impl DrivenPath {
     }
 }
 
-/// What a robot planned for a mission.
+/// Summary of a robot's plan for a mission.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PlanSummary {
-    /// Length with the approach, metres.
+    /// Length including the approach, metres.
     pub length_m: f64,
-    /// Time that it takes when nothing slows the robot, seconds.
+    /// Planned duration, seconds, if nothing slows the robot.
     pub duration_s: f64,
-    /// Fastest planned speed, m/s.
+    /// Maximum planned speed, m/s.
     pub speed_peak_m_s: f64,
-    /// Where the robot was when it planned, and how it was headed. Absent from an older agent.
+    /// Pose from which the robot planned. Absent from an older agent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub begin: Option<Pose>,
 }

@@ -1,47 +1,49 @@
-//! The envelope of every list.
+//! Envelopes of lists, which are answered in pages.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-/// Entries of a page when the request does not say.
+/// Number of entries of a page when the request has no `limit`.
 pub const PAGE_LIMIT_DEFAULT: u32 = 100;
-/// Most entries of a page.
+/// Maximum number of entries of a page.
 pub const PAGE_LIMIT_MAX: u32 = 1_000;
 
-/// One page of a list.
+/// Page of a list.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Page<T> {
-    /// The entries.
+    /// Entries of this page.
     pub items: Vec<T>,
-    /// Give this as `cursor` for the next page; `null` on the last one.
+    /// Value of `cursor` for the request of the next page; `null` on the last page.
     pub next_cursor: Option<String>,
 }
 
-/// One page of what the friction map knows.
+/// Page of a list that was read from the friction map.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct MapPage<T> {
-    /// The entries.
+    /// Entries of this page.
     pub items: Vec<T>,
-    /// Give this as `cursor` for the next page; `null` on the last one.
+    /// Value of `cursor` for the request of the next page; `null` on the last page.
     pub next_cursor: Option<String>,
-    /// As of when: nothing that was measured later counts. The end of the last epoch before the time
-    /// that was asked for; `null` when no time was, and all that has come counts.
+    /// Time up to which measurements are included: the end of the last epoch before the requested
+    /// time. `null` if no time was requested; all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
 }
 
-/// One page of how the friction map changed between two times.
+/// Page of the differences of the friction map between two times.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct DifferencePage<T> {
-    /// The entries.
+    /// Entries of this page.
     pub items: Vec<T>,
-    /// Give this as `cursor` for the next page; `null` on the last one.
+    /// Value of `cursor` for the request of the next page; `null` on the last page.
     pub next_cursor: Option<String>,
-    /// The first time: the end of the last epoch before the one that was asked for.
+    /// Time up to which measurements are included before: the end of the last epoch before the
+    /// requested first time.
     #[serde(default)]
     pub from: Option<Timestamp>,
-    /// The second time, as [`MapPage::as_of`].
+    /// Time up to which measurements are included after: the end of the last epoch before the
+    /// requested second time; `null` if none was requested, and all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
 }

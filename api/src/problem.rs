@@ -1,4 +1,4 @@
-//! Errors over REST: RFC 9457 problems with a closed list of types.
+//! Errors over REST: problem details by RFC 9457, with a closed list of problem types.
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -6,10 +6,10 @@ use utoipa::ToSchema;
 use crate::mission::MissionState;
 use crate::trajectory::Place;
 
-/// The media type of a problem.
+/// Media type of a problem.
 pub const PROBLEM_MEDIA_TYPE: &str = "application/problem+json";
 
-/// Every kind of problem that the API answers with.
+/// Type of a problem with which the API answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[expect(missing_docs, reason = "titles say it")]
 pub enum ProblemType {
@@ -118,7 +118,7 @@ pub enum ProblemType {
 }
 
 impl ProblemType {
-    /// Every kind.
+    /// Every problem type.
     pub const ALL: [Self; 51] = [
         Self::MalformedBody,
         Self::InvalidBody,
@@ -173,7 +173,7 @@ impl ProblemType {
         Self::Internal,
     ];
 
-    /// The title for people, the same for every problem of this kind.
+    /// Returns the title for people, the same for every problem of this type.
     pub const fn title(self) -> &'static str {
         match self {
             Self::MalformedBody => "The body is not JSON",
@@ -231,26 +231,26 @@ impl ProblemType {
     }
 }
 
-/// An error answer.
+/// Error answer, a problem by RFC 9457.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ProblemBody {
-    /// The kind, stable, for programs.
+    /// Type of the problem, a stable URI reference for programs.
     #[serde(rename = "type")]
     pub kind: ProblemType,
-    /// What the kind means, for people.
+    /// Title of the problem type, for people.
     pub title: String,
-    /// The HTTP status.
+    /// HTTP status of the answer.
     pub status: u16,
-    /// What is wrong here, and what to do, for people.
+    /// What is wrong with this request, and how to correct it, for people.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub detail: Option<String>,
-    /// Where in the body, as a path such as `trajectory.circle.radius_m`.
+    /// Field of the body that is wrong, as a path such as `trajectory.circle.radius_m`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub field: Option<String>,
-    /// The mission's present state, where that is what forbids it.
+    /// Present state of the mission, if it does not allow the request.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub state: Option<MissionState>,
-    /// Where along the path it cannot be driven.
+    /// Place along the path from which on it cannot be driven.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub place: Option<Place>,
 }

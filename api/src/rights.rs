@@ -1,4 +1,4 @@
-//! What somebody may do, and where: rights, sets of them, and the sites and robots they hold for.
+//! Authorisation: rights, sets of rights, and the sites and robots for which they hold.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -9,25 +9,25 @@ use utoipa::ToSchema;
 
 use crate::ids::{RobotId, SiteId};
 
-/// A named bundle of rights; each role has those of the ones before it.
+/// Named set of rights; each role has the rights of the roles before it.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
 )]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
-    /// Sees everything but tokens and the audit log, and may stop robots.
+    /// Read everything except tokens and the audit log, and stop robots.
     Viewer,
-    /// Gives missions, draws terrains, drives robots: every right but `administer`.
+    /// Every right except `administer`.
     Operator,
-    /// Makes sites, gives and revokes tokens, reads the audit log: every right.
+    /// Every right.
     Admin,
 }
 
 impl Role {
-    /// Every role, the weakest first.
+    /// Every role, in ascending order of rights.
     pub const ALL: [Self; 3] = [Self::Viewer, Self::Operator, Self::Admin];
 
-    /// The name on the wire.
+    /// Returns the role's name on the wire.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Viewer => "viewer",
@@ -36,7 +36,7 @@ impl Role {
         }
     }
 
-    /// The role of that name.
+    /// Returns the role with this name; `None` if there is none.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|role| role.as_str() == name)
     }
@@ -48,7 +48,7 @@ impl fmt::Display for Role {
     }
 }
 
-/// Why a text is no role.
+/// Error for a text that is not the name of a role.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("a role is `viewer`, `operator` or `admin`")]
 pub struct InvalidRole;
@@ -61,38 +61,37 @@ impl FromStr for Role {
     }
 }
 
-/// Most sites that a token may be limited to.
+/// Maximum number of sites to which a token is limited.
 pub const SCOPE_SITES_MAX: usize = 100;
-/// Most robots that it may be limited to, of all its sites.
+/// Maximum number of robots to which a token is limited, over all its sites.
 pub const SCOPE_ROBOTS_MAX: usize = 1_000;
 
-/// A right. Each route of the API needs one.
+/// Permission for some operations. Each route of the API requires one right.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
 )]
 #[serde(rename_all = "snake_case")]
 pub enum Right {
-    /// Stops robots; comes with every other right.
+    /// Stop robots; part of every other right.
     Stop,
-    /// Sees everything but tokens and the audit log; comes with every right but `stop`.
+    /// Read everything except tokens and the audit log; part of every right except `stop`.
     Read,
-    /// Teleoperates robots.
+    /// Teleoperate robots.
     Drive,
-    /// Clears stops.
+    /// Clear stops.
     ClearStop,
-    /// Holds and slows robots as the limit's owner that is named like the token.
+    /// Hold and slow robots by the limit of the owner that has the same name as the token.
     Hold,
-    /// Sets and ends the limits of every owner; brings `hold` along.
+    /// Set and end the limits of every owner; includes `hold`.
     ReleaseHold,
-    /// Gives missions, changes, pauses, resumes and cancels them.
+    /// Create, change, pause, resume and cancel missions.
     Dispatch,
-    /// Acknowledges alerts.
+    /// Acknowledge alerts.
     Acknowledge,
-    /// Draws terrains and geofences, ties sites to the earth, names and retires robots, withdraws
+    /// Change terrains and geofences, tie sites to WGS 84, rename and retire robots, withdraw
     /// measurements.
     Configure,
-    /// Makes sites, lets robots join and puts them out, gives and revokes tokens, reads the audit
-    /// log.
+    /// Create sites, enrol and revoke robots, create and revoke tokens, read the audit log.
     Administer,
 }
 
@@ -111,7 +110,7 @@ impl Right {
         Self::Administer,
     ];
 
-    /// The name on the wire.
+    /// Returns the right's name on the wire.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Stop => "stop",
@@ -127,7 +126,7 @@ impl Right {
         }
     }
 
-    /// The right of that name.
+    /// Returns the right with this name; `None` if there is none.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|right| right.as_str() == name)
     }
@@ -143,7 +142,7 @@ impl fmt::Display for Right {
     }
 }
 
-/// Why a text is no right.
+/// Error for a text that is not the name of a right.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "a right is `stop`, `read`, `drive`, `clear_stop`, `hold`, `release_hold`, `dispatch`, \
@@ -159,41 +158,41 @@ impl FromStr for Right {
     }
 }
 
-/// A set of rights, closed under those that others bring along: `stop` comes with every right,
-/// `read` with every right but `stop`, `hold` with `release_hold`. A list of names on the wire.
+/// Set of rights, closed under inclusion: every right includes `stop`, every right except `stop`
+/// includes `read`, and `release_hold` includes `hold`. A list of names on the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(from = "Vec<Right>", into = "Vec<Right>")]
 pub struct Rights(u16);
 
 impl Rights {
-    /// Whether a right is in it.
+    /// Whether a right is in the set.
     pub const fn includes(self, right: Right) -> bool {
         self.0 & right.bit() != 0
     }
 
-    /// Whether all of another set are in it.
+    /// Whether all rights of another set are in this set.
     pub const fn includes_all(self, other: Self) -> bool {
         self.0 & other.0 == other.0
     }
 
-    /// The rights that are in it or in another.
+    /// Returns the rights that are in this set or in another.
     #[must_use]
     pub const fn union(self, other: Self) -> Self {
         Self(self.0 | other.0)
     }
 
-    /// The rights that are in it and in another.
+    /// Returns the rights that are in this set and in another.
     #[must_use]
     pub const fn intersection(self, other: Self) -> Self {
         Self(self.0 & other.0)
     }
 
-    /// Whether it is for looking and stopping alone.
+    /// Whether the set has no right except `stop` and `read`.
     pub const fn only_watches(self) -> bool {
         self.0 & !(Right::Stop.bit() | Right::Read.bit()) == 0
     }
 
-    /// Those in it.
+    /// Iterates over the rights in the set.
     pub fn iter(self) -> impl Iterator<Item = Right> {
         Right::ALL
             .into_iter()
@@ -250,76 +249,77 @@ impl fmt::Display for Rights {
     }
 }
 
-/// A site that rights hold for.
+/// Site for which rights hold, or some of its robots.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct SiteScope {
     /// The site.
     pub site: SiteId,
-    /// Only these of its robots; all of them, and the site itself, when absent.
+    /// Robots of the site for which the rights hold; when absent, all of them and the site itself.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub robots: Option<Vec<RobotId>>,
 }
 
-/// Where rights hold: everywhere, or for sites, of which some may be limited to named robots.
-/// A list of [`SiteScope`] or `null` on the wire.
+/// Sites and robots for which rights hold: all, or listed sites, of which some may be limited to
+/// listed robots. A list of [`SiteScope`] or `null` on the wire.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(try_from = "Option<Vec<SiteScope>>", into = "Option<Vec<SiteScope>>")]
 pub struct Scope(Option<BTreeMap<SiteId, Option<BTreeSet<RobotId>>>>);
 
-/// Rights for some places. Of several, any one that has the right and the place suffices.
+/// Rights with the sites and robots for which they hold. Of several grants, a request needs one
+/// that has both its right and its place.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 pub struct Grant {
-    /// What may be done.
+    /// Rights that are granted.
     #[schema(value_type = Vec<Right>)]
     pub rights: Rights,
-    /// Where; `null` for everywhere.
+    /// Sites and robots for which the rights hold; `null` for all.
     #[schema(value_type = Option<Vec<SiteScope>>)]
     pub sites: Scope,
 }
 
-/// Why a list of sites is no scope.
+/// Reason why a list of sites and robots is not a valid scope.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidScope {
-    /// Nothing would be let through.
+    /// The list of sites, or the robots of a site, are empty.
     #[error("name at least one site, or leave `sites` out; a site's `robots` likewise")]
     Empty,
-    /// A site is named twice.
+    /// A site is listed twice.
     #[error("site `{0}` is named twice")]
     Twice(SiteId),
-    /// Too many are named.
+    /// More sites or robots are listed than [`SCOPE_SITES_MAX`] or [`SCOPE_ROBOTS_MAX`].
     #[error("at most {SCOPE_SITES_MAX} sites and {SCOPE_ROBOTS_MAX} robots can be named")]
     TooMany,
-    /// It names neither a site nor a robot of one.
+    /// A name is neither `SITE` nor `SITE/ROBOT` with valid identifiers.
     #[error("write `SITE` or `SITE/ROBOT`")]
     Name,
 }
 
 impl Scope {
-    /// Everywhere.
+    /// Scope of all sites and robots.
     pub const EVERYWHERE: Self = Self(None);
 
-    /// Whether nothing is left out.
+    /// Whether the scope contains all sites and robots.
     pub fn is_everywhere(&self) -> bool {
         self.0.is_none()
     }
 
-    /// Whether a site, or some of its robots, is in it.
+    /// Whether the scope contains a site or some of its robots.
     pub fn includes_site(&self, site: &SiteId) -> bool {
         self.0.as_ref().is_none_or(|sites| sites.contains_key(site))
     }
 
-    /// Whether a site is in it with all its robots.
+    /// Whether the scope contains a site with all its robots.
     pub fn includes_whole_site(&self, site: &SiteId) -> bool {
         self.robots_of(site).is_some_and(|robots| robots.is_none())
     }
 
-    /// Whether a robot is in it.
+    /// Whether the scope contains a robot.
     pub fn includes_robot(&self, site: &SiteId, robot: &RobotId) -> bool {
         let robots = self.robots_of(site);
         robots.is_some_and(|robots| robots.is_none_or(|robots| robots.contains(robot)))
     }
 
-    /// Whether a robot of that name is in it, of whatever site.
+    /// Whether the scope contains a robot of this name at any site.
     pub fn includes_robot_name(&self, robot: &RobotId) -> bool {
         let Some(sites) = &self.0 else {
             return true;
@@ -328,7 +328,7 @@ impl Scope {
         robots.any(|robots| robots.as_ref().is_none_or(|robots| robots.contains(robot)))
     }
 
-    /// Whether all of another scope is in it.
+    /// Whether the scope contains all of another scope.
     pub fn includes(&self, other: &Self) -> bool {
         let Some(others) = &other.0 else {
             return self.is_everywhere();
@@ -339,8 +339,8 @@ impl Scope {
         })
     }
 
-    /// What is in it or in another. It is for asking what is in it, and may be larger than what a
-    /// token may be limited to.
+    /// Returns the scope that contains what this scope or another contains. It serves for checks
+    /// only: it may exceed the limits on the size of a token's scope.
     #[must_use]
     pub fn union(&self, other: &Self) -> Self {
         let (Some(own), Some(others)) = (&self.0, &other.0) else {
@@ -360,19 +360,20 @@ impl Scope {
         Self(Some(sites))
     }
 
-    /// The sites in it; `None` for everywhere.
+    /// Iterates over the sites in the scope; `None` if it contains all.
     pub fn sites(&self) -> Option<impl Iterator<Item = &SiteId>> {
         Some(self.0.as_ref()?.keys())
     }
 
-    /// The only site in it, if it is limited to one.
+    /// Returns the only site in the scope; `None` if it contains several or all.
     pub fn only_site(&self) -> Option<&SiteId> {
         let mut sites = self.sites()?;
         let site = sites.next()?;
         sites.next().is_none().then_some(site)
     }
 
-    /// `None` if the site is not in it; the robots that it is limited to, or `None` for all.
+    /// Returns `None` if the scope does not contain the site, `Some(None)` if it contains all its
+    /// robots, and `Some(Some(robots))` if it is limited to these robots.
     pub fn robots_of(&self, site: &SiteId) -> Option<Option<&BTreeSet<RobotId>>> {
         match &self.0 {
             None => Some(None),
@@ -380,8 +381,8 @@ impl Scope {
         }
     }
 
-    /// The robots that a list of a site is limited to: `None` for all, none at all where the site
-    /// is not in it.
+    /// Returns the robots to which a list of the site is limited: `None` if all are listed, the
+    /// empty set if the scope does not contain the site.
     pub fn limit_of(&self, site: &SiteId) -> Option<BTreeSet<RobotId>> {
         match self.robots_of(site) {
             None => Some(BTreeSet::new()),
@@ -389,7 +390,8 @@ impl Scope {
         }
     }
 
-    /// What is in it, each as `site` or `site/robot`; `None` for everywhere.
+    /// Returns the names of what the scope contains, each `site` or `site/robot`; `None` if it
+    /// contains all.
     pub fn names(&self) -> Option<Vec<String>> {
         let sites = self.0.as_ref()?;
         let names = sites.iter().flat_map(|(site, robots)| match robots {
@@ -402,11 +404,11 @@ impl Scope {
         Some(names.collect())
     }
 
-    /// The scope of such names.
+    /// Creates a scope from names, each `site` or `site/robot`.
     ///
     /// # Errors
-    /// A name is neither, a site is named twice or both whole and by robots, or there are none or
-    /// too many.
+    /// [`InvalidScope`] if a name is invalid, a site is named twice or both whole and by robots, or
+    /// there are no or too many names.
     pub fn from_names<'name>(
         names: impl IntoIterator<Item = &'name str>,
     ) -> Result<Self, InvalidScope> {

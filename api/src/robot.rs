@@ -1,4 +1,4 @@
-//! Robots: what they are, and what is known of them now.
+//! Robots: their models and capabilities, and their live state.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -13,87 +13,88 @@ use crate::ids::{
 };
 use crate::safety::SafetyStatus;
 
-/// A robot's model and tyres, as its agent declares them.
+/// Model and tyres of a robot, as its agent declares them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct RobotModel {
     /// Name of the model, for people.
     pub name: String,
-    /// Tyres; friction measured with other tyres is never mixed in.
+    /// Name of the tyres; measurements with different tyres are never combined.
     pub tyres: String,
-    /// Mass with payload, kg.
+    /// Mass including payload, kg.
     pub mass_kg: f64,
-    /// Lateral distance of the wheels' contact points, W, metres.
+    /// Track width W: lateral distance between the wheels' contact points, metres.
     pub track_width_m: f64,
-    /// Longitudinal distance of the wheels' contact points, L, metres.
+    /// Wheelbase L: longitudinal distance between the wheels' contact points, metres.
     pub wheelbase_m: f64,
     /// Wheel radius r, metres.
     pub wheel_radius_m: f64,
-    /// Moment of inertia about the vertical axis `I_G`, kg m².
+    /// Yaw inertia `I_G`: moment of inertia about the vertical axis through the centre of mass, kg
+    /// m².
     pub yaw_inertia_kg_m2: f64,
-    /// What the base can do.
+    /// Motion limits of the base.
     pub limits: RobotLimits,
 }
 
-/// What a base can do, each figure positive.
+/// Motion limits of a base, all positive.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct RobotLimits {
-    /// Fastest forward speed, m/s.
+    /// Maximum speed, forward and backward, m/s.
     pub linear_max_m_s: f64,
-    /// Fastest yaw rate, rad/s.
+    /// Maximum yaw rate, rad/s.
     pub angular_max_rad_s: f64,
-    /// Strongest forward acceleration and braking, m/s².
+    /// Maximum longitudinal acceleration and braking, m/s².
     pub linear_acceleration_max_m_s2: f64,
-    /// Strongest lateral acceleration, m/s².
+    /// Maximum lateral acceleration, m/s².
     pub lateral_acceleration_max_m_s2: f64,
-    /// Largest forward jerk, m/s³.
+    /// Maximum longitudinal jerk, m/s³.
     pub linear_jerk_max_m_s3: f64,
-    /// Fastest wheel speed, rad/s.
+    /// Maximum angular speed of a wheel, rad/s.
     pub wheel_speed_max_rad_s: f64,
-    /// Strongest wheel acceleration, rad/s².
+    /// Maximum angular acceleration of a wheel, rad/s².
     pub wheel_acceleration_max_rad_s2: f64,
 }
 
 impl RobotModel {
-    /// The identifier of this model and these tyres.
+    /// Returns the identifier of this model with these tyres.
     pub fn configuration(&self) -> ConfigurationId {
         let description = serde_json::to_vec(self).unwrap_or_default();
         ConfigurationId::from_uuid(Uuid::new_v5(&DERIVED_NAMESPACE, &description))
     }
 }
 
-/// What an agent is doing.
+/// Operating mode of an agent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum RobotMode {
-    /// Standing, ready for a mission.
+    /// Stopped, ready for a mission.
     Idle,
     /// Driving a mission.
     Tracking,
     /// Teleoperated.
     Teleoperated,
-    /// Stopped and latched until an operator clears it.
+    /// Stopped by a latched stop, until a person clears it.
     Stopped,
-    /// Something is broken; the text in `fault` says what.
+    /// Out of order; `fault` contains the reason.
     Fault,
 }
 
-/// Whether the server hears a robot. The heartbeat of its control loop decides.
+/// Link state of a robot, from the time since the last heartbeat of its control loop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LinkState {
-    /// Heard a moment ago.
+    /// The last heartbeat is recent.
     Online,
     /// Some heartbeats are missing.
     Stale,
-    /// Off the network, or silent for more than a second.
+    /// Not connected, or without a heartbeat for more than a second.
     Offline,
 }
 
 impl LinkState {
-    /// Every state.
+    /// Every link state.
     pub const ALL: [Self; 3] = [Self::Online, Self::Stale, Self::Offline];
 
-    /// The state's name on the wire.
+    /// Returns the link state's name on the wire.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Online => "online",
@@ -103,51 +104,51 @@ impl LinkState {
     }
 }
 
-/// Why a robot is not heard.
+/// Reason why a robot is not online.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LinkCause {
-    /// It is on the network, and its first heartbeat has not come yet.
+    /// It is connected, but its first heartbeat has not arrived yet.
     Joining,
-    /// It left the network while it was heard: its agent or the whole robot is off.
+    /// It disconnected while its heartbeats arrived: its agent or the whole robot is off.
     RobotOff,
-    /// It went silent first: the network between it and the server is down.
+    /// Its heartbeats stopped before it disconnected: the network to the server is down.
     LinkDown,
-    /// Its agent speaks, and its control loop stands still.
+    /// Its agent sends states, but its control loop has stopped.
     LoopStopped,
-    /// The server itself was down, and has not heard it since.
+    /// The server was restarted, and no heartbeat has arrived since.
     ServerRestarted,
 }
 
-/// What a base and its agent can do beyond driving missions to their end.
+/// Optional capabilities of a base and its agent, beyond driving missions to their end.
 #[expect(
     clippy::struct_excessive_bools,
     reason = "each is an ability of its own, under its own name on the wire"
 )]
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct Capabilities {
-    /// It can pause a mission and drive it on.
+    /// Whether it can pause and resume a mission.
     #[serde(default)]
     pub pause: bool,
-    /// It can swap a mission for a new revision while it drives.
+    /// Whether it can replace a mission's trajectory while driving.
     #[serde(default)]
     pub replace: bool,
-    /// It measures its battery.
+    /// Whether it measures its battery.
     #[serde(default)]
     pub battery: bool,
-    /// It measures wheel torque, so that friction shows in steady driving too.
+    /// Whether it measures wheel torque, so that friction is measurable in steady driving too.
     #[serde(default)]
     pub wheel_torque: bool,
-    /// It latches stops, keeps to geofences and takes external limits.
+    /// Whether it supports latched stops, geofences and external limits.
     #[serde(default)]
     pub stop: bool,
-    /// It can be teleoperated.
+    /// Whether it can be teleoperated.
     #[serde(default)]
     pub teleop: bool,
     /// Rate of the control loop, Hz.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rate_hz: Option<f64>,
-    /// The kind of base, for people.
+    /// Kind of base, for people.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
@@ -156,10 +157,10 @@ pub struct Capabilities {
     pub base: Option<String>,
 }
 
-/// A robot's battery.
+/// State of a robot's battery.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Battery {
-    /// Charge, 0 to 1.
+    /// State of charge, 0 to 1.
     pub charge_ratio: f64,
     /// Voltage, volts.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -169,29 +170,29 @@ pub struct Battery {
     pub charging: bool,
 }
 
-/// Most alerts of one robot at a time.
+/// Maximum number of alerts that one robot reports at a time.
 pub const ALERTS_MAX: usize = 32;
-/// Longest text of an alert, in characters.
+/// Maximum length of the text of an alert, characters.
 pub const ALERT_TEXT_MAX: usize = 300;
-/// Longest text of what is broken on a robot, in characters; what is longer is cut.
+/// Maximum length of a robot's `fault` text, characters; the rest is cut off.
 pub const FAULT_TEXT_MAX: usize = 300;
-/// Longest version of an agent, in characters; what is longer is cut.
+/// Maximum length of an agent's version, characters; the rest is cut off.
 pub const VERSION_TEXT_MAX: usize = 100;
 
-/// How much an alert matters.
+/// Severity of an alert.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
 )]
 #[serde(rename_all = "snake_case")]
 pub enum Severity {
-    /// Worth a look.
+    /// A person should check it.
     Warning,
-    /// The robot cannot go on without a person.
+    /// The robot cannot continue without a person.
     Critical,
 }
 
 impl Severity {
-    /// The severity's name on the wire and in the database.
+    /// Returns the severity's name on the wire and in the database.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Warning => "warning",
@@ -199,7 +200,7 @@ impl Severity {
         }
     }
 
-    /// The severity of that name.
+    /// Returns the severity with this name; `None` if there is none.
     pub fn from_name(name: &str) -> Option<Self> {
         [Self::Warning, Self::Critical]
             .into_iter()
@@ -207,75 +208,76 @@ impl Severity {
     }
 }
 
-/// Something that needs a person's attention now, as the robot says it.
+/// Condition that needs a person's attention, as a robot reports it while it lasts.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct AlertReport {
-    /// What it is, stable, for programs: `[a-z0-9-]{1,63}`, such as `battery-low`.
+    /// Kind of the alert, for programs: `[a-z0-9-]{1,63}`, such as `battery-low`.
     pub code: AlertCode,
-    /// How much it matters.
+    /// Severity.
     pub severity: Severity,
-    /// What it is, for people; at most [`ALERT_TEXT_MAX`] characters.
+    /// Description, for people; at most [`ALERT_TEXT_MAX`] characters.
     #[serde(deserialize_with = "crate::text::bounded::<_, {ALERT_TEXT_MAX}>")]
     pub text: String,
 }
 
-/// An alert as the server keeps it: raised, acknowledged, cleared, each once.
+/// Alert as the server stores it. It is raised, acknowledged and cleared at most once each.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Alert {
-    /// The alert's identifier; a code that is raised again later is another alert.
+    /// Identifier of the alert. The same code raised again later is another alert.
     pub id: AlertId,
-    /// The robot's site; null for an alert about the server itself.
+    /// Site of the robot; `null` for an alert about the server itself.
     pub site: Option<SiteId>,
-    /// The robot; null for an alert about the server itself.
+    /// Robot; `null` for an alert about the server itself.
     pub robot: Option<RobotId>,
-    /// What it is, for programs.
+    /// Kind of the alert, for programs.
     pub code: AlertCode,
-    /// How much it matters.
+    /// Severity.
     pub severity: Severity,
-    /// What it is, for people.
+    /// Description, for people.
     pub text: String,
-    /// When the server first heard of it.
+    /// Time when the server raised it.
     pub raised_at: Timestamp,
-    /// When a person said to have seen it.
+    /// Time when a person acknowledged it; `null` before that.
     pub acknowledged_at: Option<Timestamp>,
-    /// When its cause was gone.
+    /// Time when its cause ended; `null` before that.
     pub cleared_at: Option<Timestamp>,
 }
 
 impl Alert {
-    /// What it is about, for people: the robot's name, or `server`.
+    /// Returns the subject of the alert, for people: the robot's identifier, or `server`.
     pub fn about(&self) -> &str {
         self.robot.as_ref().map_or("server", RobotId::as_str)
     }
 
-    /// Site and name of the robot that it is about, if it is about one.
+    /// Returns the site and identifier of the robot; `None` for an alert about the server itself.
     pub fn robot_key(&self) -> Option<(SiteId, RobotId)> {
         Some((self.site.clone()?, self.robot.clone()?))
     }
 }
 
-/// The body of `PATCH /v1/sites/{site}/robots/{robot}`; what is absent stays as it is.
+/// Body of `PATCH /v1/sites/{site}/robots/{robot}`; absent fields stay unchanged.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 pub struct ChangeRobot {
-    /// Another name for people. The identifier never changes: it is in every key and record.
+    /// New name, for people. The robot's identifier never changes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
-    /// A retired robot gets no missions and is not listed; what it measured stays.
+    /// Whether the robot is retired. A retired robot gets no missions and is omitted from lists by
+    /// default; its measurements stay.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub retired: Option<bool>,
 }
 
-/// A value with its age when the answer was made.
+/// Value with its age at the time of the answer.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Aged<T> {
     /// The value.
     pub value: T,
-    /// Time since it was measured, milliseconds, by monotonic clocks.
+    /// Time since the value was measured, milliseconds, by monotonic clocks.
     pub age_ms: u64,
 }
 
 impl<T> Aged<T> {
-    /// The same value, older by `elapsed_ms`.
+    /// Returns the same value, older by `elapsed_ms` milliseconds.
     #[must_use]
     pub fn older_by(self, elapsed_ms: u64) -> Self {
         Self {
@@ -285,169 +287,174 @@ impl<T> Aged<T> {
     }
 }
 
-/// A robot as the server knows it.
+/// Robot as the server stores it, with its live state.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Robot {
-    /// The robot's identifier within its site.
+    /// Identifier of the robot within its site.
     pub id: RobotId,
-    /// Display name; the identifier until it is renamed.
+    /// Name for people; equal to the identifier until the robot is renamed.
     pub name: String,
-    /// When it was retired, if it was.
+    /// Time when it was retired; `null` if it is not retired.
     pub retired_at: Option<Timestamp>,
-    /// The site it belongs to.
+    /// Site of the robot.
     pub site: SiteId,
-    /// Model and tyres as last declared.
+    /// Model and tyres as its agent declared them last.
     pub model: RobotModel,
-    /// The identifier of that model and those tyres.
+    /// Identifier of the configuration: of `model` with its tyres.
     pub configuration: ConfigurationId,
-    /// What the base and its agent can do.
+    /// Capabilities of the base and its agent.
     pub capabilities: Capabilities,
     /// Version of the agent.
     pub agent_version: String,
-    /// First hello.
+    /// Time of its first connection.
     pub first_seen_at: Timestamp,
-    /// Last hello.
+    /// Time of its newest connection.
     pub last_hello_at: Timestamp,
-    /// What became of its measurements.
+    /// Measurements that the server has not put on the friction map.
     pub measurements: MeasurementsTaken,
-    /// Whether the server hears it now.
+    /// Link state.
     pub link: LinkState,
-    /// Why it is not heard; `null` while it is online.
+    /// Reason why it is not online; `null` while it is online.
     pub link_cause: Option<LinkCause>,
     /// Alerts that have not cleared.
     pub alerts: Vec<Alert>,
-    /// What it said last; `null` if it has said nothing since the server started.
+    /// Last state that the robot sent; `null` if it has sent none since the server started.
     pub live: Option<RobotLive>,
 }
 
-/// What became of a robot's measurements, beside those that are on the map.
+/// Measurements of a robot that are not on the friction map.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct MeasurementsTaken {
-    /// How many were impossible and will never be taken.
+    /// Number of measurements refused for good, because they are implausible.
     pub refused: u64,
-    /// Why the last of them was.
+    /// Reason of the last refusal, for people; `null` if there was none.
     pub refused_why: Option<String>,
-    /// How many are from a time that has not come, and wait until the clock of their run is known.
+    /// Number of measurements with times in the future, kept until the clock of their run is known.
     pub deferred: u64,
 }
 
-/// What a robot said last, each value with its age.
+/// Last state that a robot sent, with the age of each value.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct RobotLive {
-    /// The agent's run.
+    /// Run of the agent.
     pub boot: BootId,
     /// Time since the server received the last state, milliseconds.
     pub heard_age_ms: u64,
-    /// The robot's own wall clock in that state; it may be wrong.
+    /// Wall clock of the robot in that state; it may be wrong.
     pub robot_time: Timestamp,
-    /// Offset of the robot's wall clock from the server's, milliseconds, to within the network
-    /// latency of a heartbeat. Both may be wrong.
+    /// Offset of the robot's wall clock from the server's, milliseconds, positive if the robot's is
+    /// ahead; accurate to the network latency of a heartbeat. Either clock may be wrong.
     pub clock_offset_ms: i64,
-    /// What the agent is doing.
+    /// Operating mode of the agent.
     pub mode: RobotMode,
-    /// What is broken, if anything.
+    /// Reason of a fault, for people; `null` without one.
     pub fault: Option<String>,
-    /// Where it is.
+    /// Pose in the site frame; `null` if unknown.
     pub pose: Option<Aged<Pose>>,
-    /// How fast it moves.
+    /// Velocity in the robot frame; `null` if unknown.
     pub twist: Option<Aged<Twist>>,
-    /// The mission it drives.
+    /// Progress of the active mission; `null` without one.
     pub mission: Option<MissionProgress>,
-    /// Both estimates of the friction under it.
+    /// Friction estimates of the tracking law and of the estimator; `null` if unknown.
     pub friction: Option<Aged<LiveFriction>>,
-    /// Its store of measurements that still wait for the server.
+    /// State of its durable queue of records for the server.
     pub outbox: OutboxStatus,
-    /// The control loop.
+    /// State of the control loop.
     pub control_loop: LoopStatus,
-    /// The battery, if the base measures it.
+    /// State of the battery; `null` if the base does not measure it.
     pub battery: Option<Battery>,
-    /// What may only slow the robot down.
+    /// Stops, leases, limits and everything else that reduces the robot's speed.
     pub safety: SafetyStatus,
 }
 
-/// How far a mission has come on the robot.
+/// Progress of a mission on the robot.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct MissionProgress {
-    /// The mission.
+    /// Identifier of the mission.
     pub id: MissionId,
-    /// Its revision.
+    /// Revision that is being driven.
     pub revision: u32,
-    /// What exactly is driven.
+    /// Hash of the trajectory that is being driven.
     pub plan_hash: PlanHash,
-    /// Arc length driven, metres; never falls.
+    /// Arc length driven, metres; never decreases.
     pub driven_m: f64,
     /// Arc length of the whole plan, metres.
     pub length_m: f64,
-    /// Distance from the path, metres, positive to its left.
+    /// Cross-track error, metres, positive to the left of the path.
     pub cross_track_m: f64,
-    /// Whether the robot stands with the mission on hold until it is resumed; while this is false
-    /// it may still be braking.
+    /// Whether the mission is paused and the robot has stopped. It is still false while the robot
+    /// brakes.
     #[serde(default)]
     pub paused: bool,
-    /// What holds it so; absent while nothing does. It is here while the robot still brakes.
+    /// Cause of the pause, already present while the robot brakes; absent while there is no pause.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub paused_by: Option<PauseCause>,
 }
 
 impl MissionProgress {
-    /// Whether the robot paused it of itself, for a stop or for teleoperation: then only a
-    /// person lets it go on.
+    /// Whether the robot itself paused the mission, because of a stop or teleoperation, so that
+    /// only a person may resume it.
     pub fn is_paused_for_safety(&self) -> bool {
         let is_for_safety = |cause| matches!(cause, PauseCause::Stop | PauseCause::Teleoperation);
         self.paused && self.paused_by.is_some_and(is_for_safety)
     }
 }
 
-/// What paused a mission. Whatever it was, only a request resumes it.
+/// Cause of a pause of a mission. The mission resumes only on request, whatever the cause.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum PauseCause {
-    /// A request to pause it.
+    /// A pause was requested.
     Request,
     /// The robot is teleoperated.
     Teleoperation,
     /// The robot was stopped.
     Stop,
-    /// Any cause of a newer peer.
+    /// Cause that this version does not know, from a newer peer.
     #[serde(other)]
     Other,
 }
 
-/// The state of a robot's durable store of measurements.
+/// State of a robot's outbox, its durable queue of records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 pub struct OutboxStatus {
-    /// Records that the server has not answered for.
+    /// Number of records that the server has not acknowledged.
     pub pending: u64,
-    /// Records lost since the store was made, because it was full.
+    /// Number of records lost since the outbox was created, because it was full.
     pub dropped: u64,
-    /// Records that the server refused, moved to the dead letters.
+    /// Number of records that the server refused; they are kept as dead letters.
     pub refused: u64,
 }
 
-/// The health of a robot's control loop.
+/// State of a robot's control loop.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct LoopStatus {
     /// Nominal rate, Hz.
     pub rate_hz: f64,
-    /// Ticks since the start.
+    /// Number of ticks since the start of the agent.
     pub ticks: u64,
-    /// Ticks that began more than one period late.
+    /// Number of ticks that began more than one period late.
     pub overruns: u64,
-    /// Longest computation of a tick since the last report, microseconds.
+    /// Maximum computing time of a tick since the last report, microseconds.
     pub tick_max_us: u32,
-    /// Commands refused since the start: they did not parse, or were of another version.
+    /// Number of commands refused since the start, because they were malformed or of another
+    /// payload version.
     #[serde(default)]
     pub commands_refused: u64,
-    /// Segments lost since the start, because they were not taken from the control loop in time.
+    /// Number of segments lost since the start, because they were not read from the control loop in
+    /// time.
     #[serde(default)]
     pub lost_segments: u64,
-    /// Measurements since the start that belong to no cell, for want of a site or a position.
+    /// Number of measurements since the start that could not be assigned to a cell, because the
+    /// site or the position was unknown.
     #[serde(default)]
     pub unplaced_blocks: u64,
-    /// Samples of the base lost since the start, because newer ones came before a tick.
+    /// Number of samples of the base lost since the start, because newer ones arrived before a
+    /// tick.
     #[serde(default)]
     pub lost_samples: u64,
-    /// Commands of the server lost since the start for want of room; it asks again.
+    /// Number of server commands lost since the start for lack of room in the queue; the server
+    /// repeats them.
     #[serde(default)]
     pub lost_commands: u64,
 }

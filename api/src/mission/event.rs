@@ -1,4 +1,4 @@
-//! What happened to a mission, when and by whom.
+//! Steps in a mission's history: what happened, when, and who caused it.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -6,56 +6,57 @@ use utoipa::ToSchema;
 
 use super::MissionState;
 
-/// Why a mission moved, for programs. Each edge of the server's table has one.
+/// Cause of a step in a mission's history, for programs. Each transition of the server's state
+/// table has one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Cause {
-    /// It was asked for.
+    /// A client requested the mission.
     #[default]
     Requested,
-    /// The server offers it to its robot.
+    /// The server offers the mission to its robot.
     Offered,
-    /// The robot cannot take it now; it waits again.
+    /// The robot cannot take the mission now; it returns to the queue.
     Returned,
-    /// The robot has taken it.
+    /// The robot accepted the mission.
     Accepted,
-    /// The robot will never take it.
+    /// The robot refused the mission for good.
     Rejected,
-    /// A pause is wanted.
+    /// A pause was requested.
     PauseRequested,
-    /// The robot holds it, standing.
+    /// The robot has stopped and holds the mission.
     Paused,
-    /// It is wanted to go on.
+    /// A resumption was requested.
     ResumeRequested,
-    /// The robot drives it again.
+    /// The robot drives the mission again.
     Resumed,
-    /// Another trajectory is wanted.
+    /// A replacement of the trajectory was requested.
     ReplaceRequested,
-    /// The robot holds the new revision.
+    /// The robot accepted the new revision.
     Replaced,
-    /// The robot refused the new revision, or it came too late; the old one stands.
+    /// The robot refused the new revision, or it came too late; the old revision stays in force.
     ReplaceRefused,
-    /// Its end is wanted.
+    /// A cancellation was requested.
     CancelRequested,
-    /// Another mission was asked for in its place.
+    /// A newer mission of the robot with start policy `replace` cancelled it.
     Superseded,
-    /// It ended by request.
+    /// The mission ended by request.
     Cancelled,
-    /// It was driven to its end.
+    /// The mission was driven to its end.
     Succeeded,
-    /// The robot gave it up.
+    /// The robot gave the mission up.
     Failed,
-    /// Its latest start passed.
+    /// The mission had not begun by its latest start.
     Expired,
-    /// The robot stayed away past the bound.
+    /// The robot was offline for longer than the mission allows.
     RobotLost,
-    /// The agent began a new run without it.
+    /// The agent restarted and no longer has the mission.
     AgentRestarted,
-    /// The robot is there, does not have it, and has not said how it ended.
+    /// The robot is online, does not have the mission, and has not reported its end.
     RobotForgot,
     /// The robot was retired.
     RobotRetired,
-    /// Something was only noted, such as a word that came too late.
+    /// Only a note, without a change of state, such as a report that came too late.
     Noted,
 }
 
@@ -87,7 +88,7 @@ impl Cause {
         Self::Noted,
     ];
 
-    /// The cause's name on the wire and in the database.
+    /// Returns the cause's name on the wire and in the database.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Requested => "requested",
@@ -116,26 +117,26 @@ impl Cause {
         }
     }
 
-    /// The cause of that name.
+    /// Returns the cause with this name; `None` if there is none.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|cause| cause.as_str() == name)
     }
 }
 
-/// Who caused an event.
+/// Party that caused a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Actor {
-    /// A request over REST.
+    /// A client, by a request over REST.
     Client,
-    /// The server itself.
+    /// The server.
     Server,
     /// The robot.
     Robot,
 }
 
 impl Actor {
-    /// The actor's name on the wire and in the database.
+    /// Returns the actor's name on the wire and in the database.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Client => "client",
@@ -144,7 +145,7 @@ impl Actor {
         }
     }
 
-    /// The actor of that name.
+    /// Returns the actor with this name; `None` if there is none.
     pub fn from_name(name: &str) -> Option<Self> {
         [Self::Client, Self::Server, Self::Robot]
             .into_iter()
@@ -152,19 +153,19 @@ impl Actor {
     }
 }
 
-/// One step in a mission's history.
+/// Step in a mission's history.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct MissionEvent {
-    /// When the server wrote it.
+    /// Time when the server recorded it.
     pub at: Timestamp,
-    /// Who caused it.
+    /// Party that caused it.
     pub actor: Actor,
-    /// The state before; `null` for the first.
+    /// State before the step; `null` for the first step.
     pub from: Option<MissionState>,
-    /// The state after; the same as before where only something was noted.
+    /// State after the step; equal to `from` if the state did not change.
     pub to: MissionState,
-    /// Why, for programs.
+    /// Cause, for programs.
     pub cause: Cause,
-    /// Why, for people.
+    /// Reason, for people; `null` without one.
     pub reason: Option<String>,
 }
