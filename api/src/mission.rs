@@ -143,8 +143,7 @@ pub enum LinkPolicy {
     /// Brakes along the path and ends the mission as failed when the server was silent for this
     /// time.
     StopAfter {
-        /// Silence of the server after which the robot brakes, seconds, [`LINK_SILENCE_MIN_S`] to
-        /// [`LINK_SILENCE_MAX_S`].
+        /// Silence of the server after which the robot brakes, seconds, 1 to 86 400.
         #[schema(minimum = 1.0, maximum = 86_400.0)]
         silence_s: f64,
     },
@@ -271,7 +270,7 @@ pub struct MissionQuality {
     pub gate_reduced_ratio: f64,
     /// Number of times that the safety gate began to hold the robot.
     pub gate_stops: u32,
-    /// Samples of θ along the driven path, at most [`THETA_SAMPLES_MAX`].
+    /// Samples of θ along the driven path, at most 64.
     pub theta: Vec<ThetaSample>,
     /// Value of the friction map's prior for this mission; absent when the map had no data along
     /// the path.
@@ -288,7 +287,7 @@ pub struct PriorGain {
     /// Fraction of the driven distance on cells for which the map had θ, 0 to 1.
     pub known_ratio: f64,
     /// Time for which θ was known, from the prior and the robot's measurements, with a relative
-    /// standard deviation of at most [`THETA_SURE_RATIO`], seconds.
+    /// standard deviation of at most 20 %, seconds.
     pub sure_s: f64,
     /// Time for which θ was known that accurately from the robot's own measurements alone, seconds.
     pub sure_alone_s: f64,
@@ -329,7 +328,7 @@ pub struct DrivenPath {
     /// Tolerance of the thinning, metres: the maximum distance of the full path from the polyline
     /// through `points`.
     pub tolerance_m: f64,
-    /// Points in driving order, in the site frame; at most [`DRIVEN_POINTS_MAX`].
+    /// Points in driving order, in the site frame; at most 2 000.
     pub points: Vec<Point>,
     /// Time at each point since the first wheel command, pauses included, seconds; interpolate
     /// linearly between points. Empty from an older agent.

@@ -215,7 +215,7 @@ pub struct AlertReport {
     pub code: AlertCode,
     /// Severity.
     pub severity: Severity,
-    /// Description, for people; at most [`ALERT_TEXT_MAX`] characters.
+    /// Description, for people; at most 300 characters.
     #[serde(deserialize_with = "crate::text::bounded::<_, {ALERT_TEXT_MAX}>")]
     pub text: String,
 }

@@ -1,7 +1,8 @@
-//! What may only slow a robot down: stops, leases of hand driving, external limits, geofences.
+//! Means that only reduce a robot's motion: stops, teleoperation leases, external limits,
+//! geofences.
 //!
-//! These words are the same over REST and on zenoh. The robot is the truth of all of them but the
-//! geofence, which its site has.
+//! The types are the same over REST and on zenoh. The robot is the authority on all of them, except
+//! the geofence, which belongs to its site.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -11,237 +12,243 @@ use uuid::Uuid;
 use crate::geometry::Polygon;
 use crate::ids::{OwnerId, StopId};
 
-/// Longest name of a person or program that stops or drives, in characters.
+/// Maximum length of the name of a person or program that stops or drives, characters.
 pub const BY_LENGTH_MAX: usize = 100;
-/// Most external limits of one robot at a time.
+/// Maximum number of external limits of one robot at a time.
 pub const LIMITS_MAX: usize = 32;
-/// Farthest that the end of an external limit may lie ahead, microseconds: one hour.
+/// Maximum time from now to the end of an external limit, microseconds: one hour.
 pub const LIMIT_AHEAD_MAX_US: u64 = 3_600_000_000;
-/// Farthest that the end of a drive command may lie ahead, microseconds.
+/// Maximum time from now to the end of a drive command, microseconds; a command with a later end is
+/// refused.
 pub const DRIVE_AHEAD_MAX_US: u64 = 1_000_000;
-/// Longest silence of a driver with which the lease stays, microseconds.
+/// Silence of the driver after which a lease ends, microseconds.
 pub const LEASE_SILENCE_MAX_US: u64 = 5_000_000;
-/// Largest zenoh payload of a drive command or an external limit, in bytes.
+/// Maximum size of the zenoh payload of a drive command or an external limit, bytes.
 pub const SMALL_PAYLOAD_MAX: usize = 1_024;
-/// Most polygons of a geofence.
+/// Maximum number of polygons of a geofence.
 pub const FENCE_POLYGONS_MAX: usize = 64;
-/// Most corners of all polygons of a geofence together; the robot looks at each in a tick.
+/// Maximum number of corners of all polygons of a geofence together; the robot checks every corner
+/// in each tick.
 pub const FENCE_CORNERS_MAX: usize = 1_000;
 
-/// A stop that is in force on a robot until an operator clears it.
+/// Latched stop of a robot, in force until a person clears it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct StopLatch {
-    /// The newest stop; a clear must name it.
+    /// Identifier of the newest stop; a request to clear it must name it.
     pub id: StopId,
-    /// Who stopped the robot, for people.
+    /// Name of the person or program that stopped the robot.
     #[serde(deserialize_with = "crate::text::bounded::<_, {crate::stop::STOP_TEXT_MAX}>")]
     pub by: String,
-    /// Why, for people.
+    /// Reason, for people.
     #[serde(deserialize_with = "crate::text::bounded::<_, {crate::mission::REASON_LENGTH_MAX}>")]
     pub reason: String,
-    /// When the robot latched it, by its own wall clock.
+    /// Time when the robot latched it, by the robot's wall clock.
     pub since: Timestamp,
 }
 
-/// Who wants to teleoperate the robot.
+/// Person who asks for, or has, the lease of teleoperation.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Driver {
-    /// One connection of one driver.
+    /// Identifier of one connection of the driver.
     pub client: Uuid,
-    /// Name for people, at most [`BY_LENGTH_MAX`] characters.
+    /// Name, for people, at most 100 characters.
     #[serde(deserialize_with = "crate::text::bounded::<_, {BY_LENGTH_MAX}>")]
     pub name: String,
 }
 
-/// A teleoperation lease, as the robot granted it.
+/// Teleoperation lease that the robot granted.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Lease {
-    /// Rises with every lease that is given, and never falls in a run of the agent.
+    /// Number of the lease, strictly increasing within one run of the agent.
     pub epoch: u64,
-    /// Who drives.
+    /// Driver that has the lease.
     pub driver: Driver,
 }
 
-/// Why a command was reduced before it reached the wheels; later values are stricter.
+/// Cause for which the gate reduced a command before it reached the wheels, in ascending order of
+/// strictness.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
 )]
 #[serde(rename_all = "snake_case")]
 pub enum GateCause {
-    /// The command changed faster than the wheels may.
+    /// The command exceeded an acceleration limit of the robot or its wheels.
     Acceleration,
-    /// The command was above a limit of the robot.
+    /// The command exceeded a speed limit of the robot or its wheels.
     Speed,
-    /// Drive commands come late: the slower the link, the slower the robot.
+    /// Drive commands arrive late; the later they arrive, the slower the robot drives.
     CommandAge,
-    /// An external limit slows the robot.
+    /// An external limit reduces the speed.
     ExternalLimit,
-    /// A fence is near, or has been crossed.
+    /// A fence is near, or was crossed.
     Fence,
-    /// The command was not a number.
+    /// The command was not a finite number.
     NotFinite,
     /// There was no command.
     NoCommand,
-    /// The teleoperator is silent, or the lease has ended.
+    /// The driver is silent, or the lease has ended.
     Lease,
-    /// The server has been silent for longer than the mission allows.
+    /// The server was silent for longer than the mission allows.
     LinkPolicy,
     /// An external limit holds the robot, or a required owner is silent.
     ExternalHold,
-    /// The robot's control loop does not keep its rate.
+    /// The control loop of the robot does not keep its rate.
     LoopOverrun,
-    /// Sensors contradict each other: the robot is held, or slowed down.
+    /// Sensors contradict each other; the robot is held or slowed down.
     SensorFault,
-    /// The robot does not know where it is.
+    /// The position of the robot is unknown or too old.
     StalePosition,
-    /// The robot leans too far.
+    /// The robot is tilted too far.
     Tilt,
-    /// The base has not been heard for too long.
+    /// The base has sent no valid feedback for too long.
     StaleFeedback,
     /// A stop is in force.
     Stop,
-    /// Any cause of a newer peer.
+    /// Cause that this version does not know, from a newer peer.
     #[serde(other)]
     Other,
 }
 
-/// How often the gate began to reduce for one cause.
+/// Number of times that one cause began to be in force.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct GateCount {
     /// The cause.
     pub cause: GateCause,
-    /// How often it began to be the strictest one, since the agent's start.
+    /// Number of times that it began to be the strictest cause, since the start of the agent.
     pub times: u64,
 }
 
-/// What the last stage before the wheels does.
+/// State of the gate, the last stage of the control loop, which can only reduce a command.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 pub struct GateStatus {
-    /// The strictest cause in the last tick; `null` while commands pass whole.
+    /// Strictest cause in the last tick; `null` while commands pass unchanged.
     pub cause: Option<GateCause>,
-    /// Ticks since the agent's start in which a command was reduced.
+    /// Number of ticks since the start of the agent in which a command was reduced.
     pub reduced_ticks: u64,
-    /// How often each cause began; those that never did are absent.
+    /// Number of times that each cause began; causes that never began are absent.
     #[serde(default)]
     pub counts: Vec<GateCount>,
 }
 
-/// What became of drive commands since the agent's start.
+/// Number of drive commands since the start of the agent, by result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 pub struct DriveCounts {
-    /// Taken.
+    /// Accepted commands.
     pub accepted: u64,
-    /// Of these: above a limit, and reduced to it.
+    /// Accepted commands that exceeded a limit and were reduced to it.
     pub over_limit: u64,
-    /// Refused: they do not parse, are too large, or are no numbers.
+    /// Refused commands that do not parse, are too large, or are not finite.
     pub malformed: u64,
-    /// Refused: another run of the agent, or another lease.
+    /// Refused commands that are addressed to another run of the agent or belong to another lease.
     pub foreign: u64,
-    /// Refused: not newer than one taken before.
+    /// Refused commands that are not newer than an accepted one.
     pub out_of_order: u64,
-    /// Refused: past their expiry, or with an expiry too far in the future.
+    /// Refused commands whose end has passed, or is too far in the future.
     pub expired: u64,
 }
 
-/// Teleoperation, as the robot reports it.
+/// State of teleoperation, as the robot reports it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct DriveStatus {
-    /// Age of drive commands on arrival, milliseconds, the worst of late; `null` without one.
+    /// Maximum recent age of drive commands on arrival, milliseconds; `null` without a recent
+    /// command.
     pub command_age_ms: Option<f64>,
-    /// Share of the robot's speed that this age allows, 0 to 1.
+    /// Fraction of the robot's speed limit that this age permits, 0 to 1.
     pub speed_share: f64,
-    /// What became of the commands.
+    /// Number of commands by result.
     pub counts: DriveCounts,
 }
 
-/// An external limit that a robot knows.
+/// External limit of a robot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct LimitStatus {
-    /// Who limits.
+    /// Owner of the limit: the program that sets it.
     #[serde(alias = "holder")]
     pub owner: OwnerId,
-    /// Whether the robot must hear this owner to move; it stays on hold while the owner is silent.
+    /// Whether the owner is required: the robot is on hold while a required owner is silent.
     pub required: bool,
-    /// Whether the robot is on hold now: because the owner asked, or because a required owner is
+    /// Whether the robot is on hold now, because the owner holds it or because a required owner is
     /// silent.
     pub hold: bool,
-    /// Fastest speed, m/s, if one was said.
+    /// Maximum speed, m/s; `null` if the owner set none.
     pub linear_max_m_s: Option<f64>,
-    /// Time until it expires, milliseconds; `null` for a required owner that is silent.
+    /// Time until the limit expires, milliseconds; `null` for a required owner that is silent.
     pub ends_in_ms: Option<u64>,
 }
 
-/// Whether a robot that is commanded to rest does: by wheels, odometry, gyro and position.
+/// Whether a robot that is commanded to rest is at standstill, measured by wheels, odometry, gyro
+/// and position.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 pub struct StandingStatus {
-    /// What is measured.
+    /// Measured state.
     pub state: StandingState,
-    /// Time from the command of rest until the robot stood, milliseconds; `null` until then.
+    /// Time from the command to rest until standstill, milliseconds; `null` before standstill.
     pub took_ms: Option<u64>,
 }
 
-/// What is measured of a robot that is commanded to rest.
+/// Measured state of a robot that is commanded to rest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum StandingState {
-    /// It brakes, or has not stood for long enough to be sure.
+    /// Braking, or not yet at rest for long enough to be certain.
     #[default]
     Stopping,
-    /// It stands.
+    /// At standstill.
     Standing,
-    /// It should stand by now and moves: its base does not obey.
+    /// Still moving after the time in which it should have stopped: its base does not obey.
     DoesNotStand,
-    /// It stood and moves again: it is pushed, rolls away, or somebody else drives it.
+    /// Moving again after standstill: it is pushed, rolls, or another program commands it.
     Moves,
-    /// Anything else, of a newer peer.
+    /// State that this version does not know, from a newer peer.
     #[serde(other)]
     Other,
 }
 
-/// Everything on a robot that may only slow it down.
+/// Everything on a robot that only reduces its motion.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct SafetyStatus {
-    /// The stop in force.
+    /// Stop in force; absent without one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stop: Option<StopLatch>,
-    /// Who teleoperates the robot.
+    /// Teleoperation lease; absent while nobody has it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub lease: Option<Lease>,
-    /// Teleoperation; absent before the first lease.
+    /// State of teleoperation; absent before the first lease.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub drive: Option<DriveStatus>,
-    /// The gate.
+    /// State of the gate.
     #[serde(default)]
     pub gate: GateStatus,
-    /// External limits, at most [`LIMITS_MAX`].
+    /// External limits, at most 32.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub limits: Vec<LimitStatus>,
-    /// External limits refused since the agent's start.
+    /// Number of external limits refused since the start of the agent.
     #[serde(default)]
     pub limits_refused: u64,
-    /// Whether the robot stands, as measured; absent while it may drive.
+    /// Whether the robot is at standstill, as measured; absent while it is permitted to drive.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub standing: Option<StandingStatus>,
-    /// The revision of the geofence that the robot has; absent before it knows its site.
+    /// Revision of the geofence on the robot; absent before the robot has its site's definition.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fence_revision: Option<u64>,
 }
 
-/// Where the robots of a site may be.
+/// Geofence of a site: the area within which its robots drive.
 ///
-/// A robot keeps within one of the `keep_in` polygons, if there is any, and out of all `keep_out`
-/// polygons; where it is to pass from one polygon into another, they overlap by its size.
+/// A robot stays inside one of the `keep_in` polygons, if there are any, and outside all `keep_out`
+/// polygons. A robot passes from one `keep_in` polygon into another only if they overlap by at
+/// least its size.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct Geofence {
-    /// Counts changes; 0 is a site that never had one.
+    /// Number of changes of the geofence; 0 for a site that never had one.
     pub revision: u64,
-    /// Where robots may be; anywhere when empty.
+    /// Polygons inside which robots stay; no restriction when empty.
     pub keep_in: Vec<Polygon>,
-    /// Where robots may not be.
+    /// Polygons outside which robots stay.
     pub keep_out: Vec<Polygon>,
 }
 
-/// Why polygons make no geofence.
+/// Reason why polygons do not form a geofence.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidGeofence {
     /// More than [`FENCE_POLYGONS_MAX`] polygons.
@@ -252,41 +259,41 @@ pub enum InvalidGeofence {
     Corners(usize),
 }
 
-/// The body of `PUT /v1/sites/{site}/geofence`: replaces the whole of it.
+/// Body of `PUT /v1/sites/{site}/geofence`, which replaces the whole geofence.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct ReplaceGeofence {
-    /// Where robots may be; anywhere when empty.
+    /// Polygons inside which robots must stay; no restriction when empty.
     #[serde(default)]
     pub keep_in: Vec<Polygon>,
-    /// Where robots may not be.
+    /// Polygons outside which robots must stay.
     #[serde(default)]
     pub keep_out: Vec<Polygon>,
 }
 
-/// The body of `PUT /v1/sites/{site}/robots/{robot}/limits/{owner}`.
+/// Body of `PUT /v1/sites/{site}/robots/{robot}/limits/{owner}`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct SetLimit {
-    /// Whether the robot is to stand.
+    /// Whether to hold the robot at rest.
     #[serde(default)]
     pub hold: bool,
-    /// Fastest speed, m/s, not negative; as before when absent.
+    /// Maximum speed, m/s, not negative; unchanged when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub linear_max_m_s: Option<f64>,
-    /// How long it lasts, milliseconds, at most an hour; say it again before it ends.
+    /// Duration of the limit, milliseconds, 1 to 3 600 000 (one hour); renew it before it ends.
     #[schema(minimum = 1, maximum = 3_600_000)]
     pub for_ms: u64,
 }
 
 impl Geofence {
-    /// Whether it bounds nothing.
+    /// Whether the geofence has no polygons.
     pub fn is_empty(&self) -> bool {
         self.keep_in.is_empty() && self.keep_out.is_empty()
     }
 
-    /// Checks its size.
+    /// Checks the numbers of polygons and corners.
     ///
     /// # Errors
-    /// [`InvalidGeofence`]: more than a robot can look at in a tick.
+    /// [`InvalidGeofence`] if there are more than a robot can check in a tick.
     pub fn validate(&self) -> Result<(), InvalidGeofence> {
         let polygons = self.keep_in.len() + self.keep_out.len();
         if polygons > FENCE_POLYGONS_MAX {

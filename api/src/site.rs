@@ -1,4 +1,4 @@
-//! Sites and their grids.
+//! Sites, their grids of cells, and their position in WGS 84.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -7,18 +7,18 @@ use utoipa::ToSchema;
 use crate::geometry::Point;
 use crate::ids::SiteId;
 
-/// Smallest side of a cell, metres.
+/// Minimum side of a cell, metres.
 pub const CELL_MIN_M: f64 = 0.1;
-/// Largest side of a cell, metres.
+/// Maximum side of a cell, metres.
 pub const CELL_MAX_M: f64 = 100.0;
-/// Longest name of anything, in characters.
+/// Maximum length of the name of a site, terrain, robot or base, characters.
 pub const NAME_LENGTH_MAX: usize = 200;
 
-/// The squares in which friction is kept.
+/// Grid of square cells in which the friction of a site is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(try_from = "GridFields")]
 pub struct Grid {
-    /// Counts changes of the grid; a segment names the one it was cut by.
+    /// Number of changes of the grid; a segment names the revision to which its cell refers.
     pub revision: u32,
     /// Side of a cell, metres.
     #[schema(minimum = 0.1, maximum = 100.0, example = 1.0)]
@@ -26,7 +26,7 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// The cell that contains a point; `None` if the point is off the map.
+    /// Returns the cell that contains a point; `None` if the point is off the map.
     pub fn cell_at(&self, point: Point) -> Option<Cell> {
         point.is_on_the_map().then(|| {
             #[expect(
@@ -41,7 +41,7 @@ impl Grid {
         })
     }
 
-    /// The middle of a cell.
+    /// Returns the centre of a cell.
     pub fn center_of(&self, cell: Cell) -> Point {
         let middle = |index: i32| (f64::from(index) + 0.5) * self.cell_m;
         Point {
@@ -57,7 +57,7 @@ struct GridFields {
     cell_m: f64,
 }
 
-/// Why something is not a grid.
+/// Error for a cell side that is out of range; contains the side, metres.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[error("cell_m must be {CELL_MIN_M} to {CELL_MAX_M}, not {0}")]
 pub struct InvalidGrid(f64);
@@ -74,25 +74,25 @@ impl TryFrom<GridFields> for Grid {
     }
 }
 
-/// One square of a site's grid, counted from the origin.
+/// Cell of a site's grid, by the indices of its column and row from the origin.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
 )]
 pub struct Cell {
-    /// Column: the cell spans `ix · cell_m` to `(ix + 1) · cell_m` in x.
+    /// Column index: the cell spans `ix · cell_m` to `(ix + 1) · cell_m` in x.
     pub ix: i32,
-    /// Row, likewise in y.
+    /// Row index: the cell spans `iy · cell_m` to `(iy + 1) · cell_m` in y.
     pub iy: i32,
 }
 
-/// Where on the earth a site's origin lies, and how the site is turned.
+/// Position of a site's origin in WGS 84, and orientation of the site's frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(try_from = "GeoOriginFields")]
 pub struct GeoOrigin {
-    /// Latitude of the origin in WGS 84, degrees north.
+    /// Latitude of the origin in WGS 84, degrees, positive north.
     #[schema(minimum = -90.0, maximum = 90.0)]
     pub latitude_deg: f64,
-    /// Longitude of the origin in WGS 84, degrees east.
+    /// Longitude of the origin in WGS 84, degrees, positive east.
     #[schema(minimum = -180.0, maximum = 180.0)]
     pub longitude_deg: f64,
     /// Angle from east to the site's x axis, counter-clockwise, degrees; 0 when absent.
@@ -110,7 +110,7 @@ struct GeoOriginFields {
     x_axis_deg: f64,
 }
 
-/// Why something is no place on the earth.
+/// Error for a coordinate or angle that is out of range.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[error("{field} must be -{most} to {most}, not {value}")]
 pub struct InvalidGeoOrigin {
@@ -145,40 +145,40 @@ impl TryFrom<GeoOriginFields> for GeoOrigin {
     }
 }
 
-/// A site as the server keeps it.
+/// Site as the server stores it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Site {
-    /// The site's identifier, a chunk of every zenoh key.
+    /// Identifier of the site, a chunk of every zenoh key.
     pub id: SiteId,
-    /// Name for people.
+    /// Name, for people.
     pub name: String,
-    /// The grid of the site's friction map.
+    /// Grid of the friction map.
     pub grid: Grid,
-    /// Counts changes of the site's terrains.
+    /// Number of changes of the site's terrains.
     pub terrain_revision: u64,
-    /// Counts changes of the site's geofence.
+    /// Number of changes of the site's geofence.
     #[serde(default)]
     pub geofence_revision: u64,
-    /// Position of the site on the earth, if it was set.
+    /// Position in WGS 84; absent if the site is not tied to it.
     #[serde(default)]
     pub origin: Option<GeoOrigin>,
-    /// When the site was made.
+    /// Time when the site was created.
     pub created_at: Timestamp,
 }
 
-/// The body of `POST /v1/sites`.
+/// Body of `POST /v1/sites`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct CreateSite {
-    /// The identifier to use.
+    /// Identifier of the new site.
     pub id: SiteId,
-    /// Name for people; the identifier when absent.
+    /// Name, for people; equal to the identifier when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
-    /// Side of a cell, metres; 1 m when absent.
+    /// Side of a cell, metres; 1 m when absent. It cannot be changed later.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0.1, maximum = 100.0)]
     pub cell_m: Option<f64>,
-    /// Where on the earth the site lies; it may be said later.
+    /// Position of the site in WGS 84; it can be set later when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub origin: Option<GeoOrigin>,
 }

@@ -1,17 +1,17 @@
-//! What becomes of a robot's other missions when one is asked for.
+//! Effect of a new mission on the other missions of its robot.
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-/// What becomes of a robot's other missions when one is asked for.
+/// Effect of a new mission on the other missions of its robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum StartPolicy {
-    /// The new one waits for its turn.
+    /// The new mission waits in the queue.
     #[default]
     Append,
-    /// The others are cancelled: the active one, and all that wait.
+    /// The other missions are cancelled, the active and the queued ones.
     Replace,
-    /// The new one is refused if the robot has any other that has not ended.
+    /// The new mission is refused if the robot has another mission that has not ended.
     Refuse,
 }

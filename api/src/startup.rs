@@ -1,27 +1,28 @@
-//! What agent and server do before anything else: give zenoh more threads than it takes by itself.
+//! Start of agent and server: gives zenoh more threads than its default.
 //!
-//! zenoh closes a TCP link lingering: the thread that closes one over which nothing gets through
-//! stands still until the kernel has given up on what was still to be sent, for up to ten seconds.
-//! By itself zenoh has one thread to send with and two to receive, so whoever came back over a new
-//! link stayed mute for seconds behind the closing of the old one. With a few threads more the new
-//! link does not wait.
+//! zenoh closes a TCP link with lingering: the closing thread blocks until the kernel has given up
+//! sending the remaining data, for up to ten seconds on a dead link. By default zenoh has one
+//! thread for sending and two for receiving, so that a peer which reconnects over a new link sends
+//! nothing for seconds while the old link closes. With additional threads the new link does not
+//! wait.
 
 use std::io::{self, Error};
 use std::os::unix::process::CommandExt as _;
 use std::process::Command;
 
-/// What zenoh reads the numbers of its threads from, once.
+/// Environment variable from which zenoh reads its numbers of threads, once.
 const VARIABLE: &str = "ZENOH_RUNTIME";
-/// As many as links may be closing at once, and one that works.
+/// One thread more in each pool than links are expected to close at once.
 const THREADS: &str =
     "(tx: (worker_threads: 4), rx: (worker_threads: 4), net: (worker_threads: 4))";
 
-/// Replaces this process by the same one with more threads for zenoh, unless somebody has said how
-/// many it is to have: a process cannot safely change its own environment. For the beginning of a
-/// program, as everything that it has done is lost.
+/// Replaces this process by the same program with more threads for zenoh, unless the environment
+/// variable `ZENOH_RUNTIME` is set already; a process cannot safely change its own environment.
+/// Call it at the beginning of `main`, since all state of the process is lost.
 ///
 /// # Errors
-/// The process cannot be replaced. It works without, but may be mute for seconds after a cut.
+/// The error of `exec` if the process cannot be replaced. The program works without it, but may
+/// send nothing for seconds after a loss of the link.
 pub fn give_zenoh_threads() -> io::Result<()> {
     if std::env::var_os(VARIABLE).is_some() {
         return Ok(());

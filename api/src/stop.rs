@@ -1,6 +1,6 @@
-//! Stops over REST: stop a robot or a fleet at once, see what became of it, clear it.
+//! Stops over REST: stop a robot or a fleet, read the progress of a stop, clear it.
 //!
-//! A stop is not a safety-rated emergency stop: it goes over a network and through programs.
+//! A stop is not a safety-rated emergency stop: it depends on a network and on software.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -8,24 +8,25 @@ use utoipa::ToSchema;
 
 use crate::ids::{RobotId, SiteId, StopId};
 
-/// How long a robot may take to confirm a stop before the stop is shown as unconfirmed,
-/// milliseconds.
+/// Time in which a robot confirms a stop, milliseconds; a stop without confirmation counts as
+/// unconfirmed afterwards.
 pub const STOP_CONFIRM_MAX_MS: u64 = 300;
-/// Longest name of who stops, and longest reason, in characters; what is longer is cut.
+/// Maximum length of the author's name and of the reason of a stop, characters; the rest is cut
+/// off.
 pub const STOP_TEXT_MAX: usize = 200;
 
-/// The body of `POST /v1/sites/{site}/robots/{robot}/stop`; it may be left out, and one that does
-/// not read stops the robot all the same.
+/// Body of `POST /v1/sites/{site}/robots/{robot}/stop`. It is optional, and an invalid body stops
+/// the robot too.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 pub struct StopRobot {
-    /// Who stops, for people; the token's name stands before it.
+    /// Name of the person who stops; the token's name is put before it.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
         deserialize_with = "crate::text::bounded_option::<_, {STOP_TEXT_MAX}>"
     )]
     pub by: Option<String>,
-    /// Why, for people.
+    /// Reason, for people.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
@@ -34,21 +35,21 @@ pub struct StopRobot {
     pub reason: Option<String>,
 }
 
-/// The body of `POST /v1/stop`; it may be left out, and one that does not read stops every robot, but
-/// for a `site` that is no identifier: that is refused.
+/// Body of `POST /v1/stop`. It is optional, and an invalid body stops every robot too; only a
+/// `site` that is not an identifier is refused.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 pub struct StopFleet {
-    /// Only the robots of this site.
+    /// Site whose robots are stopped; the robots of all sites when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub site: Option<SiteId>,
-    /// Who stops, for people; the token's name stands before it.
+    /// Name of the person who stops; the token's name is put before it.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
         deserialize_with = "crate::text::bounded_option::<_, {STOP_TEXT_MAX}>"
     )]
     pub by: Option<String>,
-    /// Why, for people.
+    /// Reason, for people.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
@@ -57,12 +58,13 @@ pub struct StopFleet {
     pub reason: Option<String>,
 }
 
-/// The body of `POST /v1/sites/{site}/robots/{robot}/stop/clear`.
+/// Body of `POST /v1/sites/{site}/robots/{robot}/stop/clear`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct ClearStop {
-    /// The newest stop of the robot: a clear never clears one that its author has not seen.
+    /// Newest stop of the robot. The request is refused if there is a newer one, so that no unseen
+    /// stop is cleared.
     pub stop: StopId,
-    /// Who clears, for people; the token's name stands before it.
+    /// Name of the person who clears; the token's name is put before it.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
@@ -71,50 +73,50 @@ pub struct ClearStop {
     pub by: Option<String>,
 }
 
-/// A stop of one robot with what became of it.
+/// Stop of one robot, with its confirmation and its clearing.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Stop {
-    /// The stop's identifier; needed to clear it.
+    /// Identifier of the stop; required to clear it.
     pub id: StopId,
-    /// The robot's site.
+    /// Site of the robot.
     pub site: SiteId,
-    /// The robot.
+    /// Robot that is stopped.
     pub robot: RobotId,
-    /// Who stopped.
+    /// Name of the person or program that stopped the robot.
     pub by: String,
-    /// Why.
+    /// Reason, for people.
     pub reason: String,
-    /// When the server was asked.
+    /// Time when the server received the request.
     pub wanted_at: Timestamp,
-    /// When it was commanded: the server heard that the robot's wheels are commanded to rest and
-    /// that it will remember the stop over a restart; `null` until then.
+    /// Time when the robot confirmed the stop: its wheels are commanded to rest, and the stop
+    /// survives a restart of the robot. `null` before that.
     pub confirmed_at: Option<Timestamp>,
-    /// When the server heard that the robot was measured to stand, by wheels, odometry, gyro and
-    /// position; `null` until then. A robot that does not stand in time raises the alert
-    /// `does-not-stand`.
+    /// Time when the server was informed that the robot is at standstill, measured by wheels,
+    /// odometry, gyro and position; `null` before that. A robot that does not come to rest in time
+    /// raises the alert `does-not-stand`.
     pub standing_at: Option<Timestamp>,
-    /// Whether the robot has not confirmed within 300 ms. The server repeats the stop until it
-    /// does.
+    /// Whether the robot has not confirmed the stop within 300 ms. The server repeats the stop
+    /// until it is confirmed.
     pub unconfirmed: bool,
-    /// Who asked last to clear it.
+    /// Name of the person who asked last to clear the stop; `null` if nobody did.
     pub clear_asked_by: Option<String>,
-    /// When that was.
+    /// Time of that request; `null` if there was none.
     pub clear_asked_at: Option<Timestamp>,
-    /// When the robot had cleared it.
+    /// Time when the robot had cleared it; `null` before that.
     pub cleared_at: Option<Timestamp>,
-    /// The stop of the same robot that came after it and took its place: a robot has at most one
-    /// stop in force. `null` for the newest.
+    /// Newer stop of the same robot that replaced this one, since a robot has at most one stop in
+    /// force; `null` for the newest stop.
     #[serde(default)]
     pub replaced_by: Option<StopId>,
 }
 
-/// The answer to `POST /v1/stop`: one stop for each robot.
+/// Answer to `POST /v1/stop`: one stop per robot.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct FleetStop {
-    /// How many robots had confirmed when the answer was made.
+    /// Number of robots that had confirmed when the answer was made.
     pub confirmed: usize,
-    /// How many had not; the server repeats the stop until they do.
+    /// Number of robots that had not confirmed; the server repeats the stop until they do.
     pub unconfirmed: usize,
-    /// The stops.
+    /// Stops of all robots concerned.
     pub stops: Vec<Stop>,
 }

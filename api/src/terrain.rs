@@ -1,4 +1,4 @@
-//! Terrains: named polygons with a class.
+//! Terrains: named polygons of a site, each with a class of ground.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -7,10 +7,10 @@ use utoipa::ToSchema;
 use crate::geometry::{Point, Polygon};
 use crate::ids::TerrainId;
 
-/// Most terrains of one site; each robot carries them all.
+/// Maximum number of terrains of one site; every robot stores them all.
 pub const TERRAINS_MAX: usize = 1_000;
 
-/// What kind of ground a terrain is.
+/// Class of ground of a terrain.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
 )]
@@ -32,78 +32,81 @@ pub enum TerrainClass {
     Other,
 }
 
-/// A terrain as the server keeps it.
+/// Terrain as the server stores it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Terrain {
-    /// The terrain's identifier within its site.
+    /// Identifier of the terrain within its site.
     pub id: TerrainId,
-    /// Counts changes of this terrain; a segment names the one it was measured on.
+    /// Number of changes of this terrain; a segment names the revision on which it was measured.
     pub revision: u32,
-    /// Name for people.
+    /// Name, for people.
     pub name: String,
-    /// Kind of ground.
+    /// Class of the ground.
     pub class: TerrainClass,
-    /// Where it lies.
+    /// Border of the terrain in the site frame.
     pub polygon: Polygon,
-    /// Where terrains overlap the higher layer counts; of equal ones the smaller identifier.
+    /// Layer. Where terrains overlap, the highest layer applies; at equal layers, the smaller
+    /// identifier.
     pub layer: i32,
-    /// When this revision was written.
+    /// Time when this revision was written.
     pub updated_at: Timestamp,
 }
 
-/// The body of `POST /v1/sites/{site}/terrains`.
+/// Body of `POST /v1/sites/{site}/terrains`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct CreateTerrain {
-    /// The identifier to use, unique within the site.
+    /// Identifier of the new terrain, unique within the site.
     pub id: TerrainId,
-    /// Name for people; the identifier when absent.
+    /// Name, for people; equal to the identifier when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
-    /// Kind of ground.
+    /// Class of the ground.
     pub class: TerrainClass,
-    /// Where it lies: 3 to 1000 corners of a simple polygon.
+    /// Border of the terrain in the site frame: 3 to 1000 corners of a simple polygon.
     pub polygon: Polygon,
-    /// Where terrains overlap the higher layer counts; 0 when absent.
+    /// Layer; 0 when absent. Where terrains overlap, the highest layer applies.
     #[serde(default)]
     pub layer: i32,
 }
 
-/// The body of `PUT /v1/sites/{site}/terrains/{terrain}`: replaces everything but the identifier.
+/// Body of `PUT /v1/sites/{site}/terrains/{terrain}`, which replaces everything but the identifier.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ReplaceTerrain {
-    /// Name for people; the identifier when absent.
+    /// Name, for people; equal to the identifier when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
-    /// Kind of ground.
+    /// Class of the ground.
     pub class: TerrainClass,
-    /// Where it lies: 3 to 1000 corners of a simple polygon.
+    /// Border of the terrain in the site frame: 3 to 1000 corners of a simple polygon.
     pub polygon: Polygon,
-    /// Where terrains overlap the higher layer counts; 0 when absent.
+    /// Layer; 0 when absent. Where terrains overlap, the highest layer applies.
     #[serde(default)]
     pub layer: i32,
 }
 
-/// Which revision of which terrain a measurement belongs to.
+/// Reference to one revision of a terrain.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema)]
 pub struct TerrainRef {
-    /// The terrain.
+    /// Identifier of the terrain.
     pub id: TerrainId,
-    /// Its revision at the time.
+    /// Revision of the terrain.
     pub revision: u32,
 }
 
-/// The part of a terrain that a robot needs to tell on which one it drives.
+/// Shape of a terrain, from which a robot determines the terrain under it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct TerrainShape {
-    /// The terrain and its revision.
+    /// Terrain and its revision.
     pub terrain: TerrainRef,
-    /// Where it lies.
+    /// Border of the terrain in the site frame.
     pub polygon: Polygon,
-    /// Where terrains overlap the higher layer counts; of equal ones the smaller identifier.
+    /// Layer. Where terrains overlap, the highest layer applies; at equal layers, the smaller
+    /// identifier.
     pub layer: i32,
 }
 
-/// The terrain under a point: the highest layer, of equal ones the smaller identifier.
+/// Returns the terrain under a point: that of the highest layer, at equal layers that of the
+/// smaller identifier. `None` where there is no terrain.
 pub fn terrain_at(shapes: &[TerrainShape], point: Point) -> Option<&TerrainShape> {
     shapes
         .iter()

@@ -1,12 +1,12 @@
-//! Texts that people and robots give: names, reasons, details. They have bounds, and nothing in them
-//! that a terminal or a page would act on instead of showing it.
+//! Texts from people and robots: names, reasons, details. Their length is bounded, and they contain
+//! no character that a terminal or a page would interpret instead of displaying it.
 
 use std::borrow::Cow;
 
 use serde::{Deserialize, Deserializer};
 
-/// Whether a character shows as itself: none that moves a cursor, ends a line, turns the direction of
-/// writing round, or cannot be seen.
+/// Whether a character is displayed as itself: it neither moves a cursor, nor ends a line, nor
+/// changes the direction of writing, nor is invisible.
 pub fn is_printable(letter: char) -> bool {
     !letter.is_control()
         && !matches!(
@@ -23,21 +23,21 @@ pub fn is_printable(letter: char) -> bool {
         )
 }
 
-/// Why a text cannot be taken.
+/// Reason why a text is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidText {
-    /// It is empty or too long.
+    /// The text is empty or too long; contains the maximum length, characters.
     #[error("it has 1 to {0} characters")]
     Length(usize),
-    /// It has a character that does not show as itself.
+    /// The text contains a character that is not printable by [`is_printable`].
     #[error("it has the character U+{:04X}, which cannot be seen", u32::from(*.0))]
     NotPrintable(char),
 }
 
-/// A line for people as it was given, without blanks around it.
+/// Returns a single-line text without surrounding white space, otherwise unchanged.
 ///
 /// # Errors
-/// [`InvalidText`].
+/// [`InvalidText`] if it is empty, longer than `length_max` characters, or not printable.
 pub fn line(text: &str, length_max: usize) -> Result<&str, InvalidText> {
     let text = text.trim();
     if text.is_empty() || text.chars().count() > length_max {
@@ -49,19 +49,19 @@ pub fn line(text: &str, length_max: usize) -> Result<&str, InvalidText> {
     }
 }
 
-/// What of a text can be shown, at most so many characters of it, without blanks around it: what is
-/// not printable becomes a blank. For texts that must be taken whatever they are, as the reason of a
-/// stop and what robots say.
+/// Returns at most `length_max` characters of a text, without surrounding white space and with a
+/// space in place of each unprintable character. For texts that must not be refused, such as the
+/// reason of a stop or a text from a robot.
 pub fn cleaned(text: &str, length_max: usize) -> String {
     let shown = |letter| if is_printable(letter) { letter } else { ' ' };
     let text: String = text.trim().chars().map(shown).take(length_max).collect();
     text.trim().to_owned()
 }
 
-/// Reads a text for `#[serde(deserialize_with)]` and keeps what [`cleaned`] keeps of it.
+/// Reads a text, for `#[serde(deserialize_with)]`, and applies [`cleaned`] to it.
 ///
 /// # Errors
-/// There is no text.
+/// The value is not a text.
 pub fn bounded<'de, D: Deserializer<'de>, const LENGTH_MAX: usize>(
     deserializer: D,
 ) -> Result<String, D::Error> {
@@ -69,10 +69,10 @@ pub fn bounded<'de, D: Deserializer<'de>, const LENGTH_MAX: usize>(
     Ok(cleaned(&text, LENGTH_MAX))
 }
 
-/// The same for a text that may be absent or `null`.
+/// Reads a text that may be absent or `null`, and applies [`cleaned`] to it.
 ///
 /// # Errors
-/// There is something else than a text.
+/// The value is neither a text nor `null`.
 pub fn bounded_option<'de, D: Deserializer<'de>, const LENGTH_MAX: usize>(
     deserializer: D,
 ) -> Result<Option<String>, D::Error> {
@@ -80,7 +80,7 @@ pub fn bounded_option<'de, D: Deserializer<'de>, const LENGTH_MAX: usize>(
     Ok(text.map(|text| cleaned(&text, LENGTH_MAX)))
 }
 
-/// A text in which everything that is not printable stands as an escape such as `\u{1b}`.
+/// Returns the text with every unprintable character replaced by an escape such as `\u{1b}`.
 pub fn escaped(text: &str) -> Cow<'_, str> {
     if text.chars().all(is_printable) {
         return Cow::Borrowed(text);

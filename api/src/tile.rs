@@ -1,29 +1,29 @@
-//! A piece of the friction map as compact binary: 4 bytes for each square.
+//! Compact binary form of a section of the friction map: 4 bytes per square.
 //!
-//! Little-endian throughout. The header, then three planes, each row by row from the lowest y, each
-//! row from the lowest x:
+//! All numbers are little-endian. The header is followed by three planes, each row by row from the
+//! lowest y, each row from the lowest x:
 //!
-//! | offset | type | what |
+//! | offset | type | content |
 //! |---|---|---|
 //! | 0 | 4 bytes | `TRFM` |
 //! | 4 | u16 | version, 1 |
 //! | 6 | u16 | length of the header in bytes, at least 64 |
-//! | 8 | u32 | columns |
-//! | 12 | u32 | rows |
-//! | 16 | i32 | number of the first column, counted from the origin in squares |
-//! | 20 | i32 | number of the first row |
+//! | 8 | u32 | number of columns |
+//! | 12 | u32 | number of rows |
+//! | 16 | i32 | index of the first column, in squares from the origin |
+//! | 20 | i32 | index of the first row |
 //! | 24 | f64 | side of a square, metres |
 //! | 32 | i64 | time at which ages are counted, microseconds since 1970 |
 //! | 40 | u32 | revision of the grid |
 //! | 44 | u32 | 0 |
-//! | 48 | 16 bytes | configuration (robot model and tyres), a UUID; zeros if nobody has measured |
-//! | 64 | UTF-8 | name of the normalisation that was used, up to the end of the header; may be empty |
+//! | 48 | 16 bytes | configuration (robot model and tyres), a UUID; zeros without any measurement |
+//! | 64 | UTF-8 | name of the applied normalisation, up to the end of the header; may be empty |
 //! | header | u16 × n | mean: 0 is unknown, else `θ = 10⁻⁶ · 10^(8·(code − 1)/65 534)` |
-//! | + 2n | u8 × n | standard deviation: `σ = 10⁻⁵ · 10^(6·code/255)`, never less than it is |
-//! | + 3n | u8 × n | count: `segments = 2^(code/8)`, rounded; 0 is one |
+//! | + 2n | u8 × n | standard deviation: `σ = 10⁻⁵ · 10^(6·code/255)`, rounded up |
+//! | + 3n | u8 × n | count: `segments = 2^(code/8)`, rounded; code 0 is one segment |
 //!
-//! A mean is within 0.015 % of what it was, a standard deviation at most 5.6 % too large, a count
-//! within 4.5 %.
+//! The encoding changes a mean by at most 0.015 %, increases a standard deviation by at most 5.6 %,
+//! and changes a count by at most 4.5 %. Values beyond the range of a code are encoded as its end.
 
 use std::f64::consts::LOG10_E;
 
@@ -32,92 +32,93 @@ use uuid::Uuid;
 use crate::ids::ConfigurationId;
 use crate::site::Cell;
 
-/// The media type of a tile.
+/// Media type of a tile.
 pub const MEDIA_TYPE: &str = "application/vnd.tread.friction-tile";
-/// The first bytes of a tile.
+/// First bytes of a tile.
 const MAGIC: [u8; 4] = *b"TRFM";
-/// The version that this writes and reads.
+/// Version of the format that this module writes and reads.
 const VERSION: u16 = 1;
-/// Bytes of the header before the name of the normalisation.
+/// Length of the header without the name of the normalisation, bytes.
 const HEADER: usize = 64;
-/// Bytes of each square.
+/// Size of one square, bytes.
 const SQUARE: usize = 4;
-/// Most squares that are read: 4 096 by 4 096.
+/// Maximum number of squares that are read: 4 096 by 4 096.
 pub const SQUARES_MAX: usize = 1 << 24;
 
-/// Lowest θ that is distinguished, as a power of ten.
+/// Decimal logarithm of the lowest θ that can be encoded.
 const THETA_LOW_LOG: f64 = -6.0;
-/// Powers of ten from the lowest to the highest θ.
+/// Range of θ that can be encoded, in decades.
 const THETA_SPAN_LOG: f64 = 8.0;
-/// Lowest standard deviation that is distinguished, as a power of ten.
+/// Decimal logarithm of the lowest standard deviation that can be encoded.
 const STD_DEV_LOW_LOG: f64 = -5.0;
-/// Powers of ten from the lowest to the highest standard deviation.
+/// Range of the standard deviation that can be encoded, in decades.
 const STD_DEV_SPAN_LOG: f64 = 6.0;
-/// Steps from a count to its double.
+/// Number of codes per doubling of the count.
 const COUNT_STEPS: f64 = 8.0;
 
-/// What a square of a tile knows.
+/// Friction of one square of a tile.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TileSquare {
-    /// θ.
+    /// Mean of θ.
     pub theta: f64,
-    /// Its standard deviation.
+    /// Standard deviation of θ.
     pub std_dev: f64,
-    /// Segments that were ever measured here.
+    /// Number of all segments ever measured here.
     pub segments: u32,
 }
 
-/// A piece of the friction map.
+/// Section of the friction map, for one configuration.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tile {
-    /// How many columns.
+    /// Number of columns.
     pub columns: u32,
-    /// How many rows.
+    /// Number of rows.
     pub rows: u32,
-    /// Number of the first column and row, in squares from the origin.
+    /// Indices of the first column and row, in squares from the origin.
     pub first: Cell,
     /// Side of a square, metres.
     pub size_m: f64,
-    /// The time at which ages are counted, microseconds since 1970.
+    /// Time at which ages are counted, microseconds since 1970.
     pub as_of_us: i64,
     /// Revision of the grid.
     pub grid_revision: u32,
-    /// Whose θ it is; `None` if nobody has measured anything.
+    /// Configuration for which θ holds; `None` without any measurement.
     pub configuration: Option<ConfigurationId>,
-    /// The normalisation that was used, if any.
+    /// Name of the applied normalisation; `None` if there was none.
     pub normalisation: Option<String>,
-    /// Row by row from the lowest y, each from the lowest x.
+    /// Squares row by row from the lowest y, each row from the lowest x; `None` where θ is unknown.
     pub squares: Vec<Option<TileSquare>>,
 }
 
-/// Why bytes are no tile.
+/// Reason why bytes are not a tile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidTile {
-    /// They do not begin as a tile does.
+    /// The bytes do not begin with the magic number, end within the header, or contain an invalid
+    /// name.
     #[error("this is no friction tile")]
     NotATile,
-    /// A version that is not known here.
+    /// The version of the format is unknown.
     #[error("version {0} of friction tiles is not known")]
     Version(u16),
-    /// There are more or fewer bytes than the header says.
+    /// The number of bytes differs from the one that the header implies.
     #[error("a tile of this size has {expected} bytes, not {found}")]
     Length {
-        /// How many there should be.
+        /// Number of bytes by the header.
         expected: usize,
-        /// How many there are.
+        /// Number of bytes found.
         found: usize,
     },
-    /// More squares than anybody makes.
+    /// The tile has more than [`SQUARES_MAX`] squares.
     #[error("a tile has at most {SQUARES_MAX} squares")]
     TooLarge,
 }
 
-/// Steps of a code that are distinguished: what is off by the last bits of a logarithm belongs to
-/// its own step.
+/// Resolution of a code before rounding, in parts of its step. Quantising first keeps rounding
+/// errors of a logarithm from moving a value to the neighbouring code.
 const PARTS_OF_A_STEP: f64 = 1.0e6;
 
-/// How many parts of a step a share of a range is, from 0 to those of `steps`. Rounded by casts,
-/// as a picture has a million of these.
+/// Converts a fraction of a range of `steps` steps to parts of a step, clamped to the range. Rounds
+/// by casts for speed: a picture has a million squares.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -165,19 +166,19 @@ fn square((mean, std_dev, count): (u16, u8, u8)) -> Option<TileSquare> {
 }
 
 impl Tile {
-    /// The tile as bytes.
+    /// Returns the tile in its binary form.
     pub fn encode(&self) -> Vec<u8> {
         self.encode_with(self.squares.iter().copied())
     }
 
-    /// The tile as bytes with these squares, as many as columns and rows say, in place of its own:
-    /// for a writer that has them in another form.
+    /// Returns the tile in its binary form, with `squares` in place of its own; their number must
+    /// be columns × rows. For a writer that stores the squares in another form.
     pub fn encode_with(
         &self,
         squares: impl ExactSizeIterator<Item = Option<TileSquare>>,
     ) -> Vec<u8> {
         let name = self.normalisation.as_deref().unwrap_or_default().as_bytes();
-        // A longer name is cut; none is.
+        // A name is far shorter; a longer one would be cut off.
         let name = &name[..name.len().min(usize::from(u16::MAX) - HEADER)];
         let header = HEADER + name.len();
         let count = squares.len();
@@ -209,10 +210,10 @@ impl Tile {
         bytes
     }
 
-    /// Reads a tile.
+    /// Parses a tile from its binary form.
     ///
     /// # Errors
-    /// [`InvalidTile`] says what is wrong with it.
+    /// [`InvalidTile`] if the bytes are not a tile of this version.
     pub fn decode(bytes: &[u8]) -> Result<Self, InvalidTile> {
         let field = |at: usize| -> Result<[u8; 8], InvalidTile> {
             let found = bytes

@@ -1,4 +1,4 @@
-//! What a user asks a robot to drive: a circle or waypoints.
+//! Trajectories that a user requests from a robot: a circle or waypoints.
 
 mod check;
 mod rules;
@@ -14,38 +14,38 @@ pub use self::rules::InvalidTrajectory;
 use self::rules::{CircleFields, WaypointsFields, is_speed};
 use crate::geometry::Point;
 
-/// Fewest waypoints of a path.
+/// Minimum number of waypoints of a path.
 pub const WAYPOINTS_MIN: usize = 2;
-/// Most waypoints of a path.
+/// Maximum number of waypoints of a path.
 pub const WAYPOINTS_MAX: usize = 100_000;
-/// Smallest distance between neighbouring waypoints, metres; closer ones are the same point.
+/// Minimum distance between neighbouring waypoints, metres; closer ones are refused as duplicates.
 pub const WAYPOINT_SPACING_MIN_M: f64 = 1.0e-3;
-/// Smallest radius of a circle, metres.
+/// Minimum radius of a circle, metres.
 pub const RADIUS_MIN_M: f64 = 0.05;
-/// Largest radius of a circle, metres.
+/// Maximum radius of a circle, metres.
 pub const RADIUS_MAX_M: f64 = 10_000.0;
-/// Slowest speed that can be asked for, metres per second.
+/// Minimum speed of a trajectory, m/s.
 pub const SPEED_MIN_M_S: f64 = 0.01;
-/// Fastest speed that can be asked for, metres per second; each robot's own limit is lower.
+/// Maximum speed of a trajectory, m/s; each robot's own limit is lower.
 pub const SPEED_MAX_M_S: f64 = 50.0;
-/// Fewest turns of a circle.
+/// Minimum number of turns of a circle.
 pub const TURNS_MIN: f64 = 0.05;
-/// Most turns of a circle.
+/// Maximum number of turns of a circle.
 pub const TURNS_MAX: f64 = 1_000.0;
-/// Deepest variation of the speed (excitation), as a share of it.
+/// Maximum depth of an excitation, as a ratio of the speed.
 pub const EXCITATION_DEPTH_MAX: f64 = 0.8;
-/// Shortest period of an excitation, seconds.
+/// Minimum period of an excitation, seconds.
 pub const EXCITATION_PERIOD_MIN_S: f64 = 1.0;
-/// Longest period of an excitation, seconds.
+/// Maximum period of an excitation, seconds.
 pub const EXCITATION_PERIOD_MAX_S: f64 = 20.0;
 
-/// A path to drive, as a user asks for it.
+/// Trajectory to drive, as a user requests it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Trajectory {
-    /// Turns on a circle.
+    /// Circle, driven for a number of turns.
     Circle(Circle),
-    /// A smooth path through points, driven without stopping at them.
+    /// Smooth path through points, driven without stopping at them.
     Waypoints(Waypoints),
 }
 
@@ -53,43 +53,44 @@ pub enum Trajectory {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Direction {
-    /// The heading grows.
+    /// The heading increases.
     #[default]
     CounterClockwise,
-    /// The heading falls.
+    /// The heading decreases.
     Clockwise,
 }
 
-/// Turns on a circle.
+/// Circle, driven for a number of turns.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(try_from = "CircleFields")]
 pub struct Circle {
-    /// The circle's centre.
+    /// Centre of the circle in the site frame.
     pub center: Point,
     /// Radius, metres.
     #[schema(minimum = 0.05, maximum = 10_000.0, example = 3.0)]
     pub radius_m: f64,
-    /// Speed along the circle, metres per second; give this or `period_s`.
+    /// Speed along the circle, m/s; give either this or `period_s`.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0.01, maximum = 50.0, example = 0.6)]
     pub speed_m_s: Option<f64>,
-    /// Time for one turn, seconds; give this or `speed_m_s`.
+    /// Time for one turn, seconds; give either this or `speed_m_s`. The resulting speed must be
+    /// 0.01 to 50 m/s.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub period_s: Option<f64>,
     /// Direction of travel; counter-clockwise when absent.
     #[serde(default)]
     pub direction: Direction,
-    /// How many turns; one when absent.
+    /// Number of turns; 1 when absent.
     #[serde(default = "one_turn")]
     #[schema(minimum = 0.05, maximum = 1000.0, default = 1.0)]
     pub turns: f64,
-    /// What the robot may do beside it; nothing when absent.
+    /// Approach speed and excitation; see there for the defaults.
     #[serde(default, skip_serializing_if = "TrajectoryOptions::is_none")]
     pub options: TrajectoryOptions,
 }
 
 impl Circle {
-    /// The speed along the circle, metres per second, from the speed or the period.
+    /// Returns the speed along the circle, m/s, given directly or by the period.
     pub fn speed_m_s(&self) -> f64 {
         let from_period =
             || std::f64::consts::TAU * self.radius_m / self.period_s.unwrap_or(f64::INFINITY);
@@ -101,44 +102,43 @@ fn one_turn() -> f64 {
     1.0
 }
 
-/// A smooth path through points.
+/// Smooth path through points.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(try_from = "WaypointsFields")]
 pub struct Waypoints {
-    /// The points in driving order, 2 to 100 000.
+    /// Points in driving order, 2 to 100 000; neighbours at least 1 mm apart.
     #[schema(min_items = 2, max_items = 100_000)]
     pub points: Vec<Waypoint>,
-    /// Speed wherever a point does not say otherwise, metres per second.
+    /// Speed where a point has none of its own, m/s.
     #[schema(minimum = 0.01, maximum = 50.0, example = 0.6)]
     pub speed_m_s: f64,
-    /// What the robot may do beside it; nothing when absent.
+    /// Approach speed and excitation; see there for the defaults.
     #[serde(default, skip_serializing_if = "TrajectoryOptions::is_none")]
     pub options: TrajectoryOptions,
 }
 
-/// What a robot may do beside following its trajectory.
+/// Options of a trajectory besides its path and speed.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct TrajectoryOptions {
-    /// Speed of the approach to the trajectory, metres per second; the trajectory's own when
-    /// absent.
+    /// Speed of the approach to the trajectory, m/s; the speed of the trajectory when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0.01, maximum = 50.0)]
     pub approach_speed_m_s: Option<f64>,
-    /// Excitation, a variation of the speed along the path, so that friction can be measured
-    /// without torque sensing.
+    /// Excitation: variation of the speed along the path, so that friction is measurable without
+    /// torque sensing. No excitation when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub excitation: Option<Excitation>,
 }
 
-/// Excitation, a periodic variation of the speed: the speed falls by the depth and recovers, and
-/// never exceeds what was asked.
+/// Periodic variation of the speed: the speed falls by the depth and recovers. It never exceeds the
+/// requested speed.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Excitation {
-    /// By which share the speed falls at most; less where the robot's limits leave less.
+    /// Maximum decrease of the speed, as a ratio of it; less where the robot's limits require it.
     #[serde(default = "default_depth")]
     #[schema(exclusive_minimum = 0.0, maximum = 0.8, default = 0.5)]
     pub depth_ratio: f64,
-    /// Time from one slowing down to the next, seconds.
+    /// Period of the variation, seconds.
     #[serde(default = "default_period")]
     #[schema(minimum = 1.0, maximum = 20.0, default = 3.0)]
     pub period_s: f64,
@@ -162,15 +162,15 @@ fn default_period() -> f64 {
 }
 
 impl TrajectoryOptions {
-    /// Whether nothing is asked for.
+    /// Whether no option is set.
     pub fn is_none(&self) -> bool {
         self.approach_speed_m_s.is_none() && self.excitation.is_none()
     }
 
-    /// Checks every figure.
+    /// Checks that every option is within its range.
     ///
     /// # Errors
-    /// [`InvalidTrajectory`] names the one that is out of range.
+    /// [`InvalidTrajectory`] names the first option that is not.
     pub fn validate(&self) -> Result<(), InvalidTrajectory> {
         if let Some(speed_m_s) = self
             .approach_speed_m_s
@@ -193,23 +193,23 @@ impl TrajectoryOptions {
     }
 }
 
-/// One point of a path.
+/// Point of a path in the site frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Waypoint {
     /// East-like coordinate, metres.
     pub x_m: f64,
     /// North-like coordinate, metres.
     pub y_m: f64,
-    /// Speed from here to the next point, metres per second.
+    /// Speed from this point to the next, m/s; the speed of the path when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub speed_m_s: Option<f64>,
-    /// Direction of the path at this point, radians; free when absent.
+    /// Direction of the path at this point, radians counter-clockwise from x; free when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub heading_rad: Option<f64>,
 }
 
 impl Waypoint {
-    /// Where the point lies.
+    /// Returns the position without speed and heading.
     pub fn position(&self) -> Point {
         Point {
             x_m: self.x_m,

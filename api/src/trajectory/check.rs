@@ -1,4 +1,4 @@
-//! What a trajectory would ask of a robot, told before anything moves.
+//! Check of a trajectory before anything moves: the plan, and what it demands of the robot.
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -8,160 +8,163 @@ use crate::geometry::{Point, Pose};
 use crate::ids::{MissionId, RobotId, SiteId};
 use crate::start_policy::StartPolicy;
 
-/// The body of `POST /v1/trajectories/check`.
+/// Body of `POST /v1/trajectories/check`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct CheckTrajectory {
-    /// The robot's site.
+    /// Site of the robot.
     pub site: SiteId,
-    /// The robot whose model and limits count.
+    /// Robot whose model and limits apply.
     pub robot: RobotId,
-    /// What would be driven.
+    /// Trajectory to check.
     pub trajectory: Trajectory,
-    /// From where. When absent: the expected end of the last mission that is driven before it; the
-    /// robot's last known pose if there is none; the start of the path if that is not known.
+    /// Pose from which to plan. When absent: the expected end of the last mission before this one,
+    /// else the robot's last known pose, else the start of the path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start: Option<Pose>,
-    /// The priority that the mission would have: queued missions of a lower one are driven after it.
+    /// Priority that the mission would have; queued missions of a lower priority are driven after
+    /// it.
     #[serde(default)]
     #[schema(minimum = -100, maximum = 100)]
     pub priority: i32,
-    /// What would become of the robot's other missions; it waits behind them when absent.
+    /// Effect that the mission would have on the robot's other missions; when absent, it would wait
+    /// behind them.
     #[serde(default)]
     pub start_policy: StartPolicy,
-    /// The mission of this robot whose trajectory it would replace; it is driven in that one's
-    /// place then, and priority and policy do not count.
+    /// Mission of this robot whose trajectory this one would replace. It is driven in place of that
+    /// mission, and `priority` and `start_policy` are ignored.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub replaces: Option<MissionId>,
-    /// Assumed θ of the ground, for the accuracy to expect; what the robot measures now when
-    /// absent, and [`THETA_ASSUMED`] if it measures nothing.
+    /// Assumed θ of the ground, from which `measurement` is predicted. When absent: the θ that the
+    /// robot measures now, else 0.2.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(exclusive_minimum = 0.0, example = 0.2)]
     pub theta: Option<f64>,
 }
 
-/// θ that a check assumes where nothing is known: firm ground.
+/// θ that a check assumes where no θ is known; corresponds to firm ground.
 pub const THETA_ASSUMED: f64 = 0.2;
 
-/// How well friction would be measured on a trajectory, by the robot's own estimator.
+/// Predicted accuracy of a friction measurement on a trajectory, from a run of the robot's own
+/// estimator along the plan.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ExpectedMeasurement {
-    /// The θ of the ground that was assumed.
+    /// Assumed θ of the ground.
     pub theta_assumed: f64,
     /// Whether the base measures wheel torque.
     pub wheel_torque: bool,
-    /// Expected standard deviation of θ at the end, as a ratio of θ; `null` where the trajectory
-    /// excites too little for a measurement.
+    /// Expected standard deviation of θ at the end, as a ratio of θ; `null` if the excitation does
+    /// not suffice for a measurement.
     pub relative_sd: Option<f64>,
-    /// Driving time until the first measurement, seconds.
+    /// Driving time until the first measurement, seconds; `null` if there is none.
     pub first_after_s: Option<f64>,
 }
 
-/// What a trajectory would ask of a robot, planned by the robot's own planner.
+/// Result of the check of a trajectory, from a plan of the robot's own planner.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct TrajectoryCheck {
-    /// From where it was planned.
+    /// Pose from which it was planned.
     pub start: Pose,
-    /// What `start` is.
+    /// Origin of `start`.
     pub start_source: StartSource,
-    /// The mission whose expected end `start` is, if it is one.
+    /// Mission whose expected end is `start`; `null` for any other origin.
     pub after_mission: Option<MissionId>,
     /// Length including the approach, metres.
     pub length_m: f64,
     /// Length of the approach, metres.
     pub approach_length_m: f64,
-    /// Time from rest to rest when nothing slows the robot, seconds.
+    /// Duration from standstill to standstill, seconds, if nothing slows the robot.
     pub duration_s: f64,
-    /// Fastest speed, m/s.
+    /// Maximum speed, m/s.
     pub speed_peak_m_s: f64,
-    /// Highest longitudinal acceleration or braking, m/s².
+    /// Maximum longitudinal acceleration or braking, m/s².
     pub linear_acceleration_peak_m_s2: f64,
-    /// Highest lateral acceleration, m/s².
+    /// Maximum lateral acceleration, m/s².
     pub lateral_acceleration_peak_m_s2: f64,
-    /// Fastest turn, rad/s.
+    /// Maximum yaw rate, rad/s.
     pub angular_peak_rad_s: f64,
-    /// Where a limit makes the robot slower than it was asked to be, in driving order; at most
-    /// [`BINDINGS_MAX`].
+    /// Sections on which a limit reduces the speed below the requested one, in driving order; at
+    /// most 1 000.
     pub bindings: Vec<Binding>,
-    /// Depth of the requested excitation, as a ratio of the speed: less than requested where the
-    /// robot's limits leave less.
+    /// Achieved depth of the requested excitation, as a ratio of the speed; less than requested
+    /// where the robot's limits require it. `null` without excitation.
     pub excitation_depth_ratio: Option<f64>,
-    /// How well friction would be measured.
+    /// Predicted accuracy of a friction measurement.
     pub measurement: ExpectedMeasurement,
-    /// The path that would be driven, including the approach.
+    /// Planned path, including the approach.
     pub path: PlannedPath,
 }
 
-/// From where a trajectory was planned.
+/// Origin of the pose from which a trajectory was planned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum StartSource {
-    /// From the pose that the request says.
+    /// The pose in the request.
     Request,
-    /// From the expected end of the last mission that is driven before.
+    /// The expected end of the last mission before this one.
     Mission,
-    /// From where the robot is now: nothing is driven before.
+    /// The present pose of the robot; no mission comes before.
     Robot,
-    /// From the start of the trajectory: nobody knows where the robot is.
+    /// The start of the trajectory; the pose of the robot is unknown.
     Trajectory,
 }
 
-/// Most points of a planned path.
+/// Maximum number of points of a planned path.
 pub const PLANNED_POINTS_MAX: usize = 1_000;
 
-/// The smooth path that the planner computes.
+/// Smooth path that the planner computed.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct PlannedPath {
-    /// Distance between consecutive points, metres, along the path.
+    /// Distance between consecutive points along the path, metres.
     pub step_m: f64,
-    /// Points in driving order, at most [`PLANNED_POINTS_MAX`]. Further turns of a circle go where
-    /// the first one went and are left out.
+    /// Points in driving order, at most 1 000. Further turns of a circle repeat the first one and
+    /// are left out.
     pub points: Vec<Point>,
 }
 
-/// Most stretches that a check names.
+/// Maximum number of sections in the result of a check.
 pub const BINDINGS_MAX: usize = 1_000;
 
-/// A stretch of a path on which one limit decides how fast the robot goes.
+/// Section of a path on which one limit determines the speed.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Binding {
-    /// Which limit.
+    /// Limit that determines the speed.
     pub limit: BindingLimit,
-    /// Where it begins.
+    /// Begin of the section.
     pub from: Place,
-    /// Where it ends.
+    /// End of the section.
     pub to: Place,
-    /// Slowest speed of the stretch, m/s.
+    /// Minimum speed within the section, m/s.
     pub speed_min_m_s: f64,
 }
 
-/// A limit that slows a robot below what was asked.
+/// Limit that reduces the speed below the requested one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum BindingLimit {
-    /// Acceleration across the path.
+    /// Lateral acceleration.
     LateralAcceleration,
     /// Yaw rate.
     AngularSpeed,
     /// Wheel speed.
     WheelSpeed,
-    /// Wheel acceleration where the bend changes.
+    /// Wheel acceleration, where the curvature changes.
     WheelAcceleration,
-    /// Acceleration or braking along the path, up to the next slower place.
+    /// Longitudinal acceleration or braking, up to the next slower place.
     LinearAcceleration,
-    /// Traction limit of the ground, longitudinal or lateral; during the approach a cautious one where
-    /// nothing is known.
+    /// Traction limit of the ground, longitudinal or lateral; on the approach a cautious default
+    /// where no friction is known.
     Traction,
 }
 
-/// A place along a path.
+/// Place along a path.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Place {
-    /// Arc length from the start, metres, where it is known.
+    /// Arc length from the start, metres; absent if unknown.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub arc_m: Option<f64>,
-    /// Index of the waypoint at or before it, from 0.
+    /// Index of the waypoint at or before the place, from 0; absent if there is none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub waypoint: Option<usize>,
-    /// Where it is.
+    /// Position in the site frame.
     pub point: Point,
 }

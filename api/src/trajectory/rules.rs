@@ -1,4 +1,4 @@
-//! What makes a trajectory possible: every field is checked where it is read.
+//! Validity rules of trajectories, applied to every field when a trajectory is read.
 
 use serde::Deserialize;
 
@@ -10,55 +10,56 @@ use super::{
 };
 use crate::geometry::{COORDINATE_MAX_M, Point};
 
-/// Why a trajectory cannot be driven by any robot.
+/// Reason why a trajectory is invalid for every robot.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum InvalidTrajectory {
-    /// The radius is not within [`RADIUS_MIN_M`] to [`RADIUS_MAX_M`].
+    /// The radius is outside [`RADIUS_MIN_M`] to [`RADIUS_MAX_M`].
     #[error("radius_m must be {RADIUS_MIN_M} to {RADIUS_MAX_M}, not {0}")]
     Radius(f64),
-    /// The turns are not within [`TURNS_MIN`] to [`TURNS_MAX`].
+    /// The number of turns is outside [`TURNS_MIN`] to [`TURNS_MAX`].
     #[error("turns must be {TURNS_MIN} to {TURNS_MAX}, not {0}")]
     Turns(f64),
-    /// Neither or both of speed and period were given.
+    /// Neither or both of speed and period are given.
     #[error("give either speed_m_s or period_s")]
     SpeedOrPeriod,
-    /// The speed is not within [`SPEED_MIN_M_S`] to [`SPEED_MAX_M_S`].
+    /// The speed is outside [`SPEED_MIN_M_S`] to [`SPEED_MAX_M_S`].
     #[error("the speed must be {SPEED_MIN_M_S} to {SPEED_MAX_M_S} m/s, not {0}")]
     Speed(f64),
-    /// A point's own speed is out of range.
+    /// The speed of a point is outside [`SPEED_MIN_M_S`] to [`SPEED_MAX_M_S`].
     #[error(
         "points[{index}].speed_m_s must be {SPEED_MIN_M_S} to {SPEED_MAX_M_S}, not {speed_m_s}"
     )]
     PointSpeed {
-        /// Which point, from 0.
+        /// Index of the point, from 0.
         index: usize,
-        /// The speed that was given.
+        /// Given speed, m/s.
         speed_m_s: f64,
     },
-    /// The centre is not finite or too far out.
+    /// The centre is not finite or beyond [`COORDINATE_MAX_M`].
     #[error("the centre must be within {COORDINATE_MAX_M} m of the origin")]
     Center,
-    /// Too few or too many points.
+    /// There are fewer than [`WAYPOINTS_MIN`] or more than [`WAYPOINTS_MAX`] points.
     #[error("a path has {WAYPOINTS_MIN} to {WAYPOINTS_MAX} points, this one has {0}")]
     PointCount(usize),
-    /// The speed on the approach to the trajectory is out of range.
+    /// The approach speed is outside [`SPEED_MIN_M_S`] to [`SPEED_MAX_M_S`].
     #[error("approach_speed_m_s must be {SPEED_MIN_M_S} to {SPEED_MAX_M_S}, not {0}")]
     ApproachSpeed(f64),
-    /// The excitation's depth is out of range.
+    /// The depth of the excitation is not above 0 and at most [`EXCITATION_DEPTH_MAX`].
     #[error("excitation.depth_ratio must be above 0, at most {EXCITATION_DEPTH_MAX}, not {0}")]
     ExcitationDepth(f64),
-    /// The excitation's period is out of range.
+    /// The period of the excitation is outside [`EXCITATION_PERIOD_MIN_S`] to
+    /// [`EXCITATION_PERIOD_MAX_S`].
     #[error(
         "excitation.period_s must be {EXCITATION_PERIOD_MIN_S} to {EXCITATION_PERIOD_MAX_S}, not {0}"
     )]
     ExcitationPeriod(f64),
-    /// A point is not finite or too far out.
+    /// A point is not finite or beyond [`COORDINATE_MAX_M`].
     #[error("points[{0}] must be within {COORDINATE_MAX_M} m of the origin")]
     PointOffTheMap(usize),
-    /// A point's heading is not finite.
+    /// The heading of a point is not finite.
     #[error("points[{0}].heading_rad must be a finite number")]
     PointHeading(usize),
-    /// A point repeats the one before it.
+    /// A point is closer to the point before it than [`WAYPOINT_SPACING_MIN_M`].
     #[error(
         "points[{0}] repeats the point before it; keep neighbours {WAYPOINT_SPACING_MIN_M} m apart"
     )]
@@ -70,10 +71,10 @@ pub(super) fn is_speed(speed_m_s: f64) -> bool {
 }
 
 impl Circle {
-    /// Checks every field.
+    /// Checks that every field is within its range.
     ///
     /// # Errors
-    /// [`InvalidTrajectory`] names the field that is out of range.
+    /// [`InvalidTrajectory`] names the first field that is not.
     pub fn validate(&self) -> Result<(), InvalidTrajectory> {
         if !self.center.is_on_the_map() {
             return Err(InvalidTrajectory::Center);
@@ -96,10 +97,10 @@ impl Circle {
 }
 
 impl Waypoints {
-    /// Checks every point.
+    /// Checks that every field and every point is within its range.
     ///
     /// # Errors
-    /// [`InvalidTrajectory`] names the first point that is out of range or doubled.
+    /// [`InvalidTrajectory`] names the first point that is out of range or a duplicate.
     pub fn validate(&self) -> Result<(), InvalidTrajectory> {
         let count = self.points.len();
         if !(WAYPOINTS_MIN..=WAYPOINTS_MAX).contains(&count) {
@@ -134,7 +135,7 @@ impl Waypoints {
 }
 
 impl Trajectory {
-    /// What the robot may do beside following it.
+    /// Returns the options of the trajectory.
     pub fn options(&self) -> TrajectoryOptions {
         match self {
             Self::Circle(circle) => circle.options,
@@ -142,7 +143,7 @@ impl Trajectory {
         }
     }
 
-    /// The fastest speed that is asked for anywhere, metres per second.
+    /// Returns the maximum requested speed, including the approach, m/s.
     pub fn speed_max_m_s(&self) -> f64 {
         let on_it = match self {
             Self::Circle(circle) => circle.speed_m_s(),
