@@ -1,16 +1,16 @@
-//! The TLS tunnel through which a robot's zenoh session reaches the server's router.
+//! TLS tunnel through which a robot's zenoh session reaches the server's router.
 //!
 //! ```text
 //!  agent                                          server
 //!  TLS 1.3, both certificates, ALPN tread/2  ───►
 //!                                            ◄─── length (2 bytes, big-endian) + RouterCredentials (JSON)
-//!  zenoh session, as the user named there    ◄──► router
+//!  zenoh session with this user name          ◄──► router
 //! ```
 //!
-//! The certificate says which robot this is. The router cannot see the certificate; it knows the
-//! robot by user name and password, which the server hands to whoever has shown the certificate.
-//! The server compares the user name that the session shows with the certificate's robot, so
-//! another robot's credentials are of no use.
+//! The certificate identifies the robot. The router does not see the certificate; it identifies the
+//! robot by user name and password, which the server sends to the peer that presented the
+//! certificate. The server compares the user name of the session with the robot of the certificate,
+//! so credentials of another robot are useless.
 
 #[cfg(feature = "splice")]
 mod splice;
@@ -24,21 +24,21 @@ use serde::{Deserialize, Serialize};
 #[cfg(feature = "splice")]
 pub use splice::splice;
 
-/// The protocol that both sides name in the TLS handshake (ALPN).
+/// Protocol identifier that both sides offer in the TLS handshake (ALPN).
 pub const ALPN: &[u8] = b"tread/2";
-/// Bytes of the length in front of the credentials.
+/// Size of the length field in front of the credentials, bytes.
 pub const LENGTH_BYTES: usize = 2;
-/// Most bytes that credentials take as JSON.
+/// Maximum size of credentials as JSON, bytes; longer ones are not sent.
 pub const CREDENTIALS_BYTES_MAX: usize = 1_024;
 
-/// What a robot's zenoh session shows to the router.
+/// Credentials of a robot's zenoh session at the router.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RouterCredentials {
-    /// The user name, `{robot}.{site}`.
+    /// User name, `{robot}.{site}`.
     pub user: String,
-    /// The password of that user.
+    /// Password of the user.
     pub password: String,
-    /// What the session's zenoh id must begin with.
+    /// Required prefix of the session's zenoh id.
     pub session_prefix: SessionPrefix,
 }
 
@@ -51,16 +51,16 @@ impl fmt::Debug for RouterCredentials {
     }
 }
 
-/// Credentials that cannot be sent.
+/// Error for credentials that cannot be sent.
 #[derive(Debug, thiserror::Error)]
 #[error("credentials take more than {CREDENTIALS_BYTES_MAX} bytes, or are no JSON")]
 pub struct CredentialsUnwritable;
 
 impl RouterCredentials {
-    /// The bytes that the server sends first: the length, then JSON.
+    /// Returns the first bytes that the server sends: the length, then the credentials as JSON.
     ///
     /// # Errors
-    /// [`CredentialsUnwritable`]: they are longer than the receiver reads.
+    /// [`CredentialsUnwritable`] if the JSON is longer than [`CREDENTIALS_BYTES_MAX`].
     pub fn to_bytes(&self) -> Result<Vec<u8>, CredentialsUnwritable> {
         let json = serde_json::to_vec(self).map_err(|_| CredentialsUnwritable)?;
         if json.len() > CREDENTIALS_BYTES_MAX {
@@ -71,26 +71,27 @@ impl RouterCredentials {
     }
 }
 
-/// The upper half of the zenoh ids that one robot's sessions may have.
+/// Upper 64 bits of the zenoh ids that the sessions of one robot may have.
 ///
-/// A router takes a second session with an id that it knows for another link of the first. With a
-/// prefix of its own, a robot cannot come with an id of another robot.
+/// A router treats a second session with a known id as another link of the first session. With a
+/// prefix of its own, a robot cannot use an id of another robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct SessionPrefix(u64);
 
 impl SessionPrefix {
-    /// Makes a prefix of 63 free bits. The uppermost bit is always set: zenoh writes its ids
-    /// without leading zeros.
+    /// Creates a prefix from 63 bits of `bits`. The uppermost bit is always set, because zenoh
+    /// writes its ids without leading zeros.
     pub fn new(bits: u64) -> Self {
         Self(bits | 1 << 63)
     }
 
-    /// The zenoh id with this prefix and another lower half, as zenoh's configuration has it.
+    /// Returns the zenoh id with this prefix and the given lower 64 bits, as zenoh's configuration
+    /// requires it: hexadecimal.
     pub fn session_id(self, lower: u64) -> String {
         format!("{:016x}{lower:016x}", self.0)
     }
 
-    /// Whether a zenoh id, as a number, has this prefix.
+    /// Whether the upper 64 bits of a zenoh id equal this prefix.
     pub fn is_of(self, session_id: u128) -> bool {
         session_id >> 64 == u128::from(self.0)
     }

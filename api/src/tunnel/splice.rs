@@ -1,4 +1,5 @@
-//! Copies between two streams, both ways: a robot's link and its session, on both sides of the tunnel.
+//! Bidirectional copy between two streams: a robot's link and its zenoh session, on both ends of
+//! the tunnel.
 
 use std::io;
 use std::pin::Pin;
@@ -8,11 +9,11 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf, copy_bidirectional_with_sizes};
 use tokio::sync::Notify;
 
-/// How long what is on its way may still take after one side has ended. Without a bound, a side that does
-/// not close, or a dead network, would keep the connection for ever.
+/// Time that data in transit has left after one side has ended. Without this bound, a side that
+/// does not close, or a dead network, would keep the connection forever.
 const END_GRACE: Duration = Duration::from_secs(1);
 
-/// A stream that tells of its end.
+/// Stream that notifies of the end of its input.
 struct Ending<'ended, S> {
     stream: S,
     ended: &'ended Notify,
@@ -51,10 +52,11 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Ending<'_, S> {
     }
 }
 
-/// Copies both ways until both sides have ended, or [`END_GRACE`] after the first of them has.
+/// Copies in both directions until both sides have ended, or until [`END_GRACE`] after the first of
+/// them has ended.
 ///
 /// # Errors
-/// One of them broke.
+/// The I/O error of a read or write on either stream.
 pub async fn splice(
     one: impl AsyncRead + AsyncWrite + Unpin,
     other: impl AsyncRead + AsyncWrite + Unpin,

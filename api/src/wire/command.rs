@@ -1,7 +1,8 @@
 //! Commands about missions, from the server to a robot.
 //!
-//! Each is a zenoh query; what a robot replies is in [`reply`](super::reply). No reply means not
-//! delivered: the server sends the same again, and the robot takes the same twice without harm.
+//! Each command is a zenoh query; its replies are in [`reply`](super::reply). Without a reply the
+//! command counts as not delivered: the server sends it again. Commands are idempotent on the
+//! robot.
 
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
@@ -14,86 +15,88 @@ use crate::mission::LinkPolicy;
 use crate::site::Cell;
 use crate::trajectory::Trajectory;
 
-/// `cmd/offer`: drive this mission.
+/// `cmd/offer`: offers a mission to drive.
 ///
-/// A higher revision of the active mission replaces it: the robot plans the new one from where
-/// it is and swaps only when it holds it whole; until its answer the old one goes on, and after a
-/// refusal too.
+/// A higher revision of the active mission replaces it: the robot plans the new revision from its
+/// present position and switches only when the plan is complete. Until its answer, and after a
+/// refusal, it keeps driving the old revision.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Offer {
-    /// The mission.
+    /// Identifier of the mission.
     pub mission: MissionId,
-    /// Its revision.
+    /// Revision of the mission.
     pub revision: u32,
-    /// What exactly is to be driven; see [`Offer::plan_hash_of`].
+    /// Hash of mission, revision and trajectory; see [`Offer::plan_hash_of`].
     pub plan_hash: PlanHash,
-    /// What is to be driven.
+    /// Trajectory to drive.
     pub trajectory: Trajectory,
-    /// How long from now the mission may still start, milliseconds; `None` for ever.
+    /// Time from now within which the mission may start, milliseconds; `None` without limit.
     pub start_within_ms: Option<u64>,
-    /// What to do when the server is no longer heard.
+    /// Behaviour when the server is silent.
     #[serde(default)]
     pub link_policy: LinkPolicy,
-    /// What the map knows along the path; absent when it knows nothing.
+    /// Data of the friction map along the path; absent when the map has none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prior: Option<PathPrior>,
-    /// Whether it is to stand at its start until it is resumed: whoever paused it, or stopped the
-    /// robot before it was taken, has not let it go on. Counts only when the mission is taken.
+    /// Whether the robot holds the mission at its start until it is resumed, because it was paused,
+    /// or the robot stopped, before the robot accepted the mission. Ignored for a new revision of
+    /// an accepted mission.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub on_hold: bool,
 }
 
-/// Most cells of a prior.
+/// Maximum number of cells of a prior.
 pub const PRIOR_CELLS_MAX: usize = 4_096;
 
-/// What the map knows along a path. It helps the robot to drive and never goes into what it
-/// measures; nor is it part of what is to be driven.
+/// Data of the friction map along a path. It is used for planning and tracking only; it never
+/// enters a measurement, and it is not part of the plan hash.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PathPrior {
-    /// The grid that cuts the cells.
+    /// Revision of the grid to which the cells refer.
     pub grid_revision: u32,
-    /// Friction coefficient to plan with: the lowest along the path, above zero.
+    /// Traction limit off the cells of `traction_limits`, a friction coefficient above 0: the
+    /// lowest along the path.
     #[serde(alias = "grip_mu")]
     pub traction_limit_mu: f64,
-    /// Standard deviation of one robot's own θ around that of all robots as a share of it, 0 to 1.
+    /// Standard deviation of one robot's θ around the common θ of all robots, as a ratio of it, 0
+    /// to 1.
     #[serde(default = "robot_bias_ratio")]
     pub robot_bias_ratio: f64,
-    /// Cells of one ground of which θ is known, at most [`PRIOR_CELLS_MAX`].
+    /// Cells with known θ that contain a single terrain, at most [`PRIOR_CELLS_MAX`].
     pub cells: Vec<CellPrior>,
-    /// Friction coefficient to plan with by place, for cells along the path, at most
-    /// [`PRIOR_CELLS_MAX`]; `traction_limit_mu` holds away from them, and everywhere where there
-    /// are none.
+    /// Traction limits of cells along the path, at most [`PRIOR_CELLS_MAX`]. `traction_limit_mu`
+    /// applies in all other cells.
     #[serde(default, alias = "grips", skip_serializing_if = "Vec::is_empty")]
     pub traction_limits: Vec<CellTractionLimit>,
 }
 
-/// Traction limit of a cell, for a plan.
+/// Traction limit of a cell, for planning.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct CellTractionLimit {
     /// The cell.
     pub cell: Cell,
-    /// Friction coefficient, above zero: a lower bound of the peak.
+    /// Friction coefficient above 0 that a plan may use; a lower bound of the peak.
     pub mu: f64,
 }
 
-/// Default of servers.
+/// Default for servers that do not send the ratio.
 const fn robot_bias_ratio() -> f64 {
     ROBOT_BIAS_RATIO
 }
 
-/// What the map knows of a cell.
+/// θ of the friction map in one cell.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct CellPrior {
     /// The cell.
     pub cell: Cell,
-    /// θ for the robot's model, above zero.
+    /// θ for the robot's model, above 0.
     pub theta: f64,
-    /// Its standard deviation, with age and biases, above zero.
+    /// Standard deviation of θ, including age and biases, above 0.
     pub std_dev: f64,
 }
 
 impl PathPrior {
-    /// Whether every number is possible and there are not too many.
+    /// Whether every number is within its range and the lists are not too long.
     pub fn is_possible(&self) -> bool {
         let is_positive = |value: f64| value.is_finite() && value > 0.0;
         let is_known = |cell: &CellPrior| {
@@ -112,38 +115,39 @@ impl PathPrior {
 }
 
 impl Offer {
-    /// The hash of a request: of its trajectory and revision, never of samples.
+    /// Returns the hash of a request: of mission, revision and trajectory, not of the planned
+    /// samples.
     pub fn plan_hash_of(mission: MissionId, revision: u32, trajectory: &Trajectory) -> PlanHash {
         let request = serde_json::to_vec(&(mission, revision, trajectory)).unwrap_or_default();
         PlanHash::from_uuid(Uuid::new_v5(&DERIVED_NAMESPACE, &request))
     }
 }
 
-/// `cmd/cancel`: end this mission, braking along its path.
+/// `cmd/cancel`: ends a mission; the robot brakes along its path.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Cancel {
-    /// The mission.
+    /// Identifier of the mission.
     pub mission: MissionId,
-    /// Why, for people.
+    /// Reason, for people.
     #[serde(deserialize_with = "crate::text::bounded::<_, {crate::mission::REASON_LENGTH_MAX}>")]
     pub reason: String,
 }
 
-/// `cmd/pause`: brake along the path of this mission and hold it, standing.
+/// `cmd/pause`: pauses a mission; the robot brakes along its path and holds the mission at rest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Pause {
-    /// The mission.
+    /// Identifier of the mission.
     pub mission: MissionId,
-    /// Its revision.
+    /// Revision of the mission.
     pub revision: u32,
 }
 
-/// `cmd/resume`: drive this mission on from where it was paused.
+/// `cmd/resume`: resumes a paused mission from the place where it was paused.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Resume {
-    /// The mission.
+    /// Identifier of the mission.
     pub mission: MissionId,
-    /// Its revision.
+    /// Revision of the mission.
     pub revision: u32,
 }
 

@@ -1,4 +1,5 @@
-//! A robot introduces itself; the server answers with the site.
+//! Hello query of a robot when it connects, and the server's answer with the definition of the
+//! site.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -11,49 +12,50 @@ use crate::safety::Geofence;
 use crate::site::Grid;
 use crate::terrain::TerrainShape;
 
-/// What a robot says on every new connection.
+/// Query that a robot sends on every new connection.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Hello {
-    /// Who speaks; the same as in the key.
+    /// Identifier of the robot; must equal the one in the key.
     pub robot: RobotId,
-    /// This run of the agent.
+    /// Present run of the agent.
     pub boot: BootId,
     /// Version of the agent.
     #[serde(deserialize_with = "crate::text::bounded::<_, {crate::robot::VERSION_TEXT_MAX}>")]
     pub agent_version: String,
     /// Model and tyres.
     pub model: RobotModel,
-    /// The robot's wall clock.
+    /// Wall clock of the robot.
     pub robot_time: Timestamp,
-    /// What the base and its agent can do; nothing beyond driving missions when absent.
+    /// Capabilities of the base and its agent; when absent, the robot only drives missions.
     #[serde(default)]
     pub capabilities: Capabilities,
 }
 
-/// The server's answer.
+/// Answer of the server to [`Hello`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Welcome {
-    /// The site as the robot must know it.
+    /// Definition of the robot's site.
     pub site: SiteDefinition,
-    /// The server's wall clock.
+    /// Wall clock of the server.
     pub server_time: Timestamp,
 }
 
-/// What a robot must know of its site to name cells and terrains.
+/// Data of a site that a robot needs to assign measurements to cells and terrains, and to respect
+/// the geofence.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SiteDefinition {
-    /// The grid.
+    /// Grid of cells.
     pub grid: Grid,
-    /// Counts changes of the terrains; a robot reports the one it holds.
+    /// Number of changes of the terrains; a robot reports the one that it has.
     pub terrain_revision: u64,
-    /// All terrains.
+    /// All terrains of the site.
     pub terrains: Vec<TerrainShape>,
-    /// Where robots may be. An older server has none, an older robot ignores it.
+    /// Geofence of the site. An older server sends none, an older robot ignores it.
     #[serde(default)]
     pub geofence: Geofence,
 }
 
-/// `cmd/site`: take this definition.
+/// `cmd/site`: replaces the robot's definition of its site.
 impl Command for SiteDefinition {
     const VERB: Verb = Verb::Site;
     type Reply = Acknowledgement;

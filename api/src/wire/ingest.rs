@@ -1,7 +1,7 @@
-//! What must not be lost: records with acknowledgement.
+//! Upload of records that must not be lost, with acknowledgement.
 //!
-//! A robot keeps each record on its disk until the server has answered for it. `(robot, boot, seq)`
-//! names a record for ever, so that the same may be sent again without counting twice.
+//! A robot keeps each record on its disk until the server has acknowledged it. `(robot, boot, seq)`
+//! identifies a record permanently, so that a repeated upload is counted once.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -11,115 +11,117 @@ use crate::ids::{BootId, MissionId, PlanHash, RobotId};
 use crate::mission::{DrivenPath, MissionQuality};
 use crate::robot::MissionProgress;
 
-/// Most records of one batch.
+/// Maximum number of records of one batch.
 pub const BATCH_RECORDS_MAX: usize = 1_000;
 
-/// Records of one run of one agent.
+/// Batch of records of one run of one agent.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Batch {
-    /// Who speaks; the same as in the key.
+    /// Identifier of the robot; must equal the one in the key.
     pub robot: RobotId,
-    /// The run of the agent that made the records; not always the present one.
+    /// Run of the agent that created the records; it may be a former run.
     pub boot: BootId,
-    /// The robot's wall clock when it sent this. With it the server puts the records' times right
-    /// when the clock is wrong; without it they are taken as they are.
+    /// Wall clock of the robot at sending. The server corrects the times of the records by its
+    /// offset; without it they are not corrected.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub robot_time: Option<Timestamp>,
-    /// The records, at most [`BATCH_RECORDS_MAX`], by rising `seq`.
+    /// Records in ascending order of `seq`, at most [`BATCH_RECORDS_MAX`].
     pub records: Vec<Record>,
 }
 
-/// One thing that must not be lost.
+/// Record that must not be lost.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Record {
-    /// Counts the records of this boot, from 0.
+    /// Sequence number of the record within its run, from 0.
     pub seq: u64,
-    /// What it is.
+    /// Content of the record.
     pub content: RecordContent,
 }
 
-/// What a record is.
+/// Content of a record.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RecordContent {
-    /// A measurement of friction.
+    /// Measurement of friction.
     Segment(Segment),
-    /// A mission has begun or ended.
+    /// Change of phase of a mission.
     Mission(MissionReport),
 }
 
-/// A mission has begun or ended on the robot.
+/// Change of phase of a mission on the robot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MissionReport {
-    /// The mission.
+    /// Identifier of the mission.
     pub mission: MissionId,
-    /// Its revision.
+    /// Revision of the mission.
     pub revision: u32,
-    /// What exactly was driven.
+    /// Hash of the trajectory that was driven.
     pub plan_hash: PlanHash,
-    /// When, by the robot's clock.
+    /// Time of the change, by the robot's clock.
     pub at: Timestamp,
-    /// What happened.
+    /// New phase.
     pub phase: MissionPhase,
-    /// When a stop or a lease began that paused it, by the robot's clock: it stood only later.
+    /// Time when the stop or lease that paused the mission began, by the robot's clock; the robot
+    /// came to rest after it. Absent for other phases and pauses.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub since: Option<Timestamp>,
-    /// Why, for people.
+    /// Reason, for people; absent without one.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
         deserialize_with = "crate::text::bounded_option::<_, {crate::mission::REASON_LENGTH_MAX}>"
     )]
     pub reason: Option<String>,
-    /// How far it had come.
+    /// Progress at that time; absent if unknown.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub progress: Option<MissionProgress>,
-    /// How well it was driven, in the report of its end.
+    /// Quality of the run; present only when the mission has ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub quality: Option<MissionQuality>,
-    /// Where the robot really was, in the report of its end.
+    /// Path that the robot drove; present only when the mission has ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub driven: Option<DrivenPath>,
 }
 
-/// A robot's word on a mission.
+/// Phase of a mission on the robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum MissionPhase {
     /// The first wheel command was given.
     Started,
-    /// Held, standing, by request.
+    /// The robot has paused the mission and is at rest.
     Paused,
-    /// Driven again after a pause.
+    /// The robot drives the mission again after a pause.
     Resumed,
-    /// A new revision is driven now; the report names it.
+    /// The robot drives the new revision that the report names.
     Replaced,
-    /// Driven to its end.
+    /// The mission was driven to its end.
     Succeeded,
-    /// Given up.
+    /// The robot gave the mission up.
     Failed,
-    /// Ended by request.
+    /// The mission ended by request.
     Cancelled,
-    /// Its latest start passed before it began.
+    /// The mission had not begun by its latest start.
     Expired,
 }
 
-/// The server's answer, after its commit. What it does not list as refused is stored.
+/// Answer of the server to a batch, after its commit. Every record that is not in `refused` is
+/// stored.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Receipt {
-    /// Records that are new to the server.
+    /// Number of records that are new to the server.
     pub committed: u64,
-    /// Records that it had before.
+    /// Number of records that the server had already.
     pub duplicates: u64,
-    /// Records that it will never take.
+    /// Records that the server refuses for good.
     pub refused: Vec<RefusedRecord>,
 }
 
-/// A record that the server will never take.
+/// Record that the server refuses for good.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RefusedRecord {
-    /// Its number.
+    /// Sequence number of the record.
     pub seq: u64,
-    /// Why, for people.
+    /// Reason, for people.
     pub reason: String,
 }

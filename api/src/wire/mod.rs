@@ -1,7 +1,7 @@
-//! zenoh payloads: JSON, versioned, readable by any zenoh client.
+//! zenoh payloads: versioned JSON, readable by any zenoh client.
 //!
-//! Every payload is `{"v": 2, "body": {…}}`. `v` is the major version: another one is refused.
-//! Fields that are not known are ignored, so that a newer peer may add some.
+//! Every payload is `{"v": 2, "body": {…}}`. `v` is the major version; a payload of another major
+//! version is refused. Unknown fields are ignored, so that a newer peer may add fields.
 
 pub mod command;
 pub mod hello;
@@ -14,23 +14,24 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::value::RawValue;
 
-/// The major version of all payloads.
+/// Major version of all payloads.
 pub const VERSION: u32 = 2;
-/// Largest payload that is read, in bytes: a path of the most waypoints with room to spare.
+/// Maximum size of a payload that is read, bytes; sufficient for a path with the maximum number of
+/// waypoints.
 pub const PAYLOAD_BYTES_MAX: usize = 16 * 1024 * 1024;
 
-/// Why a payload is refused.
+/// Reason why a payload is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum WireError {
-    /// It is larger than [`PAYLOAD_BYTES_MAX`].
+    /// The payload is larger than [`PAYLOAD_BYTES_MAX`]; contains its size, bytes.
     #[error("a payload of {0} bytes is over the limit of {PAYLOAD_BYTES_MAX}")]
     TooLarge(usize),
-    /// It is of another major version.
+    /// The payload is of another major version.
     #[error(
         "the other side speaks major version {0} and this side {VERSION}: update the older one"
     )]
     Version(u32),
-    /// It does not parse.
+    /// The payload does not parse.
     #[error("the payload does not parse")]
     Malformed(#[source] serde_json::Error),
 }
@@ -48,19 +49,19 @@ struct Incoming<'payload> {
     body: &'payload RawValue,
 }
 
-/// Writes a payload.
+/// Encodes a payload.
 ///
 /// # Errors
-/// A value that JSON cannot say, such as a map with keys that are no strings; a number that is
-/// not finite becomes `null`, which the reader refuses.
+/// The value cannot be represented in JSON, such as a map whose keys are not strings. A non-finite
+/// number is not an error: it becomes `null`, which the reader refuses.
 pub fn encode<T: Serialize>(body: &T) -> Result<Vec<u8>, serde_json::Error> {
     serde_json::to_vec(&Outgoing { v: VERSION, body })
 }
 
-/// Reads a payload.
+/// Decodes a payload.
 ///
 /// # Errors
-/// [`WireError`]: too large, another major version, or not what was expected.
+/// [`WireError`] if it is too large, of another major version, or does not parse as `T`.
 pub fn decode<T: DeserializeOwned>(payload: &[u8]) -> Result<T, WireError> {
     if payload.len() > PAYLOAD_BYTES_MAX {
         return Err(WireError::TooLarge(payload.len()));
@@ -72,17 +73,17 @@ pub fn decode<T: DeserializeOwned>(payload: &[u8]) -> Result<T, WireError> {
     serde_json::from_str(incoming.body.get()).map_err(WireError::Malformed)
 }
 
-/// Why the other side refused a query; the body of every error reply.
+/// Reason why a peer refused a query; the body of every error reply.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Refusal {
-    /// For programs.
+    /// Reason, for programs.
     pub code: RefusalCode,
-    /// For people.
+    /// Reason, for people.
     #[serde(deserialize_with = "crate::text::bounded::<_, {crate::mission::REASON_LENGTH_MAX}>")]
     pub detail: String,
 }
 
-/// Why a query was refused.
+/// Reason why a query was refused, for programs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RefusalCode {
@@ -90,13 +91,13 @@ pub enum RefusalCode {
     Malformed,
     /// The payload is of another major version.
     Version,
-    /// The payload names another robot than the key.
+    /// The payload names a robot other than the key.
     Impersonation,
-    /// The site is not known.
+    /// The site does not exist.
     UnknownSite,
-    /// Try again later.
+    /// The server is busy; try again later.
     Busy,
-    /// Any code of a newer peer.
+    /// Code that this version does not know, from a newer peer.
     #[serde(other)]
     Other,
 }
@@ -107,7 +108,7 @@ impl From<&WireError> for Refusal {
             WireError::TooLarge(_) | WireError::Malformed(_) => RefusalCode::Malformed,
             WireError::Version(_) => RefusalCode::Version,
         };
-        // The cause is for the peer's developer: where in the payload the parser stopped.
+        // The position of the parse error helps the developer of the peer.
         let cause = std::error::Error::source(error).map(|cause| format!(": {cause}"));
         Self {
             code,

@@ -1,8 +1,8 @@
-//! A robot's replies to commands: one type for each kind of command.
+//! Replies of a robot to commands: one type for each kind of command.
 //!
-//! [`Command`] binds a payload to its verb and to the reply that the verb gets, so that nobody
-//! handles a reply that cannot come. On the wire an answer is `{"boot": …, "outcome": …}`, with
-//! `"done"`, `{"accepted": {…}}`, `{"leased": {…}}` or `{"refused": {…}}` as its outcome.
+//! [`Command`] binds a payload to its verb and to the type of its reply, so that only possible
+//! replies are handled. On the wire an answer is `{"boot": …, "outcome": …}`; its outcome is
+//! `"done"`, `{"accepted": {…}}`, `{"leased": {…}}` or `{"refused": {…}}`.
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -11,109 +11,110 @@ use crate::ids::BootId;
 use crate::keys::Verb;
 use crate::mission::PlanSummary;
 
-/// What the server asks of a robot.
+/// Command from the server to a robot.
 pub trait Command: Serialize {
-    /// The verb in its key.
+    /// Verb in the key of the command.
     const VERB: Verb;
-    /// What the robot replies.
+    /// Type of the robot's reply.
     type Reply: Serialize + DeserializeOwned;
 }
 
-/// A robot's answer to a command.
+/// Answer of a robot to a command.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Answer<R> {
-    /// The run of the agent that answers.
+    /// Run of the agent that answers.
     pub boot: BootId,
-    /// What it replies.
+    /// Reply to the command.
     #[serde(rename = "outcome")]
     pub reply: R,
 }
 
-/// The reply to an offer.
+/// Reply to [`Offer`](super::command::Offer).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OfferReply {
-    /// The mission is taken, now or already before.
+    /// The robot has accepted the mission, now or already before.
     Accepted {
-        /// What the robot planned; absent when it does not say.
+        /// Summary of the robot's plan; absent if the robot does not send one.
         plan: Option<PlanSummary>,
     },
-    /// The robot will not.
+    /// The robot refused the mission.
     Refused(CommandRefusal),
 }
 
-/// The reply to a request for the lease of teleoperation.
+/// Reply to a request for the lease of teleoperation.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LeaseReply {
-    /// The lease is given; the run that gave it is that of the answer.
+    /// The robot granted the lease; it belongs to the run in the answer.
     Leased {
-        /// The lease.
+        /// Epoch of the lease.
         epoch: u64,
     },
-    /// The robot will not.
+    /// The robot refused the lease.
     Refused(CommandRefusal),
 }
 
-/// The reply to every other command.
+/// Reply to every other command.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Acknowledgement {
     /// The command has taken effect, now or already before.
     Done,
-    /// The robot will not.
+    /// The robot refused the command.
     Refused(CommandRefusal),
 }
 
-/// Why a robot does not do what a command asks.
+/// Reason why a robot refuses a command.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CommandRefusal {
-    /// For programs.
+    /// Reason, for programs.
     pub code: CommandRefusalCode,
-    /// For people.
+    /// Reason, for people.
     #[serde(deserialize_with = "crate::text::bounded::<_, {crate::mission::REASON_LENGTH_MAX}>")]
     pub detail: String,
 }
 
-/// Why a robot refuses a command.
+/// Reason why a robot refuses a command, for programs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum CommandRefusalCode {
-    /// Another mission is being driven.
+    /// Another mission is active.
     Busy,
-    /// The same mission and revision were offered with other content.
+    /// The command contradicts an earlier one: the mission was offered with this revision and other
+    /// content, or a newer stop is in force.
     Conflict,
-    /// The mission, the lease or the stop has ended here before.
+    /// The mission, the lease or the stop has already ended on the robot.
     Ended,
-    /// The trajectory cannot be driven by this robot.
+    /// The robot cannot drive the trajectory.
     Impossible,
-    /// The robot is in no state to drive.
+    /// The robot is not ready to drive.
     NotReady,
     /// The latest start has passed.
     TooLate,
-    /// The mission, or whatever the command names, is not known here.
+    /// The robot does not know the mission, lease or stop that the command names.
     Unknown,
-    /// Somebody else teleoperates the robot; the detail names who.
+    /// Another driver has the lease; `detail` names the driver.
     Leased,
     /// A stop is in force.
     Stopped,
-    /// The robot does not stand.
+    /// The robot is not at rest.
     Moving,
-    /// There are too many of these.
+    /// The robot has the maximum number of them already.
     TooMany,
-    /// Any code of a newer peer.
+    /// Code that this version does not know, from a newer peer.
     #[serde(other)]
     Other,
 }
 
 impl CommandRefusal {
-    /// A refusal with a sentence for people.
+    /// Creates a refusal with a sentence for people.
     pub fn new(code: CommandRefusalCode, detail: impl Into<String>) -> Self {
         let detail = detail.into();
         Self { code, detail }
     }
 
-    /// Whether the same command may succeed later, when the robot is in another state.
+    /// Whether the same command may succeed later, when the state of the robot has changed.
     pub const fn is_transient(&self) -> bool {
         match self.code {
             CommandRefusalCode::Busy
@@ -133,10 +134,10 @@ impl CommandRefusal {
 }
 
 impl OfferReply {
-    /// The plan, if the robot says one.
+    /// Returns the plan; `None` if the robot did not send one.
     ///
     /// # Errors
-    /// The refusal.
+    /// The refusal of the robot.
     pub fn into_result(self) -> Result<Option<PlanSummary>, CommandRefusal> {
         match self {
             Self::Accepted { plan } => Ok(plan),
@@ -155,10 +156,10 @@ impl From<Result<PlanSummary, CommandRefusal>> for OfferReply {
 }
 
 impl LeaseReply {
-    /// The epoch of the lease.
+    /// Returns the epoch of the lease.
     ///
     /// # Errors
-    /// The refusal.
+    /// The refusal of the robot.
     pub fn into_result(self) -> Result<u64, CommandRefusal> {
         match self {
             Self::Leased { epoch } => Ok(epoch),
@@ -177,10 +178,10 @@ impl From<Result<u64, CommandRefusal>> for LeaseReply {
 }
 
 impl Acknowledgement {
-    /// Nothing to say but that it is done.
+    /// Converts the acknowledgement to a result.
     ///
     /// # Errors
-    /// The refusal.
+    /// The refusal of the robot.
     pub fn into_result(self) -> Result<(), CommandRefusal> {
         match self {
             Self::Done => Ok(()),

@@ -1,9 +1,9 @@
 //! Stops, leases, drive commands and external limits on zenoh.
 //!
-//! End times are on the robot's own monotonic clock (`monotonic_us` of its state), with the run of
-//! the agent that they belong to: another run refuses them. Whoever writes one estimates that
-//! clock from the state that had the shortest way. The estimate lags by that way, so an end comes
-//! too early, never too late.
+//! End times are on the robot's monotonic clock (`monotonic_us` of its state) and belong to one run
+//! of the agent; another run refuses them. A sender estimates this clock from the state with the
+//! lowest latency. The estimate lags by that latency, so that an end time may be too early, but
+//! never too late.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -15,73 +15,74 @@ use crate::ids::{BootId, OwnerId, StopId};
 use crate::keys::Verb;
 use crate::safety::{DRIVE_AHEAD_MAX_US, Driver, LIMIT_AHEAD_MAX_US};
 
-/// `cmd/stop`: command zero, latch, and answer `done` once the latch is on the disk.
+/// `cmd/stop`: commands zero velocity, latches the stop, and answers `done` once the latch is on
+/// the disk.
 ///
-/// Works in every state and needs no lease. The same twice is one stop.
+/// It is valid in every state and needs no lease. The same stop sent twice counts once.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Stop {
-    /// The stop.
+    /// Identifier of the stop.
     pub stop: StopId,
-    /// Who stops, for people.
+    /// Name of the person or program that stops the robot.
     #[serde(deserialize_with = "crate::text::bounded::<_, {crate::stop::STOP_TEXT_MAX}>")]
     pub by: String,
-    /// Why, for people.
+    /// Reason, for people.
     #[serde(deserialize_with = "crate::text::bounded::<_, {crate::mission::REASON_LENGTH_MAX}>")]
     pub reason: String,
-    /// When it was asked for, by the sender's clock.
+    /// Time when the stop was requested, by the sender's clock.
     pub at: Timestamp,
 }
 
-/// `cmd/clear`: end the stop that is in force, if it is this one and the robot stands.
+/// `cmd/clear`: clears the stop in force, if it has this identifier and the robot is at rest.
 ///
-/// `done` also when this stop was cleared before; refused as `conflict` when a newer stop is in
-/// force, as `moving` while the robot moves. Nothing starts by itself afterwards.
+/// Also `done` if this stop was cleared before; refused as `conflict` if a newer stop is in force,
+/// as `moving` while the robot moves. The robot does not start to move by itself afterwards.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClearStop {
-    /// The newest stop that its sender knows of.
+    /// Newest stop that the sender knows.
     pub stop: StopId,
-    /// Who clears, for people.
+    /// Name of the person who clears the stop.
     #[serde(deserialize_with = "crate::text::bounded::<_, {crate::stop::STOP_TEXT_MAX}>")]
     pub by: String,
 }
 
-/// `cmd/lease`: acquire the lease of teleoperation, or take it from whoever has it.
+/// `cmd/lease`: acquires the lease of teleoperation, or takes it from another driver.
 ///
-/// A refusal as `leased` has a detail that names who has it. A lease holds the active mission: it
-/// stays paused until it is resumed by request.
+/// The `detail` of a refusal as `leased` names the driver that has the lease. A lease pauses the
+/// active mission, which stays paused until it is resumed by request.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(into = "LeaseMessage")]
 pub struct AcquireLease {
-    /// Makes the command idempotent: the same request again gets the same answer and changes
-    /// nothing.
+    /// Identifier of the request, which makes it idempotent: a repetition gets the same answer and
+    /// has no effect.
     pub request: Uuid,
-    /// Who wants it; whoever has it gets it again.
+    /// Driver that requests the lease; a driver that has it already gets it again.
     pub holder: Driver,
-    /// Whether to have it also if somebody else does now.
+    /// Whether to take the lease if another driver has it.
     pub take: bool,
 }
 
-/// `cmd/lease`: give the lease of teleoperation back. It is `done` also when nobody has it.
+/// `cmd/lease`: releases the lease of teleoperation. The answer is `done` also when nobody has it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(into = "LeaseMessage")]
 pub struct ReleaseLease {
-    /// Makes the command idempotent.
+    /// Identifier of the request, which makes it idempotent.
     pub request: Uuid,
-    /// Whose lease it is.
+    /// Driver that releases its lease.
     pub holder: Driver,
 }
 
-/// What comes on `cmd/lease`, for whoever answers it.
+/// Command on `cmd/lease`, as the robot receives it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(from = "LeaseMessage", into = "LeaseMessage")]
 pub enum LeaseCommand {
-    /// Answered by a [`LeaseReply`].
+    /// Request for the lease, answered by a [`LeaseReply`].
     Acquire(AcquireLease),
-    /// Answered by an [`Acknowledgement`].
+    /// Release of the lease, answered by an [`Acknowledgement`].
     Release(ReleaseLease),
 }
 
-/// What is wanted with a lease.
+/// Operation on the lease.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum LeaseAction {
@@ -90,7 +91,7 @@ enum LeaseAction {
     Release,
 }
 
-/// A lease command as it is on the wire.
+/// Lease command in its form on the wire.
 #[derive(Serialize, Deserialize)]
 struct LeaseMessage {
     request: Uuid,
@@ -153,47 +154,50 @@ impl From<LeaseMessage> for LeaseCommand {
     }
 }
 
-/// On the robot's `teleop` key: drive like this until then.
+/// Drive command on the robot's `teleop` key: a velocity until an end time.
 ///
-/// Taken only with the present run and lease, a number above all before, and an end in the future
-/// that is no more than a second away. Anything else changes nothing and is counted. Once the last
-/// end has passed, the target is zero in the next tick.
+/// The robot accepts it only for the present run and lease, with a `seq` above all accepted ones,
+/// and with an end in the future, at most one second ahead. Any other command is counted and
+/// ignored. Once the end of the last accepted command has passed, the target velocity is zero in
+/// the next tick.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DriveCommand {
-    /// The run of the agent.
+    /// Run of the agent.
     pub boot: BootId,
-    /// The lease.
+    /// Epoch of the lease.
     pub epoch: u64,
-    /// Counts the commands of this lease.
+    /// Sequence number of the command within the lease.
     pub seq: u64,
-    /// The robot's clock when it was sent, as the sender estimates it, microseconds. The robot
-    /// measures its age by it and slows down when that is high.
+    /// Time of sending on the robot's monotonic clock, as the sender estimates it, microseconds.
+    /// The robot computes the age of the command from it and drives slower at a high age.
     pub sent_us: u64,
-    /// The robot's clock at which it ends, microseconds.
+    /// End of the command on the robot's monotonic clock, microseconds.
     pub until_us: u64,
-    /// What is wanted.
+    /// Commanded velocity in the robot frame.
     pub twist: Twist,
 }
 
-/// On the robot's `limit/{owner}` key, or by `cmd/limit`: hold or slow down until then.
+/// External limit on the robot's `limit/{owner}` key, or by `cmd/limit`: holds or slows the robot
+/// until an end time.
 ///
-/// The highest `seq` of an owner counts while it lasts (microseconds of any clock that never falls
-/// do well). `until_us` in the past, such as 0, ends the owner's limit at once. An owner that
-/// the robot's configuration calls required holds the robot by its silence.
+/// Of one owner, the limit with the highest `seq` applies until its end; microseconds of any clock
+/// that never runs back are suitable for `seq`. An `until_us` in the past, such as 0, ends the
+/// owner's limit at once. The robot is also on hold while an owner is silent that its configuration
+/// lists as required.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ExternalLimit {
-    /// Who limits; the same as in the key.
+    /// Owner of the limit; must equal the one in the key.
     pub owner: OwnerId,
-    /// The run of the agent.
+    /// Run of the agent.
     pub boot: BootId,
-    /// The robot's clock at which it ends, microseconds, at most an hour ahead.
+    /// End of the limit on the robot's monotonic clock, microseconds, at most one hour ahead.
     pub until_us: u64,
-    /// Orders the limits of this owner.
+    /// Sequence number of the limit; strictly increasing for each owner.
     pub seq: u64,
-    /// Whether the robot is to stand.
+    /// Whether to hold the robot at rest.
     #[serde(default)]
     pub hold: bool,
-    /// Fastest speed, m/s; as before when absent.
+    /// Maximum speed, m/s; unchanged when absent.
     #[serde(default)]
     pub linear_max_m_s: Option<f64>,
 }
@@ -224,17 +228,18 @@ impl Command for ExternalLimit {
 }
 
 impl DriveCommand {
-    /// Whether its end lies ahead and not too far, at the robot's clock `now_us`.
+    /// Whether the end is in the future and at most [`DRIVE_AHEAD_MAX_US`] ahead of the robot's
+    /// clock `now_us`.
     pub const fn is_in_time(&self, now_us: u64) -> bool {
         now_us < self.until_us && self.until_us - now_us <= DRIVE_AHEAD_MAX_US
     }
 }
 
 impl ExternalLimit {
-    /// Checks what does not depend on time.
+    /// Checks the fields that do not depend on time.
     ///
     /// # Errors
-    /// A sentence, if the speed is negative or no number.
+    /// A message for people, if the speed is negative or not finite.
     pub fn validate(&self) -> Result<(), String> {
         match self.linear_max_m_s {
             Some(most_m_s) if !(most_m_s.is_finite() && most_m_s >= 0.0) => Err(format!(
@@ -244,7 +249,7 @@ impl ExternalLimit {
         }
     }
 
-    /// Whether its end is too far ahead, at the robot's clock `now_us`.
+    /// Whether the end is more than [`LIMIT_AHEAD_MAX_US`] ahead of the robot's clock `now_us`.
     pub const fn is_too_long(&self, now_us: u64) -> bool {
         self.until_us.saturating_sub(now_us) > LIMIT_AHEAD_MAX_US
     }

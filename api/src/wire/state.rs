@@ -1,4 +1,5 @@
-//! What a robot publishes about itself; the latest counts, losses do no harm.
+//! State that a robot publishes periodically, and the server's pulse. Only the newest message
+//! counts, so a lost one does no harm.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -14,90 +15,93 @@ use crate::safety::SafetyStatus;
 use crate::site::Cell;
 use crate::terrain::TerrainRef;
 
-/// A robot's state, published on its `state` key.
+/// State of a robot, published on its `state` key.
 ///
 /// Ages are by the robot's monotonic clock at the time of sending.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RobotState {
-    /// Who speaks; the same as in the key.
+    /// Identifier of the robot; must equal the one in the key.
     pub robot: RobotId,
-    /// This run of the agent.
+    /// Present run of the agent.
     pub boot: BootId,
-    /// Counts the states of this run.
+    /// Sequence number of the state within the run.
     pub seq: u64,
-    /// The robot's wall clock; it may be wrong.
+    /// Wall clock of the robot; it may be wrong.
     pub robot_time: Timestamp,
-    /// The agent's monotonic clock at sending, microseconds: what end times for this run are told
-    /// in. An older agent has none.
+    /// Monotonic clock of the agent at sending, microseconds, to which end times for this run
+    /// refer. Absent from an older agent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub monotonic_us: Option<u64>,
-    /// What the agent is doing.
+    /// Operating mode of the agent.
     pub mode: RobotMode,
-    /// What is broken, if anything.
+    /// Reason of a fault, for people; absent without one.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
         deserialize_with = "crate::text::bounded_option::<_, {crate::robot::FAULT_TEXT_MAX}>"
     )]
     pub fault: Option<String>,
-    /// Where it is.
+    /// Pose in the site frame; `null` if unknown.
     pub pose: Option<Aged<Pose>>,
-    /// How fast it moves.
+    /// Velocity in the robot frame; `null` if unknown.
     pub twist: Option<Aged<Twist>>,
-    /// The mission it drives.
+    /// Progress of the active mission; `null` without one.
     pub mission: Option<MissionProgress>,
-    /// The revision of the site's terrains that the robot holds.
+    /// Revision of the site's terrains on the robot; `null` before it has a definition of the site.
     pub terrain_revision: Option<u64>,
-    /// Measurements that wait for the server.
+    /// State of the queue of records for the server.
     pub outbox: OutboxStatus,
-    /// The control loop. A robot whose ticks stand still is not alive, whatever else it says.
+    /// State of the control loop. If its number of ticks does not increase, the state does not
+    /// count as a heartbeat.
     pub control_loop: LoopStatus,
-    /// The battery, if the base measures it.
+    /// State of the battery; absent if the base does not measure it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub battery: Option<Battery>,
-    /// What needs a person's attention now, at most
+    /// Conditions that need a person's attention now, at most
     /// [`ALERTS_MAX`](crate::robot::ALERTS_MAX), each code once.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub alerts: Vec<AlertReport>,
-    /// The agent ends by itself, and this is its last word. Nobody misses it then.
+    /// Whether the agent shuts down and this is its last state; no alert is raised for its absence
+    /// then.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub leaving: bool,
-    /// What may only slow the robot down. Absent from an older agent.
+    /// Stops, leases, limits and everything else that reduces the robot's motion. Absent from an
+    /// older agent.
     #[serde(default)]
     pub safety: SafetyStatus,
 }
 
-/// The server's pulse, published every [`PULSE_PERIOD_MS`] milliseconds on the site's `pulse` key.
+/// Pulse of the server, published every [`PULSE_PERIOD_MS`] milliseconds on the site's `pulse` key.
 ///
-/// A robot measures by it how long it has not heard the server.
+/// From it a robot measures for how long the server has been silent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ServerPulse {
-    /// The server's wall clock.
+    /// Wall clock of the server.
     pub server_time: Timestamp,
-    /// Which authorities robots are to trust; a robot that trusts others renews its certificate.
-    /// Absent where robots need no certificates, and from an older server.
+    /// Identifier of the authorities that robots must trust; a robot that trusts others renews its
+    /// certificate. Absent where robots need no certificates, and from an older server.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trust: Option<TrustId>,
 }
 
-/// How often the server's pulse comes, milliseconds.
+/// Period of the server's pulse, milliseconds.
 pub const PULSE_PERIOD_MS: u64 = 250;
 
-/// Both friction estimates of a robot, published on its `friction` key.
+/// Friction estimates of a robot, published on its `friction` key.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FrictionReport {
-    /// Who speaks; the same as in the key.
+    /// Identifier of the robot; must equal the one in the key.
     pub robot: RobotId,
-    /// This run of the agent.
+    /// Present run of the agent.
     pub boot: BootId,
-    /// Counts the reports of this run.
+    /// Sequence number of the report within the run.
     pub seq: u64,
-    /// The robot's wall clock; it may be wrong.
+    /// Wall clock of the robot; it may be wrong.
     pub robot_time: Timestamp,
-    /// Where the robot is.
+    /// Cell at the robot's position; `null` if unknown.
     pub cell: Option<Cell>,
-    /// What ground it is on.
+    /// Terrain under the robot; `null` if there is none or it is unknown.
     pub terrain: Option<TerrainRef>,
-    /// The estimates.
+    /// Estimates of the tracking law and of the estimator.
     pub friction: LiveFriction,
 }
