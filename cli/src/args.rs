@@ -1,4 +1,4 @@
-//! The words of the command line.
+//! Commands and arguments of the command line.
 
 #[cfg(test)]
 mod documented;
@@ -40,11 +40,11 @@ pub(crate) use self::values::{shield_negative_points, waypoint};
 use crate::exit::Exit;
 use crate::output::{failure, note};
 
-/// Where a server answers, unless told otherwise.
+/// Default of `--server`, the address on which a server listens by default.
 pub(crate) const SERVER_DEFAULT: &str = "http://127.0.0.1:8420";
-/// The site that a server makes for itself, unless told otherwise.
+/// Default of `--site`, the site that a server creates at its first start.
 pub(crate) const SITE_DEFAULT: &str = "yard";
-/// Most robots of a demo; each is a process of its own.
+/// Maximum number of robots of a demo; each of them is a process.
 const DEMO_ROBOTS_MAX: i64 = 50;
 
 /// Runs fleets of skid-steered robots and maps the friction of the ground while they drive.
@@ -56,12 +56,12 @@ pub(crate) struct Arguments {
 }
 
 impl Arguments {
-    /// The command line with its examples.
+    /// Returns the command line with the examples in its help texts.
     pub(crate) fn whole() -> clap::Command {
         examples::with_examples(Self::command())
     }
 
-    /// Reads the words; says what is wrong with them and ends the process otherwise.
+    /// Parses the arguments. On an error, prints it and exits the process.
     pub(crate) fn read(words: impl Iterator<Item = OsString>) -> Self {
         let words: Vec<OsString> = words.collect();
         let is_for_programs = words.iter().any(|word| word == "--json");
@@ -69,7 +69,7 @@ impl Arguments {
             .try_get_matches_from(words)
             .and_then(|matches: ArgMatches| Self::from_arg_matches(&matches));
         read.unwrap_or_else(|error| {
-            // Help and version are no errors, and go where they always go.
+            // Help and version are not errors and are printed as usual.
             if is_for_programs && error.use_stderr() {
                 refuse_for_programs(&error);
             }
@@ -78,10 +78,10 @@ impl Arguments {
     }
 }
 
-/// Says what is wrong with the words as one JSON object, as is done with all else that goes wrong.
+/// Prints a usage error as one JSON object, in the format of all other errors, and exits.
 fn refuse_for_programs(error: &clap::Error) -> ! {
     let text = error.to_string();
-    // Tips and usage come after an empty line.
+    // Tips and usage follow after an empty line.
     let first = text
         .lines()
         .map(str::trim)
@@ -95,30 +95,31 @@ fn refuse_for_programs(error: &clap::Error) -> ! {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Start a whole fleet here: server, database, router and simulated robots on missions
+    /// Start a whole fleet on this machine: server, database, router and simulated robots with
+    /// missions
     Demo(DemoArguments),
     #[command(flatten)]
     Remote(RemoteCommand),
-    /// Print what a shell needs to complete these words
+    /// Print the completion script of a shell
     Completions {
-        /// The shell
+        /// Shell to print the script for
         shell: Shell,
     },
     /// Write the manual as man pages, one for each command
     Man {
-        /// Folder to write them to; it is made when it is not there
+        /// Folder to write them to; created if it does not exist
         #[arg(long, value_name = "DIR")]
         dir: PathBuf,
     },
-    /// The server, as `tread demo` starts it
+    /// Run the server; used by `tread demo`
     #[command(hide = true, disable_help_flag = true)]
     Server(PassedOn),
-    /// An agent, as `tread demo` starts it
+    /// Run an agent; used by `tread demo`
     #[command(hide = true, disable_help_flag = true)]
     Agent(PassedOn),
 }
 
-/// Arguments of another program.
+/// Arguments that are passed on to another program.
 #[derive(Debug, Args)]
 pub(crate) struct PassedOn {
     #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
@@ -126,62 +127,62 @@ pub(crate) struct PassedOn {
 }
 
 impl PassedOn {
-    /// The arguments as `program` would see them.
+    /// Returns the arguments in the form in which `program` receives them, its name first.
     pub(crate) fn for_program(self, program: &str) -> Vec<OsString> {
         std::iter::once(program.into()).chain(self.rest).collect()
     }
 }
 
-/// Commands that talk to a running server.
+/// Commands that connect to a running server.
 #[derive(Debug, Subcommand)]
 pub(crate) enum RemoteCommand {
     /// Show version, uptime and counters of the server
     Status(PlainArguments),
-    /// List sites, or make one
+    /// List sites, create one, or set its position in WGS 84
     Sites(SitesArguments),
-    /// List the robots of a site, show, rename or retire one, let one join, or put one out
+    /// List the robots of a site, or show, rename, retire, enrol or revoke one
     Robots(Box<RobotsArguments>),
-    /// Send a robot on a circle or through waypoints, or see what it would ask of the robot
+    /// Send a robot on a circle or through waypoints, or check such a trajectory without driving it
     Send(Box<SendArguments>),
-    /// List missions, show one, wait for some, pause, resume or cancel one
+    /// List missions, show, pause, resume or cancel one, or wait for some
     Missions(MissionsArguments),
-    /// List the terrains of a site, draw, change or delete one
+    /// List the terrains of a site, or show, create, change or delete one
     Terrains(TerrainsArguments),
-    /// Show what is known of the friction of a site's ground
+    /// Show the friction of a site's ground and its uncertainty
     Friction(Box<FrictionArguments>),
-    /// Stop robots at once, and latch it; exits with 1 while one has not confirmed
+    /// Stop robots at once and latch the stop; exits with 1 while a robot has not confirmed it
     Stop(StopArguments),
-    /// List stops with their confirmation and their clearing
+    /// List stops with their confirmation and clearing
     Stops(StopsArguments),
-    /// Clear a robot's stop, when it stands; nothing starts by it
+    /// Clear the stop of a robot at rest; the robot does not start to move by itself
     Clear(ClearArguments),
-    /// List alerts, or note that one was seen
+    /// List alerts, or acknowledge one
     Alerts(AlertsArguments),
-    /// Teleoperate a robot, in this terminal
+    /// Teleoperate a robot from this terminal
     Drive(DriveArguments),
-    /// List who teleoperates which robot
+    /// List the leases of teleoperation: who drives which robot
     Leases(PlainArguments),
-    /// List, set or end what other programs hold or slow a robot by
+    /// List, set or end the limits by which other programs hold or slow a robot
     Limits(LimitsArguments),
-    /// Show or replace where the robots of a site may be
+    /// Show or replace the geofence of a site
     Geofence(GeofenceArguments),
-    /// Show robots, missions and alerts as they change, until interrupted
+    /// Show robots, missions and alerts live, until interrupted
     Watch(WatchArguments),
-    /// Sign in to a server: the token is read from the input, or from `--token-file`, and kept
+    /// Sign in to a server: read a token from the input or `--token-file` and store it
     Login(PlainArguments),
-    /// Forget the token of a server
+    /// Delete the stored token of a server; the token stays valid
     Logout(PlainArguments),
-    /// Show who the token in use is, and what it may do
+    /// Show name, rights and expiry of the token in use
     Whoami(PlainArguments),
     /// Print the token in use, for other programs such as curl
     Token(PlainArguments),
-    /// List tokens, make or revoke one
+    /// List, create or revoke tokens
     Tokens(TokensArguments),
-    /// List sessions of people who signed in at the provider, or end some
+    /// List or end the sessions of people who signed in at the OpenID provider
     Sessions(SessionsArguments),
-    /// Show the fleet's authority, or rotate it: start, status and finish
+    /// Show, rotate or replace the fleet's certificate authority
     Authority(AuthorityArguments),
-    /// Show, export or verify who changed what, and who was refused
+    /// Show, export or verify the audit log: changes and refused requests
     Audit(AuditArguments),
 }
 
@@ -216,7 +217,7 @@ impl RemoteCommand {
     }
 }
 
-/// Which server and site, and how to print.
+/// Options for the connection to the server, and for the format of the output.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct Connection {
     /// Address of the server
@@ -224,10 +225,10 @@ pub(crate) struct Connection {
     pub(crate) server: String,
     #[command(flatten)]
     pub(crate) showing: Showing,
-    /// Site to look at
+    /// Site to use
     #[arg(long, global = true, env = "TREAD_SITE", default_value = SITE_DEFAULT)]
     pub(crate) site: SiteId,
-    /// Print JSON instead of a table
+    /// Print JSON instead of tables
     #[arg(long, global = true)]
     pub(crate) json: bool,
 }
@@ -237,9 +238,9 @@ pub(crate) struct Connection {
 pub(crate) struct RobotsArguments {
     #[command(subcommand)]
     pub(crate) action: Option<RobotsAction>,
-    /// Show only this one, with the age of every value
+    /// Show only this robot, with the age of every value
     pub(crate) robot: Option<RobotId>,
-    /// List retired ones too
+    /// List retired robots too
     #[arg(long, conflicts_with = "robot")]
     pub(crate) retired: bool,
     #[command(flatten)]
@@ -257,22 +258,23 @@ impl RobotsArguments {
 
 #[derive(Debug, Args)]
 pub(crate) struct DemoArguments {
-    /// How many robots, out of the scenario
+    /// Number of robots, taken from the scenario
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=DEMO_ROBOTS_MAX))]
     pub(crate) robots: u32,
-    /// Scenario file instead of the one built in
+    /// Scenario file to use instead of the built-in one
     #[arg(long, value_name = "FILE")]
     pub(crate) scenario: Option<PathBuf>,
-    /// End when all missions have ended, or after this time at the latest; else at Ctrl-C
+    /// End when all missions have ended, at the latest after this time; without it, run until
+    /// Ctrl-C
     #[arg(long, value_name = "TIME", value_parser = duration)]
     pub(crate) exit_after: Option<Duration>,
     /// Print one JSON object at the end instead of progress and tables
     #[arg(long)]
     pub(crate) json: bool,
-    /// Port of the REST API on loopback; the next free one if it is taken
+    /// Port of the REST API on the loopback interface; if it is in use, the next free one
     #[arg(long, default_value_t = 8420)]
     pub(crate) port: u16,
-    /// Folder for the database, the agents' stores and the logs; a temporary one when absent
+    /// Folder for database, outboxes and logs; a temporary one if absent
     #[arg(long, value_name = "DIR")]
     pub(crate) data_dir: Option<PathBuf>,
 }

@@ -1,6 +1,7 @@
-//! Tokens that this user has signed in with, by server, in a file that only the user can read.
+//! Tokens with which the user has signed in, by server, in a file that only the user can read.
 //!
-//! A token is looked for in this order: `--token-file`, the variable `TREAD_TOKEN`, this file.
+//! A token is taken from the first of: `--token-file`, the environment variable `TREAD_TOKEN`, this
+//! file.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -10,14 +11,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, ensure};
 
-/// The variable with a token.
+/// Environment variable with a token.
 const TOKEN_VARIABLE: &str = "TREAD_TOKEN";
-/// The variable that names another file than the usual one.
+/// Environment variable with the path of the credentials file, instead of the default path.
 const FILE_VARIABLE: &str = "TREAD_CREDENTIALS";
-/// Bits of a mode that let others read or write.
+/// Permission bits of a file that give access to others.
 const OTHERS: u32 = 0o077;
 
-/// The token to show to a server, if there is any.
+/// Returns the token for a server; `None` if there is none.
 pub(crate) fn find(address: &str, token_file: Option<&Path>) -> anyhow::Result<Option<String>> {
     if let Some(file) = token_file {
         return read_token(file).map(Some);
@@ -32,7 +33,7 @@ pub(crate) fn find(address: &str, token_file: Option<&Path>) -> anyhow::Result<O
     }
 }
 
-/// Reads a file that holds a token and nothing else.
+/// Reads a token from a file without other content.
 pub(crate) fn read_token(file: &Path) -> anyhow::Result<String> {
     let text = std::fs::read_to_string(file)
         .with_context(|| format!("cannot read the token in {}", file.display()))?;
@@ -41,14 +42,14 @@ pub(crate) fn read_token(file: &Path) -> anyhow::Result<String> {
     Ok(token.to_owned())
 }
 
-/// The file.
+/// Credentials file.
 #[derive(Debug, Clone)]
 pub(crate) struct Store {
     file: PathBuf,
 }
 
 impl Store {
-    /// This user's; `None` for one without a home.
+    /// Returns the credentials file of the user; `None` without a home directory.
     pub(crate) fn of_user() -> Option<Self> {
         let of = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty());
         let folder = || {
@@ -60,7 +61,7 @@ impl Store {
         Some(Self { file })
     }
 
-    /// Where it is.
+    /// Returns the path of the file.
     pub(crate) fn path(&self) -> &Path {
         &self.file
     }
@@ -69,7 +70,7 @@ impl Store {
         Ok(self.read()?.remove(address))
     }
 
-    /// Keeps a token for a server.
+    /// Stores the token for a server.
     pub(crate) fn keep(&self, address: &str, token: &str) -> anyhow::Result<()> {
         self.change(|kept| {
             kept.insert(address.to_owned(), token.to_owned());
@@ -77,7 +78,7 @@ impl Store {
         })
     }
 
-    /// Forgets the token for a server, or only if it is this one.
+    /// Deletes the token of a server; with `only`, only if it equals that token.
     pub(crate) fn forget(&self, address: &str, only: Option<&str>) -> anyhow::Result<()> {
         self.change(|kept| {
             let kept_one = kept.get(address);
@@ -102,7 +103,7 @@ impl Store {
         serde_json::from_str(&text).with_context(named)
     }
 
-    /// Changes the file whole, one process after the other.
+    /// Replaces the file atomically, under a lock against other processes.
     fn change(
         &self,
         change: impl FnOnce(&mut BTreeMap<String, String>) -> bool,

@@ -1,28 +1,28 @@
-//! Exit codes, so that scripts can tell what happened without reading.
+//! Exit codes, by which scripts distinguish results and errors.
 
 use std::process::ExitCode;
 
-/// How a command ended.
+/// Result of a command that did not succeed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub(crate) enum Exit {
-    /// It was done, and what came of it is not what was wished for; or something broke here.
+    /// The command was carried out with an unwanted result, or an internal error occurred.
     WentWrong = 1,
-    /// The words on the command line make no sense; clap uses the same.
+    /// The arguments are invalid; clap uses the same code.
     Usage = 2,
     /// No server answers, or the server cannot reach the robot.
     Unreachable = 3,
-    /// The server refused: token, rights, or what was asked for.
+    /// The server refused the token, the rights or the content of the request.
     Refused = 4,
-    /// What was named is not there.
+    /// A named object does not exist.
     NotFound = 5,
-    /// The present state does not allow it, or somebody was faster.
+    /// The present state does not allow the request, or it was changed meanwhile.
     Conflict = 6,
-    /// It took longer than was allowed.
+    /// It took longer than allowed.
     TimedOut = 7,
 }
 
-/// The codes for people, below the help.
+/// Description of the exit codes, below the help.
 pub(crate) const EXIT_CODES: &str = "\
 Exit codes:
   0  done

@@ -1,8 +1,8 @@
-//! `tread`: the operator's command line, and a whole fleet in one command.
+//! `tread`: the operator's command line, and the demo of a whole fleet.
 //!
-//! Everything but `demo` speaks REST to a running server and knows nothing else of it. `demo`
-//! starts this executable again as server and as agents, so that what runs is what would run in
-//! the field: separate processes that speak zenoh.
+//! Every command except `demo`, `completions` and `man` uses the REST API of a running server and
+//! nothing else. `demo` starts this executable as server and as agents, so that the demo consists
+//! of the same processes as a fleet in the field, connected by zenoh.
 
 mod args;
 mod client;
@@ -20,7 +20,7 @@ use crate::args::{Arguments, Command};
 use crate::output::Output;
 
 fn main() -> ExitCode {
-    // The first call counts, and there is no other.
+    // Fails only if a provider is installed already, which is not the case here.
     let _first = rustls::crypto::ring::default_provider().install_default();
     let words = std::env::args_os().map(args::shield_negative_points);
     match Arguments::read(words).command {
@@ -45,14 +45,15 @@ fn main() -> ExitCode {
     }
 }
 
-/// Asks the kernel to end this process when the demo that started it is gone, however it ended.
+/// Makes the kernel terminate this process when the demo that started it has ended, in whatever
+/// way.
 fn die_with_the_demo() {
-    // Where the kernel cannot, a demo that is killed leaves its parts behind.
+    // Where the kernel does not support it, the processes of a killed demo keep running.
     #[cfg(target_os = "linux")]
     let _unsupported = nix::sys::prctl::set_pdeathsig(nix::sys::signal::Signal::SIGTERM);
 }
 
-/// Runs a command to its end and turns what went wrong into a sentence and an exit code.
+/// Runs a command to its end; prints an error and converts it to an exit code.
 fn finish(output: Output, command: impl Future<Output = anyhow::Result<ExitCode>>) -> ExitCode {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()

@@ -1,4 +1,4 @@
-//! What the command line says of itself: completions for shells, and man pages.
+//! Documentation generated from the command line: shell completions and man pages.
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -12,7 +12,7 @@ use crate::output::note;
 /// Name of the program.
 const PROGRAM: &str = "tread";
 
-/// Prints the completions for a shell.
+/// Prints the completion script for a shell.
 pub(crate) fn completions(shell: Shell) -> anyhow::Result<ExitCode> {
     let mut script = Vec::new();
     clap_complete::generate(shell, &mut Arguments::whole(), PROGRAM, &mut script);

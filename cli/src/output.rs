@@ -1,4 +1,4 @@
-//! Printing: tables for people, JSON for programs, and what went wrong.
+//! Output: tables for people, JSON for programs, and error messages.
 
 use std::io::{self, Write};
 use std::process::ExitCode;
@@ -13,7 +13,7 @@ use tread_api::problem::ProblemBody;
 use crate::client::ClientError;
 use crate::exit::Exit;
 
-/// Where answers go: standard output, as tables or as JSON.
+/// Format of answers on standard output: tables or JSON.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Output {
     json: bool,
@@ -28,7 +28,7 @@ impl Output {
         self.json
     }
 
-    /// Prints a value as JSON, or what `human` makes of it.
+    /// Prints a value as JSON, or as the text that `human` returns.
     pub(crate) fn show<T: Serialize>(
         self,
         value: &T,
@@ -41,8 +41,8 @@ impl Output {
         }
     }
 
-    /// Says what went wrong, its causes and what to do next, and chooses the exit code. Programs
-    /// get one JSON object on standard error.
+    /// Prints an error with its causes and a hint what to do next, and returns the exit code. With
+    /// `--json` it is one JSON object on standard error. A closed pipe is not an error.
     pub(crate) fn report(self, error: &anyhow::Error) -> ExitCode {
         let closed_pipe = |cause: &(dyn std::error::Error + 'static)| {
             let io_error = cause.downcast_ref::<io::Error>();
@@ -59,7 +59,7 @@ impl Output {
         };
         let next_step = client_error.and_then(ClientError::next_step);
         let message = match client_error {
-            // What lies between only says again that it could not be asked.
+            // The errors in between repeat that the server was unreachable.
             Some(ClientError::Unreachable { .. }) => format!("{error}: {}", error.root_cause()),
             _ => format!("{error:#}"),
         };
@@ -76,7 +76,7 @@ impl Output {
     }
 }
 
-/// What programs get when there is no success.
+/// Returns the JSON object for an error.
 pub(crate) fn failure(
     message: &str,
     exit: Exit,
@@ -88,7 +88,7 @@ pub(crate) fn failure(
     })
 }
 
-/// Something was waited for and has not come.
+/// Error: an awaited event did not happen in the allowed time.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub(crate) struct TookTooLong(pub(crate) String);
@@ -103,13 +103,13 @@ pub(crate) fn line(text: &str) -> anyhow::Result<()> {
     writeln!(io::stdout().lock(), "{text}").context("cannot print")
 }
 
-/// Prints a line to standard error, for people only.
+/// Prints a line to standard error.
 pub(crate) fn note(text: &str) {
-    // Nobody is left to be told when standard error is closed.
+    // An error is ignored: without standard error there is no place to report it.
     _ = writeln!(io::stderr().lock(), "{text}");
 }
 
-/// A table without lines, as command lines print them.
+/// Creates a table without borders.
 pub(crate) fn table<const N: usize>(header: [&str; N]) -> Table {
     let mut table = Table::new();
     table.load_style(presets::NOTHING);
@@ -118,7 +118,7 @@ pub(crate) fn table<const N: usize>(header: [&str; N]) -> Table {
     table
 }
 
-/// A table as text, without the spaces at the ends of its lines.
+/// Returns a table as text, without spaces at the ends of lines.
 pub(crate) fn render(table: &Table) -> String {
     let lines: Vec<String> = table
         .lines()
@@ -127,12 +127,12 @@ pub(crate) fn render(table: &Table) -> String {
     lines.join("\n")
 }
 
-/// A value, or a dash where nothing is known.
+/// Returns a value as text, `-` for `None`.
 pub(crate) fn or_dash<T: ToString>(value: Option<T>) -> String {
     value.map_or_else(|| "-".to_owned(), |value| value.to_string())
 }
 
-/// A number with so many decimals; what rounds to zero has no sign.
+/// Formats a number with `digits` decimals; a number that rounds to zero has no sign.
 pub(crate) fn fixed(value: f64, digits: usize) -> String {
     let text = format!("{value:.digits$}");
     match text.strip_prefix('-') {
@@ -141,7 +141,7 @@ pub(crate) fn fixed(value: f64, digits: usize) -> String {
     }
 }
 
-/// An age for people.
+/// Formats an age for people.
 pub(crate) fn age(age_ms: u64) -> String {
     match age_ms {
         0..1_000 => format!("{age_ms} ms"),

@@ -1,5 +1,5 @@
-//! The WebSocket to a robot, over the same client as every other request: the same address, TLS,
-//! trusted certificates and token.
+//! WebSocket to a robot, opened with the same HTTP client as every other request: with the same
+//! address, TLS, trusted certificates and token.
 
 use reqwest::{Method, StatusCode, Upgraded, header};
 use tokio_tungstenite::WebSocketStream;
@@ -10,16 +10,16 @@ use tread_api::ids::{RobotId, SiteId};
 
 use crate::client::{Client, ClientError};
 
-/// Largest frame from the server that is read, bytes; a view has some kilobytes.
+/// Maximum size of a frame from the server, bytes; a view has a few kilobytes.
 const FRAME_MAX: usize = 1 << 20;
 
-/// A socket to watch a robot and to drive it.
+/// Socket to watch and drive a robot.
 pub(crate) type Socket = WebSocketStream<Upgraded>;
 
 /// Opens the drive socket of a robot.
 ///
 /// # Errors
-/// [`ClientError`]: nobody answers, the server refuses, or what answers speaks no WebSocket.
+/// [`ClientError`] if the server does not answer, refuses, or does not open a WebSocket.
 pub(crate) async fn open(
     client: &Client,
     site: &SiteId,

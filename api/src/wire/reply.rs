@@ -81,12 +81,12 @@ pub struct CommandRefusal {
 pub enum CommandRefusalCode {
     /// Another mission is active.
     Busy,
-    /// The command contradicts an earlier one: the mission was offered with this revision and other
-    /// content, or a newer stop is in force.
+    /// The command contradicts another one: the mission was offered with this revision and other
+    /// content, a newer stop or limit is in force, or the limit is for another run of the agent.
     Conflict,
     /// The mission, the lease or the stop has already ended on the robot.
     Ended,
-    /// The robot cannot drive the trajectory.
+    /// The robot cannot drive the trajectory, or a limit is out of range.
     Impossible,
     /// The robot is not ready to drive.
     NotReady,

@@ -1,4 +1,4 @@
-//! Every command that the documentation shows is understood by the program of today.
+//! Test that every command in README and docs is accepted by the present command lines.
 
 use std::fmt::Write as _;
 
@@ -8,15 +8,16 @@ use tread_tests::shell::commands;
 
 use super::{Arguments, shield_negative_points};
 
-/// What the documentation writes for what differs each time.
+/// Placeholders in the documentation, with a valid value for each.
 const PLACEHOLDERS: [(&str, &str); 2] = [
     ("TOKEN_ID", "0192f0c1-2b3c-7d4e-8f50-617283940a1b"),
     ("ROTATION", "3f0c8a5e91d2b746"),
 ];
-/// Fewest commands that are looked at; with less, the documentation was not found.
+/// Minimum number of commands that the test must check; fewer mean that the documentation was not
+/// found.
 const COMMANDS_MIN: usize = 40;
 
-/// One of our programs.
+/// Returns the command line of one of our programs; `None` for any other program.
 fn program(name: &str) -> Option<clap::Command> {
     match name {
         "tread" => Some(Arguments::whole()),
@@ -26,7 +27,8 @@ fn program(name: &str) -> Option<clap::Command> {
     }
 }
 
-/// The words of a command of ours, with something for each placeholder; `cargo run` is one too.
+/// Returns the arguments of a command of one of our programs, with values for placeholders; `None`
+/// for any other command. `cargo run --` counts as `tread`.
 fn ours(mut words: Vec<String>) -> Option<Vec<String>> {
     if words.starts_with(&["cargo".to_owned(), "run".to_owned()]) {
         let is_other = words
@@ -47,7 +49,7 @@ fn ours(mut words: Vec<String>) -> Option<Vec<String>> {
     Some(words)
 }
 
-/// What is wrong with a whole command.
+/// Returns the error of a complete command; `None` if it is valid.
 fn fault(words: &[String]) -> Option<String> {
     let program = program(&words[0])?;
     let words = words.iter().map(|word| shield_negative_points(word.into()));
@@ -57,7 +59,8 @@ fn fault(words: &[String]) -> Option<String> {
     refused.use_stderr().then_some(first)
 }
 
-/// A flag of a command, or of one below it where `is_deep`: whether a value follows it.
+/// Returns whether a flag of a command takes a value, with `is_deep` also of its subcommands;
+/// `None` if the flag does not exist.
 fn takes_value(command: &clap::Command, flag: &str, is_deep: bool) -> Option<bool> {
     let own = command
         .get_arguments()
@@ -67,11 +70,11 @@ fn takes_value(command: &clap::Command, flag: &str, is_deep: bool) -> Option<boo
     own.or_else(|| below.find_map(|below| takes_value(below, flag, true)))
 }
 
-/// What is wrong with a part of a command, as sentences name them: a command or a flag that is not
-/// known. What it would still need may be missing, and `…` stands for whatever may be there.
+/// Returns the error of a command fragment in running text: an unknown command or flag. Required
+/// arguments may be missing, and `…` stands for any arguments.
 fn fault_of_part(words: &[&str]) -> Option<String> {
     let mut command = program(words[0])?;
-    // Adds `help` and what else clap knows by itself.
+    // Adds `help` and the other built-in subcommands of clap.
     command.build();
     let (mut path, mut is_shortened, mut has_values) = (words[0].to_owned(), false, false);
     let mut words = words[1..].iter();

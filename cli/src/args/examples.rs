@@ -1,8 +1,8 @@
-//! Examples for every command, shown below its help. A test reads each as a command line.
+//! Examples for every command, shown below its help. A test parses each of them.
 
 use crate::exit::EXIT_CODES;
 
-/// Commands by their path, with what one would type.
+/// Path of each command, with its examples.
 const EXAMPLES: &[(&str, &str)] = &[
     (
         "",
@@ -207,7 +207,7 @@ const EXAMPLES: &[(&str, &str)] = &[
     ),
 ];
 
-/// The same commands, each with its examples below its help.
+/// Returns the same command line with the examples of each command below its help.
 pub(super) fn with_examples(command: clap::Command) -> clap::Command {
     let codes = format!("{}\n\n{EXIT_CODES}", below_help("").unwrap_or_default());
     all_below(command, "").after_help(codes)
@@ -251,7 +251,7 @@ mod tests {
         }
     }
 
-    /// Words as a shell would make them of a line without anything but quotes and `>`.
+    /// Splits a line into words as a shell does, with support for quotes and `>` only.
     fn words(line: &str) -> Vec<String> {
         let typed = line.split(" > ").next().unwrap_or_default();
         let mut words = Vec::new();
@@ -265,7 +265,7 @@ mod tests {
         words
     }
 
-    /// The path of the command that was understood.
+    /// Returns the path of the parsed subcommand.
     fn chain(matches: &clap::ArgMatches) -> String {
         match matches.subcommand() {
             Some((name, below)) => format!("{name} {}", chain(below)).trim_end().to_owned(),

@@ -1,4 +1,5 @@
-//! The words of the commands about tokens, and about who is of the fleet.
+//! Arguments of the commands about identities: tokens, sessions, authority, audit log and
+//! enrolment.
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -11,13 +12,14 @@ use tread_api::rights::Right;
 
 use super::{Connection, duration};
 
-/// How to show who asks, and whom to trust.
+/// Options for authentication and for the trust in the server.
 #[derive(Debug, Clone, Default, Args)]
 pub(crate) struct Showing {
-    /// File with the token; else `TREAD_TOKEN`, else what `tread login` keeps for the server
+    /// File with the token; if absent, `TREAD_TOKEN`, else the token that `tread login` stored for
+    /// the server
     #[arg(long, global = true, value_name = "FILE")]
     pub(crate) token_file: Option<PathBuf>,
-    /// Certificate of the authority to trust, PEM, instead of the machine's
+    /// PEM file with the certificate of the authority to trust, instead of those of the system
     #[arg(long, global = true, env = "TREAD_CA", value_name = "FILE")]
     pub(crate) ca: Option<PathBuf>,
 }
@@ -38,30 +40,31 @@ pub(crate) struct TokensArguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum TokensAction {
-    /// List tokens, newest first, dead ones too
+    /// List tokens, newest first, including expired and revoked ones
     List,
-    /// Make a token; it is printed this once
+    /// Create a token; its secret is printed only once
     Create {
-        /// What people call it
+        /// Name of the token, for people
         name: String,
-        /// What it may do: viewer, operator or admin
+        /// Role: viewer, operator or admin
         #[arg(long, required_unless_present = "rights", conflicts_with = "rights")]
         role: Option<Role>,
-        /// What it may do, in place of a role, with commas: `stop`, `read`, `drive`, `clear_stop`,
+        /// Rights instead of a role, separated by commas: `stop`, `read`, `drive`, `clear_stop`,
         /// `hold`, `release_hold`, `dispatch`, `acknowledge`, `configure`, `administer`
         #[arg(long, value_name = "RIGHTS", value_delimiter = ',')]
         rights: Option<Vec<Right>>,
-        /// Where it may do that, with commas, each SITE or SITE/ROBOT; everywhere without it
+        /// Sites and robots for which the rights hold, each SITE or SITE/ROBOT, separated by
+        /// commas; all if absent
         #[arg(long = "for", value_name = "PLACES", value_delimiter = ',')]
         places: Vec<String>,
-        /// Days until it is refused
+        /// Validity, days
         #[arg(long, value_name = "DAYS", default_value_t = TOKEN_DAYS_DEFAULT,
             value_parser = clap::value_parser!(u32).range(1..=i64::from(TOKEN_DAYS_MAX)))]
         valid_days: u32,
     },
-    /// Revoke a token: it is refused from now on, and what it has open closes
+    /// Revoke a token: it is refused from now on, and its open connections are closed
     Revoke {
-        /// The token's identifier, as `tread tokens` lists it
+        /// Identifier of the token, as `tread tokens` lists it
         token: TokenId,
     },
 }
@@ -76,11 +79,11 @@ pub(crate) struct SessionsArguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum SessionsAction {
-    /// List who is signed in at the provider, newest first
+    /// List sessions, newest first
     List,
-    /// End sessions: they are refused from now on, and what they have open closes
+    /// End sessions: they are refused from now on, and their open connections are closed
     End {
-        /// The sessions' identifiers, as `tread sessions` lists them
+        /// Identifiers of the sessions, as `tread sessions` lists them
         #[arg(required = true, value_name = "SESSION")]
         sessions: Vec<SessionId>,
     },
@@ -96,23 +99,27 @@ pub(crate) struct AuthorityArguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum AuthorityAction {
-    /// Show who signs robots' certificates and, during a rotation, which robots are left
+    /// Show the authority that signs robots' certificates and, during a rotation, the robots that
+    /// have not moved to it
     Status,
-    /// Start a rotation: another authority signs from now on, and both are trusted until it is finished
+    /// Start a rotation: a new authority signs from now on, and both are trusted until it is
+    /// finished
     Start,
-    /// Finish a rotation: the former authority is retired; refused while robots are left
+    /// Finish a rotation by retiring the former authority; refused while robots hold its
+    /// certificates
     Finish {
-        /// The rotation, as `start` and `status` show it
+        /// Identifier of the rotation, as `start` and `status` show it
         #[arg(value_parser = rotation)]
         rotation: TrustId,
-        /// Finish it though robots are left; each of them must join again
+        /// Finish it although robots hold certificates of the former authority; they must join
+        /// again
         #[arg(long)]
         force: bool,
     },
-    /// Replace an authority whose key was stolen: nothing that it has signed counts any more, and every
-    /// robot must join again
+    /// Replace an authority whose key was stolen: all its certificates become invalid at once, and
+    /// every robot must join again
     Replace {
-        /// Do not ask
+        /// Skip the confirmation prompt
         #[arg(long)]
         yes: bool,
     },
@@ -128,13 +135,13 @@ fn rotation(text: &str) -> Result<TrustId, String> {
 pub(crate) struct AuditArguments {
     #[command(subcommand)]
     pub(crate) action: Option<AuditAction>,
-    /// Only what was asked with the token, or by the person, of this name
+    /// Show only requests of the token or person with this name
     #[arg(long)]
     pub(crate) who: Option<String>,
-    /// Only what was refused or failed
+    /// Show only requests that were refused or failed
     #[arg(long)]
     pub(crate) refused: bool,
-    /// At most so many, newest first
+    /// Maximum number of entries, newest first
     #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(crate) limit: u32,
     #[command(flatten)]
@@ -145,24 +152,24 @@ pub(crate) struct AuditArguments {
 pub(crate) enum AuditAction {
     /// Write all entries as JSON Lines, the oldest first
     Export {
-        /// Write them into this new file, which only its owner can read, instead of printing them
+        /// New file to write to, readable by its owner only, instead of standard output
         #[arg(long, value_name = "FILE")]
         output: Option<PathBuf>,
-        /// Only those after the entry of this number
+        /// Write only entries with a number above this one
         #[arg(long, value_name = "NUMBER")]
         after: Option<u64>,
     },
-    /// Compute the hashes of all entries here, and say which was changed, removed or put in between
+    /// Verify the hash chain and report entries that were changed, removed or inserted
     Verify {
-        /// Verify what was exported into this file instead of asking the server
+        /// Exported file to verify instead of the server's log
         file: Option<PathBuf>,
-        /// Number and hash that an earlier `verify` printed: the entry must still be the same
+        /// Number and hash from an earlier `verify`; fails if that entry has changed since
         #[arg(long, value_name = "NUMBER:HASH")]
         noted: Option<Noted>,
     },
 }
 
-/// An entry of the audit log that was noted before.
+/// Number and hash of an entry that were recorded earlier.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Noted {
     pub(crate) id: u64,
@@ -187,17 +194,17 @@ impl FromStr for Noted {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum RobotsAction {
-    /// Make a token by which one robot may join once; it is printed this once
+    /// Create a join token, which is valid for one robot once; its secret is printed only once
     JoinToken(JoinTokenArguments),
-    /// List how each robot of the site stands that has ever joined
+    /// List all robots of the site that have ever joined, with their certificates
     Enrolments(PlainArguments),
-    /// Give a robot another name for people
+    /// Change the name of a robot for people
     Rename(RenameArguments),
-    /// Retire a robot: its missions are cancelled, it gets no more and is not listed
+    /// Retire a robot: its missions are cancelled, it gets no new ones and is not listed
     Retire(RobotArguments),
-    /// Take a retired robot back
+    /// Restore a retired robot
     Restore(RobotArguments),
-    /// Put a robot out of the fleet; it comes back only by a join token that names it
+    /// Revoke a robot's enrolment; it can join again only with a join token that names it
     Revoke(RobotArguments),
 }
 
@@ -219,13 +226,14 @@ impl RobotsAction {
 pub(crate) struct JoinTokenArguments {
     #[command(subcommand)]
     pub(crate) action: Option<JoinTokenAction>,
-    /// The robot that it is for; without it any may join that is new to the site
+    /// Robot that the token is for; if absent, any robot that is new to the site
     #[arg(long, value_name = "ROBOT")]
     pub(crate) name: Option<RobotId>,
-    /// One for each robot of all sites that must join again because its authority was retired
+    /// Create a token for each robot, of all sites, that must join again because its authority was
+    /// retired
     #[arg(long, conflicts_with = "name")]
     pub(crate) all: bool,
-    /// How long it may be used, such as `30m` or `1h`, at most a day
+    /// Validity, such as `30m` or `1h`, at most one day
     #[arg(long, value_name = "TIME", default_value = "1h", value_parser = join_time)]
     pub(crate) expires: u32,
     #[command(flatten)]
@@ -234,20 +242,20 @@ pub(crate) struct JoinTokenArguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum JoinTokenAction {
-    /// List join tokens, newest first, dead ones too
+    /// List join tokens, newest first, including used, expired and revoked ones
     List,
     /// Revoke a join token
     Revoke {
-        /// The join token's identifier, as `list` shows it
+        /// Identifier of the join token, as `list` shows it
         join_token: JoinTokenId,
     },
 }
 
 #[derive(Debug, Args)]
 pub(crate) struct RenameArguments {
-    /// The robot; its identifier stays
+    /// Robot to rename; its identifier does not change
     pub(crate) robot: RobotId,
-    /// Its name
+    /// New name
     pub(crate) name: String,
     #[command(flatten)]
     pub(crate) connection: Connection,
@@ -255,13 +263,13 @@ pub(crate) struct RenameArguments {
 
 #[derive(Debug, Args)]
 pub(crate) struct RobotArguments {
-    /// The robot
+    /// Robot identifier
     pub(crate) robot: RobotId,
     #[command(flatten)]
     pub(crate) connection: Connection,
 }
 
-/// Whole minutes out of a time such as `1h`.
+/// Parses a validity such as `1h` to minutes, rounded up; an error unless it is 1 minute to 1 day.
 fn join_time(text: &str) -> Result<u32, String> {
     let time = duration(text)?;
     let minutes = u32::try_from(time.as_secs().div_ceil(60)).unwrap_or(u32::MAX);

@@ -1,4 +1,4 @@
-//! The words of the commands about sites and their ground.
+//! Arguments of the commands about sites, terrains and friction.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -24,39 +24,40 @@ pub(crate) struct SitesArguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum SitesAction {
-    /// Make a site
+    /// Create a site
     Create {
-        /// Its identifier: a-z, 0-9 and `-`
+        /// Identifier: a-z, 0-9 and `-`
         id: SiteId,
-        /// Name for people; the identifier when absent
+        /// Name for people; the identifier if absent
         #[arg(long)]
         name: Option<String>,
-        /// Side of the squares in which friction is kept, metres; it never changes
+        /// Side of a cell of the friction map, metres, 1 if absent; it cannot be changed later
         #[arg(long, value_name = "M", value_parser = positive)]
         cell: Option<f64>,
-        /// Where on the earth its origin lies, WGS 84 degrees north and east; it may be said later
+        /// Position of the origin in WGS 84, degrees north and east; can be set later with `sites
+        /// tie`
         #[arg(long, value_name = "LAT,LON", value_parser = earth)]
         origin: Option<GeoOrigin>,
-        /// Angle from east to its x axis, counter-clockwise, degrees
+        /// Angle from east to the site's x axis, counter-clockwise, degrees
         #[arg(long, value_name = "DEG", value_parser = finite, allow_hyphen_values = true)]
         #[arg(default_value_t = 0.0, requires = "origin")]
         x_axis: f64,
     },
-    /// Say where on the earth a site lies, so that its map can be given in WGS 84
+    /// Set the position of a site in WGS 84, which exports of its map in WGS 84 need
     Tie {
-        /// The site
+        /// Site identifier
         id: SiteId,
-        /// Where its origin lies, degrees north and east
+        /// Position of the origin in WGS 84, degrees north and east
         #[arg(value_name = "LAT,LON", value_parser = earth)]
         origin: GeoOrigin,
-        /// Angle from east to its x axis, counter-clockwise, degrees
+        /// Angle from east to the site's x axis, counter-clockwise, degrees
         #[arg(long, value_name = "DEG", value_parser = finite, allow_hyphen_values = true)]
         #[arg(default_value_t = 0.0)]
         x_axis: f64,
     },
-    /// Take back where on the earth a site lies
+    /// Remove the position of a site in WGS 84
     Untie {
-        /// The site
+        /// Site identifier
         id: SiteId,
     },
 }
@@ -69,19 +70,19 @@ pub(crate) struct TerrainsArguments {
     pub(crate) connection: Connection,
 }
 
-/// What can be said of a terrain; what is absent stays as it is.
+/// Properties of a terrain; absent ones stay unchanged.
 #[derive(Debug, Args)]
 pub(crate) struct Drawing {
     /// Name for people
     #[arg(long)]
     pub(crate) name: Option<String>,
-    /// Where terrains overlap the higher layer counts
+    /// Layer; where terrains overlap, the highest layer applies
     #[arg(long, allow_hyphen_values = true)]
     pub(crate) layer: Option<i32>,
-    /// Corners of its border, metres, in order
+    /// Corners of the border in order, metres in the site frame
     #[arg(value_name = "X,Y", value_parser = point)]
     pub(crate) corners: Vec<Point>,
-    /// Read the corners from a file: a line `x,y` each, or a JSON list of `{"x_m": …, "y_m": …}`
+    /// File with the corners: one line `x,y` each, or a JSON list of `{"x_m": …, "y_m": …}`
     #[arg(long, value_name = "FILE", conflicts_with = "corners")]
     pub(crate) file: Option<PathBuf>,
 }
@@ -90,32 +91,32 @@ pub(crate) struct Drawing {
 pub(crate) enum TerrainsAction {
     /// Show a terrain with its corners
     Show {
-        /// The terrain
+        /// Terrain identifier
         terrain: TerrainId,
     },
-    /// Draw a terrain
+    /// Create a terrain
     Create {
-        /// Its identifier: a-z, 0-9 and `-`
+        /// Identifier: a-z, 0-9 and `-`
         terrain: TerrainId,
-        /// Kind of ground
+        /// Class of the ground
         #[arg(long, value_parser = terrain_class())]
         class: TerrainClass,
         #[command(flatten)]
         drawing: Drawing,
     },
-    /// Change a terrain; what is not said stays
+    /// Change a terrain; absent options leave it unchanged
     Change {
-        /// The terrain
+        /// Terrain identifier
         terrain: TerrainId,
-        /// Kind of ground
+        /// Class of the ground
         #[arg(long, value_parser = terrain_class())]
         class: Option<TerrainClass>,
         #[command(flatten)]
         drawing: Drawing,
     },
-    /// Remove a terrain; what was measured on it stays
+    /// Delete a terrain; its measurements stay
     Delete {
-        /// The terrain
+        /// Terrain identifier
         terrain: TerrainId,
     },
 }
@@ -128,23 +129,23 @@ pub(crate) struct FrictionArguments {
     pub(crate) connection: Connection,
 }
 
-/// As of when, and whose measurements.
+/// Time as of which the map is read, and selection of robot models.
 #[derive(Debug, Args)]
 pub(crate) struct ReadingArguments {
-    /// As it was known then: RFC 3339, or how long ago, such as `2h`
+    /// Time as of which the map is read: RFC 3339, or how long ago, such as `2h`
     #[arg(long, value_name = "WHEN", value_parser = moment)]
     as_of: Option<Timestamp>,
     #[command(flatten)]
     models: ModelArguments,
 }
 
-/// Whose measurements.
+/// Selection of robot models.
 #[derive(Debug, Args)]
 pub(crate) struct ModelArguments {
-    /// Only measurements of this robot model and tyres; `--json` shows the identifiers
+    /// Include only this configuration (robot model and tyres); `--json` shows the identifiers
     #[arg(long, value_name = "ID")]
     configuration: Option<ConfigurationId>,
-    /// Join robot models by this normalisation of the server's configuration
+    /// Include other robot models too, by this normalisation of the server's configuration
     #[arg(long, value_name = "NAME")]
     normalisation: Option<String>,
 }
@@ -168,81 +169,81 @@ impl ModelArguments {
     }
 }
 
-/// A box of the map, or all of it.
+/// Box of the map, or the whole map.
 #[derive(Debug, Args)]
 pub(crate) struct BoxArgument {
-    /// Only this box: its lowest and highest x and y, metres; the whole map when absent
+    /// Box: lowest and highest x and y, metres in the site frame; the whole map if absent
     #[arg(long = "box", value_name = "X0,Y0,X1,Y1", value_parser = area)]
     pub(crate) area: Option<Area>,
 }
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum FrictionAction {
-    /// What is known of each terrain, or of one
+    /// Show the friction of each terrain, or of one
     Terrains {
-        /// Only this one
+        /// Show only this terrain
         terrain: Option<TerrainId>,
         #[command(flatten)]
         reading: ReadingArguments,
     },
-    /// A terrain as it was known at equally spaced times
+    /// Show the friction of a terrain at equally spaced times
     History {
-        /// The terrain
+        /// Terrain identifier
         terrain: TerrainId,
-        /// The oldest time: RFC 3339, or how long ago
+        /// First time: RFC 3339, or how long ago
         #[arg(long, value_name = "WHEN", default_value = "24h", value_parser = moment)]
         from: Timestamp,
-        /// The newest time; now when absent
+        /// Last time: RFC 3339, or how long ago; now if absent
         #[arg(long, value_name = "WHEN", value_parser = moment)]
         to: Option<Timestamp>,
-        /// From one time to the next, at least a minute
+        /// Time between two rows, at least one minute
         #[arg(long, value_name = "TIME", default_value = "1h", value_parser = duration)]
         step: Duration,
         #[command(flatten)]
         models: ModelArguments,
     },
-    /// Cells of a box or of the whole map
+    /// Show the friction of the cells in a box or of the whole map
     Cells {
         #[command(flatten)]
         area: BoxArgument,
-        /// Put cells together to squares of this side, metres
+        /// Merge cells into squares of this side, metres
         #[arg(long, value_name = "M", value_parser = positive)]
         resolution: Option<f64>,
         #[command(flatten)]
         reading: ReadingArguments,
     },
-    /// What is known at a point, of the terrain under it
+    /// Show the friction at a point, for the terrain under it
     Point {
-        /// The point, metres
+        /// Point, metres in the site frame
         #[arg(value_name = "X,Y", value_parser = point)]
         point: Point,
         #[command(flatten)]
         reading: ReadingArguments,
     },
-    /// Along a path, with the speed that follows for a robot
+    /// Show the friction along a path, with the speed that it permits a robot
     Path {
-        /// Corners of the path, metres, in order
+        /// Corners of the path in order, metres in the site frame
         #[arg(value_name = "X,Y", value_parser = point, required_unless_present = "file")]
         points: Vec<Point>,
-        /// Read the corners from a file: a line `x,y` each, or a JSON list
+        /// File with the corners: one line `x,y` each, or a JSON list
         #[arg(long, value_name = "FILE", conflicts_with = "points")]
         file: Option<PathBuf>,
-        /// Who is to drive it
+        /// Robot that is to drive the path
         #[arg(long)]
         robot: RobotId,
-        /// As it was known then: RFC 3339, or how long ago, such as `2h`
+        /// Time as of which the map is read: RFC 3339, or how long ago, such as `2h`
         #[arg(long, value_name = "WHEN", value_parser = moment)]
         as_of: Option<Timestamp>,
-        /// Join robot models by this normalisation of the server's configuration
+        /// Include other robot models too, by this normalisation of the server's configuration
         #[arg(long, value_name = "NAME")]
         normalisation: Option<String>,
     },
-    /// Cells that were measured between two times, before and after
+    /// Compare the friction of cells at two times, for cells measured between them
     Difference {
-        /// The first time: RFC 3339, or how long ago
+        /// First time: RFC 3339, or how long ago
         #[arg(long, value_name = "WHEN", value_parser = moment)]
         from: Timestamp,
-        /// The second time; now when absent
+        /// Second time: RFC 3339, or how long ago; now if absent
         #[arg(long, value_name = "WHEN", value_parser = moment)]
         to: Option<Timestamp>,
         #[command(flatten)]
@@ -250,48 +251,49 @@ pub(crate) enum FrictionAction {
         #[command(flatten)]
         models: ModelArguments,
     },
-    /// Where a visit would teach most, the best first
+    /// List the cells whose measurement would reduce the uncertainty of the map most, the best
+    /// first
     Visits {
-        /// The box to look in: its lowest and highest x and y, metres
+        /// Box to search: lowest and highest x and y, metres in the site frame
         #[arg(long = "box", value_name = "X0,Y0,X1,Y1", value_parser = area)]
         area: Area,
-        /// At most so many
+        /// Maximum number of cells
         #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=1000))]
         limit: u32,
         #[command(flatten)]
         reading: ReadingArguments,
     },
-    /// The map of one robot model as a picture with its legend
+    /// Draw the map of one robot model as a PNG picture with its legend
     Map {
-        /// Write it to this file; `-` is standard output
+        /// File to write; `-` is standard output
         #[arg(long, value_name = "FILE")]
         png: PathBuf,
         #[command(flatten)]
         area: BoxArgument,
-        /// Put cells together to squares of this side, metres
+        /// Merge cells into squares of this side, metres
         #[arg(long, value_name = "M", value_parser = positive)]
         resolution: Option<f64>,
-        /// Pixels of a square's side; as many as make a picture of usual size when absent
+        /// Side of a square in pixels; chosen for a picture of usual size if absent
         #[arg(long, value_parser = clap::value_parser!(u32).range(1..=32))]
         scale: Option<u32>,
         #[command(flatten)]
         reading: ReadingArguments,
     },
-    /// What each robot has put in, and its bias as far as it shows
+    /// List each robot's contribution to the map, with its estimated bias
     Robots,
-    /// What was taken off the map
+    /// List the measurements that were withdrawn from the map
     Withdrawals,
-    /// Take what a robot measured in some hours off the map, for good
+    /// Withdraw a robot's measurements of some hours from the map; this cannot be undone
     Withdraw {
-        /// Whose measurements
+        /// Robot whose measurements are withdrawn
         robot: RobotId,
-        /// Why, for people
+        /// Reason, for people
         #[arg(long)]
         reason: String,
-        /// A time of the first hour; from the beginning when absent
+        /// Time within the first hour; from the first measurement if absent
         #[arg(long, value_name = "WHEN", value_parser = moment)]
         from: Option<Timestamp>,
-        /// A time of the last hour; the present one when absent
+        /// Time within the last hour; the present hour if absent
         #[arg(long, value_name = "WHEN", value_parser = moment)]
         to: Option<Timestamp>,
     },

@@ -1,4 +1,4 @@
-//! The words of the commands that give robots something to do.
+//! Arguments of the commands that create and control missions.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -29,63 +29,64 @@ impl SendArguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum SendTrajectory {
-    /// Turns on a circle
+    /// Drive turns on a circle
     Circle(SendCircle),
-    /// A smooth path through points
+    /// Drive a smooth path through points
     Waypoints(SendWaypoints),
 }
 
-/// What circles and waypoints have in common.
+/// Options that circles and waypoints have in common.
 #[derive(Debug, Args)]
 pub(crate) struct Order {
     /// Robot that is to drive
     #[arg(long)]
     pub(crate) robot: RobotId,
-    /// Never start later than this from now
+    /// Let the mission expire if it has not started within this time from now
     #[arg(long, value_name = "TIME", value_parser = duration)]
     pub(crate) start_within: Option<Duration>,
-    /// What becomes of the robot's other missions
+    /// Effect on the robot's other missions
     #[arg(long, value_enum, default_value_t = Start::Append)]
     pub(crate) start: Start,
-    /// Missions of a higher priority are driven first
+    /// Priority, -100 to 100; missions of a higher priority are driven first
     #[arg(long, default_value_t = 0, allow_hyphen_values = true)]
     pub(crate) priority: i32,
-    /// Stop when the server has not been heard for so long; the robot drives on when absent
+    /// Stop the robot when the server was silent for this time; it continues the mission if absent
     #[arg(long, value_name = "TIME", value_parser = duration)]
     pub(crate) stop_after_silence: Option<Duration>,
-    /// The mission fails when the robot has been away for so long
+    /// Let the mission fail when the robot was offline for this time
     #[arg(long, value_name = "TIME", value_parser = duration)]
     pub(crate) lost_after: Option<Duration>,
-    /// Speed on the approach to the trajectory, metres per second; the trajectory's own when absent
+    /// Speed of the approach to the trajectory, metres per second; that of the trajectory if absent
     #[arg(long, value_name = "M/S", value_parser = finite, allow_negative_numbers = true)]
     pub(crate) approach_speed: Option<f64>,
-    /// Excitation the speed, so that a base without torque sensing can measure friction
+    /// Vary the speed periodically (excitation), so that friction is measurable without torque
+    /// sensing
     #[arg(long)]
     pub(crate) excite: bool,
-    /// Swap this mission for the new trajectory instead of queueing another
+    /// Replace the trajectory of this mission instead of creating a mission
     #[arg(long, value_name = "MISSION", value_parser = mission)]
     pub(crate) replaces: Option<MissionId>,
-    /// Only tell what it would ask of the robot; nothing moves
+    /// Only check the trajectory and show its plan; nothing moves
     #[arg(long, conflicts_with_all = ["replaces", "wait"])]
     pub(crate) check: bool,
     /// Wait until the mission has ended, showing its progress
     #[arg(long)]
     pub(crate) wait: bool,
-    /// Wait at most so long; the mission goes on
+    /// Wait at most for this time; the mission continues
     #[arg(long, value_name = "TIME", value_parser = duration, requires = "wait")]
     pub(crate) timeout: Option<Duration>,
     #[command(flatten)]
     pub(crate) connection: Connection,
 }
 
-/// What becomes of a robot's other missions.
+/// Effect of a new mission on the robot's other missions.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 pub(crate) enum Start {
-    /// The new one waits for them
+    /// The new mission waits behind them
     Append,
     /// They are cancelled
     Replace,
-    /// The new one is refused if there are any
+    /// The new mission is refused if there are any
     Refuse,
 }
 
@@ -110,7 +111,7 @@ impl Order {
 
 #[derive(Debug, Args)]
 pub(crate) struct SendCircle {
-    /// Centre in the site's frame, metres
+    /// Centre, metres in the site frame
     #[arg(long, value_name = "X,Y", value_parser = point)]
     pub(crate) center: Point,
     /// Radius, metres
@@ -119,10 +120,10 @@ pub(crate) struct SendCircle {
     /// Speed along the circle, metres per second
     #[arg(long, value_name = "M/S", default_value_t = 0.5, value_parser = finite, allow_negative_numbers = true)]
     pub(crate) speed: f64,
-    /// How many turns
+    /// Number of turns
     #[arg(long, default_value_t = 1.0, value_parser = finite, allow_negative_numbers = true)]
     pub(crate) turns: f64,
-    /// Drive clockwise
+    /// Drive clockwise; counter-clockwise if absent
     #[arg(long)]
     pub(crate) clockwise: bool,
     #[command(flatten)]
@@ -131,14 +132,14 @@ pub(crate) struct SendCircle {
 
 #[derive(Debug, Args)]
 pub(crate) struct SendWaypoints {
-    /// Points in the site's frame, metres, in driving order
+    /// Points in driving order, metres in the site frame
     #[arg(
         value_name = "X,Y",
         value_parser = waypoint,
         required_unless_present = "file"
     )]
     pub(crate) points: Vec<Waypoint>,
-    /// Read the points from a file: a line `x,y` each, or a JSON list of `{"x_m": …, "y_m": …}`
+    /// File with the points: one line `x,y` each, or a JSON list of `{"x_m": …, "y_m": …}`
     #[arg(long, value_name = "FILE", conflicts_with = "points")]
     pub(crate) file: Option<PathBuf>,
     /// Speed, metres per second
@@ -152,13 +153,13 @@ pub(crate) struct SendWaypoints {
 pub(crate) struct MissionsArguments {
     #[command(subcommand)]
     pub(crate) action: Option<MissionsAction>,
-    /// Only those of this robot
+    /// Show only missions of this robot
     #[arg(long)]
     pub(crate) robot: Option<RobotId>,
-    /// Only those in this state
+    /// Show only missions in this state
     #[arg(long, value_parser = mission_state())]
     pub(crate) state: Option<MissionState>,
-    /// At most so many, newest first
+    /// Maximum number of missions, newest first
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(crate) limit: u32,
     #[command(flatten)]
@@ -169,35 +170,35 @@ pub(crate) struct MissionsArguments {
 pub(crate) enum MissionsAction {
     /// Show a mission with its history
     Show {
-        /// The mission
+        /// Mission identifier
         #[arg(value_parser = mission)]
         mission: MissionId,
     },
     /// Wait until missions have ended, showing their progress; exits with 1 if one did not succeed
     #[command(visible_alias = "follow")]
     Wait {
-        /// The missions
+        /// Mission identifiers
         #[arg(required = true, value_parser = mission)]
         missions: Vec<MissionId>,
-        /// Wait at most so long; the missions go on
+        /// Wait at most for this time; the missions continue
         #[arg(long, value_name = "TIME", value_parser = duration)]
         timeout: Option<Duration>,
     },
-    /// Hold a mission: its robot brakes along the path and stands
+    /// Pause a mission: its robot brakes along the path and stays at rest
     Pause {
-        /// The mission
+        /// Mission identifier
         #[arg(value_parser = mission)]
         mission: MissionId,
     },
-    /// Let a paused mission go on
+    /// Resume a paused mission
     Resume {
-        /// The mission
+        /// Mission identifier
         #[arg(value_parser = mission)]
         mission: MissionId,
     },
     /// Cancel a mission: its robot brakes along the path
     Cancel {
-        /// The mission
+        /// Mission identifier
         #[arg(value_parser = mission)]
         mission: MissionId,
     },

@@ -1,4 +1,4 @@
-//! The words of the commands by which people watch over robots, stop them and drive them.
+//! Arguments of the commands that supervise, stop, limit and teleoperate robots.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -11,13 +11,13 @@ use super::values::{duration, finite, look_interval, positive};
 
 #[derive(Debug, Args)]
 pub(crate) struct WatchArguments {
-    /// Least time between two pictures
+    /// Minimum time between two updates of the screen
     #[arg(long, value_name = "TIME", default_value = "250ms", value_parser = look_interval)]
     pub(crate) every: Duration,
-    /// Only this robot
+    /// Show only this robot
     #[arg(long)]
     pub(crate) robot: Option<RobotId>,
-    /// A line for each change, also in a terminal
+    /// Print a line for each change, also in a terminal
     #[arg(long)]
     pub(crate) lines: bool,
     #[command(flatten)]
@@ -32,10 +32,10 @@ pub(crate) struct StopArguments {
     /// Stop every robot of every site
     #[arg(long, conflicts_with = "robots")]
     pub(crate) all: bool,
-    /// Who stops, for others to see
+    /// Name of the person who stops, shown to others
     #[arg(long, env = "USER")]
     pub(crate) by: Option<String>,
-    /// Why
+    /// Reason, for people
     #[arg(long)]
     pub(crate) reason: Option<String>,
     #[command(flatten)]
@@ -46,9 +46,9 @@ pub(crate) struct StopArguments {
 pub(crate) struct ClearArguments {
     /// Robot whose stop is cleared
     pub(crate) robot: RobotId,
-    /// The stop; shown with its reason when absent, and nothing is cleared
+    /// Identifier of the stop; if absent, the stop is shown with its reason and not cleared
     pub(crate) stop: Option<StopId>,
-    /// Who clears, for others to see
+    /// Name of the person who clears, shown to others
     #[arg(long, env = "USER")]
     pub(crate) by: Option<String>,
     #[command(flatten)]
@@ -57,13 +57,13 @@ pub(crate) struct ClearArguments {
 
 #[derive(Debug, Args)]
 pub(crate) struct StopsArguments {
-    /// Only those of this robot
+    /// Show only stops of this robot
     #[arg(long)]
     pub(crate) robot: Option<RobotId>,
-    /// Only those that are not cleared
+    /// Show only stops that are not cleared
     #[arg(long)]
     pub(crate) in_force: bool,
-    /// At most so many, newest first
+    /// Maximum number of stops, newest first
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(crate) limit: u32,
     #[command(flatten)]
@@ -74,13 +74,13 @@ pub(crate) struct StopsArguments {
 pub(crate) struct AlertsArguments {
     #[command(subcommand)]
     pub(crate) action: Option<AlertsAction>,
-    /// Only those of this robot
+    /// Show only alerts of this robot
     #[arg(long)]
     pub(crate) robot: Option<RobotId>,
-    /// Those that have cleared, too
+    /// Show cleared alerts too
     #[arg(long)]
     pub(crate) all: bool,
-    /// At most so many, newest first
+    /// Maximum number of alerts, newest first
     #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(crate) limit: u32,
     #[command(flatten)]
@@ -89,10 +89,10 @@ pub(crate) struct AlertsArguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum AlertsAction {
-    /// Note that somebody has seen an alert; it stands until its cause is gone
+    /// Acknowledge an alert: record that a person has seen it; it stays until its cause ends
     #[command(visible_alias = "ack")]
     Acknowledge {
-        /// The alert
+        /// Alert identifier
         alert: AlertId,
     },
 }
@@ -101,16 +101,16 @@ pub(crate) enum AlertsAction {
 pub(crate) struct DriveArguments {
     /// Robot to drive
     pub(crate) robot: RobotId,
-    /// Who drives, for others to see
+    /// Name of the driver, shown to others
     #[arg(long, env = "USER", default_value = "somebody")]
     pub(crate) name: String,
-    /// Take the lease from whoever drives now
+    /// Take the lease from another driver
     #[arg(long)]
     pub(crate) take: bool,
-    /// Forward speed, metres per second
+    /// Speed forwards and backwards, metres per second
     #[arg(long, value_name = "M/S", default_value_t = 0.4, value_parser = positive)]
     pub(crate) speed: f64,
-    /// Yaw rate, radians per second
+    /// Yaw rate of turns, radians per second
     #[arg(long, value_name = "RAD/S", default_value_t = 0.6, value_parser = positive)]
     pub(crate) turn: f64,
     #[command(flatten)]
@@ -119,7 +119,7 @@ pub(crate) struct DriveArguments {
 
 #[derive(Debug, Args)]
 pub(crate) struct LimitsArguments {
-    /// Robot to look at
+    /// Robot whose limits are used
     pub(crate) robot: RobotId,
     #[command(subcommand)]
     pub(crate) action: Option<LimitsAction>,
@@ -129,34 +129,34 @@ pub(crate) struct LimitsArguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum LimitsAction {
-    /// Hold or slow the robot for a while
+    /// Hold or slow the robot for a limited time
     Set {
-        /// Who limits
+        /// Owner of the limit
         owner: OwnerId,
-        /// The robot is to stand
+        /// Hold the robot at rest
         #[arg(long, required_unless_present = "speed")]
         hold: bool,
-        /// Fastest speed, metres per second
+        /// Maximum speed, metres per second
         #[arg(long, value_name = "M/S", value_parser = finite)]
         speed: Option<f64>,
-        /// How long it lasts
+        /// Duration of the limit, at most one hour
         #[arg(long = "for", value_name = "TIME", value_parser = duration)]
         lasting: Duration,
     },
-    /// End an owner's limit
+    /// End the limit of an owner
     End {
-        /// Who limits
+        /// Owner of the limit
         owner: OwnerId,
     },
 }
 
 #[derive(Debug, Args)]
 pub(crate) struct GeofenceArguments {
-    /// Replace it by this file, or by the input for `-`: JSON `{"keep_in": [[{"x_m": …, "y_m": …},
+    /// File with the new geofence, or `-` for the input: JSON `{"keep_in": [[{"x_m": …, "y_m": …},
     /// …], …], "keep_out": […]}`, as `--json` prints it
     #[arg(long, value_name = "FILE")]
     pub(crate) set: Option<PathBuf>,
-    /// Only if it is still at this revision
+    /// Replace the geofence only if it is still at this revision
     #[arg(long, requires = "set")]
     pub(crate) revision: Option<u64>,
     #[command(flatten)]

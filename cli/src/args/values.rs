@@ -1,4 +1,4 @@
-//! How single values of the command line are read.
+//! Parsers of single values of the command line.
 
 use std::ffi::OsString;
 use std::time::Duration;
@@ -14,11 +14,11 @@ use tread_api::trajectory::Waypoint;
 
 use crate::client::Area;
 
-/// Least and most time between two looks of `tread watch`.
+/// Minimum and maximum period of updates of `tread watch`.
 const LOOK_EVERY_MIN: Duration = Duration::from_millis(100);
 const LOOK_EVERY_MAX: Duration = Duration::from_hours(1);
 
-/// Reads a time such as `500ms`, `90s`, `5m` or `2h`.
+/// Parses a time span such as `500ms`, `90s`, `5m` or `2h`.
 pub(super) fn duration(text: &str) -> Result<Duration, String> {
     let unit_at = text
         .find(|letter: char| letter.is_ascii_alphabetic())
@@ -37,7 +37,7 @@ pub(super) fn duration(text: &str) -> Result<Duration, String> {
     Duration::try_from_secs_f64(number * seconds_per_unit).map_err(|error| error.to_string())
 }
 
-/// Reads the time between two looks: often enough to be of use, not so often that it is a load.
+/// Parses the update period of `tread watch`, bounded in both directions to limit the load.
 pub(super) fn look_interval(text: &str) -> Result<Duration, String> {
     let every = duration(text)?;
     if (LOOK_EVERY_MIN..=LOOK_EVERY_MAX).contains(&every) {
@@ -49,7 +49,7 @@ pub(super) fn look_interval(text: &str) -> Result<Duration, String> {
     }
 }
 
-/// Reads a number; what is no finite one could not be said in JSON.
+/// Parses a finite number; JSON cannot represent any other.
 pub(super) fn finite(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(number) if number.is_finite() => Ok(number),
@@ -57,7 +57,7 @@ pub(super) fn finite(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Reads a number above zero.
+/// Parses a number above 0.
 pub(super) fn positive(text: &str) -> Result<f64, String> {
     match finite(text) {
         Ok(number) if number > 0.0 => Ok(number),
@@ -65,7 +65,7 @@ pub(super) fn positive(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Marks arguments like `-4,2.5` as values: with a space in front they are no options.
+/// Protects arguments such as `-4,2.5` from being parsed as options, by a space in front.
 pub(crate) fn shield_negative_points(argument: OsString) -> OsString {
     let is_number = |part: &str| part.trim().parse::<f64>().is_ok();
     let are_numbers =
@@ -87,7 +87,7 @@ fn coordinates(text: &str) -> Result<(f64, f64), String> {
     Ok((number(x)?, number(y)?))
 }
 
-/// Reads a box, `x0,y0,x1,y1` in metres, whichever corners are given first.
+/// Parses a box, `x0,y0,x1,y1` in metres; any two opposite corners may be given.
 pub(super) fn area(text: &str) -> Result<Area, String> {
     let numbers: Vec<f64> = text
         .split(',')
@@ -103,7 +103,7 @@ pub(super) fn area(text: &str) -> Result<Area, String> {
     })
 }
 
-/// Reads a time: RFC 3339, or how long before now it was.
+/// Parses a time: RFC 3339, or a time span before the present.
 #[expect(
     clippy::disallowed_methods,
     reason = "a person's `2h` counts back from now"
@@ -118,37 +118,37 @@ pub(super) fn moment(text: &str) -> Result<Timestamp, String> {
     Timestamp::now().checked_sub(ago).map_err(|_| wrong())
 }
 
-/// Reads the name of a mission's state.
+/// Parses the name of a mission state.
 pub(super) fn mission_state() -> impl TypedValueParser<Value = MissionState> {
     let names = MissionState::ALL.map(MissionState::as_str);
     PossibleValuesParser::new(names)
         .try_map(|name| MissionState::from_name(&name).ok_or("is no state"))
 }
 
-/// Kinds of ground as the API names them.
+/// Terrain classes as the API names them.
 const TERRAIN_CLASSES: [&str; 13] = [
     "asphalt", "concrete", "paving", "gravel", "soil", "grass", "sand", "mud", "snow", "ice",
     "wood", "metal", "other",
 ];
 
-/// Reads a kind of ground.
+/// Parses a terrain class.
 pub(super) fn terrain_class() -> impl TypedValueParser<Value = TerrainClass> {
     PossibleValuesParser::new(TERRAIN_CLASSES)
         .try_map(|name| serde_json::from_value::<TerrainClass>(name.into()))
 }
 
-/// Reads a place on the earth, degrees north and east; the x axis of what lies there points east.
+/// Parses a position in WGS 84, degrees north and east, with an x axis to the east.
 pub(super) fn earth(text: &str) -> Result<GeoOrigin, String> {
     let (latitude_deg, longitude_deg) = coordinates(text)
         .map_err(|error| format!("{error}; degrees north and east: 48.14,11.57"))?;
     let place = serde_json::json!({
         "latitude_deg": latitude_deg, "longitude_deg": longitude_deg,
     });
-    // Read as the API reads it, so that what is no place is said here.
+    // Parsed like a body of the API, so that invalid positions are detected before a request.
     serde_json::from_value(place).map_err(|error| error.to_string())
 }
 
-/// Reads the identifier of a mission.
+/// Parses the identifier of a mission.
 pub(super) fn mission(text: &str) -> Result<MissionId, String> {
     text.parse().map_err(|_| {
         "give the whole identifier, as `tread missions` prints it: \
@@ -161,7 +161,7 @@ pub(super) fn point(text: &str) -> Result<Point, String> {
     coordinates(text).map(|(x_m, y_m)| Point { x_m, y_m })
 }
 
-/// Reads one waypoint, `x,y` in metres.
+/// Parses one waypoint, `x,y` in metres.
 pub(crate) fn waypoint(text: &str) -> Result<Waypoint, String> {
     let (x_m, y_m) = coordinates(text)?;
     Ok(Waypoint {

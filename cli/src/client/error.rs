@@ -1,49 +1,49 @@
-//! Why a request got no answer that can be used, and what to do about it.
+//! Errors of requests to the server, each with an exit code and a hint.
 
 use reqwest::StatusCode;
 use tread_api::problem::{ProblemBody, ProblemType};
 
 use crate::exit::Exit;
 
-/// Why a request got no answer that can be used.
+/// Error of a request to the server.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ClientError {
-    /// The address is not one.
+    /// The address of the server is invalid.
     #[error("`{address}` is not the address of a server: use one like http://127.0.0.1:8420")]
     Address { address: String },
-    /// A token would go over the network for everybody to read.
+    /// The token would be sent unencrypted over the network.
     #[error(
         "a token is not sent to {address} without TLS: use https, or an address of this machine"
     )]
     ClearText { address: String },
-    /// The certificate to trust is none.
+    /// The certificate file to trust is unreadable or invalid.
     #[error("cannot trust the certificate in `{file}`")]
     Authority {
         file: String,
         #[source]
         cause: std::io::Error,
     },
-    /// Nothing answers there.
+    /// The connection failed.
     #[error("no server answers at {address}")]
     Unreachable {
         address: String,
         #[source]
         cause: reqwest::Error,
     },
-    /// The server has the request and says nothing.
+    /// The server did not answer in time.
     #[error("{address} took too long to answer")]
     Silent {
         address: String,
         #[source]
         cause: reqwest::Error,
     },
-    /// The server refused.
+    /// The server refused the request.
     #[error("{}", refusal(.problem))]
     Refused { problem: Box<ProblemBody> },
-    /// What answers opens no WebSocket.
+    /// The peer does not open a WebSocket.
     #[error("what answers at {address} opens no connection to drive a robot: is there a proxy?")]
     NoWebSocket { address: String },
-    /// What answers does not speak this API.
+    /// The answer does not have the form of this API.
     #[error("what answers at {address} is no Tread server of this version ({status})")]
     NotUnderstood {
         address: String,
@@ -64,7 +64,7 @@ fn refusal(problem: &ProblemBody) -> String {
     }
 }
 
-/// What helps against a refusal; what is absent here says it in its detail.
+/// Hint for each problem type; types whose `detail` contains the hint are absent.
 const NEXT_STEPS: &[(ProblemType, &str)] = &[
     (
         ProblemType::InvalidBody,
@@ -174,7 +174,7 @@ const NEXT_STEPS: &[(ProblemType, &str)] = &[
 ];
 
 impl ClientError {
-    /// The exit code that says it.
+    /// Returns the exit code for the error.
     pub(crate) fn exit(&self) -> Exit {
         match self {
             Self::Address { .. } => Exit::Usage,
@@ -186,7 +186,7 @@ impl ClientError {
         }
     }
 
-    /// What to do next, where the error itself does not say it.
+    /// Returns a hint what to do next; `None` if the message itself contains it.
     pub(crate) fn next_step(&self) -> Option<&'static str> {
         match self {
             Self::Unreachable { .. } => Some(
@@ -208,7 +208,7 @@ impl ClientError {
         }
     }
 
-    /// What the server said, if it is the one that refused.
+    /// Returns the problem that the server answered; `None` for any other error.
     pub(crate) fn problem(&self) -> Option<&ProblemBody> {
         match self {
             Self::Refused { problem } => Some(problem),

@@ -1,4 +1,4 @@
-//! The server, its sites, their robots, and what changes.
+//! Requests about the server, sites, robots and events.
 
 use reqwest::{Method, Response};
 use tread_api::ids::{RobotId, SiteId};
@@ -8,7 +8,7 @@ use tread_api::site::{CreateSite, GeoOrigin, Site};
 use super::{Client, ClientError, STREAM_WAIT_MAX};
 
 impl Client {
-    /// What the server says of itself.
+    /// Requests version, uptime and counters of the server.
     pub(crate) async fn status(&self) -> Result<serde_json::Value, ClientError> {
         self.get("/v1/server").await
     }
@@ -21,7 +21,7 @@ impl Client {
         self.post("/v1/sites", site).await
     }
 
-    /// Says where on the earth a site lies.
+    /// Sets the position of a site in WGS 84.
     pub(crate) async fn tie_site(
         &self,
         site: &SiteId,
@@ -32,12 +32,12 @@ impl Client {
             .await
     }
 
-    /// Takes back where on the earth a site lies.
+    /// Removes the position of a site in WGS 84.
     pub(crate) async fn untie_site(&self, site: &SiteId) -> Result<Site, ClientError> {
         self.delete(&format!("/v1/sites/{site}/origin")).await
     }
 
-    /// The robots of a site, those that are retired too if wanted.
+    /// Lists the robots of a site, with `retired` including retired ones.
     pub(crate) async fn robots(
         &self,
         site: &SiteId,
@@ -52,7 +52,7 @@ impl Client {
         self.get(&format!("/v1/sites/{site}/robots/{robot}")).await
     }
 
-    /// Renames a robot, retires it or takes it back.
+    /// Renames, retires or restores a robot.
     pub(crate) async fn change_robot(
         &self,
         site: &SiteId,
@@ -64,7 +64,7 @@ impl Client {
             .await
     }
 
-    /// Opens the stream of events of a site, from where `last` points.
+    /// Opens the event stream of a site, behind the event with the identifier `last` if given.
     pub(crate) async fn events(
         &self,
         site: &SiteId,
@@ -73,7 +73,7 @@ impl Client {
     ) -> Result<Response, ClientError> {
         let mut query = vec![("site", site.to_string())];
         query.extend(robot.map(|robot| ("robots", robot.to_string())));
-        // The stream has no end of its own.
+        // The stream does not end by itself.
         let mut request = self
             .request(Method::GET, "/v1/events")
             .query(&query)

@@ -1,4 +1,4 @@
-//! Who asks, and who is of the fleet.
+//! Requests about identities, enrolment, the fleet's authority and the audit log.
 
 use reqwest::Method;
 use tread_api::audit::AuditChain;
@@ -13,7 +13,7 @@ use tread_api::page::{PAGE_LIMIT_MAX, Page};
 use super::{Client, ClientError};
 
 impl Client {
-    /// Who the token is.
+    /// Requests identity and rights of the token in use.
     pub(crate) async fn session(&self) -> Result<Session, ClientError> {
         self.get("/v1/session").await
     }
@@ -33,18 +33,18 @@ impl Client {
         self.delete(&format!("/v1/tokens/{token}")).await
     }
 
-    /// Sessions of people, newest first.
+    /// Lists the sessions of people, newest first.
     pub(crate) async fn sessions(&self) -> Result<Vec<PersonSession>, ClientError> {
         self.all("/v1/sessions").await
     }
 
-    /// Ends somebody's session.
+    /// Ends the session of a person.
     pub(crate) async fn end_session(&self, session: SessionId) -> Result<(), ClientError> {
         let request = self.request(Method::DELETE, &format!("/v1/sessions/{session}"));
         self.answered(request).await.map(|_done| ())
     }
 
-    /// Makes a token by which a robot may join.
+    /// Creates a join token.
     pub(crate) async fn create_join_token(
         &self,
         request: &CreateJoinToken,
@@ -52,7 +52,7 @@ impl Client {
         self.post("/v1/join-tokens", request).await
     }
 
-    /// Join tokens, newest first.
+    /// Lists the join tokens, newest first.
     pub(crate) async fn join_tokens(&self) -> Result<Vec<JoinToken>, ClientError> {
         self.all("/v1/join-tokens").await
     }
@@ -65,12 +65,12 @@ impl Client {
         self.delete(&format!("/v1/join-tokens/{id}")).await
     }
 
-    /// How the robots of a site stand that have ever joined.
+    /// Lists the newest enrolment of each robot of a site.
     pub(crate) async fn enrolments(&self, site: &SiteId) -> Result<Vec<Enrolment>, ClientError> {
         self.all(&format!("/v1/sites/{site}/enrolments")).await
     }
 
-    /// Puts a robot out of the fleet.
+    /// Revokes the enrolment of a robot.
     pub(crate) async fn revoke_robot(
         &self,
         site: &SiteId,
@@ -80,7 +80,7 @@ impl Client {
             .await
     }
 
-    /// The fleet's authority and its rotation.
+    /// Requests the fleet's authority and its rotation.
     pub(crate) async fn authority(&self) -> Result<FleetAuthority, ClientError> {
         self.get("/v1/authority").await
     }
@@ -91,7 +91,7 @@ impl Client {
             .await
     }
 
-    /// Finishes it.
+    /// Finishes a rotation of the fleet's authority.
     pub(crate) async fn finish_rotation(
         &self,
         request: &FinishRotation,
@@ -107,7 +107,7 @@ impl Client {
         self.post("/v1/authority/replace", request).await
     }
 
-    /// A page of the audit log, the oldest first, after the entry of this number.
+    /// Requests a page of the audit log, the oldest entry first, behind the entry with this number.
     pub(crate) async fn audit_after(
         &self,
         after: Option<u64>,
@@ -120,12 +120,12 @@ impl Client {
         self.get_with("/v1/audit", &query).await
     }
 
-    /// What frames the chain of the audit log.
+    /// Requests numbers and hashes at both ends of the audit log's hash chain.
     pub(crate) async fn audit_chain(&self) -> Result<AuditChain, ClientError> {
         self.get("/v1/audit/chain").await
     }
 
-    /// The newest entries of the audit log, at most `limit`.
+    /// Lists the newest entries of the audit log, at most `limit`.
     pub(crate) async fn audit(
         &self,
         who: Option<&str>,

@@ -1,4 +1,4 @@
-//! The ground: terrains, and what is known of their friction.
+//! Requests about terrains and the friction map.
 
 use jiff::Timestamp;
 use reqwest::Method;
@@ -14,7 +14,7 @@ use tread_api::terrain::{CreateTerrain, ReplaceTerrain, Terrain};
 
 use super::{Client, ClientError, Query};
 
-/// As of when, and whose measurements.
+/// Time as of which the map is read, and selection of robot models.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Reading {
     pub(crate) as_of: Option<Timestamp>,
@@ -35,12 +35,12 @@ impl Reading {
     }
 }
 
-/// Of which times an answer is, as far as it says so.
+/// Times to which an answer of the map refers, as far as the server sent them.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct MapTimes {
-    /// From when on, in a comparison of two times.
+    /// Time up to which the first of two compared states includes measurements.
     pub(crate) from: Option<Timestamp>,
-    /// Nothing that was measured later counts; `None` if all that has come does.
+    /// Time up to which measurements are included; `None` if all are.
     pub(crate) as_of: Option<Timestamp>,
 }
 
@@ -50,7 +50,7 @@ impl MapTimes {
     }
 }
 
-/// Entries of the map, and of which times they are; programs are told the entries.
+/// Entries of the map with the times to which they refer; JSON contains the entries alone.
 #[derive(Debug, Serialize)]
 #[serde(transparent)]
 pub(crate) struct Known<T> {
@@ -59,7 +59,7 @@ pub(crate) struct Known<T> {
     pub(crate) of: MapTimes,
 }
 
-/// A box of the map, metres.
+/// Box of the map, metres in the site frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Area {
     pub(crate) lowest: Point,
@@ -140,7 +140,7 @@ impl Client {
         }
     }
 
-    /// A terrain from the oldest to the newest time, in steps of `step_s` seconds.
+    /// Requests the friction of a terrain between two times, in steps of `step_s` seconds.
     pub(crate) async fn terrain_history(
         &self,
         (site, terrain): (&SiteId, &TerrainId),
@@ -156,7 +156,8 @@ impl Client {
         self.get_with(&path, &query).await
     }
 
-    /// Cells of a box, or of the whole map, in squares of a side.
+    /// Lists the friction of cells in a box or of the whole map, merged into squares of the given
+    /// side.
     pub(crate) async fn cell_friction(
         &self,
         site: &SiteId,
@@ -193,7 +194,7 @@ impl Client {
             .await
     }
 
-    /// Cells that were measured between two times.
+    /// Lists the friction before and after of cells that were measured between two times.
     pub(crate) async fn friction_difference(
         &self,
         site: &SiteId,
@@ -209,7 +210,7 @@ impl Client {
             .await
     }
 
-    /// Where a visit would teach most, the best first.
+    /// Lists the cells with the largest expected gain of a visit, the best first.
     pub(crate) async fn visits(
         &self,
         site: &SiteId,
@@ -224,7 +225,7 @@ impl Client {
             .await
     }
 
-    /// The map of one robot model as a picture with its legend, PNG.
+    /// Requests the map of one robot model as a PNG picture with its legend.
     pub(crate) async fn friction_picture(
         &self,
         site: &SiteId,
@@ -256,7 +257,7 @@ impl Client {
         self.all(&format!("/v1/sites/{site}/withdrawals")).await
     }
 
-    /// Takes what a robot measured in some hours off the map, for good.
+    /// Withdraws a robot's measurements of some hours from the map; this cannot be undone.
     pub(crate) async fn withdraw(
         &self,
         site: &SiteId,

@@ -1,4 +1,4 @@
-//! Missions and dry runs.
+//! Requests about missions and checks of trajectories.
 
 use reqwest::Method;
 use tread_api::ids::{MissionId, RobotId, SiteId};
@@ -16,7 +16,7 @@ impl Client {
         self.post("/v1/missions", mission).await
     }
 
-    /// The newest missions of a site, at most `limit`.
+    /// Lists the newest missions of a site, at most `limit`.
     pub(crate) async fn missions(
         &self,
         site: &SiteId,
@@ -34,13 +34,14 @@ impl Client {
         self.get(&format!("/v1/missions/{mission}")).await
     }
 
-    /// Wants a mission paused, resumed or cancelled.
+    /// Requests that a mission be paused, resumed or cancelled: `verb` is the last part of the
+    /// route.
     pub(crate) async fn act(&self, mission: MissionId, verb: &str) -> Result<Mission, ClientError> {
         let path = format!("/v1/missions/{mission}/{verb}");
         self.send(self.request(Method::POST, &path)).await
     }
 
-    /// Wants a mission to be another trajectory.
+    /// Requests that a mission drive another trajectory.
     pub(crate) async fn replace_mission(
         &self,
         mission: MissionId,
@@ -50,7 +51,7 @@ impl Client {
             .await
     }
 
-    /// What a trajectory would ask of its robot.
+    /// Checks a trajectory without driving it.
     pub(crate) async fn check_trajectory(
         &self,
         check: &CheckTrajectory,

@@ -1,5 +1,5 @@
-//! A client of the REST API: how requests are sent and answers read. What can be asked for is in
-//! the modules below, by subject.
+//! Client of the REST API: sends requests and reads answers. The requests are in the modules below,
+//! by subject.
 
 mod error;
 mod fleet;
@@ -24,24 +24,24 @@ use tread_api::text;
 pub(crate) use self::error::ClientError;
 pub(crate) use self::map::{Area, Known, MapTimes, Reading};
 
-/// Longest wait for an answer; planning the longest path takes a while.
+/// Maximum time for an answer; planning the longest path takes several seconds.
 const ANSWER_WAIT_MAX: Duration = Duration::from_secs(30);
-/// Longest life of one stream of events; then it is opened again where it ended.
+/// Maximum time that one event stream is read; it is resumed afterwards.
 const STREAM_WAIT_MAX: Duration = Duration::from_hours(24);
-/// Longest wait for a connection.
+/// Maximum time for a connection.
 const CONNECT_WAIT_MAX: Duration = Duration::from_secs(3);
-/// Most pages of one list that are followed.
+/// Maximum number of pages that are read of one list; further entries are left out.
 const PAGES_MAX: usize = 100;
 
-/// The query of a request.
+/// Query parameters of a request.
 type Query = Vec<(&'static str, String)>;
 
-/// An address as it is written everywhere.
+/// Returns a server's address in its canonical form, without trailing slashes.
 pub(crate) fn address_of(address: &str) -> &str {
     address.trim_end_matches('/')
 }
 
-/// Whether only this machine reads what is sent to a host.
+/// Whether the host is this machine, so that requests do not leave it.
 fn is_here(url: &Url) -> bool {
     match url.host_str() {
         Some("localhost") => true,
@@ -55,13 +55,13 @@ fn is_here(url: &Url) -> bool {
     }
 }
 
-/// A connection to one server.
+/// Client of one server.
 #[derive(Debug, Clone)]
 pub(crate) struct Client {
     address: String,
     token: Option<String>,
     http: reqwest::Client,
-    /// Whether what comes is to be shown in a terminal, see [`Self::read`].
+    /// Whether to escape unprintable characters in answers, see [`Self::read`].
     escapes: bool,
 }
 
@@ -76,7 +76,8 @@ fn certificates(file: &Path) -> Result<Vec<Certificate>, ClientError> {
 }
 
 impl Client {
-    /// A client that shows this token, and trusts this authority instead of the machine's.
+    /// Creates a client that sends this token, and trusts the authorities in this file instead of
+    /// those of the system.
     pub(crate) fn new(
         address: &str,
         token: Option<&str>,
@@ -101,7 +102,8 @@ impl Client {
         builder = match authority {
             Some(file) => builder.tls_certs_only(certificates(file)?),
             None if is_tls => builder,
-            // Nobody is trusted, so that no machine's certificates need be read.
+            // Without TLS no authority is trusted, so that the system's certificates are not
+            // loaded.
             None => builder.tls_certs_only([]),
         };
         let http = builder.build().map_err(|cause| ClientError::Unreachable {
@@ -117,15 +119,15 @@ impl Client {
         })
     }
 
-    /// The same client, whose answers are shown to people: whatever moves a terminal's cursor or
-    /// turns its writing round stands in them as an escape.
+    /// Returns the same client; if `is_for_people`, it replaces characters that would control a
+    /// terminal (cursor, direction of writing) by escapes in all answers.
     #[must_use]
     pub(crate) fn for_people(mut self, is_for_people: bool) -> Self {
         self.escapes = is_for_people;
         self
     }
 
-    /// The same client, whose answers are as they came.
+    /// Returns a client that leaves answers unchanged.
     pub(crate) fn exactly(&self) -> Self {
         Self {
             escapes: false,
@@ -133,9 +135,9 @@ impl Client {
         }
     }
 
-    /// Reads what the server sent. All that comes from elsewhere comes through here.
+    /// Parses an answer of the server. All data from outside passes through this function.
     pub(crate) fn read<T: DeserializeOwned>(&self, text: &[u8]) -> serde_json::Result<T> {
-        // What has neither escapes nor other letters is printable as it is.
+        // A text without backslashes and non-ASCII characters is printable already.
         let is_plain = |byte: &u8| byte.is_ascii() && !matches!(byte, b'\\' | 0x7f);
         if !self.escapes || text.iter().all(is_plain) {
             return serde_json::from_slice(text);
@@ -145,7 +147,7 @@ impl Client {
         serde_json::from_value(value)
     }
 
-    /// The token that is shown.
+    /// Returns the token that the client sends.
     pub(crate) fn token(&self) -> Option<&str> {
         self.token.as_deref()
     }
@@ -162,7 +164,7 @@ impl Client {
         }
     }
 
-    /// Why a request or an answer did not come through.
+    /// Converts a transport error of a request or an answer.
     pub(crate) fn lost(&self, cause: reqwest::Error) -> ClientError {
         let address = self.address.clone();
         if cause.is_timeout() && !cause.is_connect() {
@@ -172,7 +174,7 @@ impl Client {
         }
     }
 
-    /// Sends a request; an answer that is no success is an error.
+    /// Sends a request; an answer with an error status is converted to an error.
     async fn answered(&self, request: RequestBuilder) -> Result<Response, ClientError> {
         let response = request.send().await.map_err(|cause| self.lost(cause))?;
         if response.status().is_success() {
@@ -193,7 +195,7 @@ impl Client {
             })
     }
 
-    /// What an answer that is no success says.
+    /// Converts an answer with an error status.
     pub(crate) async fn refusal(&self, response: Response) -> ClientError {
         let (address, status) = (self.address.clone(), response.status());
         let body = match response.bytes().await {
@@ -235,12 +237,12 @@ impl Client {
         self.send(self.request(Method::DELETE, path)).await
     }
 
-    /// Follows a list to its end, at most [`PAGES_MAX`] pages.
+    /// Reads all pages of a list, at most [`PAGES_MAX`].
     async fn all<T: DeserializeOwned>(&self, path: &str) -> Result<Vec<T>, ClientError> {
         self.all_with(path, &Vec::new()).await
     }
 
-    /// Follows a list with a query to its end, at most [`PAGES_MAX`] pages.
+    /// Reads all pages of a list with query parameters, at most [`PAGES_MAX`].
     async fn all_with<T: DeserializeOwned>(
         &self,
         path: &str,
@@ -249,7 +251,8 @@ impl Client {
         Ok(self.all_of_map(path, query).await?.items)
     }
 
-    /// The same of the map, with the times that the answer is of.
+    /// Reads all pages of a list of the map, at most [`PAGES_MAX`], with the times to which it
+    /// refers.
     async fn all_of_map<T: DeserializeOwned>(
         &self,
         path: &str,
@@ -276,14 +279,14 @@ impl Client {
         Ok(Known { items, of })
     }
 
-    /// Whether the server is ready to work.
+    /// Whether the server is ready: `/readyz` answers with success.
     pub(crate) async fn is_ready(&self) -> bool {
         let answer = self.request(Method::GET, "/readyz").send().await;
         answer.is_ok_and(|response| response.status().is_success())
     }
 }
 
-/// Escapes what is not printable in all texts of a value.
+/// Escapes unprintable characters in all texts of a value.
 fn escape_all(value: &mut Value) {
     match value {
         Value::String(text) => {

@@ -1,4 +1,4 @@
-//! What may only slow robots down, and what needs a person.
+//! Requests about stops, alerts, external limits and geofences.
 
 use reqwest::Method;
 use tread_api::ids::{AlertId, OwnerId, RobotId, SiteId};
@@ -34,7 +34,7 @@ impl Client {
         self.post(&path, clear).await
     }
 
-    /// The newest stops of a site, at most `limit`.
+    /// Lists the newest stops of a site, at most `limit`.
     pub(crate) async fn stops(
         &self,
         site: &SiteId,
@@ -51,7 +51,7 @@ impl Client {
         self.get_with("/v1/stops", &query).await
     }
 
-    /// The newest alerts of a site, at most `limit`.
+    /// Lists the newest alerts of a site, at most `limit`.
     pub(crate) async fn alerts(
         &self,
         site: &SiteId,
@@ -68,7 +68,7 @@ impl Client {
         self.get_with("/v1/alerts", &query).await
     }
 
-    /// Notes that a person has seen an alert.
+    /// Acknowledges an alert.
     pub(crate) async fn acknowledge(&self, alert: AlertId) -> Result<Alert, ClientError> {
         let path = format!("/v1/alerts/{alert}/acknowledge");
         self.send(self.request(Method::POST, &path)).await
@@ -83,7 +83,7 @@ impl Client {
             .await
     }
 
-    /// Sets an owner's limit, or ends it.
+    /// Sets an owner's limit, or ends it if `limit` is `None`.
     pub(crate) async fn change_limit(
         &self,
         site: &SiteId,

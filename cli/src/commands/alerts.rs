@@ -1,4 +1,4 @@
-//! `tread alerts`: what needs a person.
+//! `tread alerts`: lists and acknowledges alerts.
 
 use std::process::ExitCode;
 

@@ -1,4 +1,4 @@
-//! `tread audit`: show, export and verify who changed what.
+//! `tread audit`: shows, exports and verifies the audit log.
 
 use std::io::{BufRead as _, BufReader, BufWriter, Write};
 use std::os::unix::fs::OpenOptionsExt as _;
@@ -15,7 +15,7 @@ use crate::args::{AuditAction, AuditArguments, Noted};
 use crate::client::Client;
 use crate::output::{Output, note, or_dash, render, table};
 
-/// How often the chain is followed anew because its oldest entries were removed meanwhile.
+/// Maximum number of attempts to verify the log while its oldest entries are being removed.
 const TRIES: u32 = 3;
 
 pub(super) async fn run(
@@ -33,7 +33,7 @@ pub(super) async fn run(
             output: file,
             after,
         }) => {
-            // What is hashed must come through as it is.
+            // Entries must stay unchanged, because they are hashed.
             export(&client.exactly(), file.as_deref(), *after).await?;
         }
         Some(AuditAction::Verify { file, noted }) => {
@@ -84,13 +84,15 @@ fn audited(entries: &[AuditEntry]) -> String {
     render(&table)
 }
 
-/// Where a page ends, as the next one is asked for.
+/// Returns the number of a page's last entry, the cursor of the next page; `None` for the last
+/// page.
 fn end_of(page: &Page<AuditEntry>) -> Option<u64> {
     let is_last = page.next_cursor.is_none();
     page.items.last().filter(|_| !is_last).map(|entry| entry.id)
 }
 
-/// Writes entries as JSON Lines, the oldest first, into a file that only its owner can read.
+/// Writes entries as JSON Lines, the oldest first, to standard output or to a new file that only
+/// its owner can read.
 async fn export(client: &Client, file: Option<&Path>, after: Option<u64>) -> anyhow::Result<()> {
     let mut to: Box<dyn Write> = match file {
         Some(file) => {
@@ -120,13 +122,13 @@ async fn export(client: &Client, file: Option<&Path>, after: Option<u64>) -> any
     Ok(())
 }
 
-/// A chain that holds.
+/// Result of a successful verification.
 struct Verified {
     before_id: u64,
     verifier: Verifier,
 }
 
-/// Computes the hashes of all entries of the server, and compares them with what they say.
+/// Computes the hashes of all entries on the server and verifies the chain.
 async fn verify(client: &Client, noted: Option<&Noted>) -> anyhow::Result<Verified> {
     for _ in 0..TRIES {
         let chain = client.audit_chain().await?;
@@ -205,7 +207,7 @@ fn found(noted: Option<&Noted>, is_found: Option<bool>) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The same for entries that were exported.
+/// Verifies the chain of exported entries.
 fn verify_file(file: &Path, noted: Option<&Noted>) -> anyhow::Result<Verified> {
     let named = || format!("cannot read {}", file.display());
     let lines = BufReader::new(std::fs::File::open(file).with_context(named)?).lines();
@@ -216,7 +218,7 @@ fn verify_file(file: &Path, noted: Option<&Noted>) -> anyhow::Result<Verified> {
         let entry: AuditEntry = serde_json::from_str(&line)
             .with_context(|| format!("line {} is no entry", index + 1))?;
         if entry.hash.is_none() && verified.is_none() {
-            // Of before the chain.
+            // Written before the introduction of the hash chain.
             continue;
         }
         let verified = verified.get_or_insert_with(|| {

@@ -1,4 +1,4 @@
-//! `tread authority`: the fleet's authority, its rotation, and its replacement.
+//! `tread authority`: shows, rotates and replaces the fleet's authority.
 
 use std::io::{self, IsTerminal as _};
 use std::process::ExitCode;
@@ -12,7 +12,7 @@ use crate::args::AuthorityAction;
 use crate::client::{Client, ClientError};
 use crate::output::{Output, note, render, table};
 
-/// What a person types who means it.
+/// Word that confirms the replacement when typed.
 const CONFIRMED: &str = "replace";
 
 pub(super) async fn run(
@@ -48,7 +48,7 @@ async fn replace(is_confirmed: bool, client: &Client) -> anyhow::Result<FleetAut
     Ok(client.replace_authority(&request).await?)
 }
 
-/// The robots of all sites that are of the fleet.
+/// Lists the valid enrolments of the robots of all sites.
 async fn enrolled(client: &Client) -> Result<Vec<Enrolment>, ClientError> {
     let mut enrolled = Vec::new();
     for site in client.sites().await? {

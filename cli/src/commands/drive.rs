@@ -1,8 +1,9 @@
-//! `tread drive`: teleoperate a robot in the terminal.
+//! `tread drive`: teleoperates a robot from the terminal.
 //!
-//! A terminal says when a key is pressed and repeats it while it is held, but not when it is let
-//! go: so a key drives for a moment, longer than the pause before it repeats. Without a key the
-//! robot stands. The terminal is put back as it was on every way out.
+//! A terminal reports when a key is pressed and repeats it while it is held, but not when it is
+//! released. Each key event therefore drives the robot for a time somewhat longer than the delay
+//! before the first repetition. Without a key the robot stops. The terminal is restored on every
+//! way out.
 
 use std::io::{self, IsTerminal as _, Write as _};
 use std::process::ExitCode;
@@ -29,18 +30,20 @@ use crate::client::Client;
 use crate::output::{age, line};
 use crate::socket::{self, Socket};
 
-/// Time between two drive commands.
+/// Period of drive commands.
 const SEND_PERIOD: Duration = Duration::from_millis(50);
-/// How long each command lasts, milliseconds.
+/// Duration of each drive command, milliseconds.
 const FOR_MS: u64 = 200;
-/// How long a key drives after it was seen last: longer than the pause before keys repeat.
+/// Time for which a key is in effect after its last event; longer than the usual delay before a key
+/// repeats.
 const KEY_HOLDS: Duration = Duration::from_millis(550);
-/// Longest wait for the server.
+/// Maximum time for connecting to the server, and for closing the socket.
 const CONNECT_MAX: Duration = Duration::from_secs(5);
-/// What the keys do.
+/// Help line with the keys.
 const HELP: &str = "arrows or WASD drive · space stands · x stops and latches · q quits";
 
-/// A terminal that gives keys at once; it is as before when this is dropped, also by a panic.
+/// Terminal in raw mode, in which keys are read one by one. Dropping it restores the terminal, also
+/// on a panic.
 struct RawTerminal;
 
 impl RawTerminal {
@@ -51,7 +54,7 @@ impl RawTerminal {
         Ok(raw)
     }
 
-    /// Writes one line over the one before.
+    /// Overwrites the current line.
     #[expect(clippy::unused_self, reason = "the terminal must be raw for it")]
     fn show(&self, text: &str) -> anyhow::Result<()> {
         let (width, _) = terminal::size().unwrap_or((80, 24));
@@ -62,7 +65,7 @@ impl RawTerminal {
         out.flush().context("cannot print")
     }
 
-    /// Writes a line that stays.
+    /// Writes a line and moves to the next.
     fn say(&self, text: &str) -> anyhow::Result<()> {
         self.show(text)?;
         write!(io::stdout(), "\r\n").context("cannot print")
@@ -71,17 +74,17 @@ impl RawTerminal {
 
 impl Drop for RawTerminal {
     fn drop(&mut self) {
-        // Nothing more can be done for a terminal that refuses.
+        // An error here cannot be handled.
         let _ = terminal::disable_raw_mode();
         let _ = execute!(io::stdout(), cursor::Show);
         let _ = writeln!(io::stdout());
     }
 }
 
-/// What a key is for.
+/// Effect of a key.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Meaning {
-    /// Shares of the full speed and of the full yaw rate.
+    /// Fractions of the full speed and of the full yaw rate, -1 to 1.
     Move(f64, f64),
     Stand,
     Stop,
@@ -115,7 +118,7 @@ fn meaning(key: KeyEvent) -> Meaning {
     }
 }
 
-/// What the keys of the last moment ask for: linear and angular, each as long as its key.
+/// Last keys for speed and yaw rate, each with the time of its event.
 #[derive(Debug, Clone, Copy, Default)]
 struct Keys {
     linear: Option<(f64, Instant)>,
@@ -168,7 +171,7 @@ pub(super) async fn run(arguments: &DriveArguments, client: &Client) -> anyhow::
     .run(&mut socket, &mut pressed)
     .await;
     drop(terminal);
-    // The server lets the robot stand when the socket closes, whether or not this arrives.
+    // The server stops the robot when the socket closes, whether or not this message arrives.
     let _ = send(&mut socket, &DriveRequest::Release(Nothing {})).await;
     let _ = tokio::time::timeout(CONNECT_MAX, socket.close(None)).await;
     keyboard.end(pressed).await;
@@ -177,7 +180,7 @@ pub(super) async fn run(arguments: &DriveArguments, client: &Client) -> anyhow::
 
 async fn connect(arguments: &DriveArguments, client: &Client) -> anyhow::Result<Socket> {
     let (site, robot) = (&arguments.connection.site, &arguments.robot);
-    // Whether it is known is asked first, for a clear word.
+    // Requested first, for a clear error message if the robot does not exist.
     client.robot(site, robot).await?;
     let opening = tokio::time::timeout(CONNECT_MAX, socket::open(client, site, robot));
     let opened = opening.await;
@@ -245,7 +248,7 @@ impl Driving<'_> {
         }
     }
 
-    /// Whether to go on.
+    /// Handles a key; returns false to quit.
     async fn press(&mut self, socket: &mut Socket, key: KeyEvent) -> anyhow::Result<bool> {
         match meaning(key) {
             Meaning::Move(linear, around) => self.keys.press((linear, around), Instant::now()),
@@ -298,7 +301,7 @@ impl Driving<'_> {
                 self.terminal.say(&format!("the lease is over: {detail}"))
             }
             DriveUpdate::Refused { detail, .. } => {
-                // Without a lease there is nothing more to do here.
+                // Without a lease the command cannot continue.
                 self.is_refused = !self.has_lease;
                 self.terminal.say(&format!("refused: {detail}"))
             }
@@ -339,7 +342,7 @@ fn status(view: &DriveView) -> String {
     let heard = view.heard_age_ms.map_or_else(|| "-".to_owned(), age);
     let driver = view.safety.lease.as_ref();
     let driver = driver.map_or("nobody", |lease| lease.driver.name.as_str());
-    // What a narrow terminal cuts off is at the end.
+    // A narrow terminal cuts the line at its end, so the most important parts come first.
     let stop = view.safety.stop.as_ref();
     let stop = stop.map_or(String::new(), |stop| format!("STOPPED by {} · ", stop.by));
     let slowed = view.safety.gate.cause.and_then(slowed_by);
@@ -350,7 +353,8 @@ fn status(view: &DriveView) -> String {
     )
 }
 
-/// What slows the robot down beyond its driver's word, if that is worth saying.
+/// Returns the reason why the robot drives slower than commanded; `None` for causes that the driver
+/// need not see.
 fn slowed_by(cause: GateCause) -> Option<&'static str> {
     match cause {
         GateCause::CommandAge => Some("slow: the link is late"),

@@ -1,4 +1,4 @@
-//! `tread robots join-token`, `rename`, `revoke` and the like: which robots are of the fleet.
+//! `tread robots join-token`, `enrolments`, `rename`, `retire`, `restore` and `revoke`.
 
 use std::process::ExitCode;
 
@@ -101,7 +101,7 @@ async fn join_token(
     Ok(())
 }
 
-/// Makes a join token for each robot that must join again.
+/// Creates a join token for each robot that must join again.
 async fn join_tokens_of_all(
     valid_minutes: u32,
     client: &Client,
@@ -118,7 +118,7 @@ async fn join_tokens_of_all(
         match client.create_join_token(&request).await {
             Ok(created) => made.push(created),
             Err(failed) => {
-                // Those that were made are told nowhere else.
+                // The secrets created so far are not shown anywhere else.
                 output.show(&made, |made| secrets(made))?;
                 return Err(failed.into());
             }

@@ -1,4 +1,4 @@
-//! `tread geofence`: where the robots of a site may be.
+//! `tread geofence`: shows and replaces the geofence of a site.
 
 use std::process::ExitCode;
 

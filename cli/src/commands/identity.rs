@@ -13,14 +13,14 @@ use crate::client::Client;
 use crate::credentials::{self, Store};
 use crate::output::{Output, line, note, or_dash, render, table};
 
-/// Longest token that is read.
+/// Maximum length of a token that is read, bytes.
 const TOKEN_MAX: u64 = 1_024;
 
 fn store() -> anyhow::Result<Store> {
     Store::of_user().context("there is no home to keep tokens in: set HOME or TREAD_CREDENTIALS")
 }
 
-/// Reads a token, sees whether the server takes it, and keeps it for that server.
+/// Reads a token, verifies it at the server, and stores it for that server.
 pub(super) async fn login(connection: &Connection, output: Output) -> anyhow::Result<ExitCode> {
     let token = match &connection.showing.token_file {
         Some(file) => credentials::read_token(file)?,
@@ -55,7 +55,7 @@ fn read_from_input() -> anyhow::Result<String> {
     Ok(token.to_owned())
 }
 
-/// Forgets the token for a server; the token stays valid.
+/// Deletes the stored token of a server; the token stays valid.
 pub(super) fn logout(client: &Client, output: Output) -> anyhow::Result<ExitCode> {
     store()?.forget(client.address(), None)?;
     output.show(&json!({"server": client.address()}), |_| {
@@ -89,7 +89,7 @@ fn who(session: &Session) -> String {
     )
 }
 
-/// The role, or the rights of who has none.
+/// Returns the role, or the rights if there is no role.
 fn what(role: Option<Role>, rights: Rights) -> String {
     role.map_or_else(|| rights.to_string(), |role| role.to_string())
 }
@@ -172,7 +172,7 @@ fn list(tokens: &[Token]) -> String {
     render(&table)
 }
 
-/// Lists or ends sessions of people.
+/// Lists or ends the sessions of people.
 pub(super) async fn sessions(
     action: Option<SessionsAction>,
     client: &Client,

@@ -1,4 +1,4 @@
-//! Keys of the terminal, one by one.
+//! Single key events of the terminal, read by a thread.
 
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -6,25 +6,25 @@ use std::time::Duration;
 use crossterm::event::{self, Event, KeyEvent};
 use tokio::sync::mpsc;
 
-/// Keys that may wait.
+/// Maximum number of key events in the queue; further ones are dropped.
 const KEYS_MAX: usize = 64;
-/// How often the keyboard is looked at, so that its thread ends soon after the rest.
+/// Period at which the thread checks whether to end.
 const KEY_POLL: Duration = Duration::from_millis(50);
 
-/// A thread that reads keys until nobody takes them.
+/// Thread that reads key events until its receiver is dropped.
 pub(super) struct Keyboard {
     reading: JoinHandle<()>,
 }
 
 impl Keyboard {
-    /// Starts to read. The terminal must give single keys.
+    /// Starts the thread. The terminal must be in raw mode.
     pub(super) fn read() -> (Self, mpsc::Receiver<KeyEvent>) {
         let (keys, pressed) = mpsc::channel(KEYS_MAX);
         let reading = std::thread::spawn(move || read_keys(&keys));
         (Self { reading }, pressed)
     }
 
-    /// Ends the thread; whoever comes next has the keyboard for itself.
+    /// Ends the thread, so that other code can read the keyboard.
     pub(super) async fn end(self, pressed: mpsc::Receiver<KeyEvent>) {
         drop(pressed);
         let reading = self.reading;
@@ -38,7 +38,7 @@ fn read_keys(keys: &mpsc::Sender<KeyEvent>) {
         match event::poll(KEY_POLL) {
             Ok(false) => {}
             Ok(true) => match event::read() {
-                // What does not fit is one key more of those that are held.
+                // When the queue is full, keys are being held; a lost repetition does no harm.
                 Ok(Event::Key(key)) => _ = keys.try_send(key),
                 Ok(_) => {}
                 Err(_) => return,

@@ -1,4 +1,4 @@
-//! `tread limits`: what other programs hold or slow a robot by.
+//! `tread limits`: lists, sets and ends the external limits of a robot.
 
 use std::process::ExitCode;
 

@@ -1,4 +1,4 @@
-//! `tread missions`: what robots were asked to do, and what came of it.
+//! `tread missions`: lists, shows, awaits and controls missions.
 
 use std::process::ExitCode;
 
@@ -53,7 +53,7 @@ pub(super) async fn run(
     Ok(ExitCode::SUCCESS)
 }
 
-/// A table of missions.
+/// Returns a table of missions.
 pub(super) fn list(missions: &[Mission]) -> String {
     if missions.is_empty() {
         return "no missions here yet: send one with `tread send`".to_owned();
@@ -85,7 +85,7 @@ pub(super) fn list(missions: &[Mission]) -> String {
     render(&table)
 }
 
-/// One line on a mission.
+/// Returns one line about a mission.
 pub(super) fn summary(mission: &Mission) -> String {
     let reason = mission
         .reason
@@ -101,7 +101,7 @@ pub(super) fn summary(mission: &Mission) -> String {
     )
 }
 
-/// A mission's state, with what is under way.
+/// Returns a mission's state, with a change in progress in parentheses.
 pub(super) fn state(mission: &Mission) -> String {
     let word = mission.state.as_str();
     if mission.state.is_terminal() {
@@ -155,7 +155,7 @@ fn history(detail: &MissionDetail) -> String {
     )
 }
 
-/// A trajectory in a few words.
+/// Returns a short description of a trajectory.
 pub(super) fn trajectory(trajectory: &Trajectory) -> String {
     match trajectory {
         Trajectory::Circle(circle) => {

@@ -1,4 +1,4 @@
-//! The commands that talk to a running server, a file each.
+//! Commands that connect to a running server, one file for each group.
 
 mod alerts;
 mod audit;

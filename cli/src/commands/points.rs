@@ -1,4 +1,4 @@
-//! Points out of a file: paths to drive, and borders of terrains.
+//! Points from a file, for paths and borders of terrains.
 
 use std::path::Path;
 
@@ -8,7 +8,7 @@ use tread_api::trajectory::Waypoint;
 
 use crate::args::waypoint;
 
-/// Reads points from a file of lines `x,y`, or of a JSON list.
+/// Reads points from a file: lines `x,y`, with `#` for comments, or a JSON list.
 pub(super) fn read_waypoints(file: &Path) -> anyhow::Result<Vec<Waypoint>> {
     let name = file.display();
     let text = std::fs::read_to_string(file).with_context(|| format!("cannot read {name}"))?;
@@ -25,7 +25,7 @@ pub(super) fn read_waypoints(file: &Path) -> anyhow::Result<Vec<Waypoint>> {
         .collect()
 }
 
-/// The places of [`read_waypoints`] alone, or those that were given on the command line.
+/// Returns the positions of [`read_waypoints`] if a file is given, else the given points.
 pub(super) fn read_corners(file: Option<&Path>, given: Vec<Point>) -> anyhow::Result<Vec<Point>> {
     match file {
         None => Ok(given),

@@ -1,4 +1,4 @@
-//! `tread robots`: who is there, and what they said last.
+//! `tread robots` and `tread leases`: list robots, show one, list leases.
 
 use std::process::ExitCode;
 
@@ -27,7 +27,7 @@ pub(super) async fn run(
     Ok(ExitCode::SUCCESS)
 }
 
-/// Who teleoperates a robot.
+/// Lease of a robot.
 #[derive(Serialize)]
 struct Leased<'robot> {
     robot: &'robot RobotId,
@@ -71,7 +71,7 @@ pub(super) async fn leases(
     Ok(ExitCode::SUCCESS)
 }
 
-/// A table of robots.
+/// Returns a table of robots.
 pub(super) fn list(robots: &[Robot]) -> String {
     if robots.is_empty() {
         return "no robot has said hello on this site yet".to_owned();
@@ -212,7 +212,7 @@ fn live_lines(live: &RobotLive) -> Vec<String> {
     lines
 }
 
-/// What keeps a robot from driving as it would.
+/// Returns lines about stop, driver and external limits of a robot.
 fn safety_lines(safety: &SafetyStatus) -> Vec<String> {
     let mut lines = Vec::new();
     lines.extend(
@@ -238,13 +238,14 @@ fn safety_lines(safety: &SafetyStatus) -> Vec<String> {
     lines
 }
 
-/// The measured θ with its standard deviation.
+/// Returns the measured θ with its standard deviation; `None` if there is none.
 pub(super) fn theta(live: &RobotLive) -> Option<String> {
     let measured = live.friction?.value.theta_measured?;
     Some(format!("{:.4} ± {:.4}", measured.theta, measured.std_dev))
 }
 
-/// How many of `steps` a mission has come, 0 to all; none while its length is not known.
+/// Returns the progress of a mission in whole steps, 0 to `steps`; `None` while its length is
+/// unknown.
 pub(super) fn steps_come(progress: MissionProgress, steps: usize) -> Option<usize> {
     let share = (progress.length_m > 0.0).then(|| progress.driven_m / progress.length_m)?;
     #[expect(

@@ -1,4 +1,4 @@
-//! `tread send`: a circle or waypoints for a robot.
+//! `tread send`: creates, replaces or checks a mission on a circle or through waypoints.
 
 use std::process::ExitCode;
 use std::time::Duration;
@@ -62,7 +62,7 @@ pub(super) async fn run(
     })
 }
 
-/// Tells what a trajectory would ask of its robot.
+/// Checks a trajectory and prints its plan.
 async fn check(
     trajectory: Trajectory,
     order: &Order,
@@ -84,7 +84,7 @@ async fn check(
     Ok(ExitCode::SUCCESS)
 }
 
-/// From where it was planned, in words.
+/// Returns the origin of the plan, in words.
 fn planned_from(checked: &TrajectoryCheck) -> String {
     let place = format!("x {:.2} m, y {:.2} m", checked.start.x_m, checked.start.y_m);
     match (checked.start_source, checked.after_mission) {
@@ -143,7 +143,7 @@ fn demands(checked: &TrajectoryCheck) -> String {
     lines.join("\n")
 }
 
-/// What the flags ask for beside the trajectory.
+/// Returns the options of the trajectory that the flags select.
 fn options(order: &Order) -> TrajectoryOptions {
     TrajectoryOptions {
         approach_speed_m_s: order.approach_speed,
@@ -194,7 +194,7 @@ fn latest_start(within: Duration) -> anyhow::Result<Timestamp> {
         .context("--start-within is too far in the future")
 }
 
-/// What keeps a robot slower than asked, in words.
+/// Returns the name of the limit that slows the robot.
 fn limit_name(limit: BindingLimit) -> &'static str {
     match limit {
         BindingLimit::LateralAcceleration => "acceleration across the path",

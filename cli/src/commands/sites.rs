@@ -1,4 +1,4 @@
-//! `tread status` and `tread sites`: the server, and where its robots are.
+//! `tread status` and `tread sites`: show the server, list and change sites.
 
 use std::process::ExitCode;
 
@@ -16,7 +16,8 @@ pub(super) async fn status(client: &Client, output: Output) -> anyhow::Result<Ex
     Ok(ExitCode::SUCCESS)
 }
 
-/// The fields of a server of any version: what is new is shown, what is gone is not missed.
+/// Formats the status of a server of any version: unknown counters are shown, missing fields left
+/// out.
 fn describe(status: &Value, address: &str) -> String {
     let mut lines = vec![format!("server          {address}")];
     let mut add = |name: &str, value: Option<String>| {
@@ -91,7 +92,7 @@ fn turned(place: GeoOrigin, x_axis_deg: f64) -> GeoOrigin {
     }
 }
 
-/// A place on the earth to about a decimetre, and how the site is turned there.
+/// Returns position in WGS 84, to about a decimetre, and orientation of a site.
 fn on_earth(origin: GeoOrigin) -> String {
     let GeoOrigin {
         latitude_deg,

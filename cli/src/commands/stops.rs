@@ -1,4 +1,4 @@
-//! `tread stop` and `tread clear`.
+//! `tread stop`, `tread stops` and `tread clear`: stop robots, list stops, clear a stop.
 
 use std::process::ExitCode;
 
@@ -24,7 +24,7 @@ pub(super) async fn stop(
         let site = None;
         client.stop_fleet(&StopFleet { site, by, reason }).await?
     } else {
-        // All at once: no robot waits for another.
+        // Sent concurrently, so that no robot waits for another.
         let words = StopRobot { by, reason };
         let asking = robots
             .iter()
@@ -79,7 +79,7 @@ fn list(stops: &[Stop]) -> String {
     render(&table)
 }
 
-/// Stops with what became of them.
+/// Lists stops with their confirmation and clearing.
 pub(super) async fn history(
     arguments: &StopsArguments,
     client: &Client,
@@ -158,7 +158,7 @@ pub(super) async fn clear(
         })?;
         return Ok(ExitCode::SUCCESS);
     }
-    // Whoever clears has seen what it is that they clear.
+    // Without a stop identifier, only show the stop: nobody clears a stop unseen.
     let live = client.robot(site, &robot).await?.live;
     let latch = live.and_then(|live| live.safety.stop);
     output.show(&latch, |latch| match latch {

@@ -1,4 +1,4 @@
-//! `tread terrains`: what ground is drawn where.
+//! `tread terrains`: lists, shows, creates, changes and deletes terrains.
 
 use std::process::ExitCode;
 
@@ -108,7 +108,7 @@ fn details(terrain: &Terrain) -> String {
     )
 }
 
-/// The class as the API names it.
+/// Returns the class as the API names it.
 pub(super) fn class_name(class: TerrainClass) -> String {
     let name = serde_json::to_value(class).ok();
     let name = name.as_ref().and_then(serde_json::Value::as_str);

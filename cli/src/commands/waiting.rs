@@ -1,4 +1,5 @@
-//! Waiting for missions to end: a bar for each in a terminal, a line for each change elsewhere.
+//! Waits until missions have ended, with a bar for each mission in a terminal and a line for each
+//! change elsewhere.
 
 use std::io::IsTerminal as _;
 use std::time::Duration;
@@ -14,16 +15,16 @@ use super::robots::steps_come;
 use crate::client::Client;
 use crate::output::{Output, TookTooLong, note};
 
-/// Time between two looks at the missions that are waited for.
+/// Polling period of the missions.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
-/// Steps of a bar.
+/// Number of steps of a bar.
 const STEPS: usize = 1_000;
 
-/// One mission that is waited for.
+/// Mission whose end is awaited.
 struct Waited {
     id: MissionId,
     bar: ProgressBar,
-    /// What was said of it last, where there are no bars.
+    /// Last printed state, where there are no bars.
     said: Option<String>,
     ended: Option<Mission>,
 }
@@ -57,10 +58,11 @@ impl Waited {
     }
 }
 
-/// Follows missions to their ends, in the order in which they were named.
+/// Waits until the missions have ended and returns them in the order of `missions`.
 ///
 /// # Errors
-/// [`TookTooLong`] past the time that was allowed; the missions go on.
+/// [`TookTooLong`] if they have not ended within `allowed`; the missions continue.
+/// [`ClientError`](crate::client::ClientError) if a request fails.
 pub(super) async fn wait(
     client: &Client,
     missions: &[MissionId],
@@ -130,7 +132,7 @@ pub(super) async fn wait(
     }
 }
 
-/// Whether all of them came to a good end.
+/// Whether all missions have succeeded.
 pub(super) fn have_succeeded(missions: &[Mission]) -> bool {
     missions
         .iter()

@@ -1,9 +1,8 @@
-//! `tread demo`: a whole fleet on this machine, each part a process of its own.
+//! `tread demo`: runs a whole fleet on this machine, each part in a process of its own.
 //!
-//! This executable starts itself again as the server and as one agent for each robot of a
-//! scenario, draws the scenario's terrains and sends its missions over REST, and shows how they
-//! come along. What the robots then know of the ground they have measured: only their simulated
-//! bases are given the truth.
+//! This executable starts itself as the server and as one agent for each robot of a scenario,
+//! creates the scenario's terrains, sends its missions over REST, and shows their progress. The
+//! robots measure the friction of the ground: only their simulated bases have the true values.
 
 mod processes;
 mod progress;
@@ -31,16 +30,16 @@ use crate::client::{Client, ClientError, Reading};
 use crate::credentials::{self, Store};
 use crate::output::{json_line, line, note};
 
-/// Longest wait for the server or the robots to be there.
+/// Maximum time until the server is ready, and until all robots are online.
 const START_WAIT_MAX: Duration = Duration::from_secs(30);
-/// Longest wait for the last measurements after the last mission has ended.
+/// Maximum time for the last measurements to be uploaded after the last mission has ended.
 const UPLOAD_WAIT_MAX: Duration = Duration::from_secs(10);
-/// Time between two looks at the fleet.
+/// Polling period of the fleet.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
-/// A mission shown is one of the newest so many.
+/// Number of newest missions that are polled.
 const MISSIONS_MAX: u32 = 1_000;
 
-/// Runs a fleet until its missions have ended, its time is over or somebody presses Ctrl-C.
+/// Runs a fleet until its missions have ended, its time is over or Ctrl-C is pressed.
 pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
     let scenario = match &arguments.scenario {
         Some(file) => Scenario::load(file)?,
@@ -128,7 +127,8 @@ fn welcome(client: &Client, processes: &Processes, folder: &Path, missions: usiz
     )
 }
 
-/// The demo's token among those of this user, so that `tread` finds it while the demo runs.
+/// Guard that keeps the demo's token in the user's credentials file, so that other `tread` commands
+/// find it while the demo runs.
 struct SignedIn {
     store: Option<Store>,
     address: String,
@@ -156,13 +156,13 @@ impl SignedIn {
 impl Drop for SignedIn {
     fn drop(&mut self) {
         if let Some(store) = &self.store {
-            // A token that is left behind opens nothing: its server is gone.
+            // A token that remains is useless: its server has ended.
             let _ = store.forget(&self.address, Some(&self.token));
         }
     }
 }
 
-/// Where the demo keeps its files.
+/// Folder of the demo's files.
 enum DataFolder {
     Temporary(tempfile::TempDir),
     Kept(PathBuf),
@@ -189,7 +189,7 @@ impl DataFolder {
     }
 }
 
-/// The scenario's part of a fleet.
+/// Scenario, robots and client of a demo.
 #[derive(Clone, Copy)]
 struct Demo<'demo> {
     scenario: &'demo Scenario,
@@ -225,7 +225,7 @@ impl Demo<'_> {
                 .create_terrain(&self.scenario.site, &request)
                 .await
             {
-                // A folder that was kept has them from the last time.
+                // A folder of an earlier demo has them already.
                 Err(ClientError::Refused { problem })
                     if problem.kind == ProblemType::AlreadyExists => {}
                 other => _ = other?,
@@ -282,7 +282,7 @@ impl Demo<'_> {
     }
 }
 
-/// Looks at the fleet until it is done.
+/// Polls the fleet until the demo is done.
 struct Watch<'demo> {
     demo: Demo<'demo>,
     shapes: Vec<TerrainShape>,
@@ -321,8 +321,8 @@ impl<'demo> Watch<'demo> {
         }
     }
 
-    /// Returns when all missions have ended and everything measured is uploaded, or when the time
-    /// is over; without a time it goes on showing the fleet for ever.
+    /// Returns when all missions have ended and all measurements are uploaded, or when the time is
+    /// over. Without a time limit it shows the fleet until it is cancelled.
     async fn until_done(&mut self, processes: &mut Processes) -> anyhow::Result<()> {
         let mut ticks = tokio::time::interval(LOOK_EVERY);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);

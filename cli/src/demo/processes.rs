@@ -1,4 +1,4 @@
-//! The processes of a demo: this executable again, as server and as agents.
+//! Child processes of a demo: this executable as server and as agents.
 
 use std::fs::File;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
@@ -13,27 +13,27 @@ use tokio::time::Instant;
 use tread_agent::sim::scenario::ScenarioRobot;
 use tread_api::ids::SiteId;
 
-/// Port of the zenoh router, if it is free.
+/// Port of the zenoh router; if it is in use, the next free one.
 const ZENOH_PORT: u16 = 7447;
-/// Days that a demo's token is valid.
+/// Validity of the demo's token, days.
 const TOKEN_VALID_DAYS: u32 = 7;
-/// Ports that are tried from the one that was asked for.
+/// Number of ports to try after the requested one.
 const PORTS_TRIED: u16 = 50;
-/// Longest wait for processes that were asked to stop.
+/// Maximum time for processes to stop; afterwards they are killed.
 const STOP_WAIT_MAX: Duration = Duration::from_secs(10);
-/// Time between two looks at processes that are to stop.
+/// Polling period of processes that are stopping.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
-/// Lines of a log that are shown when its process has died.
+/// Number of log lines to show when a process has ended unexpectedly.
 const LOG_LINES_SHOWN: usize = 15;
 
-/// One child process and its log.
+/// Child process with its log.
 struct Part {
     name: String,
     child: Child,
     log: PathBuf,
 }
 
-/// All child processes; they are killed if this is dropped without having been stopped.
+/// All child processes; dropping it kills those that are still running.
 pub(super) struct Processes {
     http: SocketAddr,
     zenoh: SocketAddr,
@@ -42,7 +42,7 @@ pub(super) struct Processes {
 }
 
 impl Processes {
-    /// Starts the server on loopback ports that are free.
+    /// Starts the server on free loopback ports.
     pub(super) fn start_server(folder: &Path, port: u16, site: &SiteId) -> anyhow::Result<Self> {
         let http = free_address(port)?;
         let zenoh = free_address(ZENOH_PORT)?;
@@ -64,7 +64,7 @@ impl Processes {
         Ok(processes)
     }
 
-    /// Makes the database and an admin's token in it, as one does before a server's first start.
+    /// Creates the database with an admin token, as before the first start of any server.
     fn make_token(&self, folder: &Path) -> anyhow::Result<()> {
         let program = std::env::current_exe().context("cannot find this executable")?;
         let made = Command::new(program)
@@ -84,7 +84,7 @@ impl Processes {
         Ok(())
     }
 
-    /// The file with an admin's token.
+    /// Returns the path of the file with the admin token.
     pub(super) fn token_file(&self) -> PathBuf {
         self.token_file.clone()
     }
@@ -137,7 +137,10 @@ impl Processes {
         format!("tcp/{}", self.zenoh)
     }
 
-    /// An error, with the end of its log, if any process has ended by itself.
+    /// Checks that no process has ended.
+    ///
+    /// # Errors
+    /// A process has ended; the message contains the end of its log.
     pub(super) fn all_alive(&mut self) -> anyhow::Result<()> {
         for part in &mut self.parts {
             if let Some(status) = part.child.try_wait()? {
@@ -153,7 +156,8 @@ impl Processes {
         Ok(())
     }
 
-    /// Asks all to stop, the agents first, and waits until they have; kills who does not.
+    /// Stops all processes, the agents first, and waits until they have ended. Kills those that
+    /// have not within [`STOP_WAIT_MAX`].
     pub(super) async fn stop(&mut self) {
         let (servers, agents) = self.parts.split_at_mut(1);
         stop_all(agents).await;
@@ -165,7 +169,7 @@ impl Processes {
 impl Drop for Processes {
     fn drop(&mut self) {
         for part in &mut self.parts {
-            // Both fail only if it has ended already.
+            // Both calls fail only if the process has ended already.
             _ = part.child.kill();
             _ = part.child.wait();
         }
@@ -174,7 +178,7 @@ impl Drop for Processes {
 
 async fn stop_all(parts: &mut [Part]) {
     for part in parts.iter() {
-        // It fails only if the process has ended already.
+        // Fails only if the process has ended already.
         _ = kill(
             Pid::from_raw(part.child.id().cast_signed()),
             Signal::SIGTERM,
@@ -190,7 +194,7 @@ async fn stop_all(parts: &mut [Part]) {
     }
 }
 
-/// The first free port of the loopback from the one that is wanted.
+/// Returns the loopback address with the first free port from `wanted` on.
 fn free_address(wanted: u16) -> anyhow::Result<SocketAddr> {
     let last = wanted.saturating_add(PORTS_TRIED);
     for port in wanted..=last {

@@ -1,4 +1,4 @@
-//! How a demo comes along, a line for each robot.
+//! Progress of a demo, with a bar for each robot.
 
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use tread_agent::sim::scenario::ScenarioRobot;
@@ -6,17 +6,17 @@ use tread_api::ids::RobotId;
 use tread_api::mission::{Mission, MissionState};
 use tread_api::robot::Robot;
 
-/// Steps of a bar.
+/// Number of steps of a bar.
 const STEPS: u64 = 1_000;
 
-/// The lines; hidden where nobody looks.
+/// Bars of the robots; hidden unless a person sees them.
 pub(super) struct Progress {
     lines: Vec<(RobotId, ProgressBar)>,
 }
 
 impl Progress {
     pub(super) fn new(robots: &[ScenarioRobot], shown: bool) -> Self {
-        // The bars draw nothing by themselves where standard error is no terminal.
+        // The bars draw nothing if standard error is not a terminal.
         let target = if shown {
             ProgressDrawTarget::stderr()
         } else {
@@ -35,7 +35,7 @@ impl Progress {
         }
     }
 
-    /// Brings the lines up to date.
+    /// Updates the bars.
     pub(super) fn show(&self, robots: &[Robot], missions: &[Mission]) {
         for (robot_id, bar) in &self.lines {
             let own = || missions.iter().filter(|mission| mission.robot == *robot_id);

@@ -1,4 +1,4 @@
-//! What a demo has shown: how its missions ended, and θ as measured against θ as it truly is.
+//! Report of a demo: results of its missions, and measured against true θ of each terrain.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -11,10 +11,10 @@ use tread_api::mission::{Mission, MissionState};
 
 use crate::output::{or_dash, render, table};
 
-/// A terrain that was driven on for less than this need not have been measured.
+/// Minimum driving time on a terrain for the check that it was measured.
 const DRIVEN_MIN: Duration = Duration::from_secs(5);
 
-/// The end of a demo.
+/// Report at the end of a demo.
 #[derive(Debug, Serialize)]
 pub(super) struct Report {
     duration_s: f64,
@@ -23,7 +23,7 @@ pub(super) struct Report {
     checks: Vec<Check>,
 }
 
-/// One terrain as it is and as it was measured.
+/// Terrain with its true and its measured θ.
 #[derive(Debug, Serialize)]
 struct TerrainReport {
     terrain: TerrainId,
@@ -31,14 +31,14 @@ struct TerrainReport {
     true_theta: f64,
     measured_theta: Option<f64>,
     std_dev: Option<f64>,
-    /// Whether the 95 % interval holds the truth.
+    /// Whether the 95 % interval contains the true θ.
     interval_holds: Option<bool>,
     interval_95: Option<(f64, f64)>,
     segments: u64,
     robots: u32,
 }
 
-/// One figure against its goal.
+/// Check of a value against its goal.
 #[derive(Debug, Serialize)]
 struct Check {
     name: &'static str,
@@ -64,7 +64,7 @@ impl Report {
             .iter()
             .map(|terrain| {
                 let known = measured.iter().find(|known| known.terrain.id == terrain.id);
-                // All robots of a scenario are of one model.
+                // All robots of a scenario have the same model.
                 let friction = known.and_then(|known| known.models.first()?.friction);
                 let driven = driven.get(&terrain.id).copied().unwrap_or_default();
                 terrain_report(
@@ -108,7 +108,7 @@ impl Report {
         }
     }
 
-    /// Whether all missions succeeded and every terrain that was driven was measured.
+    /// Whether all missions succeeded and every terrain with sufficient driving time was measured.
     pub(super) fn holds(&self) -> bool {
         self.checks.iter().all(|check| check.holds)
     }

@@ -1,4 +1,4 @@
-//! `tread friction`: friction of the ground and its uncertainty.
+//! `tread friction`: shows the friction of the ground and its uncertainty.
 
 mod tables;
 

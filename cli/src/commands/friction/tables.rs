@@ -1,4 +1,4 @@
-//! Answers of the friction map as tables.
+//! Tables of the friction map's answers.
 
 use comfy_table::Table;
 use jiff::Timestamp;
@@ -13,7 +13,7 @@ use crate::client::{Known, MapTimes};
 use crate::commands::terrains::class_name;
 use crate::output::{age, or_dash, render, table};
 
-/// Columns that say what is known of a piece of ground.
+/// Columns of the friction of an area.
 const FRICTION_COLUMNS: [&str; 7] = [
     "THETA",
     "95 % INTERVAL",
@@ -24,7 +24,7 @@ const FRICTION_COLUMNS: [&str; 7] = [
     "AGE",
 ];
 
-/// A table under the times that it is of, which the server rounds to the ends of its epochs.
+/// Puts the times to which a table refers above it; the server rounds them to the ends of epochs.
 fn of_time(of: MapTimes, table: &str) -> String {
     let as_of = of.as_of.map(|at| format!("{at:.0}"));
     match (of.from, as_of) {
@@ -37,7 +37,7 @@ fn of_time(of: MapTimes, table: &str) -> String {
     }
 }
 
-/// A table with these columns, and what is known behind them.
+/// Returns an empty table with the given columns, followed by [`FRICTION_COLUMNS`].
 fn friction_table(first: &[&str]) -> Table {
     let mut all = table::<0>([]);
     all.set_header(first.iter().chain(&FRICTION_COLUMNS));
@@ -83,7 +83,7 @@ fn columns(friction: Option<&FusedFriction>) -> [String; 7] {
     ]
 }
 
-/// A model's row; what is only expected is said as such.
+/// Returns the row of a robot model; a θ that is expected from the terrain class is marked as such.
 fn model_row(model: &ModelFriction) -> Vec<String> {
     let mut row = vec![model.model.clone()];
     row.extend(columns(model.friction.as_ref()));
@@ -213,7 +213,7 @@ pub(super) fn path(path: &PathFriction) -> String {
     of_time(MapTimes::as_of(path.as_of), &said)
 }
 
-/// Whether a value says more than that somebody was there.
+/// Whether the standard deviation is below θ itself.
 fn is_sure(friction: &FusedFriction) -> bool {
     friction.std_dev < friction.theta
 }

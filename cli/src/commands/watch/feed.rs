@@ -1,4 +1,4 @@
-//! The server's stream of events, opened again where it broke off.
+//! Event stream of the server, reopened where it was interrupted.
 
 use std::time::Duration;
 
@@ -10,32 +10,33 @@ use tread_api::ids::{RobotId, SiteId};
 
 use crate::client::{Client, ClientError};
 
-/// News that may wait to be shown; while they do, the stream is not read.
+/// Maximum number of news in the queue; while it is full, the stream is not read.
 pub(super) const NEWS_MAX: usize = 256;
-/// Rest before the stream is opened again.
+/// Time before the stream is reopened.
 const REOPEN_REST: Duration = Duration::from_secs(1);
-/// Longest silence of a stream; the server says something every 15 s.
+/// Silence after which a stream counts as interrupted; the server sends something every 15 s.
 const SILENCE_MAX: Duration = Duration::from_secs(45);
-/// Longest line of a stream, bytes: a mission of the most waypoints.
+/// Maximum size of the unread part of a stream, bytes; sufficient for a mission with the maximum
+/// number of waypoints. A longer event interrupts the stream.
 const LINE_MAX: usize = 32 * 1024 * 1024;
 
-/// What comes of watching.
+/// News from the event stream.
 #[derive(Debug)]
 pub(super) enum News {
     /// The stream is open.
     Opened,
-    /// Something has happened.
+    /// An event was received.
     Event(Box<Event>),
-    /// The stream broke off, and why; it is opened again.
+    /// The stream was interrupted, with the reason; it is reopened.
     Lost(String),
 }
 
-/// The stream of one site.
+/// Event stream of one site.
 pub(super) struct Feed<'client> {
     client: &'client Client,
     site: &'client SiteId,
     robot: Option<&'client RobotId>,
-    /// Where the stream ended, as the server calls it.
+    /// Identifier of the last event, with which the stream is resumed.
     last: Option<String>,
     was_open: bool,
 }
@@ -55,10 +56,10 @@ impl<'client> Feed<'client> {
         }
     }
 
-    /// Watches until nobody wants to know.
+    /// Receives events until the receiver of `to` is dropped.
     ///
     /// # Errors
-    /// Nobody was there from the start, or the server refuses.
+    /// The stream could not be opened at the first attempt, or the server refused it.
     pub(super) async fn run(mut self, to: mpsc::Sender<News>) -> anyhow::Result<()> {
         while !to.is_closed() {
             match self.follow(&to).await {
@@ -69,7 +70,7 @@ impl<'client> Feed<'client> {
                     if !self.was_open || is_refused {
                         return Err(error);
                     }
-                    // Whoever shows it may have ended meanwhile.
+                    // The receiver may be dropped by now.
                     _ = to.send(News::Lost(format!("{error:#}"))).await;
                 }
             }
@@ -78,7 +79,7 @@ impl<'client> Feed<'client> {
         Ok(())
     }
 
-    /// Follows one stream until it breaks off.
+    /// Receives the events of one stream until it is interrupted. Returns only with an error.
     async fn follow(&mut self, to: &mpsc::Sender<News>) -> anyhow::Result<()> {
         let last = self.last.clone();
         let opening = self.client.events(self.site, self.robot, last.as_deref());
@@ -109,8 +110,8 @@ impl<'client> Feed<'client> {
     }
 }
 
-/// The id and the event of a block of lines; events of a newer server that are not known here are
-/// passed over.
+/// Parses the identifier and the event of a block of lines. Unknown events of a newer server are
+/// ignored.
 fn read(client: &Client, block: &str) -> (Option<String>, Option<Box<Event>>) {
     let field = |name: &str| block.lines().find_map(|line| line.strip_prefix(name));
     let event = field("data: ").and_then(|text| client.read(text.as_bytes()).ok());

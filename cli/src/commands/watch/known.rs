@@ -1,4 +1,4 @@
-//! What is known of a site by the events so far.
+//! State of a site, accumulated from its events.
 
 use std::collections::BTreeMap;
 
@@ -7,20 +7,20 @@ use tread_api::ids::{AlertId, MissionId, RobotId};
 use tread_api::mission::{Mission, MissionState};
 use tread_api::robot::{Alert, LinkState, Robot};
 
-/// Missions kept.
+/// Maximum number of missions kept; the oldest are dropped.
 const MISSIONS_KEPT: usize = 1_000;
 
-/// A site by the events so far.
+/// State of a site, accumulated from its events.
 #[derive(Debug, Default)]
 pub(super) struct Known {
     robots: BTreeMap<RobotId, Robot>,
     missions: BTreeMap<MissionId, Mission>,
-    /// Those about the server itself that stand.
+    /// Alerts about the server itself that have not cleared.
     server_alerts: BTreeMap<AlertId, Alert>,
     is_whole: bool,
 }
 
-/// How many of each.
+/// Number of robots, missions and alerts by state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Counts {
     pub(super) online: usize,
@@ -53,24 +53,24 @@ impl Known {
                     self.server_alerts.insert(alert.id, *alert);
                 }
             }
-            // A robot's alerts come with the robot, its steps with the mission.
+            // Alerts of a robot are part of the robot, steps of a mission part of the mission.
             Event::Alert(_) | Event::Step(_) | Event::Map(_) | Event::End(_) => {}
         }
     }
 
-    /// Whether the snapshot has come whole.
+    /// Whether the snapshot is complete.
     pub(super) fn is_whole(&self) -> bool {
         self.is_whole
     }
 
-    /// The robots that are not retired, by name.
+    /// Iterates over the robots that are not retired, by identifier.
     pub(super) fn robots(&self) -> impl Iterator<Item = &Robot> {
         self.robots
             .values()
             .filter(|robot| robot.retired_at.is_none())
     }
 
-    /// Active missions, then those that wait, then what has ended, each the newest first.
+    /// Returns active missions, then queued ones, then ended ones, each the newest first.
     pub(super) fn missions(&self) -> Vec<Mission> {
         let mut missions: Vec<Mission> = self
             .missions
@@ -85,7 +85,7 @@ impl Known {
         missions
     }
 
-    /// A mission with the progress that its robot said last; missions are sent when they step.
+    /// Returns a mission with the newest progress of its robot; missions are only sent on a step.
     fn fresh(&self, mission: &Mission) -> Mission {
         let live = self.robots.get(&mission.robot);
         let said = live.and_then(|robot| robot.live.as_ref()?.mission);
@@ -96,7 +96,7 @@ impl Known {
         }
     }
 
-    /// Alerts that stand: those that nobody has seen first, then the newest.
+    /// Returns the alerts that have not cleared: unacknowledged ones first, then the newest.
     pub(super) fn alerts(&self) -> Vec<&Alert> {
         let of_robots = self.robots().flat_map(|robot| &robot.alerts);
         let mut alerts: Vec<&Alert> = self.server_alerts.values().chain(of_robots).collect();

@@ -1,4 +1,4 @@
-//! A line for each change: what is first, then what becomes otherwise.
+//! Text output of `tread watch`: a line for each object and for each later change of it.
 
 use std::collections::HashMap;
 
@@ -9,17 +9,19 @@ use tread_api::robot::Robot;
 use crate::commands::missions::{state, trajectory};
 use crate::commands::robots::{link_name, mode_name};
 
-/// Things whose last line is kept; beyond, all are forgotten and said once more.
+/// Maximum number of objects whose last line is kept; beyond it, all are dropped and printed once
+/// more.
 const SAID_MAX: usize = 100_000;
 
-/// What was said last of each thing.
+/// Last line printed for each object.
 #[derive(Debug, Default)]
 pub(super) struct Lines {
     said: HashMap<String, String>,
 }
 
 impl Lines {
-    /// The line for an event, if it tells something new.
+    /// Returns the line for an event; `None` if it equals the last line of the object, or the event
+    /// has none.
     pub(super) fn take(&mut self, event: &Event) -> Option<String> {
         let (thing, text) = match event {
             Event::Robot(robot) => (format!("robot    {}", robot.id), robot_text(robot)),
@@ -75,7 +77,7 @@ fn now() -> String {
     Timestamp::now().strftime("%H:%M:%SZ").to_string()
 }
 
-/// What of a robot is worth a line: not its place, which changes all the time.
+/// Returns the text for a robot, without its pose, which changes all the time.
 fn robot_text(robot: &Robot) -> String {
     let mut text = link_name(robot.link).to_owned();
     let Some(live) = &robot.live else {

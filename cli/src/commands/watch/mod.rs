@@ -1,8 +1,8 @@
-//! `tread watch`: robots, missions and alerts as they change, by the server's stream of events.
+//! `tread watch`: shows robots, missions and alerts live, from the server's event stream.
 //!
-//! In a terminal it is a picture of the whole site; elsewhere, or with `--lines`, a line for each
-//! change; with `--json` the events themselves. A stream that breaks off is opened again where it
-//! ended, so nothing is missed; while no server answers, that is said.
+//! In a terminal it draws a screen with the whole site; elsewhere, or with `--lines`, it prints a
+//! line for each change; with `--json` the events themselves. An interrupted stream is resumed
+//! where it ended, so that no event is missed; the interruption is reported.
 
 mod feed;
 mod known;
@@ -50,7 +50,7 @@ pub(super) async fn run(
     Ok(ExitCode::SUCCESS)
 }
 
-/// Prints what comes, until nothing does.
+/// Prints news until the sender is dropped.
 async fn print(mut news: mpsc::Receiver<News>, output: Output) -> anyhow::Result<()> {
     let mut lines = Lines::default();
     while let Some(news) = news.recv().await {
@@ -72,7 +72,7 @@ async fn print(mut news: mpsc::Receiver<News>, output: Output) -> anyhow::Result
     Ok(())
 }
 
-/// Why the server ends a stream, for people.
+/// Returns the reason why the server ended the stream, for people.
 fn ended(end: StreamEnd) -> &'static str {
     match end {
         StreamEnd::TooSlow => "the server ended the stream: read too slowly",

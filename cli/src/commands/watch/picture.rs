@@ -1,4 +1,4 @@
-//! The picture itself: a heading, the robots, their missions, what stands, what keys do.
+//! Layout and drawing of the screen: heading, robots, missions, alerts, message and key help.
 
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
@@ -16,25 +16,25 @@ use crate::commands::missions::{state, trajectory};
 use crate::commands::robots::{details, link_name, mode_name, steps_come, theta};
 use crate::output::{age, fixed, or_dash};
 
-/// Cells for the longest name.
+/// Maximum width of a robot's name, columns.
 const NAME_MOST: usize = 24;
-/// Cells of a bar.
+/// Width of a progress bar, columns.
 const BAR: usize = 10;
-/// Width from which identifiers are shown whole and more is told of each robot.
+/// Minimum width of the screen, columns, for whole identifiers and additional columns of robots.
 const WIDE: u16 = 130;
-/// Most rows for missions beside the robots.
+/// Maximum number of rows for missions.
 const MISSION_ROWS: u16 = 40;
-/// Rows that missions have at least, with their heading, where the screen has any to give.
+/// Minimum number of rows for missions including their heading, if the screen has enough.
 const MISSION_ROWS_LEAST: u16 = 7;
-/// Rows for all of one robot.
+/// Number of rows for the details of one robot.
 const DETAIL_ROWS: u16 = 24;
-/// Most rows for alerts.
+/// Maximum number of rows for alerts.
 const ALERT_ROWS: u16 = 5;
 
 const KEYS: &str =
     " q quit · ↑↓ select · Tab table · Enter details · o order · X STOP robot · a alert seen";
 
-/// What is drawn.
+/// Data to draw.
 pub(super) struct Picture<'screen> {
     pub(super) site: &'screen SiteId,
     pub(super) address: &'screen str,
@@ -42,10 +42,10 @@ pub(super) struct Picture<'screen> {
     pub(super) shown: &'screen Shown,
 }
 
-/// Rows for a list of so many, with its heading and its border.
+/// Returns the number of rows for a list of `count` entries, with heading and border.
 fn rows(count: usize, most: u16) -> u16 {
     let rows = u16::try_from(count).unwrap_or(most).min(most);
-    // A border with the title, and the heading.
+    // One row for the border with the title, one for the heading.
     rows + 2
 }
 
@@ -58,7 +58,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, picture: &Picture<'_>) {
         rows(alerts.len(), ALERT_ROWS)
     };
     let above = if shown.details {
-        // All of one robot, and as much of the missions as is left.
+        // Details of one robot; missions get the remaining rows.
         Constraint::Length(DETAIL_ROWS)
     } else {
         let most = frame
@@ -145,7 +145,7 @@ fn head(picture: &Picture<'_>) -> Vec<Line<'static>> {
     vec![Line::from(first), Line::from(second)]
 }
 
-/// A bar for how far a mission has come.
+/// Returns a progress bar of a mission.
 fn bar(progress: Option<MissionProgress>) -> String {
     let Some((progress, full)) = progress.and_then(|it| Some((it, steps_come(it, BAR)?))) else {
         return "-".to_owned();
@@ -174,7 +174,8 @@ fn robot_style(robot: &Robot) -> Style {
     }
 }
 
-/// What it does: `stopped` once it stands, and in any case that it does not though it should.
+/// Returns the mode: `stopping` until a stopped robot is at standstill, and a warning if it moves
+/// although it should be at rest.
 fn mode_and_standing(live: &RobotLive) -> String {
     let mode = mode_name(live.mode);
     let standing = live.safety.standing.map(|standing| standing.state);
@@ -192,7 +193,7 @@ fn robot_row(robot: &Robot, is_wide: bool) -> Row<'static> {
     let live = robot.live.as_ref();
     let twist = live.and_then(|live| live.twist);
     let mission = live.and_then(|live| live.mission);
-    // Adding nothing makes a plain zero of a negative one.
+    // Adding zero turns a negative zero into a positive one.
     let off = mission.map(|mission| format!("{:.0}", (1e3 * mission.cross_track_m).round() + 0.0));
     let mut cells = vec![
         robot.id.to_string(),
@@ -290,7 +291,7 @@ fn draw_missions(frame: &mut Frame<'_>, area: Rect, picture: &Picture<'_>, missi
         } else {
             format!("…{}", &id[id.len() - 12..])
         };
-        // While it is driven as it should be, the state says all.
+        // The reason of a normal state is omitted.
         let is_plain = matches!(
             mission.state,
             MissionState::Active | MissionState::Succeeded
@@ -381,7 +382,7 @@ mod tests {
 
     use super::*;
 
-    /// A robot as an older or newer server might tell of it.
+    /// A robot as an older or newer server sends it.
     fn robot(id: &str, link: &str) -> Event {
         let at = "2026-11-21T08:00:00Z";
         let limits = json!({

@@ -1,5 +1,5 @@
-//! The picture in a terminal: what is selected, what keys do. The terminal is put back as it was
-//! on every way out.
+//! Interactive screen of `tread watch`: selection, keys and actions. The terminal is restored on
+//! every way out.
 
 use std::time::Duration;
 
@@ -23,10 +23,10 @@ use crate::args::WatchArguments;
 use crate::client::Client;
 use crate::commands::keys::Keyboard;
 
-/// Rows that a page key moves.
+/// Number of rows by which the page keys move.
 const PAGE_ROWS: usize = 10;
 
-/// Which table the keys are for.
+/// Table to which the keys apply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) enum Section {
     #[default]
@@ -44,33 +44,33 @@ impl Section {
     }
 }
 
-/// In which order robots stand.
+/// Order of the robots.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) enum Order {
     #[default]
     Name,
-    /// Those that need a look first: stopped, lost, late.
+    /// Robots that need attention first: stopped, offline, stale.
     Trouble,
 }
 
-/// What is shown beside what is known.
+/// State of the screen besides the data of the site.
 #[derive(Debug, Default)]
 pub(super) struct Shown {
     pub(super) section: Section,
     pub(super) order: Order,
-    /// The selected thing of each section, by its identifier: what is acted upon is what was
-    /// marked, wherever it has moved to meanwhile.
+    /// Selected object of each section, by its identifier, so that an action applies to the
+    /// selected object even if its row has moved.
     selected: [Option<String>; 3],
-    /// Whether all of the selected robot is shown instead of the tables.
+    /// Whether the details of the selected robot replace its table.
     pub(super) details: bool,
-    /// What was done last, or why not.
+    /// Result of the last action.
     pub(super) said: Option<String>,
-    /// Why there are no events.
+    /// Reason why no events arrive; `None` while they do.
     pub(super) lost: Option<String>,
 }
 
 impl Shown {
-    /// The identifiers of what a section lists, in its order.
+    /// Returns the identifiers in a section, in their order.
     fn listed(&self, known: &Known, section: Section) -> Vec<String> {
         match section {
             Section::Robots => {
@@ -88,7 +88,7 @@ impl Shown {
         }
     }
 
-    /// The marked row of a section; the first one where nothing is marked.
+    /// Returns the selected row of a section; the first one if nothing is selected.
     pub(super) fn row(&self, known: &Known, section: Section) -> usize {
         let selected = self.selected[section as usize].as_ref();
         let listed = self.listed(known, section);
@@ -103,10 +103,11 @@ impl Shown {
         self.selected[self.section as usize] = listed.get(row).cloned();
     }
 
-    /// Marks what is drawn as marked, so that it stays so when the rows move.
+    /// Fixes the selection to the objects that are drawn as selected, so that it follows them when
+    /// rows move.
     fn mark(&mut self, known: &Known) {
         if !known.is_whole() {
-            // The rows have not all come.
+            // Rows are still missing.
             return;
         }
         for section in Section::ALL {
@@ -116,7 +117,7 @@ impl Shown {
         }
     }
 
-    /// The robots in their order.
+    /// Returns the robots in the chosen order.
     pub(super) fn robots<'known>(&self, known: &'known Known) -> Vec<&'known Robot> {
         let mut robots: Vec<&Robot> = known.robots().collect();
         if self.order == Order::Trouble {
@@ -125,7 +126,7 @@ impl Shown {
         robots
     }
 
-    /// The marked robot.
+    /// Returns the selected robot.
     pub(super) fn robot<'known>(&self, known: &'known Known) -> Option<&'known Robot> {
         let selected = self.selected[Section::Robots as usize].as_deref();
         known
@@ -133,7 +134,7 @@ impl Shown {
             .find(|robot| Some(robot.id.as_str()) == selected)
     }
 
-    /// The marked alert.
+    /// Returns the selected alert.
     fn alert<'known>(&self, known: &'known Known) -> Option<&'known Alert> {
         let selected = self.selected[Section::Alerts as usize].as_deref();
         let mut alerts = known.alerts().into_iter();
@@ -141,7 +142,7 @@ impl Shown {
     }
 }
 
-/// How much a robot needs a look.
+/// Returns a score of how much a robot needs attention; higher comes first.
 fn trouble(robot: &Robot) -> u8 {
     let live = robot.live.as_ref();
     let is_stopped = live.is_some_and(|live| live.safety.stop.is_some() || live.fault.is_some());
@@ -154,7 +155,7 @@ fn trouble(robot: &Robot) -> u8 {
     8 * u8::from(is_stopped) + 2 * link + alerts
 }
 
-/// What a key asks for beyond the picture.
+/// Action of a key beyond the screen itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Wish {
     Quit,
@@ -162,18 +163,18 @@ enum Wish {
     Acknowledge(AlertId),
 }
 
-/// The picture of a site.
+/// Interactive screen of a site.
 pub(super) struct Screen<'client> {
     client: &'client Client,
     site: &'client SiteId,
     every: Duration,
     known: Known,
     shown: Shown,
-    /// What was asked of the server and is not answered yet.
+    /// Requests without an answer yet.
     asked: FuturesUnordered<BoxFuture<'client, String>>,
 }
 
-/// A terminal as it was, whatever happens.
+/// Guard that restores the terminal when dropped, also on a panic.
 struct Restored;
 
 impl Drop for Restored {
@@ -194,10 +195,10 @@ impl<'client> Screen<'client> {
         }
     }
 
-    /// Shows what comes until the person has seen enough.
+    /// Shows news and handles keys until the user quits.
     pub(super) async fn run(mut self, mut news: mpsc::Receiver<News>) -> anyhow::Result<()> {
-        // The picture begins with the first word of the server: who cannot be reached is said in
-        // the terminal as it is.
+        // The screen begins with the first news, so that a connection error is printed in the
+        // normal terminal.
         let Some(first) = news.recv().await else {
             return Ok(());
         };
@@ -302,7 +303,7 @@ impl<'client> Screen<'client> {
         None
     }
 
-    /// Shows the marked robot, or the one of the marked mission or alert.
+    /// Shows the details of the selected robot, or of the robot of the selected mission or alert.
     fn open(&mut self) {
         let row = self.shown.row(&self.known, self.shown.section);
         let robot = match self.shown.section {
