@@ -44,6 +44,9 @@ struct Arguments {
     /// Configure agents for tyres that rise straight at once, instead of the default
     #[arg(long)]
     tyres_straight: bool,
+    /// Drives of each line of which to work out how well θ could be known
+    #[arg(long, default_value_t = 0)]
+    bounds: u32,
     /// Write each drive there, one JSON object a line
     #[arg(long, value_name = "FILE")]
     drives: Option<PathBuf>,
@@ -88,6 +91,7 @@ fn write(file: &mut impl Write, name: &str, drives: &[Drive]) -> anyhow::Result<
             "beyond_half_peak": outcome.beyond_half_peak,
             "asked_at_s": ASKED_AT_S,
             "theta_and_std_dev": said,
+            "bounds": outcome.bounds,
         });
         writeln!(file, "{object}")?;
     }
