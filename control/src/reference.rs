@@ -136,7 +136,7 @@ impl Governor {
         }
     }
 
-    /// Sets the upper bound of σ, clamped to [0, 1]: 0 pauses, 1 is full speed. A non-finite value
+    /// Sets the upper bound of σ, clamped to 0 to 1: 0 pauses, 1 is full speed. A non-finite value
     /// acts as 0.
     pub fn set_rate_cap(&mut self, rate_cap: f64) {
         self.rate_cap = if rate_cap.is_finite() {
