@@ -34,19 +34,19 @@ const INVERTED_S: f64 = 0.35;
 const SIGN_MIN: f64 = 0.06;
 /// Weight of evidence from a change of speed relative to that from a turn.
 const SIGN_FORWARD: f64 = 0.6;
-/// Number of standard deviations of the gain that are tolerated.
+/// Noise added to the squared predicted acceleration, (m/s²)².
 const SIGN_NOISE: f64 = 0.015;
+/// Number of standard deviations of the gain that are tolerated.
+const STD_DEVS: f64 = 4.0;
 /// Change of the predicted acceleration during which a frozen measurement is a fault, metres per
 /// second squared.
-const STD_DEVS: f64 = 4.0;
+const FROZEN_CHANGE_M_S2: f64 = 0.3;
 /// Difference of measured and predicted acceleration that no tilt explains, metres per second
 /// squared.
-const FROZEN_CHANGE_M_S2: f64 = 0.3;
-/// Measured and predicted acceleration of one axis, low-pass and high-pass filtered, metres per
-/// second squared.
 const IMPOSSIBLE_M_S2: f64 = 5.0;
 
-/// State of the comparison.
+/// Measured and predicted acceleration of one axis, low-pass and high-pass filtered, metres per
+/// second squared.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Axis {
     felt_low: f64,
@@ -65,7 +65,7 @@ impl Axis {
     }
 }
 
-/// `∫ felt·expected`, `∫ expected²`, `∫ residual²` and `∫ 1`, with exponential forgetting.
+/// State of the comparison.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Accelerometer {
     sum: BodyAcceleration,
@@ -75,11 +75,11 @@ pub(super) struct Accelerometer {
     bins: usize,
     forward: Axis,
     left: Axis,
-    /// Predicted acceleration, `[forward, left]`, when the measurement froze.
+    /// `∫ felt·expected`, `∫ expected²`, `∫ residual²` and `∫ 1`, with exponential forgetting.
     sums: [f64; 4],
-    /// Cumulative sum of the evidence that the accelerometer is inverted, seconds.
+    /// Predicted acceleration, `[forward, left]`, when the measurement froze.
     frozen_from: Option<[f64; 2]>,
-    /// Returns whether there was excitation and the gain agreed.
+    /// Cumulative sum of the evidence that the accelerometer is inverted, seconds.
     inverted_s: f64,
     verdict: Option<Finding>,
     is_healthy: bool,
@@ -100,12 +100,12 @@ impl Accelerometer {
         self.verdict
     }
 
-    /// Evaluates one bin with the forward speed of the wheels and the turn rate of the gyro.
+    /// Returns whether there was excitation and the gain agreed.
     pub(super) fn is_healthy(&self) -> bool {
         self.is_healthy
     }
 
-    /// Returns the gain and its standard deviation; None without enough excitation.
+    /// Evaluates one bin with the forward speed of the wheels and the turn rate of the gyro.
     pub(super) fn step(&mut self, speed_m_s: f64, turn_rad_s: f64, repeats: &Repeats) {
         self.verdict = None;
         self.is_healthy = false;
@@ -149,7 +149,7 @@ impl Accelerometer {
             && gain.is_some_and(|(gain, _)| (GAIN_AGREES..=GAIN_MAX).contains(&gain));
     }
 
-    /// Updates the evidence that measured and predicted acceleration have opposite signs.
+    /// Returns the gain and its standard deviation; None without enough excitation.
     fn regress(&mut self) -> Option<(f64, f64)> {
         let keep = (-BIN_S / MEMORY_S).exp();
         let before = if self.sums[1] > 0.0 {
@@ -182,7 +182,7 @@ impl Accelerometer {
         Some((product / square, std_dev))
     }
 
-    /// Wheels that slip speed up while the body slows down; in a turn the signs still agree.
+    /// Updates the evidence that measured and predicted acceleration have opposite signs.
     fn sign(&mut self) {
         let square = self.forward.expected.powi(2) + self.left.expected.powi(2);
         if square < SIGN_MIN {
@@ -191,7 +191,7 @@ impl Accelerometer {
         let product =
             self.forward.felt * self.forward.expected + self.left.felt * self.left.expected;
         let gain = (product / (square + SIGN_NOISE)).clamp(-1.0, 1.0);
-        // Returns the axis with the larger predicted acceleration.
+        // Wheels that slip speed up while the body slows down; in a turn the signs still agree.
         let weight = if self.forward.expected.abs() > self.left.expected.abs() {
             SIGN_FORWARD
         } else {
