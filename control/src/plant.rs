@@ -27,13 +27,11 @@ pub const SLIP_SPEED_FLOOR_M_S: f64 = 0.05;
 const POLE_STEP_MAX: f64 = 2.4;
 /// Maximum internal step, seconds.
 const STEP_MAX_S: f64 = 5.0e-3;
-/// Maximum internal step while a side rolls slower than [`SLOW_M_S`], where the reference speed of
-/// slip changes quickly, seconds.
+/// Maximum internal step below [`SLOW_M_S`], where slip's reference speed changes quickly, seconds.
 const STEP_SLOW_MAX_S: f64 = 2.5e-3;
 /// Rim speed below which [`STEP_SLOW_MAX_S`] applies, metres per second.
 const SLOW_M_S: f64 = 0.2;
-/// Maximum number of internal steps in one call; the rest of the time is not simulated. Reached
-/// only with `gK/u₀` above 10⁵.
+/// Maximum number of internal steps in one call (needs `gK/u₀` above 10⁵); the rest is left out.
 const STEPS_MAX: usize = 10_000;
 /// Minimum servo lag in the integration, seconds; a shorter one acts as this one.
 const SERVO_LAG_FLOOR_S: f64 = 1.0e-3;
@@ -43,8 +41,8 @@ const SERVO_LAG_FLOOR_S: f64 = 1.0e-3;
 pub struct PlantSpec {
     /// First-order lag of the wheel servo, seconds, 0 to 5.
     pub servo_lag_s: f64,
-    /// Rolling resistance coefficient, 0 to 1. It acts as a moment on the wheels, so it appears in
-    /// their torque only.
+    /// Rolling resistance coefficient, 0 to 1. It acts on the wheels and shows in their torque
+    /// only.
     pub rolling_resistance_ratio: f64,
     /// True rolling radius of the left wheels over the model's, 0.5 to 2.
     pub left_radius_ratio: f64,
@@ -269,10 +267,9 @@ impl Plant {
         }
     }
 
-    /// Returns the drive torques per side, mean over the last step like [`Plant::means`]: (ground
-    /// force plus rolling resistance) times rolling radius. An instantaneous torque beside means of
-    /// all other values would make slip lag force, and θ would be estimated too low wherever the
-    /// command changes.
+    /// Returns the drive torques per side, mean over the last step: (ground force plus rolling
+    /// resistance) times rolling radius. An instantaneous torque beside [`Plant::means`] would make
+    /// slip lag force and θ too low wherever the command changes.
     pub fn wheel_torques(&self) -> WheelTorques {
         let radius_m = self.model.wheel_radius_m();
         let side = |force_n: f64, wheel_rad_s: f64, radius_ratio: f64| {
@@ -294,10 +291,9 @@ impl Plant {
         self.contact.slip_max
     }
 
-    /// Advances the base by `dt_s` seconds under a constant wheel command.
+    /// Advances the base by `dt_s` seconds, if valid, under a constant wheel command.
     ///
-    /// A non-finite command acts as zero; one above the wheel speed limit acts as the limit. A
-    /// `dt_s` that is not finite or not above zero does nothing.
+    /// A non-finite command acts as zero; one above the wheel speed limit acts as the limit.
     pub fn step(&mut self, command: WheelSpeeds, ground: &Ground, dt_s: f64) {
         if !(dt_s.is_finite() && dt_s > 0.0) {
             return;
@@ -344,8 +340,7 @@ impl Plant {
         self.contact = contact;
     }
 
-    /// Returns the longest step within the stable range of the fastest slip pole, the servo and the
-    /// step limits, seconds.
+    /// Returns the longest step that is stable for slip poles and servo, at most [`STEP_MAX_S`].
     fn stable_step_s(&self, ground: &Ground) -> f64 {
         let model = &self.model;
         let wheels = self.state.wheel_speeds;

@@ -41,7 +41,7 @@ pub struct Breach {
     pub arc_m: f64,
     /// Centre of the robot at that arc length, site frame.
     pub point: Point,
-    /// Distance by which the disc extends beyond the border, metres; NaN if the point is not
+    /// Distance by which the disc extends beyond the border, metres; infinite if the point is not
     /// finite.
     pub depth_m: f64,
 }

@@ -1,10 +1,10 @@
 //! Plan: geometry and timing of one trajectory from the robot's pose.
 //!
 //! A circle is joined tangentially by the quickest of many smooth legs; a robot on the circle
-//! starts there. Waypoints are joined by making the robot's position the first point of the spline;
-//! a robot at the first waypoint, or beside it with no smooth path through it, starts from there.
-//! Where the path starts in another direction than the robot's heading, [`Plan::start_heading_rad`]
-//! is the heading to turn to on the spot.
+//! starts there. Waypoints are joined by such a leg too, or, near the path, by making the robot's
+//! position the first point of the spline; a robot at the first waypoint, or beside it with no
+//! smooth path through it, starts from there. Where the path starts in another direction than the
+//! robot's heading, [`Plan::start_heading_rad`] is the heading to turn to on the spot.
 
 mod error;
 mod limits;
