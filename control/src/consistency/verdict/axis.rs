@@ -1,40 +1,41 @@
-//! The two motions that are compared, and how far two words on one of them may be apart.
+//! The two compared motions, turn and forward, and the tolerated differences between channels.
 
 use super::super::history::Commanded;
 use super::super::{Finding, Kind, Subject, Unit};
 use crate::geometry::Twist;
 
-/// Slowest motions that show an inverted sign, radians and metres per second.
+/// Minimum magnitude of both values for an inverted sign, radians per second or metres per second.
 const SIGN_MIN: f64 = 0.12;
-/// How well the body or the wheels obey a command.
+/// Tolerance within which body or wheels follow a command.
 const OBEYS: Tolerance = Tolerance {
     own_rad_s: 0.15,
     own_m_s: 0.08,
     share_turn: 0.2,
     forward_share: 0.2,
 };
-/// From where on wheels do not, if the body does.
+/// Tolerance beyond which wheels do not follow their command, if the body does.
 const DISOBEYS: Tolerance = Tolerance {
     own_rad_s: 0.08,
     own_m_s: 0.05,
     share_turn: 0.15,
     forward_share: 0.15,
 };
-/// How much more than commanded wheels may say.
+/// Tolerance beyond which measured wheel speeds are above their command.
 const ABOVE: Tolerance = Tolerance {
     own_rad_s: 0.1,
     own_m_s: 0.05,
     share_turn: 0.1,
     forward_share: 0.05,
 };
-/// How near, of what the wheels say above the command, the body is to that.
+/// Maximum excess of the body over the command, as a fraction of the wheels' excess, for a fault of
+/// their sensor.
 const NEARER_ABOVE: f64 = 0.4;
-/// The same forward, of a body to its command than wheels are.
+/// Maximum deviation of the body from the command, forward, as a fraction of the wheels' deviation.
 const NEARER_FORWARD: f64 = 0.9;
-/// Nearer to one than to the other: at most this share of the distance.
+/// Ratio of distances below which a value is nearer to one than to the other.
 pub(super) const NEARER: f64 = 0.6;
 
-/// How far two motions may be apart: a part of its own and a share of the larger.
+/// Tolerated difference of two motions: an absolute part plus a fraction of the larger one.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Tolerance {
     pub(super) own_rad_s: f64,
@@ -43,7 +44,7 @@ pub(super) struct Tolerance {
     pub(super) forward_share: f64,
 }
 
-/// One of the two motions.
+/// One of the two compared motions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Axis {
     Turn,
@@ -73,7 +74,7 @@ impl Axis {
         own + share * one.abs().max(other.abs())
     }
 
-    /// How far a motion is from all that was commanded.
+    /// Returns the distance of a motion from the range of commands; 0 within.
     pub(super) fn off_command(self, motion: f64, commanded: &Commanded) -> f64 {
         let (least, most) = (self.of(commanded.least), self.of(commanded.most));
         (least - motion).max(motion - most).max(0.0)
@@ -84,8 +85,8 @@ impl Axis {
         self.off_command(motion, commanded) <= self.slack(OBEYS, least, most)
     }
 
-    /// Whether wheels contradict their command and the body is on the command's side: what no slip
-    /// does.
+    /// Returns whether wheels contradict their command and the body follows it, which no slip
+    /// causes.
     pub(super) fn is_of_sensor(self, wheels: f64, body: f64, commanded: &Commanded) -> bool {
         if self.is_above(wheels, body, commanded) {
             return true;
@@ -94,14 +95,14 @@ impl Axis {
         let off = self.off_command(wheels, commanded);
         let nearer = match self {
             Self::Turn => NEARER,
-            // Ahead nothing makes the body faster than wheels that are driven.
+            // Forward, nothing makes the body faster than driven wheels.
             Self::Forward => NEARER_FORWARD,
         };
         off > self.slack(DISOBEYS, least, most) && self.off_command(body, commanded) < nearer * off
     }
 
-    /// Whether wheels say more than they are commanded and the body does not: motors reach less
-    /// than is asked of them, or the wheels slip, but never more.
+    /// Returns whether wheels measure more than commanded and the body does not follow: saturated
+    /// motors and slipping wheels give less than commanded, never more.
     pub(super) fn is_above(self, wheels: f64, body: f64, commanded: &Commanded) -> bool {
         let (least, most) = (self.of(commanded.least), self.of(commanded.most));
         let (most, least) = if wheels < 0.0 {
@@ -132,7 +133,7 @@ pub(super) fn finding(
     }
 }
 
-/// How a channel is wrong.
+/// Returns the type of fault of a channel.
 pub(super) fn kind_of(observed: f64, predicted: f64, is_frozen: bool) -> Kind {
     let (small, large) = if observed.abs() < predicted.abs() {
         (observed.abs(), predicted.abs())

@@ -1,4 +1,4 @@
-//! The turn rate: gyro, wheels, and the heading of position fixes.
+//! Turn rate: gyro, wheels, and the heading of position fixes.
 
 use super::axis::{Axis, Tolerance, finding, kind_of};
 use super::wheels::{self, WHEELS, WITNESSED};
@@ -13,16 +13,16 @@ use crate::consistency::{Kind, Subject};
 
 const AXIS: Axis = Axis::Turn;
 
-/// By how much the wheels must be nearer to the heading than the gyro is, beside noise: more than a
-/// usual offset of the gyro.
+/// Minimum difference by which the wheels must be nearer to the heading than the gyro is, in
+/// addition to noise: more than a usual offset of the gyro, radians per second.
 const WITNESSED_MIN_RAD_S: f64 = 0.04;
-/// What wheels may differ by from the body once their gain is known.
+/// Tolerated difference of wheels and body once their gain is known.
 const LEARNED: Tolerance = Tolerance {
     share_turn: 0.14,
     ..WHEELS
 };
 
-/// Looks at the turn rate; whether nothing contradicts.
+/// Compares the turn rates; returns whether nothing contradicts.
 pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) -> bool {
     let mut agreed = None;
     for seen in view.seen() {
@@ -66,7 +66,7 @@ pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) ->
     }
     let is_opposite = kind_of(gyro, wheels, false) == Kind::Inverted;
     match agreed {
-        // Fixes of the same span see the same contradiction: two channels of the body agree.
+        // The wheels are at fault only if fixes over the same span contradict them too.
         Some((heading, _, means)) => {
             let wheels = means.wheels.angular_rad_s;
             let (slack, _) = wheels::slack(view, AXIS, wheels, heading, &recent.commanded);
@@ -85,7 +85,7 @@ pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) ->
     false
 }
 
-/// Whether the gyro and the heading of fixes say the same over a span.
+/// Returns whether the gyro and the heading of fixes agree over a span.
 fn agrees_with_heading(view: &View<'_>, recent: &Recent, seen: &Seen, means: &Means) -> bool {
     let gyro = means.gyro_rad_s;
     let heading = gyro + seen.turn_error_rad_s;
@@ -102,12 +102,12 @@ fn agrees_with_heading(view: &View<'_>, recent: &Recent, seen: &Seen, means: &Me
     !is_witnessed
 }
 
-/// Gyro and heading contradict each other: names the wrong one, or both.
+/// Names the wrong one of gyro and heading, or [`Subject::Motion`] if neither can be excluded.
 fn blame(view: &View<'_>, seen: &Seen, means: &Means, verdicts: &mut Verdicts) {
     let (gyro, wheels) = (means.gyro_rad_s, means.wheels.angular_rad_s);
     let heading = gyro + seen.turn_error_rad_s;
     let commanded = view.commanded(seen);
-    // What the wheels say, on this ground by this robot.
+    // Turn rate by wheels, corrected by the gain of this robot on this ground.
     let gain = view.turn_gain.known();
     let by_gain = (1.0 - gain.unwrap_or(1.0)) * wheels;
     let tolerance = if gain.is_some() { LEARNED } else { WHEELS };
@@ -125,7 +125,7 @@ fn blame(view: &View<'_>, seen: &Seen, means: &Means, verdicts: &mut Verdicts) {
     };
     let repeats = view.repeats;
     match witnesses.side() {
-        // Fixes and wheels are both slow where a turn begins: blaming the fixes takes longer.
+        // Fixes and wheels both lag where a turn begins, so a finding about the fixes takes longer.
         Some(Nearer::First) => {
             let kind = kind_of(heading, gyro, repeats.position.is_frozen());
             let found = finding(Subject::Position, kind, heading, gyro, AXIS);
