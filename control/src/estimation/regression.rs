@@ -111,8 +111,8 @@ impl Normal {
     }
 }
 
-/// What is known of relaxation and rotors: which parameter over θ, its mean and standard deviation.
-pub(super) fn drive_known(tyres: &TyrePrior) -> [(usize, f64, f64); 2] {
+/// What is known of relaxation, rotors and loads: which parameter over θ, its mean and standard deviation.
+pub(super) fn drive_known(tyres: &TyrePrior) -> [(usize, f64, f64); 3] {
     [
         (
             index::RELAXATION,
@@ -124,6 +124,7 @@ pub(super) fn drive_known(tyres: &TyrePrior) -> [(usize, f64, f64); 2] {
             tyres.rotor_ratio,
             tyres.rotor_std_dev_ratio.max(1.0e-5),
         ),
+        (index::LOADS, 0.0, tyres.load_difference_std_dev.max(1.0e-5)),
     ]
 }
 
