@@ -11,6 +11,8 @@ use tread_api::friction::{Information, Segment};
 
 use super::fixed::Fixed;
 
+/// Seconds of an hour.
+pub const HOUR_S: i64 = 3_600;
 /// Microseconds of an hour.
 const HOUR_US: i64 = 3_600_000_000;
 /// Hours of a day, into which old epochs are merged.

@@ -51,7 +51,7 @@ const JOIN_TOKENS: Quota = Quota {
     share: 300,
 };
 /// Most robots that may ever join.
-pub const ROBOTS_MAX: usize = 10_000;
+pub const FLEET_ROBOTS_MAX: u32 = 10_000;
 
 /// What the server signs robots' certificates with.
 #[derive(Debug)]

@@ -7,7 +7,8 @@ use tread_api::terrain::TerrainRef;
 
 use super::changes::{BLOCK_CELLS, Block};
 use super::part::{Part, PartKey};
-use super::{Choice, HOUR_S, SiteMap, Sums, place};
+use super::{Choice, SiteMap, Sums, place};
+use crate::friction::sums::HOUR_S;
 use crate::friction::weights::FrictionConfig;
 use crate::friction::{Fused, Fuser, Ground, Seen};
 
