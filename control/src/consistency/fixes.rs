@@ -9,7 +9,7 @@
 //! that began with the span shows soon; `s + b` is the speed by which both differ in the span. A
 //! wild fix between two that agree is left out, and what does not fit the line counts as noise.
 
-use super::history::{Edge, History};
+use super::history::{Edge, History, Span};
 use crate::geometry::{Point, Pose, wrap_angle_rad};
 use crate::localisation::FixNoise;
 
@@ -127,6 +127,15 @@ pub(super) struct Seen {
     pub(super) odometry_noise_m_s: f64,
     pub(super) noise_rad_s: f64,
     pub(super) wheels_noise_rad_s: f64,
+}
+
+impl Seen {
+    pub(super) fn span(&self) -> Span {
+        Span {
+            from_s: self.from_s,
+            to_s: self.to_s,
+        }
+    }
 }
 
 /// A jump of the position.

@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 
 use proptest::prelude::*;
 
-use super::speed::along_arc;
+use super::speed::{Arc, along_arc};
 use super::*;
 use crate::geometry::{Pose, Twist};
 
@@ -82,7 +82,7 @@ proptest! {
                 present = Twist { linear_m_s, angular_rad_s };
                 let curvature_1_m = present.angular_rad_s / present.linear_m_s;
                 pose = if present.linear_m_s.abs() > 1.0e-9 {
-                    along_arc(pose, curvature_1_m, present.linear_m_s * dt_s)
+                    along_arc(pose, Arc { curvature_1_m, distance_m: present.linear_m_s * dt_s })
                 } else {
                     Pose { heading_rad: pose.heading_rad + present.angular_rad_s * dt_s, ..pose }
                 };

@@ -324,7 +324,10 @@ fn read_file(flags: &Flags) -> Result<FileConfig, ConfigError> {
         file: file.clone(),
         source,
     })?;
-    file::parse(&file, &text)
+    file::parse(&text).map_err(|refused| ConfigError::Malformed {
+        file,
+        problem: refused.to_string(),
+    })
 }
 
 /// `x,y,heading` of the simulated base.

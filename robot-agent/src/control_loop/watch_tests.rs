@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::channels::EndReason;
 use super::prior_tests::everywhere;
 use super::tests::{LINE, ORIGIN, bench_at, site_of};
-use crate::sim::scenario::Scenario;
+use crate::sim::scenario::{Scenario, ScenarioText};
 use crate::testing::Bench;
 
 const HIGH_MU: f64 = 0.3;
@@ -31,7 +31,11 @@ layer = 1
 stiffness = {strip}
 "#
     );
-    Scenario::parse("bench", &text).unwrap()
+    Scenario::parse(ScenarioText {
+        file: "bench",
+        text: &text,
+    })
+    .unwrap()
 }
 
 fn knowing(scenario: &Scenario, theta: f64, seed: u64) -> Bench {

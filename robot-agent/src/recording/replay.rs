@@ -235,7 +235,7 @@ impl Player {
         let shared = &self.ends.shared;
         shared.safety.show(recorded.stop, &self.view);
         let silence = Duration::from_nanos(recorded.server_silence_ns);
-        shared.show_server_silence(now.monotonic, silence);
+        shared.replay_server_heard(now.monotonic.saturating_sub(silence));
         let judged = Duration::from_nanos(recorded.judged_ns);
         let stop = has(tick_bits::STOP_REQUESTED);
         self.core.tick_by(now, &|| judged, stop, &mut base);

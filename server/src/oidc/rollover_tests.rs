@@ -19,7 +19,7 @@ use tokio::sync::Semaphore;
 use super::verify::IdToken;
 use super::*;
 use crate::config::oidc::OidcConfig;
-use crate::identity::pending::{PendingKey, RANDOM_BYTES};
+use crate::identity::pending::{PendingKey, SIGN_IN_RANDOM_BYTES};
 
 /// How long somebody is watched who must wait: a refusal would come at once.
 const WATCHED: Duration = Duration::from_millis(300);
@@ -167,8 +167,8 @@ impl Fake {
     }
 
     async fn signs_in(&self, provider: &Provider, number: u8) -> Result<String, ExchangeError> {
-        let key = PendingKey::from_random(&[1; RANDOM_BYTES]);
-        let pending = Pending::begin(&key, &[number; RANDOM_BYTES], self.clock.now());
+        let key = PendingKey::from_random(&[1; SIGN_IN_RANDOM_BYTES]);
+        let pending = Pending::begin(&key, &[number; SIGN_IN_RANDOM_BYTES], self.clock.now());
         let there = provider.exchange(&pending.nonce, &pending).await?;
         Ok(there.subject)
     }

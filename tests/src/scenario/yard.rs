@@ -4,7 +4,7 @@
 use anyhow::Context as _;
 use serde_json::json;
 use tread_agent::geometry::paper_robot;
-use tread_agent::sim::scenario::{Scenario, ScenarioRobot, ScenarioTerrain};
+use tread_agent::sim::scenario::{Scenario, ScenarioRobot, ScenarioTerrain, ScenarioText};
 use tread_api::geometry::Point;
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::robot::{RobotLimits, RobotModel};
@@ -124,7 +124,10 @@ impl Kind {
 /// # Errors
 /// Never for the text above; tests parse it.
 pub fn ground(site: &SiteId) -> anyhow::Result<Scenario> {
-    let mut scenario = Scenario::parse("scenario", GROUND)?;
+    let mut scenario = Scenario::parse(ScenarioText {
+        file: "scenario",
+        text: GROUND,
+    })?;
     scenario.site = site.clone();
     Ok(scenario)
 }

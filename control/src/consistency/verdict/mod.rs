@@ -12,7 +12,7 @@ mod wheels;
 mod witnesses;
 
 use super::fixes::{Jump, Seen};
-use super::history::{Commanded, History, Means};
+use super::history::{Commanded, History, Means, Span};
 use super::turn_gain::TurnGain;
 use super::{AllRepeats, Finding, Subject, Track};
 use crate::geometry::Twist;
@@ -111,8 +111,10 @@ impl<'a> View<'a> {
 
     /// What was commanded for a span.
     fn commanded(&self, seen: &Seen) -> Commanded {
-        self.history
-            .commanded(seen.from_s - COMMAND_LAG_S, seen.to_s)
+        self.history.commanded(Span {
+            from_s: seen.from_s - COMMAND_LAG_S,
+            to_s: seen.to_s,
+        })
     }
 
     /// Whether the motors may reach less than is asked of them.
@@ -126,8 +128,7 @@ impl<'a> View<'a> {
     }
 
     fn recent_means(&self) -> Option<Means> {
-        let now_s = self.history.now().at_s;
-        self.history.means(now_s - RECENT_S, now_s)
+        self.history.means(self.history.last(RECENT_S))
     }
 }
 
@@ -207,8 +208,14 @@ impl Recent {
         let now_s = view.history.now().at_s;
         let middle_s = now_s - 0.5 * RECENT_S;
         let halves = (
-            view.history.means(now_s - RECENT_S, middle_s),
-            view.history.means(middle_s, now_s),
+            view.history.means(Span {
+                from_s: now_s - RECENT_S,
+                to_s: middle_s,
+            }),
+            view.history.means(Span {
+                from_s: middle_s,
+                to_s: now_s,
+            }),
         );
         let change = |axis: Axis| match halves {
             (Some(early), Some(late)) => (axis.of(late.wheels) - axis.of(early.wheels)).abs(),
@@ -218,9 +225,10 @@ impl Recent {
             means: view.recent_means()?,
             turn_change: change(Axis::Turn),
             forward_change: change(Axis::Forward),
-            commanded: view
-                .history
-                .commanded(now_s - RECENT_S - COMMAND_LAG_S, now_s),
+            commanded: view.history.commanded(Span {
+                from_s: now_s - RECENT_S - COMMAND_LAG_S,
+                to_s: now_s,
+            }),
         })
     }
 }
