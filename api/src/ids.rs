@@ -169,7 +169,7 @@ uuid_id! {
 }
 uuid_id! {
     /// A person who signs in at an OpenID provider: the version 5 UUID of the provider's issuer and
-    /// the person's subject there, so it stays whatever else the provider says of them.
+    /// the person's subject there, so it stays whatever their other claims are.
     PersonId
 }
 uuid_id! {
@@ -188,7 +188,7 @@ uuid_id! {
     ConfigurationId
 }
 uuid_id! {
-    /// What exactly a robot was asked to drive: the version 5 UUID of request and revision.
+    /// What exactly a robot was commanded to drive: the version 5 UUID of request and revision.
     ///
     /// See [`crate::wire::command::Offer::plan_hash_of`].
     PlanHash

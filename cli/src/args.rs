@@ -41,7 +41,7 @@ pub(crate) use self::values::{shield_negative_points, waypoint};
 use crate::exit::Exit;
 use crate::output::{failure, note};
 
-/// Where a server answers, unless told otherwise.
+/// Where a server answers, unless configured otherwise.
 pub(crate) const SERVER_DEFAULT: &str = "http://127.0.0.1:8420";
 /// Most robots of a demo; each is a process of its own.
 const DEMO_ROBOTS_MAX: i64 = 50;

@@ -14,7 +14,7 @@ use crate::sliding::SlidingBounds;
 const SPEED_FLOOR_M_S: f64 = 0.05;
 /// A reference slower than this is brought to rest on a stop, metres per second.
 const REST_M_S: f64 = 2.0e-3;
-/// Step in which coming to rest is foretold, seconds.
+/// Step in which coming to rest is predicted, seconds.
 const REST_STEP_S: f64 = 0.02;
 /// Most such steps.
 const REST_STEPS_MAX: u32 = 1_000;

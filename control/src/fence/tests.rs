@@ -224,7 +224,7 @@ fn a_pose_that_is_no_number_stops() {
 }
 
 #[test]
-fn a_disc_on_forbidden_ground_is_told_which_polygon_and_where_its_border_is() {
+fn an_overlap_names_the_polygon_and_the_nearest_point_of_its_border() {
     let fence = yard();
     let overlap = |x_m: f64, y_m: f64| fence.overlap(Point { x_m, y_m }, 0.4);
     assert_eq!(overlap(0.0, 0.0), None);

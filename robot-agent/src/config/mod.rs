@@ -109,7 +109,7 @@ pub struct Flags {
     /// The robot's identifier within its site
     #[arg(long)]
     pub robot: Option<RobotId>,
-    /// The server's zenoh endpoint [default: what `enroll` was told, or tcp/127.0.0.1:7447]
+    /// The server's zenoh endpoint [default: what `enroll` was given, or tcp/127.0.0.1:7447]
     #[arg(long)]
     pub server: Option<String>,
     /// Where measurements wait for the server

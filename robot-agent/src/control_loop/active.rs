@@ -41,7 +41,7 @@ pub(super) struct Step {
     pub(super) theta_loop: Option<f64>,
 }
 
-/// A change that the server is told of.
+/// A change that is reported to the server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum News {
     Paused,
@@ -91,7 +91,7 @@ pub(super) struct Active {
     /// When the cause that is reported began to pause it, by the monotonic clock.
     paused_from: Option<Duration>,
     standing_ticks: u32,
-    /// Whether the server was told that it stands paused.
+    /// Whether the pause was reported to the server.
     is_pause_reported: bool,
     stopped_because: EndReason,
     /// The revision that takes over once the robot stands.

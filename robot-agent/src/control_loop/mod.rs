@@ -35,7 +35,7 @@ pub(crate) const LOOP_END_MAX: Duration = Duration::from_secs(5);
 /// Standing ticks in a row that count as having stopped.
 const STANDING_TICKS: u32 = 5;
 
-/// Runs the loop until it is told to stop and the robot stands.
+/// Runs the loop until it is requested to stop and the robot stands.
 pub(crate) fn run(
     mut core: LoopCore,
     mut drive: Box<dyn Drive>,

@@ -302,7 +302,7 @@ impl Outbox {
         Ok(locked(&self.shared.store).finish_sync(&ticket)?)
     }
 
-    /// Syncs soon after each change, until told to stop; then once more.
+    /// Syncs soon after each change, until requested to stop; then once more.
     pub async fn keep_synced(self, stop: CancellationToken) {
         while !stop.is_cancelled() {
             tokio::select! {

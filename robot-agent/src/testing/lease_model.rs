@@ -1,4 +1,4 @@
-//! Random drivers on a random network, against a model that is told what was sent.
+//! Random drivers on a random network, against a model that knows what was sent.
 //!
 //! Messages are lost, delayed, doubled and reordered; drivers come, take, go silent and come back;
 //! old runs and old leases speak. The model knows from the messages alone which commands count.
@@ -85,7 +85,7 @@ struct Side {
     seq: u64,
 }
 
-/// What must hold, told from the messages alone.
+/// What must hold, by the messages alone.
 #[derive(Debug, Default)]
 struct Truth {
     /// Who was given which epoch.

@@ -151,7 +151,7 @@ impl Sums {
     /// The statistics of one segment; `None` if its numbers leave the range of fixed point.
     pub fn of(segment: &Segment) -> Option<Self> {
         // What a robot has in common with itself or with its like does not add up: it is kept beside
-        // what does, and told only once for all.
+        // what does, and counted only once for all.
         let errors = segment.theta_errors;
         let theta = independent(segment);
         let square = if theta.information > 0.0 {

@@ -114,7 +114,7 @@ impl Secret {
         self.kind
     }
 
-    /// The text, for the one to whom it is told.
+    /// The text, for its owner.
     pub fn reveal(&self) -> &str {
         &self.text
     }

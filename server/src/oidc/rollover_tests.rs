@@ -137,9 +137,11 @@ impl Fake {
             "/jwks" => {
                 self.asked.fetch_add(1, Ordering::SeqCst);
                 self.answers.acquire().await.unwrap().forget();
-                let told = self.tells.lock().unwrap().clone();
+                let published = self.tells.lock().unwrap().clone();
                 let key = |number| serde_json::to_value(Self::signer(number).public).unwrap();
-                told.map(|told| json!({"keys": told.into_iter().map(key).collect::<Vec<_>>()}))
+                published.map(
+                    |numbers| json!({"keys": numbers.into_iter().map(key).collect::<Vec<_>>()}),
+                )
             }
             "/token" => {
                 // The code is the nonce: it says which sign-in it is.
@@ -276,7 +278,7 @@ async fn a_discovery_that_takes_long_does_not_bring_the_former_keys_back() {
             tokio::pin!(sign_in);
             let early = tokio::time::timeout(WATCHED, &mut sign_in).await;
             assert!(early.is_err(), "{early:?}");
-            // The discovery gets the former key, and only then the other one is told.
+            // The discovery gets the former key, and only then the other one is published.
             fake.answers.add_permits(1);
             let rollover = async {
                 fake.is_asked(3).await;

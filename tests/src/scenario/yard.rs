@@ -298,7 +298,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_fleet_differs_as_the_server_is_told_whatever_the_seed() {
+    fn the_fleet_differs_as_the_server_is_configured_whatever_the_seed() {
         for (seed, count) in [(1, 5), (2, 5), (3, 2), (4, 9)] {
             let found = biases(count, &mut Random::new(seed));
             let mean = found.iter().sum::<f64>() / f64::from(count);

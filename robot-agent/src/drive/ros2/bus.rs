@@ -389,10 +389,10 @@ impl Bus {
         std::thread::scope(|scope| {
             let telling = outward.and_then(|outward| {
                 let body = || self.tell(&declared.words, outward);
-                let named = std::thread::Builder::new().name("told to the robot".to_owned());
+                let named = std::thread::Builder::new().name("to the robot".to_owned());
                 let spawned = named.spawn_scoped(scope, body);
                 spawned
-                    .inspect_err(|cause| warn!("nothing is told to the robot: {cause}"))
+                    .inspect_err(|cause| warn!("nothing is published to the robot: {cause}"))
                     .ok()
             });
             self.write_commands(&declared.commands);

@@ -9,7 +9,7 @@
 //!                      └──joins again──► revoked, and in force under the next number
 //! ```
 //!
-//! What fails is told alike, whatever the cause; the cause is for the audit log and the counters.
+//! Every failure gets the same answer, whatever the cause; the cause is for the audit log and the counters.
 
 mod joining;
 pub mod registry;
@@ -89,7 +89,7 @@ impl Membership {
     }
 }
 
-/// Why a robot gets no certificate. Who asks is told no more than that.
+/// Why a robot gets no certificate. The answer says no more than that.
 #[derive(Debug, thiserror::Error)]
 pub enum EnrolError {
     /// The request for a certificate is none, whoever sends it.

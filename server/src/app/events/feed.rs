@@ -96,7 +96,7 @@ impl Feed {
         for id in moved {
             let row = match db::missions::find(&mut tx, id).await {
                 Ok(row) => row,
-                // It will not read later either; its steps are told all the same.
+                // It will not read later either; its steps are sent all the same.
                 Err(cause @ DbError::Corrupt { .. }) => {
                     self.app
                         .log_failure("read a mission that has moved", &cause);

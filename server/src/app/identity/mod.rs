@@ -93,7 +93,7 @@ pub enum Shown {
     Session,
 }
 
-/// Why a secret opens nothing. Who asks is told no more than that; the rest is for the counters.
+/// Why a secret opens nothing. The answer says no more than that; the rest is for the counters.
 #[derive(Debug, thiserror::Error)]
 pub enum SignInError {
     /// It cannot be one: a digit is wrong.

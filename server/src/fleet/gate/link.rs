@@ -209,7 +209,7 @@ impl Link {
                 "{} showed a certificate that is no longer in force",
                 self.peer
             );
-            // Its successor may be well; people are told only of one that has none.
+            // Its successor may be well; only one that has none raises an alert.
             if self.app.enrolment_registry().standing(&robot)
                 == Some(Standing::Revoked(name.enrolment))
             {

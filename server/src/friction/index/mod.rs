@@ -129,12 +129,12 @@ pub struct Group<'map> {
     pub configuration: ConfigurationId,
     /// What each robot saw in each epoch.
     pub seen: Vec<Seen<u32>>,
-    /// Passes beside those that told nothing: their information vanishes in the sums.
+    /// Passes that are uninformative: their information vanishes in the sums.
     pub uninformative_passes: u64,
 }
 
 impl Group<'_> {
-    /// Whether any of its passes told anything.
+    /// Whether any of its passes has information.
     fn tells(&self) -> bool {
         !self.seen.is_empty()
     }

@@ -113,7 +113,7 @@ pub struct At<'config> {
 pub struct Room {
     fuser: Fuser<u32>,
     seen: Vec<Seen<u32>>,
-    /// Passes that told nothing.
+    /// Passes without information.
     uninformative_passes: u64,
 }
 
