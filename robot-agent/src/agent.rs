@@ -23,7 +23,7 @@ use uuid::Uuid;
 use crate::base::Base;
 use crate::clock::{SharedClock, SystemClock};
 use crate::config::AgentConfig;
-use crate::control_loop::LOOP_END_MAX;
+use crate::control_loop::BRAKING_MAX;
 use crate::control_loop::channels::{AgentEnds, LoopEnds, Shared, loop_channels};
 use crate::control_loop::tick::LoopCore;
 use crate::dispatcher::Dispatcher;
@@ -363,7 +363,7 @@ impl RunningAgent {
                 let _ = thread.join();
             }
         });
-        if tokio::time::timeout(2 * LOOP_END_MAX, joining)
+        if tokio::time::timeout(2 * BRAKING_MAX, joining)
             .await
             .is_err()
         {

@@ -30,8 +30,8 @@ use pace::Pace;
 use segments::Moment;
 use tick::LoopCore;
 
-/// Longest time from the request to stop until the loop ends, standing or not.
-pub(crate) const LOOP_END_MAX: Duration = Duration::from_secs(5);
+/// Longest time that braking to rest may take; when the loop has to stop, it ends after it, standing or not.
+pub(crate) const BRAKING_MAX: Duration = Duration::from_secs(5);
 /// Standing ticks in a row that count as having stopped.
 const STANDING_TICKS: u32 = 5;
 
@@ -66,7 +66,7 @@ pub(crate) fn run(
             let since = *stop_requested_at.get_or_insert(began);
             standing_ticks = if core.stands() { standing_ticks + 1 } else { 0 };
             let has_stopped = standing_ticks >= STANDING_TICKS && core.flush();
-            let is_overdue = began.saturating_sub(since) > LOOP_END_MAX;
+            let is_overdue = began.saturating_sub(since) > BRAKING_MAX;
             if has_stopped {
                 info!("the robot stands, the control loop ends");
                 return;

@@ -19,7 +19,7 @@ use super::Tick;
 use super::demands::Demands;
 use super::estimation::{Estimated, Released};
 use super::sensing::Sensed;
-use crate::control_loop::LOOP_END_MAX;
+use crate::control_loop::BRAKING_MAX;
 use crate::control_loop::active::{Active, Hold, News, progress_of};
 use crate::control_loop::channels::{ClosedSegment, EndReason, Job, LoopCommand, LoopEvent};
 use crate::control_loop::driven::TickRecord;
@@ -226,7 +226,7 @@ impl MissionStage {
         self.hold_for_sensors(tick.now, input.sensed, events);
         let wanted = self.follow(input, events);
         let active = self.active.as_ref();
-        let beyond_braking = server_silence.saturating_sub(LOOP_END_MAX);
+        let beyond_braking = server_silence.saturating_sub(BRAKING_MAX);
         Followed {
             wanted,
             is_active: active.is_some(),
