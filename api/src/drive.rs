@@ -114,9 +114,9 @@ pub enum DriveUpdate {
         /// For people; names who has the lease.
         detail: String,
     },
-    /// The stop that was asked for, confirmed or not.
+    /// The requested stop, confirmed or not.
     Stopped(Box<Stop>),
-    /// The robot as it was heard last, ten times a second.
+    /// The robot's newest state, ten times a second.
     View(Box<DriveView>),
     /// The server closes the socket.
     Ended {
@@ -158,7 +158,7 @@ pub enum DriveRefusal {
 /// A robot as a drive socket shows it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct DriveView {
-    /// Whether the server hears it.
+    /// Whether its heartbeat arrives at the server.
     pub link: LinkState,
     /// Time since its last state, milliseconds.
     pub heard_age_ms: Option<u64>,

@@ -225,7 +225,7 @@ pub struct FleetAuthority {
     /// The rotation that is under way.
     pub rotation: Option<AuthorityRotation>,
     /// False while the disk has not confirmed that the former authority is retired. It is, and a power
-    /// cut before this is true may undo it; the server asks the disk again by itself.
+    /// cut before this is true may undo it; the server tries again by itself.
     pub on_disk: bool,
     /// How many robots must join again: what they showed last was signed by an authority that was retired.
     pub robots_to_join: u32,
@@ -262,7 +262,7 @@ pub struct RobotLeft {
     pub robot: RobotId,
     /// When it got its certificate.
     pub renewed_at: Timestamp,
-    /// Whether the server hears it now.
+    /// Whether its heartbeat arrives at the server now.
     pub online: bool,
 }
 

@@ -70,7 +70,7 @@ pub struct Segment {
     /// The terrain under the robot; absent where none is drawn.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub terrain: Option<TerrainRef>,
-    /// θ, slip per friction coefficient. For who adds up segments and knows nothing of common
+    /// θ, slip per friction coefficient. For readers that add up segments without common
     /// errors: it claims no more than the sum of a robot's segments keeps.
     pub theta: Information,
     /// What the error of θ is made of; absent from an older agent.
@@ -229,7 +229,7 @@ impl ThetaEstimate {
     }
 }
 
-/// What the map knows of one piece of ground.
+/// The map's estimates of one piece of ground.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct FusedFriction {
     /// θ = 1/K, slip per friction coefficient.
@@ -298,8 +298,8 @@ pub struct TerrainFriction {
     pub name: String,
     /// Kind of ground.
     pub class: TerrainClass,
-    /// As of when: nothing that was measured later counts. The end of the last epoch before the
-    /// time that was asked for; `null` when no time was, and all that has come counts.
+    /// As of when: nothing that was measured later counts. The end of the last epoch before
+    /// the requested time; `null` when no time was, and all that has come counts.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
     /// What is known for each robot model, kept apart.
@@ -360,8 +360,8 @@ pub struct TerrainAt {
 /// What is known of the ground at a point.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PointFriction {
-    /// As of when: nothing that was measured later counts. The end of the last epoch before the
-    /// time that was asked for; `null` when no time was, and all that has come counts.
+    /// As of when: nothing that was measured later counts. The end of the last epoch before
+    /// the requested time; `null` when no time was, and all that has come counts.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
     /// The cell.
@@ -391,8 +391,8 @@ pub struct AskPath {
 /// What is known along a path.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PathFriction {
-    /// As of when: nothing that was measured later counts. The end of the last epoch before the
-    /// time that was asked for; `null` when no time was, and all that has come counts.
+    /// As of when: nothing that was measured later counts. The end of the last epoch before
+    /// the requested time; `null` when no time was, and all that has come counts.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
     /// Length, metres.
@@ -558,10 +558,10 @@ pub struct Withdrawal {
     pub at: Timestamp,
 }
 
-/// Where the map of a site has changed: in these boxes of cells, since the word before.
+/// Where the map of a site has changed: in these boxes of cells, since the event before.
 ///
-/// Changes are told at most once a second and put together to squares of cells, so that what is in
-/// a box may be as it was. Ask for what you need of it.
+/// Changes are sent at most once a second and merged into squares of cells, so that what is in
+/// a box may be as it was. Query what you need of it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct MapChange {
     /// The site.
@@ -570,8 +570,7 @@ pub struct MapChange {
     pub at: Timestamp,
     /// Revision of the grid that the cells are of.
     pub grid_revision: u32,
-    /// Counts changes of the site's terrains; another one than before changes what is said of any
-    /// cell.
+    /// Counts changes of the site's terrains; another one than before may change the answer about any cell.
     pub terrain_revision: u64,
     /// Whether anything of the map may have changed; there are no boxes then.
     pub everything: bool,

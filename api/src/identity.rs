@@ -198,7 +198,7 @@ pub struct Person {
     pub subject: String,
 }
 
-/// Who asks.
+/// Whose session it is.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(from = "SessionAnswer")]
 pub struct Session {
@@ -246,7 +246,7 @@ pub struct OidcSignIn {
     pub label: String,
     /// Where a browser is sent to sign in.
     pub path: String,
-    /// Whether the provider could be asked; the server goes on trying.
+    /// Whether the provider could be reached; the server goes on trying.
     pub available: bool,
 }
 
@@ -307,13 +307,13 @@ pub struct AuditEntry {
     pub method: String,
     /// The route, as `/openapi.json` names it.
     pub route: String,
-    /// The path asked for, without its query.
+    /// The requested path, without its query.
     pub path: String,
     /// The status of the answer.
     pub status: u16,
     /// The `x-request-id` of the answer, which the log has too.
     pub request_id: String,
-    /// What was asked: the body without secrets, shortened where it was long.
+    /// The request: the body without secrets, shortened where it was long.
     pub what: Option<serde_json::Value>,
     /// The hash of the entry before it; `null` in entries of versions that had no chain.
     pub previous_hash: Option<String>,
@@ -360,7 +360,7 @@ mod tests {
         });
         let token: Token = serde_json::from_value(token).unwrap();
         assert_eq!(token.rights, Rights::from(Role::Viewer));
-        // What is told is never widened by the role.
+        // Stated rights are never widened by the role.
         let mut value = serde_json::to_value(&token).unwrap();
         value["rights"] = serde_json::json!([]);
         value["sites"] = serde_json::json!([{"site": "yard"}]);

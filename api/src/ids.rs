@@ -169,7 +169,7 @@ uuid_id! {
 }
 uuid_id! {
     /// A person who signs in at an OpenID provider: the version 5 UUID of the provider's issuer and
-    /// the person's subject there, so it stays whatever else the provider says of them.
+    /// the person's subject there, so it stays whatever their other claims are.
     PersonId
 }
 uuid_id! {
@@ -188,15 +188,24 @@ uuid_id! {
     ConfigurationId
 }
 uuid_id! {
-    /// What exactly a robot was asked to drive: the version 5 UUID of request and revision.
+    /// What exactly a robot was commanded to drive: the version 5 UUID of request and revision.
     ///
     /// See [`crate::wire::command::Offer::plan_hash_of`].
     PlanHash
 }
 
+/// Whom an OpenID provider names: its issuer, and the subject there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct OidcSubject<'text> {
+    /// The provider's issuer.
+    pub issuer: &'text str,
+    /// The subject at that provider.
+    pub subject: &'text str,
+}
+
 impl PersonId {
-    /// The person of that subject at the provider of that issuer.
-    pub fn of(issuer: &str, subject: &str) -> Self {
+    /// The person of that subject at that provider.
+    pub fn of(OidcSubject { issuer, subject }: OidcSubject<'_>) -> Self {
         // The length keeps every pair of texts apart from every other pair.
         let name = format!("person {} {issuer} {subject}", issuer.len());
         Self(Uuid::new_v5(&DERIVED_NAMESPACE, name.as_bytes()))
@@ -231,15 +240,16 @@ mod tests {
 
     #[test]
     fn a_person_is_an_issuer_and_a_subject_there() {
-        let anna = PersonId::of("https://login.test", "anna");
-        assert_eq!(anna, PersonId::of("https://login.test", "anna"));
+        let person = |issuer, subject| PersonId::of(OidcSubject { issuer, subject });
+        let anna = person("https://login.test", "anna");
+        assert_eq!(anna, person("https://login.test", "anna"));
         for (issuer, subject) in [
             ("https://login.test", "bert"),
             ("https://login.test/", "anna"),
             ("https://login.test anna", ""),
             ("https://login.tes", "t anna"),
         ] {
-            assert_ne!(anna, PersonId::of(issuer, subject), "{issuer} {subject}");
+            assert_ne!(anna, person(issuer, subject), "{issuer} {subject}");
         }
     }
 

@@ -19,9 +19,9 @@ pub const REASON_LENGTH_MAX: usize = 500;
 pub const PRIORITY_MIN: i32 = -100;
 /// Highest priority of a mission.
 pub const PRIORITY_MAX: i32 = 100;
-/// Shortest silence after which a robot may be told to stop, seconds: several heartbeats.
+/// Shortest silence after which a mission may make its robot stop, seconds: several heartbeats.
 pub const LINK_SILENCE_MIN_S: f64 = 1.0;
-/// Longest silence after which a robot may be told to stop, and longest bound of a lost robot,
+/// Longest silence after which a mission may make its robot stop, and longest bound of a lost robot,
 /// seconds.
 pub const LINK_SILENCE_MAX_S: f64 = 86_400.0;
 /// Most points of a driven path; a longer one is thinned further.
@@ -119,7 +119,7 @@ pub struct CreateMission {
     /// What becomes of the robot's other missions; it waits behind them when absent.
     #[serde(default)]
     pub start_policy: StartPolicy,
-    /// What the robot does when it no longer hears the server; it goes on when absent.
+    /// What the robot does when nothing more of the server arrives; it goes on when absent.
     #[serde(default)]
     pub link_policy: LinkPolicy,
     /// How long the robot may stay away before its mission fails as `robot_lost`, seconds. When
@@ -130,7 +130,7 @@ pub struct CreateMission {
     pub lost_after_s: Option<f64>,
 }
 
-/// What a robot does with its mission when it no longer hears the server.
+/// What a robot does with its mission when nothing more of the server arrives.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LinkPolicy {
@@ -197,7 +197,7 @@ pub struct Mission {
     pub reason: Option<String>,
     /// Why it stands there, for programs.
     pub cause: Cause,
-    /// Whether it is to be paused; the robot has not answered yet while the state says otherwise.
+    /// Whether it is to be paused; the robot has not answered yet while the state differs.
     pub pause_wanted: bool,
     /// Counts changes of what is to be driven.
     pub revision: u32,
@@ -211,17 +211,17 @@ pub struct Mission {
     pub latest_start: Option<Timestamp>,
     /// Missions of a higher priority are driven first.
     pub priority: i32,
-    /// What the robot does when it no longer hears the server.
+    /// What the robot does when nothing more of the server arrives.
     pub link_policy: LinkPolicy,
-    /// How long the robot may stay away before it counts as lost, seconds, if that was said.
+    /// How long the robot may stay away before it counts as lost, seconds, if that was given.
     pub lost_after_s: Option<f64>,
     /// The run of the agent that took it.
     pub boot: Option<BootId>,
     /// What the robot planned.
     pub plan: Option<PlanSummary>,
-    /// How far the robot has come, by its last word while the mission was its present one.
+    /// How far the robot has come, by its last report while the mission was its present one.
     pub progress: Option<MissionProgress>,
-    /// When it was asked for.
+    /// When it was requested.
     pub created_at: Timestamp,
     /// When the robot began.
     pub started_at: Option<Timestamp>,
@@ -237,9 +237,9 @@ pub struct MissionDetail {
     pub mission: Mission,
     /// What happened to it, oldest first.
     pub events: Vec<MissionEvent>,
-    /// How well it was driven, once the robot has said so.
+    /// How well it was driven, once the robot has reported it.
     pub quality: Option<MissionQuality>,
-    /// Where the robot really was, once it has said so.
+    /// Where the robot really was, once it has reported it.
     pub driven: Option<DrivenPath>,
 }
 
@@ -287,7 +287,7 @@ pub struct PriorGain {
     /// Time from the start until the robot's own measurement was as sure, seconds; `null` if it
     /// never was.
     pub first_sure_alone_s: Option<f64>,
-    /// Cells in which the robot has measured what the map had a word on.
+    /// Cells that the robot has measured and for which the map had an estimate.
     pub cells_compared: u32,
     /// Of these, cells that contradicted the map.
     pub cells_contradicted: u32,

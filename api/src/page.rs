@@ -18,15 +18,15 @@ pub struct Page<T> {
     pub next_cursor: Option<String>,
 }
 
-/// One page of what the friction map knows.
+/// One page of the friction map.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct MapPage<T> {
     /// The entries.
     pub items: Vec<T>,
     /// Give this as `cursor` for the next page; `null` on the last one.
     pub next_cursor: Option<String>,
-    /// As of when: nothing that was measured later counts. The end of the last epoch before the time
-    /// that was asked for; `null` when no time was, and all that has come counts.
+    /// As of when: nothing that was measured later counts. The end of the last epoch before
+    /// the requested time; `null` when no time was, and all that has come counts.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
 }
@@ -38,7 +38,7 @@ pub struct DifferencePage<T> {
     pub items: Vec<T>,
     /// Give this as `cursor` for the next page; `null` on the last one.
     pub next_cursor: Option<String>,
-    /// The first time: the end of the last epoch before the one that was asked for.
+    /// The first time: the end of the last epoch before the requested one.
     #[serde(default)]
     pub from: Option<Timestamp>,
     /// The second time, as [`MapPage::as_of`].

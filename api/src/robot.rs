@@ -77,7 +77,7 @@ pub enum RobotMode {
     Fault,
 }
 
-/// Whether the server hears a robot. The heartbeat of its control loop decides.
+/// Whether a robot's heartbeat, which its control loop sends, arrives at the server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LinkState {
@@ -103,7 +103,7 @@ impl LinkState {
     }
 }
 
-/// Why a robot is not heard.
+/// Why no heartbeat of a robot arrives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LinkCause {
@@ -234,9 +234,9 @@ pub struct Alert {
     pub severity: Severity,
     /// What it is, for people.
     pub text: String,
-    /// When the server first heard of it.
+    /// When the server raised it first.
     pub raised_at: Timestamp,
-    /// When a person said to have seen it.
+    /// When a person acknowledged it.
     pub acknowledged_at: Option<Timestamp>,
     /// When its cause was gone.
     pub cleared_at: Option<Timestamp>,
@@ -310,13 +310,13 @@ pub struct Robot {
     pub last_hello_at: Timestamp,
     /// What became of its measurements.
     pub measurements: MeasurementsTaken,
-    /// Whether the server hears it now.
+    /// Whether its heartbeat arrives at the server now.
     pub link: LinkState,
-    /// Why it is not heard; `null` while it is online.
+    /// Why its heartbeat does not arrive; `null` while it is online.
     pub link_cause: Option<LinkCause>,
     /// Alerts that have not cleared.
     pub alerts: Vec<Alert>,
-    /// What it said last; `null` if it has said nothing since the server started.
+    /// Its newest report; `null` if none has come since the server started.
     pub live: Option<RobotLive>,
 }
 
@@ -331,7 +331,7 @@ pub struct MeasurementsTaken {
     pub deferred: u64,
 }
 
-/// What a robot said last, each value with its age.
+/// A robot's newest report, each value with its age.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct RobotLive {
     /// The agent's run.
@@ -447,7 +447,7 @@ pub struct LoopStatus {
     /// Samples of the base lost since the start, because newer ones came before a tick.
     #[serde(default)]
     pub lost_samples: u64,
-    /// Commands of the server lost since the start for want of room; it asks again.
+    /// Commands of the server lost since the start for want of room; the server sends them again.
     #[serde(default)]
     pub lost_commands: u64,
 }

@@ -154,7 +154,7 @@ pub struct DriveStatus {
     pub counts: DriveCounts,
 }
 
-/// An external limit that a robot knows.
+/// An external limit that a robot has.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct LimitStatus {
     /// Who limits.
@@ -162,10 +162,10 @@ pub struct LimitStatus {
     pub owner: OwnerId,
     /// Whether the robot must hear this owner to move; it stays on hold while the owner is silent.
     pub required: bool,
-    /// Whether the robot is on hold now: because the owner asked, or because a required owner is
+    /// Whether the robot is on hold now: because the owner requested it, or because a required owner is
     /// silent.
     pub hold: bool,
-    /// Fastest speed, m/s, if one was said.
+    /// Fastest speed, m/s, if one was given.
     pub linear_max_m_s: Option<f64>,
     /// Time until it expires, milliseconds; `null` for a required owner that is silent.
     pub ends_in_ms: Option<u64>,
@@ -272,7 +272,7 @@ pub struct SetLimit {
     /// Fastest speed, m/s, not negative; as before when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub linear_max_m_s: Option<f64>,
-    /// How long it lasts, milliseconds, at most an hour; say it again before it ends.
+    /// How long it lasts, milliseconds, at most an hour; renew it before it ends.
     #[schema(minimum = 1, maximum = 3_600_000)]
     pub for_ms: u64,
 }

@@ -178,7 +178,7 @@ pub struct CreateSite {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0.1, maximum = 100.0)]
     pub cell_m: Option<f64>,
-    /// Where on the earth the site lies; it may be said later.
+    /// Where on the earth the site lies; it may be set later.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub origin: Option<GeoOrigin>,
 }

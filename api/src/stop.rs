@@ -84,19 +84,19 @@ pub struct Stop {
     pub by: String,
     /// Why.
     pub reason: String,
-    /// When the server was asked.
+    /// When the server received the request.
     pub wanted_at: Timestamp,
-    /// When it was commanded: the server heard that the robot's wheels are commanded to rest and
-    /// that it will remember the stop over a restart; `null` until then.
+    /// When it was commanded: the robot has confirmed that its wheels are commanded to rest
+    /// and that the stop lasts over a restart; `null` until then.
     pub confirmed_at: Option<Timestamp>,
-    /// When the server heard that the robot was measured to stand, by wheels, odometry, gyro and
+    /// When the robot reported that it was measured to stand, by wheels, odometry, gyro and
     /// position; `null` until then. A robot that does not stand in time raises the alert
     /// `does-not-stand`.
     pub standing_at: Option<Timestamp>,
     /// Whether the robot has not confirmed within 300 ms. The server repeats the stop until it
     /// does.
     pub unconfirmed: bool,
-    /// Who asked last to clear it.
+    /// Who requested last to clear it.
     pub clear_asked_by: Option<String>,
     /// When that was.
     pub clear_asked_at: Option<Timestamp>,

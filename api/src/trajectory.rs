@@ -39,7 +39,7 @@ pub const EXCITATION_PERIOD_MIN_S: f64 = 1.0;
 /// Longest period of an excitation, seconds.
 pub const EXCITATION_PERIOD_MAX_S: f64 = 20.0;
 
-/// A path to drive, as a user asks for it.
+/// A path to drive, as a user requests it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Trajectory {
@@ -108,7 +108,7 @@ pub struct Waypoints {
     /// The points in driving order, 2 to 100 000.
     #[schema(min_items = 2, max_items = 100_000)]
     pub points: Vec<Waypoint>,
-    /// Speed wherever a point does not say otherwise, metres per second.
+    /// Speed wherever a point has none of its own, metres per second.
     #[schema(minimum = 0.01, maximum = 50.0, example = 0.6)]
     pub speed_m_s: f64,
     /// What the robot may do beside it; nothing when absent.
@@ -130,8 +130,8 @@ pub struct TrajectoryOptions {
     pub excitation: Option<Excitation>,
 }
 
-/// Excitation, a periodic variation of the speed: the speed falls by the depth and recovers, and
-/// never exceeds what was asked.
+/// Excitation, a periodic variation of the speed: the speed falls by the depth and recovers,
+/// and never exceeds the requested one.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Excitation {
     /// By which share the speed falls at most; less where the robot's limits leave less.

@@ -16,6 +16,7 @@ use std::time::Duration;
 use clap::{ArgMatches, Args, CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 use clap_complete::Shell;
 use tread_api::ids::{RobotId, SiteId};
+use tread_server::config::SITE_DEFAULT;
 
 use self::identity::Showing;
 pub(crate) use self::identity::{
@@ -40,10 +41,8 @@ pub(crate) use self::values::{shield_negative_points, waypoint};
 use crate::exit::Exit;
 use crate::output::{failure, note};
 
-/// Where a server answers, unless told otherwise.
+/// Where a server answers, unless configured otherwise.
 pub(crate) const SERVER_DEFAULT: &str = "http://127.0.0.1:8420";
-/// The site that a server makes for itself, unless told otherwise.
-pub(crate) const SITE_DEFAULT: &str = "yard";
 /// Most robots of a demo; each is a process of its own.
 const DEMO_ROBOTS_MAX: i64 = 50;
 

@@ -105,7 +105,7 @@ pub(crate) fn line(text: &str) -> anyhow::Result<()> {
 
 /// Prints a line to standard error, for people only.
 pub(crate) fn note(text: &str) {
-    // Nobody is left to be told when standard error is closed.
+    // Nobody reads it when standard error is closed.
     _ = writeln!(io::stderr().lock(), "{text}");
 }
 

@@ -1,4 +1,4 @@
-//! What a trajectory would ask of a robot, told before anything moves.
+//! What a trajectory would ask of a robot, computed before anything moves.
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -79,7 +79,7 @@ pub struct TrajectoryCheck {
     pub lateral_acceleration_peak_m_s2: f64,
     /// Fastest turn, rad/s.
     pub angular_peak_rad_s: f64,
-    /// Where a limit makes the robot slower than it was asked to be, in driving order; at most
+    /// Where a limit makes the robot slower than requested, in driving order; at most
     /// [`BINDINGS_MAX`].
     pub bindings: Vec<Binding>,
     /// Depth of the requested excitation, as a ratio of the speed: less than requested where the
@@ -134,7 +134,7 @@ pub struct Binding {
     pub speed_min_m_s: f64,
 }
 
-/// A limit that slows a robot below what was asked.
+/// A limit that slows a robot below the requested speed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum BindingLimit {

@@ -18,6 +18,11 @@ use serde_json::value::RawValue;
 pub const VERSION: u32 = 2;
 /// Largest payload that is read, in bytes: a path of the most waypoints with room to spare.
 pub const PAYLOAD_BYTES_MAX: usize = 16 * 1024 * 1024;
+/// Lease of the zenoh session between robot and server, milliseconds: after this silence either side takes the
+/// other for gone. TCP repeats what was lost after ever longer pauses; a new connection is there sooner.
+pub const SESSION_LEASE_MS: u32 = 3_000;
+/// Largest batch that zenoh hands to the kernel at once, bytes. Priorities act only above it.
+pub const BATCH_BYTES: u16 = 8 * 1024;
 
 /// Why a payload is refused.
 #[derive(Debug, thiserror::Error)]

@@ -27,8 +27,8 @@ pub struct RobotState {
     pub seq: u64,
     /// The robot's wall clock; it may be wrong.
     pub robot_time: Timestamp,
-    /// The agent's monotonic clock at sending, microseconds: what end times for this run are told
-    /// in. An older agent has none.
+    /// The agent's monotonic clock at sending, microseconds: end times for this run are on this
+    /// clock. An older agent has none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub monotonic_us: Option<u64>,
     /// What the agent is doing.

@@ -50,7 +50,7 @@ impl MapTimes {
     }
 }
 
-/// Entries of the map, and of which times they are; programs are told the entries.
+/// Entries of the map, and of which times they are; programs get the entries.
 #[derive(Debug, Serialize)]
 #[serde(transparent)]
 pub(crate) struct Known<T> {

@@ -83,7 +83,7 @@ async fn join_token(
                     |robot| format!("robot `{robot}`"),
                 );
                 note(&format!(
-                    "for {whom} of site `{}`, until {}; it is told this once:",
+                    "for {whom} of site `{}`, until {}; it is shown this once:",
                     token.site, token.expires_at
                 ));
             }
@@ -118,7 +118,7 @@ async fn join_tokens_of_all(
         match client.create_join_token(&request).await {
             Ok(created) => made.push(created),
             Err(failed) => {
-                // Those that were made are told nowhere else.
+                // Those that were made are shown nowhere else.
                 output.show(&made, |made| secrets(made))?;
                 return Err(failed.into());
             }

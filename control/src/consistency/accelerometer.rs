@@ -4,9 +4,9 @@
 //! pass the same high-pass filter, and a regression with a short memory gives the gain between
 //! them.
 
-use super::history::BIN_S;
+use super::history::{BIN_S, Means};
 use super::repeats::Repeats;
-use super::{Finding, Kind, Subject, Unit};
+use super::{Comparison, Finding, Kind, Subject, Unit};
 use crate::measured::BodyAcceleration;
 
 /// Number of bins over which the speed is differentiated.
@@ -56,12 +56,20 @@ struct Axis {
 }
 
 impl Axis {
-    fn take(&mut self, felt_m_s2: f64, expected_m_s2: f64) {
+    fn take(&mut self, comparison: Comparison) {
+        let (felt_m_s2, expected_m_s2) = (comparison.observed, comparison.predicted);
         let share = BIN_S / HIGH_PASS_S;
         self.felt_low += share * (felt_m_s2 - self.felt_low);
         self.expected_low += share * (expected_m_s2 - self.expected_low);
         self.felt = felt_m_s2 - self.felt_low;
         self.expected = expected_m_s2 - self.expected_low;
+    }
+
+    fn comparison(self) -> Comparison {
+        Comparison {
+            observed: self.felt,
+            predicted: self.expected,
+        }
     }
 }
 
@@ -106,7 +114,8 @@ impl Accelerometer {
     }
 
     /// Evaluates one bin with the forward speed of the wheels and the turn rate of the gyro.
-    pub(super) fn step(&mut self, speed_m_s: f64, turn_rad_s: f64, repeats: &Repeats) {
+    pub(super) fn step(&mut self, motion: &Means, repeats: &Repeats) {
+        let speed_m_s = motion.wheels.linear_m_s;
         self.verdict = None;
         self.is_healthy = false;
         if self.count < 1.0 {
@@ -129,19 +138,23 @@ impl Accelerometer {
         let bins = BINS as f64;
         let expected = [
             (self.speeds_m_s[BINS] - self.speeds_m_s[0]) / (bins * BIN_S),
-            speed_m_s * turn_rad_s,
+            speed_m_s * motion.gyro_rad_s,
         ];
         let mean = |of: fn(&BodyAcceleration) -> f64| self.means.iter().map(of).sum::<f64>() / bins;
         let felt = [mean(|felt| felt.forward_m_s2), mean(|felt| felt.left_m_s2)];
-        self.forward.take(felt[0], expected[0]);
-        self.left.take(felt[1], expected[1]);
+        let axes = [0, 1].map(|axis: usize| Comparison {
+            observed: felt[axis],
+            predicted: expected[axis],
+        });
+        self.forward.take(axes[0]);
+        self.left.take(axes[1]);
         let gain = self.regress();
         if !repeats.is_repeating() {
             self.sign();
         }
         self.verdict = self
-            .frozen(repeats, felt, expected)
-            .or_else(|| impossible(felt, expected))
+            .frozen(repeats, axes)
+            .or_else(|| impossible(axes))
             .or_else(|| self.inverted())
             .or_else(|| self.scaled(gain));
         self.is_healthy = self.verdict.is_none()
@@ -204,7 +217,7 @@ impl Accelerometer {
     fn inverted(&self) -> Option<Finding> {
         (self.inverted_s >= INVERTED_S).then(|| {
             let axis = self.stronger();
-            finding(Kind::Inverted, axis.felt, axis.expected)
+            finding(Kind::Inverted, axis.comparison())
         })
     }
 
@@ -228,28 +241,39 @@ impl Accelerometer {
             return None;
         };
         let axis = self.stronger();
-        Some(finding(kind, gain * axis.expected, axis.expected))
+        let comparison = Comparison {
+            observed: gain * axis.expected,
+            predicted: axis.expected,
+        };
+        Some(finding(kind, comparison))
     }
 
-    fn frozen(&mut self, repeats: &Repeats, felt: [f64; 2], expected: [f64; 2]) -> Option<Finding> {
+    fn frozen(&mut self, repeats: &Repeats, axes: [Comparison; 2]) -> Option<Finding> {
         if !repeats.is_frozen() {
             self.frozen_from = None;
             return None;
         }
-        let from = *self.frozen_from.get_or_insert(expected);
-        (0..2)
-            .find(|&axis| (expected[axis] - from[axis]).abs() > FROZEN_CHANGE_M_S2)
-            .map(|axis| finding(Kind::Frozen, felt[axis], expected[axis]))
+        let from = *self
+            .frozen_from
+            .get_or_insert(axes.map(|axis| axis.predicted));
+        axes.into_iter()
+            .zip(from)
+            .find(|(axis, from)| (axis.predicted - from).abs() > FROZEN_CHANGE_M_S2)
+            .map(|(axis, _)| finding(Kind::Frozen, axis))
     }
 }
 
-fn impossible(felt: [f64; 2], expected: [f64; 2]) -> Option<Finding> {
-    (0..2)
-        .find(|&axis| (felt[axis] - expected[axis]).abs() > IMPOSSIBLE_M_S2)
-        .map(|axis| finding(Kind::Inconsistent, felt[axis], expected[axis]))
+fn impossible(axes: [Comparison; 2]) -> Option<Finding> {
+    axes.into_iter()
+        .find(|axis| (axis.observed - axis.predicted).abs() > IMPOSSIBLE_M_S2)
+        .map(|axis| finding(Kind::Inconsistent, axis))
 }
 
-fn finding(kind: Kind, observed: f64, predicted: f64) -> Finding {
+fn finding(kind: Kind, comparison: Comparison) -> Finding {
+    let Comparison {
+        observed,
+        predicted,
+    } = comparison;
     Finding {
         subject: Subject::Accelerometer,
         kind,

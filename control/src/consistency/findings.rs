@@ -148,6 +148,23 @@ pub struct Finding {
     pub unit: Unit,
 }
 
+/// What a channel says beside what the others let expect.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Comparison {
+    pub(super) observed: f64,
+    pub(super) predicted: f64,
+}
+
+impl Comparison {
+    /// The same, with the others in doubt.
+    pub(super) fn reversed(self) -> Self {
+        Self {
+            observed: self.predicted,
+            predicted: self.observed,
+        }
+    }
+}
+
 /// Active findings, in the order of [`Subject::ALL`].
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Findings {

@@ -10,7 +10,7 @@
 //! that began with the span shows soon; `s + b` is the difference of speed in the span. A single
 //! outlier between two fixes that agree is left out, and deviations from the line count as noise.
 
-use super::history::{Edge, History};
+use super::history::{Edge, History, Span};
 use crate::geometry::{Point, Pose, wrap_angle_rad};
 use crate::localisation::FixNoise;
 
@@ -134,6 +134,15 @@ pub(super) struct Seen {
     pub(super) odometry_noise_m_s: f64,
     pub(super) noise_rad_s: f64,
     pub(super) wheels_noise_rad_s: f64,
+}
+
+impl Seen {
+    pub(super) fn span(&self) -> Span {
+        Span {
+            from_s: self.from_s,
+            to_s: self.to_s,
+        }
+    }
 }
 
 /// Jump of the position, in metres and radians.

@@ -69,6 +69,13 @@ impl Edge {
     }
 }
 
+/// A span of time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Span {
+    pub(super) from_s: f64,
+    pub(super) to_s: f64,
+}
+
 /// Means over a span.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Means {
@@ -160,6 +167,15 @@ impl History {
         self.now
     }
 
+    /// The span of this length that ends now.
+    pub(super) fn last(&self, length_s: f64) -> Span {
+        let to_s = self.now.at_s;
+        Span {
+            from_s: to_s - length_s,
+            to_s,
+        }
+    }
+
     /// Returns the edge `places` before the newest.
     fn before(&self, places: usize) -> Option<&Edge> {
         (places < self.count).then(|| &self.edges[(self.newest + EDGES - places) % EDGES])
@@ -181,8 +197,8 @@ impl History {
 
     /// Returns the means between two times; None if the history does not reach back or the span is
     /// shorter than half a bin.
-    pub(super) fn means(&self, from_s: f64, to_s: f64) -> Option<Means> {
-        let (from, to) = (self.at(from_s)?, self.at(to_s)?);
+    pub(super) fn means(&self, span: Span) -> Option<Means> {
+        let (from, to) = (self.at(span.from_s)?, self.at(span.to_s)?);
         let span_s = to.at_s - from.at_s;
         if span_s < 0.5 * BIN_S {
             return None;
@@ -200,16 +216,16 @@ impl History {
     }
 
     /// Returns the range of commands between two times.
-    pub(super) fn commanded(&self, from_s: f64, to_s: f64) -> Commanded {
+    pub(super) fn commanded(&self, span: Span) -> Commanded {
         let (mut least, mut most) = (self.now.command, self.now.command);
         for places in 0..self.count {
             let Some(edge) = self.before(places) else {
                 break;
             };
-            if edge.at_s > to_s + BIN_S {
+            if edge.at_s > span.to_s + BIN_S {
                 continue;
             }
-            if edge.at_s < from_s {
+            if edge.at_s < span.from_s {
                 break;
             }
             let command = edge.command;

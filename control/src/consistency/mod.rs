@@ -35,9 +35,10 @@ use crate::localisation::FixNoise;
 use crate::measured::{BodyAcceleration, WheelSpeeds};
 use crate::robot::RobotModel;
 use accelerometer::Accelerometer;
+use findings::Comparison;
 pub use findings::{Consequence, Finding, Findings, Kind, Subject, Unit};
 use fixes::{Fixes, Seen};
-use history::{BIN_S, History};
+use history::{BIN_S, History, Span};
 use repeats::Repeats;
 use track::Track;
 use turn_gain::TurnGain;
@@ -194,12 +195,8 @@ impl Monitor {
     /// Evaluates all channels at the end of a bin.
     fn judge(&mut self) {
         let now_s = self.history.now().at_s;
-        if let Some(recent) = self.history.means(now_s - BIN_S, now_s) {
-            self.accelerometer.step(
-                recent.wheels.linear_m_s,
-                recent.gyro_rad_s,
-                &self.repeats.acceleration,
-            );
+        if let Some(recent) = self.history.means(self.history.last(BIN_S)) {
+            self.accelerometer.step(&recent, &self.repeats.acceleration);
         }
         let fix_age_s = self
             .last_fix
@@ -210,7 +207,7 @@ impl Monitor {
             [None; SPANS_S.len()]
         };
         let mut verdicts = Verdicts::default();
-        let stands = self.stands(now_s);
+        let stands = self.stands();
         let view = verdict::View {
             model: &self.model,
             history: &self.history,
@@ -237,10 +234,12 @@ impl Monitor {
             });
         if is_quiet && verdicts.is_consistent() {
             if seen.iter().any(Option::is_some)
-                && let Some(recent) = self.history.means(now_s - LEARN_FROM_S, now_s - LEARN_TO_S)
+                && let Some(recent) = self.history.means(Span {
+                    from_s: now_s - LEARN_FROM_S,
+                    to_s: now_s - LEARN_TO_S,
+                })
             {
-                self.turn_gain
-                    .learn(recent.gyro_rad_s, recent.wheels.angular_rad_s);
+                self.turn_gain.learn(&recent);
             }
             if let Some(finding) = self.accelerometer.verdict() {
                 let raise_s = if finding.kind == Kind::Inverted {
@@ -284,14 +283,14 @@ impl Monitor {
 
     /// Returns whether command and wheels are at zero speed, and the fixes stay where they were
     /// when the robot stopped.
-    fn stands(&mut self, now_s: f64) -> bool {
-        let commanded = self.history.commanded(now_s - REST_SPAN_S, now_s);
+    fn stands(&mut self) -> bool {
+        let commanded = self.history.commanded(self.history.last(REST_SPAN_S));
         let is_commanded = [commanded.least, commanded.most]
             .iter()
             .all(|twist| *twist == Twist::default());
         let at_rest = self
             .history
-            .means(now_s - REST_SPAN_S, now_s)
+            .means(self.history.last(REST_SPAN_S))
             .is_some_and(|means| {
                 means.wheels.linear_m_s.abs() <= REST_M_S
                     && means.wheels.angular_rad_s.abs() <= REST_RAD_S

@@ -5,7 +5,7 @@
 //! makes the wheels a sharper reference where gyro and position contradict each other. Nothing else
 //! uses it. The gain is bounded, so that no fault is learned away.
 
-use super::history::BIN_S;
+use super::history::{BIN_S, Means};
 
 /// Time constant of forgetting, seconds of turning.
 const MEMORY_S: f64 = 20.0;
@@ -25,7 +25,8 @@ pub(super) struct TurnGain {
 
 impl TurnGain {
     /// Adds a bin without contradictions.
-    pub(super) fn learn(&mut self, gyro_rad_s: f64, wheels_rad_s: f64) {
+    pub(super) fn learn(&mut self, means: &Means) {
+        let (gyro_rad_s, wheels_rad_s) = (means.gyro_rad_s, means.wheels.angular_rad_s);
         if wheels_rad_s.abs() < TURN_MIN_RAD_S {
             return;
         }

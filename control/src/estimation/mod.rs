@@ -66,7 +66,7 @@ pub const BLOCK_S: f64 = 0.2;
 const RIM_SPEED_MIN_M_S: f64 = 0.15;
 /// Largest combined slip that is taken for the linear range.
 const SLIP_LINEAR_MAX: f64 = 0.15;
-/// The same before θ is known, where slip along is told by the body speed.
+/// The same before θ is known, where longitudinal slip comes from the body speed.
 const SLIP_LINEAR_FIRST_MAX: f64 = 0.10;
 /// Relative standard deviation above which there is said to be no measurement.
 const RELATIVE_STD_DEV_MAX: f64 = 0.5;
@@ -488,7 +488,7 @@ impl Estimator {
             let theta = ground.map_or(found.theta, |ground| ground.theta);
             let scale = self.load_scale(&segment);
             let square = scale * scale;
-            // What it shares with those before is the robot's own error: told, and not added up.
+            // What it shares with those before is the robot's own error: reported, and not added up.
             let own_variance = found.own_variance();
             let of_offsets = shared.own.clamp(0.0, OFFSETS_SHARE_MAX * own_variance);
             SegmentTheta {

@@ -92,7 +92,7 @@ impl Normal {
         normal
     }
 
-    /// Adds how large rolling resistance may be at this θ, where the ground has not told yet.
+    /// Adds how large rolling resistance may be at this θ, where this ground has not shown it yet.
     pub(super) fn with_resistance(mut self, offsets: &OffsetKnowledge, theta: f64) -> Self {
         if !offsets.knows_resistance {
             let resistance = (index::RESISTANCE, index::RESISTANCE);

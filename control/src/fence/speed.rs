@@ -85,8 +85,19 @@ impl Braking {
     }
 }
 
+/// A stretch of an arc; a negative distance goes backwards.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Arc {
+    pub(super) curvature_1_m: f64,
+    pub(super) distance_m: f64,
+}
+
 /// Returns the pose after a distance along an arc; a negative distance goes backwards.
-pub(super) fn along_arc(pose: Pose, curvature_1_m: f64, distance_m: f64) -> Pose {
+pub(super) fn along_arc(pose: Pose, arc: Arc) -> Pose {
+    let Arc {
+        curvature_1_m,
+        distance_m,
+    } = arc;
     let turn_rad = curvature_1_m * distance_m;
     let middle_rad = pose.heading_rad + 0.5 * turn_rad;
     // Chord of the arc: sin(x)/x of half the turn.
@@ -113,7 +124,13 @@ impl Fence {
         let direction = twist.linear_m_s.signum();
         let mut distance_m = 0.0;
         for _ in 0..STEPS_MAX {
-            let at = along_arc(pose, curvature_1_m, direction * distance_m);
+            let at = along_arc(
+                pose,
+                Arc {
+                    curvature_1_m,
+                    distance_m: direction * distance_m,
+                },
+            );
             let clearance_m = self.clearance_m(at.point()) - radius_m;
             if clearance_m < STEP_MIN_M {
                 return distance_m;
@@ -133,8 +150,11 @@ impl Fence {
             return true;
         }
         let curvature_1_m = twist.angular_rad_s / twist.linear_m_s;
-        let step_m = RETURN_STEP_M.copysign(twist.linear_m_s);
-        let next = along_arc(pose, curvature_1_m, step_m);
+        let step = Arc {
+            curvature_1_m,
+            distance_m: RETURN_STEP_M.copysign(twist.linear_m_s),
+        };
+        let next = along_arc(pose, step);
         self.clearance_m(next.point()) > clearance_m + 0.1 * RETURN_STEP_M
     }
 

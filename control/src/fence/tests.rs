@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 
 use proptest::prelude::*;
 
-use super::speed::along_arc;
+use super::speed::{Arc, along_arc};
 use super::*;
 use crate::geometry::{Pose, Twist};
 
@@ -82,7 +82,7 @@ proptest! {
                 present = Twist { linear_m_s, angular_rad_s };
                 let curvature_1_m = present.angular_rad_s / present.linear_m_s;
                 pose = if present.linear_m_s.abs() > 1.0e-9 {
-                    along_arc(pose, curvature_1_m, present.linear_m_s * dt_s)
+                    along_arc(pose, Arc { curvature_1_m, distance_m: present.linear_m_s * dt_s })
                 } else {
                     Pose { heading_rad: pose.heading_rad + present.angular_rad_s * dt_s, ..pose }
                 };
@@ -224,7 +224,7 @@ fn a_pose_that_is_no_number_stops() {
 }
 
 #[test]
-fn a_disc_on_forbidden_ground_is_told_which_polygon_and_where_its_border_is() {
+fn an_overlap_names_the_polygon_and_the_nearest_point_of_its_border() {
     let fence = yard();
     let overlap = |x_m: f64, y_m: f64| fence.overlap(Point { x_m, y_m }, 0.4);
     assert_eq!(overlap(0.0, 0.0), None);

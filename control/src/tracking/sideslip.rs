@@ -6,7 +6,7 @@ use crate::measured::WheelSpeeds;
 use crate::reference::ReferenceSample;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-use super::turn::{SIDESLIP_MAX, SteadyTurn, Turn};
+use super::turn::{SIDESLIP_MAX, SteadyTurn, Turn, TurnSpec};
 
 /// Time over which the sideslip's rate is computed, seconds.
 const RATE_SPAN_S: f64 = 0.02;
@@ -90,7 +90,14 @@ impl Instant {
         let asked_1_m = turn_rad_s / speed_m_s.max(SPEED_MIN_M_S);
         let theta = belief.theta.max(THETA_LOOK_MIN);
         let compliance_m = theta * speed_m_s * speed_m_s / GRAVITY_M_S2;
-        let turn = Turn::steady(model, friction_curve, asked_1_m, compliance_m);
+        let turn = Turn::steady(
+            model,
+            friction_curve,
+            TurnSpec {
+                curvature_1_m: asked_1_m,
+                compliance_m,
+            },
+        );
         let per_theta = |turn: SteadyTurn| -turn.sideslip / theta;
         let (linear, beyond) = (per_theta(turn.linear), per_theta(turn.beyond));
         let of_rims = |turn: SteadyTurn| {

@@ -45,18 +45,30 @@ pub(super) struct Turn {
     pub(super) beyond: SteadyTurn,
 }
 
+/// Which turn is driven.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct TurnSpec {
+    /// Curvature, 1/m, finite.
+    pub(super) curvature_1_m: f64,
+    /// `θv²/g`, metres, ≥ 0.
+    pub(super) compliance_m: f64,
+}
+
 impl Turn {
     /// Computes the turn of a finite curvature in 1/m; `compliance_m` is `θv²/g`, metres, ≥ 0. Only
     /// the shape of `friction_curve` is used, not its stiffness.
     pub(super) fn steady(
         model: &RobotModel,
         friction_curve: &FrictionCurve,
-        curvature_1_m: f64,
-        compliance_m: f64,
+        spec: TurnSpec,
     ) -> Self {
         let bound_1_m = TIGHT_MAX * 2.0 / model.effective_track_m();
-        let curvature_1_m = curvature_1_m.clamp(-bound_1_m, bound_1_m);
-        let mut wheels = Wheels::new(model, curvature_1_m, compliance_m);
+        let curvature_1_m = spec.curvature_1_m.clamp(-bound_1_m, bound_1_m);
+        let bounded = TurnSpec {
+            curvature_1_m,
+            ..spec
+        };
+        let mut wheels = Wheels::new(model, bounded);
         for _ in 0..LINEAR_ROUNDS {
             wheels.balance();
         }
@@ -94,7 +106,11 @@ struct Wheels {
 }
 
 impl Wheels {
-    fn new(model: &RobotModel, curvature_1_m: f64, compliance_m: f64) -> Self {
+    fn new(model: &RobotModel, spec: TurnSpec) -> Self {
+        let TurnSpec {
+            curvature_1_m,
+            compliance_m,
+        } = spec;
         let half_track_m = 0.5 * model.track_width_m();
         let half_base_m = 0.5 * model.wheelbase_m();
         let outward = curvature_1_m * half_track_m;
@@ -223,7 +239,7 @@ mod tests {
             // Excludes ground that cannot hold the turn at all.
             prop_assume!(speed_m_s * speed_m_s * curvature.abs() < 0.5 * curve.mu_peak() * GRAVITY_M_S2);
             let model = RobotModel::yi2007();
-            let turn = Turn::steady(&model, &curve, curvature, compliance_m);
+            let turn = Turn::steady(&model, &curve, TurnSpec { curvature_1_m: curvature, compliance_m });
             prop_assume!(turn.beyond.sideslip.abs() < SIDESLIP_MAX);
             let rims = turn.beyond.rims.map(|rim| rim * speed_m_s);
             let (forward_m_s, sideslip, driven) = driven(curve, rims);
@@ -240,7 +256,7 @@ mod tests {
         ) {
             let model = RobotModel::yi2007();
             let friction_curve = FrictionSpec { stiffness: 1.0, peak_slip, sliding_ratio }.try_into().unwrap();
-            let turn = |curvature| Turn::steady(&model, &friction_curve, curvature, compliance_m);
+            let turn = |curvature_1_m| Turn::steady(&model, &friction_curve, TurnSpec { curvature_1_m, compliance_m });
             let (one, other) = (turn(curvature), turn(-curvature));
             for (one, other) in [(one.linear, other.linear), (one.beyond, other.beyond)] {
                 prop_assert!((one.sideslip + other.sideslip).abs() < 1.0e-9);
@@ -254,10 +270,24 @@ mod tests {
     #[test]
     fn without_compliance_there_is_no_sideslip_and_on_a_straight_no_slip() {
         let model = RobotModel::yi2007();
-        let bend = Turn::steady(&model, &friction_curve(1.0, 0.2), 1.2, 0.0);
+        let bend = Turn::steady(
+            &model,
+            &friction_curve(1.0, 0.2),
+            TurnSpec {
+                curvature_1_m: 1.2,
+                compliance_m: 0.0,
+            },
+        );
         assert!(bend.beyond.sideslip.abs() < 1.0e-12, "{bend:?}");
         assert!(bend.beyond != bend.linear, "{bend:?}");
-        let straight = Turn::steady(&model, &friction_curve(1.0, 0.2), 0.0, 0.1);
+        let straight = Turn::steady(
+            &model,
+            &friction_curve(1.0, 0.2),
+            TurnSpec {
+                curvature_1_m: 0.0,
+                compliance_m: 0.1,
+            },
+        );
         let rolls = SteadyTurn {
             sideslip: 0.0,
             rims: [1.0, 1.0],
@@ -273,8 +303,10 @@ mod tests {
         let turn = Turn::steady(
             &model,
             &friction_curve(1.0, 0.9),
-            curvature_1_m,
-            compliance_m,
+            TurnSpec {
+                curvature_1_m,
+                compliance_m,
+            },
         );
         let square_m2 = model.track_width_m().powi(2) + model.wheelbase_m().powi(2);
         let left = 1.0 - 0.25 * square_m2 * curvature_1_m * curvature_1_m;

@@ -257,8 +257,8 @@ impl Plant {
     /// Follows a curve that is partly another one, for derivatives by the curve's shape: that share
     /// of the friction is of the other.
     #[must_use]
-    pub fn with_blend(mut self, shape: Shape, share: f64) -> Self {
-        self.blend = Some((shape, share));
+    pub fn with_blend(mut self, shape: Shape, ratio: f64) -> Self {
+        self.blend = Some((shape, ratio));
         self
     }
 

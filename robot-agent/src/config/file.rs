@@ -6,7 +6,6 @@ use serde::Deserialize;
 use tread_api::ids::{OwnerId, RobotId, SiteId};
 use tread_api::robot::RobotModel;
 
-use super::ConfigError;
 use super::ros2::Ros2File;
 
 /// `robot.toml`.
@@ -126,10 +125,7 @@ pub(super) struct DriveFile {
     pub(super) clock_ahead_s: Option<i64>,
 }
 
-/// Reads the text of a configuration; `file` is its name in errors.
-pub(super) fn parse(file: &str, text: &str) -> Result<FileConfig, ConfigError> {
-    toml::from_str(text).map_err(|refused| ConfigError::Malformed {
-        file: file.to_owned(),
-        problem: refused.to_string(),
-    })
+/// Reads the text of a configuration.
+pub(super) fn parse(text: &str) -> Result<FileConfig, toml::de::Error> {
+    toml::from_str(text)
 }

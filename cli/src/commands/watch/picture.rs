@@ -20,7 +20,7 @@ use crate::output::{age, fixed, or_dash};
 const NAME_MOST: usize = 24;
 /// Cells of a bar.
 const BAR: usize = 10;
-/// Width from which identifiers are shown whole and more is told of each robot.
+/// Width from which identifiers are shown whole and more is shown of each robot.
 const WIDE: u16 = 130;
 /// Most rows for missions beside the robots.
 const MISSION_ROWS: u16 = 40;

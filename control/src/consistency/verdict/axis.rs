@@ -1,7 +1,7 @@
 //! The two compared motions, turn and forward, and the tolerated differences between channels.
 
 use super::super::history::Commanded;
-use super::super::{Finding, Kind, Subject, Unit};
+use super::super::{Comparison, Finding, Kind, Subject, Unit};
 use crate::geometry::Twist;
 
 /// Minimum magnitude of both values for an inverted sign, radians per second or metres per second.
@@ -44,11 +44,37 @@ pub(super) struct Tolerance {
     pub(super) forward_share: f64,
 }
 
+/// What the wheels and another channel of the body say of one motion.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Rates {
+    pub(super) wheels: f64,
+    pub(super) body: f64,
+}
+
 /// One of the two compared motions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Axis {
     Turn,
     Forward,
+}
+
+impl Rates {
+    pub(super) fn difference(self) -> f64 {
+        (self.body - self.wheels).abs()
+    }
+
+    /// The wheels are in doubt.
+    pub(super) fn of_wheels(self) -> Comparison {
+        Comparison {
+            observed: self.wheels,
+            predicted: self.body,
+        }
+    }
+
+    /// The other channel is in doubt.
+    pub(super) fn of_body(self) -> Comparison {
+        self.of_wheels().reversed()
+    }
 }
 
 impl Axis {
@@ -66,6 +92,7 @@ impl Axis {
         }
     }
 
+    /// How far two values of this motion may be apart, in either order.
     pub(super) fn slack(self, tolerance: Tolerance, one: f64, other: f64) -> f64 {
         let (own, share) = match self {
             Self::Turn => (tolerance.own_rad_s, tolerance.share_turn),
@@ -87,23 +114,25 @@ impl Axis {
 
     /// Returns whether wheels contradict their command and the body follows it, which no slip
     /// causes.
-    pub(super) fn is_of_sensor(self, wheels: f64, body: f64, commanded: &Commanded) -> bool {
-        if self.is_above(wheels, body, commanded) {
+    pub(super) fn is_of_sensor(self, rates: Rates, commanded: &Commanded) -> bool {
+        if self.is_above(rates, commanded) {
             return true;
         }
         let (least, most) = (self.of(commanded.least), self.of(commanded.most));
-        let off = self.off_command(wheels, commanded);
+        let off = self.off_command(rates.wheels, commanded);
         let nearer = match self {
             Self::Turn => NEARER,
             // Forward, nothing makes the body faster than driven wheels.
             Self::Forward => NEARER_FORWARD,
         };
-        off > self.slack(DISOBEYS, least, most) && self.off_command(body, commanded) < nearer * off
+        off > self.slack(DISOBEYS, least, most)
+            && self.off_command(rates.body, commanded) < nearer * off
     }
 
     /// Returns whether wheels measure more than commanded and the body does not follow: saturated
     /// motors and slipping wheels give less than commanded, never more.
-    pub(super) fn is_above(self, wheels: f64, body: f64, commanded: &Commanded) -> bool {
+    pub(super) fn is_above(self, rates: Rates, commanded: &Commanded) -> bool {
+        let Rates { wheels, body } = rates;
         let (least, most) = (self.of(commanded.least), self.of(commanded.most));
         let (most, least) = if wheels < 0.0 {
             (-least, -most)
@@ -117,13 +146,11 @@ impl Axis {
     }
 }
 
-pub(super) fn finding(
-    subject: Subject,
-    kind: Kind,
-    observed: f64,
-    predicted: f64,
-    axis: Axis,
-) -> Finding {
+pub(super) fn finding(subject: Subject, kind: Kind, comparison: Comparison, axis: Axis) -> Finding {
+    let Comparison {
+        observed,
+        predicted,
+    } = comparison;
     Finding {
         subject,
         kind,
@@ -134,7 +161,11 @@ pub(super) fn finding(
 }
 
 /// Returns the type of fault of a channel.
-pub(super) fn kind_of(observed: f64, predicted: f64, is_frozen: bool) -> Kind {
+pub(super) fn kind_of(comparison: Comparison, is_frozen: bool) -> Kind {
+    let Comparison {
+        observed,
+        predicted,
+    } = comparison;
     let (small, large) = if observed.abs() < predicted.abs() {
         (observed.abs(), predicted.abs())
     } else {

@@ -1,12 +1,12 @@
 //! Forward and lateral speed: wheels, odometry over ground, and position fixes.
 
-use super::axis::{Axis, Tolerance, finding, kind_of};
+use super::axis::{Axis, Rates, Tolerance, finding, kind_of};
 use super::wheels::{self, WHEELS, WITNESSED};
 use super::witnesses::{Nearer, Witnesses};
 use super::{BODY, RAISE_FIX_S, RAISE_FROZEN_S, RAISE_SLIP_S, Recent, Verdicts, View};
 use crate::consistency::fixes::Seen;
-use crate::consistency::history::Means;
-use crate::consistency::{Kind, Subject};
+use crate::consistency::history::{Means, Span};
+use crate::consistency::{Comparison, Kind, Subject};
 
 const AXIS: Axis = Axis::Forward;
 /// Tolerated difference of the position to odometry, wheels and command where these three agree.
@@ -40,7 +40,7 @@ pub(super) fn look(
     let mut error_m_s = None;
     // Dead reckoning with a wrong gyro gives no forward direction.
     for seen in view.seen().filter(|_| view.uses.gyro) {
-        let Some(means) = view.history.means(seen.from_s, seen.to_s) else {
+        let Some(means) = view.history.means(seen.span()) else {
             continue;
         };
         is_seen = true;
@@ -57,7 +57,11 @@ pub(super) fn look(
             continue;
         }
         let commanded = view.commanded(seen);
-        let (slack, share) = wheels::slack(view, AXIS, wheels, position, &commanded);
+        let rates = Rates {
+            wheels,
+            body: position,
+        };
+        let (slack, share) = wheels::slack(view, AXIS, rates, &commanded);
         let noise = share * seen.noise_m_s + 0.3 * recent.forward_change;
         if seen.forward_error_m_s.abs() > slack + noise {
             let odometry = means.odometry_m_s.filter(|_| view.uses.odometry);
@@ -67,12 +71,15 @@ pub(super) fn look(
                 // The wheels are right: odometry and fixes are distinguished later.
                 return false;
             }
-            wheels::against_body(view, position, wheels, &commanded, AXIS, verdicts);
+            wheels::against_body(view, rates, &commanded, AXIS, verdicts);
             return false;
         }
-        if is_turn_clean && moves_laterally(seen, &means, position, wheels) {
-            let (subject, left) = (Subject::WheelsAndMotion, seen.left_error_m_s);
-            let found = finding(subject, Kind::Inconsistent, 0.0, left, AXIS);
+        if is_turn_clean && moves_laterally(seen, &means) {
+            let lateral = Comparison {
+                observed: 0.0,
+                predicted: seen.left_error_m_s,
+            };
+            let found = finding(Subject::WheelsAndMotion, Kind::Inconsistent, lateral, AXIS);
             verdicts.contradict(found, RAISE_SLIP_S);
             return false;
         }
@@ -82,13 +89,17 @@ pub(super) fn look(
         return true;
     };
     let (wheels, commanded) = (recent.means.wheels.linear_m_s, &recent.commanded);
-    let (slack, _) = wheels::slack(view, AXIS, wheels, odometry, commanded);
+    let rates = Rates {
+        wheels,
+        body: odometry,
+    };
+    let (slack, _) = wheels::slack(view, AXIS, rates, commanded);
     if (odometry - wheels).abs() <= slack + recent.forward_change {
         return true;
     }
     if AXIS.obeys(wheels, commanded) {
         if view.repeats.odometry.is_frozen() {
-            let found = finding(Subject::Odometry, Kind::Frozen, odometry, wheels, AXIS);
+            let found = finding(Subject::Odometry, Kind::Frozen, rates.of_body(), AXIS);
             verdicts.contradict(found, RAISE_FROZEN_S);
             return false;
         }
@@ -103,7 +114,7 @@ pub(super) fn look(
     if view.is_saturated(recent.means.wheels, commanded) && !is_seconded {
         return false;
     }
-    wheels::against_body(view, odometry, wheels, commanded, AXIS, verdicts);
+    wheels::against_body(view, rates, commanded, AXIS, verdicts);
     false
 }
 
@@ -118,7 +129,10 @@ fn agrees_with_position(
     let wheels = means.wheels.linear_m_s;
     let position = wheels + seen.forward_error_m_s;
     let at = |at_s: f64| {
-        let means = view.history.means(at_s - INSTANT_S, at_s);
+        let means = view.history.means(Span {
+            from_s: at_s - INSTANT_S,
+            to_s: at_s,
+        });
         means.map_or(wheels, |means| means.wheels.linear_m_s)
     };
     let span_s = seen.to_s - seen.from_s;
@@ -164,25 +178,32 @@ fn blame(view: &View<'_>, seen: &Seen, means: &Means, odometry: f64, verdicts: &
         )),
     };
     let repeats = view.repeats;
+    let of_odometry = Comparison {
+        observed: odometry,
+        predicted: position,
+    };
+    let of_position = of_odometry.reversed();
     let found = match witnesses.side() {
         Some(Nearer::First) => {
-            let kind = kind_of(position, odometry, repeats.position.is_frozen());
-            finding(Subject::Position, kind, position, odometry, AXIS)
+            let kind = kind_of(of_position, repeats.position.is_frozen());
+            finding(Subject::Position, kind, of_position, AXIS)
         }
         Some(Nearer::Second) => {
-            let kind = kind_of(odometry, position, repeats.odometry.is_frozen());
-            finding(Subject::Odometry, kind, odometry, position, AXIS)
+            let kind = kind_of(of_odometry, repeats.odometry.is_frozen());
+            finding(Subject::Odometry, kind, of_odometry, AXIS)
         }
         None => {
             let kind = Kind::Inconsistent;
-            finding(Subject::Motion, kind, odometry, position, AXIS)
+            finding(Subject::Motion, kind, of_odometry, AXIS)
         }
     };
     verdicts.contradict(found, RAISE_FIX_S);
 }
 
 /// Returns whether fixes show lateral motion beyond the tolerance.
-fn moves_laterally(seen: &Seen, means: &Means, position_m_s: f64, wheels_m_s: f64) -> bool {
+fn moves_laterally(seen: &Seen, means: &Means) -> bool {
+    let wheels_m_s = means.wheels.linear_m_s;
+    let position_m_s = wheels_m_s + seen.forward_error_m_s;
     let (own_m_s, share, lever_m) = LEFT;
     let speed_m_s = position_m_s.abs().max(wheels_m_s.abs());
     let slack = own_m_s + share * speed_m_s + lever_m * means.gyro_rad_s.abs() + seen.noise_m_s;

@@ -12,7 +12,7 @@ mod wheels;
 mod witnesses;
 
 use super::fixes::{Jump, Seen};
-use super::history::{Commanded, History, Means};
+use super::history::{Commanded, History, Means, Span};
 use super::turn_gain::TurnGain;
 use super::{AllRepeats, Finding, Subject, Track};
 use crate::geometry::Twist;
@@ -112,8 +112,10 @@ impl<'a> View<'a> {
 
     /// Returns the range of commands for a span, including their delay.
     fn commanded(&self, seen: &Seen) -> Commanded {
-        self.history
-            .commanded(seen.from_s - COMMAND_LAG_S, seen.to_s)
+        self.history.commanded(Span {
+            from_s: seen.from_s - COMMAND_LAG_S,
+            to_s: seen.to_s,
+        })
     }
 
     /// Returns whether the motors may be saturated, so that wheels turn less than commanded.
@@ -127,8 +129,7 @@ impl<'a> View<'a> {
     }
 
     fn recent_means(&self) -> Option<Means> {
-        let now_s = self.history.now().at_s;
-        self.history.means(now_s - RECENT_S, now_s)
+        self.history.means(self.history.last(RECENT_S))
     }
 }
 
@@ -208,8 +209,14 @@ impl Recent {
         let now_s = view.history.now().at_s;
         let middle_s = now_s - 0.5 * RECENT_S;
         let halves = (
-            view.history.means(now_s - RECENT_S, middle_s),
-            view.history.means(middle_s, now_s),
+            view.history.means(Span {
+                from_s: now_s - RECENT_S,
+                to_s: middle_s,
+            }),
+            view.history.means(Span {
+                from_s: middle_s,
+                to_s: now_s,
+            }),
         );
         let change = |axis: Axis| match halves {
             (Some(early), Some(late)) => (axis.of(late.wheels) - axis.of(early.wheels)).abs(),
@@ -219,9 +226,10 @@ impl Recent {
             means: view.recent_means()?,
             turn_change: change(Axis::Turn),
             forward_change: change(Axis::Forward),
-            commanded: view
-                .history
-                .commanded(now_s - RECENT_S - COMMAND_LAG_S, now_s),
+            commanded: view.history.commanded(Span {
+                from_s: now_s - RECENT_S - COMMAND_LAG_S,
+                to_s: now_s,
+            }),
         })
     }
 }

@@ -2,7 +2,8 @@
 
 use super::axis::{Axis, finding};
 use super::{RAISE_FROZEN_S, Recent, Verdicts, View};
-use crate::consistency::{Finding, Kind, Subject, Unit};
+use crate::consistency::history::Span;
+use crate::consistency::{Comparison, Finding, Kind, Subject, Unit};
 
 /// Distance and turn during which a constant position is a fault, metres and radians.
 const FROZEN_PATH: (f64, f64) = (0.08, 0.12);
@@ -38,7 +39,10 @@ pub(super) fn frozen(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) 
     let now_s = view.history.now().at_s;
     let from_s = since.as_secs_f64().max(now_s - FROZEN_SPAN_MAX_S);
     let span_s = now_s - from_s;
-    let Some(means) = view.history.means(from_s, now_s) else {
+    let Some(means) = view.history.means(Span {
+        from_s,
+        to_s: now_s,
+    }) else {
         return;
     };
     let path_m = means.wheels.linear_m_s.abs() * span_s;
@@ -60,7 +64,11 @@ pub(super) fn frozen(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) 
         } else {
             (means.gyro_rad_s, Axis::Turn)
         };
-        let finding = finding(Subject::Position, Kind::Frozen, 0.0, predicted, axis);
+        let comparison = Comparison {
+            observed: 0.0,
+            predicted,
+        };
+        let finding = finding(Subject::Position, Kind::Frozen, comparison, axis);
         verdicts.contradict(finding, RAISE_FROZEN_S);
     }
 }

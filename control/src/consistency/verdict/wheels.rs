@@ -1,9 +1,9 @@
 //! Wheels that contradict the body: faulty sensor, slip, or a locked side.
 
-use super::axis::{Axis, NEARER, Tolerance, finding, kind_of};
+use super::axis::{Axis, NEARER, Rates, Tolerance, finding, kind_of};
 use super::{RAISE_FAST_S, RAISE_FROZEN_S, RAISE_SLIP_S, Recent, Verdicts, View};
-use crate::consistency::history::Commanded;
-use crate::consistency::{Finding, Kind, Subject, Unit};
+use crate::consistency::history::{Commanded, Span};
+use crate::consistency::{Comparison, Finding, Kind, Subject, Unit};
 use crate::geometry::Twist;
 use crate::measured::WheelSpeeds;
 
@@ -64,7 +64,11 @@ pub(super) fn frozen_base(view: &View<'_>, recent: &Recent, verdicts: &mut Verdi
         if !axis.obeys(wheels, commanded) {
             let (least, most) = (axis.of(commanded.least), axis.of(commanded.most));
             let predicted = if wheels < least { least } else { most };
-            let found = finding(Subject::Wheels, Kind::Frozen, wheels, predicted, axis);
+            let comparison = Comparison {
+                observed: wheels,
+                predicted,
+            };
+            let found = finding(Subject::Wheels, Kind::Frozen, comparison, axis);
             verdicts.contradict(found, RAISE_FAST_S);
             return;
         }
@@ -76,13 +80,13 @@ pub(super) fn frozen_base(view: &View<'_>, recent: &Recent, verdicts: &mut Verdi
 pub(super) fn slack(
     view: &View<'_>,
     axis: Axis,
-    wheels: f64,
-    body: f64,
+    rates: Rates,
     commanded: &Commanded,
 ) -> (f64, f64) {
-    if axis.is_above(wheels, body, commanded) {
+    let Rates { wheels, body } = rates;
+    if axis.is_above(rates, commanded) {
         (axis.slack(ABOVE, wheels, body), ABOVE_NOISE_RATIO)
-    } else if axis.is_of_sensor(wheels, body, commanded) || is_held(view, axis) {
+    } else if axis.is_of_sensor(rates, commanded) || is_held(view, axis) {
         (axis.slack(WITNESSED, wheels, body), SENSOR_NOISE_RATIO)
     } else {
         (axis.slack(WHEELS, wheels, body), 1.0)
@@ -97,7 +101,10 @@ fn is_held(view: &View<'_>, axis: Axis) -> bool {
         return false;
     };
     let history = view.history;
-    let commanded = history.commanded(since.as_secs_f64(), history.now().at_s - HELD_LAG_S);
+    let commanded = history.commanded(Span {
+        from_s: since.as_secs_f64(),
+        to_s: history.now().at_s - HELD_LAG_S,
+    });
     let (least, most) = (axis.of(commanded.least), axis.of(commanded.most));
     let is_at_rest = view
         .recent_means()
@@ -121,8 +128,7 @@ fn sensor_raise_s(view: &View<'_>) -> f64 {
 /// Records wheels that contradict the body as a faulty sensor or as slip.
 pub(super) fn against_body(
     view: &View<'_>,
-    body: f64,
-    wheels: f64,
+    rates: Rates,
     commanded: &Commanded,
     axis: Axis,
     verdicts: &mut Verdicts,
@@ -132,18 +138,19 @@ pub(super) fn against_body(
     let most_rad_s = (commanded.least.angular_rad_s.abs()).max(commanded.most.angular_rad_s.abs());
     let is_saturated = axis == Axis::Turn
         && !is_frozen
-        && wheels.abs() < most_rad_s
+        && rates.wheels.abs() < most_rad_s
         && view
             .recent_means()
             .is_some_and(|recent| view.is_saturated(recent.wheels, commanded));
-    let kind = kind_of(wheels, body, is_frozen);
-    let is_of_sensor = axis.is_of_sensor(wheels, body, commanded) && !is_saturated;
+    let comparison = rates.of_wheels();
+    let kind = kind_of(comparison, is_frozen);
+    let is_of_sensor = axis.is_of_sensor(rates, commanded) && !is_saturated;
     if is_of_sensor || is_held(view, axis) {
-        let found = finding(Subject::Wheels, kind, wheels, body, axis);
+        let found = finding(Subject::Wheels, kind, comparison, axis);
         verdicts.contradict(found, sensor_raise_s(view));
     } else {
         let subject = Subject::WheelsAndMotion;
-        let found = finding(subject, Kind::Inconsistent, wheels, body, axis);
+        let found = finding(subject, Kind::Inconsistent, comparison, axis);
         verdicts.contradict(found, RAISE_SLIP_S);
     }
 }
@@ -153,13 +160,14 @@ pub(super) fn against_body(
 pub(super) fn locked(view: &View<'_>, verdicts: &mut Verdicts) {
     let model = view.model;
     let now_s = view.history.now().at_s;
-    let Some(means) = view.history.means(now_s - LOCKED_SPAN_S, now_s) else {
+    let Some(means) = view.history.means(view.history.last(LOCKED_SPAN_S)) else {
         return;
     };
     let measured = model.wheel_speeds_from_twist(means.wheels);
-    let commanded = view
-        .history
-        .commanded(now_s - LOCKED_SPAN_S - LOCKED_LAG_S, now_s);
+    let commanded = view.history.commanded(Span {
+        from_s: now_s - LOCKED_SPAN_S - LOCKED_LAG_S,
+        to_s: now_s,
+    });
     let sides = |of: fn(WheelSpeeds) -> f64| {
         // The slowest command of this side over the ranges of forward speed and turn rate.
         let corner = |linear: Twist, angular: Twist| Twist {
@@ -220,7 +228,13 @@ pub(super) fn locked(view: &View<'_>, verdicts: &mut Verdicts) {
                 let is_frozen = view.repeats.wheels.is_frozen();
                 let found = Finding {
                     subject: Subject::Wheels,
-                    kind: kind_of(measured, commanded, is_frozen),
+                    kind: kind_of(
+                        Comparison {
+                            observed: measured,
+                            predicted: commanded,
+                        },
+                        is_frozen,
+                    ),
                     ..finding
                 };
                 verdicts.contradict(found, sensor_raise_s(view));
