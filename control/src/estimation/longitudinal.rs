@@ -52,8 +52,8 @@ struct Step {
     samples: f64,
     usable: f64,
     rim_m_s: f64,
-    /// Speed of the faster rim, whichever way it turns, summed.
-    fastest_m_s: f64,
+    /// Speeds of the left and the right rim, summed.
+    sides_m_s: [f64; 2],
     wheels_m_s: f64,
     harmonic_m_s: f64,
     force_m_s: f64,
@@ -143,7 +143,8 @@ impl LongitudinalFilter {
         let radius_m = model.wheel_radius_m();
         let wheels = sample.wheel_speeds;
         step.rim_m_s += 0.5 * radius_m * (wheels.left_rad_s + wheels.right_rad_s);
-        step.fastest_m_s += radius_m * wheels.magnitude_max_rad_s();
+        step.sides_m_s[0] += radius_m * wheels.left_rad_s;
+        step.sides_m_s[1] += radius_m * wheels.right_rad_s;
         step.samples += 1.0;
         if let Some(rims) = signed_rims(sample, model) {
             let inverse = 0.5 * (rims.left_m_s.recip() + rims.right_m_s.recip());
@@ -182,8 +183,9 @@ impl LongitudinalFilter {
         let mut rows: Rows = [None; 3];
         let gained_m_s2 = forward_m_s2 - std::mem::replace(&mut self.last_ahead_m_s2, forward_m_s2);
         // On the spot the rims turn against each other, and their mean is zero.
+        let [left_m_s, right_m_s] = step.sides_m_s.map(|sum| (sum / count).abs());
         let is_standing =
-            step.fastest_m_s / count < STANDING_M_S && gyro_rad_s.abs() < STANDING_RAD_S;
+            left_m_s.max(right_m_s) < STANDING_M_S && gyro_rad_s.abs() < STANDING_RAD_S;
         self.standing = if is_standing { self.standing + 1 } else { 0 };
         if step.usable >= count {
             rows[0] = self.wheels(

@@ -399,7 +399,9 @@ impl Estimator {
                 .hypot(uncertainty.mass_ratio)
                 .max(SCALE_STD_DEV_MIN),
         };
-        let Some(apparent) = self.apparent_mass.value() else {
+        // A robot whose mass is exact is as its model says.
+        let apparent = self.apparent_mass.value();
+        let Some(apparent) = apparent.filter(|_| uncertainty.mass_ratio > 0.0) else {
             return known;
         };
         let std_dev = apparent

@@ -40,6 +40,7 @@ pub(super) struct EstimationFile {
     pub(super) tyre_relaxation_std_dev_m: Option<f64>,
     pub(super) rotor_ratio: Option<f64>,
     pub(super) rotor_std_dev_ratio: Option<f64>,
+    pub(super) load_difference_std_dev: Option<f64>,
     pub(super) payload_ratio: Option<f64>,
 }
 
