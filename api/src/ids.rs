@@ -199,9 +199,18 @@ uuid_id! {
     PlanHash
 }
 
+/// Whom an OpenID provider names: its issuer, and the subject there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct OidcSubject<'text> {
+    /// The provider's issuer.
+    pub issuer: &'text str,
+    /// The subject at that provider.
+    pub subject: &'text str,
+}
+
 impl PersonId {
     /// Returns the identifier of the person with this subject at the provider with this issuer.
-    pub fn of(issuer: &str, subject: &str) -> Self {
+    pub fn of(OidcSubject { issuer, subject }: OidcSubject<'_>) -> Self {
         // The length makes the name of every pair of issuer and subject unique.
         let name = format!("person {} {issuer} {subject}", issuer.len());
         Self(Uuid::new_v5(&DERIVED_NAMESPACE, name.as_bytes()))
@@ -237,15 +246,16 @@ mod tests {
 
     #[test]
     fn a_person_is_an_issuer_and_a_subject_there() {
-        let anna = PersonId::of("https://login.test", "anna");
-        assert_eq!(anna, PersonId::of("https://login.test", "anna"));
+        let person = |issuer, subject| PersonId::of(OidcSubject { issuer, subject });
+        let anna = person("https://login.test", "anna");
+        assert_eq!(anna, person("https://login.test", "anna"));
         for (issuer, subject) in [
             ("https://login.test", "bert"),
             ("https://login.test/", "anna"),
             ("https://login.test anna", ""),
             ("https://login.tes", "t anna"),
         ] {
-            assert_ne!(anna, PersonId::of(issuer, subject), "{issuer} {subject}");
+            assert_ne!(anna, person(issuer, subject), "{issuer} {subject}");
         }
     }
 

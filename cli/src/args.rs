@@ -16,6 +16,7 @@ use std::time::Duration;
 use clap::{ArgMatches, Args, CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 use clap_complete::Shell;
 use tread_api::ids::{RobotId, SiteId};
+use tread_server::config::SITE_DEFAULT;
 
 use self::identity::Showing;
 pub(crate) use self::identity::{
@@ -40,11 +41,9 @@ pub(crate) use self::values::{shield_negative_points, waypoint};
 use crate::exit::Exit;
 use crate::output::{failure, note};
 
-/// Default of `--server`, the address on which a server listens by default.
+/// Where a server answers, unless configured otherwise.
 pub(crate) const SERVER_DEFAULT: &str = "http://127.0.0.1:8420";
-/// Default of `--site`, the site that a server creates at its first start.
-pub(crate) const SITE_DEFAULT: &str = "yard";
-/// Maximum number of robots of a demo; each of them is a process.
+/// Most robots of a demo; each is a process of its own.
 const DEMO_ROBOTS_MAX: i64 = 50;
 
 /// Runs fleets of skid-steered robots and maps the friction of the ground while they drive.

@@ -1,35 +1,36 @@
-//! A bounded variation of the speed along a path, so that a base without torque sensing can measure θ.
+//! Excitation: a bounded variation of speed along a path, so that a base without torque sensing can
+//! measure θ.
 //!
-//! Friction shows only where something accelerates. The plan's time is run through at the pace
-//! `w(t) = 1 − ½A(1 − cos Ωt)`, so `τ(t) = (1 − ½A)t + (A/2Ω) sin Ωt`: the speed falls to `1 − A` of
-//! the plan's and comes back, and never exceeds it. The path stays the path.
+//! Friction is observable only under acceleration. The plan's time τ advances at the rate
+//! `w(t) = 1 − ½A(1 − cos Ωt)`, so `τ(t) = (1 − ½A)t + (A/2Ω) sin Ωt`: the speed varies between
+//! `1 − A` and 1 times the plan's speed. The path is unchanged.
 
 use std::f64::consts::TAU;
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Deepest excitation, share of the speed.
+/// Maximum depth A, as a fraction of the speed.
 pub const DEPTH_MAX: f64 = 0.8;
-/// Shortest period, seconds.
+/// Minimum period, seconds.
 pub const PERIOD_MIN_S: f64 = 1.0;
-/// Longest period, seconds.
+/// Maximum period, seconds.
 pub const PERIOD_MAX_S: f64 = 20.0;
-/// Share of the acceleration limit that an excitation may take.
+/// Fraction of the acceleration limit that an excitation may use.
 const ACCELERATION_SHARE: f64 = 0.5;
-/// Share of the jerk limit that the excitation alone may take.
+/// Fraction of the jerk limit that the excitation alone may use.
 const JERK_SHARE: f64 = 0.35;
-/// Share of the jerk limit that its product with the plan's acceleration may take.
+/// Fraction of the jerk limit that the product of excitation and plan acceleration may use.
 const CROSS_JERK_SHARE: f64 = 0.25;
-/// Steps of the search for the time at which the plan's own time is reached.
+/// Number of bisection steps in inverting τ(t).
 const BISECTIONS: u32 = 80;
 
-/// What was asked for.
+/// Requested excitation, not yet checked.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ExcitationSpec {
-    /// By which share the speed falls at most, above 0, at most [`DEPTH_MAX`].
+    /// Depth A: maximum reduction of the speed as a fraction of it, above 0, at most [`DEPTH_MAX`].
     pub depth_ratio: f64,
-    /// Time from one slowing down to the next, [`PERIOD_MIN_S`] to [`PERIOD_MAX_S`], seconds.
+    /// Period 2π/Ω, [`PERIOD_MIN_S`] to [`PERIOD_MAX_S`], seconds.
     pub period_s: f64,
 }
 
@@ -42,48 +43,51 @@ impl Default for ExcitationSpec {
     }
 }
 
-/// Why an excitation was refused.
+/// Parameter of an excitation that is out of its range.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum ExcitationError {
-    /// The depth is not above zero, or too deep.
+    /// The depth is not above zero, or above [`DEPTH_MAX`].
     #[error("`depth_ratio` must be above 0 and at most {DEPTH_MAX}, not {0}")]
     Depth(f64),
-    /// The period is out of its range.
+    /// The period is outside [`PERIOD_MIN_S`] to [`PERIOD_MAX_S`].
     #[error("`period_s` must be between {PERIOD_MIN_S} and {PERIOD_MAX_S}, not {0}")]
     Period(f64),
 }
 
-/// What a robot's limits leave for an excitation.
+/// Limits of plan and robot that bound an excitation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Room {
-    /// Fastest speed of the plan, metres per second.
+    /// Maximum speed of the plan, metres per second.
     pub(crate) speed_m_s: f64,
-    /// Lowest acceleration limit along the path, metres per second squared.
+    /// Minimum of the acceleration limit along the path, metres per second squared.
     pub(crate) acceleration_m_s2: f64,
     /// Jerk limit, metres per second cubed.
     pub(crate) jerk_m_s3: f64,
 }
 
-/// A checked excitation, as deep as the limits let it be.
+/// Checked excitation, with its depth reduced to what the limits allow.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Excitation {
     depth: f64,
     rate_rad_s: f64,
 }
 
-/// Plan time and its pace at a time.
+/// Plan time and its derivatives at one time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Warp {
-    /// τ, seconds of the plan.
+    /// τ, plan seconds.
     pub(crate) plan_s: f64,
-    /// w, seconds of the plan per second.
+    /// w = dτ/dt, plan seconds per second.
     pub(crate) pace: f64,
     /// ẇ, per second.
     pub(crate) pace_rate_1_s: f64,
 }
 
 impl Excitation {
-    /// Checks an excitation and lessens its depth to what the limits leave.
+    /// Checks an excitation and reduces its depth to what the limits allow.
+    ///
+    /// # Errors
+    /// [`ExcitationError`] if depth or period is out of its range.
     pub(crate) fn within(spec: ExcitationSpec, room: Room) -> Result<Self, ExcitationError> {
         if !(spec.depth_ratio > 0.0 && spec.depth_ratio <= DEPTH_MAX) {
             return Err(ExcitationError::Depth(spec.depth_ratio));
@@ -103,27 +107,28 @@ impl Excitation {
         })
     }
 
-    /// Share by which the speed falls at most.
+    /// Returns the depth A after reduction, as a fraction of the speed.
     pub fn depth_ratio(&self) -> f64 {
         self.depth
     }
 
-    /// Period, seconds.
+    /// Returns the period, seconds.
     pub fn period_s(&self) -> f64 {
         TAU / self.rate_rad_s
     }
 
-    /// Hardest acceleration by the excitation alone at a speed, metres per second squared.
+    /// Returns the maximum acceleration of the excitation alone at a plan speed, `½AΩv`, metres per
+    /// second squared.
     pub fn acceleration_m_s2(&self, speed_m_s: f64) -> f64 {
         0.5 * self.depth * self.rate_rad_s * speed_m_s
     }
 
-    /// Share of the jerk limit that is left for the plan.
+    /// Returns the fraction of the jerk limit that is left for the plan.
     pub(crate) fn jerk_left_ratio() -> f64 {
         1.0 - JERK_SHARE - CROSS_JERK_SHARE
     }
 
-    /// Where the plan is at a time, seconds.
+    /// Returns τ, w and ẇ at a time since the start, seconds.
     pub(crate) fn warp(&self, time_s: f64) -> Warp {
         let (sin, cos) = (self.rate_rad_s * time_s).sin_cos();
         Warp {
@@ -133,7 +138,7 @@ impl Excitation {
         }
     }
 
-    /// When the plan's own time is reached, seconds.
+    /// Returns the time t at which τ(t) = `plan_s`, seconds.
     pub(crate) fn time_s(&self, plan_s: f64) -> f64 {
         let (mut early_s, mut late_s) = (0.0, plan_s / (1.0 - self.depth));
         for _ in 0..BISECTIONS {

@@ -1,12 +1,12 @@
-//! One mission on one robot: plan, governor and tracking law together.
+//! Execution of one mission on one robot: plan, governor and tracking law.
 //!
 //! ```text
 //! Approach ─► Tracking ─► Settling ─► Done
-//!     └──────────┴─ stop ─► Stopping ─► Stopped
-//! any of the moving ones ─► Failed(reason)
+//!     └──────────┴───────────┴─ stop ─► Stopping ─► Stopped
+//! any state that is not final ─► Failed(reason)
 //! ```
-//! `Approach` first turns on the spot where the path leaves in another direction, then drives the
-//! leg to the trajectory. The last four states are final and command rest.
+//! `Approach` first turns on the spot where the path starts in another direction, then drives the
+//! leg to the trajectory. `Done`, `Stopped` and `Failed` are final and command zero wheel speeds.
 
 use crate::geometry::{Twist, wrap_angle_rad};
 use crate::measured::{Measured, WheelSpeeds};
@@ -19,43 +19,44 @@ use crate::tracking::{
     ThetaKnowledge, Tracker, TrackerConfig, TrackerError, TrackingErrors, desaturated,
 };
 
-/// Turn on the spot when the path leaves by more than this from the robot's heading, radians.
+/// Heading error to the path's start above which the robot turns on the spot, radians.
 const ALIGN_FROM_RAD: f64 = 0.12;
-/// A turn on the spot ends within this angle, radians.
+/// Heading error at which a turn on the spot ends, radians.
 const ALIGNED_RAD: f64 = 0.04;
-/// A turn on the spot ends below this turn rate, radians per second.
+/// Turn rate below which a turn on the spot may end, radians per second.
 const ALIGNED_RATE_RAD_S: f64 = 0.08;
 /// Gain from heading error to turn rate on the spot, per second.
 const ALIGN_GAIN_1_S: f64 = 2.0;
-/// Share of the turn-rate limit used on the spot.
+/// Fraction of the turn rate limit used on the spot.
 const ALIGN_SHARE: f64 = 0.4;
-/// Fastest change of the turn rate on the spot, radians per second squared.
+/// Maximum angular acceleration on the spot, radians per second squared.
 const ALIGN_ACCELERATION_RAD_S2: f64 = 2.0;
-/// Longest turn on the spot, seconds.
+/// Maximum duration of a turn on the spot, seconds; longer fails the mission.
 const ALIGN_MAX_S: f64 = 30.0;
 
 /// Tolerances and bounds of one mission.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FollowerConfig {
-    /// Gains of the law.
+    /// Gains and bounds of the tracking law.
     pub tracker: TrackerConfig,
-    /// Distance from the path's end that counts as there, metres.
+    /// Distance to the reference below which the path's end counts as reached, metres.
     pub end_tolerance_m: f64,
-    /// Speed that counts as standing, metres per second.
+    /// Speed below which the robot counts as stopped, metres per second.
     pub rest_speed_m_s: f64,
-    /// How long the robot must be there and stand, seconds.
+    /// Time for which the robot must be at the end and stopped, seconds.
     pub settle_hold_s: f64,
-    /// Longest time to settle, seconds.
+    /// Maximum time for that, seconds; longer fails the mission. Also bounds the wait for zero
+    /// speed after a stop.
     pub settle_max_s: f64,
-    /// Cross-track error that fails the mission when it lasts, metres.
+    /// Cross-track error above which the mission fails if it lasts, metres.
     pub cross_track_max_m: f64,
-    /// How long it must last, seconds.
+    /// Time for which the cross-track error must last to fail the mission, seconds.
     pub cross_track_max_for_s: f64,
-    /// What counts as no progress.
+    /// Bounds beyond which a robot without progress fails the mission.
     pub progress: ProgressBounds,
-    /// Age of the pose at which the robot waits, seconds.
+    /// Pose age above which the reference pauses, seconds.
     pub pose_age_hold_s: f64,
-    /// Age of the pose that fails the mission, seconds.
+    /// Pose age above which the mission fails, seconds.
     pub pose_age_max_s: f64,
 }
 
@@ -80,24 +81,24 @@ impl Default for FollowerConfig {
     }
 }
 
-/// Why a mission failed on the robot.
+/// Reason why a mission failed on the robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FailureReason {
     /// The cross-track error was too large for too long.
     LeftPath,
-    /// The robot did not come to rest at the path's end in time.
+    /// The robot did not stop at the path's end in time.
     NotSettled,
-    /// The robot could not turn to the path's direction in time.
+    /// The robot did not turn to the path's start heading in time.
     NotAligned,
-    /// The robot made no progress although it should.
+    /// The robot made no progress although it was allowed to drive.
     Stuck,
-    /// No usable pose for too long.
+    /// There was no usable pose for too long.
     PoseLost,
 }
 
 impl FailureReason {
-    /// A sentence part for people.
+    /// Returns a clause to display.
     pub fn text(self) -> &'static str {
         match self {
             Self::LeftPath => "the robot left its path",
@@ -109,60 +110,60 @@ impl FailureReason {
     }
 }
 
-/// Where a mission is.
+/// State of a mission.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum FollowerStatus {
     /// On the approach to the trajectory.
     Approach,
     /// On the trajectory.
     Tracking,
-    /// At its end, coming to rest.
+    /// At the trajectory's end, stopping.
     Settling,
-    /// At its end, at rest. Final.
+    /// At the trajectory's end, stopped. Final.
     Done,
     /// Braking along the path after a stop.
     Stopping,
-    /// At rest after a stop. Final.
+    /// Stopped after a stop. Final.
     Stopped,
-    /// Given up. Final.
+    /// Failed. Final.
     Failed(FailureReason),
 }
 
 impl FollowerStatus {
-    /// Whether nothing will change any more.
+    /// Returns whether the state is final.
     pub fn is_final(self) -> bool {
         matches!(self, Self::Done | Self::Stopped | Self::Failed(_))
     }
 }
 
-/// What one tick gives.
+/// Output of one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FollowerOutput {
-    /// Wheel speeds to command; still to pass the gate.
+    /// Wheel speeds to command, before the gate.
     pub wheel_speeds: WheelSpeeds,
-    /// The twist behind them.
+    /// Twist of these wheel speeds.
     pub twist: Twist,
-    /// Where the mission is.
+    /// State of the mission.
     pub status: FollowerStatus,
-    /// Arc length of the reference, metres; never falls.
+    /// Arc length of the reference, metres; never decreases.
     pub progress_m: f64,
-    /// Length of the whole path, metres.
+    /// Length of the path including the approach, metres.
     pub length_m: f64,
-    /// The plan's time that is left, seconds.
+    /// Remaining plan time, seconds.
     pub remaining_s: f64,
-    /// Errors in the frame of the reference.
+    /// Tracking errors in the frame of the reference.
     pub errors: TrackingErrors,
-    /// Where the robot should be.
+    /// Desired pose and motion.
     pub reference: ReferenceSample,
-    /// θ̂ in the loop; never a measurement.
+    /// Adapted θ̂; not a measurement of θ.
     pub theta_loop: f64,
-    /// Weight of friction feed-forward, 0 to 1.
+    /// Confidence in the known θ, 0 to 1; 0 without one, and while not driving.
     pub confidence: f64,
-    /// Whether the wheel limits cut the command.
+    /// Whether the wheel speed limit cut the command.
     pub saturated: bool,
 }
 
-/// One mission.
+/// Controller of one mission.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Follower {
     plan: Plan,
@@ -170,7 +171,7 @@ pub struct Follower {
     config: FollowerConfig,
     governor: Governor,
     tracker: Tracker,
-    /// On the approach to a trajectory whose ground is unknown.
+    /// Slide detector; only on an approach over ground of unknown friction.
     sliding: Option<Sliding>,
     status: FollowerStatus,
     aligning: bool,
@@ -181,7 +182,7 @@ pub struct Follower {
     monitor: ProgressMonitor,
     is_stuck: bool,
     best_arc_m: f64,
-    /// Paused, or slowed to nothing, by the operator.
+    /// Fraction of the plan's speed set by the operator; 0 pauses.
     rate_cap: f64,
     invalid_s: f64,
     last_errors: TrackingErrors,
@@ -189,7 +190,7 @@ pub struct Follower {
 }
 
 impl Follower {
-    /// A mission that has not moved yet.
+    /// Creates a mission in its initial state.
     ///
     /// # Errors
     /// [`TrackerError`] names a gain that is out of its range.
@@ -230,27 +231,27 @@ impl Follower {
         })
     }
 
-    /// The plan that is driven.
+    /// Returns the plan.
     pub fn plan(&self) -> &Plan {
         &self.plan
     }
 
-    /// What walks along the plan.
+    /// Returns the governor, which advances the reference along the plan.
     pub fn governor(&self) -> &Governor {
         &self.governor
     }
 
-    /// Where the mission is.
+    /// Returns the state of the mission.
     pub fn status(&self) -> FollowerStatus {
         self.status
     }
 
-    /// Starts with what a map or an earlier run knows about θ, at full weight.
+    /// Sets θ̂ at once to a known θ times its confidence, see [`Tracker::warm_start`].
     pub fn warm_start(&mut self, knowledge: ThetaKnowledge) {
         self.tracker.warm_start(knowledge);
     }
 
-    /// Brakes to rest along the path, for good.
+    /// Brakes to zero speed along the path and ends the mission; cannot be revoked.
     pub fn stop(&mut self) {
         if !self.status.is_final() {
             self.governor.stop();
@@ -258,7 +259,8 @@ impl Follower {
         }
     }
 
-    /// Limits the pace to a share of the plan's, 0 to 1; 0 pauses, 1 resumes fully.
+    /// Limits the speed to a fraction of the plan's, clamped to 0 to 1: 0 pauses, 1 resumes fully.
+    /// A non-finite value pauses.
     pub fn set_pace(&mut self, share: f64) {
         self.rate_cap = if share.is_finite() {
             share.clamp(0.0, 1.0)
@@ -267,22 +269,23 @@ impl Follower {
         };
     }
 
-    /// Limits the speed along the path, metres per second; none lifts the limit.
+    /// Sets the maximum speed along the path, metres per second; None removes the limit.
     pub fn set_speed_limit(&mut self, limit_m_s: Option<f64>) {
         self.governor.set_speed_limit(limit_m_s);
     }
 
-    /// Tells the mission what the base was commanded last, where that is not what it gave itself.
+    /// Sets the last command to the base if it differs from this mission's own.
     pub fn set_commanded(&mut self, commanded: WheelSpeeds) {
         self.tracker.set_commanded(commanded);
     }
 
-    /// Holds θ̂ and the integral, for instance while something else cuts the command.
+    /// Holds θ̂, χ̂ and the integral, for instance while another stage reduces the command.
     pub fn hold_adaptation(&mut self, held: bool) {
         self.tracker.hold_adaptation(held);
     }
 
-    /// One tick.
+    /// Computes the command of one tick of `dt_s` seconds. An invalid `dt_s` or a final state gives
+    /// zero wheel speeds.
     pub fn step(
         &mut self,
         measured: &Measured,
@@ -349,7 +352,7 @@ impl Follower {
         }
     }
 
-    /// Turns on the spot; none once the robot points along the path.
+    /// Turns on the spot; None once the robot's heading is along the path.
     fn align(&mut self, measured: &Measured, dt_s: f64) -> Option<FollowerOutput> {
         let error_rad = wrap_angle_rad(self.plan.start_heading_rad() - measured.pose.heading_rad);
         let started = self.align_rate_rad_s.abs() > 0.0;
@@ -396,7 +399,7 @@ impl Follower {
         })
     }
 
-    /// Looks whether the robot itself gets on along its path.
+    /// Checks whether the robot itself makes progress along its path.
     fn watch_progress(&mut self, reference: &ReferenceSample, commanded_m_s: f64, dt_s: f64) {
         let tick = ProgressTick {
             robot_m: reference.arc_m - self.last_errors.along_track_m,
@@ -408,7 +411,7 @@ impl Follower {
         self.is_stuck = self.monitor.step(&tick, &self.config.progress);
     }
 
-    /// Moves the state on after a tick of driving.
+    /// Updates the state after a tick of driving.
     fn advance(&mut self, reference: &ReferenceSample, measured: &Measured, dt_s: f64) {
         let config = self.config;
         let far = self.last_errors.cross_track_m.abs() > config.cross_track_max_m;
@@ -444,7 +447,7 @@ impl Follower {
             FollowerStatus::Stopping => {
                 let rests = self.governor.is_stopped(&self.plan);
                 self.hold_s = if rests { self.hold_s + dt_s } else { 0.0 };
-                // A robot that does not stand in time is brought to rest by the gate's ramp.
+                // The gate stops a robot that does not stop in time.
                 if (self.hold_s > 0.0 && standing) || self.hold_s > config.settle_max_s {
                     self.enter(FollowerStatus::Stopped);
                 }
@@ -465,14 +468,14 @@ impl Follower {
         }
     }
 
-    /// The present state with a command of rest.
+    /// Returns the present state with zero wheel speeds.
     fn at_rest(&self) -> FollowerOutput {
         let reference = self.governor.sample(&self.plan);
         FollowerOutput {
             wheel_speeds: WheelSpeeds::default(),
             twist: Twist::default(),
             status: self.status,
-            // Rounding may take the reference back by a last digit.
+            // Rounding may reduce the reference's arc length in its last digit.
             progress_m: reference.arc_m.max(self.best_arc_m),
             length_m: self.plan.length_m(),
             remaining_s: (self.plan.duration_s() - self.governor.clock_s()).max(0.0),

@@ -1,40 +1,40 @@
-//! The ground's friction: friction coefficient over slip, equations (7) to (9) of the paper.
+//! Friction coefficient μ of the ground over slip λ, equations (7) to (9) of the paper.
 //!
 //! `μ(λ) = K (σ₁(λ) + σ₂(λ) λ)` for λ ≥ 0: rises with slope K up to the peak at `λ_m`, then falls
-//! in a straight line to the share α of the peak at λ = 1. θ = 1/K is the slip compliance.
+//! linearly to the fraction α of the peak at λ = 1. θ = 1/K is the slip compliance.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Slip up to which friction is assumed to grow in proportion to it.
+/// Slip up to which friction is assumed proportional to slip (`λ_m` of the paper).
 pub const SLIP_LINEAR: f64 = 0.2;
 
-/// The three figures of a friction curve, not yet checked.
+/// The three parameters of a friction curve, not yet checked.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct FrictionSpec {
-    /// Slope K of the rising part, above zero.
+    /// Friction stiffness K: slope at zero slip, finite and above 0.
     pub stiffness: f64,
     /// Slip `λ_m` at the peak, above 0 and below 1.
     pub peak_slip: f64,
-    /// Share α of the peak that is left at full sliding, 0 to 1.
+    /// Ratio α of friction at full sliding (λ = 1) to peak friction, 0 to 1.
     pub sliding_ratio: f64,
 }
 
-/// Why a friction curve was refused.
+/// Parameter of a friction curve that is out of its range.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum FrictionError {
-    /// K is not a finite number above zero.
+    /// K is not finite or not above zero.
     #[error("`stiffness` must be finite and above zero, not {0}")]
     Stiffness(f64),
     /// `λ_m` is not strictly between 0 and 1.
     #[error("`peak_slip` must be above 0 and below 1, not {0}")]
     PeakSlip(f64),
-    /// α is not between 0 and 1.
+    /// α is not within 0 to 1.
     #[error("`sliding_ratio` must be between 0 and 1, not {0}")]
     SlidingRatio(f64),
 }
 
-/// A checked friction curve (7).
+/// Friction curve μ(λ) of (7) with checked parameters.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "FrictionSpec", into = "FrictionSpec")]
 pub struct FrictionCurve {
@@ -65,7 +65,7 @@ impl From<FrictionCurve> for FrictionSpec {
 }
 
 impl FrictionCurve {
-    /// The paper's shape, `λ_m` = 0.2 and α = 0.8, of stiffness 1.
+    /// Returns the paper's shape, `λ_m` = 0.2 and α = 0.8, with K = 1.
     pub fn yi2007() -> Self {
         Self {
             spec: FrictionSpec {
@@ -76,7 +76,10 @@ impl FrictionCurve {
         }
     }
 
-    /// A curve of stiffness K with the paper's shape.
+    /// Returns a curve of stiffness K with the paper's `λ_m` and α.
+    ///
+    /// # Errors
+    /// [`FrictionError::Stiffness`] if K is not finite or not above zero.
     #[cfg(any(test, feature = "testing"))]
     pub fn with_stiffness(stiffness: f64) -> Result<Self, FrictionError> {
         FrictionSpec {
@@ -86,37 +89,37 @@ impl FrictionCurve {
         .try_into()
     }
 
-    /// K, the slope of the rising part.
+    /// Returns the friction stiffness K, the slope at zero slip.
     pub fn stiffness(&self) -> f64 {
         self.spec.stiffness
     }
 
-    /// θ = 1/K, the slip compliance.
+    /// Returns the slip compliance θ = 1/K.
     pub fn theta(&self) -> f64 {
         self.spec.stiffness.recip()
     }
 
-    /// `λ_m`, the slip at the peak.
+    /// Returns the slip `λ_m` at peak friction.
     pub fn peak_slip(&self) -> f64 {
         self.spec.peak_slip
     }
 
-    /// α, the share of the peak left at full sliding.
+    /// Returns the ratio α of friction at full sliding to peak friction.
     pub fn sliding_ratio(&self) -> f64 {
         self.spec.sliding_ratio
     }
 
-    /// `μ_p = K λ_m`, the largest friction coefficient.
+    /// Returns the peak friction coefficient `μ_p = K λ_m`.
     pub fn mu_peak(&self) -> f64 {
         self.spec.stiffness * self.spec.peak_slip
     }
 
-    /// Friction coefficient at a slip, odd in it; slips beyond 1 slide as at 1.
+    /// Returns the friction coefficient at a slip: an odd function, constant beyond a slip of ±1.
     pub fn mu(&self, slip: f64) -> f64 {
         (self.mu_over_slip(slip.abs()) * slip).clamp(-self.mu_peak(), self.mu_peak())
     }
 
-    /// `μ(|σ|)/|σ|` for a slip magnitude ≥ 0, regular at zero where it is K.
+    /// Returns `μ(|σ|)/|σ|` for a slip magnitude ≥ 0; equals K below `λ_m`, also at zero.
     pub fn mu_over_slip(&self, slip_magnitude: f64) -> f64 {
         let FrictionSpec {
             stiffness,

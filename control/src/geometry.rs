@@ -4,7 +4,7 @@ use std::f64::consts::{PI, TAU};
 
 use serde::{Deserialize, Serialize};
 
-/// A point of the site's frame.
+/// Point in the site frame; in [`Pose::body_from_site`] also in the body frame.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Point {
     /// East-like coordinate, metres.
@@ -14,35 +14,36 @@ pub struct Point {
 }
 
 impl Point {
-    /// Distance to another point, metres.
+    /// Returns the distance to another point, metres.
     pub fn distance_m(self, other: Self) -> f64 {
         (other.x_m - self.x_m).hypot(other.y_m - self.y_m)
     }
 
-    /// Direction from here to another point, radians; 0 when both are the same.
+    /// Returns the direction from here to another point, radians counter-clockwise from x, in [−π,
+    /// π]; 0 if both are equal.
     pub fn bearing_rad(self, other: Self) -> f64 {
         (other.y_m - self.y_m).atan2(other.x_m - self.x_m)
     }
 
-    /// Whether both coordinates are finite.
+    /// Returns whether both coordinates are finite.
     pub fn is_finite(self) -> bool {
         self.x_m.is_finite() && self.y_m.is_finite()
     }
 }
 
-/// Position and heading in the site's frame.
+/// Position and heading in the site frame.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Pose {
     /// East-like coordinate, metres.
     pub x_m: f64,
     /// North-like coordinate, metres.
     pub y_m: f64,
-    /// Heading counter-clockwise from x, radians; any real number, see [`wrap_angle_rad`].
+    /// Heading counter-clockwise from x, radians; not limited to one turn, see [`wrap_angle_rad`].
     pub heading_rad: f64,
 }
 
 impl Pose {
-    /// The position alone.
+    /// Returns the position alone.
     pub fn point(self) -> Point {
         Point {
             x_m: self.x_m,
@@ -50,12 +51,13 @@ impl Pose {
         }
     }
 
-    /// Whether all three numbers are finite.
+    /// Returns whether all three values are finite.
     pub fn is_finite(self) -> bool {
         self.point().is_finite() && self.heading_rad.is_finite()
     }
 
-    /// The other point as seen from this pose: x ahead, y to the left.
+    /// Transforms a point from the site frame to the body frame of this pose: x forward, y to the
+    /// left.
     pub fn body_from_site(self, point: Point) -> Point {
         let (sin, cos) = self.heading_rad.sin_cos();
         let (east_m, north_m) = (point.x_m - self.x_m, point.y_m - self.y_m);
@@ -66,23 +68,23 @@ impl Pose {
     }
 }
 
-/// Velocity of a body that moves ahead and turns.
+/// Forward speed and turn rate of a body.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Twist {
-    /// Speed ahead, metres per second.
+    /// Forward speed, metres per second.
     pub linear_m_s: f64,
     /// Turn rate, radians per second, counter-clockwise positive.
     pub angular_rad_s: f64,
 }
 
 impl Twist {
-    /// Whether both numbers are finite.
+    /// Returns whether both values are finite.
     pub fn is_finite(self) -> bool {
         self.linear_m_s.is_finite() && self.angular_rad_s.is_finite()
     }
 }
 
-/// The same angle in (−π, π].
+/// Returns the equivalent angle in (−π, π].
 pub fn wrap_angle_rad(angle_rad: f64) -> f64 {
     let wrapped = angle_rad.rem_euclid(TAU);
     if wrapped > PI { wrapped - TAU } else { wrapped }

@@ -1,18 +1,20 @@
-//! Tread's control part: everything a robot computes between its sensors and its wheels.
+//! Tread's control library: all computation on a robot between sensors and wheel commands.
 //!
-//! Pure: no I/O, no clock, no randomness, no `async`, and no allocation in a control tick. Units
-//! are SI and stand last in a name. Frames are right-handed: the site's frame is metric with
-//! headings counter-clockwise from x; the body frame has x ahead and y to the left.
+//! No I/O, clock, randomness or `async`, and no allocation in a control tick. Units are SI and
+//! stand last in a name. Frames are right-handed: the site frame is metric with headings
+//! counter-clockwise from x; the body frame has x forward and y to the left.
 //!
-//! * Words: [`geometry`], [`robot`], [`friction`], [`slip`], [`measured`].
-//! * Planning (may allocate): [`trajectory`] is what is asked for, [`path`] its geometry,
-//!   [`profile`] its timing, [`excitation`] a variation of it, [`plan`] all, from where the robot stands.
-//! * Driving (one call per tick): [`mod@reference`] walks along the plan, [`tracking`] turns errors
-//!   into wheel speeds, [`follower`] runs one mission, [`mod@gate`] has the last word within [`twist_limits`], [`fence`] says
-//!   how fast a robot may be where it is.
-//! * Knowing: [`localisation`] says where the robot is, [`estimation`] the friction of the ground,
-//!   [`consistency`] whether the sensors agree.
-//! * [`plant`] is the simulated base.
+//! * Basic types: [`geometry`], [`robot`], [`friction`], [`slip`], [`measured`].
+//! * Planning (may allocate): [`trajectory`] is the request, [`path`] its geometry, [`profile`] its
+//!   timing, [`excitation`] an optional variation of speed, [`plan`] combines them from a start
+//!   pose.
+//! * Driving (one call per tick): [`mod@reference`] advances a reference along the plan,
+//!   [`tracking`] computes wheel speeds from tracking errors, [`follower`] runs one mission,
+//!   [`mod@gate`] limits the final command within [`twist_limits`], [`fence`] computes the speed
+//!   limit near a fence, [`progress`] detects a robot that is stuck.
+//! * Estimation: [`localisation`] estimates the robot's pose, [`estimation`] the friction of the
+//!   ground, [`consistency`] detects sensors that contradict each other.
+//! * [`plant`] simulates the base.
 
 pub mod consistency;
 pub mod estimation;

@@ -1,10 +1,10 @@
-//! What is commanded to, and measured at, the base.
+//! Commands to the base and measurements from it.
 
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Pose, Twist};
 
-/// Turn rates of the two sides' wheels; positive drives ahead.
+/// Angular speeds of the wheels per side; positive drives forward.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct WheelSpeeds {
     /// Left wheels, radians per second.
@@ -14,18 +14,18 @@ pub struct WheelSpeeds {
 }
 
 impl WheelSpeeds {
-    /// Whether both numbers are finite.
+    /// Returns whether both values are finite.
     pub fn is_finite(self) -> bool {
         self.left_rad_s.is_finite() && self.right_rad_s.is_finite()
     }
 
-    /// The larger of both magnitudes, radians per second.
+    /// Returns the larger magnitude of both sides, radians per second.
     pub fn magnitude_max_rad_s(self) -> f64 {
         self.left_rad_s.abs().max(self.right_rad_s.abs())
     }
 }
 
-/// Drive torques of the two sides, both wheels of a side together; positive drives ahead.
+/// Drive torques per side, sum over both wheels of a side; positive drives forward.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct WheelTorques {
     /// Left wheels, newton metres.
@@ -35,7 +35,7 @@ pub struct WheelTorques {
 }
 
 impl WheelTorques {
-    /// Whether both numbers are finite.
+    /// Returns whether both values are finite.
     pub fn is_finite(self) -> bool {
         self.left_n_m.is_finite() && self.right_n_m.is_finite()
     }
@@ -50,23 +50,23 @@ pub struct BodyAcceleration {
     pub left_m_s2: f64,
 }
 
-/// What a tracking law may look at in one tick.
+/// Measurements that a tracking law uses in one tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Measured {
-    /// Where the robot is, site frame.
+    /// Robot pose in the site frame.
     pub pose: Pose,
-    /// How it moves, body frame.
+    /// Forward speed and turn rate in the body frame.
     pub twist: Twist,
-    /// How its wheels turn, as measured.
+    /// Measured wheel speeds.
     pub wheel_speeds: WheelSpeeds,
-    /// Age of the last accepted position fix, seconds.
+    /// Time since the last accepted position fix, seconds.
     pub pose_age_s: f64,
-    /// Standard deviation of the position per axis, metres; infinite where it is not known.
+    /// Standard deviation of the position per axis, metres; infinite if unknown.
     pub position_std_dev_m: f64,
 }
 
 impl Measured {
-    /// Whether every number is finite.
+    /// Returns whether all values but `position_std_dev_m` are finite.
     pub fn is_finite(&self) -> bool {
         self.pose.is_finite()
             && self.twist.is_finite()

@@ -1,9 +1,9 @@
-//! The simulated base: a free four-wheel skid-steered body.
+//! Simulated base: a free four-wheel skid-steered body.
 //!
 //! Every contact i obeys one vector law, `F = −N μ(|σ|) σ/|σ|`: isotropic combined slip, with μ of
 //! (7) and σ the slip velocity over the reference speed `u`. The body has Coriolis terms,
 //! `m(ẍ − ẏφ̇) = ΣF`, `m(ÿ + ẋφ̇) = ΣP`, `I_G φ̈ = Σ(x_i P_i − y_i F_i)`; no constraint is imposed
-//! (the paper's (4) would be one that no force enforces).
+//! (the paper's constraint (4) is enforced by no force).
 //!
 //! The reference speed is `u = (|rω|⁴ + u₀⁴)^¼` with `u₀` = 0.05 m/s, so that the law is regular at
 //! standstill and equals the paper's |rω| within 1.2·10⁻⁵ at 0.6 m/s. Slip poles, `gK/u` and its
@@ -21,34 +21,34 @@ use crate::robot::{GRAVITY_M_S2, RobotModel};
 
 pub use tyres::{TyreRise, Tyres};
 
-/// Reference speed below which slip is regularised, metres per second.
+/// Reference speed u₀ below which slip is regularised, metres per second.
 pub const SLIP_SPEED_FLOOR_M_S: f64 = 0.05;
-/// Largest product of slip pole and step; the method is stable up to 2.78.
+/// Maximum product of slip pole and step; the method is stable up to 2.78.
 const POLE_STEP_MAX: f64 = 2.4;
-/// Longest internal step, seconds.
+/// Maximum internal step, seconds.
 const STEP_MAX_S: f64 = 5.0e-3;
-/// The same while a side rolls slower than [`SLOW_M_S`]: there the slip's reference speed changes
-/// quickly.
+/// Maximum internal step below [`SLOW_M_S`], where slip's reference speed changes quickly, seconds.
 const STEP_SLOW_MAX_S: f64 = 2.5e-3;
-/// Rim speed that counts as slow, metres per second.
+/// Rim speed below which [`STEP_SLOW_MAX_S`] applies, metres per second.
 const SLOW_M_S: f64 = 0.2;
-/// Most internal steps in one call; beyond it the step is cut, which needs `gK/u₀` above 10⁵.
+/// Maximum number of internal steps in one call (needs `gK/u₀` above 10⁵); the rest is left out.
 const STEPS_MAX: usize = 10_000;
-/// Shortest servo lag that is integrated; a shorter one acts as this one, seconds.
+/// Minimum servo lag in the integration, seconds; a shorter one acts as this one.
 const SERVO_LAG_FLOOR_S: f64 = 1.0e-3;
 
-/// What the simulated base is like beyond the robot's model.
+/// Parameters of the simulated base beyond the robot model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlantSpec {
-    /// First-order lag of the wheel servo, seconds, ≥ 0.
+    /// First-order lag of the wheel servo, seconds, 0 to 5.
     pub servo_lag_s: f64,
-    /// Rolling resistance over load, ≥ 0. It is a moment on the wheels: it shows in their torque.
+    /// Rolling resistance coefficient, 0 to 1. It acts on the wheels and shows in their torque
+    /// only.
     pub rolling_resistance_ratio: f64,
-    /// True rolling radius of the left wheels over the model's, about 1.
+    /// True rolling radius of the left wheels over the model's, 0.5 to 2.
     pub left_radius_ratio: f64,
-    /// True rolling radius of the right wheels over the model's, about 1.
+    /// True rolling radius of the right wheels over the model's, 0.5 to 2.
     pub right_radius_ratio: f64,
-    /// How the tyres differ from the ground's curve.
+    /// Deviation of the tyres from the isotropic friction curve (7).
     pub tyres: Tyres,
 }
 
@@ -64,30 +64,30 @@ impl Default for PlantSpec {
     }
 }
 
-/// Why a plant was refused.
+/// Parameter of a plant that is out of its range.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum PlantError {
-    /// A figure is NaN, infinite or out of its range.
+    /// A value is NaN, infinite or out of its range.
     #[error("`{field}` is out of its range: {value}")]
     OutOfRange {
-        /// The field's name.
+        /// Name of the field.
         field: &'static str,
-        /// What it held.
+        /// Rejected value.
         value: f64,
     },
 }
 
-/// The ground under the two sides of a robot.
+/// Friction curves of the ground under the two sides of a robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ground {
-    /// Under the left wheels.
+    /// Curve under the left wheels.
     pub left: FrictionCurve,
-    /// Under the right wheels.
+    /// Curve under the right wheels.
     pub right: FrictionCurve,
 }
 
 impl Ground {
-    /// The same ground under both sides.
+    /// Returns ground with the same curve under both sides.
     pub fn uniform(curve: FrictionCurve) -> Self {
         Self {
             left: curve,
@@ -96,23 +96,23 @@ impl Ground {
     }
 }
 
-/// The true state of the simulated base.
+/// True state of the simulated base.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PlantState {
-    /// Pose in the site's frame.
+    /// Pose in the site frame.
     pub pose: Pose,
-    /// Speed ahead, ẋ, metres per second.
+    /// Forward speed ẋ in the body frame, metres per second.
     pub forward_m_s: f64,
-    /// Speed to the left, ẏ, metres per second.
+    /// Lateral speed ẏ in the body frame, metres per second, positive to the left.
     pub left_m_s: f64,
-    /// Turn rate φ̇, radians per second.
+    /// Turn rate φ̇, radians per second, counter-clockwise positive.
     pub yaw_rate_rad_s: f64,
     /// Wheel speeds.
     pub wheel_speeds: WheelSpeeds,
 }
 
 impl PlantState {
-    /// Speed ahead and turn rate.
+    /// Returns forward speed and turn rate.
     pub fn twist(&self) -> Twist {
         Twist {
             linear_m_s: self.forward_m_s,
@@ -121,7 +121,7 @@ impl PlantState {
     }
 }
 
-/// The simulated base.
+/// Simulated base with its state.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Plant {
     model: RobotModel,
@@ -129,29 +129,29 @@ pub struct Plant {
     state: PlantState,
     contact: Contact,
     means: PlantMeans,
-    /// Means of the forward forces of the left and the right side over the last step, newtons.
+    /// Means of the forward forces over the last step, `[left, right]`, newtons.
     side_longitudinal_n: [f64; 2],
 }
 
-/// Means over the time of one call of [`Plant::step`]: what encoders that count, and inertial
-/// sensors that do not alias, give for it.
+/// Means over the time of one call of [`Plant::step`], as counting encoders and inertial sensors
+/// with anti-aliasing measure them.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PlantMeans {
     /// Wheel speeds.
     pub wheel_speeds: WheelSpeeds,
     /// Turn rate φ̇, radians per second.
     pub yaw_rate_rad_s: f64,
-    /// What an accelerometer at the centre of mass feels.
+    /// Specific force at the centre of mass in the body frame, as an accelerometer measures it.
     pub acceleration: BodyAcceleration,
 }
 
-/// Sums from which [`PlantMeans`] are made.
+/// Integrals over one call of [`Plant::step`], from which [`PlantMeans`] are computed.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct MeanSums {
     left_rad: f64,
     right_rad: f64,
     yaw_rad: f64,
-    /// `∫ẏφ̇ dt` and `∫ẋφ̇ dt`, metres per second.
+    /// `∫ẏφ̇ dt` here and `∫ẋφ̇ dt` below, metres per second.
     left_turned_m_s: f64,
     forward_turned_m_s: f64,
 }
@@ -183,7 +183,7 @@ impl MeanSums {
     }
 }
 
-/// Forces of all contacts on the body.
+/// Sums of all contact forces on the body, and the largest combined slip.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Contact {
     longitudinal_n: f64,
@@ -194,14 +194,14 @@ struct Contact {
     slip_max: f64,
 }
 
-/// Derivative of the state; wheel accelerations last.
+/// State in the order of `pack`, or its time derivative.
 type Rates = [f64; 8];
 
 impl Plant {
-    /// A base at rest at a pose.
+    /// Creates a stopped base at a pose in the site frame.
     ///
     /// # Errors
-    /// [`PlantError`] when a figure of `spec` is out of its range.
+    /// [`PlantError`] if a value of `spec` is out of its range or the pose is not finite.
     pub fn new(model: RobotModel, spec: PlantSpec, pose: Pose) -> Result<Self, PlantError> {
         let check = |field, value: f64, range: std::ops::RangeInclusive<f64>| {
             if range.contains(&value) {
@@ -242,23 +242,23 @@ impl Plant {
         })
     }
 
-    /// The true state.
+    /// Returns the true state.
     pub fn state(&self) -> &PlantState {
         &self.state
     }
 
-    /// Puts the base into a state, for instance a pose after a push.
+    /// Sets the state, for instance a pose after a push.
     #[cfg(any(test, feature = "testing"))]
     pub fn set_state(&mut self, state: PlantState) {
         self.state = state;
     }
 
-    /// Means over the last step.
+    /// Returns means over the last step; zero before the first.
     pub fn means(&self) -> &PlantMeans {
         &self.means
     }
 
-    /// What an accelerometer at the centre of mass feels now, without noise.
+    /// Returns the specific force at the centre of mass after the last step, without noise.
     #[cfg(any(test, feature = "testing"))]
     pub fn body_acceleration(&self) -> BodyAcceleration {
         BodyAcceleration {
@@ -267,9 +267,9 @@ impl Plant {
         }
     }
 
-    /// Drive torques per side as means over the last step, like [`Plant::means`]: ground force
-    /// times rolling radius plus rolling resistance. A torque of one moment beside means of all
-    /// else would make slip lag behind force, and θ read low wherever the command moves.
+    /// Returns the drive torques per side, mean over the last step: (ground force plus rolling
+    /// resistance) times rolling radius. An instantaneous torque beside [`Plant::means`] would make
+    /// slip lag force and θ too low wherever the command changes.
     pub fn wheel_torques(&self) -> WheelTorques {
         let radius_m = self.model.wheel_radius_m();
         let side = |force_n: f64, wheel_rad_s: f64, radius_ratio: f64| {
@@ -286,14 +286,14 @@ impl Plant {
         }
     }
 
-    /// Largest combined slip of the four wheels after the last step.
+    /// Returns the largest combined slip of the four wheels after the last step.
     pub fn slip_max(&self) -> f64 {
         self.contact.slip_max
     }
 
-    /// Moves the base on by `dt_s` under a constant wheel command.
+    /// Advances the base by `dt_s` seconds, if valid, under a constant wheel command.
     ///
-    /// A command that is not finite acts as zero; one above the wheel limit acts as the limit.
+    /// A non-finite command acts as zero; one above the wheel speed limit acts as the limit.
     pub fn step(&mut self, command: WheelSpeeds, ground: &Ground, dt_s: f64) {
         if !(dt_s.is_finite() && dt_s > 0.0) {
             return;
@@ -316,7 +316,7 @@ impl Plant {
         let mut contact = self.contact_forces(&start, ground);
         let (mut left_n_s, mut right_n_s) = (0.0, 0.0);
         for _ in 0..STEPS_MAX {
-            // Even parts, so that no sliver of a step is left over.
+            // Equal parts, so that no short step is left over.
             let parts = (left_s / self.stable_step_s(ground)).ceil().max(1.0);
             let step_s = left_s / parts;
             let before = self.state;
@@ -340,7 +340,7 @@ impl Plant {
         self.contact = contact;
     }
 
-    /// The longest step that keeps the fastest slip pole well inside the stable range.
+    /// Returns the longest step that is stable for slip poles and servo, at most [`STEP_MAX_S`].
     fn stable_step_s(&self, ground: &Ground) -> f64 {
         let model = &self.model;
         let wheels = self.state.wheel_speeds;
@@ -423,7 +423,7 @@ impl Plant {
             let longitudinal_slip =
                 (state.forward_m_s - state.yaw_rate_rad_s * y_m - rim_m_s) * per_speed_s_m;
             for x_m in [half_base_m, -half_base_m] {
-                // The slip across that would give its force on an isotropic tyre.
+                // Lateral slip that would give the same lateral force on an isotropic tyre.
                 let slip_left = tyres.lateral_stiffness_ratio
                     * (state.left_m_s + state.yaw_rate_rad_s * x_m)
                     * per_speed_s_m;
@@ -444,7 +444,7 @@ impl Plant {
     }
 }
 
-/// Reference speed of the slip ratio for a rim speed, regular at zero, metres per second.
+/// Returns the reference speed of slip for a rim speed, `(|rω|⁴ + u₀⁴)^¼`, metres per second.
 pub fn slip_reference_m_s(rim_m_s: f64) -> f64 {
     (rim_m_s.powi(4) + SLIP_SPEED_FLOOR_M_S.powi(4))
         .sqrt()

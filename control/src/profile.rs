@@ -1,13 +1,13 @@
-//! Timing along a path: how fast, when. Jerk-bounded, and never above a limit.
+//! Timing along a path: speed as a function of time, jerk-bounded and within all limits.
 //!
 //! Two steps. First the quickest timing `s₀(t)` with piecewise constant acceleration under the
 //! limits, by a forward and a backward pass over `E = v²/2`. Then its mean over a window T,
 //! `s₁(t) = (1/T) ∫ s₀(u) du` for u from t − T to t. The mean's acceleration is a mean of
-//! accelerations, so within the bound; its jerk is at most `2a/T`, which chooses T. Its speed at a
-//! place is a mean of speeds at places that are driven at most T before and after. No timing under
-//! the limits drives farther in T than the quickest one under the limits as they are, nor farther
-//! than `D = T·v_max`; so the passes use limits that were lowered to their minimum within one of
-//! both, and the bound holds exactly. Both ends are at rest.
+//! accelerations, so within the bound; its jerk is at most `2a/T`, which determines T. Its speed at
+//! a point of the path is a mean of speeds at points that are driven at most T before and after. No
+//! timing under the limits drives farther in T than the quickest one, nor farther than
+//! `D = T·v_max`. So the passes use, at each node, the minimum of the limits within time T or
+//! within distance D, and the bound holds exactly. Speed is zero at both ends.
 
 #![expect(
     clippy::cast_precision_loss,
@@ -21,14 +21,14 @@ use std::collections::VecDeque;
 /// Limits at one node of an even grid along the path.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct NodeLimits {
-    /// Fastest speed here, metres per second, above zero.
+    /// Maximum speed, metres per second, above zero.
     pub(crate) speed_m_s: f64,
-    /// Hardest acceleration here, metres per second squared, above zero.
+    /// Maximum acceleration and deceleration along the path, metres per second squared, above zero.
     pub(crate) acceleration_m_s2: f64,
 }
 
 impl NodeLimits {
-    /// The lower of each limit.
+    /// Returns the smaller of each limit.
     pub(crate) fn stricter(&self, other: &Self) -> Self {
         Self {
             speed_m_s: self.speed_m_s.min(other.speed_m_s),
@@ -37,7 +37,7 @@ impl NodeLimits {
     }
 }
 
-/// Where one is along the path, and how fast, at a time.
+/// Arc length, speed and acceleration along the path at one time.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ProfileSample {
     /// Arc length, metres.
@@ -48,18 +48,18 @@ pub struct ProfileSample {
     pub acceleration_m_s2: f64,
 }
 
-/// A node of the timing before the mean: constant acceleration until the next one.
+/// Node of the timing `s₀`: constant acceleration until the next node.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Node {
     time_s: f64,
     arc_m: f64,
     speed_m_s: f64,
     acceleration_m_s2: f64,
-    /// `∫ s₀` up to here.
+    /// `∫ s₀ dt` from the start to this node, metre seconds.
     arc_integral_m_s: f64,
 }
 
-/// Timing along a path.
+/// Timing along a path, with zero speed at both ends.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SpeedProfile {
     nodes: Vec<Node>,
@@ -68,8 +68,9 @@ pub struct SpeedProfile {
 }
 
 impl SpeedProfile {
-    /// Timing over an even grid of at least two nodes, from rest to rest. The first `brisk` nodes
-    /// keep to limits within the time T, the others within the way D.
+    /// Computes the timing over an even grid of at least two nodes, from zero speed to zero speed.
+    /// The first `brisk` nodes keep to the limits within time T, the others to those within
+    /// distance D (see module).
     pub(crate) fn new(
         length_m: f64,
         limits: &[NodeLimits],
@@ -84,7 +85,7 @@ impl SpeedProfile {
             .fold(f64::MIN_POSITIVE, f64::max);
         let fastest_m_s = limits.iter().map(|node| node.speed_m_s).fold(0.0, f64::max);
         let window_s = 2.0 * hardest_m_s2 / jerk_max_m_s3;
-        // One cell more than the distance, so that limits between nodes are covered too.
+        // One cell more than the distance, to cover limits between nodes.
         let reach = ((window_s * fastest_m_s / cell_m).ceil() + 1.0).min(cells as f64) as usize;
         let spans = spans(limits, cell_m, reach, brisk, window_s);
         let speeds = lowest_within(limits, &spans, |node| node.speed_m_s);
@@ -97,12 +98,13 @@ impl SpeedProfile {
         }
     }
 
-    /// Time from rest to rest, seconds.
+    /// Returns the time from start to end, seconds.
     pub fn duration_s(&self) -> f64 {
         self.nodes.last().map_or(0.0, |node| node.time_s) + self.window_s
     }
 
-    /// Where one is at a time; at rest at the ends before and after.
+    /// Returns the timing at a time since the start, seconds; before 0 and after the end the speed
+    /// is zero.
     pub fn sample(&self, time_s: f64) -> ProfileSample {
         let (late, early) = (self.raw(time_s), self.raw(time_s - self.window_s));
         ProfileSample {
@@ -113,7 +115,7 @@ impl SpeedProfile {
         }
     }
 
-    /// The timing before the mean.
+    /// Returns the timing `s₀` before the mean.
     fn raw(&self, time_s: f64) -> Node {
         let after = self.nodes.partition_point(|node| node.time_s <= time_s);
         let rest = Node {
@@ -139,7 +141,8 @@ impl SpeedProfile {
     }
 }
 
-/// `E` at every node of the quickest timing under limits, by a forward and a backward pass.
+/// Returns `E = v²/2` at every node of the quickest timing under limits, by a forward and a
+/// backward pass.
 fn quickest(speeds_m_s: &[f64], accelerations_m_s2: &[f64], cell_m: f64) -> Vec<f64> {
     let mut energies: Vec<f64> = speeds_m_s.iter().map(|speed| 0.5 * speed * speed).collect();
     energies[0] = 0.0;
@@ -155,7 +158,8 @@ fn quickest(speeds_m_s: &[f64], accelerations_m_s2: &[f64], cell_m: f64) -> Vec<
     energies
 }
 
-/// First and last node to whose limits each node keeps; neither ever goes back.
+/// Returns, for each node, the first and last node whose limits it keeps to; both are
+/// non-decreasing.
 fn spans(
     limits: &[NodeLimits],
     cell_m: f64,
@@ -184,7 +188,7 @@ fn spans(
                 while after < last && timed[after].time_s < time_s + window_s {
                     after += 1;
                 }
-                // One cell more on each side, so that limits between nodes are covered too.
+                // One cell more on each side, to cover limits between nodes.
                 from = from.max(before.saturating_sub(2));
                 to = to.min(after + 1);
             }
@@ -220,7 +224,7 @@ fn time_nodes(energies: &[f64], cell_m: f64) -> Vec<Node> {
     nodes
 }
 
-/// Minimum over each span of nodes, in linear time; no begin or end of a span goes back.
+/// Returns the minimum over each span of nodes in linear time; span ends must be non-decreasing.
 fn lowest_within(
     limits: &[NodeLimits],
     spans: &[(usize, usize)],

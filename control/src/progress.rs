@@ -1,62 +1,62 @@
-//! Whether a mission makes progress: the robot itself, not its reference.
+//! Detects that a robot makes no progress along its path, whatever its reference does.
 //!
-//! The robot's place is its measured position projected on the path. Progress counts from the
-//! farthest place that has counted before, in gains that noise does not give: neither a reference
-//! that creeps on, nor a robot that moves to and fro, nor many gains too small to count end the
-//! time without progress. A robot that may drive slowly needs a smaller gain. Time in which it must
-//! not drive does not count, and does not make up for what counted before.
+//! The robot's measured position is projected on the path. Progress counts from the largest arc
+//! length that has counted before, in gains larger than noise: a reference that creeps on, a robot
+//! that moves to and fro, and gains too small to count do not reset the time without progress. A
+//! robot that is only allowed to drive slowly needs a smaller gain. Time in which it must not drive
+//! is left out of the sum.
 //!
-//! A robot that makes no progress and whose feedback drives it faster than its plan all the while
-//! drives blindly, or digs: that is bounded by the way commanded, sooner than by the time.
+//! A robot without progress whose feedback commands more speed than the plan drives blindly, or its
+//! wheels dig in. The distance commanded beyond the plan bounds this case, sooner than the time
+//! does.
 
-/// Bounds of what counts as no progress.
+/// Bounds beyond which a robot counts as stuck.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ProgressBounds {
-    /// Longest time without progress in which the robot may drive, seconds.
+    /// Maximum time without progress in which the robot may drive, seconds.
     pub time_max_s: f64,
-    /// Gain along the path that counts as progress, metres.
+    /// Gain of arc length that counts as progress, metres.
     pub gain_m: f64,
-    /// Longest distance commanded beyond the plan without progress, metres.
+    /// Maximum distance commanded beyond the plan without progress, metres.
     pub beyond_plan_max_m: f64,
 }
 
-/// Share of the distance that the robot may drive that counts as progress, where it is less than
-/// the gain.
+/// Fraction of the allowed distance that counts as progress once the time is over, where it is less
+/// than [`ProgressBounds::gain_m`].
 const GAIN_SHARE: f64 = 0.25;
-/// Speed below which a robot is not to drive, metres per second.
+/// Allowed speed below which the robot must not drive, metres per second.
 const ALLOWED_MIN_M_S: f64 = 1.0e-3;
 
-/// What is known in one tick.
+/// Input of the monitor in one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ProgressTick {
     /// Arc length of the robot's measured position projected on its path, metres.
     pub(crate) robot_m: f64,
-    /// Speed that plan, pace and speed limits allow, were the robot at its reference, metres per
-    /// second.
+    /// Speed that plan, rate cap and speed limit allow a robot without lag, metres per second.
     pub(crate) allowed_m_s: f64,
-    /// Speed ahead that is commanded, metres per second.
+    /// Commanded forward speed, metres per second.
     pub(crate) commanded_m_s: f64,
     /// Speed of the reference, metres per second.
     pub(crate) reference_m_s: f64,
-    /// Time since the tick before, seconds.
+    /// Time since the previous tick, seconds.
     pub(crate) dt_s: f64,
 }
 
-/// Watches one mission.
+/// Progress monitor of one mission.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct ProgressMonitor {
-    /// Farthest place that has counted, metres; none before the first tick.
+    /// Largest arc length that has counted as progress, metres; None before the first tick.
     best_m: Option<f64>,
-    /// Time in which the robot might have driven since, seconds.
+    /// Time since then in which the robot was allowed to drive, seconds.
     idle_s: f64,
-    /// Distance that it might have driven in that time, metres.
+    /// Distance that the robot was allowed to drive since then, metres.
     allowed_m: f64,
-    /// Distance commanded beyond the plan in that time, metres.
+    /// Distance commanded beyond the plan since then, metres.
     beyond_plan_m: f64,
 }
 
 impl ProgressMonitor {
-    /// One tick; true once the robot has made no progress for too long.
+    /// Updates the monitor with one tick; returns true once the robot is stuck.
     pub(crate) fn step(&mut self, tick: &ProgressTick, bounds: &ProgressBounds) -> bool {
         let best_m = *self.best_m.get_or_insert(tick.robot_m);
         if tick.allowed_m_s >= ALLOWED_MIN_M_S {
@@ -67,7 +67,7 @@ impl ProgressMonitor {
         }
         let gained_m = tick.robot_m - best_m;
         let is_over = self.idle_s > bounds.time_max_s;
-        // A slow robot is looked at when its time is over: a share of a short distance is no
+        // The smaller gain applies only once the time is over: a fraction of a short distance is no
         // progress.
         let needed_m = if is_over {
             bounds.gain_m.min(GAIN_SHARE * self.allowed_m)

@@ -1,73 +1,73 @@
-//! The governor: walks along a plan by its own clock.
+//! Governor: advances the reference along a plan by a clock of its own.
 //!
 //! The plan's time τ advances by `dτ = σ dt`, σ from 0 to 1. σ falls when the robot lags or its
-//! wheels saturate, is capped from outside (pause, speed limit), and goes to rest along the path on
-//! a stop. The speed `v = σ v₁(τ)` never jumps: it is braked and raised within the robot's limits,
-//! with a bounded jerk. τ never goes back. States: walking → (stop) braking → at rest.
+//! wheels saturate, has an external upper bound (pause, speed limit), and falls to zero along the
+//! path on a stop. The speed `v = σ v₁(τ)` changes within the robot's acceleration limit and with
+//! bounded jerk. τ never decreases. States: running → (stop) braking → stopped.
 
 use crate::geometry::Pose;
 use crate::plan::{Plan, PlanSample};
 use crate::robot::RobotModel;
 use crate::sliding::SlidingBounds;
 
-/// Plan speed below which rates of σ are computed as at this one, metres per second.
+/// Lower bound of the plan speed in computing limits of σ̇, metres per second.
 const SPEED_FLOOR_M_S: f64 = 0.05;
-/// A reference slower than this is brought to rest on a stop, metres per second.
+/// Speed below which a reference that brakes for a stop is set to zero, metres per second.
 const REST_M_S: f64 = 2.0e-3;
-/// Step in which coming to rest is foretold, seconds.
+/// Time step of the prediction of the stopping pose, seconds.
 const REST_STEP_S: f64 = 0.02;
-/// Most such steps.
+/// Maximum number of steps of the prediction of the stopping pose.
 const REST_STEPS_MAX: u32 = 1_000;
-/// Gain from a gap in σ to its rate, per second.
+/// Gain from the error of σ to σ̇, per second.
 const RATE_GAIN_1_S: f64 = 3.0;
-/// Fastest rise of σ, per second.
+/// Maximum σ̇, per second.
 const RISE_MAX_1_S: f64 = 1.0;
-/// Lag behind the reference that does not slow it, metres.
+/// Distance between robot and reference up to which the reference is not slowed, metres.
 const LAG_FREE_M: f64 = 0.10;
-/// Lag at which the reference waits, metres.
+/// Distance between robot and reference from which the reference waits (σ target 0), metres.
 const LAG_FULL_M: f64 = 0.40;
-/// σ that is aimed at while the wheels are saturated.
+/// Target of σ while the wheels are saturated.
 const SATURATED_RATE: f64 = 0.5;
 
-/// How far a speed limit looks ahead, plan seconds.
+/// Horizon over which a speed limit is checked, plan seconds.
 const LOOK_AHEAD_S: f64 = 1.5;
-/// Samples of that look.
+/// Number of intervals in [`LOOK_AHEAD_S`].
 const LOOK_AHEAD_STEPS: u8 = 6;
 
-/// How far bounds on sliding ground look ahead, plan seconds.
+/// Horizon over which the bounds on sliding ground are checked, plan seconds.
 const SLIDING_AHEAD_S: f64 = 0.96;
-/// Samples of that look.
+/// Number of intervals in [`SLIDING_AHEAD_S`].
 const SLIDING_STEPS: u8 = 16;
-/// Gain from a gap in σ to its rate on sliding ground, per second.
+/// Gain from the error of σ to σ̇ on sliding ground, per second.
 const SLIDING_GAIN_1_S: f64 = 10.0;
-/// Heading error that does not slow a sliding robot's reference, radians.
+/// Heading error up to which a sliding robot's reference is not slowed, radians.
 const HEADING_FREE_RAD: f64 = 0.2;
-/// Heading error at which it would wait, radians.
+/// Heading error at which the slowing of a sliding robot would reach σ = 0, radians.
 const HEADING_FULL_RAD: f64 = 0.8;
-/// Least σ that a heading error asks for: only a robot that drives can come back to its path.
+/// Minimum σ that a heading error causes: the robot must drive to come back to its path.
 const HEADING_RATE_MIN: f64 = 0.3;
 
-/// Where the robot should be, and how it should move.
+/// Desired pose and motion at one time, in the site frame.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ReferenceSample {
-    /// Position, and heading along the path.
+    /// Position, and heading tangential to the path.
     pub pose: Pose,
     /// Speed along the path v, metres per second, ≥ 0.
     pub speed_m_s: f64,
     /// Acceleration along the path a, metres per second squared.
     pub acceleration_m_s2: f64,
-    /// Turn rate of the path's heading ω, radians per second.
+    /// Turn rate of the path's heading ω, radians per second, counter-clockwise positive.
     pub turn_rad_s: f64,
-    /// Its change ω̇, radians per second squared.
+    /// Turn acceleration ω̇, radians per second squared.
     pub turn_acceleration_rad_s2: f64,
-    /// Curvature, per metre.
+    /// Curvature, per metre, positive to the left.
     pub curvature_1_m: f64,
-    /// Arc length, metres; never falls.
+    /// Arc length from the plan's start, metres; never decreases.
     pub arc_m: f64,
 }
 
 impl ReferenceSample {
-    /// A place of the plan, passed with another speed and acceleration than planned.
+    /// Returns the reference at a plan sample for another speed and acceleration than planned.
     fn at(planned: &PlanSample, speed_m_s: f64, acceleration_m_s2: f64) -> Self {
         let path = &planned.path;
         Self {
@@ -89,23 +89,24 @@ impl From<&PlanSample> for ReferenceSample {
     }
 }
 
-/// What the governor looks at in one tick.
+/// Input of the governor in one tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct GovernorInput {
-    /// Distance between the robot and its reference, metres.
+    /// Distance between the robot and its reference, metres; a non-finite value makes the reference
+    /// wait.
     pub lag_m: f64,
     /// Whether the wheels cannot follow their commands.
     pub saturated: bool,
 }
 
-/// A robot that slides: what it may ask of the ground, and how far it is turned off its path.
+/// Acceleration bounds of a robot that slides, and its heading error to the path in radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Slide {
     bounds: SlidingBounds,
     heading_rad: f64,
 }
 
-/// Walks along a plan.
+/// Reference generator of one plan.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Governor {
     clock_s: f64,
@@ -120,7 +121,7 @@ pub struct Governor {
 }
 
 impl Governor {
-    /// A governor at the start of a plan, at rest, that may run at full speed.
+    /// Creates a governor at the start of a plan, at zero speed and σ = 1.
     pub fn new(model: &RobotModel) -> Self {
         Self {
             clock_s: 0.0,
@@ -135,7 +136,8 @@ impl Governor {
         }
     }
 
-    /// Caps σ from outside: 0 pauses, 1 is full speed. Not finite counts as 0.
+    /// Sets the upper bound of σ, clamped to 0 to 1: 0 pauses, 1 is full speed. A non-finite value
+    /// acts as 0.
     pub fn set_rate_cap(&mut self, rate_cap: f64) {
         self.rate_cap = if rate_cap.is_finite() {
             rate_cap.clamp(0.0, 1.0)
@@ -144,8 +146,8 @@ impl Governor {
         };
     }
 
-    /// Caps the speed along the path, metres per second; none lifts the cap. A figure that is no
-    /// number, or not above zero, pauses.
+    /// Sets the maximum speed along the path, metres per second; None removes it. A non-finite or
+    /// non-positive value pauses.
     pub fn set_speed_limit(&mut self, limit_m_s: Option<f64>) {
         self.speed_limit_m_s = limit_m_s.map(|limit| {
             if limit.is_finite() {
@@ -156,7 +158,7 @@ impl Governor {
         });
     }
 
-    /// The largest σ that keeps the speed below its cap now and over the next second.
+    /// Returns the largest σ that keeps the speed within its limit over the next [`LOOK_AHEAD_S`].
     fn rate_within_speed_limit(&self, plan: &Plan) -> f64 {
         let Some(limit_m_s) = self.speed_limit_m_s else {
             return 1.0;
@@ -168,8 +170,8 @@ impl Governor {
         (limit_m_s / fastest_m_s).min(1.0)
     }
 
-    /// Fastest speed now and soon that plan, pace and speed limit allow a robot that keeps up,
-    /// metres per second.
+    /// Returns the speed that plan, rate cap and speed limit allow a robot without lag, now or
+    /// [`LOOK_AHEAD_S`] ahead, whichever is larger, metres per second; 0 after a stop.
     pub(crate) fn allowed_speed_m_s(&self, plan: &Plan) -> f64 {
         if self.stopping {
             return 0.0;
@@ -179,7 +181,8 @@ impl Governor {
         planned_m_s * self.rate_cap.min(self.rate_within_speed_limit(plan))
     }
 
-    /// Bounds what is asked of ground that was found to slide; none lifts the bounds.
+    /// Sets acceleration bounds on sliding ground and the heading error in radians; None removes
+    /// the bounds.
     pub(crate) fn set_sliding(&mut self, bounds: Option<SlidingBounds>, heading_rad: f64) {
         self.sliding = bounds.map(|bounds| Slide {
             bounds,
@@ -187,8 +190,9 @@ impl Governor {
         });
     }
 
-    /// The largest σ that sliding ground allows: within its bounds at every bend ahead, as far as
-    /// braking along the path does not do, and slow while the robot is turned off its path.
+    /// Returns the largest σ that sliding ground allows: braking along the path reaches the lateral
+    /// and yaw bound of every bend within [`SLIDING_AHEAD_S`], and σ is smaller while the heading
+    /// error is large.
     fn rate_on_sliding_ground(&self, plan: &Plan, planned: &PlanSample) -> f64 {
         let Some(Slide {
             bounds,
@@ -213,38 +217,38 @@ impl Governor {
             .min(1.0)
     }
 
-    /// Starts to brake along the path, for good.
+    /// Starts to brake to zero speed along the path; cannot be revoked.
     pub fn stop(&mut self) {
         self.stopping = true;
     }
 
-    /// Whether a stop was asked for.
+    /// Returns whether [`Governor::stop`] was called.
     pub fn is_stopping(&self) -> bool {
         self.stopping
     }
 
-    /// σ, the plan's seconds per second.
+    /// Returns σ, plan seconds per second, 0 to 1.
     pub fn rate(&self) -> f64 {
         self.rate
     }
 
-    /// τ, the plan's time, seconds.
+    /// Returns τ, the plan's time, seconds.
     pub fn clock_s(&self) -> f64 {
         self.clock_s
     }
 
-    /// Whether the reference has reached the plan's end.
+    /// Returns whether the reference has reached the plan's end.
     pub fn is_at_end(&self, plan: &Plan) -> bool {
         self.clock_s >= plan.duration_s()
     }
 
-    /// Whether the reference has come to rest after a stop.
+    /// Returns whether the reference has reached zero speed after a stop.
     pub fn is_stopped(&self, plan: &Plan) -> bool {
         self.stopping
             && (self.rate <= 0.0 || plan.sample(self.clock_s).speed_m_s * self.rate < REST_M_S)
     }
 
-    /// Moves on by one tick and gives the new reference.
+    /// Advances the clock by `dt_s` seconds and returns the new reference.
     pub fn step(&mut self, plan: &Plan, input: &GovernorInput, dt_s: f64) -> ReferenceSample {
         let planned = plan.sample(self.clock_s);
         let floor_m_s = planned.speed_m_s.max(SPEED_FLOOR_M_S);
@@ -262,8 +266,9 @@ impl Governor {
                 .min(self.rate_within_speed_limit(plan))
                 .min(self.rate_on_sliding_ground(plan, &planned))
         };
-        // A change of σ asks for σ̇v₁ on top of σ²a₁; braking gets what the limit leaves. The brake
-        // is let go as the speed falls, a = √(jv), so that rest is met without a knock.
+        // A change of σ adds σ̇v₁ to the acceleration σ²a₁; braking gets what the limit leaves. The
+        // deceleration falls with the speed, a = √(jv), so that zero speed is reached without a
+        // jump of acceleration.
         let speed_m_s = self.rate * planned.speed_m_s;
         let own_m_s2 = self.rate * self.rate * planned.acceleration_m_s2;
         let brake_m_s2 = self
@@ -299,7 +304,7 @@ impl Governor {
         self.reference(&plan.sample(self.clock_s))
     }
 
-    /// Where the reference comes to rest if it is held from now on.
+    /// Predicts the pose in which the reference stops if it is paused from now on.
     pub fn rest(mut self, plan: &Plan) -> Pose {
         self.set_rate_cap(0.0);
         let input = GovernorInput::default();
@@ -313,12 +318,12 @@ impl Governor {
         reference.pose
     }
 
-    /// The present reference.
+    /// Returns the present reference.
     pub fn sample(&self, plan: &Plan) -> ReferenceSample {
         self.reference(&plan.sample(self.clock_s))
     }
 
-    /// The reference some time ahead, if σ stays as it is, seconds.
+    /// Returns the reference `ahead_s` seconds from now if σ stays constant.
     pub fn sample_ahead(&self, plan: &Plan, ahead_s: f64) -> ReferenceSample {
         self.reference(&plan.sample(self.clock_s + self.rate * ahead_s))
     }
@@ -339,7 +344,7 @@ mod tests {
     use crate::geometry::Point;
     use crate::trajectory::{CircleSpec, Direction, Trajectory};
 
-    /// Time in which a robot that drives is slowed, seconds.
+    /// Time within which the robot must be slowed, seconds.
     const BRAKED_S: f64 = 2.0;
 
     proptest! {

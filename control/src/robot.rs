@@ -1,4 +1,5 @@
-//! A robot's fixed properties, checked once.
+//! Physical parameters and limits of a robot, validated once, and the kinematics that follow from
+//! them.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -9,62 +10,62 @@ use crate::measured::WheelSpeeds;
 /// Standard gravity, metres per second squared.
 pub const GRAVITY_M_S2: f64 = 9.806_65;
 
-/// Share of the traction limit that a plan may use along the path.
+/// Fraction of `μg` that a plan may use along the path.
 const TRACTION_SHARE_LONGITUDINAL: f64 = 0.58;
-/// Share of the traction limit that a plan may use across the path: both together leave three tenths for
-/// turning the body and for feedback.
+/// Fraction of `μg` that a plan may use across the path. Both fractions together leave three tenths
+/// (in root sum of squares) for turning the body and for feedback.
 const TRACTION_SHARE_LATERAL: f64 = 0.4;
 
-/// What a robot may do at most. Every figure is finite and above zero.
+/// Speed and acceleration limits of a robot. Every value is finite and above zero.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Limits {
-    /// Fastest turn of a wheel, radians per second.
+    /// Maximum angular speed of a wheel, radians per second.
     pub wheel_speed_max_rad_s: f64,
-    /// Fastest change of a wheel's speed, radians per second squared.
+    /// Maximum angular acceleration of a wheel, radians per second squared.
     pub wheel_acceleration_max_rad_s2: f64,
-    /// Fastest drive ahead, metres per second.
+    /// Maximum speed along the path, metres per second.
     pub linear_max_m_s: f64,
-    /// Fastest turn of the body, radians per second.
+    /// Maximum turn rate of the body, radians per second.
     pub angular_max_rad_s: f64,
-    /// Hardest acceleration and braking along the path, metres per second squared.
+    /// Maximum acceleration and deceleration along the path, metres per second squared.
     pub linear_acceleration_max_m_s2: f64,
-    /// Fastest change of acceleration along the path, metres per second cubed.
+    /// Maximum jerk along the path, metres per second cubed.
     pub linear_jerk_max_m_s3: f64,
-    /// Hardest acceleration across the path, metres per second squared.
+    /// Maximum lateral acceleration, metres per second squared.
     pub lateral_acceleration_max_m_s2: f64,
 }
 
-/// A robot's properties as written in a file or sent over a network, not yet checked.
+/// Robot parameters as in a file or message, not yet validated.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct RobotModelSpec {
     /// Mass m, kilograms.
     pub mass_kg: f64,
-    /// Distance between the left and right wheels' contacts, W, metres.
+    /// Track width W: distance between the left and right wheels' contacts, metres.
     pub track_width_m: f64,
-    /// Distance between the front and rear wheels' contacts, L, metres.
+    /// Wheelbase L: distance between the front and rear wheels' contacts, metres.
     pub wheelbase_m: f64,
-    /// Rolling radius of a wheel, r, metres.
+    /// Rolling radius r of a wheel, metres.
     pub wheel_radius_m: f64,
-    /// Moment of inertia about the vertical, `I_G`, kg m².
+    /// Yaw inertia `I_G` about the vertical axis through the centre of mass, kg m².
     pub yaw_inertia_kg_m2: f64,
-    /// What the robot may do at most.
+    /// Speed and acceleration limits.
     pub limits: Limits,
 }
 
-/// Why a robot's properties were refused.
+/// Robot parameter that is out of its range.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum RobotModelError {
-    /// A figure is NaN, infinite, zero or negative.
+    /// A value is NaN, infinite, zero or negative.
     #[error("`{field}` must be finite and above zero, not {value}")]
     NotPositive {
-        /// The field's name.
+        /// Name of the field.
         field: &'static str,
-        /// What it held.
+        /// Rejected value.
         value: f64,
     },
 }
 
-/// A robot's checked properties: every figure is finite and above zero.
+/// Validated robot parameters: every value is finite and above zero.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "RobotModelSpec", into = "RobotModelSpec")]
 pub struct RobotModel {
@@ -115,7 +116,8 @@ impl From<RobotModel> for RobotModelSpec {
 }
 
 impl RobotModel {
-    /// The robot of Yi, Song, Zhang and Goodwin, section IV, with limits that suit it.
+    /// Returns the robot of Yi, Song, Zhang and Goodwin, section IV. The limits are not from the
+    /// paper.
     pub fn yi2007() -> Self {
         Self {
             spec: RobotModelSpec {
@@ -137,44 +139,46 @@ impl RobotModel {
         }
     }
 
-    /// Mass m, kilograms.
+    /// Returns the mass m, kilograms.
     pub fn mass_kg(&self) -> f64 {
         self.spec.mass_kg
     }
 
-    /// Distance between the left and right wheels' contacts, W, metres.
+    /// Returns the track width W, metres.
     pub fn track_width_m(&self) -> f64 {
         self.spec.track_width_m
     }
 
-    /// Distance between the front and rear wheels' contacts, L, metres.
+    /// Returns the wheelbase L, metres.
     pub fn wheelbase_m(&self) -> f64 {
         self.spec.wheelbase_m
     }
 
-    /// Rolling radius of a wheel, r, metres.
+    /// Returns the rolling radius r of a wheel, metres.
     pub fn wheel_radius_m(&self) -> f64 {
         self.spec.wheel_radius_m
     }
 
-    /// Moment of inertia about the vertical, `I_G`, kg m².
+    /// Returns the yaw inertia `I_G`, kg m².
     pub fn yaw_inertia_kg_m2(&self) -> f64 {
         self.spec.yaw_inertia_kg_m2
     }
 
-    /// What the robot may do at most.
+    /// Returns the speed and acceleration limits.
     pub fn limits(&self) -> &Limits {
         &self.spec.limits
     }
 
-    /// Load on the two wheels of one side at rest, newtons.
+    /// Returns the normal force on the two wheels of one side at standstill, newtons.
     pub fn side_load_n(&self) -> f64 {
         self.spec.mass_kg * GRAVITY_M_S2 / 2.0
     }
 
-    /// The same robot with accelerations that a peak friction coefficient can give.
+    /// Returns this robot with acceleration limits lowered to what a peak friction coefficient
+    /// allows.
     ///
-    /// Only a share of `μg`: the rest turns the wheels against the ground, and serves feedback.
+    /// Only fractions of `μg` are used along and across the path: the rest serves turning of the
+    /// body and feedback.
     pub(crate) fn within_traction_limit(&self, mu_peak: f64) -> Self {
         let along_m_s2 = Self::longitudinal_traction_m_s2(mu_peak);
         let across_m_s2 = Self::lateral_traction_m_s2(mu_peak);
@@ -186,37 +190,40 @@ impl RobotModel {
         Self { spec }
     }
 
-    /// Acceleration along the path that a plan may ask of ground with this peak friction, metres per
-    /// second squared.
+    /// Returns the acceleration along the path that a plan may use on ground with a peak friction
+    /// coefficient, metres per second squared.
     pub fn longitudinal_traction_m_s2(mu_peak: f64) -> f64 {
         TRACTION_SHARE_LONGITUDINAL * mu_peak * GRAVITY_M_S2
     }
 
-    /// The same across the path.
+    /// Returns the lateral acceleration that a plan may use on ground with a peak friction
+    /// coefficient, metres per second squared.
     pub fn lateral_traction_m_s2(mu_peak: f64) -> f64 {
         TRACTION_SHARE_LATERAL * mu_peak * GRAVITY_M_S2
     }
 
-    /// How much wider than W the robot turns at low speed: `W_eff/W = 1 + (L/W)²`, whatever the
-    /// ground. (Moment balance of four isotropic contacts in the linear range of (7).)
+    /// Returns `W_eff/W = 1 + (L/W)²`, valid at low speed for every friction. (Moment balance of
+    /// four isotropic contacts in the linear range of (7).)
     pub fn effective_track_ratio(&self) -> f64 {
         1.0 + (self.spec.wheelbase_m / self.spec.track_width_m).powi(2)
     }
 
-    /// Track width that turns wheel speeds into turn rates, metres.
+    /// Returns the effective track width `W_eff`, metres, which relates wheel speeds to the turn
+    /// rate.
     pub fn effective_track_m(&self) -> f64 {
         self.spec.track_width_m * self.effective_track_ratio()
     }
 
-    /// Fastest speeding up of a turn, radians per second squared: with the rims' share of it as
-    /// strong as the acceleration limit along the path, and within what the wheels may do.
+    /// Returns the maximum angular acceleration, radians per second squared: that at which the rim
+    /// acceleration of turning on the spot equals the linear acceleration limit or the wheels'
+    /// limit, whichever is smaller.
     pub fn angular_acceleration_max_rad_s2(&self) -> f64 {
         let limits = self.limits();
         let rim_max_m_s2 = limits.wheel_acceleration_max_rad_s2 * self.spec.wheel_radius_m;
         limits.linear_acceleration_max_m_s2.min(rim_max_m_s2) / (0.5 * self.effective_track_m())
     }
 
-    /// Wheel speeds that give this twist at low speed, through the effective track.
+    /// Returns the wheel speeds for a twist by the low-speed kinematics with `W_eff`.
     pub fn wheel_speeds_from_twist(&self, twist: Twist) -> WheelSpeeds {
         let half_m_s = 0.5 * self.effective_track_m() * twist.angular_rad_s;
         WheelSpeeds {
@@ -225,7 +232,7 @@ impl RobotModel {
         }
     }
 
-    /// The twist that these wheel speeds give at low speed, through the effective track.
+    /// Returns the twist of wheel speeds by the low-speed kinematics with `W_eff`.
     pub fn twist_from_wheel_speeds(&self, wheels: WheelSpeeds) -> Twist {
         let radius_m = self.spec.wheel_radius_m;
         Twist {

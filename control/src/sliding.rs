@@ -1,81 +1,85 @@
-//! Whether the ground gives less than a plan assumes, seen from gyro and wheel speeds.
+//! Detects from gyro and wheel speeds that the ground gives less friction than the plan assumes.
 //!
-//! In the linear range the turn that the wheels ask for runs ahead of the body's by
-//! `θ (u/g) (4 I_G/(m(W² + L²))) ω̇`, u the speed of the rims. Ground whose peak the plan assumes
-//! explains so much of it with `θ = λ_m/μ`; what is left over, less what radii, the effective
-//! track and noise may do, is summed to an angle, and a robot slides once that is large:
+//! In the linear range the turn rate of the wheels leads that of the body by
+//! `θ (u/g) (4 I_G/(m(W² + L²))) ω̇`, u the rim speed. With `θ = λ_m/μ` of the assumed peak
+//! friction coefficient μ this is the lead that slip explains. The rest, less tolerances for
+//! rolling radii, effective track and noise, is integrated to an angle; a large angle means
+//! sliding:
 //!
 //! ```text
-//! rolling ─ angle large, too little shown ─► sliding (for good)
+//! rolling ─ angle large, demonstrated acceleration small ─► sliding (never back)
 //! ```
-//! What the body did shows what the ground gave: four wheels of equal load that push the body
-//! with `a_y = vω` and turn it with `I_G ω̇` have a mean square of at least
-//! `a_y² + (2 I_G ω̇/(m √(W² + L²)))²`, so that some wheel had at least the root of it over g as μ.
-//! It bounds friction from below as far as the nose turns with the course and rates are seen well;
-//! where not, more is shown than was given. Either way the robot only becomes slower, never
-//! quicker.
+//! The motion of the body gives a lower bound of friction: four wheels of equal load that
+//! accelerate the body with `a_y = vω` and turn it with `I_G ω̇` have a mean square of at least
+//! `a_y² + (2 I_G ω̇/(m √(W² + L²)))²`, so at least one wheel had its root over g as friction
+//! coefficient μ. The bound is too high where the heading turns without the course, or where turn
+//! rates are noisy. The result only ever slows the robot.
 
 use crate::friction::SLIP_LINEAR;
 use crate::measured::Measured;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-/// Time over which rates are smoothed, seconds.
+/// Time constant of the low-pass filter of turn rates, seconds.
 const SMOOTHING_S: f64 = 0.05;
-/// What the linear range explains is taken this much larger.
+/// Factor by which the lead that linear slip explains is enlarged.
 const EXPLAINED_RATIO: f64 = 1.2;
-/// Difference of the sides' rolling radii that is not taken for sliding before it is measured.
+/// Tolerated relative difference of left and right rolling radius before it is measured.
 const RADII_RATIO: f64 = 0.04;
-/// The same after.
+/// Tolerated relative difference of left and right rolling radius after it is measured.
 const RADII_LEFT_RATIO: f64 = 0.004;
-/// Turn rate below which a robot drives straight on, so that its radii can be measured, radians
-/// per second.
+/// Turn rate below which driving counts as straight and measures the rolling radii, radians per
+/// second.
 const STRAIGHT_RAD_S: f64 = 0.03;
-/// Speed squared over time that measures them half-way, metres squared per second.
+/// `∫ u² dt` at which the measured difference of radii has weight one half, metres squared per
+/// second.
 const RADII_MIDDLE_M2_S: f64 = 0.002;
-/// The same of the effective track: it grows in tight turns.
+/// Tolerated relative error of the effective track width, which grows in tight turns.
 const TRACK_RATIO: f64 = 0.1;
-/// The same of the turn rates' noise, radians per second.
+/// Tolerated noise of the turn rates, radians per second.
 const NOISE_RAD_S: f64 = 0.01;
-/// Angle from which a robot slides, radians.
+/// Integrated unexplained angle above which the robot counts as sliding, radians.
 const SLIDING_RAD: f64 = 0.007;
-/// Slowest rims for which slip is computed, metres per second.
+/// Lowest rim speed used to compute the explained lead, metres per second.
 const RIM_MIN_M_S: f64 = 0.05;
-/// Share of what was shown that may be asked for along and across the path.
+/// Fraction of the demonstrated acceleration that a sliding robot may use along and across the
+/// path.
 const SHARE: f64 = 0.5;
-/// The same in yaw, where turning wheels scrub.
+/// Fraction of the demonstrated acceleration that a sliding robot may use in yaw, where wheels
+/// scrub.
 const SHARE_YAW: f64 = 0.35;
-/// Least that counts as shown, over what the plan assumes.
+/// Lower bound of the demonstrated acceleration, as a fraction of the assumed `μg`.
 const SHOWN_RATIO_MIN: f64 = 0.2;
 
-/// What may be asked of ground that slides.
+/// Maximum accelerations on ground where the robot slides.
 #[expect(
     clippy::struct_field_names,
     reason = "all are accelerations, and units stand last"
 )]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct SlidingBounds {
-    /// Along the path, where a bend ahead is braked for, metres per second squared.
+    /// Deceleration along the path before a bend, metres per second squared.
     pub(crate) along_m_s2: f64,
-    /// Across the path, metres per second squared.
+    /// Acceleration across the path, metres per second squared.
     pub(crate) across_m_s2: f64,
-    /// In yaw, radians per second squared.
+    /// Acceleration in yaw, radians per second squared.
     pub(crate) yaw_rad_s2: f64,
 }
 
-/// Turn rates of body and wheels, smoothed alike.
+/// Turn rate of the body, and turn rate of the wheels minus that of the body, both low-pass
+/// filtered.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Smoothed {
     turn_rad_s: f64,
     forward_rad_s: f64,
 }
 
-/// Watches one robot on its way.
+/// Slide detector of one robot on its approach to a trajectory.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Sliding {
     model: RobotModel,
     assumed_mu: f64,
     smoothed: Option<Smoothed>,
-    /// `∫ (turn of the wheels − turn of the body) u` and `∫ u²` straight on.
+    /// `∫ (ω of the wheels − ω of the body) u dt` and `∫ u² dt` over straight driving.
     straight: [f64; 2],
     shown_m_s2: f64,
     left_over_rad: f64,
@@ -83,7 +87,8 @@ pub(crate) struct Sliding {
 }
 
 impl Sliding {
-    /// A robot with traction, on ground whose plan assumes a peak friction coefficient.
+    /// Creates a detector in state rolling, for a plan that assumes the peak friction coefficient
+    /// `assumed_mu`.
     pub(crate) fn new(model: RobotModel, assumed_mu: f64) -> Self {
         Self {
             model,
@@ -96,7 +101,7 @@ impl Sliding {
         }
     }
 
-    /// Takes one tick.
+    /// Updates the detector with the measurements of one tick of `dt_s` seconds.
     pub(crate) fn step(&mut self, measured: &Measured, dt_s: f64) {
         let model = &self.model;
         let turn_rad_s = measured.twist.angular_rad_s;
@@ -125,7 +130,7 @@ impl Sliding {
             self.straight[1] += rim_m_s * rim_m_s * dt_s;
         }
         let known_m2_s = RADII_MIDDLE_M2_S + self.straight[1];
-        // More than radii can do is sliding.
+        // A larger lead than tolerated radii can cause counts as sliding.
         let radii_most_rad_s = RADII_RATIO * rim_m_s / model.effective_track_m();
         let radii_rad_s =
             (self.straight[0] / known_m2_s * rim_m_s).clamp(-radii_most_rad_s, radii_most_rad_s);
@@ -140,12 +145,13 @@ impl Sliding {
             + NOISE_RAD_S;
         let left_over_rad_s = (smoothed.forward_rad_s - radii_rad_s).abs() - explained_rad_s;
         self.left_over_rad = (self.left_over_rad + left_over_rad_s * dt_s).max(0.0);
-        // Ground that has given what the plan asks of it along the path is as good as assumed.
+        // The ground has given what the plan needs along the path, so it is as good as assumed.
         let is_enough = self.shown_m_s2 >= RobotModel::longitudinal_traction_m_s2(self.assumed_mu);
         self.slides |= self.left_over_rad > SLIDING_RAD && !is_enough;
     }
 
-    /// What may be asked of the ground, if the robot slides; rises with what was shown.
+    /// Returns the acceleration bounds if the robot slides, else None. They grow with the
+    /// demonstrated acceleration.
     pub(crate) fn bounds(&self) -> Option<SlidingBounds> {
         let least_m_s2 = SHOWN_RATIO_MIN * self.assumed_mu * GRAVITY_M_S2;
         let shown_m_s2 = self.shown_m_s2.max(least_m_s2);
@@ -156,7 +162,8 @@ impl Sliding {
         })
     }
 
-    /// Acceleration of the wheels per yaw acceleration, metres.
+    /// Returns the tangential acceleration at the wheels per yaw acceleration,
+    /// `2 I_G/(m √(W² + L²))`, metres.
     fn lever_m(model: &RobotModel) -> f64 {
         let half_m = 0.5 * model.track_width_m().hypot(model.wheelbase_m());
         model.yaw_inertia_kg_m2() / (model.mass_kg() * half_m)
@@ -189,7 +196,8 @@ mod tests {
         }
     }
 
-    /// A robot that drives faster and faster, then swings, its body behind its wheels by a lag.
+    /// Measurements of a robot that accelerates to 0.5 m/s in 1 s, then oscillates in yaw; the body
+    /// lags its wheels by `lag_s`.
     fn driven(swing_rad_s: f64, pace_1_s: f64, lag_s: f64, radii: [f64; 2]) -> Vec<Measured> {
         (0..300)
             .map(|tick| {

@@ -1,30 +1,31 @@
-//! Longitudinal slip of each side's wheels, equation (3) of the paper.
+//! Longitudinal slip of the wheels of each side, equation (3) of the paper.
 
 use crate::measured::WheelSpeeds;
 use crate::robot::RobotModel;
 
-/// Speeds of the body in its own frame.
+/// Velocity of the centre of mass and turn rate, in the body frame.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct BodyVelocity {
-    /// ẋ, metres per second.
+    /// Forward speed ẋ, metres per second.
     pub forward_m_s: f64,
-    /// ẏ, metres per second.
+    /// Lateral speed ẏ, metres per second, positive to the left.
     pub left_m_s: f64,
-    /// φ̇, radians per second.
+    /// Turn rate φ̇, radians per second, counter-clockwise positive.
     pub yaw_rate_rad_s: f64,
 }
 
-/// Longitudinal slips of the two sides (3), held within ±1; λ₁ = λ₂ and λ₃ = λ₄.
+/// Longitudinal slip λ of each side by (3), clamped to ±1; λ₁ = λ₂ and λ₃ = λ₄.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SideSlips {
-    /// λ₁ = λ₂.
+    /// Slip of the left wheels, λ₁ = λ₂.
     pub left: f64,
-    /// λ₃ = λ₄.
+    /// Slip of the right wheels, λ₃ = λ₄.
     pub right: f64,
 }
 
 impl SideSlips {
-    /// Slips of a moving base. Wheels must turn forward: at `rω` = 0 the slip is not defined.
+    /// Computes `λ = (rω − v_x)/(rω)` per side with `v_x = ẋ ∓ (W/2) φ̇`. Both wheel speeds must be
+    /// above zero: slip is undefined at `rω` = 0.
     pub fn of(velocity: &BodyVelocity, wheels: WheelSpeeds, model: &RobotModel) -> Self {
         let half_m_s = 0.5 * model.track_width_m() * velocity.yaw_rate_rad_s;
         let slip = |wheel_rad_s: f64, contact_m_s: f64| {

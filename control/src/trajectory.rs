@@ -1,22 +1,22 @@
-//! What a robot is asked to drive: a circle or waypoints.
+//! Trajectories that a user requests: a circle or waypoints.
 
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::Point;
 
-/// Which way round a circle is driven, seen from above.
+/// Direction of travel around a circle, seen from above.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Direction {
-    /// The heading grows.
+    /// The heading increases.
     #[default]
     CounterClockwise,
-    /// The heading falls.
+    /// The heading decreases.
     Clockwise,
 }
 
 impl Direction {
-    /// +1 counter-clockwise, −1 clockwise.
+    /// Returns +1 for counter-clockwise, −1 for clockwise.
     pub fn sign(self) -> f64 {
         match self {
             Self::CounterClockwise => 1.0,
@@ -25,29 +25,29 @@ impl Direction {
     }
 }
 
-/// Turns on a circle, counted from where the robot joins it.
+/// Request to drive around a circle, starting where the robot joins it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct CircleSpec {
-    /// The circle's centre.
+    /// Centre in the site frame.
     pub center: Point,
-    /// Radius, metres, at least [`crate::path::RADIUS_MIN_M`].
+    /// Radius, metres, [`crate::path::RADIUS_MIN_M`] to [`crate::plan::COORDINATE_MAX_M`].
     pub radius_m: f64,
     /// Speed along the circle, metres per second.
     pub speed_m_s: f64,
-    /// Which way round.
+    /// Direction of travel.
     pub direction: Direction,
-    /// How many turns, above zero.
+    /// Number of turns, above zero, not necessarily whole.
     pub turns: f64,
 }
 
 /// One point of a waypoint path.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Waypoint {
-    /// Where.
+    /// Position in the site frame.
     pub point: Point,
-    /// Speed from here to the next point, metres per second; the path's own when absent.
+    /// Speed from here to the next point, metres per second; None for [`WaypointsSpec::speed_m_s`].
     pub speed_m_s: Option<f64>,
-    /// Direction of the path here, radians; free when absent.
+    /// Direction of the path at this point, radians counter-clockwise from x; None leaves it free.
     pub heading_rad: Option<f64>,
 }
 
@@ -61,21 +61,21 @@ impl From<Point> for Waypoint {
     }
 }
 
-/// A smooth path through points, driven without stopping at them.
+/// Request to drive a smooth path through points without stopping at them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct WaypointsSpec {
-    /// The points in driving order, 2 to [`crate::plan::WAYPOINTS_MAX`].
+    /// Points in driving order, 2 to [`crate::plan::WAYPOINTS_MAX`].
     pub points: Vec<Waypoint>,
-    /// Speed wherever a point does not say otherwise, metres per second.
+    /// Speed from points without a speed of their own, metres per second.
     pub speed_m_s: f64,
 }
 
-/// What a robot is asked to drive.
+/// Trajectory that a user requests.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 pub enum Trajectory {
-    /// Turns on a circle.
+    /// Circle.
     Circle(CircleSpec),
-    /// A smooth path through points.
+    /// Smooth path through points.
     Waypoints(WaypointsSpec),
 }

@@ -1,37 +1,37 @@
-//! The limits of a commanded twist, and one bounded step of a command towards what is wanted.
+//! Limits of a commanded twist, and one rate-limited step of a command towards a target.
 //!
-//! The *commanded twist* is what the commanded wheel speeds mean by the kinematics of the configured
-//! model: `v = r (ω_l + ω_r)/2` and `ω = r (ω_r − ω_l)/W_eff`. Each step bounds the speeding up of
-//! both parts, and of every wheel: away from zero a part gains at most its acceleration limit times
-//! the time. Slowing down is bounded apart, by whoever takes the step. What the robot truly does
-//! beyond the kinematics (slip, rolling radii that differ, a slope) is not limited here.
+//! The *commanded twist* follows from the commanded wheel speeds by the kinematics of the
+//! configured model: `v = r (ω_l + ω_r)/2` and `ω = r (ω_r − ω_l)/W_eff`. In each step the
+//! magnitudes of v, ω and both wheel speeds grow by at most their acceleration limit times the time
+//! step. The caller gives the limit of slowing down ([`Slowing`]). Motion beyond the kinematics
+//! (slip, unequal rolling radii, a slope) is not limited here.
 
 use crate::geometry::Twist;
 use crate::measured::WheelSpeeds;
 use crate::robot::RobotModel;
 
-/// How hard a command may slow down in one step.
+/// Maximum deceleration of a command, positive.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Slowing {
-    /// Along the path, metres per second squared.
+    /// Deceleration of v, metres per second squared.
     pub linear_m_s2: f64,
-    /// In yaw, radians per second squared.
+    /// Deceleration of ω, radians per second squared.
     pub angular_rad_s2: f64,
 }
 
-/// Limits of a commanded twist and of the wheel speeds behind it.
+/// Speed and acceleration limits of a commanded twist and of its wheel speeds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TwistLimits {
     model: RobotModel,
 }
 
 impl TwistLimits {
-    /// Limits of a robot.
+    /// Creates the limits of a robot model.
     pub fn of(model: &RobotModel) -> Self {
         Self { model: *model }
     }
 
-    /// Slowing as hard as the wheels' acceleration limit lets them.
+    /// Returns the deceleration of v alone, or ω alone, at the wheels' acceleration limit.
     pub fn slowing_by_wheels(&self) -> Slowing {
         let rim_m_s2 =
             self.model.limits().wheel_acceleration_max_rad_s2 * self.model.wheel_radius_m();
@@ -41,7 +41,7 @@ impl TwistLimits {
         }
     }
 
-    /// The share, at most 1, by which a twist must be scaled to be within every speed limit.
+    /// Returns the factor in (0, 1] that scales a twist to within every speed limit (v, ω, wheels).
     pub fn share_within(&self, twist: Twist) -> f64 {
         let limits = self.model.limits();
         let wheels_rad_s = self
@@ -60,10 +60,12 @@ impl TwistLimits {
             .min(share(wheels_rad_s, limits.wheel_speed_max_rad_s))
     }
 
-    /// From `previous` towards `target`, as far as `dt_s` allows: speeding up within the
-    /// acceleration limits, slowing down within `slowing`, every wheel within its own limits.
+    /// Returns the command after `dt_s` seconds from `previous` towards `target`: v and ω speed up
+    /// within the acceleration limits, slow down within `slowing`, and every wheel keeps its own
+    /// limits. `target` is not passed.
     ///
-    /// Both must be finite and `target` within the speed limits; so is the result, if `previous` is.
+    /// Both twists must be finite and `target` within the speed limits. If `previous` is within the
+    /// speed limits, the result is too.
     pub fn step(&self, previous: Twist, target: Twist, slowing: Slowing, dt_s: f64) -> Twist {
         let limits = self.model.limits();
         let free = Twist {
@@ -93,8 +95,9 @@ impl TwistLimits {
         }
     }
 
-    /// The share of a change of the wheel speeds that the wheels' limits leave. On the straight
-    /// line between two commands within the speed limits every command is within them.
+    /// Returns the fraction, at most 1, of a change of wheel speeds that the wheels' speed and
+    /// acceleration limits allow. The speed limits are convex, so every command between two allowed
+    /// ones is allowed.
     fn wheel_share(&self, from: WheelSpeeds, to: WheelSpeeds, dt_s: f64) -> f64 {
         let limits = self.model.limits();
         let change_max_rad_s = limits.wheel_acceleration_max_rad_s2 * dt_s;
@@ -121,8 +124,8 @@ impl TwistLimits {
     }
 }
 
-/// One part of a twist towards its target: away from zero by `up` at most, towards zero by `down`.
-/// Through zero it takes the time for both.
+/// Moves `previous` towards `target`: its magnitude grows by at most `up` and falls by at most
+/// `down`. A change of sign first uses `down` to reach zero, then the rest of the step with `up`.
 fn stepped(previous: f64, target: f64, up: f64, down: f64) -> f64 {
     if previous * target >= 0.0 {
         let sign = if previous.abs() > 0.0 {

@@ -14,7 +14,7 @@ const THETA: f64 = 0.25;
 const CURVATURE: f64 = 1.5;
 const CURVATURE_HALF_RANGE: f64 = 1.0;
 
-/// A robot on brush tyres, told how far κ may spread, with perfect torque constants.
+/// A robot on brush tyres, configured with how far κ may spread, with perfect torque constants.
 fn brush_robot(seed: u64, curvature: f64, radius_ratios: [f64; 2]) -> SimRobot {
     let mut robot = SimRobot::new(Pose::default(), THETA.recip(), seed, true);
     let spec = PlantSpec {

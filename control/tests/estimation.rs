@@ -114,6 +114,25 @@ fn without_torque_swinging_bends_measure_theta_and_intervals_hold() {
 }
 
 #[test]
+fn a_robot_that_turns_on_the_spot_does_not_count_as_standing() {
+    // The wheels' mean speed is zero all the while: what the gyro says is no offset.
+    for seed in 0..4 {
+        let mut robot = SimRobot::new(Pose::default(), 2.0, seed, false);
+        let on_the_spot = robot.model.wheel_speeds_from_twist(Twist {
+            linear_m_s: 0.0,
+            angular_rad_s: 0.6,
+        });
+        for _ in 0..200 {
+            robot.act(on_the_spot);
+        }
+        weave(&mut robot, 40.0);
+        let found = robot.estimator.estimate().theta;
+        let found = found.expect("swinging bends measure θ");
+        assert!((found.theta - 0.5).abs() < 4.0 * found.std_dev, "{found:?}");
+    }
+}
+
+#[test]
 fn without_torque_steady_driving_tells_nothing_at_any_moment() {
     for seed in 0..10 {
         for curvature_1_m in [0.0, 1.0 / 6.0] {
@@ -529,7 +548,8 @@ fn a_segment_tells_its_own_error_apart_from_those_it_shares_with_others() {
     for segment in &unknown {
         let common = segment.common_ratio;
         assert!(segment.theta().is_some(), "none is dropped: {segment:?}");
-        assert!((0.12..0.2).contains(&common.robot), "{common:?}");
+        // The mass was learned from accelerations; rotors and accelerometer limit that.
+        assert!((0.03..0.12).contains(&common.robot), "{common:?}");
         assert!((0.01..0.5).contains(&common.tyres), "{common:?}");
     }
     let known = segments(EstimatorPrior::exact());

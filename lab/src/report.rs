@@ -12,20 +12,21 @@ pub struct Check {
     pub name: String,
     /// The goal in words, for instance `≤ 0.6`.
     pub goal: String,
-    /// What was measured.
-    pub value: f64,
+    /// What was measured; `None` if nothing was.
+    pub value: Option<f64>,
     /// Whether the goal is reached.
     pub holds: bool,
 }
 
 impl Check {
-    /// A figure that must not be above a bound; NaN does not hold.
-    pub fn at_most(name: impl Into<String>, value: f64, bound: f64) -> Self {
+    /// A figure that must not be above a bound; none, and NaN, do not hold.
+    pub fn at_most(name: impl Into<String>, value: impl Into<Option<f64>>, bound: f64) -> Self {
+        let value = value.into();
         Self {
             name: name.into(),
             goal: format!("≤ {bound}"),
             value,
-            holds: value <= bound,
+            holds: value.is_some_and(|value| value <= bound),
         }
     }
 
@@ -34,9 +35,15 @@ impl Check {
         Self {
             name: name.into(),
             goal: format!("{} … {}", range.start(), range.end()),
-            value,
+            value: Some(value),
             holds: range.contains(&value),
         }
+    }
+
+    /// What was measured, for people.
+    pub fn figure(&self, decimals: usize) -> String {
+        let figure = |value| format!("{value:.decimals$}");
+        self.value.map_or_else(|| "none".to_owned(), figure)
     }
 
     /// Whether it holds, for people.
@@ -62,8 +69,8 @@ pub fn checks_markdown<'a>(checks: impl IntoIterator<Item = &'a Check>) -> Strin
     for check in checks {
         // A bar would end the cell.
         let name = check.name.replace('|', "\\|");
-        let (goal, verdict) = (&check.goal, check.verdict());
-        let _ = writeln!(text, "| {name} | {goal} | {:.4} | {verdict} |", check.value);
+        let (goal, value, verdict) = (&check.goal, check.figure(4), check.verdict());
+        let _ = writeln!(text, "| {name} | {goal} | {value} | {verdict} |");
     }
     text
 }
@@ -79,5 +86,7 @@ mod tests {
         let last = table.lines().last().unwrap();
         assert_eq!(last, "| \\|ε\\|, m | ≤ 0.1 | NaN | FAILS |");
         assert!(!Check::between("x", f64::NAN, 0.0..=1.0).holds);
+        let nothing = Check::at_most("x", None, 1.0);
+        assert!(!nothing.holds && nothing.figure(4) == "none");
     }
 }

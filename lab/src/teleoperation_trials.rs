@@ -215,11 +215,20 @@ impl Trial<'_> {
     }
 }
 
-/// Runs so many trials on one robot.
+/// What is run.
+#[derive(Debug, Clone, Copy)]
+pub struct TrialRun {
+    /// Number of trials.
+    pub trials: u64,
+    /// Seed of their random numbers.
+    pub seed: u64,
+}
+
+/// Runs the trials on one robot.
 ///
 /// # Errors
 /// [`BenchError`] when the bench cannot be made; the built-in scenario always can.
-pub fn run(trials: u64, seed: u64) -> Result<HandReport, BenchError> {
+pub fn run(TrialRun { trials, seed }: TrialRun) -> Result<HandReport, BenchError> {
     let impossible = |cause: String| BenchError::Impossible(cause);
     let scenario = Scenario::built_in().map_err(|cause| impossible(cause.to_string()))?;
     let start = Pose {
@@ -252,7 +261,11 @@ mod tests {
 
     #[test]
     fn silence_brings_the_robot_to_rest_in_time_and_within_its_braking_distance() {
-        let report = run(150, 9).unwrap();
+        let report = run(TrialRun {
+            trials: 150,
+            seed: 9,
+        })
+        .unwrap();
         assert_eq!((report.misses, report.overruns), (0, 0), "{report:?}");
         assert!(
             report.silences >= 150 && report.fastest_m_s > 0.7,
@@ -264,6 +277,7 @@ mod tests {
 
     #[test]
     fn a_seed_repeats_to_the_bit() {
-        assert_eq!(run(5, 3).unwrap(), run(5, 3).unwrap());
+        let short = TrialRun { trials: 5, seed: 3 };
+        assert_eq!(run(short).unwrap(), run(short).unwrap());
     }
 }

@@ -102,7 +102,7 @@ impl Clock for SystemClock {
     }
 }
 
-/// A clock that moves only when told.
+/// A clock that moves only when advanced.
 #[derive(Debug)]
 pub struct ManualClock {
     elapsed: Mutex<Duration>,

@@ -224,7 +224,7 @@ impl Dispatcher {
     /// Takes the site of a server's welcome; false if the loop has no room for it now.
     ///
     /// A geofence that is larger than a tick can look at is no reason to drive without any: the
-    /// robot then finds no room anywhere until it is told of another.
+    /// robot then finds no room anywhere until it gets another.
     pub(crate) fn take_welcome(&self, definition: SiteDefinition) -> bool {
         match definition.geofence.validate() {
             Ok(()) => self.take_site(definition),

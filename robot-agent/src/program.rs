@@ -44,7 +44,7 @@ pub fn command_line() -> clap::Command {
     <Words as clap::CommandFactory>::command()
 }
 
-/// Runs an agent until it is told to stop by SIGTERM or ctrl-c; the first argument is the
+/// Runs an agent until SIGTERM or ctrl-c stops it; the first argument is the
 /// program's name. Sets up logging, so it is for whole processes.
 ///
 /// The code is 0 after an orderly stop, 1 when the agent could not start or a part of it died,
@@ -134,8 +134,8 @@ async fn wait(agent: &RunningAgent) -> anyhow::Result<()> {
     let mut terminate = signal(SignalKind::terminate()).context("no signal handler")?;
     let mut interrupt = signal(SignalKind::interrupt()).context("no signal handler")?;
     tokio::select! {
-        _ = terminate.recv() => info!("told to stop by SIGTERM"),
-        _ = interrupt.recv() => info!("told to stop by ctrl-c"),
+        _ = terminate.recv() => info!("stopping by SIGTERM"),
+        _ = interrupt.recv() => info!("stopping by ctrl-c"),
         ended = agent.failed() => return Err(ended.into()),
     }
     Ok(())

@@ -228,7 +228,7 @@ impl Reporter {
 /// Time between two looks at the counters of what was lost.
 const LOSSES_EVERY: Duration = Duration::from_secs(10);
 
-/// Logs what the loop had to give up, when there is more of it, until told to stop.
+/// Logs what the loop had to give up, when there is more of it, until requested to stop.
 pub(crate) async fn log_losses(
     shared: Arc<Shared>,
     base: Option<Arc<Counts>>,

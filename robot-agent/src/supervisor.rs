@@ -1,6 +1,6 @@
 //! Starts every task and thread of an agent, and notices when one ends that should not.
 //!
-//! A task that ends or panics before the agent is told to stop is a failure of the whole agent:
+//! A task that ends or panics before the agent is requested to stop is a failure of the whole agent:
 //! [`Supervisor::failed`] names it, and the program ends with a code that makes systemd start it
 //! again.
 

@@ -261,7 +261,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_manual_clock_moves_only_when_told_and_moves_both_times() {
+    fn a_manual_clock_moves_only_when_advanced_and_moves_both_times() {
         let clock = Clock::manual("2026-11-01T00:00:00Z".parse().unwrap());
         let (wall, elapsed) = (clock.now(), clock.elapsed());
         assert_eq!((clock.now(), clock.elapsed()), (wall, elapsed));

@@ -37,7 +37,7 @@ counters! {
     records_refused,
     /// Segments with times in the future, deferred until their run's clock is known.
     segments_deferred,
-    /// Raw segments removed after their time; what they said stays on the map.
+    /// Raw segments removed after their time; their statistics stay on the map.
     segments_removed,
     /// Mission reports taken.
     mission_reports_committed,
@@ -68,7 +68,7 @@ counters! {
     refused_other_run,
     /// Messages of robots whose enrolment was revoked.
     refused_revoked_robot,
-    /// Messages of robots that have not joined, where only those that have may speak.
+    /// Messages of robots that have not joined, where only those that have are accepted.
     refused_unenrolled_robot,
     /// Robots that joined, with those that joined again.
     robots_enrolled,

@@ -5,7 +5,7 @@
 //! renewal counts.
 //!
 //! Whoever can write the database may make one; the server need not run, and may. The token is
-//! told once: on standard output, or into a file that only its owner can read.
+//! shown once: on standard output, or into a file that only its owner can read.
 
 use std::io::{self, Write as _};
 use std::os::unix::fs::OpenOptionsExt as _;
@@ -118,7 +118,7 @@ pub(crate) async fn run(args: InitArgs) -> anyhow::Result<()> {
         None => writeln!(io::stdout().lock(), "{}", created.secret).context("cannot print")?,
     }
     let (name, expires_at) = (&created.token.name, created.token.expires_at);
-    eprintln!("admin's token `{name}`, valid until {expires_at}; it is told this once");
+    eprintln!("admin's token `{name}`, valid until {expires_at}; it is shown this once");
     Ok(())
 }
 
@@ -156,7 +156,7 @@ fn write_secret(file: &Path, secret: &str) -> io::Result<()> {
         std::fs::rename(&new, file)
     };
     written().inspect_err(|_| {
-        // What is half written is of no use; why it is, is told.
+        // What is half written is of no use; the error says why.
         let _ = std::fs::remove_file(&new);
     })
 }

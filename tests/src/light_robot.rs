@@ -1,4 +1,4 @@
-//! Robots without physics: they speak like an agent, as fast as they are told to.
+//! Robots without physics: they speak like an agent, as fast as they are configured to.
 //!
 //! They say hello, hold a liveliness token, publish states, and upload segments in batches with
 //! acknowledgement. What they never do is drive.
@@ -146,7 +146,7 @@ pub struct LightRobot {
     pub boot: BootId,
     /// Its session.
     pub session: Session,
-    /// What the server told it of the site.
+    /// What the server answered of the site.
     pub welcome: Welcome,
     model: RobotModel,
     ingest_key: String,

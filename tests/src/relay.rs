@@ -1,7 +1,7 @@
 //! A network between robots and server that can be cut and healed.
 //!
 //! Every connection to the relay is carried on to its target. While it is cut, bytes are neither
-//! read nor written and new connections hang, as on a radio link out of range: no side is told.
+//! read nor written and new connections hang, as on a radio link out of range: no side is notified.
 //! A relay may carry only so many bytes a second each way, as a narrow link does.
 
 use std::net::{Ipv4Addr, SocketAddr};

@@ -19,6 +19,11 @@ pub const VERSION: u32 = 2;
 /// Maximum size of a payload that is read, bytes; sufficient for a path with the maximum number of
 /// waypoints.
 pub const PAYLOAD_BYTES_MAX: usize = 16 * 1024 * 1024;
+/// Lease of the zenoh session between robot and server, milliseconds: after this silence either side takes the
+/// other for gone. TCP repeats what was lost after ever longer pauses; a new connection is there sooner.
+pub const SESSION_LEASE_MS: u32 = 3_000;
+/// Largest batch that zenoh hands to the kernel at once, bytes. Priorities act only above it.
+pub const BATCH_BYTES: u16 = 8 * 1024;
 
 /// Reason why a payload is refused.
 #[derive(Debug, thiserror::Error)]

@@ -140,7 +140,7 @@ fn every_command_of_the_documentation_is_understood() {
 }
 
 #[test]
-fn every_program_that_cargo_is_told_to_run_is_there() {
+fn every_program_that_the_docs_run_by_cargo_is_there() {
     let mut faults = String::new();
     for document in documents() {
         for block in document

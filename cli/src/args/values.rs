@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mission_that_is_none_is_told_where_to_find_one() {
+    fn a_mission_that_is_none_is_refused_with_where_to_find_one() {
         assert!(mission("123").unwrap_err().contains("tread missions"));
         assert!(mission("0192f0c1-2b3c-7d4e-8f50-617283940a1b").is_ok());
     }

@@ -309,7 +309,7 @@ impl Driving<'_> {
                 let how = if stop.confirmed_at.is_some() {
                     "confirmed"
                 } else {
-                    "NOT CONFIRMED, it is told again"
+                    "NOT CONFIRMED, it is sent again"
                 };
                 let text = format!(
                     "stopped, {how}; clear it with: tread clear {} {}",

@@ -83,7 +83,7 @@ async fn join_token(
                     |robot| format!("robot `{robot}`"),
                 );
                 note(&format!(
-                    "for {whom} of site `{}`, until {}; it is told this once:",
+                    "for {whom} of site `{}`, until {}; it is shown this once:",
                     token.site, token.expires_at
                 ));
             }

@@ -133,7 +133,7 @@ pub(super) async fn tokens(
                 } = &created.token;
                 let what = what(*role, *rights);
                 note(&format!(
-                    "`{name}`: {what}, {sites}, until {expires_at}; it is told this once:"
+                    "`{name}`: {what}, {sites}, until {expires_at}; it is shown this once:"
                 ));
             }
             output.show(&created, |created| created.secret.clone())?;

@@ -67,7 +67,7 @@ fn list(stops: &[Stop]) -> String {
         let confirmed = if stop.confirmed_at.is_some() {
             "yes"
         } else {
-            "NOT YET, it is told again"
+            "NOT YET, it is sent again"
         };
         table.add_row([
             stop.robot.to_string(),

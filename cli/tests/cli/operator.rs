@@ -183,7 +183,7 @@ async fn robots_are_named_stopped_fenced_and_watched_over_by_commands() {
 
     let stopped = yard.json(&["stop", ROBOT, "--by", "Ann"]).await;
     let stop = id_of(&stopped["stops"][0]);
-    // The robot is told before it is written down.
+    // The robot gets the stop before the database does.
     let in_force = ["stops", "--in-force"];
     let stops = yard.table_that_says(&in_force, &stop).await;
     assert!(stops.contains("Ann"), "{stops}");

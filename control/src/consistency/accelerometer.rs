@@ -1,46 +1,52 @@
-//! The accelerometer against what wheels and gyro say: `a_x = v̇` and `a_y = vω`.
+//! Compares the accelerometer with wheels and gyro: `a_x = v̇` and `a_y = vω`.
 //!
-//! A lean adds a part of gravity, so that only changes are compared: both sides pass the same
-//! high-pass filter, and a regression with a short memory gives the gain between them.
+//! A tilt adds a part of gravity, so only changes are compared: measured and predicted acceleration
+//! pass the same high-pass filter, and a regression with a short memory gives the gain between
+//! them.
 
-use super::history::BIN_S;
+use super::history::{BIN_S, Means};
 use super::repeats::Repeats;
-use super::{Finding, Kind, Subject, Unit};
+use super::{Comparison, Finding, Kind, Subject, Unit};
 use crate::measured::BodyAcceleration;
 
-/// Bins over which a speed's change is taken.
+/// Number of bins over which the speed is differentiated.
 const BINS: usize = 4;
 /// Time constant of the high-pass filter, seconds.
 const HIGH_PASS_S: f64 = 3.0;
-/// Memory of the regression, seconds.
+/// Time constant of the regression's memory, seconds.
 const MEMORY_S: f64 = 1.5;
-/// Least excitation, metres squared per second cubed.
+/// Minimum excitation `∫ expected² dt` for a gain, metres squared per second cubed.
 const EXCITATION_MIN: f64 = 0.04;
-/// Gain beyond which it is scaled. A low gain is no fault: slip and noise of the prediction give
-/// one.
+/// Gain above which the accelerometer is inconsistent. A low gain is no fault: slip and noise of
+/// the prediction cause one.
 const GAIN_MAX: f64 = 1.6;
-/// Gain from which it agrees.
+/// Gain from which the accelerometer agrees.
 const GAIN_AGREES: f64 = 0.5;
-/// Gain below which it is inverted.
+/// Gain of the regression below which the accelerometer is inverted.
 const GAIN_INVERTED: f64 = -0.3;
-/// Gain that ice does not give: wheels that slip speed up while the body slows down, but not as
-/// much.
+/// Lower limit of gains that ice can cause: wheels that slip speed up while the body slows down,
+/// but by less.
 const GAIN_OF_ICE: f64 = -0.5;
-/// How far below that gain must be for how long, seconds: longer than the wheels may lag.
+/// Cumulative evidence from which the accelerometer is inverted, seconds; longer than the lag of
+/// the wheels.
 const INVERTED_S: f64 = 0.35;
-/// Excitation, squared, that shows the sign: at least this, and noise beside it.
+/// Minimum squared predicted acceleration for evidence on the sign, (m/s²)².
 const SIGN_MIN: f64 = 0.06;
-/// What a change of speed weighs against a turn.
+/// Weight of evidence from a change of speed relative to that from a turn.
 const SIGN_FORWARD: f64 = 0.6;
+/// Noise added to the squared predicted acceleration, (m/s²)².
 const SIGN_NOISE: f64 = 0.015;
-/// Standard deviations of the gain that are let be.
+/// Number of standard deviations of the gain that are tolerated.
 const STD_DEVS: f64 = 4.0;
-/// Change of what is expected while it is frozen, metres per second squared.
+/// Change of the predicted acceleration during which a frozen measurement is a fault, metres per
+/// second squared.
 const FROZEN_CHANGE_M_S2: f64 = 0.3;
-/// Difference that no lean explains, metres per second squared.
+/// Difference of measured and predicted acceleration that no tilt explains, metres per second
+/// squared.
 const IMPOSSIBLE_M_S2: f64 = 5.0;
 
-/// One axis.
+/// Measured and predicted acceleration of one axis, low-pass and high-pass filtered, metres per
+/// second squared.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Axis {
     felt_low: f64,
@@ -50,16 +56,24 @@ struct Axis {
 }
 
 impl Axis {
-    fn take(&mut self, felt_m_s2: f64, expected_m_s2: f64) {
+    fn take(&mut self, comparison: Comparison) {
+        let (felt_m_s2, expected_m_s2) = (comparison.observed, comparison.predicted);
         let share = BIN_S / HIGH_PASS_S;
         self.felt_low += share * (felt_m_s2 - self.felt_low);
         self.expected_low += share * (expected_m_s2 - self.expected_low);
         self.felt = felt_m_s2 - self.felt_low;
         self.expected = expected_m_s2 - self.expected_low;
     }
+
+    fn comparison(self) -> Comparison {
+        Comparison {
+            observed: self.felt,
+            predicted: self.expected,
+        }
+    }
 }
 
-/// What is known of it.
+/// State of the comparison.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Accelerometer {
     sum: BodyAcceleration,
@@ -69,11 +83,11 @@ pub(super) struct Accelerometer {
     bins: usize,
     forward: Axis,
     left: Axis,
-    /// `∫ felt·expected`, `∫ expected²`, `∫ residual²` and `∫ 1`, with a memory.
+    /// `∫ felt·expected`, `∫ expected²`, `∫ residual²` and `∫ 1`, with exponential forgetting.
     sums: [f64; 4],
-    /// What was expected when it froze.
+    /// Predicted acceleration, `[forward, left]`, when the measurement froze.
     frozen_from: Option<[f64; 2]>,
-    /// Cumulative sum of the evidence that it is inverted, seconds.
+    /// Cumulative sum of the evidence that the accelerometer is inverted, seconds.
     inverted_s: f64,
     verdict: Option<Finding>,
     is_healthy: bool,
@@ -94,13 +108,14 @@ impl Accelerometer {
         self.verdict
     }
 
-    /// Whether it was excited, and agreed.
+    /// Returns whether there was excitation and the gain agreed.
     pub(super) fn is_healthy(&self) -> bool {
         self.is_healthy
     }
 
-    /// A bin is over.
-    pub(super) fn step(&mut self, speed_m_s: f64, turn_rad_s: f64, repeats: &Repeats) {
+    /// Evaluates one bin with the forward speed of the wheels and the turn rate of the gyro.
+    pub(super) fn step(&mut self, motion: &Means, repeats: &Repeats) {
+        let speed_m_s = motion.wheels.linear_m_s;
         self.verdict = None;
         self.is_healthy = false;
         if self.count < 1.0 {
@@ -123,19 +138,23 @@ impl Accelerometer {
         let bins = BINS as f64;
         let expected = [
             (self.speeds_m_s[BINS] - self.speeds_m_s[0]) / (bins * BIN_S),
-            speed_m_s * turn_rad_s,
+            speed_m_s * motion.gyro_rad_s,
         ];
         let mean = |of: fn(&BodyAcceleration) -> f64| self.means.iter().map(of).sum::<f64>() / bins;
         let felt = [mean(|felt| felt.forward_m_s2), mean(|felt| felt.left_m_s2)];
-        self.forward.take(felt[0], expected[0]);
-        self.left.take(felt[1], expected[1]);
+        let axes = [0, 1].map(|axis: usize| Comparison {
+            observed: felt[axis],
+            predicted: expected[axis],
+        });
+        self.forward.take(axes[0]);
+        self.left.take(axes[1]);
         let gain = self.regress();
         if !repeats.is_repeating() {
             self.sign();
         }
         self.verdict = self
-            .frozen(repeats, felt, expected)
-            .or_else(|| impossible(felt, expected))
+            .frozen(repeats, axes)
+            .or_else(|| impossible(axes))
             .or_else(|| self.inverted())
             .or_else(|| self.scaled(gain));
         self.is_healthy = self.verdict.is_none()
@@ -143,7 +162,7 @@ impl Accelerometer {
             && gain.is_some_and(|(gain, _)| (GAIN_AGREES..=GAIN_MAX).contains(&gain));
     }
 
-    /// The gain and its standard deviation, where there was excitation.
+    /// Returns the gain and its standard deviation; None without enough excitation.
     fn regress(&mut self) -> Option<(f64, f64)> {
         let keep = (-BIN_S / MEMORY_S).exp();
         let before = if self.sums[1] > 0.0 {
@@ -176,7 +195,7 @@ impl Accelerometer {
         Some((product / square, std_dev))
     }
 
-    /// Looks whether what is felt and what is expected have the same sign.
+    /// Updates the evidence that measured and predicted acceleration have opposite signs.
     fn sign(&mut self) {
         let square = self.forward.expected.powi(2) + self.left.expected.powi(2);
         if square < SIGN_MIN {
@@ -185,7 +204,7 @@ impl Accelerometer {
         let product =
             self.forward.felt * self.forward.expected + self.left.felt * self.left.expected;
         let gain = (product / (square + SIGN_NOISE)).clamp(-1.0, 1.0);
-        // Wheels that slip speed up while the body slows down; in a turn it still goes their way.
+        // Wheels that slip speed up while the body slows down; in a turn the signs still agree.
         let weight = if self.forward.expected.abs() > self.left.expected.abs() {
             SIGN_FORWARD
         } else {
@@ -198,11 +217,11 @@ impl Accelerometer {
     fn inverted(&self) -> Option<Finding> {
         (self.inverted_s >= INVERTED_S).then(|| {
             let axis = self.stronger();
-            finding(Kind::Inverted, axis.felt, axis.expected)
+            finding(Kind::Inverted, axis.comparison())
         })
     }
 
-    /// The axis that is excited more.
+    /// Returns the axis with the larger predicted acceleration.
     fn stronger(&self) -> Axis {
         if self.forward.expected.abs() > self.left.expected.abs() {
             self.forward
@@ -222,28 +241,39 @@ impl Accelerometer {
             return None;
         };
         let axis = self.stronger();
-        Some(finding(kind, gain * axis.expected, axis.expected))
+        let comparison = Comparison {
+            observed: gain * axis.expected,
+            predicted: axis.expected,
+        };
+        Some(finding(kind, comparison))
     }
 
-    fn frozen(&mut self, repeats: &Repeats, felt: [f64; 2], expected: [f64; 2]) -> Option<Finding> {
+    fn frozen(&mut self, repeats: &Repeats, axes: [Comparison; 2]) -> Option<Finding> {
         if !repeats.is_frozen() {
             self.frozen_from = None;
             return None;
         }
-        let from = *self.frozen_from.get_or_insert(expected);
-        (0..2)
-            .find(|&axis| (expected[axis] - from[axis]).abs() > FROZEN_CHANGE_M_S2)
-            .map(|axis| finding(Kind::Frozen, felt[axis], expected[axis]))
+        let from = *self
+            .frozen_from
+            .get_or_insert(axes.map(|axis| axis.predicted));
+        axes.into_iter()
+            .zip(from)
+            .find(|(axis, from)| (axis.predicted - from).abs() > FROZEN_CHANGE_M_S2)
+            .map(|(axis, _)| finding(Kind::Frozen, axis))
     }
 }
 
-fn impossible(felt: [f64; 2], expected: [f64; 2]) -> Option<Finding> {
-    (0..2)
-        .find(|&axis| (felt[axis] - expected[axis]).abs() > IMPOSSIBLE_M_S2)
-        .map(|axis| finding(Kind::Inconsistent, felt[axis], expected[axis]))
+fn impossible(axes: [Comparison; 2]) -> Option<Finding> {
+    axes.into_iter()
+        .find(|axis| (axis.observed - axis.predicted).abs() > IMPOSSIBLE_M_S2)
+        .map(|axis| finding(Kind::Inconsistent, axis))
 }
 
-fn finding(kind: Kind, observed: f64, predicted: f64) -> Finding {
+fn finding(kind: Kind, comparison: Comparison) -> Finding {
+    let Comparison {
+        observed,
+        predicted,
+    } = comparison;
     Finding {
         subject: Subject::Accelerometer,
         kind,

@@ -1,30 +1,31 @@
-//! What the monitor finds, in the words that others read.
+//! Findings of the consistency monitor.
 
-/// What a finding is about.
+/// Sensor channel, or group of channels, that a finding names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Subject {
-    /// The wheels' measured speeds.
+    /// Measured wheel speeds.
     Wheels,
-    /// The gyro.
+    /// Gyro.
     Gyro,
-    /// The accelerometer.
+    /// Accelerometer.
     Accelerometer,
     /// Odometry: the measured speed of the body over ground.
     Odometry,
-    /// The position fixes.
+    /// Position fixes.
     Position,
-    /// The left wheels stand though they are commanded to turn.
+    /// Left wheels that are commanded to turn but stand still.
     LeftWheels,
-    /// The right wheels do.
+    /// Right wheels that are commanded to turn but stand still.
     RightWheels,
-    /// Wheels and body disagree, by slip or by a sensor: nothing distinguishes them.
+    /// Wheels and body disagree, by slip or by a faulty sensor; the data do not distinguish them.
     WheelsAndMotion,
-    /// Channels that say how the body moves disagree, and nothing tells which is right.
+    /// Channels of the body's motion (gyro, odometry, position) disagree, and the data do not show
+    /// which is wrong.
     Motion,
 }
 
 impl Subject {
-    /// All of them.
+    /// All subjects, in the order of their discriminants.
     pub const ALL: [Self; 9] = [
         Self::Wheels,
         Self::Gyro,
@@ -37,7 +38,7 @@ impl Subject {
         Self::Motion,
     ];
 
-    /// For people.
+    /// Returns the name to display.
     pub fn text(self) -> &'static str {
         match self {
             Self::Wheels => "wheel speeds",
@@ -52,18 +53,18 @@ impl Subject {
         }
     }
 
-    /// Whether wheels and gyro may be right where this is wrong.
+    /// Returns whether dead reckoning by wheels and gyro may be right if this subject is wrong.
     pub(super) fn is_beside_dead_reckoning(self) -> bool {
         matches!(self, Self::Odometry | Self::Position)
     }
 
-    /// Whether a robot with this finding may not know where it is. Where it must not move without
-    /// that, no motion can show that the finding is over.
+    /// Returns whether the robot's position may be wrong under this finding. A robot that must not
+    /// move without a position cannot show by motion that the finding is over.
     pub(super) fn is_of_place(self) -> bool {
         matches!(self, Self::Position | Self::Motion)
     }
 
-    /// What a robot with this finding may still do.
+    /// Returns the restriction of the robot under a finding about this subject.
     pub fn consequence(self) -> Consequence {
         match self {
             Self::Accelerometer | Self::Odometry => Consequence::NoLearning,
@@ -78,33 +79,33 @@ impl Subject {
     }
 }
 
-/// What a finding asks for; later ones are stricter and include the earlier.
+/// Restriction under a finding; later ones are stricter and include the earlier.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Consequence {
-    /// Nothing is learned of the ground.
+    /// Friction is not estimated.
     NoLearning,
-    /// The robot drives slowly.
+    /// The robot drives slowly, and friction is not estimated.
     Slow,
-    /// The robot does not drive by itself.
+    /// The robot stops, and is only teleoperated slowly.
     Hold,
 }
 
-/// How a channel is wrong.
+/// Type of fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// It repeats its word to the last bit.
+    /// Values repeat to the last bit.
     Frozen,
-    /// Its sign is wrong.
+    /// The sign is wrong.
     Inverted,
-    /// It leapt.
+    /// The value jumped.
     Jumped,
-    /// It contradicts the others otherwise: biased, scaled, rotated.
+    /// Other contradiction to the other channels: bias, scale, rotation.
     Inconsistent,
-    /// It stands though it is commanded to turn.
+    /// Wheels stand still though they are commanded to turn.
     Locked,
 }
 
-/// What the figures of a finding are.
+/// Unit of the values of a finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unit {
     /// m
@@ -120,7 +121,7 @@ pub enum Unit {
 }
 
 impl Unit {
-    /// Its symbol.
+    /// Returns the symbol, for instance `m/s`.
     pub fn symbol(self) -> &'static str {
         match self {
             Self::Metres => "m",
@@ -132,39 +133,56 @@ impl Unit {
     }
 }
 
-/// A contradiction.
+/// Contradiction between one subject and the other channels.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Finding {
-    /// What it is about.
+    /// Subject that is wrong.
     pub subject: Subject,
-    /// How it is wrong.
+    /// Type of fault.
     pub kind: Kind,
-    /// What it says.
+    /// Measured value, in `unit`.
     pub observed: f64,
-    /// What the others say.
+    /// Value predicted from the other channels, in `unit`.
     pub predicted: f64,
-    /// The unit of both.
+    /// Unit of `observed` and `predicted`.
     pub unit: Unit,
 }
 
-/// The findings that stand, in the order of [`Subject::ALL`].
+/// What a channel says beside what the others let expect.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Comparison {
+    pub(super) observed: f64,
+    pub(super) predicted: f64,
+}
+
+impl Comparison {
+    /// The same, with the others in doubt.
+    pub(super) fn reversed(self) -> Self {
+        Self {
+            observed: self.predicted,
+            predicted: self.observed,
+        }
+    }
+}
+
+/// Active findings, in the order of [`Subject::ALL`].
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Findings {
     pub(super) standing: [Option<Finding>; Subject::ALL.len()],
 }
 
 impl Findings {
-    /// Each of them.
+    /// Returns all active findings.
     pub fn iter(&self) -> impl Iterator<Item = &Finding> {
         self.standing.iter().flatten()
     }
 
-    /// The one about a subject.
+    /// Returns the active finding about a subject, if there is one.
     pub fn about(&self, subject: Subject) -> Option<&Finding> {
         self.standing[subject as usize].as_ref()
     }
 
-    /// The strictest consequence.
+    /// Returns the strictest restriction of all active findings; None without findings.
     pub fn consequence(&self) -> Option<Consequence> {
         self.iter()
             .map(|finding| finding.subject.consequence())

@@ -1,60 +1,63 @@
-//! Position fixes against dead reckoning: jumps at once, speeds and turn rates over a span.
+//! Compares position fixes with dead reckoning: jumps immediately, speeds and turn rates over a
+//! span.
 //!
-//! What fixes and dead reckoning differ by is fitted, by least squares, with a straight line that
-//! bends where the span begins:
+//! The difference between fixes and dead reckoning is fitted, by least squares, with a straight
+//! line that bends where the span begins:
 //! ```text
 //! e(t) = a + s·t + b·max(0, t − begin)      s ~ N(0, usual error), a and b free
 //! ```
-//! The fixes before the span say where it began, better than those in it could, so that a fault
-//! that began with the span shows soon; `s + b` is the speed by which both differ in the span. A
-//! wild fix between two that agree is left out, and what does not fit the line counts as noise.
+//! The fixes before the span determine its start better than those in it could, so that a fault
+//! that began with the span shows soon; `s + b` is the difference of speed in the span. A single
+//! outlier between two fixes that agree is left out, and deviations from the line count as noise.
 
-use super::history::{Edge, History};
+use super::history::{Edge, History, Span};
 use crate::geometry::{Point, Pose, wrap_angle_rad};
 use crate::localisation::FixNoise;
 
-/// Fixes that are kept: the longest span and what is before it, of 20 Hz.
+/// Number of fixes kept: the longest span and [`BEFORE_S`] at 20 Hz.
 const FIXES: usize = 52;
-/// Fewest fixes in a span, and with those before it.
+/// Minimum number of fixes in a span, and together with those before it.
 const FIXES_MIN: (usize, usize) = (3, 5);
-/// How long before a span fixes still say where it began, seconds.
+/// Time before a span whose fixes are used too, seconds.
 const BEFORE_S: f64 = 0.6;
-/// Usual speeds by which fixes and right channels differ, metres and radians per second: slip, and
-/// what the gyro is off by.
+/// Usual difference between fixes and healthy channels, metres per second and radians per second:
+/// slip, and the gyro's offset.
 const USUAL: (f64, f64) = (0.06, 0.03);
-/// What the error of fixes that follow each other walks off, metres and radians per root of a
-/// second: not all of their noise is new with each.
+/// Random walk of the fixes' error, metres and radians per square root of a second: part of their
+/// noise is correlated.
 const DRIFT: (f64, f64) = (0.01, 0.002);
-/// Standard deviations, of a fix, from both of its neighbours that make it a wild one.
+/// Number of standard deviations from both neighbours above which a fix is an outlier.
 const WILD_STD_DEVS: f64 = 6.0;
-/// Smallest standard deviation of a fix that is assumed, metres and radians.
+/// Minimum standard deviation of a fix, metres and radians.
 const STD_DEV_MIN: (f64, f64) = (0.02, 0.008);
-/// Standard deviations that noise is let reach; spans overlap, so there are few independent ones.
+/// Number of standard deviations of noise that are tolerated; spans overlap, so few are
+/// independent.
 const STD_DEVS: f64 = 4.3;
-/// The same of spans shorter than this, seconds.
+/// Number of standard deviations that are tolerated in spans shorter than [`SHORT_S`] seconds.
 const DEVIATIONS_SHORT: f64 = 5.0;
 const SHORT_S: f64 = 0.5;
-/// Shortest jump that is one, metres; smaller ones are a matter of localisation.
+/// Minimum jump of the position, metres; smaller ones are left to localisation.
 const JUMP_M: f64 = 0.5;
-/// The same of the heading, radians.
+/// Minimum jump of the heading, radians.
 const JUMP_RAD: f64 = 0.5;
-/// Share of the path since the last fix that wheels may err by without a jump.
+/// Tolerated error of dead reckoning as a fraction of the distance since the last fix.
 const JUMP_SLIP_RATIO: f64 = 1.0;
-/// Fixes in a row that must agree with each other on a jump.
+/// Number of consecutive fixes that must agree with each other to confirm a jump.
 const JUMP_FIXES: u32 = 3;
-/// How long fixes must agree on another place of a standing robot until it is believed, seconds.
+/// Time for which fixes must agree on another position of the robot until it is accepted, seconds.
 const MOVED_AFTER_S: f64 = 10.0;
-/// How long fixes must be back where they are expected until a jump is over, seconds.
+/// Time for which fixes must be back at the expected position until a jump is over, seconds.
 const BACK_AFTER_S: f64 = 1.0;
 
-/// A fix and dead reckoning at its time.
+/// Position fix, and dead reckoning at its time.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Fix {
     at_s: f64,
     pose: Pose,
     integrated: Point,
     integrated_rad: f64,
-    /// How far the wheels' heading is before the gyro's, and odometry's path before the wheels'.
+    /// Heading by wheels minus heading by gyro, radians; distance by odometry minus distance by
+    /// wheels, metres.
     wheels_lead_rad: f64,
     odometry_lead_m: f64,
 }
@@ -71,7 +74,8 @@ impl Fix {
         }
     }
 
-    /// Where dead reckoning comes from this fix, and how far that is.
+    /// Propagates this fix to the time of `to` by dead reckoning. Returns the pose in the site
+    /// frame and the distance travelled, metres.
     fn carried(&self, to: &Self) -> (Pose, f64) {
         let offset_rad = self.pose.heading_rad - self.integrated_rad;
         let (sin, cos) = offset_rad.sin_cos();
@@ -87,13 +91,14 @@ impl Fix {
         (pose, x_m.hypot(y_m))
     }
 
-    /// By how much the other is not where dead reckoning comes from this one: metres and radians.
+    /// Returns the difference of `other` to the pose propagated from this fix: distance in metres,
+    /// heading in radians, and the distance travelled in metres.
     fn error(&self, other: &Self) -> (f64, f64, f64) {
         let (expected, driven_m) = self.carried(other);
         let by_gyro_rad = wrap_angle_rad(other.pose.heading_rad - expected.heading_rad);
         let by_wheels_rad =
             wrap_angle_rad(by_gyro_rad - (other.wheels_lead_rad - self.wheels_lead_rad));
-        // A gyro that is wrong is no jump of the position.
+        // The smaller heading error counts, so that a wrong gyro is no jump of the position.
         let by_rad = if by_wheels_rad.abs() < by_gyro_rad.abs() {
             by_wheels_rad
         } else {
@@ -107,51 +112,62 @@ impl Fix {
     }
 }
 
-/// How fixes say that the robot moved over a span, beside what dead reckoning says.
+/// Motion by fixes minus motion by dead reckoning over a span.
 #[expect(clippy::struct_field_names, reason = "units stand last")]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Seen {
-    /// When the span begins and ends.
+    /// Start and end of the span, seconds.
     pub(super) from_s: f64,
     pub(super) to_s: f64,
-    /// Forward and to the left over dead reckoning's, metres per second.
+    /// Forward and lateral speed by fixes minus that by dead reckoning, metres per second.
     pub(super) forward_error_m_s: f64,
     pub(super) left_error_m_s: f64,
-    /// Forward, over odometry's, where there is any, metres per second.
+    /// Forward speed by fixes minus that by odometry, metres per second; meaningless without
+    /// odometry.
     pub(super) odometry_error_m_s: f64,
-    /// Turn rate over the gyro's, and over the wheels', radians per second.
+    /// Turn rate by fixes minus that by gyro, and minus that by wheels, radians per second.
     pub(super) turn_error_rad_s: f64,
     pub(super) wheels_turn_error_rad_s: f64,
-    /// What noise may do to the speeds over dead reckoning and over odometry, and to the turn rate.
+    /// Tolerated noise of the speeds against dead reckoning and odometry, and of the turn rates
+    /// against gyro and wheels.
     pub(super) noise_m_s: f64,
     pub(super) odometry_noise_m_s: f64,
     pub(super) noise_rad_s: f64,
     pub(super) wheels_noise_rad_s: f64,
 }
 
-/// A jump of the position.
+impl Seen {
+    pub(super) fn span(&self) -> Span {
+        Span {
+            from_s: self.from_s,
+            to_s: self.to_s,
+        }
+    }
+}
+
+/// Jump of the position, in metres and radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Jump {
     pub(super) by_m: f64,
     pub(super) by_rad: f64,
 }
 
-/// The fixes of late.
+/// Recent fixes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Fixes {
     ring: [Fix; FIXES],
     count: usize,
     newest: usize,
     std_devs: (f64, f64),
-    /// When the newest was measured, used or not; older ones come too late.
+    /// Time of the newest fix, used or not, seconds; older fixes are ignored.
     last_s: Option<f64>,
-    /// The last fix where it was expected.
+    /// Last fix at the expected position.
     anchor: Option<Fix>,
-    /// The one before, should that one have been a wild one.
+    /// Fix at the expected position before `anchor`, used if `anchor` was an outlier.
     before: Option<Fix>,
-    /// How many fixes in a row were, since nothing was known of the place.
+    /// Number of fixes at the expected position since the start.
     agreed: u32,
-    /// The newest of fixes that agree on another place, the first one's time, and how many.
+    /// Newest of the fixes that agree on another position, time of the first one, and their number.
     elsewhere: Option<(Fix, f64, u32)>,
     jump: Option<Jump>,
     back_since_s: Option<f64>,
@@ -186,7 +202,7 @@ fn median(values: &mut [f64]) -> f64 {
 }
 
 impl Fixes {
-    /// Forgets all fixes but a jump: where the robot went since, nobody knows.
+    /// Clears all fixes but keeps a jump: the motion since is unknown.
     pub(super) fn restart(&mut self) {
         *self = Self {
             jump: self.jump,
@@ -194,22 +210,22 @@ impl Fixes {
         };
     }
 
-    /// The newest fix that is used.
+    /// Returns the newest fix that is used.
     pub(super) fn newest(&self) -> Option<Pose> {
         (self.count > 0).then(|| self.ring[self.newest].pose)
     }
 
-    /// Standard deviations of a fix, metres and radians.
+    /// Returns the standard deviations of a fix, metres and radians.
     pub(super) fn std_devs(&self) -> (f64, f64) {
         self.std_devs
     }
 
-    /// The jump that is not over yet.
+    /// Returns the jump that is not over yet.
     pub(super) fn jump(&self) -> Option<Jump> {
         self.jump
     }
 
-    /// Takes a fix; true if it is used.
+    /// Adds a fix; returns whether it is used.
     pub(super) fn take(
         &mut self,
         at_s: f64,
@@ -241,7 +257,8 @@ impl Fixes {
         }
     }
 
-    /// Whether a fix is where the last one and dead reckoning let it be.
+    /// Returns whether a fix is at the position expected by dead reckoning from the last one, and
+    /// updates the jump.
     fn is_expected(&mut self, fix: Fix) -> bool {
         let Some(anchor) = self.anchor else {
             self.anchor = Some(fix);
@@ -277,7 +294,7 @@ impl Fixes {
         };
         self.elsewhere = Some((fix, since_s, count));
         if count >= JUMP_FIXES && self.agreed < JUMP_FIXES && self.jump.is_none() {
-            // The first fix of all was the wild one.
+            // The first of all fixes was the outlier.
             self.count = 0;
             self.before = None;
             self.forget_jump(fix);
@@ -302,7 +319,7 @@ impl Fixes {
         self.back_since_s = None;
     }
 
-    /// What the fixes of the last `span_s` seconds say.
+    /// Returns the difference of motion over the last `span_s` seconds; None with too few fixes.
     pub(super) fn seen(&self, span_s: f64) -> Option<Seen> {
         let newest = self.ring[self.newest];
         let fix = |places: usize| &self.ring[(self.newest + FIXES - places) % FIXES];
@@ -316,7 +333,7 @@ impl Fixes {
         if in_span < FIXES_MIN.0 || used < FIXES_MIN.1 || age_s(in_span - 1) < 0.6 * span_s {
             return None;
         }
-        // The median angle first: positions are turned by it.
+        // The median angle first: positions are rotated by it.
         let offset_rad = |fix: &Fix| wrap_angle_rad(fix.pose.heading_rad - fix.integrated_rad);
         let reference_rad = offset_rad(&newest);
         let mut angles = [0.0; FIXES];
@@ -359,7 +376,7 @@ impl Fixes {
             let away = |one: usize, other: usize| errors[one][column] - errors[other][column];
             let most = WILD_STD_DEVS * std_dev;
             let wild = |places: usize| match places {
-                // The newest: the next one will say.
+                // The newest fix has one neighbour only; the next fix decides.
                 0 => away(0, 1).abs() > most && away(1, 2).abs() < 0.5 * most,
                 _ if places + 1 == used => false,
                 _ => {
@@ -383,7 +400,7 @@ impl Fixes {
         let [forward, left, odometry, turn, wheels_turn] = [0, 1, 2, 3, 4].map(fit);
         let (forward, left, odometry) = (forward?, left?, odometry?);
         let (turn, wheels_turn) = (turn?, wheels_turn?);
-        // Few fixes are in a short span, and there are many such spans.
+        // A short span has few fixes, and there are many short spans.
         let std_devs = if span_s < SHORT_S {
             DEVIATIONS_SHORT
         } else {
@@ -405,21 +422,21 @@ impl Fixes {
     }
 }
 
-/// What is compared of a fix, and the first column that is an angle.
+/// Number of compared quantities of a fix, and index of the first one that is an angle.
 const COLUMNS: usize = 5;
 const HEADING: usize = 3;
 
-/// A line that bends.
+/// Line with a bend at `begin_s`.
 #[derive(Debug, Clone, Copy)]
 struct Bend {
     begin_s: f64,
     std_dev: f64,
-    /// The usual speed before it bends.
+    /// Standard deviation of the slope before the bend.
     usual: f64,
 }
 
 impl Bend {
-    /// The speed behind the bend, and its standard deviation.
+    /// Returns the slope after the bend and its standard deviation; None if the system is singular.
     fn fit(&self, points: impl Iterator<Item = (f64, f64)> + Clone) -> Option<(f64, f64)> {
         let basis = |at_s: f64| [1.0, at_s, (at_s - self.begin_s).max(0.0)];
         let (mut normal, mut right) = ([[0.0; 3]; 3], [0.0; 3]);
@@ -453,7 +470,7 @@ impl Bend {
     }
 }
 
-/// The inverse of a symmetric matrix; none if there is none.
+/// Returns the inverse of a symmetric matrix; None if it is singular.
 fn inverse(matrix: &[[f64; 3]; 3]) -> Option<[[f64; 3]; 3]> {
     let minor = |row: usize, column: usize| {
         let rows = [(row + 1) % 3, (row + 2) % 3].map(|row| matrix[row]);

@@ -1,5 +1,5 @@
-//! What wheels, gyro and odometry said of late, as integrals over time: any span's mean is a
-//! difference of two of them.
+//! Recent measurements of wheels, gyro and odometry as integrals over time: the mean over a span is
+//! the difference of two of them.
 
 use std::time::Duration;
 
@@ -7,14 +7,14 @@ use crate::geometry::{Point, Twist};
 
 /// Time between two edges, seconds.
 pub(super) const BIN_S: f64 = 0.05;
-/// Edges that are kept: 3.2 s, the longest span and the oldest fix together.
+/// Number of edges kept: 3.2 s, the longest span and the oldest fix together.
 const EDGES: usize = 64;
-/// Oldest word of odometry that still counts, seconds.
+/// Maximum age of odometry that is used, seconds.
 const ODOMETRY_AGE_MAX_S: f64 = 0.25;
-/// Share of a span in which odometry must have been heard.
+/// Minimum fraction of a span with odometry.
 const ODOMETRY_SHARE_MIN: f64 = 0.8;
 
-/// Integrals up to one moment.
+/// Integrals up to one time.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Edge {
     pub(super) at_s: f64,
@@ -23,24 +23,24 @@ pub(super) struct Edge {
     wheels_m: f64,
     odometry_m: f64,
     odometry_s: f64,
-    /// Dead reckoning by wheels and gyro.
+    /// Position by dead reckoning with wheels and gyro, metres.
     pub(super) at: Point,
-    /// The command then.
+    /// Commanded twist at this time.
     command: Twist,
 }
 
 impl Edge {
-    /// Heading by the gyro, radians, not wrapped.
+    /// Returns the heading by gyro, radians, not wrapped.
     pub(super) fn heading_rad(&self) -> f64 {
         self.gyro_rad
     }
 
-    /// By how much the wheels turned farther than the gyro says, radians.
+    /// Returns the heading by wheels minus the heading by gyro, radians.
     pub(super) fn wheels_lead_rad(&self) -> f64 {
         self.wheels_rad - self.gyro_rad
     }
 
-    /// By how much odometry went farther than the wheels, metres.
+    /// Returns the distance by odometry minus the distance by wheels, metres.
     pub(super) fn odometry_lead_m(&self) -> f64 {
         self.odometry_m - self.wheels_m
     }
@@ -69,6 +69,13 @@ impl Edge {
     }
 }
 
+/// A span of time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Span {
+    pub(super) from_s: f64,
+    pub(super) to_s: f64,
+}
+
 /// Means over a span.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Means {
@@ -77,19 +84,19 @@ pub(super) struct Means {
     pub(super) odometry_m_s: Option<f64>,
 }
 
-/// Least and greatest twist that was commanded.
+/// Minimum and maximum of the commanded twists, per component.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Commanded {
     pub(super) least: Twist,
     pub(super) most: Twist,
 }
 
-/// The last seconds.
+/// Integrals over the last seconds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct History {
     now: Edge,
     edges: [Edge; EDGES],
-    /// How many there are, and where the newest is.
+    /// Number of edges, and index of the newest.
     count: usize,
     newest: usize,
     odometry: Option<(f64, f64)>,
@@ -108,7 +115,7 @@ impl Default for History {
 }
 
 impl History {
-    /// Nothing, from a moment on.
+    /// Clears all integrals and starts at a time; keeps the command.
     pub(super) fn restart(&mut self, at: Duration) {
         let command = self.now.command;
         *self = Self::default();
@@ -131,7 +138,7 @@ impl History {
         self.odometry = Some((forward_m_s, self.now.at_s));
     }
 
-    /// Adds what gyro and wheels said at a moment; true if an edge was passed.
+    /// Adds measurements of gyro and wheels at a time; returns whether a bin has ended.
     pub(super) fn add(&mut self, at: Duration, gyro_rad_s: f64, wheels: Twist) -> bool {
         let now = &mut self.now;
         let dt_s = (at.as_secs_f64() - now.at_s).max(0.0);
@@ -160,15 +167,24 @@ impl History {
         self.now
     }
 
-    /// The edge so many places before the newest.
+    /// The span of this length that ends now.
+    pub(super) fn last(&self, length_s: f64) -> Span {
+        let to_s = self.now.at_s;
+        Span {
+            from_s: to_s - length_s,
+            to_s,
+        }
+    }
+
+    /// Returns the edge `places` before the newest.
     fn before(&self, places: usize) -> Option<&Edge> {
         (places < self.count).then(|| &self.edges[(self.newest + EDGES - places) % EDGES])
     }
 
-    /// The integrals at a moment; none if that is too long ago.
+    /// Returns the integrals at a time, interpolated; None before the oldest edge.
     pub(super) fn at(&self, at_s: f64) -> Option<Edge> {
         let mut later = self.now;
-        // Bounded by the edges that are kept.
+        // At most the number of edges.
         for places in 0..self.count {
             let edge = self.before(places)?;
             if edge.at_s <= at_s {
@@ -179,9 +195,10 @@ impl History {
         None
     }
 
-    /// Means from one moment to a later one.
-    pub(super) fn means(&self, from_s: f64, to_s: f64) -> Option<Means> {
-        let (from, to) = (self.at(from_s)?, self.at(to_s)?);
+    /// Returns the means between two times; None if the history does not reach back or the span is
+    /// shorter than half a bin.
+    pub(super) fn means(&self, span: Span) -> Option<Means> {
+        let (from, to) = (self.at(span.from_s)?, self.at(span.to_s)?);
         let span_s = to.at_s - from.at_s;
         if span_s < 0.5 * BIN_S {
             return None;
@@ -198,17 +215,17 @@ impl History {
         })
     }
 
-    /// What was commanded between two moments.
-    pub(super) fn commanded(&self, from_s: f64, to_s: f64) -> Commanded {
+    /// Returns the range of commands between two times.
+    pub(super) fn commanded(&self, span: Span) -> Commanded {
         let (mut least, mut most) = (self.now.command, self.now.command);
         for places in 0..self.count {
             let Some(edge) = self.before(places) else {
                 break;
             };
-            if edge.at_s > to_s + BIN_S {
+            if edge.at_s > span.to_s + BIN_S {
                 continue;
             }
-            if edge.at_s < from_s {
+            if edge.at_s < span.from_s {
                 break;
             }
             let command = edge.command;

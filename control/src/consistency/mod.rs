@@ -1,24 +1,23 @@
-//! Whether the sensors agree: each channel is predicted from the others all the time.
+//! Consistency of the sensors: each channel is predicted from the others all the time.
 //!
-//! The turn rate is seen by gyro, wheels and the heading of position fixes; the forward speed by
-//! wheels, odometry over ground and position; changes of both by the accelerometer. The wheels'
-//! command is one more word on the wheels. What contradicts the others beyond noise, for long
-//! enough, is a [`Finding`]:
+//! The turn rate is measured by gyro, wheels and the heading of position fixes; the forward speed
+//! by wheels, odometry over ground and position; changes of both by the accelerometer. The wheels'
+//! command is a further prediction for the wheels. A channel that contradicts the others beyond
+//! noise for long enough gives a [`Finding`]:
 //!
-//! * Gyro, odometry and position say how the *body* moves, so that two of them which disagree mean
-//!   a fault of one. It is the one that the wheels, or else the command, contradict more.
-//! * Wheels that contradict the body are a fault of their sensor where they contradict their
-//!   command too and the body obeys it. Where they obey it, they may as well slip: the finding is
-//!   then [`Subject::WheelsAndMotion`], and nobody is blamed.
-//! * A channel that repeats its word to the last bit while it should not is frozen.
+//! * Gyro, odometry and position measure the motion of the *body*, so if two of them disagree, one
+//!   is faulty: the one that the wheels, or else the command, contradict more.
+//! * If wheels contradict the body, their sensor is faulty where they contradict their command too
+//!   and the body follows it. Where they follow the command, they may slip: the finding is then
+//!   [`Subject::WheelsAndMotion`], which names no sensor.
+//! * A channel that repeats its value to the last bit while it should change is frozen.
 //!
 //! ```text
 //!            contradicts for RAISE_S                       agrees for CLEAR_S, while excited
-//! consistent ───────────────────────► finding that stands ──────────────────────────────►
-//! consistent
+//! consistent ───────────────────────► active finding ──────────────────────────────► consistent
 //! ```
-//! How findings end, also at rest, is [`track`]'s matter; who is compared with whom, [`verdict`]'s.
-//! Pure, without allocation.
+//! [`track`] implements the end of findings, also at standstill; [`verdict`] compares the channels.
+//! No I/O, no allocation.
 
 mod accelerometer;
 mod findings;
@@ -36,41 +35,42 @@ use crate::localisation::FixNoise;
 use crate::measured::{BodyAcceleration, WheelSpeeds};
 use crate::robot::RobotModel;
 use accelerometer::Accelerometer;
+use findings::Comparison;
 pub use findings::{Consequence, Finding, Findings, Kind, Subject, Unit};
 use fixes::{Fixes, Seen};
-use history::{BIN_S, History};
+use history::{BIN_S, History, Span};
 use repeats::Repeats;
 use track::Track;
 use turn_gain::TurnGain;
 use verdict::Verdicts;
 
-/// Longest pause between two samples over which motion is followed.
+/// Maximum time between two samples; a longer gap resets the history.
 const GAP_MAX: Duration = Duration::from_millis(250);
-/// Oldest fix that still says how the robot moves, seconds.
+/// Maximum age of the last fix for comparisons, seconds.
 const FIX_AGE_MAX_S: f64 = 0.8;
-/// Spans over which fixes are compared, seconds: quick for large errors, slow for small ones.
+/// Spans over which fixes are compared, seconds: short for large errors, long for small ones.
 const SPANS_S: [f64; 5] = [0.4, 0.55, 0.75, 1.2, 2.0];
 
-/// What the sensors said at one moment; absent where one said nothing.
+/// Measurements at one time; None for sensors without a measurement.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Sample {
-    /// When it was measured.
+    /// Time of measurement.
     pub at: Duration,
-    /// Gyro, radians per second.
+    /// Turn rate by gyro, radians per second, counter-clockwise positive.
     pub gyro_rad_s: Option<f64>,
-    /// Wheel speeds as measured.
+    /// Measured wheel speeds.
     pub wheel_speeds: Option<WheelSpeeds>,
-    /// Acceleration without gravity.
+    /// Acceleration without gravity, in the body frame.
     pub acceleration: Option<BodyAcceleration>,
-    /// Speed of the body over ground, metres per second.
+    /// Forward speed of the body over ground, metres per second.
     pub odometry_m_s: Option<f64>,
-    /// A position fix; it may be older than the samples before it.
+    /// Position fix in the site frame; it may be older than earlier samples.
     pub position: Option<Pose>,
-    /// How good that fix is, if that is known.
+    /// Standard deviations of the fix, if known.
     pub position_noise: Option<FixNoise>,
 }
 
-/// Words that repeat, by channel.
+/// Repeated values by channel.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct AllRepeats {
     gyro: Repeats,
@@ -80,26 +80,26 @@ struct AllRepeats {
     position: Repeats,
 }
 
-/// Watches one robot.
+/// Consistency monitor of one robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Monitor {
     model: RobotModel,
     history: History,
     fixes: Fixes,
-    /// What the fixes of each span say, judged at the last fix.
+    /// Difference of motion by fixes for each span, computed at the last fix.
     seen: [Option<Seen>; SPANS_S.len()],
     last_fix: Option<Duration>,
     last: Option<Duration>,
     repeats: AllRepeats,
     accelerometer: Accelerometer,
     turn_gain: TurnGain,
-    /// Where fixes were when the robot came to rest.
+    /// Position fix when the robot stopped.
     rest_at: Option<Pose>,
     tracks: [Track; Subject::ALL.len()],
 }
 
 impl Monitor {
-    /// A robot of which nothing was heard yet.
+    /// Creates a monitor without measurements.
     pub fn new(model: RobotModel) -> Self {
         Self {
             model,
@@ -116,14 +116,14 @@ impl Monitor {
         }
     }
 
-    /// The findings that stand.
+    /// Returns the active findings.
     pub fn findings(&self) -> Findings {
         Findings {
             standing: self.tracks.map(|track| track.standing),
         }
     }
 
-    /// Notes what the wheels are commanded from now on.
+    /// Sets the wheel speeds commanded from now on; a non-finite command is ignored.
     pub fn command(&mut self, command: WheelSpeeds) {
         if command.is_finite() {
             let twist = self.model.twist_from_wheel_speeds(command);
@@ -131,7 +131,7 @@ impl Monitor {
         }
     }
 
-    /// Takes what the sensors said; samples come in the order of their arrival.
+    /// Adds a sample; samples come in the order of their arrival. Non-finite values are ignored.
     pub fn take(&mut self, sample: &Sample) {
         let at = sample.at;
         if let Some(odometry_m_s) = finite(sample.odometry_m_s) {
@@ -175,7 +175,7 @@ impl Monitor {
             .is_none_or(|last| at.saturating_sub(last) > GAP_MAX);
         self.last = self.last.max(Some(at));
         if is_gap {
-            // Where the robot went meanwhile, nobody knows.
+            // The motion during the gap is unknown.
             self.history.restart(at);
             self.fixes.restart();
             self.seen = [None; SPANS_S.len()];
@@ -192,15 +192,11 @@ impl Monitor {
         }
     }
 
-    /// Looks at all channels at the end of a bin.
+    /// Evaluates all channels at the end of a bin.
     fn judge(&mut self) {
         let now_s = self.history.now().at_s;
-        if let Some(recent) = self.history.means(now_s - BIN_S, now_s) {
-            self.accelerometer.step(
-                recent.wheels.linear_m_s,
-                recent.gyro_rad_s,
-                &self.repeats.acceleration,
-            );
+        if let Some(recent) = self.history.means(self.history.last(BIN_S)) {
+            self.accelerometer.step(&recent, &self.repeats.acceleration);
         }
         let fix_age_s = self
             .last_fix
@@ -211,7 +207,7 @@ impl Monitor {
             [None; SPANS_S.len()]
         };
         let mut verdicts = Verdicts::default();
-        let stands = self.stands(now_s);
+        let stands = self.stands();
         let view = verdict::View {
             model: &self.model,
             history: &self.history,
@@ -225,7 +221,8 @@ impl Monitor {
         }
         .with_believed();
         verdict::judge(&view, &mut verdicts);
-        // A part of the wheels' motion that is not the body's would be felt as a wrong gain.
+        // Motion of the wheels that is not the body's would appear as a wrong gain of the
+        // accelerometer.
         let is_quiet = self
             .tracks
             .iter()
@@ -237,10 +234,12 @@ impl Monitor {
             });
         if is_quiet && verdicts.is_consistent() {
             if seen.iter().any(Option::is_some)
-                && let Some(recent) = self.history.means(now_s - LEARN_FROM_S, now_s - LEARN_TO_S)
+                && let Some(recent) = self.history.means(Span {
+                    from_s: now_s - LEARN_FROM_S,
+                    to_s: now_s - LEARN_TO_S,
+                })
             {
-                self.turn_gain
-                    .learn(recent.gyro_rad_s, recent.wheels.angular_rad_s);
+                self.turn_gain.learn(&recent);
             }
             if let Some(finding) = self.accelerometer.verdict() {
                 let raise_s = if finding.kind == Kind::Inverted {
@@ -276,22 +275,22 @@ impl Monitor {
         }
     }
 
-    /// Whether a finding on the place ended at rest, and no motion has shown yet that it was right
-    /// to.
+    /// Returns whether a finding about the position ended at standstill and no motion has confirmed
+    /// that since.
     fn is_on_probation(&self) -> bool {
         self.tracks.iter().any(|track| track.is_on_probation)
     }
 
-    /// Whether the robot stands, by what it is commanded and by its wheels, and the fixes stay
-    /// where they were when it came to rest.
-    fn stands(&mut self, now_s: f64) -> bool {
-        let commanded = self.history.commanded(now_s - REST_SPAN_S, now_s);
+    /// Returns whether command and wheels are at zero speed, and the fixes stay where they were
+    /// when the robot stopped.
+    fn stands(&mut self) -> bool {
+        let commanded = self.history.commanded(self.history.last(REST_SPAN_S));
         let is_commanded = [commanded.least, commanded.most]
             .iter()
             .all(|twist| *twist == Twist::default());
         let at_rest = self
             .history
-            .means(now_s - REST_SPAN_S, now_s)
+            .means(self.history.last(REST_SPAN_S))
             .is_some_and(|means| {
                 means.wheels.linear_m_s.abs() <= REST_M_S
                     && means.wheels.angular_rad_s.abs() <= REST_RAD_S
@@ -316,21 +315,22 @@ impl Monitor {
     }
 }
 
-/// Span over which a robot stands, seconds, and what its wheels may say then, metres and radians
-/// per second.
+/// Span over which a robot must have stopped, seconds, and maximum speeds of its wheels in it,
+/// metres and radians per second.
 const REST_SPAN_S: f64 = 1.0;
 const REST_M_S: f64 = 0.02;
 const REST_RAD_S: f64 = 0.05;
-/// How far fixes of a standing robot may be from the first one, metres and radians, and in standard
-/// standard deviations of a fix.
+/// Maximum distance of a stopped robot's fixes from the first one, metres and radians, or in
+/// standard deviations of a fix if that is more.
 const REST_SPREAD_M: f64 = 0.3;
 const REST_SPREAD_RAD: f64 = 0.1;
 const REST_DEVIATIONS: f64 = 7.0;
 
-/// Span over which the gain of turns is learned, seconds ago: a fault is found sooner than that.
+/// Window in which the turn gain is learned, seconds ago: a fault is found sooner than that.
 const LEARN_FROM_S: f64 = 2.3;
 const LEARN_TO_S: f64 = 2.0;
-/// How long the accelerometer must contradict, seconds; the evidence on its sign is summed already.
+/// Time for which the accelerometer must contradict, seconds; evidence on its sign is accumulated
+/// already.
 const ACCELEROMETER_RAISE_S: f64 = 0.2;
 
 fn finite(value: Option<f64>) -> Option<f64> {

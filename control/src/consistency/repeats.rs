@@ -1,17 +1,18 @@
-//! How long a channel has said the same to the last bit: what a sensor with noise never does.
+//! Counts how long a channel has repeated the same value to the last bit, which a sensor with noise
+//! never does.
 
 use std::time::Duration;
 
-/// Shortest time of equal words that counts as frozen.
+/// Minimum time of equal values that counts as frozen.
 const FROZEN_AFTER: Duration = Duration::from_millis(350);
-/// Fewest equal words that count as frozen.
+/// Minimum number of equal values that counts as frozen.
 const FROZEN_COUNT: u32 = 4;
 
-/// The same of those that may turn out to be frozen.
+/// Minimum time and number of equal values that count as repeating, and may prove to be frozen.
 const REPEATING_AFTER: Duration = Duration::from_millis(150);
 const REPEATING_COUNT: u32 = 3;
 
-/// Equal words in a row.
+/// Consecutive equal values of a channel.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Repeats {
     words: [u64; 3],
@@ -21,7 +22,7 @@ pub(super) struct Repeats {
 }
 
 impl Repeats {
-    /// Takes the next word.
+    /// Adds the next value.
     pub(super) fn take(&mut self, at: Duration, values: [f64; 3]) {
         let words = values.map(f64::to_bits);
         if self.since.is_none() || words != self.words {
@@ -37,17 +38,18 @@ impl Repeats {
         }
     }
 
-    /// Whether they have been equal for long.
+    /// Returns whether the values have been equal for [`FROZEN_AFTER`].
     pub(super) fn is_frozen(&self) -> bool {
         self.count >= FROZEN_COUNT && self.for_long >= FROZEN_AFTER
     }
 
-    /// Whether they may turn out to be frozen: they have been equal for a while.
+    /// Returns whether the values have been equal for [`REPEATING_AFTER`], and may prove to be
+    /// frozen.
     pub(super) fn is_repeating(&self) -> bool {
         self.count >= REPEATING_COUNT && self.for_long >= REPEATING_AFTER
     }
 
-    /// When the first of the equal words came.
+    /// Returns the time of the first of the equal values.
     pub(super) fn since(&self) -> Option<Duration> {
         self.since
     }

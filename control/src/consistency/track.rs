@@ -1,23 +1,24 @@
-//! Evidence on one subject over time: when a finding begins to stand, and when it ends.
+//! Evidence on one subject over time: start and end of a finding.
 //!
-//! A finding ends when its channel has agreed for [`CLEAR_S`] in motion that shows it. One about the
-//! place may leave the robot where it must not move, so it ends at rest as well, when fixes agree with
-//! each other and with the robot that stands for [`REST_CLEAR_S`]. That does not show that it is right
-//! in motion: until motion has shown it, the track is on probation, and the first contradiction lets
-//! the finding stand again. Each such relapse doubles the time at rest that the next one takes.
+//! A finding ends when its channel has agreed for [`CLEAR_S`] during motion that excites it. A
+//! finding about the position may forbid the robot to move, so it also ends at standstill, when
+//! fixes agree with each other and with a stopped robot for [`REST_CLEAR_S`]. That does not prove
+//! the channel right in motion: until motion does, the track is on probation, and the first
+//! contradiction makes the finding active again. Each such relapse doubles the time required at
+//! standstill.
 
 use super::Finding;
 use super::history::BIN_S;
 use super::verdict::Verdict;
 
-/// How long a channel must agree until its finding ends, seconds.
+/// Time for which a channel must agree until its finding ends, seconds.
 const CLEAR_S: f64 = 2.0;
 
-/// How long fixes must agree with each other and with a robot that stands until a finding about
-/// them ends at rest, seconds; after relapses longer, up to the second one.
+/// Time for which fixes must agree with each other and with a stopped robot until a finding about
+/// them ends at standstill, seconds; it doubles with each relapse, up to the second value.
 const REST_CLEAR_S: f64 = 10.0;
 const REST_CLEAR_MAX_S: f64 = 600.0;
-/// Relapses that are counted.
+/// Maximum number of relapses that are counted.
 const RELAPSES_MAX: u32 = 16;
 
 /// Evidence on one subject.
@@ -25,13 +26,13 @@ const RELAPSES_MAX: u32 = 16;
 pub(super) struct Track {
     pub(super) against_s: f64,
     agreeing_s: f64,
-    /// How long it has agreed at rest, and how often that was not the end of it.
+    /// Time for which it has agreed at standstill, seconds, and number of relapses.
     pub(super) rested_s: f64,
     relapses: u32,
-    /// Its finding ended at rest, and no motion has shown yet that it is right.
+    /// Whether its finding ended at standstill and no motion has confirmed that since.
     pub(super) is_on_probation: bool,
     pub(super) standing: Option<Finding>,
-    /// What was found last, until motion has shown that it is over.
+    /// Last finding, kept until motion has shown that it is over.
     pub(super) found: Option<Finding>,
 }
 
@@ -50,7 +51,7 @@ impl Track {
             }
             Verdict::StillAgainst => {
                 self.agreeing_s = 0.0;
-                // Noise of a moment costs a part of the time at rest.
+                // A short contradiction by noise reduces the time at standstill only in part.
                 self.rested_s = (self.rested_s - 5.0 * BIN_S).max(0.0);
                 return;
             }
@@ -71,13 +72,12 @@ impl Track {
         }
     }
 
-    /// How long it must agree at rest: twice as long after each time that motion has shown it wrong
-    /// again.
+    /// Returns the required time of agreement at standstill, seconds, doubled with each relapse.
     fn rest_s(&self) -> f64 {
         (REST_CLEAR_S * 2.0_f64.powi(self.relapses.cast_signed())).min(REST_CLEAR_MAX_S)
     }
 
-    /// What ended at rest is there again.
+    /// Records that a finding that ended at standstill is active again.
     pub(super) fn relapse(&mut self) {
         self.is_on_probation = false;
         self.relapses = (self.relapses + 1).min(RELAPSES_MAX);

@@ -1,22 +1,22 @@
-//! How much of the turn that the wheels say this robot makes on this ground: scrub and rolling radii
-//! make it another one for each robot.
+//! Gain from the turn rate by wheels to that of the body, for this robot on this ground: it depends
+//! on scrub and rolling radii.
 //!
-//! A regression of the gyro on the wheels with a memory, while nothing contradicts. It makes the
-//! wheels a sharper witness where gyro and position contradict each other, and nothing else: it is
-//! bounded, so that no fault is learned away.
+//! Regression of the gyro on the wheels with exponential forgetting, while nothing contradicts. It
+//! makes the wheels a sharper reference where gyro and position contradict each other. Nothing else
+//! uses it. The gain is bounded, so that no fault is learned away.
 
-use super::history::BIN_S;
+use super::history::{BIN_S, Means};
 
-/// Memory, seconds of turning.
+/// Time constant of forgetting, seconds of turning.
 const MEMORY_S: f64 = 20.0;
-/// Slowest turn that is learned from, radians per second.
+/// Minimum turn rate of the wheels for learning, radians per second.
 const TURN_MIN_RAD_S: f64 = 0.15;
-/// Excitation from which on the gain counts, radians squared per second.
+/// Minimum excitation `∫ ω² dt` for a valid gain, radians squared per second.
 const KNOWN_MIN: f64 = 0.3;
-/// Range of the gain.
+/// Bounds of the gain.
 const GAIN: std::ops::RangeInclusive<f64> = 0.7..=1.3;
 
-/// The gain of one robot.
+/// Sums of the regression.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct TurnGain {
     product: f64,
@@ -24,8 +24,9 @@ pub(super) struct TurnGain {
 }
 
 impl TurnGain {
-    /// A bin in which nothing contradicted.
-    pub(super) fn learn(&mut self, gyro_rad_s: f64, wheels_rad_s: f64) {
+    /// Adds a bin without contradictions.
+    pub(super) fn learn(&mut self, means: &Means) {
+        let (gyro_rad_s, wheels_rad_s) = (means.gyro_rad_s, means.wheels.angular_rad_s);
         if wheels_rad_s.abs() < TURN_MIN_RAD_S {
             return;
         }
@@ -34,7 +35,7 @@ impl TurnGain {
         self.square = keep * self.square + BIN_S * wheels_rad_s * wheels_rad_s;
     }
 
-    /// The gain, once the robot has turned enough.
+    /// Returns the gain, once the robot has turned enough.
     pub(super) fn known(&self) -> Option<f64> {
         (self.square >= KNOWN_MIN)
             .then(|| (self.product / self.square).clamp(*GAIN.start(), *GAIN.end()))

@@ -197,6 +197,7 @@ impl Block {
         regressors[index::RESISTANCE] = -self.rim_difference_m_s;
         regressors[index::RELAXATION] = force.rate.mu[1] - force.rate.mu[0];
         regressors[index::ROTORS] = -(force.rate.rim_m_s[1] - force.rate.rim_m_s[0]);
+        regressors[index::LOADS] = 2.0 * force.mean_m_s;
         let mut common_noise = Regressors::zeros();
         common_noise[index::RADIUS_OFFSET] = self.rim_difference_noise;
         common_noise[index::RESISTANCE] = -self.rim_difference_noise;
@@ -236,6 +237,7 @@ impl Block {
         regressors[index::RESISTANCE] = -self.rim_mean_m_s;
         regressors[index::RELAXATION] = 0.5 * (force.rate.mu[1] + force.rate.mu[0]);
         regressors[index::ROTORS] = -0.5 * (force.rate.rim_m_s[1] + force.rate.rim_m_s[0]);
+        regressors[index::LOADS] = 0.5 * force.difference_m_s;
         Some(Row {
             regressors,
             response: slip_m_s,

@@ -1,4 +1,4 @@
-//! How well θ will be measured on a plan: told before the robot moves.
+//! Predicts how well θ will be measured on a plan, before the robot moves.
 //!
 //! The estimator itself is driven along the plan with the samples that an undisturbed robot would
 //! give on ground of an assumed θ; its own standard deviation is the expectation. Pure in plan,

@@ -31,6 +31,9 @@ const STANDING_M_S: f64 = 3.0e-3;
 const STANDING_NOISE_M_S: f64 = 1.0e-3;
 /// Turn rate below which a robot drives straight, radians per second.
 const TURNING_MIN_RAD_S: f64 = 1.0e-3;
+/// Turn rate above which a robot moves although its wheels stand, radians per second: it slides, or
+/// is carried. A gyro's offset is far smaller.
+const STANDING_RAD_S: f64 = 0.05;
 /// Steps the wheels must have stood before the body does too.
 const STANDING_STEPS: u32 = 3;
 
@@ -49,6 +52,8 @@ struct Step {
     samples: f64,
     usable: f64,
     rim_m_s: f64,
+    /// Speeds of the left and the right rim, summed.
+    sides_m_s: [f64; 2],
     wheels_m_s: f64,
     harmonic_m_s: f64,
     force_m_s: f64,
@@ -136,9 +141,10 @@ impl LongitudinalFilter {
         let acceleration = sample.acceleration?;
         let step = &mut self.step;
         let radius_m = model.wheel_radius_m();
-        let mean_m_s =
-            0.5 * radius_m * (sample.wheel_speeds.left_rad_s + sample.wheel_speeds.right_rad_s);
-        step.rim_m_s += mean_m_s;
+        let wheels = sample.wheel_speeds;
+        step.rim_m_s += 0.5 * radius_m * (wheels.left_rad_s + wheels.right_rad_s);
+        step.sides_m_s[0] += radius_m * wheels.left_rad_s;
+        step.sides_m_s[1] += radius_m * wheels.right_rad_s;
         step.samples += 1.0;
         if let Some(rims) = signed_rims(sample, model) {
             let inverse = 0.5 * (rims.left_m_s.recip() + rims.right_m_s.recip());
@@ -176,7 +182,10 @@ impl LongitudinalFilter {
         self.predict(&step, forward_m_s2, gyro_rad_s, noise, sideways);
         let mut rows: Rows = [None; 3];
         let gained_m_s2 = forward_m_s2 - std::mem::replace(&mut self.last_ahead_m_s2, forward_m_s2);
-        let is_standing = (step.rim_m_s / count).abs() < STANDING_M_S;
+        // On the spot the rims turn against each other, and their mean is zero.
+        let [left_m_s, right_m_s] = step.sides_m_s.map(|sum| (sum / count).abs());
+        let is_standing =
+            left_m_s.max(right_m_s) < STANDING_M_S && gyro_rad_s.abs() < STANDING_RAD_S;
         self.standing = if is_standing { self.standing + 1 } else { 0 };
         if step.usable >= count {
             rows[0] = self.wheels(

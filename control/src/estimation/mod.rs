@@ -3,12 +3,12 @@
 //! This is the figure that reaches the map; it never mixes with θ̂ of the loop. Per side, in the
 //! linear range, `λ = θ μ` holds exactly under combined slip: slip is regressed on force, from
 //! *measured* wheel speed, gyro, accelerometer, body speed and wheel torque. Every row is linear in
-//! eleven parameters: θ; what is the robot's own, namely `δ_c` and `δ_d` (the shares by which
+//! twelve parameters: θ; what is the robot's own, namely `δ_c` and `δ_d` (the shares by which
 //! nominal radii are too large, mean and right minus left), the effective track, the gyro's and the
 //! accelerometer's offset and the latter's scale; θf, rolling resistance f in measured torques; θκ,
-//! the bend of a curved tyre; θℓ, the contacts' relaxation length, times the force's rate; and θj,
-//! the inertia of rotors and wheels over the mass, whose torque no contact carries. Without the
-//! last three, in metres per second, u rim speeds:
+//! the bend of a curved tyre; θℓ, the contacts' relaxation length, times the force's rate; θj,
+//! the inertia of rotors and wheels over the mass, whose torque no contact carries; and θε, the
+//! difference of the sides' loads. Without the last four, in metres per second, u rim speeds:
 //!
 //! ```text
 //! with wheel torque
@@ -20,9 +20,11 @@
 //! The robot's own parameters survive changes of the ground; θ, f and κ are the ground's. Samples
 //! are averaged over blocks; the noise of the regressor is taken out of its square (errors in
 //! variables), and its effect is part of the standard deviation. Only the difference of `δ_c` and
-//! θf shows, so what is known of it goes from segment to segment as a whole (`offsets.rs`). Where
-//! nothing excites θ, there is no θ: `None`.
+//! θf shows, so what is known of it goes from segment to segment as a whole (`offsets.rs`). Torques
+//! are over the model's mass; accelerations tell by how much the robot is heavier
+//! ([`apparent_mass`]). Where nothing excites θ, there is no θ: `None`.
 
+mod apparent_mass;
 mod block;
 mod change;
 mod contacts;
@@ -41,6 +43,7 @@ mod window;
 use crate::measured::WheelSpeeds;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
+use apparent_mass::ApparentMass;
 use block::{Block, BlockBuilder, BlockContext, ThetaBound};
 use change::ChangeDetector;
 use excitation::Excitation;
@@ -63,7 +66,7 @@ pub const BLOCK_S: f64 = 0.2;
 const RIM_SPEED_MIN_M_S: f64 = 0.15;
 /// Largest combined slip that is taken for the linear range.
 const SLIP_LINEAR_MAX: f64 = 0.15;
-/// The same before θ is known, where slip along is told by the body speed.
+/// The same before θ is known, where longitudinal slip comes from the body speed.
 const SLIP_LINEAR_FIRST_MAX: f64 = 0.10;
 /// Relative standard deviation above which there is said to be no measurement.
 const RELATIVE_STD_DEV_MAX: f64 = 0.5;
@@ -84,6 +87,8 @@ pub const MODEL_RATIO: f64 = 1.5e-3;
 const OFFSETS_SHARE_MAX: f64 = 0.9;
 /// Standard deviations to either side of a 95 % interval.
 const NORMAL_95: f64 = 1.959_963_984_540_054;
+/// Least standard deviation that the torque scale is taken to have beforehand.
+const SCALE_STD_DEV_MIN: f64 = 1.0e-3;
 /// Longest time between two samples over which anything is averaged, seconds.
 const GAP_MAX_S: f64 = 0.1;
 /// Samples in a row that are refused because the wheels' speed leapt.
@@ -111,6 +116,7 @@ pub struct Estimator {
     pending: Sums,
     change: ChangeDetector,
     excitation: Excitation,
+    apparent_mass: ApparentMass,
     bound: ThetaBound,
     estimate: Estimate,
     /// What all blocks of this ground give, where that is a measurement.
@@ -149,6 +155,7 @@ impl Estimator {
             pending: Sums::default(),
             change: ChangeDetector::default(),
             excitation: Excitation::default(),
+            apparent_mass: ApparentMass::default(),
             bound: ThetaBound {
                 theta: None,
                 slip_max: f64::INFINITY,
@@ -189,11 +196,14 @@ impl Estimator {
         if dt_s > GAP_MAX_S {
             // Nothing is known of the time between: averages begin anew.
             self.block = BlockBuilder::default();
+            self.apparent_mass.interrupt();
             self.turning_before = None;
             self.longitudinal = LongitudinalFilter::new();
             return UpdateOutcome::default();
         }
         self.step_longitudinal(sample, dt_s);
+        self.apparent_mass
+            .add(sample, &self.model, &self.noise, dt_s);
         self.block.add(sample, &self.model, dt_s);
         if !self.block.is_full() {
             return UpdateOutcome::default();
@@ -203,7 +213,7 @@ impl Estimator {
         let context = BlockContext {
             model: &self.model,
             noise: &self.noise,
-            curvature: self.tyres.at(self.bound.theta_weights),
+            curvature: self.tyres.at(self.bound.theta_of_slip()),
             radius_difference: self.estimate.radius_difference.value,
             theta: self.bound.theta_of_slip(),
         };
@@ -242,10 +252,10 @@ impl Estimator {
     fn step_longitudinal(&mut self, sample: &SensorSample, dt_s: f64) {
         let bound = SlipBound {
             theta_most: self.bound.theta_most,
-            theta: self.bound.theta_weights,
+            theta: self.bound.theta_of_slip(),
             slip_max: SLIP_LINEAR_MAX.min(self.bound.slip_max),
             radius_difference: self.estimate.radius_difference.value,
-            curvature: self.tyres.at(self.bound.theta_weights),
+            curvature: self.tyres.at(self.bound.theta_of_slip()),
         };
         let rows = self
             .longitudinal
@@ -369,9 +379,42 @@ impl Estimator {
     /// friction then. Accelerations are forces over the true mass.
     fn load_scale(&self, sums: &Sums) -> f64 {
         if sums.has_torque() {
-            1.0 + self.uncertainty.payload_ratio
+            self.torque_scale().value
         } else {
             1.0
+        }
+    }
+
+    /// Torque scale times true mass, over the model's mass: what was known of it beforehand, and
+    /// what torques and accelerations tell.
+    fn torque_scale(&self) -> ValueWithDeviation {
+        let uncertainty = &self.uncertainty;
+        // Errors of the torque constants scale the forces; each side has its own, and the force
+        // difference holds half of each. Errors of the radii cancel: the torque reads too high by
+        // what the rim speed beside it reads too low.
+        let constants = self.noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2;
+        let known = ValueWithDeviation {
+            value: 1.0 + uncertainty.payload_ratio,
+            std_dev: constants
+                .hypot(uncertainty.mass_ratio)
+                .max(SCALE_STD_DEV_MIN),
+        };
+        // A robot whose mass is exact is as its model says.
+        let apparent = self.apparent_mass.value();
+        let Some(apparent) = apparent.filter(|_| uncertainty.mass_ratio > 0.0) else {
+            return known;
+        };
+        let std_dev = apparent
+            .std_dev
+            .hypot(self.tyres.rotor_std_dev_ratio)
+            .hypot(self.noise.accelerometer_scale_ratio * known.value);
+        let weights = [known.std_dev.powi(-2), std_dev.powi(-2)];
+        let values = [known.value, apparent.value - self.tyres.rotor_ratio];
+        let sum = weights[0] + weights[1];
+        let value = (weights[0] * values[0] + weights[1] * values[1]) / sum;
+        ValueWithDeviation {
+            value,
+            std_dev: sum.sqrt().recip(),
         }
     }
 
@@ -389,12 +432,9 @@ impl Estimator {
 
     /// Standard deviation of the error that scales all of a robot's θ, as a share.
     fn gain_ratio(&self, sums: &Sums) -> f64 {
-        // Errors of the torque constants scale the forces; each side has its own, and the force
-        // difference holds half of each. Errors of the radii cancel: the torque reads too high by
-        // what the rim speed beside it reads too low.
         if sums.has_torque() {
-            let constants = self.noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2;
-            constants.hypot(self.uncertainty.mass_ratio)
+            let scale = self.torque_scale();
+            scale.std_dev / scale.value
         } else {
             MODEL_RATIO.hypot(self.uncertainty.inertia_ratio)
         }
@@ -450,7 +490,7 @@ impl Estimator {
             let theta = ground.map_or(found.theta, |ground| ground.theta);
             let scale = self.load_scale(&segment);
             let square = scale * scale;
-            // What it shares with those before is the robot's own error: told, and not added up.
+            // What it shares with those before is the robot's own error: reported, and not added up.
             let own_variance = found.own_variance();
             let of_offsets = shared.own.clamp(0.0, OFFSETS_SHARE_MAX * own_variance);
             SegmentTheta {

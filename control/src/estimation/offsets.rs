@@ -124,6 +124,7 @@ impl OffsetKnowledge {
     ) -> Option<(SMatrix<f64, OFFSETS, OFFSETS>, SVector<f64, OFFSETS>)> {
         let mut matrix = normal.matrix;
         let mut right = normal.right;
+        take_out(index::LOADS, &mut matrix, &mut right);
         take_out(index::ROTORS, &mut matrix, &mut right);
         take_out(index::RELAXATION, &mut matrix, &mut right);
         take_out(index::CURVATURE, &mut matrix, &mut right);

@@ -92,7 +92,7 @@ impl Normal {
         normal
     }
 
-    /// Adds how large rolling resistance may be at this θ, where the ground has not told yet.
+    /// Adds how large rolling resistance may be at this θ, where this ground has not shown it yet.
     pub(super) fn with_resistance(mut self, offsets: &OffsetKnowledge, theta: f64) -> Self {
         if !offsets.knows_resistance {
             let resistance = (index::RESISTANCE, index::RESISTANCE);
@@ -111,8 +111,8 @@ impl Normal {
     }
 }
 
-/// What is known of relaxation and rotors: which parameter over θ, its mean and standard deviation.
-pub(super) fn drive_known(tyres: &TyrePrior) -> [(usize, f64, f64); 2] {
+/// What is known of relaxation, rotors and loads: which parameter over θ, its mean and standard deviation.
+pub(super) fn drive_known(tyres: &TyrePrior) -> [(usize, f64, f64); 3] {
     [
         (
             index::RELAXATION,
@@ -124,6 +124,7 @@ pub(super) fn drive_known(tyres: &TyrePrior) -> [(usize, f64, f64); 2] {
             tyres.rotor_ratio,
             tyres.rotor_std_dev_ratio.max(1.0e-5),
         ),
+        (index::LOADS, 0.0, tyres.load_difference_std_dev.max(1.0e-5)),
     ]
 }
 

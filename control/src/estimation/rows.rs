@@ -5,7 +5,7 @@ use nalgebra::{SMatrix, SVector};
 use super::types::Curvature;
 
 /// Number of parameters.
-pub(super) const PARAMETERS: usize = 11;
+pub(super) const PARAMETERS: usize = 12;
 /// Number of the parameters that all segments of a ground share, which follow θ: the robot's own,
 /// and the rolling resistance.
 pub(super) const OFFSETS: usize = 7;
@@ -47,12 +47,15 @@ pub(super) mod index {
     /// θj, θ times the inertia of the rotors and wheels over the mass: torque that no contact
     /// carries.
     pub(in crate::estimation) const ROTORS: usize = 10;
+    /// θε, θ times the difference of the sides' loads over their sum, left minus right: a robot
+    /// whose centre of mass is off the middle slips less on the side that carries more.
+    pub(in crate::estimation) const LOADS: usize = 11;
     /// θκ², a regressor's place only, as all that follow.
-    pub(in crate::estimation) const CURVATURE_SQUARE: usize = 11;
+    pub(in crate::estimation) const CURVATURE_SQUARE: usize = 12;
     /// κ.
-    pub(in crate::estimation) const CURVATURE_ALONE: usize = 12;
+    pub(in crate::estimation) const CURVATURE_ALONE: usize = 13;
     /// θ²κ.
-    pub(in crate::estimation) const THETA_CURVATURE: usize = 13;
+    pub(in crate::estimation) const THETA_CURVATURE: usize = 14;
 }
 
 /// The regressors that have the force's noise.

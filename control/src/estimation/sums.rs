@@ -7,7 +7,7 @@ use super::rows::{Channel, Row, index};
 
 /// Blocks of straight driving for a rolling resistance.
 const RESISTANCE_BLOCKS_MIN: f64 = 10.0;
-/// Relative standard deviation above which an effective track is not told.
+/// Relative standard deviation above which no effective track is given.
 const TRACK_STD_DEV_MAX: f64 = 0.1;
 
 /// Additive sums.

@@ -75,6 +75,9 @@ pub struct TyrePrior {
     /// Its standard deviation.
     #[serde(default)]
     pub rotor_std_dev_ratio: f64,
+    /// Standard deviation of the difference of the sides' loads over their sum; its mean is 0.
+    #[serde(default)]
+    pub load_difference_std_dev: f64,
     /// Error of θ, as a share, where nearly all of the residuals is what rows do not know. Where it
     /// is 0 the model counts as exact, and residuals beyond the noise as more noise.
     #[serde(default)]
@@ -155,17 +158,20 @@ pub(super) struct Curvature {
 }
 
 impl TyrePrior {
-    /// Tyres of which nothing is known: straight, or as bent as a brush of a peak of 0.3, with the
-    /// relaxation lengths of small tyres, and the rotors of geared motors.
+    /// Tyres of which nothing is known: straight, or as curved as a `LuGre` tyre of a peak of 0.5,
+    /// with the relaxation lengths of small tyres, the rotors of geared motors, and a load off the
+    /// middle. The largest friction coefficient is below the peak of wet grass or loose gravel
+    /// (0.3), since slip beyond a peak looks like a small stiffness.
     pub fn unknown() -> Self {
         Self {
-            curvature: 0.5,
-            curvature_std_dev: 0.5,
-            mu_max: Some(0.6),
+            curvature: 1.0,
+            curvature_std_dev: 1.0,
+            mu_max: Some(0.25),
             relaxation_m: 0.04,
             relaxation_std_dev_m: 0.03,
             rotor_ratio: 0.05,
             rotor_std_dev_ratio: 0.04,
+            load_difference_std_dev: 0.05,
             unexplained_ratio: 0.1,
             ..Self::default()
         }
@@ -197,6 +203,7 @@ impl Default for TyrePrior {
             relaxation_std_dev_m: 0.0,
             rotor_ratio: 0.0,
             rotor_std_dev_ratio: 0.0,
+            load_difference_std_dev: 0.0,
             unexplained_ratio: 0.0,
         }
     }

@@ -1,13 +1,14 @@
-//! Where a robot may be: the pure geometry of fences, and the speed that keeps it inside.
+//! Geofence: geometry of allowed and forbidden polygons, and the speed limit that keeps a robot
+//! inside.
 //!
-//! The robot is a disc around its centre. *Clearance* is how far a point is inside the allowed
-//! ground: into one of the `keep_in` polygons (the deepest, if there are several) and away from
-//! every `keep_out` polygon. It changes by no more than the distance between two points, so a path
-//! can be walked in steps as long as the clearance of the last one: a few looks answer exactly how
-//! far the robot may go along its arc, whatever the fence looks like.
+//! The robot is a disc around its centre. *Clearance* is the signed distance of a point from the
+//! border of the allowed ground, positive inside: into one of the `keep_in` polygons (the deepest,
+//! if there are several) and out of every `keep_out` polygon. Clearance is Lipschitz with constant
+//! 1, so a path can be sampled in steps as long as the clearance of the last sample: a few samples
+//! give the free distance along an arc, whatever the shape of the fence.
 //!
-//! [`speed`] caps the speed so that it still stops within that distance. Nothing here allocates after
-//! [`Fence::new`].
+//! [`Fence::judge`] limits the speed so that the robot stops within that distance. Nothing here
+//! allocates after [`Fence::new`].
 
 mod ring;
 mod speed;
@@ -20,59 +21,61 @@ pub use speed::{
     Braking, FenceInput, FenceVerdict, MARGIN_STD_DEVS, MU_UNKNOWN, REACTION_S, RETURN_MAX_M_S,
 };
 
-/// Distance kept from a fence beyond the robot's own radius, metres.
+/// Distance from the robot's disc to the fence that is kept free, metres.
 pub const MARGIN_M: f64 = 0.10;
-/// Shortest step along a planned path, metres.
+/// Minimum step in checking a planned path, metres.
 const BREACH_STEP_M: f64 = 0.02;
 
-/// Polygons within which, and out of which, a robot must keep.
+/// Polygons that a robot must stay inside (`keep_in`: any one of them) and outside (`keep_out`: all
+/// of them).
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Fence {
     keep_in: Vec<Ring>,
     keep_out: Vec<Ring>,
 }
 
-/// Where something leaves the allowed ground.
+/// First point of a path at which a robot's disc leaves the allowed ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Breach {
-    /// Distance from the start to there, metres.
+    /// Arc length from the start of the path, metres.
     pub arc_m: f64,
-    /// The centre of the robot there.
+    /// Centre of the robot at that arc length, site frame.
     pub point: Point,
-    /// How far the robot's disc is outside there, metres.
+    /// Distance by which the disc extends beyond the border, metres; infinite if the point is not
+    /// finite.
     pub depth_m: f64,
 }
 
-/// A polygon of a fence, by its place.
+/// Polygon of a fence, by its index in the list given to [`Fence::new`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FencePolygon {
-    /// One within which a robot must keep.
+    /// Polygon inside which a robot must stay.
     KeepIn(usize),
-    /// One out of which a robot must keep.
+    /// Polygon outside which a robot must stay.
     KeepOut(usize),
 }
 
-/// Where a disc is on ground that is not allowed.
+/// Overlap of a disc with forbidden ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Overlap {
-    /// The polygon that forbids it: of several `keep_in` ones the one that is left the least.
+    /// Violated polygon; of several `keep_in` polygons the one with the smallest depth.
     pub polygon: FencePolygon,
-    /// The point of its border that is nearest to the disc's centre.
+    /// Point of the polygon's border nearest to the disc's centre, site frame.
     pub border: Point,
-    /// How far the disc is on the wrong side of it, metres.
+    /// Distance by which the disc extends beyond the border, metres.
     pub depth_m: f64,
 }
 
-/// Radius of the disc that stands for a robot, without margin, metres.
+/// Returns the radius of the disc that encloses a robot, without margin, metres.
 pub fn disc_radius_m(model: &RobotModel) -> f64 {
-    // The body ends about a wheel's radius beyond the axles.
+    // The body is assumed to end one wheel radius beyond the axles.
     0.5 * model
         .track_width_m()
         .hypot(model.wheelbase_m() + 2.0 * model.wheel_radius_m())
 }
 
 impl Fence {
-    /// A fence of polygons, each its corners in order.
+    /// Creates a fence; each polygon is a list of corners in order, in the site frame.
     pub fn new(keep_in: Vec<Vec<Point>>, keep_out: Vec<Vec<Point>>) -> Self {
         let rings =
             |polygons: Vec<Vec<Point>>| polygons.iter().map(|corners| Ring::new(corners)).collect();
@@ -82,7 +85,7 @@ impl Fence {
         }
     }
 
-    /// A fence within which there is no room at all, for one that cannot be used.
+    /// Creates a fence without any allowed ground, in place of one that is invalid.
     pub fn without_room() -> Self {
         Self {
             keep_in: vec![Ring::new(&[])],
@@ -90,13 +93,13 @@ impl Fence {
         }
     }
 
-    /// Whether it bounds nothing.
+    /// Returns whether the fence has no polygon, so that it allows everything.
     pub fn is_empty(&self) -> bool {
         self.keep_in.is_empty() && self.keep_out.is_empty()
     }
 
-    /// How far a point is inside the allowed ground, metres; negative outside. Infinite without
-    /// any polygon.
+    /// Returns the clearance of a point, metres: positive inside the allowed ground, negative
+    /// outside, infinite without any polygon, −∞ for a point that is not finite.
     pub fn clearance_m(&self, point: Point) -> f64 {
         if !point.is_finite() {
             return f64::NEG_INFINITY;
@@ -109,7 +112,7 @@ impl Fence {
         };
         let mut clearance_m = inside_m;
         for ring in &self.keep_out {
-            // One that is farther than the nearest so far need not be looked at.
+            // A polygon farther away than the present clearance cannot reduce it.
             if ring.outside_at_least_m(point) < clearance_m {
                 clearance_m = clearance_m.min(-ring.depth_m(point));
             }
@@ -117,7 +120,8 @@ impl Fence {
         clearance_m
     }
 
-    /// The polygon that a disc overlaps the most without being allowed to; none if it may be there.
+    /// Returns the forbidden overlap of a disc with the largest depth, or None if the whole disc is
+    /// on allowed ground.
     pub fn overlap(&self, center: Point, radius_m: f64) -> Option<Overlap> {
         let of = |polygon: FencePolygon, ring: &Ring, depth_m: f64| Overlap {
             polygon,
@@ -136,20 +140,21 @@ impl Fence {
         inside
             .into_iter()
             .chain(outside)
-            // Not a number is no permission.
+            // NaN counts as an overlap.
             .filter(|overlap| overlap.depth_m > 0.0 || overlap.depth_m.is_nan())
             .max_by(|one, other| one.depth_m.total_cmp(&other.depth_m))
     }
 
-    /// The first place at which a robot that drives a plan, with the margin that it keeps anyway,
-    /// would leave the allowed ground.
+    /// Returns the first point of a plan at which the robot's disc plus [`MARGIN_M`] leaves the
+    /// allowed ground, or None.
     pub fn plan_breach(&self, plan: &Plan, model: &RobotModel) -> Option<Breach> {
         let radius_m = disc_radius_m(model) + MARGIN_M;
         let point_at = |arc_m: f64| plan.path().sample(arc_m).pose.point();
         self.first_breach(point_at, plan.length_m(), radius_m)
     }
 
-    /// The first place along a path at which a disc leaves the allowed ground.
+    /// Returns the first point of a path at which a disc of `radius_m` leaves the allowed ground,
+    /// or None. `point_at` gives the disc's centre for an arc length of 0 to `length_m`.
     pub fn first_breach(
         &self,
         point_at: impl Fn(f64) -> Point,
@@ -163,7 +168,7 @@ impl Fence {
         loop {
             let point = point_at(arc_m);
             let depth_m = radius_m - self.clearance_m(point);
-            // Not a number is no permission.
+            // NaN counts as a breach.
             if depth_m > 0.0 || depth_m.is_nan() {
                 return Some(Breach {
                     arc_m,
@@ -174,7 +179,7 @@ impl Fence {
             if arc_m >= length_m {
                 return None;
             }
-            // Clearance cannot be used up before so much more of the path.
+            // Clearance falls by at most the distance driven.
             arc_m = (arc_m + (-depth_m).max(BREACH_STEP_M)).min(length_m);
         }
     }

@@ -1,14 +1,15 @@
-//! One polygon of a fence, prepared for looking at it in a tick.
+//! One polygon of a fence, prepared for distance queries in a control tick.
 //!
-//! Its sides lie in groups of neighbours, each in a box: a group whose box is farther away than
-//! the nearest side so far, and that no ray to the right can meet, need not be looked at.
+//! Neighbouring sides form groups, each with a bounding box. A group is skipped if its box is
+//! farther away than the nearest side found so far and the ray from the point in the direction of x
+//! cannot meet it.
 
 use crate::geometry::Point;
 
-/// Sides in a group.
+/// Number of sides in a group.
 const GROUP_SIDES: usize = 12;
 
-/// One side of a polygon, prepared.
+/// One side of a polygon, with its inverse squared length.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Side {
     from: Point,
@@ -16,7 +17,7 @@ struct Side {
     inverse_length_1_m2: f64,
 }
 
-/// The least box along the axes that holds some points.
+/// Axis-aligned bounding box of some points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Bounds {
     low: Point,
@@ -47,7 +48,7 @@ impl Bounds {
         })
     }
 
-    /// How far a point is outside along each axis, metres; 0 within.
+    /// Returns the distance of a point from the box along each axis, `(x, y)`, metres; 0 within.
     fn off(&self, point: Point) -> (f64, f64) {
         let off = |value: f64, low: f64, high: f64| (low - value).max(value - high).max(0.0);
         (
@@ -61,7 +62,7 @@ impl Bounds {
         x_m * x_m + y_m * y_m
     }
 
-    /// Whether the ray from a point to the right can meet a side in it.
+    /// Returns whether the ray from a point in the direction of x can meet a side in the box.
     fn is_met_by_ray(&self, point: Point) -> bool {
         (self.low.y_m..=self.high.y_m).contains(&point.y_m) && point.x_m <= self.high.x_m
     }
@@ -73,7 +74,7 @@ struct Group {
     sides: Vec<Side>,
 }
 
-/// What a look at the border finds.
+/// Nearest point of the border found so far, and its squared distance.
 #[derive(Debug, Clone, Copy)]
 struct Nearest {
     distance_m2: f64,
@@ -109,14 +110,15 @@ impl Group {
         }
     }
 
-    /// Whether the ray from a point to the right crosses an odd number of its sides.
+    /// Returns whether the ray from a point in the direction of x crosses an odd number of the
+    /// group's sides.
     fn is_crossed(&self, point: Point) -> bool {
         let mut is_crossed = false;
         for side in &self.sides {
             let (from, to) = (side.from, side.to);
             let (side_x, side_y) = (to.x_m - from.x_m, to.y_m - from.y_m);
             let (x_m, y_m) = (point.x_m - from.x_m, point.y_m - from.y_m);
-            // Without a division.
+            // Compares cross products, without a division.
             let is_upward = to.y_m > from.y_m;
             let is_beside = (from.y_m > point.y_m) != (to.y_m > point.y_m);
             is_crossed ^= is_beside && ((x_m * side_y < side_x * y_m) == is_upward);
@@ -125,7 +127,7 @@ impl Group {
     }
 }
 
-/// A polygon.
+/// Closed polygon.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Ring {
     groups: Vec<Group>,
@@ -147,13 +149,13 @@ impl Ring {
         }
     }
 
-    /// A lower bound of the distance from outside; 0 within the polygon's box.
+    /// Returns a lower bound of the distance of a point outside, metres; 0 within the bounding box.
     pub(super) fn outside_at_least_m(&self, point: Point) -> f64 {
         let (x_m, y_m) = self.bounds.off(point);
         x_m.max(y_m)
     }
 
-    /// Distance to the border, positive inside.
+    /// Returns the distance to the border, metres, positive inside.
     pub(super) fn depth_m(&self, point: Point) -> f64 {
         let mut is_inside = false;
         for group in &self.groups {
@@ -165,7 +167,7 @@ impl Ring {
         if is_inside { distance_m } else { -distance_m }
     }
 
-    /// The point of the border that is nearest.
+    /// Returns the nearest point of the border.
     pub(super) fn border_near(&self, point: Point) -> Point {
         self.nearest(point).point
     }
@@ -175,7 +177,7 @@ impl Ring {
             distance_m2: f64::INFINITY,
             point,
         };
-        // The group that is likely the nearest first, so that most others need no look.
+        // Start with the group whose box is nearest, so that most others can be skipped.
         let by_box = |group: &&Group| group.bounds.distance_m2(point);
         let likely = self
             .groups
@@ -199,7 +201,7 @@ mod tests {
 
     use super::*;
 
-    /// The same without groups.
+    /// Computes [`Ring::depth_m`] without groups.
     fn plain(corners: &[Point], point: Point) -> f64 {
         let next = corners.iter().cycle().skip(1);
         let side = |(&from, &to): (&Point, &Point)| Side {
@@ -234,7 +236,7 @@ mod tests {
                 Point { x_m: radius_m * angle_rad.cos(), y_m: radius_m * angle_rad.sin() }
             }).collect();
             let ring = Ring::new(&corners);
-            // On the height of a corner, where a ray meets two sides at once.
+            // At the height of a corner, where a ray meets two sides at once.
             let y_m = if is_on_a_corner { corners[0].y_m } else { y_m };
             let point = Point { x_m, y_m };
             let depth_m = ring.depth_m(point);

@@ -1,54 +1,57 @@
-//! The speed that keeps a robot inside its fence.
+//! Speed limit that keeps a robot inside its fence.
 //!
-//! It is the fastest from which the robot still stops within its free distance `d`, `v t + v²/2a =
-//! d`, with the time `t` until it brakes and the braking `a` that the ground's lower bound of
-//! friction surely gives. Outside already, only motion that gains clearance is let through, slowly.
+//! The limit is the speed from which the robot still stops within its free distance `d`,
+//! `v t + v²/2a = d`, with the reaction time `t` and the deceleration `a` that the lower bound of
+//! friction allows. A robot outside may only move, slowly, where its clearance increases.
 
 use super::{Fence, MARGIN_M, disc_radius_m};
 use crate::geometry::{Pose, Twist};
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-/// Standard deviations of the position by which the margin grows.
+/// Number of standard deviations of the position that are added to the margin.
 pub const MARGIN_STD_DEVS: f64 = 2.0;
-/// Fastest drive back in from outside, metres per second.
+/// Maximum speed on the way back inside, metres per second.
 pub const RETURN_MAX_M_S: f64 = 0.15;
-/// Friction coefficient that ground of unknown friction is taken to have.
+/// Friction coefficient assumed on ground of unknown friction.
 pub const MU_UNKNOWN: f64 = 0.15;
-/// Time from a decision until the wheels brake, seconds: a tick of the slowest loop, the servo,
-/// and the age of the position.
+/// Time from a decision until the wheels brake, seconds: one period of the slowest loop, the servo
+/// lag, and the age of the position.
 pub const REACTION_S: f64 = 0.20;
-/// Steps along an arc before the rest of it counts as not free.
+/// Maximum number of steps along an arc; what lies beyond counts as not free.
 const STEPS_MAX: u32 = 24;
-/// Shortest step along an arc, metres; clearance below this counts as none.
+/// Clearance below which a point counts as not free, metres.
 const STEP_MIN_M: f64 = 0.005;
-/// Step by which motion from outside is tried, metres.
+/// Distance ahead at which a robot outside checks that its clearance increases, metres.
 const RETURN_STEP_M: f64 = 0.05;
 
-/// What the cap of the speed depends on.
+/// Input of [`Fence::judge`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FenceInput {
-    /// Where the robot is.
+    /// Robot pose in the site frame.
     pub pose: Pose,
-    /// Standard deviation of its position, metres.
+    /// Standard deviation of the position per axis, metres; a non-finite value stops the robot.
     pub position_std_dev_m: f64,
-    /// How it moves.
+    /// Present twist.
     pub present: Twist,
-    /// How it is to move.
+    /// Commanded twist before the limit.
     pub wanted: Twist,
-    /// Friction coefficient that the ground surely gives; [`MU_UNKNOWN`] when absent.
+    /// Lower bound of the ground's friction coefficient; None, or a value not above zero, acts as
+    /// [`MU_UNKNOWN`].
     pub mu_lower: Option<f64>,
 }
 
-/// How a robot stands to its fence.
+/// Clearance and speed limit of a robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FenceVerdict {
-    /// Clearance of the robot's disc with its margin, metres; below zero it is outside.
+    /// Clearance of the robot's disc with its margin, metres; negative outside, −∞ for input that
+    /// is not finite.
     pub clearance_m: f64,
-    /// Fastest speed along its arc, metres per second; none while the fence is out of reach.
+    /// Maximum speed along the robot's arc, metres per second; None while the fence is out of
+    /// reach.
     pub speed_max_m_s: Option<f64>,
 }
 
-/// Braking that a robot has.
+/// Guaranteed deceleration of a robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Braking {
     /// Deceleration, metres per second squared.
@@ -56,8 +59,8 @@ pub struct Braking {
 }
 
 impl Braking {
-    /// What a robot surely has: its own limit, and half of what the ground gives, for the rest goes into
-    /// steering.
+    /// Returns the smaller of the robot's acceleration limit and half of `μg`; the other half is
+    /// left for steering.
     pub fn sure(model: &RobotModel, mu_lower: Option<f64>) -> Self {
         let mu = mu_lower
             .filter(|mu| mu.is_finite() && *mu > 0.0)
@@ -68,13 +71,13 @@ impl Braking {
         }
     }
 
-    /// Distance from a decision to standstill, metres.
+    /// Returns the distance from a decision to zero speed, `v t + v²/2a`, metres.
     pub fn stopping_distance_m(self, speed_m_s: f64) -> f64 {
         let speed_m_s = speed_m_s.abs();
         speed_m_s * REACTION_S + speed_m_s * speed_m_s / (2.0 * self.deceleration_m_s2)
     }
 
-    /// Fastest speed with which the robot stops within a distance, metres per second.
+    /// Returns the maximum speed from which the robot stops within a distance, metres per second.
     pub fn speed_within_m_s(self, distance_m: f64) -> f64 {
         let delay_m_s = self.deceleration_m_s2 * REACTION_S;
         let free_m2_s2 = 2.0 * self.deceleration_m_s2 * distance_m.max(0.0);
@@ -82,11 +85,22 @@ impl Braking {
     }
 }
 
-/// The pose after a distance along an arc; a negative one goes backwards.
-pub(super) fn along_arc(pose: Pose, curvature_1_m: f64, distance_m: f64) -> Pose {
+/// A stretch of an arc; a negative distance goes backwards.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Arc {
+    pub(super) curvature_1_m: f64,
+    pub(super) distance_m: f64,
+}
+
+/// Returns the pose after a distance along an arc; a negative distance goes backwards.
+pub(super) fn along_arc(pose: Pose, arc: Arc) -> Pose {
+    let Arc {
+        curvature_1_m,
+        distance_m,
+    } = arc;
     let turn_rad = curvature_1_m * distance_m;
     let middle_rad = pose.heading_rad + 0.5 * turn_rad;
-    // The chord of the arc: sin(x)/x of half the turn.
+    // Chord of the arc: sin(x)/x of half the turn.
     let half_rad = 0.5 * turn_rad;
     let chord_m = if half_rad.abs() < 1.0e-6 {
         distance_m
@@ -101,7 +115,7 @@ pub(super) fn along_arc(pose: Pose, curvature_1_m: f64, distance_m: f64) -> Pose
 }
 
 impl Fence {
-    /// How far a disc may go along its arc, metres, at most `most_m`; 0 outside.
+    /// Returns the free distance of a disc along its arc, metres, at most `most_m`; 0 outside.
     fn free_distance_m(&self, pose: Pose, twist: Twist, radius_m: f64, most_m: f64) -> f64 {
         if twist.linear_m_s.abs() < 1.0e-6 {
             return most_m;
@@ -110,7 +124,13 @@ impl Fence {
         let direction = twist.linear_m_s.signum();
         let mut distance_m = 0.0;
         for _ in 0..STEPS_MAX {
-            let at = along_arc(pose, curvature_1_m, direction * distance_m);
+            let at = along_arc(
+                pose,
+                Arc {
+                    curvature_1_m,
+                    distance_m: direction * distance_m,
+                },
+            );
             let clearance_m = self.clearance_m(at.point()) - radius_m;
             if clearance_m < STEP_MIN_M {
                 return distance_m;
@@ -123,20 +143,23 @@ impl Fence {
         distance_m
     }
 
-    /// Whether motion from outside leads back in.
+    /// Returns whether a motion from outside increases the clearance, or leaves the disc in place.
     fn leads_back(&self, pose: Pose, twist: Twist, clearance_m: f64) -> bool {
         if twist.linear_m_s.abs() < 1.0e-6 {
             // Turning on the spot leaves the disc where it is.
             return true;
         }
         let curvature_1_m = twist.angular_rad_s / twist.linear_m_s;
-        let step_m = RETURN_STEP_M.copysign(twist.linear_m_s);
-        let next = along_arc(pose, curvature_1_m, step_m);
+        let step = Arc {
+            curvature_1_m,
+            distance_m: RETURN_STEP_M.copysign(twist.linear_m_s),
+        };
+        let next = along_arc(pose, step);
         self.clearance_m(next.point()) > clearance_m + 0.1 * RETURN_STEP_M
     }
 
-    /// The speed that keeps a robot inside, looking along the arc that is wanted and along the one
-    /// that is driven.
+    /// Computes the speed limit from the free distance along both the present and the wanted arc.
+    /// Input that is not finite gives a limit of 0; an empty fence gives none.
     pub fn judge(&self, input: &FenceInput, model: &RobotModel) -> FenceVerdict {
         if self.is_empty() {
             return FenceVerdict {
@@ -175,7 +198,8 @@ impl Fence {
             .linear_m_s
             .abs()
             .max(input.wanted.linear_m_s.abs());
-        // A little more than is needed, so that the cap does not flicker at its own edge.
+        // Farther than the stopping distance, so that the limit does not switch on and off at its
+        // edge.
         let reach_m = 1.2 * braking.stopping_distance_m(fastest_m_s);
         if clearance_m >= reach_m {
             return FenceVerdict {

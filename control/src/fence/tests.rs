@@ -1,10 +1,10 @@
-//! What fences promise: no robot that keeps to them leaves, and their geometry is exact.
+//! Fences: a robot within its speed limit never leaves, and distances to polygons are exact.
 
 use std::f64::consts::PI;
 
 use proptest::prelude::*;
 
-use super::speed::along_arc;
+use super::speed::{Arc, along_arc};
 use super::*;
 use crate::geometry::{Pose, Twist};
 
@@ -51,7 +51,7 @@ proptest! {
         let braking = Braking::sure(&model, mu);
         let dt_s = 0.02;
         let mut present = Twist::default();
-        // What was decided comes to the wheels this much later.
+        // Decisions reach the wheels after this delay.
         let mut delayed = [Twist::default(); 5];
         for (linear_m_s, angular_rad_s) in twists {
             for _ in 0..100 {
@@ -67,13 +67,13 @@ proptest! {
                 delayed[4] = Twist {
                     linear_m_s: share * linear_m_s, angular_rad_s: share * angular_rad_s,
                 };
-                // No braking harder than the ground surely gives.
+                // No braking harder than the lower bound of friction allows.
                 let target = delayed[0];
                 let most = braking.deceleration_m_s2 * dt_s;
                 let linear_m_s = present.linear_m_s
                     + (target.linear_m_s - present.linear_m_s).clamp(-most, most);
                 let is_braking = linear_m_s.abs() < present.linear_m_s.abs();
-                // Braking stays on the arc, as the gate does.
+                // Braking keeps the curvature, as the gate does.
                 let angular_rad_s = if is_braking && present.linear_m_s.abs() > 1.0e-9 {
                     present.angular_rad_s * linear_m_s / present.linear_m_s
                 } else {
@@ -82,7 +82,7 @@ proptest! {
                 present = Twist { linear_m_s, angular_rad_s };
                 let curvature_1_m = present.angular_rad_s / present.linear_m_s;
                 pose = if present.linear_m_s.abs() > 1.0e-9 {
-                    along_arc(pose, curvature_1_m, present.linear_m_s * dt_s)
+                    along_arc(pose, Arc { curvature_1_m, distance_m: present.linear_m_s * dt_s })
                 } else {
                     Pose { heading_rad: pose.heading_rad + present.angular_rad_s * dt_s, ..pose }
                 };
@@ -224,11 +224,11 @@ fn a_pose_that_is_no_number_stops() {
 }
 
 #[test]
-fn a_disc_on_forbidden_ground_is_told_which_polygon_and_where_its_border_is() {
+fn an_overlap_names_the_polygon_and_the_nearest_point_of_its_border() {
     let fence = yard();
     let overlap = |x_m: f64, y_m: f64| fence.overlap(Point { x_m, y_m }, 0.4);
     assert_eq!(overlap(0.0, 0.0), None);
-    // Between the two that overlap there is room; at the end of the second there is not.
+    // The overlap of the two polygons is inside; beyond the end of the second is not.
     assert_eq!(overlap(4.8, 0.0), None);
     let over = overlap(11.9, 0.0).unwrap();
     assert_eq!(over.polygon, FencePolygon::KeepIn(1));

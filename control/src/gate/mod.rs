@@ -1,14 +1,13 @@
-//! The last word before the wheels: it can only reduce a command.
+//! Gate: last stage before the wheels, which can only reduce a command.
 //!
-//! A stop, a stale base, a lost position, sensors that
-//! contradict each other, a lean, a hold from outside, silence of whoever must be
-//! heard, or a command that is not finite asks for rest; limits and caps of the speed cut what is
-//! left, both sides by the same share, so that a cut command bends the same way. The limits are
-//! those of the commanded twist and of the wheels ([`crate::twist_limits`]): in every tick and
-//! for every cause, speeding up stays within the acceleration limits, and while the base's word is
-//! late nothing speeds up. Slowing down for a reason is
-//! bounded by the braking limit: rest is met on a ramp, along the arc that was being driven. The
-//! strictest cause is reported: the order of [`GateCause`], and of several caps the lowest one.
+//! These reasons require zero speed: a stop, stale feedback of the base, a lost position,
+//! contradicting sensors, too much tilt, an external hold, a silent server or driver, a slow
+//! control loop, or a command that is missing or not finite. Speed limits and caps scale both sides
+//! by the same factor, which keeps the curvature. In every tick and for every cause, speeding up
+//! stays within the limits of the commanded twist and of the wheels ([`crate::twist_limits`]), and
+//! nothing speeds up while feedback of the base is late. Slowing down for a reason is bounded by
+//! the braking limit and keeps the curvature until the robot has stopped. The strictest cause is
+//! reported: the last in the order of [`GateCause`]; of several caps only the lowest counts.
 
 pub mod teleoperation;
 
@@ -16,48 +15,48 @@ use crate::measured::WheelSpeeds;
 use crate::robot::RobotModel;
 use crate::twist_limits::{Slowing, TwistLimits};
 
-/// Why a command was reduced; later ones are stricter.
+/// Cause of a reduced command; later ones are stricter.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, serde::Serialize, serde::Deserialize,
 )]
 #[serde(rename_all = "snake_case")]
 pub enum GateCause {
-    /// The command changed faster than the robot or its wheels may.
+    /// The command changed faster than the acceleration limits of robot or wheels.
     Acceleration,
     /// The command was above a speed limit: along the path, in yaw, or of a wheel.
     Speed,
-    /// Teleoperation commands arrive late: the slower the link, the slower the robot.
+    /// Teleoperation commands arrive late, which lowers the speed limit.
     CommandAge,
-    /// A limit from outside.
+    /// External speed limit.
     ExternalLimit,
-    /// A fence is near, or has been crossed.
+    /// Speed limit of a fence that is near or has been crossed.
     Fence,
-    /// The command was not a number.
+    /// The command, the previous command or the time step was not finite.
     NotFinite,
     /// There was no command.
     NoCommand,
-    /// Whoever teleoperates is silent.
+    /// The teleoperating driver is silent.
     Lease,
     /// The server has been silent for longer than the mission allows.
     LinkPolicy,
-    /// A hold from outside.
+    /// External hold.
     ExternalHold,
-    /// The control loop does not keep its rate.
+    /// The control loop is slower than its rate.
     LoopOverrun,
     /// Sensors contradict each other.
     SensorFault,
-    /// The robot does not know where it is.
+    /// The position of the robot is lost.
     StalePosition,
-    /// The robot leans too far.
+    /// The tilt of the robot is above its limit.
     Tilt,
-    /// The base has not been heard for too long.
+    /// The feedback of the base is too old.
     StaleFeedback,
     /// A stop is in force.
     Stop,
 }
 
 impl GateCause {
-    /// Every cause, in order.
+    /// All causes, from the least to the most strict.
     pub const ALL: [Self; 16] = [
         Self::Acceleration,
         Self::Speed,
@@ -78,47 +77,47 @@ impl GateCause {
     ];
 }
 
-/// Everything outside the command that may reduce it; by default nothing does.
+/// Reasons outside the command that may reduce it; none by default.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[expect(
     clippy::struct_excessive_bools,
     reason = "each says whether one independent reason holds"
 )]
 pub struct Reasons {
-    /// A stop is latched.
+    /// Whether a stop is latched.
     pub is_stopped: bool,
-    /// How far the robot leans from level, radians, if the base measures it. What is not a number
-    /// holds like a lean that is too far.
+    /// Tilt of the robot from level, radians; None if the base does not measure it. NaN counts as
+    /// too much tilt.
     pub tilt_rad: Option<f64>,
-    /// The robot must know where it is, and does not.
+    /// Whether the robot needs its position and has lost it.
     pub is_position_lost: bool,
-    /// The control loop does not keep its rate.
+    /// Whether the control loop is slower than its rate.
     pub is_loop_late: bool,
-    /// A sensor that the robot drives by is wrong.
+    /// Whether a sensor needed for driving is wrong.
     pub is_sensor_wrong: bool,
-    /// Somebody outside holds the robot.
+    /// Whether an external program holds the robot.
     pub is_held_outside: bool,
-    /// The server has been silent for longer than it may.
+    /// Whether the server has been silent for longer than the mission allows.
     pub is_link_silent: bool,
-    /// Whoever teleoperates is silent.
+    /// Whether the teleoperating driver is silent.
     pub is_driver_silent: bool,
-    /// Fastest speed that keeps the robot inside its fence, metres per second.
+    /// Maximum speed that keeps the robot inside its fence, metres per second.
     pub fence_max_m_s: Option<f64>,
-    /// Fastest speed that somebody outside allows, metres per second.
+    /// Maximum speed set by an external program, metres per second.
     pub outside_max_m_s: Option<f64>,
-    /// Fastest speed that the age of teleoperation commands allows, metres per second.
+    /// Maximum speed for the age of teleoperation commands, metres per second.
     pub command_age_max_m_s: Option<f64>,
-    /// Fastest speed of a robot that does not know where it is, metres per second.
+    /// Maximum speed of a robot without a position, metres per second.
     pub blind_max_m_s: Option<f64>,
-    /// Fastest speed of a robot whose sensors contradict each other, metres per second.
+    /// Maximum speed of a robot whose sensors contradict each other, metres per second.
     pub sensors_max_m_s: Option<f64>,
-    /// How fast the robot really goes along its path, metres per second, if that is known. While it
-    /// comes to rest its wheels do not pull it on to a speed that it does not have yet.
+    /// Measured speed along the path, metres per second; None if unknown. While the robot stops,
+    /// its wheels do not turn faster than this speed, as far as their acceleration limit allows.
     pub real_m_s: Option<f64>,
 }
 
 impl Reasons {
-    /// The strictest reason for rest, if there is one.
+    /// Returns the strictest reason to stop, or None.
     fn hold(&self, limits: &GateLimits) -> Option<GateCause> {
         let leans = self
             .tilt_rad
@@ -137,7 +136,7 @@ impl Reasons {
         .find_map(|(is_so, cause)| is_so.then_some(cause))
     }
 
-    /// The lowest of the speeds that may be driven, and its cause; the stricter one of equals.
+    /// Returns the lowest speed cap and its cause, or None; of equal caps the stricter cause.
     fn cap(&self) -> Option<(f64, GateCause)> {
         [
             (self.blind_max_m_s, GateCause::StalePosition),
@@ -147,7 +146,7 @@ impl Reasons {
             (self.command_age_max_m_s, GateCause::CommandAge),
         ]
         .into_iter()
-        // A cap that is no number is no permission.
+        // NaN and negative caps count as 0.
         .filter_map(|(most_m_s, cause)| {
             let most_m_s = most_m_s?;
             let is_number = !most_m_s.is_nan();
@@ -157,41 +156,41 @@ impl Reasons {
     }
 }
 
-/// Bounds of the gate.
+/// Limits that the gate enforces.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GateLimits {
     model: RobotModel,
-    /// Fastest wheel, radians per second.
+    /// Maximum angular speed of a wheel, radians per second.
     pub wheel_speed_max_rad_s: f64,
-    /// Fastest change of a wheel's speed, radians per second squared.
+    /// Maximum angular acceleration of a wheel, radians per second squared.
     pub wheel_acceleration_max_rad_s2: f64,
-    /// Fastest slowing down of the robot's centre while it comes to rest, as a wheel's, radians per
-    /// second squared.
+    /// Maximum deceleration of the robot's centre while it stops, as angular acceleration of a
+    /// wheel, radians per second squared.
     pub wheel_braking_max_rad_s2: f64,
-    /// Oldest feedback of the base that is trusted, seconds.
+    /// Maximum age of the base's feedback, seconds; older feedback stops the robot.
     pub feedback_age_max_s: f64,
-    /// Farthest that the robot may lean from level, radians.
+    /// Maximum tilt from level, radians; more stops the robot.
     pub tilt_max_rad: f64,
     /// Rolling radius of a wheel, metres.
     pub wheel_radius_m: f64,
 }
 
-/// Farthest that a robot may lean from level unless said otherwise, radians: 25 degrees.
+/// Default of the maximum tilt from level, radians: 25 degrees.
 pub const TILT_MAX_RAD: f64 = 0.436;
 
-/// Time that a tick without one is taken to have lasted, seconds.
+/// Duration assumed for a tick whose time step is invalid, seconds.
 const TICK_USUAL_S: f64 = 0.01;
-/// Share of the oldest feedback that is trusted beyond which nothing speeds up: what is wanted for
-/// a base that falls silent is predicted from where it was.
+/// Fraction of the maximum feedback age above which nothing speeds up, because the command for a
+/// silent base is based on its predicted motion.
 const LATE_SHARE: f64 = 0.5;
-/// Share above a speed limit that is rounding.
+/// Relative excess over a speed limit that counts as rounding.
 const ROUNDING_SHARE: f64 = 1.0e-9;
-/// Speed below which a robot's slip says nothing, metres per second.
+/// Wheel speed at the rim below which slip is not evaluated, metres per second.
 const SLIP_LEAST_M_S: f64 = 0.01;
 
 impl GateLimits {
-    /// Limits of a robot; it brakes no harder along the path than twice its planned braking, so
-    /// that a turn can be undone at the same time.
+    /// Returns the limits of a robot. Its braking along the path is at most twice its planned
+    /// deceleration, so that a turn can be ended at the same time.
     pub fn of(model: &RobotModel) -> Self {
         let limits = model.limits();
         let braking = 2.0 * limits.linear_acceleration_max_m_s2 / model.wheel_radius_m();
@@ -207,38 +206,38 @@ impl GateLimits {
     }
 }
 
-/// What the gate looks at in one tick.
+/// Input of the gate in one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GateInput {
-    /// What is wanted; none asks for rest.
+    /// Wanted wheel speeds; None requires zero speed.
     pub command: Option<WheelSpeeds>,
-    /// What the gate let through last.
+    /// Last output of the gate.
     pub previous: WheelSpeeds,
     /// Whether a stop is in force.
     pub stop: bool,
-    /// Age of the last word from the base, seconds.
+    /// Age of the last feedback of the base, seconds.
     pub feedback_age_s: f64,
-    /// Time since the gate's last word, seconds.
+    /// Time since the last output of the gate, seconds.
     pub dt_s: f64,
 }
 
-/// What the gate lets through.
+/// Output of the gate in one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GateOutput {
     /// Wheel speeds for the base.
     pub wheel_speeds: WheelSpeeds,
-    /// What they are on the ramp to.
+    /// Wheel speeds after reductions, towards which the acceleration limits lead.
     pub target: WheelSpeeds,
-    /// The strictest cause of a reduction; none when the command passed whole.
+    /// Strictest cause of a reduction; None if the command passed unchanged.
     pub cause: Option<GateCause>,
 }
 
-/// Lets a command through, reduced where it must be, for no reason but those of the input.
+/// Reduces a command for the reasons in the input alone, see [`gate_with`].
 pub fn gate(input: &GateInput, limits: &GateLimits) -> GateOutput {
     gate_with(input, &Reasons::default(), limits)
 }
 
-/// Lets a command through, reduced where it must be.
+/// Reduces a command for the reasons in the input and in `reasons`, within the limits.
 pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> GateOutput {
     let mut cause: Option<GateCause> = None;
     let mut note = |new: GateCause| cause = cause.max(Some(new));
@@ -254,7 +253,7 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
         }
         Some(command) => command,
     };
-    // Without a time there is no ramp up; rest is met as if a usual tick had passed.
+    // Without a valid time step nothing speeds up; stopping assumes a tick of usual duration.
     let dt_s = if input.dt_s.is_finite() && input.dt_s >= 0.0 {
         input.dt_s
     } else {
@@ -284,7 +283,7 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
     let share =
         TwistLimits::of(&limits.model).share_within(limits.model.twist_from_wheel_speeds(target));
     if share < 1.0 {
-        // Rounding between wheel speeds and twists is no reason to report.
+        // Rounding between wheel speeds and twists is not reported.
         if share < 1.0 - ROUNDING_SHARE {
             note(GateCause::Speed);
         }
@@ -328,10 +327,10 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
     }
 }
 
-/// The share of both sides' speeds that a tick takes away while the robot comes to rest.
+/// Returns the fraction of both sides' speeds that a tick removes while the robot stops.
 ///
-/// The centre slows down at the braking limit, also in a turn, where one side must slow down faster
-/// for it: by twice the limit at the most.
+/// The centre decelerates at the braking limit, also in a turn, where one side must decelerate
+/// faster than the centre: by at most twice the limit.
 fn rest_share(previous: WheelSpeeds, braking: f64, up: f64) -> f64 {
     let fastest_rad_s = previous.magnitude_max_rad_s();
     let centre_rad_s = 0.5 * (previous.left_rad_s + previous.right_rad_s).abs();
@@ -345,8 +344,9 @@ fn rest_share(previous: WheelSpeeds, braking: f64, up: f64) -> f64 {
         .min(1.0)
 }
 
-/// The share of both sides' speeds by which the wheels are ahead of the robot, as far as they may
-/// change in a tick: a robot that still gains speed by slip would be pulled on while they brake.
+/// Returns the fraction by which the wheels exceed the robot's measured speed, at most what they
+/// may change in a tick. Without this reduction a robot that gains speed by slip would be
+/// accelerated while it brakes.
 fn slip_share(previous: WheelSpeeds, real_m_s: Option<f64>, radius_m: f64, up: f64) -> f64 {
     let centre_m_s = 0.5 * radius_m * (previous.left_rad_s + previous.right_rad_s);
     let Some(real_m_s) = real_m_s.filter(|real_m_s| real_m_s.is_finite()) else {
@@ -361,7 +361,7 @@ fn slip_share(previous: WheelSpeeds, real_m_s: Option<f64>, radius_m: f64, up: f
         .clamp(0.0, 1.0)
 }
 
-/// What a tick of the ramp depends on beside the speeds.
+/// Parameters of one tick of the ramp.
 #[derive(Debug, Clone, Copy)]
 struct Step {
     dt_s: f64,
@@ -376,11 +376,11 @@ fn scaled(speeds: WheelSpeeds, share: f64) -> WheelSpeeds {
     }
 }
 
-/// From `previous` towards `target` as far as `dt_s` allows.
+/// Returns the wheel speeds after `dt_s` from `previous` towards `target`.
 ///
-/// While the command stands, it speeds up within the limits of the twist and slows down as the
-/// wheels may; where a cap cuts, the braking ramp holds along the path. Rest is met by both sides
-/// at once, so that the robot stays on its arc.
+/// A nonzero target is approached within the limits of the twist, and slowing down within the
+/// wheels' limit, or within the braking limit along the path if a cap applies. For a zero target
+/// both sides are reduced by the same fraction, so that the robot stays on its arc.
 fn ramped(
     previous: WheelSpeeds,
     target: WheelSpeeds,
@@ -409,7 +409,7 @@ fn ramped(
     let to = model.twist_from_wheel_speeds(target);
     let next = twist_limits.step(from, to, slowing, step.dt_s);
     if next == to {
-        // Not through the twist and back: a command that passes whole passes to the bit.
+        // Returned as it is: conversion to a twist and back would round it.
         return target;
     }
     model.wheel_speeds_from_twist(next)

@@ -1,42 +1,42 @@
-//! What a teleoperated twist becomes before the gate: within the robot's limits, on a ramp.
+//! Teleoperation commands before the gate: limited to the robot's speeds and accelerations.
 //!
-//! Late commands slow the robot down: above [`AGE_FULL_S`] the share of its speed falls in a
-//! straight line to [`SHARE_LEAST`] at [`AGE_LEAST_S`]. [`AgeMeter`] keeps the worst age of late,
-//! so that one command that came quickly does not make up for many that did not.
+//! Late commands slow the robot down: above an age of [`AGE_FULL_S`] the allowed fraction of speed
+//! falls linearly to [`SHARE_LEAST`] at [`AGE_LEAST_S`]. [`AgeMeter`] keeps the worst recent age,
+//! so that one quick command does not make up for many late ones.
 //!
 //! In the last [`STEADY_BEFORE_END_S`] of a command the robot gains no more speed, and wheels that
-//! run faster than it by slip come back to its own speed: should the driver fall silent, it brakes
-//! from the speed that it had when the command ended.
+//! run faster than the robot by slip are slowed to its speed. If the driver falls silent, the robot
+//! brakes from the speed that it had when the command ended.
 
 use super::SLIP_LEAST_M_S;
 use crate::geometry::Twist;
 use crate::robot::RobotModel;
 use crate::twist_limits::{Slowing, TwistLimits};
 
-/// Age of commands up to which the whole speed is allowed, seconds.
+/// Age of commands up to which the full speed is allowed, seconds.
 pub const AGE_FULL_S: f64 = 0.15;
-/// Age of commands from which on only the least share is allowed, seconds.
+/// Age of commands from which only [`SHARE_LEAST`] is allowed, seconds.
 pub const AGE_LEAST_S: f64 = 0.5;
-/// The least share of the speed.
+/// Minimum fraction of the speed that late commands allow.
 pub const SHARE_LEAST: f64 = 0.2;
-/// Fastest teleoperate of a robot that does not know where it is, metres per second.
+/// Maximum speed of teleoperating a robot without a position, metres per second.
 pub const BLIND_MAX_M_S: f64 = 0.3;
-/// Time before the end of a command from which on it speeds the robot up no more, seconds: twice
-/// the lag of a wheel servo, so that robot and wheels have come together when it ends.
+/// Time before the end of a command in which it no longer accelerates the robot, seconds: twice the
+/// lag of a wheel servo, so that robot and wheels have the same speed when it ends.
 pub const STEADY_BEFORE_END_S: f64 = 0.1;
-/// Share of the worst age that is forgotten with each command that comes sooner.
+/// Fraction of the difference to the worst age that each earlier command removes.
 const FORGOTTEN_SHARE: f64 = 0.05;
 
-/// Keeps the worst age of commands of late.
+/// Worst recent age of commands: rises at once, decays with each command of a smaller age.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct AgeMeter {
     worst_s: Option<f64>,
 }
 
 impl AgeMeter {
-    /// A command came at this age.
+    /// Updates the worst age with the age of a command, seconds.
     pub fn note(&mut self, age_s: f64) {
-        // An age that is no number is taken for a bad one.
+        // A non-finite age counts as [`AGE_LEAST_S`].
         let age_s = if age_s.is_finite() {
             age_s.max(0.0)
         } else {
@@ -48,18 +48,18 @@ impl AgeMeter {
         });
     }
 
-    /// The worst age of late, seconds; none before the first command.
+    /// Returns the worst recent age, seconds; None before the first command.
     pub fn worst_s(&self) -> Option<f64> {
         self.worst_s
     }
 
-    /// The share of the speed that it allows.
+    /// Returns the allowed fraction of the speed, [`SHARE_LEAST`] to 1; 1 before the first command.
     pub fn speed_share(&self) -> f64 {
         self.worst_s.map_or(1.0, speed_share)
     }
 }
 
-/// The share of the speed that commands of this age allow, [`SHARE_LEAST`] to 1.
+/// Returns the fraction of the speed allowed for an age of commands, [`SHARE_LEAST`] to 1.
 pub fn speed_share(age_s: f64) -> f64 {
     if !age_s.is_finite() {
         return SHARE_LEAST;
@@ -68,8 +68,8 @@ pub fn speed_share(age_s: f64) -> f64 {
     (1.0 - late * (1.0 - SHARE_LEAST)).max(SHARE_LEAST)
 }
 
-/// The twist within the robot's limits, bent the same way; true if it was above one. What is not
-/// finite becomes rest.
+/// Scales a twist to within the robot's limits, keeping its curvature; true if it was above one. A
+/// twist that is not finite becomes zero, with true.
 pub fn within_limits(twist: Twist, model: &RobotModel) -> (Twist, bool) {
     if !twist.is_finite() {
         return (Twist::default(), true);
@@ -84,7 +84,7 @@ pub fn within_limits(twist: Twist, model: &RobotModel) -> (Twist, bool) {
     };
     let mut over_ratio = over(twist.linear_m_s, limits.linear_max_m_s)
         .max(over(twist.angular_rad_s, limits.angular_max_rad_s));
-    // Across: v·ω, which falls with the square of the share.
+    // Lateral acceleration v·ω scales with the square of the factor.
     let across_m_s2 = twist.linear_m_s * twist.angular_rad_s;
     over_ratio = over_ratio.max(over(across_m_s2, limits.lateral_acceleration_max_m_s2).sqrt());
     let wheels = model.wheel_speeds_from_twist(twist).magnitude_max_rad_s();
@@ -96,8 +96,8 @@ pub fn within_limits(twist: Twist, model: &RobotModel) -> (Twist, bool) {
     (within, over_ratio > 1.0)
 }
 
-/// One tick from `previous` towards `target`, at the robot's accelerations; towards rest at twice
-/// that, as it brakes.
+/// Moves `previous` towards `target` for one tick within the robot's acceleration limits; slowing
+/// down uses twice these limits.
 pub fn approach(previous: Twist, target: Twist, model: &RobotModel, dt_s: f64) -> Twist {
     let dt_s = if dt_s.is_finite() { dt_s.max(0.0) } else { 0.0 };
     let slowing = Slowing {
@@ -107,10 +107,10 @@ pub fn approach(previous: Twist, target: Twist, model: &RobotModel, dt_s: f64) -
     TwistLimits::of(model).step(previous, target, slowing, dt_s)
 }
 
-/// A target that is no faster than what is driven already, and never the other way.
+/// Limits a target to the magnitude and direction of the present command, per component.
 ///
-/// What is wanted near the end of a command: a robot that still gains speed when its driver is
-/// heard no more would first go faster.
+/// Used near the end of a command: a robot that still gains speed when its driver falls silent
+/// would otherwise continue to accelerate.
 pub fn no_faster(previous: Twist, target: Twist) -> Twist {
     let least = |previous: f64, target: f64| {
         if previous * target > 0.0 {
@@ -125,8 +125,8 @@ pub fn no_faster(previous: Twist, target: Twist) -> Twist {
     }
 }
 
-/// A twist that is not ahead of what the robot really does, bent the same way: wheels that slip
-/// to gain speed are taken back to the robot's.
+/// Scales a twist down to the measured forward speed, keeping its curvature: wheels that slip to
+/// gain speed are slowed to the robot's speed.
 pub fn no_faster_than_real(twist: Twist, real_m_s: f64) -> Twist {
     if twist.linear_m_s.abs() < SLIP_LEAST_M_S || !real_m_s.is_finite() {
         return twist;

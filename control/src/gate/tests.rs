@@ -1,4 +1,4 @@
-//! What the gate promises, over random commands and reasons.
+//! Properties of the gate over random commands and reasons.
 
 use proptest::prelude::*;
 
@@ -41,7 +41,7 @@ fn centre_m_s(speeds: WheelSpeeds) -> f64 {
     0.5 * RobotModel::yi2007().wheel_radius_m() * (speeds.left_rad_s + speeds.right_rad_s).abs()
 }
 
-/// The caps that are set; one that is no number is no permission.
+/// Speed caps that are set; NaN and negative caps count as 0.
 fn caps_of(reasons: &Reasons) -> impl Iterator<Item = (f64, GateCause)> + use<> {
     [
         (reasons.fence_max_m_s, GateCause::Fence),
@@ -57,8 +57,7 @@ fn caps_of(reasons: &Reasons) -> impl Iterator<Item = (f64, GateCause)> + use<> 
     })
 }
 
-/// Whether neither the forward speed nor the turn rate is beyond both what was wanted and what was
-/// commanded before.
+/// Whether neither forward speed nor turn rate exceeds both the wanted and the previous command.
 fn is_within(got: WheelSpeeds, before: WheelSpeeds, wanted: WheelSpeeds) -> bool {
     let model = RobotModel::yi2007();
     let [got, before, wanted] =
@@ -68,7 +67,7 @@ fn is_within(got: WheelSpeeds, before: WheelSpeeds, wanted: WheelSpeeds) -> bool
         && got.angular_rad_s.abs() <= most(before.angular_rad_s, wanted.angular_rad_s)
 }
 
-/// One tick of a gate that is asked for anything.
+/// One tick of a gate with random input.
 #[derive(Debug, Clone, Copy)]
 struct AnyTick {
     command: Option<WheelSpeeds>,
@@ -87,7 +86,7 @@ fn any_tick() -> impl Strategy<Value = AnyTick> {
         })),
     ];
     let age_s = prop_oneof![6 => Just(0.0), 1 => 0.0..0.4_f64, 1 => Just(f64::NAN)];
-    // On time, late, twice in a moment, and without a time.
+    // On time, late, twice at the same time, and with an invalid time step.
     let dt_s = prop_oneof![
         8 => Just(0.01),
         2 => 0.0..0.2_f64,
@@ -166,11 +165,11 @@ proptest! {
             prop_assert_eq!(output.cause, Some(hold));
             prop_assert!(got.left_rad_s.abs() <= before_left.abs());
             prop_assert!(got.right_rad_s.abs() <= before_right.abs());
-            // Along the arc that was being driven.
+            // Along the present arc.
             let cross = got.left_rad_s * before_right - got.right_rad_s * before_left;
             prop_assert!(cross.abs() < 1.0e-6);
         }
-        // Given time, every cap is kept.
+        // After enough time every cap is kept.
         let mut settled = previous;
         for _ in 0..4_000 {
             let input = GateInput { previous: settled, ..input };
@@ -233,7 +232,7 @@ proptest! {
             prop_assert!(after.linear_m_s.abs() <= limits.linear_max_m_s + 1.0e-9);
             prop_assert!(after.angular_rad_s.abs() <= limits.angular_max_rad_s + 1.0e-9);
             prop_assert!(got.magnitude_max_rad_s() <= limits.wheel_speed_max_rad_s + 1.0e-9);
-            // Without a time, and while the base is late, nothing speeds up.
+            // With an invalid time step, and while feedback is late, nothing speeds up.
             let is_timed = tick.dt_s.is_finite() && tick.dt_s > 0.0;
             let is_late = tick.feedback_age_s > 0.5 * gate_limits.feedback_age_max_s;
             let dt_s = if is_timed && !is_late { tick.dt_s } else { 0.0 };
@@ -333,11 +332,11 @@ fn a_robot_slower_than_its_wheels_is_not_pulled_on_while_they_brake() {
     };
     let ramp_m_s = rest(None);
     assert!((0.30..0.40).contains(&ramp_m_s), "{ramp_m_s}");
-    // What is faster than its wheels, or not known, is braked on the ramp.
+    // A robot faster than its wheels, or of unknown speed, is braked on the ramp.
     for real_m_s in [0.6, f64::NAN] {
         assert!((rest(Some(real_m_s)) - ramp_m_s).abs() < 1.0e-12);
     }
-    // Down to the robot's own speed at the wheels' rate, and from there on the ramp.
+    // Down to the robot's measured speed at the wheels' rate, and from there on the ramp.
     assert!(
         (0.15..=0.2).contains(&rest(Some(0.2))),
         "{}",

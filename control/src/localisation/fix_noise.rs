@@ -1,28 +1,29 @@
-//! How noisy fixes are, found from the fixes where nobody states it.
+//! Estimates the noise of position fixes that state none.
 //!
-//! Two fixes in a row differ by what the robot moved, which gyro and wheels know over so short a
-//! time, and by the noise of both: `d = (z_k − z_{k−1}) − Δ`, of variance 2R per axis. R is the
-//! running mean of `d²/2`, begun with what is configured. Errors that change slowly do not show
-//! (a wandering receiver's): they are not in R. A wild fix counts as one of four standard
+//! Two consecutive fixes differ by the robot's motion, which gyro and wheels measure well over so
+//! short a time, and by the noise of both: `d = (z_k − z_{k−1}) − Δ`, of variance 2R per axis. R is
+//! the running mean of `d²/2`, started with the configured noise. R does not contain errors that
+//! change slowly, such as a receiver's drift. An outlier counts as at most four standard
 //! deviations.
 
 use super::FixNoise;
 use crate::geometry::{Pose, wrap_angle_rad};
 
-/// Fixes that the configured noise counts for.
+/// Weight of the configured noise, as a number of fixes.
 const CONFIGURED_FIXES: f64 = 5.0;
-/// Fixes over which is averaged.
+/// Number of fixes over which is averaged.
 const MEMORY_FIXES: f64 = 50.0;
-/// Difference that counts at most, in standard deviations: one wild fix is no noise.
+/// Maximum difference that counts, in standard deviations, so that one outlier is not taken as
+/// noise.
 const DIFFERENCE_MAX: f64 = 4.0;
-/// Longest time between two fixes that are compared, seconds.
+/// Maximum time between two fixes that are compared, seconds.
 const APART_MAX_S: f64 = 1.0;
-/// Position noise that is found, per axis, metres.
+/// Bounds of the estimated position noise per axis, metres.
 const POSITION_RANGE_M: std::ops::RangeInclusive<f64> = 1.0e-3..=0.2;
-/// Heading noise that is found, radians.
+/// Bounds of the estimated heading noise, radians.
 const HEADING_RANGE_RAD: std::ops::RangeInclusive<f64> = 1.0e-3..=0.1;
 
-/// A fix, and where the filter was after it.
+/// Fix, and the pose of the filter after it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Anchor {
     fix: Pose,
@@ -30,18 +31,18 @@ struct Anchor {
     age_s: f64,
 }
 
-/// The running mean.
+/// Running mean of the noise variances.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct FixNoiseEstimate {
     anchor: Option<Anchor>,
     fixes: f64,
-    /// Variances: position per axis, metres squared, and heading.
+    /// Variances: position per axis, metres squared, and heading, radians squared.
     position_m2: f64,
     heading_rad2: f64,
 }
 
 impl FixNoiseEstimate {
-    /// What is configured, until fixes tell.
+    /// Starts with the configured noise.
     pub(super) fn new(configured: FixNoise) -> Self {
         Self {
             anchor: None,
@@ -51,7 +52,7 @@ impl FixNoiseEstimate {
         }
     }
 
-    /// The noise of a fix.
+    /// Returns the standard deviations of a fix.
     pub(super) fn noise(&self) -> FixNoise {
         FixNoise {
             position_m: self.position_m2.sqrt(),
@@ -59,20 +60,20 @@ impl FixNoiseEstimate {
         }
     }
 
-    /// Time goes by.
+    /// Adds to the age of the last fix.
     pub(super) fn wait(&mut self, dt_s: f64) {
         if let Some(anchor) = &mut self.anchor {
             anchor.age_s += dt_s;
         }
     }
 
-    /// The robot went where nobody knows.
+    /// Discards the last fix, because the motion since is unknown.
     pub(super) fn forget_motion(&mut self) {
         self.anchor = None;
     }
 
-    /// Compares a fix with the one before; `filter` is the pose that was predicted for it from
-    /// there.
+    /// Compares a fix with the previous one; `filter` is the pose that the filter predicts for it
+    /// from the previous one.
     pub(super) fn compare(&mut self, fix: Pose, filter: Pose) {
         let Some(anchor) = self.anchor.filter(|anchor| anchor.age_s <= APART_MAX_S) else {
             return;
@@ -88,7 +89,7 @@ impl FixNoiseEstimate {
             filter.heading_rad,
             anchor.filter.heading_rad,
         ));
-        // A difference of two has twice the variance of one.
+        // A difference of two values has twice the variance of one.
         let position_m2 = 0.25 * (x_m * x_m + y_m * y_m);
         let heading_rad2 = 0.5 * turned_rad * turned_rad;
         self.fixes = (self.fixes + 1.0).min(MEMORY_FIXES);
@@ -101,7 +102,7 @@ impl FixNoiseEstimate {
         take(&mut self.heading_rad2, heading_rad2, HEADING_RANGE_RAD);
     }
 
-    /// A fix was used, and the filter is here now.
+    /// Records a fix that was used, and the pose of the filter after it.
     pub(super) fn anchor(&mut self, fix: Pose, filter: Pose) {
         self.anchor = Some(Anchor {
             fix,
@@ -122,10 +123,10 @@ mod tests {
     use crate::measured::WheelSpeeds;
     use crate::robot::RobotModel;
 
-    /// Loop of 100 Hz.
+    /// Period of the loop at 100 Hz.
     const LOOP_S: f64 = 0.01;
 
-    /// A robot that drives a circle of 2 m with fixes of this noise, one in so many ticks.
+    /// Simulation of a robot on a circle of 2 m with noisy fixes, one per a number of ticks.
     struct Drive {
         filter: Localisation,
         random: ChaCha8Rng,
@@ -146,7 +147,7 @@ mod tests {
             std_dev * radius * (std::f64::consts::TAU * self.random.random::<f64>()).cos()
         }
 
-        /// Drives on; how many fixes were refused.
+        /// Drives on and returns the number of fixes that were refused.
         fn run(
             &mut self,
             seconds: u32,
@@ -205,7 +206,7 @@ mod tests {
             let mut drive = Drive::new(seed);
             drive.run(30, ticks_per_fix, noise, 0.0);
             let found = drive.filter.fix_noise.noise();
-            // What the wheels do not know of the motion between two fixes counts as noise too.
+            // The wheels' error between two fixes counts as noise too.
             let position = found.position_m / position_m.hypot(1.0e-3);
             let heading = found.heading_rad / heading_rad;
             prop_assert!((0.7..1.4).contains(&position), "position {position}");

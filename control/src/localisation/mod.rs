@@ -1,6 +1,6 @@
 //! Pose estimation: an extended Kalman filter that fuses position fixes, gyro and wheel speeds.
 //!
-//! **State** `(x, y, φ, δ_v, v_l, b)`: position in the site's frame, m; heading, rad; true minus
+//! **State** `(x, y, φ, δ_v, v_l, b)`: position in the site frame, m; heading, rad; true minus
 //! odometric forward speed, m/s; lateral speed, m/s (a skid-steered base slides in turns); gyro
 //! bias, rad/s. **Inputs**: odometric forward speed `v_o` and measured turn rate `ω_m`.
 //!
@@ -13,13 +13,13 @@
 //! ḃ = 0 + random walk                    `gyro_offset_walk`
 //! ```
 //!
-//! **Measurement model**: a fix is `(x, y, φ) + noise` of an earlier moment. It is carried forward
-//! over its age with the present twist; its covariance is its own where it states one, and is else
-//! found from the differences of fixes in a row (`fix_noise.rs`), begun with the configured one. A
-//! χ² gate on the Mahalanobis distance refuses outliers and counts them; after [`REFUSED_MAX`] in
-//! a row the robot was moved, and the filter starts again from the fix. The covariance update is
-//! Joseph's form. See Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking
-//! and Navigation*, 2001, chapters 5 and 10.
+//! **Measurement model**: a fix is `(x, y, φ) + noise` at an earlier time. It is propagated over
+//! its age with the present twist. Its covariance is the stated one, or else estimated from the
+//! differences of consecutive fixes (`fix_noise.rs`), starting with the configured one. A χ² gate
+//! on the Mahalanobis distance refuses outliers and counts them; after [`REFUSED_MAX`] in a row the
+//! robot has been moved, and the filter restarts from the fix. The covariance update is Joseph's
+//! form. See Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and
+//! Navigation*, 2001, chapters 5 and 10.
 
 mod fix_noise;
 
@@ -30,32 +30,32 @@ use crate::measured::WheelSpeeds;
 use crate::robot::RobotModel;
 use fix_noise::FixNoiseEstimate;
 
-/// Refused fixes in a row after which the filter starts afresh.
+/// Number of consecutive refused fixes after which the filter restarts.
 pub const REFUSED_MAX: u32 = 20;
-/// Squared Mahalanobis distance beyond which a fix is refused (three degrees of freedom, one in
-/// 10⁶ true ones).
+/// Squared Mahalanobis distance beyond which a fix is refused (χ² with three degrees of freedom;
+/// one in 10⁶ correct fixes exceeds it).
 const GATE: f64 = 30.7;
-/// Curvature of paths that nobody heard of, one standard deviation, 1/m: a bend may begin in them.
+/// Standard deviation of the path's curvature while no measurements arrive, 1/m.
 const UNHEARD_CURVATURE_PER_M: f64 = 1.0;
-/// Longest prediction in one call, seconds.
+/// Maximum time of prediction in one call, seconds.
 const STEP_MAX_S: f64 = 0.5;
-/// Oldest fix that is used, seconds.
+/// Maximum age of a fix that is used, seconds.
 const FIX_AGE_MAX_S: f64 = 1.0;
-/// Largest speed or turn rate that is believed, metres or radians per second.
+/// Magnitude of speeds and turn rates from which a sample is refused, metres or radians per second.
 const RATE_MAX: f64 = 100.0;
 
-/// A measured pose.
+/// Measured pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PositionFix {
-    /// Pose in the site's frame.
+    /// Pose in the site frame.
     pub pose: Pose,
-    /// How long ago it was measured, seconds.
+    /// Time since its measurement, seconds; accepted from 0 to 1.
     pub age_s: f64,
-    /// How good it is; none if that is to be found from the fixes themselves.
+    /// Noise of the fix; None to estimate it from the fixes.
     pub noise: Option<FixNoise>,
 }
 
-/// How good a fix is; one standard deviation each, above zero.
+/// Standard deviations of a fix, each finite and above zero.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FixNoise {
     /// Position, per axis, metres.
@@ -71,22 +71,22 @@ impl FixNoise {
     }
 }
 
-/// Noise of the sensors that localisation uses; one standard deviation each.
+/// Noise of the sensors that localisation uses, as standard deviations.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct LocalisationNoise {
-    /// Position of a fix that states none, per axis, metres: until fixes tell.
+    /// Position noise of a fix that states none, per axis, metres; the start value of its estimate.
     pub position_m: f64,
-    /// Heading of such a fix, radians: until fixes tell.
+    /// Heading noise of a fix that states none, radians; the start value of its estimate.
     pub heading_rad: f64,
-    /// Gyro, white, at the loop's rate, radians per second.
+    /// White noise of the gyro at the loop's rate, radians per second.
     pub gyro_rad_s: f64,
-    /// Wandering of the gyro's offset, radians per second and root second.
+    /// Random walk of the gyro's bias, radians per second per square root of a second.
     pub gyro_offset_walk: f64,
-    /// Difference between true and odometric forward speed, metres per second.
+    /// True minus odometric forward speed, metres per second.
     pub speed_m_s: f64,
-    /// Speed to the left, metres per second.
+    /// Lateral speed, metres per second.
     pub sideways_m_s: f64,
-    /// Time over which both speeds forget, seconds.
+    /// Correlation time of both speeds, seconds.
     pub speed_memory_s: f64,
 }
 
@@ -104,22 +104,22 @@ impl Default for LocalisationNoise {
     }
 }
 
-/// What became of a fix.
+/// Result of processing a fix.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FixOutcome {
-    /// It was the first, and is the pose now.
+    /// It was the first fix; the filter starts from it.
     Started,
-    /// It was fused.
+    /// It was fused into the estimate.
     Fused,
-    /// It is not finite, or too old.
+    /// It was refused: not finite, too old, from the future, or with invalid noise.
     Invalid,
-    /// It cannot be true, given what was known.
+    /// It was refused: too far from the prediction.
     Outlier,
-    /// Too many in a row could not be true: the filter started afresh from this one.
+    /// It was the last of too many outliers in a row; the filter restarted from it.
     Restarted,
 }
 
-/// The filter.
+/// Extended Kalman filter of one robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Localisation {
     model: RobotModel,
@@ -138,7 +138,7 @@ pub struct Localisation {
 }
 
 impl Localisation {
-    /// A filter that knows nothing yet.
+    /// Creates a filter without a pose.
     pub fn new(model: RobotModel, noise: LocalisationNoise) -> Self {
         Self {
             model,
@@ -160,7 +160,7 @@ impl Localisation {
         }
     }
 
-    /// The pose; none before the first fix.
+    /// Returns the pose in the site frame; None before the first fix.
     pub fn pose(&self) -> Option<Pose> {
         self.started.then(|| Pose {
             x_m: self.state[0],
@@ -169,7 +169,7 @@ impl Localisation {
         })
     }
 
-    /// How the robot moves, body frame.
+    /// Returns forward speed and turn rate in the body frame, corrected by the estimated errors.
     pub fn twist(&self) -> Twist {
         Twist {
             linear_m_s: self.forward_m_s + self.state[3],
@@ -177,7 +177,8 @@ impl Localisation {
         }
     }
 
-    /// Standard deviation of the position, the larger axis, metres; infinite before the first fix.
+    /// Returns the standard deviation of the position on the worse axis, metres; infinite before
+    /// the first fix.
     pub fn position_std_dev_m(&self) -> f64 {
         if self.started {
             self.covariance[(0, 0)]
@@ -189,27 +190,27 @@ impl Localisation {
         }
     }
 
-    /// Age of the last fix that was used, seconds; infinite before the first.
+    /// Returns the age of the last fix that was used, seconds; infinite before the first.
     pub fn fix_age_s(&self) -> f64 {
         self.fix_age_s
     }
 
-    /// Fixes refused because they could not be true.
+    /// Returns the number of fixes refused as outliers.
     pub fn outliers(&self) -> u64 {
         self.outliers
     }
 
-    /// Samples and fixes refused because they were not finite, too large or too old.
+    /// Returns the number of samples and fixes refused as not finite, too large or too old.
     pub fn invalid(&self) -> u64 {
         self.invalid
     }
 
-    /// How often the filter started afresh.
+    /// Returns the number of restarts.
     pub fn restarts(&self) -> u64 {
         self.restarts
     }
 
-    /// Moves on by one tick with the gyro's and the wheels' measured rates.
+    /// Predicts the state over `dt_s` seconds with the measured rates of gyro and wheels.
     pub fn predict(&mut self, gyro_rad_s: f64, wheels: WheelSpeeds, dt_s: f64) {
         if !(dt_s.is_finite() && dt_s > 0.0) {
             self.invalid += 1;
@@ -219,7 +220,7 @@ impl Localisation {
         self.fix_noise.wait(dt_s);
         let wheel_m_s =
             0.5 * self.model.wheel_radius_m() * (wheels.left_rad_s + wheels.right_rad_s);
-        // A sample that cannot be used leaves the last rates standing; the covariance grows.
+        // After a refused sample the last rates apply; the covariance grows.
         if gyro_rad_s.is_finite() && gyro_rad_s.abs() < RATE_MAX {
             self.turn_rad_s = gyro_rad_s - self.state[5];
         } else {
@@ -253,7 +254,7 @@ impl Localisation {
         motion[(2, 5)] = -dt_s;
         motion[(3, 3)] = fade;
         motion[(4, 4)] = fade;
-        // Standing wheels do not slide: the Markov speeds are let loose with the speed.
+        // Stopped wheels do not slide: the noise driving both speeds grows with the speed.
         let moving = (self.forward_m_s.abs() + 0.2 * self.turn_rad_s.abs()).min(0.5) / 0.5;
         let renewed = (1.0 - fade * fade) * (0.05 + 0.95 * moving).powi(2);
         self.covariance = motion * self.covariance * motion.transpose();
@@ -263,9 +264,9 @@ impl Localisation {
         self.covariance[(5, 5)] += dt_s * self.noise.gyro_offset_walk.powi(2);
     }
 
-    /// Nothing was heard for `unheard_s` seconds: the robot may be wherever its last speeds could
-    /// have brought it, or where it was. Called before the prediction that ends the silence, whose
-    /// rates are already those of after it.
+    /// Enlarges the covariance after `unheard_s` seconds without measurements: the robot may have
+    /// stopped, or continued at its last speeds on any curve. Must be called before the prediction
+    /// that ends the gap, which replaces these speeds.
     pub fn lose_track(&mut self, unheard_s: f64) {
         if !self.started || !unheard_s.is_finite() || unheard_s <= 0.0 {
             return;
@@ -280,7 +281,7 @@ impl Localisation {
         }
     }
 
-    /// Takes a position fix.
+    /// Fuses a position fix, unless it is invalid or an outlier.
     pub fn correct(&mut self, fix: &PositionFix) -> FixOutcome {
         let is_in_time = (0.0..=FIX_AGE_MAX_S).contains(&fix.age_s);
         let is_possible = fix.noise.is_none_or(FixNoise::is_possible);
@@ -343,7 +344,7 @@ impl Localisation {
         }
     }
 
-    /// The fix carried on over its age with the present motion.
+    /// Propagates the fix over its age with the present motion.
     fn carried(&self, fix: &PositionFix) -> Pose {
         let turn_rad = self.turn_rad_s * fix.age_s;
         let (sin, cos) = (fix.pose.heading_rad + 0.5 * turn_rad).sin_cos();

@@ -1,4 +1,4 @@
-//! How a robot joins a circle or a waypoint path: the quickest of many smooth legs.
+//! Approach of a robot to a circle or a waypoint path: the quickest of many smooth legs.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 
@@ -8,30 +8,30 @@ use super::{Path, Piece, Polynomial};
 use crate::geometry::{Point, Pose, wrap_angle_rad};
 use crate::robot::RobotModel;
 
-/// A robot nearer to the circle than this starts on it, metres.
+/// Distance to the circle below which a robot starts on it, metres.
 const ON_CIRCLE_M: f64 = 0.05;
-/// A robot that points along the path within this angle need not turn on the spot, radians.
+/// Heading difference to the path below which a robot need not turn on the spot, radians.
 const ALIGNED_RAD: f64 = 0.1;
-/// Places on the circle that are tried.
+/// Number of join points on the circle that are tried.
 const PLACES: u32 = 36;
-/// Shortest leg that is tried, metres.
+/// Minimum distance from the start to the end of a leg, metres.
 const LEG_MIN_M: f64 = 0.2;
-/// Lengths of the leg's parameter that are tried, over its chord.
+/// Parameter lengths of a leg that are tried, relative to its chord.
 const STRETCHES: [f64; 5] = [1.0, 1.15, 1.35, 1.7, 2.4];
-/// Distances straight behind the path's start that a leg may lead through, metres.
+/// Distances straight behind the path's start of intermediate points that are tried, metres.
 const RUN_INS_M: [f64; 3] = [0.5, 1.0, 2.0];
-/// Start directions that are tried, radians from the direction of the place.
+/// Start headings that are tried, radians relative to the bearing of the leg's end.
 const TURNS_RAD: [f64; 5] = [-1.0, -0.5, 0.0, 0.5, 1.0];
-/// Paces of the parameter at a leg's start that are tried, over that at its end: a slow one bends
-/// early, while the robot gathers speed.
+/// Parameter speeds at a leg's start that are tried, relative to that at its end: a low one bends
+/// early, while the robot still accelerates.
 const START_PACES: [f64; 2] = [1.0, 0.4];
-/// Turn rate computed for turning on the spot, share of the limit.
+/// Turn rate assumed for turning on the spot, as a fraction of the limit.
 const SPOT_TURN_SHARE: f64 = 0.4;
 
-/// The circle that is joined.
+/// Circle to join.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct CircleTarget {
-    /// Centre.
+    /// Centre in the site frame.
     pub(crate) center: Point,
     /// Radius, metres.
     pub(crate) radius_m: f64,
@@ -74,8 +74,8 @@ impl CircleTarget {
     }
 }
 
-/// The leg to the circle, empty when the robot stands on it, and the polar angle where it joins;
-/// nothing when no leg can be driven.
+/// Returns the quickest leg to the circle (empty if the robot is on it) and the polar angle of the
+/// join in radians; None if no leg can be driven.
 pub(crate) fn join_circle(
     target: &CircleTarget,
     start: Pose,
@@ -100,12 +100,12 @@ pub(crate) fn join_circle(
             radius_m: target.radius_m,
         }),
     };
-    // From the nearest place on, the way the circle is driven, so that a good bound comes early.
+    // Start with the nearest point, in driving direction, so that a tight bound is found early.
     for place in 0..PLACES {
         let place_rad = nearest_rad + target.sign * TAU * f64::from(place) / f64::from(PLACES);
         let end = target.derivatives(place_rad);
         let bound_s = best.as_ref().map_or(f64::INFINITY, |(best_s, ..)| *best_s);
-        // What is left of the circle counts nothing: turns are counted from the join.
+        // The remaining circle does not count: turns are counted from the join.
         if let Some((time_s, legs)) = join(start, &end, bound_s, &timing)
             && time_s < bound_s
         {
@@ -115,11 +115,11 @@ pub(crate) fn join_circle(
     best.map(|(_, legs, place_rad)| (legs, place_rad))
 }
 
-/// The quickest leg from a pose to where a path starts, and about its time, seconds; none when the
-/// start is too near, or every leg too tight or slower than a bound.
+/// Returns the quickest leg from a pose to the start of a path and its estimated time in seconds;
+/// None if the start is too near, or every leg is too tight or slower than `bound_s`.
 ///
-/// A leg is one curve, or one to a point straight behind the start and one from there: a long curve
-/// into a tight bend would swing far out.
+/// A leg is one curve, or two: one to a point straight behind the path's start and one from there.
+/// One long curve into a tight bend would swing far out.
 pub(crate) fn join(
     start: Pose,
     end: &Derivatives,
@@ -150,7 +150,7 @@ pub(crate) fn join(
         };
         let entry = [behind, forward, still, still, still];
         let before = LegTime {
-            // Where the second curve counts, the first does to its end.
+            // If any of the second curve is off the circle, all of the first one counts.
             ring: timing.ring.filter(|_| last_s <= 0.0),
             ..*timing
         };
@@ -165,7 +165,8 @@ pub(crate) fn join(
     best
 }
 
-/// The quickest single curve to a state, and about its time, seconds, if it is below a bound.
+/// Returns the quickest single curve to a state and its estimated time in seconds, if it is below
+/// `bound_s`.
 fn curve(
     start: Pose,
     end: &Derivatives,
@@ -208,7 +209,7 @@ fn curve(
     best
 }
 
-/// About how long it takes to turn on the spot, seconds; nothing when hardly any turn is needed.
+/// Returns the estimated time to turn on the spot, seconds; 0 below [`ALIGNED_RAD`].
 fn spot_turn_s(start: Pose, heading_rad: f64, model: &RobotModel) -> f64 {
     let turn_rad = wrap_angle_rad(heading_rad - start.heading_rad).abs();
     if turn_rad > ALIGNED_RAD {
@@ -218,8 +219,8 @@ fn spot_turn_s(start: Pose, heading_rad: f64, model: &RobotModel) -> f64 {
     }
 }
 
-/// A leg of about a length, that joins at the path's own pace of its parameter, and starts with a
-/// share of it.
+/// Returns a leg of parameter length `length_m` over the end's parameter speed. It starts with
+/// `start_pace` times that parameter speed and zero higher derivatives.
 fn leg(
     start: Point,
     heading_rad: f64,

@@ -1,4 +1,4 @@
-//! About how long a curve takes: what tells good legs and splines from others.
+//! Estimated driving time of a curve, used to compare legs and splines.
 
 #![expect(
     clippy::cast_precision_loss,
@@ -9,21 +9,21 @@ use super::{Polynomial, RADIUS_MIN_M};
 use crate::geometry::Point;
 use crate::robot::RobotModel;
 
-/// Points at which a leg's time is summed.
+/// Number of steps in summing a leg's time.
 const TIME_STEPS: usize = 48;
-/// Points at which the time of a spline's piece is summed.
+/// Number of steps in summing the time of one piece of a spline.
 const PIECE_TIME_STEPS: usize = 10;
-/// Slowest advance of a curve over that at its end; a slower one is about to come to a point.
+/// Minimum parameter speed of a curve relative to that at its end; below it a cusp is near.
 const ADVANCE_SHARE_MIN: f64 = 0.05;
-/// Tightest turn of a leg, metres.
+/// Minimum radius of a leg, metres.
 const LEG_RADIUS_MIN_M: f64 = 2.0 * RADIUS_MIN_M;
-/// Share of the limits assumed in the bends of a spline: one that needs them all is no good
-/// one.
+/// Fraction of the limits assumed in the bends of a spline, to prefer splines that do not need the
+/// full limits.
 const SPLINE_LIMIT_SHARE: f64 = 0.5;
-/// A leg nearer to its circle than this is on it, metres.
+/// Distance to its circle below which a leg counts as on it, metres.
 const ON_RING_M: f64 = 0.03;
 
-/// A circle that is joined: what of a leg lies on it counts no time.
+/// Circle to join; the part of a leg on it counts no time.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Ring {
     pub(super) center: Point,
@@ -31,32 +31,32 @@ pub(super) struct Ring {
 }
 
 impl Ring {
-    /// How far a point is off it, metres.
+    /// Returns the distance of a point from the circle, metres.
     pub(super) fn distance_m(&self, point: Point) -> f64 {
         (self.center.distance_m(point) - self.radius_m).abs()
     }
 }
 
-/// How legs are timed.
+/// Parameters of timing a leg.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LegTime<'robot> {
-    /// Speed on the leg, metres per second.
+    /// Desired speed on the leg, metres per second.
     pub(super) speed_m_s: f64,
     pub(super) model: &'robot RobotModel,
     pub(super) ring: Option<Ring>,
 }
 
-/// A part of a leg.
+/// One step of a leg.
 #[derive(Debug, Clone, Copy, Default)]
 struct Part {
     length_m: f64,
-    /// `v²/2` at most, metres squared per second squared.
+    /// Maximum `v²/2`, metres squared per second squared.
     energy: f64,
 }
 
 impl LegTime<'_> {
-    /// About how long a leg takes, from rest or in passing, until it is on its ring for good; none
-    /// when it is too tight to drive, or slower than a bound.
+    /// Returns the estimated time of a leg in seconds until it stays on its ring, starting from
+    /// zero speed or not; None if it is too tight to drive, or slower than `bound_s`.
     pub(super) fn of_leg_s(&self, leg: &Polynomial, from_rest: bool, bound_s: f64) -> Option<f64> {
         let mut parts = [Part::default(); TIME_STEPS];
         let (mut least_s, mut counted, mut off_m) = (0.0, 0, 0.0);
@@ -89,7 +89,8 @@ impl LegTime<'_> {
         (time_s <= bound_s).then_some(time_s)
     }
 
-    /// As in the plan's timing, no limit is passed within the way over which speeds are averaged.
+    /// Lowers each step's speed to the minimum within the distance over which the plan's timing
+    /// averages speeds.
     fn keep_distance(&self, parts: &mut [Part; TIME_STEPS]) {
         let limits = self.model.limits();
         let reach_m = self.speed_m_s * 2.0 * limits.linear_acceleration_max_m_s2
@@ -111,7 +112,8 @@ impl LegTime<'_> {
         }
     }
 
-    /// Speed is gathered and lost within the acceleration limit.
+    /// Limits the change of `v²/2` between neighbouring steps to the acceleration limit times the
+    /// distance of their middles.
     fn gather(&self, parts: &mut [Part; TIME_STEPS], from_rest: bool) {
         let half_m_s2 = 0.5 * self.model.limits().linear_acceleration_max_m_s2;
         let mut energy = if from_rest { 0.0 } else { f64::INFINITY };
@@ -127,7 +129,7 @@ impl LegTime<'_> {
     }
 }
 
-/// About how long a piece of a spline takes, seconds; none when it is too tight to drive.
+/// Returns the estimated time of a piece of a spline, seconds; None if it is too tight to drive.
 pub(super) fn piece_time_s(piece: &Polynomial, speed_m_s: f64, model: &RobotModel) -> Option<f64> {
     let mut time_s = 0.0;
     for step in 0..PIECE_TIME_STEPS {
@@ -143,7 +145,7 @@ pub(super) fn piece_time_s(piece: &Polynomial, speed_m_s: f64, model: &RobotMode
     Some(time_s)
 }
 
-/// Fastest speed, length and middle of one of a number of steps; none where it is too tight.
+/// Returns maximum speed, length and middle point of one of `steps` steps; None if it is too tight.
 fn step_of(
     curve: &Polynomial,
     (step, steps): (usize, usize),

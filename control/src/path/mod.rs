@@ -1,9 +1,9 @@
-//! Geometry of a path, by arc length, without any timing.
+//! Geometry of a path by arc length, without timing.
 //!
-//! A path is a row of pieces: arcs (exact) and polynomials. Joins are C⁴ in the parameter, which
-//! never stands still, so position, heading, curvature and the curvature's slope are continuous
-//! along the path. (Where a waypoint's heading is given the join is C³, which suffices for that.)
-//! Sampling allocates nothing.
+//! A path is a sequence of pieces: arcs (exact) and polynomials. Joins are C⁴ in the parameter,
+//! whose speed is never zero, so position, heading, curvature and the slope of curvature are
+//! continuous along the path. (Where a waypoint's heading is given the join is C³, which suffices
+//! for that.) Sampling does not allocate.
 
 #![expect(clippy::cast_precision_loss, reason = "counts stay far below 2^52")]
 
@@ -22,43 +22,45 @@ pub(crate) use polynomial::Polynomial;
 pub(crate) use route::{from_here, joined_from_afar};
 pub(crate) use spline::Knot;
 
-/// Tightest turn that a path may have, metres.
+/// Minimum radius of curvature of a path, metres.
 pub const RADIUS_MIN_M: f64 = 0.05;
-/// Fewest parameter intervals per polynomial piece in the table of arc lengths.
+/// Minimum number of parameter intervals per polynomial piece in the table of arc lengths.
 const INTERVALS_MIN: usize = 8;
-/// Most parameter intervals per polynomial piece.
+/// Maximum number of parameter intervals per polynomial piece.
 const INTERVALS_MAX: usize = 256;
-/// Parameter interval aimed at, about metres.
+/// Desired parameter interval, about metres.
 const INTERVAL_M: f64 = 0.1;
-/// Newton steps from arc length to parameter.
+/// Maximum number of Newton steps from arc length to parameter.
 const NEWTON_STEPS: usize = 4;
-/// Slowest advance along a polynomial, metres per parameter unit; below it the path has a cusp.
+/// Minimum parameter speed of a polynomial, metres per parameter unit; below it the path has a
+/// cusp.
 const ADVANCE_MIN: f64 = 1.0e-3;
 
-/// Most that a path may turn over a quarter of a parameter interval, radians; beyond it turns back.
+/// Maximum turn of the heading over a quarter of a parameter interval, radians; more counts as a
+/// cusp.
 const TURN_MAX_RAD: f64 = 1.5;
 
 /// One piece of a path.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Piece {
-    /// Part of a circle.
+    /// Arc of a circle.
     Arc {
-        /// Centre.
+        /// Centre in the site frame.
         center: Point,
         /// Radius, metres.
         radius_m: f64,
-        /// Polar angle of the start as seen from the centre, radians.
+        /// Polar angle of the start seen from the centre, radians.
         start_rad: f64,
         /// +1 counter-clockwise, −1 clockwise.
         sign: f64,
         /// Arc length, metres.
         length_m: f64,
     },
-    /// A polynomial curve.
+    /// Polynomial curve.
     Polynomial(Polynomial),
 }
 
-/// Start of a parameter interval in the table of arc lengths.
+/// Parameter interval in the table of arc lengths, with the arc length at its start.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Node {
     arc_m: f64,
@@ -67,39 +69,42 @@ struct Node {
     parameter_end: f64,
 }
 
-/// A path at one arc length.
+/// Pose and curvature of a path at one arc length.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PathSample {
-    /// Position, and heading along the path.
+    /// Position, and heading tangential to the path, site frame.
     pub pose: Pose,
     /// Curvature, per metre, positive to the left.
     pub curvature_1_m: f64,
-    /// Change of curvature along the path, per metre squared.
+    /// Derivative of curvature by arc length, per metre squared.
     pub curvature_slope_1_m2: f64,
 }
 
-/// Why a geometry was refused; `piece` counts from zero along the path.
+/// Reason why a geometry is invalid; `piece` counts from zero along the path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 pub(crate) enum PathError {
-    /// The path turns tighter than [`RADIUS_MIN_M`], or turns back on the spot.
+    /// The path turns tighter than [`RADIUS_MIN_M`], or has a cusp.
     #[error("the path turns too sharply in its piece {piece}")]
     TooTight {
-        /// Which piece.
+        /// Index of the piece.
         piece: usize,
     },
 }
 
-/// A path by arc length.
+/// Path parametrised by arc length.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Path {
     pieces: Vec<Piece>,
     nodes: Vec<Node>,
-    /// Arc length at the start of each piece, and the whole length last.
+    /// Arc length at the start of each piece, then the total length.
     starts_m: Vec<f64>,
 }
 
 impl Path {
-    /// Joins pieces and measures them.
+    /// Joins pieces in order and computes their arc lengths.
+    ///
+    /// # Errors
+    /// [`PathError::TooTight`] if a polynomial turns too tightly or has a cusp.
     pub(crate) fn new(pieces: Vec<Piece>) -> Result<Self, PathError> {
         let mut nodes = Vec::with_capacity(pieces.len() * INTERVALS_MIN);
         let mut starts_m = Vec::with_capacity(pieces.len() + 1);
@@ -142,17 +147,18 @@ impl Path {
         })
     }
 
-    /// Length of the whole path, metres.
+    /// Returns the total length, metres.
     pub fn length_m(&self) -> f64 {
         self.starts_m.last().copied().unwrap_or_default()
     }
 
-    /// Number of pieces.
+    /// Returns the number of pieces.
     pub(crate) fn piece_count(&self) -> usize {
         self.pieces.len()
     }
 
-    /// Arc length at which a piece starts; the whole length beyond the last.
+    /// Returns the arc length at which a piece starts, metres; the total length for an index beyond
+    /// the last.
     pub(crate) fn piece_start_m(&self, piece: usize) -> f64 {
         self.starts_m
             .get(piece)
@@ -160,7 +166,7 @@ impl Path {
             .unwrap_or_else(|| self.length_m())
     }
 
-    /// The path at an arc length, metres; clamped to the path's ends.
+    /// Returns the path at an arc length in metres, clamped to the path's ends.
     pub fn sample(&self, arc_m: f64) -> PathSample {
         let arc_m = arc_m.clamp(0.0, self.length_m());
         let after = self.nodes.partition_point(|node| node.arc_m <= arc_m);
@@ -235,7 +241,8 @@ fn check_turn(
             curvature_1_m,
             ..
         } = polynomial.sample(parameter);
-        // Between two places near a cusp the heading turns back, however gentle the bends there.
+        // Between two samples around a cusp the heading reverses, however small the curvature at
+        // both.
         let turned_rad = before_rad.replace(pose.heading_rad).map_or(0.0, |before| {
             crate::geometry::wrap_angle_rad(pose.heading_rad - before)
         });

@@ -1,11 +1,11 @@
-//! A planar polynomial curve of degree nine or less.
+//! Planar polynomial curve of degree nine or less.
 
 use nalgebra::{SMatrix, SVector};
 
 use super::PathSample;
 use crate::geometry::{Point, Pose};
 
-/// Coefficients of one coordinate, lowest first.
+/// Number of coefficients of one coordinate, lowest power first.
 const COEFFICIENTS: usize = 10;
 /// Nodes and weights of the five-point Gauss-Legendre rule on [−1, 1].
 const GAUSS: [(f64, f64); 5] = [
@@ -16,10 +16,10 @@ const GAUSS: [(f64, f64); 5] = [
     (-0.906_179_845_938_664, 0.236_926_885_056_189_08),
 ];
 
-/// Position and its first four derivatives by parameter.
+/// Position and its first four derivatives by the parameter.
 pub(crate) type Derivatives = [Point; 5];
 
-/// A curve over the parameter 0 to `span`.
+/// Curve over the parameter range 0 to `span`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Polynomial {
     x: [f64; COEFFICIENTS],
@@ -29,7 +29,7 @@ pub(crate) struct Polynomial {
 }
 
 impl Polynomial {
-    /// The quintic with given position, first and second derivative at both ends.
+    /// Returns the quintic with given position, first and second derivative at both ends.
     pub(crate) fn quintic(start: [Point; 3], end: [Point; 3], span: f64) -> Self {
         let axis = |of: fn(&Point) -> f64| {
             let [p_0, v_0, a_0] = [
@@ -56,7 +56,8 @@ impl Polynomial {
         }
     }
 
-    /// The curve of degree nine with given derivatives up to the fourth at both ends.
+    /// Returns the polynomial of degree nine with given derivatives up to the fourth at both ends;
+    /// None if the linear system cannot be solved.
     pub(crate) fn nonic(start: &Derivatives, end: &Derivatives, span: f64) -> Option<Self> {
         const FACTORIALS: [f64; 5] = [1.0, 1.0, 2.0, 6.0, 24.0];
         let falling = |power: usize, order: usize| {
@@ -94,12 +95,12 @@ impl Polynomial {
         })
     }
 
-    /// Largest parameter.
+    /// Returns the end of the parameter range.
     pub(crate) fn span(&self) -> f64 {
         self.span
     }
 
-    /// The derivative of an order at a parameter.
+    /// Returns the derivative of a given order at a parameter.
     pub(crate) fn derivative(&self, order: usize, parameter: f64) -> Point {
         let axis = |coefficients: &[f64; COEFFICIENTS]| {
             let mut value = 0.0;
@@ -118,9 +119,10 @@ impl Polynomial {
         }
     }
 
-    /// Metres per parameter unit at a parameter.
+    /// Returns the parameter speed `|p'|` at a parameter, metres per parameter unit.
     pub(crate) fn advance(&self, parameter: f64) -> f64 {
-        // Horner's rule on both coordinates at once: this is most of what a reference costs.
+        // Horner's rule on both coordinates at once: most of a reference's computing time is spent
+        // here.
         let (mut x, mut y) = (0.0, 0.0);
         for power in (1..=self.degree).rev() {
             let factor = power as f64;
@@ -130,7 +132,7 @@ impl Polynomial {
         (x * x + y * y).sqrt()
     }
 
-    /// Position and the first three derivatives, in one pass of Horner's rule.
+    /// Returns position and the first three derivatives, in one pass of Horner's rule.
     fn jet(&self, parameter: f64) -> [Point; 4] {
         let (mut x, mut y) = ([0.0; 4], [0.0; 4]);
         for power in (0..=self.degree).rev() {
@@ -148,7 +150,8 @@ impl Polynomial {
         })
     }
 
-    /// Arc length between two parameters, metres.
+    /// Returns the arc length between two parameters by five-point Gauss-Legendre quadrature,
+    /// metres.
     pub(crate) fn length_m(&self, start: f64, end: f64) -> f64 {
         let (middle, half) = (0.5 * (start + end), 0.5 * (end - start));
         GAUSS
@@ -158,7 +161,7 @@ impl Polynomial {
             * half
     }
 
-    /// Pose, curvature and its slope at a parameter.
+    /// Returns pose, curvature and slope of curvature at a parameter.
     pub(crate) fn sample(&self, parameter: f64) -> PathSample {
         let [position, first, second, third] = self.jet(parameter);
         let advance_2 = (first.x_m * first.x_m + first.y_m * first.y_m).max(f64::MIN_POSITIVE);
@@ -179,7 +182,7 @@ impl Polynomial {
     }
 }
 
-/// Coefficients over 0 to `span` from those over 0 to 1.
+/// Converts coefficients over the parameter range 0 to 1 to those over 0 to `span`.
 fn unscaled(mut unit: [f64; COEFFICIENTS], span: f64) -> [f64; COEFFICIENTS] {
     let mut scale = 1.0;
     for coefficient in &mut unit {

@@ -1,4 +1,4 @@
-//! A path through waypoints from where the robot stands: the quickest of several splines.
+//! Path through waypoints from the robot's pose: the quickest of several splines.
 
 use super::join::join;
 use super::leg_time::{LegTime, piece_time_s};
@@ -7,20 +7,22 @@ use super::{Path, PathError, Piece, Polynomial};
 use crate::geometry::{Pose, wrap_angle_rad};
 use crate::robot::RobotModel;
 
-/// A robot this near to the first waypoint may start beside it when no smooth path leads through
+/// Distance to the first waypoint below which the robot may skip it if no smooth path leads through
 /// it, metres.
 const BESIDE_START_M: f64 = 0.25;
-/// The path follows the robot's heading when it would leave within this angle of it, radians.
+/// Difference between the path's start heading and the robot's below which the path may start along
+/// the latter, radians.
 const HEADING_KEPT_RAD: f64 = 0.6;
-/// Turns at a waypoint beyond which its heading is set half-way through the turn, radians; tried in
-/// this order. Where it is set the path is C³, else C⁴.
+/// Turn angles above which a waypoint's heading is fixed half-way through the turn, radians; tried
+/// in this order. The path is C³ where the heading is fixed, else C⁴.
 const CROSSWISE_FROM_RAD: [f64; 4] = [2.6, 1.7, 0.8, 0.0];
-/// Most knots of a path for which all of them are tried.
+/// Maximum number of knots for which every angle of [`CROSSWISE_FROM_RAD`] is tried.
 const ALL_SPLINES_MAX: usize = 500;
-/// Paces of the spline's parameter that are tried, as exponents of the chord.
+/// Exponents α of the spline's parameter `chord^α` that are tried.
 const SPLINE_EXPONENTS: [f64; 3] = [1.0, 0.75, 0.5];
 
-/// A smooth leg to the first knot and a spline from there; also of how many pieces the leg is.
+/// Returns a path of a smooth leg to the first knot and a spline from there, and the number of the
+/// leg's pieces; None if there is no such path.
 pub(crate) fn joined_from_afar(
     knots: &[Knot],
     start: Pose,
@@ -45,7 +47,11 @@ pub(crate) fn joined_from_afar(
     Path::new(pieces).ok().map(|path| (path, count))
 }
 
-/// A spline from where the robot stands; it leaves along the robot's heading when that is near.
+/// Returns a spline from the first knot, which is the robot's position. It starts along the robot's
+/// heading where that is near and not much slower.
+///
+/// # Errors
+/// [`PathError::TooTight`] if no spline can be driven.
 pub(crate) fn from_here(
     knots: &mut [Knot],
     start: Pose,
@@ -70,7 +76,8 @@ pub(crate) fn from_here(
         }
         (Ok((path, _)), Err(_)) | (Err(_), Ok((path, _))) => Ok(path),
         (Err(error), Err(_)) => {
-            // Beside the first waypoint, where no smooth path leads through it: it counts as met.
+            // Near the first waypoint without a smooth path through it: the waypoint counts as
+            // reached.
             if knots.len() < 3 || knots[0].point.distance_m(knots[1].point) > BESIDE_START_M {
                 return Err(error);
             }
@@ -84,7 +91,8 @@ pub(crate) fn from_here(
     }
 }
 
-/// The quickest spline through the knots over several paces of its parameter, and about its time.
+/// Returns the quickest spline through the knots over several parametrisations, and its estimated
+/// time in seconds.
 fn best_spline(
     knots: &[Knot],
     speed_m_s: f64,
@@ -93,7 +101,7 @@ fn best_spline(
     let mut best: Option<(Vec<Polynomial>, f64)> = None;
     let mut refused = None;
     for turn_rad in CROSSWISE_FROM_RAD {
-        // Long paths take the first that can be driven, short ones the quickest of all.
+        // Long paths use the first drivable angle, short ones the quickest of all.
         if best.is_some() && knots.len() > ALL_SPLINES_MAX {
             break;
         }
@@ -116,8 +124,8 @@ fn best_spline(
     best.ok_or(refused.unwrap_or(PathError::TooTight { piece: 0 }))
 }
 
-/// Knots at which the path turns by more than an angle get the heading half-way through the turn,
-/// so that the path swings through them instead of coming to a point.
+/// Fixes the heading of knots at which the path turns by more than `from_rad` to half-way through
+/// the turn, so that the path swings through them without a cusp.
 fn turned_crosswise(knots: &[Knot], from_rad: f64) -> Vec<Knot> {
     let mut turned = knots.to_vec();
     for index in 1..knots.len().saturating_sub(1) {

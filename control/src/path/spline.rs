@@ -1,26 +1,27 @@
-//! The smoothest quintic spline through given points.
+//! Minimum-jerk quintic spline through given points.
 //!
-//! Minimises `∫ |p‴|²` over the parameter, which takes `chord^α` from knot to knot: α = 1 runs at an
-//! even pace, a smaller α takes short chords slower and bulges less beside them. The minimiser is a
-//! quintic spline, C⁴ at every knot whose tangent is free and C³ where it is given. Its first and
-//! second derivatives at the knots solve one block-tridiagonal system, so planning is linear in
-//! the number of points.
+//! Minimises `∫ |p‴|²` over the parameter, which advances by `chord^α` from knot to knot: with α =
+//! 1 the parameter speed is even, a smaller α slows down on short chords and bulges less beside
+//! them. The minimiser is a quintic spline, C⁴ at every knot whose tangent is free and C³ where it
+//! is given. Its first and second derivatives at the knots solve one block-tridiagonal system, so
+//! planning is linear in the number of points.
 
 use nalgebra::{Matrix2, Matrix4, Vector4};
 
 use super::Polynomial;
 use crate::geometry::Point;
 
-/// A point that the spline passes through.
+/// Point that the spline passes through.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Knot {
-    /// Where.
+    /// Position in the site frame.
     pub(crate) point: Point,
-    /// Direction of the path here, radians; free when absent.
+    /// Heading of the path at this point, radians counter-clockwise from x; None leaves it free.
     pub(crate) heading_rad: Option<f64>,
 }
 
-/// `∂²/∂(v₀,a₀,v₁,a₁)²` of `∫₀¹ (p‴)²` and its coupling to the gap, halved, on the unit interval.
+/// Returns half of `∂²/∂(v₀,a₀,v₁,a₁)²` of `∫₀¹ (p‴)²` and of its coupling to the gap `p₁ − p₀`, on
+/// the unit interval.
 fn unit_cost() -> (Matrix4<f64>, Vector4<f64>) {
     // c₃, c₄, c₅ of the quintic as rows over (gap, v₀, a₀, v₁, a₁).
     const ROWS: [[f64; 5]; 3] = [
@@ -49,7 +50,8 @@ fn unit_cost() -> (Matrix4<f64>, Vector4<f64>) {
     )
 }
 
-/// One polynomial per pair of neighbouring knots. Neighbours must not be at the same place.
+/// Returns one polynomial per pair of neighbouring knots, which must differ in position; `exponent`
+/// is α.
 pub(crate) fn min_jerk_spline(knots: &[Knot], exponent: f64) -> Vec<Polynomial> {
     let count = knots.len();
     if count < 2 {
@@ -113,7 +115,8 @@ pub(crate) fn min_jerk_spline(knots: &[Knot], exponent: f64) -> Vec<Polynomial> 
         .collect()
 }
 
-/// Takes the given tangents out of the unknowns; their length is the pace of the chords beside.
+/// Replaces the unknown tangents of knots with given headings; their length is the mean parameter
+/// speed of the adjacent chords.
 fn fix_tangents(
     knots: &[Knot],
     pace: impl Fn(usize) -> f64,
@@ -155,7 +158,7 @@ fn fix_tangents(
     }
 }
 
-/// Block elimination of a symmetric positive definite block-tridiagonal system.
+/// Solves a symmetric positive definite block-tridiagonal system by block elimination.
 fn solve(
     mut diagonal: Vec<Matrix2<f64>>,
     above: &[Matrix2<f64>],

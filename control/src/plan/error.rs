@@ -1,4 +1,4 @@
-//! Why a trajectory cannot be driven.
+//! Errors of planning a trajectory.
 
 use thiserror::Error;
 
@@ -6,65 +6,68 @@ use super::{LENGTH_MAX_M, WAYPOINTS_MAX};
 use crate::excitation::ExcitationError;
 use crate::path::RADIUS_MIN_M;
 
-/// Why a trajectory cannot be driven; places count from zero.
+/// Reason why a trajectory cannot be planned. Indices count from zero.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum PlanError {
-    /// A figure is NaN, infinite or too large.
+    /// A value is NaN, infinite, or a coordinate beyond [`super::COORDINATE_MAX_M`]; also a
+    /// traction limit not above zero.
     #[error("{what} at {place} is not a usable number: {value}")]
     NotFinite {
-        /// Which figure.
+        /// Name of the value.
         what: &'static str,
-        /// Index of the waypoint, 0 for a circle or the start.
+        /// Index of the waypoint, 0 for a circle, the start or an option.
         place: usize,
-        /// What it held.
+        /// Rejected value.
         value: f64,
     },
-    /// A radius that is zero, negative or tighter than [`RADIUS_MIN_M`].
+    /// The circle's radius is NaN, below [`RADIUS_MIN_M`] or above [`super::COORDINATE_MAX_M`],
+    /// metres.
     #[error("the radius must be at least {RADIUS_MIN_M} m, not {0} m")]
     Radius(f64),
-    /// No turn, or a negative one.
+    /// The number of turns is not finite or not above zero.
     #[error("the number of turns must be above zero, not {0}")]
     Turns(f64),
-    /// Fewer than two waypoints.
+    /// Fewer than two waypoints; the value is their number.
     #[error("a path needs at least two waypoints, not {0}")]
     TooFewWaypoints(usize),
-    /// More than [`WAYPOINTS_MAX`] waypoints.
+    /// More than [`WAYPOINTS_MAX`] waypoints; the value is their number.
     #[error("a path may have at most {WAYPOINTS_MAX} waypoints, not {0}")]
     TooManyWaypoints(usize),
-    /// A waypoint at the same place as the one before.
+    /// Two consecutive waypoints are closer than [`super::WAYPOINT_SPACING_MIN_M`].
     #[error("waypoint {place} is at the same place as the one before")]
     DuplicateWaypoint {
         /// Index of the second of the two.
         place: usize,
     },
-    /// A speed that is zero or negative.
+    /// A speed is zero or negative.
     #[error("the speed at {place} must be above zero, not {speed_m_s} m/s")]
     SpeedNotPositive {
-        /// Index of the waypoint, 0 for a circle or a path's own speed.
+        /// Index of the waypoint, 0 for a circle, a path's own speed or the approach speed.
         place: usize,
-        /// What was asked for.
+        /// Requested speed, metres per second.
         speed_m_s: f64,
     },
-    /// A speed above what the robot can drive.
+    /// A speed is above the robot's limit.
     #[error("the speed at {place} is {speed_m_s} m/s, above the robot's limit of {limit_m_s} m/s")]
     SpeedAboveLimit {
-        /// Index of the waypoint, 0 for a circle or a path's own speed.
+        /// Index of the waypoint, 0 for a circle, a path's own speed or the approach speed.
         place: usize,
-        /// What was asked for.
+        /// Requested speed, metres per second.
         speed_m_s: f64,
-        /// The robot's limit.
+        /// Smaller of the linear speed limit and 85 % of the wheels' speed limit, metres per
+        /// second.
         limit_m_s: f64,
     },
     /// The path would turn tighter than [`RADIUS_MIN_M`].
     #[error("the path turns too sharply near waypoint {place}")]
     TooTight {
-        /// Index of the waypoint at the start of the sharp piece; 0 on the approach to a circle.
+        /// Index of the waypoint at the start of the sharp turn; 0 on the approach to a circle.
         place: usize,
     },
-    /// The path is longer than [`LENGTH_MAX_M`].
+    /// The path is longer than [`LENGTH_MAX_M`]; the value is its length, metres.
     #[error("the path is {0} m long, above the limit of {LENGTH_MAX_M} m")]
     TooLong(f64),
-    /// The excitation that was asked for is out of its range.
+    /// Depth or period of the excitation is out of its range.
     #[error("the excitation cannot be driven")]
     Excitation(#[from] ExcitationError),
 }

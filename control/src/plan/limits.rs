@@ -1,4 +1,4 @@
-//! What the robot may do at each place of a path.
+//! Speed and acceleration limits at each node of a path.
 
 use super::{PlanError, SlowedBy};
 use crate::excitation::{Excitation, ExcitationSpec, Room};
@@ -6,31 +6,32 @@ use crate::path::PathSample;
 use crate::profile::NodeLimits;
 use crate::robot::RobotModel;
 
-/// Share of the wheels' speed and acceleration that a plan may ask for; the rest is for feedback,
-/// which keeps to the limits too. [`Shares`] are those of the twist.
+/// Fraction of the wheels' speed and acceleration limits that a plan may use; the rest is left for
+/// feedback. [`Shares`] has the fractions of the twist limits.
 pub(super) const WHEEL_SHARE: f64 = 0.85;
-/// Least share of the yaw acceleration that a speed that changes in a bend gets.
+/// Minimum fraction of the yaw acceleration that is left for a change of speed in a bend.
 const YAW_LEFT_MIN: f64 = 0.2;
 
-/// Shares of the limits of the twist that a plan may ask for.
+/// Fractions of the twist limits that a plan may use.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Shares {
     linear_speed: f64,
     angular_speed: f64,
     linear_acceleration: f64,
-    /// None where the timing does not look at it.
+    /// None if the timing ignores the yaw acceleration limit.
     angular_acceleration: Option<f64>,
 }
 
 impl Shares {
-    /// On the trajectory. Of the speed less is left than what a robot is said to be slowed by.
+    /// Fractions on the trajectory. The 2 % of speed that they leave unused is not reported as
+    /// slowing.
     const TRAJECTORY: Self = Self {
         linear_speed: 0.98,
         angular_speed: 0.95,
         linear_acceleration: 0.95,
         angular_acceleration: Some(0.9),
     };
-    /// On the way to it time counts, and a robot that lags, or cuts a bend, does no harm.
+    /// Fractions on the approach: time counts, and lag or cutting a bend does no harm.
     const APPROACH: Self = Self {
         linear_speed: 1.0,
         angular_speed: 1.0,
@@ -38,7 +39,7 @@ impl Shares {
         angular_acceleration: None,
     };
 
-    /// Those of the approach to the trajectory, or of the trajectory itself.
+    /// Returns the fractions for the approach, or for the trajectory itself.
     pub(super) fn on(is_approach: bool) -> &'static Self {
         if is_approach {
             &Self::APPROACH
@@ -48,7 +49,8 @@ impl Shares {
     }
 }
 
-/// The excitation that the limits leave room for, and limits without that room.
+/// Returns the excitation that the limits allow, and subtracts its share from `nodes` and
+/// `jerk_m_s3`.
 pub(super) fn with_excitation(
     spec: ExcitationSpec,
     nodes: &mut [NodeLimits],
@@ -74,7 +76,7 @@ pub(super) fn with_excitation(
     Ok(excitation)
 }
 
-/// What bounds the accelerations: the robot's own limits, or what the ground gives.
+/// Names of the limits that bound the accelerations: the robot's own, or the ground's traction.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Blame {
     pub(super) longitudinal: SlowedBy,
@@ -82,7 +84,7 @@ pub(super) struct Blame {
 }
 
 impl Blame {
-    /// Of a model whose limits have been brought within the traction limit already.
+    /// `model` must already be limited to the traction limit.
     pub(super) fn of(model: &RobotModel, traction_limit_mu: Option<f64>) -> Self {
         let limits = model.limits();
         let gives = |at_m_s2: fn(f64) -> f64, limit_m_s2: f64| {
@@ -109,17 +111,17 @@ impl Blame {
     }
 }
 
-/// What the robot may do at a node, and the limit that makes it slower than it was asked to be.
+/// Limits at a node, and the limit that keeps the speed below the requested one.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct NodeBounds {
     pub(super) limits: NodeLimits,
     pub(super) by: Option<SlowedBy>,
-    /// What bounds the acceleration along the path.
+    /// Limit of the acceleration along the path.
     pub(super) longitudinal: SlowedBy,
 }
 
 impl NodeBounds {
-    /// The stricter of both in every respect.
+    /// Returns the smaller speed and the smaller acceleration, each with its cause.
     pub(super) fn stricter(&self, other: &Self) -> Self {
         Self {
             limits: self.limits.stricter(&other.limits),
@@ -137,8 +139,8 @@ impl NodeBounds {
     }
 }
 
-/// What the robot may do where the path bends like this. `blame` names what bounds its
-/// accelerations.
+/// Returns the limits at a point of the path with its curvature. `blame` names the causes of the
+/// acceleration limits.
 pub(super) fn node_limits(
     path: &PathSample,
     asked_m_s: f64,
@@ -156,7 +158,8 @@ pub(super) fn node_limits(
     });
     let rim_max_m_s = WHEEL_SHARE * limits.wheel_speed_max_rad_s * radius_m;
     let rim_max_m_s2 = WHEEL_SHARE * limits.wheel_acceleration_max_rad_s2 * radius_m;
-    // The outer wheels: v (1 + bW/2), and a (1 + bW/2) + v² b' W/2, half of the limit for each.
+    // Outer wheels: v (1 + bW/2), and a (1 + bW/2) + v² b' W/2, each term with half of the limit
+    // (W: effective track).
     let outer = 1.0 + bend * half_track_m;
     let floor = f64::MIN_POSITIVE;
     let bounds_m_s = [

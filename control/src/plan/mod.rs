@@ -1,10 +1,10 @@
-//! A plan: geometry and timing of one trajectory from where the robot stands.
+//! Plan: geometry and timing of one trajectory from the robot's pose.
 //!
-//! A circle is joined tangentially by the quickest of many smooth legs; a robot that stands on it
-//! starts there. Waypoints are joined by making the robot's place the first point of the spline;
-//! a robot that stands on the first waypoint, or beside it with no smooth path through it, starts
-//! from there. Where the path leaves in another
-//! direction than the robot points, [`Plan::start_heading_rad`] tells where to turn on the spot.
+//! A circle is joined tangentially by the quickest of many smooth legs; a robot on the circle
+//! starts there. Waypoints are joined by such a leg too, or, near the path, by making the robot's
+//! position the first point of the spline; a robot at the first waypoint, or beside it with no
+//! smooth path through it, starts from there. Where the path starts in another direction than the
+//! robot's heading, [`Plan::start_heading_rad`] is the heading to turn to on the spot.
 
 mod error;
 mod limits;
@@ -28,48 +28,49 @@ pub use traction_limit::{TractionLimitCell, TractionLimitMap};
 use limits::{Blame, NodeBounds, Shares, WHEEL_SHARE, node_limits, with_excitation};
 use slowed::{CellBounds, Stretches};
 
-/// Most waypoints of a path.
+/// Maximum number of waypoints of a path.
 pub const WAYPOINTS_MAX: usize = 100_000;
-/// Neighbouring waypoints nearer than this are the same point, metres.
+/// Minimum distance between consecutive waypoints, metres; closer ones are refused as duplicates.
 pub const WAYPOINT_SPACING_MIN_M: f64 = 1.0e-3;
-/// Largest coordinate, metres.
+/// Maximum magnitude of a coordinate, metres.
 pub const COORDINATE_MAX_M: f64 = 1.0e6;
-/// Longest path, metres.
+/// Maximum length of a path, metres.
 pub const LENGTH_MAX_M: f64 = 200_000.0;
-/// A robot nearer to the first waypoint than this starts from it, metres.
+/// Distance below which a robot counts as being at the first waypoint, metres.
 const ON_START_M: f64 = 0.05;
-/// Distance between the nodes of the timing, metres, on paths that are short enough.
+/// Distance between nodes of the timing, metres, unless [`GRID_MIN`] or [`GRID_MAX`] bounds their
+/// number.
 const GRID_M: f64 = 0.02;
-/// Most nodes of the timing.
+/// Maximum number of cells of the timing.
 const GRID_MAX: usize = 1_000_000;
-/// Curvature from which a cell of the timing is looked into, per metre.
+/// Curvature above which a cell of the timing is subdivided, per metre.
 const BEND_LOOKED_INTO_1_M: f64 = 1.0;
-/// Parts of such a cell.
+/// Number of parts of a subdivided cell.
 const PARTS_LOOKED_INTO: u8 = 8;
-/// Peak friction coefficient that is assumed on the approach while nothing is
-/// known of the ground.
+/// Peak friction coefficient assumed on the approach to the trajectory while the ground is unknown.
 pub const TRACTION_LIMIT_UNKNOWN_MU: f64 = 0.14;
-/// Fewest cells of the timing.
+/// Minimum number of cells of the timing.
 const GRID_MIN: usize = 16;
 
-/// What a plan may do beside its trajectory; nothing by default.
+/// Options of a plan; none by default.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PlanOptions<'map> {
-    /// Speed on the approach to the trajectory, metres per second; the trajectory's own when
-    /// absent.
+    /// Speed on the approach to the trajectory, metres per second; None for the trajectory's own.
     pub approach_speed_m_s: Option<f64>,
-    /// A variation of the speed (excitation), so that θ can be measured without torque.
+    /// Variation of the speed, so that θ can be measured without torque sensing.
     pub excitation: Option<ExcitationSpec>,
-    /// Lower bound of the ground's peak friction coefficient, above zero: accelerations stay within
-    /// what it can give. Without it only the robot's own limits hold.
+    /// Lower bound of the ground's peak friction coefficient, above zero, which limits
+    /// accelerations. None leaves the robot's own limits (and [`TRACTION_LIMIT_UNKNOWN_MU`] on the
+    /// approach).
     pub traction_limit_mu: Option<f64>,
-    /// The same by place. The geometry keeps to the lowest of it, the timing to what holds at each
-    /// place; `traction_limit_mu` counts no more then.
+    /// Lower bound of the peak friction coefficient by position; replaces `traction_limit_mu`. The
+    /// geometry uses its minimum, the timing its value at each point.
     pub traction_limits: Option<&'map TractionLimitMap>,
 }
 
 impl PlanOptions<'_> {
-    /// Peak friction coefficient that the geometry assumes, if the ground is known.
+    /// Returns the peak friction coefficient that the geometry assumes, or None if the ground is
+    /// unknown.
     fn least_traction_limit_mu(&self) -> Option<f64> {
         self.traction_limits
             .map(TractionLimitMap::least)
@@ -77,12 +78,12 @@ impl PlanOptions<'_> {
     }
 }
 
-/// The plan at one time or place.
+/// Plan at one time.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PlanSample {
-    /// Geometry at the arc length.
+    /// Pose and curvature at the arc length.
     pub path: PathSample,
-    /// Arc length, metres.
+    /// Arc length from the start, metres.
     pub arc_m: f64,
     /// Speed along the path, metres per second, ≥ 0.
     pub speed_m_s: f64,
@@ -90,7 +91,7 @@ pub struct PlanSample {
     pub acceleration_m_s2: f64,
 }
 
-/// Geometry and timing of one trajectory.
+/// Geometry and timing of one trajectory with its approach.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
     path: Path,
@@ -105,17 +106,17 @@ pub struct Plan {
     stretches: Stretches,
 }
 
-/// A speed that holds from an arc length on.
+/// Requested speed from an arc length on.
 struct SpeedFrom {
     arc_m: f64,
     speed_m_s: f64,
 }
 
 impl Plan {
-    /// Plans a trajectory from where the robot stands, at rest.
+    /// Plans a trajectory from the pose of a stopped robot.
     ///
     /// # Errors
-    /// [`PlanError`] names what cannot be driven, and where.
+    /// [`PlanError`] names the invalid value or the sharp turn, with the waypoint's index.
     pub fn new(
         trajectory: &Trajectory,
         start: Pose,
@@ -124,10 +125,10 @@ impl Plan {
         Self::with_options(trajectory, start, model, &PlanOptions::default())
     }
 
-    /// The same with options.
+    /// Plans a trajectory from the pose of a stopped robot, with options.
     ///
     /// # Errors
-    /// [`PlanError`] names what cannot be driven, and where.
+    /// [`PlanError`] names the invalid value or the sharp turn, with the waypoint's index.
     pub fn with_options(
         trajectory: &Trajectory,
         start: Pose,
@@ -252,7 +253,7 @@ impl Plan {
                 return Err(PlanError::DuplicateWaypoint { place });
             }
         }
-        // Points that the robot stands on are behind it; the last one always stays.
+        // Waypoints at the robot's position are skipped; the last waypoint is never skipped.
         let first = points[..points.len() - 1]
             .iter()
             .take_while(|waypoint| waypoint.point.distance_m(start.point()) < ON_START_M)
@@ -280,7 +281,7 @@ impl Plan {
             approach_pieces = legs;
             path
         } else {
-            // The robot's place is the first knot: it stands on the path, or too near for a leg.
+            // The robot's position is the first knot: it is on the path, or too near for a leg.
             let behind = first
                 .checked_sub(1)
                 .and_then(|behind| points[behind].heading_rad);
@@ -293,7 +294,7 @@ impl Plan {
             );
             from_here(&mut knots, start, spec.speed_m_s, model).map_err(too_tight)?
         };
-        // Waypoint at which a piece starts; the first one's for the approach too.
+        // Index of the waypoint at which a piece starts; 0 for the approach.
         let place_of = |piece: usize| (piece + first).saturating_sub(approach_pieces.max(1));
         let mut speeds = vec![SpeedFrom {
             arc_m: 0.0,
@@ -366,7 +367,8 @@ impl Plan {
             let shares = Shares::on(arc_m < approach_end_m);
             let mut node = node_limits(&here, speed_m_s, model, blame, shares);
             let bend_1_m = here.curvature_1_m.abs();
-            // A sharp bend may have its peak between two nodes: both keep to what is in between.
+            // A sharp bend may have its peak between two nodes: the limits in between apply to
+            // both.
             if bend_1_m.max(bend_before_1_m) > BEND_LOOKED_INTO_1_M
                 && let Some(before) = bounds.last_mut()
             {
@@ -388,8 +390,8 @@ impl Plan {
             Some(spec) => Some(with_excitation(spec, &mut nodes, &mut jerk_m_s3)?),
             None => None,
         };
-        // On unknown ground the approach to the trajectory is bounded by a cautious traction limit
-        // already, and needs no more room before and after a bend than the mean takes.
+        // On unknown ground the approach is already bounded by a cautious traction limit, so its
+        // limits apply within the averaging time T only (see `profile`).
         let brisk = match options.least_traction_limit_mu() {
             Some(_) => 0,
             None => (approach_end_m / cell_m).ceil() as usize,
@@ -418,7 +420,8 @@ impl Plan {
                 .max(sample.acceleration_m_s2.abs());
             plan.peak_lateral_m_s2 = plan.peak_lateral_m_s2.max(turn_rad_s * sample.speed_m_s);
             plan.peak_angular_rad_s = plan.peak_angular_rad_s.max(turn_rad_s);
-            // An excitation is asked for and slows nothing: the timing without it is looked at.
+            // A requested excitation does not count as slowing, so the timing without it is
+            // checked.
             let timing = plan.profile.sample(plan.profile.duration_s() * share);
             let node = ((timing.arc_m / cell_m) as usize).min(cells);
             let cell = CellBounds {
@@ -432,7 +435,8 @@ impl Plan {
         Ok(plan)
     }
 
-    /// The plan at a time since its start, seconds; at rest at its ends before and after.
+    /// Returns the plan at a time since its start, seconds; before 0 and after the end the speed is
+    /// zero.
     pub fn sample(&self, time_s: f64) -> PlanSample {
         let warp = self.excitation.map_or(
             Warp {
@@ -452,66 +456,66 @@ impl Plan {
         }
     }
 
-    /// Where a limit makes the robot slower than it was asked to be, in driving order; at most
-    /// [`SLOWED_MAX`] stretches.
+    /// Returns the stretches on which a limit keeps the speed below the requested one, in driving
+    /// order; at most [`SLOWED_MAX`].
     pub fn slowed(&self) -> &[Slowed] {
         self.stretches.as_slice()
     }
 
-    /// The variation of the speed (excitation), if there is one, as deep as the limits left it.
+    /// Returns the excitation, if there is one, with its depth as reduced by the limits.
     pub fn excitation(&self) -> Option<&Excitation> {
         self.excitation.as_ref()
     }
 
-    /// The geometry alone.
+    /// Returns the geometry without timing.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Length of the whole path with its approach, metres.
+    /// Returns the length of the path including the approach, metres.
     pub fn length_m(&self) -> f64 {
         self.path.length_m()
     }
 
-    /// Length of the approach to the circle or the first waypoint, metres.
+    /// Returns the length of the approach to the circle or the first waypoint, metres.
     pub fn approach_length_m(&self) -> f64 {
         self.approach_length_m
     }
 
-    /// Peak friction coefficient that the approach is computed with, unless the ground
-    /// is known.
+    /// Returns the peak friction coefficient assumed on the approach, or None if the ground is
+    /// known.
     pub(crate) fn assumed_mu(&self) -> Option<f64> {
         (!self.traction_limit_is_known).then_some(TRACTION_LIMIT_UNKNOWN_MU)
     }
 
-    /// Time from rest to rest when nothing slows the robot, without turning on the spot, seconds.
+    /// Returns the time from start to end without any delay or initial turn on the spot, seconds.
     pub fn duration_s(&self) -> f64 {
         let own_s = self.profile.duration_s();
         self.excitation
             .map_or(own_s, |excitation| excitation.time_s(own_s))
     }
 
-    /// Direction in which the path leaves the start, radians.
+    /// Returns the heading of the path at its start, radians counter-clockwise from x.
     pub fn start_heading_rad(&self) -> f64 {
         self.path.sample(0.0).pose.heading_rad
     }
 
-    /// Fastest speed along the path, metres per second.
+    /// Returns the maximum speed along the path, metres per second.
     pub fn peak_speed_m_s(&self) -> f64 {
         self.peak_speed_m_s
     }
 
-    /// Hardest acceleration or braking along the path, metres per second squared.
+    /// Returns the maximum magnitude of acceleration along the path, metres per second squared.
     pub fn peak_acceleration_m_s2(&self) -> f64 {
         self.peak_acceleration_m_s2
     }
 
-    /// Hardest acceleration across the path, metres per second squared.
+    /// Returns the maximum magnitude of lateral acceleration, metres per second squared.
     pub fn peak_lateral_acceleration_m_s2(&self) -> f64 {
         self.peak_lateral_m_s2
     }
 
-    /// Fastest turn, radians per second.
+    /// Returns the maximum magnitude of the turn rate, radians per second.
     pub fn peak_angular_rad_s(&self) -> f64 {
         self.peak_angular_rad_s
     }
@@ -526,10 +530,10 @@ fn check_coordinate(what: &'static str, place: usize, point: Point) -> Result<()
     Ok(())
 }
 
-/// What the robot may do on its approach to the trajectory.
+/// Returns the robot with the limits of the approach to the trajectory.
 fn on_approach(model: &RobotModel, options: &PlanOptions<'_>) -> RobotModel {
     match options.least_traction_limit_mu() {
-        // The model has been bounded already.
+        // The limits already include the traction limit.
         Some(_) => *model,
         None => model.within_traction_limit(TRACTION_LIMIT_UNKNOWN_MU),
     }

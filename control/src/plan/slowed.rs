@@ -1,68 +1,68 @@
-//! Where a plan is slower than it was asked to be, and what makes it so.
+//! Stretches on which a plan is slower than requested, and the limit that causes each.
 
 use crate::profile::ProfileSample;
 
-/// What makes the robot slower than it was asked to be.
+/// Limit that keeps the speed below the requested one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum SlowedBy {
-    /// Acceleration across the path.
+    /// Lateral acceleration.
     LateralAcceleration,
     /// Yaw rate.
     AngularSpeed,
     /// Wheel speed.
     WheelSpeed,
-    /// Wheel or yaw acceleration where the bend changes.
+    /// Wheel or yaw acceleration where the curvature changes.
     WheelAcceleration,
-    /// Acceleration or braking along the path.
+    /// Acceleration or deceleration along the path.
     LinearAcceleration,
-    /// What the ground is known to give, along or across the path.
+    /// Traction limit of the ground, along or across the path.
     Traction,
 }
 
-/// A stretch of the path on which one limit makes the robot slower than it was asked to be.
+/// Stretch of the path on which one limit keeps the speed below the requested one.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Slowed {
-    /// Which limit.
+    /// Cause.
     pub by: SlowedBy,
-    /// Arc length of its begin, metres.
+    /// Arc length of its start, metres.
     pub from_m: f64,
     /// Arc length of its end, metres.
     pub to_m: f64,
-    /// Slowest speed of the stretch, metres per second.
+    /// Minimum speed on the stretch, metres per second.
     pub speed_min_m_s: f64,
 }
 
-/// Most stretches that a plan names.
+/// Maximum number of stretches that a plan reports; further ones are dropped.
 pub const SLOWED_MAX: usize = 1_000;
-/// A robot this near to the speed that was asked for counts as driving it.
+/// Ratio of planned to requested speed from which the plan counts as not slowed.
 const AS_ASKED: f64 = 0.98;
-/// What lies nearer than this to the same limit is one stretch, metres at rest.
+/// Distance below which stretches of the same cause are merged, at zero speed, metres.
 const STRETCH_GAP_M: f64 = 0.08;
-/// The same for a moving robot, seconds.
+/// Addition to [`STRETCH_GAP_M`] per speed, seconds.
 const STRETCH_GAP_S: f64 = 0.2;
 
-/// What holds in one cell of the timing.
+/// Requested and allowed speed in one cell of the timing.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct CellBounds {
-    /// Speed that was asked for, metres per second.
+    /// Requested speed, metres per second.
     pub asked_m_s: f64,
-    /// Speed that the limits leave, metres per second.
+    /// Speed that the limits at this cell allow, metres per second.
     pub left_m_s: f64,
-    /// The limit that leaves less than was asked for.
+    /// Limit that keeps the allowed speed below the requested one; None if there is none.
     pub by: Option<SlowedBy>,
-    /// The limit to blame where the robot has yet to reach, or already leaves, the speed that the place
-    /// itself would allow.
+    /// Cause to report where the robot is slower than this cell allows, because it accelerates or
+    /// brakes.
     pub longitudinal: SlowedBy,
 }
 
-/// The stretches of a plan, gathered in driving order.
+/// Stretches of a plan in driving order.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Stretches {
     slowed: Vec<Slowed>,
 }
 
 impl Stretches {
-    /// Takes the planned speed at one place.
+    /// Adds the planned speed at one point of the path.
     pub(super) fn note(&mut self, timing: &ProfileSample, cell: &CellBounds) {
         let ProfileSample {
             arc_m, speed_m_s, ..
@@ -89,7 +89,7 @@ impl Stretches {
         }
     }
 
-    /// In driving order.
+    /// Returns the stretches in driving order.
     pub(super) fn as_slice(&self) -> &[Slowed] {
         &self.slowed
     }

@@ -1,30 +1,31 @@
-//! Friction of the ground along a path, by place.
+//! Lower bound of the peak friction coefficient by position.
 
 use crate::geometry::Point;
 
-/// A square of a grid with its peak friction coefficient.
+/// Square of a grid with its peak friction coefficient.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TractionLimitCell {
-    /// Which square ahead of the origin along x: floor of the coordinate over the side.
+    /// Index along x: floor of the coordinate over the side length, site frame.
     pub ix: i32,
-    /// The same along y.
+    /// Index along y: floor of the coordinate over the side length, site frame.
     pub iy: i32,
     /// Lower bound of the peak friction coefficient, above zero.
     pub mu: f64,
 }
 
-/// Lower bounds of the peak friction coefficient by place.
+/// Lower bounds of the peak friction coefficient by position, on a grid of squares in the site
+/// frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TractionLimitMap {
     square_m: f64,
-    /// By row and column.
+    /// Sorted by `(iy, ix)`.
     squares: Box<[TractionLimitCell]>,
     elsewhere_mu: f64,
 }
 
 impl TractionLimitMap {
-    /// Squares of this side, and what holds where none is near; `None` for a number that is not
-    /// above zero or not finite.
+    /// Creates a map of squares with side `square_m`; `elsewhere_mu` holds away from all squares.
+    /// Returns None if a value is not finite or not above zero.
     pub fn new(
         square_m: f64,
         mut squares: Vec<TractionLimitCell>,
@@ -42,8 +43,9 @@ impl TractionLimitMap {
         })
     }
 
-    /// The lowest of the square at a place and of its eight neighbours, so that a robot is slow
-    /// before any of its wheels is on ice; the value for elsewhere where none of them is known.
+    /// Returns the minimum over the square at a point and its eight neighbours, so that a robot
+    /// slows down before any wheel is on slippery ground; `elsewhere_mu` if none of the nine is
+    /// known.
     pub fn at(&self, point: Point) -> f64 {
         #[expect(
             clippy::cast_possible_truncation,
@@ -69,7 +71,7 @@ impl TractionLimitMap {
         }
     }
 
-    /// The lowest of all.
+    /// Returns the minimum over all squares and `elsewhere_mu`.
     pub fn least(&self) -> f64 {
         let squares = self.squares.iter().map(|square| square.mu);
         squares.fold(self.elsewhere_mu, f64::min)

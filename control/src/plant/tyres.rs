@@ -1,13 +1,13 @@
-//! How real tyres may differ from the paper's: lateral stiffness, and a smooth rise to the peak.
+//! Tyre models beyond the paper's: anisotropic stiffness, and a smooth rise to the peak.
 
 use crate::friction::FrictionCurve;
 
-/// How tyres differ from the isotropic piecewise line of (7).
+/// Deviation of tyres from the isotropic, piecewise linear friction curve (7).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tyres {
-    /// Stiffness across over that along, above 0.
+    /// Ratio of lateral to longitudinal stiffness, 0.1 to 10; 1 is isotropic.
     pub lateral_stiffness_ratio: f64,
-    /// Shape of the rise to the peak.
+    /// Shape of the rise to peak friction.
     pub rise: TyreRise,
 }
 
@@ -23,16 +23,16 @@ impl Default for Tyres {
 /// Shape of a tyre's friction over slip up to its peak.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum TyreRise {
-    /// The paper's: straight to the peak, then falling.
+    /// Piecewise linear as in (7): linear to the peak, then falling.
     #[default]
     Straight,
-    /// A brush's: `μ = K λ (1 − z + z²/3)`, `z = λ/(3λ_m)`, with the same initial slope K and the
-    /// same peak `K λ_m`, reached at `z = 1` and kept beyond it.
+    /// Brush model: `μ = K λ (1 − z + z²/3)`, `z = λ/(3λ_m)`, with the same initial slope K and the
+    /// same peak `K λ_m` as (7), reached at `z = 1` and constant beyond.
     Brush,
 }
 
 impl TyreRise {
-    /// `μ(|σ|)/|σ|` for a slip magnitude ≥ 0.
+    /// Returns `μ(|σ|)/|σ|` for a slip magnitude ≥ 0.
     pub(crate) fn mu_over_slip(self, curve: &FrictionCurve, slip: f64) -> f64 {
         match self {
             Self::Straight => curve.mu_over_slip(slip),

@@ -1,26 +1,28 @@
-//! Gains and bounds of the law, checked once.
+//! Gains and bounds of the tracking law, with their validation.
 
 use thiserror::Error;
 
 use crate::friction::FrictionCurve;
 
-/// Gains across the path; in metres driven, so that the speed does not change their damping. Only
-/// the inner loop's is not.
+/// Gains across the path. All but `yaw_rate` act per distance driven, so that damping does not
+/// depend on speed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CrossGains {
-    /// Cross-track gain `k_y`, per metre squared.
+    /// Cross-track gain `k_y`, per metre squared, above 0.
     pub cross_1_m2: f64,
-    /// Heading gain `k_θ`, per metre.
+    /// Heading gain `k_θ`, per metre, above 0.
     pub heading_1_m: f64,
-    /// Integral gain `k_I` on the cross-track error over the distance driven, per metre cubed.
+    /// Integral gain `k_I` on the cross-track error over the distance driven, per metre cubed, 0 to
+    /// below `k_θ k_y`.
     pub integral_1_m3: f64,
-    /// Gain from the gap between the wanted and the measured turn rate to the command; below 1, so
-    /// that no lag or delay of the base can make this inner loop unstable.
+    /// Inner-loop gain `k_r` from turn rate error (wanted minus measured) to the turn rate command,
+    /// 0 to below 1, so that no lag or delay of the base can make the loop unstable.
     pub yaw_rate: f64,
 }
 
 impl CrossGains {
-    /// A mean of two sets; `share` of the first.
+    /// Returns the mean of two sets with weight `share` for the first and 1 − `share` for the
+    /// second.
     pub(super) fn blend(first: Self, second: Self, share: f64) -> Self {
         let mix = |one: f64, other: f64| other + share * (one - other);
         Self {
@@ -35,39 +37,43 @@ impl CrossGains {
 /// Gains and bounds of the law.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackerConfig {
-    /// Along-track gain `k_x`, per second.
+    /// Along-track gain `k_x`, per second, above 0.
     pub along_track_gain_1_s: f64,
-    /// Gains across the path while the pose is quiet.
+    /// Gains across the path for a pose without noise.
     pub quiet: CrossGains,
-    /// Gains across the path while the pose is noisy.
+    /// Gains across the path for a noisy pose.
     pub noisy: CrossGains,
-    /// Noise of the pose half-way between both, as density `σ√T` of white noise, m·√s.
+    /// Pose noise at which both gain sets have equal weight, as amplitude density `σ√T` of white
+    /// noise, m·√s.
     pub noise_middle_m_sqrt_s: f64,
-    /// The same as the position's standard deviation, metres: a filter's noise is no white one.
+    /// Standard deviation of the position at which both gain sets have equal weight, metres; it
+    /// covers filtered noise, which is not white.
     pub position_middle_m: f64,
-    /// Largest turn of the path's curvature by the integral, per metre.
+    /// Maximum magnitude of the integral term, as curvature, per metre.
     pub integral_max_1_m: f64,
-    /// First-order lag of the wheel servo that is led, seconds.
+    /// First-order lag of the wheel servo that the law compensates, seconds.
     pub servo_lag_s: f64,
-    /// Adaptation gain ρ.
+    /// Adaptation gain ρ of θ̂, per metre squared.
     pub adaptation_gain: f64,
-    /// Friction curve, for the loss beyond its peak; of this curve only the shape counts, never the
-    /// stiffness.
+    /// Friction curve that gives the loss beyond the peak. Only its shape (`λ_m`, α) is used, not
+    /// its stiffness.
     pub friction_curve: FrictionCurve,
-    /// Adaptation gain of the share of that loss which shows.
+    /// Adaptation gain `ρ_χ` of χ̂, the fraction of that loss that shows, per metre squared.
     pub beyond_gain: f64,
-    /// Fastest change of θ̂, per second.
+    /// Maximum magnitude of θ̂̇ by the gradient, per second.
     pub adaptation_rate_max_1_s: f64,
-    /// Pull of θ̂ to a θ that is known, per second, at full confidence: so little that errors may
-    /// lead it off.
+    /// Rate p of the pull of θ̂ towards a known θ at full confidence, per second. It is weak enough
+    /// for tracking errors to lead θ̂ away from it.
     pub adaptation_pull_1_s: f64,
-    /// The same farther from it than it may be led off.
+    /// Additional rate of the pull beyond the band of [`TrackerConfig::adaptation_band_ratio`], per
+    /// second.
     pub adaptation_return_1_s: f64,
-    /// How far θ̂ may be led off a known θ, as a share of that and beside its standard deviation.
+    /// Half-width of the band around a known θ without the additional pull, as a fraction of θ; the
+    /// standard deviation of θ is added to it.
     pub adaptation_band_ratio: f64,
-    /// Largest θ̂.
+    /// Maximum θ̂, above 0.
     pub theta_max: f64,
-    /// Age of the pose beyond which adaptation and integral are held, seconds.
+    /// Pose age above which adaptation and integral are held, seconds.
     pub pose_age_max_s: f64,
 }
 
@@ -104,21 +110,24 @@ impl Default for TrackerConfig {
     }
 }
 
-/// Why gains were refused.
+/// Gain or bound that is out of its range.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum TrackerError {
-    /// A figure is NaN, infinite or out of its range.
+    /// A value is NaN, infinite or out of its range.
     #[error("`{field}` is out of its range: {value}")]
     OutOfRange {
-        /// The field's name.
+        /// Name of the field.
         field: &'static str,
-        /// What it held.
+        /// Rejected value.
         value: f64,
     },
 }
 
 impl TrackerConfig {
-    /// Refuses gains that are out of range by name.
+    /// Checks all ranges.
+    ///
+    /// # Errors
+    /// [`TrackerError::OutOfRange`] names the first value out of its range.
     pub(super) fn check(&self) -> Result<(), TrackerError> {
         let positive = [
             ("along_track_gain_1_s", self.along_track_gain_1_s),
@@ -165,7 +174,7 @@ impl TrackerConfig {
                     value: gains.yaw_rate,
                 });
             }
-            // Routh's criterion of the loop across the path, `s³ + k_θ s² + k_y s + k_I`.
+            // Routh criterion of the loop across the path, s³ + k_θ s² + k_y s + k_I.
             if gains.integral_1_m3 >= gains.heading_1_m * gains.cross_1_m2 {
                 return Err(TrackerError::OutOfRange {
                     field: integral,

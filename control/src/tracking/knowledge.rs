@@ -1,25 +1,25 @@
-//! What the law is given about the ground.
+//! Prior knowledge of θ that the tracking law uses.
 
-/// How many standard deviations apart two words contradict each other.
+/// Number of standard deviations of the difference above which two values contradict each other.
 const CONTRADICTION: f64 = 3.0;
 
-/// What is known about θ: a map's prior or the robot's own measurement.
+/// Slip compliance θ with its standard deviation, from the map or measured by this robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ThetaKnowledge {
-    /// θ = 1/K.
+    /// Slip compliance θ = 1/K.
     pub theta: f64,
-    /// Its standard deviation.
+    /// Standard deviation of θ.
     pub std_dev: f64,
 }
 
 impl ThetaKnowledge {
-    /// Whether both cannot well be true of one ground.
+    /// Returns whether both values are unlikely to hold for the same ground.
     pub(super) fn contradicts(self, other: Self) -> bool {
         let apart = (self.theta - other.theta).abs();
         apart > CONTRADICTION * self.std_dev.hypot(other.std_dev)
     }
 
-    /// How much of it to believe, 0 to 1: falls with the relative standard deviation.
+    /// Returns the confidence c = 1/(1 + (3σ/θ)²), 0 to 1; 0 for values out of range.
     pub fn confidence(&self) -> f64 {
         let relative = self.std_dev / self.theta;
         if self.theta > 0.0 && relative.is_finite() && relative >= 0.0 {
@@ -29,13 +29,13 @@ impl ThetaKnowledge {
         }
     }
 
-    /// Two independent words on the same ground, weighed by their standard deviations; one that is
-    /// not usable is left out.
+    /// Returns the mean of two independent values for the same ground, weighted by 1/σ². A value
+    /// with zero confidence is left out.
     #[must_use]
     pub fn fused(self, other: Self) -> Self {
         let weight = |known: &Self| {
             if known.confidence() > 0.0 {
-                // A standard deviation of zero would silence the other word for good.
+                // A standard deviation of zero would override the other value for ever.
                 known.std_dev.max(1.0e-3 * known.theta).powi(-2)
             } else {
                 0.0

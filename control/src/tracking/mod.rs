@@ -1,29 +1,28 @@
-//! The shipped tracking law: wheel speeds from tracking errors. `docs/control.md` has the proof.
+//! Adaptive tracking law: wheel speeds from tracking errors. `docs/control.md` has the proof.
 //!
-//! The paper's idea on a base that really slips. With errors in the frame of the robot's *course*,
-//! which differs from its heading by the sideslip `β = −vωθ/g` (θ = 1/K, steady turn of the
-//! four-wheel sum), the error's own motion holds `ė_y = v sin e_θ + (v²ω/g) θ̃`. So
-//! `V = ½k_y(e_x² + e_y²) + (1 − cos e_θ) + k_y θ̃²/(2ρ)` falls under `θ̂̇ = ρ e_y v²ω/g`, the
-//! adaptation (26) of the paper, on a law that never inverts a measured velocity: it is regular at
+//! The law adapts θ̂ as the paper does, for a base that slips sideways. Errors are taken in the
+//! frame of the robot's *course*, which differs from its heading by the sideslip `β = −vωθ/g` (θ =
+//! 1/K, steady turn of the four-wheel sum); then `ė_y = v sin e_θ + (v²ω/g) θ̃`. So
+//! `V = ½k_y(e_x² + e_y²) + (1 − cos e_θ) + k_y θ̃²/(2ρ)` decreases under `θ̂̇ = ρ e_y v²ω/g`, the
+//! adaptation (26) of the paper. The law never inverts a measured velocity, so it is regular at
 //! standstill.
 //!
 //! In tight bends wheels slip beyond the peak of their friction curve, whatever the speed, and the
-//! sideslip is several times as large. The turn is therefore computed with the four-wheel sum
-//! itself, in its linear range and with the loss beyond the peak of
-//! [`TrackerConfig::friction_curve`]; a share χ̂ of that loss is believed, adapted like θ̂, so that
-//! tyres of another shape are found out.
+//! sideslip is several times as large. The turn is therefore computed by the four-wheel sum itself,
+//! once in its linear range and once with the loss beyond the peak of
+//! [`TrackerConfig::friction_curve`]. The fraction χ̂ of that loss is adapted like θ̂, which covers
+//! tyres with a curve of another shape.
 //!
 //! The command is the reference's motion, corrected by the errors (Kanayama's form, with integral
-//! action over the distance driven), plus feed-forward with θ̂: the sideslip, the rims that the
-//! turn needs, lead for the wheel servo and half a sample, and lead for slip relaxation, `vθ/g`
+//! action over the distance driven), plus feed-forward with θ̂: the sideslip, the rim speeds that
+//! the turn needs, lead for the wheel servo and half a sample, and lead for slip relaxation, `vθ/g`
 //! along and `(vθ/g)·4 I_G/(m(W² + L²))` in yaw. An inner loop on the measured turn rate, of gain
-//! below one, keeps margin where slip is slow. Gains follow the noise of the pose.
+//! below one, keeps the stability margin where slip is slow. Gains depend on the noise of the pose.
 //!
-//! θ̂ starts at zero: no knowledge, no sideslip. A known θ pulls it, by the confidence in it. χ̂
-//! starts at one, and goes back to it when a known θ contradicts the one before. Both are bounded
-//! in range and rate, and held while the wheels saturate, something outside cuts the command, or
-//! the pose is stale. They serve this loop only; what the map gets comes from
-//! [`crate::estimation`].
+//! θ̂ starts at zero, which means no sideslip. A known θ pulls it, weighted by its confidence. χ̂
+//! starts at one, and returns to one when a known θ contradicts the previous one. Both are bounded
+//! in range and rate, and held while the wheels saturate, a later stage reduces the command, or the
+//! pose is stale. They serve this loop only; the map uses [`crate::estimation`].
 
 mod config;
 mod knowledge;
@@ -42,46 +41,48 @@ pub use knowledge::ThetaKnowledge;
 use noise::NoiseLevel;
 use sideslip::{Belief, Sideslip};
 
-/// Fastest drive backwards, to come back to a point that was overrun, metres per second.
+/// Maximum speed backwards, to come back to a reference that was overrun, metres per second.
 const REVERSE_MAX_M_S: f64 = 0.15;
-/// How much faster than its reference a robot that lags drives at the most, metres per second. One
-/// that gathers more speed comes to the next bend too fast for slippery ground.
+/// Maximum speed above the reference's of a robot that lags, metres per second. A higher speed
+/// would be too fast for the next bend on slippery ground.
 const CATCH_UP_MAX_M_S: f64 = 0.06;
-/// Share of the robot's speed limit up to which it may drive faster than that.
+/// Fraction of the speed limit up to which a robot that lags may drive faster than
+/// [`CATCH_UP_MAX_M_S`] allows.
 const CATCH_UP_SPEED_SHARE: f64 = 0.5;
-/// Largest error along the path that acts, metres.
+/// Bound of the along-track error in the feedback, metres.
 const ALONG_TRACK_MAX_M: f64 = 0.3;
-/// Reference speed below which the integral is held, metres per second.
+/// Reference speed below which integral and adaptation are held, metres per second.
 const INTEGRAL_SPEED_MIN_M_S: f64 = 0.05;
-/// Heading feedback acts as if driving at least this fast, so that it holds at rest too.
+/// Minimum speed in the heading feedback, metres per second, so that it acts at standstill too.
 const HEADING_SPEED_MIN_M_S: f64 = 0.15;
-/// Cross-track errors smaller than this move neither θ̂ nor χ̂, metres.
+/// Cross-track error below which neither θ̂ nor χ̂ changes, metres.
 const ADAPTATION_DEAD_ZONE_M: f64 = 5.0e-4;
-/// Most of what the acceleration limits cut that is carried into the next tick. Noise would be cut
-/// on the side of speeding up alone, and the robot would turn and drive too slowly in the mean.
+/// Maximum part of the command cut by the acceleration limits that is added to the next tick's.
+/// Without it noise would be cut on the side of speeding up only, and the mean speed and turn rate
+/// would be too low.
 const CARRIED_MAX: Twist = Twist {
     linear_m_s: 0.05,
     angular_rad_s: 0.3,
 };
 
-/// How much smaller the standard deviation of a word is that replaces the one χ̂ was adapted under.
+/// Ratio of standard deviations below which a new θ replaces the one under which χ̂ was adapted.
 const BETTER_WORD: f64 = 0.5;
-/// Fastest change of the share of the loss beyond the peak that is believed, per second.
+/// Maximum magnitude of χ̂'s rate of change, per second.
 const BEYOND_RATE_MAX_1_S: f64 = 1.0;
 
-/// How far the robot is from its reference.
+/// Tracking errors: reference minus robot, in the frame of the reference.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct TrackingErrors {
-    /// How far the reference is ahead along its path, metres.
+    /// Along-track error `e_x`, metres; positive if the reference is ahead of the robot.
     pub along_track_m: f64,
-    /// How far the reference is to the left of the robot, across its path, metres.
+    /// Cross-track error `e_y`, metres; positive if the reference is to the left of the robot.
     pub cross_track_m: f64,
-    /// Reference heading minus the robot's, radians.
+    /// Reference heading minus robot heading, radians, in (−π, π].
     pub heading_rad: f64,
 }
 
 impl TrackingErrors {
-    /// Errors in the frame of the reference.
+    /// Computes the errors in the frame of the reference.
     pub fn between(reference: &ReferenceSample, measured: &Measured) -> Self {
         let robot = reference.pose.body_from_site(measured.pose.point());
         Self {
@@ -91,64 +92,64 @@ impl TrackingErrors {
         }
     }
 
-    /// Distance to the reference, metres.
+    /// Returns the distance between robot and reference, metres.
     pub fn distance_m(&self) -> f64 {
         self.along_track_m.hypot(self.cross_track_m)
     }
 }
 
-/// What the law gives in one tick.
+/// Output of the law in one tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct TrackerOutput {
-    /// Wheel speeds to command.
+    /// Wheel speeds to command, within all limits.
     pub wheel_speeds: WheelSpeeds,
-    /// The twist behind them.
+    /// Twist of these wheel speeds by the low-speed kinematics.
     pub twist: Twist,
     /// Errors in the frame of the reference.
     pub errors: TrackingErrors,
-    /// θ̂ in the loop; never a measurement.
+    /// Adapted θ̂; not a measurement of θ.
     pub theta_loop: f64,
-    /// How much of the friction that is lost beyond the peak is believed in the loop, χ̂, 0 to 1.
+    /// Adapted χ̂: fraction, 0 to 1, of the modelled friction loss beyond the peak.
     pub beyond_loop: f64,
-    /// How much the known θ is believed, 0 to 1.
+    /// Confidence in the known θ, 0 to 1; 0 without one.
     pub confidence: f64,
-    /// Whether the wheel limits cut the command.
+    /// Whether the wheel speed limit cut the command.
     pub saturated: bool,
 }
 
-/// What a speed limit cut from a command.
+/// Speed limits that cut a command.
 #[derive(Debug, Clone, Copy)]
 struct Cut {
-    /// A wheel's.
+    /// A wheel speed limit.
     by_wheels: bool,
-    /// That of the turn rate.
+    /// The turn rate limit.
     in_yaw: bool,
 }
 
-/// The law and its memory.
+/// Tracking law with its state.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tracker {
     model: RobotModel,
     config: TrackerConfig,
     integral_1_m: f64,
     theta: f64,
-    /// Share of the loss beyond the peak of the friction curve that is believed, χ̂.
+    /// χ̂, the fraction of the loss beyond the peak of the friction curve.
     beyond: f64,
-    /// The θ under which χ̂ was adapted.
+    /// Known θ under which χ̂ was adapted.
     known: Option<ThetaKnowledge>,
-    /// χ̂ is on its way back to one.
+    /// Whether χ̂ is returning to one.
     forgets: bool,
     noise: NoiseLevel,
     was_cut: bool,
     held_from_outside: bool,
-    /// What the acceleration limits cut from the last command.
+    /// Part of the last command cut by the acceleration limits.
     carried: Twist,
-    /// What was commanded last; none before the first tick.
+    /// Last commanded twist; None before the first tick.
     commanded: Option<Twist>,
 }
 
 impl Tracker {
-    /// A law at rest, with θ̂ at zero.
+    /// Creates a law in its initial state: θ̂ = 0, χ̂ = 1, integral 0.
     ///
     /// # Errors
     /// [`TrackerError`] names a gain or bound that is out of its range.
@@ -170,31 +171,33 @@ impl Tracker {
         })
     }
 
-    /// Holds θ̂ and the integral while something outside, such as the gate, cuts the command.
+    /// Holds θ̂, χ̂ and the integral while another stage, such as the gate, reduces the command.
     pub fn hold_adaptation(&mut self, held: bool) {
         self.held_from_outside = held;
     }
 
-    /// Tells the law what the base was commanded last, where that is not what it gave itself: it
-    /// speeds up from there.
+    /// Sets the last command to the base if it differs from this law's own; the next tick's
+    /// acceleration limits start from it.
     pub fn set_commanded(&mut self, commanded: WheelSpeeds) {
         self.commanded =
             Some(self.model.twist_from_wheel_speeds(commanded)).filter(|twist| twist.is_finite());
     }
 
-    /// Starts with what a map or an earlier run knows, at its full weight from the first metre.
+    /// Sets θ̂ at once to θ times its confidence, at most [`TrackerConfig::theta_max`]. Does
+    /// nothing at zero confidence.
     pub fn warm_start(&mut self, knowledge: ThetaKnowledge) {
         if knowledge.confidence() > 0.0 {
             self.theta = (knowledge.confidence() * knowledge.theta).min(self.config.theta_max);
         }
     }
 
-    /// θ̂ in the loop.
+    /// Returns the adapted θ̂; not a measurement of θ.
     pub fn theta_loop(&self) -> f64 {
         self.theta
     }
 
-    /// One tick: the command for this reference from what is measured and known.
+    /// Computes the command of one tick of `dt_s` seconds. `knowledge` with zero confidence counts
+    /// as None.
     pub fn step(
         &mut self,
         reference: &ReferenceSample,
@@ -227,7 +230,7 @@ impl Tracker {
         let along_track_m = forward
             .x_m
             .clamp(-ALONG_TRACK_MAX_M, catch_up_m.min(ALONG_TRACK_MAX_M));
-        // Bounded so that a far-off robot comes in at a bounded angle instead of spinning.
+        // Bounded so that a robot far off approaches at a bounded angle instead of spinning.
         let cross_max_m = 0.8 * gains.heading_1_m / gains.cross_1_m2;
         let cross_track_m = forward.y_m.clamp(-cross_max_m, cross_max_m);
 
@@ -277,13 +280,13 @@ impl Tracker {
         }
     }
 
-    /// What was adapted under a θ that is now contradicted says nothing: χ̂ goes back to one.
+    /// Moves χ̂ back to one after a known θ contradicts the one under which χ̂ was adapted.
     fn apply_knowledge(&mut self, knowledge: Option<ThetaKnowledge>, dt_s: f64) {
         if let Some(now) = knowledge {
             let anchor = *self.known.get_or_insert(now);
             self.forgets |= anchor.contradicts(now);
-            // A better word on the same ground takes its place; many slightly better ones would
-            // carry it along with a θ that moves.
+            // A much better value for the same ground replaces the stored one; replacing it by many
+            // slightly better ones would let it follow a θ that changes.
             if anchor.contradicts(now) || now.std_dev < BETTER_WORD * anchor.std_dev {
                 self.known = Some(now);
             }
@@ -294,14 +297,14 @@ impl Tracker {
         }
     }
 
-    /// Bounded, so that it cannot wind up.
+    /// Adds to the integral within its bound, so that it cannot wind up.
     fn integrate(&mut self, change_1_m: f64) {
         let bound = self.config.integral_max_1_m;
         self.integral_1_m = (self.integral_1_m + change_1_m).clamp(-bound, bound);
     }
 
-    /// `θ̂̇ = ρ e_y φ + pull·c (cθ − θ̂)` and `χ̂̇ = ρ_χ e_y φ_χ`, c the confidence, φ and `φ_χ`
-    /// the drifts per θ and per χ; bounded in rate and range.
+    /// Adapts `θ̂̇ = ρ e_y φ + pull·c (cθ − θ̂)` and `χ̂̇ = ρ_χ e_y φ_χ`, c the confidence, φ and
+    /// `φ_χ` the drifts per θ and per χ; bounded in rate and range.
     fn adapt(
         &mut self,
         sideslip: &Sideslip,
@@ -315,7 +318,7 @@ impl Tracker {
         } else {
             cross_track_m
         };
-        // More changes nothing at the end of what is assumed, and would wind up.
+        // At the bound of the modelled sideslip a larger θ̂ or χ̂ has no effect and would wind up.
         let most = if sideslip.is_at_end {
             0.0
         } else {
@@ -330,10 +333,10 @@ impl Tracker {
             weight * (config.adaptation_pull_1_s * apart + config.adaptation_return_1_s * outside)
         });
         let bound = config.adaptation_rate_max_1_s;
-        // The pull is a way back, not a drift: it may act faster than the gradient.
+        // The pull is not limited to the rate bound of the gradient.
         let rate = gradient.clamp(-bound, bound) + pull;
         self.theta = (self.theta + rate * dt_s).clamp(0.0, config.theta_max);
-        // On its way back to one nothing leads it off.
+        // χ̂ is not adapted while it returns to one.
         if !self.forgets {
             let gradient = (config.beyond_gain * error_m * sideslip.drift_per_beyond_m_s).min(most);
             let rate = gradient.clamp(-BEYOND_RATE_MAX_1_S, BEYOND_RATE_MAX_1_S);
@@ -341,7 +344,7 @@ impl Tracker {
         }
     }
 
-    /// The wheel speeds that come nearest to what is wanted within every limit, and which speed
+    /// Returns the wheel speeds nearest to the wanted twist within every limit, and which speed
     /// limit cut it.
     fn within_limits(&mut self, before: Twist, wanted: Twist, dt_s: f64) -> (WheelSpeeds, Cut) {
         let limits = self.model.limits();
@@ -377,8 +380,8 @@ impl Tracker {
     }
 }
 
-/// Wheel speeds for a twist within the wheel limit: the turn is kept, the speed gives way. True if
-/// it had to.
+/// Returns wheel speeds for a twist within the wheel speed limit, and whether it cut the command.
+/// The turn rate is kept and the forward speed reduced.
 pub fn desaturated(model: &RobotModel, twist: Twist) -> (WheelSpeeds, bool) {
     let limit_rad_s = model.limits().wheel_speed_max_rad_s;
     let free = model.wheel_speeds_from_twist(twist);

@@ -1,14 +1,15 @@
-//! How noisy the pose is, found while driving.
+//! Estimates the noise of the pose while driving.
 
 use crate::geometry::Pose;
 use crate::measured::Measured;
 
-/// Time over which the noise of the pose is averaged, seconds.
+/// Time constant of the mean, seconds.
 const NOISE_MEMORY_S: f64 = 2.0;
-/// Largest jump of the pose that counts as noise, metres.
+/// Bound of a single jump of the pose, metres.
 const NOISE_JUMP_MAX_M: f64 = 0.1;
 
-/// How noisy the pose is across the robot: what it jumps beyond what the measured motion explains.
+/// Lateral noise of the pose: its difference to the pose propagated from the previous tick by the
+/// measured motion.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct NoiseLevel {
     before: Option<Measured>,
@@ -17,7 +18,7 @@ pub(super) struct NoiseLevel {
 }
 
 impl NoiseLevel {
-    /// Takes the next pose and gives the density.
+    /// Updates the estimate with the next pose and returns the density, m²·s.
     pub(super) fn update(&mut self, measured: &Measured, dt_s: f64) -> f64 {
         if let Some(before) = self.before.replace(*measured) {
             let motion = before.twist;

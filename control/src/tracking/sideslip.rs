@@ -1,4 +1,4 @@
-//! What the reference's turn asks beyond the kinematics: sideslip, and rims that roll otherwise.
+//! Feed-forward of the reference's turn beyond the kinematics: sideslip, and rim speeds.
 
 use crate::friction::FrictionCurve;
 use crate::geometry::Twist;
@@ -6,38 +6,38 @@ use crate::measured::WheelSpeeds;
 use crate::reference::ReferenceSample;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-use super::turn::{SIDESLIP_MAX, SteadyTurn, Turn};
+use super::turn::{SIDESLIP_MAX, SteadyTurn, Turn, TurnSpec};
 
-/// Time over which the sideslip's rate is looked at, seconds.
+/// Time over which the sideslip's rate is computed, seconds.
 const RATE_SPAN_S: f64 = 0.02;
-/// Speed that curvature is taken over at least, metres per second.
+/// Minimum speed in computing curvature from the turn rate, metres per second.
 const SPEED_MIN_M_S: f64 = 1.0e-3;
-/// θ with which a turn is computed at least: sideslip is looked at per θ.
+/// Minimum θ in computing a turn, because its sideslip is divided by θ.
 const THETA_LOOK_MIN: f64 = 0.02;
 
-/// What the law believes of the ground.
+/// Adapted parameters of the ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Belief {
-    /// θ̂.
+    /// Adapted θ̂.
     pub(super) theta: f64,
-    /// Share of the loss beyond the peak that is believed, 0 to 1.
+    /// Adapted χ̂: fraction of the loss beyond the peak, 0 to 1.
     pub(super) beyond: f64,
 }
 
-/// Sideslip of a reference, and what adapts it.
+/// Sideslip of a reference with its derivatives by θ and χ.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Sideslip {
-    /// The angle between course and heading.
+    /// Course minus heading β, radians, counter-clockwise positive.
     pub(super) angle_rad: f64,
-    /// Its rate.
+    /// Rate of β, radians per second.
     pub(super) rate_rad_s: f64,
-    /// How much the robot drifts to the right per θ, metres per second.
+    /// Drift to the right per θ, φ, metres per second.
     pub(super) drift_per_theta_m_s: f64,
-    /// The same per share of the loss beyond the peak.
+    /// Drift to the right per χ, `φ_χ`, metres per second.
     pub(super) drift_per_beyond_m_s: f64,
-    /// Whether it is at the end of what is assumed: more of θ or of the loss changes nothing.
+    /// Whether the sideslip is at its bound, so that a larger θ̂ or χ̂ has no effect.
     pub(super) is_at_end: bool,
-    /// What the rims must roll beyond the kinematics of the reference.
+    /// Twist of the rims minus twist of the reference.
     pub(super) rims: Twist,
 }
 
@@ -69,11 +69,11 @@ impl Sideslip {
     }
 }
 
-/// A reference at one time.
+/// Sideslip of a reference at one time.
 struct Instant {
-    /// Sideslip per θ, to the right.
+    /// Sideslip to the right per θ, radians.
     per_theta: f64,
-    /// What of it is lost friction, if all of it is believed.
+    /// Additional sideslip per θ at χ = 1, radians.
     per_theta_beyond: f64,
     is_at_end: bool,
     rims: Twist,
@@ -90,7 +90,14 @@ impl Instant {
         let asked_1_m = turn_rad_s / speed_m_s.max(SPEED_MIN_M_S);
         let theta = belief.theta.max(THETA_LOOK_MIN);
         let compliance_m = theta * speed_m_s * speed_m_s / GRAVITY_M_S2;
-        let turn = Turn::steady(model, friction_curve, asked_1_m, compliance_m);
+        let turn = Turn::steady(
+            model,
+            friction_curve,
+            TurnSpec {
+                curvature_1_m: asked_1_m,
+                compliance_m,
+            },
+        );
         let per_theta = |turn: SteadyTurn| -turn.sideslip / theta;
         let (linear, beyond) = (per_theta(turn.linear), per_theta(turn.beyond));
         let of_rims = |turn: SteadyTurn| {

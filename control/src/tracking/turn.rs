@@ -1,62 +1,74 @@
-//! A steady turn of the four-wheel sum, with wheels beyond the peak of their friction curve.
+//! Steady turn of the four-wheel sum, with wheels beyond the peak of their friction curve.
 //!
-//! In a turn every wheel slips, by what the turn's geometry asks and by what the force across it
-//! takes. With the rims' speeds as unknowns the balances of force along and of moment are linear in
-//! them, and the balance across gives the sideslip, while the share of stiffness that each wheel
-//! has left, `μ(σ)/(Kσ)` of (7), stands still; those shares are found in a few rounds. Curvature
-//! and `θv²/g` decide alone.
+//! In a turn every wheel slips, by the geometry of the turn and by the lateral force. For a given
+//! fraction of stiffness `k = μ(σ)/(Kσ)` of (7) at each wheel, the balances of longitudinal force
+//! and of moment are linear in the inverse rim speeds, and the balance of lateral force gives the
+//! sideslip. The fractions k follow by iteration. The result depends on curvature and `θv²/g` only.
+//! `docs/control.md` has the equations.
 
 use crate::friction::FrictionCurve;
 use crate::robot::RobotModel;
 
-/// Rounds in which a turn in the linear range is found: force along takes up the sideslip.
+/// Number of iterations of a turn in the linear range, where the sideslip enters the longitudinal
+/// force.
 const LINEAR_ROUNDS: u32 = 2;
-/// Rounds in which the shares of stiffness are found.
+/// Maximum number of iterations of the fractions of stiffness.
 const SHARE_ROUNDS: u32 = 6;
-/// Change of a share that asks for another round.
+/// Change of a fraction of stiffness below which the iteration ends.
 const SHARE_STEP_MIN: f64 = 1.0e-6;
-/// Largest sideslip that is assumed, left over ahead: beyond it the robot slides, and a nose
-/// that is turned further in makes it slide more.
+/// Bound of the sideslip, lateral over forward speed. Beyond it the robot slides, and turning the
+/// heading further in makes it slide more.
 pub(super) const SIDESLIP_MAX: f64 = 0.1;
-/// Share of stiffness that a wheel keeps at least.
+/// Minimum fraction of stiffness of a wheel.
 const SHARE_MIN: f64 = 0.05;
-/// Slowest and fastest rims over the forward speed.
+/// Bounds of the rim speeds over the forward speed.
 const RIMS: std::ops::RangeInclusive<f64> = 0.05..=20.0;
-/// Share of the curvature at which the inner rims would stand, by kinematics alone, up to which a
-/// turn is computed.
+/// Bound of the curvature, as a fraction of that at which the inner rims stop by kinematics alone.
 const TIGHT_MAX: f64 = 0.7;
 
-/// A steady turn, all speeds over the forward speed.
+/// Steady turn, all speeds relative to the forward speed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SteadyTurn {
-    /// Speed to the left.
+    /// Lateral speed, positive to the left.
     pub(super) sideslip: f64,
-    /// Speed of the left and of the right rims.
+    /// Rim speeds, `[left, right]`.
     pub(super) rims: [f64; 2],
 }
 
-/// The same turn twice: as if every wheel stayed in the linear range, and with what friction is
-/// lost beyond the peak.
+/// Turn computed twice: with every wheel in the linear range, and with the friction loss beyond the
+/// peak.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Turn {
-    /// Curvature that was assumed, 1/m: the asked one up to a bound.
+    /// Curvature after its bound, 1/m.
     pub(super) curvature_1_m: f64,
     pub(super) linear: SteadyTurn,
     pub(super) beyond: SteadyTurn,
 }
 
+/// Which turn is driven.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct TurnSpec {
+    /// Curvature, 1/m, finite.
+    pub(super) curvature_1_m: f64,
+    /// `θv²/g`, metres, ≥ 0.
+    pub(super) compliance_m: f64,
+}
+
 impl Turn {
-    /// The turn of a curvature, 1/m, finite; `compliance_m` is `θv²/g`, metres, ≥ 0. Only the shape
-    /// of `friction_curve` counts, not its stiffness.
+    /// Computes the turn of a finite curvature in 1/m; `compliance_m` is `θv²/g`, metres, ≥ 0. Only
+    /// the shape of `friction_curve` is used, not its stiffness.
     pub(super) fn steady(
         model: &RobotModel,
         friction_curve: &FrictionCurve,
-        curvature_1_m: f64,
-        compliance_m: f64,
+        spec: TurnSpec,
     ) -> Self {
         let bound_1_m = TIGHT_MAX * 2.0 / model.effective_track_m();
-        let curvature_1_m = curvature_1_m.clamp(-bound_1_m, bound_1_m);
-        let mut wheels = Wheels::new(model, curvature_1_m, compliance_m);
+        let curvature_1_m = spec.curvature_1_m.clamp(-bound_1_m, bound_1_m);
+        let bounded = TurnSpec {
+            curvature_1_m,
+            ..spec
+        };
+        let mut wheels = Wheels::new(model, bounded);
         for _ in 0..LINEAR_ROUNDS {
             wheels.balance();
         }
@@ -75,26 +87,30 @@ impl Turn {
     }
 }
 
-/// Four wheels on their way to balance.
+/// State of the iteration over four wheels.
 struct Wheels {
     curvature_1_m: f64,
-    /// `4θv²/g`, metres: slip of one wheel that carries the force of all, over curvature.
+    /// `4θv²/g`, metres: slip per curvature of one wheel that carries the lateral force of all.
     slip_of_all_m: f64,
-    /// Half the wheelbase over half the track.
+    /// Wheelbase over track width, L/W.
     slenderness: f64,
-    /// Speed of the ground under the left and the right wheels, ahead.
+    /// Forward speed of the ground contacts, `[left, right]`.
     ground: [f64; 2],
-    /// Speed across under the front wheels that the turn itself brings.
+    /// Lateral speed of the front contacts due to the turn.
     lateral: f64,
-    /// Share of stiffness left: front and rear of the left side, then of the right.
+    /// Fractions of stiffness, `[[front, rear]; left, right]`.
     shares: [[f64; 2]; 2],
-    /// One over the rims' speeds.
+    /// Inverse rim speeds, `[left, right]`.
     per_rim: [f64; 2],
     sideslip: f64,
 }
 
 impl Wheels {
-    fn new(model: &RobotModel, curvature_1_m: f64, compliance_m: f64) -> Self {
+    fn new(model: &RobotModel, spec: TurnSpec) -> Self {
+        let TurnSpec {
+            curvature_1_m,
+            compliance_m,
+        } = spec;
         let half_track_m = 0.5 * model.track_width_m();
         let half_base_m = 0.5 * model.wheelbase_m();
         let outward = curvature_1_m * half_track_m;
@@ -117,14 +133,16 @@ impl Wheels {
         }
     }
 
-    /// Solves the balances for these shares.
+    /// Solves the balances for the present fractions of stiffness.
     fn balance(&mut self) {
         let sums = self.shares.map(|[front, rear]| front + rear);
         let gaps = self.shares.map(|[front, rear]| front - rear);
-        // Force along: the body's acceleration along, v²κ times sideslip, is what is left of it.
+        // Longitudinal force: equals mass times −v²κ times sideslip, the acceleration along the
+        // robot.
         let longitudinal = [sums[0] * self.ground[0], sums[1] * self.ground[1]];
         let force = sums[0] + sums[1] + self.slip_of_all_m * self.sideslip * self.curvature_1_m;
-        // Moment over half the track: what the sides push apart, less what the axles scrub.
+        // Moment over half the track width: difference of the sides' longitudinal forces less the
+        // axles' scrubbing.
         let scrubs = [0, 1].map(|side| {
             self.slenderness * (gaps[side] * self.sideslip + sums[side] * self.lateral)
         });
@@ -136,7 +154,7 @@ impl Wheels {
             (longitudinal[0] * moment - force * left) / determinant,
         ]
         .map(|per_rim| per_rim.clamp(RIMS.end().recip(), RIMS.start().recip()));
-        // Force across.
+        // Lateral force.
         let stiffness = self.per_rim[0] * sums[0] + self.per_rim[1] * sums[1];
         let unequal = self.per_rim[0] * gaps[0] + self.per_rim[1] * gaps[1];
         let sideslip =
@@ -144,7 +162,7 @@ impl Wheels {
         self.sideslip = sideslip.clamp(-SIDESLIP_MAX, SIDESLIP_MAX);
     }
 
-    /// Takes the shares of stiffness that this slip leaves; whether any moved.
+    /// Computes the fractions of stiffness from the present slip; returns whether any has changed.
     fn lose(&mut self, friction_curve: &FrictionCurve) -> bool {
         let mut has_moved = false;
         for side in [0, 1] {
@@ -183,7 +201,8 @@ mod tests {
         spec.try_into().unwrap()
     }
 
-    /// A simulated base that has driven on these rims for long: forward speed, sideslip, curvature.
+    /// Returns forward speed, sideslip and curvature of the simulated base after a long time on
+    /// these rim speeds.
     fn driven(curve: FrictionCurve, rims_m_s: [f64; 2]) -> (f64, f64, f64) {
         let model = RobotModel::yi2007();
         let spec = PlantSpec {
@@ -217,10 +236,10 @@ mod tests {
         ) {
             let curve = friction_curve(stiffness, peak_slip);
             let compliance_m = speed_m_s * speed_m_s / (stiffness * GRAVITY_M_S2);
-            // Ground that cannot hold the turn at all is not modelled.
+            // Excludes ground that cannot hold the turn at all.
             prop_assume!(speed_m_s * speed_m_s * curvature.abs() < 0.5 * curve.mu_peak() * GRAVITY_M_S2);
             let model = RobotModel::yi2007();
-            let turn = Turn::steady(&model, &curve, curvature, compliance_m);
+            let turn = Turn::steady(&model, &curve, TurnSpec { curvature_1_m: curvature, compliance_m });
             prop_assume!(turn.beyond.sideslip.abs() < SIDESLIP_MAX);
             let rims = turn.beyond.rims.map(|rim| rim * speed_m_s);
             let (forward_m_s, sideslip, driven) = driven(curve, rims);
@@ -237,7 +256,7 @@ mod tests {
         ) {
             let model = RobotModel::yi2007();
             let friction_curve = FrictionSpec { stiffness: 1.0, peak_slip, sliding_ratio }.try_into().unwrap();
-            let turn = |curvature| Turn::steady(&model, &friction_curve, curvature, compliance_m);
+            let turn = |curvature_1_m| Turn::steady(&model, &friction_curve, TurnSpec { curvature_1_m, compliance_m });
             let (one, other) = (turn(curvature), turn(-curvature));
             for (one, other) in [(one.linear, other.linear), (one.beyond, other.beyond)] {
                 prop_assert!((one.sideslip + other.sideslip).abs() < 1.0e-9);
@@ -251,10 +270,24 @@ mod tests {
     #[test]
     fn without_compliance_there_is_no_sideslip_and_on_a_straight_no_slip() {
         let model = RobotModel::yi2007();
-        let bend = Turn::steady(&model, &friction_curve(1.0, 0.2), 1.2, 0.0);
+        let bend = Turn::steady(
+            &model,
+            &friction_curve(1.0, 0.2),
+            TurnSpec {
+                curvature_1_m: 1.2,
+                compliance_m: 0.0,
+            },
+        );
         assert!(bend.beyond.sideslip.abs() < 1.0e-12, "{bend:?}");
         assert!(bend.beyond != bend.linear, "{bend:?}");
-        let straight = Turn::steady(&model, &friction_curve(1.0, 0.2), 0.0, 0.1);
+        let straight = Turn::steady(
+            &model,
+            &friction_curve(1.0, 0.2),
+            TurnSpec {
+                curvature_1_m: 0.0,
+                compliance_m: 0.1,
+            },
+        );
         let rolls = SteadyTurn {
             sideslip: 0.0,
             rims: [1.0, 1.0],
@@ -270,8 +303,10 @@ mod tests {
         let turn = Turn::steady(
             &model,
             &friction_curve(1.0, 0.9),
-            curvature_1_m,
-            compliance_m,
+            TurnSpec {
+                curvature_1_m,
+                compliance_m,
+            },
         );
         let square_m2 = model.track_width_m().powi(2) + model.wheelbase_m().powi(2);
         let left = 1.0 - 0.25 * square_m2 * curvature_1_m * curvature_1_m;

@@ -1,10 +1,11 @@
-//! What the laws are asked to follow: a plan, or a figure-8 given as a function of time.
+//! Reference motions of the comparison: a plan, or a figure-8 as a function of time.
 
 use tread_control::geometry::{Point, Pose};
 use tread_control::plan::Plan;
 use tread_control::reference::ReferenceSample;
 
-/// Points of a closed path, metres: about 33 m long, with bends to the left and to the right.
+/// Corner points of a closed path, metres: about 33 m long, with bends to the left and to the
+/// right.
 pub const CLOSED_PATH_M: [(f64, f64); 12] = [
     (0.0, 0.0),
     (3.0, -0.5),
@@ -20,14 +21,14 @@ pub const CLOSED_PATH_M: [(f64, f64); 12] = [
     (-1.5, 1.2),
 ];
 
-/// Newton steps to the nearest point.
+/// Number of Newton steps to the nearest point.
 const NEWTON_STEPS: usize = 6;
-/// Speed below which a Newton step is computed as at this one, metres per second.
+/// Lower bound of the speed in a Newton step, metres per second.
 const SPEED_FLOOR_M_S: f64 = 0.05;
-/// Farthest move of the nearest point in one Newton step, seconds.
+/// Maximum move of the nearest point in one Newton step, seconds.
 const MOVE_MAX_S: f64 = 0.5;
 
-/// `(A sin wt, B sin 2wt)`, driven in motion from t = 0.
+/// Figure-8 `(A sin wt, B sin 2wt)`, already in motion at t = 0.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Figure8 {
     /// A, metres.
@@ -36,12 +37,13 @@ pub struct Figure8 {
     pub half_width_m: f64,
     /// w, radians per second.
     pub rate_rad_s: f64,
-    /// How often round.
+    /// Number of laps.
     pub laps: f64,
 }
 
 impl Figure8 {
-    /// `(4 sin 0.15t, 2 sin 0.3t)` m, three times round: half of it is scored.
+    /// Returns `(4 sin 0.15t, 2 sin 0.3t)` m with three laps; the second half of the time is
+    /// scored.
     pub fn usual() -> Self {
         Self {
             half_length_m: 4.0,
@@ -51,7 +53,7 @@ impl Figure8 {
         }
     }
 
-    /// Time for one lap, seconds.
+    /// Returns the time of one lap, seconds.
     pub fn lap_s(&self) -> f64 {
         std::f64::consts::TAU / self.rate_rad_s
     }
@@ -84,26 +86,26 @@ impl Figure8 {
     }
 }
 
-/// The nearest point of a course to a robot.
+/// Point of a course nearest to a robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Nearest {
-    /// Its time on the course, seconds.
+    /// Time of this point on the course, seconds.
     pub time_s: f64,
-    /// The robot's distance to the left of it, metres.
+    /// Distance of the robot to the left of the course, metres.
     pub cross_track_m: f64,
 }
 
-/// What the laws follow.
+/// Reference motion that the laws follow.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Course {
-    /// A plan from rest to rest; the reference waits for nobody.
+    /// A plan from zero speed to zero speed; the reference does not wait for the robot.
     Plan(Plan),
     /// A figure-8 as a function of time.
     Figure8(Figure8),
 }
 
 impl Course {
-    /// How long it takes, seconds.
+    /// Returns the duration, seconds.
     pub fn duration_s(&self) -> f64 {
         match self {
             Self::Plan(plan) => plan.duration_s(),
@@ -111,7 +113,7 @@ impl Course {
         }
     }
 
-    /// The reference at a time, seconds.
+    /// Returns the reference at a time, seconds.
     pub fn sample(&self, time_s: f64) -> ReferenceSample {
         match self {
             Self::Plan(plan) => ReferenceSample::from(&plan.sample(time_s)),
@@ -119,13 +121,13 @@ impl Course {
         }
     }
 
-    /// The nearest point to a robot near `guess_s`; moves a bounded distance from there.
+    /// Returns the point nearest to a robot, searched from `guess_s` over a bounded distance.
     pub fn nearest(&self, point: Point, guess_s: f64) -> Nearest {
         let mut time_s = guess_s;
         for _ in 0..NEWTON_STEPS {
             let sample = self.sample(time_s);
             let forward = sample.pose.body_from_site(point);
-            // The speed at which the nearest point moves per metre ahead falls inside a bend.
+            // Inside a bend the nearest point moves faster than the robot by this factor's inverse.
             let bend = (1.0 - sample.curvature_1_m * forward.y_m).max(0.2);
             let step_s = forward.x_m / (bend * sample.speed_m_s.max(SPEED_FLOOR_M_S));
             time_s = (time_s + step_s.clamp(-MOVE_MAX_S, MOVE_MAX_S)).clamp(0.0, self.duration_s());

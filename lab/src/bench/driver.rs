@@ -1,4 +1,4 @@
-//! A law with its memory, whichever it is.
+//! Common interface of the compared tracking laws.
 
 use tread_control::friction::FrictionCurve;
 use tread_control::measured::{BodyAcceleration, Measured, WheelSpeeds};
@@ -14,24 +14,25 @@ use crate::bench::kanayama::Kanayama;
 use crate::bench::paper_law::PaperLaw;
 use crate::bench::pursuit::Pursuit;
 
-/// What a law sees in one tick.
+/// Input of a law in one tick.
 #[derive(Debug, Clone, Copy)]
 pub struct LawInput<'a> {
-    /// What it follows.
+    /// Course that it follows.
     pub course: &'a Course,
     /// Time on the course, seconds.
     pub time_s: f64,
-    /// Where the robot should be now.
+    /// Desired pose and motion now.
     pub reference: &'a ReferenceSample,
-    /// Where the robot is and how it moves.
+    /// Measured pose and motion.
     pub measured: &'a Measured,
-    /// What is known of θ; only the shipped law uses it.
+    /// Known θ; only the shipped law uses it.
     pub knowledge: Option<ThetaKnowledge>,
-    /// What an accelerometer at the centre of mass feels; only the paper's law uses it.
+    /// Acceleration at the centre of mass, as an accelerometer measures it; only the paper's law
+    /// uses it.
     pub felt: BodyAcceleration,
 }
 
-/// A law with its memory.
+/// A tracking law with its state.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Driver(Kind);
 
@@ -44,11 +45,11 @@ enum Kind {
 }
 
 impl Driver {
-    /// A law at rest. The paper's law is given the ground's curve; where that is none for it, the
-    /// shipped law drives.
+    /// Creates a law in its initial state. The paper's law uses `curve`; if it cannot be
+    /// constructed, the shipped law replaces it.
     ///
     /// # Errors
-    /// [`TrackerError`] when the shipped law's configuration is out of range.
+    /// [`TrackerError`] if the shipped law's configuration is out of range.
     pub fn new(
         model: RobotModel,
         config: TrackerConfig,
@@ -69,7 +70,7 @@ impl Driver {
         }))
     }
 
-    /// Wheel speeds to command; with the shipped law's own output, if it is that.
+    /// Returns the wheel speeds to command, and the full output of the shipped law if it drives.
     pub fn step(
         &mut self,
         input: &LawInput<'_>,
@@ -94,14 +95,14 @@ impl Driver {
         }
     }
 
-    /// Holds the shipped law's adaptation while the gate cuts its command.
+    /// Holds the shipped law's adaptation while the gate reduces its command.
     pub fn hold_adaptation(&mut self, held: bool) {
         if let Kind::Shipped(law) = &mut self.0 {
             law.hold_adaptation(held);
         }
     }
 
-    /// How far ahead of the wheels' centre the point is that it leads, metres.
+    /// Returns the distance of the controlled point ahead of the robot's centre, metres.
     pub fn point_forward_m(&self) -> f64 {
         match &self.0 {
             Kind::Paper(law) => law.point_forward_m(),

@@ -1,4 +1,4 @@
-//! Kanayama's tracker: as usually shipped, and tuned with integral action.
+//! Kanayama's tracker: with usual gains, and tuned with integral action.
 
 use tread_control::geometry::{Twist, wrap_angle_rad};
 use tread_control::measured::{Measured, WheelSpeeds};
@@ -6,22 +6,22 @@ use tread_control::reference::ReferenceSample;
 use tread_control::robot::RobotModel;
 use tread_control::tracking::desaturated;
 
-/// Largest integral of the cross-track error, metre seconds.
+/// Bound of the integral of the cross-track error, metre seconds.
 const INTEGRAL_MAX_M_S: f64 = 0.1;
 
-/// Which track width turns a twist into wheel speeds.
+/// Track width that converts a twist to wheel speeds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Track {
-    /// The distance between the wheels, as for a differential drive.
+    /// Distance between the wheels, as for a differential drive.
     Raw,
-    /// The effective one of a skid-steered base.
+    /// Effective track width of a skid-steered base.
     Effective,
 }
 
 /// Gains of the tracker.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KanayamaGains {
-    /// Which track width is used.
+    /// Track width in use.
     pub track: Track,
     /// `k_x`, per second.
     pub along_1_s: f64,
@@ -34,7 +34,7 @@ pub struct KanayamaGains {
 }
 
 impl KanayamaGains {
-    /// As usually shipped: no integral action.
+    /// Returns usual gains, without integral action.
     pub fn usual() -> Self {
         Self {
             track: Track::Effective,
@@ -45,7 +45,7 @@ impl KanayamaGains {
         }
     }
 
-    /// Tuned, with integral action: the peer that counts.
+    /// Returns tuned gains with integral action, the strongest peer.
     pub fn tuned() -> Self {
         Self {
             along_1_s: 3.0,
@@ -57,7 +57,7 @@ impl KanayamaGains {
     }
 }
 
-/// The tracker.
+/// Kanayama's tracker with its state.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Kanayama {
     model: RobotModel,
@@ -66,7 +66,7 @@ pub struct Kanayama {
 }
 
 impl Kanayama {
-    /// A tracker at rest.
+    /// Creates a tracker with zero integral.
     pub fn new(model: RobotModel, gains: KanayamaGains) -> Self {
         Self {
             model,
@@ -75,7 +75,7 @@ impl Kanayama {
         }
     }
 
-    /// One tick.
+    /// Computes the wheel speeds of one tick of `dt_s` seconds.
     pub fn step(
         &mut self,
         reference: &ReferenceSample,

@@ -1,7 +1,8 @@
-//! Peers, written only for comparison, and the run that compares. Nothing that ships uses them.
+//! Tracking laws for comparison only, and the run that compares them. Shipped programs do not use
+//! them.
 //!
-//! Every law drives the same [`Course`] on the same free plant from the same start, and sees the
-//! same measurements. Noise comes from outside: a run draws no random numbers.
+//! Every law drives the same [`Course`] on the same free plant from the same start, with the same
+//! measurements. The caller supplies noise: a run draws no random numbers.
 
 mod course;
 mod driver;
@@ -21,15 +22,15 @@ pub use run::{BenchError, CrossTrack, Run, Scenario, TickInput, TickOutput, cros
 
 use tread_control::tracking::ThetaKnowledge;
 
-/// A law that drives a comparison.
+/// Tracking law in a comparison.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Law {
     /// Kanayama's tracker.
     Kanayama(KanayamaGains),
-    /// Regulated pure pursuit with Nav2's rules.
+    /// Regulated pure pursuit by Nav2's rules.
     Pursuit(PursuitConfig),
-    /// The paper's law, its wheel speeds found by inverting the measured velocity.
+    /// The paper's law; its wheel speeds follow from inverting the measured velocity.
     Yi2007,
-    /// The shipped law, with what it is given about θ before the first tick.
+    /// The shipped law, with the θ that is known before the first tick.
     Shipped(Option<ThetaKnowledge>),
 }

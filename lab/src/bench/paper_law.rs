@@ -1,5 +1,6 @@
 //! The law `yi2007` on a free base: integrators in the loop, wheel speeds by (21) with the measured
-//! velocity. No force enforces the constraint that (21) inverts, so it diverges; that is shown.
+//! velocity. No force enforces the constraint that (21) inverts, so the law diverges, as the
+//! comparison shows.
 
 use nalgebra::Vector2;
 
@@ -14,14 +15,14 @@ use tread_control::measured::{BodyAcceleration, Measured, WheelSpeeds};
 use tread_control::robot::RobotModel;
 use tread_control::tracking::desaturated;
 
-/// Step of the differences that give the course's third derivative, seconds.
+/// Time step of the central difference that gives the course's third derivative, seconds.
 const DIFFERENCE_S: f64 = 0.01;
-/// θ̂ is held between these: at zero the law would be blind.
+/// Bounds of θ̂: at zero the law would have no input.
 const THETA_RANGE: [f64; 2] = [0.01, 10.0];
-/// τ₁ is held within this, so that a run away stays finite.
+/// Bound of |τ₁|, so that a diverging run stays finite.
 const ZETA_MAX: f64 = 1.0;
 
-/// The law with its memory.
+/// The law with its state.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PaperLaw {
     model: RobotModel,
@@ -33,7 +34,8 @@ pub struct PaperLaw {
 }
 
 impl PaperLaw {
-    /// The law of section IV, θ̂ from 1; the wheel transformation knows the true curve.
+    /// Creates the law of section IV with θ̂ = 1; its wheel transformation uses the true curve.
+    /// Returns None if the model or the gains are invalid.
     pub fn new(model: RobotModel, curve: FrictionCurve) -> Option<Self> {
         let config = Yi2007Config::section_iv();
         Some(Self {
@@ -46,12 +48,12 @@ impl PaperLaw {
         })
     }
 
-    /// Distance of the control point ahead of the centre, metres.
+    /// Returns the distance of the control point ahead of the centre, metres.
     pub fn point_forward_m(&self) -> f64 {
         self.law.config().centre_forward_m
     }
 
-    /// One tick.
+    /// Computes the wheel speeds of one tick of `dt_s` seconds.
     pub fn step(
         &mut self,
         course: &Course,
@@ -71,7 +73,7 @@ impl PaperLaw {
         };
         let desired = desired(course, time_s);
         let Ok(output) = self.law.evaluate(&input, &desired) else {
-            // Singular at standstill: drive ahead until it is not.
+            // Singular at standstill: drive forward until it is not.
             let twist = Twist {
                 linear_m_s: 0.1,
                 angular_rad_s: 0.0,
@@ -88,7 +90,7 @@ impl PaperLaw {
             .reduced
             .inputs(tau, eta, &shape)
             .and_then(|inputs| self.reduced.wheel_speeds(inputs, &shape));
-        // Where no forward wheel speed gives τ, the wheels keep theirs.
+        // Where no forward wheel speed gives τ, the last wheel speeds apply.
         if let Ok(wheels) = wheels {
             let most_rad_s = self.model.limits().wheel_speed_max_rad_s;
             self.wheels = WheelSpeeds {
@@ -100,7 +102,7 @@ impl PaperLaw {
     }
 }
 
-/// The course as the motion of point D, its jerk by differences.
+/// Returns the course as motion of point D, with its jerk by a central difference.
 fn desired(course: &Course, time_s: f64) -> DesiredPoint {
     let derivatives = |time_s: f64| {
         let sample = course.sample(time_s);

@@ -1,8 +1,8 @@
-//! Regulated pure pursuit by Nav2's published rules, written afresh.
+//! Regulated pure pursuit by Nav2's published rules, an independent implementation.
 //!
-//! Look-ahead `v·t` between bounds; curvature `2y/d²` to the point there; speed scaled down with
-//! the path's curvature below a radius, never below a floor; turn on the spot when the path leaves
-//! to the side. Nav2's defaults, but the course's own speed in place of `desired_linear_vel`.
+//! Look-ahead `v·t` within bounds; curvature `2y/d²` to the point there; speed reduced by the
+//! path's curvature below a radius, with a minimum; turn on the spot when the path leaves to the
+//! side. Nav2's defaults, but the course's own speed in place of `desired_linear_vel`.
 
 use crate::bench::course::Course;
 use tread_control::geometry::Twist;
@@ -12,14 +12,14 @@ use tread_control::tracking::desaturated;
 
 /// Turn rate on the spot, radians per second.
 const ROTATE_RAD_S: f64 = 1.8;
-/// Path direction beyond which it turns on the spot, radians.
+/// Bearing of the look-ahead point above which it turns on the spot, radians.
 const ROTATE_FROM_RAD: f64 = 0.785;
 /// Time step of the search for the look-ahead point, seconds.
 const SEARCH_S: f64 = 0.02;
-/// Most steps of that search.
+/// Maximum number of steps of that search.
 const SEARCH_MAX: u32 = 500;
 
-/// Parameters by Nav2's names.
+/// Parameters with their names in Nav2.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PursuitConfig {
     /// `lookahead_time`, seconds.
@@ -46,7 +46,7 @@ impl Default for PursuitConfig {
     }
 }
 
-/// The tracker; it follows the path, not the clock.
+/// Pure pursuit with its state; it follows the path, not the time of the reference.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pursuit {
     model: RobotModel,
@@ -55,7 +55,7 @@ pub struct Pursuit {
 }
 
 impl Pursuit {
-    /// A tracker at the start of a course.
+    /// Creates a tracker at the start of a course.
     pub fn new(model: RobotModel, config: PursuitConfig) -> Self {
         Self {
             model,
@@ -64,7 +64,7 @@ impl Pursuit {
         }
     }
 
-    /// One tick.
+    /// Computes the wheel speeds of one tick.
     pub fn step(&mut self, course: &Course, measured: &Measured) -> WheelSpeeds {
         let config = &self.config;
         let nearest = course.nearest(measured.pose.point(), self.nearest_s);

@@ -1,8 +1,8 @@
-//! Robots besides the paper's.
+//! Robots other than the paper's.
 
 use tread_control::robot::{Limits, RobotModel, RobotModelSpec};
 
-/// A robot about as large as a Husky: 50 kg, wheels of 16.5 cm.
+/// Returns a robot about as large as a Husky: 50 kg, wheel radius 16.5 cm.
 pub fn husky_like() -> RobotModel {
     let spec = RobotModelSpec {
         mass_kg: 50.0,

@@ -1,4 +1,4 @@
-//! One comparison: a law, a course, the free plant.
+//! One run of the comparison: a law on a course, with the free plant.
 
 use crate::bench::Law;
 use crate::bench::course::Course;
@@ -12,26 +12,26 @@ use tread_control::plant::{Ground, Plant, PlantError, PlantSpec, PlantState};
 use tread_control::robot::RobotModel;
 use tread_control::tracking::{ThetaKnowledge, TrackerConfig, TrackerError, TrackerOutput};
 
-/// Cross-track error at which a run is given up, metres.
+/// Cross-track error above which a run is aborted, metres.
 const GIVEN_UP_M: f64 = 50.0;
 
-/// Under what a comparison runs.
+/// Conditions of a run.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Scenario {
-    /// The ground at the start; the paper's law is given it.
+    /// Friction curve of the ground at the start; the paper's law uses it.
     pub curve: FrictionCurve,
-    /// Lag of the wheel servo, seconds.
+    /// True lag of the wheel servo, seconds.
     pub servo_lag_s: f64,
-    /// Gains of the shipped law, and the lag that it is configured with.
+    /// Gains of the shipped law, and the servo lag that it assumes.
     pub tracker: TrackerConfig,
-    /// Period of the loop, seconds.
+    /// Period of the control loop, seconds.
     pub loop_s: f64,
-    /// Sensor samples per loop, at least 1.
+    /// Number of sensor samples per period, at least 1.
     pub samples: u32,
 }
 
 impl Scenario {
-    /// 50 Hz, sensors at 200 Hz, 50 ms of lag that is known.
+    /// Returns a loop of 50 Hz, sensors at 200 Hz, and 50 ms of servo lag, known to the law.
     pub fn usual(curve: FrictionCurve) -> Self {
         Self {
             curve,
@@ -43,42 +43,42 @@ impl Scenario {
     }
 }
 
-/// Why a comparison cannot run.
+/// Reason why a run cannot start.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum BenchError {
-    /// The plant was refused.
+    /// A parameter of the plant is out of range.
     #[error("the simulated base was refused")]
     Plant(#[from] PlantError),
-    /// The shipped law was refused.
+    /// A gain of the shipped law is out of range.
     #[error("the law was refused")]
     Tracker(#[from] TrackerError),
 }
 
-/// What one tick gets from outside.
+/// External input of one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TickInput<'a> {
-    /// The ground under the robot during this tick.
+    /// Ground under the robot during this tick.
     pub ground: &'a Ground,
-    /// Error of the measured pose.
+    /// Error to add to the measured pose.
     pub pose_error: Pose,
-    /// What is known of θ.
+    /// Known θ.
     pub knowledge: Option<ThetaKnowledge>,
 }
 
-/// What one tick led to.
+/// Result of one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TickOutput {
-    /// Time at which the law looked, seconds.
+    /// Time of the law's input, seconds.
     pub time_s: f64,
-    /// The true distance from the course then, to the left, metres.
+    /// True distance to the left of the course at that time, metres.
     pub cross_track_m: f64,
-    /// What was commanded.
+    /// Commanded wheel speeds after the gate.
     pub command: WheelSpeeds,
-    /// The shipped law's own words.
+    /// Full output of the shipped law, if it drives.
     pub tracker: Option<TrackerOutput>,
 }
 
-/// A run under way.
+/// Run in progress.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Run {
     course: Course,
@@ -86,7 +86,7 @@ pub struct Run {
     driver: Driver,
     plant: Plant,
     limits: GateLimits,
-    /// What the gate let through last.
+    /// Last output of the gate.
     command: WheelSpeeds,
     nearest_s: f64,
     ticks: u32,
@@ -94,10 +94,10 @@ pub struct Run {
 }
 
 impl Run {
-    /// A robot on the course's start, moving as the course does there.
+    /// Places a robot at the start of the course, with the course's motion there.
     ///
     /// # Errors
-    /// [`BenchError`] when the scenario's lag is out of range.
+    /// [`BenchError`] if the scenario's servo lag or a gain of the shipped law is out of range.
     pub fn new(
         course: Course,
         model: RobotModel,
@@ -135,25 +135,25 @@ impl Run {
         })
     }
 
-    /// The simulated base.
+    /// Returns the simulated base.
     pub fn plant(&self) -> &Plant {
         &self.plant
     }
 
-    /// Time since the start, seconds.
+    /// Returns the time since the start, seconds.
     pub fn time_s(&self) -> f64 {
         f64::from(self.ticks) * self.scenario.loop_s
     }
 
-    /// Whether the robot was lost so far that the run ended.
+    /// Returns whether the run was aborted because the robot left the course.
     pub fn is_given_up(&self) -> bool {
         self.given_up
     }
 
-    /// One tick; `each_sample` sees the plant after every sensor sample and the time since the
-    /// last.
+    /// Runs one tick; calls `each_sample` after every sensor sample with the plant and the time
+    /// since the last sample in seconds.
     ///
-    /// None at the end of the course, or when the robot is lost.
+    /// Returns None at the end of the course, or after an abort.
     pub fn tick(
         &mut self,
         input: &TickInput,
@@ -215,7 +215,7 @@ impl Run {
         })
     }
 
-    /// The point that the law leads: the centre, or the paper's point D.
+    /// Returns the point that the law controls: the centre, or the paper's point D.
     fn scored_point(&self) -> Point {
         let pose = self.plant.state().pose;
         let forward_m = self.driver.point_forward_m();
@@ -232,14 +232,15 @@ impl Run {
 pub struct CrossTrack {
     /// Root mean square over the second half of the time, metres.
     pub rms_m: f64,
-    /// Largest over the whole time, metres.
+    /// Maximum magnitude over the whole time, metres.
     pub most_m: f64,
 }
 
-/// Drives a plan without noise on one ground; the law is given θ from the start, or never.
+/// Runs a law on a plan without noise on uniform ground. The shipped law has its known θ from the
+/// start.
 ///
 /// # Errors
-/// [`BenchError`] when the scenario's lag is out of range.
+/// [`BenchError`] if the scenario's servo lag or a gain of the shipped law is out of range.
 pub fn cross_track(
     plan: &Plan,
     model: RobotModel,

@@ -1,16 +1,16 @@
-//! Dynamics in closed form, (15) to (17), corrected: equal to the sum over four wheels.
+//! Dynamics in closed form, (15) to (17), with corrections: equal to the sum over four wheels.
 //!
-//! `v₁ = σ₂(λ₁)u₁ − σ₂(λ₃)u₂`, `v₂ = σ₂(λ₁)u₁ + σ₂(λ₃)u₂`, `u₁ = 1/(rω₁)`, `u₂ = 1/(rω₃)`.
-//! With `a_i = σ₁(λ_i)/(|λ_i| σ₂(λ_i))`, `σ_r1 = a₁ − a₃`, `σ_r2 = a₁ + a₃`:
+//! `v₁ = σ₂(λ₁)u₁ − σ₂(λ₃)u₂`, `v₂ = σ₂(λ₁)u₁ + σ₂(λ₃)u₂`, `u₁ = 1/(rω₁)`, `u₂ = 1/(rω₃)`. With
+//! `a_i = σ₁(λ_i)/(|λ_i| σ₂(λ_i))`, `σ_r1 = a₁ − a₃`, `σ_r2 = a₁ + a₃`:
 //!
 //! ```text
 //! ΣF/m  = gK [½σ_Σ + ¼Wφ̇ v₁ − ½ẋ v₂]                                              (16a)
 //! ΣP/m  = −½gKẏ [v₂(1 + ½σ_r2) + ½σ_r1 v₁]                                        (16b)
 //! ΣM/I  = mgK/(4I) {−Wσ_Δ + (Wẋ − ¼L²φ̇σ_r1) v₁ − ½[W² + L²(1 + ½σ_r2)]φ̇ v₂}        (16c)
 //! ```
-//! Printed differently: `σ_r1` and `σ_r2` swapped in (16b) and (17), +½ for −¼ in (16c), no ½ in
-//! `e₂` of (17), sgn(φ̇) in both. The form is singular for α = 1 beyond `λ_m` (σ₂ = 0), and holds
-//! for |λ| < 1 only: there use [`super::wheels::four_wheel_sum`].
+//! The paper prints: `σ_r1` and `σ_r2` swapped in (16b) and (17), +½ for −¼ in (16c), no ½ in `e₂`
+//! of (17), sgn(φ̇) in `σ_r1` and `σ_r2`. The form is singular for α = 1 beyond `λ_m` (σ₂ = 0), and
+//! holds for |λ| < 1 only: elsewhere use [`super::wheels::four_wheel_sum`].
 
 use nalgebra::{Matrix2, RowVector2, Vector2};
 
@@ -25,14 +25,14 @@ use tread_control::robot::GRAVITY_M_S2;
 /// σ₁ and σ₂ of (9) for a slip magnitude.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sigma {
-    /// σ₁, zero in the linear range.
+    /// σ₁; zero in the linear range.
     pub one: f64,
-    /// σ₂, one in the linear range, negative beyond.
+    /// σ₂; one in the linear range, ≤ 0 beyond.
     pub two: f64,
 }
 
 impl Sigma {
-    /// (9) at `|λ|`.
+    /// Computes (9) at `|λ|`.
     pub fn at(slip: f64, curve: &FrictionCurve) -> Self {
         let (peak, alpha) = (curve.peak_slip(), curve.sliding_ratio());
         if slip.abs() < peak {
@@ -46,7 +46,7 @@ impl Sigma {
     }
 }
 
-/// Everything in (16), (17) that depends on the slips alone.
+/// Terms of (16) and (17) that depend on the slips alone.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SlipShape {
     /// σ of the left side.
@@ -64,7 +64,7 @@ pub struct SlipShape {
 }
 
 impl SlipShape {
-    /// None where the closed form is singular: σ₂ = 0, or a slip held at ±1.
+    /// Computes the terms; None where the closed form is singular: σ₂ = 0, or a slip clamped at ±1.
     pub fn at(slips: SideSlips, curve: &FrictionCurve) -> Option<Self> {
         let (left, right) = (Sigma::at(slips.left, curve), Sigma::at(slips.right, curve));
         if left.two.abs().min(right.two.abs()) <= f64::EPSILON
@@ -94,7 +94,7 @@ impl SlipShape {
         })
     }
 
-    /// The shape of the linear range, where σ₁ = 0 and σ₂ = 1.
+    /// Returns the terms of the linear range, where σ₁ = 0 and σ₂ = 1.
     pub fn linear() -> Self {
         let sigma = Sigma { one: 0.0, two: 1.0 };
         Self {
@@ -107,7 +107,7 @@ impl SlipShape {
         }
     }
 
-    /// The inputs `(v₁, v₂)` of these wheel speeds, which must turn forward, seconds per metre.
+    /// Returns the inputs `(v₁, v₂)` of wheel speeds above zero, seconds per metre.
     pub fn inputs(&self, wheels: WheelSpeeds, radius_m: f64) -> Vector2<f64> {
         let left = self.left.two / (radius_m * wheels.left_rad_s);
         let right = self.right.two / (radius_m * wheels.right_rad_s);
@@ -115,7 +115,7 @@ impl SlipShape {
     }
 }
 
-/// E₁ of (17), corrected: rows forward and left, columns v₁ and v₂.
+/// Returns E₁ of (17), corrected: rows forward and left, columns v₁ and v₂.
 pub fn e_1(velocity: &BodyVelocity, shape: &SlipShape, setting: &Setting) -> Matrix2<f64> {
     let (forward, left) = (velocity.forward_m_s, velocity.left_m_s);
     Matrix2::new(
@@ -126,7 +126,7 @@ pub fn e_1(velocity: &BodyVelocity, shape: &SlipShape, setting: &Setting) -> Mat
     )
 }
 
-/// e₂ of (17), corrected: the yaw row.
+/// Returns e₂ of (17), corrected: the yaw row.
 pub fn e_2(velocity: &BodyVelocity, shape: &SlipShape, setting: &Setting) -> RowVector2<f64> {
     let (track_m, base_m) = (setting.model.track_width_m(), setting.model.wheelbase_m());
     let turn = velocity.yaw_rate_rad_s;
@@ -136,7 +136,7 @@ pub fn e_2(velocity: &BodyVelocity, shape: &SlipShape, setting: &Setting) -> Row
     )
 }
 
-/// Forces by (17): `¼mgK (E v + [2σ_Σ, 0, −Wσ_Δ])` in the body frame.
+/// Returns the forces by (17), `¼mgK (E v + [2σ_Σ, 0, −Wσ_Δ])`, in the body frame.
 ///
 /// None where the closed form is singular, see [`SlipShape::at`].
 pub fn forces(

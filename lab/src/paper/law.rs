@@ -1,22 +1,22 @@
 //! The law `yi2007`: point D (22), its third derivative (23), the law (25), the adaptation (26).
 //!
 //! With `ε = z − z_d`, `s = ε̈ + k₁ε̇ + k₂ε`, `f = −z⃛_d + k₁ε̈ + k₂ε̇` and `r = −γ − f − ξs`:
-//! `w = α⁻¹(θ̂r − β)`, `θ̂̇ = −ρ sᵀr`. On the reduced model `V = ½sᵀs + θ̃²/(2θρ)` falls as
-//! `V̇ = −ξ sᵀs`. Nothing drives θ̂ to the truth unless the motion excites it: on the paper's own
-//! circle it settles at 0.9747 while θ = 0.2.
+//! `w = α⁻¹(θ̂r − β)`, `θ̂̇ = −ρ sᵀr`. On the reduced model `V = ½sᵀs + θ̃²/(2θρ)` decreases as
+//! `V̇ = −ξ sᵀs`. θ̂ converges to θ only under excitation: on the paper's own circle it settles at
+//! 0.9747 while θ = 0.2.
 //!
-//! `s` needs ε̈, so an acceleration: it is measured. With K̂ζ in its place the proof is void.
-//! `det α = −η₁/S`: the law is singular at standstill and refuses there.
+//! `s` needs ε̈, so an acceleration, which is measured. With K̂ζ in its place the proof does not
+//! hold. `det α = −η₁/S`: the law is singular at standstill and returns an error there.
 
 use nalgebra::{Matrix2, SVector, Vector2};
 use thiserror::Error;
 
 use tread_control::geometry::{Point, Pose};
 
-/// Forward speed below which α is taken for singular, metres per second.
+/// Forward speed below which α counts as singular, metres per second.
 pub const SPEED_MIN_M_S: f64 = 1.0e-3;
 
-/// Gains of the law and the place of its control point.
+/// Gains of the law and the position of its control point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Yi2007Config {
     /// S, distance of the control point D ahead of the centre, metres, above zero.
@@ -32,7 +32,7 @@ pub struct Yi2007Config {
 }
 
 impl Yi2007Config {
-    /// Section IV.
+    /// Returns the gains of section IV.
     pub fn section_iv() -> Self {
         Self {
             centre_forward_m: 0.167,
@@ -44,37 +44,38 @@ impl Yi2007Config {
     }
 }
 
-/// Why the law was refused, or refuses.
+/// Error of constructing or evaluating the law.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum Yi2007Error {
     /// A gain is NaN, infinite, zero or negative.
     #[error("`{field}` must be finite and above zero, not {value}")]
     OutOfRange {
-        /// The field's name.
+        /// Name of the field.
         field: &'static str,
-        /// What it held.
+        /// Rejected value.
         value: f64,
     },
-    /// The robot is too slow: α of (23) cannot be inverted.
+    /// The forward speed, in metres per second, is too low to invert α of (23).
     #[error("the law is singular at {0} m/s")]
     Standstill(f64),
 }
 
-/// The desired motion of point D, site frame.
+/// Desired motion of point D in the site frame.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct DesiredPoint {
     /// `z_d`, metres.
     pub position: Vector2<f64>,
-    /// Its first derivative, metres per second.
+    /// First derivative of `z_d`, metres per second.
     pub velocity: Vector2<f64>,
-    /// Its second derivative, metres per second squared.
+    /// Second derivative of `z_d`, metres per second squared.
     pub acceleration: Vector2<f64>,
-    /// Its third derivative, metres per second cubed.
+    /// Third derivative of `z_d`, metres per second cubed.
     pub jerk: Vector2<f64>,
 }
 
 impl DesiredPoint {
-    /// Section IV: `(R sin(t/T), R cos(t/T))` with R 6 m and T 10 s, driven clockwise.
+    /// Returns the circle of section IV, `(R sin(t/T), R cos(t/T))` with R 6 m and T 10 s, driven
+    /// clockwise.
     pub fn section_iv(time_s: f64) -> Self {
         const RADIUS_M: f64 = 6.0;
         const RATE_RAD_S: f64 = 0.1;
@@ -89,10 +90,10 @@ impl DesiredPoint {
     }
 }
 
-/// What the law looks at.
+/// Input of the law at one time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LawInput {
-    /// Pose of the centre, site frame.
+    /// Pose of the centre in the site frame.
     pub pose: Pose,
     /// η₁ = ẋ, metres per second.
     pub forward_m_s: f64,
@@ -100,22 +101,22 @@ pub struct LawInput {
     pub left_m_s: f64,
     /// η̇₁, measured, metres per second squared.
     pub forward_m_s2: f64,
-    /// ζ = τ₁, the law's own integrator.
+    /// ζ = τ₁, the state of the law's integrator.
     pub zeta: f64,
-    /// θ̂.
+    /// θ̂, the adapted slip compliance.
     pub theta: f64,
 }
 
-/// What the law gives.
+/// Output of the law at one time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LawOutput {
     /// `w₁ = ζ̇`, `w₂ = τ₂`.
     pub inputs: Vector2<f64>,
-    /// θ̂̇ (26).
+    /// θ̂̇ of (26), per second.
     pub theta_rate_1_s: f64,
-    /// ε, metres.
+    /// `ε = z − z_d`, metres.
     pub error: Vector2<f64>,
-    /// s, metres per second squared.
+    /// `s = ε̈ + k₁ε̇ + k₂ε`, metres per second squared.
     pub surface: Vector2<f64>,
 }
 
@@ -126,7 +127,7 @@ pub struct Yi2007 {
 }
 
 impl Yi2007 {
-    /// Checks the gains.
+    /// Creates a law with checked gains.
     ///
     /// # Errors
     /// [`Yi2007Error::OutOfRange`] names the gain.
@@ -145,12 +146,12 @@ impl Yi2007 {
         Ok(Self { config })
     }
 
-    /// The gains.
+    /// Returns the gains.
     pub fn config(&self) -> &Yi2007Config {
         &self.config
     }
 
-    /// The control point D (22).
+    /// Returns the control point D (22), site frame.
     pub fn point(&self, pose: Pose) -> Point {
         let (sin, cos) = pose.heading_rad.sin_cos();
         Point {
@@ -159,7 +160,7 @@ impl Yi2007 {
         }
     }
 
-    /// (25) and (26) at one instant.
+    /// Evaluates (25) and (26) at one time.
     ///
     /// # Errors
     /// [`Yi2007Error::Standstill`] below [`SPEED_MIN_M_S`].
@@ -206,20 +207,20 @@ impl Yi2007 {
 pub struct ClosedLoopState {
     /// Time, seconds.
     pub time_s: f64,
-    /// Pose of the centre.
+    /// Pose of the centre in the site frame.
     pub pose: Pose,
     /// η₁, metres per second.
     pub forward_m_s: f64,
     /// η₂, metres per second.
     pub left_m_s: f64,
-    /// ζ.
+    /// ζ, the state of the law's integrator.
     pub zeta: f64,
-    /// θ̂.
+    /// θ̂, the adapted slip compliance.
     pub theta: f64,
 }
 
 impl ClosedLoopState {
-    /// Section IV; η₂ and ζ are not in the paper and start at zero.
+    /// Returns the initial state of section IV; η₂ and ζ are not in the paper and start at zero.
     pub fn section_iv() -> Self {
         Self {
             time_s: 0.0,
@@ -236,11 +237,11 @@ impl ClosedLoopState {
     }
 }
 
-/// The paper's simulation: law, adaptation and reduced model, fourth-order Runge-Kutta.
+/// The paper's simulation: law, adaptation and reduced model, by fourth-order Runge-Kutta.
 #[derive(Debug, Clone, Copy)]
 pub struct ClosedLoop {
     law: Yi2007,
-    /// K, the ground's true stiffness.
+    /// K, the true friction stiffness of the ground.
     stiffness: f64,
     desired: fn(f64) -> DesiredPoint,
     state: ClosedLoopState,
@@ -250,10 +251,10 @@ pub struct ClosedLoop {
 type Packed = SVector<f64, 7>;
 
 impl ClosedLoop {
-    /// A loop at a state.
+    /// Creates a closed loop at a state.
     ///
     /// # Errors
-    /// [`Yi2007Error::OutOfRange`] when K is not finite and above zero.
+    /// [`Yi2007Error::OutOfRange`] if K is not finite or not above zero.
     pub fn new(
         law: Yi2007,
         stiffness: f64,
@@ -274,12 +275,12 @@ impl ClosedLoop {
         })
     }
 
-    /// The present state.
+    /// Returns the present state.
     pub fn state(&self) -> &ClosedLoopState {
         &self.state
     }
 
-    /// Errors and inputs at the present state.
+    /// Returns errors and inputs at the present state.
     ///
     /// # Errors
     /// [`Yi2007Error::Standstill`] where the law is singular.
@@ -287,7 +288,7 @@ impl ClosedLoop {
         self.evaluate(&pack(&self.state), self.state.time_s)
     }
 
-    /// `V = ½sᵀs + θ̃²/(2θρ)` at the present state.
+    /// Returns `V = ½sᵀs + θ̃²/(2θρ)` at the present state.
     ///
     /// # Errors
     /// [`Yi2007Error::Standstill`] where the law is singular.
@@ -299,7 +300,7 @@ impl ClosedLoop {
         Ok(0.5 * output.surface.norm_squared() + gap * gap / weight)
     }
 
-    /// Moves on by `dt_s`.
+    /// Advances the state by `dt_s` seconds.
     ///
     /// # Errors
     /// [`Yi2007Error::Standstill`] where the law is singular.

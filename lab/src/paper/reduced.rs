@@ -1,7 +1,7 @@
-//! The reduced model: constraint (18), dynamics (19) and (20), input transformation (21).
+//! Reduced model: constraint (18), dynamics (19) and (20), input transformation (21).
 //!
 //! `ẏ + Sφ̇ = 0` leaves the pseudo-velocities η = (ẋ, ẏ), and `φ̇ = −η₂/S`. As printed, without the
-//! Coriolis terms of (14): `η̇ = M_η Gᵀ(forces)`, which (21) turns into `η̇ = Kτ`.
+//! Coriolis terms of (14): `η̇ = M_η Gᵀ(forces)`, which (21) transforms to `η̇ = Kτ`.
 
 use nalgebra::{Matrix2, Vector2};
 use thiserror::Error;
@@ -14,10 +14,10 @@ use tread_control::slip::BodyVelocity;
 use crate::paper::Setting;
 use tread_control::robot::GRAVITY_M_S2;
 
-/// Determinant below which (21) is singular: standstill without turning.
+/// Magnitude of the determinant below which (21) counts as singular: standstill without turning.
 const DETERMINANT_MIN: f64 = 1.0e-9;
 
-/// Why the reduced model has no answer.
+/// Error of constructing or evaluating the reduced model.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum ReducedError {
     /// S is zero or not finite.
@@ -26,12 +26,12 @@ pub enum ReducedError {
     /// `E₁ + g₁ᵀe₂` cannot be inverted at this velocity.
     #[error("the transformation (21) is singular at this velocity")]
     Singular,
-    /// The inputs ask for wheels that stand, turn back, or turn without bound.
+    /// The inputs need a wheel that stands still, turns backwards, or turns infinitely fast.
     #[error("no forward wheel speed gives these inputs")]
     NoWheelSpeed,
 }
 
-/// The constrained robot.
+/// Robot with the constraint (18).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reduced {
     setting: Setting,
@@ -39,10 +39,10 @@ pub struct Reduced {
 }
 
 impl Reduced {
-    /// A robot whose turning centre is held at S ahead of its centre of mass.
+    /// Creates a robot whose turning centre is held S ahead of its centre of mass, metres.
     ///
     /// # Errors
-    /// [`ReducedError::Centre`] when S is zero or not finite.
+    /// [`ReducedError::Centre`] if S is zero or not finite.
     pub fn new(setting: Setting, centre_forward_m: f64) -> Result<Self, ReducedError> {
         if !centre_forward_m.is_finite() || centre_forward_m.abs() <= 0.0 {
             return Err(ReducedError::Centre(centre_forward_m));
@@ -53,12 +53,12 @@ impl Reduced {
         })
     }
 
-    /// S, metres.
+    /// Returns S, metres.
     pub fn centre_forward_m(&self) -> f64 {
         self.centre_forward_m
     }
 
-    /// (19a) in the body frame: all three speeds from η.
+    /// Returns all three speeds from η, (19a) in the body frame.
     pub fn velocity(&self, eta: Vector2<f64>) -> BodyVelocity {
         BodyVelocity {
             forward_m_s: eta[0],
@@ -67,14 +67,14 @@ impl Reduced {
         }
     }
 
-    /// Diagonal of `M_η⁻¹`: m and `m + I_G/S²`, kilograms.
+    /// Returns the diagonal of `M_η⁻¹`: m and `m + I_G/S²`, kilograms.
     fn masses_kg(&self) -> Vector2<f64> {
         let model = &self.setting.model;
         let turned_kg = model.yaw_inertia_kg_m2() / self.centre_forward_m.powi(2);
         Vector2::new(model.mass_kg(), model.mass_kg() + turned_kg)
     }
 
-    /// η̇ under forces on the body, (19b) as printed.
+    /// Returns η̇ under forces on the body, (19b) as printed, metres per second squared.
     pub fn rates(&self, force: &BodyForce) -> Vector2<f64> {
         let masses_kg = self.masses_kg();
         Vector2::new(
@@ -83,12 +83,12 @@ impl Reduced {
         )
     }
 
-    /// η̇ under forward wheel speeds, both ranges of slip, by the four-wheel sum.
+    /// Returns η̇ under forward wheel speeds, in both ranges of slip, by the four-wheel sum.
     pub fn rates_from_wheels(&self, eta: Vector2<f64>, wheels: WheelSpeeds) -> Vector2<f64> {
         self.rates(&four_wheel_sum(&self.velocity(eta), wheels, &self.setting))
     }
 
-    /// `E₁ + g₁ᵀe₂` of (20).
+    /// Returns `E₁ + g₁ᵀe₂` of (20).
     fn input_matrix(&self, eta: Vector2<f64>, shape: &SlipShape) -> Matrix2<f64> {
         let velocity = self.velocity(eta);
         let mut matrix = e_1(&velocity, shape, &self.setting);
@@ -98,7 +98,7 @@ impl Reduced {
         matrix
     }
 
-    /// The vector `[2σ_Σ, Wσ_Δ/S]` of (20) and (21); printed there as a fraction.
+    /// Returns the vector `[2σ_Σ, Wσ_Δ/S]` of (20) and (21); (21) prints it as a fraction.
     fn offset(&self, shape: &SlipShape) -> Vector2<f64> {
         let track_m = self.setting.model.track_width_m();
         Vector2::new(
@@ -107,7 +107,7 @@ impl Reduced {
         )
     }
 
-    /// (20): η̇ from the inputs v, metres per second squared.
+    /// Returns η̇ from the inputs v by (20), metres per second squared.
     pub fn rates_from_inputs(
         &self,
         eta: Vector2<f64>,
@@ -122,7 +122,7 @@ impl Reduced {
             .scale(scale_n)
     }
 
-    /// (21): the inputs v that make `η̇ = Kτ`.
+    /// Returns the inputs v that make `η̇ = Kτ`, (21).
     ///
     /// # Errors
     /// [`ReducedError::Singular`] near standstill.
@@ -142,10 +142,10 @@ impl Reduced {
         Ok(inverse * (wanted - self.offset(shape)))
     }
 
-    /// Wheel speeds of inputs v.
+    /// Returns the wheel speeds of inputs v.
     ///
     /// # Errors
-    /// [`ReducedError::NoWheelSpeed`] where a wheel would have to stand still or turn back.
+    /// [`ReducedError::NoWheelSpeed`] where a wheel would have to stand still or turn backwards.
     pub fn wheel_speeds(
         &self,
         inputs: Vector2<f64>,

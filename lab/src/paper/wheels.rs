@@ -1,9 +1,9 @@
-//! The four wheels, one by one: turning centres (4) to (6), forces (7) to (15).
+//! Forces of the four wheels, one by one: turning centres (4) to (6), forces (7) to (15).
 //!
-//! Wheels count as in the paper: left front, left rear, right front, right rear. Forces are signed
-//! (the paper writes magnitudes and `sgn(λ)`). The friction coefficient depends on the longitudinal
-//! slip alone, and `P_i = F_i tan θ_i` (10), so that the force opposes the slip *vector*. With (13)
-//! as printed the right side's lateral force would push with the slip.
+//! Wheels are numbered as in the paper: left front, left rear, right front, right rear. Forces are
+//! signed (the paper writes magnitudes and `sgn(λ)`). The friction coefficient depends on the
+//! longitudinal slip alone, and `P_i = F_i tan θ_i` (10), so that the force opposes the slip
+//! *vector*. With (13) as printed the right side's lateral force would push with the slip.
 
 use tread_control::friction::FrictionCurve;
 use tread_control::measured::WheelSpeeds;
@@ -12,17 +12,17 @@ use tread_control::slip::{BodyVelocity, SideSlips};
 
 use crate::paper::Setting;
 
-/// Turn rate below which the turning centres lie at infinity, radians per second.
+/// Turn rate below which the turning centres are at infinity, radians per second.
 const TURN_MIN_RAD_S: f64 = 1.0e-9;
 
-/// Forces on the body, and its accelerations as (1) means them.
+/// Forces and moment on the body, in the body frame.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct BodyForce {
-    /// ΣF, newtons forward.
+    /// ΣF, newtons, forward.
     pub longitudinal_n: f64,
-    /// ΣP, newtons to the left.
+    /// ΣP, newtons, to the left.
     pub left_n: f64,
-    /// `Σ(x_i P_i − y_i F_i)`, newton metres.
+    /// `Σ(x_i P_i − y_i F_i)`, newton metres, counter-clockwise positive.
     pub moment_n_m: f64,
 }
 
@@ -38,7 +38,8 @@ pub struct BodyRates {
 }
 
 impl BodyForce {
-    /// (14) with its Coriolis terms: `m(ẍ − ẏφ̇) = ΣF`, `m(ÿ + ẋφ̇) = ΣP`.
+    /// Returns the accelerations by (14) with its Coriolis terms: `m(ẍ − ẏφ̇) = ΣF`,
+    /// `m(ÿ + ẋφ̇) = ΣP`.
     pub fn rates(&self, velocity: &BodyVelocity, model: &RobotModel) -> BodyRates {
         BodyRates {
             forward_m_s2: self.longitudinal_n / model.mass_kg()
@@ -50,10 +51,10 @@ impl BodyForce {
     }
 }
 
-/// Turning centres of the contacts and of the body (4) to (6), body frame.
+/// Turning centres of the contacts and of the body (4) to (6), in the body frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TurningCentres {
-    /// S = −ẏ/φ̇, the x of all three, metres.
+    /// S = −ẏ/φ̇, the x coordinate of all three, metres.
     pub forward_m: f64,
     /// `y_l = (ẋ − rω₁)/φ̇`, metres.
     pub left_m: f64,
@@ -64,7 +65,7 @@ pub struct TurningCentres {
 }
 
 impl TurningCentres {
-    /// None when the body does not turn: the centres lie at infinity.
+    /// Computes the centres; None when the body does not turn, so that they are at infinity.
     pub fn of(velocity: &BodyVelocity, wheels: WheelSpeeds, model: &RobotModel) -> Option<Self> {
         let turn = velocity.yaw_rate_rad_s;
         (turn.abs() > TURN_MIN_RAD_S).then(|| Self {
@@ -76,15 +77,15 @@ impl TurningCentres {
     }
 }
 
-/// Force over load and slip, `(σ₁ + σ₂|λ|)/|λ|` times K: what multiplies the slip vector.
+/// Returns force over load and slip, `K(σ₁ + σ₂|λ|)/|λ|`, the factor of the slip vector.
 fn stiffness(curve: &FrictionCurve, slip: f64) -> f64 {
     curve.mu_over_slip(slip.abs())
 }
 
-/// Sum of the four wheels' forces, in both ranges of slip, regular at λ = 0.
+/// Returns the sum of the four wheels' forces, in both ranges of slip, regular at λ = 0.
 ///
-/// Wheels must turn forward. Slips beyond 1 slide as at 1 along the wheel; across it the force keeps
-/// the direction of the slip vector.
+/// Wheels must turn forward. Longitudinal slips beyond 1 act as 1; the lateral force keeps the
+/// direction of the slip vector.
 pub fn four_wheel_sum(
     velocity: &BodyVelocity,
     wheels: WheelSpeeds,
@@ -106,7 +107,7 @@ pub fn four_wheel_sum(
         for x_sign in [1.0, -1.0] {
             let x_m = x_sign * 0.5 * model.wheelbase_m();
             let left_m_s = velocity.left_m_s + velocity.yaw_rate_rad_s * x_m;
-            // F tan θ = F v_y/Δv_x, and Δv_x = −rω λ while the slip is not held at ±1.
+            // F tan θ = F v_y/Δv_x, and Δv_x = −rω λ while the slip is not clamped at ±1.
             let lateral_n = if slip.abs() < 1.0 {
                 -load_n * stiff * left_m_s / rim_m_s
             } else {
@@ -120,9 +121,10 @@ pub fn four_wheel_sum(
     sum
 }
 
-/// Lateral forces of the four wheels by (12) and (13), the latter with its sign corrected.
+/// Returns the lateral forces of the four wheels in newtons by (12) and (13), the latter with its
+/// sign corrected.
 ///
-/// None when the body does not turn, or a contact's turning centre lies on it.
+/// None when the body does not turn, or a turning centre is at its contact.
 pub fn lateral_forces_n(
     velocity: &BodyVelocity,
     wheels: WheelSpeeds,

@@ -22,6 +22,8 @@ pub struct RoughDrive {
     waiting: Feedback,
     simulated_to: Option<Duration>,
     steps_per_sample: u32,
+    /// The command of each sample so far.
+    commands: Vec<WheelSpeeds>,
 }
 
 impl RoughDrive {
@@ -46,7 +48,13 @@ impl RoughDrive {
             waiting: Feedback::default(),
             simulated_to: None,
             steps_per_sample,
+            commands: Vec::new(),
         })
+    }
+
+    /// The command of each sample so far.
+    pub fn commands(&self) -> &[WheelSpeeds] {
+        &self.commands
     }
 
     /// What it truly is and does.
@@ -63,6 +71,7 @@ impl SteppedDrive for RoughDrive {
         let mut at = from;
         while at + SAMPLE_PERIOD <= now {
             at += SAMPLE_PERIOD;
+            self.commands.push(self.command);
             let means = self.plant.advance(self.command, self.steps_per_sample);
             self.sensors
                 .sample(&self.plant.truth(), &means, at, &mut self.waiting);

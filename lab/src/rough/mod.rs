@@ -4,6 +4,7 @@
 //! have limits and gears, encoders count and positions come late. A robot is driven closed-loop by
 //! the agent's own control loop, configured as an integrator would: with the data sheet.
 
+pub mod bound;
 pub mod curve;
 pub mod drive;
 pub mod plant;

@@ -13,6 +13,7 @@ use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 
+use super::curve::{Curve, Shape};
 use super::spec::Deviations;
 
 /// Integration step, seconds: a hundredth of the fastest oscillation of a contact.
@@ -80,6 +81,15 @@ pub struct Means {
     pub torques: WheelTorques,
 }
 
+/// What turns the wheels in a step, left and right.
+#[derive(Debug, Clone, Copy)]
+enum WheelDrive {
+    /// The servo, towards these speeds, radians per second.
+    Servo([f64; 2]),
+    /// Whatever it takes to have these speeds at the step's end.
+    Given([f64; 2]),
+}
+
 /// A robot of the rough world.
 #[derive(Debug, Clone)]
 pub struct Plant {
@@ -102,6 +112,7 @@ pub struct Plant {
     motor_n_m: [f64; 2],
     /// How far the wheels have turned, radians.
     turned_rad: [f64; 2],
+    blend: Option<(Shape, f64)>,
 }
 
 impl Plant {
@@ -159,6 +170,7 @@ impl Plant {
             integral_n_m: [0.0; 2],
             motor_n_m: [0.0; 2],
             turned_rad: [0.0; 2],
+            blend: None,
             spec,
         };
         plant.bear(1.0);
@@ -242,6 +254,24 @@ impl Plant {
         }
     }
 
+    /// Follows a curve that is partly another one, for derivatives by the curve's shape: that share
+    /// of the friction is of the other.
+    #[must_use]
+    pub fn with_blend(mut self, shape: Shape, ratio: f64) -> Self {
+        self.blend = Some((shape, ratio));
+        self
+    }
+
+    /// Friction coefficient over slip.
+    fn mu_over_slip(&self, slip: f64, sliding_m_s: f64) -> f64 {
+        let curve = self.spec.curve;
+        let own = curve.mu_over_slip(slip, sliding_m_s);
+        self.blend.map_or(own, |(shape, share)| {
+            let other = Curve { shape, ..curve };
+            (1.0 - share) * own + share * other.mu_over_slip(slip, sliding_m_s)
+        })
+    }
+
     /// Torques of the motors for commanded wheel speeds.
     fn command(&mut self, command: [f64; 2]) {
         for (side, target_rad_s) in command.into_iter().enumerate() {
@@ -265,13 +295,13 @@ impl Plant {
     }
 
     /// Forces of the contacts on the body, forward and left each, newtons.
-    fn forces(&mut self) -> [[f64; 2]; 4] {
+    fn forces(&self) -> [[f64; 2]; 4] {
         let curve = self.spec.curve;
         let damping =
             2.0 * DAMPING_RATIO * (curve.stiffness * self.spec.relaxation_m / GRAVITY_M_S2).sqrt();
         self.contacts.map(|contact| {
             let slip = contact.deflection[0].hypot(contact.deflection[1]);
-            let mu_over_slip = curve.mu_over_slip(slip, contact.slip_m_s);
+            let mu_over_slip = self.mu_over_slip(slip, contact.slip_m_s);
             let rim_m_s = (self.wheels_rad_s[contact.side] * self.radius_m[contact.side]).abs();
             let damped =
                 damping * (1.0 - rim_m_s / DAMPED_BELOW_M_S).max(0.0) / self.spec.relaxation_m;
@@ -294,8 +324,10 @@ impl Plant {
         })
     }
 
-    fn step(&mut self, command: [f64; 2], sums: &mut Sums) {
-        self.command(command);
+    fn step(&mut self, drive: WheelDrive, sums: &mut Sums) {
+        if let WheelDrive::Servo(command) = drive {
+            self.command(command);
+        }
         let forces = self.forces();
         let (mut force, mut moment, mut side_n) = ([0.0; 2], 0.0, [0.0; 2]);
         let mut side_load_n = [0.0; 2];
@@ -330,8 +362,18 @@ impl Plant {
             let resistance =
                 self.spec.rolling_resistance_ratio * side_load_n[side] * radius_m * turns;
             let lost = self.spec.gear_loss_ratio * contact_n_m.abs() * turns;
-            let driving = self.motor_n_m[side] - contact_n_m - resistance - lost;
-            self.wheels_rad_s[side] += STEP_S * driving / self.side_inertia_kg_m2;
+            let taken = contact_n_m + resistance + lost;
+            match drive {
+                WheelDrive::Servo(_) => {
+                    let driving = self.motor_n_m[side] - taken;
+                    self.wheels_rad_s[side] += STEP_S * driving / self.side_inertia_kg_m2;
+                }
+                WheelDrive::Given(next) => {
+                    let rate = (next[side] - speed) / STEP_S;
+                    self.motor_n_m[side] = taken + self.side_inertia_kg_m2 * rate;
+                    self.wheels_rad_s[side] = next[side];
+                }
+            }
             self.turned_rad[side] += STEP_S * self.wheels_rad_s[side];
         }
         self.deflect();
@@ -373,10 +415,26 @@ impl Plant {
     /// Moves on by so many steps under commanded wheel speeds; means over that time.
     pub fn advance(&mut self, command: WheelSpeeds, steps: u32) -> Means {
         let mut sums = Sums::default();
+        let command = [command.left_rad_s, command.right_rad_s];
         for _ in 0..steps {
-            self.step([command.left_rad_s, command.right_rad_s], &mut sums);
+            self.step(WheelDrive::Servo(command), &mut sums);
         }
         sums.means()
+    }
+
+    /// Moves on by one step for each of these wheel speeds, left and right, which the wheels have at
+    /// its end; means over that time. The motors give whatever torque that takes.
+    pub fn advance_along(&mut self, wheels_rad_s: &[[f64; 2]]) -> Means {
+        let mut sums = Sums::default();
+        for next in wheels_rad_s {
+            self.step(WheelDrive::Given(*next), &mut sums);
+        }
+        sums.means()
+    }
+
+    /// Wheel speeds, left and right, radians per second.
+    pub fn wheels_rad_s(&self) -> [f64; 2] {
+        self.wheels_rad_s
     }
 }
 

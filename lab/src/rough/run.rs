@@ -11,6 +11,7 @@ use tread_api::trajectory::{
 use tread_control::estimation::EstimatorPrior;
 use tread_control::geometry::Pose;
 
+use super::bound::{BoundInput, bounds};
 use super::drive::RoughDrive;
 use super::sensors::SensorSpec;
 use super::spec::{Deviations, Make};
@@ -94,6 +95,8 @@ pub struct Trial {
     pub seed: u64,
     /// How the agent's estimator is configured for the robot and its tyres.
     pub prior: EstimatorPrior,
+    /// Whether to work out how well θ could be known; that takes about ten times as long.
+    pub is_bounded: bool,
 }
 
 /// What came of a drive.
@@ -101,6 +104,8 @@ pub struct Trial {
 pub struct Outcome {
     /// What the agent said of θ at [`ASKED_AT_S`].
     pub said: [Option<ThetaEstimate>; ASKED_AT_S.len()],
+    /// Lower bounds of the standard deviation of ln θ at those times, where they were asked for.
+    pub bounds: Option<[f64; ASKED_AT_S.len()]>,
     /// The true θ.
     pub truth: f64,
     /// Share of the time in which a contact slipped beyond half the slip of the peak.
@@ -127,18 +132,34 @@ pub fn run(trial: &Trial) -> anyhow::Result<Outcome> {
     bench.begin(1, &trial.course.trajectory(), None)?;
     let (mut ticks, mut beyond) = (0_u32, 0_u32);
     let mut said = [None; ASKED_AT_S.len()];
+    let mut at_samples = [0; ASKED_AT_S.len()];
     let mut driven_ticks = 0;
-    for (said, asked_at_s) in said.iter_mut().zip(ASKED_AT_S) {
+    for (index, asked_at_s) in ASKED_AT_S.into_iter().enumerate() {
         for _ in driven_ticks..asked_at_s * 100 {
             bench.tick();
             ticks += 1;
             beyond += u32::from(bench.drive().plant().slip_over_peak() > 0.5);
         }
         driven_ticks = asked_at_s * 100;
-        *said = bench.theta();
+        said[index] = bench.theta();
+        at_samples[index] = bench.drive().commands().len();
     }
+    let bounds = if trial.is_bounded {
+        let found = bounds(&BoundInput {
+            model: &model,
+            deviations: trial.deviations,
+            sensors: trial.sensors,
+            commands: bench.drive().commands(),
+            at_samples: &at_samples,
+        });
+        let found = found.and_then(|found| <[f64; ASKED_AT_S.len()]>::try_from(found).ok());
+        Some(found.ok_or_else(|| anyhow::anyhow!("no bound of seed {}", trial.seed))?)
+    } else {
+        None
+    };
     Ok(Outcome {
         said,
+        bounds,
         truth: trial.deviations.curve.theta(),
         beyond_half_peak: f64::from(beyond) / f64::from(ticks.max(1)),
     })

@@ -18,7 +18,7 @@ use crate::random::Random;
 /// Time between two samples of the fast sensors.
 pub const SAMPLE_PERIOD: Duration = Duration::from_millis(10);
 /// Time over which a position's slow error changes, seconds.
-const POSITION_WANDERS_S: f64 = 20.0;
+pub const POSITION_WANDERS_S: f64 = 20.0;
 /// How far an outlier is off, metres.
 const OUTLIER_M: f64 = 1.0;
 

@@ -89,6 +89,12 @@ pub(super) fn checked(
                 tyres.rotor_std_dev_ratio,
                 RATIO_RANGE,
             )?,
+            load_difference_std_dev: within(
+                "estimation.load_difference_std_dev",
+                file.load_difference_std_dev,
+                tyres.load_difference_std_dev,
+                RATIO_RANGE,
+            )?,
             ..tyres
         },
         model: ModelUncertainty {

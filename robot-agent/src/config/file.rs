@@ -6,7 +6,6 @@ use serde::Deserialize;
 use tread_api::ids::{OwnerId, RobotId, SiteId};
 use tread_api::robot::RobotModel;
 
-use super::ConfigError;
 use super::ros2::Ros2File;
 
 /// `robot.toml`.
@@ -41,6 +40,7 @@ pub(super) struct EstimationFile {
     pub(super) tyre_relaxation_std_dev_m: Option<f64>,
     pub(super) rotor_ratio: Option<f64>,
     pub(super) rotor_std_dev_ratio: Option<f64>,
+    pub(super) load_difference_std_dev: Option<f64>,
     pub(super) payload_ratio: Option<f64>,
 }
 
@@ -126,10 +126,7 @@ pub(super) struct DriveFile {
     pub(super) clock_ahead_s: Option<i64>,
 }
 
-/// Reads the text of a configuration; `file` is its name in errors.
-pub(super) fn parse(file: &str, text: &str) -> Result<FileConfig, ConfigError> {
-    toml::from_str(text).map_err(|refused| ConfigError::Malformed {
-        file: file.to_owned(),
-        problem: refused.to_string(),
-    })
+/// Reads the text of a configuration.
+pub(super) fn parse(text: &str) -> Result<FileConfig, toml::de::Error> {
+    toml::from_str(text)
 }

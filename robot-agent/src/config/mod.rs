@@ -109,7 +109,7 @@ pub struct Flags {
     /// The robot's identifier within its site
     #[arg(long)]
     pub robot: Option<RobotId>,
-    /// The server's zenoh endpoint [default: what `enroll` was told, or tcp/127.0.0.1:7447]
+    /// The server's zenoh endpoint [default: what `enroll` was given, or tcp/127.0.0.1:7447]
     #[arg(long)]
     pub server: Option<String>,
     /// Where measurements wait for the server
@@ -324,7 +324,10 @@ fn read_file(flags: &Flags) -> Result<FileConfig, ConfigError> {
         file: file.clone(),
         source,
     })?;
-    file::parse(&file, &text)
+    file::parse(&text).map_err(|refused| ConfigError::Malformed {
+        file,
+        problem: refused.to_string(),
+    })
 }
 
 /// `x,y,heading` of the simulated base.

@@ -19,15 +19,14 @@ use tread_control::measured::{Measured, WheelSpeeds};
 use tread_control::robot::RobotModel;
 use tread_control::tracking::ThetaKnowledge;
 
+use super::STANDING_TICKS;
 use super::channels::{EndReason, Job};
 use super::driven::TickRecord;
 use super::prior::Prior;
 use super::surface::Comparison;
 
-/// Speeds below which a held robot counts as standing, m/s and rad/s.
-const STANDING: f64 = 0.04;
-/// Ticks in a row that it must stand.
-const STANDING_TICKS: u32 = 5;
+/// Speed below which a held robot counts as standing, m/s; twice that in rad/s.
+const HELD_STANDING: f64 = 0.04;
 
 /// What a tick of a mission gives.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -39,10 +38,10 @@ pub(super) struct Step {
     /// It has just come to stand by a pause, or has just left that.
     pub(super) news: Option<News>,
     /// θ̂ of the tracking law.
-    pub(super) theta_loop: f64,
+    pub(super) theta_loop: Option<f64>,
 }
 
-/// A change that the server is told of.
+/// A change that is reported to the server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum News {
     Paused,
@@ -92,7 +91,7 @@ pub(super) struct Active {
     /// When the cause that is reported began to pause it, by the monotonic clock.
     paused_from: Option<Duration>,
     standing_ticks: u32,
-    /// Whether the server was told that it stands paused.
+    /// Whether the pause was reported to the server.
     is_pause_reported: bool,
     stopped_because: EndReason,
     /// The revision that takes over once the robot stands.
@@ -290,7 +289,7 @@ impl Active {
                 wanted: WheelSpeeds::default(),
                 end: None,
                 news,
-                theta_loop: f64::NAN,
+                theta_loop: None,
             };
         }
         self.job.follower.set_commanded(command);
@@ -313,16 +312,16 @@ impl Active {
             wanted: output.wheel_speeds,
             end,
             news,
-            theta_loop: output.theta_loop,
+            theta_loop: Some(output.theta_loop),
         }
     }
 
     fn note_standing(&mut self, measured: &Measured, model: &RobotModel, command: WheelSpeeds) {
         let command_m_s = command.magnitude_max_rad_s() * model.wheel_radius_m();
         let stands = self.is_on_hold()
-            && command_m_s < STANDING
-            && measured.twist.linear_m_s.abs() < STANDING
-            && measured.twist.angular_rad_s.abs() < 2.0 * STANDING;
+            && command_m_s < HELD_STANDING
+            && measured.twist.linear_m_s.abs() < HELD_STANDING
+            && measured.twist.angular_rad_s.abs() < 2.0 * HELD_STANDING;
         self.standing_ticks = if stands || self.stands_held() {
             self.standing_ticks.saturating_add(1)
         } else {

@@ -365,11 +365,11 @@ impl Shared {
         self.server_heard_us.fetch_max(now_us, Ordering::Relaxed);
     }
 
-    /// Makes the server as silent as a record says that it was.
-    pub(crate) fn show_server_silence(&self, now: Duration, silence: Duration) {
+    /// Replaces when the server was heard by what a record says.
+    pub(crate) fn replay_server_heard(&self, heard: Duration) {
         // Rounded up: what is kept in whole microseconds is met, and a server heard later than the
         // tick began stays silent for no time.
-        let heard_us = now.saturating_sub(silence).as_nanos().div_ceil(1_000);
+        let heard_us = heard.as_nanos().div_ceil(1_000);
         let heard_us = u64::try_from(heard_us).unwrap_or(u64::MAX);
         self.server_heard_us.store(heard_us, Ordering::Relaxed);
     }

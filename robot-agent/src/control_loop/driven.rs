@@ -298,7 +298,7 @@ fn distance_from_line_m(point: Point, from: Point, to: Point) -> f64 {
     })
 }
 
-/// By how much more than its tolerance a point is lost when only the ends of its stretch are told:
+/// By how much more than its tolerance a point is lost when only the ends of its stretch are kept:
 /// from the line through them, and from where even motion between them would have brought the
 /// robot at that time. Above 1 is too much.
 fn shortfall(passed: Passed, from: Passed, to: Passed) -> f64 {

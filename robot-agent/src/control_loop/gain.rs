@@ -13,7 +13,7 @@ pub(crate) struct GroundRecord {
     /// Whether the map knew this cell.
     pub(crate) is_on_the_map: bool,
     /// What the law was given.
-    pub(crate) told: Option<ThetaKnowledge>,
+    pub(crate) given: Option<ThetaKnowledge>,
     /// What the robot has measured by itself.
     pub(crate) measured: Option<ThetaKnowledge>,
 }
@@ -48,7 +48,7 @@ impl Gain {
         if ground.is_on_the_map {
             self.known_m += driven_m;
         }
-        if is_sure(ground.told) {
+        if is_sure(ground.given) {
             self.sure_s += dt_s;
         }
         if is_sure(ground.measured) {

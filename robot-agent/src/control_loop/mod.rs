@@ -30,12 +30,12 @@ use pace::Pace;
 use segments::Moment;
 use tick::LoopCore;
 
-/// Longest time from the word to stop until the loop ends, standing or not.
+/// Longest time that braking to rest may take; when the loop has to stop, it ends after it, standing or not.
 pub(crate) const BRAKING_MAX: Duration = Duration::from_secs(5);
 /// Standing ticks in a row that count as having stopped.
 const STANDING_TICKS: u32 = 5;
 
-/// Runs the loop until it is told to stop and the robot stands.
+/// Runs the loop until it is requested to stop and the robot stands.
 pub(crate) fn run(
     mut core: LoopCore,
     mut drive: Box<dyn Drive>,

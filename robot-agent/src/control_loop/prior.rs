@@ -87,8 +87,8 @@ impl Prior {
     }
 }
 
-/// Both words on the ground together; the robot's own alone where they contradict each other.
-pub(crate) fn told(
+/// Both estimates of the ground fused; the robot's own alone where they contradict each other.
+pub(crate) fn fused(
     measured: Option<ThetaKnowledge>,
     prior: Option<ThetaKnowledge>,
 ) -> Option<ThetaKnowledge> {
@@ -199,11 +199,11 @@ mod tests {
     #[test]
     fn both_words_count_and_a_contradicted_map_does_not() {
         let measured = knowledge(0.21, 0.02);
-        let both = told(Some(measured), Some(knowledge(0.19, 0.02))).unwrap();
+        let both = fused(Some(measured), Some(knowledge(0.19, 0.02))).unwrap();
         assert!((both.theta - 0.2).abs() < 1e-9 && both.std_dev < 0.02);
-        assert_eq!(told(None, Some(measured)), Some(measured));
-        assert_eq!(told(Some(measured), None), Some(measured));
+        assert_eq!(fused(None, Some(measured)), Some(measured));
+        assert_eq!(fused(Some(measured), None), Some(measured));
         let wrong = knowledge(1.4, 0.05);
-        assert_eq!(told(Some(measured), Some(wrong)), Some(measured));
+        assert_eq!(fused(Some(measured), Some(wrong)), Some(measured));
     }
 }

@@ -61,25 +61,28 @@ fn a_wrong_prior_never_comes_onto_the_map() {
         // The same bound as for a robot that was given nothing.
         assert!(
             (theta - truth).abs() / truth < 0.1 + 3.0 * std_dev / truth,
-            "told {wrong}: θ {theta} ± {std_dev}, truly {truth}"
+            "given {wrong}: θ {theta} ± {std_dev}, truly {truth}"
         );
-        assert!(bench.segments.len() >= 5, "told {wrong}");
+        assert!(bench.segments.len() >= 5, "given {wrong}");
     }
 }
 
 #[test]
-fn a_robot_that_was_told_knows_the_ground_from_the_first_metre() {
-    let told = |prior: Option<&PathPrior>| {
+fn a_robot_with_a_prior_knows_the_ground_from_the_first_metre() {
+    let estimate_with = |prior: Option<&PathPrior>| {
         let mut bench = knowing_bench(0.7, 4, prior);
         bench.start(1, LINE, None);
         bench.run_for(Duration::from_millis(300));
         bench.ends.shared.snapshot().theta_loop.unwrap()
     };
     let truth = 1.43;
-    let cold = told(None);
-    let warm = told(Some(&everywhere(truth, 0.1, 0.5)));
+    let cold = estimate_with(None);
+    let warm = estimate_with(Some(&everywhere(truth, 0.1, 0.5)));
     assert!((warm - truth).abs() < 0.1 * truth, "θ̂ {warm}");
-    assert!((cold - truth).abs() > 0.5 * truth, "θ̂ {cold} untold");
+    assert!(
+        (cold - truth).abs() > 0.5 * truth,
+        "θ̂ {cold} without a prior"
+    );
 }
 
 #[test]

@@ -15,7 +15,7 @@ use super::channels::EndReason;
 use super::tests::{CIRCLE, LINE, ORIGIN, bench_at, one_ground, site_of};
 use crate::drive::simulated::{Individual, SimMode, SimulatedDrive};
 use crate::sim::faults::{Channel, Fault, FaultKind};
-use crate::sim::scenario::Scenario;
+use crate::sim::scenario::{Scenario, ScenarioText};
 use crate::testing::{Bench, PERIOD};
 
 const SECOND: Duration = Duration::from_secs(1);
@@ -297,7 +297,11 @@ faults = [
   { after_s = 9.0, kind = "ignores_commands" },
 ]
 "#;
-    let scenario = Scenario::parse("bench", text).unwrap();
+    let scenario = Scenario::parse(ScenarioText {
+        file: "bench",
+        text,
+    })
+    .unwrap();
     let faults = &scenario.robots[0].faults;
     assert_eq!(faults.len(), 3);
     assert_eq!(
@@ -307,6 +311,11 @@ faults = [
         }
     );
     let unknown = text.replace("ignores_commands", "ignores_everything");
-    let refused = Scenario::parse("bench", &unknown).unwrap_err().to_string();
+    let refused = Scenario::parse(ScenarioText {
+        file: "bench",
+        text: &unknown,
+    })
+    .unwrap_err()
+    .to_string();
     assert!(refused.contains("ignores_everything"), "{refused}");
 }

@@ -16,7 +16,7 @@ const MEMORY_S: f64 = 0.5;
 const RIM_MIN_M_S: f64 = 0.05;
 
 /// Farthest that a rim's speed may be from its own mean of late, metres per second: what changes
-/// faster is not told.
+/// faster is not reported.
 const STEADY_M_S: f64 = 0.06;
 
 /// The slip of both sides, smoothed.

@@ -31,7 +31,7 @@ const MOVES_FOR: Duration = Duration::from_millis(300);
 /// Weakest braking that is expected, metres per second squared: half of what unknown ground gives.
 const BRAKING_M_S2: f64 = 0.7;
 /// Longest braking that is waited for.
-const BRAKING_MAX: Duration = Duration::from_secs(4);
+const EXPECTED_BRAKING_MAX: Duration = Duration::from_secs(4);
 /// Added to it: lag of the base, and ramps with a jerk limit.
 const MARGIN: Duration = Duration::from_millis(700);
 
@@ -109,7 +109,9 @@ impl StandingWatch {
         let (commanded_at, due) = *self.commanded.get_or_insert_with(|| {
             let speed_m_s = motion.speed_m_s().unwrap_or(0.0);
             let braking = Duration::try_from_secs_f64(speed_m_s / BRAKING_M_S2);
-            let braking = braking.map_or(BRAKING_MAX, |braking| braking.min(BRAKING_MAX));
+            let braking = braking.map_or(EXPECTED_BRAKING_MAX, |braking| {
+                braking.min(EXPECTED_BRAKING_MAX)
+            });
             (now, now + braking + MARGIN)
         });
         let Some(shown) = self.shown(motion) else {

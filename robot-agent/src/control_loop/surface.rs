@@ -187,8 +187,8 @@ mod tests {
             alarms += u32::from(comparison.contradicts());
         }
         let expected = f64::from(CELLS) * FALSE_ALARM_PROBABILITY;
-        // Four standard deviations of a count of that mean; the bias is told as a share of the
-        // map's word.
+        // Four standard deviations of a count of that mean; the bias is given as a share of the
+        // map's θ.
         assert!(alarms > 0, "an alarm that never comes tests nothing");
         assert!(
             f64::from(alarms) < expected + 4.0 * expected.sqrt(),

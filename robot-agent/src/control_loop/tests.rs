@@ -13,7 +13,7 @@ use tread_control::geometry::Pose;
 
 use super::channels::{EVENTS_MAX, EndReason, Fault, LoopCommand};
 use super::site_view::SiteView;
-use crate::sim::scenario::Scenario;
+use crate::sim::scenario::{Scenario, ScenarioText};
 use crate::testing::Bench;
 
 /// Longest simulated time of a test's mission.
@@ -72,7 +72,11 @@ polygon = [[-50.0, -50.0], [50.0, -50.0], [50.0, 50.0], [-50.0, 50.0]]
 stiffness = {stiffness}
 "#
     );
-    Scenario::parse("bench", &text).unwrap()
+    Scenario::parse(ScenarioText {
+        file: "bench",
+        text: &text,
+    })
+    .unwrap()
 }
 
 pub(super) const ORIGIN: Pose = Pose {

@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::channels::EndReason;
 use super::prior_tests::everywhere;
 use super::tests::{LINE, ORIGIN, bench_at, site_of};
-use crate::sim::scenario::Scenario;
+use crate::sim::scenario::{Scenario, ScenarioText};
 use crate::testing::Bench;
 
 const HIGH_MU: f64 = 0.3;
@@ -31,7 +31,11 @@ layer = 1
 stiffness = {strip}
 "#
     );
-    Scenario::parse("bench", &text).unwrap()
+    Scenario::parse(ScenarioText {
+        file: "bench",
+        text: &text,
+    })
+    .unwrap()
 }
 
 fn knowing(scenario: &Scenario, theta: f64, seed: u64) -> Bench {
@@ -43,7 +47,7 @@ fn knowing(scenario: &Scenario, theta: f64, seed: u64) -> Bench {
 }
 
 #[test]
-fn ground_that_is_not_as_the_map_says_is_told_while_it_is_so_and_no_longer() {
+fn ground_that_is_not_as_the_map_says_is_reported_while_it_is_so_and_no_longer() {
     for (strip, is_other) in [(0.7, true), (5.0, false)] {
         let mut bench = knowing(&floor_with_strip(5.0, strip, ""), 0.2, 6);
         bench.start(1, LINE, None);
@@ -63,7 +67,7 @@ fn ground_that_is_not_as_the_map_says_is_told_while_it_is_so_and_no_longer() {
         assert_eq!(bench.ended[0].1, EndReason::Reached);
         assert_eq!(seen > 0, is_other, "K {strip}");
         if is_other {
-            assert!(where_m < 5.5, "first told {where_m} m on");
+            assert!(where_m < 5.5, "first reported {where_m} m on");
             let left = bench.ends.shared.snapshot().surface_change;
             assert_eq!(left, None, "eight metres as expected end it");
         }
@@ -86,7 +90,7 @@ fn ground_that_is_not_as_the_map_says_is_told_while_it_is_so_and_no_longer() {
 }
 
 #[test]
-fn a_robot_that_was_told_nothing_reports_no_gain() {
+fn a_robot_without_a_prior_reports_no_gain() {
     let scenario = floor_with_strip(5.0, 5.0, "");
     let mut bench = bench_at(&scenario, ORIGIN, 7);
     bench.know_site(site_of(&scenario)).unwrap();
@@ -97,7 +101,7 @@ fn a_robot_that_was_told_nothing_reports_no_gain() {
 }
 
 #[test]
-fn wheels_that_turn_without_progress_are_told_until_they_take_the_robot_on() {
+fn wheels_that_turn_without_progress_are_reported_until_they_take_the_robot_on() {
     // No friction at all for a while, then a floor.
     let scenario = floor_with_strip(0.004, 0.004, "{ after_s = 9.0, stiffness = 5.0 }");
     let mut bench = bench_at(&scenario, ORIGIN, 8);

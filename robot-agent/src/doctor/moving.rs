@@ -354,7 +354,7 @@ mod tests {
     }
 
     #[test]
-    fn a_radius_is_told_from_the_distance_over_ground_with_the_line_that_mends_it() {
+    fn a_radius_is_reported_from_the_distance_over_ground_with_the_line_that_mends_it() {
         let [turned, mut forward] = healthy();
         let turned = Drove {
             turn_rad_s: turned.turn_rad_s.map(|rate| 1.25 * rate),

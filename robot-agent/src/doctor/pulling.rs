@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plausible_torque_is_told_with_friction_and_mass() {
+    fn a_plausible_torque_is_reported_with_friction_and_mass() {
         let well = found(Effort::Torque, 0.5, [1.0, 1.0]).unwrap();
         assert!(well.holds);
         assert!(well.text.contains("0.50 to 0.50"), "{}", well.text);
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn a_torque_constant_ten_times_off_is_told_with_the_one_that_fits() {
+    fn a_torque_constant_ten_times_off_is_reported_with_the_one_that_fits() {
         let constant = Effort::Current(0.5);
         let of_constant = Some("drive.ros2.joints.torque_constant_n_m_a");
         for (factor, fits) in [(10.0, "0.050 N·m/A"), (0.1, "5.000 N·m/A")] {

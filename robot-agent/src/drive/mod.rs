@@ -159,7 +159,7 @@ pub trait Drive: Send {
         SILENT_AFTER_MAX
     }
 
-    /// Whether the base itself is told to rest, for it is not heard.
+    /// Whether the base itself is commanded to rest, because no message of it arrives.
     fn is_silent(&self) -> bool {
         false
     }

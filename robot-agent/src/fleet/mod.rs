@@ -77,7 +77,7 @@ pub enum Noted {
     Distrusted,
 }
 
-/// Who is told of what the link notices; must not wait.
+/// Callback for what the link notices; must not wait.
 pub type Note = Arc<dyn Fn(Noted) + Send + Sync>;
 
 /// What must not wait in any queue, as it came.
@@ -97,7 +97,7 @@ pub type TakeUrgent = Arc<dyn Fn(Urgent<'_>) + Send + Sync>;
 /// Who hears what comes in besides commands.
 #[derive(Clone)]
 pub struct Listeners {
-    /// Is told of what the link notices.
+    /// Takes what the link notices.
     pub note: Note,
     /// Takes what must not wait.
     pub urgent: TakeUrgent,
@@ -148,7 +148,7 @@ fn open(config: &zenoh::Config, given_up: &CancellationToken) -> Option<zenoh::S
 }
 
 /// Opens a session on a thread of its own, which can be left behind: opening blocks until the
-/// server is there. `None` once told to stop.
+/// server is there. `None` once requested to stop.
 async fn open_session(
     config: zenoh::Config,
     stop: &CancellationToken,
@@ -190,7 +190,7 @@ pub fn check_endpoint(server: &str) -> Result<(), LinkError> {
 }
 
 impl FleetLink {
-    /// Connects, however long that takes, and declares everything; `None` once told to stop.
+    /// Connects, however long that takes, and declares everything; `None` once requested to stop.
     /// Dropped before it is done, it leaves nothing behind for long.
     ///
     /// # Errors

@@ -5,6 +5,7 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use tread_api::ids::BootId;
+use tread_api::wire::{BATCH_BYTES, SESSION_LEASE_MS};
 
 use super::{LinkError, zenoh_failed};
 
@@ -18,14 +19,10 @@ const RETRY_MAX_MS: u32 = 300;
 const OPEN_TIMEOUT_MS: u32 = 2_500;
 /// Longest row of tries to connect before the configuration is looked at again, milliseconds.
 const CONNECT_TIMEOUT_MS: u32 = 5_000;
-/// After this silence the router takes a robot for gone, milliseconds.
-const LEASE_MS: u32 = 3_000;
 /// Send buffer of the kernel, bytes.
 const SEND_BUFFER_BYTES: u32 = 32_768;
 /// Send buffer of the kernel towards the tunnel, bytes; another one follows it.
 const TUNNEL_SEND_BUFFER_BYTES: u32 = 4 * 1024;
-/// Largest batch that zenoh hands to the kernel at once, bytes.
-const BATCH_BYTES: u16 = 8_192;
 
 /// Longest pause before an agent first looks for its server.
 const START_JITTER_MAX: Duration = Duration::from_millis(300);
@@ -115,7 +112,7 @@ pub fn session_config(server: &str) -> Result<zenoh::Config, LinkError> {
         ("listen/endpoints", "[]".to_owned()),
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
-        ("transport/link/tx/lease", LEASE_MS.to_string()),
+        ("transport/link/tx/lease", SESSION_LEASE_MS.to_string()),
         ("transport/link/tx/batch_size", BATCH_BYTES.to_string()),
         (
             "transport/unicast/open_timeout",

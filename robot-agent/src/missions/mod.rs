@@ -36,7 +36,7 @@ pub struct ActiveMission {
     pub plan_hash: PlanHash,
     /// What was planned.
     pub plan: PlanSummary,
-    /// Whether the server was told that it is cancelled; then it ends as that and nothing else.
+    /// Whether its cancellation was reported to the server; then it ends as that and nothing else.
     #[serde(default)]
     pub is_cancelled: bool,
 }

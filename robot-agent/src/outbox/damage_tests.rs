@@ -11,7 +11,7 @@ use tempfile::TempDir;
 
 use super::OutboxDamage;
 use super::frame::{self, Frame};
-use super::store::Store;
+use super::store::{Settled, Store};
 use super::tests::{SMALL, boot, contents, fast_folder, log_files, open, report, sync};
 
 /// What happens to the bytes of one file; places are shares of its length.
@@ -82,7 +82,10 @@ fn filled(folder: &Path, sizes: &[usize], settled: f64) -> Vec<(u64, Vec<u8>)> {
     }
     let waiting = contents(&store);
     if let Some(last) = place(settled, waiting.len()).checked_sub(1) {
-        store.settle(waiting[last].0, 0);
+        store.settle(Settled {
+            through_ordinal: waiting[last].0,
+            refused: 0,
+        });
     }
     sync(&mut store);
     contents(&store)

@@ -32,8 +32,8 @@ use tread_api::wire::ingest::{BATCH_RECORDS_MAX, Batch, Receipt, Record, RecordC
 
 use dead_letters::DeadLetters;
 pub use frame::CONTENT_BYTES_MAX;
-use store::Store;
 pub use store::{Limits, StoreError};
+use store::{Settled, Store};
 
 /// Longest time that an appended record waits for the disk to have it.
 pub const SYNC_DELAY: Duration = Duration::from_millis(100);
@@ -202,7 +202,10 @@ impl Outbox {
                 // Written by another version of the agent: moved to the dead letters, so that the head moves on.
                 let text = String::from_utf8_lossy(&content);
                 self.dead_letter(name.boot, name.seq, &cause, &text)?;
-                locked(&self.shared.store).settle(name.ordinal, 1);
+                locked(&self.shared.store).settle(Settled {
+                    through_ordinal: name.ordinal,
+                    refused: 1,
+                });
                 continue;
             }
             let batch = Batch {
@@ -237,7 +240,10 @@ impl Outbox {
             self.dead_letter(sent.batch.boot, record.seq, &refusal.reason, &content)?;
             refused += 1;
         }
-        locked(&self.shared.store).settle(sent.through_ordinal, refused);
+        locked(&self.shared.store).settle(Settled {
+            through_ordinal: sent.through_ordinal,
+            refused,
+        });
         self.shared.unsynced.notify_one();
         Ok(())
     }
@@ -296,7 +302,7 @@ impl Outbox {
         Ok(locked(&self.shared.store).finish_sync(&ticket)?)
     }
 
-    /// Syncs soon after each change, until told to stop; then once more.
+    /// Syncs soon after each change, until requested to stop; then once more.
     pub async fn keep_synced(self, stop: CancellationToken) {
         while !stop.is_cancelled() {
             tokio::select! {

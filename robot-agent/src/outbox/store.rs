@@ -110,6 +110,15 @@ pub(super) struct Store {
     has_damage: bool,
 }
 
+/// What a receipt settles.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Settled {
+    /// Ordinal of the last record of it.
+    pub(super) through_ordinal: u64,
+    /// How many of the records were refused.
+    pub(super) refused: u64,
+}
+
 /// Files to sync without holding the store, and the head that is safe once that is done.
 #[derive(Debug)]
 pub(super) struct SyncTicket {
@@ -382,8 +391,12 @@ impl Store {
         })
     }
 
-    /// Everything up to this ordinal is settled, `refused` of it by refusal.
-    pub(super) fn settle(&mut self, through_ordinal: u64, refused: u64) {
+    /// Removes what is settled.
+    pub(super) fn settle(&mut self, settled: Settled) {
+        let Settled {
+            through_ordinal,
+            refused,
+        } = settled;
         while self
             .pending
             .front()

@@ -13,7 +13,7 @@ use uuid::Uuid;
 
 use super::frame::Head;
 use super::recovery::Recovery;
-use super::store::Store;
+use super::store::{Settled, Store};
 use super::*;
 
 #[derive(Debug, Clone)]
@@ -175,8 +175,8 @@ proptest! {
                     #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "at most 25")]
                     let count = (model.pending.len() as f64 * share) as usize;
                     if let Some(last) = count.checked_sub(1) {
-                        let through = model.pending[last].0;
-                        store.settle(through, 0);
+                        let through_ordinal = model.pending[last].0;
+                        store.settle(Settled { through_ordinal, refused: 0 });
                         model.pending.drain(..count);
                     }
                 }

@@ -27,8 +27,8 @@ use crate::drive::{Battery, Drive, Feedback, StatedNoise};
 use crate::geometry::control_model;
 use crate::safety::LoopView;
 
-/// Differing ticks that are told one by one.
-pub(crate) const TOLD_MAX: usize = 10;
+/// Differing ticks that are reported one by one.
+pub(crate) const REPORTED_MAX: usize = 10;
 
 /// Why a record could not be run again to its end.
 #[derive(Debug, thiserror::Error)]
@@ -71,7 +71,7 @@ pub(crate) struct Replayed {
     /// Ticks of them that went otherwise.
     pub(crate) differing: u64,
     /// The first of those.
-    pub(crate) told: Vec<DifferingTick>,
+    pub(crate) first_differing: Vec<DifferingTick>,
     /// What is missing from the record, so that nothing behind it could be run again.
     pub(crate) gap: Option<String>,
     /// Where the record is torn; nothing is missing before.
@@ -181,7 +181,7 @@ impl Player {
                 lasting: Duration::ZERO,
                 driving_ticks: 0,
                 differing: 0,
-                told: Vec::new(),
+                first_differing: Vec::new(),
                 gap: None,
                 torn: None,
             },
@@ -235,7 +235,7 @@ impl Player {
         let shared = &self.ends.shared;
         shared.safety.show(recorded.stop, &self.view);
         let silence = Duration::from_nanos(recorded.server_silence_ns);
-        shared.show_server_silence(now.monotonic, silence);
+        shared.replay_server_heard(now.monotonic.saturating_sub(silence));
         let judged = Duration::from_nanos(recorded.judged_ns);
         let stop = has(tick_bits::STOP_REQUESTED);
         self.core.tick_by(now, &|| judged, stop, &mut base);
@@ -288,10 +288,10 @@ impl Player {
             return;
         }
         self.found.differing += 1;
-        if self.found.told.len() < TOLD_MAX {
+        if self.found.first_differing.len() < REPORTED_MAX {
             let since = Duration::from_nanos(recorded.monotonic_ns);
             let after = since.saturating_sub(self.began.unwrap_or(since));
-            self.found.told.push(DifferingTick {
+            self.found.first_differing.push(DifferingTick {
                 tick: recorded.number,
                 after_s: after.as_secs_f64(),
                 differences: codec::differences(recorded, &replayed),

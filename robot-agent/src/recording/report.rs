@@ -69,7 +69,7 @@ pub(crate) fn holds(found: &Replayed) -> bool {
     checks(found).iter().all(|(_, _, _, holds)| *holds)
 }
 
-fn told(tick: &DifferingTick) -> Value {
+fn tick_json(tick: &DifferingTick) -> Value {
     let differences: Vec<Value> = tick
         .differences
         .iter()
@@ -93,7 +93,7 @@ pub(crate) fn object(found: &Replayed) -> Value {
         "driving_ticks": found.driving_ticks,
         "torn": found.torn,
         "gap": found.gap,
-        "differing": found.told.iter().map(told).collect::<Vec<_>>(),
+        "differing": found.first_differing.iter().map(tick_json).collect::<Vec<_>>(),
         "checks": checks,
     })
 }
@@ -129,7 +129,7 @@ pub(crate) fn text(found: &Replayed) -> String {
         ));
     }
     lines.extend(found.gap.clone());
-    for tick in &found.told {
+    for tick in &found.first_differing {
         lines.push(format!(
             "tick {} after {:.3} s differs:",
             tick.tick, tick.after_s

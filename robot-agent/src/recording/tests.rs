@@ -356,9 +356,9 @@ fn a_record_with_one_input_changed_by_a_millionth_differs_from_there_on() {
     let found = replayed(&changed);
     assert!(!report::holds(&found));
     assert!(
-        found.told[0].tick >= 300 && found.told[0].tick < 310,
+        found.first_differing[0].tick >= 300 && found.first_differing[0].tick < 310,
         "{:?}",
-        found.told[0]
+        found.first_differing[0]
     );
     assert!(found.differing > 50, "{}", found.differing);
     let text = report::text(&found);
@@ -366,7 +366,7 @@ fn a_record_with_one_input_changed_by_a_millionth_differs_from_there_on() {
 }
 
 #[test]
-fn a_changed_output_is_told_with_both_figures() {
+fn a_changed_output_is_reported_with_both_figures() {
     let folder = TempDir::new().unwrap();
     let file = short(folder.path());
     let changed = with_tick(&file, 250, |tick, into| {
@@ -378,9 +378,9 @@ fn a_changed_output_is_told_with_both_figures() {
         true
     });
     let found = replayed(&changed);
-    assert_eq!((found.differing, found.told[0].tick), (1, 250));
-    let [difference] = &found.told[0].differences[..] else {
-        panic!("{:?}", found.told[0]);
+    assert_eq!((found.differing, found.first_differing[0].tick), (1, 250));
+    let [difference] = &found.first_differing[0].differences[..] else {
+        panic!("{:?}", found.first_differing[0]);
     };
     assert_eq!(difference.name, "command left, rad/s");
     assert_eq!(difference.recorded.to_bits(), 77.5_f64.to_bits());

@@ -10,7 +10,7 @@ use tread_control::robot::RobotModel;
 use super::tests::{Teleoperator, limit};
 use crate::control_loop::channels::EndReason;
 use crate::drive::SensorSample;
-use crate::sim::scenario::Scenario;
+use crate::sim::scenario::{Scenario, ScenarioText};
 use crate::testing::{Bench, PERIOD, site_of};
 
 const START: Pose = Pose {
@@ -45,7 +45,11 @@ stiffness = {stiffness}
 "#
         );
     }
-    Scenario::parse("bench", &text).unwrap()
+    Scenario::parse(ScenarioText {
+        file: "bench",
+        text: &text,
+    })
+    .unwrap()
 }
 
 fn bench(seed: u64) -> Bench {

@@ -347,7 +347,7 @@ mod tests {
         let refused = operator.acquire(&acquire(2, 1), 0);
         assert_eq!(refused, Err(LeaseRefusal::Taken(driver(0))));
         assert_eq!(operator.acquire(&take(3, 1), 0), Ok(2));
-        // The first one's request comes twice; it must not steal the lease back, nor be told that
+        // The first one's request comes twice; it must not steal the lease back, nor get an answer that
         // it has it.
         let again = operator.acquire(&acquire(1, 0), 0);
         assert_eq!(again, Err(LeaseRefusal::Over));

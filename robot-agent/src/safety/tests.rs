@@ -211,7 +211,7 @@ fn a_stop_zeroes_the_target_in_the_next_tick_and_nothing_starts_by_itself_after_
     bench.run_for(SECOND);
     assert_eq!(paused_by(&bench), Some(PauseCause::Stop));
     assert_eq!(bench.news, [MissionPhase::Paused]);
-    // It had to brake first; the stop's own time is what is told.
+    // It had to brake first; the stop's own time is what is reported.
     let paused_for = bench.paused_for.unwrap();
     assert!(paused_for.as_millis() >= 100, "{paused_for:?}");
     assert!(paused_for.as_secs() < 5, "{paused_for:?}");
@@ -494,7 +494,7 @@ fn a_command_that_is_about_to_end_does_not_speed_the_robot_up() {
 }
 
 #[test]
-fn a_base_that_is_told_nothing_more_stops_its_wheels() {
+fn a_base_without_commands_stops_its_wheels() {
     let (mut bench, _) = driving();
     // The agent is gone: nobody reads, nobody writes.
     let gone_at = bench.now;

@@ -88,7 +88,7 @@ impl TickWatch {
     }
 }
 
-/// Watches until the loop is told to stop, or returns early when it stands still.
+/// Watches until the loop is requested to stop, or returns early when it stands still.
 pub(crate) fn run(shared: &Arc<Shared>, clock: &SharedClock) {
     let mut watch = TickWatch::new(clock.monotonic());
     while !shared.stop.load(Ordering::Relaxed) {

@@ -105,6 +105,7 @@ impl GroundMap {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sim::scenario::ScenarioText;
 
     #[test]
     fn each_side_stands_on_its_own_ground_as_it_is_then() {
@@ -127,7 +128,7 @@ layer = 1
 stiffness = 0.5
 then = [{ after_s = 10.0, stiffness = 0.1 }, { after_s = 20.0, stiffness = 3.0 }]
 "#;
-        let scenario = Scenario::parse("t", text).unwrap();
+        let scenario = Scenario::parse(ScenarioText { file: "t", text }).unwrap();
         let map = GroundMap::new(&scenario, 1.0).unwrap();
         let stiffness_at = |x_m: f64, y_m: f64, at_s: u64| {
             let ground = map.under(

@@ -54,6 +54,15 @@ pub enum ScenarioError {
     },
 }
 
+/// The text of a scenario, and where it is from.
+#[derive(Debug, Clone, Copy)]
+pub struct ScenarioText<'text> {
+    /// The file's name in errors.
+    pub file: &'text str,
+    /// What is read.
+    pub text: &'text str,
+}
+
 /// A site as it truly is.
 #[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
@@ -250,7 +259,10 @@ impl Scenario {
     /// # Errors
     /// Never for the file in this repository; a test holds it to that.
     pub fn built_in() -> Result<Self, ScenarioError> {
-        Self::parse(BUILT_IN_NAME, BUILT_IN)
+        Self::parse(ScenarioText {
+            file: BUILT_IN_NAME,
+            text: BUILT_IN,
+        })
     }
 
     /// Reads a scenario file.
@@ -267,14 +279,17 @@ impl Scenario {
             return Err(ScenarioError::TooLarge { file });
         }
         let text = std::fs::read_to_string(path).map_err(unreadable)?;
-        Self::parse(&file, &text)
+        Self::parse(ScenarioText {
+            file: &file,
+            text: &text,
+        })
     }
 
-    /// Reads a scenario; `file` is its name in errors.
+    /// Reads a scenario.
     ///
     /// # Errors
     /// [`ScenarioError::Malformed`] names line and key.
-    pub fn parse(file: &str, text: &str) -> Result<Self, ScenarioError> {
+    pub fn parse(ScenarioText { file, text }: ScenarioText<'_>) -> Result<Self, ScenarioError> {
         let malformed = |problem: String| ScenarioError::Malformed {
             file: file.to_owned(),
             problem,

@@ -13,7 +13,7 @@ pub struct TruthSample {
     pub at: Duration,
     /// The true state of the base.
     pub state: PlantState,
-    /// What its wheels were told.
+    /// What its wheels were commanded.
     pub command: WheelSpeeds,
     /// True θ under its middle, with its own tyres.
     pub theta: f64,

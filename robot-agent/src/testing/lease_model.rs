@@ -1,4 +1,4 @@
-//! Random drivers on a random network, against a model that is told what was sent.
+//! Random drivers on a random network, against a model that knows what was sent.
 //!
 //! Messages are lost, delayed, doubled and reordered; drivers come, take, go silent and come back;
 //! old runs and old leases speak. The model knows from the messages alone which commands count.
@@ -49,8 +49,17 @@ pub struct LeaseModelReport {
     pub counts: DriveCounts,
 }
 
+/// What the model runs.
+#[derive(Debug, Clone, Copy)]
+pub struct LeaseModelRun {
+    /// Steps of its world.
+    pub steps: u64,
+    /// Seed of its random numbers.
+    pub seed: u64,
+}
+
 /// Runs the model.
-pub fn run(steps: u64, seed: u64) -> LeaseModelReport {
+pub fn run(LeaseModelRun { steps, seed }: LeaseModelRun) -> LeaseModelReport {
     let mut world = World::new(seed);
     for _ in 0..steps {
         world.step();
@@ -76,7 +85,7 @@ struct Side {
     seq: u64,
 }
 
-/// What must hold, told from the messages alone.
+/// What must hold, by the messages alone.
 #[derive(Debug, Default)]
 struct Truth {
     /// Who was given which epoch.
@@ -314,7 +323,10 @@ mod tests {
 
     #[test]
     fn no_stale_expired_old_or_foreign_command_is_ever_taken_and_no_good_one_refused() {
-        let report = run(100_000, 5);
+        let report = run(LeaseModelRun {
+            steps: 100_000,
+            seed: 5,
+        });
         assert_eq!(report.wrongly_accepted, 0, "{report:?}");
         assert_eq!(report.wrongly_refused, 0, "{report:?}");
         assert_eq!((report.outlived, report.stolen), (0, 0), "{report:?}");

@@ -80,7 +80,7 @@ impl<T> From<SendError<T>> for BenchError {
     }
 }
 
-/// A base whose time passes when it is told.
+/// A base whose time passes by explicit steps.
 pub trait SteppedDrive: Drive {
     /// Moves the base on to `now`.
     fn advance(&mut self, now: Duration);
@@ -465,7 +465,7 @@ impl<D: SteppedDrive> Bench<D> {
         self.now
     }
 
-    /// The robot's clock, as end times are told, microseconds.
+    /// The robot's clock, on which end times are, microseconds.
     pub fn now_us(&self) -> u64 {
         microseconds(self.now)
     }
@@ -536,7 +536,7 @@ impl<D: SteppedDrive> Bench<D> {
         self.collect();
     }
 
-    /// A tick in which the base goes on as it is told, but is not heard.
+    /// A tick in which the base follows its command, but sends no message.
     pub fn tick_unheard(&mut self) {
         self.simulate();
         let now = self.moment();
@@ -555,7 +555,7 @@ impl<D: SteppedDrive> Bench<D> {
         self.collect();
     }
 
-    /// A tick of a base that moves as it is told, and whose sensors say this and nothing else.
+    /// A tick of a base that follows its command, and whose sensors say this and nothing else.
     #[cfg(test)]
     pub(crate) fn tick_frozen(&mut self, said: SensorSample) {
         self.simulate();

@@ -102,7 +102,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn moments_before_the_epoch_and_beyond_the_last_are_told() {
+    fn moments_before_the_epoch_convert_and_those_beyond_the_last_are_clamped() {
         let before = Time::from_nanoseconds(-1);
         assert_eq!((before.sec, before.nanosec), (-1, 999_999_999));
         assert_eq!(before.nanoseconds(), Some(-1));

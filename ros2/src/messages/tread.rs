@@ -33,7 +33,7 @@ pub mod sample_bits {
 
 /// What is there, or true, of a [`LoopTick`].
 pub mod tick_bits {
-    /// The agent was told to stop.
+    /// The agent was requested to stop.
     pub const STOP_REQUESTED: u32 = 1;
     /// The drive itself took the base for silent.
     pub const BASE_SILENT: u32 = 1 << 1;

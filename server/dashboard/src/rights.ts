@@ -18,10 +18,10 @@ const ofRole = { viewer: ['stop', 'read'], operator: everything.slice(0, -1), ad
 
 /** What a session may do, each with where. */
 function grantsOf(session: Session): readonly Grant[] {
-  const told: readonly Grant[] | undefined = session.grants;
+  const stated: readonly Grant[] | undefined = session.grants;
   const rights: readonly Right[] | undefined = session.rights;
   const ofAll = () => rights ?? (session.role ? ofRole[session.role] : []);
-  return told ?? [{ rights: [...ofAll()], sites: session.sites }];
+  return stated ?? [{ rights: [...ofAll()], sites: session.sites }];
 }
 
 /** What a session may do somewhere. */

@@ -157,9 +157,9 @@ export const texts = {
     allOf: (site: string) => `Stop all of ${site}`,
     region: 'Stop',
     sending: (robot: string) => `${robot}: stop is being sent …`,
-    unconfirmed: (robot: string) => `${robot} has NOT confirmed its stop. It is told again until it does.`,
+    unconfirmed: (robot: string) => `${robot} has NOT confirmed its stop. The stop is sent again until it does.`,
     failed: (robot: string) =>
-      `${robot} may not have been told to stop: the server does not answer. Use the switch on the robot.`,
+      `${robot} may not have got the stop: the server does not answer. Use the switch on the robot.`,
     refused: (robot: string, why: string) => `${robot} was not stopped. ${why}`,
     stopping: (robot: string) => `${robot} is stopping: its wheels are commanded to rest`,
     confirmed: (robot: string) => `${robot} is stopped and stands`,

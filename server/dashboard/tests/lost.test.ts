@@ -24,7 +24,7 @@ test('a lost server is said, what was drawn is kept, and everything goes on when
   await page.getByRole('button', { name: 'Send', exact: true }).click();
   await page.getByText('The server does not answer; what you entered is kept.').waitFor();
   await page.getByRole('button', { name: 'Stop rover-1' }).click();
-  await page.getByText(/rover-1 may not have been told to stop/).waitFor();
+  await page.getByText(/rover-1 may not have got the stop/).waitFor();
   // Nothing that was so is shown as if it were.
   await page.locator('.head .warn', { hasText: /^last known · / }).waitFor();
   await shot(page, 'lost');
@@ -58,7 +58,7 @@ test('after a long time without the server the page goes on by itself, and the s
   wire.end();
 });
 
-test('a driver whose line is cut is told, and the robot stands', async () => {
+test('a driver whose line is cut is notified, and the robot stands', async () => {
   const wire = await line();
   const page = await open({ address: wire.address, expected: CUT });
   await select(page, 'rover-3');

@@ -27,6 +27,7 @@ use self::sent::unnumbered;
 pub use self::sent::{EventFilter, Sent};
 use self::snapshot::Reading;
 pub use self::snapshot::SNAPSHOT_BYTES_MAX;
+use super::enrolment::FLEET_ROBOTS_MAX;
 use super::identity::Credential;
 use super::shares::{Bounds, Place};
 use super::{App, AppError};
@@ -45,8 +46,8 @@ pub(super) const SHARES: Bounds = Bounds {
     viewers: CLIENTS_MAX - CLIENTS_AT_WORK,
     each: CLIENTS_PER_IDENTITY_MAX,
 };
-/// Robots of one server in a snapshot.
-const ROBOTS_MAX: u32 = 10_000;
+/// Most raised alerts in a snapshot.
+const ALERTS_MAX: u32 = 10_000;
 
 /// A client's end of its buffer; dropping it ends the subscription.
 #[derive(Debug)]
@@ -195,7 +196,7 @@ impl App {
         if filter.robots.is_empty() {
             return Ok(None);
         }
-        let rows = db::robots::all(&mut tx, ROBOTS_MAX).await?;
+        let rows = db::robots::all(&mut tx, FLEET_ROBOTS_MAX).await?;
         let of_site = |row: &&RobotRow| {
             let is_site = filter.site.as_ref().is_none_or(|site| *site == row.site);
             is_site && filter.within.includes_robot(&row.site, &row.id)

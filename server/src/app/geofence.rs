@@ -7,12 +7,10 @@ use tread_control::fence::{Fence, FencePolygon, disc_radius_m};
 use tread_control::geometry as control;
 
 use super::check::{control_fence, control_model};
+use super::enrolment::FLEET_ROBOTS_MAX;
 use super::{App, AppError, site_row};
 use crate::db;
 use crate::db::robots::RobotRow;
-
-/// Most robots whose place is looked at.
-const ROBOTS_MAX: u32 = 10_000;
 
 impl App {
     /// A site's geofence.
@@ -54,7 +52,7 @@ impl App {
             detail: invalid.to_string(),
         })?;
         let fence = control_fence(&geofence);
-        for row in db::robots::list(&mut tx, (site_pk, None), "", false, ROBOTS_MAX).await? {
+        for row in db::robots::list(&mut tx, (site_pk, None), "", false, FLEET_ROBOTS_MAX).await? {
             let presence = self.presences().get(&(site.clone(), row.id.clone()));
             let Some(pose) = presence.state().and_then(|state| state.pose) else {
                 continue;

@@ -173,7 +173,7 @@ impl App {
             run_id,
             started_at,
             normalisations: normalisations.into_iter().map(Arc::new).collect(),
-            map_readers: Semaphore::new(friction::READERS_MAX),
+            map_readers: Semaphore::new(friction::MAP_READERS_MAX),
             pictures: Pictures::default(),
             views: Views::default(),
             news: MapNews::default(),

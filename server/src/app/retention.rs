@@ -16,13 +16,12 @@ use super::map::MapChange;
 use super::{App, AppError};
 use crate::config::RetentionConfig;
 use crate::db;
+use crate::friction::sums::DAY_H;
 
 /// How often the server looks for what is over its time.
 const LOOK_EVERY: Duration = Duration::from_mins(10);
 /// Measurements that one transaction removes; others write in between.
 const REMOVED_MAX: u32 = 2_000;
-/// Hours of a day.
-const DAY_H: i64 = 24;
 
 /// Runs of agents of which anything was removed: only their uploads are held against the names.
 #[derive(Debug, Default)]

@@ -160,7 +160,7 @@ impl App {
     /// Takes a robot's introduction and answers with its site.
     ///
     /// # Errors
-    /// What the robot is told: its site is not known, its model is not possible, or the server
+    /// The refusal that the robot gets: its site is not known, its model is not possible, or the server
     /// cannot write now.
     pub async fn hello(&self, site: &SiteId, hello: &Hello) -> Result<Welcome, Refusal> {
         check_model(hello).map_err(|detail| refusal(RefusalCode::Malformed, detail))?;

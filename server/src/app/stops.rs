@@ -13,7 +13,7 @@
 //!
 //! The robot is the truth of what is in force, in the order in which stops came to it: the clear of
 //! the last one ends those before. A robot that does not show a stop which it had confirmed and
-//! which nobody asked to clear is told again, and may answer that it was cleared (`judge`).
+//! which nobody asked to clear gets it again, and may answer that it was cleared (`judge`).
 //! Everything of a stopped robot that was active or queued is held, and goes on only when a
 //! person says so.
 
@@ -38,7 +38,7 @@ use tread_api::wire::reply::Acknowledgement;
 use tread_api::wire::safety::ClearStop;
 
 use self::delivery::{Outgoing, Settling};
-pub(super) use self::delivery::{Told, tell};
+pub(super) use self::delivery::{StopDelivery, send_stop};
 pub(super) use self::unrecorded::Unrecorded;
 use super::missions::control::hold_all;
 use super::{App, AppError, page, site_row};
@@ -190,7 +190,7 @@ impl App {
                 .spawn_passing("stop", outgoing.deliver(tell.clone()));
         }
         drop(tell);
-        warn!("{} robots are told to stop by {by}: {reason}", stops.len());
+        warn!("{by} stops {} robots: {reason}", stops.len());
         let (shown, seen) = oneshot::channel();
         let settling = Settling {
             app: self.clone(),
@@ -312,11 +312,12 @@ impl App {
         let Some(robot_pk) = db::robots::pk_of(tx, &key.0, &key.1).await? else {
             return Ok(());
         };
-        // A stop that the robot has not confirmed yet is newer than what it shows, and is to be told
-        // still; so is one that is not written down.
+        // A stop that the robot has not confirmed yet is newer than what it shows, and is still to be
+        // sent; so is one that is not written down.
         let open = db::stops::in_force_of(tx, robot_pk).await?;
-        let is_untold = open.is_some_and(|open| open.id != latch.id && open.confirmed_at.is_none());
-        if is_untold || self.unrecorded().has_of(key) {
+        let is_pending =
+            open.is_some_and(|open| open.id != latch.id && open.confirmed_at.is_none());
+        if is_pending || self.unrecorded().has_of(key) {
             return Ok(());
         }
         let now = self.clock().now();
@@ -440,7 +441,7 @@ impl App {
             return Ok(None);
         }
         let text = format!(
-            "it has not confirmed the stop by {} ({}); it is told again until it does",
+            "it has not confirmed the stop by {} ({}); the stop is sent again until it does",
             stop.by, stop.reason
         );
         let alert = (UNCONFIRMED_ALERT, Severity::Critical, text);

@@ -196,11 +196,11 @@ impl Session {
         self.app.supervisor().stop_token()
     }
 
-    /// Ends the session: a robot that it drives is told to stand, and the lease is given back.
+    /// Ends the session: a robot that it drives is commanded to rest, and the lease is released.
     pub fn end(&mut self) {
         if self.active.is_some() {
             let robot = &self.key.1;
-            warn!(robot.id = %robot, "the driver of robot `{robot}` is gone; it is told to stand");
+            warn!(robot.id = %robot, "the driver of robot `{robot}` is gone; it is commanded to rest");
             self.app.counters().drivers_lost.one();
             self.release();
         }

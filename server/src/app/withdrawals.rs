@@ -14,13 +14,11 @@ use super::map::MapChange;
 use super::{App, AppError, page, people_line, site_row};
 use crate::db;
 use crate::db::withdrawals::WithdrawalRow;
-use crate::friction::sums::DAY_H;
+use crate::friction::sums::{DAY_H, HOUR_S};
 use crate::friction::{bucket_h, epoch_h};
 
 /// Most withdrawals of one server; each segment that comes is held against them.
 const WITHDRAWALS_MAX: usize = 1_000;
-/// Seconds of an hour.
-const HOUR_S: i64 = 3_600;
 
 impl App {
     /// Withdraws what a robot measured in whole hours, from all sites' maps that it is on.

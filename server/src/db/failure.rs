@@ -1,4 +1,4 @@
-//! Failures of the storage itself, told apart from answers such as a violated constraint.
+//! Failures of the storage itself, as distinct from answers such as a violated constraint.
 //!
 //! After some errors (a full disk, a failed read or write, no memory) SQLite rolls a transaction
 //! back by itself, and the library's count of open transactions no longer fits the connection. A

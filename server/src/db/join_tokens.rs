@@ -6,7 +6,7 @@ use tread_api::enrolment::JoinToken;
 use tread_api::ids::{JoinTokenId, RobotId};
 use tread_api::rights::Scope;
 
-use super::secrets::{Kept, look_up_tokens};
+use super::secrets::{TokenRow, look_up_tokens};
 use super::{DbError, from_us, parse, scope_text, to_us};
 use crate::identity::secret::Fingerprint;
 

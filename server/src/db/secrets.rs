@@ -1,8 +1,8 @@
-//! What is kept of a secret, whatever it opens: its hash.
+//! Rows of tokens, which keep the hash of a secret and never the secret.
 
-/// What is kept of a secret, with what it opens.
+/// A token as it is stored.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Kept<T> {
+pub struct TokenRow<T> {
     /// The hash of the secret.
     pub hash: Vec<u8>,
     /// The token.
@@ -24,7 +24,7 @@ macro_rules! look_up_tokens {
         pub async fn by_lookup(
             db: &mut SqliteConnection,
             fingerprint: &Fingerprint,
-        ) -> Result<Option<Kept<$token>>, DbError> {
+        ) -> Result<Option<TokenRow<$token>>, DbError> {
             let lookup = fingerprint.lookup();
             let row = sqlx::query!(
                 "SELECT id, hash FROM " + $table + " WHERE lookup = ?",
@@ -36,7 +36,7 @@ macro_rules! look_up_tokens {
                 return Ok(None);
             };
             let token = find(db, parse($what, &row.id)?).await?;
-            Ok(token.map(|token| Kept {
+            Ok(token.map(|token| TokenRow {
                 hash: row.hash,
                 token,
             }))

@@ -28,9 +28,9 @@ pub enum Owner {
     Person(SignedIn),
 }
 
-/// A session as it is kept.
+/// A session as it is stored.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Kept {
+pub struct SessionRow {
     /// The session.
     pub id: SessionId,
     /// Whose it is.
@@ -74,7 +74,7 @@ struct Raw {
     last_used_at_us: Option<i64>,
 }
 
-impl TryFrom<Raw> for Kept {
+impl TryFrom<Raw> for SessionRow {
     type Error = DbError;
 
     fn try_from(raw: Raw) -> Result<Self, DbError> {
@@ -158,19 +158,19 @@ pub async fn insert(db: &mut SqliteConnection, session: &NewSession) -> Result<(
 pub async fn by_lookup(
     db: &mut SqliteConnection,
     fingerprint: &Fingerprint,
-) -> Result<Option<Kept>, DbError> {
+) -> Result<Option<SessionRow>, DbError> {
     let lookup = fingerprint.lookup();
     let raw = sessions!("WHERE lookup = ?", lookup)
         .fetch_optional(db)
         .await?;
-    raw.map(Kept::try_from).transpose()
+    raw.map(SessionRow::try_from).transpose()
 }
 
 /// The session of that identifier.
-pub async fn find(db: &mut SqliteConnection, id: SessionId) -> Result<Option<Kept>, DbError> {
+pub async fn find(db: &mut SqliteConnection, id: SessionId) -> Result<Option<SessionRow>, DbError> {
     let id = id.to_string();
     let raw = sessions!("WHERE id = ?", id).fetch_optional(db).await?;
-    raw.map(Kept::try_from).transpose()
+    raw.map(SessionRow::try_from).transpose()
 }
 
 /// Which sessions of people to list.
@@ -195,7 +195,7 @@ pub async fn list(
     db: &mut SqliteConnection,
     filter: &OfPeople<'_>,
     limit: u32,
-) -> Result<Vec<Kept>, DbError> {
+) -> Result<Vec<SessionRow>, DbError> {
     let at_us = to_us(filter.at);
     let before = filter.before.map(|id| id.to_string());
     let within = to_json("groups", &filter.within)?;
@@ -219,7 +219,7 @@ pub async fn list(
     )
     .fetch_all(db)
     .await?;
-    raw.into_iter().map(Kept::try_from).collect()
+    raw.into_iter().map(SessionRow::try_from).collect()
 }
 
 /// How many sessions people have that are valid at a time.
@@ -306,10 +306,11 @@ mod tests {
     use sqlx::Connection as _;
     use sqlx::migrate::Migrator;
     use sqlx::sqlite::SqliteConnectOptions;
+    use tread_api::ids::OidcSubject;
 
     use super::*;
     use crate::db::Db;
-    use crate::identity::secret::{Kind, RANDOM_BYTES, Secret};
+    use crate::identity::secret::{Kind, SECRET_RANDOM_BYTES, Secret};
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
     async fn sessions_of_before_there_were_people_stay() {
@@ -366,7 +367,10 @@ mod tests {
             (3, vec!["yard"]),
         ] {
             let subject = format!("person {number}");
-            let id = PersonId::of(issuer, &subject);
+            let id = PersonId::of(OidcSubject {
+                issuer,
+                subject: &subject,
+            });
             let signed_in = SignedIn {
                 person: Person {
                     id,
@@ -381,7 +385,7 @@ mod tests {
                     .parse()
                     .unwrap(),
                 owner: Owner::Person(signed_in),
-                fingerprint: Secret::from_random(Kind::Session, &[number; RANDOM_BYTES])
+                fingerprint: Secret::from_random(Kind::Session, &[number; SECRET_RANDOM_BYTES])
                     .fingerprint(),
                 created_at: Timestamp::UNIX_EPOCH,
                 expires_at: Timestamp::from_second(1_000).unwrap(),

@@ -6,7 +6,7 @@ use tread_api::identity::{Role, Token};
 use tread_api::ids::TokenId;
 use tread_api::rights::{Rights, Scope};
 
-use super::secrets::{Kept, look_up_tokens};
+use super::secrets::{TokenRow, look_up_tokens};
 use super::{DbError, corrupt, from_json, from_us, parse, scope_text, to_json, to_us};
 use crate::identity::secret::Fingerprint;
 
@@ -256,7 +256,7 @@ pub async fn forget_dead(
 pub async fn all_valid(
     db: &mut SqliteConnection,
     at: Timestamp,
-) -> Result<Vec<Kept<Token>>, DbError> {
+) -> Result<Vec<TokenRow<Token>>, DbError> {
     let at_us = to_us(at);
     let rows = sqlx::query!(
         "SELECT id, hash, name, role, rights, scope, created_at_us, created_by, expires_at_us,
@@ -279,7 +279,7 @@ pub async fn all_valid(
             revoked_at_us: row.revoked_at_us,
             last_used_at_us: row.last_used_at_us,
         };
-        Ok(Kept {
+        Ok(TokenRow {
             hash: row.hash,
             token: token.try_into()?,
         })

@@ -61,7 +61,7 @@ const REFUSED: [Who; 5] = [
     Who::Nobody,
 ];
 
-/// How often a robot is told something on each key.
+/// How often something is sent to a robot on each key.
 const SAID_TIMES: u32 = 3;
 
 /// What was done, by whom, and on which key.
@@ -322,7 +322,7 @@ fn expression(row: &RobotKeys) -> String {
 }
 
 /// Does over a robot's link everything with every key of `rover-1`. What it hears goes to `heard`;
-/// whether its questions are answered is told.
+/// returns whether its queries are answered.
 async fn do_all(
     session: &Session,
     who: Who,
@@ -558,7 +558,7 @@ async fn another_robots_password_and_session_id_open_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_client_that_does_not_name_the_protocol_is_refused_before_anything_is_told() {
+async fn a_client_that_does_not_name_the_protocol_is_refused_before_anything_is_sent() {
     let rig = Rig::start().await;
     for protocols in [vec![], vec![b"h2".to_vec()], vec![b"tread/1".to_vec()]] {
         let failed = rig.app.counters().gate_tls_failed.get();

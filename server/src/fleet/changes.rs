@@ -19,7 +19,7 @@ use crate::app::App;
 pub(super) async fn run(app: App, routers: Arc<Routers>, stop: CancellationToken) {
     let mut news = app.map_news();
     let mut publishers = Publishers::new(keys::map);
-    // Words that were missed, and how many of them each site has been told of.
+    // Changes that were missed, and how many of them were published for each site.
     let mut missed: u64 = 0;
     let mut announced: HashMap<SiteId, u64> = HashMap::new();
     loop {

@@ -46,6 +46,7 @@ use self::router_pool::RouterPool;
 use self::routers::Routers;
 use self::teleop::ZenohDrive;
 use crate::app::App;
+use crate::app::enrolment::FLEET_ROBOTS_MAX;
 use crate::app::ingest::Upload;
 use crate::app::robot_link::RobotLink;
 use crate::app::stops::STOP_CONFIRM_MAX;
@@ -55,17 +56,12 @@ use crate::rate_limit::RateLimit;
 use crate::supervisor::Supervisor;
 
 /// Most robots that may be connected; zenoh's own default is 1000.
-const SESSIONS_MAX: u32 = 10_000;
-/// After this silence a robot takes the server for gone and connects anew, milliseconds. TCP sends
-/// what was lost again after ever longer pauses; a new connection is there sooner.
-const LEASE_MS: u32 = 3_000;
+const SESSIONS_MAX: u32 = FLEET_ROBOTS_MAX;
 /// Most connections that may be in the middle of their opening.
 const ACCEPT_PENDING_MAX: u32 = 1_000;
 /// What the system may keep of what is sent to one robot, bytes. Priorities act only above it: on
 /// a narrow link a larger one would let drive commands wait behind everything else.
 const SEND_BUFFER_BYTES: u32 = 16 * 1024;
-/// Most bytes that are sent at once, for the same reason.
-const BATCH_BYTES: u32 = 8 * 1024;
 /// Most bytes of a message that is put together of fragments, with its key; zenoh would take 1 GiB.
 const MESSAGE_BYTES_MAX: usize = PAYLOAD_BYTES_MAX + 64 * 1024;
 /// How long the session may take to open, and to close.

@@ -12,6 +12,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use tracing::warn;
 use tread_api::tunnel::RouterCredentials;
+use tread_api::wire::{BATCH_BYTES, SESSION_LEASE_MS};
 use uuid::Uuid;
 use zenoh::{Config, Session, Wait as _};
 
@@ -21,8 +22,8 @@ use super::inbox::{self, Channels};
 use super::probe;
 use super::routers::Router;
 use super::{
-    ACCEPT_PENDING_MAX, BATCH_BYTES, FleetError, LEASE_MS, MESSAGE_BYTES_MAX, SEND_BUFFER_BYTES,
-    SESSION_TIMEOUT, SESSIONS_MAX,
+    ACCEPT_PENDING_MAX, FleetError, MESSAGE_BYTES_MAX, SEND_BUFFER_BYTES, SESSION_TIMEOUT,
+    SESSIONS_MAX,
 };
 use crate::app::presence::RobotKey;
 use crate::authority::Authorities;
@@ -162,7 +163,7 @@ fn config(address: SocketAddr) -> zenoh::Result<Config> {
             format!("[\"tcp/{address}#so_sndbuf={SEND_BUFFER_BYTES}\"]"),
         ),
         ("transport/link/tx/batch_size", BATCH_BYTES.to_string()),
-        ("transport/link/tx/lease", LEASE_MS.to_string()),
+        ("transport/link/tx/lease", SESSION_LEASE_MS.to_string()),
         (
             "transport/link/rx/max_message_size",
             MESSAGE_BYTES_MAX.to_string(),

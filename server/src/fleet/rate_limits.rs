@@ -16,7 +16,7 @@ use crate::app::presence::RobotKey;
 use crate::rate_limit::{Bucket, RateLimit};
 
 /// Robots that are kept track of; those that have been quiet are forgotten first.
-const ROBOTS_MAX: usize = 50_000;
+const TRACKED_ROBOTS_MAX: usize = 50_000;
 /// Tokens of one robot that are known on all routers: a few runs of its agent.
 const TOKENS_MAX: usize = 16;
 /// Tokens of one robot that are taken up later.
@@ -204,10 +204,10 @@ impl RateLimits {
         if let Some(robot) = robots.get_mut(key) {
             return Some(act(robot));
         }
-        if robots.len() >= ROBOTS_MAX {
+        if robots.len() >= TRACKED_ROBOTS_MAX {
             robots.retain(|_, robot| !robot.is_quiet(now));
         }
-        if robots.len() >= ROBOTS_MAX {
+        if robots.len() >= TRACKED_ROBOTS_MAX {
             return None;
         }
         let robot = robots.entry(key.clone()).or_default();

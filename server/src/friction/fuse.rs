@@ -45,7 +45,7 @@ pub struct Fused {
     pub track: Option<Estimate>,
     /// Rolling resistance coefficient.
     pub rolling: Option<Estimate>,
-    /// Passes that ever came, also those that a change has made void and those that told nothing.
+    /// Passes that ever came, also those that a change has made void and those without information.
     pub passes: u64,
     /// Robots behind the estimate.
     pub robots: u32,
@@ -58,7 +58,7 @@ pub struct Fused {
 }
 
 impl Fused {
-    /// The same with passes that told nothing counted too: their information is below what the sums
+    /// The same with uninformative passes counted too: their information is below what the sums
     /// resolve, 2.3·10⁻¹⁰, so that they change no estimate.
     #[must_use]
     pub fn with_uninformative(self, uninformative_passes: u64) -> Self {

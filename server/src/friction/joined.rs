@@ -181,7 +181,7 @@ pub(super) fn joined<R: Ord + Copy>(
 
 /// Standard deviation above which a robot's own word does not count beside others.
 const VAGUE_STD_DEV: f64 = 1.0;
-/// Fewest robots of which one can be told to be wrong.
+/// Fewest robots of which one can be identified as wrong.
 const ROBUST_ROBOTS_MIN: usize = 3;
 
 /// What robots say with one of them left out: sums of weights, of weighted values and of weighted

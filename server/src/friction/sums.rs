@@ -11,6 +11,8 @@ use tread_api::friction::{Information, Segment};
 
 use super::fixed::Fixed;
 
+/// Seconds of an hour.
+pub const HOUR_S: i64 = 3_600;
 /// Microseconds of an hour.
 const HOUR_US: i64 = 3_600_000_000;
 /// Hours of a day, into which old epochs are merged.
@@ -149,7 +151,7 @@ impl Sums {
     /// The statistics of one segment; `None` if its numbers leave the range of fixed point.
     pub fn of(segment: &Segment) -> Option<Self> {
         // What a robot has in common with itself or with its like does not add up: it is kept beside
-        // what does, and told only once for all.
+        // what does, and counted only once for all.
         let errors = segment.theta_errors;
         let theta = independent(segment);
         let square = if theta.information > 0.0 {

@@ -7,11 +7,9 @@ use tread_api::friction::{Information, ROBOT_BIAS_RATIO};
 
 use super::fixed::Fixed;
 use super::fuse::THETA_STD_DEV_MAX;
-use super::sums::{Pair, Pass};
+use super::sums::{HOUR_S, Pair, Pass};
 use super::weights::FrictionConfig;
 use super::*;
-
-pub(super) const HOUR_S: i64 = 3_600;
 
 fn now() -> Timestamp {
     "2026-11-01T12:00:00Z".parse().unwrap()

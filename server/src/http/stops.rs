@@ -13,8 +13,8 @@
 //! All robots are those that the token is for.
 //!
 //! Whoever wrote a `site` meant some robots and not all, and nobody can tell which: to stop all of
-//! them would take the yards of others away, to stop none and say nothing would be worse. So the one
-//! who asks is told at once, as with a site that is not known. Everything else that cannot be read
+//! them would take the yards of others away, to stop none and say nothing would be worse. So the request
+//! is refused at once, as with a site that is not known. Everything else that cannot be read
 //! may be a cry for help, and stops everything.
 
 use std::time::Duration;

@@ -22,7 +22,7 @@ use ring::hmac;
 /// How long somebody may take at the provider.
 pub const SIGN_IN_LASTS: SignedDuration = SignedDuration::from_mins(10);
 /// Random bytes of a sign-in, and of the key.
-pub const RANDOM_BYTES: usize = 32;
+pub const SIGN_IN_RANDOM_BYTES: usize = 32;
 /// Longest cookie that is read.
 const COOKIE_MAX: usize = 80;
 
@@ -32,7 +32,7 @@ pub struct PendingKey(hmac::Key);
 
 impl PendingKey {
     /// The key of these bytes, which must come from the operating system's generator.
-    pub fn from_random(random: &[u8; RANDOM_BYTES]) -> Self {
+    pub fn from_random(random: &[u8; SIGN_IN_RANDOM_BYTES]) -> Self {
         Self(hmac::Key::new(hmac::HMAC_SHA256, random))
     }
 }
@@ -57,7 +57,7 @@ impl std::fmt::Debug for Pending {
 
 impl Pending {
     /// Begins a sign-in.
-    pub fn begin(key: &PendingKey, random: &[u8; RANDOM_BYTES], now: Timestamp) -> Self {
+    pub fn begin(key: &PendingKey, random: &[u8; SIGN_IN_RANDOM_BYTES], now: Timestamp) -> Self {
         let cookie = format!("{}.{}", now.as_second(), URL_SAFE_NO_PAD.encode(random));
         Self::of(key, cookie)
     }
@@ -111,12 +111,12 @@ mod tests {
     }
 
     fn key(byte: u8) -> PendingKey {
-        PendingKey::from_random(&[byte; RANDOM_BYTES])
+        PendingKey::from_random(&[byte; SIGN_IN_RANDOM_BYTES])
     }
 
     #[test]
     fn a_sign_in_goes_on_with_its_own_cookie_and_state_for_ten_minutes() {
-        let pending = Pending::begin(&key(1), &[2; RANDOM_BYTES], time(0));
+        let pending = Pending::begin(&key(1), &[2; SIGN_IN_RANDOM_BYTES], time(0));
         let resume = |key: &PendingKey, cookie: &str, state: &str, second| {
             Pending::resume(key, cookie, state, time(second))
         };
@@ -124,7 +124,7 @@ mod tests {
         assert_eq!(resume(&key(1), cookie, state, 599), Some(pending.clone()));
         assert_eq!(resume(&key(1), cookie, state, 600), None, "too late");
         assert_eq!(resume(&key(2), cookie, state, 0), None, "another server's");
-        let other = Pending::begin(&key(1), &[3; RANDOM_BYTES], time(0));
+        let other = Pending::begin(&key(1), &[3; SIGN_IN_RANDOM_BYTES], time(0));
         assert_eq!(resume(&key(1), other.cookie(), state, 0), None);
         assert_eq!(resume(&key(1), cookie, &other.state, 0), None);
         assert_eq!(resume(&key(1), cookie, "", 0), None);
@@ -140,7 +140,7 @@ mod tests {
 
     #[test]
     fn what_goes_to_the_provider_tells_nothing_of_the_rest() {
-        let pending = Pending::begin(&key(1), &[2; RANDOM_BYTES], time(0));
+        let pending = Pending::begin(&key(1), &[2; SIGN_IN_RANDOM_BYTES], time(0));
         let texts = [&pending.state, &pending.nonce, &pending.verifier];
         // PKCE wants 43 to 128 characters out of the unreserved ones.
         assert!(texts.iter().all(|text| text.len() == 43));

@@ -12,13 +12,13 @@ use subtle::ConstantTimeEq as _;
 use tread_api::identity::Role;
 
 /// Random bytes in a secret.
-pub const RANDOM_BYTES: usize = 32;
+pub const SECRET_RANDOM_BYTES: usize = 32;
 /// Bytes of the checksum.
 const CHECKSUM_BYTES: usize = 4;
 /// What every secret begins with.
 const BRAND: &str = "tread_";
 /// Hex digits of a secret.
-const DIGITS: usize = 2 * (RANDOM_BYTES + CHECKSUM_BYTES);
+const DIGITS: usize = 2 * (SECRET_RANDOM_BYTES + CHECKSUM_BYTES);
 /// Bytes of a secret as text.
 const TEXT_LENGTH: usize = BRAND.len() + 2 + DIGITS;
 /// Leading random digits that failures are counted by.
@@ -75,7 +75,7 @@ impl fmt::Debug for Secret {
 
 impl Secret {
     /// The secret of these bytes, which must come from the operating system's generator.
-    pub fn from_random(kind: Kind, random: &[u8; RANDOM_BYTES]) -> Self {
+    pub fn from_random(kind: Kind, random: &[u8; SECRET_RANDOM_BYTES]) -> Self {
         let mut text = format!("{BRAND}{}_", kind.initial());
         let sum = checksum(kind, random);
         for byte in random.iter().chain(&sum) {
@@ -94,7 +94,7 @@ impl Secret {
         let (initial, digits) = rest.split_once('_')?;
         let is_kind = |kind: &Kind| initial.chars().eq([kind.initial()]);
         let kind = Kind::ALL.into_iter().find(is_kind)?;
-        let mut bytes = [0; RANDOM_BYTES + CHECKSUM_BYTES];
+        let mut bytes = [0; SECRET_RANDOM_BYTES + CHECKSUM_BYTES];
         let (pairs, odd) = digits.as_bytes().as_chunks::<2>();
         if pairs.len() != bytes.len() || !odd.is_empty() {
             return None;
@@ -102,7 +102,7 @@ impl Secret {
         for (byte, [high, low]) in bytes.iter_mut().zip(pairs) {
             *byte = (value(*high)? << 4) | value(*low)?;
         }
-        let (random, sum) = bytes.split_first_chunk::<RANDOM_BYTES>()?;
+        let (random, sum) = bytes.split_first_chunk::<SECRET_RANDOM_BYTES>()?;
         (sum == checksum(kind, random)).then(|| Self {
             kind,
             text: text.to_owned(),
@@ -114,7 +114,7 @@ impl Secret {
         self.kind
     }
 
-    /// The text, for the one to whom it is told.
+    /// The text, for its owner.
     pub fn reveal(&self) -> &str {
         &self.text
     }

@@ -52,6 +52,8 @@ impl SubjectId {
 
 #[cfg(test)]
 mod tests {
+    use tread_api::ids::OidcSubject;
+
     use super::*;
 
     #[test]
@@ -66,7 +68,11 @@ mod tests {
             assert!(may_name_token(name), "{name}");
             assert!(!may_name_token(&name_of_person(name)), "{name}");
         }
-        let person = PersonId::of("https://login.test", "anna").to_string();
+        let person = PersonId::of(OidcSubject {
+            issuer: "https://login.test",
+            subject: "anna",
+        })
+        .to_string();
         // With a name that somebody gives behind it the third would read like a person too.
         for name in ["oidc:", "OIDC:anna", "oidc", " Oidc : anna", &person] {
             assert!(!may_name_token(name), "{name}");

@@ -19,7 +19,7 @@ use tokio::sync::Semaphore;
 use super::verify::IdToken;
 use super::*;
 use crate::config::oidc::OidcConfig;
-use crate::identity::pending::{PendingKey, RANDOM_BYTES};
+use crate::identity::pending::{PendingKey, SIGN_IN_RANDOM_BYTES};
 
 /// How long somebody is watched who must wait: a refusal would come at once.
 const WATCHED: Duration = Duration::from_millis(300);
@@ -137,9 +137,11 @@ impl Fake {
             "/jwks" => {
                 self.asked.fetch_add(1, Ordering::SeqCst);
                 self.answers.acquire().await.unwrap().forget();
-                let told = self.tells.lock().unwrap().clone();
+                let published = self.tells.lock().unwrap().clone();
                 let key = |number| serde_json::to_value(Self::signer(number).public).unwrap();
-                told.map(|told| json!({"keys": told.into_iter().map(key).collect::<Vec<_>>()}))
+                published.map(
+                    |numbers| json!({"keys": numbers.into_iter().map(key).collect::<Vec<_>>()}),
+                )
             }
             "/token" => {
                 // The code is the nonce: it says which sign-in it is.
@@ -167,8 +169,8 @@ impl Fake {
     }
 
     async fn signs_in(&self, provider: &Provider, number: u8) -> Result<String, ExchangeError> {
-        let key = PendingKey::from_random(&[1; RANDOM_BYTES]);
-        let pending = Pending::begin(&key, &[number; RANDOM_BYTES], self.clock.now());
+        let key = PendingKey::from_random(&[1; SIGN_IN_RANDOM_BYTES]);
+        let pending = Pending::begin(&key, &[number; SIGN_IN_RANDOM_BYTES], self.clock.now());
         let there = provider.exchange(&pending.nonce, &pending).await?;
         Ok(there.subject)
     }
@@ -276,7 +278,7 @@ async fn a_discovery_that_takes_long_does_not_bring_the_former_keys_back() {
             tokio::pin!(sign_in);
             let early = tokio::time::timeout(WATCHED, &mut sign_in).await;
             assert!(early.is_err(), "{early:?}");
-            // The discovery gets the former key, and only then the other one is told.
+            // The discovery gets the former key, and only then the other one is published.
             fake.answers.add_permits(1);
             let rollover = async {
                 fake.is_asked(3).await;

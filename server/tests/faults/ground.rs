@@ -131,7 +131,7 @@ impl Ground {
                     .fetch_add(receipt.committed, Ordering::Relaxed);
                 Ok(receipt)
             }
-            // What the robot is told when the storage fails.
+            // What the robot is answered when the storage fails.
             Err(Refusal {
                 code: RefusalCode::Busy,
                 ..

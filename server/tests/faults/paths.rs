@@ -7,7 +7,9 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
-use tread_api::ids::{AlertId, BootId, ConfigurationId, MissionId, PersonId, SessionId, TokenId};
+use tread_api::ids::{
+    AlertId, BootId, ConfigurationId, MissionId, OidcSubject, PersonId, SessionId, TokenId,
+};
 use tread_api::mission::{Cause, MissionState, Replacement};
 use tread_server::app::AppError;
 use tread_server::authority::Issued;
@@ -346,9 +348,13 @@ pub(crate) const PATHS: &[WritePath] = &[
             Box::pin(ground.write(async move |tx| {
                 let issuer = "https://login.test";
                 let subject = format!("person {number}");
+                let id = PersonId::of(OidcSubject {
+                    issuer,
+                    subject: &subject,
+                });
                 let signed_in = SignedIn {
                     person: of(json!({
-                        "id": PersonId::of(issuer, &subject), "issuer": issuer, "subject": subject,
+                        "id": id, "issuer": issuer, "subject": subject,
                     })),
                     name: "anna".to_owned(),
                     groups: vec!["operators".to_owned()],

@@ -71,19 +71,19 @@ async fn a_mission_is_paused_and_resumed_when_its_robot_says_so() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_mission_is_paused_when_its_robot_stands_and_not_when_it_was_told() {
+async fn a_mission_is_paused_when_its_robot_stands_and_not_when_it_was_commanded() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;
     let mission = yard.create_mission(&robot.id).await;
     yard.mission_becomes(mission.id, MissionState::Active).await;
     robot.set_mood(Mood::Braking);
     act(&yard, &mission, "pause", &json!({})).await;
-    eventually("the robot was told", async || {
+    eventually("the robot was commanded to pause", async || {
         let holds = robot.holds();
         if holds.is_empty() { Err(holds) } else { Ok(()) }
     })
     .await;
-    // It was told, it has answered, and it drives still.
+    // It was commanded, it has answered, and it drives still.
     tokio::time::sleep(Duration::from_millis(1_500)).await;
     let braking = yard.mission(mission.id).await;
     assert_eq!(braking.mission.state, MissionState::Active);
@@ -95,7 +95,7 @@ async fn a_mission_is_paused_when_its_robot_stands_and_not_when_it_was_told() {
         MissionState::Paused
     );
     act(&yard, &mission, "resume", &json!({})).await;
-    eventually("the robot was told to go on", async || {
+    eventually("the robot was commanded to go on", async || {
         let holds = robot.holds();
         if holds.contains(&Verb::Resume) {
             Ok(())
@@ -343,7 +343,7 @@ async fn the_same_key_many_times_at_once_makes_one_mission() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_robot_that_stays_away_loses_its_mission_and_is_told_when_it_comes_back() {
+async fn a_robot_that_stays_away_loses_its_mission_and_gets_a_cancel_when_it_comes_back() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;
     let (status, body) = ask(&yard, &robot, json!({"lost_after_s": 1.0})).await;
@@ -359,12 +359,12 @@ async fn a_robot_that_stays_away_loses_its_mission_and_is_told_when_it_comes_bac
         (LinkState::Offline, Some(LinkCause::LoopStopped))
     );
     robot.start_loop();
-    eventually("the robot is told", async || {
-        let told = robot
+    eventually("the robot gets a cancel", async || {
+        let is_cancelled = robot
             .cancels()
             .iter()
             .any(|cancel| cancel.mission == mission.id);
-        if told { Ok(()) } else { Err(()) }
+        if is_cancelled { Ok(()) } else { Err(()) }
     })
     .await;
     robot.report(0, &mission, MissionPhase::Succeeded).await;

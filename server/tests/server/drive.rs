@@ -95,7 +95,7 @@ impl Socket {
     }
 
     pub(crate) async fn acquire(&mut self, name: &str) -> Lease {
-        // End times are told in the robot's time, which its states tell.
+        // End times are in the robot's time, which its states carry.
         self.view(|view| view.heard_age_ms.is_some()).await;
         self.send(&json!({"acquire": {"name": name}})).await;
         let update = self.update().await;
@@ -112,7 +112,7 @@ impl Socket {
 }
 
 pub(crate) async fn driven_at(robot: &Robot, linear_m_s: f64) {
-    let what = format!("the robot is told {linear_m_s} m/s");
+    let what = format!("the robot is commanded {linear_m_s} m/s");
     eventually(&what, async || {
         let is = is_driven_at(robot, linear_m_s);
         let last = robot.drives().last().map(|command| command.twist);
@@ -343,7 +343,7 @@ async fn anybody_on_the_socket_may_stop_and_a_server_that_stops_lets_the_robot_s
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn of_a_flood_of_commands_the_newest_counts_and_a_plain_request_is_told_what_this_is() {
+async fn of_a_flood_of_commands_the_newest_counts_and_a_plain_request_is_refused_with_the_reason() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;
     let mut driver = Socket::open(&yard, "rover-1").await;
@@ -359,7 +359,7 @@ async fn of_a_flood_of_commands_the_newest_counts_and_a_plain_request_is_told_wh
     driver.0.flush().await.unwrap();
     // Like every client it goes on: a link that is full drops commands rather than queue them.
     let mut fed = 2_000;
-    eventually("the robot is told the newest command", async || {
+    eventually("the robot gets the newest command", async || {
         if is_driven_at(&robot, 0.1999) {
             return Ok(());
         }

@@ -1,4 +1,4 @@
-//! What a trajectory would ask of a robot, told before anything moves.
+//! What a trajectory would ask of a robot, computed before anything moves.
 
 use reqwest::StatusCode;
 use serde_json::{Value, json};
@@ -62,7 +62,7 @@ fn points(path: &Value) -> Vec<(f64, f64)> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_planned_path_is_told_by_a_dry_run_and_of_a_mission_and_is_bounded() {
+async fn the_planned_path_is_given_by_a_dry_run_and_of_a_mission_and_is_bounded() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;
     let mut body = circle(&robot.id);

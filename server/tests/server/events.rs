@@ -84,7 +84,7 @@ async fn events_begin_with_a_snapshot_follow_what_happens_and_resume() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_mission_that_does_not_read_keeps_no_other_from_being_told() {
+async fn a_mission_that_does_not_read_keeps_no_other_from_being_sent() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;
     let mut missions = Vec::new();

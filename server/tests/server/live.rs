@@ -1,4 +1,4 @@
-//! Where the map changes is told: on the feed of events, on the network, and as gauges.
+//! Where the map changes is published: on the feed of events, on the network, and as gauges.
 
 use std::time::Duration;
 
@@ -39,7 +39,7 @@ async fn read_event(
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_change_of_the_map_is_told_to_clients_and_programs_on_the_network() {
+async fn a_change_of_the_map_is_sent_to_clients_and_programs_on_the_network() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;
     let (words, mut notified) = tokio::sync::mpsc::channel(64);
@@ -61,7 +61,7 @@ async fn a_change_of_the_map_is_told_to_clients_and_programs_on_the_network() {
     read_event(&mut stream, &mut text, "snapshot_end", |_| true).await;
     // The first look at the sites is what later ones are compared with.
     let mut seq = 0;
-    let told = loop {
+    let published = loop {
         let drive = [(3, 4), (5, 6), (-70, 1)];
         let drive = drive.map(|cell| {
             seq += 1;
@@ -72,19 +72,25 @@ async fn a_change_of_the_map_is_told_to_clients_and_programs_on_the_network() {
         if let Ok(change) = change {
             break change.unwrap();
         }
-        assert!(seq < 30, "nothing was told on the network");
+        assert!(seq < 30, "nothing was published on the network");
     };
-    assert_eq!((told.site.as_str(), told.everything), ("yard", false));
-    let corners: Vec<(i32, i32)> = told
+    assert_eq!(
+        (published.site.as_str(), published.everything),
+        ("yard", false)
+    );
+    let corners: Vec<(i32, i32)> = published
         .boxes
         .iter()
         .map(|one| (one.min.ix, one.min.iy))
         .collect();
     assert_eq!(corners, [(-128, 0), (0, 0)], "two cells share a square");
-    assert_eq!((told.boxes[1].max.ix, told.boxes[1].max.iy), (63, 63));
+    assert_eq!(
+        (published.boxes[1].max.ix, published.boxes[1].max.iy),
+        (63, 63)
+    );
     let body = read_event(&mut stream, &mut text, "map", |_| true).await;
     let change: MapChange = serde_json::from_value(body["map"].clone()).unwrap();
-    assert_eq!(change, told);
+    assert_eq!(change, published);
 
     let square = json!([{"x_m": 0, "y_m": 0}, {"x_m": 9, "y_m": 0}, {"x_m": 9, "y_m": 9}]);
     let body = json!({"id": "slab", "class": "concrete", "polygon": square});

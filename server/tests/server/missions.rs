@@ -171,7 +171,10 @@ async fn what_a_robot_cannot_drive_is_rejected_with_its_words() {
     let rejected = yard
         .mission_becomes(mission.id, MissionState::Rejected)
         .await;
-    assert_eq!(rejected.mission.reason.as_deref(), Some("as told"));
+    assert_eq!(
+        rejected.mission.reason.as_deref(),
+        Some("as the test asked")
+    );
     yard.server.stop().await.unwrap();
 }
 

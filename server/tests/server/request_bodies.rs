@@ -1,5 +1,5 @@
 //! The bodies of all requests: what the description requires the server requires, and nothing else;
-//! a list is no object; and with a database that somebody else has locked each is told so.
+//! a list is no object; and with a database that somebody else has locked each is refused as busy.
 
 use futures_util::future::join_all;
 use reqwest::{Method, StatusCode, header};

@@ -143,7 +143,7 @@ async fn a_robot_shows_with_its_link_and_a_new_terrain_reaches_it() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn health_and_readiness_are_told() {
+async fn health_and_readiness_are_reported() {
     let yard = Yard::start().await;
     assert_eq!(yard.get::<Value>("/healthz").await["status"], "ok");
     assert_eq!(yard.get::<Value>("/readyz").await["status"], "ok");

@@ -1,4 +1,4 @@
-//! A client of the event stream that reads too slowly is told so, and nobody else notices.
+//! A client of the event stream that reads too slowly is closed with that reason, and nobody else notices.
 
 use std::time::Duration;
 

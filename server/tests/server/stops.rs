@@ -276,7 +276,7 @@ async fn a_pause_that_the_robot_reports_for_its_safety_is_what_is_wanted_from_th
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_robot_that_does_not_confirm_is_shown_and_told_again_over_a_restart() {
+async fn a_stop_that_is_not_confirmed_is_shown_and_sent_again_over_a_restart() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;
     robot.be_deaf_to_stops(true);
@@ -323,7 +323,7 @@ async fn a_stop_that_the_robot_forgot_is_sent_again_and_one_of_its_own_is_adopte
     yard.stop_becomes("it is written", |stop| stop.confirmed_at.is_some())
         .await;
     robot.say(|state| state.safety.stop = None);
-    eventually("it is told again", async || {
+    eventually("the stop is sent again", async || {
         let count = robot.stops().len();
         if count >= 2 { Ok(()) } else { Err(count) }
     })
@@ -475,12 +475,12 @@ async fn a_stop_whose_body_is_wrong_or_missing_stops_all_the_same() {
         .client()
         .post(yard.url("/v1/stop"))
         .json(&json!({"sight": "yard"}));
-    let mut told = 0;
+    let mut sent = 0;
     for request in [bare, garbage, unknown] {
         let (status, body) = yard.send(request).await;
         assert_eq!(status, StatusCode::OK, "{body}");
-        told += 1;
-        assert_eq!(robot.stops().len(), told);
+        sent += 1;
+        assert_eq!(robot.stops().len(), sent);
     }
     let (status, body) = yard
         .post("/v1/sites/yard/robots/nobody/stop", &json!({}))

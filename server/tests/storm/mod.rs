@@ -5,7 +5,7 @@
 //! and links go down at any moment. After every step the history that the server wrote is checked
 //! against the reference; at the end of a run the network heals, and every mission must end, with
 //! both sides of one mind. People stop robots, clear their stops and teleoperate meanwhile; what
-//! was held for that must not be told to go on before somebody says so.
+//! was held for that must not be resumed before somebody says so.
 
 mod dice;
 mod network;

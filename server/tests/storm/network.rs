@@ -35,7 +35,7 @@ pub(super) struct World {
 }
 
 impl World {
-    /// Nothing that was held may be told to go on.
+    /// No command may resume what was held.
     fn check_sent(&mut self, verb: Verb, payload: &[u8]) {
         let mission = match verb {
             Verb::Offer => match wire::decode::<Offer>(payload) {

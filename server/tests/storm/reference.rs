@@ -1,4 +1,4 @@
-//! What must hold of missions, whatever happens: told from the history that the server wrote.
+//! What must hold of missions, whatever happens, judged by the history that the server wrote.
 
 use std::collections::{BTreeMap, HashMap};
 

@@ -94,7 +94,7 @@ impl Robot {
         self.lease = None;
     }
 
-    /// A new run of the agent; what was held is over, and told only if the robot still could.
+    /// A new run of the agent; what was held is over, and reported only if the robot still could.
     pub(crate) fn restart(&mut self, boot: u64, tells: bool) {
         self.boot = boot_id(boot);
         (self.lease, self.leases) = (None, 0);
@@ -359,7 +359,7 @@ impl Robot {
         Ok(())
     }
 
-    /// Whatever is active stands, and goes on only when it is told to.
+    /// Whatever is active stands, and goes on only when it is commanded to.
     fn stand(&mut self, cause: PauseCause) {
         if let Some(held) = &mut self.held {
             (held.to_stand, held.paused_by) = (true, cause);

@@ -14,7 +14,7 @@ use tokio::time::{Instant, timeout_at};
 use tokio_tungstenite::connect_async;
 use tokio_tungstenite::tungstenite::{ClientRequestBuilder, Message};
 use tread_api::identity::Role;
-use tread_server::identity::secret::{Kind, RANDOM_BYTES, Secret};
+use tread_server::identity::secret::{Kind, SECRET_RANDOM_BYTES, Secret};
 
 use super::attackers::{Outcome, Plan};
 use crate::pace::Pace;
@@ -211,7 +211,7 @@ async fn wrong_tokens(http: SocketAddr, until: Instant) -> Outcome {
     let mut pace = Pace::new(WRONG_TOKENS_HZ, until);
     let (mut count, mut refused, mut locked) = (0_u64, 0_u64, 0_u64);
     while pace.due().await.is_some() {
-        let random: [u8; RANDOM_BYTES] =
+        let random: [u8; SECRET_RANDOM_BYTES] =
             std::array::from_fn(|_| uuid::Uuid::new_v4().as_bytes()[0]);
         let secret = Secret::from_random(Kind::Token(Some(Role::Admin)), &random);
         let request = format!(

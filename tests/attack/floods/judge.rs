@@ -32,8 +32,8 @@ const LOG_MAX_MIB: f64 = 10.0;
 const HTTP_FLOODS: usize = 6;
 /// How long the audit log's writer may take.
 const AUDIT_REST: Duration = Duration::from_secs(1);
-/// Failures of one kind that are told.
-const TOLD_MAX: usize = 5;
+/// Failures of one kind that are reported.
+const REPORTED_MAX: usize = 5;
 
 /// All that there is to judge.
 #[derive(Debug, Serialize)]
@@ -99,7 +99,7 @@ impl Facts {
             &worked.failed_changes,
         ]
         .into_iter()
-        .flat_map(|failed| failed.iter().take(TOLD_MAX).cloned())
+        .flat_map(|failed| failed.iter().take(REPORTED_MAX).cloned())
         .collect();
         let mut checks = vec![
             Check::so("the server survived", !server.has_ended),
@@ -253,7 +253,7 @@ async fn audited(
     let (is_exported, said) = run_tread(fleet, &["audit", "export", "--output", name]).await?;
     anyhow::ensure!(is_exported, "the audit log is not exported: {said}");
     let missing = missing(&worked.changes, &std::fs::read_to_string(&file)?)?;
-    failures.extend(missing.iter().take(TOLD_MAX).cloned());
+    failures.extend(missing.iter().take(REPORTED_MAX).cloned());
     Ok((is_verified, count(missing.len())))
 }
 

@@ -37,8 +37,8 @@ const STREAM_MAX: Duration = Duration::from_millis(50);
 const ANSWER_BYTES_MAX: usize = 256 * 1024;
 /// Who asks at the same time.
 const AT_ONCE: u64 = 4;
-/// Failures that are told.
-const TOLD_MAX: usize = 20;
+/// Failures that are reported.
+const REPORTED_MAX: usize = 20;
 /// What only an answer that makes a secret may contain.
 const SECRET_BEGINNINGS: [&str; 5] = ["tread_v_", "tread_o_", "tread_a_", "tread_s_", "tread_j_"];
 /// What no answer may contain.
@@ -99,7 +99,7 @@ struct Seen {
 
 impl Seen {
     fn fail(&mut self, what: &str, request: &Request, answer: &str) {
-        if self.failures.len() < TOLD_MAX {
+        if self.failures.len() < REPORTED_MAX {
             let answer: String = answer.chars().take(300).collect();
             let head: String = request.head.chars().take(200).collect();
             self.failures
@@ -119,7 +119,7 @@ impl Seen {
         self.secrets += other.secrets;
         self.hangs += other.hangs;
         self.failures.extend(other.failures);
-        self.failures.truncate(TOLD_MAX);
+        self.failures.truncate(REPORTED_MAX);
     }
 }
 

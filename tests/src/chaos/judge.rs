@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn one_mission_after_the_other_is_told_from_two_at_once() {
+    fn one_mission_after_the_other_is_distinguished_from_two_at_once() {
         let after = steps(&[
             ("a", "offered"),
             ("b", "queued"),

@@ -215,7 +215,7 @@ async fn ended(fleet: &Fleet, followed: &[Followed]) -> Vec<MissionDetail> {
     }
 }
 
-/// What the robot itself remembers, once it has told the server everything.
+/// What the robot itself remembers, once it has uploaded everything.
 async fn robots_memory(
     fleet: &mut Fleet,
     robot: &RobotId,

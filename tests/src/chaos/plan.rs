@@ -37,7 +37,7 @@ pub(super) enum Action {
     StartServer,
     KillAgent,
     StartAgent,
-    /// Nothing passes any more, and nobody is told.
+    /// Nothing passes any more, and nobody is notified.
     Cut,
     Heal,
     /// Every connection is reset, and new ones do not pass while it is cut.

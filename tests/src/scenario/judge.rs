@@ -215,7 +215,7 @@ pub fn tracking(
 /// How a robot came to rest after a word to stop.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Stopping {
-    /// How fast it went when it was told, m/s.
+    /// How fast it went at the command, m/s.
     pub from_m_s: f64,
     /// How far it still went, metres.
     pub distance_m: f64,
@@ -223,7 +223,7 @@ pub struct Stopping {
     pub time_s: f64,
 }
 
-/// How a robot stopped that was told to at a simulated time.
+/// How a robot stopped that was commanded to at a simulated time.
 ///
 /// # Errors
 /// It was not seen to come to rest.

@@ -34,11 +34,11 @@ use crate::random::Random;
 const SITE: &str = "yard";
 /// The same ground, on which nobody has.
 const BLANK: &str = "blank";
-/// Pace while robots are stopped from outside: what is told in real time must find its place.
+/// Pace while robots are stopped from outside: what is commanded in real time must find its place.
 const PACE_STOPPING: f64 = 4.0;
 /// Speed asked of robots that arrive, m/s.
 const ARRIVAL_M_S: f64 = 1.0;
-/// Line at which arriving robots are told to stop, metres north.
+/// Line at which arriving robots are commanded to stop, metres north.
 const STOP_LINE_M: f64 = 16.0;
 /// Longest wait for them to come there, and to stand, real.
 const STOP_WAIT_MAX: Duration = Duration::from_mins(5);

@@ -63,7 +63,7 @@ pub struct Arrival {
     pub robot: RobotId,
     /// How the bend and the end on the ice went.
     pub course: Option<[Tracking; 2]>,
-    /// Friction coefficient that the map told it to plan with where it was lowest.
+    /// Friction coefficient that the map gave it to plan with where it was lowest.
     pub traction_limit_mu: Option<f64>,
     /// How the missions ended.
     pub ends: Vec<MissionState>,

@@ -4,7 +4,7 @@
 use anyhow::Context as _;
 use serde_json::json;
 use tread_agent::geometry::paper_robot;
-use tread_agent::sim::scenario::{Scenario, ScenarioRobot, ScenarioTerrain};
+use tread_agent::sim::scenario::{Scenario, ScenarioRobot, ScenarioTerrain, ScenarioText};
 use tread_api::geometry::Point;
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::robot::{RobotLimits, RobotModel};
@@ -124,7 +124,10 @@ impl Kind {
 /// # Errors
 /// Never for the text above; tests parse it.
 pub fn ground(site: &SiteId) -> anyhow::Result<Scenario> {
-    let mut scenario = Scenario::parse("scenario", GROUND)?;
+    let mut scenario = Scenario::parse(ScenarioText {
+        file: "scenario",
+        text: GROUND,
+    })?;
     scenario.site = site.clone();
     Ok(scenario)
 }
@@ -295,7 +298,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_fleet_differs_as_the_server_is_told_whatever_the_seed() {
+    fn the_fleet_differs_as_the_server_is_configured_whatever_the_seed() {
         for (seed, count) in [(1, 5), (2, 5), (3, 2), (4, 9)] {
             let found = biases(count, &mut Random::new(seed));
             let mean = found.iter().sum::<f64>() / f64::from(count);

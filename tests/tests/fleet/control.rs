@@ -102,13 +102,13 @@ async fn a_mission_is_paused_resumed_and_replaced_and_its_record_is_kept() {
         ended.mission.trajectory,
         serde_json::from_value(bend(0.0)).unwrap()
     );
-    let quality = ended.quality.expect("the robot told how it went");
+    let quality = ended.quality.expect("the robot reported how it went");
     assert!(
         quality.paused_s > 0.0 && quality.cross_track_rms_m < 0.2,
         "{quality:?}"
     );
     assert!(!quality.theta.is_empty());
-    let driven = ended.driven.expect("the robot told where it was");
+    let driven = ended.driven.expect("the robot reported where it was");
     let first = driven.points.first().unwrap();
     let last = driven.points.last().unwrap();
     assert!(first.x_m.hypot(first.y_m) < 0.3, "{first:?}");

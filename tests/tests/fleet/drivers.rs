@@ -157,7 +157,7 @@ async fn losing_the_driver_always_stops_the_robot_however_it_happens() {
     it_stands_and_is_free(&fleet).await;
     drop(driver);
 
-    // The network swallows everything, and no side is told.
+    // The network swallows everything, and no side is notified.
     let driver = drive(&fleet, relay.address()).await;
     it_drives(&fleet).await;
     relay.cut();

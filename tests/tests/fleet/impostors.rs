@@ -47,7 +47,7 @@ async fn of_two_agents_under_one_name_the_newest_counts_and_the_other_ends_its_m
         .mission_reaches(mission, &[MissionState::Failed], SHORT)
         .await;
     assert_eq!(failed.mission.cause, Cause::AgentRestarted);
-    // The older one does not drive on: it was told, and what it says of that is kept.
+    // The older one does not drive on: it got a cancel, and what it reports of that is kept.
     let log = || async { fleet.log(robot.as_str()) };
     let ended = format!("mission {mission} ended: Cancelled");
     eventually("the older one ends it", SHORT, log, |log| {

@@ -41,15 +41,20 @@ async fn a_robot_joins_drives_a_circle_renews_on_the_way_and_is_put_out() {
 
     fleet.revoke(&robot).await;
     let seen = || fleet.rest.robot(&robot);
-    eventually("it is offline, and people are told", SHORT, seen, |seen| {
-        seen.as_ref().is_some_and(|seen| {
-            let told = seen
-                .alerts
-                .iter()
-                .any(|alert| alert.code.as_str() == "revoked-robot");
-            seen.link == LinkState::Offline && told
-        })
-    })
+    eventually(
+        "it is offline, and an alert is raised",
+        SHORT,
+        seen,
+        |seen| {
+            seen.as_ref().is_some_and(|seen| {
+                let is_raised = seen
+                    .alerts
+                    .iter()
+                    .any(|alert| alert.code.as_str() == "revoked-robot");
+                seen.link == LinkState::Offline && is_raised
+            })
+        },
+    )
     .await;
 
     // It comes back by a token that names it, and by nothing else.
@@ -208,7 +213,7 @@ async fn the_authority_is_rotated_under_a_robot_that_drives_and_one_that_comes_b
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_robot_that_comes_back_after_its_authority_was_retired_is_told_of_and_joins_again() {
+async fn a_robot_that_comes_back_after_its_authority_was_retired_raises_an_alert_and_joins_again() {
     let mut fleet = secure_fleet(LONG_CERTIFICATE_S).await;
     let [there, late] = ["rover-1", "rover-2"].map(|name| name.parse::<RobotId>().unwrap());
     for (robot, x_m) in [(&late, 20.0), (&there, 0.0)] {
@@ -229,7 +234,7 @@ async fn a_robot_that_comes_back_after_its_authority_was_retired_is_told_of_and_
         let mut alerts = robot.alerts.iter();
         alerts.any(|alert| alert.code.as_str() == "retired-authority")
     };
-    eventually("people are told", SHORT, look, |seen| {
+    eventually("an alert is raised", SHORT, look, |seen| {
         seen.as_ref()
             .is_some_and(|seen| is_notified(seen) && seen.link == LinkState::Offline)
     })
@@ -267,7 +272,7 @@ async fn after_a_replacement_no_robot_of_before_gets_in_until_it_has_joined_agai
     for robot in [&first, &second] {
         let look = || fleet.rest.robot(robot);
         eventually(
-            "its link is cut, and people are told",
+            "its link is cut, and an alert is raised",
             SHORT,
             look,
             |seen| {

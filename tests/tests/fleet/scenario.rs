@@ -1,6 +1,6 @@
 //! Fleets in a simulated time: what the map is worth, and what a wrong one does not do.
 
-use tread_agent::sim::scenario::{Scenario, ScenarioRobot};
+use tread_agent::sim::scenario::{Scenario, ScenarioRobot, ScenarioText};
 use tread_api::friction::{ModelFriction, StoredSegment, TerrainFriction};
 use tread_api::ids::{MissionId, RobotId, SiteId};
 use tread_api::mission::{MissionDetail, MissionState};
@@ -26,7 +26,11 @@ class = "grass"
 polygon = [[-40, -40], [40, -40], [40, 40], [-40, 40]]
 stiffness = 2.5
 "#;
-    let mut scenario = Scenario::parse("field", text).unwrap();
+    let mut scenario = Scenario::parse(ScenarioText {
+        file: "field",
+        text,
+    })
+    .unwrap();
     for (&(name, stiffness_ratio), seed) in robots.iter().zip(40..) {
         scenario.robots.push(ScenarioRobot {
             id: name.parse().unwrap(),

@@ -342,7 +342,9 @@ impl<'client> Screen<'client> {
                                 stop.id
                             )
                         }
-                        Ok(_) => format!("{robot} has NOT CONFIRMED its stop; it is told again"),
+                        Ok(_) => {
+                            format!("{robot} has NOT CONFIRMED its stop; the stop is sent again")
+                        }
                         Err(error) => format!("{robot} may not be stopped: {error}"),
                     }
                 }));

@@ -1,40 +1,41 @@
-//! The two motions that are compared, and how far two words on one of them may be apart.
+//! The two compared motions, turn and forward, and the tolerated differences between channels.
 
 use super::super::history::Commanded;
-use super::super::{Finding, Kind, Subject, Unit};
+use super::super::{Comparison, Finding, Kind, Subject, Unit};
 use crate::geometry::Twist;
 
-/// Slowest motions that show an inverted sign, radians and metres per second.
+/// Minimum magnitude of both values for an inverted sign, radians per second or metres per second.
 const SIGN_MIN: f64 = 0.12;
-/// How well the body or the wheels obey a command.
+/// Tolerance within which body or wheels follow a command.
 const OBEYS: Tolerance = Tolerance {
     own_rad_s: 0.15,
     own_m_s: 0.08,
     share_turn: 0.2,
     forward_share: 0.2,
 };
-/// From where on wheels do not, if the body does.
+/// Tolerance beyond which wheels do not follow their command, if the body does.
 const DISOBEYS: Tolerance = Tolerance {
     own_rad_s: 0.08,
     own_m_s: 0.05,
     share_turn: 0.15,
     forward_share: 0.15,
 };
-/// How much more than commanded wheels may say.
+/// Tolerance beyond which measured wheel speeds are above their command.
 const ABOVE: Tolerance = Tolerance {
     own_rad_s: 0.1,
     own_m_s: 0.05,
     share_turn: 0.1,
     forward_share: 0.05,
 };
-/// How near, of what the wheels say above the command, the body is to that.
+/// Maximum excess of the body over the command, as a fraction of the wheels' excess, for a fault of
+/// their sensor.
 const NEARER_ABOVE: f64 = 0.4;
-/// The same forward, of a body to its command than wheels are.
+/// Maximum deviation of the body from the command, forward, as a fraction of the wheels' deviation.
 const NEARER_FORWARD: f64 = 0.9;
-/// Nearer to one than to the other: at most this share of the distance.
+/// Ratio of distances below which a value is nearer to one than to the other.
 pub(super) const NEARER: f64 = 0.6;
 
-/// How far two motions may be apart: a part of its own and a share of the larger.
+/// Tolerated difference of two motions: an absolute part plus a fraction of the larger one.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Tolerance {
     pub(super) own_rad_s: f64,
@@ -43,11 +44,37 @@ pub(super) struct Tolerance {
     pub(super) forward_share: f64,
 }
 
-/// One of the two motions.
+/// What the wheels and another channel of the body say of one motion.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Rates {
+    pub(super) wheels: f64,
+    pub(super) body: f64,
+}
+
+/// One of the two compared motions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Axis {
     Turn,
     Forward,
+}
+
+impl Rates {
+    pub(super) fn difference(self) -> f64 {
+        (self.body - self.wheels).abs()
+    }
+
+    /// The wheels are in doubt.
+    pub(super) fn of_wheels(self) -> Comparison {
+        Comparison {
+            observed: self.wheels,
+            predicted: self.body,
+        }
+    }
+
+    /// The other channel is in doubt.
+    pub(super) fn of_body(self) -> Comparison {
+        self.of_wheels().reversed()
+    }
 }
 
 impl Axis {
@@ -65,6 +92,7 @@ impl Axis {
         }
     }
 
+    /// How far two values of this motion may be apart, in either order.
     pub(super) fn slack(self, tolerance: Tolerance, one: f64, other: f64) -> f64 {
         let (own, share) = match self {
             Self::Turn => (tolerance.own_rad_s, tolerance.share_turn),
@@ -73,7 +101,7 @@ impl Axis {
         own + share * one.abs().max(other.abs())
     }
 
-    /// How far a motion is from all that was commanded.
+    /// Returns the distance of a motion from the range of commands; 0 within.
     pub(super) fn off_command(self, motion: f64, commanded: &Commanded) -> f64 {
         let (least, most) = (self.of(commanded.least), self.of(commanded.most));
         (least - motion).max(motion - most).max(0.0)
@@ -84,25 +112,27 @@ impl Axis {
         self.off_command(motion, commanded) <= self.slack(OBEYS, least, most)
     }
 
-    /// Whether wheels contradict their command and the body is on the command's side: what no slip
-    /// does.
-    pub(super) fn is_of_sensor(self, wheels: f64, body: f64, commanded: &Commanded) -> bool {
-        if self.is_above(wheels, body, commanded) {
+    /// Returns whether wheels contradict their command and the body follows it, which no slip
+    /// causes.
+    pub(super) fn is_of_sensor(self, rates: Rates, commanded: &Commanded) -> bool {
+        if self.is_above(rates, commanded) {
             return true;
         }
         let (least, most) = (self.of(commanded.least), self.of(commanded.most));
-        let off = self.off_command(wheels, commanded);
+        let off = self.off_command(rates.wheels, commanded);
         let nearer = match self {
             Self::Turn => NEARER,
-            // Ahead nothing makes the body faster than wheels that are driven.
+            // Forward, nothing makes the body faster than driven wheels.
             Self::Forward => NEARER_FORWARD,
         };
-        off > self.slack(DISOBEYS, least, most) && self.off_command(body, commanded) < nearer * off
+        off > self.slack(DISOBEYS, least, most)
+            && self.off_command(rates.body, commanded) < nearer * off
     }
 
-    /// Whether wheels say more than they are commanded and the body does not: motors reach less
-    /// than is asked of them, or the wheels slip, but never more.
-    pub(super) fn is_above(self, wheels: f64, body: f64, commanded: &Commanded) -> bool {
+    /// Returns whether wheels measure more than commanded and the body does not follow: saturated
+    /// motors and slipping wheels give less than commanded, never more.
+    pub(super) fn is_above(self, rates: Rates, commanded: &Commanded) -> bool {
+        let Rates { wheels, body } = rates;
         let (least, most) = (self.of(commanded.least), self.of(commanded.most));
         let (most, least) = if wheels < 0.0 {
             (-least, -most)
@@ -116,13 +146,11 @@ impl Axis {
     }
 }
 
-pub(super) fn finding(
-    subject: Subject,
-    kind: Kind,
-    observed: f64,
-    predicted: f64,
-    axis: Axis,
-) -> Finding {
+pub(super) fn finding(subject: Subject, kind: Kind, comparison: Comparison, axis: Axis) -> Finding {
+    let Comparison {
+        observed,
+        predicted,
+    } = comparison;
     Finding {
         subject,
         kind,
@@ -132,8 +160,12 @@ pub(super) fn finding(
     }
 }
 
-/// How a channel is wrong.
-pub(super) fn kind_of(observed: f64, predicted: f64, is_frozen: bool) -> Kind {
+/// Returns the type of fault of a channel.
+pub(super) fn kind_of(comparison: Comparison, is_frozen: bool) -> Kind {
+    let Comparison {
+        observed,
+        predicted,
+    } = comparison;
     let (small, large) = if observed.abs() < predicted.abs() {
         (observed.abs(), predicted.abs())
     } else {

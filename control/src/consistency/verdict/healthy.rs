@@ -1,15 +1,15 @@
-//! Which channels are shown to be right: by motion, by no longer being what was found, or at rest.
+//! Channels confirmed to be right: by motion, by the end of the fault found, or at standstill.
 
 use super::axis::Axis;
 use super::{Recent, Verdicts, View};
 use crate::consistency::{Kind, Subject, Unit};
 
-/// Motion that shows whether a channel agrees, radians and metres per second.
+/// Minimum motion that confirms a channel, radians per second or metres per second.
 const EXCITED: f64 = 0.1;
-/// The same of the place.
+/// Minimum motion that confirms the position, radians per second or metres per second.
 const EXCITED_PLACE: f64 = 0.2;
 
-/// Says which channels agree, where nothing contradicts anything.
+/// Records which channels agree; called only while nothing contradicts.
 pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
     let standing = |subject: Subject| view.tracks[subject as usize].standing;
     let means = &recent.means;
@@ -17,7 +17,7 @@ pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
     let turns = gyro.abs() >= EXCITED && wheels.angular_rad_s.abs() >= EXCITED;
     let goes = wheels.linear_m_s.abs() >= EXCITED;
     let has_fixes = view.seen().next().is_some();
-    // What was wrong at rest is right where it agrees at rest.
+    // A fault found at standstill is over if the channel agrees at standstill.
     let was_at_rest = |subject: Subject| {
         standing(subject).is_some_and(|found| {
             found.kind == Kind::Inconsistent && found.predicted.abs() < EXCITED
@@ -39,7 +39,8 @@ pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
     let position = standing(Subject::Position);
     let has_jumped = position.is_some_and(|found| found.kind == Kind::Jumped);
     let position_lives = was_frozen(Subject::Position) && !repeats.position.is_frozen();
-    // A motion of the kind in which it was found shows a place; turning shows no scale.
+    // Motion of the kind in which the fault was found confirms the position; turning does not
+    // confirm the scale.
     let shows_place = |subject: Subject| {
         let is_large = |speed: f64| speed.abs() >= EXCITED_PLACE;
         let goes = is_large(wheels.linear_m_s);
@@ -66,8 +67,8 @@ pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
         verdicts.agree(Subject::Motion);
     }
     verdicts.agree(Subject::WheelsAndMotion);
-    // What was frozen and still repeats itself is not shown to be right by standing still. A source
-    // that only says the same while the robot stands may be; motion will show it at once.
+    // Standstill does not confirm a frozen source that still repeats. A source that repeats only
+    // while the robot stands may be right; motion will show it immediately.
     let is_heard = uses.position && view.seen.iter().any(Option::is_some);
     if is_heard && view.stands {
         if !(was_frozen(Subject::Position) && repeats.position.is_repeating()) {

@@ -1,7 +1,7 @@
-//! Who contradicts whom, and who is wrong.
+//! Comparison of channels with each other, and identification of the wrong one.
 //!
-//! A channel that a finding names says nothing of the others: they are judged without it, and it is
-//! compared with them for its own sake alone, to see whether its finding may end.
+//! A channel named by a finding is left out when the others are compared. It is then compared with
+//! them separately, to see whether its finding may end.
 
 mod axis;
 mod forward;
@@ -12,7 +12,7 @@ mod wheels;
 mod witnesses;
 
 use super::fixes::{Jump, Seen};
-use super::history::{Commanded, History, Means};
+use super::history::{Commanded, History, Means, Span};
 use super::turn_gain::TurnGain;
 use super::{AllRepeats, Finding, Subject, Track};
 use crate::geometry::Twist;
@@ -21,27 +21,27 @@ use axis::{Axis, Tolerance};
 
 /// Span over which fast channels are compared, seconds.
 const RECENT_S: f64 = 0.3;
-/// How long a command may take to show, seconds.
+/// Maximum delay from a command to its effect, seconds.
 const COMMAND_LAG_S: f64 = 0.3;
-/// Share of the fixes' noise by which one channel must be nearer to them than another.
+/// Fraction of the fixes' noise by which one channel must be nearer to them than another.
 const WITNESS_NOISE_RATIO: f64 = 0.8;
-/// What two channels of the body may differ by, above their noise.
+/// Tolerated difference of two channels of the body's motion, in addition to noise.
 const BODY: Tolerance = Tolerance {
     own_rad_s: 0.02,
     own_m_s: 0.06,
     share_turn: 0.12,
     forward_share: 0.12,
 };
-/// Share of the commanded speed below which motors may be at their limit.
+/// Ratio of measured to commanded wheel speed below which motors may be saturated.
 const SATURATED: f64 = 0.95;
-/// How long contradictions must last, seconds: of fast channels, of fixes, where slip is one
-/// explanation, and of a frozen channel.
+/// Duration of a contradiction until it becomes a finding, seconds: of fast channels, of fixes,
+/// where slip is one explanation, and of a frozen channel.
 const RAISE_FAST_S: f64 = 0.3;
 const RAISE_FIX_S: f64 = 0.15;
 const RAISE_SLIP_S: f64 = 0.6;
 const RAISE_FROZEN_S: f64 = 0.1;
 
-/// Which channels are compared.
+/// Channels that are compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[expect(clippy::struct_excessive_bools, reason = "each is one channel")]
 pub(super) struct Uses {
@@ -52,7 +52,7 @@ pub(super) struct Uses {
 }
 
 impl Uses {
-    /// Channels that no finding names.
+    /// Returns the channels that no finding names.
     fn believed(tracks: &[Track]) -> Self {
         let is_right = |subject: Subject| tracks[subject as usize].standing.is_none();
         Self {
@@ -63,7 +63,8 @@ impl Uses {
         }
     }
 
-    /// The same with one that a finding names, if there is a finding about it.
+    /// Adds the channel of a subject; None if it is included already or the subject is no single
+    /// channel.
     fn with(self, subject: Subject) -> Option<Self> {
         let mut with = self;
         match subject {
@@ -81,7 +82,7 @@ impl Uses {
     }
 }
 
-/// What is looked at.
+/// Input of one comparison.
 #[derive(Clone, Copy)]
 pub(super) struct View<'a> {
     pub(super) model: &'a RobotModel,
@@ -91,31 +92,33 @@ pub(super) struct View<'a> {
     pub(super) repeats: &'a AllRepeats,
     pub(super) tracks: &'a [Track],
     pub(super) turn_gain: TurnGain,
-    /// Whether the robot stands by command and wheels, and the fixes with it.
+    /// Whether the robot has stopped by command and wheels, and the fixes do not move.
     pub(super) stands: bool,
     pub(super) uses: Uses,
 }
 
 impl<'a> View<'a> {
-    /// The same with the channels that no finding names.
+    /// Returns this view with the channels that no finding names.
     pub(super) fn with_believed(self) -> Self {
         let uses = Uses::believed(self.tracks);
         Self { uses, ..self }
     }
 
-    /// What fixes say of each span, the shortest first; those that repeat themselves say nothing.
+    /// Returns the motion by fixes for each span, the shortest first; empty while fixes repeat.
     fn seen(&self) -> impl Iterator<Item = &'a Seen> {
         let is_used = self.uses.position && !self.repeats.position.is_repeating();
         self.seen.iter().flatten().filter(move |_| is_used)
     }
 
-    /// What was commanded for a span.
+    /// Returns the range of commands for a span, including their delay.
     fn commanded(&self, seen: &Seen) -> Commanded {
-        self.history
-            .commanded(seen.from_s - COMMAND_LAG_S, seen.to_s)
+        self.history.commanded(Span {
+            from_s: seen.from_s - COMMAND_LAG_S,
+            to_s: seen.to_s,
+        })
     }
 
-    /// Whether the motors may reach less than is asked of them.
+    /// Returns whether the motors may be saturated, so that wheels turn less than commanded.
     fn is_saturated(&self, wheels: Twist, commanded: &Commanded) -> bool {
         let rim = |twist| {
             let wheels = self.model.wheel_speeds_from_twist(twist);
@@ -126,12 +129,11 @@ impl<'a> View<'a> {
     }
 
     fn recent_means(&self) -> Option<Means> {
-        let now_s = self.history.now().at_s;
-        self.history.means(now_s - RECENT_S, now_s)
+        self.history.means(self.history.last(RECENT_S))
     }
 }
 
-/// What is found in one bin, by subject.
+/// Results of one bin, by subject.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Verdicts {
     against: [Option<(Finding, f64)>; Subject::ALL.len()],
@@ -153,7 +155,7 @@ impl Verdicts {
         self.rests[subject as usize] = true;
     }
 
-    /// Whether channels that are believed contradict nobody.
+    /// Returns whether there is no contradiction.
     pub(super) fn is_consistent(&self) -> bool {
         self.against.iter().all(Option::is_none)
     }
@@ -170,23 +172,23 @@ impl Verdicts {
     }
 }
 
-/// What is found of one subject in one bin.
+/// Result for one subject in one bin.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Verdict {
-    /// It contradicts, and after so many seconds of that a finding stands.
+    /// It contradicts; the finding becomes active after the given number of seconds.
     Against(Finding, f64),
-    /// It contradicts, and a finding stands already.
+    /// It contradicts, and a finding is active already.
     StillAgainst,
-    /// It is shown to be right.
+    /// It is confirmed to be right.
     Agrees,
-    /// It says what a robot that stands would make it say.
+    /// It agrees with a stopped robot.
     AgreesAtRest,
-    /// Nothing shows what it is like.
+    /// There is no evidence.
     Nothing,
 }
 
 impl Verdict {
-    /// The same, which lets a finding stand as soon as it contradicts.
+    /// Returns this result with a duration of 0 until the finding becomes active.
     pub(super) fn at_once(self) -> Self {
         match self {
             Self::Against(finding, _) => Self::Against(finding, 0.0),
@@ -207,8 +209,14 @@ impl Recent {
         let now_s = view.history.now().at_s;
         let middle_s = now_s - 0.5 * RECENT_S;
         let halves = (
-            view.history.means(now_s - RECENT_S, middle_s),
-            view.history.means(middle_s, now_s),
+            view.history.means(Span {
+                from_s: now_s - RECENT_S,
+                to_s: middle_s,
+            }),
+            view.history.means(Span {
+                from_s: middle_s,
+                to_s: now_s,
+            }),
         );
         let change = |axis: Axis| match halves {
             (Some(early), Some(late)) => (axis.of(late.wheels) - axis.of(early.wheels)).abs(),
@@ -218,14 +226,15 @@ impl Recent {
             means: view.recent_means()?,
             turn_change: change(Axis::Turn),
             forward_change: change(Axis::Forward),
-            commanded: view
-                .history
-                .commanded(now_s - RECENT_S - COMMAND_LAG_S, now_s),
+            commanded: view.history.commanded(Span {
+                from_s: now_s - RECENT_S - COMMAND_LAG_S,
+                to_s: now_s,
+            }),
         })
     }
 }
 
-/// Looks at everything.
+/// Compares all channels, then each one that a finding names.
 pub(super) fn judge(view: &View<'_>, verdicts: &mut Verdicts) {
     let Some(recent) = Recent::of(view) else {
         return;
@@ -247,7 +256,7 @@ pub(super) fn judge(view: &View<'_>, verdicts: &mut Verdicts) {
     }
 }
 
-/// Compares the channels that are used.
+/// Compares the channels in use.
 fn compare(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
     if view.uses.position {
         position::jumped(view, verdicts);

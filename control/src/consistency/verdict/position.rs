@@ -1,19 +1,20 @@
-//! Position fixes by themselves: a jump, and fixes that stay while the robot goes on.
+//! Position fixes alone: jumps, and fixes that stay constant while the robot moves.
 
 use super::axis::{Axis, finding};
 use super::{RAISE_FROZEN_S, Recent, Verdicts, View};
-use crate::consistency::{Finding, Kind, Subject, Unit};
+use crate::consistency::history::Span;
+use crate::consistency::{Comparison, Finding, Kind, Subject, Unit};
 
-/// Path and turn in which a frozen position should have moved, metres and radians.
+/// Distance and turn during which a constant position is a fault, metres and radians.
 const FROZEN_PATH: (f64, f64) = (0.08, 0.12);
-/// Longest time for that, seconds.
+/// Maximum time over which distance and turn are taken, seconds.
 const FROZEN_SPAN_MAX_S: f64 = 2.0;
 
 pub(super) fn jumped(view: &View<'_>, verdicts: &mut Verdicts) {
     let Some(jump) = view.jump else {
         return;
     };
-    // The larger of both, a metre being as far as a radian.
+    // The larger of both values, one metre counting as one radian.
     let (observed, unit) = if jump.by_m >= jump.by_rad.abs() {
         (jump.by_m, Unit::Metres)
     } else {
@@ -29,7 +30,7 @@ pub(super) fn jumped(view: &View<'_>, verdicts: &mut Verdicts) {
     verdicts.contradict(finding, 0.0);
 }
 
-/// Fixes that stay the same to the last bit while wheels or gyro say that the robot went on.
+/// Detects fixes that repeat to the last bit while wheels or gyro show motion.
 pub(super) fn frozen(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
     let repeats = &view.repeats.position;
     let Some(since) = repeats.since().filter(|_| repeats.is_frozen()) else {
@@ -38,7 +39,10 @@ pub(super) fn frozen(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) 
     let now_s = view.history.now().at_s;
     let from_s = since.as_secs_f64().max(now_s - FROZEN_SPAN_MAX_S);
     let span_s = now_s - from_s;
-    let Some(means) = view.history.means(from_s, now_s) else {
+    let Some(means) = view.history.means(Span {
+        from_s,
+        to_s: now_s,
+    }) else {
         return;
     };
     let path_m = means.wheels.linear_m_s.abs() * span_s;
@@ -49,7 +53,7 @@ pub(super) fn frozen(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) 
             && forward_m_s.abs() < 0.25 * means.wheels.linear_m_s.abs()
     });
     let moves = view.uses.wheels && path_m >= FROZEN_PATH.0 && !odometry_stands;
-    // A gyro that is frozen too says nothing.
+    // A gyro that is frozen too is no evidence.
     let turns = view.uses.gyro
         && turn_rad >= FROZEN_PATH.1
         && !view.repeats.gyro.is_frozen()
@@ -60,7 +64,11 @@ pub(super) fn frozen(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) 
         } else {
             (means.gyro_rad_s, Axis::Turn)
         };
-        let finding = finding(Subject::Position, Kind::Frozen, 0.0, predicted, axis);
+        let comparison = Comparison {
+            observed: 0.0,
+            predicted,
+        };
+        let finding = finding(Subject::Position, Kind::Frozen, comparison, axis);
         verdicts.contradict(finding, RAISE_FROZEN_S);
     }
 }

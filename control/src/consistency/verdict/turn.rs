@@ -1,6 +1,6 @@
-//! The turn rate: gyro, wheels, and the heading of position fixes.
+//! Turn rate: gyro, wheels, and the heading of position fixes.
 
-use super::axis::{Axis, Tolerance, finding, kind_of};
+use super::axis::{Axis, Rates, Tolerance, finding, kind_of};
 use super::wheels::{self, WHEELS, WITNESSED};
 use super::witnesses::{Nearer, Witnesses};
 use super::{
@@ -9,24 +9,24 @@ use super::{
 };
 use crate::consistency::fixes::Seen;
 use crate::consistency::history::Means;
-use crate::consistency::{Kind, Subject};
+use crate::consistency::{Comparison, Kind, Subject};
 
 const AXIS: Axis = Axis::Turn;
 
-/// By how much the wheels must be nearer to the heading than the gyro is, beside noise: more than a
-/// usual offset of the gyro.
+/// Minimum difference by which the wheels must be nearer to the heading than the gyro is, in
+/// addition to noise: more than a usual offset of the gyro, radians per second.
 const WITNESSED_MIN_RAD_S: f64 = 0.04;
-/// What wheels may differ by from the body once their gain is known.
+/// Tolerated difference of wheels and body once their gain is known.
 const LEARNED: Tolerance = Tolerance {
     share_turn: 0.14,
     ..WHEELS
 };
 
-/// Looks at the turn rate; whether nothing contradicts.
+/// Compares the turn rates; returns whether nothing contradicts.
 pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) -> bool {
     let mut agreed = None;
     for seen in view.seen() {
-        let Some(means) = view.history.means(seen.from_s, seen.to_s) else {
+        let Some(means) = view.history.means(seen.span()) else {
             continue;
         };
         let heading = means.gyro_rad_s + seen.turn_error_rad_s;
@@ -41,51 +41,60 @@ pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) ->
     }
     if !view.uses.gyro {
         return agreed.is_none_or(|(heading, seen, means)| {
-            let wheels = means.wheels.angular_rad_s;
+            let rates = Rates {
+                wheels: means.wheels.angular_rad_s,
+                body: heading,
+            };
             let commanded = view.commanded(seen);
-            let (slack, share) = wheels::slack(view, AXIS, wheels, heading, &commanded);
+            let (slack, share) = wheels::slack(view, AXIS, rates, &commanded);
             let slack = slack + share * seen.wheels_noise_rad_s + recent.turn_change;
-            let is_clean = (heading - wheels).abs() <= slack;
+            let is_clean = rates.difference() <= slack;
             if !is_clean {
-                wheels::against_body(view, heading, wheels, &commanded, AXIS, verdicts);
+                wheels::against_body(view, rates, &commanded, AXIS, verdicts);
             }
             is_clean
         });
     }
     let is_frozen = view.repeats.gyro.is_frozen();
-    let (gyro, wheels) = (recent.means.gyro_rad_s, recent.means.wheels.angular_rad_s);
-    let (slack, _) = wheels::slack(view, AXIS, wheels, gyro, &recent.commanded);
-    if (gyro - wheels).abs() <= slack + recent.turn_change {
+    let rates = Rates {
+        wheels: recent.means.wheels.angular_rad_s,
+        body: recent.means.gyro_rad_s,
+    };
+    let (slack, _) = wheels::slack(view, AXIS, rates, &recent.commanded);
+    if rates.difference() <= slack + recent.turn_change {
         return true;
     }
-    let obeys = AXIS.obeys(wheels, &recent.commanded);
+    let obeys = AXIS.obeys(rates.wheels, &recent.commanded);
     if is_frozen && obeys && !view.repeats.wheels.is_frozen() {
-        let found = finding(Subject::Gyro, Kind::Frozen, gyro, wheels, AXIS);
+        let found = finding(Subject::Gyro, Kind::Frozen, rates.of_body(), AXIS);
         verdicts.contradict(found, RAISE_FROZEN_S);
         return false;
     }
-    let is_opposite = kind_of(gyro, wheels, false) == Kind::Inverted;
+    let is_opposite = kind_of(rates.of_body(), false) == Kind::Inverted;
     match agreed {
-        // Fixes of the same span see the same contradiction: two channels of the body agree.
+        // The wheels are at fault only if fixes over the same span contradict them too.
         Some((heading, _, means)) => {
-            let wheels = means.wheels.angular_rad_s;
-            let (slack, _) = wheels::slack(view, AXIS, wheels, heading, &recent.commanded);
-            if (heading - wheels).abs() <= slack {
+            let by_fixes = Rates {
+                wheels: means.wheels.angular_rad_s,
+                body: heading,
+            };
+            let (slack, _) = wheels::slack(view, AXIS, by_fixes, &recent.commanded);
+            if by_fixes.difference() <= slack {
                 return false;
             }
-            wheels::against_body(view, gyro, wheels, &recent.commanded, AXIS, verdicts);
+            wheels::against_body(view, rates, &recent.commanded, AXIS, verdicts);
         }
         None if view.seen().next().is_some() => {}
         None if is_opposite && obeys => {
-            let found = finding(Subject::Gyro, Kind::Inverted, gyro, wheels, AXIS);
+            let found = finding(Subject::Gyro, Kind::Inverted, rates.of_body(), AXIS);
             verdicts.contradict(found, RAISE_FAST_S);
         }
-        None => wheels::against_body(view, gyro, wheels, &recent.commanded, AXIS, verdicts),
+        None => wheels::against_body(view, rates, &recent.commanded, AXIS, verdicts),
     }
     false
 }
 
-/// Whether the gyro and the heading of fixes say the same over a span.
+/// Returns whether the gyro and the heading of fixes agree over a span.
 fn agrees_with_heading(view: &View<'_>, recent: &Recent, seen: &Seen, means: &Means) -> bool {
     let gyro = means.gyro_rad_s;
     let heading = gyro + seen.turn_error_rad_s;
@@ -102,12 +111,12 @@ fn agrees_with_heading(view: &View<'_>, recent: &Recent, seen: &Seen, means: &Me
     !is_witnessed
 }
 
-/// Gyro and heading contradict each other: names the wrong one, or both.
+/// Names the wrong one of gyro and heading, or [`Subject::Motion`] if neither can be excluded.
 fn blame(view: &View<'_>, seen: &Seen, means: &Means, verdicts: &mut Verdicts) {
     let (gyro, wheels) = (means.gyro_rad_s, means.wheels.angular_rad_s);
     let heading = gyro + seen.turn_error_rad_s;
     let commanded = view.commanded(seen);
-    // What the wheels say, on this ground by this robot.
+    // Turn rate by wheels, corrected by the gain of this robot on this ground.
     let gain = view.turn_gain.known();
     let by_gain = (1.0 - gain.unwrap_or(1.0)) * wheels;
     let tolerance = if gain.is_some() { LEARNED } else { WHEELS };
@@ -124,21 +133,26 @@ fn blame(view: &View<'_>, seen: &Seen, means: &Means, verdicts: &mut Verdicts) {
         )),
     };
     let repeats = view.repeats;
+    let of_gyro = Comparison {
+        observed: gyro,
+        predicted: heading,
+    };
+    let of_heading = of_gyro.reversed();
     match witnesses.side() {
-        // Fixes and wheels are both slow where a turn begins: blaming the fixes takes longer.
+        // Fixes and wheels both lag where a turn begins, so a finding about the fixes takes longer.
         Some(Nearer::First) => {
-            let kind = kind_of(heading, gyro, repeats.position.is_frozen());
-            let found = finding(Subject::Position, kind, heading, gyro, AXIS);
+            let kind = kind_of(of_heading, repeats.position.is_frozen());
+            let found = finding(Subject::Position, kind, of_heading, AXIS);
             verdicts.contradict(found, RAISE_SLIP_S);
         }
         Some(Nearer::Second) => {
-            let kind = kind_of(gyro, heading, repeats.gyro.is_frozen());
-            let found = finding(Subject::Gyro, kind, gyro, heading, AXIS);
+            let kind = kind_of(of_gyro, repeats.gyro.is_frozen());
+            let found = finding(Subject::Gyro, kind, of_gyro, AXIS);
             verdicts.contradict(found, RAISE_FIX_S);
         }
         None => {
             let kind = Kind::Inconsistent;
-            let found = finding(Subject::Motion, kind, gyro, heading, AXIS);
+            let found = finding(Subject::Motion, kind, of_gyro, AXIS);
             verdicts.contradict(found, RAISE_FIX_S);
         }
     }

@@ -1,56 +1,58 @@
-//! Wheels that contradict the body: their sensor, slip, or a side that stands.
+//! Wheels that contradict the body: faulty sensor, slip, or a locked side.
 
-use super::axis::{Axis, NEARER, Tolerance, finding, kind_of};
+use super::axis::{Axis, NEARER, Rates, Tolerance, finding, kind_of};
 use super::{RAISE_FAST_S, RAISE_FROZEN_S, RAISE_SLIP_S, Recent, Verdicts, View};
-use crate::consistency::history::Commanded;
-use crate::consistency::{Finding, Kind, Subject, Unit};
+use crate::consistency::history::{Commanded, Span};
+use crate::consistency::{Comparison, Finding, Kind, Subject, Unit};
 use crate::geometry::Twist;
 use crate::measured::WheelSpeeds;
 
-/// What wheels and body may differ by: wheels slip, and scrub in turns.
+/// Tolerated difference of wheels and body: wheels slip, and scrub in turns.
 pub(super) const WHEELS: Tolerance = Tolerance {
     own_rad_s: 0.08,
     own_m_s: 0.06,
     share_turn: 0.28,
     forward_share: 0.16,
 };
-/// The same where the command, or another channel of the body, says as well that one is wrong.
+/// Tolerated difference where the command, or another channel of the body, also indicates a fault.
 pub(super) const WITNESSED: Tolerance = Tolerance {
     own_rad_s: 0.06,
     own_m_s: 0.05,
     share_turn: 0.15,
     forward_share: 0.12,
 };
-/// The same where wheels say more than they are commanded.
+/// Tolerated difference where wheels measure more than commanded.
 const ABOVE: Tolerance = Tolerance {
     own_rad_s: 0.06,
     own_m_s: 0.05,
     share_turn: 0.15,
     forward_share: 0.1,
 };
-/// Shares of the fixes' noise that are let be where the command says as well that wheels are wrong.
+/// Fractions of the fixes' noise that are tolerated where the command also indicates a fault of the
+/// wheels.
 const SENSOR_NOISE_RATIO: f64 = 0.6;
 const ABOVE_NOISE_RATIO: f64 = 0.5;
-/// Change of the command, radians and metres per second and a share of it, that shows in the word
-/// of wheels that turn, and how long it may take to show, seconds.
+/// Change of the command, radians or metres per second plus a fraction of it, that must change the
+/// value of turning wheels, and the maximum delay of that, seconds.
 const HELD_MIN: f64 = 0.08;
 const HELD_SHARE: f64 = 0.1;
 const HELD_LAG_S: f64 = 0.25;
-/// Span in which a side that stands shows, seconds.
+/// Span in which a locked side is detected, seconds.
 const LOCKED_SPAN_S: f64 = 0.2;
-/// How long a side's command may take to show, seconds.
+/// Maximum delay from a side's command to its effect, seconds.
 const LOCKED_LAG_S: f64 = 0.3;
-/// A wheel stands below this share of its command and goes above that one.
+/// Fractions of the command: a side is locked below the first and turns above the second.
 const LOCKED: (f64, f64) = (0.2, 0.5);
-/// Slowest command by which a locked wheel shows, metres per second.
+/// Minimum command at which a locked side is detected, metres per second.
 const LOCKED_MIN_M_S: f64 = 0.16;
-/// How long the sensor of wheels, and a locked side, must show, seconds.
+/// Duration of a fault of the wheels' sensor, of a locked side, and of repeating wheels until a
+/// finding, seconds.
 const RAISE_SENSOR_S: f64 = 0.2;
 const RAISE_LOCKED_S: f64 = 0.3;
 const RAISE_REPEATING_S: f64 = 0.5;
 
-/// Wheels and gyro that both repeat themselves while the wheels are to do something else: a base
-/// that says the same for ever. A gyro with noise would not.
+/// Detects a base whose wheels and gyro both repeat while the wheels are commanded otherwise. A
+/// gyro with noise does not repeat.
 pub(super) fn frozen_base(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
     let are_used = view.uses.wheels && view.uses.gyro;
     if !(are_used && view.repeats.wheels.is_frozen() && view.repeats.gyro.is_frozen()) {
@@ -62,39 +64,47 @@ pub(super) fn frozen_base(view: &View<'_>, recent: &Recent, verdicts: &mut Verdi
         if !axis.obeys(wheels, commanded) {
             let (least, most) = (axis.of(commanded.least), axis.of(commanded.most));
             let predicted = if wheels < least { least } else { most };
-            let found = finding(Subject::Wheels, Kind::Frozen, wheels, predicted, axis);
+            let comparison = Comparison {
+                observed: wheels,
+                predicted,
+            };
+            let found = finding(Subject::Wheels, Kind::Frozen, comparison, axis);
             verdicts.contradict(found, RAISE_FAST_S);
             return;
         }
     }
 }
 
-/// What wheels and body may differ by, and the share of the body's noise that comes to it.
+/// Returns the tolerated difference of wheels and body, and the fraction of the body's noise to add
+/// to it.
 pub(super) fn slack(
     view: &View<'_>,
     axis: Axis,
-    wheels: f64,
-    body: f64,
+    rates: Rates,
     commanded: &Commanded,
 ) -> (f64, f64) {
-    if axis.is_above(wheels, body, commanded) {
+    let Rates { wheels, body } = rates;
+    if axis.is_above(rates, commanded) {
         (axis.slack(ABOVE, wheels, body), ABOVE_NOISE_RATIO)
-    } else if axis.is_of_sensor(wheels, body, commanded) || is_held(view, axis) {
+    } else if axis.is_of_sensor(rates, commanded) || is_held(view, axis) {
         (axis.slack(WITNESSED, wheels, body), SENSOR_NOISE_RATIO)
     } else {
         (axis.slack(WHEELS, wheels, body), 1.0)
     }
 }
 
-/// Whether the wheels repeat their word while they are commanded this and that: what no wheel that
-/// turns does. Wheels at rest may.
+/// Returns whether the wheels repeat their value while the command changes, which turning wheels
+/// never do. Stopped wheels may.
 fn is_held(view: &View<'_>, axis: Axis) -> bool {
     let repeats = &view.repeats.wheels;
     let Some(since) = repeats.since().filter(|_| repeats.is_frozen()) else {
         return false;
     };
     let history = view.history;
-    let commanded = history.commanded(since.as_secs_f64(), history.now().at_s - HELD_LAG_S);
+    let commanded = history.commanded(Span {
+        from_s: since.as_secs_f64(),
+        to_s: history.now().at_s - HELD_LAG_S,
+    });
     let (least, most) = (axis.of(commanded.least), axis.of(commanded.most));
     let is_at_rest = view
         .recent_means()
@@ -102,63 +112,64 @@ fn is_held(view: &View<'_>, axis: Axis) -> bool {
     !is_at_rest && most - least > HELD_MIN + HELD_SHARE * least.abs().max(most.abs())
 }
 
-/// How long the sensor of the wheels must show.
+/// Returns the duration of a fault of the wheels' sensor until a finding, seconds.
 fn sensor_raise_s(view: &View<'_>) -> f64 {
     let repeats = &view.repeats.wheels;
     if repeats.is_frozen() {
         RAISE_FROZEN_S
     } else if repeats.is_repeating() {
-        // A moment later it is known whether they are frozen.
+        // Shortly later it is certain whether they are frozen.
         RAISE_REPEATING_S
     } else {
         RAISE_SENSOR_S
     }
 }
 
-/// Wheels that contradict the body: their sensor, or slip.
+/// Records wheels that contradict the body as a faulty sensor or as slip.
 pub(super) fn against_body(
     view: &View<'_>,
-    body: f64,
-    wheels: f64,
+    rates: Rates,
     commanded: &Commanded,
     axis: Axis,
     verdicts: &mut Verdicts,
 ) {
     let is_frozen = view.repeats.wheels.is_frozen();
-    // Motors that reach less than is asked of them turn less as well.
+    // Saturated motors also turn the robot less than commanded.
     let most_rad_s = (commanded.least.angular_rad_s.abs()).max(commanded.most.angular_rad_s.abs());
     let is_saturated = axis == Axis::Turn
         && !is_frozen
-        && wheels.abs() < most_rad_s
+        && rates.wheels.abs() < most_rad_s
         && view
             .recent_means()
             .is_some_and(|recent| view.is_saturated(recent.wheels, commanded));
-    let kind = kind_of(wheels, body, is_frozen);
-    let is_of_sensor = axis.is_of_sensor(wheels, body, commanded) && !is_saturated;
+    let comparison = rates.of_wheels();
+    let kind = kind_of(comparison, is_frozen);
+    let is_of_sensor = axis.is_of_sensor(rates, commanded) && !is_saturated;
     if is_of_sensor || is_held(view, axis) {
-        let found = finding(Subject::Wheels, kind, wheels, body, axis);
+        let found = finding(Subject::Wheels, kind, comparison, axis);
         verdicts.contradict(found, sensor_raise_s(view));
     } else {
         let subject = Subject::WheelsAndMotion;
-        let found = finding(subject, Kind::Inconsistent, wheels, body, axis);
+        let found = finding(subject, Kind::Inconsistent, comparison, axis);
         verdicts.contradict(found, RAISE_SLIP_S);
     }
 }
 
-/// A side that stands though it is commanded to turn, while the other one turns: by the gyro, which
-/// turns as the wheels say if it truly stands, and as commanded if only its encoder does.
+/// Detects a side that stands still though it is commanded to turn, while the other one turns. The
+/// gyro follows the wheels if the side is locked, and the command if only its encoder is faulty.
 pub(super) fn locked(view: &View<'_>, verdicts: &mut Verdicts) {
     let model = view.model;
     let now_s = view.history.now().at_s;
-    let Some(means) = view.history.means(now_s - LOCKED_SPAN_S, now_s) else {
+    let Some(means) = view.history.means(view.history.last(LOCKED_SPAN_S)) else {
         return;
     };
     let measured = model.wheel_speeds_from_twist(means.wheels);
-    let commanded = view
-        .history
-        .commanded(now_s - LOCKED_SPAN_S - LOCKED_LAG_S, now_s);
+    let commanded = view.history.commanded(Span {
+        from_s: now_s - LOCKED_SPAN_S - LOCKED_LAG_S,
+        to_s: now_s,
+    });
     let sides = |of: fn(WheelSpeeds) -> f64| {
-        // The slowest that this side was commanded, by both ends of what both motions were.
+        // The slowest command of this side over the ranges of forward speed and turn rate.
         let corner = |linear: Twist, angular: Twist| Twist {
             linear_m_s: linear.linear_m_s,
             angular_rad_s: angular.angular_rad_s,
@@ -217,7 +228,13 @@ pub(super) fn locked(view: &View<'_>, verdicts: &mut Verdicts) {
                 let is_frozen = view.repeats.wheels.is_frozen();
                 let found = Finding {
                     subject: Subject::Wheels,
-                    kind: kind_of(measured, commanded, is_frozen),
+                    kind: kind_of(
+                        Comparison {
+                            observed: measured,
+                            predicted: commanded,
+                        },
+                        is_frozen,
+                    ),
                     ..finding
                 };
                 verdicts.contradict(found, sensor_raise_s(view));

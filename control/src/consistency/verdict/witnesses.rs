@@ -1,31 +1,31 @@
-//! Two channels of the body disagree: which of both wheels and command support.
+//! Decides which of two channels of the body wheels and command support.
 
 use super::axis::NEARER;
 
-/// The same where both are as near as wheels can tell.
+/// Ratio of distances below which one is nearer, where the wheels tolerate both.
 const NEARER_OF_BOTH: f64 = 0.35;
 
-/// Which of two channels.
+/// One of two channels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Nearer {
     First,
     Second,
 }
 
-/// What wheels and command say of two channels of the body that disagree: how far each is from
-/// them, a fast one first and position fixes second.
+/// Distances of two channels of the body from wheels and command: a fast channel first, position
+/// fixes second.
 pub(super) struct Witnesses {
-    /// None where the wheels are not believed.
+    /// None if a finding names the wheels.
     pub(super) by_wheels: Option<(f64, f64)>,
-    /// What the wheels may differ by, and what noise of the fixes adds.
+    /// Tolerated difference of the wheels, and noise of the fixes in addition.
     pub(super) slack: f64,
     pub(super) noise: f64,
-    /// None where motors may be at their limit: then the command says little.
+    /// None if motors may be saturated: then the command is no evidence.
     pub(super) by_command: Option<(f64, f64)>,
 }
 
 impl Witnesses {
-    /// Which of both is right, if anything distinguishes them.
+    /// Returns the channel that is right; None if wheels and command do not distinguish them.
     pub(super) fn side(&self) -> Option<Nearer> {
         let by_command = self.by_command.and_then(|off| nearer(off, NEARER));
         let Some(by_wheels) = self.by_wheels else {
@@ -41,12 +41,12 @@ impl Witnesses {
             (true, true) => nearer(by_wheels, NEARER_OF_BOTH),
             (false, false) => by_command,
         };
-        // Two witnesses that contradict each other name nobody.
+        // Wheels and command that support different channels give no result.
         side.filter(|side| by_command.is_none_or(|other| other == *side))
     }
 }
 
-/// Which of two distances is clearly the smaller one.
+/// Returns which of two distances is the smaller by the ratio `share`.
 fn nearer((first, second): (f64, f64), share: f64) -> Option<Nearer> {
     if first < share * second {
         Some(Nearer::First)

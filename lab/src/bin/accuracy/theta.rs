@@ -167,7 +167,7 @@ pub(crate) fn run(options: &Options) -> Section {
         .checks
         .iter()
         .filter(|check| check.name.ends_with(INTERVALS_HOLD))
-        .map(|check| check.value)
+        .filter_map(|check| check.value)
         .collect();
     #[expect(clippy::cast_precision_loss, reason = "a count of scenarios")]
     let average = coverages.iter().sum::<f64>() / coverages.len() as f64;

@@ -478,7 +478,7 @@ fn case_checks(case: &Case, options: &Options) -> Vec<Check> {
         Check {
             name: format!("{name}: share of trials in which it is named"),
             goal: format!("≥ {}", goals.named_share_min),
-            value: identified,
+            value: Some(identified),
             holds: identified >= goals.named_share_min,
         },
         Check::at_most(
@@ -531,7 +531,7 @@ pub(crate) fn checks(options: &Options) -> Vec<Check> {
     checks.push(Check {
         name: format!("slip on ice said to be a disagreement in {hours} h"),
         goal: "≥ 1".to_owned(),
-        value: f64::from(ice),
+        value: Some(f64::from(ice)),
         holds: ice >= 1,
     });
     checks

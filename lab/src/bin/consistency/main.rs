@@ -36,10 +36,10 @@ fn main() -> ExitCode {
         Output::Lines => {
             for check in &checks {
                 println!(
-                    "{}  {:<62} {:>9.3}  goal {}",
+                    "{}  {:<62} {:>9}  goal {}",
                     check.verdict(),
                     check.name,
-                    check.value,
+                    check.figure(3),
                     check.goal
                 );
             }

@@ -101,6 +101,7 @@ pub(crate) fn alone(change: Change, has_torque: bool, arguments: &Arguments) -> 
             },
             seed: arguments.seed + u64::from(index),
             prior: arguments.prior(),
+            is_bounded: index < arguments.bounds,
         }
     };
     (0..arguments.runs).map(trial).collect()
@@ -120,6 +121,7 @@ pub(crate) fn population(has_torque: bool, arguments: &Arguments) -> Vec<Trial> 
                 .unwrap_or(Course::Figure8),
             seed,
             prior: arguments.prior(),
+            is_bounded: index < arguments.bounds,
         }
     };
     let runs = arguments.runs.saturating_mul(10);

@@ -1,13 +1,13 @@
 //! `rough`: whether what agents report of the ground holds on robots unlike their own simulator.
 //!
 //! `cargo run --release -p tread-lab --bin rough -- [--runs N] [--seed N] [--only TEXT]
-//! [--tyres-straight] [--drives FILE] [--json]`
+//! [--tyres-straight] [--bounds N] [--drives FILE] [--json]`
 //!
 //! Every robot is configured with its data sheet and drives in the rough world. A line is one way
 //! of being different, or the population, in which everything differs at once, and its strata.
 //! Printed are the coverage of the 95 % intervals, the median error, the median half-width and the
 //! share of answers without an interval, or with one wider than 60 % of its value, which says as
-//! little.
+//! little. With `--bounds` some drives of each line are set against how well θ could be known.
 
 #![expect(clippy::print_stdout, reason = "a program that prints a report")]
 
@@ -44,6 +44,9 @@ struct Arguments {
     /// Configure agents for tyres that rise straight at once, instead of the default
     #[arg(long)]
     tyres_straight: bool,
+    /// Drives of each line of which to work out how well θ could be known
+    #[arg(long, default_value_t = 0)]
+    bounds: u32,
     /// Write each drive there, one JSON object a line
     #[arg(long, value_name = "FILE")]
     drives: Option<PathBuf>,
@@ -88,6 +91,7 @@ fn write(file: &mut impl Write, name: &str, drives: &[Drive]) -> anyhow::Result<
             "beyond_half_peak": outcome.beyond_half_peak,
             "asked_at_s": ASKED_AT_S,
             "theta_and_std_dev": said,
+            "bounds": outcome.bounds,
         });
         writeln!(file, "{object}")?;
     }
@@ -136,7 +140,7 @@ fn main() -> anyhow::Result<ExitCode> {
     if let Some(mut file) = file {
         file.flush()?;
     }
-    let checks: Vec<Check> = lines.iter().map(Line::check).collect();
+    let checks: Vec<Check> = lines.iter().flat_map(Line::checks).collect();
     if arguments.json {
         println!(
             "{}",

@@ -3,9 +3,9 @@
 use std::ops::RangeInclusive;
 
 use serde::Serialize;
-use tread_api::friction::NORMAL_95;
+use tread_api::friction::{NORMAL_95, ThetaEstimate};
 use tread_lab::report::Check;
-use tread_lab::rough::run::{Outcome, Trial};
+use tread_lab::rough::run::{ASKED_AT_S, Outcome, Trial};
 
 /// Half-width over value above which an interval counts as none.
 const WIDE_RATIO: f64 = 0.6;
@@ -13,6 +13,12 @@ const WIDE_RATIO: f64 = 0.6;
 const LINE_GOAL: RangeInclusive<f64> = 0.9..=1.0;
 /// Coverage that the population must have.
 const POPULATION_GOAL: RangeInclusive<f64> = 0.93..=0.975;
+/// Half-width over value up to which a bound is useful.
+const USEFUL_RATIO: f64 = 0.4;
+/// Median half-width over that of the bound that a line may have.
+const OVER_BOUND_GOAL: f64 = 1.5;
+/// The last answer of a drive.
+const LAST: usize = ASKED_AT_S.len() - 1;
 /// Name of the line in which everything differs.
 pub(crate) const POPULATION: &str = "population";
 /// Share of the time beyond half the peak's slip above which a drive is of the stratum that slips.
@@ -38,6 +44,12 @@ pub(crate) struct Line {
     abstained_at_end: f64,
     /// Share of the time in which a contact slipped beyond half the slip of the peak.
     beyond_half_peak: f64,
+    /// Median half-width over its value at best, where it was worked out.
+    bound: Option<f64>,
+    /// Median of the half-width over the best one, of answers that have both.
+    over_bound: Option<f64>,
+    /// Share of drives that end without an estimate although the best one is useful.
+    abstained_needlessly: Option<f64>,
 }
 
 impl Line {
@@ -45,12 +57,24 @@ impl Line {
     pub(crate) fn of(name: impl Into<String>, has_torque: bool, drives: &[&Drive]) -> Self {
         let (mut errors, mut widths, mut beyond) = (Vec::new(), Vec::new(), Vec::new());
         let (mut covered, mut asked, mut last) = (0, 0, 0);
+        let (mut bounds, mut over, mut useful, mut missing) = (Vec::new(), Vec::new(), 0, 0);
         for (_, outcome) in drives {
+            for (bound, said) in outcome.bounds.iter().flatten().zip(outcome.said) {
+                bounds.push(NORMAL_95 * bound);
+                over.extend(said.map(|said| said.std_dev / said.theta / bound));
+            }
+            if let Some([.., last]) = outcome.bounds
+                && NORMAL_95 * last <= USEFUL_RATIO
+            {
+                useful += 1;
+                let is_narrow = |said: ThetaEstimate| half_width(&said) <= WIDE_RATIO;
+                missing += usize::from(!outcome.said[LAST].is_some_and(is_narrow));
+            }
             beyond.push(outcome.beyond_half_peak);
             asked += outcome.said.len();
             for (index, said) in outcome.said.into_iter().enumerate() {
                 let Some(said) = said else { continue };
-                let half_width = NORMAL_95 * said.std_dev / said.theta;
+                let half_width = half_width(&said);
                 if half_width > WIDE_RATIO {
                     continue;
                 }
@@ -71,16 +95,38 @@ impl Line {
             abstained: 1.0 - share(errors.len(), asked),
             abstained_at_end: 1.0 - share(last, drives.len()),
             beyond_half_peak: median(&mut beyond),
+            bound: (!bounds.is_empty()).then(|| median(&mut bounds)),
+            over_bound: (!over.is_empty()).then(|| median(&mut over)),
+            abstained_needlessly: (useful > 0).then(|| share(missing, useful)),
         }
     }
 
-    /// Whether the coverage is what it must be.
-    pub(crate) fn check(&self) -> Check {
-        let torque = if self.has_torque { "with" } else { "without" };
-        let name = format!(
-            "{}, {torque} torque: coverage of the 95 % intervals",
-            self.name
-        );
+    /// What must hold: the coverage, and where bounds were worked out width and availability.
+    pub(crate) fn checks(&self) -> Vec<Check> {
+        let named = |what: &str| {
+            let torque = if self.has_torque { "with" } else { "without" };
+            format!("{}, {torque} torque: {what}", self.name)
+        };
+        let mut checks = vec![self.coverage_check(named("coverage of the 95 % intervals"))];
+        checks.extend(self.over_bound.map(|over| {
+            Check::at_most(
+                named("median half-width over the bound's"),
+                over,
+                OVER_BOUND_GOAL,
+            )
+        }));
+        let most = if self.has_torque { 0.1 } else { 0.3 };
+        checks.extend(self.abstained_needlessly.map(|share| {
+            Check::at_most(
+                named("none after 60 s though the bound is useful"),
+                share,
+                most,
+            )
+        }));
+        checks
+    }
+
+    fn coverage_check(&self, name: String) -> Check {
         let goal = if self.name == POPULATION {
             POPULATION_GOAL
         } else {
@@ -151,7 +197,7 @@ pub(crate) fn strata(has_torque: bool, drives: &[Drive]) -> Vec<Line> {
 /// The table for people.
 pub(crate) fn print(lines: &[Line]) {
     println!(
-        "{:<42} {:>6} {:>9} {:>9} {:>9} {:>9} {:>9} {:>9} {:>9}",
+        "{:<42} {:>6} {:>9} {:>9} {:>9} {:>9} {:>9} {:>12} {:>9} {:>8} {:>8} {:>9}",
         "",
         "torque",
         "estimates",
@@ -160,11 +206,17 @@ pub(crate) fn print(lines: &[Line]) {
         "± half",
         "none",
         "none at 60 s",
-        "> ½ peak"
+        "> ½ peak",
+        "± bound",
+        "/ bound",
+        "needless"
     );
+    let percent = |value: Option<f64>| {
+        value.map_or_else(|| "-".to_owned(), |value| format!("{:.1}%", 100.0 * value))
+    };
     for line in lines {
         println!(
-            "{:<42} {:>6} {:>9} {:>8.1}% {:>+8.1}% {:>8.1}% {:>8.1}% {:>11.1}% {:>8.1}%{}",
+            "{:<42} {:>6} {:>9} {:>8.1}% {:>+8.1}% {:>8.1}% {:>8.1}% {:>11.1}% {:>8.1}% {:>8} {:>8} {:>9}{}",
             line.name,
             if line.has_torque { "yes" } else { "no" },
             line.estimates,
@@ -174,9 +226,22 @@ pub(crate) fn print(lines: &[Line]) {
             100.0 * line.abstained,
             100.0 * line.abstained_at_end,
             100.0 * line.beyond_half_peak,
-            if line.check().holds { "" } else { "  MISSED" },
+            percent(line.bound),
+            line.over_bound
+                .map_or_else(|| "-".to_owned(), |over| format!("{over:.1}")),
+            percent(line.abstained_needlessly),
+            if line.checks().iter().all(|check| check.holds) {
+                ""
+            } else {
+                "  MISSED"
+            },
         );
     }
+}
+
+/// Half-width of the 95 % interval over its value.
+fn half_width(said: &ThetaEstimate) -> f64 {
+    NORMAL_95 * said.std_dev / said.theta
 }
 
 fn median(figures: &mut [f64]) -> f64 {

@@ -18,7 +18,7 @@ use super::sensing::{CheckedSample, Sensed};
 use super::{Tick, age_s};
 use crate::control_loop::channels::{ClosedSegment, Fault};
 use crate::control_loop::gain::GroundRecord;
-use crate::control_loop::prior::{Prior, told};
+use crate::control_loop::prior::{Prior, fused};
 use crate::control_loop::progress::ProgressWatch;
 use crate::control_loop::segments::{CutInput, Place, SegmentCutter};
 use crate::control_loop::site_view::{Footing, SiteView};
@@ -392,7 +392,7 @@ impl Ground {
         GroundRecord {
             traction_limit_mu: prior.traction_limit_mu(),
             is_on_the_map: mapped.is_some(),
-            told: told(self.measured, mapped),
+            given: fused(self.measured, mapped),
             measured: self.measured,
         }
     }

@@ -238,7 +238,7 @@ impl MissionStage {
     /// Gives the law what is known of the ground where the mission begins.
     fn warm_start(&mut self, estimated: &Estimated<'_>) {
         if let Some(active) = &mut self.active
-            && let Some(knowledge) = estimated.ground_at_begin.with(&active.job.prior).told
+            && let Some(knowledge) = estimated.ground_at_begin.with(&active.job.prior).given
         {
             active.job.follower.warm_start(knowledge);
         }
@@ -287,7 +287,7 @@ impl MissionStage {
         let (now, estimated) = (input.tick.now, input.estimated);
         let active = self.active.as_mut()?;
         self.known = estimated.ground.with(active.prior());
-        let knowledge = self.known.told;
+        let knowledge = self.known.given;
         if active.is_at_rest_for_replacement() {
             let old = active.replace(knowledge);
             let (at, progress) = (now.wall, active.progress);
@@ -303,8 +303,8 @@ impl MissionStage {
             input.commanded,
             input.tick.dt_s,
         );
-        if step.theta_loop.is_finite() {
-            self.theta_loop = Some(step.theta_loop);
+        if let Some(theta) = step.theta_loop.filter(|theta| theta.is_finite()) {
+            self.theta_loop = Some(theta);
         }
         let (at, progress) = (now.wall, active.progress);
         match step.news {

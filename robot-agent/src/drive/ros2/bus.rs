@@ -40,7 +40,7 @@ const RETRY_MS: (u32, u32) = (50, 200);
 /// Rest after a row of tries.
 const OPEN_REST: Duration = Duration::from_millis(100);
 /// After this silence a router takes the agent for gone, milliseconds.
-const LEASE_MS: u32 = 3_000;
+const BUS_LEASE_MS: u32 = 3_000;
 /// Largest payload that is looked at, bytes.
 const PAYLOAD_BYTES_MAX: usize = tread_ros2::cdr::MESSAGE_BYTES_MAX;
 /// The agent's only node.
@@ -75,7 +75,7 @@ pub fn session_config(bus: &BusSettings) -> Result<zenoh::Config, LinkError> {
         ("listen/endpoints", listen),
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
-        ("transport/link/tx/lease", LEASE_MS.to_string()),
+        ("transport/link/tx/lease", BUS_LEASE_MS.to_string()),
         // A router with a clock of its own holds the time of every message against it, and logs an
         // error for each one once the machine's clock was set back. Stamps are in the messages.
         ("timestamping/enabled", "false".to_owned()),
@@ -389,10 +389,10 @@ impl Bus {
         std::thread::scope(|scope| {
             let telling = outward.and_then(|outward| {
                 let body = || self.tell(&declared.words, outward);
-                let named = std::thread::Builder::new().name("told to the robot".to_owned());
+                let named = std::thread::Builder::new().name("to the robot".to_owned());
                 let spawned = named.spawn_scoped(scope, body);
                 spawned
-                    .inspect_err(|cause| warn!("nothing is told to the robot: {cause}"))
+                    .inspect_err(|cause| warn!("nothing is published to the robot: {cause}"))
                     .ok()
             });
             self.write_commands(&declared.commands);

@@ -7,7 +7,7 @@
 //! bus ◄─thread─── outward (plan, driven path, θ, diagnostics) ◄─── newest snapshot ◄─── loop
 //! ```
 //! A message that is not wholly good is dropped and counted by its reason. A base that is not
-//! heard for [`Timing::silent_after`](settings::Timing) is told to rest at once; it hears nothing
+//! heard for [`Timing::silent_after`](settings::Timing) is commanded to rest at once; it gets nothing
 //! else until the loop itself has come to rest, so that no command leaps.
 
 pub mod assemble;
@@ -78,7 +78,7 @@ impl Ros2Drive {
     }
 
     /// A drive of a base that is being examined: somebody else hears every message, and wheels that
-    /// do not do what they are told are believed all the same.
+    /// do not follow their command are believed all the same.
     ///
     /// # Errors
     /// As [`Ros2Drive::new`].
@@ -130,7 +130,7 @@ impl Ros2Drive {
         Arc::clone(&self.counts)
     }
 
-    /// Whether the base is told to rest, whatever the loop commands.
+    /// Whether the base is commanded to rest, whatever the loop commands.
     pub fn must_rest(&self) -> bool {
         self.must_rest
     }

@@ -1,4 +1,4 @@
-//! Whether the wheels do what they are told, or somebody lies: stuck encoders, swapped sides, a
+//! Whether the wheels follow their command, or a fault shows: stuck encoders, swapped sides, a
 //! drive that was switched off, another node that commands the base too.
 //!
 //! A wheel's speed must lie between the least and the greatest command of the last

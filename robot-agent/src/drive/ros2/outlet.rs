@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use tread_control::measured::WheelSpeeds;
 
-/// Longest time without a new command after which the base is told to rest.
+/// Longest time without a new command after which the base is commanded to rest.
 pub const COMMAND_SILENCE_MAX: Duration = Duration::from_millis(100);
 
 /// The place where the newest command lies.

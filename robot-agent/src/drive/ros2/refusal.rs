@@ -35,7 +35,7 @@ pub enum Refusal {
     OutOfOrder,
     /// Another writer on a topic whose writer is heard.
     SecondWriter,
-    /// The wheels do not do what they are told.
+    /// The wheels do not follow their command.
     Disobedient,
     /// The wheels turn, and otherwise than commanded: somebody else may command them.
     OtherMotion,
@@ -81,7 +81,7 @@ impl Refusal {
             Self::Late => "messages that came late",
             Self::OutOfOrder => "messages that came twice or out of order",
             Self::SecondWriter => "messages of a second writer",
-            Self::Disobedient => "messages of wheels that do not do what they are told",
+            Self::Disobedient => "messages of wheels that do not follow their command",
             Self::OtherMotion => {
                 "messages of wheels that turn otherwise than commanded, as if another node commands \
                  the base,"

@@ -14,7 +14,7 @@ use crate::clock::{Clock as _, ManualClock};
 
 const NAMES: [&str; 2] = ["left", "right"];
 const STEP: Duration = Duration::from_millis(10);
-const TOLD: WheelSpeeds = WheelSpeeds {
+const COMMANDED: WheelSpeeds = WheelSpeeds {
     left_rad_s: 4.0,
     right_rad_s: 5.0,
 };
@@ -192,7 +192,7 @@ impl Talk {
         self.drive.read(self.clock.monotonic());
     }
 
-    /// Commands the base; what it is told.
+    /// Commands the base; what is sent to it.
     fn tell(&mut self, command: WheelSpeeds) -> WheelSpeeds {
         self.drive.write(command);
         let (number, command) = self.drive.outlet.newer_than(self.number).unwrap();
@@ -312,19 +312,19 @@ fn every_bad_message_is_counted_by_its_reason_and_is_no_word_of_the_base() {
         let mut talk = Talk::new();
         for _ in 0..5 {
             talk.say(&GOOD);
-            assert_eq!(talk.tell(TOLD), TOLD);
+            assert_eq!(talk.tell(COMMANDED), COMMANDED);
         }
         let counts = talk.drive.counts();
         for _ in 0..12 {
             talk.say(&bad);
-            talk.tell(TOLD);
+            talk.tell(COMMANDED);
         }
         let count = |source| counts.dropped(source, refusal);
         assert!(
             count(Source::Imu) + count(Source::Joints) >= 12,
             "{refusal:?}"
         );
-        assert_eq!(talk.tell(TOLD), WheelSpeeds::default(), "{refusal:?}");
+        assert_eq!(talk.tell(COMMANDED), WheelSpeeds::default(), "{refusal:?}");
     }
 }
 
@@ -332,27 +332,27 @@ fn every_bad_message_is_counted_by_its_reason_and_is_no_word_of_the_base() {
 fn a_silent_base_rests_in_time_and_hears_nothing_until_the_loop_has_come_to_rest() {
     let mut talk = Talk::new();
     assert_eq!(
-        talk.tell(TOLD),
+        talk.tell(COMMANDED),
         WheelSpeeds::default(),
         "it has not been heard yet"
     );
     talk.say(&GOOD);
     talk.tell(WheelSpeeds::default());
-    assert_eq!(talk.tell(TOLD), TOLD);
+    assert_eq!(talk.tell(COMMANDED), COMMANDED);
     let heard_at = talk.clock.monotonic();
-    while talk.tell(TOLD) == TOLD {
+    while talk.tell(COMMANDED) == COMMANDED {
         talk.pass();
     }
     let silence = talk.clock.monotonic().saturating_sub(heard_at);
     assert!(silence <= Duration::from_millis(110), "{silence:?}");
     talk.say(&GOOD);
     assert_eq!(
-        talk.tell(TOLD),
+        talk.tell(COMMANDED),
         WheelSpeeds::default(),
         "the command must not leap"
     );
     talk.tell(WheelSpeeds::default());
-    assert_eq!(talk.tell(TOLD), TOLD);
+    assert_eq!(talk.tell(COMMANDED), COMMANDED);
 }
 
 #[test]
@@ -386,7 +386,7 @@ fn a_base_that_starts_again_under_its_identifier_is_heard_and_old_messages_are_n
 }
 
 #[test]
-fn wheels_that_do_not_do_what_they_are_told_are_not_believed() {
+fn wheels_that_do_not_follow_their_command_are_not_believed() {
     let mut talk = Talk::new();
     let stuck = Said {
         joints: [0.0, 0.0],
@@ -394,7 +394,7 @@ fn wheels_that_do_not_do_what_they_are_told_are_not_believed() {
     };
     talk.say(&GOOD);
     let began = talk.clock.monotonic();
-    while talk.tell(TOLD) == TOLD {
+    while talk.tell(COMMANDED) == COMMANDED {
         talk.say(&stuck);
         assert!(talk.clock.monotonic() < began + Duration::from_secs(2));
     }
@@ -411,12 +411,12 @@ fn a_base_that_another_node_commands_too_rests_until_that_ceases() {
     let mut talk = Talk::new();
     for _ in 0..5 {
         talk.say(&GOOD);
-        assert_eq!(talk.tell(TOLD), TOLD);
+        assert_eq!(talk.tell(COMMANDED), COMMANDED);
     }
     let counts = talk.drive.counts();
     let rest = WheelSpeeds::default();
     let mut ticks = 0;
-    while talk.tell(TOLD) == TOLD {
+    while talk.tell(COMMANDED) == COMMANDED {
         counts.note_foreign_command();
         talk.say(&GOOD);
         ticks += 1;
@@ -433,7 +433,7 @@ fn a_base_that_another_node_commands_too_rests_until_that_ceases() {
         talk.say(&GOOD);
         talk.tell(rest);
     }
-    assert_eq!(talk.tell(TOLD), TOLD);
+    assert_eq!(talk.tell(COMMANDED), COMMANDED);
 }
 
 #[test]

@@ -13,7 +13,9 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpSocket, TcpStream, lookup_host};
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
-use tread_api::tunnel::{ALPN, CREDENTIALS_BYTES_MAX, RouterCredentials};
+use tread_api::tunnel::{
+    ALPN, CREDENTIALS_BYTES_MAX, NOT_SENT_BYTES_MAX, RouterCredentials, UNANSWERED_MAX,
+};
 use zenoh::config::EndPoint;
 
 use crate::fleet::LinkError;
@@ -26,13 +28,8 @@ const DIAL_TIMEOUT: Duration = Duration::from_millis(2_500);
 /// Send buffer of the kernel, bytes, unless the endpoint names one: priorities act only above that
 /// buffer, so on a slow link a large one makes everything wait behind the bulk.
 const SEND_BUFFER_BYTES: u32 = 24 * 1024;
-/// What the kernel takes of what it cannot send yet, bytes.
-const NOT_SENT_BYTES_MAX: u32 = 4 * 1024;
 /// What rustls takes of what the socket cannot, bytes.
 const TLS_BUFFER_BYTES: usize = 4 * 1024;
-/// After this long without an answer to what was sent, the kernel gives a connection up: the
-/// session has given it up long before.
-const UNANSWERED_MAX: Duration = Duration::from_secs(10);
 /// The protocol that an endpoint through the tunnel names.
 const PROTOCOL: &str = "tls";
 /// The setting of an endpoint for the size of the send buffer, as zenoh calls it.

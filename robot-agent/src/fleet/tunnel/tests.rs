@@ -149,7 +149,7 @@ async fn a_session_reconnects_until_the_server_has_other_credentials_for_it() {
     *port.credentials.lock().unwrap() = credentials("second");
     assert_eq!(say(&tunnel, &message).await, b"", "nothing passes");
     let stale = tokio::time::timeout(PATIENCE, tunnel.stale());
-    stale.await.expect("the owner is told to open another");
+    stale.await.expect("the owner is notified to open another");
     let another = port.tunnel().await;
     assert_eq!(another.user.password, "second");
 }

@@ -27,9 +27,12 @@ speed_m_s = 0.5
 
 fn refusal(from: &str, to: &str) -> String {
     assert!(GOOD.contains(from), "{from}");
-    Scenario::parse("test.toml", &GOOD.replace(from, to))
-        .unwrap_err()
-        .to_string()
+    Scenario::parse(ScenarioText {
+        file: "test.toml",
+        text: &GOOD.replace(from, to),
+    })
+    .unwrap_err()
+    .to_string()
 }
 
 #[test]
@@ -103,12 +106,22 @@ fn a_mistake_is_named_with_file_line_and_key() {
             assert!(refused.contains(part), "`{part}` is missing in: {refused}");
         }
     }
-    assert!(Scenario::parse("test.toml", GOOD).is_ok());
+    assert!(
+        Scenario::parse(ScenarioText {
+            file: "test.toml",
+            text: GOOD
+        })
+        .is_ok()
+    );
 }
 
 #[test]
 fn doubled_names_are_refused() {
     let second = "\n[[robots]]\nid = \"rover-1\"\nx_m = 0\ny_m = 0\nheading_rad = 0\nseed = 2\n";
-    let refused = Scenario::parse("test.toml", &format!("{GOOD}{second}")).unwrap_err();
+    let refused = Scenario::parse(ScenarioText {
+        file: "test.toml",
+        text: &format!("{GOOD}{second}"),
+    })
+    .unwrap_err();
     assert!(refused.to_string().contains("twice"), "{refused}");
 }

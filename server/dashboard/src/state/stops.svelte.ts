@@ -42,7 +42,7 @@ export class Stops {
       this.#take([stop]);
       this.sent.delete(robot);
     } catch (error) {
-      this.sent.set(robot, { state: 'failed', text: told(robot, error) });
+      this.sent.set(robot, { state: 'failed', text: failureText(robot, error) });
     }
   }
 
@@ -57,7 +57,7 @@ export class Stops {
       this.#take(stopped.stops);
       this.sent.delete(FLEET);
     } catch (error) {
-      this.sent.set(FLEET, { state: 'failed', text: told(texts.stop.everyRobot, error) });
+      this.sent.set(FLEET, { state: 'failed', text: failureText(texts.stop.everyRobot, error) });
     }
   }
 
@@ -135,7 +135,7 @@ export class Stops {
   }
 }
 
-function told(robot: string, error: unknown): string {
+function failureText(robot: string, error: unknown): string {
   const isLost = error instanceof Problem && error.isLost;
   return isLost ? texts.stop.failed(robot) : texts.stop.refused(robot, sentence(error));
 }

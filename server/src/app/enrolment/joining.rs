@@ -19,7 +19,7 @@ use jiff::Timestamp;
 use tread_api::enrolment::{EnrolRobot, Enrolment, RobotCertificate};
 use tread_api::ids::RobotId;
 
-use super::{EnrolError, Enrolled, EnrolmentService, ROBOTS_MAX};
+use super::{EnrolError, Enrolled, EnrolmentService, FLEET_ROBOTS_MAX};
 use crate::app::{App, AppError};
 use crate::authority::{Issued, RobotName, RobotRequest, Trusted};
 use crate::connections::Purpose;
@@ -117,10 +117,10 @@ impl App {
             return Err(EnrolError::KnownRobot(token.id));
         }
         let robot_count = db::enrolments::robot_count(&mut tx).await?;
-        if former.is_none() && usize::try_from(robot_count).is_ok_and(|count| count >= ROBOTS_MAX) {
+        if former.is_none() && robot_count >= i64::from(FLEET_ROBOTS_MAX) {
             return Err(EnrolError::App(AppError::TooMany {
                 what: "robots that have joined",
-                count: ROBOTS_MAX,
+                count: FLEET_ROBOTS_MAX as usize,
             }));
         }
         let number = former.map_or(1, |former| former.number.saturating_add(1));

@@ -9,7 +9,7 @@
 //!                      └──joins again──► revoked, and in force under the next number
 //! ```
 //!
-//! What fails is told alike, whatever the cause; the cause is for the audit log and the counters.
+//! Every failure gets the same answer, whatever the cause; the cause is for the audit log and the counters.
 
 mod joining;
 pub mod registry;
@@ -51,7 +51,7 @@ const JOIN_TOKENS: Quota = Quota {
     share: 300,
 };
 /// Most robots that may ever join.
-pub const ROBOTS_MAX: usize = 10_000;
+pub const FLEET_ROBOTS_MAX: u32 = 10_000;
 
 /// What the server signs robots' certificates with.
 #[derive(Debug)]
@@ -89,7 +89,7 @@ impl Membership {
     }
 }
 
-/// Why a robot gets no certificate. Who asks is told no more than that.
+/// Why a robot gets no certificate. The answer says no more than that.
 #[derive(Debug, thiserror::Error)]
 pub enum EnrolError {
     /// The request for a certificate is none, whoever sends it.

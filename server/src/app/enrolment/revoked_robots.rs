@@ -1,4 +1,4 @@
-//! Robots that were put out of the fleet and go on trying: people are told, not too often.
+//! Revoked robots that go on trying to connect: they raise alerts, not too often.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, PoisonError};

@@ -9,7 +9,8 @@ use tread_api::ids::MissionId;
 use tread_api::robot::{Alert, Robot};
 
 use super::super::{App, AppError};
-use super::ROBOTS_MAX;
+use super::ALERTS_MAX;
+use crate::app::enrolment::FLEET_ROBOTS_MAX;
 use crate::app::presence::RobotKey;
 use crate::db::robots::RobotRow;
 use crate::db::{self, DbError};
@@ -95,7 +96,7 @@ impl Feed {
         for id in moved {
             let row = match db::missions::find(&mut tx, id).await {
                 Ok(row) => row,
-                // It will not read later either; its steps are told all the same.
+                // It will not read later either; its steps are sent all the same.
                 Err(cause @ DbError::Corrupt { .. }) => {
                     self.app
                         .log_failure("read a mission that has moved", &cause);
@@ -166,11 +167,11 @@ impl Feed {
     async fn read_rows(&self) -> Result<Rows, AppError> {
         let mut tx = self.app.db().read("events").await?;
         let mut rows = Rows::new();
-        for row in db::robots::all(&mut tx, ROBOTS_MAX).await? {
+        for row in db::robots::all(&mut tx, FLEET_ROBOTS_MAX).await? {
             let key = (row.site.clone(), row.id.clone());
             rows.insert(key, (row, Vec::new()));
         }
-        for alert in db::alerts::raised(&mut tx, ROBOTS_MAX).await? {
+        for alert in db::alerts::raised(&mut tx, ALERTS_MAX).await? {
             let row = alert.robot_key().and_then(|key| rows.get_mut(&key));
             if let Some((_row, alerts)) = row {
                 alerts.push(alert);

@@ -15,8 +15,9 @@ use tread_api::rights;
 use tread_api::robot::Alert;
 
 use super::super::{App, AppError};
-use super::ROBOTS_MAX;
+use super::ALERTS_MAX;
 use super::sent::{EventFilter, Sent, unnumbered};
+use crate::app::enrolment::FLEET_ROBOTS_MAX;
 use crate::app::presence::RobotKey;
 use crate::db;
 use crate::db::alerts::AlertFilter;
@@ -158,7 +159,7 @@ impl App {
             events.push(unnumbered(event, Some(topic), about));
         };
         let mut tx = self.db().read("events").await?;
-        let alerts = db::alerts::raised(&mut tx, ROBOTS_MAX).await?;
+        let alerts = db::alerts::raised(&mut tx, ALERTS_MAX).await?;
         if filter.wants(Topic::Robots) {
             let mut of_robots: HashMap<RobotKey, Vec<Alert>> = HashMap::new();
             for alert in &alerts {
@@ -166,7 +167,7 @@ impl App {
                     of_robots.entry(key).or_default().push(alert.clone());
                 }
             }
-            for row in db::robots::all(&mut tx, ROBOTS_MAX).await? {
+            for row in db::robots::all(&mut tx, FLEET_ROBOTS_MAX).await? {
                 if row.retired_at.is_none() && filter.wants_robot(&row.site, &row.id) {
                     let key = (row.site.clone(), row.id.clone());
                     let alerts = of_robots.remove(&key).unwrap_or_default();

@@ -15,6 +15,7 @@ use super::drawn::Drawn;
 use super::{App, AppError, Asked, Reading, SiteView, page, terrain_ref};
 use crate::friction::Ground;
 use crate::friction::index::{Contribution, SiteMap};
+use crate::friction::sums::HOUR_S;
 
 /// Most cells that one question about visits looks at.
 const LOOKED_AT_MAX: f64 = 262_144.0;
@@ -22,8 +23,6 @@ const LOOKED_AT_MAX: f64 = 262_144.0;
 const VISIT_DEVIATION_RATIO: f64 = 0.13;
 /// The same of ground of which nothing is known: a factor of three either way.
 const UNKNOWN_DEVIATION_RATIO: f64 = 1.1;
-/// Seconds of an hour.
-const HOUR_S: i64 = 3_600;
 
 impl App {
     /// Cells of a box in which a visit would shrink the standard deviation of θ most, the best

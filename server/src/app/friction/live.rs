@@ -1,7 +1,7 @@
-//! Tells where maps change: on the feed of events, and to whoever publishes it on the network.
+//! Publishes where maps change: on the feed of events, and to whoever publishes it on the network.
 //!
-//! Changes are put together to the squares of cells in which they are counted, and told once a
-//! period: a word is as long however fast robots drive.
+//! Changes are put together to the squares of cells in which they are counted, and published once a
+//! period: an event is as long however fast robots drive.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -33,7 +33,7 @@ impl Default for MapNews {
     }
 }
 
-/// What was told last of a site.
+/// What was published last of a site.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Announced {
     change: u64,

@@ -40,7 +40,7 @@ const UNKNOWN_MODEL: &str = "not declared";
 /// Most times of one history.
 const TIMES_MAX: i64 = 1_000;
 /// Questions about the map that are worked on at once; further ones wait for their turn.
-pub(in crate::app) const READERS_MAX: usize = 4;
+pub(in crate::app) const MAP_READERS_MAX: usize = 4;
 
 /// Everything that answers about a site's terrains need from the database.
 #[derive(Debug)]

@@ -93,9 +93,9 @@ impl App {
 }
 
 impl App {
-    /// What a robot is told of the ground along a trajectory; `None` when nothing is known of it.
+    /// The prior of the ground along a trajectory that a robot gets; `None` when nothing is known of it.
     ///
-    /// Cells with several grounds are left out: the robot could not tell them apart. A terrain has
+    /// Cells with several grounds are left out: the robot could not distinguish them. A terrain has
     /// no higher traction limit on the path than where it is known to be lowest, there or near it:
     /// ground that has frozen in one cell may have in the next, where nobody has been since.
     pub(in crate::app) async fn prior_along(
@@ -157,10 +157,10 @@ impl App {
                     continue;
                 }
                 let has_one_ground = map.cell(cell, reading.choice()).len() == 1;
-                let told = reader
+                let measured = reader
                     .known_at(place)
                     .filter(|known| has_one_ground && is_measured(known));
-                if let Some(known) = told {
+                if let Some(known) = measured {
                     let prior = CellPrior {
                         cell,
                         theta: known.theta,

@@ -34,7 +34,7 @@ pub(in crate::app) struct Reading {
     configuration: Option<ConfigurationId>,
     normalisation: Option<Arc<Normalisation>>,
     config: FrictionConfig,
-    /// The time at which ages are counted, microseconds since 1970. Now is told in whole minutes,
+    /// The time at which ages are counted, microseconds since 1970. Now is rounded to whole minutes,
     /// so that an answer stays the same for as long as its parts do.
     pub(in crate::app) now_us: i64,
 }

@@ -40,7 +40,7 @@ use crate::connections::Purpose;
 use crate::db::sessions::Owner;
 use crate::db::{self, DbError, Tx};
 use crate::identity::attempts::{Attempts, Source};
-use crate::identity::secret::{Fingerprint, Kind, RANDOM_BYTES, Secret};
+use crate::identity::secret::{Fingerprint, Kind, SECRET_RANDOM_BYTES, Secret};
 use crate::identity::subject::SubjectId;
 
 /// Most sessions of one token or person; the oldest ends when another begins.
@@ -93,7 +93,7 @@ pub enum Shown {
     Session,
 }
 
-/// Why a secret opens nothing. Who asks is told no more than that; the rest is for the counters.
+/// Why a secret opens nothing. The answer says no more than that; the rest is for the counters.
 #[derive(Debug, thiserror::Error)]
 pub enum SignInError {
     /// It cannot be one: a digit is wrong.
@@ -205,7 +205,7 @@ impl App {
         let kept = db::tokens::all_valid(&mut tx, now).await?;
         let sessions = db::sessions::all_valid(&mut tx, now).await?;
         let mut valid = Valid::default();
-        for db::secrets::Kept { hash, token } in kept {
+        for db::secrets::TokenRow { hash, token } in kept {
             let expires_at = token.expires_at;
             valid.token_ids.insert(token.id);
             if let Some(fingerprint) = Fingerprint::from_kept(&hash) {
@@ -361,7 +361,7 @@ async fn token_of(
 
 /// A new secret of the operating system's random numbers: the only place that makes one.
 pub(super) fn new_secret(kind: Kind) -> Result<Secret, AppError> {
-    let mut random = [0; RANDOM_BYTES];
+    let mut random = [0; SECRET_RANDOM_BYTES];
     getrandom::fill(&mut random).map_err(|error| AppError::NoRandomness(error.to_string()))?;
     Ok(Secret::from_random(kind, &random))
 }

@@ -20,7 +20,7 @@ use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::CancellationToken;
 use tracing::info;
 use tread_api::identity::{OidcSignIn, Person};
-use tread_api::ids::PersonId;
+use tread_api::ids::{OidcSubject, PersonId};
 use tread_api::rights::{Grant, Scope};
 use tread_api::text::cleaned;
 
@@ -29,12 +29,12 @@ use super::id_tokens::IdTokens;
 use crate::app::{App, AppError};
 use crate::config::oidc::OidcConfig;
 use crate::db;
-use crate::db::sessions::{Kept, Owner, SignedIn};
+use crate::db::sessions::{Owner, SessionRow, SignedIn};
 use crate::identity::address::network_of;
 use crate::identity::claims::{NAME_MAX, groups, shown_name};
 use crate::identity::grants::Grants;
 use crate::identity::origin::{Origin, Provenance};
-use crate::identity::pending::{Pending, PendingKey, RANDOM_BYTES};
+use crate::identity::pending::{Pending, PendingKey, SIGN_IN_RANDOM_BYTES};
 use crate::identity::secret::Secret;
 use crate::identity::subject::name_of_person;
 use crate::oidc::{ExchangeError, Provider, SignedInThere};
@@ -162,7 +162,7 @@ struct Used {
 
 impl People {
     fn new(config: &OidcConfig, app: &App) -> anyhow::Result<Self> {
-        let mut random = [0; RANDOM_BYTES];
+        let mut random = [0; SIGN_IN_RANDOM_BYTES];
         getrandom::fill(&mut random).map_err(|error| AppError::NoRandomness(error.to_string()))?;
         Ok(Self {
             provider: Provider::new(config, app.clock().clone())?,
@@ -261,7 +261,10 @@ impl People {
         let (subject, claims) = (&there.subject, &there.claims);
         let issuer = self.issuer().to_owned();
         let person = Person {
-            id: PersonId::of(&issuer, subject),
+            id: PersonId::of(OidcSubject {
+                issuer: &issuer,
+                subject,
+            }),
             issuer,
             subject: subject.clone(),
         };
@@ -308,7 +311,7 @@ impl App {
     }
 
     /// A person's session as whoever shows its secret; `None` if its groups give nothing.
-    pub(super) fn person_of(&self, kept: Kept, checked_at: Duration) -> Option<Credential> {
+    pub(super) fn person_of(&self, kept: SessionRow, checked_at: Duration) -> Option<Credential> {
         let Owner::Person(signed_in) = kept.owner else {
             return None;
         };
@@ -343,7 +346,7 @@ impl App {
                 cookie: None,
             });
         }
-        let mut random = [0; RANDOM_BYTES];
+        let mut random = [0; SIGN_IN_RANDOM_BYTES];
         getrandom::fill(&mut random).map_err(|error| AppError::NoRandomness(error.to_string()))?;
         let pending = Pending::begin(&people.key, &random, self.clock().now());
         let Some(location) = people.provider.sign_in_url(&pending) else {

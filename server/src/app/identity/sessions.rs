@@ -10,7 +10,7 @@ use tread_api::rights::Scope;
 
 use super::{Credential, SESSION_LASTS, SESSIONS_EACH_MAX, SignInError, new_secret};
 use crate::app::{App, AppError, page};
-use crate::db::sessions::{Kept, NewSession, OfPeople, Owner};
+use crate::db::sessions::{NewSession, OfPeople, Owner, SessionRow};
 use crate::db::{self, DbError, Tx};
 use crate::identity::secret::{Kind, Secret};
 use crate::identity::subject::SubjectId;
@@ -147,7 +147,7 @@ impl App {
         }))
     }
 
-    fn listed(&self, kept: Kept) -> Option<PersonSession> {
+    fn listed(&self, kept: SessionRow) -> Option<PersonSession> {
         let Owner::Person(signed_in) = kept.owner else {
             return None;
         };

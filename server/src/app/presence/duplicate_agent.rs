@@ -1,7 +1,7 @@
 //! Two agents under one robot's name.
 //!
 //! The newest hello is the robot. What another run says meanwhile is refused; when it goes on
-//! saying so, it is a second agent: an alert names both, and it is told to end what it drives.
+//! saying so, it is a second agent: an alert names both, and it gets a cancel for what it drives.
 
 use std::time::Duration;
 
@@ -136,7 +136,7 @@ mod tests {
         says(2, 1, SECOND);
         presences.take_alert_changes();
         assert_eq!(says(1, 8, SECOND), Heard::Other);
-        // A straggler that is told twice is no second agent.
+        // A straggler that is heard twice is no second agent.
         assert_eq!(says(1, 8, 3 * SECOND), Heard::Other);
         assert!(presences.take_duplicate_agents(3 * SECOND).is_empty());
         assert_eq!(says(1, 9, 3 * SECOND), Heard::Other);

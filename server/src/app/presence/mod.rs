@@ -130,7 +130,7 @@ impl Presence {
         self.clock_offsets_ms.iter().copied().max().unwrap_or(0)
     }
 
-    /// The robot's monotonic clock now, microseconds, as told by the state that had the shortest
+    /// The robot's monotonic clock now, microseconds, by the state that had the shortest
     /// way: it lags by that way, so an end that is written with it comes too early, never too
     /// late. With the run that it belongs to; `None` for a robot that does not say.
     pub fn robot_clock_us(&self, now: Duration) -> Option<(BootId, u64)> {

@@ -119,7 +119,7 @@ fn of_a_robot_that_said_no_hello_nothing_is_kept() {
 }
 
 #[test]
-fn robot_off_link_down_and_a_loop_that_stands_still_are_told_apart() {
+fn robot_off_link_down_and_a_loop_that_stands_still_are_distinguished() {
     let presences = Presences::default();
     let cause = |now| presences.get(&key()).link_cause(now);
     assert_eq!(cause(SECOND), Some(LinkCause::ServerRestarted));

@@ -12,7 +12,7 @@ use crate::app::missions::reports::adopt;
 use crate::app::missions::transitions::Change;
 use crate::app::missions::{Step, add_note, take_step};
 use crate::app::presence::{DuplicateAgent, RobotKey};
-use crate::app::stops::{Told, tell};
+use crate::app::stops::{StopDelivery, send_stop};
 use crate::app::terrains::site_definition;
 use crate::app::{App, AppError};
 use crate::db;
@@ -361,11 +361,11 @@ pub(super) async fn disown(
     };
     warn!(
         mission.id = %mission, robot.id = %key.1,
-        "robot `{}` drives mission `{mission}`, and is told to end it: {reason}", key.1
+        "robot `{}` drives mission `{mission}`, and gets a cancel: {reason}", key.1
     );
     app.counters().missions_disowned.one();
     let command = Cancel { mission, reason };
-    // Whatever it answers, its next states show whether it has ended; if not, it is told again.
+    // Whatever it answers, its next states show whether it has ended; if not, the cancel is sent again.
     let _ = app.commands().send(&key, &command).await;
     Ok(Finished::Again)
 }
@@ -379,25 +379,25 @@ pub(super) async fn end_duplicate_agent(app: App, duplicate: DuplicateAgent) -> 
     warn!(
         mission.id = %mission, robot.id = %key.1,
         "a second agent drives mission `{mission}` under the name of robot `{}`, as boot {boot}, \
-         and is told to end it", key.1
+         and gets a cancel", key.1
     );
     app.counters().missions_disowned.one();
     let reason = "another agent has taken this robot's name".to_owned();
     let command = Cancel { mission, reason };
-    // Whatever it answers, its next states show whether it has ended; if not, it is told again.
+    // Whatever it answers, its next states show whether it has ended; if not, the cancel is sent again.
     let _ = app.commands().send_to(&key, Some(boot), &command).await;
     Finished::Again
 }
 
-/// Tells a robot again to stop, and writes down that it has confirmed.
+/// Sends a stop again, and records that the robot has confirmed it.
 pub(super) async fn stop_again(app: App, stop: Stop) -> Result<Finished, AppError> {
-    match tell(&app, &stop).await {
-        Told::Confirmed => {
+    match send_stop(&app, &stop).await {
+        StopDelivery::Confirmed => {
             let confirmed = (stop.id, app.clock().now());
             app.note_confirmed(&[stop], &[confirmed]).await?;
         }
-        Told::Over => app.note_over(&stop).await?,
-        Told::Unconfirmed => {
+        StopDelivery::Over => app.note_over(&stop).await?,
+        StopDelivery::Unconfirmed => {
             app.note_unconfirmed(&[&stop]).await?;
             return Ok(Finished::Again);
         }

@@ -48,8 +48,8 @@ const RETRY_MIN: Duration = Duration::from_millis(100);
 const RETRY_MAX: Duration = Duration::from_secs(2);
 /// Missions that expire in one pass.
 const EXPIRE_MAX: u32 = 1_000;
-/// How long a robot may show a mission that is none of its open ones before it is told: its report
-/// of the end may be on its way.
+/// How long a robot may show a mission that is none of its open ones before it gets a cancel: its
+/// report of the end may be on its way.
 const FOREIGN_GRACE: Duration = Duration::from_millis(1_500);
 
 /// A command that is under way or waits to be repeated.

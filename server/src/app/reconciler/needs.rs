@@ -16,7 +16,7 @@ pub(super) const RESTART_GRACE: Duration = Duration::from_secs(3);
 /// the mission counts as forgotten.
 pub(super) const FORGET_GRACE: Duration = Duration::from_secs(5);
 /// How long a robot may show a mission as paused, or as driven, before that counts although its
-/// record has not come; the other way round, before it is told again.
+/// record has not come; the other way round, before the command is sent again.
 pub(super) const HOLD_GRACE: Duration = Duration::from_secs(1);
 /// How long a robot may stay away beyond what was left of its plan, seconds.
 pub const LOST_MARGIN_S: f64 = 60.0;

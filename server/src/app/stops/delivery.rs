@@ -14,9 +14,9 @@ use tread_api::wire::safety::Stop as StopCommand;
 use super::super::{App, AppError};
 use crate::db;
 
-/// What a robot has said to a stop.
+/// What a robot has answered to a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::app) enum Told {
+pub(in crate::app) enum StopDelivery {
     /// It is in force, or was replaced by one that came later.
     Confirmed,
     /// It was in force and has been cleared since, perhaps with one that came later.
@@ -25,8 +25,8 @@ pub(in crate::app) enum Told {
     Unconfirmed,
 }
 
-/// Tells a robot to stop.
-pub(in crate::app) async fn tell(app: &App, stop: &Stop) -> Told {
+/// Sends a stop to its robot.
+pub(in crate::app) async fn send_stop(app: &App, stop: &Stop) -> StopDelivery {
     let command = StopCommand {
         stop: stop.id,
         by: stop.by.clone(),
@@ -38,21 +38,21 @@ pub(in crate::app) async fn tell(app: &App, stop: &Stop) -> Told {
     // Whatever runs under the robot's name stops; only its present run can confirm.
     let present = app.presences().get(&key).boot().map(|(boot, _since)| boot);
     let Ok(answer) = app.commands().send_to(&key, None, &command).await else {
-        return Told::Unconfirmed;
+        return StopDelivery::Unconfirmed;
     };
     if present.is_some_and(|boot| boot != answer.boot) {
         app.counters().commands_unanswered.one();
-        return Told::Unconfirmed;
+        return StopDelivery::Unconfirmed;
     }
     match answer.reply {
-        Acknowledgement::Done => Told::Confirmed,
+        Acknowledgement::Done => StopDelivery::Confirmed,
         Acknowledgement::Refused(refusal) if refusal.code == CommandRefusalCode::Ended => {
-            Told::Over
+            StopDelivery::Over
         }
         Acknowledgement::Refused(refusal) => {
             let detail = refusal.detail;
             error!(robot.id = %stop.robot, "robot `{}` does not stop: {detail}", stop.robot);
-            Told::Unconfirmed
+            StopDelivery::Unconfirmed
         }
     }
 }
@@ -71,8 +71,8 @@ impl Outgoing {
         let ending = self.app.supervisor().stop_token();
         let unrecorded = self.app.unrecorded();
         loop {
-            let told = tell(&self.app, &self.stop).await;
-            if told != Told::Unconfirmed {
+            let delivery = send_stop(&self.app, &self.stop).await;
+            if delivery != StopDelivery::Unconfirmed {
                 // What is over was in force; the reconciler hears that it is over. Nobody listens
                 // only when the server stops.
                 let _ = tell_of.send((self.stop.id, self.app.clock().now())).await;

@@ -3,7 +3,7 @@
 //! ```text
 //!          asked for, in place of what was open        confirmed
 //!  none ─────────────────────────────► unconfirmed ─────────────► confirmed
-//!   ▲  ▲                                 ▲  │ told again            │ │ │
+//!   ▲  ▲                                 ▲  │ sent again            │ │ │
 //!   │  └──────── over, says the robot ───┼──┘    shown no more      │ │ │
 //!   │                                    └──────────────────────────┘ │ │
 //!   │             clear asked for, and shown no more                  │ │
@@ -45,9 +45,9 @@ pub(super) struct Shown {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Verdict {
     Nothing,
-    /// The robot is told.
+    /// The stop is sent.
     Tell,
-    /// The robot does not show what it confirmed: it is told again.
+    /// The robot does not show what it confirmed: the stop is sent again.
     Lost,
     /// The robot has cleared it, as somebody asked.
     Cleared,

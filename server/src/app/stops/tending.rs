@@ -68,12 +68,12 @@ impl App {
             self.commit_alerts(tx, shown).await?;
             for stop in &lost {
                 let robot = &stop.robot;
-                warn!(robot.id = %robot, "robot `{robot}` no longer shows its stop; it is told again");
+                warn!(robot.id = %robot, "robot `{robot}` no longer shows its stop; the stop is sent again");
                 self.counters().stops_lost.one();
             }
             Ok::<(), AppError>(())
         };
-        // Robots are told again also while nothing can be written.
+        // Stops are sent again also while nothing can be written.
         if let Err(error) = writing.await {
             self.log_failure("write down what became of stops", &error);
         }
@@ -123,7 +123,7 @@ impl App {
             }
             match verdict {
                 Verdict::Tell => {
-                    // Whoever is there is told, and that raises the alert if it does not confirm.
+                    // A robot that is there gets the stop, and raises the alert if it does not confirm.
                     if !is_alerted && !presence.is_there(self.clock().elapsed()) {
                         tending.alerts.push(key);
                     }

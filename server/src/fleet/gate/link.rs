@@ -11,7 +11,7 @@ use tokio::io::AsyncWriteExt as _;
 use tokio::net::{TcpSocket, TcpStream};
 use tokio_rustls::{TlsAcceptor, server};
 use tracing::{debug, info, warn};
-use tread_api::tunnel::{ALPN, RouterCredentials, splice};
+use tread_api::tunnel::{ALPN, NOT_SENT_BYTES_MAX, RouterCredentials, UNANSWERED_MAX, splice};
 
 use super::Failures;
 use super::links::{CertificateHash, Entry, Links};
@@ -37,10 +37,6 @@ const INSIDE_TIMEOUT: Duration = Duration::from_secs(5);
 const OPENING_TIMEOUT: Duration = Duration::from_secs(5);
 /// Time between two looks whether the router has let go of a session.
 const SESSION_GONE_EVERY: Duration = Duration::from_millis(5);
-/// What the kernel takes of what it cannot send yet, bytes: it has lost its priority too.
-const NOT_SENT_BYTES_MAX: u32 = 4 * 1024;
-/// After this long without an answer to what was sent, the kernel gives a connection up.
-const UNANSWERED_MAX: Duration = Duration::from_secs(10);
 /// Bytes on their way within the gate, each way: what stands here has lost its priority.
 const BUFFER_BYTES: usize = 4 * 1024;
 /// Bytes of a connection that are looked at before anything else is done.
@@ -213,7 +209,7 @@ impl Link {
                 "{} showed a certificate that is no longer in force",
                 self.peer
             );
-            // Its successor may be well; people are told only of one that has none.
+            // Its successor may be well; only one that has none raises an alert.
             if self.app.enrolment_registry().standing(&robot)
                 == Some(Standing::Revoked(name.enrolment))
             {

@@ -5,7 +5,7 @@
 //!     │ too many open? ─► displaces one without a handshake, or is refused
 //!     │ begins like TLS? ─no─► closed
 //!     │ handshake with a certificate of the fleet's authority, in time? ─no─► closed
-//!     │ the certificate's enrolment in force? ─no─► closed, and people are told
+//!     │ the certificate's enrolment in force? ─no─► closed, and an alert is raised
 //!     │ cut off a short time ago? ─► its end
 //!     │ more than four links of this robot? ─► its oldest goes
 //!     │ the gate sends the robot its user name and password

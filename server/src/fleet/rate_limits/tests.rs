@@ -162,10 +162,10 @@ fn refused_messages_are_logged_now_and_then_with_their_count() {
 #[test]
 fn robots_that_are_kept_track_of_are_bounded_and_quiet_ones_make_room() {
     let limits = RateLimits::default();
-    for number in 0..=ROBOTS_MAX {
+    for number in 0..=TRACKED_ROBOTS_MAX {
         drop(limits.admit(robot(&format!("r{number}")), Kind::State, ms(0)));
     }
-    assert_eq!(limits.lock().len(), ROBOTS_MAX);
+    assert_eq!(limits.lock().len(), TRACKED_ROBOTS_MAX);
     let later = Duration::from_mins(2);
     assert!(limits.admit(robot("late"), Kind::State, later).is_some());
     assert_eq!(limits.lock().len(), 1);

@@ -170,7 +170,7 @@ mod tests {
         }
 
         #[test]
-        fn what_has_changed_since_is_told_or_everything_may_have(
+        fn what_has_changed_since_is_reported_or_everything_may_have(
             cells in prop::collection::vec((0..100, 0..3), 1..3_000), share in 0.0_f64..1.0,
         ) {
             let mut changes = Changes::default();

@@ -21,11 +21,8 @@ pub use self::changes::{BLOCK_CELLS, Block, Changes};
 use self::names::{Names, Number};
 use self::part::{Part, PartKey};
 pub use self::summaries::{At, CELLS_PER_BLOCK, CellSummary, GROUND_NONE, KnownCell, Lens, Room};
-use super::sums::{DAY_H, bucket_h};
+use super::sums::{DAY_H, HOUR_S, bucket_h};
 use super::{Seen, Sums};
-
-/// Seconds of an hour.
-const HOUR_S: i64 = 3_600;
 
 /// A sum with the names of what it is about.
 #[derive(Debug, Clone, Copy)]
@@ -132,12 +129,12 @@ pub struct Group<'map> {
     pub configuration: ConfigurationId,
     /// What each robot saw in each epoch.
     pub seen: Vec<Seen<u32>>,
-    /// Passes beside those that told nothing: their information vanishes in the sums.
+    /// Passes that are uninformative: their information vanishes in the sums.
     pub uninformative_passes: u64,
 }
 
 impl Group<'_> {
-    /// Whether any of its passes told anything.
+    /// Whether any of its passes has information.
     fn tells(&self) -> bool {
         !self.seen.is_empty()
     }

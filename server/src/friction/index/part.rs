@@ -114,7 +114,7 @@ impl Part {
         }
     }
 
-    /// How many passes it has, whether they told anything or not.
+    /// How many passes it has, with information or without.
     pub(super) fn passes(&self) -> u64 {
         u64::from(self.segments)
     }

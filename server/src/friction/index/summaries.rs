@@ -7,7 +7,8 @@ use tread_api::terrain::TerrainRef;
 
 use super::changes::{BLOCK_CELLS, Block};
 use super::part::{Part, PartKey};
-use super::{Choice, HOUR_S, SiteMap, Sums, place};
+use super::{Choice, SiteMap, Sums, place};
+use crate::friction::sums::HOUR_S;
 use crate::friction::weights::FrictionConfig;
 use crate::friction::{Fused, Fuser, Ground, Seen};
 
@@ -112,7 +113,7 @@ pub struct At<'config> {
 pub struct Room {
     fuser: Fuser<u32>,
     seen: Vec<Seen<u32>>,
-    /// Passes that told nothing.
+    /// Passes without information.
     uninformative_passes: u64,
 }
 

@@ -1,4 +1,4 @@
-//! What browsers are told: the session's cookie, headers that keep pages apart, and which foreign
+//! What browsers are sent: the session's cookie, headers that keep pages apart, and which foreign
 //! pages may ask at all.
 
 use std::sync::Arc;

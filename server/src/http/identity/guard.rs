@@ -62,7 +62,7 @@ pub(in crate::http) struct Guard {
     names: Arc<Names>,
 }
 
-/// A refusal: what is told, and what is counted.
+/// A refusal: what is answered, and what is counted.
 struct Refusal {
     response: Box<Response>,
     who: Option<Arc<Credential>>,

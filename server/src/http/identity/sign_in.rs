@@ -70,7 +70,7 @@ pub(in crate::http) struct AnswerQuery {
     code: Option<String>,
     /// Why not, if it has not.
     error: Option<String>,
-    /// The provider that says so.
+    /// Issuer of the provider that answers.
     iss: Option<String>,
 }
 

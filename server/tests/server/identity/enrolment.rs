@@ -288,12 +288,12 @@ async fn a_certificate_that_a_thief_of_the_key_makes_is_not_exchanged_for_one_at
     let (status, refused) = renew(&yard, &forged, &thief).await;
     assert_eq!(status, StatusCode::UNAUTHORIZED, "{refused}");
     assert_eq!(yard.counters().await.renewals_not_issued, 2);
-    eventually("people are told", async || {
+    eventually("an alert is raised", async || {
         let (_, alerts) = yard.get_value("/v1/alerts").await;
         let mut items = alerts["items"].as_array().unwrap().iter();
-        let told =
+        let is_raised =
             items.any(|it| it["code"] == "unknown-certificate" && it["cleared_at"].is_null());
-        if told { Ok(()) } else { Err(alerts) }
+        if is_raised { Ok(()) } else { Err(alerts) }
     })
     .await;
     eventually("it is in the audit log", async || {

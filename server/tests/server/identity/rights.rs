@@ -355,7 +355,7 @@ async fn a_token_of_one_robot_acts_on_it_alone_and_lists_show_nothing_else() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_happens_elsewhere_is_not_told_to_a_stream_that_is_open() {
+async fn what_happens_elsewhere_is_not_sent_to_a_stream_that_is_open() {
     let ground = Ground::prepare().await;
     let own = ground
         .yard
@@ -365,7 +365,7 @@ async fn what_happens_elsewhere_is_not_told_to_a_stream_that_is_open() {
     let mut stream = client(Some(&own)).get(url).send().await.unwrap();
     let mut text = String::new();
     read_until(&mut stream, &mut text, |text| text.contains("snapshot_end")).await;
-    // In this order: when the second is told, the first would have been.
+    // In this order: when the second is sent, the first would have been.
     let other = ground.yard.create_mission(&ground.second.id).await;
     let shown = ground.yard.create_mission(&ground.first.id).await;
     let id = shown.id.to_string();
@@ -575,7 +575,7 @@ async fn an_admin_of_a_site_uses_up_its_share_of_tokens_and_nobody_elses() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_token_has_used_as_an_idempotency_key_is_told_to_no_other_and_blocks_none() {
+async fn what_a_token_has_used_as_an_idempotency_key_is_shown_to_no_other_and_blocks_none() {
     let yard = Yard::start().await;
     let mut robots = Vec::new();
     let mut tokens = Vec::new();

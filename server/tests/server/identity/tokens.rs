@@ -24,7 +24,7 @@ async fn ask(yard: &Yard, token: &str) -> (StatusCode, Value) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_token_is_told_once_and_kept_nowhere() {
+async fn a_token_is_shown_once_and_stored_nowhere() {
     let yard = Yard::start().await;
     let (status, made) = yard
         .post(

@@ -96,7 +96,7 @@ impl Drop for Provider {
     }
 }
 
-/// A browser without a page: cookies, and redirects as far as it is told.
+/// A browser without a page: cookies, and redirects as far as the test asks.
 pub(super) struct Browser {
     client: reqwest::Client,
     server: String,

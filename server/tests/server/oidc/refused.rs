@@ -106,7 +106,7 @@ async fn an_id_token_of_another_sign_in_is_not_believed() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn whoever_is_in_no_group_is_told_so_as_a_person_and_as_a_program() {
+async fn whoever_is_in_no_group_is_refused_with_that_reason_as_a_person_and_as_a_program() {
     let port = free_port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;

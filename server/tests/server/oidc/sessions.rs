@@ -163,7 +163,7 @@ async fn a_person_has_one_share_of_sessions_and_is_never_called_like_a_token() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_token_that_is_made_with_the_name_of_a_person_is_told_from_them_everywhere() {
+async fn a_token_that_is_made_with_the_name_of_a_person_is_distinguished_from_them_everywhere() {
     let port = free_port();
     let _provider = Provider::start(port, &Kind::default()).await;
     let yard = start(port).await;

@@ -109,7 +109,7 @@ fn says<C: Command>(boot: BootId, reply: C::Reply) -> Vec<u8> {
 fn offered(heard: &Heard, state: &mut RobotState) -> Option<OfferReply> {
     Some(match heard.mood {
         Mood::Silent => return None,
-        Mood::Refusing(code) => OfferReply::Refused(CommandRefusal::new(code, "as told")),
+        Mood::Refusing(code) => OfferReply::Refused(CommandRefusal::new(code, "as the test asked")),
         Mood::Willing | Mood::Braking => {
             let offer = heard.offers.last().unwrap();
             state.mode = RobotMode::Tracking;

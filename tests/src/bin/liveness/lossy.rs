@@ -129,7 +129,7 @@ struct Filter {
 
 impl Filter {
     fn set_up(port: &str) -> anyhow::Result<Self> {
-        // Where packets arrive: a sender whose packet is dropped at its own end is told.
+        // Where packets arrive: a sender whose packet is dropped at its own end is notified.
         nft("table inet cut {\nchain arriving {\ntype filter hook input priority 0;\n}\n}")?;
         Ok(Self {
             port: port.to_owned(),

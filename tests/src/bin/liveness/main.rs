@@ -75,7 +75,7 @@ async fn shown(fleet: &Fleet, robot: &RobotId, link: LinkState) -> anyhow::Resul
     shown_since(fleet, robot, link, Instant::now()).await
 }
 
-/// The same, told from a moment that has passed.
+/// The same, counted from a moment that has passed.
 async fn shown_since(
     fleet: &Fleet,
     robot: &RobotId,

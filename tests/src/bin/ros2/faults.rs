@@ -32,7 +32,7 @@ const LOOK_EVERY: Duration = Duration::from_millis(20);
 /// How long it must have moved before the next fault.
 const MOVES_FOR: Duration = Duration::from_secs(2);
 
-/// A fault, what the agent must say of it, and how soon the robot must be told to rest.
+/// A fault, what the agent must say of it, and how soon the robot must be commanded to rest.
 struct Fault {
     name: &'static str,
     value: &'static str,
@@ -69,7 +69,7 @@ const FAULTS: [Fault; 12] = [
         ..fault(
             "stuck",
             "on",
-            &["do not do what they are told", "wheel speeds"],
+            &["do not follow their command", "wheel speeds"],
         )
     },
     // Started again under its identifier, after a pause that a supervisor makes.
@@ -179,7 +179,7 @@ impl Trial<'_> {
         Ok(checks)
     }
 
-    /// Whether and how soon the robot was told to rest.
+    /// Whether and how soon the robot was commanded to rest.
     fn of_rest(&self, fault: &Fault, switched_at: Instant) -> Vec<Check> {
         let name = fault.name;
         let most_ms = fault.zero_max_ms;
@@ -207,7 +207,10 @@ impl Trial<'_> {
         // A base that starts again may be heard again by now.
         if !starts_again(name) && !is_shared {
             let is_at_rest = zero.is_some() && !self.observer.is_moving();
-            checks.push(Check::so(format!("{name}: it is told to rest"), is_at_rest));
+            checks.push(Check::so(
+                format!("{name}: it is commanded to rest"),
+                is_at_rest,
+            ));
         }
         checks
     }
@@ -226,7 +229,7 @@ impl Trial<'_> {
         }
     }
 
-    /// Waits until the robot has been told to move for so long without a pause.
+    /// Waits until the robot has been commanded to move for so long without a pause.
     async fn moves_for(&self, span: Duration) -> bool {
         let bound = self.judgement.patience(AGAIN_MAX, AGAIN_AT_ALL_MAX) + span;
         let until = Instant::now() + bound;

@@ -24,9 +24,9 @@ const REST: f64 = 1.0e-9;
 /// A command that comes later is not the answer to a sensor's message.
 const ANSWER_MAX: Duration = Duration::from_secs(1);
 
-/// Topic, type and the begin of the type's hash of all that the agent tells the robot, as tokens
+/// Topic, type and the begin of the type's hash of all that the agent publishes to the robot, as tokens
 /// have them.
-const TOLD: [&str; 4] = [
+const PUBLISHED: [&str; 4] = [
     "/%rover%tread%plan/nav_msgs::msg::dds_::Path_/RIHS01_1957a5bb",
     "/%rover%tread%driven/nav_msgs::msg::dds_::Path_/RIHS01_1957a5bb",
     "/%rover%tread%theta/std_msgs::msg::dds_::Float64MultiArray_/RIHS01_1025ddc6",
@@ -192,11 +192,11 @@ fn shown_by(tokens: &[String]) -> Vec<Check> {
     };
     vec![
         counted("the agent's node", "/NN/", 1),
-        counted("what it commands and tells", "/MP/", 1 + TOLD.len()),
+        counted("what it publishes", "/MP/", 1 + PUBLISHED.len()),
         counted("what it listens to", "/MS/", 5),
         Check::so(
             "graph: plan, driven path, friction and diagnostics by topic and type",
-            TOLD.iter().all(|told| of_agent(told) == 1),
+            PUBLISHED.iter().all(|topic| of_agent(topic) == 1),
         ),
         Check::so(
             "graph: the robot's own node",

@@ -20,8 +20,8 @@ mod stop;
 use std::process::ExitCode;
 
 use clap::Parser;
-use tread_agent::testing::lease_model;
-use tread_lab::teleoperation_trials;
+use tread_agent::testing::lease_model::{self, LeaseModelRun};
+use tread_lab::teleoperation_trials::{self, TrialRun};
 use tread_tests::fleet::Fleet;
 use tread_tests::process::node;
 use tread_tests::report::{self, Check, figure};
@@ -63,9 +63,16 @@ pub(crate) struct Arguments {
 async fn main() -> anyhow::Result<ExitCode> {
     let arguments = Arguments::parse();
     let node = node()?;
-    let (trials, steps, seed) = (arguments.trials, arguments.steps, arguments.seed);
-    let mut checks =
-        tokio::task::spawn_blocking(move || on_the_bench(trials, steps, seed)).await??;
+    let seed = arguments.seed;
+    let trials = TrialRun {
+        trials: arguments.trials,
+        seed,
+    };
+    let model = LeaseModelRun {
+        steps: arguments.steps,
+        seed,
+    };
+    let mut checks = tokio::task::spawn_blocking(move || on_the_bench(trials, model)).await??;
     let fleet = Fleet::start_with(&node).await;
     checks.extend(stop::measure(&arguments, &fleet).await?);
     drop(fleet);
@@ -78,9 +85,11 @@ async fn main() -> anyhow::Result<ExitCode> {
     report::tell(arguments.json, &checks)
 }
 
-fn on_the_bench(trials: u64, steps: u64, seed: u64) -> anyhow::Result<Vec<Check>> {
-    let hand = teleoperation_trials::run(trials, seed)?;
-    let model = lease_model::run(steps, seed);
+fn on_the_bench(run: TrialRun, model: LeaseModelRun) -> anyhow::Result<Vec<Check>> {
+    let TrialRun { trials, .. } = run;
+    let hand = teleoperation_trials::run(run)?;
+    let steps = model.steps;
+    let model = lease_model::run(model);
     let counts = model.counts;
     let refused = counts.malformed + counts.foreign + counts.out_of_order + counts.expired;
     Ok(vec![

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::Context;
-use tread_agent::sim::scenario::Scenario;
+use tread_agent::sim::scenario::{Scenario, ScenarioText};
 use tread_agent::{Agent, AgentConfig, RunningAgent};
 use tread_api::ids::RobotId;
 use tread_tests::fleet::{GROUND_THETA, SITE};
@@ -25,7 +25,10 @@ pub(crate) fn start(number: u32, endpoint: &str, folder: &Path) -> anyhow::Resul
         "site = \"{SITE}\"\ncell_m = 1.0\nterrains = []\n[ground]\nstiffness = {stiffness}\n\
          [[robots]]\nid = \"{robot}\"\nx_m = {x_m:?}\ny_m = 0.0\nheading_rad = 0.0\nseed = {number}\n"
     );
-    let scenario = Scenario::parse("scenario", &text)?;
+    let scenario = Scenario::parse(ScenarioText {
+        file: "scenario",
+        text: &text,
+    })?;
     let data_dir = folder.join(robot.as_str());
     let config = AgentConfig::simulated(scenario, robot, endpoint.to_owned(), data_dir)?;
     Agent::start(config).context("an agent does not start")

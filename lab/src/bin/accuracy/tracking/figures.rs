@@ -62,7 +62,7 @@ fn from_the_table(lines: &[Line], checks: &mut Vec<Check>) {
                 .iter()
                 .filter(quiet)
                 .find(|line| line.course == course && line.terrain == Terrain::Uniform(stiffness));
-            let ratio = line.map_or(f64::NAN, |line| line.rms_m[OWN] / line.rms_m[PEER]);
+            let ratio = line.map(|line| line.rms_m[OWN] / line.rms_m[PEER]);
             let name = format!("{course}, K {stiffness}, own θ over the peer");
             checks.push(Check::at_most(name, ratio, share));
         }

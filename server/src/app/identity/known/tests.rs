@@ -38,7 +38,7 @@ fn a_look_up_that_began_before_an_end_is_not_kept_after_it() {
 }
 
 #[test]
-fn who_expires_or_is_ended_is_gone_and_told_so() {
+fn a_credential_that_expires_or_is_ended_is_gone_and_its_requests_are_cancelled() {
     let known = Known::default();
     let keep = |byte| {
         let generation = known.generation();
