@@ -22,9 +22,9 @@ pub enum LinkError {
     /// A call of zenoh failed.
     #[error("zenoh could not {action}: {problem}")]
     Zenoh {
-        /// What was tried.
+        /// The action that failed.
         action: &'static str,
-        /// What zenoh said.
+        /// The error message of zenoh.
         problem: String,
     },
 }

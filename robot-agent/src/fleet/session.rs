@@ -28,7 +28,7 @@ const TUNNEL_SEND_BUFFER_BYTES: u32 = 4 * 1024;
 /// Longest pause before the first attempt to connect.
 const START_JITTER_MAX: Duration = Duration::from_millis(300);
 
-/// Returns the pause before the first attempt to connect, from 0 to [`START_JITTER_MAX`], derived
+/// Returns the pause before the first attempt to connect, from 0 to `START_JITTER_MAX`, derived
 /// from the random boot identifier.
 pub fn start_jitter(boot: BootId) -> Duration {
     let share = f64::from(boot.as_uuid().as_fields().0) / f64::from(u32::MAX);
@@ -48,7 +48,7 @@ fn with_small_buffer(server: &str) -> String {
 /// Credentials of a session at the router.
 #[derive(Clone)]
 pub(super) struct SessionUser {
-    /// The session's zenoh id, as zenoh's configuration has it.
+    /// zenoh id of the session, in hexadecimal.
     pub(super) session_id: String,
     /// The user name.
     pub(super) user: String,
