@@ -4,7 +4,6 @@
 //! The base has a watchdog of its own and stops the wheels without commands; ending the process
 //! makes the service manager start a new one. Runs on its own thread, independent of a starved
 //! async runtime.
-//! must not silence it.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
